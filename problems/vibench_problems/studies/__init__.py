@@ -1,0 +1,8 @@
+"""The studies that vibench ships; each entry point names the path of a study file."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+quick = Path(__file__).with_name("quick.toml")
+paper_obstacle = Path(__file__).with_name("paper-obstacle.toml")

@@ -1,0 +1,13 @@
+"""No enrichment: the primal and the dual basis know nothing of each other."""
+
+from __future__ import annotations
+
+from vibench.strategy import Enrichment, Kind, Offline, PrimalStrategy
+
+
+class Decorrelated(PrimalStrategy):
+    """V_N alone (Balajewicz, Amsallem and Farhat 2016; §2.2 of Niakh et al. 2022); nothing guarantees stability."""
+
+    def build(self, offline: Offline, tolerance: float | None) -> Enrichment:  # noqa: ARG002
+        """Add nothing."""
+        return Enrichment(Kind.NONE)

@@ -1,0 +1,1 @@
+"""vibench: a benchmark framework for reduced-order models of parametrised variational inequalities."""

@@ -1,0 +1,203 @@
+"""The command line."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Annotated, Literal
+
+import pandas as pd
+import typer
+from rich import box
+from rich.console import Console
+from rich.table import Table
+
+from vibench import figures, plugins, provenance, qp, tables
+from vibench.errors import RequestError, VibenchError, unknown_name
+from vibench.matrix import Cell, expand
+from vibench.progress import Report
+from vibench.qp import Status
+from vibench.runner import Outcome, run_study
+from vibench.schema import TABLES
+from vibench.solver_settings import SETTINGS
+from vibench.study import Study, load_study
+
+app = typer.Typer(
+    name="vibench",
+    help="Benchmark reduced-order models of parametrised variational inequalities.",
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,
+)
+
+WIDTH = 160
+"""Columns of a table where the output is no terminal."""
+
+LISTS = {"problems": "problem", "primal": "primal strategy", "dual": "dual strategy", "studies": "study"}
+
+
+@app.command()
+def run(
+    study: Annotated[str, typer.Argument(help="A registered study, or a TOML file.")] = "quick",
+    problem: Annotated[list[str] | None, typer.Option(help="Replace the problems of the study (repeatable).")] = None,
+    dual: Annotated[list[str] | None, typer.Option(help="Replace the dual strategies.")] = None,
+    primal: Annotated[list[str] | None, typer.Option(help="Replace the primal strategies.")] = None,
+    solver: Annotated[list[str] | None, typer.Option(help="Replace the QP solvers.")] = None,
+    pod_tol: Annotated[list[float] | None, typer.Option(help="Replace the tolerances (or sizes) of the POD.")] = None,
+    dual_tol: Annotated[list[float] | None, typer.Option(help="Replace those of the dual strategies.")] = None,
+    primal_tol: Annotated[list[float] | None, typer.Option(help="Replace those of the primal strategies.")] = None,
+    out: Annotated[Path | None, typer.Option(help="Folder for the results; runs/<study> unless given.")] = None,
+    jobs: Annotated[int, typer.Option(min=0, help="Worker processes; 0: one per core. Changes no result.")] = 0,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="List the matrix and stop.")] = False,
+    fresh: Annotated[bool, typer.Option("--fresh", help="Begin from nothing, not from earlier results.")] = False,
+    retry: Annotated[bool, typer.Option("--retry", help="Also redo cells that did not end ok.")] = False,
+    strict: Annotated[bool, typer.Option("--strict", help="Exit with 1 if a cell is not ok or unavailable.")] = False,
+) -> None:
+    """Run a study's matrix; an interrupted run goes on where it stopped."""
+    overrides = {
+        "problem": problem, "dual": dual, "primal": primal, "solvers": solver,
+        "pod": pod_tol, "dual_tol": dual_tol, "primal_tol": primal_tol,
+    }  # fmt: skip
+    loaded = load_study(study, {axis: values for axis, values in overrides.items() if values})
+    console = _console()
+    if dry_run:
+        _list_matrix(console, expand(loaded))
+        return
+    folder = out or Path("runs") / loaded.name
+    workers = jobs or provenance.cores()
+    with Report(console, workers) as report:
+        outcome = run_study(loaded, folder, report, jobs=workers, fresh=fresh, retry=retry)
+    path = tables.results_file(str(folder))
+    tables.export(path, folder / "tables")
+    if outcome.interrupted:
+        console.print(f"interrupted: {outcome.missing} cells have no row yet; the same command goes on from here")
+        raise typer.Exit(130)
+    drawn = figures.draw_all(path, folder / "figures")
+    _summarise(console, loaded, folder, outcome, drawn)
+    if strict and any(row["status"] not in (Status.OK, Status.UNAVAILABLE) for row in outcome.rows):
+        raise typer.Exit(1)
+
+
+@app.command("list")
+def list_plugins(
+    what: Annotated[
+        str | None, typer.Argument(help="problems, primal, dual, solvers or studies; all of them unless given.")
+    ] = None,
+) -> None:
+    """List what is registered: names, what they are, and their options."""
+    console = _console()
+    if what is not None and what not in (*LISTS, "solvers"):
+        raise unknown_name("list", what, (*LISTS, "solvers"))
+    for title in [what] if what else [*LISTS, "solvers"]:
+        rows = _solver_rows() if title == "solvers" else _plugin_rows(LISTS[title])
+        columns = ("name", "version" if title == "solvers" else "from", "what", "options")
+        _print_frame(console, pd.DataFrame(rows, columns=columns), title)
+
+
+@app.command()
+def show(
+    run: Annotated[str, typer.Argument(metavar="RUN", help="A run folder, or the name of a study run before.")],
+    table: Annotated[str, typer.Option(help="summary, benefits, cells, queries, histories or thresholds.")] = "summary",
+    form: Annotated[
+        Literal["terminal", "markdown", "csv"], typer.Option("--format", help="How to print it.")
+    ] = "terminal",
+) -> None:
+    """Print a table of a run."""
+    path = tables.results_file(run)
+    derived = {"summary": ("cells", tables.summary), "benefits": ("thresholds", tables.benefits)}
+    if table in derived:
+        source, view = derived[table]
+        frame = view(tables.read(path, source))
+    elif table in TABLES:
+        frame = tables.in_order(tables.read(path, table))
+    else:
+        raise unknown_name("table", table, (*derived, *TABLES))
+    if form == "terminal":
+        _print_frame(_console(), frame, f"{path.parent.name}: {table}")
+    else:
+        sys.stdout.write(tables.to_csv(frame) if form == "csv" else tables.to_markdown(frame))
+
+
+def main() -> None:
+    """Entry point: what is wrong with a request is one line and exit code 2."""
+    usage_error = typer.BadParameter.__mro__[2]  # click's ClickException, whichever copy of click typer brings
+    try:
+        code = app(standalone_mode=False)
+    except RequestError as error:
+        code = _refuse(error)
+    except VibenchError as error:
+        code = _refuse(error, 1)
+    except typer.Abort:
+        code = 130
+    except Exception as error:
+        if not isinstance(error, usage_error):
+            raise
+        code = _refuse(error.format_message())  # type: ignore[attr-defined]
+    sys.exit(code if isinstance(code, int) else 0)
+
+
+def _refuse(error: object, code: int = 2) -> int:
+    sys.stderr.write("vibench: " + " ".join(str(error).split()) + "\n")
+    return code
+
+
+def _console() -> Console:
+    console = Console(highlight=False)
+    return console if console.is_terminal else Console(highlight=False, width=WIDTH)
+
+
+def _list_matrix(console: Console, cells: list[Cell]) -> None:
+    for cell in cells:
+        console.print(f"{cell.key}  {cell}", markup=False, soft_wrap=True)
+    console.print(f"{len(cells)} cells")
+
+
+def _summarise(console: Console, study: Study, folder: Path, outcome: Outcome, drawn: list[Path]) -> None:
+    path = tables.results_file(str(folder))
+    _print_frame(console, tables.summary(tables.read(path, "cells")), study.name)
+    short = [row for row in outcome.rows if row["status"] != Status.OK]
+    for row in short:
+        tolerance = "" if row["primal_tol"] is None else f" {row['primal_tol']:g}"
+        console.print(
+            f"{row['status']}: {row['problem']} · {row['dual']} · {row['primal']}{tolerance} · {row['solver']}: "
+            f"{row['queries_ok']} of {row['queries']} queries ok; {row['reason']}",
+            markup=False, soft_wrap=True,
+        )  # fmt: skip
+    console.print(f"{len(outcome.rows)} cells, {len(outcome.rows) - len(short)} ok, {len(short)} fell short")
+    console.print(f"results: {path}, tables: {folder / 'tables'}, {len(drawn)} figures: {folder / 'figures'}")
+
+
+def _plugin_rows(kind: str) -> list[tuple[str, str, str, str]]:
+    rows = []
+    for name in plugins.names(kind):
+        if kind == "study":
+            study = load_study(name)
+            rows.append((name, plugins.version(kind, name), f"{len(expand(study))} cells", ""))
+            continue
+        summary = (plugins.load(kind, name).__doc__ or "").strip().split("\n")[0]
+        options = [f"{o.name}: {o.expected}" + f" = {o.default}" * bool(o.default) for o in plugins.options(kind, name)]
+        rows.append((name, plugins.version(kind, name), summary, "\n".join(options)))
+    return rows
+
+
+def _solver_rows() -> list[tuple[str, str, str, str]]:
+    extra = plugins.qp_solvers()
+    installed = qp.installed_solvers(extra)
+    known = sorted({*SETTINGS, *extra})
+    return [
+        (name, provenance.solver_version(name), "installed" if name in installed else "not installed", "")
+        for name in known
+    ]
+
+
+def _print_frame(console: Console, frame: pd.DataFrame, title: str) -> None:
+    table = Table(title=title, title_justify="left", pad_edge=False, box=box.SIMPLE_HEAD)
+    rows = [[tables.cell_text(value) for value in row] for row in frame.itertuples(index=False)]
+    for k, name in enumerate(frame.columns):
+        numeric = pd.api.types.is_numeric_dtype(frame[name])
+        words = [word for row in rows for word in row[k].split()]
+        widest = max((len(word) for word in words), default=1)
+        table.add_column(str(name), justify="right" if numeric else "left", min_width=min(widest, 24))
+    for row in rows:
+        table.add_row(*(text.replace("[", "\\[") for text in row))
+    console.print(table)

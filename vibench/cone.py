@@ -1,0 +1,102 @@
+"""Projection on polyhedral cones and the greedy construction of cones (paper, §4)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import nnls
+
+from vibench.arrays import Array
+from vibench.errors import NumericalError
+from vibench.greedy import LazyMaximum
+from vibench.space import InnerProduct
+from vibench.strategy import Cone, Stop, no_free
+
+Subtract = Callable[[Array, Array], tuple[Array, str]]
+"""From a snapshot θ (m,) and the generators so far (m×r): the part Υ ∈ K_r of θ to leave out, and a fallback note."""
+
+
+@dataclass(frozen=True)
+class Projection:
+    """Projection of θ on a cone: coefficients α ≥ 0 (R,) and the distance ‖θ − χα‖_W."""
+
+    coefficients: Array
+    distance: float
+
+
+def project(generators: Array, theta: Array, W: InnerProduct) -> Projection:
+    """Project θ (m,) on the cone of `generators` (m×R) in the W norm; a nonnegative least squares problem."""
+    return _project_whitened(W.whiten(generators), W.whiten(theta))
+
+
+def _project_whitened(generators: Array, theta: Array) -> Projection:
+    if not generators.shape[1]:
+        return Projection(np.zeros(0), float(np.linalg.norm(theta)))
+    try:
+        coefficients, distance = nnls(generators, theta, maxiter=30 * generators.shape[1])
+    except RuntimeError as error:
+        raise NumericalError(f"projection on a cone of {generators.shape[1]} generators failed: {error}") from None
+    return Projection(np.asarray(coefficients), float(distance))
+
+
+def greedy_cone(snapshots: Array, W: InnerProduct, stop: Stop, subtract: Subtract) -> Cone:
+    """Greedy cone with the relative maximum criterion (paper, Algorithm 2 and Remark 4.3).
+
+    Each step takes the snapshot farthest from the present cone and adds the direction of what `subtract` leaves of
+    it. Cones are nested, so distances only fall and the maximum is taken lazily. It ends before `stop` where all
+    snapshots are reproduced to round-off (Remark 4.2).
+
+    Parameters
+    ----------
+    snapshots
+        θ_q (m×Q), coefficientwise nonnegative.
+    W
+        Inner product of the multiplier space.
+    stop
+        Relative largest projection error, or number of generators.
+    subtract
+        What to leave out of the chosen snapshot: nothing for CPG, line 9 of Algorithm 2 for mCPG.
+
+    Raises
+    ------
+    NumericalError
+        If a snapshot has a negative coefficient: it would not be in W⁺.
+    """
+    if snapshots.size and snapshots.min() < 0.0:
+        raise NumericalError(f"a multiplier snapshot has the negative coefficient {snapshots.min():.1e}")
+    whitened = W.whiten(snapshots)
+    norms = np.linalg.norm(whitened, axis=0)
+    largest = float(norms.max(initial=0.0))
+    if largest == 0.0:
+        return Cone(np.zeros((W.dim, 0)), np.zeros(1), no_free(0))
+    maximum = LazyMaximum(norms / largest)
+    generators, in_whitened = np.zeros((W.dim, 0)), np.zeros((W.dim, 0))
+    pick, error = int(np.argmax(norms >= norms.max() * (1.0 - 1e-9))), 1.0
+    errors, fallbacks = [error], []
+    while not stop.reached(generators.shape[1], error) and generators.shape[1] < snapshots.shape[1]:
+        part, note = subtract(snapshots[:, pick], generators)
+        if note:
+            fallbacks.append(f"generator {generators.shape[1] + 1}: {note}")
+        direction = snapshots[:, pick] - part
+        length = float(W.norm(direction))
+        if length <= 1e-12 * norms[pick]:
+            break
+        generators = np.column_stack([generators, direction / length])
+        in_whitened = W.whiten(generators)
+        maximum.exclude(pick)
+        if generators.shape[1] == snapshots.shape[1]:
+            errors.append(0.0)
+            break
+        pick, error = maximum.next(
+            lambda q: _project_whitened(in_whitened, whitened[:, q]).distance / largest  # noqa: B023  called at once
+        )
+        errors.append(error)
+    return Cone(generators, np.array(errors), no_free(generators.shape[1]), tuple(fallbacks))
+
+
+def orthogonality(generators: Array, W: InnerProduct) -> Array:
+    """e_orth(r) for r = 0 … R−1: distance of generator r+1 from the cone of the first r (paper, equation (41))."""
+    whitened = W.whiten(generators)
+    return np.array([_project_whitened(whitened[:, :r], whitened[:, r]).distance for r in range(whitened.shape[1])])

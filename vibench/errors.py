@@ -1,0 +1,26 @@
+"""The errors vibench raises on purpose; the command line turns them into one line and an exit code."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable
+
+
+class VibenchError(Exception):
+    """Base of every error vibench raises on purpose; its message is one line."""
+
+
+class RequestError(VibenchError):
+    """What the user asked for is wrong: a study file, a name, an option or an output folder (exit code 2)."""
+
+
+class NumericalError(VibenchError):
+    """A computation cannot go on: a matrix that is not SPD, values that are not finite, no convergence."""
+
+
+def unknown_name(kind: str, name: str, known: Iterable[str]) -> RequestError:
+    """Build the error for a name nobody registered, with the nearest known one suggested."""
+    choices = sorted(known)
+    near = difflib.get_close_matches(name, choices, n=1)
+    hint = f"; did you mean '{near[0]}'?" if near else ""
+    return RequestError(f"no {kind} is called '{name}'{hint} (known: {', '.join(choices) or 'none'})")

@@ -1,0 +1,130 @@
+"""The results file: one SQLite database per run folder, one transaction per cell."""
+
+from __future__ import annotations
+
+import json
+import sqlite3
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from vibench.errors import RequestError
+from vibench.schema import TABLES, VERSION
+
+FILE = "results.sqlite"
+
+
+class Journal:
+    """The results of one study in one folder.
+
+    Parameters
+    ----------
+    folder
+        The run folder; made if it does not exist.
+    study
+        What the numbers of the study depend on (`matrix.identity`): results of another study are refused.
+
+    Raises
+    ------
+    RequestError
+        If the folder is a file, or holds something that is not a results file of this study and schema.
+    """
+
+    def __init__(self, folder: Path, study: Mapping[str, Any]) -> None:
+        if folder.exists() and not folder.is_dir():
+            raise RequestError(f"output folder '{folder}' is a file")
+        path = folder / FILE
+        if folder.is_dir() and not path.exists() and any(folder.iterdir()):
+            raise RequestError(f"output folder '{folder}' is not empty and holds no {FILE}; choose another with --out")
+        _refuse_other(path, study)
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            self._db = sqlite3.connect(path)
+            self._db.execute("PRAGMA journal_mode=WAL")
+            self._db.execute("PRAGMA foreign_keys=ON")
+            with self._db:
+                self._create(study)
+        except (OSError, sqlite3.Error) as error:
+            raise RequestError(f"output folder '{folder}' cannot be written: {error}") from None
+
+    def _create(self, study: Mapping[str, Any]) -> None:
+        self._db.execute("CREATE TABLE IF NOT EXISTS meta (key TEXT PRIMARY KEY, value TEXT)")
+        for table, columns in TABLES.items():
+            declared = ", ".join(f'"{name}" {kind}' for name, kind in columns.items())
+            self._db.execute(f"CREATE TABLE IF NOT EXISTS {table} ({declared})")
+        self._db.execute("CREATE INDEX IF NOT EXISTS queries_of_cell ON queries(cell)")
+        entries = {"schema": str(VERSION), "study": json.dumps(study, sort_keys=True)}
+        self._db.executemany("INSERT OR REPLACE INTO meta VALUES (?, ?)", entries.items())
+
+    def close(self) -> None:
+        """Close the file; what was written stays."""
+        self._db.close()
+
+    def finished(self) -> dict[str, tuple[str, str]]:
+        """Cells that have a row: key → (status, code)."""
+        return {key: (status, code) for key, status, code in self._db.execute("SELECT cell, status, code FROM cells")}
+
+    def write_cell(self, cell: Mapping[str, Any], queries: Sequence[Mapping[str, Any]]) -> None:
+        """Write a cell and its queries in one transaction, in place of earlier rows of the same cell."""
+        self._add_columns(queries)
+        with self._db:
+            self._db.execute("DELETE FROM cells WHERE cell = ?", (cell["cell"],))
+            self._insert("cells", [cell])
+            self._insert("queries", queries)
+
+    def write_histories(self, artefact: str, rows: Sequence[Mapping[str, Any]]) -> None:
+        """Write the histories of one artefact in place of its earlier ones."""
+        with self._db:
+            self._db.execute("DELETE FROM histories WHERE artefact = ?", (artefact,))
+            self._insert("histories", rows)
+
+    def write_thresholds(self, rows: Sequence[Mapping[str, Any]]) -> None:
+        """Replace the table of thresholds."""
+        with self._db:
+            self._db.execute("DELETE FROM thresholds")
+            self._insert("thresholds", rows)
+
+    def rows(self, table: str) -> list[dict[str, Any]]:
+        """All rows of a table."""
+        cursor = self._db.execute(f"SELECT * FROM {table}")
+        names = [column[0] for column in cursor.description]
+        return [dict(zip(names, row, strict=True)) for row in cursor]
+
+    def _insert(self, table: str, rows: Iterable[Mapping[str, Any]]) -> None:
+        for row in rows:
+            names = ", ".join(f'"{name}"' for name in row)
+            marks = ", ".join("?" for _ in row)
+            self._db.execute(f"INSERT INTO {table} ({names}) VALUES ({marks})", tuple(row.values()))
+
+    def _add_columns(self, queries: Sequence[Mapping[str, Any]]) -> None:
+        """Make room for as many parameters mu_1, mu_2, … as the rows have."""
+        known = {row[1] for row in self._db.execute("PRAGMA table_info(queries)")}
+        for name in dict.fromkeys(name for row in queries for name in row):
+            if name not in known and name.startswith("mu_"):
+                self._db.execute(f'ALTER TABLE queries ADD COLUMN "{name}" REAL')
+
+
+def _refuse_other(path: Path, study: Mapping[str, Any]) -> None:
+    if not path.exists():
+        return
+    try:
+        found = read_meta(path)
+    except sqlite3.Error as error:
+        raise RequestError(f"'{path}' is not a results file of vibench: {error}") from None
+    if found.get("schema") != str(VERSION):
+        raise RequestError(f"'{path}' has schema {found.get('schema')}, this vibench writes {VERSION}; use --out")
+    there = json.loads(found.get("study", "{}"))
+    if there != json.loads(json.dumps(study)):
+        what = ", ".join(
+            f"{key} {there.get(key)!r} instead of {study[key]!r}" for key in study if there.get(key) != study[key]
+        )
+        raise RequestError(f"'{path.parent}' holds results of another study ({what}); use another --out, or --fresh")
+
+
+def read_meta(path: Path) -> dict[str, str]:
+    """The meta table of a results file."""
+    db = sqlite3.connect(f"file:{path}?mode=ro", uri=True)
+    try:
+        return dict(db.execute("SELECT key, value FROM meta"))
+    finally:
+        db.close()

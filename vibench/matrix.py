@@ -1,0 +1,154 @@
+"""The matrix of a study: its cells, each with an identity that is the same whenever its numbers are."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict, dataclass
+from itertools import product
+from typing import Any
+
+from vibench import plugins
+from vibench.errors import RequestError
+from vibench.provenance import core_code, solver_version
+from vibench.strategy import Stop
+from vibench.study import Entry, Study, ToleranceTable
+
+
+def digest(content: Any) -> str:
+    """Short hash of anything JSON can hold, the same for equal content."""
+    text = json.dumps(content, sort_keys=True, separators=(",", ":"), ensure_ascii=True)
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+@dataclass(frozen=True)
+class Plugin:
+    """A plugin with its options, as an axis of a study names it.
+
+    Attributes
+    ----------
+    kind, name
+        What it is registered as.
+    options
+        Options as canonical JSON.
+    code
+        Distribution, version and a hash of the module it comes from.
+    """
+
+    kind: str
+    name: str
+    options: str
+    code: str
+
+    @classmethod
+    def from_entry(cls, kind: str, entry: Entry) -> Plugin:
+        """Plugin of an axis entry that has been checked."""
+        return cls(kind, entry.name, json.dumps(entry.options, sort_keys=True), plugins.code(kind, entry.name))
+
+    def create(self) -> Any:
+        """A new instance."""
+        return plugins.create(self.kind, self.name, json.loads(self.options))
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One cell: problem × dual strategy × primal strategy × tolerances × QP solver × assembly.
+
+    `seed`, `validation` and `accuracy` are the study's; labels are for reading and no part of the identity.
+    """
+
+    problem: Plugin
+    dual: Plugin
+    primal: Plugin
+    pod: Stop
+    cone: Stop
+    primal_tol: float | None
+    solver: str
+    assembly: str
+    seed: int
+    validation: int
+    accuracy: float
+    labels: tuple[str, str, str]
+
+    @property
+    def key(self) -> str:
+        """Hash of everything that determines the cell's numbers, the code aside."""
+        content = asdict(self)
+        del content["labels"]
+        for plugin in ("problem", "dual", "primal"):
+            del content[plugin]["code"]
+        return digest(content)
+
+    @property
+    def code(self) -> str:
+        """Hash of the code that computes the cell: the core, its plugins and its solver."""
+        plugins_used = [plugin.code for plugin in (self.problem, self.dual, self.primal)]
+        return digest([core_code(), *plugins_used, solver_version(self.solver)])
+
+    def __str__(self) -> str:
+        problem, dual, primal = self.labels
+        tolerance = "" if self.primal_tol is None else f" {self.primal_tol:g}"
+        sizes = f"{_stop(self.pod, 'N')}, {_stop(self.cone, 'R')}"
+        return f"{problem} · {dual} · {primal}{tolerance} · {sizes} · {self.solver}"
+
+
+def _stop(stop: Stop, size: str) -> str:
+    return f"{stop.tolerance:g}" if stop.tolerance is not None else f"{size}={stop.size}"
+
+
+def expand(study: Study) -> list[Cell]:
+    """All cells of a study, duplicates merged, in the order of its axes.
+
+    Raises
+    ------
+    RequestError
+        If a strategy that takes a tolerance is given none.
+    """
+    cells: dict[str, Cell] = {}
+    takes = {entry.name: plugins.load("primal strategy", entry.name).takes_tolerance for entry in study.primal}
+    for problem, table in product(study.problem, study.tolerances):
+        for dual, pod, cone, primal, tolerance in _combinations(study, table, takes):
+            for assembly, solver in product(study.assembly, study.solver_names()):
+                cell = Cell(
+                    problem=Plugin.from_entry("problem", problem),
+                    dual=Plugin.from_entry("dual strategy", dual),
+                    primal=Plugin.from_entry("primal strategy", primal),
+                    pod=pod,
+                    cone=cone,
+                    primal_tol=tolerance,
+                    solver=solver,
+                    assembly=assembly,
+                    seed=study.seed,
+                    validation=study.validation,
+                    accuracy=study.accuracy,
+                    labels=(problem.title, dual.title, primal.title),
+                )
+                cells.setdefault(cell.key, cell)
+    if not cells:
+        raise RequestError(f"study '{study.name}': the matrix is empty")
+    return list(cells.values())
+
+
+def _combinations(
+    study: Study, table: ToleranceTable, takes: Mapping[str, bool]
+) -> Iterator[tuple[Entry, Stop, Stop, Entry, float | None]]:
+    pods = [Stop(tolerance=value) for value in table.pod or []] + [Stop(size=value) for value in table.N or []]
+    for pod, dual, primal in product(pods, study.dual, study.primal):
+        cones = [Stop(tolerance=value) for value in _of(table.dual, dual, "tolerances.dual")]
+        cones += [Stop(size=value) for value in _of(table.R, dual, "tolerances.R")]
+        tolerances: list[float | None] = [None]
+        if takes[primal.name]:
+            tolerances = list(_of(table.primal, primal, "tolerances.primal"))
+        for cone, tolerance in product(cones, tolerances):
+            yield dual, pod, cone, primal, tolerance
+
+
+def _of(values: Any, entry: Entry, key: str) -> list[Any]:
+    """The values meant for one entry: a plain list is for all, a table says for whom."""
+    if not isinstance(values, dict):
+        return values or []
+    found = values.get(entry.title, values.get(entry.name))
+    if found is None:
+        raise RequestError(f"{key} gives nothing for '{entry.title}', which takes a tolerance")
+    return list(found)

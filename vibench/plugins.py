@@ -1,0 +1,167 @@
+"""Plugins found through entry points, created from options that their annotations check."""
+
+from __future__ import annotations
+
+import importlib
+import inspect
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cache
+from importlib.metadata import EntryPoint, entry_points
+from pathlib import Path
+from typing import Any, get_type_hints
+
+from pydantic import TypeAdapter, ValidationError
+
+from vibench.errors import RequestError, unknown_name
+from vibench.problem import Problem
+from vibench.provenance import source_hash
+from vibench.qp import QPSolver
+from vibench.strategy import DualStrategy, PrimalStrategy
+
+GROUPS: Mapping[str, str] = {
+    "problem": "vibench.problems",
+    "dual strategy": "vibench.dual_strategies",
+    "primal strategy": "vibench.primal_strategies",
+    "QP solver": "vibench.qp_solvers",
+    "study": "vibench.studies",
+}
+_BASES: Mapping[str, type] = {"problem": Problem, "dual strategy": DualStrategy, "primal strategy": PrimalStrategy}
+
+
+@dataclass(frozen=True)
+class Option:
+    """One option of a plugin: name, what is expected, default as text ("" when it must be given)."""
+
+    name: str
+    expected: str
+    default: str
+
+
+def names(kind: str) -> list[str]:
+    """Names registered for one kind of plugin, a key of `GROUPS`."""
+    return sorted(_registered(kind))
+
+
+def load(kind: str, name: str) -> Any:
+    """What a plugin's entry point refers to.
+
+    Raises
+    ------
+    RequestError
+        If no plugin has that name, it cannot be imported, or it is not of its kind.
+    """
+    registered = _registered(kind)
+    if name not in registered:
+        raise unknown_name(kind, name, registered)
+    try:
+        plugin = registered[name].load()
+    except (ImportError, AttributeError) as error:
+        raise RequestError(f"{kind} '{name}' ({registered[name].value}) cannot be loaded: {error}") from None
+    base = _BASES.get(kind)
+    if base is not None and not (isinstance(plugin, type) and issubclass(plugin, base)):
+        raise RequestError(f"{kind} '{name}' ({registered[name].value}) is not a subclass of {base.__qualname__}")
+    return plugin
+
+
+def create(kind: str, name: str, options: Mapping[str, Any]) -> Any:
+    """Instance of a plugin, its options checked."""
+    return load(kind, name)(**check_options(kind, name, options))
+
+
+def version(kind: str, name: str) -> str:
+    """Distribution and version a plugin comes from, "vibench 0.1.0"."""
+    found = _registered(kind)[name].dist
+    return f"{found.name} {found.version}" if found is not None else "unknown"
+
+
+@cache
+def code(kind: str, name: str) -> str:
+    """Version of a plugin with a hash of the package it is written in, so that edited code is not taken for the old."""
+    module = importlib.import_module(_registered(kind)[name].module)
+    return f"{version(kind, name)} {source_hash(Path(str(module.__file__)).parent)}"
+
+
+def options(kind: str, name: str) -> list[Option]:
+    """The options of a plugin, read from its constructor."""
+    found = []
+    for parameter, annotation in _parameters(load(kind, name)):
+        default = "" if parameter.default is inspect.Parameter.empty else repr(parameter.default)
+        found.append(Option(parameter.name, _expected(annotation), default))
+    return found
+
+
+def check_options(kind: str, name: str, given: Mapping[str, Any]) -> dict[str, Any]:
+    """Options as the annotations of the plugin's constructor ask for them.
+
+    Raises
+    ------
+    RequestError
+        Naming the option, what was given and what is expected.
+    """
+    known = {parameter.name: (parameter, annotation) for parameter, annotation in _parameters(load(kind, name))}
+    for option in given:
+        if option not in known:
+            raise unknown_name(f"option of {kind} '{name}'", option, known)
+    checked = {}
+    for option, (parameter, annotation) in known.items():
+        if option not in given:
+            if parameter.default is inspect.Parameter.empty:
+                raise RequestError(f"{kind} '{name}' needs the option '{option}' ({_expected(annotation)})")
+            continue
+        try:
+            checked[option] = TypeAdapter(annotation).validate_python(given[option], strict=True)
+        except ValidationError:
+            raise RequestError(
+                f"option '{option}' of {kind} '{name}' is {given[option]!r}; expected {_expected(annotation)}"
+            ) from None
+    return checked
+
+
+def qp_solvers() -> dict[str, QPSolver]:
+    """Solvers registered by plugins, those that qpsolvers does not have."""
+    return {name: load("QP solver", name) for name in names("QP solver")}
+
+
+def study_path(name: str) -> Path:
+    """File of a registered study."""
+    return Path(load("study", name))
+
+
+@cache
+def _registered(kind: str) -> dict[str, EntryPoint]:
+    found: dict[str, EntryPoint] = {}
+    for entry in entry_points(group=GROUPS[kind]):
+        other = found.get(entry.name)
+        if other is not None and other.value != entry.value:
+            raise RequestError(f"two packages register the {kind} '{entry.name}': {other.value} and {entry.value}")
+        found[entry.name] = entry
+    return found
+
+
+def _parameters(plugin: Any) -> list[tuple[inspect.Parameter, Any]]:
+    constructor = inspect.getattr_static(plugin, "__init__")
+    if constructor is object.__init__:
+        return []
+    hints = get_type_hints(constructor, include_extras=True)
+    parameters = list(inspect.signature(constructor).parameters.values())[1:]  # without self
+    return [(p, hints.get(p.name, Any)) for p in parameters]
+
+
+def _expected(annotation: Any) -> str:
+    """An annotation in words: "float > 0.0", "'coarse', 'fine' or int ≥ 150"."""
+    schema = TypeAdapter(annotation).json_schema()
+    return " or ".join(_words(part) for part in schema.get("anyOf", [schema]))
+
+
+def _words(schema: Mapping[str, Any]) -> str:
+    if "enum" in schema:
+        return ", ".join(repr(value) for value in schema["enum"])
+    if "const" in schema:
+        return repr(schema["const"])
+    kind = {"integer": "int", "number": "float", "string": "str", "boolean": "bool", "array": "list"}.get(
+        str(schema.get("type", "")), str(schema.get("type", "any value"))
+    )
+    signs = {"exclusiveMinimum": ">", "minimum": "≥", "exclusiveMaximum": "<", "maximum": "≤"}
+    bounds = [f"{sign} {schema[key]:g}" for key, sign in signs.items() if key in schema]
+    return " ".join([kind, " and ".join(bounds)]).strip()

@@ -1,0 +1,130 @@
+"""What a problem plugin is: a parametrised variational inequality on a high-fidelity pair of spaces."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from vibench.arrays import Array, SparseMatrix
+from vibench.errors import NumericalError
+from vibench.space import InnerProduct
+
+
+@dataclass(frozen=True)
+class ParameterBox:
+    """The parameter domain D: a box.
+
+    Attributes
+    ----------
+    names
+        One name per parameter.
+    lower, upper
+        Bounds (d,).
+    units
+        One unit per parameter, "1" for a number.
+    """
+
+    names: tuple[str, ...]
+    lower: Array
+    upper: Array
+    units: tuple[str, ...]
+
+    @property
+    def dim(self) -> int:
+        """Number d of parameters."""
+        return len(self.names)
+
+    def grid(self, *counts: int) -> Array:
+        """Regular grid (P×d) with `counts` points per direction, the last direction running fastest."""
+        axes = [np.linspace(a, b, k) for a, b, k in zip(self.lower, self.upper, counts, strict=True)]
+        return np.stack([m.ravel() for m in np.meshgrid(*axes, indexing="ij")], axis=1)
+
+    def sample(self, count: int, seed: int) -> Array:
+        """`count` uniform random points (count×d), the same for the same seed."""
+        uniform = np.random.default_rng(seed).random((count, self.dim))
+        return np.asarray(self.lower + uniform * (self.upper - self.lower))
+
+
+@dataclass(frozen=True)
+class VariationalInequality:
+    """u = argmin ½ uᵀA u − fᵀu subject to B u ≤ g at one parameter (paper, equations (1), (2) and (7)).
+
+    Attributes
+    ----------
+    A
+        Stiffness, sparse SPD (n×n), on the free degrees of freedom.
+    f
+        Load (n,), the lift's share included.
+    B
+        Constraint, sparse (m×n), sign such that A u + Bᵀλ = f with λ ≥ 0.
+    g
+        Bound (m,), the lift's share included.
+    lift
+        Values that an inhomogeneous Dirichlet condition adds to u in pictures; `None` where there are none.
+    """
+
+    A: SparseMatrix
+    f: Array
+    B: SparseMatrix
+    g: Array
+    lift: Array | None = field(default=None)
+
+
+class Problem(ABC):
+    """A parametrised variational inequality with its high-fidelity discretisation.
+
+    Constructor arguments are the plugin's options; their annotations check what a study file gives. A problem is
+    immutable once built, and `assemble` depends on nothing but the parameter.
+    """
+
+    parameters: ParameterBox
+    """Names, bounds and units of the parameters."""
+    V: InnerProduct
+    """Inner product of the primal space, X_V (n×n), independent of the parameter."""
+    W: InnerProduct
+    """Inner product of the multiplier space, X_W (m×m), in a basis whose nonnegative coefficients are the cone W⁺."""
+
+    @abstractmethod
+    def training_set(self) -> Array:
+        """Parameters (P×d) the reduced model is trained on."""
+
+    def validation_set(self, count: int, seed: int) -> Array:
+        """Parameters (count×d) the reduced model is judged on; uniform in the box unless a problem knows better."""
+        return self.parameters.sample(count, seed)
+
+    @abstractmethod
+    def assemble(self, mu: Array) -> VariationalInequality:
+        """High-fidelity matrices and vectors at the parameter mu (d,)."""
+
+    def multiplier_integrals(self) -> Array:
+        """Integrals (m,) of the multiplier basis functions, the unit in which a constraint violation is a length.
+
+        X_W applied to ones, which is right for every basis that sums to one in an L² product.
+        """
+        return self.W.apply(np.ones(self.W.dim))
+
+    def diagnostics(self, mu: Array) -> Mapping[str, float]:  # noqa: ARG002
+        """Figures worth keeping beside a high-fidelity solution at mu (d,), such as mesh quality; none by default."""
+        return {}
+
+
+def checked_assembly(problem: Problem, mu: Array) -> VariationalInequality:
+    """`problem.assemble(mu)`, refused with a line that names the fault if shapes are wrong or values not finite.
+
+    Raises
+    ------
+    NumericalError
+        Naming the member, what was wrong and what would be right.
+    """
+    vi = problem.assemble(mu)
+    n, m = problem.V.dim, problem.W.dim
+    for name, value, shape in (("A", vi.A, (n, n)), ("f", vi.f, (n,)), ("B", vi.B, (m, n)), ("g", vi.g, (m,))):
+        if value.shape != shape:
+            raise NumericalError(f"{name} has shape {value.shape} at mu = {mu.tolist()}; the spaces ask for {shape}")
+        entries = value if isinstance(value, np.ndarray) else value.data
+        if not np.all(np.isfinite(entries)):
+            raise NumericalError(f"{name} has entries that are not finite at mu = {mu.tolist()}")
+    return vi

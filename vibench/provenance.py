@@ -1,0 +1,65 @@
+"""Where numbers come from: machine, versions, and the code that computed them."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import platform
+from functools import cache
+from importlib.metadata import PackageNotFoundError, packages_distributions, version
+from pathlib import Path
+
+SOLVER_MODULES = {"highs": "highspy", "proxqp": "proxsuite"}
+"""Import packages of the solvers that are not called like their solver."""
+
+
+@cache
+def machine() -> str:
+    """The machine as results quote it: processor, cores usable, memory, system."""
+    processor = platform.processor() or platform.machine()
+    info = Path("/proc/cpuinfo")
+    if info.is_file():
+        models = [line.split(":", 1)[1].strip() for line in info.read_text().splitlines() if "model name" in line]
+        processor = models[0] if models else processor
+    memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30
+    return f"{processor}, {cores()} cores, {memory:.0f} GiB, {platform.system()} {platform.machine()}"
+
+
+def cores() -> int:
+    """Cores this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def versions(solver: str) -> dict[str, str]:
+    """Versions of Python, the numerical libraries, vibench and one solver."""
+    found = {name: distribution_version(name) for name in ("numpy", "scipy", "qpsolvers", "vibench")}
+    return {"python": platform.python_version(), **found, solver: solver_version(solver)}
+
+
+def distribution_version(name: str) -> str:
+    """Version of an installed distribution, "" where it is not installed."""
+    try:
+        return version(name)
+    except PackageNotFoundError:
+        return ""
+
+
+@cache
+def solver_version(solver: str) -> str:
+    """Version of the distribution a QP solver comes in, "" where it is not installed."""
+    distributions = packages_distributions().get(SOLVER_MODULES.get(solver, solver), [])
+    return distribution_version(distributions[0]) if distributions else ""
+
+
+@cache
+def core_code() -> str:
+    """Version of vibench with a hash of its core's sources."""
+    return f"{distribution_version('vibench')} {source_hash(Path(__file__).parent)}"
+
+
+def source_hash(folder: Path) -> str:
+    """Short hash of the Python sources directly in a folder."""
+    content = hashlib.sha256()
+    for path in sorted(folder.glob("*.py")):
+        content.update(path.name.encode() + b"\0" + path.read_bytes())
+    return content.hexdigest()[:12]

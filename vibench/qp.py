@@ -1,0 +1,217 @@
+"""The one door to quadratic programming solvers; nothing that comes back through it is believed unverified.
+
+A quadratic program is a `VariationalInequality`, dense or sparse: min ½ xᵀA x − fᵀx subject to B x ≤ g, with
+multipliers α ≥ 0 such that A x + Bᵀα = f.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import Any, Protocol
+
+import numpy as np
+import qpsolvers
+import scipy.sparse as sp
+from scipy.optimize import nnls
+
+from vibench.arrays import Array, SparseMatrix
+from vibench.errors import unknown_name
+from vibench.problem import VariationalInequality
+from vibench.solver_settings import SETTINGS, settings_for
+
+
+class Status(StrEnum):
+    """What became of a query, from good to bad; the order is the severity a cell inherits."""
+
+    OK = "ok"
+    INACCURATE = "inaccurate"
+    NONFINITE = "nonfinite"
+    INFEASIBLE = "infeasible"
+    FAILED = "failed"
+    TIMEOUT = "timeout"
+    CRASHED = "crashed"
+    ERROR = "error"
+    UNAVAILABLE = "unavailable"
+
+    @property
+    def severity(self) -> int:
+        """Position in the order above."""
+        return list(Status).index(self)
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What a solver claims: x (n,), multipliers α (m,) with A x + Bᵀα = f, its own status and iteration count."""
+
+    x: Array | None
+    alpha: Array | None
+    solver_status: str
+    iterations: int | None = None
+
+
+class QPSolver(Protocol):
+    """What the entry point group `vibench.qp_solvers` registers: a solver qpsolvers does not have."""
+
+    def __call__(self, program: VariationalInequality, accuracy: float) -> Answer:
+        """Solve to the relative accuracy asked for."""
+
+
+@dataclass(frozen=True)
+class Residuals:
+    """Relative residuals as the benchmark computes them, whatever the solver claims.
+
+    Attributes
+    ----------
+    primal
+        max (B x − g)₊ with every row in units of its own norm, over max(1, ‖g‖∞).
+    dual
+        ‖A x − f + Bᵀα‖∞ over max(‖A x‖∞, ‖f‖∞, ‖Bᵀα‖∞).
+    gap
+        |xᵀA x − fᵀx + gᵀα| over max(|½ xᵀA x|, |fᵀx|, |gᵀα|).
+    """
+
+    primal: float
+    dual: float
+    gap: float
+
+    @property
+    def worst(self) -> float:
+        """The largest of the three."""
+        return max(self.primal, self.dual, self.gap)
+
+
+def solve(
+    program: VariationalInequality, solver: str, accuracy: float, extra: Mapping[str, QPSolver] | None = None
+) -> Answer:
+    """Solve a quadratic program with a solver known by name.
+
+    The data are scaled first, every constraint row to unit norm and the objective to ‖f‖∞ = 1, so that the absolute
+    tolerances of the solvers mean what the residuals of the benchmark measure; the answer is scaled back.
+
+    Parameters
+    ----------
+    program
+        A, f, B, g; dense, or sparse for solvers that take sparse data.
+    solver
+        A name that qpsolvers knows, or one of `extra`.
+    accuracy
+        Relative accuracy, passed on in the solver's own words (`vibench.solver_settings`).
+    extra
+        Solvers registered through the entry point group `vibench.qp_solvers`.
+
+    Raises
+    ------
+    RequestError
+        If no solver has that name.
+    """
+    rows, cost = _row_norms(program.B), _scale(program.f)
+    scaled = VariationalInequality(program.A / cost, program.f / cost, _divide_rows(program.B, rows), program.g / rows)
+    if extra and solver in extra:
+        answer = extra[solver](scaled, accuracy)
+    else:
+        answer = _through_qpsolvers(scaled, solver, accuracy)
+    if answer.alpha is None:
+        return answer
+    return Answer(answer.x, cost * np.maximum(answer.alpha, 0.0) / rows, answer.solver_status, answer.iterations)
+
+
+def residuals(program: VariationalInequality, x: Array, alpha: Array) -> Residuals:
+    """Relative residuals of x (n,), α (m,) ≥ 0; see `Residuals`."""
+    A, f, B, g = program.A, program.f, program.B, program.g
+    rows = _row_norms(B)
+    Ax, force = A @ x, B.T @ alpha
+    excess = (B @ x - g) / rows
+    primal = float(np.max(excess, initial=0.0)) / max(1.0, float(np.max(np.abs(g / rows), initial=0.0)))
+    dual = _ratio(_peak(Ax - f + force), max(_peak(Ax), _peak(f), _peak(force)))
+    energy, work, bound = float(x @ Ax), float(f @ x), float(g @ alpha)
+    gap = _ratio(abs(energy - work + bound), max(abs(0.5 * energy), abs(work), abs(bound)))
+    return Residuals(primal, dual, gap)
+
+
+def judge(program: VariationalInequality, answer: Answer, accuracy: float) -> tuple[Status, str, Residuals | None]:
+    """Classify an answer by what we compute ourselves: status, reason ("" when ok), residuals if they exist."""
+    if answer.x is None or answer.alpha is None:
+        if infeasibility_certificate(program) is not None:
+            return Status.INFEASIBLE, "no point satisfies the constraints (certified)", None
+        return Status.FAILED, f"the solver returned nothing: {answer.solver_status}", None
+    if not (np.all(np.isfinite(answer.x)) and np.all(np.isfinite(answer.alpha))):
+        return Status.NONFINITE, f"the solution is not finite: {answer.solver_status}", None
+    found = residuals(program, answer.x, answer.alpha)
+    if found.worst <= accuracy:
+        return Status.OK, "", found
+    if found.primal > accuracy and infeasibility_certificate(program) is not None:
+        return Status.INFEASIBLE, "no point satisfies the constraints (certified)", found
+    name = max(("primal", "dual", "gap"), key=lambda key: getattr(found, key))
+    value = getattr(found, name)
+    return Status.INACCURATE, f"{name} residual {value:.1e} above {accuracy:.0e}: {answer.solver_status}", found
+
+
+def infeasibility_certificate(program: VariationalInequality, tolerance: float = 1e-10) -> Array | None:
+    """α ≥ 0 with Bᵀα = 0 and gᵀα = −1 (Farkas), or `None` if no such α is found; dense programs only."""
+    if not isinstance(program.B, np.ndarray) or not program.B.size:
+        return None
+    rows = _row_norms(program.B)
+    system = np.vstack([(program.B / rows[:, None]).T, program.g / rows / _scale(program.g / rows)])
+    target = np.zeros(system.shape[0])
+    target[-1] = -1.0
+    try:
+        alpha, distance = nnls(system, target, maxiter=30 * system.shape[1])
+    except RuntimeError:  # nnls gave up: no certificate
+        return None
+    if distance > tolerance * max(1.0, float(alpha.max(initial=0.0))):
+        return None
+    return np.asarray(alpha / rows)
+
+
+def installed_solvers(extra: Mapping[str, QPSolver] | None = None) -> list[str]:
+    """Names of the solvers that can be run here."""
+    return sorted(set(qpsolvers.available_solvers) & set(SETTINGS) | set(extra or {}))
+
+
+def check_solver_name(solver: str, extra: Mapping[str, QPSolver] | None = None) -> None:
+    """Refuse a name that neither the settings table nor a plugin knows (installed or not is another question)."""
+    known = set(SETTINGS) | set(extra or {})
+    if solver not in known:
+        raise unknown_name("QP solver", solver, known)
+
+
+def _through_qpsolvers(program: VariationalInequality, solver: str, accuracy: float) -> Answer:
+    problem = qpsolvers.Problem(_plain(program.A), -program.f, _plain(program.B), program.g)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # statuses come through the answer, and are verified by `judge`
+        solution = qpsolvers.solve_problem(problem, solver=solver, **settings_for(solver, accuracy))
+    status, iterations = SETTINGS[solver].report(solution)
+    if solution.x is None or solution.z is None:
+        return Answer(None, None, status, iterations)
+    return Answer(np.asarray(solution.x, float), np.asarray(solution.z, float), status, iterations)
+
+
+def _plain(matrix: Any) -> Any:
+    """Dense arrays as they are, sparse ones as the CSC matrices solvers ask for."""
+    return matrix if isinstance(matrix, np.ndarray) else sp.csc_matrix(matrix)
+
+
+def _row_norms(B: SparseMatrix | Array) -> Array:
+    """Euclidean norms (m,) of the rows, 1 where a row is zero."""
+    squares = (B * B).sum(axis=1) if isinstance(B, np.ndarray) else B.multiply(B).sum(axis=1)
+    norms = np.sqrt(np.asarray(squares, float).ravel())
+    return np.where(norms > 0.0, norms, 1.0)
+
+
+def _divide_rows(B: SparseMatrix | Array, rows: Array) -> SparseMatrix | Array:
+    return B / rows[:, None] if isinstance(B, np.ndarray) else sp.diags_array(1.0 / rows) @ B
+
+
+def _peak(vector: Array) -> float:
+    return float(np.max(np.abs(vector), initial=0.0))
+
+
+def _scale(vector: Array) -> float:
+    return _peak(vector) or 1.0
+
+
+def _ratio(numerator: float, denominator: float) -> float:
+    return numerator / denominator if denominator > 0.0 else numerator

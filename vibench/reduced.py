@@ -1,0 +1,88 @@
+"""The reduced model: project, solve, reconstruct (paper, §2.2 and §2.3; MATH in the documentation, §4)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from vibench.arrays import Array
+from vibench.problem import Problem, VariationalInequality, checked_assembly
+from vibench.strategy import Enrichment, Kind
+
+
+@dataclass(frozen=True)
+class ReducedProblem:
+    """The reduced variational inequality at one parameter.
+
+    Attributes
+    ----------
+    program
+        Dense A (N'×N'), f (N',), B (R×N'), g (R,) in coordinates of `basis` and of the generators.
+    basis
+        V-orthonormal primal basis Z (n×N') at this parameter: u = Z x.
+    """
+
+    program: VariationalInequality
+    basis: Array
+
+
+class ReducedModel:
+    """V_N + enrichment against a reduced cone.
+
+    Parameters
+    ----------
+    problem
+        The high-fidelity problem.
+    basis
+        V-orthonormal basis of V_N (n×N).
+    enrichment
+        What the primal strategy adds.
+    generators
+        χ (m×R), unit norm in W.
+    span
+        W-orthonormal basis of span χ (m×rank), what per-parameter enrichments are computed from.
+
+    Attributes
+    ----------
+    fixed_basis
+        The part of the primal basis that does not depend on the parameter (n×(N+S)).
+    """
+
+    def __init__(self, problem: Problem, basis: Array, enrichment: Enrichment, generators: Array, span: Array) -> None:
+        self.problem = problem
+        self.generators = generators
+        self.span = span
+        self._enrichment = enrichment
+        self.fixed_basis = basis if enrichment.vectors is None else np.hstack([basis, enrichment.vectors])
+
+    @property
+    def kind(self) -> Kind:
+        """How the enrichment depends on the parameter."""
+        return self._enrichment.kind
+
+    def primal_basis(self, vi: VariationalInequality) -> Array:
+        """V-orthonormal basis Z (n×N') at the parameter of `vi`; V_N comes first."""
+        if self._enrichment.kind is not Kind.PER_PARAMETER or self._enrichment.supply is None:
+            return self.fixed_basis
+        V = self.problem.V
+        added = self._enrichment.supply(V, vi, self.span)
+        return np.hstack([self.fixed_basis, V.orthonormalise(added, self.fixed_basis)])
+
+    def assemble(self, mu: Array) -> ReducedProblem:
+        """Assemble at mu (d,) in full, as the paper does: high-fidelity matrices, then their projections.
+
+        Raises
+        ------
+        NumericalError
+            If what the problem assembles has the wrong shape or values that are not finite.
+        """
+        vi = checked_assembly(self.problem, mu)
+        Z = self.primal_basis(vi)
+        return ReducedProblem(project(vi, Z, self.generators), Z)
+
+
+def project(vi: VariationalInequality, Z: Array, chi: Array) -> VariationalInequality:
+    """Galerkin projection on span Z (n×N') and the cone of χ (m×R): dense A, f, B, g."""
+    A = Z.T @ np.asarray(vi.A @ Z)
+    return VariationalInequality(A=0.5 * (A + A.T), f=Z.T @ vi.f, B=chi.T @ np.asarray(vi.B @ Z), g=chi.T @ vi.g)

@@ -1,0 +1,112 @@
+"""The one table that says, for every QP solver, how to ask for an accuracy and how to read its report.
+
+A new solver of qpsolvers is one entry here. Tolerances are relative; `vibench.qp` scales the data so that absolute
+tolerances mean the same.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+
+@dataclass(frozen=True)
+class SolverSettings:
+    """How to talk to one solver.
+
+    Attributes
+    ----------
+    settings
+        Keyword arguments for an accuracy.
+    status, iterations
+        Paths into `solution.extras` ("info.status") where the solver leaves its own words, "" where it leaves none.
+    """
+
+    settings: Callable[[float], Mapping[str, Any]]
+    status: str = ""
+    iterations: str = ""
+
+    def report(self, solution: Any) -> tuple[str, int | None]:
+        """Status in the solver's words and its number of iterations."""
+        status = _follow(solution.extras, self.status)
+        text = ("found" if solution.found else "not found") if status is None else str(status)
+        count = _follow(solution.extras, self.iterations)
+        return text, None if count is None else int(np.ravel(count)[0])
+
+
+def _follow(extras: Mapping[str, Any], path: str) -> Any:
+    value: Any = extras
+    for step in path.split(".") if path else []:
+        value = value.get(step) if isinstance(value, Mapping) else getattr(value, step, None)
+        if value is None:
+            return None
+    return value if path else None
+
+
+SETTINGS: Mapping[str, SolverSettings] = {
+    "piqp": SolverSettings(
+        lambda accuracy: {
+            "eps_abs": 0.1 * accuracy,
+            "eps_rel": 0.1 * accuracy,
+            "max_iter": 500,
+            "check_duality_gap": True,
+            "eps_duality_gap_abs": 0.1 * accuracy,
+            "eps_duality_gap_rel": 0.1 * accuracy,
+        },
+        status="info.status",
+        iterations="info.iter",
+    ),
+    "proxqp": SolverSettings(
+        lambda accuracy: {
+            "eps_abs": 0.1 * accuracy,
+            "eps_rel": 0.0,
+            "max_iter": 1000,
+            "check_duality_gap": True,
+            "eps_duality_gap_abs": 0.1 * accuracy,
+            "eps_duality_gap_rel": 0.1 * accuracy,
+        },
+        status="info.status",
+        iterations="info.iter",
+    ),
+    "osqp": SolverSettings(
+        lambda accuracy: {
+            "eps_abs": 0.1 * accuracy,
+            "eps_rel": 0.1 * accuracy,
+            "max_iter": 4000,
+            "polishing": True,
+        },
+        status="info.status",
+        iterations="info.iter",
+    ),
+    "clarabel": SolverSettings(
+        lambda accuracy: {"tol_gap_abs": 0.1 * accuracy, "tol_gap_rel": 0.1 * accuracy, "tol_feas": 0.1 * accuracy},
+        status="status",
+    ),
+    "daqp": SolverSettings(
+        lambda accuracy: {"primal_tol": 0.01 * accuracy, "dual_tol": 0.01 * accuracy, "zero_tol": 1e-14},
+        iterations="iterations",
+    ),
+    "quadprog": SolverSettings(lambda _: {}, iterations="iterations"),
+    "highs": SolverSettings(
+        lambda accuracy: {
+            "primal_feasibility_tolerance": max(0.1 * accuracy, 1e-10),
+            "dual_feasibility_tolerance": max(0.1 * accuracy, 1e-10),
+        },
+    ),
+    "scs": SolverSettings(lambda accuracy: {"eps_abs": 0.1 * accuracy, "eps_rel": 0.1 * accuracy, "max_iters": 20_000}),
+    "cvxopt": SolverSettings(
+        lambda accuracy: {"abstol": 0.1 * accuracy, "reltol": 0.1 * accuracy, "feastol": 0.1 * accuracy},
+        iterations="iterations",
+    ),
+    "ecos": SolverSettings(
+        lambda accuracy: {"abstol": 0.1 * accuracy, "reltol": 0.1 * accuracy, "feastol": 0.1 * accuracy},
+    ),
+}
+
+
+def settings_for(solver: str, accuracy: float) -> dict[str, Any]:
+    """Keyword arguments that ask `solver` for a relative accuracy."""
+    return dict(SETTINGS[solver].settings(accuracy))

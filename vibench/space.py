@@ -1,0 +1,126 @@
+"""Finite-dimensional Hilbert spaces given by a sparse Gram matrix: norms, Riesz, orthonormal bases, numerical rank."""
+
+from __future__ import annotations
+
+from functools import cached_property
+
+import numpy as np
+import scipy.sparse as sp
+from scipy.sparse.linalg import splu, spsolve_triangular
+
+from vibench.arrays import Array, Indices, SparseMatrix
+from vibench.errors import NumericalError
+from vibench.linalg import orthonormal_range
+
+
+class InnerProduct:
+    """The inner product ⟨u, v⟩ = uᵀ X v of a space, X sparse symmetric positive definite.
+
+    X = Pᵀ L D Lᵀ P is factorised once, without pivoting off the diagonal, so that F = D^½ Lᵀ P is a Cholesky factor
+    (X = FᵀF). "Whitened" coordinates F v carry the plain Euclidean inner product: singular values, QR and nonnegative
+    least squares are done there, and no digit is lost to squaring.
+
+    Parameters
+    ----------
+    matrix
+        X, sparse (n×n).
+
+    Raises
+    ------
+    NumericalError
+        If X is not square, not finite, not symmetric or not positive definite.
+    """
+
+    def __init__(self, matrix: SparseMatrix) -> None:
+        self.matrix = sp.csc_array(matrix)
+        rows, columns = self.matrix.shape
+        if rows != columns:
+            raise NumericalError(f"a Gram matrix must be square, this one is {rows}×{columns}")
+        if not np.all(np.isfinite(self.matrix.data)):
+            raise NumericalError("the Gram matrix has entries that are not finite")
+        scale = abs(self.matrix).max() if self.matrix.nnz else 0.0
+        if rows and abs(self.matrix - self.matrix.T).max() > 1e-12 * scale:
+            raise NumericalError("the Gram matrix is not symmetric")
+        self._factor  # noqa: B018  an indefinite matrix is refused here, not at its first use
+
+    def __getstate__(self) -> dict[str, SparseMatrix]:
+        """Leave the factorisation behind when pickled: SuperLU objects do not travel."""
+        return {"matrix": self.matrix}
+
+    @property
+    def dim(self) -> int:
+        """Dimension n of the space."""
+        return int(self.matrix.shape[0])
+
+    @cached_property
+    def _factor(self) -> tuple[SparseMatrix, Array, Indices, SparseMatrix]:
+        """Unit lower L (CSC), √D (n,), the permutation and its inverse's SuperLU object."""
+        try:
+            lu = splu(self.matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
+        except RuntimeError as error:
+            raise NumericalError(f"the Gram matrix cannot be factorised: {error}") from None
+        pivots = lu.U.diagonal()
+        if not np.array_equal(lu.perm_r, lu.perm_c) or np.any(pivots <= 0.0):
+            raise NumericalError("the Gram matrix is not positive definite")
+        return sp.csc_array(lu.L), np.sqrt(pivots), np.argsort(lu.perm_c), lu
+
+    def apply(self, u: Array) -> Array:
+        """X u, for u (n,) or (n, k)."""
+        return np.asarray(self.matrix @ u)
+
+    def gram(self, u: Array, v: Array) -> Array:
+        """Matrix of inner products uᵀ X v (k×l) of the columns of u (n×k) and v (n×l)."""
+        return np.asarray(u.T @ self.apply(v))
+
+    def norm(self, u: Array) -> Array:
+        """Norms of u (n,) as a scalar array, or of every column of u (n×k) as (k,)."""
+        return np.asarray(np.linalg.norm(self.whiten(u), axis=0))
+
+    def riesz(self, functional: Array) -> Array:
+        """Riesz representer X⁻¹ ℓ of functionals given as (n,) or (n, k)."""
+        return np.asarray(self._factor[3].solve(np.ascontiguousarray(functional)))
+
+    def whiten(self, u: Array) -> Array:
+        """F u: coordinates in which the inner product is Euclidean; u (n,) or (n, k)."""
+        lower, root, order, _ = self._factor
+        y = lower.T @ u[order]
+        return np.asarray(root * y if y.ndim == 1 else root[:, None] * y)
+
+    def unwhiten(self, y: Array) -> Array:
+        """F⁻¹ y, the inverse of `whiten`; y (n,) or (n, k)."""
+        lower, root, order, _ = self._factor
+        scaled = y / root if y.ndim == 1 else y / root[:, None]
+        u = np.empty_like(scaled)
+        if scaled.size:
+            u[order] = spsolve_triangular(lower.T, scaled, lower=False, unit_diagonal=True)
+        return u
+
+    def whiten_functional(self, functional: Array) -> Array:
+        """F⁻ᵀ ℓ: whitened coordinates of the Riesz representer of ℓ (n,) or (n, k); Euclidean norms are dual norms."""
+        lower, root, order, _ = self._factor
+        permuted = np.ascontiguousarray(functional[order])
+        if not permuted.size:
+            return permuted
+        y = spsolve_triangular(lower, permuted, lower=True, unit_diagonal=True)
+        return np.asarray(y / root if y.ndim == 1 else y / root[:, None])
+
+    def orthonormalise(self, u: Array, against: Array | None = None) -> Array:
+        """Orthonormal basis of span(u), or of what u adds to the span of an orthonormal basis.
+
+        Columns are scaled to unit norm, `against` is projected out twice, and the rank is revealed by a pivoted QR in
+        whitened coordinates; directions below `linalg.RANK_RTOL` of a unit vector are dropped.
+
+        Parameters
+        ----------
+        u
+            Vectors (n×k), of any rank.
+        against
+            Orthonormal vectors (n×l) to be orthogonal to; `None` for none.
+
+        Returns
+        -------
+        Array
+            Orthonormal vectors (n×r), r ≤ k.
+        """
+        fixed = np.zeros((self.dim, 0)) if against is None else self.whiten(against)
+        return self.unwhiten(orthonormal_range(self.whiten(u), fixed))
