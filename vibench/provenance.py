@@ -6,11 +6,11 @@ import hashlib
 import os
 import platform
 from functools import cache
-from importlib.metadata import PackageNotFoundError, packages_distributions, version
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
-SOLVER_MODULES = {"highs": "highspy", "proxqp": "proxsuite"}
-"""Import packages of the solvers that are not called like their solver."""
+SOLVER_DISTRIBUTIONS = {"highs": "highspy", "proxqp": "proxsuite"}
+"""Distributions of the solvers that are not called like their solver."""
 
 
 @cache
@@ -47,8 +47,7 @@ def distribution_version(name: str) -> str:
 @cache
 def solver_version(solver: str) -> str:
     """Version of the distribution a QP solver comes in, "" where it is not installed."""
-    distributions = packages_distributions().get(SOLVER_MODULES.get(solver, solver), [])
-    return distribution_version(distributions[0]) if distributions else ""
+    return distribution_version(SOLVER_DISTRIBUTIONS.get(solver, solver))
 
 
 @cache

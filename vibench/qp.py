@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import Any, Protocol
 
@@ -44,12 +44,16 @@ class Status(StrEnum):
 
 @dataclass(frozen=True)
 class Answer:
-    """What a solver claims: x (n,), multipliers α (m,) with A x + Bᵀα = f, its own status and iteration count."""
+    """What a solver claims: x (n,), multipliers α (m,) with A x + Bᵀα = f, its own status and iteration count.
+
+    `solve` sets negative multipliers to zero; `negative` is how negative the worst of them was.
+    """
 
     x: Array | None
     alpha: Array | None
     solver_status: str
     iterations: int | None = None
+    negative: float = 0.0
 
 
 class QPSolver(Protocol):
@@ -115,7 +119,8 @@ def solve(
         answer = _through_qpsolvers(scaled, solver, accuracy)
     if answer.alpha is None:
         return answer
-    return Answer(answer.x, cost * np.maximum(answer.alpha, 0.0) / rows, answer.solver_status, answer.iterations)
+    alpha = cost * answer.alpha / rows
+    return replace(answer, alpha=np.maximum(alpha, 0.0), negative=-min(float(np.min(alpha, initial=0.0)), 0.0))
 
 
 def residuals(program: VariationalInequality, x: Array, alpha: Array) -> Residuals:
@@ -146,7 +151,12 @@ def judge(program: VariationalInequality, answer: Answer, accuracy: float) -> tu
         return Status.INFEASIBLE, "no point satisfies the constraints (certified)", found
     name = max(("primal", "dual", "gap"), key=lambda key: getattr(found, key))
     value = getattr(found, name)
-    return Status.INACCURATE, f"{name} residual {value:.1e} above {accuracy:.0e}: {answer.solver_status}", found
+    clipped = f" after setting multipliers down to -{answer.negative:.0e} to zero" if answer.negative else ""
+    return (
+        Status.INACCURATE,
+        f"{name} residual {value:.1e} above {accuracy:.0e}{clipped}: {answer.solver_status}",
+        found,
+    )
 
 
 def infeasibility_certificate(program: VariationalInequality, tolerance: float = 1e-10) -> Array | None:
