@@ -30,7 +30,7 @@ app = typer.Typer(
     rich_markup_mode=None,
 )
 
-WIDTH = 160
+WIDTH = 180
 """Columns of a table where the output is no terminal."""
 
 LISTS = {"problems": "problem", "primal": "primal strategy", "dual": "dual strategy", "studies": "study"}
@@ -191,7 +191,7 @@ def _solver_rows() -> list[tuple[str, str, str, str]]:
 
 
 def _print_frame(console: Console, frame: pd.DataFrame, title: str) -> None:
-    table = Table(title=title, title_justify="left", pad_edge=False, box=box.SIMPLE_HEAD)
+    table = Table(title=title, title_justify="left", pad_edge=False, padding=(0, 1, 0, 0), box=box.SIMPLE_HEAD)
     rows = [[tables.cell_text(value) for value in row] for row in frame.itertuples(index=False)]
     for k, name in enumerate(frame.columns):
         numeric = pd.api.types.is_numeric_dtype(frame[name])

@@ -106,7 +106,7 @@ def orthogonality(histories: pd.DataFrame) -> Figure:
 def enrichment(histories: pd.DataFrame, queries: pd.DataFrame, cells: pd.DataFrame) -> Figure:
     """σ and min β over the steps of the tightest fixed enrichments, β over the validation set (paper, Figure 7)."""
     fixed = queries[queries["enrichment_kind"] == Kind.FIXED]
-    pairs = list(fixed.groupby(PAIR, dropna=False))
+    pairs = _pairs(fixed)
     figure, grid = _panels(len(pairs), 3)
     for row, (pair, group) in enumerate(pairs):
         axes = grid[3 * row : 3 * row + 3]
@@ -120,6 +120,7 @@ def enrichment(histories: pd.DataFrame, queries: pd.DataFrame, cells: pd.DataFra
                 shown = line[line["value"] > 1e-14]
                 where.semilogy(shown["step"], shown["value"], color=COLOURS[k], marker=".", ms=4)
             where.set(xlabel="vectors added", ylabel=label, title=_pair_title(pair, queries, cells))
+            where.set_xlim(left=0)
         for k, (key, line) in enumerate(_one_solver(group).groupby(["primal", "primal_tol"], dropna=False)):
             values = np.sort(line["beta_span"].to_numpy())
             axes[2].plot(values, color=COLOURS[k % 7], linestyle=STYLES[k % 7], label=f"{key[0]}, δ = {key[1]:g}")
@@ -134,7 +135,7 @@ def inf_sup(queries: pd.DataFrame, cells: pd.DataFrame) -> Figure:
     Over the span in the first row, over the cone in the second (bands where the bounds differ); parameters sorted by
     the constant of the loosest fixed enrichment.
     """
-    pairs = list(queries.groupby(PAIR, dropna=False))
+    pairs = _pairs(queries)
     figure, grid = _panels(2, len(pairs))
     for column, (pair, of_pair) in enumerate(pairs):
         group = _one_solver(of_pair)
@@ -168,6 +169,11 @@ def _constants(axes: tuple[Axes, Axes], line: pd.DataFrame, prefix: str, *, k: i
     lower, upper = line[f"{prefix}cone_lower"].to_numpy(), line[f"{prefix}cone_upper"].to_numpy()
     below.plot(x, upper, **style)
     below.fill_between(x, lower, upper, color=COLOURS[k % 7], alpha=0.2)
+
+
+def _pairs(queries: pd.DataFrame) -> list[tuple[Any, pd.DataFrame]]:
+    """Queries by pair of tolerances, in the order of the tables."""
+    return list(queries.groupby(PAIR, dropna=False, sort=False))
 
 
 def _panels(rows: int, columns: int) -> tuple[Figure, list[Axes]]:

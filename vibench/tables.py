@@ -58,10 +58,11 @@ def export(path: Path, folder: Path) -> list[Path]:
 
 
 def in_order(frame: pd.DataFrame) -> pd.DataFrame:
-    """Rows sorted by the columns that name them, so that the number of jobs does not change a table."""
+    """Rows sorted by the columns that name them, loose tolerances first: the number of jobs does not change a table."""
     names = (*KEYS, "primal_a", "primal_b", "primal_tol_a", "primal_tol_b", "stage", "quantity", "query", "step")
+    by = [name for name in names if name in frame.columns]
     return frame.sort_values(
-        [name for name in names if name in frame.columns], kind="stable", na_position="first", ignore_index=True
+        by, ascending=["_tol" not in name for name in by], kind="stable", na_position="first", ignore_index=True
     )
 
 
