@@ -11,6 +11,7 @@ import typer
 from rich import box
 from rich.console import Console
 from rich.table import Table
+from rich.text import Text
 
 from vibench import figures, plugins, provenance, qp, tables
 from vibench.errors import RequestError, VibenchError, unknown_name
@@ -191,13 +192,23 @@ def _solver_rows() -> list[tuple[str, str, str, str]]:
 
 
 def _print_frame(console: Console, frame: pd.DataFrame, title: str) -> None:
-    table = Table(title=title, title_justify="left", pad_edge=False, padding=(0, 1, 0, 0), box=box.SIMPLE_HEAD)
-    rows = [[tables.cell_text(value) for value in row] for row in frame.itertuples(index=False)]
-    for k, name in enumerate(frame.columns):
-        numeric = pd.api.types.is_numeric_dtype(frame[name])
-        words = [word for row in rows for word in row[k].split()]
-        widest = max((len(word) for word in words), default=1)
-        table.add_column(str(name), justify="right" if numeric else "left", min_width=min(widest, 24))
+    """Print a table; text columns that say the same in every row go into the title, and nothing is cut off."""
+    shared = [name for name in frame.columns if len(frame) > 1 and _same_text(frame[name])]
+    title = ", ".join([title, *(f"{name} {tables.cell_text(frame[name].iloc[0])}" for name in shared)])
+    table = Table(title=Text(title), title_justify="left", pad_edge=False, padding=(0, 1, 0, 0), box=box.SIMPLE_HEAD)
+    shown = frame.drop(columns=shared)
+    rows = [[tables.cell_text(value) for value in row] for row in shown.itertuples(index=False)]
+    for k, name in enumerate(shown.columns):
+        widest = max((len(word) for row in rows for word in row[k].split()), default=1)
+        numeric = pd.api.types.is_numeric_dtype(shown[name])
+        table.add_column(Text(str(name)), justify="right" if numeric else "left", min_width=min(widest, 24))
     for row in rows:
-        table.add_row(*(text.replace("[", "\\[") for text in row))
+        table.add_row(*map(Text, row))
+    unbounded = console.options.update(width=10 * WIDTH)
+    natural = console.measure(table, options=unbounded).maximum
+    console.width = max(console.width, min(natural, WIDTH))  # better a wrapped line than a cut one
     console.print(table)
+
+
+def _same_text(column: pd.Series) -> bool:
+    return not pd.api.types.is_numeric_dtype(column) and column.nunique(dropna=False) == 1
