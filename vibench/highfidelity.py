@@ -60,18 +60,16 @@ def solve(vi: VariationalInequality) -> HighFidelitySolution:
     NumericalError
         If neither way reaches `ACCURACY`.
     """
-    m = vi.B.shape[0]
-    free = splu(sp.csc_array(vi.A)).solve(vi.f)
-    found = _active_set_iterations(vi, vi.B @ free > vi.g)
+    found = _active_set_iterations(vi, np.zeros(vi.B.shape[0], dtype=bool))
     fallback = ""
     if found is None:
         answer = qp.solve(vi, FALLBACK_SOLVER, ACCURACY)
-        if answer.x is None or answer.alpha is None or not np.all(np.isfinite(answer.alpha)):
+        if answer.alpha is None or not np.all(np.isfinite(answer.alpha)):
             raise NumericalError(f"the high-fidelity problem was not solved: {answer.solver_status}")
         found = _active_set_iterations(vi, answer.alpha > 1e-8 * np.max(answer.alpha, initial=0.0))
         fallback = f"the active set cycled; first guess by {FALLBACK_SOLVER}"
     if found is None:
-        raise NumericalError(f"the active set of the high-fidelity problem ({m} constraints) cycles")
+        raise NumericalError("no active set solves the high-fidelity problem; is it feasible?")
     u, lam, iterations = found
     residuals = qp.residuals(vi, u, lam)
     if not residuals.worst <= ACCURACY:
@@ -80,10 +78,16 @@ def solve(vi: VariationalInequality) -> HighFidelitySolution:
 
 
 def _active_set_iterations(vi: VariationalInequality, active: Mask) -> tuple[Array, Array, int] | None:
-    """u, λ and iterations of the primal–dual active set method from a first guess (m,); `None` if it cycles."""
+    """u, λ and iterations of the primal–dual active set method from a first guess (m,).
+
+    `None` if the sets repeat themselves without an answer, or one of them has dependent constraints.
+    """
     seen: set[bytes] = set()
     for iteration in range(1, MAX_ITERATIONS + 1):
-        u, lam = _solve_active(vi, np.flatnonzero(active))
+        try:
+            u, lam = _solve_active(vi, np.flatnonzero(active))
+        except RuntimeError:  # SuperLU: exactly singular
+            return None
         scale = np.max(np.abs(lam), initial=0.0)
         violated = ~active & (vi.B @ u - vi.g > 1e-14 * np.max(np.abs(vi.g), initial=0.0))
         kept = active & (lam > 1e-14 * scale)

@@ -11,7 +11,7 @@ from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from typing import Any, get_type_hints
 
-from pydantic import TypeAdapter, ValidationError
+from pydantic import ConfigDict, TypeAdapter, ValidationError
 
 from vibench.errors import RequestError, unknown_name
 from vibench.problem import Problem
@@ -26,6 +26,9 @@ GROUPS: Mapping[str, str] = {
     "QP solver": "vibench.qp_solvers",
     "study": "vibench.studies",
 }
+FINITE = ConfigDict(allow_inf_nan=False)
+"""No option of a plugin may be infinite or not a number."""
+
 _BASES: Mapping[str, type] = {"problem": Problem, "dual strategy": DualStrategy, "primal strategy": PrimalStrategy}
 
 
@@ -110,7 +113,7 @@ def check_options(kind: str, name: str, given: Mapping[str, Any]) -> dict[str, A
                 raise RequestError(f"{kind} '{name}' needs the option '{option}' ({_expected(annotation)})")
             continue
         try:
-            checked[option] = TypeAdapter(annotation).validate_python(given[option], strict=True)
+            checked[option] = TypeAdapter(annotation, config=FINITE).validate_python(given[option], strict=True)
         except ValidationError:
             raise RequestError(
                 f"option '{option}' of {kind} '{name}' is {given[option]!r}; expected {_expected(annotation)}"

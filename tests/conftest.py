@@ -1,0 +1,58 @@
+"""Fixtures shared by the tests that do no numerics."""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import subprocess
+import sysconfig
+from collections.abc import Callable, Iterator
+from importlib.metadata import EntryPoint
+from pathlib import Path
+
+import pytest
+
+from vibench import plugins
+
+
+@pytest.fixture(scope="session")
+def command() -> str:
+    """The installed command."""
+    return str(Path(sysconfig.get_path("scripts")) / "vibench")
+
+
+@pytest.fixture(scope="session")
+def quick_run(command: str, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Folder of one run of the registered study `quick` through the installed command, shared by parallel workers."""
+    base = tmp_path_factory.getbasetemp()
+    shared = base.parent if "PYTEST_XDIST_WORKER" in os.environ else base
+    folder = shared / "quick"
+    with (shared / "quick.lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if not (folder / "printed.txt").exists():
+            run = [command, "run", "quick", "--out", str(folder), "--jobs", "2"]
+            done = subprocess.run(run, cwd=shared, capture_output=True, text=True, check=False)
+            assert done.returncode == 0, done.stderr
+            (folder / "printed.txt").write_text(done.stdout, encoding="utf-8")
+    return folder
+
+
+Register = Callable[..., None]
+
+
+@pytest.fixture
+def register(monkeypatch: pytest.MonkeyPatch) -> Iterator[Register]:
+    """Function that makes entry points, given as (group, name, value), the only ones there are."""
+
+    def forget() -> None:
+        plugins._registered.cache_clear()
+        plugins.code.cache_clear()
+
+    def replace(*entries: tuple[str, str, str]) -> None:
+        found = [EntryPoint(name=name, group=group, value=value) for group, name, value in entries]
+        monkeypatch.setattr(plugins, "entry_points", lambda *, group: [e for e in found if e.group == group])
+        forget()
+
+    forget()
+    yield replace
+    forget()

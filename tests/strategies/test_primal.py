@@ -1,0 +1,136 @@
+from __future__ import annotations
+
+import pickle
+
+import numpy as np
+import pytest
+
+from numerics import Varying
+from vibench import highfidelity
+from vibench.infsup import inf_sup_full, inf_sup_on, multipliers
+from vibench.linalg import orthonormal_range, remove, singular_values
+from vibench.strategy import Cone, Kind, Offline, no_free
+from vibench.supremizer import supremizers
+from vibench_problems.obstacle import Obstacle
+from vibench_strategies.decorrelated import Decorrelated
+from vibench_strategies.offline_pga import OfflinePGA
+from vibench_strategies.online_supremizers import OnlineSupremizers
+
+
+def offline(problem, count: int, modes: int, generators: int) -> Offline:
+    """A reduced setting from some training solutions."""
+    training = problem.training_set()
+    solved = [highfidelity.solve(problem.assemble(mu)) for mu in training[:: max(1, len(training) // count)]]
+    u, lam = np.column_stack([s.u for s in solved]), np.column_stack([s.lam for s in solved])
+    basis = problem.V.orthonormalise(u)[:, :modes]
+    chi = lam[:, :generators] / problem.W.norm(lam[:, :generators])
+    cone = Cone(chi, np.ones(1), no_free(generators))
+    return Offline(problem, basis, cone, multipliers(chi, problem.W).span, training)
+
+
+@pytest.fixture(scope="module")
+def varying() -> Offline:
+    return offline(Varying(count=9), 9, 3, 4)
+
+
+@pytest.fixture(scope="module")
+def obstacle() -> Offline:
+    return offline(Obstacle("coarse"), 12, 5, 9)
+
+
+def test_decorrelated_adds_nothing(varying: Offline) -> None:
+    assert Decorrelated().build(varying, None).kind is Kind.NONE
+
+
+def test_online_supremizers_reach_the_whole_space_at_every_parameter(varying: Offline) -> None:
+    enrichment = pickle.loads(pickle.dumps(OnlineSupremizers().build(varying, None)))
+    assert enrichment.kind is Kind.PER_PARAMETER
+    problem, cone = varying.problem, multipliers(varying.cone.generators, varying.problem.W)
+    for mu in (np.array([0.05]), np.array([0.61])):
+        vi = problem.assemble(mu)
+        added = enrichment.supply(problem.V, vi, varying.span)
+        assert np.allclose(added, supremizers(problem.V, vi.B, varying.span))
+        Z = np.hstack([varying.basis, problem.V.orthonormalise(added, varying.basis)])
+        assert np.isclose(inf_sup_on(Z, vi.B, cone).span, inf_sup_full(problem.V, vi.B, cone).span, rtol=1e-10)
+
+
+@pytest.mark.parametrize("delta", [0.95, 0.5, 1e-3])
+@pytest.mark.parametrize("setting", ["varying", "obstacle"])
+def test_pga_keeps_its_promise_at_every_training_parameter(request, setting: str, delta: float) -> None:
+    data: Offline = request.getfixturevalue(setting)
+    problem, V = data.problem, data.problem.V
+    enrichment = OfflinePGA().build(data, delta)
+    sigma = enrichment.history["sigma"]
+    assert np.all(np.diff(sigma) <= 1e-9)
+    assert sigma[-1] <= delta < (sigma[-2] if len(sigma) > 1 else 1.0)
+    Z = np.hstack([data.basis, enrichment.vectors])
+    assert np.allclose(V.gram(Z, Z), np.eye(Z.shape[1]), atol=1e-11)
+    cone = multipliers(data.cone.generators, problem.W)
+    for mu in data.training[:: max(1, len(data.training) // 9)]:
+        B = problem.assemble(mu).B
+        target = V.whiten(V.orthonormalise(supremizers(V, B, data.span)))
+        reached = float(singular_values(remove(V.whiten(Z), target)).max())
+        assert reached <= delta + 1e-9
+        own, online = inf_sup_on(Z, B, cone), inf_sup_full(V, B, cone)
+        for what in ("span", "cone_upper"):
+            assert getattr(own, what) >= np.sqrt(1.0 - delta**2) * getattr(online, what) * (1.0 - 1e-9)
+
+
+def test_pga_adds_vectors_from_the_training_supremizers(varying: Offline) -> None:
+    problem, V = varying.problem, varying.problem.V
+    enrichment = OfflinePGA().build(varying, 0.1)
+    everything = [supremizers(V, problem.assemble(mu).B, varying.span) for mu in varying.training]
+    space = orthonormal_range(V.whiten(np.hstack([varying.basis, *everything])))
+    assert np.abs(remove(space, V.whiten(enrichment.vectors))).max() < 1e-9
+    assert enrichment.vectors.shape[1] > varying.span.shape[1]  # B(mu) varies: one parameter's are not enough
+
+
+def test_with_one_supremizer_space_sigma_is_the_sines_of_the_principal_angles(obstacle: Offline) -> None:
+    V = obstacle.problem.V
+    B = obstacle.problem.assemble(obstacle.training[40]).B
+    target = orthonormal_range(V.whiten(supremizers(V, B, obstacle.span)))
+    sines = singular_values(remove(V.whiten(obstacle.basis), target))
+    sigma = OfflinePGA().build(obstacle, 1e-10).history["sigma"]
+    steps = min(len(sigma), len(sines))
+    assert np.allclose(sigma[:steps], sines[:steps], atol=1e-9)
+    assert len(sigma) - 1 == np.count_nonzero(sines > 1e-10) <= obstacle.span.shape[1]
+
+
+def test_with_a_tiny_tolerance_offline_and_online_spaces_coincide(obstacle: Offline) -> None:
+    V = obstacle.problem.V
+    B = obstacle.problem.assemble(obstacle.training[7]).B
+    added = OfflinePGA().build(obstacle, 1e-10).vectors
+    online = V.orthonormalise(supremizers(V, B, obstacle.span), obstacle.basis)
+    assert added.shape == online.shape
+    assert np.allclose(singular_values(V.gram(added, online)), 1.0, atol=1e-9)
+
+
+def test_the_tolerance_between_offline_and_online_constants(obstacle: Offline) -> None:
+    """0 ≤ 1 − β_off/β_on ≤ 1 − √(1 − δ²) where all parameters share one supremizer space."""
+    problem = obstacle.problem
+    cone = multipliers(obstacle.cone.generators, problem.W)
+    for delta in (0.3, 0.9):
+        Z = np.hstack([obstacle.basis, OfflinePGA().build(obstacle, delta).vectors])
+        for mu in problem.validation_set(4, 1):
+            B = problem.assemble(mu).B
+            loss = 1.0 - inf_sup_on(Z, B, cone).span / inf_sup_full(problem.V, B, cone).span
+            assert -1e-9 <= loss <= 1.0 - np.sqrt(1.0 - delta**2) + 1e-9
+
+
+def test_lazy_and_plain_pga_choose_the_same_vectors(monkeypatch, varying: Offline) -> None:
+    from vibench_strategies import offline_pga
+
+    class Plain(offline_pga.LazyMaximum):
+        def next(self, evaluate):
+            self._bounds = np.minimum(self._bounds, [evaluate(p) for p in range(len(self._bounds))])
+            return super().next(lambda p: float(self._bounds[p]))
+
+    lazy = OfflinePGA().build(varying, 0.05)
+    monkeypatch.setattr(offline_pga, "LazyMaximum", Plain)
+    plain = OfflinePGA().build(varying, 0.05)
+    assert np.allclose(lazy.vectors, plain.vectors, atol=1e-8)
+
+
+def test_pga_without_a_tolerance_is_refused(varying: Offline) -> None:
+    with pytest.raises(ValueError, match="needs a tolerance"):
+        OfflinePGA().build(varying, None)

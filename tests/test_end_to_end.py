@@ -1,0 +1,95 @@
+"""The whole matrix through the command line, judged by the invariants that every row must keep."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from vibench import tables
+
+CONSTANTS = ("span", "cone_lower", "cone_upper")
+
+
+def at_least(larger: pd.Series, smaller: pd.Series, scale: pd.Series) -> bool:
+    """Larger ≥ smaller up to 1e-8 relative and 1e-12 of the size of the form."""
+    return bool(np.all(larger >= smaller * (1.0 - 1e-8) - 1e-12 * scale))
+
+
+@pytest.fixture(scope="module")
+def queries(quick_run: Path) -> pd.DataFrame:
+    frame = tables.read(quick_run / "results.sqlite", "queries")
+    kinds = tables.read(quick_run / "results.sqlite", "cells").set_index("cell")["enrichment_kind"]
+    return frame.assign(kind=frame["cell"].map(kinds))
+
+
+def test_every_cell_of_the_quick_matrix_has_a_row(quick_run: Path) -> None:
+    cells = tables.read(quick_run / "results.sqlite", "cells")
+    assert len(cells) == 2 * 3 * 3
+    assert set(cells["primal"]) == {"decorrelated", "online-supremizers", "offline-pga"}
+    assert cells[["dual", "primal", "primal_tol", "solver"]].duplicated().sum() == 0
+    assert (cells["queries"] == 16).all()
+
+
+def test_every_ok_query_is_as_accurate_as_the_study_asks(queries: pd.DataFrame) -> None:
+    ok = queries[queries["status"] == "ok"]
+    assert len(ok) > 0.9 * len(queries)
+    assert ok[["primal_residual", "dual_residual", "gap"]].max().max() <= 1e-7
+    assert (queries[queries["status"] != "ok"]["reason"] != "").all()
+    assert ok["error_u"].max() < 0.01
+
+
+def test_invariants_of_the_inf_sup_constants_hold_in_every_row(queries: pd.DataFrame) -> None:
+    scale = queries["beta_full_cone_upper"]
+    pairs = (("beta_full_", "beta_"), ("beta_", "beta_plain_"), ("beta_full_", "beta_hf_"))
+    for larger, smaller in pairs:
+        assert at_least(queries[f"{larger}span"], queries[f"{smaller}span"], scale), (larger, smaller)
+        assert at_least(queries[f"{larger}cone_upper"], queries[f"{smaller}cone_lower"], scale), (larger, smaller)
+    for whose in ("", "full_", "plain_", "hf_"):
+        assert at_least(queries[f"beta_{whose}cone_upper"], queries[f"beta_{whose}span"], scale)
+        assert (queries[f"beta_{whose}cone_lower"] <= queries[f"beta_{whose}cone_upper"]).all()
+    online = queries[queries["kind"] == "per-parameter"]
+    for what in CONSTANTS:
+        assert np.allclose(online[f"beta_{what}"], online[f"beta_full_{what}"], rtol=1e-8)
+    bare = queries[queries["kind"] == "none"]
+    for what in CONSTANTS:
+        assert np.allclose(bare[f"beta_{what}"], bare[f"beta_plain_{what}"], rtol=1e-8, atol=1e-14)
+
+
+def test_span_constants_vanish_exactly_below_the_rank(quick_run: Path, queries: pd.DataFrame) -> None:
+    cells = tables.read(quick_run / "results.sqlite", "cells").set_index("cell")
+    short = cells["N"] + cells["enrichment"] < cells["rank"]
+    assert short.any()
+    assert not short.all()
+    vanishes = queries["beta_span"].to_numpy() == 0.0
+    assert np.array_equal(vanishes, short.loc[queries["cell"]].to_numpy())
+
+
+def test_fixed_enrichments_keep_their_promise_on_the_validation_set(queries: pd.DataFrame) -> None:
+    """All parameters share one supremizer space here, so the bound of the training set holds everywhere."""
+    fixed = queries[queries["kind"] == "fixed"]
+    bound = np.sqrt(1.0 - fixed["primal_tol"] ** 2)
+    assert (fixed["beta_span"] >= bound * fixed["beta_full_span"] * (1.0 - 1e-9)).all()
+    assert (fixed["beta_cone_upper"] >= bound * fixed["beta_full_cone_lower"] * (1.0 - 1e-9)).all()
+
+
+def test_solvers_agree_on_what_they_solved(queries: pd.DataFrame) -> None:
+    """Inf-sup constants do not depend on the solver at all, errors of u only in the digits of the accuracy."""
+    keys = ["dual", "primal", "primal_tol", "query"]
+    ok = queries[queries["status"] == "ok"]
+    spread = ok.groupby(keys, dropna=False)[["error_u", "beta_span"]].agg(lambda values: values.max() - values.min())
+    assert spread["beta_span"].max() == 0.0
+    assert spread["error_u"].max() < 3e-4
+
+
+def test_the_modified_cone_is_no_larger_and_better_conditioned(quick_run: Path) -> None:
+    cells = tables.read(quick_run / "results.sqlite", "cells")
+    sizes = cells.groupby("dual")["R"].first()
+    assert sizes["mcpg"] <= sizes["cpg"]
+    histories = tables.read(quick_run / "results.sqlite", "histories")
+    orth = histories[histories["quantity"] == "e_orth"]
+    common = orth.groupby("dual")["step"].max().min()
+    medians = orth[(orth["step"] > 0) & (orth["step"] <= common)].groupby("dual")["value"].median()
+    assert medians["mcpg"] > medians["cpg"]

@@ -1,0 +1,91 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import scipy.sparse as sp
+from hypothesis import given
+from hypothesis import strategies as st
+
+from numerics import Varying, spd
+from test_qp import exact
+from vibench import highfidelity
+from vibench.errors import NumericalError
+from vibench.problem import VariationalInequality
+
+
+def string(n: int, gap: float, load: float) -> VariationalInequality:
+    """−u″ = −load on (0, 1), u ≥ −gap, with lumped constraints on every inner node."""
+    h = 1.0 / (n + 1)
+    A = sp.diags_array([2.0 * np.ones(n), -np.ones(n - 1), -np.ones(n - 1)], offsets=[0, 1, -1]) / h
+    return VariationalInequality(sp.csc_array(A), -load * h * np.ones(n), -h * sp.eye_array(n), h * gap * np.ones(n))
+
+
+def test_the_string_on_a_table_against_its_closed_form() -> None:
+    """Contact from s on with s = √(2 gap/load); u = −gap + load (s − x)²/2 before; the multiplier is the load."""
+    gap, load, n = 0.02, 1.0, 999
+    solution = highfidelity.solve(string(n, gap, load))
+    s = np.sqrt(2.0 * gap / load)
+    x = np.linspace(0.0, 1.0, n + 2)[1:-1]
+    nearest = np.minimum(x, 1.0 - x)
+    exact_u = np.where(nearest < s, -gap + 0.5 * load * (s - nearest) ** 2, -gap)
+    assert np.abs(solution.u - exact_u).max() < 2e-6
+    inside = nearest > s + 2e-3
+    assert np.allclose(solution.lam[inside], load, rtol=1e-8)
+    assert np.all(solution.lam[nearest < s - 2e-3] == 0.0)
+
+
+@given(st.integers(0, 10_000))
+def test_every_solution_is_that_of_the_right_active_set(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    vi = VariationalInequality(spd(7, rng), rng.standard_normal(7), rng.standard_normal((4, 7)), rng.random(4) * 0.2)
+    sparse = VariationalInequality(sp.csc_array(vi.A), vi.f, sp.csr_array(vi.B), vi.g)
+    found = highfidelity.solve(sparse)
+    x, alpha = exact(vi)
+    assert np.allclose(found.u, x, atol=1e-8)
+    assert np.allclose(found.lam, alpha, atol=1e-7)
+    assert found.residuals.worst <= 1e-10
+
+
+def test_kkt_conditions_hold_with_exact_zeros() -> None:
+    problem = Varying()
+    for mu in problem.training_set():
+        vi = problem.assemble(mu)
+        found = highfidelity.solve(vi)
+        assert np.abs(vi.A @ found.u + vi.B.T @ found.lam - vi.f).max() <= 1e-10 * np.abs(vi.f).max()
+        assert np.all(found.lam >= 0.0)
+        gap = vi.B @ found.u - vi.g
+        assert gap.max() <= 1e-10
+        assert np.all((found.lam == 0.0) | (np.abs(gap) <= 1e-10))
+        assert 0 < np.count_nonzero(found.lam) < 8
+
+
+def test_a_cycling_active_set_is_helped_and_the_help_is_recorded(monkeypatch: pytest.MonkeyPatch) -> None:
+    vi = string(50, 0.02, 1.0)
+    alone = highfidelity.solve(vi)
+    assert alone.fallback == ""
+    iterate, calls = highfidelity._active_set_iterations, []
+
+    def cycles_at_first(vi, active):
+        calls.append(active)
+        return None if len(calls) == 1 else iterate(vi, active)
+
+    monkeypatch.setattr(highfidelity, "_active_set_iterations", cycles_at_first)
+    helped = highfidelity.solve(vi)
+    assert "cycled" in helped.fallback
+    assert np.allclose(helped.u, alone.u, atol=1e-12)
+    assert np.array_equal(helped.lam == 0.0, alone.lam == 0.0)
+
+
+def test_no_active_constraint_and_all_active() -> None:
+    free = highfidelity.solve(string(20, 10.0, 1.0))
+    assert np.all(free.lam == 0.0)
+    pressed = highfidelity.solve(string(20, 0.0, 1.0))
+    assert np.allclose(pressed.lam, 1.0)
+    assert np.abs(pressed.u).max() < 1e-15
+
+
+def test_an_infeasible_problem_is_refused() -> None:
+    B = sp.csr_array(np.array([[1.0, 0.0], [-1.0, 0.0]]))
+    vi = VariationalInequality(sp.csc_array(np.eye(2)), np.ones(2), B, np.array([-1.0, -1.0]))
+    with pytest.raises(NumericalError):
+        highfidelity.solve(vi)

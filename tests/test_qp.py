@@ -1,0 +1,164 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import scipy.sparse as sp
+from hypothesis import given
+from hypothesis import strategies as st
+
+from numerics import spd
+from vibench import qp
+from vibench.errors import RequestError
+from vibench.problem import VariationalInequality
+from vibench.qp import Answer, Status
+
+seeds = st.integers(0, 10_000)
+
+
+def program(seed: int, n: int = 6, m: int = 4) -> VariationalInequality:
+    """A feasible program with rows and cost of very different sizes."""
+    rng = np.random.default_rng(seed)
+    B = rng.standard_normal((m, n)) * 10.0 ** rng.integers(-4, 4, (m, 1))
+    g = B @ rng.standard_normal(n) * 0.1 + np.abs(B).sum(axis=1) * 0.05
+    return VariationalInequality(spd(n, rng), 1e-3 * rng.standard_normal(n) * 50.0, B, g)
+
+
+def exact(vi: VariationalInequality) -> tuple[np.ndarray, np.ndarray]:
+    """Solution by trying every active set."""
+    m = len(vi.g)
+    for bits in range(2**m):
+        active = [i for i in range(m) if bits >> i & 1]
+        C = vi.B[active]
+        kkt = np.block([[vi.A, C.T], [C, np.zeros((len(active), len(active)))]])
+        solution = np.linalg.lstsq(kkt, np.concatenate([vi.f, vi.g[active]]), rcond=None)[0]
+        x, lam = solution[: len(vi.f)], solution[len(vi.f) :]
+        scale = np.abs(vi.B).sum(axis=1)
+        if np.all(lam >= -1e-9 * (1.0 + np.abs(lam).max(initial=0.0))) and np.all(vi.B @ x - vi.g <= 1e-10 * scale):
+            alpha = np.zeros(m)
+            alpha[active] = lam
+            return x, alpha
+    raise AssertionError("no active set")
+
+
+@given(seeds)
+def test_residuals_vanish_at_the_solution_and_only_there(seed: int) -> None:
+    vi = program(seed)
+    x, alpha = exact(vi)
+    assert qp.residuals(vi, x, np.maximum(alpha, 0.0)).worst < 1e-8
+    moved = qp.residuals(vi, x + 0.1 * np.abs(x).max(), alpha)
+    assert max(moved.dual, moved.primal) > 1e-4
+
+
+def test_residuals_as_defined_by_hand() -> None:
+    vi = VariationalInequality(A=2.0 * np.eye(2), f=np.array([2.0, 0.0]), B=np.array([[3.0, 4.0]]), g=np.array([1.0]))
+    found = qp.residuals(vi, np.array([1.0, 0.0]), np.array([0.5]))
+    assert np.isclose(found.primal, (3.0 - 1.0) / 5.0)  # row of norm 5; ‖g‖ in row units is 0.2, so the floor 1 counts
+    assert np.isclose(found.dual, 2.0 / 2.0)  # Ax − f + Bᵀα = (1.5, 2); over max(2, 2, 2)
+    assert np.isclose(found.gap, 0.5 / 2.0)  # 2 − 2 + 0.5 over max(1, 2, 0.5)
+
+
+@pytest.mark.parametrize("solver", ["piqp", "proxqp", "osqp"])
+@pytest.mark.parametrize("accuracy", [1e-5, 1e-7])
+def test_required_solvers_reach_the_accuracy_they_are_asked_for(solver: str, accuracy: float) -> None:
+    for seed in range(30):
+        vi = program(seed)
+        if abs(vi.f @ exact(vi)[0]) < 0.05 * np.abs(vi.f).max():
+            continue  # the energy nearly vanishes, so a relative gap asks for more than the accuracy
+        answer = qp.solve(vi, solver, accuracy)
+        status, reason, found = qp.judge(vi, answer, accuracy)
+        assert status is Status.OK, (seed, reason)
+        assert found is not None
+        assert found.worst <= accuracy
+        assert answer.iterations is not None
+        x, _ = exact(vi)
+        assert np.allclose(answer.x, x, atol=200.0 * accuracy * (1.0 + np.abs(x).max()))
+
+
+def test_sparse_programs_go_through_the_same_door() -> None:
+    vi = program(3)
+    sparse = VariationalInequality(sp.csc_array(vi.A), vi.f, sp.csr_array(vi.B), vi.g)
+    answer = qp.solve(sparse, "piqp", 1e-9)
+    assert np.allclose(answer.x, exact(vi)[0], atol=1e-7)
+    assert qp.residuals(sparse, answer.x, answer.alpha).worst <= 1e-9
+
+
+def test_a_program_without_constraints() -> None:
+    vi = VariationalInequality(np.eye(3), np.arange(3.0), np.zeros((0, 3)), np.zeros(0))
+    answer = qp.solve(vi, "piqp", 1e-8)
+    assert qp.judge(vi, answer, 1e-8)[0] is Status.OK
+    assert np.allclose(answer.x, np.arange(3.0), atol=1e-7)
+
+
+INFEASIBLE = VariationalInequality(np.eye(2), np.ones(2), np.array([[1.0, 0.0], [-1.0, 0.0]]), np.array([-1.0, -1.0]))
+
+
+def test_infeasible_only_with_a_certificate_of_our_own() -> None:
+    alpha = qp.infeasibility_certificate(INFEASIBLE)
+    assert alpha is not None
+    assert np.all(alpha >= 0.0)
+    assert np.allclose(INFEASIBLE.B.T @ alpha, 0.0)
+    assert INFEASIBLE.g @ alpha < 0.0
+    assert qp.infeasibility_certificate(program(0)) is None
+    nothing = Answer(None, None, "infeasible, I say")
+    assert qp.judge(INFEASIBLE, nothing, 1e-7)[0] is Status.INFEASIBLE
+    status, reason, found = qp.judge(program(0), nothing, 1e-7)
+    assert status is Status.FAILED
+    assert "infeasible, I say" in reason
+    assert found is None
+
+
+def test_not_finite_is_seen_before_anything_else() -> None:
+    vi = program(1)
+    x, alpha = exact(vi)
+    x[0] = np.nan
+    assert qp.judge(vi, Answer(x, alpha, "solved"), 1e-7)[0] is Status.NONFINITE
+
+
+def test_a_claim_is_not_believed() -> None:
+    vi = program(2)
+    x, alpha = exact(vi)
+    status, reason, found = qp.judge(vi, Answer(x + 1e-3, alpha, "solved"), 1e-7)
+    assert status is Status.INACCURATE
+    assert "solved" in reason
+    assert "above 1e-07" in reason
+    assert found is not None
+
+
+def test_negative_multipliers_are_set_to_zero_and_reported() -> None:
+    vi = VariationalInequality(np.eye(2), np.ones(2), np.array([[1.0, 0.0], [0.0, 1.0]]), np.array([0.5, 0.5]))
+
+    def wrong(scaled: VariationalInequality, accuracy: float) -> Answer:
+        return Answer(np.array([0.5, 0.5]), np.array([0.5, -0.1]), "solved")
+
+    answer = qp.solve(vi, "wrong", 1e-7, {"wrong": wrong})
+    assert answer.alpha is not None
+    assert answer.alpha.tolist() == [0.5, 0.0]
+    assert np.isclose(answer.negative, 0.1)
+    assert "multipliers down to -1e-01" in qp.judge(vi, answer, 1e-7)[1]
+
+
+def test_a_registered_solver_sees_scaled_data_and_its_answer_is_scaled_back() -> None:
+    vi = program(5)
+    seen = {}
+
+    def brute(scaled: VariationalInequality, accuracy: float) -> Answer:
+        seen["rows"] = np.linalg.norm(scaled.B, axis=1)
+        seen["f"] = np.abs(scaled.f).max()
+        return Answer(*exact(scaled), "found")
+
+    answer = qp.solve(vi, "brute", 1e-9, {"brute": brute})
+    assert np.allclose(seen["rows"], 1.0)
+    assert np.isclose(seen["f"], 1.0)
+    assert qp.residuals(vi, answer.x, answer.alpha).worst < 1e-9
+
+
+def test_names_are_checked_with_a_suggestion() -> None:
+    qp.check_solver_name("piqp")
+    qp.check_solver_name("mine", {"mine": lambda program, accuracy: Answer(None, None, "")})
+    with pytest.raises(RequestError, match="no QP solver is called 'proxpq'; did you mean 'proxqp'"):
+        qp.check_solver_name("proxpq")
+
+
+def test_severities_follow_the_order_of_the_statuses() -> None:
+    order = [Status.OK, Status.INACCURATE, Status.FAILED, Status.CRASHED, Status.UNAVAILABLE]
+    assert sorted(order[::-1], key=lambda status: status.severity) == order
