@@ -5,6 +5,7 @@ vibench run paper-obstacle && python results/make.py runs/paper-obstacle results
 
 from __future__ import annotations
 
+import json
 import shutil
 import sys
 from pathlib import Path
@@ -50,7 +51,8 @@ def main() -> None:
 def page(path: Path, name: str) -> str:
     """The README of the folder: how it was made, the comparison, the summary, what fell short, the figures."""
     cells = tables.in_order(tables.read(path, "cells"))
-    versions = cells["versions"].iloc[0]
+    versions = {name: text for row in cells["versions"] for name, text in json.loads(row).items()}
+    named = ", ".join(f"{name} {text}" for name, text in versions.items())
     short = cells[cells["status"] != "ok"].groupby(["solver", "status"])
     fell = [
         f"- {solver}: {len(group)} cells {status}, {int((group['queries'] - group['queries_ok']).sum())} of "
@@ -60,7 +62,7 @@ def page(path: Path, name: str) -> str:
     parts = [
         f"# {name}",
         f"Made by `vibench run {name} && python results/make.py runs/{name} results/{name}`, on one machine: "
-        f"{cells['machine'].iloc[0]}; {versions}. Seconds are CPU seconds on one thread.",
+        f"{cells['machine'].iloc[0]}; {named}. Seconds are CPU seconds on one thread.",
         f"## {PUBLISHED[name]['title']}",
         tables.to_markdown(comparison(cells, name)),
         f"Ours: {SOLVER}, assembly in full as in the paper; the threshold by the same formula from our seconds.",

@@ -13,7 +13,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from vibench import figures, plugins, provenance, qp, tables
+from vibench import figures, invariants, plugins, provenance, qp, tables
 from vibench.errors import RequestError, VibenchError, unknown_name
 from vibench.matrix import Cell, expand
 from vibench.progress import Report
@@ -165,6 +165,12 @@ def _summarise(console: Console, study: Study, folder: Path, outcome: Outcome, d
             markup=False, soft_wrap=True,
         )  # fmt: skip
     console.print(f"{len(outcome.rows)} cells, {len(outcome.rows) - len(short)} ok, {len(short)} fell short")
+    queries = tables.read(path, "queries")
+    broken = invariants.violations(queries, tables.read(path, "cells").set_index("cell")["enrichment_kind"])
+    for violation in broken:
+        console.print(f"invariant: {violation}; this is a bug of vibench or of a plugin's spaces")
+    if not broken:
+        console.print(f"invariants of the inf-sup constants hold in all {len(queries)} queries")
     console.print(f"results: {path}, tables: {folder / 'tables'}, {len(drawn)} figures: {folder / 'figures'}")
 
 

@@ -39,8 +39,8 @@ class Failed:
 def initialise(memory_gib: float) -> None:
     """Prepare a worker: one thread, no more memory than allowed, and Ctrl-C left to the parent."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    limit = int(memory_gib * 2**30)
-    resource.setrlimit(resource.RLIMIT_AS, (limit, resource.getrlimit(resource.RLIMIT_AS)[1]))
+    limit, hard = int(memory_gib * 2**30), resource.getrlimit(resource.RLIMIT_AS)[1]
+    resource.setrlimit(resource.RLIMIT_AS, (limit if hard == resource.RLIM_INFINITY else min(limit, hard), hard))
     threadpool_limits(1)
 
 

@@ -12,6 +12,7 @@ from vibench.linalg import orthonormal_range, remove, singular_values
 from vibench.strategy import Cone, Kind, Offline, no_free
 from vibench.supremizer import supremizers
 from vibench_problems.obstacle import Obstacle
+from vibench_strategies import offline_pga
 from vibench_strategies.decorrelated import Decorrelated
 from vibench_strategies.offline_pga import OfflinePGA
 from vibench_strategies.online_supremizers import OnlineSupremizers
@@ -118,8 +119,6 @@ def test_the_tolerance_between_offline_and_online_constants(obstacle: Offline) -
 
 
 def test_lazy_and_plain_pga_choose_the_same_vectors(monkeypatch, varying: Offline) -> None:
-    from vibench_strategies import offline_pga
-
     class Plain(offline_pga.LazyMaximum):
         def next(self, evaluate):
             self._bounds = np.minimum(self._bounds, [evaluate(p) for p in range(len(self._bounds))])
