@@ -26,7 +26,6 @@ from vibench.study import Study, load_study
 app = typer.Typer(
     name="vibench",
     help="Benchmark reduced-order models of parametrised variational inequalities.",
-    no_args_is_help=True,
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
 )
@@ -123,7 +122,7 @@ def main() -> None:
     """Entry point: what is wrong with a request is one line and exit code 2."""
     usage_error = typer.BadParameter.__mro__[2]  # click's ClickException, whichever copy of click typer brings
     try:
-        code = app(standalone_mode=False)
+        code = app(args=sys.argv[1:] or ["--help"], standalone_mode=False)
     except RequestError as error:
         code = _refuse(error)
     except VibenchError as error:

@@ -138,7 +138,8 @@ def load_study(request: str, overrides: Mapping[str, Sequence[Any]] | None = Non
     except tomllib.TOMLDecodeError as error:
         raise RequestError(f"{path}: not valid TOML: {error}") from None
     given = {key: list(values) for key, values in (overrides or {}).items() if values}
-    source = f"{path}" + (" with the options of the command line" if given else "")
+    source = str(path) if path == Path(request) else f"study '{request}'"
+    source += " with the options of the command line" if given else ""
     study = _validate(_replace_axes(content, given), source)
     _check_names(study, source)
     return study

@@ -1,0 +1,116 @@
+"""Seconds: which clock, how many repeats, one thread."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+
+import pytest
+from threadpoolctl import threadpool_info
+
+from vibench import timing
+from vibench.timing import NO_TIME, REPEATS, THREAD_VARIABLES, Seconds, Stopwatch, median_seconds, one_thread, timed
+
+
+@pytest.fixture
+def clocks(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
+    """Function that makes every timed piece of work take the given (CPU, wall) seconds in turn."""
+
+    def script(*durations: tuple[float, float]) -> None:
+        cpu: Iterator[float] = iter([t for c, _ in durations for t in (100.0, 100.0 + c)])
+        wall: Iterator[float] = iter([t for _, w in durations for t in (500.0, 500.0 + w)])
+        monkeypatch.setattr(timing.time, "thread_time", lambda: next(cpu))
+        monkeypatch.setattr(timing.time, "perf_counter", lambda: next(wall))
+
+    return script
+
+
+class Work:
+    """Counts how often it is done; the result says which time it was."""
+
+    def __init__(self) -> None:
+        self.count = 0
+
+    def __call__(self) -> int:
+        self.count += 1
+        return self.count
+
+
+def test_seconds_add_up() -> None:
+    assert Seconds(1.0, 2.0) + Seconds(0.5, 0.25) == Seconds(1.5, 2.25)
+    assert sum([Seconds(1.0, 2.0)] * 3, NO_TIME) == Seconds(3.0, 6.0)
+
+
+def test_work_is_timed_once(clocks: Callable[..., None]) -> None:
+    clocks((0.25, 0.75))
+    work = Work()
+    assert timed(work) == (1, Seconds(0.25, 0.75))
+    assert work.count == 1
+
+
+def test_the_median_of_the_repeats_counts_and_the_warm_up_does_not(clocks: Callable[..., None]) -> None:
+    clocks((0.9, 0.9), (0.5, 0.75), (0.125, 0.25), (0.25, 0.5), (0.375, 0.125), (0.0625, 0.625))
+    work = Work()
+    assert median_seconds(work) == (1, Seconds(0.25, 0.5))
+    assert work.count == 1 + REPEATS
+
+
+def test_at_least_five_repeats_count() -> None:
+    assert REPEATS >= 5
+
+
+def test_slow_work_is_done_once(clocks: Callable[..., None]) -> None:
+    clocks((0.125, 1.25))
+    work = Work()
+    assert median_seconds(work) == (1, Seconds(0.125, 1.25))
+    assert work.count == 1
+
+
+def test_what_work_raises_comes_through() -> None:
+    with pytest.raises(ZeroDivisionError):
+        median_seconds(lambda: 1 // 0)
+
+
+def test_sleep_and_other_threads_are_no_cpu_seconds() -> None:
+    def busy() -> None:
+        while not done.is_set():
+            sum(range(1000))
+
+    done = threading.Event()
+    other = threading.Thread(target=busy)
+    watch = Stopwatch()
+    other.start()
+    time.sleep(0.2)
+    done.set()
+    other.join()
+    spent = watch.seconds()
+    assert spent.wall >= 0.2
+    assert spent.cpu < 0.5 * spent.wall
+
+
+def test_one_thread_holds_inside_and_is_undone_outside(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(THREAD_VARIABLES[0], "7")
+    monkeypatch.delenv(THREAD_VARIABLES[1], raising=False)
+    with one_thread():
+        assert [os.environ[name] for name in THREAD_VARIABLES] == ["1"] * len(THREAD_VARIABLES)
+        assert {library["num_threads"] for library in threadpool_info()} <= {1}
+    assert os.environ[THREAD_VARIABLES[0]] == "7"
+    assert THREAD_VARIABLES[1] not in os.environ
+
+
+def test_one_thread_is_undone_after_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(THREAD_VARIABLES[0], "7")
+    with pytest.raises(KeyError), one_thread():
+        raise KeyError
+    assert os.environ[THREAD_VARIABLES[0]] == "7"
+
+
+def test_one_thread_reaches_processes_started_inside() -> None:
+    code = "import numpy, threadpoolctl; print({x['num_threads'] for x in threadpoolctl.threadpool_info()})"
+    with one_thread():
+        done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "{1}"
