@@ -16,7 +16,7 @@ from vibench import matrix
 from vibench.errors import RequestError
 from vibench.matrix import Cell, Plugin, digest, expand
 from vibench.strategy import Stop
-from vibench.study import load_study
+from vibench.study_file import load_study
 
 Expand = Callable[[Mapping[str, Any]], list[Cell]]
 

@@ -16,7 +16,8 @@ from vibench.schema import HISTORY_KEYS, KEYS
 from vibench.stage import Stage
 from vibench.stages import ConeStage, EnrichmentStage, PODStage
 from vibench.strategy import Stop
-from vibench.study import Study, load_study
+from vibench.study import Study
+from vibench.study_file import load_study
 from vibench.sweeps import HighFidelity, ReferenceConstants
 
 

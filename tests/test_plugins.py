@@ -21,7 +21,7 @@ from vibench.errors import RequestError
 from vibench.matrix import Plugin
 from vibench.problem import Problem
 from vibench.strategy import DualStrategy, PrimalStrategy
-from vibench.study import load_study
+from vibench.study_file import load_study
 
 HERE = __name__
 
@@ -232,9 +232,10 @@ def test_a_registered_study_without_file_is_refused(register: Register, monkeypa
     assert "/nowhere/lost.toml" in refusal(load_study, "lost")
 
 
-def test_solvers_come_as_callables(register: Register) -> None:
+def test_a_registered_solver_comes_as_a_callable(register: Register) -> None:
     register(("vibench.qp_solvers", "mine", f"{HERE}:no_strategy"))
-    assert plugins.qp_solvers() == {"mine": no_strategy}
+    assert plugins.qp_solver("mine") == {"mine": no_strategy}
+    assert plugins.qp_solver("piqp") == {}
 
 
 ACCEPTED = [

@@ -20,7 +20,7 @@ from vibench.runner import queries_stage
 from vibench.stage import Stage
 from vibench.stages import PODStage
 from vibench.strategy import Stop
-from vibench.study import load_study
+from vibench.study_file import load_study
 from vibench.sweeps import CHUNKS, HighFidelity
 
 PROBLEM = Plugin("problem", "p", "{}", "")
@@ -183,9 +183,7 @@ def test_less_than_a_second_left_is_not_said(report: Make, cells: list[Cell], qu
     assert "left" not in printed.getvalue()
 
 
-def test_no_control_characters_where_there_is_no_terminal(
-    report: Make, cells: list[Cell], queries: list[Stage]
-) -> None:
+def test_plain_lines_where_there_is_no_terminal(report: Make, cells: list[Cell], queries: list[Stage]) -> None:
     made, printed = report()
     with made:
         made.start(len(cells), [*CHUNK, *queries])
@@ -220,12 +218,3 @@ def test_a_terminal_gets_no_bar_where_nothing_is_to_be_done(report: Make) -> Non
         made.start(3, [])
     assert "stages on" in printed.getvalue()
     assert "0:00:00" not in printed.getvalue()
-
-
-def test_cells_without_a_stage_are_counted_too(report: Make, cells: list[Cell]) -> None:
-    """An unavailable solver costs no stage; its cells still are some of those to run."""
-    made, printed = report()
-    made.start(2, [])
-    for cell in cells[:2]:
-        made.cell(cell, {"status": "unavailable", "reason": "not installed"})
-    assert "[2/0]" not in printed.getvalue()

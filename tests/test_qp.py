@@ -154,7 +154,7 @@ def test_a_registered_solver_sees_scaled_data_and_its_answer_is_scaled_back() ->
 
 def test_names_are_checked_with_a_suggestion() -> None:
     qp.check_solver_name("piqp")
-    qp.check_solver_name("mine", {"mine": lambda program, accuracy: Answer(None, None, "")})
+    qp.check_solver_name("mine", ["mine"])
     with pytest.raises(RequestError, match="no QP solver is called 'proxpq'; did you mean 'proxqp'"):
         qp.check_solver_name("proxpq")
 

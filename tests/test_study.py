@@ -16,7 +16,8 @@ from hypothesis import strategies as st
 from samples import REMOVE, STUDY, changed, toml, write_study
 from vibench.errors import RequestError
 from vibench.matrix import expand
-from vibench.study import Study, find_study, load_study
+from vibench.study import Study
+from vibench.study_file import find_study, load_study
 
 JARGON = ("list[", "dict[", "literal[", "constrained", "instance of")
 """Words of the validation library that mean nothing to the author of a study file."""

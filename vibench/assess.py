@@ -54,7 +54,7 @@ def errors(problem: Problem, vi: VariationalInequality, reference: Reference, u:
     du, dlam = u - reference.u, lam - reference.lam
     norm_u = max(float(V.norm(reference.u)), reference.floor_u)
     norm_lam = max(float(W.norm(reference.lam)), reference.floor_lam)
-    energy = np.sqrt(float(reference.u @ (vi.A @ reference.u)))
+    energy = np.sqrt(max(float(reference.u @ (vi.A @ reference.u)), 0.0))
     excess = vi.B @ u - vi.g
     return Errors(
         u=_over(float(V.norm(du)), norm_u),

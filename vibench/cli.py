@@ -21,7 +21,8 @@ from vibench.qp import Status
 from vibench.runner import Outcome, run_study
 from vibench.schema import TABLES
 from vibench.solver_settings import SETTINGS
-from vibench.study import Study, load_study
+from vibench.study import Study
+from vibench.study_file import load_study
 
 app = typer.Typer(
     name="vibench",
@@ -177,17 +178,28 @@ def _plugin_rows(kind: str) -> list[tuple[str, str, str, str]]:
     rows = []
     for name in plugins.names(kind):
         if kind == "study":
-            study = load_study(name)
-            rows.append((name, plugins.version(kind, name), f"{len(expand(study))} cells", ""))
+            rows.append((name, plugins.version(kind, name), _study_summary(name), ""))
             continue
-        summary = (plugins.load(kind, name).__doc__ or "").strip().split("\n")[0]
-        options = [f"{o.name}: {o.expected}" + f" = {o.default}" * bool(o.default) for o in plugins.options(kind, name)]
+        try:
+            summary = (plugins.load(kind, name).__doc__ or "").strip().split("\n")[0]
+            options = [
+                f"{o.name}: {o.expected}" + f" = {o.default}" * bool(o.default) for o in plugins.options(kind, name)
+            ]
+        except RequestError as error:
+            summary, options = str(error), []
         rows.append((name, plugins.version(kind, name), summary, "\n".join(options)))
     return rows
 
 
+def _study_summary(name: str) -> str:
+    try:
+        return f"{len(expand(load_study(name)))} cells"
+    except RequestError as error:
+        return str(error)
+
+
 def _solver_rows() -> list[tuple[str, str, str, str]]:
-    extra = plugins.qp_solvers()
+    extra = plugins.names("QP solver")
     installed = qp.installed_solvers(extra)
     known = sorted({*SETTINGS, *extra})
     return [

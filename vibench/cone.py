@@ -57,7 +57,7 @@ def greedy_cone(snapshots: Array, W: InnerProduct, stop: Stop, subtract: Subtrac
     stop
         Relative largest projection error, or number of generators.
     subtract
-        What to leave out of the chosen snapshot: nothing for CPG, line 9 of Algorithm 2 for mCPG.
+        What to leave out of the chosen snapshot: nothing (Remark 4.3), or what line 9 of Algorithm 2 says.
 
     Raises
     ------

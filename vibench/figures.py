@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -18,8 +19,10 @@ from vibench.strategy import Kind
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
 """Okabe and Ito's palette, told apart by colour-blind readers; lines differ in style too."""
 
-STYLES = ("-", "--", "-.", ":", (0, (5, 1)), (0, (3, 1, 1, 1)), (0, (1, 1)))
+STYLES: tuple[Any, ...] = ("-", "--", "-.", ":", (0, (5, 1)), (0, (3, 1, 1, 1)), (0, (1, 1)))
 MARKERS = "os^vDPX"
+BLACK = 6
+"""Index of the style kept for the high-fidelity pair."""
 PANEL = (4.2, 3.3)
 
 PAIR = ["pod_tol", "pod_size", "dual_tol", "dual_size"]
@@ -62,15 +65,17 @@ def draw_all(path: Path, folder: Path) -> list[Path]:
 
 
 def _figures(histories: pd.DataFrame, queries: pd.DataFrame, cells: pd.DataFrame) -> Iterator[tuple[str, Figure]]:
-    for (problem, options), group in queries.groupby(["problem", "problem_options"]):
-        name = _file_name(problem, options, queries)
+    groups = list(queries.groupby(["problem", "problem_options"]))
+    names = _file_names([str(problem) for (problem, _), _ in groups])
+    for name, ((problem, options), group) in zip(names, groups, strict=True):
         mine = histories[(histories["problem"] == problem) & (histories["problem_options"] == options)]
         sizes = cells[(cells["problem"] == problem) & (cells["problem_options"] == options)]
         yield f"{name}-errors", projection_errors(mine)
         yield f"{name}-orthogonality", orthogonality(mine)
-        for dual, of_dual in group.groupby("dual"):
+        duals = list(group.groupby("dual"))
+        for dual, (label, of_dual) in zip(_file_names([str(label) for label, _ in duals]), duals, strict=True):
             if (of_dual["enrichment_kind"] == Kind.FIXED).any():
-                yield f"{name}-{dual}-enrichment", enrichment(mine[mine["dual"] == dual], of_dual, sizes)
+                yield f"{name}-{dual}-enrichment", enrichment(mine[mine["dual"] == label], of_dual, sizes)
             yield f"{name}-{dual}-inf-sup", inf_sup(of_dual, sizes)
 
 
@@ -84,9 +89,9 @@ def projection_errors(histories: pd.DataFrame) -> Figure:
     left.set(xlabel="number of modes N", ylabel="relative error $e_{POD}$", title="POD")
     cones = histories[(histories["stage"] == "cone") & (histories["quantity"] == "error")]
     for k, (label, line) in enumerate(_longest(cones, ["dual"])):
-        right.semilogy(line["step"], line["value"], color=COLOURS[k], linestyle=STYLES[k], label=label[0])
+        right.semilogy(line["step"], line["value"], label=label[0], **_style(k))
     right.set(xlabel="number of generators R", ylabel="largest relative error e(R)", title="cones")
-    right.legend()
+    _legend(right)
     return figure
 
 
@@ -95,11 +100,9 @@ def orthogonality(histories: pd.DataFrame) -> Figure:
     figure, (axes,) = _panels(1, 1)
     lines = histories[(histories["stage"] == "cone") & (histories["quantity"] == "e_orth")]
     for k, (label, line) in enumerate(_longest(lines, ["dual"])):
-        axes.semilogy(
-            line["step"], line["value"], color=COLOURS[k], linestyle=STYLES[k], marker=MARKERS[k], ms=3, label=label[0]
-        )
+        axes.semilogy(line["step"], line["value"], marker=MARKERS[k % len(MARKERS)], ms=3, label=label[0], **_style(k))
     axes.set(xlabel="generators before, r", ylabel="$e_{orth}(r)$")
-    axes.legend()
+    _legend(axes)
     return figure
 
 
@@ -116,16 +119,18 @@ def enrichment(histories: pd.DataFrame, queries: pd.DataFrame, cells: pd.DataFra
             ("sigma", axes[0], "σ, largest over the training set"),
             ("beta_span_min", axes[1], "min β over the span, training set"),
         ):
-            for k, (_, line) in enumerate(tight[tight["quantity"] == quantity].groupby("primal")):
+            for k, (key, line) in enumerate(tight[tight["quantity"] == quantity].groupby("primal")):
                 shown = line[line["value"] > 1e-14]
-                where.semilogy(shown["step"], shown["value"], color=COLOURS[k], marker=".", ms=4)
+                where.semilogy(shown["step"], shown["value"], marker=".", ms=4, label=key, **_style(k))
             where.set(xlabel="vectors added", ylabel=label, title=_pair_title(pair, queries, cells))
             where.set_xlim(left=0)
         for k, (key, line) in enumerate(_one_solver(group).groupby(["primal", "primal_tol"], dropna=False)):
             values = np.sort(line["beta_span"].to_numpy())
-            axes[2].plot(values, color=COLOURS[k % 7], linestyle=STYLES[k % 7], label=f"{key[0]}, δ = {key[1]:g}")
+            axes[2].plot(values, label=_label(*key), **_style(k))
         axes[2].set(xlabel="validation parameters, sorted", ylabel="β over the span")
-        axes[2].legend()
+        for panel in axes:
+            if len(panel.get_lines()) > 1 or panel is axes[2]:
+                _legend(panel)
     return figure
 
 
@@ -147,33 +152,44 @@ def inf_sup(queries: pd.DataFrame, cells: pd.DataFrame) -> Figure:
         top, below = grid[column], grid[len(pairs) + column]
         for k, (key, line) in enumerate(kept.groupby(["primal", "primal_tol"], dropna=False)):
             ordered = line.set_index("query").loc[order]
-            label = key[0] if pd.isna(key[1]) else f"{key[0]}, δ = {key[1]:g}"
-            _constants((top, below), ordered, "beta_", k=k, label=label)
+            _constants((top, below), ordered, "beta_", k=k, label=_label(*key))
             if k == 0:
-                _constants((top, below), ordered, "beta_hf_", k=6, label="high-fidelity")
+                _constants((top, below), ordered, "beta_hf_", k=BLACK, label="high-fidelity")
         top.set(yscale="log", ylabel="β over the span", title=_pair_title(pair, queries, cells))
         below.set(yscale="log", ylabel="β over the cone", xlabel="validation parameters, sorted")
-    handles, labels = grid[0].get_legend_handles_labels()
-    grid[0].legend(handles, labels, fontsize=7)
+    _legend(grid[0])
     return figure
 
 
 def _constants(axes: tuple[Axes, Axes], line: pd.DataFrame, prefix: str, *, k: int, label: str) -> None:
     """One strategy's span constants, and its cone interval as a line with a band."""
-    style: dict[str, Any] = {"color": COLOURS[k % 7], "linestyle": STYLES[k % 7]}
     top, below = axes
     x = np.arange(len(line))
     span = line[f"{prefix}span"].to_numpy()
     vanishes = bool(np.all(span < 1e-12))
-    top.plot(x, np.where(span < 1e-12, np.nan, span), label=f"{label} (0)" if vanishes else label, **style)
+    top.plot(x, np.where(span < 1e-12, np.nan, span), label=f"{label} (0)" if vanishes else label, **_style(k))
     lower, upper = line[f"{prefix}cone_lower"].to_numpy(), line[f"{prefix}cone_upper"].to_numpy()
-    below.plot(x, upper, **style)
-    below.fill_between(x, lower, upper, color=COLOURS[k % 7], alpha=0.2)
+    below.plot(x, upper, **_style(k))
+    below.fill_between(x, lower, upper, color=_style(k)["color"], alpha=0.2)
 
 
 def _pairs(queries: pd.DataFrame) -> list[tuple[Any, pd.DataFrame]]:
     """Queries by pair of tolerances, in the order of the tables."""
     return list(queries.groupby(PAIR, dropna=False, sort=False))
+
+
+def _style(k: int) -> dict[str, Any]:
+    """Colour and line of the k-th thing in a panel; lines change when the colours have run out."""
+    return {"color": COLOURS[k % len(COLOURS)], "linestyle": STYLES[(k + k // len(COLOURS)) % len(STYLES)]}
+
+
+def _label(name: Any, tolerance: Any) -> str:
+    return str(name) if pd.isna(tolerance) else f"{name}, δ = {tolerance:g}"
+
+
+def _legend(axes: Axes) -> None:
+    if axes.get_legend_handles_labels()[1]:
+        axes.legend(fontsize=7)
 
 
 def _panels(rows: int, columns: int) -> tuple[Figure, list[Axes]]:
@@ -193,8 +209,8 @@ def _longest(lines: pd.DataFrame, by: list[str]) -> list[tuple[tuple[Any, ...], 
 
 
 def _one_solver(queries: pd.DataFrame) -> pd.DataFrame:
-    """Queries of one solver: inf-sup constants do not depend on it."""
-    return queries[queries["solver"] == queries["solver"].iloc[0]]
+    """One row per strategy, tolerance and query: inf-sup constants do not depend on the solver."""
+    return queries.drop_duplicates(["primal", "primal_options", "primal_tol", "query"])
 
 
 def _same(frame: pd.DataFrame, pair: tuple[Any, ...]) -> pd.Series:
@@ -209,7 +225,13 @@ def _pair_title(pair: tuple[Any, ...], queries: pd.DataFrame, cells: pd.DataFram
     return f"(N, R) = ({of_pair['N'].iloc[0]:.0f}, {of_pair['R'].iloc[0]:.0f})"
 
 
-def _file_name(problem: str, options: str, queries: pd.DataFrame) -> str:
-    """The problem's label; numbered where entries with other options share it."""
-    same = sorted(queries[queries["problem"] == problem]["problem_options"].unique())
-    return problem if len(same) == 1 else f"{problem}-{same.index(options) + 1}"
+def _file_name(label: str, number: int, count: int) -> str:
+    """A label as part of a file name: numbered where several share it, or look the same once signs are gone."""
+    plain = re.sub(r"[^\w.=-]+", "-", label).strip("-.")[:60] or "unnamed"
+    return plain if count == 1 else f"{plain}-{number + 1}"
+
+
+def _file_names(labels: list[str]) -> list[str]:
+    """File names for labels, in their order, all different."""
+    plain = [_file_name(label, 0, 1) for label in labels]
+    return [_file_name(label, plain[:k].count(plain[k]), plain.count(plain[k])) for k, label in enumerate(labels)]

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 import pandas as pd
 
+from vibench.schema import CONSTANTS
 from vibench.strategy import Kind
 
 RELATIVE = 1e-8
@@ -45,7 +46,8 @@ def violations(queries: pd.DataFrame, kinds: pd.Series) -> list[Violation]:
     kinds
         How the enrichment of each cell depends on the parameter, by cell.
     """
-    return list(_found(queries, queries["cell"].map(kinds)))
+    constants = queries[list(CONSTANTS)].astype(float)
+    return list(_found(constants, queries["cell"].map(kinds)))
 
 
 def _found(queries: pd.DataFrame, kind: pd.Series) -> Iterator[Violation]:

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import sqlite3
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
+
+import numpy as np
 
 from vibench.errors import RequestError
 from vibench.schema import TABLES, VERSION
@@ -22,7 +26,9 @@ class Journal:
     folder
         The run folder; made if it does not exist.
     study
-        What the numbers of the study depend on (`matrix.identity`): results of another study are refused.
+        What the numbers of the study depend on: results of another study are refused.
+    ours
+        The folder is known to be a run folder, though it holds no results file now.
 
     Raises
     ------
@@ -30,14 +36,12 @@ class Journal:
         If the folder is a file, or holds something that is not a results file of this study and schema.
     """
 
-    def __init__(self, folder: Path, study: Mapping[str, Any]) -> None:
-        if folder.exists() and not folder.is_dir():
-            raise RequestError(f"output folder '{folder}' is a file")
+    def __init__(self, folder: Path, study: Mapping[str, Any], *, ours: bool = False) -> None:
         path = folder / FILE
-        if folder.is_dir() and not path.exists() and any(folder.iterdir()):
-            raise RequestError(f"output folder '{folder}' is not empty and holds no {FILE}; choose another with --out")
-        _refuse_other(path, study)
         try:
+            if not ours:
+                _refuse_foreign(folder)
+            _refuse_other(path, study)
             folder.mkdir(parents=True, exist_ok=True)
             self._db = sqlite3.connect(path)
             self._db.execute("PRAGMA journal_mode=WAL")
@@ -57,7 +61,9 @@ class Journal:
         self._db.executemany("INSERT OR REPLACE INTO meta VALUES (?, ?)", entries.items())
 
     def close(self) -> None:
-        """Close the file; what was written stays."""
+        """Close the file; what was written stays, in the one file."""
+        with contextlib.suppress(sqlite3.OperationalError, sqlite3.ProgrammingError):  # being read, or closed before
+            self._db.execute("PRAGMA journal_mode=DELETE")
         self._db.close()
 
     def finished(self) -> dict[str, tuple[str, str]]:
@@ -94,7 +100,9 @@ class Journal:
         for row in rows:
             names = ", ".join(f'"{name}"' for name in row)
             marks = ", ".join("?" for _ in row)
-            self._db.execute(f"INSERT INTO {table} ({names}) VALUES ({marks})", tuple(row.values()))
+            self._db.execute(
+                f"INSERT INTO {table} ({names}) VALUES ({marks})", tuple(_plain(value) for value in row.values())
+            )
 
     def _add_columns(self, queries: Sequence[Mapping[str, Any]]) -> None:
         """Make room for as many parameters mu_1, mu_2, … as the rows have."""
@@ -104,16 +112,27 @@ class Journal:
                 self._db.execute(f'ALTER TABLE queries ADD COLUMN "{name}" REAL')
 
 
+def _plain(value: Any) -> Any:
+    """A value SQLite stores as what it is: NumPy scalars would end as bytes."""
+    return value.item() if isinstance(value, np.generic) else value
+
+
+def _refuse_foreign(folder: Path) -> None:
+    if folder.exists() and not folder.is_dir():
+        raise RequestError(f"output folder '{folder}' is a file")
+    if folder.is_dir() and not (folder / FILE).exists() and any(folder.iterdir()):
+        raise RequestError(f"output folder '{folder}' is not empty and holds no {FILE}; choose another with --out")
+
+
 def _refuse_other(path: Path, study: Mapping[str, Any]) -> None:
     if not path.exists():
         return
-    try:
-        found = read_meta(path)
-    except sqlite3.Error as error:
-        raise RequestError(f"'{path}' is not a results file of vibench: {error}") from None
+    found = read_meta(path)
+    if not found:  # made by a run that was killed before it could write anything
+        return
     if found.get("schema") != str(VERSION):
         raise RequestError(f"'{path}' has schema {found.get('schema')}, this vibench writes {VERSION}; use --out")
-    there = json.loads(found.get("study", "{}"))
+    there = study_of(path, found)
     if there != json.loads(json.dumps(study)):
         what = ", ".join(
             f"{key} {there.get(key)!r} instead of {study[key]!r}" for key in study if there.get(key) != study[key]
@@ -122,9 +141,29 @@ def _refuse_other(path: Path, study: Mapping[str, Any]) -> None:
 
 
 def read_meta(path: Path) -> dict[str, str]:
-    """The meta table of a results file."""
-    db = sqlite3.connect(f"file:{path}?mode=ro", uri=True)
+    """The meta table of a results file, empty where the file is.
+
+    Raises
+    ------
+    RequestError
+        If the file is something else.
+    """
+    db = sqlite3.connect(f"file:{quote(str(path))}?mode=ro", uri=True)
     try:
-        return dict(db.execute("SELECT key, value FROM meta"))
+        tables = [name for (name,) in db.execute("SELECT name FROM sqlite_master WHERE type = 'table'")]
+        return dict(db.execute("SELECT key, value FROM meta")) if tables else {}
+    except sqlite3.Error as error:
+        raise RequestError(f"'{path}' is not a results file of vibench: {error}") from None
     finally:
         db.close()
+
+
+def study_of(path: Path, meta: Mapping[str, str]) -> dict[str, Any]:
+    """The identity of the study a results file belongs to."""
+    try:
+        found = json.loads(meta.get("study", ""))
+    except ValueError:
+        found = None
+    if not isinstance(found, dict):
+        raise RequestError(f"'{path}' does not say which study it belongs to; use --out")
+    return found

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from itertools import product
 from typing import Any
@@ -44,7 +44,9 @@ class Plugin:
     @classmethod
     def from_entry(cls, kind: str, entry: Entry) -> Plugin:
         """Plugin of an axis entry that has been checked."""
-        return cls(kind, entry.name, json.dumps(entry.options, sort_keys=True), plugins.code(kind, entry.name))
+        return cls(
+            kind, entry.name, plugins.canonical_options(kind, entry.name, entry.options), plugins.code(kind, entry.name)
+        )
 
     def create(self) -> Any:
         """A new instance."""
@@ -84,7 +86,9 @@ class Cell:
     def code(self) -> str:
         """Hash of the code that computes the cell: the core, its plugins and its solver."""
         plugins_used = [plugin.code for plugin in (self.problem, self.dual, self.primal)]
-        return digest([core_code(), *plugins_used, solver_version(self.solver)])
+        registered = self.solver in plugins.names("QP solver")
+        solver = plugins.code("QP solver", self.solver) if registered else solver_version(self.solver)
+        return digest([core_code(), *plugins_used, solver])
 
     def __str__(self) -> str:
         problem, dual, primal = self.labels
@@ -103,12 +107,11 @@ def expand(study: Study) -> list[Cell]:
     Raises
     ------
     RequestError
-        If a strategy that takes a tolerance is given none.
+        If there is none, or a strategy that takes a tolerance is given none.
     """
     cells: dict[str, Cell] = {}
-    takes = {entry.name: plugins.load("primal strategy", entry.name).takes_tolerance for entry in study.primal}
     for problem, table in product(study.problem, study.tolerances):
-        for dual, pod, cone, primal, tolerance in _combinations(study, table, takes):
+        for dual, pod, cone, primal, tolerance in _combinations(study, table):
             for assembly, solver in product(study.assembly, study.solver_names()):
                 cell = Cell(
                     problem=Plugin.from_entry("problem", problem),
@@ -130,25 +133,8 @@ def expand(study: Study) -> list[Cell]:
     return list(cells.values())
 
 
-def _combinations(
-    study: Study, table: ToleranceTable, takes: Mapping[str, bool]
-) -> Iterator[tuple[Entry, Stop, Stop, Entry, float | None]]:
+def _combinations(study: Study, table: ToleranceTable) -> Iterator[tuple[Entry, Stop, Stop, Entry, float | None]]:
     pods = [Stop(tolerance=value) for value in table.pod or []] + [Stop(size=value) for value in table.N or []]
     for pod, dual, primal in product(pods, study.dual, study.primal):
-        cones = [Stop(tolerance=value) for value in _of(table.dual, dual, "tolerances.dual")]
-        cones += [Stop(size=value) for value in _of(table.R, dual, "tolerances.R")]
-        tolerances: list[float | None] = [None]
-        if takes[primal.name]:
-            tolerances = list(_of(table.primal, primal, "tolerances.primal"))
-        for cone, tolerance in product(cones, tolerances):
+        for cone, tolerance in product(table.of_dual(dual), table.of_primal(primal)):
             yield dual, pod, cone, primal, tolerance
-
-
-def _of(values: Any, entry: Entry, key: str) -> list[Any]:
-    """The values meant for one entry: a plain list is for all, a table says for whom."""
-    if not isinstance(values, dict):
-        return values or []
-    found = values.get(entry.title, values.get(entry.name))
-    if found is None:
-        raise RequestError(f"{key} gives nothing for '{entry.title}', which takes a tolerance")
-    return list(found)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import inspect
+import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
@@ -57,13 +58,19 @@ def load(kind: str, name: str) -> Any:
     registered = _registered(kind)
     if name not in registered:
         raise unknown_name(kind, name, registered)
+    where = f"{kind} '{name}' ({registered[name].value})"
     try:
         plugin = registered[name].load()
-    except (ImportError, AttributeError) as error:
-        raise RequestError(f"{kind} '{name}' ({registered[name].value}) cannot be loaded: {error}") from None
+    except Exception as error:  # noqa: BLE001  importing a plugin runs code of strangers
+        line = " ".join(f"{type(error).__name__}: {error}".split())
+        raise RequestError(f"{where} cannot be loaded: {line}") from None
     base = _BASES.get(kind)
     if base is not None and not (isinstance(plugin, type) and issubclass(plugin, base)):
-        raise RequestError(f"{kind} '{name}' ({registered[name].value}) is not a subclass of {base.__qualname__}")
+        raise RequestError(f"{where} is not a subclass of {base.__qualname__}")
+    if kind == "QP solver" and not callable(plugin):
+        raise RequestError(f"{where} is not callable")
+    if kind == "study" and not isinstance(plugin, str | Path):
+        raise RequestError(f"{where} is not the path of a study file")
     return plugin
 
 
@@ -113,7 +120,8 @@ def check_options(kind: str, name: str, given: Mapping[str, Any]) -> dict[str, A
                 raise RequestError(f"{kind} '{name}' needs the option '{option}' ({_expected(annotation)})")
             continue
         try:
-            checked[option] = TypeAdapter(annotation, config=FINITE).validate_python(given[option], strict=True)
+            text = json.dumps(given[option], default=str)
+            checked[option] = TypeAdapter(annotation, config=FINITE).validate_json(text, strict=True)
         except ValidationError:
             raise RequestError(
                 f"option '{option}' of {kind} '{name}' is {given[option]!r}; expected {_expected(annotation)}"
@@ -121,9 +129,18 @@ def check_options(kind: str, name: str, given: Mapping[str, Any]) -> dict[str, A
     return checked
 
 
-def qp_solvers() -> dict[str, QPSolver]:
-    """Solvers registered by plugins, those that qpsolvers does not have."""
-    return {name: load("QP solver", name) for name in names("QP solver")}
+def canonical_options(kind: str, name: str, given: Mapping[str, Any]) -> str:
+    """Options as JSON, the same for equal ones: those that say what is the default anyway are left out."""
+    defaults = {parameter.name: parameter.default for parameter, _ in _parameters(load(kind, name))}
+    adapter = TypeAdapter(dict[str, Any])
+    checked = check_options(kind, name, given)
+    kept = {option: value for option, value in checked.items() if value != defaults[option]}
+    return json.dumps(adapter.dump_python(kept, mode="json"), sort_keys=True)
+
+
+def qp_solver(name: str) -> dict[str, QPSolver]:
+    """The solver registered under this name by a plugin, keyed by it; nothing where qpsolvers has it."""
+    return {name: load("QP solver", name)} if name in names("QP solver") else {}
 
 
 def study_path(name: str) -> Path:
@@ -148,7 +165,8 @@ def _parameters(plugin: Any) -> list[tuple[inspect.Parameter, Any]]:
         return []
     hints = get_type_hints(constructor, include_extras=True)
     parameters = list(inspect.signature(constructor).parameters.values())[1:]  # without self
-    return [(p, hints.get(p.name, Any)) for p in parameters]
+    named = [p for p in parameters if p.kind not in (p.VAR_POSITIONAL, p.VAR_KEYWORD)]
+    return [(p, hints.get(p.name, Any)) for p in named]
 
 
 def _expected(annotation: Any) -> str:

@@ -5,10 +5,11 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import ClassVar
 
 import numpy as np
 
-from vibench.arrays import Array, SparseMatrix
+from vibench.arrays import Array, Indices, SparseMatrix
 from vibench.errors import NumericalError
 from vibench.space import InnerProduct
 
@@ -73,6 +74,31 @@ class VariationalInequality:
     lift: Array | None = field(default=None)
 
 
+@dataclass(frozen=True)
+class Picture:
+    """A solution to look at.
+
+    Attributes
+    ----------
+    points, triangles
+        Mesh in the configuration to be drawn (2×p), (3×t).
+    values, name
+        Nodal values to colour it with (p,), and what they are, with their unit.
+    positions, multiplier
+        Where the multiplier lives (1×m on a line, 2×m in the plane) and its values (m,).
+    multiplier_name
+        What the multiplier is, with its unit.
+    """
+
+    points: Array
+    triangles: Indices
+    values: Array
+    name: str
+    positions: Array
+    multiplier: Array
+    multiplier_name: str
+
+
 class Problem(ABC):
     """A parametrised variational inequality with its high-fidelity discretisation.
 
@@ -86,6 +112,8 @@ class Problem(ABC):
     """Inner product of the primal space, X_V (n×n), independent of the parameter."""
     W: InnerProduct
     """Inner product of the multiplier space, X_W (m×m), in a basis whose nonnegative coefficients are the cone W⁺."""
+    constant: ClassVar[frozenset[str]] = frozenset()
+    """Members of `VariationalInequality`, "A", "f", "B" or "g", that do not depend on mu and are factorised once."""
 
     @abstractmethod
     def training_set(self) -> Array:
@@ -106,9 +134,28 @@ class Problem(ABC):
         """
         return self.W.apply(np.ones(self.W.dim))
 
+    def refuse(self, mu: Array, u: Array, lam: Array) -> str:  # noqa: ARG002
+        """Why the problem's model does not cover a high-fidelity solution u (n,), λ (m,) at mu (d,); "" if it does."""
+        return ""
+
+    def picture(self, mu: Array, u: Array, lam: Array) -> Picture | None:  # noqa: ARG002
+        """What to draw of a solution u (n,), λ (m,) at mu (d,); `None` where a problem has no picture."""
+        return None
+
     def diagnostics(self, mu: Array) -> Mapping[str, float]:  # noqa: ARG002
         """Figures worth keeping beside a high-fidelity solution at mu (d,), such as mesh quality; none by default."""
         return {}
+
+
+def check_coercive(problem: Problem, mu: Array) -> None:
+    """Refuse a problem whose A is not symmetric positive definite at mu (d,).
+
+    Raises
+    ------
+    NumericalError
+        Saying where, and what it is not.
+    """
+    InnerProduct(problem.assemble(mu).A, f"A at mu = {mu.tolist()}")
 
 
 def checked_assembly(problem: Problem, mu: Array) -> VariationalInequality:

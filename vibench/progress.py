@@ -72,12 +72,12 @@ class Report:
         if self._bar is not None:
             self._bar.stop()
 
-    def start(self, cells: int, pending: Sequence[Stage]) -> None:
-        """Say what is to be done."""
+    def start(self, cells: int, pending: Sequence[Stage], unavailable: int = 0) -> None:
+        """Say what is to be done; cells whose solver is not installed get their row without it."""
         self._left = TimeLeft(pending, self._jobs)
         todo = sum(isinstance(stage, QueriesStage) for stage in pending)
         self._all_chunks = sum(isinstance(stage, HighFidelity) for stage in pending)
-        self._total = todo
+        self._total = todo + unavailable
         self._console.print(
             f"{cells} cells, {todo} to run, {len(pending)} stages on {self._jobs} worker{'s'[: self._jobs > 1]}"
         )

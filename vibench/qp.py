@@ -7,7 +7,7 @@ multipliers α ≥ 0 such that A x + Bᵀα = f.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import Any, Protocol
@@ -18,7 +18,7 @@ import scipy.sparse as sp
 from scipy.optimize import nnls
 
 from vibench.arrays import Array, SparseMatrix
-from vibench.errors import unknown_name
+from vibench.errors import NumericalError, unknown_name
 from vibench.problem import VariationalInequality
 from vibench.solver_settings import SETTINGS, settings_for
 
@@ -108,8 +108,8 @@ def solve(
 
     Raises
     ------
-    RequestError
-        If no solver has that name.
+    NumericalError
+        If what the solver returns has the wrong shape.
     """
     rows, cost = _row_norms(program.B), _scale(program.f)
     scaled = VariationalInequality(program.A / cost, program.f / cost, _divide_rows(program.B, rows), program.g / rows)
@@ -117,6 +117,9 @@ def solve(
         answer = extra[solver](scaled, accuracy)
     else:
         answer = _through_qpsolvers(scaled, solver, accuracy)
+    for name, value, size in (("x", answer.x, len(program.f)), ("α", answer.alpha, len(program.g))):
+        if value is not None and value.shape != (size,):
+            raise NumericalError(f"the solver returned {name} of shape {value.shape}, expected ({size},)")
     if answer.alpha is None:
         return answer
     alpha = cost * answer.alpha / rows
@@ -176,14 +179,14 @@ def infeasibility_certificate(program: VariationalInequality, tolerance: float =
     return np.asarray(alpha / rows)
 
 
-def installed_solvers(extra: Mapping[str, QPSolver] | None = None) -> list[str]:
-    """Names of the solvers that can be run here."""
-    return sorted(set(qpsolvers.available_solvers) & set(SETTINGS) | set(extra or {}))
+def installed_solvers(extra: Iterable[str] = ()) -> list[str]:
+    """Names of the solvers that can be run here; `extra` are those that plugins register."""
+    return sorted(set(qpsolvers.available_solvers) & set(SETTINGS) | set(extra))
 
 
-def check_solver_name(solver: str, extra: Mapping[str, QPSolver] | None = None) -> None:
+def check_solver_name(solver: str, extra: Iterable[str] = ()) -> None:
     """Refuse a name that neither the settings table nor a plugin knows (installed or not is another question)."""
-    known = set(SETTINGS) | set(extra or {})
+    known = set(SETTINGS) | set(extra)
     if solver not in known:
         raise unknown_name("QP solver", solver, known)
 

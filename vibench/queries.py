@@ -92,12 +92,13 @@ class QueriesStage(Stage):
         """Solve once per repeat (timed), judge, and compare (not timed)."""
         reduced = model.assemble(mu)
         program = reduced.program
-        work = partial(qp.solve, program, self.solver, self.accuracy, plugins.qp_solvers())
+        work = partial(qp.solve, program, self.solver, self.accuracy, plugins.qp_solver(self.solver))
         row: Row = {"assemble_s": assembly.cpu}
         try:
             answer, solving = median_seconds(work)
-        except Exception as error:  # noqa: BLE001  a solver may raise anything; the row says what
-            return row | {"status": Status.ERROR.value, "reason": f"{type(error).__name__}: {error}"}
+        except (Exception, SystemExit) as error:  # noqa: BLE001  a solver may raise anything; the row says what
+            reason = " ".join(f"{type(error).__name__}: {error}".split())
+            return row | {"status": Status.ERROR.value, "reason": reason}
         status, reason, residuals = qp.judge(program, answer, self.accuracy)
         if solving.wall > self.query_seconds:
             status, reason = Status.TIMEOUT, f"took {solving.wall:.1f} s, the limit is {self.query_seconds:g} s"

@@ -16,7 +16,7 @@ from pebble import ProcessExpired, ProcessPool
 from vibench import plugins, provenance, qp
 from vibench.assembly import AssemblyStage
 from vibench.errors import RequestError
-from vibench.journal import FILE, Journal, read_meta
+from vibench.journal import FILE, Journal, read_meta, study_of
 from vibench.matrix import Cell, digest, expand
 from vibench.naming import HistoryNames, cell_columns
 from vibench.qp import Status
@@ -35,8 +35,8 @@ ARTEFACTS = "artefacts"
 class Observer(Protocol):
     """Who is told how a run goes on."""
 
-    def start(self, cells: int, pending: Sequence[Stage]) -> None:
-        """The matrix has so many cells; these stages have to be run."""
+    def start(self, cells: int, pending: Sequence[Stage], unavailable: int) -> None:
+        """The matrix has so many cells; these stages have to be run, so many cells have a solver that is not there."""
 
     def stage(self, stage: Stage, wall: float) -> None:
         """A stage is done, after so many wall seconds."""
@@ -94,9 +94,8 @@ def run_study(
         If the folder cannot be used.
     """
     cells = expand(study)
-    if fresh:
-        _clear(folder, study)
-    journal = Journal(folder, identity(study))
+    cleared = fresh and _clear(folder, study)
+    journal = Journal(folder, identity(study), ours=cleared)
     try:
         finished = journal.finished()
         todo = [cell for cell in cells if _to_do(cell, finished, retry)]
@@ -117,17 +116,20 @@ def _to_do(cell: Cell, finished: Mapping[str, tuple[str, str]], retry: bool) -> 
     return retry and status != Status.OK
 
 
-def _clear(folder: Path, study: Study) -> None:
-    """Remove a study's earlier results; never those of a study with another name."""
+def _clear(folder: Path, study: Study) -> bool:
+    """Remove a study's earlier results, never those of a study with another name; whether there were any."""
     path = folder / FILE
-    if path.exists():
-        there = json.loads(read_meta(path).get("study", "{}")).get("name")
-        if there != study.name:
-            raise RequestError(f"'{folder}' holds results of the study '{there}'; --fresh removes only '{study.name}'")
-        for file in folder.glob(f"{FILE}*"):
-            file.unlink()
-        for name in (ARTEFACTS, "tables", "figures"):
-            shutil.rmtree(folder / name, ignore_errors=True)
+    if not path.is_file():
+        return False
+    meta = read_meta(path)
+    there = study_of(path, meta).get("name") if meta else study.name
+    if there != study.name:
+        raise RequestError(f"'{folder}' holds results of the study '{there}'; --fresh removes only '{study.name}'")
+    for file in folder.glob(f"{FILE}*"):
+        file.unlink()
+    for name in (ARTEFACTS, "tables", "figures"):
+        shutil.rmtree(folder / name, ignore_errors=True)
+    return True
 
 
 @dataclass
@@ -147,7 +149,7 @@ class _Run:
 
     def execute(self, todo: Sequence[Cell], jobs: int) -> bool:
         """Run the cells; returns whether Ctrl-C ended it."""
-        available = set(qp.installed_solvers(plugins.qp_solvers()))
+        available = set(qp.installed_solvers(plugins.names("QP solver")))
         store = Store(self.folder / ARTEFACTS)
         self.folder.joinpath(ARTEFACTS).mkdir(exist_ok=True)
         for cell in todo:
@@ -155,17 +157,15 @@ class _Run:
                 stage = queries_stage(cell, self.study)
                 self.cells.setdefault(stage.key, []).append(cell)
                 self._add(stage, store)
-        self.observer.start(self.cell_count, list(self.stages.values()))
-        for cell in todo:
-            if cell.solver not in available:
-                self._fail_cell(cell, Status.UNAVAILABLE, f"the QP solver '{cell.solver}' is not installed")
+        unavailable = [cell for cell in todo if cell.solver not in available]
+        self.observer.start(self.cell_count, list(self.stages.values()), len(unavailable))
+        for cell in unavailable:
+            self._fail_cell(cell, Status.UNAVAILABLE, f"the QP solver '{cell.solver}' is not installed")
         if not self.stages:
             return False
         with one_thread():
             context = multiprocessing.get_context("spawn")
-            pool = ProcessPool(
-                max_workers=jobs, context=context, initializer=initialise, initargs=[self.study.limits.memory_gib]
-            )
+            pool = ProcessPool(max_workers=jobs, context=context, initializer=initialise)
             try:
                 self._loop(pool, jobs)
             except KeyboardInterrupt:
@@ -193,13 +193,14 @@ class _Run:
 
     def _loop(self, pool: ProcessPool, jobs: int) -> None:
         running: dict[Future[Any], Stage] = {}
+        limits = self.study.limits
         while self.waiting or running:
             ready = [key for key, needed in self.waiting.items() if not needed]
             for key in ready[: jobs - len(running)]:
                 del self.waiting[key]
                 stage = self.stages[key]
-                arguments = [str(self.folder / ARTEFACTS), stage]
-                running[pool.schedule(perform, args=arguments, timeout=self.study.limits.cell_seconds)] = stage
+                arguments = [str(self.folder / ARTEFACTS), stage, limits.memory_gib]
+                running[pool.schedule(perform, args=arguments, timeout=limits.cell_seconds)] = stage
             done, _ = wait(running, return_when=FIRST_COMPLETED)
             for future in done:
                 self._finish(running.pop(future), self._outcome(future))

@@ -24,6 +24,8 @@ class InnerProduct:
     ----------
     matrix
         X, sparse (n×n).
+    name
+        What to call it when it is refused.
 
     Raises
     ------
@@ -31,21 +33,22 @@ class InnerProduct:
         If X is not square, not finite, not symmetric or not positive definite.
     """
 
-    def __init__(self, matrix: SparseMatrix) -> None:
+    def __init__(self, matrix: SparseMatrix, name: str = "the Gram matrix") -> None:
         self.matrix = sp.csc_array(matrix)
+        self._name = name
         rows, columns = self.matrix.shape
         if rows != columns:
-            raise NumericalError(f"a Gram matrix must be square, this one is {rows}×{columns}")
+            raise NumericalError(f"{name} must be square, it is {rows}×{columns}")
         if not np.all(np.isfinite(self.matrix.data)):
-            raise NumericalError("the Gram matrix has entries that are not finite")
+            raise NumericalError(f"{name} has entries that are not finite")
         scale = abs(self.matrix).max() if self.matrix.nnz else 0.0
         if rows and abs(self.matrix - self.matrix.T).max() > 1e-12 * scale:
-            raise NumericalError("the Gram matrix is not symmetric")
+            raise NumericalError(f"{name} is not symmetric")
         self._factor  # noqa: B018  an indefinite matrix is refused here, not at its first use
 
-    def __getstate__(self) -> dict[str, SparseMatrix]:
+    def __getstate__(self) -> dict[str, object]:
         """Leave the factorisation behind when pickled: SuperLU objects do not travel."""
-        return {"matrix": self.matrix}
+        return {"matrix": self.matrix, "_name": self._name}
 
     @property
     def dim(self) -> int:
@@ -58,10 +61,10 @@ class InnerProduct:
         try:
             lu = splu(self.matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
         except RuntimeError as error:
-            raise NumericalError(f"the Gram matrix cannot be factorised: {error}") from None
+            raise NumericalError(f"{self._name} cannot be factorised: {error}") from None
         pivots = lu.U.diagonal()
         if not np.array_equal(lu.perm_r, lu.perm_c) or np.any(pivots <= 0.0):
-            raise NumericalError("the Gram matrix is not positive definite")
+            raise NumericalError(f"{self._name} is not positive definite")
         return sp.csc_array(lu.L), np.sqrt(pivots), np.argsort(lu.perm_c), lu
 
     def apply(self, u: Array) -> Array:

@@ -59,8 +59,8 @@ class Store:
         try:
             with self._path(key).open("rb") as file:
                 artefact = pickle.load(file)
-        except FileNotFoundError:
-            return None
+        except (OSError, EOFError, pickle.UnpicklingError, AttributeError, ImportError, ValueError, IndexError):
+            return None  # not there, cut off, or written by other code: it is made again
         if not isinstance(artefact, Artefact) or artefact.machine != machine():
             return None
         if len(self._recent) >= 64:

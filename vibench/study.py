@@ -1,17 +1,23 @@
-"""Study files: what may stand in one, and the line that says what is wrong with it."""
+"""What may stand in a study file."""
 
 from __future__ import annotations
 
-import tomllib
-from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Annotated, Any, Literal, TypeAlias
 
 from annotated_types import Ge, Gt, Le, Lt, MinLen
-from pydantic import AllowInfNan, BaseModel, ConfigDict, ValidationError, model_validator
+from pydantic import (
+    AllowInfNan,
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Discriminator,
+    Tag,
+    model_validator,
+)
 
 from vibench import plugins, qp
-from vibench.errors import RequestError, unknown_name
+from vibench.errors import RequestError
+from vibench.strategy import Stop
 
 Tolerance: TypeAlias = Annotated[float, Gt(0.0), Lt(1.0), AllowInfNan(False)]
 Size: TypeAlias = Annotated[int, Ge(1), Le(100_000)]
@@ -19,6 +25,34 @@ Seconds: TypeAlias = Annotated[float, Gt(0.0), AllowInfNan(False)]
 Tolerances: TypeAlias = Annotated[list[Tolerance], MinLen(1)]
 Sizes: TypeAlias = Annotated[list[Size], MinLen(1)]
 Name: TypeAlias = Annotated[str, MinLen(1)]
+Names: TypeAlias = Annotated[list[Name], MinLen(1)]
+
+
+def _word_or_list(value: Any) -> str:
+    return "<list>" if isinstance(value, list) else "<word>"
+
+
+def _table_or_list(value: Any) -> str:
+    return "<table>" if isinstance(value, dict) else "<list>"
+
+
+def _only_available(value: Any) -> Any:
+    if value != "available":
+        raise ValueError("expected 'available' or a list of solver names")
+    return value
+
+
+Solvers: TypeAlias = Annotated[
+    Annotated[Literal["available"], BeforeValidator(_only_available), Tag("<word>")] | Annotated[Names, Tag("<list>")],
+    Discriminator(_word_or_list),
+]
+PerStrategyTolerances: TypeAlias = Annotated[
+    Annotated[Tolerances, Tag("<list>")] | Annotated[dict[str, Tolerances], Tag("<table>")],
+    Discriminator(_table_or_list),
+]
+PerStrategySizes: TypeAlias = Annotated[
+    Annotated[Sizes, Tag("<list>")] | Annotated[dict[str, Sizes], Tag("<table>")], Discriminator(_table_or_list)
+]
 
 
 class _Model(BaseModel):
@@ -58,8 +92,8 @@ class ToleranceTable(_Model):
 
     pod: Tolerances | None = None
     N: Sizes | None = None
-    dual: Tolerances | dict[str, Tolerances] | None = None
-    R: Sizes | dict[str, Sizes] | None = None
+    dual: PerStrategyTolerances | None = None
+    R: PerStrategySizes | None = None
     primal: dict[str, Tolerances] = {}
 
     @model_validator(mode="after")
@@ -70,23 +104,45 @@ class ToleranceTable(_Model):
             raise ValueError("give either 'dual' (tolerances) or 'R' (sizes)")
         return self
 
+    def of_dual(self, entry: Entry) -> list[Stop]:
+        """Where the cone of one dual strategy is to stop."""
+        if self.dual is not None:
+            return [Stop(tolerance=value) for value in _meant_for(self.dual, entry, "tolerances.dual")]
+        return [Stop(size=value) for value in _meant_for(self.R or [], entry, "tolerances.R")]
+
+    def of_primal(self, entry: Entry) -> list[float | None]:
+        """Tolerances of one primal strategy; `None` alone for a strategy that takes none."""
+        if not plugins.load("primal strategy", entry.name).takes_tolerance:
+            return [None]
+        return list(_meant_for(self.primal, entry, "tolerances.primal"))
+
+
+def _meant_for(values: Any, entry: Entry, key: str) -> list[Any]:
+    """The values meant for one entry: a plain list is for all, a table says for whom."""
+    if not isinstance(values, dict):
+        return list(values)
+    found = values.get(entry.title, values.get(entry.name))
+    if found is None:
+        raise RequestError(f"{key} gives nothing for '{entry.title}', which takes a tolerance")
+    return list(found)
+
 
 class Limits(_Model):
     """What a query and a stage may take; a stage is everything of a cell that is computed in one go."""
 
     query_seconds: Seconds = 20.0
     cell_seconds: Seconds = 600.0
-    memory_gib: Seconds = 8.0
+    memory_gib: Annotated[float, Gt(0.0), Lt(1e6), AllowInfNan(False)] = 8.0
 
 
 class Study(_Model):
     """A study file: the axes of the matrix and what all its cells share."""
 
     name: Annotated[str, MinLen(1)]
-    seed: Annotated[int, Ge(0)] = 0
+    seed: Annotated[int, Ge(0), Lt(2**63)] = 0
     validation: Annotated[int, Ge(1), Le(100_000)]
     accuracy: Annotated[float, Ge(1e-14), Le(1e-2), AllowInfNan(False)] = 1e-7
-    solvers: Literal["available"] | Annotated[list[Name], MinLen(1)]
+    solvers: Solvers
     dual: Annotated[list[Entry], MinLen(1)]
     primal: Annotated[list[Entry], MinLen(1)]
     assembly: Annotated[list[Literal["full"]], MinLen(1)] = ["full"]
@@ -102,124 +158,4 @@ class Study(_Model):
 
     def solver_names(self) -> list[str]:
         """Solvers to run: those named, or all that are installed."""
-        return qp.installed_solvers(plugins.qp_solvers()) if self.solvers == "available" else list(self.solvers)
-
-
-def find_study(request: str) -> Path:
-    """File behind what the user called a study: a path, or the name of a registered one."""
-    path = Path(request)
-    if path.suffix == ".toml" or path.exists():
-        if not path.is_file():
-            raise RequestError(f"study file '{request}' {'is not a file' if path.exists() else 'does not exist'}")
-        return path
-    return plugins.study_path(request)
-
-
-def load_study(request: str, overrides: Mapping[str, Sequence[Any]] | None = None) -> Study:
-    """Read and check a study.
-
-    Parameters
-    ----------
-    request
-        Path of a TOML file, or the name of a registered study.
-    overrides
-        Axes to replace everywhere, keys of `OVERRIDES`; empty sequences replace nothing.
-
-    Raises
-    ------
-    RequestError
-        With file, key, what was found and what is expected.
-    """
-    path = find_study(request)
-    try:
-        content = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError) as error:
-        raise RequestError(f"{path}: cannot be read: {error}") from None
-    except tomllib.TOMLDecodeError as error:
-        raise RequestError(f"{path}: not valid TOML: {error}") from None
-    given = {key: list(values) for key, values in (overrides or {}).items() if values}
-    source = str(path) if path == Path(request) else f"study '{request}'"
-    source += " with the options of the command line" if given else ""
-    study = _validate(_replace_axes(content, given), source)
-    _check_names(study, source)
-    return study
-
-
-OVERRIDES = ("problem", "dual", "primal", "solvers", "pod", "dual_tol", "primal_tol")
-
-
-def _replace_axes(content: dict[str, Any], given: Mapping[str, list[Any]]) -> dict[str, Any]:
-    """The content of a study file with whole axes replaced, as the options of the command line ask."""
-    content = dict(content)
-    for axis in ("problem", "dual", "primal", "solvers"):
-        if axis in given:
-            content[axis] = [_entry_in(content.get(axis), name) for name in given[axis]]
-    tables = content.get("tolerances")
-    if isinstance(tables, list) and all(isinstance(table, dict) for table in tables):
-        content["tolerances"] = [_replace_tolerances(dict(table), given) for table in tables]
-    return content
-
-
-def _replace_tolerances(table: dict[str, Any], given: Mapping[str, list[Any]]) -> dict[str, Any]:
-    for key, tolerance, size in (("pod", "pod", "N"), ("dual_tol", "dual", "R")):
-        if key in given:
-            table.pop(size, None)
-            table[tolerance] = given[key]
-    primal = table.get("primal")
-    if "primal_tol" in given and isinstance(primal, dict):
-        table["primal"] = dict.fromkeys(primal, given["primal_tol"])
-    return table
-
-
-def _entry_in(axis: Any, name: str) -> Any:
-    """The axis entry with this name or label, its options included; the bare name where the file has none."""
-    for entry in axis if isinstance(axis, list) else []:
-        if isinstance(entry, dict) and name in (entry.get("name"), entry.get("label")):
-            return entry
-    return name
-
-
-def _validate(content: dict[str, Any], source: str) -> Study:
-    try:
-        return Study.model_validate(content)
-    except ValidationError as error:
-        first = error.errors(include_url=False)[0]
-        where = ".".join(str(part) for part in first["loc"])
-        message = first["msg"].removeprefix("Value error, ")
-        found = f" (found {first['input']!r})" if isinstance(first["input"], str | int | float) else ""
-        if first["type"] == "extra_forbidden":
-            known = [key for model in (Study, Entry, ToleranceTable, Limits) for key in model.model_fields]
-            raise RequestError(f"{source}: {unknown_name('key', where.rsplit('.', 1)[-1], set(known))}") from None
-        raise RequestError(f"{source}: {where + ': ' if where else ''}{message}{found}") from None
-
-
-def _check_names(study: Study, source: str) -> None:
-    """Refuse names no plugin has, options it does not take and tolerances that name no entry of their axis."""
-    try:
-        for kind, axis in (
-            ("problem", study.problem),
-            ("dual strategy", study.dual),
-            ("primal strategy", study.primal),
-        ):
-            for entry in axis:
-                plugins.check_options(kind, entry.name, entry.options)
-        extra = plugins.qp_solvers()
-        for solver in study.solver_names():
-            qp.check_solver_name(solver, extra)
-        for table in study.tolerances:
-            for kind, axis, tolerances in (
-                ("dual strategy of this study", study.dual, table.dual),
-                ("dual strategy of this study", study.dual, table.R),
-                ("primal strategy of this study", study.primal, table.primal),
-            ):
-                known = {name for entry in axis for name in (entry.name, entry.title)}
-                for name in tolerances if isinstance(tolerances, dict) else ():
-                    if name not in known and not _registered_elsewhere(kind, name):
-                        raise unknown_name(kind, name, known)
-    except RequestError as error:
-        raise RequestError(f"{source}: {error}") from None
-
-
-def _registered_elsewhere(kind: str, name: str) -> bool:
-    """Whether a tolerance names a plugin that exists, though an option of the command line took it off the axis."""
-    return name in plugins.names(kind.removesuffix(" of this study"))
+        return qp.installed_solvers(plugins.names("QP solver")) if self.solvers == "available" else list(self.solvers)

@@ -52,7 +52,7 @@ class ConstraintClasses:
 
 
 def constraint_classes(matrices: Sequence[SparseMatrix]) -> ConstraintClasses:
-    """Sort matrices into classes of proportional ones; in the obstacle problem there is one."""
+    """Sort matrices into classes of proportional ones."""
     representatives: list[SparseMatrix] = []
     members, factors = [], []
     for matrix in matrices:

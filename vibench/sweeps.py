@@ -12,7 +12,7 @@ from vibench.arrays import Array
 from vibench.assess import constants_full
 from vibench.infsup import nodal_multipliers
 from vibench.matrix import Plugin
-from vibench.problem import Problem, checked_assembly
+from vibench.problem import Problem, check_coercive, checked_assembly
 from vibench.stage import Result, Stage, build_problem, value_of
 from vibench.store import History, Store
 from vibench.timing import NO_TIME, Seconds, Stopwatch
@@ -52,11 +52,13 @@ class HighFidelity(Stage):
         everything = problem.training_set() if self.purpose == "training" else self._validation(problem)
         first, mus = self._part(everything)
         u, lam = np.zeros((problem.V.dim, len(mus))), np.zeros((problem.W.dim, len(mus)))
-        seconds, fallbacks = [], []
+        seconds, fallbacks, solver = [], [], highfidelity.Solver(problem)
         for k, mu in enumerate(mus):
             watch = Stopwatch()
-            solution = highfidelity.solve(checked_assembly(problem, mu))
+            solution = solver.solve(mu)
             seconds.append(watch.seconds())
+            if k == 0 or "A" not in problem.constant:
+                check_coercive(problem, mu)
             u[:, k], lam[:, k] = solution.u, solution.lam
             fallbacks.append(solution.fallback)
         solutions = Solutions(mus, u, lam, tuple(seconds), tuple(fallbacks))

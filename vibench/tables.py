@@ -5,6 +5,7 @@ from __future__ import annotations
 import sqlite3
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
 import pandas as pd
 
@@ -26,10 +27,7 @@ def results_file(run: str) -> Path:
     for folder in (Path(run), Path("runs") / run):
         path = folder if folder.name == FILE else folder / FILE
         if path.is_file():
-            try:
-                schema = read_meta(path).get("schema")
-            except sqlite3.Error as error:
-                raise RequestError(f"'{path}' is not a results file of vibench: {error}") from None
+            schema = read_meta(path).get("schema")
             if schema != str(VERSION):
                 raise RequestError(f"'{path}' has schema {schema}, this vibench reads {VERSION}")
             return path
@@ -38,7 +36,7 @@ def results_file(run: str) -> Path:
 
 def read(path: Path, table: str) -> pd.DataFrame:
     """One table of a results file, cells in the order they were first written."""
-    db = sqlite3.connect(f"file:{path}?mode=ro", uri=True)
+    db = sqlite3.connect(f"file:{quote(str(path))}?mode=ro", uri=True)
     try:
         return pd.read_sql_query(f"SELECT * FROM {table}", db)
     finally:
@@ -128,9 +126,14 @@ def to_csv(frame: pd.DataFrame) -> str:
 
 def to_markdown(frame: pd.DataFrame) -> str:
     """A Markdown table with figures of three digits."""
-    rows = [[cell_text(value) for value in row] for row in frame.itertuples(index=False)]
+    rows = [[_one_cell(cell_text(value)) for value in row] for row in frame.itertuples(index=False)]
     text = pd.DataFrame(rows, columns=frame.columns).to_markdown(index=False, disable_numparse=True)
     return f"{text}\n"
+
+
+def _one_cell(text: str) -> str:
+    """Text that does not end its cell or its line in Markdown."""
+    return " ".join(text.split()).replace("|", "\\|")
 
 
 def cell_text(value: Any) -> str:

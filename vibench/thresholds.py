@@ -63,13 +63,16 @@ def threshold_rows(cells: Iterable[Mapping[str, Any]]) -> list[dict[str, Any]]:
     for b in timed:
         rows.append(_row(None, b))
         if b["enrichment_kind"] == Kind.FIXED:
-            shared = tuple(b[name] for name in _SHARED)
+            shared = _comparable(b)
             rows += [
-                _row(a, b)
-                for a in timed
-                if a["enrichment_kind"] == Kind.PER_PARAMETER and tuple(a[name] for name in _SHARED) == shared
+                _row(a, b) for a in timed if a["enrichment_kind"] == Kind.PER_PARAMETER and _comparable(a) == shared
             ]
     return rows
+
+
+def _comparable(cell: Mapping[str, Any]) -> tuple[Any, ...]:
+    """What two cells must share: all but the enrichment, and the machine that measured their seconds."""
+    return tuple(cell[name] for name in (*_SHARED, "machine"))
 
 
 def _row(a: Mapping[str, Any] | None, b: Mapping[str, Any]) -> dict[str, Any]:

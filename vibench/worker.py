@@ -5,6 +5,8 @@ from __future__ import annotations
 import resource
 import signal
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -36,29 +38,48 @@ class Failed:
     reason: str
 
 
-def initialise(memory_gib: float) -> None:
-    """Prepare a worker: one thread, no more memory than allowed, and Ctrl-C left to the parent."""
+def initialise() -> None:
+    """Prepare a worker: one thread, and Ctrl-C left to the parent."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    limit, hard = int(memory_gib * 2**30), resource.getrlimit(resource.RLIMIT_AS)[1]
-    resource.setrlimit(resource.RLIMIT_AS, (limit if hard == resource.RLIM_INFINITY else min(limit, hard), hard))
     threadpool_limits(1)
 
 
-def perform(folder: str, stage: Stage) -> Done | Failed:
+def perform(folder: str, stage: Stage, memory_gib: float) -> Done | Failed:
     """Run one stage; what a plugin raises becomes a reason, so that the rest of the matrix goes on."""
-    store = _store(folder)
     start = time.perf_counter()
     try:
-        result = stage.run(store)
-        queries = isinstance(stage, QueriesStage)
-        if not queries:
-            store.put(stage.key, result.value, result.seconds, result.histories)
+        with _memory_limit(memory_gib):
+            store = _store(folder)
+            result = stage.run(store)
+            queries = isinstance(stage, QueriesStage)
+            if not queries:
+                store.put(stage.key, result.value, result.seconds, result.histories)
     except MemoryError:
-        return Failed(Status.ERROR, "out of memory: the limit memory_gib was reached")
-    except Exception as error:  # noqa: BLE001  plugins may raise anything; the row says what
+        return Failed(Status.ERROR, f"out of memory: the limit is memory_gib = {memory_gib:g}")
+    except (Exception, SystemExit) as error:  # noqa: BLE001  plugins may raise anything; the row says what
         name = "" if isinstance(error, VibenchError) else f"{type(error).__name__}: "
         return Failed(Status.ERROR, " ".join(f"{name}{error}".split()))
     return Done(result.histories, result.value if queries else None, time.perf_counter() - start)
+
+
+@contextmanager
+def _memory_limit(gib: float) -> Iterator[None]:
+    """No more address space than this while a stage runs; outside, the worker must be able to answer."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_AS)
+    limit = int(gib * 2**30)
+    if _address_space() > limit:
+        raise MemoryError
+    resource.setrlimit(resource.RLIMIT_AS, (limit if hard == resource.RLIM_INFINITY else min(limit, hard), hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_AS, (soft, hard))
+
+
+def _address_space() -> int:
+    """Bytes of address space in use, 0 where the system does not tell."""
+    statm = Path("/proc/self/statm")
+    return int(statm.read_text().split()[0]) * resource.getpagesize() if statm.is_file() else 0
 
 
 @cache

@@ -11,7 +11,7 @@ from skfem import Basis, BilinearForm, ElementTriP1, LinearForm, MeshTri, conden
 from skfem.helpers import dot, grad
 
 from vibench.arrays import Array, SparseMatrix
-from vibench.problem import ParameterBox, Problem, VariationalInequality
+from vibench.problem import ParameterBox, Picture, Problem, VariationalInequality
 from vibench.space import InnerProduct
 from vibench_problems.disc_mesh import aspect_ratios, disc_in_square
 
@@ -121,6 +121,14 @@ class Obstacle(Problem):
         scale, x, y = self._modes
         moved = self.mesh.p + (mu[0] - 1.0) * scale
         return np.asarray(moved + mu[1] * x + mu[2] * y)
+
+    def picture(self, mu: Array, u: Array, lam: Array) -> Picture:
+        """The membrane's deflection on the mapped mesh and the contact pressure on the disc (paper, Figure 4)."""
+        deflection = np.zeros(self.nodes)
+        deflection[self.free] = u
+        points = self.points(mu)
+        disc = points[:, self.disc_nodes]
+        return Picture(points, self.mesh.t, deflection, "deflection u [m]", disc, lam, "multiplier λ [1/m]")
 
     def diagnostics(self, mu: Array) -> Mapping[str, float]:
         """Largest aspect ratio of the mapped mesh (paper, Figure 3; 1 for equilateral triangles)."""

@@ -8,9 +8,12 @@ import numpy as np
 
 from vibench.arrays import Array
 from vibench.greedy import TIE, LazyMaximum
-from vibench.linalg import orthonormal_range, remove, singular_values, svd
+from vibench.linalg import orthonormal_range, remove, svd
 from vibench.strategy import Enrichment, Kind, Offline, PrimalStrategy
 from vibench.supremizer import SupremizerCoordinates, constraint_classes
+
+SMALL = 1e-10
+"""Squares of sines below this are computed from residual vectors, not from the downdated Gram matrix."""
 
 
 class OfflinePGA(PrimalStrategy):
@@ -32,36 +35,59 @@ class OfflinePGA(PrimalStrategy):
         problem = offline.problem
         classes = constraint_classes([problem.assemble(mu).B for mu in offline.training])
         space = SupremizerCoordinates(problem.V, offline.basis, classes.representatives)
-        targets = [orthonormal_range(space.supremizers(B, offline.span)) for B in classes.representatives]
+        modes = space.plain.shape[1]
+        targets = [_Target(space.supremizers(B, offline.span), modes) for B in classes.representatives]
         maximum = LazyMaximum(np.ones(len(targets)))
-        grown = space.plain
-        history = []
+        grown, history = space.plain, []
         while True:
-            worst, sigma = maximum.next(lambda p: _sigma(grown, targets[p]))  # noqa: B023  called at once
+            worst, sigma = maximum.next(lambda p: targets[p].sigma(grown))  # noqa: B023  called at once
             history.append(sigma)
             if sigma <= tolerance:
                 break
-            grown = np.column_stack([grown, _worst_direction(grown, targets[worst])])
-        added = space.vectors(grown[:, space.plain.shape[1] :])
+            grown = np.column_stack([grown, targets[worst].worst_direction(grown)])
+        added = space.vectors(grown[:, modes:])
         return Enrichment(Kind.FIXED, vectors=added, history={"sigma": np.array(history)})
 
 
-def _sigma(space: Array, target: Array) -> float:
-    """σ_S(mu): the largest sine of the principal angles between S_R(mu) and V_N + S."""
-    return float(np.max(singular_values(remove(space, target)), initial=0.0))
+class _Target:
+    """One supremizer space S_R(mu): an orthonormal basis Q and the Gram matrix of what V_N + S leaves of it.
 
-
-def _worst_direction(space: Array, target: Array) -> Array:
-    """Unit vector (d,) of lines 5 to 7: the normalised residual of the worst v in S_R(mu).
-
-    Many σ equal 1 while V_N + S is smaller than S_R(mu). In a cluster of equal singular values the vector is chosen by
-    a rule that does not depend on the basis LAPACK happened to return: the projection on the cluster of the basis
-    vector of `target` that is closest to it.
+    The Gram matrix loses a rank-one term for every vector added to S, brought up to date only when it is looked at.
+    Its eigenvalues are squares of sines and keep half their digits, so small ones are computed from residuals again.
     """
-    residual = remove(space, target)
-    _, sines, right = svd(residual)
-    cluster = right[sines >= sines[0] - TIE]
-    weight = np.linalg.norm(cluster, axis=0)
-    closest = int(np.argmax(weight >= weight.max() - TIE))
-    v = remove(space, residual @ (cluster.T @ cluster[:, closest]))
-    return np.asarray(v / np.linalg.norm(v))
+
+    def __init__(self, supremizers: Array, modes: int) -> None:
+        self._basis = orthonormal_range(supremizers)
+        self._known = modes
+        outside = self._basis[modes:]  # coordinates beyond those of V_N
+        self._gram = outside.T @ outside
+
+    def sigma(self, space: Array) -> float:
+        """σ_S(mu): the largest sine of the principal angles between S_R(mu) and V_N + S (d×k, orthonormal)."""
+        return float(self._sines(space)[0][0]) if self._basis.size else 0.0
+
+    def worst_direction(self, space: Array) -> Array:
+        """Unit vector (d,) of lines 5 to 7: the normalised residual of the worst v in S_R(mu).
+
+        Many σ equal 1 while V_N + S is smaller than S_R(mu). In a cluster of equal sines the vector is chosen by a rule
+        that does not depend on the basis LAPACK happened to return: the projection on the cluster of the basis vector
+        of S_R(mu) that is closest to it.
+        """
+        sines, right = self._sines(space)
+        cluster = right[sines >= sines[0] - TIE]
+        weight = np.linalg.norm(cluster, axis=0)
+        closest = int(np.argmax(weight >= weight.max() - TIE))
+        v = remove(space, self._basis @ (cluster.T @ cluster[:, closest]))
+        v = remove(space, v / np.linalg.norm(v))
+        return np.asarray(v / np.linalg.norm(v))
+
+    def _sines(self, space: Array) -> tuple[Array, Array]:
+        """Sines (r,), falling, and the directions in S_R(mu) they belong to, as rows (r×r)."""
+        rows = space[:, self._known :].T @ self._basis
+        self._gram = self._gram - rows.T @ rows
+        self._known = space.shape[1]
+        squares, vectors = np.linalg.eigh(self._gram)
+        if squares[-1] < SMALL:
+            _, sines, right = svd(remove(space, self._basis))
+            return sines, right
+        return np.sqrt(np.maximum(squares[::-1], 0.0)), vectors.T[::-1]

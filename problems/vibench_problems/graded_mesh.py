@@ -1,0 +1,145 @@
+"""Triangulations of a quarter disc, graded towards a zone of its arc that starts at the apex."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import Delaunay
+from skfem import MeshTri
+
+from vibench.arrays import Array, Indices
+
+COARSEST = 0.2
+"""Largest element size, in radii."""
+
+
+@dataclass(frozen=True)
+class QuarterDisc:
+    """A mesh of the quarter of the unit disc with x ≥ 0 and y ≤ 0, centre at the origin, apex at (0, −1).
+
+    Attributes
+    ----------
+    mesh
+        The triangulation.
+    zone
+        Nodes of the arc from the apex to the end of the zone, in order.
+    axis, flat
+        Nodes with x = 0 and with y = 0.
+    """
+
+    mesh: MeshTri
+    zone: Indices
+    axis: Indices
+    flat: Indices
+
+
+def quarter_disc(edges: int, angle: float, growth: float) -> QuarterDisc:
+    """Mesh with `edges` equal edges on the arc 0 ≤ θ ≤ `angle`, layers around it growing by the factor `growth`.
+
+    Nodes lie on curves at growing distances from the zone, spaced like the curves; the rest of the boundary follows
+    the same sizes. The domain is convex, so Delaunay's triangulation of the nodes is one of the domain.
+
+    Parameters
+    ----------
+    edges
+        Number of equal edges on the zone.
+    angle
+        End of the zone [rad], below π/2.
+    growth
+        Ratio of the sizes of two layers that follow each other, above 1.
+    """
+    finest = 2.0 * np.sin(0.5 * angle / edges)
+
+    def size(points: Array) -> Array:
+        return np.asarray(np.minimum(finest + (growth - 1.0) * _distance_to_zone(points, angle), COARSEST))
+
+    zone = _on_arc(np.linspace(0.0, angle, edges + 1))
+    rest = _on_arc(_graded(angle, 0.5 * np.pi, lambda t: size(_on_arc(t))))
+    flat = _graded(0.0, 1.0, lambda s: size(np.column_stack([1.0 - s, np.zeros_like(s)])))
+    axis = _graded(0.0, 1.0, lambda s: size(np.column_stack([np.zeros_like(s), -s])))
+    flat_points = np.column_stack([1.0 - flat, np.zeros_like(flat)])[1:]
+    axis_points = np.column_stack([np.zeros_like(axis), -axis])[1:-1]
+    boundary = np.vstack([zone, rest[1:], flat_points, axis_points])
+    points = np.vstack([boundary, _layers(angle, finest, growth, size)])
+    triangles = _triangulate(points)
+    for _ in range(4):
+        points = _smoothed(points, triangles, len(boundary))
+        triangles = _triangulate(points)
+    mesh = MeshTri(np.ascontiguousarray(points.T), np.ascontiguousarray(triangles.T))
+    return QuarterDisc(
+        mesh, np.arange(edges + 1), np.flatnonzero(points[:, 0] == 0.0), np.flatnonzero(points[:, 1] == 0.0)
+    )
+
+
+def _on_arc(theta: Array) -> Array:
+    """Points (n×2) of the unit circle at angles from the apex; exact on the axis and on the flat."""
+    points = np.column_stack([np.sin(theta), -np.cos(theta)])
+    points[theta <= 0.0] = (0.0, -1.0)
+    points[theta >= 0.5 * np.pi] = (1.0, 0.0)
+    return points
+
+
+def _distance_to_zone(points: Array, angle: float) -> Array:
+    """Distances (n,) of points (n×2) from the arc 0 ≤ θ ≤ angle."""
+    theta = np.arctan2(points[:, 0], -points[:, 1])
+    radial = np.abs(1.0 - np.linalg.norm(points, axis=1))
+    end = np.linalg.norm(points - _on_arc(np.array([angle])), axis=1)
+    return np.asarray(np.where(theta <= angle, radial, end))
+
+
+def _graded(start: float, end: float, size: Callable[[Array], Array]) -> Array:
+    """Positions from `start` to `end` whose spacing follows `size` (lengths per unit of the position)."""
+    fine = np.linspace(start, end, 20_001)
+    density = 1.0 / size(fine)
+    count = np.concatenate([[0.0], np.cumsum(0.5 * (density[1:] + density[:-1]) * np.diff(fine))])
+    pieces = max(round(count[-1]), 1)
+    return np.interp(np.linspace(0.0, count[-1], pieces + 1), count, fine)
+
+
+def _layers(angle: float, finest: float, growth: float, size: Callable[[Array], Array]) -> Array:
+    """Inner nodes (n×2) on curves at growing distances from the zone, every other one shifted by half a spacing.
+
+    A curve runs from the axis along a smaller arc to the end of the zone and turns around that end to the boundary.
+    """
+    end = _on_arc(np.array([angle]))[0]
+    inwards, onwards = -end, np.array([np.cos(angle), np.sin(angle)])
+    layers, distance, shift = [], 0.0, 0.0
+    while distance < 1.1:
+        distance += np.sqrt(3.0) / 2.0 * min(finest + (growth - 1.0) * distance, COARSEST)
+        spacing = min(finest + (growth - 1.0) * distance, COARSEST)
+        shift = 0.5 - shift
+        radius = max(1.0 - distance, 0.0)
+        along = np.arange(shift * spacing, radius * angle + np.pi * distance, spacing)
+        on_arc = along < radius * angle
+        turn = (along[~on_arc] - radius * angle) / distance
+        directions = np.cos(turn)[:, None] * inwards + np.sin(turn)[:, None] * onwards
+        curve = np.vstack([radius * _on_arc(along[on_arc] / max(radius, spacing)), end + distance * directions])
+        clear = 0.6 * size(curve)
+        inside = (curve[:, 0] > clear) & (curve[:, 1] < -clear) & (np.linalg.norm(curve, axis=1) < 1.0 - clear)
+        layers.append(curve[inside & (_distance_to_zone(curve, angle) > 0.9 * distance)])
+    return np.vstack(layers)
+
+
+def _triangulate(points: Array) -> Indices:
+    """Delaunay triangles (k×3), counter-clockwise, without the flat ones of nodes that lie on one line."""
+    triangles = Delaunay(points).simplices
+    a, b, c = (points[triangles[:, k]] for k in range(3))
+    turned = (b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0]
+    longest = np.max([np.sum((q - p) ** 2, axis=1) for p, q in ((a, b), (b, c), (c, a))], axis=0)
+    proper = np.abs(turned) > 1e-8 * longest
+    triangles, turned = triangles[proper], turned[proper]
+    triangles[turned < 0.0] = triangles[turned < 0.0][:, [0, 2, 1]]
+    return np.asarray(triangles, dtype=np.intp)
+
+
+def _smoothed(points: Array, triangles: Indices, fixed: int) -> Array:
+    """One Laplacian sweep over the nodes after the first `fixed`: half way to the mean of the neighbours."""
+    edges = np.vstack([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]])
+    edges = np.vstack([edges, edges[:, ::-1]])
+    count = np.maximum(np.bincount(edges[:, 0], minlength=len(points)), 1)
+    mean = np.column_stack([np.bincount(edges[:, 0], points[edges[:, 1], d], len(points)) for d in range(2)])
+    moved = points.copy()
+    moved[fixed:] += 0.5 * (mean / count[:, None] - points)[fixed:]
+    return moved

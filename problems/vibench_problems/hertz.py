@@ -1,0 +1,187 @@
+"""Frictionless contact of two discs: the Hertz problem of Niakh, Drouet, Ehrlacher and Ern (2022), §5.2."""
+
+from __future__ import annotations
+
+from typing import Annotated, ClassVar, Literal
+
+import numpy as np
+import scipy.sparse as sp
+from annotated_types import Ge, Gt, Le, Lt
+from skfem import Basis, BilinearForm, ElementTriP1, ElementVector
+from skfem.helpers import ddot, dot, eye, grad, sym_grad, trace
+
+from vibench.arrays import Array
+from vibench.problem import ParameterBox, Picture, Problem, VariationalInequality
+from vibench.space import InnerProduct
+from vibench_problems.graded_mesh import quarter_disc
+from vibench_problems.mortar import coupling
+
+SLAVE_ANGLE = np.pi / 6.0
+"""End of the potential contact zone on disc 1 [rad]: x ≤ 0.5 m."""
+
+MASTER_ANGLE = 0.83
+"""End of the potential contact zone on disc 2 [rad]; the arc of the smallest disc still covers x ≤ 0.5 m."""
+
+EDGES = {"coarse": 90, "medium": 240, "paper": 560, "fine": 1120}
+"""Slave edges behind each named resolution; 560 give the paper's 6130 nodes at the default growth and ratio."""
+
+NODES_PER_EDGE = 6130 / EDGES["paper"]
+
+
+@BilinearForm
+def elasticity(u, v, w):  # type: ignore[no-untyped-def]
+    """∫ σ(u) : ε(v) with Lamé's constants, equation (47)."""
+    strain = sym_grad(u)
+    return ddot(w.lame * eye(trace(strain), 2) + 2.0 * w.shear * strain, sym_grad(v))
+
+
+@BilinearForm
+def norm_form(u, v, w):  # type: ignore[no-untyped-def]
+    """∫ u·v + ℓ̂² ∫ ∇u : ∇v, equation (44)."""
+    return dot(u, v) + w.length**2 * ddot(grad(u), grad(v))
+
+
+class Hertz(Problem):
+    """Two quarter discs pressed together, the radius of the lower one the parameter.
+
+    P1 displacements, multipliers constant on macro-edges of two slave edges (local average contact), pairing by the
+    vertical projection in the physical configuration. Disc 2 is scaled about its apex, which changes neither its
+    two-dimensional elastic energy nor the gap on the axis; the flats are moved by a rigid lifting, which loads nothing:
+    A and f do not depend on mu, only B and g do.
+
+    Parameters
+    ----------
+    resolution
+        "coarse" (about 1000 nodes), "medium", "paper" (6130 nodes, 560 slave edges, 280 multipliers), "fine", or a
+        number of nodes.
+    quadrature
+        "exact" (segments cut at projected master nodes), or Gauss points per slave edge (the paper's way).
+    flats
+        "free" horizontally, or "clamped".
+    ratio
+        Master edges per slave edge of the same length.
+    growth
+        Ratio of the sizes of successive element layers away from the contact zone.
+    length
+        ℓ̂ [m] of the norm (44).
+    young, poisson
+        E [Pa] and ν.
+    approach
+        d [m]: each flat moves by d towards the other.
+    gap
+        γ₀ [m] between the apexes.
+    """
+
+    parameters = ParameterBox(names=("radius",), lower=np.array([0.7]), upper=np.array([1.3]), units=("m",))
+    constant: ClassVar[frozenset[str]] = frozenset({"A", "f"})
+
+    def __init__(
+        self,
+        resolution: Literal["coarse", "medium", "paper", "fine"] | Annotated[int, Ge(300), Le(200_000)] = "paper",
+        quadrature: Literal["exact"] | Annotated[int, Ge(1), Le(20)] = "exact",
+        flats: Literal["free", "clamped"] = "free",
+        ratio: Annotated[float, Ge(0.25), Le(4.0)] = 1.0,
+        growth: Annotated[float, Gt(1.0), Le(2.0)] = 1.365,
+        length: Annotated[float, Gt(0.0)] = 1.0,
+        young: Annotated[float, Gt(0.0)] = 15.0,
+        poisson: Annotated[float, Ge(0.0), Lt(0.5)] = 0.35,
+        approach: Annotated[float, Gt(0.0)] = 0.09,
+        gap: Annotated[float, Ge(0.0)] = 1e-3,
+    ) -> None:
+        edges = EDGES[resolution] if isinstance(resolution, str) else 2 * round(resolution / NODES_PER_EDGE / 2)
+        self.quadrature, self.gap = quadrature, gap
+        self.slave = quarter_disc(edges, SLAVE_ANGLE, growth)
+        masters = round(ratio * edges * MASTER_ANGLE / SLAVE_ANGLE)
+        self.master = quarter_disc(masters, MASTER_ANGLE, growth)
+        lame = young * poisson / ((1.0 + poisson) * (1.0 - 2.0 * poisson))
+        shear = young / (2.0 * (1.0 + poisson))
+        blocks, norms, fixed, offset = [], [], [], 0
+        for disc in (self.slave, self.master):
+            basis = Basis(disc.mesh, ElementVector(ElementTriP1()))
+            blocks.append(elasticity.assemble(basis, lame=lame, shear=shear))
+            norms.append(norm_form.assemble(basis, length=length))
+            fixed += [offset + 2 * disc.axis, offset + 2 * disc.flat + 1]
+            fixed += [offset + 2 * disc.flat] if flats == "clamped" else []
+            offset += basis.N
+        self.free = np.setdiff1d(np.arange(offset), np.concatenate(fixed))
+        self._all_stiffness = sp.csr_array(sp.block_diag(blocks))
+        self._stiffness = self._all_stiffness[self.free][:, self.free]
+        self._second = 2 * self.slave.mesh.p.shape[1]  # first degree of freedom of disc 2
+        self._contact_dofs = np.concatenate([2 * self.slave.zone + 1, self._second + 2 * self.master.zone + 1])
+        self._lift = np.zeros(offset)
+        self._lift[1 : self._second : 2], self._lift[self._second + 1 :: 2] = -approach, approach
+        self.V = InnerProduct(sp.csr_array(sp.block_diag(norms))[self.free][:, self.free])
+        self.W = InnerProduct(sp.diags_array(self.macro_lengths))
+
+    @property
+    def nodes(self) -> int:
+        """Nodes of both meshes."""
+        return int(self.slave.mesh.p.shape[1] + self.master.mesh.p.shape[1])
+
+    @property
+    def macro_lengths(self) -> Array:
+        """Lengths (m,) of the macro-edges."""
+        zone = self.slave.mesh.p[:, self.slave.zone]
+        return np.asarray(np.linalg.norm(np.diff(zone, axis=1), axis=0).reshape(-1, 2).sum(axis=1))
+
+    def training_set(self) -> Array:
+        """The 81 radii 0.7 + 0.0075 i."""
+        return self.parameters.grid(81)
+
+    def points(self, mu: Array) -> tuple[Array, Array]:
+        """Nodes (2×…) of disc 1 and of disc 2 at the radius mu[0], undeformed; the apexes on x = 0 at γ₀ and at 0."""
+        upper = self.slave.mesh.p + np.array([[0.0], [1.0 + self.gap]])
+        lower = mu[0] * (self.master.mesh.p + np.array([[0.0], [1.0]])) * np.array([[1.0], [-1.0]])
+        return upper, lower
+
+    def assemble(self, mu: Array) -> VariationalInequality:
+        """Form (45) and the non-interpenetration condition ∫ (v₂∘φ − v₁)·e_y η ≤ ∫ (x − φ(x))·e_y η, lifting included.
+
+        The lifting moves disc 1 by −d and disc 2 by +d as rigid bodies: it takes 2d from the gap and loads nothing.
+
+        Raises
+        ------
+        NumericalError
+            If mu is so small that the arc of disc 2 does not face the whole potential contact zone.
+        """
+        upper, lower = self.points(mu)
+        integrals = coupling(upper[:, self.slave.zone], lower[:, self.master.zone], self.quadrature)
+        values = sp.coo_array(sp.hstack([-integrals.slave, integrals.master]))
+        shape = (self.W.dim, len(self._lift))
+        B = sp.csr_array((values.data, (values.row, self._contact_dofs[values.col])), shape=shape)
+        return VariationalInequality(
+            A=self._stiffness,
+            f=np.zeros(len(self.free)),
+            B=B[:, self.free],
+            g=integrals.gap - B @ self._lift,
+            lift=self._lift,
+        )
+
+    def refuse(self, mu: Array, u: Array, lam: Array) -> str:  # noqa: ARG002
+        """Contact that reaches the last macro-edge may go on beyond the potential contact zone."""
+        if lam[-1] <= 0.0:
+            return ""
+        return "the contact reaches the end of the potential contact zone: a smaller approach d keeps it inside"
+
+    def displacement(self, u: Array) -> Array:
+        """Displacements (2×nodes) of both discs, the lifting included, disc 1 first."""
+        everywhere = self._lift.copy()
+        everywhere[self.free] += u
+        return np.asarray(everywhere.reshape(-1, 2).T)
+
+    def resultants(self, u: Array) -> tuple[float, float]:
+        """Vertical forces [N/m] that the flats exert on disc 1 (downwards) and on disc 2 (upwards), half bodies."""
+        forces = self._all_stiffness @ self.displacement(u).T.ravel()
+        upper, lower = 2 * self.slave.flat + 1, self._second + 2 * self.master.flat + 1
+        return -float(forces[upper].sum()), float(forces[lower].sum())
+
+    def picture(self, mu: Array, u: Array, lam: Array) -> Picture:
+        """Deformed discs coloured by the vertical displacement, and the contact pressure (paper, Figure 10)."""
+        upper, lower = self.points(mu)
+        moved = self.displacement(u)
+        triangles = np.hstack([self.slave.mesh.t, self.master.mesh.t + self.slave.mesh.p.shape[1]])
+        middles = upper[:1, self.slave.zone[1::2]]
+        return Picture(
+            np.hstack([upper, lower]) + moved, triangles, moved[1], "vertical displacement [m]", middles, lam,
+            "contact pressure [Pa]",
+        )  # fmt: skip
