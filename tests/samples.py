@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import json
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -144,8 +144,3 @@ def wire_study(**axes: Any) -> dict[str, Any]:
         "tolerances": [{"pod": [1e-3], "dual": [1e-2]}],
     }
     return content | axes
-
-
-def names_in(text: str, words: Sequence[str]) -> list[str]:
-    """Those of some words that a text lacks."""
-    return [word for word in words if word not in text]

@@ -190,14 +190,16 @@ class TestOutputFolder:
         refused(main("run"), "runs/quick", "is a file")
 
 
-def test_a_plugin_that_cannot_be_loaded_is_refused(main: Main, register: Register) -> None:
+@pytest.mark.usefixtures("_nothing_starts")
+@pytest.mark.parametrize(("option", "group"), [("--problem", "problems"), ("--solver", "qp_solvers")])
+def test_a_plugin_that_cannot_be_loaded_is_refused(option: str, group: str, main: Main, register: Register) -> None:
     ours = [
         (entry.group, entry.name, entry.value)
         for entry in importlib.metadata.distribution("vibench").entry_points
         if entry.group.startswith("vibench.")
     ]
-    register(*ours, ("vibench.problems", "broken", "no_such_module:Problem"))
-    refused(main("run", "--problem", "broken"), "'broken'", "no_such_module")
+    register(*ours, (f"vibench.{group}", "broken", "no_such_module:member"))
+    refused(main("run", option, "broken"), "'broken'", "no_such_module")
 
 
 def test_one_broken_plugin_does_not_hide_the_others_from_the_list(main: Main, register: Register) -> None:
@@ -225,7 +227,8 @@ def test_without_arguments_the_help_is_printed(main: Main) -> None:
 def test_help_is_no_error(command: list[str], main: Main) -> None:
     code, out, err = main(*command, "--help")
     assert (code, err) == (0, "")
-    assert "Usage: vibench" in out
+    assert "Usage: " in out
+    assert "--help" in out
 
 
 def test_help_names_every_option_of_run(main: Main) -> None:
@@ -322,8 +325,8 @@ def test_show_prints_the_summary(main: Main, quick_run: Path) -> None:
 
 def test_a_run_ends_with_the_summary_and_says_where_things_are(quick_run: Path) -> None:
     printed = (quick_run / "printed.txt").read_text(encoding="utf-8")
-    cells = len(read(quick_run / FILE, "cells"))
-    assert f"{cells} cells, {cells} ok, 0 fell short" in printed
+    fine = read(quick_run / FILE, "cells")["status"] == "ok"
+    assert f"{len(fine)} cells, {fine.sum()} ok, {len(fine) - fine.sum()} fell short" in printed
     assert str(quick_run / FILE) in printed
     assert "online [ms]" in printed
     assert "\x1b" not in printed

@@ -21,9 +21,10 @@ def queries(quick_run: Path) -> pd.DataFrame:
 
 def test_every_cell_of_the_quick_matrix_has_a_row(quick_run: Path) -> None:
     cells = tables.read(quick_run / "results.sqlite", "cells")
-    assert len(cells) == 2 * 3 * 3
+    assert len(cells) == 2 * 2 * 3 * 3
+    assert set(cells["problem"]) == {"obstacle", "hertz"}
     assert set(cells["primal"]) == {"decorrelated", "online-supremizers", "offline-pga"}
-    assert cells[["dual", "primal", "primal_tol", "solver"]].duplicated().sum() == 0
+    assert cells[["problem", "dual", "primal", "primal_tol", "solver"]].duplicated().sum() == 0
     assert (cells["queries"] == 16).all()
 
 
@@ -54,8 +55,8 @@ def test_span_constants_vanish_exactly_below_the_rank(quick_run: Path, queries: 
 
 
 def test_fixed_enrichments_keep_their_promise_on_the_validation_set(queries: pd.DataFrame) -> None:
-    """All parameters share one supremizer space here, so the bound of the training set holds everywhere."""
-    fixed = queries[queries["kind"] == "fixed"]
+    """Obstacle: all parameters share one supremizer space, so the bound of the training set holds everywhere."""
+    fixed = queries[(queries["kind"] == "fixed") & (queries["problem"] == "obstacle")]
     bound = np.sqrt(1.0 - fixed["primal_tol"] ** 2)
     assert (fixed["beta_span"] >= bound * fixed["beta_full_span"] * (1.0 - 1e-9)).all()
     assert (fixed["beta_cone_upper"] >= bound * fixed["beta_full_cone_lower"] * (1.0 - 1e-9)).all()
@@ -63,19 +64,32 @@ def test_fixed_enrichments_keep_their_promise_on_the_validation_set(queries: pd.
 
 def test_solvers_agree_on_what_they_solved(queries: pd.DataFrame) -> None:
     """Inf-sup constants do not depend on the solver at all, errors of u only in the digits of the accuracy."""
-    keys = ["dual", "primal", "primal_tol", "query"]
+    keys = ["problem", "dual", "primal", "primal_tol", "query"]
     ok = queries[queries["status"] == "ok"]
     spread = ok.groupby(keys, dropna=False)[["error_u", "beta_span"]].agg(lambda values: values.max() - values.min())
     assert spread["beta_span"].max() == 0.0
     assert spread["error_u"].max() < 3e-4
 
 
-def test_the_modified_cone_is_no_larger_and_better_conditioned(quick_run: Path) -> None:
+@pytest.mark.parametrize("problem", ["obstacle", "hertz"])
+def test_the_modified_cone_is_no_larger_and_better_conditioned(quick_run: Path, problem: str) -> None:
     cells = tables.read(quick_run / "results.sqlite", "cells")
-    sizes = cells.groupby("dual")["R"].first()
+    sizes = cells[cells["problem"] == problem].groupby("dual")["R"].first()
     assert sizes["mcpg"] <= sizes["cpg"]
     histories = tables.read(quick_run / "results.sqlite", "histories")
-    orth = histories[histories["quantity"] == "e_orth"]
+    orth = histories[(histories["quantity"] == "e_orth") & (histories["problem"] == problem)]
     common = orth.groupby("dual")["step"].max().min()
     medians = orth[(orth["step"] > 0) & (orth["step"] <= common)].groupby("dual")["value"].median()
     assert medians["mcpg"] > medians["cpg"]
+
+
+def test_fixed_enrichments_keep_their_promise_on_the_training_set_of_both_problems(quick_run: Path) -> None:
+    histories = tables.read(quick_run / "results.sqlite", "histories")
+    keys = ["problem", "dual", "primal", "primal_tol", "step"]
+    own, full = (
+        histories[histories["quantity"] == quantity].set_index(keys)["value"].sort_index()
+        for quantity in ("beta_span_training", "beta_full_span_training")
+    )
+    assert len(own) == 2 * (125 + 81)
+    bound = np.sqrt(1.0 - own.index.get_level_values("primal_tol").to_numpy() ** 2)
+    assert np.all(own.to_numpy() >= bound * full.to_numpy() * (1.0 - 1e-9))

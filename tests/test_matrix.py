@@ -11,6 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from conftest import Register
 from samples import REMOVE, STUDY, changed, write_study
 from vibench import matrix
 from vibench.errors import RequestError
@@ -188,6 +189,20 @@ def test_the_code_changes_with_the_core_and_the_solver(what: str, monkeypatch: p
     before = SAMPLE.code
     monkeypatch.setattr(matrix, what, lambda *_: "another version")
     assert SAMPLE.code != before
+
+
+def test_the_code_changes_with_a_solver_of_a_plugin(
+    register: Register, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.syspath_prepend(tmp_path)
+    (tmp_path / "own_solver.py").write_text("def solve(program, accuracy): ...\n")
+    register(("vibench.qp_solvers", "mine", "own_solver:solve"))
+    mine = replace(SAMPLE, solver="mine")
+    before = mine.code, SAMPLE.code
+    (tmp_path / "own_solver.py").write_text("def solve(program, accuracy): return None\n")
+    register(("vibench.qp_solvers", "mine", "own_solver:solve"))
+    assert mine.code != before[0]
+    assert SAMPLE.code == before[1]
 
 
 def test_equal_options_give_one_cell(cells_of: Expand) -> None:

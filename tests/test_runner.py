@@ -9,7 +9,8 @@ import shutil
 import signal
 import sqlite3
 import subprocess
-from collections.abc import Callable, Mapping
+import time
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -32,25 +33,10 @@ def plugins_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-@pytest.fixture(scope="module")
-def vibench(command: str, plugins_folder: Path) -> Vibench:
-    """Function that runs the installed command in a folder; what is left of it after two minutes is killed."""
-
-    def run(folder: Path, *arguments: str, plugins: Path = plugins_folder) -> subprocess.CompletedProcess[str]:
-        process = started([command, *arguments], folder, plugins)
-        try:
-            out, err = process.communicate(timeout=120)
-        finally:
-            with contextlib.suppress(ProcessLookupError):  # nobody is left
-                os.killpg(process.pid, signal.SIGKILL)
-        return subprocess.CompletedProcess(arguments, process.returncode, out, err)
-
-    return run
-
-
-def started(command: list[str], folder: Path, plugins: Path) -> subprocess.Popen[str]:
-    """A process that leads a group of its own, which its workers join."""
-    return subprocess.Popen(
+@contextlib.contextmanager
+def started(command: list[str], folder: Path, plugins: Path) -> Iterator[subprocess.Popen[str]]:
+    """A process that leads a group of its own; whoever is left of the group at the end is killed."""
+    process = subprocess.Popen(
         command,
         cwd=folder,
         env=os.environ | {"PYTHONPATH": str(plugins), "PYTHONUNBUFFERED": "1"},
@@ -59,6 +45,24 @@ def started(command: list[str], folder: Path, plugins: Path) -> subprocess.Popen
         text=True,
         start_new_session=True,
     )
+    try:
+        yield process
+    finally:
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(process.pid, signal.SIGKILL)
+        process.communicate()
+
+
+@pytest.fixture(scope="module")
+def vibench(command: str, plugins_folder: Path) -> Vibench:
+    """Function that runs the installed command in a folder."""
+
+    def run(folder: Path, *arguments: str, plugins: Path = plugins_folder) -> subprocess.CompletedProcess[str]:
+        with started([command, *arguments], folder, plugins) as process:
+            out, err = process.communicate(timeout=120)
+        return subprocess.CompletedProcess(arguments, process.returncode, out, err)
+
+    return run
 
 
 def rows(folder: Path, table: str = "cells") -> list[dict[str, Any]]:
@@ -85,8 +89,8 @@ def by_solver(folder: Path) -> dict[str, dict[str, Any]]:
 
 BAD_PROBLEMS: Mapping[str, tuple[set[str], str]] = {
     "wire-raises": ({"error"}, "in highfidelity: ArithmeticError: the wire snapped"),
-    "wire-nan": ({"error"}, "in highfidelity: f has entries that are not finite at mu = [4.0]"),
-    "wire-shape": ({"error"}, "in highfidelity: g has shape (11,) at mu = [4.0]; the spaces ask for (12,)"),
+    "wire-nan": ({"error"}, "in highfidelity: f has entries that are not finite at mu = ["),
+    "wire-shape": ({"error"}, "in highfidelity: g has shape (11,) at mu = ["),
     "wire-indefinite": ({"error"}, "not positive definite"),
     "wire-broken": ({"error"}, "in highfidelity: OSError: no wire in stock"),
     "wire-hungry": ({"error"}, "out of memory: the limit is memory_gib = 8"),
@@ -311,40 +315,29 @@ def test_retry_redoes_what_was_not_ok(vibench: Vibench, again: Path) -> None:
     assert len(rows(again / "runs" / "wire", "queries")) == 9
 
 
-def test_fresh_starts_over(vibench: Vibench, again: Path) -> None:
+def test_fresh_starts_over_and_leaves_the_notes_somebody_made(vibench: Vibench, again: Path) -> None:
     execute(again / "runs" / "wire", "UPDATE cells SET reason = 'old'")
+    (again / "runs" / "wire" / "notes.txt").write_text("precious")
     printed, after = run_again(vibench, again, "--fresh")
     assert "3 cells, 3 to run" in printed
     assert len(after) == 3
     assert "old" not in {row["reason"] for row in after}
-
-
-def test_fresh_leaves_the_notes_somebody_made_in_the_folder(vibench: Vibench, again: Path) -> None:
-    (again / "runs" / "wire" / "notes.txt").write_text("precious")
-    _, after = run_again(vibench, again, "--fresh")
-    assert len(after) == 3
     assert (again / "runs" / "wire" / "notes.txt").read_text() == "precious"
 
 
 def test_a_cell_without_row_is_done_again(vibench: Vibench, again: Path) -> None:
-    execute(again / "runs" / "wire", "DELETE FROM cells WHERE solver = 'careful'")
-    before = by_solver(again / "runs" / "wire")
+    """With those artefacts it needs that are gone."""
+    folder = again / "runs" / "wire"
+    execute(folder, "DELETE FROM cells WHERE solver = 'careful'")
+    (lost,) = (folder / "artefacts").glob("podstage-*")
+    lost.unlink()
+    before = by_solver(folder)
     printed, after = run_again(vibench, again)
-    assert "3 cells, 1 to run, 1 stages" in printed
+    assert "3 cells, 1 to run, 2 stages" in printed
+    assert lost.exists()
     assert {row["solver"]: row["status"] for row in after} == {"piqp": "ok", "careful": "ok", "gives-up": "failed"}
     assert [row for row in after if row["solver"] != "careful"] == [before["piqp"], before["gives-up"]]
-    assert len(rows(again / "runs" / "wire", "queries")) == 9
-
-
-def test_a_missing_artefact_is_computed_again(vibench: Vibench, again: Path) -> None:
-    execute(again / "runs" / "wire", "DELETE FROM cells WHERE solver = 'careful'")
-    (lost,) = (again / "runs" / "wire" / "artefacts").glob("podstage-*")
-    lost.unlink()
-    printed, after = run_again(vibench, again)
-    assert "1 to run" in printed
-    assert by_solver(again / "runs" / "wire")["careful"]["status"] == "ok"
-    assert lost.exists()
-    assert len(after) == 3
+    assert len(rows(folder, "queries")) == 9
 
 
 def test_other_cells_join_those_of_the_same_study(vibench: Vibench, again: Path) -> None:
@@ -378,17 +371,6 @@ def test_a_plugin_that_was_edited_is_run_again(vibench: Vibench, again: Path, ed
     assert [row["status"] for row in after] == ["ok"] * 3
 
 
-def test_a_solver_that_was_edited_is_run_again(
-    vibench: Vibench, plugins_folder: Path, edited_plugins: Path, tmp_path: Path
-) -> None:
-    """Though nothing else of the cell comes from the package."""
-    study = wire_study(problem=["obstacle"], solvers=["gives-up"], validation=1)
-    study["problem"] = [{"name": "obstacle", "options": {"resolution": 150}}]
-    write_study(tmp_path, study)
-    assert [row["status"] for row in run_again(vibench, tmp_path)[1]] == ["failed"]
-    assert [row["status"] for row in run_again(vibench, tmp_path, plugins=edited_plugins)[1]] == ["ok"]
-
-
 def test_a_solver_that_leaves_takes_only_its_cell_along(vibench: Vibench, tmp_path: Path) -> None:
     """`sys.exit` in a plugin ends neither the run nor the other cells."""
     done = vibench(tmp_path, "run", write_study(tmp_path, wire_study(solvers=["leaves", "piqp"])), "--jobs", "1")
@@ -396,15 +378,6 @@ def test_a_solver_that_leaves_takes_only_its_cell_along(vibench: Vibench, tmp_pa
     found = by_solver(tmp_path / "runs" / "wire")
     assert {solver: row["status"] for solver, row in found.items()} == {"leaves": "error", "piqp": "ok"}
     assert "SystemExit" in found["leaves"]["reason"]
-
-
-def test_queries_over_their_limit_time_out(vibench: Vibench, tmp_path: Path) -> None:
-    study = wire_study(limits={"query_seconds": 1e-9})
-    done = vibench(tmp_path, "run", write_study(tmp_path, study), "--jobs", "1")
-    assert done.returncode == 0
-    (row,) = rows(tmp_path / "runs" / "wire")
-    assert (row["status"], row["queries_ok"]) == ("timeout", 0)
-    assert "the limit is 1e-09 s" in row["reason"]
 
 
 def test_too_little_memory_is_a_reason(vibench: Vibench, tmp_path: Path) -> None:
@@ -418,36 +391,74 @@ def test_too_little_memory_is_a_reason(vibench: Vibench, tmp_path: Path) -> None
     assert row["reason"]
 
 
-@pytest.mark.parametrize(("kill", "code"), [(signal.SIGINT, 130), (signal.SIGKILL, -9)], ids=["interrupted", "killed"])
-def test_a_run_that_was_stopped_goes_on_later(
-    kill: signal.Signals, code: int, command: str, plugins_folder: Path, vibench: Vibench, tmp_path: Path
-) -> None:
+@pytest.fixture
+def waiting(tmp_path: Path) -> Path:
+    """Folder of a study of two cells; the second waits for a file "go on" there."""
     waits = {"name": "cone-waits", "options": {"file": str(tmp_path / "go on")}}
     write_study(tmp_path, wire_study(dual=["cpg", waits]))
-    process = started([command, "run", "study.toml", "--jobs", "2"], tmp_path, plugins_folder)
+    return tmp_path
+
+
+def read_until(process: subprocess.Popen[str], words: str) -> None:
+    """Read what a process prints until some words come."""
     assert process.stdout is not None
     printed = ""
-    while "[1/2] ok" not in printed:
+    while words not in printed:
         line = process.stdout.readline()
         assert line, f"the run ended: {printed}"
         printed += line
-    os.killpg(process.pid, kill)  # the workers too, as a terminal does
-    out, err = process.communicate()
+
+
+@pytest.mark.parametrize(("kill", "code"), [(signal.SIGINT, 130), (signal.SIGKILL, -9)], ids=["interrupted", "killed"])
+def test_a_run_that_was_stopped_goes_on_later(
+    kill: signal.Signals, code: int, command: str, plugins_folder: Path, vibench: Vibench, waiting: Path
+) -> None:
+    with started([command, "run", "study.toml", "--jobs", "2"], waiting, plugins_folder) as process:
+        read_until(process, "[1/2] ok")
+        os.killpg(process.pid, kill)  # the workers too, as a terminal does
+        out, err = process.communicate(timeout=60)
     assert process.returncode == code
     assert err == ""
-    folder = tmp_path / "runs" / "wire"
+    folder = waiting / "runs" / "wire"
     before = rows(folder)
     assert [row["dual"] for row in before] == ["cpg"]
     if kill is signal.SIGINT:
         assert "interrupted: 1 cells have no row yet" in out
         assert len(pd.read_csv(folder / "tables" / "cells.csv")) == 1
 
-    (tmp_path / "go on").touch()
-    printed, after = run_again(vibench, tmp_path)
+    (waiting / "go on").touch()
+    printed, after = run_again(vibench, waiting)
     assert "2 cells, 1 to run" in printed
     assert after[0] == before[0]
     assert [(row["dual"], row["status"]) for row in after] == [("cpg", "ok"), ("cone-waits", "ok")]
     assert len(rows(folder, "queries")) == 6
+
+
+def test_a_run_that_is_terminated_leaves_no_worker_behind(command: str, plugins_folder: Path, waiting: Path) -> None:
+    """As where a terminal is closed, or a scheduler ends a job: only the command itself is told."""
+    with started([command, "run", "study.toml", "--jobs", "2"], waiting, plugins_folder) as process:
+        read_until(process, "[1/2] ok")
+        process.terminate()
+        process.wait(timeout=60)
+        for _ in range(100):
+            try:
+                os.killpg(process.pid, 0)
+            except ProcessLookupError:
+                return
+            time.sleep(0.1)
+        pytest.fail("a worker goes on")
+
+
+def test_a_run_in_which_nothing_works_comes_to_its_end(vibench: Vibench, tmp_path: Path) -> None:
+    """One problem raises, and of the other every query takes too long."""
+    study = wire_study(problem=["wire-raises", "wire"], limits={"query_seconds": 1e-9})
+    done = vibench(tmp_path, "run", write_study(tmp_path, study), "--jobs", "1")
+    assert (done.returncode, done.stderr) == (0, "")
+    found = {row["problem"]: row for row in rows(tmp_path / "runs" / "wire")}
+    assert {problem: row["status"] for problem, row in found.items()} == {"wire-raises": "error", "wire": "timeout"}
+    assert "the limit is 1e-09 s" in found["wire"]["reason"]
+    assert {row["queries_ok"] for row in found.values()} == {0}
+    assert "2 cells, 0 ok, 2 fell short" in done.stdout
 
 
 MEASURED = ("_s", "peak_memory_mib", "disturbed", "benefit_threshold", "meaning")

@@ -155,6 +155,7 @@ def _check_names(study: Study, source: str) -> None:
                 plugins.check_options(kind, entry.name, entry.options)
         for solver in study.solver_names():
             qp.check_solver_name(solver, plugins.names("QP solver"))
+            plugins.qp_solver(solver)
         for table in study.tolerances:
             _check_tolerances(study, table)
     except RequestError as error:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import resource
 import signal
+import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -39,9 +41,17 @@ class Failed:
 
 
 def initialise() -> None:
-    """Prepare a worker: one thread, and Ctrl-C left to the parent."""
+    """Prepare a worker: one thread, Ctrl-C left to the parent, and no life after the parent's."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threadpool_limits(1)
+    threading.Thread(target=_follow, args=(os.getppid(),), daemon=True).start()
+
+
+def _follow(parent: int) -> None:
+    """End this process once its parent has: nobody would enforce its limits or want its results."""
+    while os.getppid() == parent:
+        time.sleep(1.0)
+    os._exit(1)
 
 
 def perform(folder: str, stage: Stage, memory_gib: float) -> Done | Failed:

@@ -89,7 +89,7 @@ class Hertz(Problem):
         gap: Annotated[float, Ge(0.0)] = 1e-3,
     ) -> None:
         edges = EDGES[resolution] if isinstance(resolution, str) else 2 * round(resolution / NODES_PER_EDGE / 2)
-        self.quadrature, self.gap = quadrature, gap
+        self.quadrature, self.gap, self.young, self.poisson = quadrature, gap, young, poisson
         self.slave = quarter_disc(edges, SLAVE_ANGLE, growth)
         masters = round(ratio * edges * MASTER_ANGLE / SLAVE_ANGLE)
         self.master = quarter_disc(masters, MASTER_ANGLE, growth)

@@ -5,4 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 
 quick = Path(__file__).with_name("quick.toml")
+hertz_quadrature = Path(__file__).with_name("hertz-quadrature.toml")
+paper_hertz = Path(__file__).with_name("paper-hertz.toml")
 paper_obstacle = Path(__file__).with_name("paper-obstacle.toml")

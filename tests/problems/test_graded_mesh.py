@@ -1,0 +1,49 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from vibench_problems.disc_mesh import aspect_ratios
+from vibench_problems.graded_mesh import quarter_disc
+
+
+@pytest.mark.parametrize(("edges", "angle", "growth"), [(40, 0.5, 1.3), (90, np.pi / 6.0, 1.36), (60, 0.83, 1.1)])
+def test_the_mesh_is_a_triangulation_of_the_quarter_disc(edges: int, angle: float, growth: float) -> None:
+    disc = quarter_disc(edges, angle, growth)
+    p, t = disc.mesh.p, disc.mesh.t
+    a, b, c = (p[:, t[k]] for k in range(3))
+    area = 0.5 * np.abs((b - a)[0] * (c - a)[1] - (b - a)[1] * (c - a)[0])
+    arc = p[:, np.abs(np.linalg.norm(p, axis=0) - 1.0) < 1e-12]
+    theta = np.sort(np.arctan2(arc[0], -arc[1]))
+    polygon = 0.5 * np.sin(np.diff(theta)).sum()  # the triangles between the centre and the nodes of the arc
+    assert area.sum() == pytest.approx(polygon, rel=1e-10)
+    assert np.pi / 4.0 - 0.02 < polygon < np.pi / 4.0
+    assert set(np.unique(t)) == set(range(p.shape[1]))
+    assert aspect_ratios(p, t).max() < 2.5
+
+
+def test_the_zone_has_equal_edges_from_the_apex_to_its_end() -> None:
+    disc = quarter_disc(50, 0.6, 1.2)
+    zone = disc.mesh.p[:, disc.zone]
+    assert zone.shape == (2, 51)
+    assert np.array_equal(zone[:, 0], [0.0, -1.0])
+    assert zone[:, -1] == pytest.approx([np.sin(0.6), -np.cos(0.6)])
+    lengths = np.linalg.norm(np.diff(zone, axis=1), axis=0)
+    assert np.allclose(lengths, 2.0 * np.sin(0.006), rtol=1e-12)
+
+
+def test_the_straight_sides_are_named_and_exact() -> None:
+    disc = quarter_disc(40, 0.5, 1.3)
+    p = disc.mesh.p
+    assert np.all(p[0, disc.axis] == 0.0)
+    assert np.all(p[1, disc.flat] == 0.0)
+    assert {(0.0, 0.0), (0.0, -1.0)} <= set(map(tuple, p[:, disc.axis].T))
+    assert {(0.0, 0.0), (1.0, 0.0)} <= set(map(tuple, p[:, disc.flat].T))
+    assert p[0].min() == 0.0
+    assert p[1].max() == 0.0
+
+
+def test_slower_growth_gives_more_nodes_and_the_same_zone() -> None:
+    coarse, fine = quarter_disc(60, 0.5, 1.5), quarter_disc(60, 0.5, 1.1)
+    assert fine.mesh.p.shape[1] > 2 * coarse.mesh.p.shape[1]
+    assert np.array_equal(coarse.mesh.p[:, coarse.zone], fine.mesh.p[:, fine.zone])
