@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
+import pictures
 
 from vibench import figures, tables
 from vibench.schema import TABLES
@@ -64,6 +65,12 @@ PAPER = {
 }
 """What the paper prints: title, δ_PGA of the offline enrichment, columns; seconds on its authors' machine."""
 
+PICTURES = {
+    "paper-obstacle": ("obstacle", ((0.9, 0.025, -0.025),)),
+    "paper-hertz": ("hertz", ((0.7,), (1.0,), (1.3,))),
+}
+"""Problem and parameters of the solutions to draw: the paper's Figures 4 and 10."""
+
 DUAL = "mcpg"
 SOLVER = "piqp"
 """Cone and solver whose seconds stand beside the paper's; no other solver of the study solved every query."""
@@ -79,12 +86,14 @@ def main() -> None:
         frame = tables.in_order(tables.read(path, table))
         frame.to_csv(target / f"{table}.csv", index=False, float_format="%.6g")
     figures.draw_all(path, target)
-    (target / "README.md").write_text(page(path, target.name), encoding="utf-8")
+    if target.name in PICTURES:
+        pictures.draw(*PICTURES[target.name], target)
+    (target / "README.md").write_text(page(path, target), encoding="utf-8")
 
 
-def page(path: Path, name: str) -> str:
+def page(path: Path, target: Path) -> str:
     """The README of the folder: how it was made, the comparison, the summary, what fell short, the figures."""
-    cells = tables.in_order(tables.read(path, "cells"))
+    name, cells = target.name, tables.in_order(tables.read(path, "cells"))
     versions = {name: text for row in cells["versions"] for name, text in json.loads(row).items()}
     named = ", ".join(f"{name} {text}" for name, text in versions.items())
     short = cells[cells["status"] != "ok"].groupby(["solver", "status"])
@@ -93,22 +102,31 @@ def page(path: Path, name: str) -> str:
         f"{int(group['queries'].sum())} of their queries"
         for (solver, status), group in short
     ]
+    drawn = sorted(file.name for file in target.glob("*.png"))
     parts = [
         f"# {name}",
         f"Made by `vibench run {name} && python results/make.py runs/{name} results/{name}`, on one machine: "
         f"{cells['machine'].iloc[0]}; {named}. Seconds are CPU seconds on one thread.",
-        f"## {PAPER[name][0]}",
-        tables.to_markdown(comparison(cells, name)),
-        f"Ours: {SOLVER}, assembly in full as in the paper; the threshold by the same formula from our seconds.",
+        *(beside_the_paper(cells, name) if name in PAPER else []),
         "## All cells",
-        f"{len(cells)} cells, {int((cells['status'] == 'ok').sum())} with every query ok; the others:",
+        f"{len(cells)} cells, {int((cells['status'] == 'ok').sum())} with every query ok"
+        + ("; the others:" if fell else "."),
         "\n".join(fell),
         tables.to_markdown(tables.summary(cells)),
         "## Figures",
-        "\n".join(f"![{file.stem}]({file.name})" for file in sorted((path.parent / "figures").glob("*.png"))),
+        "\n".join(f"![{Path(name).stem}]({name})" for name in drawn),
         "Full tables: " + ", ".join(f"[{table}.csv]({table}.csv)" for table in TABLES) + ".",
     ]
-    return "\n\n".join(part.strip() for part in parts) + "\n"
+    return "\n\n".join(part.strip() for part in parts if part) + "\n"
+
+
+def beside_the_paper(cells: pd.DataFrame, name: str) -> list[str]:
+    """The section that compares with the paper."""
+    return [
+        f"## {PAPER[name][0]}",
+        tables.to_markdown(comparison(cells, name)),
+        f"Ours: {SOLVER}, assembly in full as in the paper; the threshold by the same formula from our seconds.",
+    ]
 
 
 def comparison(cells: pd.DataFrame, name: str) -> pd.DataFrame:
