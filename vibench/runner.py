@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import multiprocessing
 import shutil
+import signal
 from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, wait
 from dataclasses import dataclass, field
@@ -165,8 +166,13 @@ class _Run:
             return False
         with one_thread():
             context = multiprocessing.get_context("spawn")
+            # workers inherit the blocked signal: Ctrl-C is for this process alone, also while they come to life
+            signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
             pool = ProcessPool(max_workers=jobs, context=context, initializer=initialise)
+            started = pool.active
+            signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
             try:
+                assert started  # asking starts the pool
                 self._loop(pool, jobs)
             except KeyboardInterrupt:
                 return True
