@@ -434,6 +434,32 @@ def test_a_run_that_was_stopped_goes_on_later(
     assert len(rows(folder, "queries")) == 6
 
 
+def test_workers_never_see_an_interrupt(command: str, plugins_folder: Path, waiting: Path) -> None:
+    """From the moment on which they come to life; their own Python would answer with a traceback."""
+    (waiting / "go on").touch()
+    with started([command, "run", "study.toml", "--jobs", "2"], waiting, plugins_folder) as process:
+        told, end = 0, time.monotonic() + 60
+        while process.poll() is None and time.monotonic() < end:
+            for worker in workers(process.pid):
+                with contextlib.suppress(ProcessLookupError):
+                    os.kill(worker, signal.SIGINT)
+                    told += 1
+            time.sleep(0.005)
+        _, err = process.communicate(timeout=10)
+    assert told > 10
+    assert (process.returncode, err) == (0, "")
+
+
+def workers(pid: int) -> list[int]:
+    """The processes of multiprocessing's that a process started, but for the keeper of their resources."""
+    found: list[int] = []
+    for children in Path(f"/proc/{pid}/task").glob("*/children"):
+        with contextlib.suppress(FileNotFoundError, ProcessLookupError):
+            numbers = children.read_text().split()
+            found += [int(number) for number in numbers if "spawn_main" in Path(f"/proc/{number}/cmdline").read_text()]
+    return found
+
+
 def test_a_run_that_is_terminated_leaves_no_worker_behind(command: str, plugins_folder: Path, waiting: Path) -> None:
     """As where a terminal is closed, or a scheduler ends a job: only the command itself is told."""
     with started([command, "run", "study.toml", "--jobs", "2"], waiting, plugins_folder) as process:

@@ -6,9 +6,11 @@ import json
 import multiprocessing
 import shutil
 import signal
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, wait
+from contextlib import contextmanager
 from dataclasses import dataclass, field
+from multiprocessing import resource_tracker
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -133,6 +135,17 @@ def _clear(folder: Path, study: Study) -> bool:
     return True
 
 
+@contextmanager
+def _interrupts_held() -> Iterator[None]:
+    """Ctrl-C waits; processes started meanwhile never see it, for they inherit what is blocked."""
+    resource_tracker.ensure_running()  # whose start unblocks the signal
+    signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
+
+
 @dataclass
 class _Run:
     """One execution: which stages wait for which, and what to write when they end."""
@@ -166,13 +179,11 @@ class _Run:
             return False
         with one_thread():
             context = multiprocessing.get_context("spawn")
-            # workers inherit the blocked signal: Ctrl-C is for this process alone, also while they come to life
-            signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-            pool = ProcessPool(max_workers=jobs, context=context, initializer=initialise)
-            started = pool.active
-            signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
+            with _interrupts_held():
+                pool = ProcessPool(max_workers=jobs, context=context, initializer=initialise)
+                started = pool.active  # asking starts the pool
             try:
-                assert started  # asking starts the pool
+                assert started
                 self._loop(pool, jobs)
             except KeyboardInterrupt:
                 return True
