@@ -59,7 +59,8 @@ class Hertz(Problem):
     flats
         "free" horizontally, or "clamped".
     ratio
-        Master edges per slave edge of the same length.
+        Master edges per slave edge of the same length, before disc 2 is scaled. By default both zones have as many
+        edges, and the master's are the longer ones at every radius, as mortar methods want it.
     growth
         Ratio of the sizes of successive element layers away from the contact zone.
     length
@@ -80,8 +81,8 @@ class Hertz(Problem):
         resolution: Literal["coarse", "medium", "paper", "fine"] | Annotated[int, Ge(300), Le(200_000)] = "paper",
         quadrature: Literal["exact"] | Annotated[int, Ge(1), Le(20)] = "exact",
         flats: Literal["free", "clamped"] = "free",
-        ratio: Annotated[float, Ge(0.25), Le(4.0)] = 1.0,
-        growth: Annotated[float, Gt(1.0), Le(2.0)] = 1.365,
+        ratio: Annotated[float, Ge(0.25), Le(4.0)] = 0.631,
+        growth: Annotated[float, Gt(1.0), Le(2.0)] = 1.265,
         length: Annotated[float, Gt(0.0)] = 1.0,
         young: Annotated[float, Gt(0.0)] = 15.0,
         poisson: Annotated[float, Ge(0.0), Lt(0.5)] = 0.35,
