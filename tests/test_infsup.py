@@ -1,7 +1,5 @@
 from __future__ import annotations
 
-from itertools import combinations
-
 import numpy as np
 import pytest
 import scipy.linalg
@@ -12,74 +10,15 @@ from hypothesis import strategies as st
 from numerics import Varying, space
 from vibench.infsup import (
     beta_span,
-    cone_interval,
     inf_sup_full,
     inf_sup_on,
     multipliers,
     nodal_multipliers,
-    simplex_minimiser,
 )
 from vibench.space import InnerProduct
 from vibench.supremizer import supremizers
 
 seeds = st.integers(0, 10_000)
-
-
-def cone_minimum_by_faces(M: np.ndarray, G: np.ndarray) -> float:
-    """min √(αᵀMα / αᵀGα) over α ≥ 0: on the face where it sits, α is a positive generalised eigenvector."""
-    best = np.inf
-    for size in range(1, len(G) + 1):
-        for face in combinations(range(len(G)), size):
-            pick = np.ix_(face, face)
-            values, vectors = scipy.linalg.eigh(M[pick], G[pick])
-            for value, vector in zip(values, vectors.T, strict=True):
-                if np.all(vector >= -1e-10) or np.all(vector <= 1e-10):
-                    best = min(best, np.sqrt(max(value, 0.0)))
-    return best
-
-
-def random_pair(seed: int, rows: int, count: int, shift: float) -> tuple[np.ndarray, np.ndarray]:
-    rng = np.random.default_rng(seed)
-    chi = rng.random((10, count))
-    chi /= np.linalg.norm(chi, axis=0)
-    return rng.standard_normal((rows, count)) + shift, chi.T @ chi
-
-
-@given(seeds, st.integers(2, 6), st.integers(1, 5), st.sampled_from([0.0, 0.5, 3.0]))
-def test_the_cone_interval_holds_the_minimum_over_all_faces(seed: int, rows: int, count: int, shift: float) -> None:
-    C, G = random_pair(seed, rows, count, shift)
-    span = float(np.sqrt(max(scipy.linalg.eigh(C.T @ C, G, eigvals_only=True)[0], 0.0)))
-    lower, upper, sharp = cone_interval(C, G, span)
-    exact = cone_minimum_by_faces(C.T @ C, G)
-    assert lower <= exact * (1.0 + 1e-7) + 1e-7  # the brute force squares: it knows zero only to 1e-8
-    assert exact <= upper * (1.0 + 1e-7) + 1e-7
-    assert sharp.split("/")[0] in ("L0", "L½", "L1")
-    assert sharp.split("/")[1] in ("U0", "U1")
-
-
-def test_the_interval_is_a_point_where_the_minimum_sits_on_a_generator() -> None:
-    C = np.array([[1.0, 0.9], [0.0, 1.5]])
-    G = np.array([[1.0, 0.2], [0.2, 1.0]])
-    lower, upper, sharp = cone_interval(C, G, 0.1)
-    assert lower == upper == 1.0
-    assert sharp == "L½/U0"
-
-
-def test_opposite_images_leave_no_stability_over_the_cone() -> None:
-    C, G = np.array([[1.0, -1.0], [0.0, 0.0]]), np.eye(2)
-    lower, upper, _ = cone_interval(C, G, 0.0)
-    assert lower == 0.0
-    assert upper < 1e-12
-
-
-@given(seeds)
-def test_the_simplex_minimiser_beats_every_other_point(seed: int) -> None:
-    C, _ = random_pair(seed, 4, 5, 0.5)
-    alpha = simplex_minimiser(1e-3 * C)
-    assert np.isclose(alpha.sum(), 1.0)
-    assert np.all(alpha >= 0.0)
-    others = np.random.default_rng(seed).dirichlet(np.ones(5), 200)
-    assert np.linalg.norm(C @ alpha) <= np.linalg.norm(C @ others.T, axis=0).min() + 1e-9
 
 
 @given(seeds)

@@ -12,9 +12,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.optimize import nnls
 
 from vibench.arrays import Array, SparseMatrix
+from vibench.cone_bounds import cone_interval
 from vibench.linalg import singular_values
 from vibench.space import InnerProduct
 
@@ -94,60 +94,6 @@ def beta_span(on_span: Array) -> float:
     if rows < rank:
         return 0.0
     return float(singular_values(on_span)[-1])
-
-
-def cone_interval(C: Array, G: Array, span: float) -> tuple[float, float, str]:
-    """Certified bounds on min ‖Cα‖/√(αᵀGα) over α ≥ 0, for G with unit diagonal.
-
-    Upper: U0, the best single generator, and U1, the quotient at the minimiser of ‖Cα‖ over the simplex. Lower: L0,
-    the span constant; L1, min_i yᵀc_i with y the direction of that minimiser's image, valid because ‖χα‖ ≤ Σα; L½,
-    √min M_ij/G_ij over pairs, valid when M and G are entrywise nonnegative.
-
-    Parameters
-    ----------
-    C
-        Images (N'×R) of the generators.
-    G
-        Gram matrix (R×R), unit diagonal.
-    span
-        β_span of the same pair.
-
-    Returns
-    -------
-    tuple
-        Lower bound, upper bound, and the names of those that were sharpest, "L½/U0".
-    """
-    count = G.shape[0]
-    if not count:
-        return float("inf"), float("inf"), ""
-    M = C.T @ C
-    alpha = simplex_minimiser(C)
-    image, weight = C @ alpha, float(alpha @ G @ alpha)
-    norm = float(np.linalg.norm(image))
-    uppers = {
-        "U0": float(np.sqrt(np.min(np.diag(M) / np.diag(G)))),
-        "U1": norm / np.sqrt(weight),
-    }
-    lowers = {"L0": span, "L1": max(0.0, float(np.min(image @ C)) / norm) if norm > 0.0 else 0.0}
-    if M.min() >= 0.0 and G.min() >= 0.0:
-        pairs = G > 0.0
-        lowers["L½"] = float(np.sqrt(np.min(M[pairs] / G[pairs])))
-    low, high = max(lowers, key=lambda k: lowers[k]), min(uppers, key=lambda k: uppers[k])
-    return min(lowers[low], uppers[high]), uppers[high], f"{low}/{high}"
-
-
-def simplex_minimiser(C: Array) -> Array:
-    """Minimiser α (R,) of ‖Cα‖ over α ≥ 0, Σα = 1.
-
-    The nonnegative least squares solution of [C; 1ᵀ]α ≈ [0; 1], with C in units of its largest column, is a multiple
-    of it: at the optimum ‖Cα‖² = t²q and t minimises t²q + (t − 1)², so the sum t alone depends on the weight.
-    """
-    size = float(np.linalg.norm(C, axis=0).max(initial=0.0)) or 1.0
-    system = np.vstack([C / size, np.ones(C.shape[1])])
-    target = np.zeros(system.shape[0])
-    target[-1] = 1.0
-    alpha, _ = nnls(system, target, maxiter=30 * C.shape[1])
-    return np.asarray(alpha / alpha.sum())
 
 
 def inf_sup_on(Z: Array, B: SparseMatrix, cone: Multipliers) -> InfSup:

@@ -2,7 +2,8 @@
 
 Whole space ≥ own space ≥ V_N alone, whole space ≥ high-fidelity pair, own = whole space for per-parameter enrichments,
 cone ≥ span. The order is exact for the span; of intervals over the cone, the upper end of the larger constant is
-compared with the lower end of the smaller.
+compared with the lower end of the smaller. Round-off is allowed for, in units of the constant of the whole space,
+which is no larger than the norm of the form.
 """
 
 from __future__ import annotations
@@ -13,12 +14,9 @@ from dataclasses import dataclass
 import numpy as np
 import pandas as pd
 
+from vibench.cone_bounds import ABSOLUTE, RELATIVE
 from vibench.schema import CONSTANTS
 from vibench.strategy import Kind
-
-RELATIVE = 1e-8
-ABSOLUTE = 1e-12
-"""Slack in units of the constant of the whole space, which is no larger than the norm of the form."""
 
 ORDER = (("full_", ""), ("", "plain_"), ("full_", "hf_"))
 """Pairs of constants: the first is at least the second."""
