@@ -4,10 +4,11 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from vibench.invariants import violations
+from vibench.invariants import EFFECTIVITIES, violations
 from vibench.schema import CONSTANTS
 
-GOOD = dict.fromkeys(CONSTANTS, 0.1) | {f"beta_full_{what}": 0.2 for what in ("span", "cone_lower", "cone_upper")}
+GOOD = dict.fromkeys(CONSTANTS, 0.1) | dict.fromkeys(EFFECTIVITIES, 1.0)
+GOOD |= {f"beta_full_{what}": 0.2 for what in ("span", "cone_lower", "cone_upper")}
 KINDS = pd.Series({"a": "fixed", "b": "per-parameter"})
 
 
@@ -19,6 +20,7 @@ def rows(**changed: float) -> pd.DataFrame:
 def test_constants_in_order_are_fine_and_so_is_round_off() -> None:
     assert violations(rows(), KINDS) == []
     assert violations(rows(beta_plain_span=0.1 * (1.0 + 5e-9)), KINDS) == []
+    assert violations(rows(effectivity_u=np.nan, effectivity_lambda=40.0), KINDS) == []
     assert violations(rows(beta_span=np.inf, beta_full_span=np.inf, beta_cone_upper=np.inf), KINDS) == []
 
 
@@ -30,6 +32,8 @@ def test_constants_in_order_are_fine_and_so_is_round_off() -> None:
         ({"beta_plain_cone_upper": 0.09}, "beta_plain_cone_upper ≥ beta_plain_span"),
         ({"beta_cone_lower": 0.11}, "beta_cone_upper ≥ beta_cone_lower"),
         ({"beta_span": np.nan}, "beta_span ≥ beta_plain_span"),
+        ({"effectivity_u": 0.999}, "effectivity_u ≥ 1"),
+        ({"effectivity_lambda": 0.5}, "effectivity_lambda ≥ 1"),
     ],
 )
 def test_every_violation_is_found_and_named(changed: dict[str, float], names: str) -> None:

@@ -168,8 +168,8 @@ def test_a_failing_write_of_histories_leaves_the_earlier_ones(journal: Journal) 
 
 def test_thresholds_replace_all_earlier_ones(journal: Journal) -> None:
     row = {"problem": "p", "benefit_threshold": 3.0, "meaning": "from"}
-    journal.write_thresholds([row, row])
-    journal.write_thresholds([row | {"benefit_threshold": 4.0}])
+    journal.replace("thresholds", [row, row])
+    journal.replace("thresholds", [row | {"benefit_threshold": 4.0}])
     assert [row["benefit_threshold"] for row in journal.rows("thresholds")] == [4.0]
 
 

@@ -496,7 +496,7 @@ def test_the_number_of_jobs_changes_no_result(vibench: Vibench, tmp_path: Path) 
         problem=[{"name": "wire", "label": "long", "options": {"nodes": 40}}],
         dual=["cpg", "mcpg"],
         primal=["online-supremizers", "offline-pga"],
-        solvers=["piqp", "gives-up"],
+        solvers=["piqp", "osqp", "gives-up"],
         tolerances=[{"pod": [1e-3], "dual": [1e-2], "primal": {"offline-pga": [0.5]}}],
     )
     write_study(tmp_path, study)

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import scipy.linalg
 
 from vibench import sweeps
 from vibench.assembly import AssemblyStage
@@ -160,9 +161,14 @@ def test_a_slow_query_is_a_timeout(store: Store) -> None:
 def test_the_reference_constants_are_those_of_every_parameter(store: Store) -> None:
     constants = value_of(store, ReferenceConstants(PROBLEM, 9, 3))
     mus = PROBLEM.create().validation_set(9, 3)
-    scaled = [c.span / mu[0] ** 2 for c, mu in zip(constants, mus, strict=True)]  # B = mu_1² times one matrix
+    scaled = [c.inf_sup.span / mu[0] ** 2 for c, mu in zip(constants, mus, strict=True)]  # B = mu_1² times one matrix
     assert np.allclose(scaled, scaled[0], rtol=1e-9)
     assert scaled[0] > 0.0
+    problem = PROBLEM.create()
+    for c, mu in zip(constants, mus, strict=True):
+        values = scipy.linalg.eigh(problem.assemble(mu).A.toarray(), problem.V.matrix.toarray(), eigvals_only=True)
+        assert 0.998 * values[0] <= c.coercivity <= values[0]
+        assert values[-1] <= c.continuity <= 1.002 * values[-1]
 
 
 def test_a_missing_artefact_is_named(tmp_path: Path) -> None:

@@ -35,6 +35,8 @@ class Errors:
     ----------
     u, lam, energy
         Relative, in the norms of V, of W and of A(mu).
+    absolute_u, absolute_lam
+        The first two before they are divided.
     violation
         Largest (B u_N − g)₊, each row over the integral of its multiplier function [unit of u].
     complementarity
@@ -44,6 +46,8 @@ class Errors:
     u: float
     lam: float
     energy: float
+    absolute_u: float
+    absolute_lam: float
     violation: float
     complementarity: float
 
@@ -56,10 +60,13 @@ def errors(problem: Problem, vi: VariationalInequality, reference: Reference, u:
     norm_lam = max(float(W.norm(reference.lam)), reference.floor_lam)
     energy = np.sqrt(max(float(reference.u @ (vi.A @ reference.u)), 0.0))
     excess = vi.B @ u - vi.g
+    error_u, error_lam = float(V.norm(du)), float(W.norm(dlam))
     return Errors(
-        u=_over(float(V.norm(du)), norm_u),
-        lam=_over(float(W.norm(dlam)), norm_lam),
+        u=_over(error_u, norm_u),
+        lam=_over(error_lam, norm_lam),
         energy=_over(np.sqrt(max(float(du @ (vi.A @ du)), 0.0)), energy),
+        absolute_u=error_u,
+        absolute_lam=error_lam,
         violation=float(np.max(excess / problem.multiplier_integrals(), initial=0.0)),
         complementarity=float(reference.lam @ excess),
     )

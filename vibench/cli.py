@@ -8,14 +8,13 @@ from typing import Annotated, Literal
 
 import pandas as pd
 import typer
-from rich import box
 from rich.console import Console
-from rich.table import Table
-from rich.text import Text
 
-from vibench import figures, invariants, plugins, provenance, qp, tables
+from vibench import agreement, figures, invariants, plugins, provenance, qp, replay, tables
 from vibench.errors import RequestError, VibenchError, unknown_name
+from vibench.loading import recorded_cell
 from vibench.matrix import Cell, expand
+from vibench.printing import new_console, print_frame
 from vibench.progress import Report
 from vibench.qp import Status
 from vibench.runner import Outcome, run_study
@@ -30,9 +29,6 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
 )
-
-WIDTH = 180
-"""Columns of a table where the output is no terminal."""
 
 LISTS = {"problems": "problem", "primal": "primal strategy", "dual": "dual strategy", "studies": "study"}
 
@@ -60,7 +56,7 @@ def run(
         "pod": pod_tol, "dual_tol": dual_tol, "primal_tol": primal_tol,
     }  # fmt: skip
     loaded = load_study(study, {axis: values for axis, values in overrides.items() if values})
-    console = _console()
+    console = new_console()
     if dry_run:
         _list_matrix(console, expand(loaded))
         return
@@ -86,13 +82,13 @@ def list_plugins(
     ] = None,
 ) -> None:
     """List what is registered: names, what they are, and their options."""
-    console = _console()
+    console = new_console()
     if what is not None and what not in (*LISTS, "solvers"):
         raise unknown_name("list", what, (*LISTS, "solvers"))
     for title in [what] if what else [*LISTS, "solvers"]:
         rows = _solver_rows() if title == "solvers" else _plugin_rows(LISTS[title])
         columns = ("name", "version" if title == "solvers" else "from", "what", "options")
-        _print_frame(console, pd.DataFrame(rows, columns=columns), title)
+        print_frame(console, pd.DataFrame(rows, columns=columns), title)
 
 
 @app.command()
@@ -114,9 +110,40 @@ def show(
     else:
         raise unknown_name("table", table, (*derived, *TABLES))
     if form == "terminal":
-        _print_frame(_console(), frame, f"{path.parent.name}: {table}")
+        print_frame(new_console(), frame, f"{path.parent.name}: {table}")
     else:
         sys.stdout.write(tables.to_csv(frame) if form == "csv" else tables.to_markdown(frame))
+
+
+@app.command("replay")
+def replay_query(
+    run: Annotated[str, typer.Argument(metavar="RUN", help="A run folder, or the name of a study run before.")],
+    cell: Annotated[str, typer.Argument(metavar="CELL", help="Key of a cell, or its beginning.")],
+    query: Annotated[int | None, typer.Option(min=0, help="Which query; the worst of the cell unless given.")] = None,
+    out: Annotated[Path | None, typer.Option(help="File for the program; in RUN/replay unless given.")] = None,
+) -> None:
+    """Solve the quadratic program of one row again with every installed solver."""
+    recorded = recorded_cell(run, cell)
+    number = replay.worst_query(recorded) if query is None else query
+    file = out or recorded.path.parent / "replay" / f"{recorded.row['cell']}-{number}.npz"
+    frame = replay.replay(recorded, number, file)
+    console = new_console()
+    console.print(f"{recorded.cell}, query {number}: mu = {recorded.parameters[number].tolist()}", soft_wrap=True)
+    print_frame(console, frame, f"accuracy {recorded.cell.accuracy:g}, our residuals; distance of u from the record")
+    console.print(f"the program, as qpsolvers reads it: {file}", soft_wrap=True)
+
+
+@app.command()
+def export_qps(
+    run: Annotated[str, typer.Argument(metavar="RUN", help="A run folder, or the name of a study run before.")],
+    folder: Annotated[Path, typer.Argument(metavar="DIR", help="A folder that is new, or empty.")],
+) -> None:
+    """Write the reduced programs of a run and their solutions as a test set for QP solvers."""
+    count = replay.export(run, folder)
+    new_console().print(
+        f"{count} programs in {folder / 'programs'}; `python {folder / replay.CHECKER}` rechecks every solution",
+        soft_wrap=True,
+    )
 
 
 def main() -> None:
@@ -142,11 +169,6 @@ def _refuse(error: object, code: int = 2) -> int:
     return code
 
 
-def _console() -> Console:
-    console = Console(highlight=False)
-    return console if console.is_terminal else Console(highlight=False, width=WIDTH)
-
-
 def _list_matrix(console: Console, cells: list[Cell]) -> None:
     for cell in cells:
         console.print(f"{cell.key}  {cell}", markup=False, soft_wrap=True)
@@ -155,7 +177,7 @@ def _list_matrix(console: Console, cells: list[Cell]) -> None:
 
 def _summarise(console: Console, study: Study, folder: Path, outcome: Outcome, drawn: list[Path]) -> None:
     path = tables.results_file(str(folder))
-    _print_frame(console, tables.summary(tables.read(path, "cells")), study.name)
+    print_frame(console, tables.summary(tables.read(path, "cells")), study.name)
     short = [row for row in outcome.rows if row["status"] != Status.OK]
     for row in short:
         tolerance = "" if row["primal_tol"] is None else f" {row['primal_tol']:g}"
@@ -170,7 +192,8 @@ def _summarise(console: Console, study: Study, folder: Path, outcome: Outcome, d
     for violation in broken:
         console.print(f"invariant: {violation}; this is a bug of vibench or of a plugin's spaces")
     if not broken:
-        console.print(f"invariants of the inf-sup constants hold in all {len(queries)} queries")
+        console.print(f"invariants of the constants and the error bounds hold in all {len(queries)} queries")
+    console.print(agreement.sentence(tables.read(path, "disagreements")))
     console.print(f"results: {path}, tables: {folder / 'tables'}, {len(drawn)} figures: {folder / 'figures'}")
 
 
@@ -206,26 +229,3 @@ def _solver_rows() -> list[tuple[str, str, str, str]]:
         (name, provenance.solver_version(name), "installed" if name in installed else "not installed", "")
         for name in known
     ]
-
-
-def _print_frame(console: Console, frame: pd.DataFrame, title: str) -> None:
-    """Print a table; text columns that say the same in every row go into the title, and nothing is cut off."""
-    shared = [name for name in frame.columns if len(frame) > 1 and _same_text(frame[name])]
-    title = ", ".join([title, *(f"{name} {tables.cell_text(frame[name].iloc[0])}" for name in shared)])
-    table = Table(title=Text(title), title_justify="left", pad_edge=False, padding=(0, 1, 0, 0), box=box.SIMPLE_HEAD)
-    shown = frame.drop(columns=shared)
-    rows = [[tables.cell_text(value) for value in row] for row in shown.itertuples(index=False)]
-    for k, name in enumerate(shown.columns):
-        widest = max((len(word) for row in rows for word in row[k].split()), default=1)
-        numeric = pd.api.types.is_numeric_dtype(shown[name])
-        table.add_column(Text(str(name)), justify="right" if numeric else "left", min_width=min(widest, 24))
-    for row in rows:
-        table.add_row(*map(Text, row))
-    unbounded = console.options.update(width=10 * WIDTH)
-    natural = console.measure(table, options=unbounded).maximum
-    console.width = max(console.width, min(natural, WIDTH))  # better a wrapped line than a cut one
-    console.print(table)
-
-
-def _same_text(column: pd.Series) -> bool:
-    return not pd.api.types.is_numeric_dtype(column) and column.nunique(dropna=False) == 1

@@ -1,9 +1,9 @@
 """What must hold in every row of `queries`, whatever was run; a violation is a bug in our own linear algebra.
 
 Whole space ≥ own space ≥ V_N alone, whole space ≥ high-fidelity pair, own = whole space for per-parameter enrichments,
-cone ≥ span. The order is exact for the span; of intervals over the cone, the upper end of the larger constant is
-compared with the lower end of the smaller. Round-off is allowed for, in units of the constant of the whole space,
-which is no larger than the norm of the form.
+cone ≥ span; certified error bounds ≥ errors. The order is exact for the span; of intervals over the cone, the upper end
+of the larger constant is compared with the lower end of the smaller. Round-off is allowed for, in units of the constant
+of the whole space, which is no larger than the norm of the form.
 """
 
 from __future__ import annotations
@@ -17,6 +17,9 @@ import pandas as pd
 from vibench.cone_bounds import ABSOLUTE, RELATIVE
 from vibench.schema import CONSTANTS
 from vibench.strategy import Kind
+
+EFFECTIVITIES = ("effectivity_u", "effectivity_lambda")
+"""Certified bound over error: at least 1 wherever there is one."""
 
 ORDER = (("full_", ""), ("", "plain_"), ("full_", "hf_"))
 """Pairs of constants: the first is at least the second."""
@@ -44,8 +47,8 @@ def violations(queries: pd.DataFrame, kinds: pd.Series) -> list[Violation]:
     kinds
         How the enrichment of each cell depends on the parameter, by cell.
     """
-    constants = queries[list(CONSTANTS)].astype(float)
-    return list(_found(constants, queries["cell"].map(kinds)))
+    numbers = queries[[*CONSTANTS, *EFFECTIVITIES]].astype(float)
+    return list(_found(numbers, queries["cell"].map(kinds)))
 
 
 def _found(queries: pd.DataFrame, kind: pd.Series) -> Iterator[Violation]:
@@ -56,6 +59,10 @@ def _found(queries: pd.DataFrame, kind: pd.Series) -> Iterator[Violation]:
     for whose in ("", "full_", "plain_", "hf_"):
         yield from _at_least(queries, f"beta_{whose}cone_upper", f"beta_{whose}span", scale)
         yield from _at_least(queries, f"beta_{whose}cone_upper", f"beta_{whose}cone_lower", scale)
+    for name in EFFECTIVITIES:
+        below = queries[name] < 1.0
+        if below.any():
+            yield Violation(f"{name} ≥ 1", int(below.sum()), float(1.0 - queries[name].min()))
     online, of_online = queries[kind == Kind.PER_PARAMETER], scale[kind == Kind.PER_PARAMETER]
     for larger, smaller in (("span", "full_span"), ("cone_upper", "full_cone_lower")):
         yield from _at_least(online, f"beta_{larger}", f"beta_{smaller}", of_online)

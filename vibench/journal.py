@@ -13,7 +13,7 @@ from urllib.parse import quote
 import numpy as np
 
 from vibench.errors import RequestError
-from vibench.schema import TABLES, VERSION
+from vibench.schema import STORED, VERSION
 
 FILE = "results.sqlite"
 
@@ -53,10 +53,11 @@ class Journal:
 
     def _create(self, study: Mapping[str, Any]) -> None:
         self._db.execute("CREATE TABLE IF NOT EXISTS meta (key TEXT PRIMARY KEY, value TEXT)")
-        for table, columns in TABLES.items():
+        for table, columns in STORED.items():
             declared = ", ".join(f'"{name}" {kind}' for name, kind in columns.items())
             self._db.execute(f"CREATE TABLE IF NOT EXISTS {table} ({declared})")
-        self._db.execute("CREATE INDEX IF NOT EXISTS queries_of_cell ON queries(cell)")
+        for table in ("queries", "solutions"):
+            self._db.execute(f"CREATE INDEX IF NOT EXISTS {table}_of_cell ON {table}(cell)")
         entries = {"schema": str(VERSION), "study": json.dumps(study, sort_keys=True)}
         self._db.executemany("INSERT OR REPLACE INTO meta VALUES (?, ?)", entries.items())
 
@@ -70,13 +71,16 @@ class Journal:
         """Cells that have a row: key → (status, code)."""
         return {key: (status, code) for key, status, code in self._db.execute("SELECT cell, status, code FROM cells")}
 
-    def write_cell(self, cell: Mapping[str, Any], queries: Sequence[Mapping[str, Any]]) -> None:
-        """Write a cell and its queries in one transaction, in place of earlier rows of the same cell."""
+    def write_cell(
+        self, cell: Mapping[str, Any], queries: Sequence[Mapping[str, Any]], solutions: Sequence[Mapping[str, Any]] = ()
+    ) -> None:
+        """Write a cell, its queries and solutions in one transaction, in place of earlier rows of the same cell."""
         self._add_columns(queries)
         with self._db:
             self._db.execute("DELETE FROM cells WHERE cell = ?", (cell["cell"],))
             self._insert("cells", [cell])
             self._insert("queries", queries)
+            self._insert("solutions", solutions)
 
     def write_histories(self, artefact: str, rows: Sequence[Mapping[str, Any]]) -> None:
         """Write the histories of one artefact in place of its earlier ones."""
@@ -84,11 +88,11 @@ class Journal:
             self._db.execute("DELETE FROM histories WHERE artefact = ?", (artefact,))
             self._insert("histories", rows)
 
-    def write_thresholds(self, rows: Sequence[Mapping[str, Any]]) -> None:
-        """Replace the table of thresholds."""
+    def replace(self, table: str, rows: Sequence[Mapping[str, Any]]) -> None:
+        """Replace the whole of a table that follows from the others."""
         with self._db:
-            self._db.execute("DELETE FROM thresholds")
-            self._insert("thresholds", rows)
+            self._db.execute(f"DELETE FROM {table}")
+            self._insert(table, rows)
 
     def rows(self, table: str) -> list[dict[str, Any]]:
         """All rows of a table."""

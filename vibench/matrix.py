@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from itertools import product
 from typing import Any
 
@@ -81,6 +81,28 @@ class Cell:
         for plugin in ("problem", "dual", "primal"):
             del content[plugin]["code"]
         return digest(content)
+
+    @property
+    def definition(self) -> str:
+        """The cell as JSON, which `from_definition` reads."""
+        return json.dumps(asdict(self), sort_keys=True, ensure_ascii=False)
+
+    @classmethod
+    def from_definition(cls, text: str) -> Cell:
+        """The cell a definition describes, with its plugins as they are today.
+
+        Raises
+        ------
+        RequestError
+            If one of them is not installed any more.
+        """
+        content = json.loads(text)
+        for axis in ("problem", "dual", "primal"):
+            plugin = Plugin(**content[axis])
+            content[axis] = replace(plugin, code=plugins.code(plugin.kind, plugin.name))
+        for axis in ("pod", "cone"):
+            content[axis] = Stop(**content[axis])
+        return cls(**content | {"labels": tuple(content["labels"])})
 
     @property
     def code(self) -> str:

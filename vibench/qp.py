@@ -111,7 +111,7 @@ def solve(
     NumericalError
         If what the solver returns has the wrong shape.
     """
-    rows, cost = _row_norms(program.B), _scale(program.f)
+    rows, cost = row_norms(program.B), _scale(program.f)
     scaled = VariationalInequality(program.A / cost, program.f / cost, _divide_rows(program.B, rows), program.g / rows)
     if extra and solver in extra:
         answer = extra[solver](scaled, accuracy)
@@ -126,17 +126,36 @@ def solve(
     return replace(answer, alpha=np.maximum(alpha, 0.0), negative=-min(float(np.min(alpha, initial=0.0)), 0.0))
 
 
+@dataclass(frozen=True)
+class Scales:
+    """What the residuals of a solution are relative to; the primal one in units of each row's own norm."""
+
+    primal: float
+    dual: float
+    gap: float
+
+
+def scales(program: VariationalInequality, x: Array, alpha: Array) -> Scales:
+    """Denominators of the residuals of x (n,), α (m,); see `Residuals`."""
+    A, f, B, g = program.A, program.f, program.B, program.g
+    Ax = A @ x
+    return Scales(
+        primal=max(1.0, _peak(g / row_norms(B))),
+        dual=max(_peak(Ax), _peak(f), _peak(B.T @ alpha)),
+        gap=max(abs(0.5 * float(x @ Ax)), abs(float(f @ x)), abs(float(g @ alpha))),
+    )
+
+
 def residuals(program: VariationalInequality, x: Array, alpha: Array) -> Residuals:
     """Relative residuals of x (n,), α (m,) ≥ 0; see `Residuals`."""
     A, f, B, g = program.A, program.f, program.B, program.g
-    rows = _row_norms(B)
-    Ax, force = A @ x, B.T @ alpha
-    excess = (B @ x - g) / rows
-    primal = float(np.max(excess, initial=0.0)) / max(1.0, float(np.max(np.abs(g / rows), initial=0.0)))
-    dual = _ratio(_peak(Ax - f + force), max(_peak(Ax), _peak(f), _peak(force)))
-    energy, work, bound = float(x @ Ax), float(f @ x), float(g @ alpha)
-    gap = _ratio(abs(energy - work + bound), max(abs(0.5 * energy), abs(work), abs(bound)))
-    return Residuals(primal, dual, gap)
+    scale = scales(program, x, alpha)
+    Ax = A @ x
+    return Residuals(
+        primal=float(np.max((B @ x - g) / row_norms(B), initial=0.0)) / scale.primal,
+        dual=_ratio(_peak(Ax - f + B.T @ alpha), scale.dual),
+        gap=_ratio(abs(float(x @ Ax) - float(f @ x) + float(g @ alpha)), scale.gap),
+    )
 
 
 def judge(program: VariationalInequality, answer: Answer, accuracy: float) -> tuple[Status, str, Residuals | None]:
@@ -166,7 +185,7 @@ def infeasibility_certificate(program: VariationalInequality, tolerance: float =
     """α ≥ 0 with Bᵀα = 0 and gᵀα = −1 (Farkas), or `None` if no such α is found; dense programs only."""
     if not isinstance(program.B, np.ndarray) or not program.B.size:
         return None
-    rows = _row_norms(program.B)
+    rows = row_norms(program.B)
     system = np.vstack([(program.B / rows[:, None]).T, program.g / rows / _scale(program.g / rows)])
     target = np.zeros(system.shape[0])
     target[-1] = -1.0
@@ -207,7 +226,7 @@ def _plain(matrix: Any) -> Any:
     return matrix if isinstance(matrix, np.ndarray) else sp.csc_matrix(matrix)
 
 
-def _row_norms(B: SparseMatrix | Array) -> Array:
+def row_norms(B: SparseMatrix | Array) -> Array:
     """Euclidean norms (m,) of the rows, 1 where a row is zero."""
     squares = (B * B).sum(axis=1) if isinstance(B, np.ndarray) else B.multiply(B).sum(axis=1)
     norms = np.sqrt(np.asarray(squares, float).ravel())

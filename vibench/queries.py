@@ -5,36 +5,32 @@ from __future__ import annotations
 import resource
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
-from typing import Any
 
 import numpy as np
 
-from vibench import plugins, qp
 from vibench.arrays import Array
 from vibench.assembly import Assembled, AssemblyStage
-from vibench.assess import Reference, errors
+from vibench.assess import Reference
+from vibench.error_bounds import Stability
 from vibench.infsup import InfSup, Multipliers
-from vibench.problem import checked_assembly
 from vibench.qp import Status
+from vibench.query import Row, Task
 from vibench.reduced import ReducedModel
 from vibench.stage import Result, Stage, value_of
 from vibench.stages import reduced_model
 from vibench.store import Store
 from vibench.strategy import Kind
 from vibench.sweeps import ReferenceConstants, Solutions, gather, sweep, training
-from vibench.timing import Seconds, median_seconds
-
-Row = dict[str, Any]
-"""A row of a results table: column → value."""
+from vibench.timing import Seconds
 
 
 @dataclass(frozen=True)
 class CellRows:
-    """The rows one cell leaves: its own, and one per query."""
+    """The rows one cell leaves: its own, one per query, and the solutions of the queries that have one."""
 
     cell: Row
     queries: tuple[Row, ...]
+    solutions: tuple[Row, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -48,7 +44,7 @@ class QueriesStage(Stage):
 
     @property
     def reference(self) -> ReferenceConstants:
-        """The stage that knows β_HF."""
+        """The stage that knows the constants of the high-fidelity problem."""
         return ReferenceConstants(self.assembly.enrichment.pod.problem, self.assembly.count, self.assembly.seed)
 
     @property
@@ -71,65 +67,26 @@ class QueriesStage(Stage):
             for space, columns in ((model.problem.V, snapshots.u), (model.problem.W, snapshots.lam))
         )
         assembled: Assembled = value_of(store, self.assembly)
-        constants: list[InfSup] = value_of(store, self.reference)
-        rows = []
+        constants: list[Stability] = value_of(store, self.reference)
+        task = Task(self.solver, self.accuracy, self.query_seconds)
+        rows, solutions = [], []
         for k in range(len(reference.mu)):
             exact = Reference(reference.u[:, k], reference.lam[:, k], *floors)
+            found, solution = task.run(model, reference.mu[k], exact, constants[k], assembled.seconds[k])
             rows.append(
                 {f"mu_{i + 1}": float(value) for i, value in enumerate(reference.mu[k])}
                 | {"hf_s": reference.seconds[k].cpu}
-                | self._query(model, reference.mu[k], exact, assembled.seconds[k])
+                | found
                 | _constants("beta_", assembled.own[k])
                 | _constants("beta_full_", assembled.full[k])
                 | _constants("beta_plain_", assembled.plain[k])
-                | _constants("beta_hf_", constants[k])
+                | _constants("beta_hf_", constants[k].inf_sup)
                 | {"bounds": assembled.own[k].sharp}
             )
+            if solution is not None:
+                solutions.append({"query": k} | solution)
         cell = self._cell(store, model, prepared, rows) | self._offline(store, reference)
-        return Result(CellRows(cell, tuple(rows)))
-
-    def _query(self, model: ReducedModel, mu: Array, exact: Reference, assembly: Seconds) -> Row:
-        """Solve once per repeat (timed), judge, and compare (not timed)."""
-        reduced = model.assemble(mu)
-        program = reduced.program
-        work = partial(qp.solve, program, self.solver, self.accuracy, plugins.qp_solver(self.solver))
-        row: Row = {"assemble_s": assembly.cpu}
-        try:
-            answer, solving = median_seconds(work)
-        except (Exception, SystemExit) as error:  # noqa: BLE001  a solver may raise anything; the row says what
-            reason = " ".join(f"{type(error).__name__}: {error}".split())
-            return row | {"status": Status.ERROR.value, "reason": reason}
-        status, reason, residuals = qp.judge(program, answer, self.accuracy)
-        if solving.wall > self.query_seconds:
-            status, reason = Status.TIMEOUT, f"took {solving.wall:.1f} s, the limit is {self.query_seconds:g} s"
-        row |= {
-            "solve_s": solving.cpu,
-            "total_s": assembly.cpu + solving.cpu,
-            "total_wall_s": assembly.wall + solving.wall,
-            "status": status.value,
-            "reason": reason,
-            "solver_status": answer.solver_status,
-            "iterations": answer.iterations,
-        }
-        if residuals is None or answer.x is None or answer.alpha is None:
-            return row
-        found = errors(
-            model.problem,
-            checked_assembly(model.problem, mu),
-            exact,
-            reduced.basis @ answer.x,
-            model.generators @ answer.alpha,
-        )
-        return row | {
-            "primal_residual": residuals.primal,
-            "dual_residual": residuals.dual,
-            "gap": residuals.gap,
-            "error_u": found.u,
-            "error_lambda": found.lam,
-            "error_energy": found.energy,
-            "violation": found.violation,
-            "complementarity": found.complementarity,
-        }
+        return Result(CellRows(cell, tuple(rows), tuple(solutions)))
 
     def _cell(self, store: Store, model: ReducedModel, prepared: Multipliers, rows: Sequence[Row]) -> Row:
         """Sizes, and means and extremes over the queries."""
@@ -143,6 +100,7 @@ class QueriesStage(Stage):
         per_parameter = built.kind is Kind.PER_PARAMETER
         size = basis.shape[1]
         return summarise(rows) | {
+            "model": self.assembly.key,
             "enrichment_kind": built.kind.value,
             "dim_V": model.problem.V.dim,
             "dim_W": model.problem.W.dim,

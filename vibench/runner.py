@@ -17,6 +17,7 @@ from typing import Any, Protocol
 from pebble import ProcessExpired, ProcessPool
 
 from vibench import plugins, provenance, qp
+from vibench.agreement import disagreement_rows
 from vibench.assembly import AssemblyStage
 from vibench.errors import RequestError
 from vibench.journal import FILE, Journal, read_meta, study_of
@@ -25,14 +26,12 @@ from vibench.naming import HistoryNames, cell_columns
 from vibench.qp import Status
 from vibench.queries import CellRows, QueriesStage
 from vibench.stage import Stage
-from vibench.stages import ConeStage, EnrichmentStage, PODStage
-from vibench.store import History, Store
+from vibench.stages import enrichment_stage
+from vibench.store import ARTEFACTS, History, Store
 from vibench.study import Study
 from vibench.thresholds import threshold_rows
 from vibench.timing import one_thread
 from vibench.worker import Done, Failed, initialise, perform
-
-ARTEFACTS = "artefacts"
 
 
 class Observer(Protocol):
@@ -64,10 +63,7 @@ def identity(study: Study) -> dict[str, Any]:
 
 def queries_stage(cell: Cell, study: Study) -> QueriesStage:
     """The last stage of a cell; its inputs lead to all others."""
-    enrichment = EnrichmentStage(
-        PODStage(cell.problem, cell.pod), ConeStage(cell.problem, cell.dual, cell.cone), cell.primal, cell.primal_tol
-    )
-    assembly = AssemblyStage(enrichment, cell.assembly, cell.validation, cell.seed)
+    assembly = AssemblyStage(enrichment_stage(cell), cell.assembly, cell.validation, cell.seed)
     return QueriesStage(assembly, cell.solver, cell.accuracy, study.limits.query_seconds)
 
 
@@ -106,7 +102,11 @@ def run_study(
         interrupted = run.execute(todo, jobs)
         keys = {cell.key for cell in cells}
         rows = tuple(row for row in journal.rows("cells") if row["cell"] in keys)
-        journal.write_thresholds(threshold_rows(journal.rows("cells")))
+        everything = journal.rows("cells")
+        journal.replace("thresholds", threshold_rows(everything))
+        journal.replace(
+            "disagreements", disagreement_rows(everything, journal.rows("queries"), journal.rows("solutions"))
+        )
     finally:
         journal.close()
     return Outcome(rows, len(cells) - len(rows), interrupted)
@@ -266,7 +266,7 @@ class _Run:
         keys = cell_columns(cell)
         row = {"cell": cell.key, **keys, **found.cell, **self._provenance(cell)}
         queries = [{"cell": cell.key, **keys, "query": k, **query} for k, query in enumerate(found.queries)]
-        self.journal.write_cell(row, queries)
+        self.journal.write_cell(row, queries, [{"cell": cell.key, **solution} for solution in found.solutions])
         self.observer.cell(cell, row)
 
     def _provenance(self, cell: Cell) -> dict[str, Any]:
@@ -277,6 +277,7 @@ class _Run:
             "machine": provenance.machine(),
             "threads": 1,
             "versions": json.dumps(provenance.versions(cell.solver), sort_keys=True),
+            "definition": cell.definition,
         }
 
     def _write_histories(self, stage: Stage, histories: Iterable[History]) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-VERSION = 1
+VERSION = 2
 """Schema version of a results file; a file of another version is refused."""
 
 KEYS: Mapping[str, str] = {
@@ -27,6 +27,7 @@ KEYS: Mapping[str, str] = {
 CELLS: Mapping[str, str] = {
     "cell": "TEXT PRIMARY KEY",
     **KEYS,
+    "model": "TEXT",
     "status": "TEXT NOT NULL",
     "reason": "TEXT",
     "queries": "INTEGER",
@@ -68,7 +69,10 @@ CELLS: Mapping[str, str] = {
     "machine": "TEXT",
     "threads": "INTEGER",
     "versions": "TEXT",
+    "definition": "TEXT",
 }
+"""`model` names the reduced model, which cells that differ in their solver alone share; `definition` is the cell in
+JSON."""
 
 CONSTANTS = tuple(
     f"beta_{whose}{what}" for whose in ("", "full_", "plain_", "hf_") for what in ("span", "cone_lower", "cone_upper")
@@ -87,6 +91,12 @@ QUERIES: Mapping[str, str] = {
     "error_u": "REAL",
     "error_lambda": "REAL",
     "error_energy": "REAL",
+    "error_u_absolute": "REAL",
+    "error_lambda_absolute": "REAL",
+    "bound_u": "REAL",
+    "bound_lambda": "REAL",
+    "effectivity_u": "REAL",
+    "effectivity_lambda": "REAL",
     "violation": "REAL",
     "complementarity": "REAL",
     **dict.fromkeys(CONSTANTS, "REAL"),
@@ -99,7 +109,18 @@ QUERIES: Mapping[str, str] = {
     "gap": "REAL",
     "iterations": "INTEGER",
 }
-"""Beside these a query has mu_1, mu_2, …, as many as its problem has parameters."""
+"""Beside these a query has mu_1, mu_2, …, as many as its problem has parameters. Bounds are absolute; an effectivity is
+bound over absolute error."""
+
+SOLUTIONS: Mapping[str, str] = {
+    "cell": "TEXT NOT NULL REFERENCES cells(cell) ON DELETE CASCADE",
+    "query": "INTEGER",
+    "x": "BLOB",
+    "alpha": "BLOB",
+    "slack_linear": "REAL",
+    "slack_constant": "REAL",
+}
+"""What the solvers returned, as little-endian doubles, and what the accuracy leaves open (`vibench.agreement`)."""
 
 HISTORY_KEYS: Mapping[str, str] = {name: KEYS[name] for name in KEYS if name not in ("solver", "assembly")}
 
@@ -128,9 +149,27 @@ THRESHOLDS: Mapping[str, str] = {
     "meaning": "TEXT",
 }
 
+DISAGREEMENTS: Mapping[str, str] = {
+    **{name: KEYS[name] for name in KEYS if name != "solver"},
+    "solver_a": "TEXT",
+    "solver_b": "TEXT",
+    "queries": "INTEGER",
+    "difference_max": "REAL",
+    "query_worst": "INTEGER",
+    "allowed_worst": "REAL",
+    "flagged": "INTEGER",
+    "query_flagged": "INTEGER",
+}
+"""Every two solvers on one reduced model, over the queries both solved: relative differences of u in V."""
+
 TABLES: Mapping[str, Mapping[str, str]] = {
     "cells": CELLS,
     "queries": QUERIES,
     "histories": HISTORIES,
     "thresholds": THRESHOLDS,
+    "disagreements": DISAGREEMENTS,
 }
+"""The tables for reading; each is exported as CSV."""
+
+STORED: Mapping[str, Mapping[str, str]] = {**TABLES, "solutions": SOLUTIONS}
+"""All tables of the results file."""

@@ -72,7 +72,7 @@ SETTINGS: Mapping[str, SolverSettings] = {
         iterations="info.iter",
     ),
     "osqp": SolverSettings(  # a first-order method: its iteration limit decides between slow and inaccurate
-        lambda accuracy: {"eps_abs": 0.3 * accuracy, "eps_rel": 0.3 * accuracy, "max_iter": 10_000},
+        lambda accuracy: {"eps_abs": 0.1 * accuracy, "eps_rel": 0.3 * accuracy, "max_iter": 10_000},
         status="info.status",
         iterations="info.iter",
     ),

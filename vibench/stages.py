@@ -10,7 +10,7 @@ import numpy as np
 from vibench.arrays import Array
 from vibench.cone import orthogonality
 from vibench.infsup import Multipliers, beta_span, multipliers
-from vibench.matrix import Plugin
+from vibench.matrix import Cell, Plugin
 from vibench.pod import POD, pod
 from vibench.reduced import ReducedModel
 from vibench.stage import Result, Stage, build_problem, value_of
@@ -129,6 +129,12 @@ def _training_constants(
         History(key, "beta_span_training", tuple(own)),
         History(key, "beta_full_span_training", tuple(full[classes.members] * np.abs(classes.factors))),
     ]
+
+
+def enrichment_stage(cell: Cell) -> EnrichmentStage:
+    """The stage that completes the reduced model of a cell."""
+    cone = ConeStage(cell.problem, cell.dual, cell.cone)
+    return EnrichmentStage(PODStage(cell.problem, cell.pod), cone, cell.primal, cell.primal_tol)
 
 
 def reduced_model(store: Store, stage: EnrichmentStage) -> tuple[ReducedModel, Array, Multipliers]:

@@ -12,6 +12,9 @@ from typing import Any
 from vibench.provenance import machine
 from vibench.timing import Seconds
 
+ARTEFACTS = "artefacts"
+"""Folder of the artefacts within a run folder."""
+
 
 @dataclass(frozen=True)
 class History:

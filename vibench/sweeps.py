@@ -1,4 +1,4 @@
-"""High-fidelity sweeps: solutions over the training and the validation parameters, and β_HF."""
+"""High-fidelity sweeps: solutions over the training and the validation parameters, and their constants."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import numpy as np
 from vibench import highfidelity
 from vibench.arrays import Array
 from vibench.assess import constants_full
+from vibench.error_bounds import Stability, extreme_quotients
 from vibench.infsup import nodal_multipliers
 from vibench.matrix import Plugin
 from vibench.problem import Problem, check_coercive, checked_assembly
@@ -104,7 +105,7 @@ def gather(store: Store, chunks: tuple[Stage, ...]) -> Solutions:
 
 @dataclass(frozen=True)
 class ReferenceConstants(Stage):
-    """Inf-sup constants β_HF of the high-fidelity pair at the validation parameters."""
+    """Constants of the high-fidelity problem at the validation parameters: β_HF, coercivity and continuity."""
 
     problem: Plugin
     count: int
@@ -115,7 +116,10 @@ class ReferenceConstants(Stage):
         return ()
 
     def run(self, store: Store) -> Result:  # noqa: ARG002
-        """One `InfSup` per parameter."""
+        """One `Stability` per parameter."""
         problem = build_problem(self.problem)
-        matrices = [checked_assembly(problem, mu).B for mu in problem.validation_set(self.count, self.seed)]
-        return Result(constants_full(problem.V, matrices, nodal_multipliers(problem.W)))
+        assembled = [checked_assembly(problem, mu) for mu in problem.validation_set(self.count, self.seed)]
+        inf_sup = constants_full(problem.V, [vi.B for vi in assembled], nodal_multipliers(problem.W))
+        different = assembled[:1] if "A" in problem.constant else assembled
+        quotients = [extreme_quotients(vi.A, problem.V) for vi in different] * (len(assembled) // len(different))
+        return Result([Stability(found, *extremes) for found, extremes in zip(inf_sup, quotients, strict=True)])

@@ -1,0 +1,117 @@
+"""The disagreement audit: solvers that are both `ok` on the same reduced problem must agree as far as accuracy says.
+
+For two solutions k = 1, 2 of min ½xᵀAx − fᵀx, Bx ≤ g, with α_k ≥ 0, residuals r_k = Ax_k − f + Bᵀα_k, excesses
+p_k = (Bx_k − g)₊ and gaps δ_k = x_kᵀAx_k − fᵀx_k + gᵀα_k, the difference d = x₁ − x₂ satisfies
+
+    dᵀAd ≤ dᵀ(r₁ − r₂) + Σ_k (δ_k − x_kᵀr_k) + p₁ᵀα₂ + p₂ᵀα₁.
+
+Where every relative residual is at most ε, each term has a bound that belongs to one of the two solutions; with the
+smallest eigenvalue of A they give ‖d‖² ≤ (l₁ + l₂)‖d‖ + c₁ + c₂. In a V-orthonormal basis ‖d‖ is the distance of the
+two displacements in V.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from itertools import combinations
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from vibench.arrays import Array
+from vibench.problem import VariationalInequality
+from vibench.qp import Status, row_norms, scales
+from vibench.schema import DISAGREEMENTS, KEYS
+
+
+@dataclass(frozen=True)
+class Slack:
+    """What an accuracy leaves open around one solution: its shares l and c of the bound above."""
+
+    linear: float
+    constant: float
+
+
+def slack(program: VariationalInequality, x: Array, alpha: Array, accuracy: float) -> Slack:
+    """Slack of a solution x (n,), α (m,) whose three relative residuals are at most `accuracy`."""
+    scale = scales(program, x, alpha)
+    smallest = float(np.linalg.eigvalsh(program.A)[0])
+    if not smallest > 0.0:
+        return Slack(float("inf"), float("inf"))
+    excess = scale.primal * float(row_norms(program.B) @ alpha)
+    constant = accuracy * (scale.gap + float(np.abs(x).sum()) * scale.dual + excess)
+    return Slack(accuracy * np.sqrt(len(x)) * scale.dual / smallest, constant / smallest)
+
+
+def allowed(first: Slack, second: Slack) -> float:
+    """The largest ‖x₁ − x₂‖ that two slacks allow."""
+    half = 0.5 * (first.linear + second.linear)
+    return float(half + np.sqrt(half**2 + first.constant + second.constant))
+
+
+@dataclass(frozen=True)
+class Recorded:
+    """An `ok` answer of one solver to one query: x (N',) and its slack."""
+
+    solver: str
+    query: int
+    x: Array
+    slack: Slack
+
+
+def disagreement_rows(
+    cells: Iterable[Mapping[str, Any]], queries: Iterable[Mapping[str, Any]], solutions: Iterable[Mapping[str, Any]]
+) -> list[dict[str, Any]]:
+    """Rows of the disagreements table from rows of the cells, queries and solutions tables."""
+    fine = {(row["cell"], row["query"]) for row in queries if row["status"] == Status.OK}
+    known = {cell["cell"]: cell for cell in cells if cell["model"]}
+    answers: dict[str, list[Recorded]] = {}
+    for row in solutions:
+        if (row["cell"], row["query"]) in fine:
+            cell, left_open = known[row["cell"]], Slack(row["slack_linear"], row["slack_constant"])
+            x = np.frombuffer(row["x"], "<f8")
+            answers.setdefault(cell["model"], []).append(Recorded(cell["solver"], row["query"], x, left_open))
+    keys = {cell["model"]: {name: cell[name] for name in DISAGREEMENTS if name in KEYS} for cell in known.values()}
+    return [keys[model] | row for model, found in answers.items() for row in compare(found)]
+
+
+def sentence(disagreements: pd.DataFrame) -> str:
+    """The audit in a line."""
+    if disagreements.empty:
+        return "no two solvers were ok on the same reduced problem"
+    pairs, flagged = int(disagreements["queries"].sum()), int(disagreements["flagged"].sum())
+    worst = disagreements.loc[disagreements["difference_max"].idxmax()]
+    largest = f"u differs by at most {worst['difference_max']:.1e} ({worst['solver_a']} and {worst['solver_b']})"
+    if not flagged:
+        return f"solvers that were ok on the same reduced problem agree in all {pairs} comparisons: {largest}"
+    return f"solvers disagree by more than the accuracy allows in {flagged} of {pairs} comparisons: {largest}"
+
+
+def compare(answers: Iterable[Recorded]) -> Iterator[dict[str, Any]]:
+    """For every two solvers of one reduced model: how far apart they are, and how often farther than allowed."""
+    by_solver: dict[str, dict[int, Recorded]] = {}
+    for answer in answers:
+        by_solver.setdefault(answer.solver, {})[answer.query] = answer
+    for a, b in combinations(sorted(by_solver), 2):
+        common = sorted(by_solver[a].keys() & by_solver[b].keys())
+        if common:
+            yield {"solver_a": a, "solver_b": b, **_differences(by_solver[a], by_solver[b], common)}
+
+
+def _differences(a: Mapping[int, Recorded], b: Mapping[int, Recorded], queries: list[int]) -> dict[str, Any]:
+    apart = np.array([float(np.linalg.norm(a[k].x - b[k].x)) for k in queries])
+    limits = np.array([allowed(a[k].slack, b[k].slack) for k in queries])
+    sizes = np.array([float(np.linalg.norm(a[k].x)) for k in queries])
+    relative = apart / np.where(sizes > 0.0, sizes, 1.0)
+    far = apart > limits
+    worst = int(np.argmax(relative))
+    return {
+        "queries": len(queries),
+        "difference_max": float(relative[worst]),
+        "query_worst": queries[worst],
+        "allowed_worst": float(limits[worst] / (sizes[worst] or 1.0)),
+        "flagged": int(far.sum()),
+        "query_flagged": queries[int(np.argmax(far))] if far.any() else None,
+    }

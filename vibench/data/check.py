@@ -1,0 +1,62 @@
+"""Recompute the residuals of every solution of this test set; needs NumPy, and nothing of the tool that wrote it.
+
+Programs are min ½ xᵀPx + qᵀx subject to Gx ≤ h, in programs/NAME.npz; solutions x and multipliers z ≥ 0 of
+Px + q + Gᵀz = 0 are x_SOLVER and z_SOLVER in solutions/NAME.npz; rows.csv says what was claimed of each. With the rows
+of G and h divided by the norms of the rows of G, the relative residuals are
+
+    primal  max(Gx − h)₊ / max(1, |h|∞)
+    dual    |Px + q + Gᵀz|∞ / max(|Px|∞, |q|∞, |Gᵀz|∞)      (P, q, G, z as they are)
+    gap     |xᵀPx + qᵀx + hᵀz| / max(½|xᵀPx|, |qᵀx|, |hᵀz|)  (likewise)
+
+Usage: python check.py [FOLDER]. Exit code 1 if a row that claims "ok" is not, or a claimed residual is another number.
+"""
+
+from __future__ import annotations
+
+import csv
+import sys
+from pathlib import Path
+
+import numpy as np
+
+ROUND_OFF = 1e-13
+"""Two computations of a residual may differ by this much."""
+
+
+def residuals(P: np.ndarray, q: np.ndarray, G: np.ndarray, h: np.ndarray, x: np.ndarray, z: np.ndarray) -> list[float]:
+    """Primal and dual residual and gap, as defined above."""
+    norms = np.sqrt(np.sum(G**2, axis=1))
+    norms[norms == 0.0] = 1.0
+    primal = max(0.0, ((G @ x - h) / norms).max(initial=0.0)) / max(1.0, abs(h / norms).max(initial=0.0))
+    parts = [P @ x, q, G.T @ z]
+    largest = max(abs(part).max(initial=0.0) for part in parts)
+    dual = abs(sum(parts)).max(initial=0.0) / (largest or 1.0)
+    terms = [float(x @ P @ x), float(q @ x), float(h @ z)]
+    size = max(0.5 * abs(terms[0]), abs(terms[1]), abs(terms[2]))
+    return [primal, dual, abs(sum(terms)) / (size or 1.0)]
+
+
+def main(folder: Path) -> int:
+    """Check all rows; the number of those that are wrong."""
+    wrong, count, fine = 0, 0, 0
+    with (folder / "rows.csv").open(newline="") as file:
+        for row in csv.DictReader(file):
+            count += 1
+            program = np.load(folder / "programs" / f"{row['program']}.npz", allow_pickle=False)
+            solution = np.load(folder / "solutions" / f"{row['program']}.npz", allow_pickle=False)
+            x, z = solution[f"x_{row['solver']}"], solution[f"z_{row['solver']}"]
+            finite = bool(np.all(np.isfinite(x)) and np.all(np.isfinite(z)))
+            found = residuals(program["P"], program["q"], program["G"], program["h"], x, z)
+            claimed = [float(row[name] or "nan") for name in ("primal_residual", "dual_residual", "gap")]
+            honest = all(abs(a - b) <= ROUND_OFF + 1e-6 * abs(b) for a, b in zip(found, claimed, strict=True))
+            good = finite and z.min(initial=0.0) >= 0.0 and max(found) <= float(row["accuracy"]) + ROUND_OFF
+            fine += row["status"] == "ok"
+            if not honest or (row["status"] == "ok" and not good):
+                wrong += 1
+                print(f"{row['program']} {row['solver']}: {row['status']}, claimed {claimed}, found {found}")
+    print(f"{count} solutions, {fine} claimed ok, {wrong} wrong")
+    return wrong
+
+
+if __name__ == "__main__":
+    sys.exit(1 if main(Path(sys.argv[1] if len(sys.argv) > 1 else Path(__file__).parent)) else 0)

@@ -1,0 +1,107 @@
+"""One query: a reduced problem solved (timed), judged, and compared with the high-fidelity solution (not timed)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from vibench import plugins, qp
+from vibench.agreement import Slack, slack
+from vibench.arrays import Array
+from vibench.assess import Reference, errors
+from vibench.error_bounds import Stability, bounds
+from vibench.problem import checked_assembly
+from vibench.qp import Answer, Status
+from vibench.reduced import ReducedModel, ReducedProblem
+from vibench.timing import Seconds, median_seconds
+
+Row = dict[str, Any]
+"""A row of a results table: column → value."""
+
+UNMEASURABLE = 1e-8
+"""Relative errors below this may be those of the high-fidelity solution: no effectivity is made of them."""
+
+
+@dataclass(frozen=True)
+class Task:
+    """How the queries of a cell are solved and judged."""
+
+    solver: str
+    accuracy: float
+    query_seconds: float
+
+    def run(
+        self, model: ReducedModel, mu: Array, exact: Reference, stability: Stability, assembly: Seconds
+    ) -> tuple[Row, Row | None]:
+        """The columns of one query, and of its solution if there is one; `assembly` is what assembling takes."""
+        reduced = model.assemble(mu)
+        program = reduced.program
+        work = partial(qp.solve, program, self.solver, self.accuracy, plugins.qp_solver(self.solver))
+        row: Row = {"assemble_s": assembly.cpu}
+        try:
+            answer, solving = median_seconds(work)
+        except (Exception, SystemExit) as error:  # noqa: BLE001  a solver may raise anything; the row says what
+            reason = " ".join(f"{type(error).__name__}: {error}".split())
+            return row | {"status": Status.ERROR.value, "reason": reason}, None
+        status, reason, residuals = qp.judge(program, answer, self.accuracy)
+        if solving.wall > self.query_seconds:
+            status, reason = Status.TIMEOUT, f"took {solving.wall:.1f} s, the limit is {self.query_seconds:g} s"
+        row |= {
+            "solve_s": solving.cpu,
+            "total_s": assembly.cpu + solving.cpu,
+            "total_wall_s": assembly.wall + solving.wall,
+            "status": status.value,
+            "reason": reason,
+            "solver_status": answer.solver_status,
+            "iterations": answer.iterations,
+        }
+        if residuals is None or answer.x is None or answer.alpha is None:
+            return row, None
+        row |= {"primal_residual": residuals.primal, "dual_residual": residuals.dual, "gap": residuals.gap}
+        row |= _assessed(model, mu, reduced, answer.x, answer.alpha, exact, stability)
+        return row, solution_row(answer, slack(program, answer.x, answer.alpha, self.accuracy))
+
+
+def _assessed(
+    model: ReducedModel, mu: Array, reduced: ReducedProblem, x: Array, alpha: Array, exact: Reference, known: Stability
+) -> Row:
+    """Errors, their certified bounds and effectivities."""
+    problem, vi = model.problem, checked_assembly(model.problem, mu)
+    u, lam = reduced.basis @ x, model.generators @ alpha
+    found = errors(problem, vi, exact, u, lam)
+    row = {
+        "error_u": found.u,
+        "error_lambda": found.lam,
+        "error_energy": found.energy,
+        "error_u_absolute": found.absolute_u,
+        "error_lambda_absolute": found.absolute_lam,
+        "violation": found.violation,
+        "complementarity": found.complementarity,
+    }
+    certified = bounds(problem, vi, known, u, lam)
+    if certified is not None:
+        row |= {"bound_u": certified.u, "bound_lambda": certified.lam}
+        if found.u > UNMEASURABLE:
+            row["effectivity_u"] = certified.u / found.absolute_u
+        if found.lam > UNMEASURABLE:
+            row["effectivity_lambda"] = certified.lam / found.absolute_lam
+    return row
+
+
+def solution_row(answer: Answer, left_open: Slack) -> Row:
+    """Columns of the solutions table."""
+    return {
+        "x": np.asarray(answer.x, "<f8").tobytes(),
+        "alpha": np.asarray(answer.alpha, "<f8").tobytes(),
+        "slack_linear": left_open.linear,
+        "slack_constant": left_open.constant,
+    }
+
+
+def vectors(row: Mapping[str, Any]) -> tuple[Array, Array]:
+    """X and α of a row of the solutions table."""
+    return np.frombuffer(row["x"], "<f8"), np.frombuffer(row["alpha"], "<f8")
