@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import scipy.sparse as sp
 
@@ -50,3 +52,8 @@ class Varying(Problem):
             B=sp.csr_array(-weights),
             g=weights @ (0.3 + 0.2 * x * mu[0]),
         )
+
+
+def fitted_rate(widths: Sequence[float], errors: Sequence[float]) -> float:
+    """Slope of the errors over the mesh widths, both logarithmic."""
+    return float(np.polyfit(np.log(widths), np.log(errors), 1)[0])

@@ -20,6 +20,9 @@ from vibench.space import InnerProduct
 ACCURACY = 1e-10
 """Relative KKT accuracy of every snapshot."""
 
+CONDENSED_SHARE = 10
+"""Systems are condensed on the multipliers where there are this many times more displacements."""
+
 MAX_ITERATIONS = 100
 FALLBACK_SOLVER = "piqp"
 
@@ -57,8 +60,8 @@ class Solver:
     Parameters
     ----------
     problem
-        Its declaration `constant` decides how the systems are solved: condensed on the multipliers where A is constant,
-        as sparse saddle-point systems elsewhere.
+        Its declaration `constant` decides how the systems are solved: condensed on the multipliers where A is constant
+        and they are few, as sparse saddle-point systems elsewhere.
     """
 
     def __init__(self, problem: Problem) -> None:
@@ -74,7 +77,8 @@ class Solver:
             If the assembly is wrong, the solution does not reach `ACCURACY`, or the problem refuses it.
         """
         vi = checked_assembly(self._problem, mu)
-        if "A" in self._problem.constant and self._stiffness is None:
+        few = CONDENSED_SHARE * vi.B.shape[0] <= vi.B.shape[1]
+        if few and "A" in self._problem.constant and self._stiffness is None:
             self._stiffness = InnerProduct(vi.A)
         found = solve(vi, self._stiffness)
         reason = self._problem.refuse(mu, found.u, found.lam)

@@ -36,7 +36,7 @@ def disc_in_square(nodes: int, radius: float) -> MeshTri:
         If the disc's boundary could not be resolved.
     """
     rings = rings_for(nodes * np.pi * radius**2)
-    disc_points, disc_triangles = _disc(rings, radius)
+    disc_points, disc_triangles = rings_in_disc(rings, radius)
     wanted = nodes - len(disc_points)
     spacing = np.sqrt((1.0 - np.pi * radius**2) / max(wanted, 1) * 2.0 / np.sqrt(3.0))
     outside = _outside(spacing, radius)
@@ -83,7 +83,7 @@ def _cross(u: Array, v: Array) -> Array:
     return np.asarray(u[0] * v[1] - u[1] * v[0])
 
 
-def _disc(rings: int, radius: float) -> tuple[Array, NDArray[np.int64]]:
+def rings_in_disc(rings: int, radius: float) -> tuple[Array, NDArray[np.int64]]:
     """Nodes (n×2), ring by ring from the centre, and triangles (k×3), six congruent sectors."""
     points = [np.zeros((1, 2))]
     for k in range(1, rings + 1):
