@@ -17,11 +17,11 @@ PARAMETERS = [np.array((h, c)) for h in np.linspace(0.14, 0.2, 6) for c in np.li
 
 INTRODUCTION = """# The radial obstacle problem against its closed form
 
-Made by `python results/exact_answers.py > results/exact-answers.md`. Relative errors of u in V and of λ in L², means over
-36 parameters; the rate is that from the level before. P1 displacements are of order 1. The multiplier jumps at the edge
-of the contact, which P1 functions follow with order ½ only: on meshes made of rings the error of λ is √h times a factor
-that depends on where between two rings the edge lies, which is why the rates of single parameters scatter. The closed
-form is derived in `problems/vibench_problems/radial.py`.
+Made by `python results/exact_answers.py > results/exact-answers.md`. Relative errors of u in V and of λ in L²,
+means over 36 parameters; the rate is that from the level before. P1 displacements are of order 1. The multiplier
+jumps at the edge of the contact, which P1 functions follow with order ½ only: on meshes made of rings the error of
+λ is √h times a factor that depends on where between two rings the edge lies, which is why the rates of single
+parameters scatter. The closed form is derived in `problems/vibench_problems/radial.py`.
 """
 
 
