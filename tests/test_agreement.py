@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from numerics import spd
 from vibench import qp
-from vibench.agreement import Recorded, Slack, allowed, compare, disagreement_rows, sentence, slack
+from vibench.agreement import Recorded, Slack, allowed, compare, disagreement_rows, sentence, slack, solution_row
 from vibench.problem import VariationalInequality
 from vibench.schema import KEYS
 
@@ -68,10 +68,7 @@ def test_only_ok_answers_of_the_same_reduced_model_are_compared() -> None:
     queries = [{"cell": str(c), "query": q, "status": "ok"} for c in (1, 2, 3) for q in (0, 1)]
     queries[3]["status"] = "inaccurate"  # cell 2, query 1
     x = np.array([1.0, 2.0])
-    solutions = [
-        {"cell": q["cell"], "query": q["query"], "x": x.tobytes(), "slack_linear": 0.0, "slack_constant": 0.0}
-        for q in queries
-    ]
+    solutions = [{"cell": q["cell"], "query": q["query"], **solution_row(x, x, Slack(0.0, 0.0))} for q in queries]
     (row,) = disagreement_rows(cells, queries, solutions)
     assert (row["dual"], row["queries"], row["flagged"], row["difference_max"]) == ("of m", 1, 0, 0.0)
 

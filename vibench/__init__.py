@@ -9,7 +9,20 @@ if TYPE_CHECKING:
 
 
 def load(run: str, cell: str) -> ReducedModel:
-    """The reduced model of a row of a run, ready for queries; see `vibench.loading.load`."""
-    from vibench import loading  # noqa: PLC0415  `import vibench` alone stays cheap
+    """The reduced model of a row of a run, ready for queries.
 
-    return loading.load(run, cell)
+    Parameters
+    ----------
+    run
+        Run folder, or name of a study run before.
+    cell
+        Key of the cell, or its beginning.
+
+    Raises
+    ------
+    RequestError
+        If there is no such run or cell, or other code computed it.
+    """
+    from vibench.loading import recorded_cell  # noqa: PLC0415  `import vibench` alone stays cheap
+
+    return recorded_cell(run, cell).model

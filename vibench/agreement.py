@@ -51,6 +51,21 @@ def allowed(first: Slack, second: Slack) -> float:
     return float(half + np.sqrt(half**2 + first.constant + second.constant))
 
 
+def solution_row(x: Array, alpha: Array, left_open: Slack) -> dict[str, Any]:
+    """Columns of the solutions table."""
+    return {
+        "x": np.asarray(x, "<f8").tobytes(),
+        "alpha": np.asarray(alpha, "<f8").tobytes(),
+        "slack_linear": left_open.linear,
+        "slack_constant": left_open.constant,
+    }
+
+
+def vectors(row: Mapping[str, Any]) -> tuple[Array, Array]:
+    """The two vectors, x and α, of a row of the solutions table."""
+    return np.frombuffer(row["x"], "<f8"), np.frombuffer(row["alpha"], "<f8")
+
+
 @dataclass(frozen=True)
 class Recorded:
     """An `ok` answer of one solver to one query: x (N',) and its slack."""
@@ -71,8 +86,8 @@ def disagreement_rows(
     for row in solutions:
         if (row["cell"], row["query"]) in fine:
             cell, left_open = known[row["cell"]], Slack(row["slack_linear"], row["slack_constant"])
-            x = np.frombuffer(row["x"], "<f8")
-            answers.setdefault(cell["model"], []).append(Recorded(cell["solver"], row["query"], x, left_open))
+            answer = Recorded(cell["solver"], row["query"], vectors(row)[0], left_open)
+            answers.setdefault(cell["model"], []).append(answer)
     keys = {cell["model"]: {name: cell[name] for name in DISAGREEMENTS if name in KEYS} for cell in known.values()}
     return [keys[model] | row for model, found in answers.items() for row in compare(found)]
 

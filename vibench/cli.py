@@ -94,7 +94,7 @@ def list_plugins(
 @app.command()
 def show(
     run: Annotated[str, typer.Argument(metavar="RUN", help="A run folder, or the name of a study run before.")],
-    table: Annotated[str, typer.Option(help="summary, benefits, cells, queries, histories or thresholds.")] = "summary",
+    table: Annotated[str, typer.Option(help=f"summary, benefits, {', '.join(TABLES)}.")] = "summary",
     form: Annotated[
         Literal["terminal", "markdown", "csv"], typer.Option("--format", help="How to print it.")
     ] = "terminal",

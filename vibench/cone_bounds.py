@@ -16,7 +16,7 @@ import scipy.linalg
 from scipy.optimize import nnls
 
 from vibench.arrays import Array
-from vibench.copositive import entrywise_bound, semidefinite_bound, split_bound
+from vibench.copositive import ROUNDED, entrywise_bound, semidefinite_bound, split_bound
 
 GAP = 0.01
 """Relative width below which an interval is narrow enough."""
@@ -65,7 +65,7 @@ def _ladder(C: Array, G: Array, uppers: dict[str, float]) -> Iterator[dict[str, 
     alpha = simplex_minimiser(C)
     image = C @ alpha
     norm = float(np.linalg.norm(image))
-    nonnegative = bool(G.min() >= -1e-14)
+    nonnegative = bool(G.min() >= -ROUNDED)
     yield {
         "U0": float(np.sqrt(np.min(np.diag(M) / np.diag(G)))),
         "U1": _quotient(C, G, alpha),
@@ -88,7 +88,7 @@ def _starts(M: Array, G: Array, alpha: Array) -> list[Array]:
     """Where the descent starts: the simplex minimiser, the best generator, the pair of smallest entrywise quotient."""
     best, pair = np.zeros(len(G)), np.zeros(len(G))
     best[np.argmin(np.diag(M) / np.diag(G))] = 1.0
-    touching = G > 1e-14
+    touching = G > ROUNDED
     quotients = np.where(touching, M / np.where(touching, G, 1.0), np.inf)
     pair[list(np.unravel_index(int(np.argmin(quotients)), G.shape))] = 1.0
     return [alpha, best, pair, np.ones(len(G))]

@@ -19,6 +19,9 @@ from vibench.arrays import Array
 SWEEPS = 1500
 """Iterations of the alternating direction method for one semidefinite program, at most."""
 
+ROUNDED = 1e-14
+"""Entries of a Gram matrix of unit vectors below this are zeros that were rounded."""
+
 CHECK = 50
 """Iterations between two looks at the bound they lead to."""
 
@@ -79,10 +82,10 @@ def _below(x: Array) -> float:
 def entrywise_bound(M: Array, G: Array) -> float:
     """The largest t ≥ 0 with M ≥ tG entrywise where G is positive, corrected for negative M where it is zero; or 0.
 
-    Entries of G below 1e-14 are zeros that were rounded; with −n the smallest entry of M there,
+    Where G is zero but for round-off (`ROUNDED`), with −n the smallest entry of M there,
     αᵀ(M − tG)α ≥ −n (Σα)² ≥ −n R αᵀGα.
     """
-    touching = G > 1e-14
+    touching = G > ROUNDED
     negative = -float(np.min(M[~touching], initial=0.0))
     return max(0.0, float(np.min(M[touching] / G[touching])) - len(G) * negative)
 
@@ -134,7 +137,7 @@ def split_bound(M: Array, G: Array, upper: float, target: float) -> tuple[float,
 
 def _edge(part: _Part) -> tuple[int, int]:
     """The two generators whose forms are farthest from what the bound needs."""
-    quotients = part.M - np.where(part.G > 1e-14, part.G, 0.0) * np.diag(part.M).min()
+    quotients = part.M - np.where(part.G > ROUNDED, part.G, 0.0) * np.diag(part.M).min()
     np.fill_diagonal(quotients, np.inf)
     i, j = np.unravel_index(int(np.argmin(quotients)), quotients.shape)
     return int(min(i, j)), int(max(i, j))

@@ -2,20 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
-import numpy as np
-
 from vibench import plugins, qp
-from vibench.agreement import Slack, slack
+from vibench.agreement import slack, solution_row
 from vibench.arrays import Array
 from vibench.assess import Reference, errors
 from vibench.error_bounds import Stability, bounds
 from vibench.problem import checked_assembly
-from vibench.qp import Answer, Status
+from vibench.qp import Status
 from vibench.reduced import ReducedModel, ReducedProblem
 from vibench.timing import Seconds, median_seconds
 
@@ -63,7 +60,7 @@ class Task:
             return row, None
         row |= {"primal_residual": residuals.primal, "dual_residual": residuals.dual, "gap": residuals.gap}
         row |= _assessed(model, mu, reduced, answer.x, answer.alpha, exact, stability)
-        return row, solution_row(answer, slack(program, answer.x, answer.alpha, self.accuracy))
+        return row, solution_row(answer.x, answer.alpha, slack(program, answer.x, answer.alpha, self.accuracy))
 
 
 def _assessed(
@@ -90,18 +87,3 @@ def _assessed(
         if found.lam > UNMEASURABLE:
             row["effectivity_lambda"] = certified.lam / found.absolute_lam
     return row
-
-
-def solution_row(answer: Answer, left_open: Slack) -> Row:
-    """Columns of the solutions table."""
-    return {
-        "x": np.asarray(answer.x, "<f8").tobytes(),
-        "alpha": np.asarray(answer.alpha, "<f8").tobytes(),
-        "slack_linear": left_open.linear,
-        "slack_constant": left_open.constant,
-    }
-
-
-def vectors(row: Mapping[str, Any]) -> tuple[Array, Array]:
-    """X and α of a row of the solutions table."""
-    return np.frombuffer(row["x"], "<f8"), np.frombuffer(row["alpha"], "<f8")

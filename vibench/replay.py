@@ -13,12 +13,12 @@ import pandas as pd
 import qpsolvers
 
 from vibench import plugins, qp
+from vibench.agreement import vectors
 from vibench.arrays import Array
 from vibench.errors import RequestError
 from vibench.loading import RecordedCell, recorded_cells
 from vibench.problem import VariationalInequality
 from vibench.qp import Answer, Status
-from vibench.query import vectors
 from vibench.timing import median_seconds
 
 CHECKER = "check.py"

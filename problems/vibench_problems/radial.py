@@ -20,10 +20,6 @@ from vibench_problems.obstacle import mass, paraboloid, stiffness, unit_load
 RINGS = {"coarse": 11, "medium": 20, "paper": 34, "fine": 68}
 """Rings of nodes behind each named resolution: 397, 1261, 3571 and 14 077 nodes."""
 
-ZONE = 0.5
-"""Radius of the potential contact zone ω, as a share of that of Ω."""
-
-
 Radially = Callable[[Array], Array]
 """A function of the distance from the centre."""
 
@@ -74,8 +70,9 @@ class RadialSolution:
 class Radial(Problem):
     """Membrane of load −1 on the unit disc above ψ(x) = −h − c|x|², h and c the parameters; solved by hand.
 
-    P1 displacements, zero on the circle, P1 multipliers on |x| ≤ ½. Only g depends on mu. For checking whatever claims
-    to solve obstacle problems against an answer that no mesh has touched.
+    P1 displacements, zero on the circle, P1 multipliers on the inner half of the rings: |x| ≤ ½, or 5/11 at "coarse".
+    Only g depends on mu. For checking whatever claims to solve obstacle problems against an answer that no mesh has
+    touched.
 
     Parameters
     ----------
@@ -109,7 +106,8 @@ class Radial(Problem):
         self._stiffness = laplacian[self.free][:, self.free]
         self._load = -unit_load.assemble(self._basis)[self.free]
         self._coupling = -disc_mass[:, self.free]
-        self._obstacle = (unit_load.assemble(self._disc), paraboloid.assemble(self._disc, intorder=4))
+        self._one = unit_load.assemble(self._disc)[self.disc_nodes]
+        self._square = paraboloid.assemble(self._disc, intorder=4)[self.disc_nodes]
         self.V = InnerProduct((mass.assemble(self._basis) + length**2 * laplacian)[self.free][:, self.free])
         self.W = InnerProduct(disc_mass[:, self.disc_nodes])
 
@@ -119,8 +117,9 @@ class Radial(Problem):
 
     def assemble(self, mu: Array) -> VariationalInequality:
         """The forms of the obstacle problem; b = −∫ v η and g = −∫ ψ η, so that B u ≤ g says u ≥ ψ."""
-        one, square = (part[self.disc_nodes] for part in self._obstacle)
-        return VariationalInequality(A=self._stiffness, f=self._load, B=self._coupling, g=mu[0] * one + mu[1] * square)
+        return VariationalInequality(
+            A=self._stiffness, f=self._load, B=self._coupling, g=mu[0] * self._one + mu[1] * self._square
+        )
 
     def exact(self, mu: Array) -> RadialSolution:
         """The solution in closed form at mu = (h, c)."""
