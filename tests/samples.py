@@ -11,6 +11,8 @@ from typing import Any
 
 import fake_plugins
 from vibench.schema import CELLS, QUERIES
+from vibench.stage import Stage
+from vibench.store import Store
 
 STUDY: Mapping[str, Any] = {
     "name": "sample",
@@ -144,3 +146,12 @@ def wire_study(**axes: Any) -> dict[str, Any]:
         "tolerances": [{"pod": [1e-3], "dual": [1e-2]}],
     }
     return content | axes
+
+
+def carry_out(stage: Stage, store: Store) -> None:
+    """Run a stage after all it needs, as the runner does."""
+    for needed in stage.inputs():
+        if store.get(needed.key) is None:
+            carry_out(needed, store)
+    result = stage.run(store)
+    store.put(stage.key, result.value, result.seconds, result.histories)

@@ -116,6 +116,7 @@ def test_ends_where_everything_is_reproduced() -> None:
     one = np.array([1.0, 2.0, 0.0, 1.0])
     cone = greedy_cone(np.column_stack([one, 2.0 * one, one]), X, Stop(tolerance=1e-9), nothing)
     assert cone.size == 1
+    assert greedy_cone(np.column_stack([one, 2.0 * one, one]), X, Stop(size=3), nothing).size == 1
     everything = greedy_cone(np.eye(4)[:, :2], X, Stop(size=9), nothing)
     assert everything.size == 2
     assert everything.errors[-1] == 0.0

@@ -39,6 +39,19 @@ def test_no_other_basis_of_the_size_does_better(seed: int) -> None:
     assert tail(snapshots, found.basis, X) <= tail(snapshots, other, X) + 1e-12
 
 
+@given(seeds, st.integers(1, 6), st.integers(0, 3), st.floats(1e-14, 1e-6))
+def test_copies_and_near_copies_add_nothing(seed: int, count: int, copies: int, near: float) -> None:
+    X = space(10, seed)
+    rng = np.random.default_rng(seed)
+    single = rng.standard_normal((10, count))
+    repeated = single[:, rng.integers(count, size=copies)] * (1.0 + near * rng.standard_normal((10, copies)))
+    found = pod(np.hstack([single, repeated]), X, Stop(tolerance=1e-4)).basis
+    assert found.shape[1] <= count
+    assert np.allclose(X.gram(found, found), np.eye(found.shape[1]), atol=1e-12)
+    if count == 1:
+        assert np.isclose(abs(X.gram(found, single)[0, 0]), X.norm(single)[0], rtol=1e-6)
+
+
 def test_the_smallest_size_that_meets_the_tolerance_is_taken() -> None:
     X = space(8)
     q = X.orthonormalise(np.random.default_rng(0).standard_normal((8, 4)))

@@ -57,6 +57,18 @@ def test_residuals_as_defined_by_hand() -> None:
     assert np.isclose(found.gap, 0.5 / 2.0)  # 2 − 2 + 0.5 over max(1, 2, 0.5)
 
 
+def test_the_gap_of_a_solution_that_is_round_off_is_relative_to_the_energy_of_the_load() -> None:
+    vi = VariationalInequality(A=2.0 * np.eye(2), f=np.array([2.0, 0.0]), B=np.array([[1.0, 0.0]]), g=np.zeros(1))
+    found = qp.residuals(vi, np.array([1e-17, 0.0]), np.array([2.0]))
+    assert np.isclose(found.gap, 2e-17 / (1e-4 * 4.0**2 / (2.0 * 8.0)))  # 1e-17·2 over 1e-4 (fᵀf)²/2fᵀAf
+
+
+def test_without_unknowns_there_is_nothing_to_solve_but_something_to_violate() -> None:
+    for bound, status in ((1.0, "ok"), (-1.0, "infeasible")):
+        vi = VariationalInequality(np.zeros((0, 0)), np.zeros(0), np.zeros((1, 0)), np.array([bound]))
+        assert qp.judge(vi, qp.solve(vi, "osqp", 1e-8), 1e-8)[0] == status
+
+
 @pytest.mark.parametrize("solver", ["piqp", "proxqp", "osqp"])
 @pytest.mark.parametrize("accuracy", [1e-5, 1e-7])
 def test_required_solvers_reach_the_accuracy_they_are_asked_for(solver: str, accuracy: float) -> None:

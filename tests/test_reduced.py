@@ -2,6 +2,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from numerics import Varying
 from vibench import highfidelity, qp
@@ -55,6 +57,29 @@ def test_a_training_snapshot_is_reproduced_when_it_is_in_the_spaces(solved, kind
         assert np.allclose(query.basis @ answer.x, exact.u, atol=1e-8)
         if kind is Kind.PER_PARAMETER:  # only a stable pair makes the multiplier unique
             assert np.allclose(reduced.generators @ answer.alpha, exact.lam, atol=1e-4)
+
+
+@given(st.integers(14, 40), st.integers(3, 8), st.integers(1, 6), st.integers(0, 5))
+@settings(max_examples=30)
+def test_any_training_snapshot_in_the_spaces_is_reproduced(n: int, m: int, count: int, which: int) -> None:
+    """With supremizers the pair is stable, so u ∈ V_N' and λ in the cone make both the solution of the reduced QP."""
+    problem = Varying(n, m, count)
+    mus = problem.training_set()
+    solutions = [highfidelity.solve(problem.assemble(mu)) for mu in mus]
+    contact = [s for s in solutions if s.lam.any()]
+    if not contact:
+        return
+    online = Enrichment(Kind.PER_PARAMETER, supply=lambda V, vi, span: supremizers(V, vi.B, span))
+    chi = np.column_stack([s.lam for s in contact])
+    cone = multipliers(chi / problem.W.norm(chi), problem.W)
+    basis = problem.V.orthonormalise(np.column_stack([s.u for s in solutions]))
+    reduced = ReducedModel(problem, basis, online, cone.chi, cone.span)
+    exact = solutions[which % count]
+    query = reduced.assemble(mus[which % count])
+    answer = qp.solve(query.program, "piqp", 1e-12)
+    u, lam = query.basis @ answer.x, reduced.generators @ answer.alpha
+    assert problem.V.norm(u - exact.u) <= 1e-6 * problem.V.norm(exact.u)
+    assert problem.W.norm(lam - exact.lam) <= 1e-4 * max(problem.W.norm(s.lam) for s in contact)
 
 
 def test_bases_are_orthonormal_and_v_n_comes_first(solved) -> None:

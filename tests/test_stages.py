@@ -7,12 +7,13 @@ import numpy as np
 import pytest
 import scipy.linalg
 
+from samples import carry_out
 from vibench import sweeps
 from vibench.assembly import AssemblyStage
 from vibench.errors import NumericalError
 from vibench.matrix import Plugin
 from vibench.queries import QueriesStage, summarise
-from vibench.stage import Stage, value_of
+from vibench.stage import value_of
 from vibench.stages import ConeStage, EnrichmentStage, PODStage, reduced_model
 from vibench.store import Store
 from vibench.strategy import Kind, Stop
@@ -30,15 +31,6 @@ def cell(primal: str, tolerance: float | None, solver: str = "piqp") -> QueriesS
         tolerance,
     )
     return QueriesStage(AssemblyStage(enrichment, "full", 9, 3), solver, 1e-8, 20.0)
-
-
-def carry_out(stage: Stage, store: Store) -> None:
-    """Run a stage after all it needs, as the runner does."""
-    for needed in stage.inputs():
-        if store.get(needed.key) is None:
-            carry_out(needed, store)
-    result = stage.run(store)
-    store.put(stage.key, result.value, result.seconds, result.histories)
 
 
 @pytest.fixture(scope="module")

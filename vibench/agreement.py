@@ -37,7 +37,7 @@ class Slack:
 def slack(program: VariationalInequality, x: Array, alpha: Array, accuracy: float) -> Slack:
     """Slack of a solution x (n,), α (m,) whose three relative residuals are at most `accuracy`."""
     scale = scales(program, x, alpha)
-    smallest = float(np.linalg.eigvalsh(program.A)[0])
+    smallest = float(np.min(np.linalg.eigvalsh(program.A), initial=np.inf))
     if not smallest > 0.0:
         return Slack(float("inf"), float("inf"))
     excess = scale.primal * float(row_norms(program.B) @ alpha)

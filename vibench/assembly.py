@@ -7,7 +7,7 @@ from functools import partial
 
 from vibench.assess import constants_full, constants_on
 from vibench.infsup import InfSup, inf_sup_on
-from vibench.problem import checked_assembly
+from vibench.problem import checked_assembly, validation_parameters
 from vibench.stage import Result, Stage
 from vibench.stages import EnrichmentStage, reduced_model
 from vibench.store import Store
@@ -51,7 +51,7 @@ class AssemblyStage(Stage):
         """Time every assembly and compute the constants of the spaces it leads to."""
         model, basis, prepared = reduced_model(store, self.enrichment)
         problem = model.problem
-        mus = problem.validation_set(self.count, self.seed)
+        mus = validation_parameters(problem, self.count, self.seed)
         measured, own, matrices = [], [], []
         for mu in mus:
             reduced, seconds = median_seconds(partial(model.assemble, mu))

@@ -14,6 +14,9 @@ from vibench.greedy import LazyMaximum
 from vibench.space import InnerProduct
 from vibench.strategy import Cone, Stop, no_free
 
+REPRODUCED = 1e-12
+"""Relative distances below this are round-off."""
+
 Subtract = Callable[[Array, Array], tuple[Array, str]]
 """From a snapshot θ (m,) and the generators so far (m×r): the part Υ ∈ K_r of θ to leave out, and a fallback note."""
 
@@ -75,13 +78,13 @@ def greedy_cone(snapshots: Array, W: InnerProduct, stop: Stop, subtract: Subtrac
     generators, in_whitened = np.zeros((W.dim, 0)), np.zeros((W.dim, 0))
     pick, error = int(np.argmax(norms >= norms.max() * (1.0 - 1e-9))), 1.0
     errors, fallbacks = [error], []
-    while not stop.reached(generators.shape[1], error) and generators.shape[1] < snapshots.shape[1]:
+    while not stop.reached(generators.shape[1], error) and error > REPRODUCED:
         part, note = subtract(snapshots[:, pick], generators)
         if note:
             fallbacks.append(f"generator {generators.shape[1] + 1}: {note}")
         direction = snapshots[:, pick] - part
         length = float(W.norm(direction))
-        if length <= 1e-12 * norms[pick]:
+        if length <= REPRODUCED * norms[pick]:
             break
         generators = np.column_stack([generators, direction / length])
         in_whitened = W.whiten(generators)

@@ -36,14 +36,17 @@ class LazyMaximum:
         self.evaluations = 0
 
     def next(self, evaluate: Callable[[int], float]) -> tuple[int, float]:
-        """Index and value of the largest indicator now; `evaluate(p)` computes the indicator of index p."""
+        """Index of the largest indicator now, the smallest within `TIE`, and the largest value.
+
+        `evaluate(p)` computes the indicator of index p.
+        """
         fresh = np.zeros(len(self._bounds), dtype=bool)
         while True:
-            candidates = np.flatnonzero(self._bounds >= self._bounds.max() - self._tie)
+            largest = float(self._bounds.max())
+            candidates = np.flatnonzero(self._bounds >= largest - self._tie)
             stale = candidates[~fresh[candidates]]
             if not len(stale):
-                best = int(candidates[0])
-                return best, float(self._bounds[best])
+                return int(candidates[0]), largest
             p = int(stale[0])
             self._bounds[p] = min(self._bounds[p], evaluate(p))
             fresh[p] = True

@@ -14,7 +14,7 @@ from vibench import tables
 from vibench.arrays import Array
 from vibench.errors import RequestError
 from vibench.matrix import Cell
-from vibench.problem import VariationalInequality
+from vibench.problem import VariationalInequality, validation_parameters
 from vibench.reduced import ReducedModel
 from vibench.stage import Stage
 from vibench.stages import enrichment_stage, reduced_model
@@ -63,7 +63,7 @@ class RecordedCell:
     @cached_property
     def parameters(self) -> Array:
         """The validation parameters (queries×d)."""
-        return self.model.problem.validation_set(self.cell.validation, self.cell.seed)
+        return validation_parameters(self.model.problem, self.cell.validation, self.cell.seed)
 
     def program(self, query: int) -> VariationalInequality:
         """The reduced quadratic program of one query, exactly as it was solved."""

@@ -158,6 +158,31 @@ def check_coercive(problem: Problem, mu: Array) -> None:
     InnerProduct(problem.assemble(mu).A, f"A at mu = {mu.tolist()}")
 
 
+def training_parameters(problem: Problem) -> Array:
+    """The training set (P×d), refused with a line if it is empty, of the wrong shape or not finite.
+
+    Raises
+    ------
+    NumericalError
+        Saying what was wrong and what would be right.
+    """
+    return _checked(problem, "training_set", np.asarray(problem.training_set(), float), None)
+
+
+def validation_parameters(problem: Problem, count: int, seed: int) -> Array:
+    """The validation set (count×d), checked likewise."""
+    return _checked(problem, "validation_set", np.asarray(problem.validation_set(count, seed), float), count)
+
+
+def _checked(problem: Problem, name: str, mus: Array, count: int | None) -> Array:
+    expected = f"({'P' if count is None else count}, {problem.parameters.dim}){' with P > 0' if count is None else ''}"
+    if mus.ndim != 2 or mus.shape[1] != problem.parameters.dim or not len(mus) or count not in (None, len(mus)):
+        raise NumericalError(f"{name} has shape {mus.shape}, expected {expected}")
+    if not np.all(np.isfinite(mus)):
+        raise NumericalError(f"{name} has parameters that are not finite")
+    return mus
+
+
 def checked_assembly(problem: Problem, mu: Array) -> VariationalInequality:
     """`problem.assemble(mu)`, refused with a line that names the fault if shapes are wrong or values not finite.
 

@@ -22,6 +22,9 @@ from vibench.errors import NumericalError, unknown_name
 from vibench.problem import VariationalInequality
 from vibench.solver_settings import SETTINGS, settings_for
 
+ENERGY_FLOOR = 1e-4
+"""The gap is relative to no less than this share of the energy that a steepest descent step would gain."""
+
 
 class Status(StrEnum):
     """What became of a query, from good to bad; the order is the severity a cell inherits."""
@@ -74,7 +77,9 @@ class Residuals:
     dual
         ‖A x − f + Bᵀα‖∞ over max(‖A x‖∞, ‖f‖∞, ‖Bᵀα‖∞).
     gap
-        |xᵀA x − fᵀx + gᵀα| over max(|½ xᵀA x|, |fᵀx|, |gᵀα|).
+        |xᵀA x − fᵀx + gᵀα| over max(|½ xᵀA x|, |fᵀx|, |gᵀα|, `ENERGY_FLOOR` (fᵀf)² / 2fᵀA f). The last term is a share
+        of what one step of steepest descent from 0 gains: where constraints leave next to nothing of that energy, the
+        others are round-off.
     """
 
     primal: float
@@ -111,6 +116,8 @@ def solve(
     NumericalError
         If what the solver returns has the wrong shape.
     """
+    if not len(program.f):
+        return Answer(np.zeros(0), np.zeros(len(program.g)), "nothing to solve: no unknowns")
     rows, cost = row_norms(program.B), _scale(program.f)
     scaled = VariationalInequality(program.A / cost, program.f / cost, _divide_rows(program.B, rows), program.g / rows)
     if extra and solver in extra:
@@ -142,8 +149,14 @@ def scales(program: VariationalInequality, x: Array, alpha: Array) -> Scales:
     return Scales(
         primal=max(1.0, _peak(g / row_norms(B))),
         dual=max(_peak(Ax), _peak(f), _peak(B.T @ alpha)),
-        gap=max(abs(0.5 * float(x @ Ax)), abs(float(f @ x)), abs(float(g @ alpha))),
+        gap=max(abs(0.5 * float(x @ Ax)), abs(float(f @ x)), abs(float(g @ alpha)), ENERGY_FLOOR * _descent(A, f)),
     )
+
+
+def _descent(A: SparseMatrix | Array, f: Array) -> float:
+    """(fᵀf)² / 2fᵀA f: the energy that the best multiple of f gains, a part of what A⁻¹f would."""
+    curvature = float(f @ (A @ f))
+    return 0.5 * float(f @ f) ** 2 / curvature if curvature > 0.0 else 0.0
 
 
 def residuals(program: VariationalInequality, x: Array, alpha: Array) -> Residuals:
@@ -183,7 +196,7 @@ def judge(program: VariationalInequality, answer: Answer, accuracy: float) -> tu
 
 def infeasibility_certificate(program: VariationalInequality, tolerance: float = 1e-10) -> Array | None:
     """α ≥ 0 with Bᵀα = 0 and gᵀα = −1 (Farkas), or `None` if no such α is found; dense programs only."""
-    if not isinstance(program.B, np.ndarray) or not program.B.size:
+    if not isinstance(program.B, np.ndarray) or not len(program.g):
         return None
     rows = row_norms(program.B)
     system = np.vstack([(program.B / rows[:, None]).T, program.g / rows / _scale(program.g / rows)])

@@ -12,6 +12,7 @@ from vibench.cone import orthogonality
 from vibench.infsup import Multipliers, beta_span, multipliers
 from vibench.matrix import Cell, Plugin
 from vibench.pod import POD, pod
+from vibench.problem import training_parameters
 from vibench.reduced import ReducedModel
 from vibench.stage import Result, Stage, build_problem, value_of
 from vibench.store import History, Store
@@ -96,7 +97,7 @@ class EnrichmentStage(Stage):
         problem = build_problem(self.pod.problem)
         basis: POD = value_of(store, self.pod)
         reduced: ReducedCone = value_of(store, self.cone)
-        offline = Offline(problem, basis.basis, reduced.cone, reduced.prepared.span, problem.training_set())
+        offline = Offline(problem, basis.basis, reduced.cone, reduced.prepared.span, training_parameters(problem))
         strategy = self.primal.create()
         enrichment, seconds = timed(lambda: strategy.build(offline, self.tolerance))
         key = {"stage": "enrichment"}

@@ -13,7 +13,13 @@ from vibench.assess import constants_full
 from vibench.error_bounds import Stability, extreme_quotients
 from vibench.infsup import nodal_multipliers
 from vibench.matrix import Plugin
-from vibench.problem import Problem, check_coercive, checked_assembly
+from vibench.problem import (
+    Problem,
+    check_coercive,
+    checked_assembly,
+    training_parameters,
+    validation_parameters,
+)
 from vibench.stage import Result, Stage, build_problem, value_of
 from vibench.store import History, Store
 from vibench.timing import NO_TIME, Seconds, Stopwatch
@@ -50,7 +56,7 @@ class HighFidelity(Stage):
     def run(self, store: Store) -> Result:  # noqa: ARG002
         """Assemble and solve at every parameter of the chunk."""
         problem = build_problem(self.problem)
-        everything = problem.training_set() if self.purpose == "training" else self._validation(problem)
+        everything = training_parameters(problem) if self.purpose == "training" else self._validation(problem)
         first, mus = self._part(everything)
         u, lam = np.zeros((problem.V.dim, len(mus))), np.zeros((problem.W.dim, len(mus)))
         seconds, fallbacks, solver = [], [], highfidelity.Solver(problem)
@@ -66,7 +72,7 @@ class HighFidelity(Stage):
         return Result(solutions, sum(seconds, NO_TIME), self._diagnostics(problem, mus, first))
 
     def _validation(self, problem: Problem) -> Array:
-        return problem.validation_set(self.count, self.seed)
+        return validation_parameters(problem, self.count, self.seed)
 
     def _part(self, everything: Array) -> tuple[int, Array]:
         edges = np.linspace(0, len(everything), CHUNKS + 1).round().astype(int)
@@ -118,7 +124,7 @@ class ReferenceConstants(Stage):
     def run(self, store: Store) -> Result:  # noqa: ARG002
         """One `Stability` per parameter."""
         problem = build_problem(self.problem)
-        assembled = [checked_assembly(problem, mu) for mu in problem.validation_set(self.count, self.seed)]
+        assembled = [checked_assembly(problem, mu) for mu in validation_parameters(problem, self.count, self.seed)]
         inf_sup = constants_full(problem.V, [vi.B for vi in assembled], nodal_multipliers(problem.W))
         different = assembled[:1] if "A" in problem.constant else assembled
         quotients = [extreme_quotients(vi.A, problem.V) for vi in different] * (len(assembled) // len(different))

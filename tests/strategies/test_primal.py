@@ -4,6 +4,8 @@ import pickle
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from numerics import Varying
 from vibench import highfidelity
@@ -75,6 +77,38 @@ def test_pga_keeps_its_promise_at_every_training_parameter(request, setting: str
         own, online = inf_sup_on(Z, B, cone), inf_sup_full(V, B, cone)
         for what in ("span", "cone_upper"):
             assert getattr(own, what) >= np.sqrt(1.0 - delta**2) * getattr(online, what) * (1.0 - 1e-9)
+
+
+@given(
+    st.integers(12, 40),
+    st.integers(3, 9),
+    st.integers(1, 6),
+    st.integers(1, 5),
+    st.integers(1, 4),
+    st.floats(1e-6, 0.99),
+)
+@settings(max_examples=40)
+def test_pga_on_any_small_problem(n: int, m: int, count: int, modes: int, generators: int, delta: float) -> None:
+    """σ falls, σ ≤ δ and β_S ≥ √(1 − δ²) β_on over the whole training set, for dimensions of every kind."""
+    data = offline(Varying(n, m, count), count, modes, min(generators, count))
+    problem, V = data.problem, data.problem.V
+    enrichment = OfflinePGA().build(data, delta)
+    sigma = enrichment.history["sigma"]
+    assert np.all(np.diff(sigma) <= 1e-9)
+    assert len(sigma) == enrichment.vectors.shape[1] + 1
+    Z = np.hstack([data.basis, enrichment.vectors])
+    cone = multipliers(data.cone.generators, problem.W)
+    worst = 0.0
+    for mu in data.training:
+        B = problem.assemble(mu).B
+        target = orthonormal_range(V.whiten(supremizers(V, B, data.span)))
+        sine = float(singular_values(remove(V.whiten(Z), target)).max(initial=0.0))
+        worst = max(worst, sine)
+        own, online = inf_sup_on(Z, B, cone), inf_sup_full(V, B, cone)
+        for what in ("span", "cone_upper"):
+            assert getattr(own, what) >= np.sqrt(1.0 - sine**2) * getattr(online, what) * (1.0 - 1e-9)
+    assert worst <= delta + 1e-9
+    assert np.isclose(worst, sigma[-1], atol=1e-8)
 
 
 def test_pga_adds_vectors_from_the_training_supremizers(varying: Offline) -> None:

@@ -6,7 +6,8 @@ of G and h divided by the norms of the rows of G, the relative residuals are
 
     primal  max(Gx − h)₊ / max(1, |h|∞)
     dual    |Px + q + Gᵀz|∞ / max(|Px|∞, |q|∞, |Gᵀz|∞)      (P, q, G, z as they are)
-    gap     |xᵀPx + qᵀx + hᵀz| / max(½|xᵀPx|, |qᵀx|, |hᵀz|)  (likewise)
+    gap     |xᵀPx + qᵀx + hᵀz| / max(½|xᵀPx|, |qᵀx|, |hᵀz|, 1e-4 (qᵀq)² / 2qᵀPq)  (likewise; the last one a share
+            of the energy that a step of steepest descent gains, for solutions that are zero up to round-off)
 
 Usage: python check.py [FOLDER]. Exit code 1 if a row that claims "ok" is not, or a claimed residual is another number.
 """
@@ -32,7 +33,9 @@ def residuals(P: np.ndarray, q: np.ndarray, G: np.ndarray, h: np.ndarray, x: np.
     largest = max(abs(part).max(initial=0.0) for part in parts)
     dual = abs(sum(parts)).max(initial=0.0) / (largest or 1.0)
     terms = [float(x @ P @ x), float(q @ x), float(h @ z)]
-    size = max(0.5 * abs(terms[0]), abs(terms[1]), abs(terms[2]))
+    curvature = float(q @ P @ q)
+    floor = 1e-4 * float(q @ q) ** 2 / (2.0 * curvature) if curvature > 0.0 else 0.0
+    size = max(0.5 * abs(terms[0]), abs(terms[1]), abs(terms[2]), floor)
     return [primal, dual, abs(sum(terms)) / (size or 1.0)]
 
 

@@ -1,0 +1,92 @@
+"""What the plain and the modified greedy promise for every family of snapshots, degenerate ones included."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import scipy.sparse as sp
+from hypothesis import given
+from hypothesis import strategies as st
+
+from vibench.arrays import Array
+from vibench.cone import project
+from vibench.space import InnerProduct
+from vibench.strategy import Stop
+from vibench_strategies.cpg import CPG
+from vibench_strategies.mcpg import ModifiedCPG
+
+M = 12
+GREEDIES = pytest.mark.parametrize("strategy", [CPG(), ModifiedCPG()], ids=["cpg", "mcpg"])
+
+
+def line_mass() -> InnerProduct:
+    """The consistent mass matrix of a line: whitening destroys signs, as on the meshes."""
+    return InnerProduct(sp.diags_array([4.0 * np.ones(M), np.ones(M - 1), np.ones(M - 1)], offsets=[0, 1, -1]) / M)
+
+
+W = line_mass()
+
+
+@st.composite
+def families(draw: st.DrawFn) -> Array:
+    """Nonnegative snapshots (12×Q) with exact zeros, some of them zero, copies, multiples or nearly parallel."""
+    rng = np.random.default_rng(draw(st.integers(0, 10_000)))
+    columns: list[Array] = []
+    kinds = st.sampled_from(["new", "bump", "zero", "copy", "multiple", "nearly"])
+    for kind in draw(st.lists(kinds, min_size=1, max_size=8)):
+        source = columns[rng.integers(len(columns))] if columns else rng.random(M)
+        columns.append(
+            {
+                "new": rng.random(M) * (rng.random(M) < 0.6),
+                "bump": np.maximum(0.0, 1.0 - ((np.arange(M) - 11.0 * rng.random()) / 4.0) ** 2),
+                "zero": np.zeros(M),
+                "copy": source.copy(),
+                "multiple": 10.0 ** rng.integers(-6, 3) * source,
+                "nearly": source * (1.0 + 1e-9 * rng.random(M)),
+            }[kind]
+        )
+    return np.column_stack(columns)
+
+
+@GREEDIES
+@given(families())
+def test_cones_are_nested_errors_fall_and_generators_are_unit_vectors_of_w_plus(strategy, theta: Array) -> None:
+    cone = strategy.reduce(theta, W, Stop(size=theta.shape[1]))
+    chi, errors = cone.generators, cone.errors
+    assert np.all(chi >= 0.0)
+    assert np.allclose(W.norm(chi), 1.0, atol=1e-12)
+    assert np.all(np.diff(errors) <= 1e-12)
+    for r in range(cone.size):
+        shorter = strategy.reduce(theta, W, Stop(size=r)).generators
+        assert np.array_equal(shorter, chi[:, :r])
+
+
+@GREEDIES
+@given(families())
+def test_without_a_limit_every_snapshot_is_reproduced(strategy, theta: Array) -> None:
+    cone = strategy.reduce(theta, W, Stop(size=theta.shape[1]))
+    largest = max(float(W.norm(theta).max()), 1e-300)
+    for snapshot in theta.T:
+        assert project(cone.generators, snapshot, W).distance <= 1e-7 * largest
+
+
+@GREEDIES
+@given(families(), st.floats(1e-6, 0.9))
+def test_the_tolerance_is_met_and_not_before_its_time(strategy, theta: Array, tolerance: float) -> None:
+    cone = strategy.reduce(theta, W, Stop(tolerance=tolerance))
+    largest = float(W.norm(theta).max())
+    if largest == 0.0:
+        assert cone.size == 0
+        return
+    distances = [[project(cone.generators[:, :r], q, W).distance for q in theta.T] for r in (cone.size, cone.size - 1)]
+    assert max(distances[0]) <= (tolerance + 1e-8) * largest
+    assert max(distances[1]) > (tolerance - 1e-8) * largest
+
+
+@given(families())
+def test_the_modified_cone_contains_the_snapshots_it_was_made_from(theta: Array) -> None:
+    """Remark 4.1: each step keeps the cone of the snapshots chosen so far inside."""
+    cone = ModifiedCPG().reduce(theta, W, Stop(size=theta.shape[1]))
+    for r in range(1, cone.size + 1):
+        inside = sum(project(cone.generators[:, :r], q, W).distance <= 1e-7 * W.norm(q) for q in theta.T)
+        assert inside >= r
