@@ -136,6 +136,18 @@ def test_a_claim_is_not_believed() -> None:
     assert found is not None
 
 
+@pytest.mark.parametrize(
+    ("load", "x", "alpha", "name"), [(2.0, 0.5, 1.0, "gap"), (6.0, 3.0, 0.0, "primal")], ids=["gap", "primal"]
+)
+def test_one_residual_alone_makes_an_answer_inaccurate(load: float, x: float, alpha: float, name: str) -> None:
+    """The program, min x² − load·x subject to x ≤ 1, has a solution: nothing here is infeasible."""
+    vi = VariationalInequality(A=np.array([[2.0]]), f=np.array([load]), B=np.array([[1.0]]), g=np.ones(1))
+    status, reason, found = qp.judge(vi, Answer(np.array([x]), np.array([alpha]), "solved"), 1e-6)
+    assert status is Status.INACCURATE
+    assert reason.startswith(f"{name} residual")
+    assert [key for key in ("primal", "dual", "gap") if getattr(found, key) > 0.0] == [name]
+
+
 def test_negative_multipliers_are_set_to_zero_and_reported() -> None:
     vi = VariationalInequality(np.eye(2), np.ones(2), np.array([[1.0, 0.0], [0.0, 1.0]]), np.array([0.5, 0.5]))
 

@@ -7,6 +7,7 @@ from typing import ClassVar
 import numpy as np
 
 from vibench.arrays import Array
+from vibench.errors import NumericalError
 from vibench.greedy import TIE, LazyMaximum
 from vibench.linalg import orthonormal_range, remove, svd
 from vibench.strategy import Enrichment, Kind, Offline, PrimalStrategy
@@ -29,6 +30,11 @@ class OfflinePGA(PrimalStrategy):
 
         Training parameters whose constraint matrices are proportional share one supremizer space and count once.
         σ only falls as S grows (Lemma 3.2), so the maximum is taken lazily.
+
+        Raises
+        ------
+        NumericalError
+            If the tolerance is not reached with every supremizer there is.
         """
         if tolerance is None:
             raise ValueError("the projected greedy algorithm needs a tolerance")
@@ -44,6 +50,8 @@ class OfflinePGA(PrimalStrategy):
             history.append(sigma)
             if sigma <= tolerance:
                 break
+            if grown.shape[1] == grown.shape[0]:
+                raise NumericalError(f"all supremizers leave σ = {sigma:.0e}, above the tolerance {tolerance:g}")
             grown = np.column_stack([grown, targets[worst].worst_direction(grown)])
         added = space.vectors(grown[:, modes:])
         return Enrichment(Kind.FIXED, vectors=added, history={"sigma": np.array(history)})

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 from numerics import Varying
 from vibench import highfidelity
+from vibench.errors import NumericalError
 from vibench.infsup import inf_sup_full, inf_sup_on, multipliers
 from vibench.linalg import orthonormal_range, remove, singular_values
 from vibench.strategy import Cone, Kind, Offline, no_free
@@ -167,3 +168,8 @@ def test_lazy_and_plain_pga_choose_the_same_vectors(monkeypatch, varying: Offlin
 def test_pga_without_a_tolerance_is_refused(varying: Offline) -> None:
     with pytest.raises(ValueError, match="needs a tolerance"):
         OfflinePGA().build(varying, None)
+
+
+def test_a_tolerance_nobody_can_reach_ends_with_a_reason(varying: Offline) -> None:
+    with pytest.raises(NumericalError, match=r"all supremizers leave σ = .*, above the tolerance 0"):
+        OfflinePGA().build(varying, 0.0)

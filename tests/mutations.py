@@ -1,0 +1,282 @@
+"""Seeded faults: each is put into a copy of the sources, and the tests have to notice it.
+
+    python tests/mutations.py [NAME …]
+
+Tests that mirror the changed file run first, all others if those pass. Prints which test caught which fault; exit code
+1 if one survives, or if the tests fail on the copy as it is.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import subprocess
+import sys
+import tempfile
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+ROOT = Path(__file__).parents[1]
+IMPORTED = ("", "problems", "strategies", "tests")
+AT_ONCE = 2
+"""Copies that are tested side by side."""
+
+PATIENCE = 600
+"""Seconds after which tests that do not end count as failed."""
+
+
+@dataclass(frozen=True)
+class Fault:
+    """A fault: the text `right`, found once in a file, becomes `wrong`; `tests` are those that mirror the file."""
+
+    name: str
+    file: str
+    right: str
+    wrong: str
+    tests: tuple[str, ...]
+
+
+FAULTS = (
+    Fault(
+        "wrong-sign-of-b",
+        "problems/vibench_problems/obstacle.py",
+        "B=-",
+        "B=+",
+        ("tests/problems/test_obstacle.py",),
+    ),
+    Fault(
+        "euclidean-norm-of-w",
+        "vibench/cone.py",
+        "return _project_whitened(W.whiten(generators), W.whiten(theta))",
+        "return _project_whitened(generators, theta)",
+        ("tests/test_cone.py",),
+    ),
+    Fault(
+        "generators-not-normalised",
+        "vibench/cone.py",
+        "np.column_stack([generators, direction / length])",
+        "np.column_stack([generators, direction])",
+        ("tests/test_cone.py",),
+    ),
+    Fault(
+        "stale-values-in-the-heap",
+        "vibench/greedy.py",
+        "if not len(stale):",
+        "if True:",
+        ("tests/test_greedy.py",),
+    ),
+    Fault(
+        "coefficientwise-constraint-dropped",
+        "strategies/vibench_strategies/mcpg.py",
+        "B=np.vstack([-np.eye(count), usable[support]]),\n        g=np.concatenate([np.zeros(count), theta[support]]),",
+        "B=-np.eye(count),\n        g=np.zeros(count),",
+        ("tests/strategies",),
+    ),
+    Fault(
+        "lifting-forgotten",
+        "problems/vibench_problems/hertz.py",
+        "g=integrals.gap - B @ self._lift,",
+        "g=integrals.gap,",
+        ("tests/problems/test_hertz.py",),
+    ),
+    Fault(
+        "sigma-not-updated",
+        "strategies/vibench_strategies/offline_pga.py",
+        "self._gram = self._gram - rows.T @ rows",
+        "self._gram = self._gram",
+        ("tests/strategies",),
+    ),
+    Fault(
+        "one-mode-too-many",
+        "vibench/pod.py",
+        "modes = left[:, :size]",
+        "modes = left[:, : size + 1]",
+        ("tests/test_pod.py",),
+    ),
+    Fault(
+        "seconds-of-another-stage",
+        "vibench/queries.py",
+        '"enrichment": (enrichment,),',
+        '"enrichment": (enrichment.pod,),',
+        ("tests/test_stages.py",),
+    ),
+    Fault(
+        "residuals-not-checked",
+        "vibench/qp.py",
+        "if found.worst <= accuracy:",
+        "if True:",
+        ("tests/test_qp.py",),
+    ),
+    Fault(
+        "gap-not-checked",
+        "vibench/qp.py",
+        "return max(self.primal, self.dual, self.gap)",
+        "return max(self.primal, self.dual)",
+        ("tests/test_qp.py",),
+    ),
+    Fault(
+        "nan-not-seen",
+        "vibench/qp.py",
+        "if not (np.all(np.isfinite(answer.x)) and np.all(np.isfinite(answer.alpha))):",
+        "if False:",
+        ("tests/test_qp.py",),
+    ),
+    Fault(
+        "infeasible-without-certificate",
+        "vibench/qp.py",
+        "if found.primal > accuracy and infeasibility_certificate(program) is not None:",
+        "if found.primal > accuracy:",
+        ("tests/test_qp.py",),
+    ),
+    Fault(
+        "multipliers-not-scaled-back",
+        "vibench/qp.py",
+        "alpha = cost * answer.alpha / rows",
+        "alpha = cost * answer.alpha",
+        ("tests/test_qp.py",),
+    ),
+    Fault(
+        "tail-without-the-square",
+        "vibench/pod.py",
+        "np.sqrt(np.cumsum((sigma**2)[::-1])[::-1])",
+        "np.cumsum(sigma[::-1])[::-1]",
+        ("tests/test_pod.py",),
+    ),
+    Fault(
+        "supremizers-by-the-wrong-product",
+        "vibench/supremizer.py",
+        "return V.riesz(np.asarray(B.T @ eta))",
+        "return np.asarray(B.T @ eta)",
+        ("tests/test_supremizer.py",),
+    ),
+    Fault(
+        "span-constant-below-the-rank",
+        "vibench/infsup.py",
+        "if rows < rank:",
+        "if rows < 0:",
+        ("tests/test_infsup.py",),
+    ),
+    Fault(
+        "cone-interval-too-narrow",
+        "vibench/copositive.py",
+        "return max(0.0, float(np.min(M[touching] / G[touching])) - len(G) * negative)",
+        "return max(0.0, float(np.min(M[touching] / G[touching])))",
+        ("tests/test_cone_bounds.py",),
+    ),
+    Fault(
+        "bound-without-the-mismatch",
+        "vibench/error_bounds.py",
+        "(size * residual / beta + mismatch) / alpha",
+        "(size * residual / beta) / alpha",
+        ("tests/test_error_bounds.py",),
+    ),
+    Fault(
+        "agreement-too-generous",
+        "vibench/agreement.py",
+        "half = 0.5 * (first.linear + second.linear)",
+        "half = 500.0 * (first.linear + second.linear)",
+        ("tests/test_agreement.py",),
+    ),
+    Fault(
+        "validated-on-the-training-set",
+        "vibench/sweeps.py",
+        'training_parameters(problem) if self.purpose == "training" else self._validation(problem)',
+        "training_parameters(problem)",
+        ("tests/test_stages.py",),
+    ),
+    Fault(
+        "active-set-without-release",
+        "vibench/highfidelity.py",
+        "kept = active & (lam > 1e-14 * scale)",
+        "kept = active",
+        ("tests/test_highfidelity.py",),
+    ),
+    Fault(
+        "threshold-the-other-way-round",
+        "vibench/thresholds.py",
+        "Meaning.FROM if dearer > 0.0 else Meaning.UNTIL",
+        "Meaning.UNTIL if dearer > 0.0 else Meaning.FROM",
+        ("tests/test_thresholds.py",),
+    ),
+    Fault(
+        "warm-up-counted",
+        "vibench/timing.py",
+        "runs = [timed(work)[1] for _ in range(REPEATS)]",
+        "runs = [first] * REPEATS",
+        ("tests/test_timing.py",),
+    ),
+    Fault(
+        "rows-doubled-at-the-second-write",
+        "vibench/journal.py",
+        'self._db.execute("DELETE FROM cells WHERE cell = ?", (cell["cell"],))',
+        "pass",
+        ("tests/test_journal.py",),
+    ),
+)
+
+
+def changed(root: Path, fault: Fault) -> str:
+    """The text of the faulty file; refuses a fault that no longer fits the sources."""
+    text = (root / fault.file).read_text(encoding="utf-8")
+    if text.count(fault.right) != 1:
+        raise SystemExit(f"{fault.name}: found {text.count(fault.right)} times in {fault.file}, expected once")
+    return text.replace(fault.right, fault.wrong)
+
+
+def first_failure(root: Path, tests: Sequence[str]) -> str | None:
+    """The first test that fails on a tree, or `None`."""
+    paths = os.pathsep.join(str(root / folder) for folder in IMPORTED)
+    command = [sys.executable, "-m", "pytest", "-x", "-p", "no:cacheprovider", "--tb=no", "-rfE", *tests]
+    environment = {**os.environ, "PYTHONPATH": paths, "PYTHONDONTWRITEBYTECODE": "1"}
+    try:
+        done = subprocess.run(
+            command, cwd=root, env=environment, capture_output=True, text=True, check=False, timeout=PATIENCE
+        )
+    except subprocess.TimeoutExpired:
+        return f"no end within {PATIENCE} s"
+    if done.returncode == 0:
+        return None
+    failed = re.search(r"^(?:FAILED|ERROR) (\S+)", done.stdout, re.MULTILINE)
+    if done.returncode != 1 or not failed:
+        raise SystemExit(f"the tests could not be run:\n{done.stdout[-2000:]}{done.stderr[-2000:]}")
+    return failed[1]
+
+
+def copy_of_sources(folder: str) -> Path:
+    """A copy of the tree without what it does not need."""
+    ignored = shutil.ignore_patterns(".git", ".venv", "runs", "__pycache__", ".*_cache", ".hypothesis")
+    return Path(shutil.copytree(ROOT, Path(folder) / "copy", ignore=ignored))
+
+
+def caught(fault: Fault) -> str | None:
+    """The test that notices a fault, or `None`."""
+    with tempfile.TemporaryDirectory() as folder:
+        root = copy_of_sources(folder)
+        (root / fault.file).write_text(changed(root, fault), encoding="utf-8")
+        return first_failure(root, fault.tests) or first_failure(root, ["tests"])
+
+
+def main(names: Sequence[str]) -> int:
+    """Try the faults with these names, or all; the number of those that survive."""
+    chosen = [fault for fault in FAULTS if not names or fault.name in names]
+    if unknown := set(names) - {fault.name for fault in FAULTS}:
+        raise SystemExit(f"no fault named {', '.join(sorted(unknown))}")
+    mirrored = sorted({test for fault in chosen for test in fault.tests})
+    with tempfile.TemporaryDirectory() as folder:
+        broken = first_failure(copy_of_sources(folder), mirrored)
+    if broken:
+        raise SystemExit(f"{broken} fails without any fault")
+    survivors = 0
+    with ThreadPoolExecutor(AT_ONCE) as pool:
+        for fault, test in zip(chosen, pool.map(caught, chosen), strict=True):
+            survivors += test is None
+            print(f"{fault.name:40s} {test or 'SURVIVED'}", flush=True)
+    print(f"{len(chosen)} faults, {survivors} survived")
+    return 1 if survivors else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
