@@ -13,6 +13,16 @@ from pathlib import Path
 import pytest
 
 from vibench import plugins
+from vibench.store import CACHE_VARIABLE
+
+
+@pytest.fixture(scope="session", autouse=True)
+def artefacts(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """Folder in which the runs of this test process keep their artefacts: nobody else's are reused."""
+    folder = tmp_path_factory.mktemp("cache")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv(CACHE_VARIABLE, str(folder))
+        yield folder / "artefacts"
 
 
 @pytest.fixture(scope="session")

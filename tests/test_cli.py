@@ -166,12 +166,12 @@ class TestOutputFolder:
     def test_results_of_another_study_are_refused_and_kept(
         self, fresh: list[str], main: Main, quick_run: Path, tmp_path: Path
     ) -> None:
-        shutil.copytree(quick_run, "other", ignore=shutil.ignore_patterns("artefacts"))
+        shutil.copytree(quick_run, "other")
         refused(main("run", write_study(tmp_path), "--out", "other", *fresh), "other", "study", "quick", "sample")
         assert len(read(Path("other", FILE), "cells")) == len(expand(load_study("quick")))
 
     def test_another_seed_is_another_study(self, main: Main, quick_run: Path, tmp_path: Path) -> None:
-        shutil.copytree(quick_run, "other", ignore=shutil.ignore_patterns("artefacts"))
+        shutil.copytree(quick_run, "other")
         text = plugins.study_path("quick").read_text(encoding="utf-8")
         path = tmp_path / "seeded.toml"
         path.write_text(text.replace("seed = 2022", "seed = 2023"), encoding="utf-8")

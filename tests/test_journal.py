@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 import sqlite3
 from collections.abc import Callable, Iterator
@@ -14,7 +15,7 @@ import pytest
 from samples import cell_row, query_rows
 from vibench import journal as module
 from vibench.errors import RequestError
-from vibench.journal import FILE, Journal, read_meta
+from vibench.journal import FILE, Journal, claimed, read_meta
 from vibench.schema import CELLS, TABLES, VERSION
 
 STUDY = {"name": "sample", "seed": 1, "validation": 4, "accuracy": 1e-7}
@@ -43,6 +44,20 @@ def refusal(action: Callable[[], object]) -> str:
     line = str(caught.value)
     assert "\n" not in line
     return line
+
+
+def claim(folder: Path) -> None:
+    with claimed(folder):
+        pass
+
+
+def test_a_folder_has_one_run_at_a_time(tmp_path: Path) -> None:
+    """The second one is told who the first is; a folder that was claimed before is no foreign one."""
+    with claimed(tmp_path / "run"):
+        assert f"another run writes into '{tmp_path / 'run'}' (process {os.getpid()} on" in refusal(
+            lambda: claim(tmp_path / "run")
+        )
+    claim(tmp_path / "run")
 
 
 def test_a_new_folder_gets_every_table(journal: Journal, tmp_path: Path) -> None:
@@ -209,13 +224,14 @@ def test_a_refused_folder_is_left_as_it_was(journal: Journal, tmp_path: Path) ->
 
 def test_a_file_in_place_of_the_folder_is_refused(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
-    assert "is a file" in refusal(lambda: Journal(tmp_path / "file", STUDY))
+    assert "is a file" in refusal(lambda: claim(tmp_path / "file"))
+    assert "cannot be written" in refusal(lambda: claim(tmp_path / "file" / "below"))
     assert "cannot be written" in refusal(lambda: Journal(tmp_path / "file" / "below", STUDY))
 
 
 def test_a_folder_with_other_things_is_refused(tmp_path: Path) -> None:
     (tmp_path / "notes.txt").touch()
-    line = refusal(lambda: Journal(tmp_path, STUDY))
+    line = refusal(lambda: claim(tmp_path))
     assert "not empty" in line
     assert FILE in line
     assert [path.name for path in tmp_path.iterdir()] == ["notes.txt"]

@@ -107,9 +107,9 @@ def test_a_duration_in_words_is_about_the_duration(seconds: float) -> None:
 def report() -> Callable[..., tuple[Report, io.StringIO]]:
     """Function that gives a report and what it prints."""
 
-    def make(*, terminal: bool = False, jobs: int = 2) -> tuple[Report, io.StringIO]:
+    def make(*, terminal: bool = False) -> tuple[Report, io.StringIO]:
         printed = io.StringIO()
-        return Report(Console(file=printed, force_terminal=terminal, width=120), jobs), printed
+        return Report(Console(file=printed, force_terminal=terminal, width=120)), printed
 
     return make
 
@@ -120,19 +120,25 @@ OK = {"status": "ok", "reason": ""}
 
 def test_the_beginning_says_what_is_to_be_done(report: Make, queries: list[Stage]) -> None:
     made, printed = report()
-    made.start(20, [*queries[:3], *PODS])
+    made.start(20, [*queries[:3], *PODS], 0, 2)
     assert printed.getvalue() == "20 cells, 3 to run, 7 stages on 2 workers\n"
 
 
 def test_one_worker_is_no_workers(report: Make) -> None:
-    made, printed = report(jobs=1)
-    made.start(1, [])
-    assert printed.getvalue() == "1 cells, 0 to run, 0 stages on 1 worker\n"
+    made, printed = report()
+    made.start(1, PODS, 0, 1)
+    assert printed.getvalue() == "1 cells, 0 to run, 4 stages on 1 worker\n"
+
+
+def test_where_nothing_is_to_be_done_nobody_works(report: Make) -> None:
+    made, printed = report()
+    made.start(1, [], 0, 0)
+    assert printed.getvalue() == "1 cells, 0 to run, 0 stages\n"
 
 
 def test_high_fidelity_parts_are_reported_sweep_by_sweep(report: Make) -> None:
     made, printed = report()
-    made.start(1, CHUNK)
+    made.start(1, CHUNK, 0, 2)
     for chunk in CHUNK[:-1]:
         made.stage(chunk, 0.1)
     assert "high-fidelity" not in printed.getvalue()
@@ -142,7 +148,7 @@ def test_high_fidelity_parts_are_reported_sweep_by_sweep(report: Make) -> None:
 
 def test_other_stages_are_not_reported(report: Make) -> None:
     made, printed = report()
-    made.start(1, PODS)
+    made.start(1, PODS, 0, 2)
     before = printed.getvalue()
     made.stage(PODS[0], 0.1)
     assert printed.getvalue() == before
@@ -150,7 +156,7 @@ def test_other_stages_are_not_reported(report: Make) -> None:
 
 def test_every_cell_has_a_line(report: Make, cells: list[Cell], queries: list[Stage]) -> None:
     made, printed = report()
-    made.start(len(cells), queries)
+    made.start(len(cells), queries, 0, 2)
     made.cell(cells[0], OK)
     made.cell(cells[1], {"status": "timeout", "reason": "took [bold]long"})
     lines = printed.getvalue().splitlines()
@@ -161,14 +167,14 @@ def test_every_cell_has_a_line(report: Make, cells: list[Cell], queries: list[St
 
 def test_a_long_line_stays_one_line(report: Make, cells: list[Cell], queries: list[Stage]) -> None:
     made, printed = report()
-    made.start(1, queries[:1])
+    made.start(1, queries[:1], 0, 2)
     made.cell(cells[0], {"status": "error", "reason": "word " * 100})
     assert len(printed.getvalue().splitlines()) == 2
 
 
 def test_the_time_left_is_said_once_known(report: Make, cells: list[Cell], queries: list[Stage]) -> None:
-    made, printed = report(jobs=1)
-    made.start(len(cells), queries)
+    made, printed = report()
+    made.start(len(cells), queries, 0, 1)
     made.stage(queries[0], 20.0)
     made.cell(cells[0], OK)
     same = sum(isinstance(stage, QueriesStage) for stage in queries) - 1
@@ -177,7 +183,7 @@ def test_the_time_left_is_said_once_known(report: Make, cells: list[Cell], queri
 
 def test_less_than_a_second_left_is_not_said(report: Make, cells: list[Cell], queries: list[Stage]) -> None:
     made, printed = report()
-    made.start(len(cells), queries[:2])
+    made.start(len(cells), queries[:2], 0, 2)
     made.stage(queries[0], 0.2)
     made.cell(cells[0], OK)
     assert "left" not in printed.getvalue()
@@ -186,7 +192,7 @@ def test_less_than_a_second_left_is_not_said(report: Make, cells: list[Cell], qu
 def test_plain_lines_where_there_is_no_terminal(report: Make, cells: list[Cell], queries: list[Stage]) -> None:
     made, printed = report()
     with made:
-        made.start(len(cells), [*CHUNK, *queries])
+        made.start(len(cells), [*CHUNK, *queries], 0, 2)
         for stage in (*CHUNK, *queries):
             made.stage(stage, 3.0)
         for cell in cells:
@@ -200,7 +206,7 @@ def test_plain_lines_where_there_is_no_terminal(report: Make, cells: list[Cell],
 def test_a_terminal_gets_a_bar_and_only_what_fell_short(report: Make, cells: list[Cell], queries: list[Stage]) -> None:
     made, printed = report(terminal=True)
     with made:
-        made.start(len(cells), queries)
+        made.start(len(cells), queries, 0, 2)
         made.stage(queries[0], 30.0)
         made.cell(cells[0], OK)
         made.cell(cells[1], {"status": "error", "reason": "broke"})
@@ -215,6 +221,6 @@ def test_a_terminal_gets_a_bar_and_only_what_fell_short(report: Make, cells: lis
 def test_a_terminal_gets_no_bar_where_nothing_is_to_be_done(report: Make) -> None:
     made, printed = report(terminal=True)
     with made:
-        made.start(3, [])
-    assert "stages on" in printed.getvalue()
+        made.start(3, [], 0, 0)
+    assert "0 stages" in printed.getvalue()
     assert "0:00:00" not in printed.getvalue()

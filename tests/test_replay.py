@@ -17,7 +17,6 @@ from vibench import loading, qp, replay
 from vibench.cli import app
 from vibench.errors import RequestError
 from vibench.loading import recorded_cell, recorded_cells
-from vibench.store import ARTEFACTS
 
 STUDY = """
 name = "small"
@@ -63,8 +62,8 @@ def test_a_recorded_cell_solves_as_it_did(run: Path) -> None:
     assert model.fixed_basis.shape[1] == recorded.row["N"] + recorded.row["enrichment"]
 
 
-def test_stages_whose_artefacts_are_gone_are_run_again(run: Path) -> None:
-    for file in (run / ARTEFACTS).glob("*stage-*"):
+def test_stages_whose_artefacts_are_gone_are_run_again(run: Path, artefacts: Path) -> None:
+    for file in artefacts.glob("*stage-*"):
         file.unlink()
     before = recorded_cell(str(run), key(run)).rows("queries")[1]["primal_residual"]
     recorded = recorded_cell(str(run), key(run))

@@ -1,4 +1,4 @@
-"""Seconds: which clock, how many repeats, one thread."""
+"""Seconds: which clock, how many repeats, one thread, and how disturbed the machine is."""
 
 from __future__ import annotations
 
@@ -10,10 +10,9 @@ import time
 from collections.abc import Callable, Iterator
 
 import pytest
-from threadpoolctl import threadpool_info
 
 from vibench import timing
-from vibench.timing import NO_TIME, REPEATS, THREAD_VARIABLES, Seconds, Stopwatch, median_seconds, one_thread, timed
+from vibench.timing import NO_TIME, ONE_THREAD, REPEATS, Calibration, Seconds, Stopwatch, median_seconds, timed
 
 
 @pytest.fixture
@@ -92,25 +91,24 @@ def test_sleep_and_other_threads_are_no_cpu_seconds() -> None:
     assert spent.cpu < 0.5 * spent.wall
 
 
-def test_one_thread_holds_inside_and_is_undone_outside(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv(THREAD_VARIABLES[0], "7")
-    monkeypatch.delenv(THREAD_VARIABLES[1], raising=False)
-    with one_thread():
-        assert [os.environ[name] for name in THREAD_VARIABLES] == ["1"] * len(THREAD_VARIABLES)
-        assert {library["num_threads"] for library in threadpool_info()} <= {1}
-    assert os.environ[THREAD_VARIABLES[0]] == "7"
-    assert THREAD_VARIABLES[1] not in os.environ
-
-
-def test_one_thread_is_undone_after_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv(THREAD_VARIABLES[0], "7")
-    with pytest.raises(KeyError), one_thread():
-        raise KeyError
-    assert os.environ[THREAD_VARIABLES[0]] == "7"
-
-
-def test_one_thread_reaches_processes_started_inside() -> None:
+def test_processes_started_with_it_have_one_thread() -> None:
     code = "import numpy, threadpoolctl; print({x['num_threads'] for x in threadpoolctl.threadpool_info()})"
-    with one_thread():
-        done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    environment = os.environ | ONE_THREAD
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, env=environment)
     assert done.stdout.strip() == "{1}"
+
+
+def test_before_each_repeat_something_is_done_that_is_not_timed(clocks: Callable[..., None]) -> None:
+    clocks(*[(0.1, 0.1)] * (1 + REPEATS))
+    calls: list[int] = []
+    work = Work()
+    _, seconds = median_seconds(work, before=lambda: calls.append(work.count))
+    assert calls == list(range(1 + REPEATS))
+    assert seconds.cpu == pytest.approx(0.1)
+
+
+def test_the_calibration_tells_how_much_slower_than_at_its_best(clocks: Callable[..., None]) -> None:
+    walls = (2.0, 1.0, 3.0, 2.0, 4.0, 9.0, 0.5, 0.7, 0.9, 1.0, 2.0, 3.0)
+    clocks(*[(0.0, wall) for wall in walls])
+    calibration = Calibration()
+    assert [calibration.slowdown() for _ in range(3)] == pytest.approx([2.0, 1.0, 2.0])

@@ -17,9 +17,10 @@ from vibench.matrix import Cell, expand
 from vibench.printing import new_console, print_frame
 from vibench.progress import Report
 from vibench.qp import Status
-from vibench.runner import Outcome, run_study
+from vibench.runner import Options, Outcome, run_study
 from vibench.schema import TABLES
 from vibench.solver_settings import SETTINGS
+from vibench.store import usable_store
 from vibench.study import Study
 from vibench.study_file import load_study
 
@@ -49,6 +50,12 @@ def run(
     fresh: Annotated[bool, typer.Option("--fresh", help="Begin from nothing, not from earlier results.")] = False,
     retry: Annotated[bool, typer.Option("--retry", help="Also redo cells that did not end ok.")] = False,
     strict: Annotated[bool, typer.Option("--strict", help="Exit with 1 if a cell is not ok or unavailable.")] = False,
+    executor: Annotated[
+        Literal["local", "dask"], typer.Option(help="Processes of this machine, or the workers of a dask cluster.")
+    ] = "local",
+    scheduler: Annotated[
+        str | None, typer.Option(metavar="ADDRESS", help="A dask scheduler; a cluster on this machine unless given.")
+    ] = None,
 ) -> None:
     """Run a study's matrix; an interrupted run goes on where it stopped."""
     overrides = {
@@ -60,10 +67,12 @@ def run(
     if dry_run:
         _list_matrix(console, expand(loaded))
         return
+    if scheduler is not None and executor != "dask":
+        raise RequestError(f"--scheduler {scheduler} is for --executor dask")
     folder = out or Path("runs") / loaded.name
-    workers = jobs or provenance.cores()
-    with Report(console, workers) as report:
-        outcome = run_study(loaded, folder, report, jobs=workers, fresh=fresh, retry=retry)
+    options = Options(jobs or provenance.cores(), fresh, retry, executor, scheduler)
+    with Report(console) as report:
+        outcome = run_study(loaded, folder, report, options)
     path = tables.results_file(str(folder))
     tables.export(path, folder / "tables")
     if outcome.interrupted:
@@ -146,6 +155,24 @@ def export_qps(
     )
 
 
+@app.command()
+def clean(
+    older_than: Annotated[float, typer.Option(min=0.0, metavar="DAYS", help="Keep what is younger.")] = 0.0,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Only show what there is.")] = False,
+) -> None:
+    """Show what the artefacts of all runs take on the disk, and free it; results stay."""
+    console, store = new_console(), usable_store()
+    found = pd.DataFrame(store.contents(), columns=["stage", "MiB", "days"])
+    found["MiB"], found["days"] = found["MiB"] / 2**20, found["days"] / 86400.0
+    table = found.groupby("stage", as_index=False).agg(
+        artefacts=("MiB", "size"), MiB=("MiB", "sum"), oldest=("days", "max")
+    )
+    print_frame(console, table.rename(columns={"oldest": "oldest [days]"}), f"artefacts in {store.folder}")
+    if not dry_run:
+        freed = store.clear(older_than * 86400.0)
+        console.print(f"{freed / 2**20:.1f} MiB freed; what is needed again is computed again")
+
+
 def main() -> None:
     """Entry point: what is wrong with a request is one line and exit code 2."""
     usage_error = typer.BadParameter.__mro__[2]  # click's ClickException, whichever copy of click typer brings
@@ -155,6 +182,8 @@ def main() -> None:
         code = _refuse(error)
     except VibenchError as error:
         code = _refuse(error, 1)
+    except OSError as error:
+        code = _refuse(f"'{error.filename}' cannot be written or read: {error.strerror}", 1)
     except typer.Abort:
         code = 130
     except Exception as error:

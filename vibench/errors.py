@@ -14,6 +14,10 @@ class RequestError(VibenchError):
     """What the user asked for is wrong: a study file, a name, an option or an output folder (exit code 2)."""
 
 
+class StorageError(VibenchError):
+    """A result that could not be written: no space left, no permission, a device that failed."""
+
+
 class NumericalError(VibenchError):
     """A computation cannot go on: a matrix that is not SPD, values that are not finite, no convergence."""
 

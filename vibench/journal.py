@@ -5,17 +5,46 @@ from __future__ import annotations
 import contextlib
 import json
 import sqlite3
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
 import numpy as np
 
-from vibench.errors import RequestError
+from vibench.errors import RequestError, StorageError
+from vibench.locking import locked
 from vibench.schema import STORED, VERSION
 
 FILE = "results.sqlite"
+
+LOCK = ".lock"
+"""File in a run folder that the run holds."""
+
+
+@contextlib.contextmanager
+def claimed(folder: Path) -> Iterator[None]:
+    """Have a run folder for oneself; it is made if it does not exist.
+
+    Raises
+    ------
+    RequestError
+        If the folder is a file, holds something that is not a results file, or is used by another run.
+    """
+    try:
+        if folder.exists() and not folder.is_dir():
+            raise RequestError(f"output folder '{folder}' is a file")
+        if folder.is_dir() and not (folder / FILE).exists() and any(path.name != LOCK for path in folder.iterdir()):
+            raise RequestError(f"output folder '{folder}' is not empty and holds no {FILE}; choose another with --out")
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise RequestError(f"output folder '{folder}' cannot be written: {error.strerror}") from None
+    with locked(folder / LOCK, busy=f"another run writes into '{folder}'"):
+        yield
+
+
+UNWRITABLE = {sqlite3.SQLITE_FULL, sqlite3.SQLITE_IOERR, sqlite3.SQLITE_READONLY, sqlite3.SQLITE_CANTOPEN}
+"""What SQLite says where the disk is full, gone, or not ours."""
 
 
 class Journal:
@@ -27,20 +56,16 @@ class Journal:
         The run folder; made if it does not exist.
     study
         What the numbers of the study depend on: results of another study are refused.
-    ours
-        The folder is known to be a run folder, though it holds no results file now.
 
     Raises
     ------
     RequestError
-        If the folder is a file, or holds something that is not a results file of this study and schema.
+        If the folder holds something that is not a results file of this study and schema.
     """
 
-    def __init__(self, folder: Path, study: Mapping[str, Any], *, ours: bool = False) -> None:
+    def __init__(self, folder: Path, study: Mapping[str, Any]) -> None:
         path = folder / FILE
         try:
-            if not ours:
-                _refuse_foreign(folder)
             _refuse_other(path, study)
             folder.mkdir(parents=True, exist_ok=True)
             self._db = sqlite3.connect(path)
@@ -75,8 +100,8 @@ class Journal:
         self, cell: Mapping[str, Any], queries: Sequence[Mapping[str, Any]], solutions: Sequence[Mapping[str, Any]] = ()
     ) -> None:
         """Write a cell, its queries and solutions in one transaction, in place of earlier rows of the same cell."""
-        self._add_columns(queries)
-        with self._db:
+        with self._writing():
+            self._add_columns(queries)
             self._db.execute("DELETE FROM cells WHERE cell = ?", (cell["cell"],))
             self._insert("cells", [cell])
             self._insert("queries", queries)
@@ -84,13 +109,13 @@ class Journal:
 
     def write_histories(self, artefact: str, rows: Sequence[Mapping[str, Any]]) -> None:
         """Write the histories of one artefact in place of its earlier ones."""
-        with self._db:
+        with self._writing():
             self._db.execute("DELETE FROM histories WHERE artefact = ?", (artefact,))
             self._insert("histories", rows)
 
     def replace(self, table: str, rows: Sequence[Mapping[str, Any]]) -> None:
         """Replace the whole of a table that follows from the others."""
-        with self._db:
+        with self._writing():
             self._db.execute(f"DELETE FROM {table}")
             self._insert(table, rows)
 
@@ -99,6 +124,17 @@ class Journal:
         cursor = self._db.execute(f"SELECT * FROM {table}")
         names = [column[0] for column in cursor.description]
         return [dict(zip(names, row, strict=True)) for row in cursor]
+
+    @contextlib.contextmanager
+    def _writing(self) -> Iterator[None]:
+        """One transaction; what cannot be written leaves what was there before."""
+        try:
+            with self._db:
+                yield
+        except sqlite3.OperationalError as error:
+            if error.sqlite_errorcode & 0xFF not in UNWRITABLE:
+                raise
+            raise StorageError(f"results cannot be written: {error}") from None
 
     def _insert(self, table: str, rows: Iterable[Mapping[str, Any]]) -> None:
         for row in rows:
@@ -119,13 +155,6 @@ class Journal:
 def _plain(value: Any) -> Any:
     """A value SQLite stores as what it is: NumPy scalars would end as bytes."""
     return value.item() if isinstance(value, np.generic) else value
-
-
-def _refuse_foreign(folder: Path) -> None:
-    if folder.exists() and not folder.is_dir():
-        raise RequestError(f"output folder '{folder}' is a file")
-    if folder.is_dir() and not (folder / FILE).exists() and any(folder.iterdir()):
-        raise RequestError(f"output folder '{folder}' is not empty and holds no {FILE}; choose another with --out")
 
 
 def _refuse_other(path: Path, study: Mapping[str, Any]) -> None:

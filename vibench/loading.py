@@ -1,4 +1,4 @@
-"""A recorded cell brought back to life: its reduced model, from the artefacts of its run."""
+"""A recorded cell brought back to life: its reduced model, from artefacts, or made again where they are gone."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from vibench.problem import VariationalInequality, validation_parameters
 from vibench.reduced import ReducedModel
 from vibench.stage import Stage
 from vibench.stages import enrichment_stage, reduced_model
-from vibench.store import ARTEFACTS, Store
+from vibench.store import Store, usable_store
 from vibench.tables import results_file
 
 
@@ -56,7 +56,7 @@ class RecordedCell:
                 f"cell {self.row['cell']} was computed by other code, or with another version of its solver; "
                 "run its study again"
             )
-        store, enrichment = Store(self.path.parent / ARTEFACTS), enrichment_stage(self.cell)
+        store, enrichment = usable_store(), enrichment_stage(self.cell)
         _provide(enrichment, store)
         return reduced_model(store, enrichment)[0]
 

@@ -57,10 +57,9 @@ def duration(seconds: float) -> str:
 class Report:
     """Tells a person how a run goes on; the observer of `runner.run_study`."""
 
-    def __init__(self, console: Console, jobs: int) -> None:
+    def __init__(self, console: Console) -> None:
         self._console = console
-        self._jobs = jobs
-        self._left = TimeLeft([], jobs)
+        self._left = TimeLeft([], 1)
         self._cells = self._total = self._chunks = self._all_chunks = 0
         self._start = time.perf_counter()
         self._bar: Progress | None = None
@@ -72,14 +71,15 @@ class Report:
         if self._bar is not None:
             self._bar.stop()
 
-    def start(self, cells: int, pending: Sequence[Stage], unavailable: int = 0) -> None:
+    def start(self, cells: int, pending: Sequence[Stage], unavailable: int, workers: int) -> None:
         """Say what is to be done; cells whose solver is not installed get their row without it."""
-        self._left = TimeLeft(pending, self._jobs)
+        self._left = TimeLeft(pending, max(workers, 1))
         todo = sum(isinstance(stage, QueriesStage) for stage in pending)
         self._all_chunks = sum(isinstance(stage, HighFidelity) for stage in pending)
         self._total = todo + unavailable
         self._console.print(
-            f"{cells} cells, {todo} to run, {len(pending)} stages on {self._jobs} worker{'s'[: self._jobs > 1]}"
+            f"{cells} cells, {todo} to run, {len(pending)} stages"
+            + f" on {workers} worker{'s' * (workers != 1)}" * (workers > 0)
         )
         if self._console.is_terminal and pending:
             columns = ("[progress.description]{task.description}", BarColumn(), MofNCompleteColumn())

@@ -9,6 +9,8 @@ from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
+import qpsolvers
+
 SOLVER_DISTRIBUTIONS = {"highs": "highspy", "proxqp": "proxsuite"}
 """Distributions of the solvers that are not called like their solver."""
 
@@ -54,6 +56,14 @@ def solver_version(solver: str) -> str:
 def core_code() -> str:
     """Version of vibench with a hash of its core's sources."""
     return f"{distribution_version('vibench')} {source_hash(Path(__file__).parent)}"
+
+
+@cache
+def libraries() -> str:
+    """Versions of the libraries that results of stages depend on, the QP solvers among them."""
+    names = ["numpy", "scipy", "scikit-fem", "qpsolvers", *qpsolvers.available_solvers]
+    found = {name: solver_version(name) for name in names}
+    return ", ".join([f"python {platform.python_version()}", *(f"{name} {there}" for name, there in found.items())])
 
 
 def source_hash(folder: Path) -> str:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import resource
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,16 +12,19 @@ from vibench.arrays import Array
 from vibench.assembly import Assembled, AssemblyStage
 from vibench.assess import Reference
 from vibench.error_bounds import Stability
-from vibench.infsup import InfSup, Multipliers
+from vibench.infsup import InfSup
+from vibench.provenance import machine
 from vibench.qp import Status
 from vibench.query import Row, Task
-from vibench.reduced import ReducedModel
-from vibench.stage import Result, Stage, value_of
+from vibench.stage import Failed, Pieces, PiecewiseStage, Stage, value_of
 from vibench.stages import reduced_model
-from vibench.store import Store
+from vibench.store import Artefact, Store
 from vibench.strategy import Kind
-from vibench.sweeps import ReferenceConstants, Solutions, gather, sweep, training
-from vibench.timing import Seconds
+from vibench.sweeps import ReferenceConstants, gather, sweep, training
+from vibench.timing import calibration
+
+DISTURBED = 1.3
+"""Rows measured where the calibration is this much slower than at its best are marked."""
 
 
 @dataclass(frozen=True)
@@ -33,14 +36,23 @@ class CellRows:
     solutions: tuple[Row, ...] = ()
 
 
+Answered = tuple[Row, Row | None]
+"""The row of a query, and of its solution if there is one."""
+
+
 @dataclass(frozen=True)
-class QueriesStage(Stage):
-    """All queries of one cell."""
+class QueriesStage(PiecewiseStage):
+    """All queries of one cell, each a piece; the value is a `CellRows`."""
 
     assembly: AssemblyStage
     solver: str
     accuracy: float
     query_seconds: float
+
+    @property
+    def pieces(self) -> int:
+        """One query per validation parameter."""
+        return self.assembly.count
 
     @property
     def reference(self) -> ReferenceConstants:
@@ -57,83 +69,110 @@ class QueriesStage(Stage):
         problem = self.assembly.enrichment.pod.problem
         return (self.assembly, *self.assembly.inputs(), self.reference, *training(problem), *self.validation)
 
-    def run(self, store: Store) -> Result:
-        """Solve, verify and assess every query; the value is a `CellRows`."""
-        model, _, prepared = reduced_model(store, self.assembly.enrichment)
-        snapshots = gather(store, training(self.assembly.enrichment.pod.problem))
-        reference = gather(store, self.validation)
-        floors = tuple(
-            1e-12 * float(np.max(space.norm(columns), initial=0.0))
-            for space, columns in ((model.problem.V, snapshots.u), (model.problem.W, snapshots.lam))
-        )
-        assembled: Assembled = value_of(store, self.assembly)
-        constants: list[Stability] = value_of(store, self.reference)
-        task = Task(self.solver, self.accuracy, self.query_seconds)
-        rows, solutions = [], []
-        for k in range(len(reference.mu)):
-            exact = Reference(reference.u[:, k], reference.lam[:, k], *floors)
-            found, solution = task.run(model, reference.mu[k], exact, constants[k], assembled.seconds[k])
-            rows.append(
-                {f"mu_{i + 1}": float(value) for i, value in enumerate(reference.mu[k])}
-                | {"hf_s": reference.seconds[k].cpu}
-                | found
-                | _constants("beta_", assembled.own[k])
-                | _constants("beta_full_", assembled.full[k])
-                | _constants("beta_plain_", assembled.plain[k])
-                | _constants("beta_hf_", constants[k].inf_sup)
-                | {"bounds": assembled.own[k].sharp}
-            )
-            if solution is not None:
-                solutions.append({"query": k} | solution)
-        cell = self._cell(store, model, prepared, rows) | self._offline(store, reference)
-        return Result(CellRows(cell, tuple(rows), tuple(solutions)))
+    def begin(self, store: Store) -> Queries:
+        """Bring the reduced model and the reference solutions back."""
+        return Queries(self, store)
 
-    def _cell(self, store: Store, model: ReducedModel, prepared: Multipliers, rows: Sequence[Row]) -> Row:
-        """Sizes, and means and extremes over the queries."""
-        enrichment = self.assembly.enrichment
-        built, cone = value_of(store, enrichment), value_of(store, enrichment.cone)
-        basis = value_of(store, enrichment.pod).basis
+
+class Queries(Pieces):
+    """The queries of a cell: solve, verify and assess every one."""
+
+    def __init__(self, stage: QueriesStage, store: Store) -> None:
+        self._slowdown = calibration().slowdown()
+        self._stage, self._store = stage, store
+        enrichment = stage.assembly.enrichment
+        self._model, _, self._prepared = reduced_model(store, enrichment)
+        snapshots = gather(store, training(enrichment.pod.problem))
+        self._reference = gather(store, stage.validation)
+        problem = self._model.problem
+        self._floors = tuple(
+            1e-12 * float(np.max(space.norm(columns), initial=0.0))
+            for space, columns in ((problem.V, snapshots.u), (problem.W, snapshots.lam))
+        )
+        self._assembled: Assembled = value_of(store, stage.assembly)
+        self._constants: list[Stability] = value_of(store, stage.reference)
+        self._task = Task(stage.solver, stage.accuracy, stage.query_seconds)
+
+    def piece(self, number: int, watch: Callable[[bool], None]) -> Answered:
+        """The rows of one query."""
+        reference, k = self._reference, number
+        exact = Reference(reference.u[:, k], reference.lam[:, k], *self._floors)
+        found, solution = self._task.run(
+            self._model, reference.mu[k], exact, self._constants[k], self._assembled.seconds[k], watch
+        )
+        return self._known(k) | found, solution and {"query": k} | solution
+
+    def lost(self, number: int, failed: Failed) -> Answered:
+        """The row of a query whose process hung or died."""
+        outcome = {"status": failed.status.value, "reason": failed.reason}
+        return self._known(number) | {"assemble_s": self._assembled.seconds[number].cpu} | outcome, None
+
+    def finish(self, pieces: Sequence[Answered]) -> CellRows:
+        """All rows; the cell's are means and extremes over the queries."""
+        rows, solutions = [row for row, _ in pieces], [solution for _, solution in pieces if solution is not None]
+        slowdown = max(self._slowdown, calibration().slowdown())
+        found = summarise(rows, slowdown)
+        return CellRows(found | self._sizes() | self._offline(), tuple(rows), tuple(solutions))
+
+    def _known(self, number: int) -> Row:
+        """What is known of a query before it is asked: where, and the inf-sup constants there."""
+        reference, assembled = self._reference, self._assembled
+        return (
+            {f"mu_{i + 1}": float(value) for i, value in enumerate(reference.mu[number])}
+            | {"hf_s": reference.seconds[number].cpu}
+            | _constants("beta_", assembled.own[number])
+            | _constants("beta_full_", assembled.full[number])
+            | _constants("beta_plain_", assembled.plain[number])
+            | _constants("beta_hf_", self._constants[number].inf_sup)
+            | {"bounds": assembled.own[number].sharp}
+        )
+
+    def _sizes(self) -> Row:
+        """Dimensions, fallbacks, memory."""
+        enrichment = self._stage.assembly.enrichment
+        built, cone = value_of(self._store, enrichment), value_of(self._store, enrichment.cone)
+        size = value_of(self._store, enrichment.pod).basis.shape[1]
         fallbacks = [*cone.cone.fallbacks, *built.fallbacks]
-        for purpose, chunks in (("training", training(enrichment.pod.problem)), ("validation", self.validation)):
-            notes = [note for note in gather(store, chunks).fallbacks if note]
+        for purpose, chunks in (("training", training(enrichment.pod.problem)), ("validation", self._stage.validation)):
+            notes = [note for note in gather(self._store, chunks).fallbacks if note]
             fallbacks += [f"{len(notes)} of the {purpose} solutions: {notes[0]}"] if notes else []
-        per_parameter = built.kind is Kind.PER_PARAMETER
-        size = basis.shape[1]
-        return summarise(rows) | {
-            "model": self.assembly.key,
+        added = self._model.fixed_basis.shape[1] - size
+        return {
+            "model": self._stage.assembly.key,
             "enrichment_kind": built.kind.value,
-            "dim_V": model.problem.V.dim,
-            "dim_W": model.problem.W.dim,
+            "dim_V": self._model.problem.V.dim,
+            "dim_W": self._model.problem.W.dim,
             "N": size,
             "R": cone.cone.size,
-            "rank": prepared.rank,
-            "enrichment": prepared.rank if per_parameter else model.fixed_basis.shape[1] - size,
+            "rank": self._prepared.rank,
+            "enrichment": self._prepared.rank if built.kind is Kind.PER_PARAMETER else added,
             "fallbacks": "; ".join(fallbacks),
             "peak_memory_mib": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
         }
 
-    def _offline(self, store: Store, reference: Solutions) -> Row:
-        """Seconds of the stages the cell would have had to run."""
-        enrichment = self.assembly.enrichment
+    def _offline(self) -> Row:
+        """Seconds of the stages the cell would have had to run, and the machines that measured them."""
+        enrichment = self._stage.assembly.enrichment
         stages = {
             "snapshots": training(enrichment.pod.problem),
             "pod": (enrichment.pod,),
             "cone": (enrichment.cone,),
             "enrichment": (enrichment,),
         }
-        spent = {name: [_artefact_seconds(store, stage) for stage in parts] for name, parts in stages.items()}
+        artefacts = {name: [self._artefact(stage) for stage in parts] for name, parts in stages.items()}
+        spent = {name: [artefact.seconds for artefact in found] for name, found in artefacts.items()}
         row: Row = {f"offline_{name}_s": sum(s.cpu for s in parts) for name, parts in spent.items()}
         row["offline_assembly_s"] = 0.0
         row["offline_s"] = sum(row.values())
         row["offline_wall_s"] = sum(s.wall for parts in spent.values() for s in parts)
-        row["hf_s"] = float(np.mean([s.cpu for s in reference.seconds]))
-        return row
+        row["hf_s"] = float(np.mean([s.cpu for s in self._reference.seconds]))
+        machines = {artefact.machine for found in artefacts.values() for artefact in found} | {machine()}
+        return row | {"machine": "; ".join(sorted(machines))}
 
-
-def _artefact_seconds(store: Store, stage: Stage) -> Seconds:
-    artefact = store.get(stage.key)
-    assert artefact is not None  # an input of this stage
-    return artefact.seconds
+    def _artefact(self, stage: Stage) -> Artefact:
+        artefact = self._store.get(stage.key)
+        assert artefact is not None  # an input of this stage
+        return artefact
 
 
 def _constants(prefix: str, constants: InfSup) -> Row:
@@ -144,8 +183,11 @@ def _constants(prefix: str, constants: InfSup) -> Row:
     }
 
 
-def summarise(rows: Sequence[Row]) -> Row:
-    """The columns of a cell that are means, extremes and counts over its queries; means are over the ok ones."""
+def summarise(rows: Sequence[Row], slowdown: float = 1.0) -> Row:
+    """The columns of a cell that are means, extremes and counts over its queries; means are over the ok ones.
+
+    `slowdown` is that of the calibration, before or after the queries.
+    """
     fine = [row for row in rows if row["status"] == Status.OK]
     worst = max((Status(row["status"]) for row in rows), key=lambda status: status.severity)
     reasons = [f"mu={_mu(row)}: {row['reason']}" for row in rows if row["status"] == worst and row["reason"]]
@@ -179,7 +221,8 @@ def summarise(rows: Sequence[Row]) -> Row:
         "beta_span_min": min(row["beta_span"] for row in rows),
         "beta_cone_lower_min": min(row["beta_cone_lower"] for row in rows),
         "beta_cone_upper_min": min(row["beta_cone_upper"] for row in rows),
-        "disturbed": int(wall > 1.5 * cpu),
+        "slowdown": slowdown,
+        "disturbed": int(wall > 1.5 * cpu or slowdown > DISTURBED),
     }
 
 

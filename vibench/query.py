@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -32,15 +33,27 @@ class Task:
     query_seconds: float
 
     def run(
-        self, model: ReducedModel, mu: Array, exact: Reference, stability: Stability, assembly: Seconds
+        self,
+        model: ReducedModel,
+        mu: Array,
+        exact: Reference,
+        stability: Stability,
+        assembly: Seconds,
+        watch: Callable[[bool], None],
     ) -> tuple[Row, Row | None]:
-        """The columns of one query, and of its solution if there is one; `assembly` is what assembling takes."""
+        """The columns of one query, and of its solution if there is one.
+
+        `assembly` is what assembling takes; `watch` is told, untimed, when the solver begins and when it is back.
+        """
         reduced = model.assemble(mu)
         program = reduced.program
         work = partial(qp.solve, program, self.solver, self.accuracy, plugins.qp_solver(self.solver))
         row: Row = {"assemble_s": assembly.cpu}
         try:
-            answer, solving = median_seconds(work)
+            answer, solving = median_seconds(work, before=partial(watch, True))
+            watch(False)
+        except MemoryError:
+            raise
         except (Exception, SystemExit) as error:  # noqa: BLE001  a solver may raise anything; the row says what
             reason = " ".join(f"{type(error).__name__}: {error}".split())
             return row | {"status": Status.ERROR.value, "reason": reason}, None

@@ -3,42 +3,39 @@
 from __future__ import annotations
 
 import json
-import multiprocessing
 import shutil
-import signal
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence, Set
 from concurrent.futures import FIRST_COMPLETED, Future, wait
-from contextlib import contextmanager
 from dataclasses import dataclass, field
-from multiprocessing import resource_tracker
 from pathlib import Path
 from typing import Any, Protocol
-
-from pebble import ProcessExpired, ProcessPool
 
 from vibench import plugins, provenance, qp
 from vibench.agreement import disagreement_rows
 from vibench.assembly import AssemblyStage
-from vibench.errors import RequestError
-from vibench.journal import FILE, Journal, read_meta, study_of
+from vibench.errors import RequestError, StorageError
+from vibench.executors import Executor, executor
+from vibench.isolation import Job
+from vibench.journal import FILE, Journal, claimed, read_meta, study_of
 from vibench.matrix import Cell, digest, expand
 from vibench.naming import HistoryNames, cell_columns
 from vibench.qp import Status
 from vibench.queries import CellRows, QueriesStage
-from vibench.stage import Stage
+from vibench.stage import Done, Failed, PiecewiseStage, Stage, Unstored
 from vibench.stages import enrichment_stage
-from vibench.store import ARTEFACTS, History, Store
+from vibench.store import History, Store, usable_store
 from vibench.study import Study
 from vibench.thresholds import threshold_rows
-from vibench.timing import one_thread
-from vibench.worker import Done, Failed, initialise, perform
+
+LOG = "workers.log"
+"""File in the run folder that takes what plugins and solvers print."""
 
 
 class Observer(Protocol):
     """Who is told how a run goes on."""
 
-    def start(self, cells: int, pending: Sequence[Stage], unavailable: int) -> None:
-        """The matrix has so many cells; these stages have to be run, so many cells have a solver that is not there."""
+    def start(self, cells: int, pending: Sequence[Stage], unavailable: int, workers: int) -> None:
+        """Of so many cells these stages have to be run, on so many workers; so many have a solver that is not there."""
 
     def stage(self, stage: Stage, wall: float) -> None:
         """A stage is done, after so many wall seconds."""
@@ -67,9 +64,32 @@ def queries_stage(cell: Cell, study: Study) -> QueriesStage:
     return QueriesStage(assembly, cell.solver, cell.accuracy, study.limits.query_seconds)
 
 
-def run_study(
-    study: Study, folder: Path, observer: Observer, *, jobs: int = 1, fresh: bool = False, retry: bool = False
-) -> Outcome:
+@dataclass(frozen=True)
+class Options:
+    """How a study is run; none of it changes a number besides times.
+
+    Attributes
+    ----------
+    jobs
+        Worker processes.
+    fresh
+        Begin from nothing: earlier results of this study are removed, artefacts are made anew.
+    retry
+        Also redo cells that did not end ok.
+    executor
+        "local" or "dask".
+    scheduler
+        Address of a dask scheduler; `None` for a cluster on this machine.
+    """
+
+    jobs: int = 1
+    fresh: bool = False
+    retry: bool = False
+    executor: str = "local"
+    scheduler: str | None = None
+
+
+def run_study(study: Study, folder: Path, observer: Observer, options: Options = Options()) -> Outcome:
     """Run what is missing of a study's matrix and write every result into its folder.
 
     Parameters
@@ -80,35 +100,35 @@ def run_study(
         Run folder; earlier results of the same study are continued.
     observer
         Told about progress.
-    jobs
-        Worker processes; their number changes no result.
-    fresh
-        Begin from nothing: earlier results and artefacts of this study are removed.
-    retry
-        Also redo cells that did not end ok.
+    options
+        How to run it.
 
     Raises
     ------
     RequestError
-        If the folder cannot be used.
+        If the folder, the store of artefacts or the executor cannot be used.
+    StorageError
+        If something cannot be written; what was written before is kept.
     """
-    cells = expand(study)
-    cleared = fresh and _clear(folder, study)
-    journal = Journal(folder, identity(study), ours=cleared)
-    try:
-        finished = journal.finished()
-        todo = [cell for cell in cells if _to_do(cell, finished, retry)]
-        run = _Run(study, folder, journal, observer, HistoryNames(cells), len(cells))
-        interrupted = run.execute(todo, jobs)
-        keys = {cell.key for cell in cells}
-        rows = tuple(row for row in journal.rows("cells") if row["cell"] in keys)
-        everything = journal.rows("cells")
-        journal.replace("thresholds", threshold_rows(everything))
-        journal.replace(
-            "disagreements", disagreement_rows(everything, journal.rows("queries"), journal.rows("solutions"))
-        )
-    finally:
-        journal.close()
+    cells, store = expand(study), usable_store()
+    with claimed(folder), store.used():
+        if options.fresh:
+            _clear(folder, study)
+        journal = Journal(folder, identity(study))
+        try:
+            finished = journal.finished()
+            todo = [cell for cell in cells if _to_do(cell, finished, options.retry)]
+            run = _Run(study, folder, store, journal, observer, HistoryNames(cells), len(cells), options)
+            interrupted = run.execute(todo)
+            keys = {cell.key for cell in cells}
+            everything = journal.rows("cells")
+            journal.replace("thresholds", threshold_rows(everything))
+            journal.replace(
+                "disagreements", disagreement_rows(everything, journal.rows("queries"), journal.rows("solutions"))
+            )
+        finally:
+            journal.close()
+    rows = tuple(row for row in everything if row["cell"] in keys)
     return Outcome(rows, len(cells) - len(rows), interrupted)
 
 
@@ -119,31 +139,19 @@ def _to_do(cell: Cell, finished: Mapping[str, tuple[str, str]], retry: bool) -> 
     return retry and status != Status.OK
 
 
-def _clear(folder: Path, study: Study) -> bool:
-    """Remove a study's earlier results, never those of a study with another name; whether there were any."""
+def _clear(folder: Path, study: Study) -> None:
+    """Remove a study's earlier results, never those of a study with another name."""
     path = folder / FILE
     if not path.is_file():
-        return False
+        return
     meta = read_meta(path)
     there = study_of(path, meta).get("name") if meta else study.name
     if there != study.name:
         raise RequestError(f"'{folder}' holds results of the study '{there}'; --fresh removes only '{study.name}'")
     for file in folder.glob(f"{FILE}*"):
         file.unlink()
-    for name in (ARTEFACTS, "tables", "figures"):
+    for name in ("tables", "figures"):
         shutil.rmtree(folder / name, ignore_errors=True)
-    return True
-
-
-@contextmanager
-def _interrupts_held() -> Iterator[None]:
-    """Ctrl-C waits; processes started meanwhile never see it, for they inherit what is blocked."""
-    resource_tracker.ensure_running()  # whose start unblocks the signal
-    signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
 
 
 @dataclass
@@ -152,85 +160,80 @@ class _Run:
 
     study: Study
     folder: Path
+    store: Store
     journal: Journal
     observer: Observer
     names: HistoryNames
     cell_count: int
+    options: Options
     waiting: dict[str, set[str]] = field(default_factory=dict)
     stages: dict[str, Stage] = field(default_factory=dict)
     reused: set[str] = field(default_factory=set)
     cells: dict[str, list[Cell]] = field(default_factory=dict)
 
-    def execute(self, todo: Sequence[Cell], jobs: int) -> bool:
+    def execute(self, todo: Sequence[Cell]) -> bool:
         """Run the cells; returns whether Ctrl-C ended it."""
         available = set(qp.installed_solvers(plugins.names("QP solver")))
-        store = Store(self.folder / ARTEFACTS)
-        self.folder.joinpath(ARTEFACTS).mkdir(exist_ok=True)
-        for cell in todo:
-            if cell.solver in available:
+        unavailable = [cell for cell in todo if cell.solver not in available]
+        runnable = [cell for cell in todo if cell.solver in available]
+        workers = self._workers() if runnable else None
+        try:
+            for cell in runnable:
+                assert workers is not None
                 stage = queries_stage(cell, self.study)
                 self.cells.setdefault(stage.key, []).append(cell)
-                self._add(stage, store)
-        unavailable = [cell for cell in todo if cell.solver not in available]
-        self.observer.start(self.cell_count, list(self.stages.values()), len(unavailable))
-        for cell in unavailable:
-            self._fail_cell(cell, Status.UNAVAILABLE, f"the QP solver '{cell.solver}' is not installed")
-        if not self.stages:
-            return False
-        with one_thread():
-            context = multiprocessing.get_context("spawn")
-            with _interrupts_held():
-                pool = ProcessPool(max_workers=jobs, context=context, initializer=initialise)
-                started = pool.active  # asking starts the pool
-            try:
-                assert started
-                self._loop(pool, jobs)
-            except KeyboardInterrupt:
-                return True
-            finally:
-                pool.stop()  # type: ignore[no-untyped-call]
-                pool.join()
+                self._add(stage, workers.machines)
+            slots = workers.slots if workers is not None else 0
+            self.observer.start(self.cell_count, list(self.stages.values()), len(unavailable), slots)
+            for cell in unavailable:
+                self._fail_cell(cell, Status.UNAVAILABLE, f"the QP solver '{cell.solver}' is not installed")
+            if workers is not None:
+                self._loop(workers)
+        except KeyboardInterrupt:
+            return True
+        finally:
+            if workers is not None:
+                workers.close()
         return False
 
-    def _add(self, stage: Stage, store: Store) -> bool:
-        """Plan a stage and what it needs; `True` if it has to be run, `False` if its artefact is there."""
+    def _workers(self) -> Executor:
+        options = self.options
+        log = self.folder / LOG
+        return executor(options.executor, options.scheduler, options.jobs, self.store.folder, log)
+
+    def _add(self, stage: Stage, machines: Set[str]) -> bool:
+        """Plan a stage and what it needs; `True` if it has to be run, `False` if its artefact is there.
+
+        Seconds count only where they were measured: an artefact of another machine is made anew.
+        """
         if stage.key in self.stages:
             return True
         if stage.key in self.reused:
             return False
-        artefact = None if isinstance(stage, QueriesStage) else store.get(stage.key)
-        if artefact is not None:
+        stored = not (self.options.fresh or isinstance(stage, PiecewiseStage))
+        artefact = self.store.get(stage.key) if stored else None
+        if artefact is not None and artefact.machine in machines:
             self._write_histories(stage, artefact.histories)
             self.reused.add(stage.key)
             return False
-        needed = {needed.key for needed in stage.inputs() if self._add(needed, store)}
+        needed = {needed.key for needed in stage.inputs() if self._add(needed, machines)}
         self.stages[stage.key] = stage
         self.waiting[stage.key] = needed
         return True
 
-    def _loop(self, pool: ProcessPool, jobs: int) -> None:
+    def _loop(self, workers: Executor) -> None:
         running: dict[Future[Any], Stage] = {}
         limits = self.study.limits
         while self.waiting or running:
             ready = [key for key, needed in self.waiting.items() if not needed]
-            for key in ready[: jobs - len(running)]:
+            for key in ready[: workers.slots - len(running)]:
                 del self.waiting[key]
                 stage = self.stages[key]
-                arguments = [str(self.folder / ARTEFACTS), stage, limits.memory_gib]
-                running[pool.schedule(perform, args=arguments, timeout=limits.cell_seconds)] = stage
+                job = Job(str(self.store.folder), stage, limits.query_seconds, limits.cell_seconds, limits.memory_gib)
+                running[workers.submit(job)] = stage
             done, _ = wait(running, return_when=FIRST_COMPLETED)
             for future in done:
-                self._finish(running.pop(future), self._outcome(future))
-
-    def _outcome(self, future: Future[Any]) -> Done | Failed:
-        try:
-            result = future.result()
-        except TimeoutError:
-            return Failed(Status.TIMEOUT, f"stopped after cell_seconds = {self.study.limits.cell_seconds:g} s")
-        except ProcessExpired as error:
-            return Failed(Status.CRASHED, f"the worker process died with exit code {error.exitcode}")
-        assert isinstance(result, Done | Failed)  # what `perform` returns
-        return result
+                self._finish(running.pop(future), _outcome(future))
 
     def _finish(self, stage: Stage, outcome: Done | Failed) -> None:
         if isinstance(outcome, Failed):
@@ -264,7 +267,7 @@ class _Run:
 
     def _write(self, cell: Cell, found: CellRows) -> None:
         keys = cell_columns(cell)
-        row = {"cell": cell.key, **keys, **found.cell, **self._provenance(cell)}
+        row = {"cell": cell.key, **keys, "machine": provenance.machine(), **found.cell, **self._provenance(cell)}
         queries = [{"cell": cell.key, **keys, "query": k, **query} for k, query in enumerate(found.queries)]
         self.journal.write_cell(row, queries, [{"cell": cell.key, **solution} for solution in found.solutions])
         self.observer.cell(cell, row)
@@ -274,7 +277,6 @@ class _Run:
             "seed": cell.seed,
             "study_hash": digest(self.study.model_dump(mode="json")),
             "code": cell.code,
-            "machine": provenance.machine(),
             "threads": 1,
             "versions": json.dumps(provenance.versions(cell.solver), sort_keys=True),
             "definition": cell.definition,
@@ -292,3 +294,14 @@ class _Run:
             ]
         if rows:
             self.journal.write_histories(stage.key, rows)
+
+
+def _outcome(future: Future[Any]) -> Done | Failed:
+    try:
+        result = future.result()
+    except Exception as error:  # noqa: BLE001  a cluster that lost the stage's workers again and again
+        return Failed(Status.CRASHED, " ".join(f"the executor lost it: {type(error).__name__}: {error}".split()))
+    if isinstance(result, Unstored):
+        raise StorageError(result.reason)
+    assert isinstance(result, Done | Failed)  # what `Keeper.run` returns
+    return result

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-VERSION = 2
+VERSION = 3
 """Schema version of a results file; a file of another version is refused."""
 
 KEYS: Mapping[str, str] = {
@@ -62,6 +62,7 @@ CELLS: Mapping[str, str] = {
     "residual_max": "REAL",
     "fallbacks": "TEXT",
     "peak_memory_mib": "REAL",
+    "slowdown": "REAL",
     "disturbed": "INTEGER",
     "seed": "INTEGER",
     "study_hash": "TEXT",

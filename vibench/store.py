@@ -1,19 +1,33 @@
-"""Artefacts: results of stages, each a file under the hash of its inputs."""
+"""Artefacts: results of stages, each a file under the hash of its inputs, shared by all runs."""
 
 from __future__ import annotations
 
+import contextlib
+import hashlib
 import os
 import pickle
 import tempfile
+import time
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import platformdirs
+
+from vibench.errors import RequestError, StorageError
+from vibench.locking import locked
 from vibench.provenance import machine
 from vibench.timing import Seconds
 
-ARTEFACTS = "artefacts"
-"""Folder of the artefacts within a run folder."""
+CACHE_VARIABLE = "VIBENCH_CACHE"
+"""Environment variable that says where artefacts are kept."""
+
+SUFFIX = ".artefact"
+"""How artefacts' files end; a SHA-256 of what follows, then a pickle."""
+
+LOCK = "lock"
+"""File that runs share and `clear` wants for itself."""
 
 
 @dataclass(frozen=True)
@@ -37,7 +51,7 @@ class History:
 
 @dataclass(frozen=True)
 class Artefact:
-    """Result of a stage, the seconds it took where it was measured, and its histories."""
+    """Result of a stage, the seconds it took on the machine where it was measured, and its histories."""
 
     value: Any
     seconds: Seconds
@@ -45,26 +59,31 @@ class Artefact:
     machine: str
 
 
-class Store:
-    """The artefacts of a run folder.
+def default_folder() -> Path:
+    """Where artefacts are kept: `$VIBENCH_CACHE`, or the user's cache folder."""
+    return Path(os.environ.get(CACHE_VARIABLE) or platformdirs.user_cache_dir("vibench")).absolute() / "artefacts"
 
-    An artefact of another machine counts as missing: its seconds would not compare.
-    """
+
+class Store:
+    """The artefacts in a folder."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         self._recent: dict[str, Artefact] = {}
 
     def get(self, key: str) -> Artefact | None:
-        """The artefact stored under a key, or `None`."""
+        """The artefact stored under a key; `None` if there is none that is whole."""
         if key in self._recent:
             return self._recent[key]
         try:
-            with self._path(key).open("rb") as file:
-                artefact = pickle.load(file)
-        except (OSError, EOFError, pickle.UnpicklingError, AttributeError, ImportError, ValueError, IndexError):
-            return None  # not there, cut off, or written by other code: it is made again
-        if not isinstance(artefact, Artefact) or artefact.machine != machine():
+            content = self._path(key).read_bytes()
+            size = hashlib.sha256().digest_size
+            if hashlib.sha256(content[size:]).digest() != content[:size]:
+                return None  # cut off, or changed on the disk
+            artefact = pickle.loads(content[size:])
+        except (OSError, pickle.UnpicklingError, EOFError, AttributeError, ImportError):
+            return None  # not there, or of classes that are not there any more
+        if not isinstance(artefact, Artefact):
             return None
         if len(self._recent) >= 64:
             self._recent.pop(next(iter(self._recent)))
@@ -72,17 +91,89 @@ class Store:
         return artefact
 
     def put(self, key: str, value: Any, seconds: Seconds, histories: tuple[History, ...]) -> None:
-        """Store an artefact: written beside its place, then renamed, so that it is whole or not there."""
-        self.folder.mkdir(parents=True, exist_ok=True)
-        artefact = Artefact(value, seconds, histories, machine())
-        handle, name = tempfile.mkstemp(dir=self.folder, suffix=".part")
+        """Store an artefact: written beside its place, synced, then renamed, so that it is whole or not there.
+
+        Raises
+        ------
+        StorageError
+            If it cannot be written.
+        """
+        content = pickle.dumps(Artefact(value, seconds, histories, machine()), protocol=pickle.HIGHEST_PROTOCOL)
+        self._recent.pop(key, None)
+        part = None
         try:
+            self.folder.mkdir(parents=True, exist_ok=True)
+            handle, part = tempfile.mkstemp(dir=self.folder, suffix=".part")
             with os.fdopen(handle, "wb") as file:
-                pickle.dump(artefact, file, protocol=pickle.HIGHEST_PROTOCOL)
-            Path(name).replace(self._path(key))
-        except BaseException:
-            Path(name).unlink(missing_ok=True)
-            raise
+                file.write(hashlib.sha256(content).digest())
+                file.write(content)
+                file.flush()
+                os.fsync(file.fileno())
+            Path(part).replace(self._path(key))
+        except OSError as error:
+            raise StorageError(f"artefacts cannot be written to '{self.folder}': {error.strerror}") from None
+        finally:
+            if part is not None:
+                Path(part).unlink(missing_ok=True)
+
+    @contextlib.contextmanager
+    def used(self) -> Iterator[None]:
+        """Nobody clears the store meanwhile.
+
+        Raises
+        ------
+        RequestError
+            If it is being cleared now, or cannot be written.
+        """
+        with locked(self.folder / LOCK, shared=True, busy=f"the artefacts in '{self.folder}' are being removed"):
+            yield
+
+    def contents(self) -> list[tuple[str, int, float]]:
+        """What is stored: sort of stage, bytes, seconds since it was made; one entry per artefact."""
+        found = []
+        for path in sorted(self.folder.glob(f"*{SUFFIX}")):
+            with contextlib.suppress(FileNotFoundError):
+                status = path.stat()
+                found.append((path.name.partition("-")[0], status.st_size, time.time() - status.st_mtime))
+        return found
+
+    def clear(self, older_than: float = 0.0) -> int:
+        """Remove artefacts made more than so many seconds ago, and what killed runs left; returns the bytes freed.
+
+        Raises
+        ------
+        RequestError
+            If a run uses the store.
+        """
+        freed = 0
+        if not self.folder.is_dir():
+            return freed
+        with locked(self.folder / LOCK, busy=f"a run uses the artefacts in '{self.folder}'"):
+            for path in [*self.folder.glob(f"*{SUFFIX}"), *self.folder.glob("*.part")]:
+                status = path.stat()
+                if path.suffix == ".part" or time.time() - status.st_mtime >= older_than:
+                    path.unlink()
+                    freed += status.st_size
+        return freed
 
     def _path(self, key: str) -> Path:
-        return self.folder / f"{key}.pickle"
+        return self.folder / f"{key}{SUFFIX}"
+
+
+def usable_store() -> Store:
+    """The store all runs share.
+
+    Raises
+    ------
+    RequestError
+        If its folder cannot be made.
+    """
+    store = Store(default_folder())
+    try:
+        store.folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise RequestError(
+            f"the folder for artefacts, '{store.folder}', cannot be made: {error.strerror}; "
+            f"set {CACHE_VARIABLE} to another one"
+        ) from None
+    return store

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import os
 import statistics
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
 from typing import TypeVar
 
-from threadpoolctl import threadpool_limits
+import numpy as np
 
 T = TypeVar("T")
 
@@ -20,7 +19,8 @@ REPEATS = 5
 SLOW = 1.0
 """A query that takes longer than this many seconds is timed once."""
 
-THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMEXPR_NUM_THREADS")
+ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMEXPR_NUM_THREADS"), "1")
+"""Environment in which numerical libraries start with one thread."""
 
 
 @dataclass(frozen=True)
@@ -55,26 +55,55 @@ def timed(work: Callable[[], T]) -> tuple[T, Seconds]:
     return result, watch.seconds()
 
 
-def median_seconds(work: Callable[[], T]) -> tuple[T, Seconds]:
-    """Result of some work and its seconds: one warm-up, then the median of `REPEATS`; the first run if it is slow."""
-    result, first = timed(work)
+def median_seconds(work: Callable[[], T], before: Callable[[], None] = lambda: None) -> tuple[T, Seconds]:
+    """Result of some work and its seconds: one warm-up, then the median of `REPEATS`; the first run if it is slow.
+
+    `before` is called, untimed, before each of them.
+    """
+
+    def once() -> tuple[T, Seconds]:
+        before()
+        return timed(work)
+
+    result, first = once()
     if first.wall > SLOW:
         return result, first
-    runs = [timed(work)[1] for _ in range(REPEATS)]
+    runs = [once()[1] for _ in range(REPEATS)]
     return result, Seconds(statistics.median(r.cpu for r in runs), statistics.median(r.wall for r in runs))
 
 
-@contextmanager
-def one_thread() -> Iterator[None]:
-    """Numerical libraries on one thread in this process and in those started inside."""
-    before = {name: os.environ.get(name) for name in THREAD_VARIABLES}
-    os.environ.update(dict.fromkeys(THREAD_VARIABLES, "1"))
-    try:
-        with threadpool_limits(1):
-            yield
-    finally:
-        for name, value in before.items():
-            if value is None:
-                os.environ.pop(name, None)
-            else:
-                os.environ[name] = value
+class Calibration:
+    """A fixed piece of numerical work, timed again and again, that tells how much slower the machine is than it was.
+
+    What takes time from it, another process on its core, a shared cache, a lower clock rate, takes it from everything
+    that is timed beside it.
+    """
+
+    TRIES = 3
+
+    def __init__(self) -> None:
+        self._matrix = np.random.default_rng(0).standard_normal((160, 160))
+        self._best = float("inf")
+        self.slowdown()
+
+    def slowdown(self) -> float:
+        """Wall seconds of the work now, the quickest of three, over the quickest ever in this process."""
+        now = min(timed(self._work)[1].wall for _ in range(self.TRIES))
+        self._best = min(self._best, now)
+        return now / self._best
+
+    def _work(self) -> float:
+        """Dense products, as BLAS does them, and a loop of small calls, as Python does."""
+        product, total = self._matrix, 0.0
+        for _ in range(4):
+            product = self._matrix @ product
+            product = product / np.abs(product).max()
+        for row in self._matrix:
+            total += float(row @ row)
+        return total
+
+
+@cache
+def calibration() -> Calibration:
+    """The calibration of this process."""
+    return Calibration()

@@ -2,49 +2,57 @@
 
 from __future__ import annotations
 
+import faulthandler
 import os
 import resource
 import signal
+import sys
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from functools import cache
+from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from threadpoolctl import threadpool_limits
 
-from vibench.errors import VibenchError
+from vibench.errors import StorageError, VibenchError
+from vibench.isolation import Finished, Job, Progress, Watch
 from vibench.qp import Status
-from vibench.queries import QueriesStage
-from vibench.stage import Stage
-from vibench.store import History, Store
+from vibench.stage import Done, Failed, PiecewiseStage, Unstored
+from vibench.store import Store
+
+T = TypeVar("T")
+Send = Callable[[Any], None]
 
 
-@dataclass(frozen=True)
-class Done:
-    """A stage that went through: its histories, its value if the parent needs it, and how long it kept its worker."""
-
-    histories: tuple[History, ...]
-    value: Any
-    wall: float
-
-
-@dataclass(frozen=True)
-class Failed:
-    """A stage that did not: the status its cells get, and why."""
-
-    status: Status
-    reason: str
-
-
-def initialise() -> None:
-    """Prepare a worker: one thread, Ctrl-C left to the parent, and no life after the parent's."""
+def main() -> None:
+    """Serve the keeper at the other end of a socket until it hangs up."""
+    connection, log = Connection(int(sys.argv[1])), os.open(sys.argv[2], os.O_WRONLY | os.O_APPEND | os.O_CREAT)
+    for stream in (1, 2):  # what plugins print is nobody's business, and must not look like ours
+        os.dup2(log, stream)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threadpool_limits(1)
     threading.Thread(target=_follow, args=(os.getppid(),), daemon=True).start()
+    own = os.getpid()
+
+    def send(message: Any) -> None:
+        if os.getpid() != own:  # a plugin forked, and this is the other one
+            os._exit(0)
+        connection.send(message)
+
+    while True:
+        try:
+            job, progress = connection.recv()
+        except EOFError:
+            return
+        faulthandler.dump_traceback_later(
+            2.0 * job.cell_seconds + 60.0, exit=True
+        )  # if nobody is left to enforce limits
+        send(perform(job, progress, send))
+        faulthandler.cancel_dump_traceback_later()
 
 
 def _follow(parent: int) -> None:
@@ -54,27 +62,57 @@ def _follow(parent: int) -> None:
     os._exit(1)
 
 
-def perform(folder: str, stage: Stage, memory_gib: float) -> Done | Failed:
+def perform(job: Job, progress: Progress, send: Send) -> Done | Failed | Unstored:
     """Run one stage; what a plugin raises becomes a reason, so that the rest of the matrix goes on."""
     start = time.perf_counter()
+
+    def work() -> Done:
+        store = _store(job.store)
+        if isinstance(job.stage, PiecewiseStage):
+            value = _pieces(job, store, progress, send)
+            return Done((), value, time.perf_counter() - start)
+        result = job.stage.run(store)
+        store.put(job.stage.key, result.value, result.seconds, result.histories)
+        return Done(result.histories, None, time.perf_counter() - start)
+
+    try:
+        return _guarded(job.memory_gib, work)
+    except StorageError as error:
+        return Unstored(str(error))
+
+
+def _pieces(job: Job, store: Store, progress: Progress, send: Send) -> Any:
+    """What is still to be done of a piecewise stage, piece by piece; its value."""
+    stage = job.stage
+    assert isinstance(stage, PiecewiseStage)
+    pieces = stage.begin(store)
+    found = dict(progress.found)
+    for number in range(stage.pieces):
+        if number not in found and number not in progress.lost:
+            value = _guarded(job.memory_gib, lambda: pieces.piece(number, lambda on: send(Watch(number, on))))  # noqa: B023
+            found[number] = pieces.lost(number, value) if isinstance(value, Failed) else value
+            send(Finished(number, found[number]))
+    found |= {number: pieces.lost(number, failed) for number, failed in progress.lost.items()}
+    return pieces.finish([found[number] for number in range(stage.pieces)])
+
+
+def _guarded(memory_gib: float, work: Callable[[], T]) -> T | Failed:
+    """What some work gives, or why it gave nothing."""
     try:
         with _memory_limit(memory_gib):
-            store = _store(folder)
-            result = stage.run(store)
-            queries = isinstance(stage, QueriesStage)
-            if not queries:
-                store.put(stage.key, result.value, result.seconds, result.histories)
+            return work()
     except MemoryError:
         return Failed(Status.ERROR, f"out of memory: the limit is memory_gib = {memory_gib:g}")
-    except (Exception, SystemExit) as error:  # noqa: BLE001  plugins may raise anything; the row says what
+    except StorageError:
+        raise
+    except (Exception, SystemExit, KeyboardInterrupt) as error:  # noqa: BLE001  plugins may raise anything
         name = "" if isinstance(error, VibenchError) else f"{type(error).__name__}: "
         return Failed(Status.ERROR, " ".join(f"{name}{error}".split()))
-    return Done(result.histories, result.value if queries else None, time.perf_counter() - start)
 
 
 @contextmanager
 def _memory_limit(gib: float) -> Iterator[None]:
-    """No more address space than this while a stage runs; outside, the worker must be able to answer."""
+    """No more address space than this for some work; outside, the worker must be able to answer."""
     soft, hard = resource.getrlimit(resource.RLIMIT_AS)
     limit = int(gib * 2**30)
     if _address_space() > limit:
@@ -95,3 +133,7 @@ def _address_space() -> int:
 @cache
 def _store(folder: str) -> Store:
     return Store(Path(folder))
+
+
+if __name__ == "__main__":
+    main()
