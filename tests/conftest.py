@@ -12,6 +12,8 @@ from pathlib import Path
 
 import pytest
 
+from running import Vibench, started
+from samples import install_fakes
 from vibench import plugins
 from vibench.store import CACHE_VARIABLE
 
@@ -66,3 +68,23 @@ def register(monkeypatch: pytest.MonkeyPatch) -> Iterator[Register]:
     forget()
     yield replace
     forget()
+
+
+@pytest.fixture(scope="module")
+def plugins_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Where the third-party package is installed; one of the solvers that are optional is not."""
+    folder = install_fakes(tmp_path_factory.mktemp("third-party") / "site")
+    (folder / "ecos.py").write_text("raise ImportError('not on this machine')\n")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def vibench(command: str, plugins_folder: Path) -> Vibench:
+    """Function that runs the installed command in a folder."""
+
+    def run(folder: Path, *arguments: str, plugins: Path = plugins_folder) -> subprocess.CompletedProcess[str]:
+        with started([command, *arguments], folder, plugins) as process:
+            out, err = process.communicate(timeout=120)
+        return subprocess.CompletedProcess(arguments, process.returncode, out, err)
+
+    return run

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import ctypes
 import os
+import re
+import signal
 import sys
 import time
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import numpy as np
 import scipy.sparse as sp
@@ -78,6 +81,89 @@ class Hungry(Wire):
         self.meal = np.ones(2**36)
 
 
+class Sleeps(Wire):
+    def assemble(self, mu: Array) -> VariationalInequality:
+        time.sleep(3600)
+        return super().assemble(mu)
+
+
+class Exits(Wire):
+    def assemble(self, mu: Array) -> VariationalInequality:
+        os._exit(3)
+
+
+class Segfaults(Wire):
+    def assemble(self, mu: Array) -> VariationalInequality:
+        segfault()
+        return super().assemble(mu)
+
+
+class Infeasible(Wire):
+    def assemble(self, mu: Array) -> VariationalInequality:
+        vi = super().assemble(mu)
+        both = sp.csr_array(sp.vstack([vi.B[:6], -vi.B[:6]]))
+        return VariationalInequality(vi.A, vi.f, both, np.full(12, -1.0))
+
+
+class CrookedSpace(Wire):
+    def __init__(self) -> None:
+        super().__init__()
+        self.V = InnerProduct(self.stiffness - 1e3 * self.mass, "X_V")
+
+
+class Chatty(Wire):
+    """Prints, writes past Python, forks, and is right all the same."""
+
+    forked = False
+
+    def assemble(self, mu: Array) -> VariationalInequality:
+        print("assembling", mu)
+        print("careful", file=sys.stderr)
+        os.write(1, b"written past Python\n")
+        if not self.forked:
+            self.forked = True
+            os.fork()  # two go on from here
+        return super().assemble(mu)
+
+
+def segfault() -> None:
+    ctypes.string_at(0)
+
+
+class BadCone(DualStrategy):
+    """Returns a cone that is broken in the way asked for."""
+
+    def __init__(self, how: Literal["nan", "shape", "negative", "long", "nothing"]) -> None:
+        self.how = how
+
+    def reduce(self, snapshots: Array, W: InnerProduct, stop: Stop) -> Cone:
+        chi = snapshots[:, :2] / W.norm(snapshots[:, :2])
+        broken = {"nan": chi * np.nan, "shape": chi[1:], "negative": -chi, "long": 2.0 * chi, "nothing": None}[self.how]
+        if broken is None:
+            return None  # type: ignore[return-value]
+        return Cone(broken, np.ones(1), np.zeros(2, dtype=bool))
+
+
+class BadVectors(PrimalStrategy):
+    """Returns vectors that are broken in the way asked for."""
+
+    def __init__(self, how: Literal["nan", "shape", "long", "supply", "nothing"]) -> None:
+        self.how = how
+
+    def build(self, offline: Offline, tolerance: float | None) -> Enrichment:
+        if self.how == "supply":
+            return Enrichment(Kind.PER_PARAMETER, supply=flat_supply)
+        if self.how == "nothing":
+            return None  # type: ignore[return-value]
+        one = offline.problem.V.orthonormalise(np.ones((offline.problem.V.dim, 1)), offline.basis)
+        broken = {"nan": one * np.nan, "shape": one[1:], "long": 2.0 * one}[self.how]
+        return Enrichment(Kind.FIXED, vectors=broken)
+
+
+def flat_supply(V: InnerProduct, vi: VariationalInequality, span: Array) -> Array:
+    return np.ones(V.dim)
+
+
 class RaisingCone(DualStrategy):
     def reduce(self, snapshots: Array, W: InnerProduct, stop: Stop) -> Cone:
         raise LookupError("no generator found")
@@ -142,6 +228,34 @@ def numpy_count(program: VariationalInequality, accuracy: float) -> Answer:
 
 def dies(program: VariationalInequality, accuracy: float) -> Answer:
     os._exit(7)
+
+
+def hangs(program: VariationalInequality, accuracy: float) -> Answer:
+    """In native code that keeps every other thread of its process waiting."""
+    re.fullmatch("(a|a)*b", "a" * 200)
+    return careful(program, accuracy)
+
+
+def segfaults(program: VariationalInequality, accuracy: float) -> Answer:
+    segfault()
+    return careful(program, accuracy)
+
+
+def dies_sometimes(program: VariationalInequality, accuracy: float) -> Answer:
+    """Where the force is below 6 N/m: one mode carries the load, and the data are scaled to a load of 1."""
+    if np.abs(program.A).max() > 0.6:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return careful(program, accuracy)
+
+
+def hungry(program: VariationalInequality, accuracy: float) -> Answer:
+    return Answer(np.ones(2**36), np.ones(3), "solved")
+
+
+def chatty(program: VariationalInequality, accuracy: float) -> Answer:
+    print("solving")
+    os.write(2, b"solving past Python\n")
+    return careful(program, accuracy)
 
 
 def leaves(program: VariationalInequality, accuracy: float) -> Answer:

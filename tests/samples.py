@@ -100,9 +100,19 @@ FAKES: Mapping[str, Mapping[str, str]] = {
         "wire-indefinite": "Indefinite",
         "wire-broken": "Broken",
         "wire-hungry": "Hungry",
+        "wire-sleeps": "Sleeps",
+        "wire-exits": "Exits",
+        "wire-segfaults": "Segfaults",
+        "wire-infeasible": "Infeasible",
+        "wire-crooked": "CrookedSpace",
+        "wire-chatty": "Chatty",
     },
-    "vibench.dual_strategies": {"cone-raises": "RaisingCone", "cone-waits": "WaitingCone"},
-    "vibench.primal_strategies": {"enrichment-raises": "RaisingEnrichment", "enrichment-counts": "CountingEnrichment"},
+    "vibench.dual_strategies": {"cone-raises": "RaisingCone", "cone-waits": "WaitingCone", "cone-bad": "BadCone"},
+    "vibench.primal_strategies": {
+        "enrichment-raises": "RaisingEnrichment",
+        "enrichment-counts": "CountingEnrichment",
+        "enrichment-bad": "BadVectors",
+    },
     "vibench.qp_solvers": {
         "careful": "careful",
         "raises": "raises",
@@ -114,6 +124,11 @@ FAKES: Mapping[str, Mapping[str, str]] = {
         "counts": "numpy_count",
         "dies": "dies",
         "leaves": "leaves",
+        "hangs": "hangs",
+        "segfaults": "segfaults",
+        "dies-sometimes": "dies_sometimes",
+        "hungry": "hungry",
+        "chatty": "chatty",
     },
 }
 """What the third-party package registers: group → name → member of `fake_plugins`."""

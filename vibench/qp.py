@@ -114,7 +114,7 @@ def solve(
     Raises
     ------
     NumericalError
-        If what the solver returns has the wrong shape.
+        If what the solver returns is not an `Answer`, or has the wrong shape.
     """
     if not len(program.f):
         return Answer(np.zeros(0), np.zeros(len(program.g)), "nothing to solve: no unknowns")
@@ -122,6 +122,8 @@ def solve(
     scaled = VariationalInequality(program.A / cost, program.f / cost, _divide_rows(program.B, rows), program.g / rows)
     if extra and solver in extra:
         answer = extra[solver](scaled, accuracy)
+        if not isinstance(answer, Answer):
+            raise NumericalError(f"the solver returned a {type(answer).__name__}, expected an Answer")
     else:
         answer = _through_qpsolvers(scaled, solver, accuracy)
     for name, value, size in (("x", answer.x, len(program.f)), ("α", answer.alpha, len(program.g))):

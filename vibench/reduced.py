@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from vibench.arrays import Array
+from vibench.errors import NumericalError
 from vibench.problem import Problem, VariationalInequality, checked_assembly
 from vibench.strategy import Enrichment, Kind
 
@@ -67,6 +68,8 @@ class ReducedModel:
             return self.fixed_basis
         V = self.problem.V
         added = self._enrichment.supply(V, vi, self.span)
+        if added.ndim != 2 or added.shape[0] != V.dim:
+            raise NumericalError(f"the enrichment supplied vectors of shape {added.shape}, expected ({V.dim}, count)")
         return np.hstack([self.fixed_basis, V.orthonormalise(added, self.fixed_basis)])
 
     def assemble(self, mu: Array) -> ReducedProblem:

@@ -260,6 +260,10 @@ class _Run:
             if key in self.waiting:
                 del self.waiting[key]
                 self._fail(self.stages[key], Failed(failed.status, reason))
+        wanted = {key for key in self.waiting if key in self.cells}
+        wanted |= {needed.key for key in wanted for needed in self.stages[key].inputs()}
+        for key in self.waiting.keys() - wanted:  # led to nothing but what failed
+            del self.waiting[key]
 
     def _fail_cell(self, cell: Cell, status: Status, reason: str) -> None:
         row = {"status": status.value, "reason": reason, "queries": cell.validation, "queries_ok": 0}

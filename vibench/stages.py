@@ -9,6 +9,7 @@ import numpy as np
 
 from vibench.arrays import Array
 from vibench.cone import orthogonality
+from vibench.contracts import check_cone, check_enrichment
 from vibench.infsup import Multipliers, beta_span, multipliers
 from vibench.matrix import Cell, Plugin
 from vibench.pod import POD, pod
@@ -66,8 +67,11 @@ class ConeStage(Stage):
         strategy = self.dual.create()
         watch = Stopwatch()
         cone = strategy.reduce(snapshots, W, self.stop)
+        spent = watch.seconds()
+        check_cone(cone, W)
+        watch = Stopwatch()
         found = ReducedCone(cone, multipliers(cone.generators, W))
-        seconds = watch.seconds()
+        seconds = spent + watch.seconds()
         key = {"stage": "cone"}
         return Result(
             found,
@@ -100,6 +104,7 @@ class EnrichmentStage(Stage):
         offline = Offline(problem, basis.basis, reduced.cone, reduced.prepared.span, training_parameters(problem))
         strategy = self.primal.create()
         enrichment, seconds = timed(lambda: strategy.build(offline, self.tolerance))
+        check_enrichment(enrichment, problem.V, basis.basis)
         key = {"stage": "enrichment"}
         histories = [History(key, quantity, tuple(values)) for quantity, values in enrichment.history.items()]
         if enrichment.kind is Kind.FIXED:

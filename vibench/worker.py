@@ -33,6 +33,7 @@ def main() -> None:
     connection, log = Connection(int(sys.argv[1])), os.open(sys.argv[2], os.O_WRONLY | os.O_APPEND | os.O_CREAT)
     for stream in (1, 2):  # what plugins print is nobody's business, and must not look like ours
         os.dup2(log, stream)
+    faulthandler.enable()
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threadpool_limits(1)
     threading.Thread(target=_follow, args=(os.getppid(),), daemon=True).start()

@@ -1,0 +1,110 @@
+"""Running the command as a user would, and looking at what it leaves behind."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import sqlite3
+import subprocess
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+
+from vibench.journal import FILE
+from vibench.schema import TABLES
+
+Vibench = Callable[..., "subprocess.CompletedProcess[str]"]
+
+
+@contextlib.contextmanager
+def started(command: list[str], folder: Path, plugins: Path) -> Iterator[subprocess.Popen[str]]:
+    """A process that leads a group of its own; whoever is left of the group at the end is killed."""
+    process = subprocess.Popen(
+        command,
+        cwd=folder,
+        env=os.environ | {"PYTHONPATH": str(plugins), "PYTHONUNBUFFERED": "1"},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
+    try:
+        yield process
+    finally:
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(process.pid, signal.SIGKILL)
+        process.communicate()
+
+
+def rows(folder: Path, table: str = "cells") -> list[dict[str, Any]]:
+    """The rows of a results file, in the order they were written."""
+    db = sqlite3.connect(folder / FILE)
+    db.row_factory = sqlite3.Row
+    try:
+        return [dict(row) for row in db.execute(f"SELECT rowid, * FROM {table} ORDER BY rowid")]
+    finally:
+        db.close()
+
+
+def execute(folder: Path, statement: str) -> None:
+    db = sqlite3.connect(folder / FILE)
+    db.execute("PRAGMA foreign_keys=ON")
+    db.execute(statement)
+    db.commit()
+    db.close()
+
+
+def by_solver(folder: Path) -> dict[str, dict[str, Any]]:
+    return {row["solver"]: row for row in rows(folder)}
+
+
+def run_again(vibench: Vibench, folder: Path, *options: str, **more: Any) -> tuple[str, list[dict[str, Any]]]:
+    """Run the study of a folder once more; gives what was printed and the rows of the cells."""
+    done = vibench(folder, "run", "study.toml", "--jobs", "1", *options, **more)
+    assert done.returncode == 0, done.stderr
+    return done.stdout, rows(folder / "runs" / "wire")
+
+
+def read_until(process: subprocess.Popen[str], words: str) -> None:
+    """Read what a process prints until some words come."""
+    assert process.stdout is not None
+    printed = ""
+    while words not in printed:
+        line = process.stdout.readline()
+        assert line, f"the run ended: {printed}"
+        printed += line
+
+
+def workers(pid: int) -> list[int]:
+    """The worker processes that a process started."""
+    found: list[int] = []
+    for children in Path(f"/proc/{pid}/task").glob("*/children"):
+        with contextlib.suppress(FileNotFoundError, ProcessLookupError):
+            numbers = children.read_text().split()
+            found += [
+                int(number) for number in numbers if "vibench.worker" in Path(f"/proc/{number}/cmdline").read_text()
+            ]
+    return found
+
+
+MEASURED = ("_s", "peak_memory_mib", "slowdown", "disturbed", "benefit_threshold", "meaning")
+"""How the columns end that hold seconds, memory, or what follows from them."""
+
+
+def numbers(folder: Path) -> dict[str, pd.DataFrame]:
+    """The tables of a run without seconds, memory, and what follows from them; in an order of their own."""
+    found = {table: pd.read_csv(folder / "tables" / f"{table}.csv") for table in TABLES}
+    return {
+        table: frame[[name for name in frame.columns if not name.endswith(MEASURED)]] for table, frame in found.items()
+    }
+
+
+def assert_same_numbers(one: Path, other: Path) -> None:
+    """Two runs of a study that differ in nothing but their times."""
+    theirs = numbers(other)
+    for table, frame in numbers(one).items():
+        assert len(frame) > 0, table
+        pd.testing.assert_frame_equal(frame, theirs[table], check_exact=True)
