@@ -1,0 +1,88 @@
+"""Stages that misbehave, for the keeper of worker processes; importable there."""
+
+from __future__ import annotations
+
+import os
+import re
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import fake_plugins
+from vibench.stage import Failed, Pieces, PiecewiseStage, Result, Stage
+from vibench.store import Store
+from vibench.timing import Seconds
+
+
+def misbehave(how: str) -> None:
+    """Do what the word says."""
+    if how == "sleep":
+        time.sleep(3600)
+    elif how == "hang":  # in native code, no other thread of the process runs
+        re.fullmatch("(a|a)*b", "a" * 200)
+    elif how == "exit":
+        os._exit(5)
+    elif how == "segfault":
+        fake_plugins.segfault()
+    elif how == "interrupt":
+        raise KeyboardInterrupt
+    elif how == "fork":
+        os.fork()
+
+
+@dataclass(frozen=True)
+class Whole(Stage):
+    """A stage in one piece; it notes that it was begun."""
+
+    how: str
+    diary: str = ""
+
+    def inputs(self) -> tuple[Stage, ...]:
+        return ()
+
+    def run(self, store: Store) -> Result:
+        if self.diary:
+            with Path(self.diary).open("a") as file:
+                file.write(f"{os.getpid()} {os.getppid()}\n")
+        misbehave(self.how)
+        return Result(self.how, Seconds(1.0, 1.0))
+
+
+@dataclass(frozen=True)
+class InPieces(PiecewiseStage):
+    """Every piece does what its word says: before it, "watched" or not."""
+
+    hows: tuple[str, ...]
+    at_begin: str = ""
+    at_end: str = ""
+
+    @property
+    def pieces(self) -> int:
+        return len(self.hows)
+
+    def inputs(self) -> tuple[Stage, ...]:
+        return ()
+
+    def begin(self, store: Store) -> Pieces:
+        misbehave(self.at_begin)
+        return Work(self)
+
+
+class Work(Pieces):
+    def __init__(self, stage: InPieces) -> None:
+        self.stage = stage
+
+    def piece(self, number: int, watch: Callable[[bool], None]) -> Any:
+        watch(True)
+        misbehave(self.stage.hows[number])
+        watch(False)
+        return number, os.getpid()
+
+    def lost(self, number: int, failed: Failed) -> Any:
+        return number, failed
+
+    def finish(self, pieces: Sequence[Any]) -> Any:
+        misbehave(self.stage.at_end)
+        return list(pieces)
