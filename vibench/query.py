@@ -13,7 +13,7 @@ from vibench.arrays import Array
 from vibench.assess import Reference, errors
 from vibench.error_bounds import Stability, bounds
 from vibench.problem import checked_assembly
-from vibench.qp import Status
+from vibench.qp import Answer, Status
 from vibench.reduced import ReducedModel, ReducedProblem
 from vibench.timing import Seconds, median_seconds
 
@@ -45,9 +45,14 @@ class Task:
 
         `assembly` is what assembling takes; `watch` is told, untimed, when the solver begins and when it is back.
         """
-        reduced = model.assemble(mu)
+        reduced, registered = model.assemble(mu), plugins.qp_solver(self.solver)
         program = reduced.program
-        work = partial(qp.solve, program, self.solver, self.accuracy, plugins.qp_solver(self.solver))
+        answers: list[Answer] = []
+
+        def work() -> Answer:
+            answers.append(qp.solve(program, self.solver, self.accuracy, registered))
+            return answers[-1]
+
         row: Row = {"assemble_s": assembly.cpu}
         try:
             answer, solving = median_seconds(work, before=partial(watch, True))
@@ -68,12 +73,19 @@ class Task:
             "reason": reason,
             "solver_status": answer.solver_status,
             "iterations": answer.iterations,
+            "repeatable": int(all(_same(answer, other) for other in answers)),
         }
         if residuals is None or answer.x is None or answer.alpha is None:
             return row, None
         row |= {"primal_residual": residuals.primal, "dual_residual": residuals.dual, "gap": residuals.gap}
         row |= _assessed(model, mu, reduced, answer.x, answer.alpha, exact, stability)
         return row, solution_row(answer.x, answer.alpha, slack(program, answer.x, answer.alpha, self.accuracy))
+
+
+def _same(one: Answer, other: Answer) -> bool:
+    """Whether two answers are the same to the last bit."""
+    pairs = ((one.x, other.x), (one.alpha, other.alpha))
+    return all((a is b) if a is None or b is None else a.tobytes() == b.tobytes() for a, b in pairs)
 
 
 def _assessed(

@@ -109,6 +109,7 @@ QUERIES: Mapping[str, str] = {
     "dual_residual": "REAL",
     "gap": "REAL",
     "iterations": "INTEGER",
+    "repeatable": "INTEGER",
 }
 """Beside these a query has mu_1, mu_2, …, as many as its problem has parameters. Bounds are absolute; an effectivity is
 bound over absolute error."""
