@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import signal
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -48,6 +49,25 @@ class Whole(Stage):
                 file.write(f"{os.getpid()} {os.getppid()}\n")
         misbehave(self.how)
         return Result(self.how, Seconds(1.0, 1.0))
+
+
+@dataclass(frozen=True)
+class KillsItsParent(Stage):
+    """Kills the process that keeps the worker, the first time it is run."""
+
+    diary: str
+
+    def inputs(self) -> tuple[Stage, ...]:
+        return ()
+
+    def run(self, store: Store) -> Result:
+        first = not Path(self.diary).exists()
+        with Path(self.diary).open("a") as file:
+            file.write("begun\n")
+        if first:
+            os.kill(os.getppid(), signal.SIGKILL)
+            time.sleep(3600)
+        return Result("survived")
 
 
 @dataclass(frozen=True)
