@@ -5,6 +5,7 @@ from __future__ import annotations
 import fcntl
 import os
 import subprocess
+import sys
 import sysconfig
 from collections.abc import Callable, Iterator
 from importlib.metadata import EntryPoint
@@ -14,7 +15,7 @@ import pytest
 
 from running import Vibench, started
 from samples import install_fakes
-from vibench import plugins
+from vibench import cli, plugins
 from vibench.store import CACHE_VARIABLE
 
 
@@ -88,3 +89,22 @@ def vibench(command: str, plugins_folder: Path) -> Vibench:
         return subprocess.CompletedProcess(arguments, process.returncode, out, err)
 
     return run
+
+
+Main = Callable[..., tuple[int, str, str]]
+
+
+@pytest.fixture
+def main(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> Main:
+    """Function that calls the command in an empty folder; gives exit code, what was printed, and errors."""
+    (tmp_path / "here").mkdir()
+    monkeypatch.chdir(tmp_path / "here")
+
+    def call(*arguments: str) -> tuple[int, str, str]:
+        monkeypatch.setattr(sys, "argv", ["vibench", *arguments])
+        with pytest.raises(SystemExit) as caught:
+            cli.main()
+        printed = capsys.readouterr()
+        return int(caught.value.code or 0), printed.out, printed.err
+
+    return call

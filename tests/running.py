@@ -126,3 +126,16 @@ def _split(frame: pd.DataFrame, shaky: set[str]) -> tuple[pd.DataFrame, pd.DataF
     solvers = frame.columns.intersection(["solver", "solver_a", "solver_b"])
     theirs = frame[solvers].isin(shaky).any(axis=1)
     return frame[~theirs], frame[theirs].drop(columns=[name for name in CHANGEABLE if name in frame])
+
+
+def refused(outcome: tuple[int, str, str], *words: str) -> str:
+    """The one line of a request that was refused; fails unless it was, and holds these words."""
+    code, out, err = outcome
+    assert code == 2, err
+    assert out == ""
+    assert err.endswith("\n")
+    assert len(err.splitlines()) == 1, err
+    assert err.startswith("vibench: ")
+    assert "Traceback" not in err
+    assert [word for word in words if word not in err] == [], err
+    return err

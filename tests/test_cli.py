@@ -6,14 +6,14 @@ import csv
 import importlib.metadata
 import io
 import shutil
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from conftest import Register
+from conftest import Main, Register
+from running import refused
 from samples import STUDY, changed, write_study
 from vibench import cli, plugins
 from vibench.journal import FILE
@@ -23,24 +23,6 @@ from vibench.solver_settings import SETTINGS
 from vibench.study_file import load_study
 from vibench.tables import read
 
-Main = Callable[..., tuple[int, str, str]]
-
-
-@pytest.fixture
-def main(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> Main:
-    """Function that calls the command in an empty folder; gives exit code, what was printed, and errors."""
-    (tmp_path / "here").mkdir()
-    monkeypatch.chdir(tmp_path / "here")
-
-    def call(*arguments: str) -> tuple[int, str, str]:
-        monkeypatch.setattr(sys, "argv", ["vibench", *arguments])
-        with pytest.raises(SystemExit) as caught:
-            cli.main()
-        printed = capsys.readouterr()
-        return int(caught.value.code or 0), printed.out, printed.err
-
-    return call
-
 
 @pytest.fixture
 def _nothing_starts(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -48,19 +30,6 @@ def _nothing_starts(monkeypatch: pytest.MonkeyPatch) -> None:
         raise AssertionError("a stage was run")
 
     monkeypatch.setattr("vibench.runner._Run.execute", started)
-
-
-def refused(outcome: tuple[int, str, str], *words: str) -> str:
-    """The one line of a request that was refused; fails unless it was, and holds these words."""
-    code, out, err = outcome
-    assert code == 2, err
-    assert out == ""
-    assert err.endswith("\n")
-    assert len(err.splitlines()) == 1, err
-    assert err.startswith("vibench: ")
-    assert "Traceback" not in err
-    assert [word for word in words if word not in err] == [], err
-    return err
 
 
 RUN = {
