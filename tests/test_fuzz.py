@@ -18,7 +18,8 @@ PARTS = 10
 
 ODD: list[Any] = [
     "", " ", "nan", "quick", "piqp", "mcpg", "\x7f", "µ" * 50, "../..", 0, 1, -1, 2**70, -0.0, 1e-400, 1e300, 0.5,
-    True, False, float("nan"), float("inf"), float("-inf"), [], {}, [[]], [{}], [None], [0.5, "x"], {"name": "cpg"}, {"": 1},
+    True, False, float("nan"), float("inf"), float("-inf"), [], {}, [[]],
+    [{}], [None], [0.5, "x"], {"name": "cpg"}, {"": 1},
     {"name": "obstacle", "options": {"resolution": -5}}, {"name": "hertz", "options": {"colour": 3}}, ["osqp", "osqp"],
     [{"name": "cpg", "label": ""}], {"offline-pga": []}, {"offline-pga": [2.0]},
 ]  # fmt: skip

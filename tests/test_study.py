@@ -127,6 +127,11 @@ WRONG: Mapping[str, tuple[tuple[str | int, ...], Any, tuple[str, ...]]] = {
     "primal tolerance zero": ((*TABLE, "primal"), {"offline-pga": [0.0]}, ("primal.offline-pga.0", "greater than 0")),
     "primal tolerances empty": ((*TABLE, "primal"), {"offline-pga": []}, ("primal.offline-pga", "at least 1")),
     "primal tolerance of a stranger": ((*TABLE, "primal"), {"offline-gpa": [0.5]}, ("did you mean 'offline-pga'",)),
+    "primal tolerance for one that takes none": (
+        (*TABLE, "primal"),
+        {"decorrelated": [0.5], "offline-pga": [0.5]},
+        ("tolerances.primal", "'decorrelated'", "takes no tolerance"),
+    ),
     "primal tolerance for nobody": ((*TABLE, "primal"), [0.5], ("tolerances.0.primal",)),
     "limits no table": (("limits",), 3, ("limits", "found 3")),
     "limit zero": (("limits",), {"query_seconds": 0.0}, ("limits.query_seconds", "greater than 0")),
@@ -269,6 +274,14 @@ def test_overrides_find_entries_by_label(tmp_path: Path) -> None:
     path = write_study(tmp_path, changed(STUDY, "problem", to=entries))
     study = load_study(path, {"problem": ["large"]})
     assert [(entry.title, entry.options["resolution"]) for entry in study.problem] == [("large", "paper")]
+
+
+def test_an_override_keeps_every_entry_with_its_name(tmp_path: Path) -> None:
+    entries = [{"name": "obstacle", "label": size, "options": {"resolution": size}} for size in ("coarse", "medium")]
+    study = load_study(
+        write_study(tmp_path, changed(STUDY, "problem", to=[*entries, "hertz"])), {"problem": ["obstacle"]}
+    )
+    assert [entry.title for entry in study.problem] == ["coarse", "medium"]
 
 
 def test_overrides_replace_tolerances_in_every_table(tmp_path: Path) -> None:

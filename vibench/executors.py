@@ -105,9 +105,14 @@ class Dask(Executor):
             resource_tracker.ensure_running()  # whose start lets Ctrl-C through again
             with interrupts_held():
                 self._cluster = LocalCluster(
-                    n_workers=slots, threads_per_worker=1, processes=True, protocol="tcp", dashboard_address="127.0.0.1:0",
-                    memory_limit=0, silence_logs="CRITICAL",
-                )  # fmt: skip
+                    n_workers=slots,
+                    threads_per_worker=1,
+                    processes=True,
+                    protocol="tcp",
+                    dashboard_address="127.0.0.1:0",
+                    memory_limit=0,
+                    silence_logs="CRITICAL",
+                )
         try:
             self._client = Client(self._cluster or scheduler, timeout="10s", set_as_default=False)
         except (OSError, ValueError) as error:

@@ -71,7 +71,7 @@ def _replace_axes(content: dict[str, Any], given: Mapping[str, list[Any]]) -> di
     content = dict(content)
     for axis in ("problem", "dual", "primal", "solvers"):
         if axis in given:
-            content[axis] = [_entry_in(content.get(axis), name) for name in given[axis]]
+            content[axis] = [entry for name in given[axis] for entry in _entries_in(content.get(axis), name)]
     tables = content.get("tolerances")
     if isinstance(tables, list) and all(isinstance(table, dict) for table in tables):
         primal = content.get("primal")
@@ -101,12 +101,10 @@ def _takes_tolerance(entry: Any) -> bool:
     return known and bool(plugins.load("primal strategy", name).takes_tolerance)
 
 
-def _entry_in(axis: Any, name: str) -> Any:
-    """The axis entry with this name or label, its options included; the bare name where the file has none."""
-    for entry in axis if isinstance(axis, list) else []:
-        if isinstance(entry, dict) and name in (entry.get("name"), entry.get("label")):
-            return entry
-    return name
+def _entries_in(axis: Any, name: str) -> list[Any]:
+    """The axis entries with this name or label, their options included; the bare name where the file has none."""
+    tables = [entry for entry in axis if isinstance(entry, dict)] if isinstance(axis, list) else []
+    return [entry for entry in tables if name in (entry.get("name"), entry.get("label"))] or [name]
 
 
 def _validate(content: dict[str, Any], source: str) -> Study:
@@ -175,7 +173,8 @@ def _check_tolerances(study: Study, table: ToleranceTable) -> None:
     for entry in study.dual:
         table.of_dual(entry)
     for entry in study.primal:
-        table.of_primal(entry)
+        if table.of_primal(entry) == [None] and not table.primal.keys().isdisjoint({entry.name, entry.title}):
+            raise RequestError(f"tolerances.primal gives something for '{entry.title}', which takes no tolerance")
 
 
 def _registered_elsewhere(kind: str, name: str) -> bool:
