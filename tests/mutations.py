@@ -204,9 +204,37 @@ FAULTS = (
     Fault(
         "warm-up-counted",
         "vibench/timing.py",
-        "runs = [timed(work)[1] for _ in range(REPEATS)]",
+        "runs = [once()[1] for _ in range(REPEATS)]",
         "runs = [first] * REPEATS",
         ("tests/test_timing.py",),
+    ),
+    Fault(
+        "checksum-not-verified",
+        "vibench/store.py",
+        "if hashlib.sha256(content[size:]).digest() != content[:size]:",
+        "if False:",
+        ("tests/test_store.py",),
+    ),
+    Fault(
+        "folder-not-locked",
+        "vibench/locking.py",
+        "fcntl.flock(file, (fcntl.LOCK_SH if shared else fcntl.LOCK_EX) | fcntl.LOCK_NB)",
+        "pass",
+        ("tests/test_journal.py",),
+    ),
+    Fault(
+        "limit-of-a-query-not-enforced",
+        "vibench/isolation.py",
+        "elif time.monotonic() > min(own, deadline):",
+        "elif time.monotonic() > deadline:",
+        ("tests/test_isolation.py",),
+    ),
+    Fault(
+        "good-pieces-thrown-away",
+        "vibench/isolation.py",
+        "progress.found[message.piece] = message.value",
+        "pass",
+        ("tests/test_isolation.py",),
     ),
     Fault(
         "rows-doubled-at-the-second-write",
@@ -239,7 +267,7 @@ def first_failure(root: Path, tests: Sequence[str]) -> str | None:
         return f"no end within {PATIENCE} s"
     if done.returncode == 0:
         return None
-    failed = re.search(r"^(?:FAILED|ERROR) (\S+)", done.stdout, re.MULTILINE)
+    failed = re.search(r"^(?:FAILED|ERROR) (.+?)(?: - .*)?$", done.stdout, re.MULTILINE)
     if done.returncode != 1 or not failed:
         raise SystemExit(f"the tests could not be run:\n{done.stdout[-2000:]}{done.stderr[-2000:]}")
     return failed[1]
