@@ -12,11 +12,15 @@ from importlib.metadata import EntryPoint
 from pathlib import Path
 
 import pytest
+from hypothesis import settings
 
 from running import Vibench, started
 from samples import install_fakes
 from vibench import cli, plugins
 from vibench.store import CACHE_VARIABLE
+
+settings.register_profile("any machine", deadline=None)
+settings.load_profile("any machine")
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -84,3 +84,21 @@ def test_a_run_that_is_terminated_leaves_no_worker_behind(command: str, plugins_
                 return
             time.sleep(0.1)
         pytest.fail("a worker goes on")
+
+
+def test_two_runs_do_not_write_into_one_folder(
+    command: str, plugins_folder: Path, vibench: Vibench, waiting: Path
+) -> None:
+    with started([command, "run", "study.toml", "--jobs", "2"], waiting, plugins_folder) as process:
+        read_until(process, "[1/2] ok")
+        for options in ((), ("--fresh",)):
+            second = vibench(waiting, "run", "study.toml", *options)
+            assert second.returncode == 2
+            assert f"another run writes into 'runs/wire' (process {process.pid} on" in second.stderr
+        refused = vibench(waiting, "clean")
+        assert refused.returncode == 2
+        assert "a run uses the artefacts in" in refused.stderr
+        (waiting / "go on").touch()
+        out, err = process.communicate(timeout=60)
+    assert (process.returncode, err) == (0, "")
+    assert "2 cells, 2 ok" in out

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import hashlib
+import pickle
+import re
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import pandas as pd
@@ -19,6 +23,8 @@ from running import (
 from samples import wire_study, write_study
 from vibench.journal import FILE
 from vibench.schema import TABLES
+from vibench.store import CACHE_VARIABLE, SUFFIX, Store
+from vibench.sweeps import CHUNKS
 
 SOLVERS = ["piqp", "careful", "gives-up"]
 
@@ -167,3 +173,56 @@ def test_the_number_of_jobs_changes_no_result(vibench: Vibench, tmp_path: Path) 
         done = vibench(tmp_path, "run", "study.toml", "--jobs", jobs, "--out", jobs, "--fresh")
         assert done.returncode == 0, done.stderr
     assert_same_numbers(tmp_path / "1", tmp_path / "2")
+
+
+def of_another_machine(artefacts: Path) -> None:
+    """Make all artefacts look as if they had been made elsewhere."""
+    store = Store(artefacts)
+    for path in artefacts.glob(f"*{SUFFIX}"):
+        found = store.get(path.name.removesuffix(SUFFIX))
+        assert found is not None
+        content = pickle.dumps(replace(found, machine="elsewhere"))
+        path.write_bytes(hashlib.sha256(content).digest() + content)
+
+
+def test_artefacts_are_shared_by_studies_and_seconds_only_on_their_machine(
+    vibench: Vibench, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path / "cache"))
+    made = 2 * CHUNKS + 5  # high-fidelity solutions; POD, cone, enrichment; reference constants, assembly
+    one = wire_study(solvers=["piqp", "careful"])
+    two = one | {"name": "other", "accuracy": 1e-6}
+    write_study(tmp_path, one, "one.toml")
+    write_study(tmp_path, two, "two.toml")
+
+    def stages(*options: str) -> int:
+        done = vibench(tmp_path, "run", *options, "--jobs", "1")
+        assert (done.returncode, done.stderr) == (0, "")
+        return int(re.search(r"to run, (\d+) stages", done.stdout)[1])
+
+    assert stages("one.toml") == made + 2
+    assert stages("two.toml") == 2  # only the queries of its two cells
+    assert stages("one.toml", "--out", "again") == 2
+    assert stages("one.toml", "--out", "anew", "--fresh") == made + 2
+    assert_same_numbers(tmp_path / "again", tmp_path / "anew")
+    again, anew = (rows(tmp_path / folder)[0]["offline_s"] for folder in ("again", "anew"))
+    assert again == rows(tmp_path / "runs" / "wire")[0]["offline_s"] != anew  # measured again only where made anew
+    of_another_machine(tmp_path / "cache" / "artefacts")
+    assert stages("one.toml", "--out", "here") == made + 2
+    assert rows(tmp_path / "here")[0]["machine"] == rows(tmp_path / "again")[0]["machine"]
+
+
+def test_clean_shows_and_frees_what_artefacts_take(
+    vibench: Vibench, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path / "cache"))
+    vibench(tmp_path, "run", write_study(tmp_path, wire_study()), "--jobs", "1")
+    artefacts = tmp_path / "cache" / "artefacts"
+    count = len(list(artefacts.glob(f"*{SUFFIX}")))
+    for options, left in ((("--dry-run",), count), (("--older-than", "1"), count), ((), 0)):
+        done = vibench(tmp_path, "clean", *options)
+        assert (done.returncode, done.stderr) == (0, "")
+        assert re.search(rf"highfidelity +{2 * CHUNKS} ", done.stdout)
+        assert len(list(artefacts.glob(f"*{SUFFIX}"))) == left
+    assert "MiB freed" in done.stdout
+    assert (tmp_path / "runs" / "wire" / FILE).exists()
