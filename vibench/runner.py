@@ -7,6 +7,7 @@ import shutil
 from collections.abc import Iterable, Mapping, Sequence, Set
 from concurrent.futures import FIRST_COMPLETED, Future, wait
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -19,6 +20,7 @@ from vibench.isolation import Job
 from vibench.journal import FILE, Journal, claimed, read_meta, study_of
 from vibench.matrix import Cell, digest, expand
 from vibench.naming import HistoryNames, cell_columns
+from vibench.plan import Plan
 from vibench.qp import Status
 from vibench.queries import CellRows, QueriesStage
 from vibench.stage import Done, Failed, PiecewiseStage, Stage, Unstored
@@ -166,9 +168,7 @@ class _Run:
     names: HistoryNames
     cell_count: int
     options: Options
-    waiting: dict[str, set[str]] = field(default_factory=dict)
-    stages: dict[str, Stage] = field(default_factory=dict)
-    reused: set[str] = field(default_factory=set)
+    plan: Plan = field(default_factory=Plan)
     cells: dict[str, list[Cell]] = field(default_factory=dict)
 
     def execute(self, todo: Sequence[Cell]) -> bool:
@@ -182,9 +182,9 @@ class _Run:
                 assert workers is not None
                 stage = queries_stage(cell, self.study)
                 self.cells.setdefault(stage.key, []).append(cell)
-                self._add(stage, workers.machines)
+                self.plan.add_goal(stage, partial(self._is_there, workers.machines))
             slots = workers.slots if workers is not None else 0
-            self.observer.start(self.cell_count, list(self.stages.values()), len(unavailable), slots)
+            self.observer.start(self.cell_count, list(self.plan.stages.values()), len(unavailable), slots)
             for cell in unavailable:
                 self._fail_cell(cell, Status.UNAVAILABLE, f"the QP solver '{cell.solver}' is not installed")
             if workers is not None:
@@ -201,34 +201,24 @@ class _Run:
         log = self.folder / LOG
         return executor(options.executor, options.scheduler, options.jobs, self.store.folder, log)
 
-    def _add(self, stage: Stage, machines: Set[str]) -> bool:
-        """Plan a stage and what it needs; `True` if it has to be run, `False` if its artefact is there.
+    def _is_there(self, machines: Set[str], stage: Stage) -> bool:
+        """Whether a stage's artefact can be reused; its histories are written if so.
 
         Seconds count only where they were measured: an artefact of another machine is made anew.
         """
-        if stage.key in self.stages:
-            return True
-        if stage.key in self.reused:
+        if self.options.fresh or isinstance(stage, PiecewiseStage):
             return False
-        stored = not (self.options.fresh or isinstance(stage, PiecewiseStage))
-        artefact = self.store.get(stage.key) if stored else None
-        if artefact is not None and artefact.machine in machines:
-            self._write_histories(stage, artefact.histories)
-            self.reused.add(stage.key)
+        artefact = self.store.get(stage.key)
+        if artefact is None or artefact.machine not in machines:
             return False
-        needed = {needed.key for needed in stage.inputs() if self._add(needed, machines)}
-        self.stages[stage.key] = stage
-        self.waiting[stage.key] = needed
+        self._write_histories(stage, artefact.histories)
         return True
 
     def _loop(self, workers: Executor) -> None:
         running: dict[Future[Any], Stage] = {}
         limits = self.study.limits
-        while self.waiting or running:
-            ready = [key for key, needed in self.waiting.items() if not needed]
-            for key in ready[: workers.slots - len(running)]:
-                del self.waiting[key]
-                stage = self.stages[key]
+        while self.plan.waiting or running:
+            for stage in self.plan.begin(workers.slots - len(running)):
                 job = Job(str(self.store.folder), stage, limits.query_seconds, limits.cell_seconds, limits.memory_gib)
                 running[workers.submit(job)] = stage
             done, _ = wait(running, return_when=FIRST_COMPLETED)
@@ -245,25 +235,18 @@ class _Run:
                 self._write(cell, outcome.value)
         else:
             self._write_histories(stage, outcome.histories)
-        for needed in self.waiting.values():
-            needed.discard(stage.key)
+        self.plan.done(stage)
 
     def _fail(self, stage: Stage, failed: Failed) -> None:
-        """Give a row to every cell that needs a stage that failed, and drop what would have followed."""
+        """Give a row to every cell that needs a stage that failed."""
         if isinstance(stage, QueriesStage):
-            for cell in self.cells[stage.key]:
-                self._fail_cell(cell, failed.status, failed.reason)
-            return
-        name = type(stage).__name__.removesuffix("Stage").lower()
-        reason = failed.reason if failed.reason.startswith("in ") else f"in {name}: {failed.reason}"
-        for key in [key for key, needed in self.waiting.items() if stage.key in needed]:
-            if key in self.waiting:
-                del self.waiting[key]
-                self._fail(self.stages[key], Failed(failed.status, reason))
-        wanted = {key for key in self.waiting if key in self.cells}
-        wanted |= {needed.key for key in wanted for needed in self.stages[key].inputs()}
-        for key in self.waiting.keys() - wanted:  # led to nothing but what failed
-            del self.waiting[key]
+            without, reason = [stage], failed.reason
+        else:
+            without = [goal for goal in self.plan.lost(stage) if isinstance(goal, QueriesStage)]
+            reason = f"in {type(stage).__name__.removesuffix('Stage').lower()}: {failed.reason}"
+        for goal in without:
+            for cell in self.cells[goal.key]:
+                self._fail_cell(cell, failed.status, reason)
 
     def _fail_cell(self, cell: Cell, status: Status, reason: str) -> None:
         row = {"status": status.value, "reason": reason, "queries": cell.validation, "queries_ok": 0}
