@@ -5,13 +5,17 @@ from __future__ import annotations
 import os
 import re
 import signal
+import subprocess
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 import fake_plugins
+from vibench.matrix import Plugin
 from vibench.stage import Failed, Pieces, PiecewiseStage, Result, Stage
 from vibench.store import Store
 from vibench.timing import Seconds
@@ -31,6 +35,12 @@ def misbehave(how: str) -> None:
         raise KeyboardInterrupt
     elif how == "fork":
         os.fork()
+    elif how == "hunger":
+        np.ones(2**36)
+    elif how == "child":  # which would outlive its parent
+        subprocess.Popen(["sleep", "601"])
+    elif how == "moment":
+        time.sleep(0.05)
 
 
 @dataclass(frozen=True)
@@ -49,6 +59,20 @@ class Whole(Stage):
                 file.write(f"{os.getpid()} {os.getppid()}\n")
         misbehave(self.how)
         return Result(self.how, Seconds(1.0, 1.0))
+
+
+@dataclass(frozen=True)
+class OfAPlugin(Stage):
+    """A stage that depends on a plugin, below another stage."""
+
+    below: OfAPlugin | None = None
+    problem: Plugin | None = None
+
+    def inputs(self) -> tuple[Stage, ...]:
+        return ()
+
+    def run(self, store: Store) -> Result:
+        return Result("fine")
 
 
 @dataclass(frozen=True)
@@ -72,11 +96,12 @@ class KillsItsParent(Stage):
 
 @dataclass(frozen=True)
 class InPieces(PiecewiseStage):
-    """Every piece does what its word says: before it, "watched" or not."""
+    """Every piece does what its word says, and what the one in `unwatched` says before the keeper is told."""
 
     hows: tuple[str, ...]
     at_begin: str = ""
     at_end: str = ""
+    unwatched: tuple[str, ...] = ()
 
     @property
     def pieces(self) -> int:
@@ -95,6 +120,7 @@ class Work(Pieces):
         self.stage = stage
 
     def piece(self, number: int, watch: Callable[[bool], None]) -> Any:
+        misbehave(self.stage.unwatched[number] if self.stage.unwatched else "")
         watch(True)
         misbehave(self.stage.hows[number])
         watch(False)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import re
 import subprocess
+import time
 from collections.abc import Iterator
 from concurrent.futures import wait
 from pathlib import Path
@@ -13,10 +14,10 @@ import pytest
 from distributed import LocalCluster
 
 from fake_stages import KillsItsParent, Whole
-from running import Vibench, assert_same_numbers
+from running import Vibench, assert_same_numbers, read_until, started
 from samples import wire_study, write_study
 from vibench import executors
-from vibench.errors import RequestError
+from vibench.errors import ExecutorError, RequestError
 from vibench.executors import Dask, Local
 from vibench.isolation import Job
 from vibench.stage import Done, Stage
@@ -66,8 +67,16 @@ def test_a_cluster_somebody_has_is_used_and_left_alone(cluster: LocalCluster, tm
             stage = Whole(f"fine {k}")
             assert isinstance(workers.submit(job(stage, tmp_path)).result(timeout=60), Done)
             assert Store(tmp_path).get(stage.key) is not None
+            endless = workers.submit(job(Whole("sleep", str(tmp_path / f"diary {k}")), tmp_path))
+            while not (tmp_path / f"diary {k}").exists():
+                time.sleep(0.05)
         finally:
             workers.close()
+        worker = int((tmp_path / f"diary {k}").read_text().split()[0])
+        with pytest.raises(ProcessLookupError):  # nothing of ours goes on there
+            os.kill(worker, 0)
+        with pytest.raises(ExecutorError):
+            endless.result(timeout=10)
     assert list(tmp_path.glob("*.part")) == []
 
 
@@ -86,8 +95,8 @@ def test_a_dask_worker_that_dies_is_survived(cluster: LocalCluster, tmp_path: Pa
 def test_workers_with_another_vibench_are_refused(
     cluster: LocalCluster, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(executors, "core_code", lambda: "mine")
-    with pytest.raises(RequestError, match=r"the dask worker tcp://.* has another vibench: .* instead of mine"):
+    monkeypatch.setattr(executors, "code_here", lambda: "mine")
+    with pytest.raises(RequestError, match=r"the dask worker tcp://.* has other code: .* instead of mine"):
         Dask(cluster.scheduler_address, 1, tmp_path)
 
 
@@ -97,6 +106,29 @@ def test_workers_that_do_not_see_the_artefacts_are_refused(
     monkeypatch.setattr(executors, "_describe", elsewhere)
     with pytest.raises(RequestError, match="does not see the artefacts"):
         Dask(cluster.scheduler_address, 1, tmp_path)
+
+
+def test_a_cluster_that_is_shut_down_stops_the_run_with_a_line_and_it_goes_on_without(
+    command: str, plugins_folder: Path, vibench: Vibench, tmp_path: Path
+) -> None:
+    waits = {"name": "cone-waits", "options": {"file": str(tmp_path / "go on")}}
+    path = write_study(tmp_path, wire_study(dual=["cpg", waits]))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(plugins_folder)  # which processes that are spawned inherit
+        cluster = LocalCluster(n_workers=2, threads_per_worker=1, protocol="tcp", dashboard_address="127.0.0.1:0")
+    options = ["run", path, "--executor", "dask", "--scheduler", cluster.scheduler_address]
+    with started([command, *options], tmp_path, plugins_folder) as process:
+        read_until(process, "[1/2] ok")
+        cluster.close()
+        _, err = process.communicate(timeout=90)
+    assert process.returncode == 1
+    assert err.splitlines()[-1].startswith("vibench: the dask ")
+    assert err.splitlines()[-1].endswith("the same command goes on from here")
+    (tmp_path / "go on").touch()
+    done = vibench(tmp_path, "run", path)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert "2 cells, 1 to run" in done.stdout
+    assert "2 cells, 2 ok" in done.stdout
 
 
 def test_a_scheduler_that_does_not_answer_is_named(vibench: Vibench, tmp_path: Path) -> None:

@@ -55,32 +55,46 @@ def test_a_run_that_was_stopped_goes_on_later(
     assert len(rows(folder, "queries")) == 6
 
 
-def test_workers_never_see_an_interrupt(command: str, plugins_folder: Path, waiting: Path) -> None:
-    """From the moment on which they come to life; their own Python would answer with a traceback."""
+def test_workers_do_not_see_ctrl_c(command: str, plugins_folder: Path, waiting: Path) -> None:
+    """A terminal tells the group of the command; from the moment on which they come to life, workers are in others."""
     (waiting / "go on").touch()
+    groups: set[int] = set()
     with started([command, "run", "study.toml", "--jobs", "2"], waiting, plugins_folder) as process:
-        told, end = 0, time.monotonic() + 60
-        while process.poll() is None and time.monotonic() < end:
+        while process.poll() is None:
             for worker in workers(process.pid):
                 with contextlib.suppress(ProcessLookupError):
-                    os.kill(worker, signal.SIGINT)
-                    told += 1
+                    groups.add(os.getpgid(worker))
             time.sleep(0.005)
         _, err = process.communicate(timeout=10)
-    assert told > 10
     assert (process.returncode, err) == (0, "")
+    assert len(groups) == 2
+    assert process.pid not in groups
+
+
+def test_a_second_interrupt_changes_nothing(command: str, plugins_folder: Path, waiting: Path) -> None:
+    with started([command, "run", "study.toml", "--jobs", "2"], waiting, plugins_folder) as process:
+        read_until(process, "[1/2] ok")
+        for _ in range(20):
+            with contextlib.suppress(ProcessLookupError):
+                os.killpg(process.pid, signal.SIGINT)
+            time.sleep(0.01)
+        out, err = process.communicate(timeout=60)
+    assert (process.returncode, err) == (130, "")
+    assert "interrupted: 1 cells have no row yet; the same command goes on from here" in out
+    assert len(rows(waiting / "runs" / "wire")) == 1
 
 
 def test_a_run_that_is_terminated_leaves_no_worker_behind(command: str, plugins_folder: Path, waiting: Path) -> None:
     """As where a terminal is closed, or a scheduler ends a job: only the command itself is told."""
     with started([command, "run", "study.toml", "--jobs", "2"], waiting, plugins_folder) as process:
         read_until(process, "[1/2] ok")
+        left = set(workers(process.pid))
+        assert left
         process.terminate()
         process.wait(timeout=60)
         for _ in range(100):
-            try:
-                os.killpg(process.pid, 0)
-            except ProcessLookupError:
+            left = {worker for worker in left if Path(f"/proc/{worker}").exists()}
+            if not left:
                 return
             time.sleep(0.1)
         pytest.fail("a worker goes on")

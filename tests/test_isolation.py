@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import signal
 import subprocess
@@ -9,12 +10,15 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
-from fake_stages import InPieces, Whole
+from fake_stages import InPieces, OfAPlugin, Whole
+from vibench import isolation, plugins
 from vibench.isolation import Job, Keeper, StoppedError
+from vibench.matrix import Plugin
 from vibench.qp import Status
 from vibench.stage import Done, Failed, Stage, Unstored
 from vibench.store import Store
@@ -87,6 +91,92 @@ def test_beyond_the_limit_of_the_cell_the_pieces_done_are_kept(run: Run) -> None
     assert isinstance(found, Done)
     assert [isinstance(value, Failed) for _, value in found.value] == [False, False, True, True]
     assert found.value[3][1] == Failed(Status.TIMEOUT, "stopped after cell_seconds = 2 s")
+
+
+def test_a_piece_that_dies_before_it_is_watched_costs_itself(run: Run) -> None:
+    found = run(InPieces(("fine", "fine", "fine"), unwatched=("", "exit", "")))
+    assert isinstance(found, Done)
+    assert [isinstance(value, Failed) for _, value in found.value] == [False, True, False]
+
+
+def test_many_quick_pieces_have_the_limit_of_the_cell_too(run: Run) -> None:
+    start = time.monotonic()
+    found = run(InPieces(("moment",) * 200), cell=1.0)
+    assert time.monotonic() - start < 1.0 + 5.0
+    assert isinstance(found, Done)
+    lost = [value for _, value in found.value if isinstance(value, Failed)]
+    assert 100 < len(lost) < 200
+    assert set(lost) == {Failed(Status.TIMEOUT, "stopped after cell_seconds = 1 s")}
+
+
+def test_a_death_beyond_the_limit_is_not_the_reason_of_pieces_never_asked(run: Run) -> None:
+    found = run(InPieces(("fine", "sleep", "exit", "fine")), query=600.0, cell=1.0)
+    assert isinstance(found, Done)
+    assert {value.status for _, value in found.value[1:]} == {Status.TIMEOUT}
+
+
+def test_a_process_without_memory_is_replaced(run: Run) -> None:
+    found = run(InPieces(("fine", "hunger", "fine")))
+    assert isinstance(found, Done)
+    assert found.value[1][1] == Failed(Status.ERROR, "out of memory: the limit is memory_gib = 8")
+    assert found.value[0][1] != found.value[2][1]
+    starved = run(Whole("hunger"))
+    assert isinstance(starved, Failed)
+    assert "out of memory" in starved.reason
+    assert isinstance(run(Whole("fine")), Done)
+
+
+def test_a_finish_that_dies_is_tried_once_more_with_what_is_there(run: Run) -> None:
+    found = run(InPieces(("fine", "fine"), at_end="exit"))
+    assert isinstance(found, Failed)
+    assert found.status is Status.CRASHED
+
+
+def test_what_a_plugin_started_ends_with_its_process(run: Run, keeper: Keeper) -> None:
+    assert isinstance(run(InPieces(("child",))), Done)
+    assert sleepers()
+    keeper.close()
+    assert not sleepers()
+
+
+def sleepers() -> list[str]:
+    found = []
+    for path in Path("/proc").glob("[0-9]*/cmdline"):
+        with contextlib.suppress(OSError):
+            found += [str(path)] if path.read_bytes() == b"sleep\x00601\x00" else []
+    return found
+
+
+def test_a_plugin_that_is_not_the_one_planned_with_is_refused(run: Run) -> None:
+    """Its result would be stored under the hash of the other."""
+    known = Plugin("problem", "obstacle", "{}", plugins.code("problem", "obstacle"))
+    assert isinstance(run(OfAPlugin(OfAPlugin(problem=known))), Done)
+    other = replace(known, code="older")
+    found = run(OfAPlugin(OfAPlugin(problem=other)))
+    assert isinstance(found, Failed)
+    assert found.reason == "the problem 'obstacle' was changed since the run began; run the study again"
+
+
+def test_another_vibench_than_planned_with_is_refused(keeper: Keeper, tmp_path: Path) -> None:
+    found = keeper.run(replace(Job(str(tmp_path), Whole("fine"), 1.0, 30.0, 8.0), code="older"))
+    assert isinstance(found, Failed)
+    assert "vibench or one of the libraries was changed" in found.reason
+
+
+def test_a_suspended_run_is_not_late(monkeypatch: pytest.MonkeyPatch) -> None:
+    clock = isolation._Clock()
+    now = time.monotonic()
+    monkeypatch.setattr(isolation.time, "monotonic", lambda: now + 3600.0)
+    assert clock.tick() <= 1.0
+
+
+def test_a_talkative_job_can_be_stopped(keeper: Keeper, tmp_path: Path) -> None:
+    job = Job(str(tmp_path), InPieces(("moment",) * 2000), 1.0, 600.0, 8.0)
+    threading.Timer(2.0, keeper.stop).start()
+    start = time.monotonic()
+    with pytest.raises(StoppedError):
+        keeper.run(job)
+    assert time.monotonic() - start < 5.0
 
 
 @pytest.mark.parametrize("where", ["at_begin", "at_end"])

@@ -183,7 +183,8 @@ def main() -> None:
     except VibenchError as error:
         code = _refuse(error, 1)
     except OSError as error:
-        code = _refuse(f"'{error.filename}' cannot be written or read: {error.strerror}", 1)
+        where = f"'{error.filename}' cannot be written or read: " if error.filename else ""
+        code = _refuse(f"{where}{error.strerror or error}", 1)
     except typer.Abort:
         code = 130
     except Exception as error:

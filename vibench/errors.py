@@ -18,6 +18,10 @@ class StorageError(VibenchError):
     """A result that could not be written: no space left, no permission, a device that failed."""
 
 
+class ExecutorError(VibenchError):
+    """Whoever was to run stages is gone: a cluster that was shut down, a network that broke."""
+
+
 class NumericalError(VibenchError):
     """A computation cannot go on: a matrix that is not SPD, values that are not finite, no convergence."""
 

@@ -2,23 +2,25 @@
 
 from __future__ import annotations
 
+import contextlib
 import secrets
+import signal
 import threading
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from multiprocessing import resource_tracker
 from pathlib import Path
+from queue import SimpleQueue
 from typing import Any
 
-from vibench.errors import RequestError
-from vibench.isolation import Job, Keeper, interrupts_held
-from vibench.provenance import core_code, machine
+from vibench.errors import ExecutorError, RequestError
+from vibench.isolation import Job, Keeper, code_here
+from vibench.provenance import machine
+from vibench.qp import Status
 from vibench.stage import Done, Failed, Unstored
 
 Outcome = Done | Failed | Unstored
-
-_of_thread = threading.local()
 
 
 class Executor(ABC):
@@ -32,6 +34,15 @@ class Executor(ABC):
     @abstractmethod
     def submit(self, job: Job) -> Future[Outcome]:
         """Begin a job."""
+
+    def check(self) -> None:  # noqa: B027  nothing to check where jobs run in our own threads
+        """Make sure that jobs can still end.
+
+        Raises
+        ------
+        ExecutorError
+            If whoever runs them is gone.
+        """
 
     @abstractmethod
     def close(self) -> None:
@@ -52,22 +63,30 @@ class Local(Executor):
     def __init__(self, slots: int, log: Path) -> None:
         self.slots, self.machines = slots, frozenset({machine()})
         self._log = log
-        self._keepers: list[Keeper] = []
-        self._threads = ThreadPoolExecutor(slots, initializer=self._initialise)
-
-    def _initialise(self) -> None:
-        _of_thread.keeper = Keeper(self._log)
-        self._keepers.append(_of_thread.keeper)
+        self._keepers = [Keeper(log) for _ in range(slots)]
+        self._free: SimpleQueue[Keeper] = SimpleQueue()
+        for keeper in self._keepers:
+            self._free.put(keeper)
+        self._threads = ThreadPoolExecutor(slots)
 
     def submit(self, job: Job) -> Future[Outcome]:
         """Begin a job in a worker process that is free."""
-        return self._threads.submit(_run, job)
+        return self._threads.submit(self._run, job)
+
+    def _run(self, job: Job) -> Outcome:
+        keeper = self._free.get()
+        try:
+            return keeper.run(job)
+        finally:
+            self._free.put(keeper)
 
     def close(self) -> None:
         """End the worker processes."""
         for keeper in self._keepers:
-            keeper.close()
+            keeper.stop()
         self._threads.shutdown(cancel_futures=True)
+        for keeper in self._keepers:
+            keeper.close()
         if self._log.is_file() and not self._log.stat().st_size:
             self._log.unlink()
 
@@ -100,10 +119,11 @@ class Dask(Executor):
             raise RequestError(
                 "the executor 'dask' needs dask.distributed: install vibench with its extra 'cluster'"
             ) from None
+        self._token = secrets.token_hex(8)
         self._cluster: Any = None
         if scheduler is None:
             resource_tracker.ensure_running()  # whose start lets Ctrl-C through again
-            with interrupts_held():
+            with _interrupts_held():
                 self._cluster = LocalCluster(
                     n_workers=slots,
                     threads_per_worker=1,
@@ -117,11 +137,11 @@ class Dask(Executor):
             self._client = Client(self._cluster or scheduler, timeout="10s", set_as_default=False)
         except (OSError, ValueError) as error:
             raise RequestError(f"no dask scheduler answers at '{scheduler}': {error}") from None
-        self.slots, self.machines = self._check(store)
+        self.slots, self.machines = self._check_workers(store)
 
-    def _check(self, store: Path) -> tuple[int, frozenset[str]]:
+    def _check_workers(self, store: Path) -> tuple[int, frozenset[str]]:
         """How many workers there are, and on which machines; refuses those that cannot do the work."""
-        token = store / f"{secrets.token_hex(8)}.part"
+        token = store / f"{self._token}.part"
         token.touch()
         try:
             found: dict[str, tuple[bool, str, str]] = self._client.run(_describe, str(token))
@@ -134,50 +154,72 @@ class Dask(Executor):
         for address, (sees, code, _) in found.items():
             if not sees:
                 raise RequestError(f"the dask worker {address} does not see the artefacts in '{store}'")
-            if code != core_code():
-                raise RequestError(f"the dask worker {address} has another vibench: {code} instead of {core_code()}")
+            if code != code_here():
+                raise RequestError(f"the dask worker {address} has other code: {code} instead of {code_here()}")
         return len(found), frozenset(where for _, _, where in found.values())
 
     def submit(self, job: Job) -> Future[Outcome]:
         """Begin a job on a worker."""
         result: Future[Outcome] = Future()
-        theirs = self._client.submit(_run_alone, job, pure=False)
+        theirs = self._client.submit(_run_for, self._token, job, pure=False)
         theirs.add_done_callback(lambda done: _hand_over(done, result))
         return result
 
+    def check(self) -> None:
+        """The scheduler answers."""
+        if self._client.status != "running":
+            raise ExecutorError("the dask scheduler is gone; the same command goes on from here")
+
     def close(self) -> None:
-        """Leave the cluster, and end it if it is ours."""
+        """End the jobs, leave the cluster as it was found, and end it if it is ours."""
+        with contextlib.suppress(Exception):  # a cluster that is gone has nothing to be ended
+            if self._client.status == "running":
+                self._client.run(_dismiss, self._token)
         self._client.close()
         if self._cluster is not None:
             self._cluster.close()
 
 
+@contextlib.contextmanager
+def _interrupts_held() -> Iterator[None]:
+    """Processes started meanwhile never see Ctrl-C: they inherit what is blocked."""
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
 def _hand_over(theirs: Any, ours: Future[Outcome]) -> None:
-    """Give the result of a dask future to one of the standard library's, for which `concurrent.futures.wait` works."""
-    if theirs.cancelled():
-        ours.cancel()
-    elif (error := theirs.exception()) is not None:
-        ours.set_exception(error)
-    else:
+    """Give the end of a dask future to one of the standard library's, for which `concurrent.futures.wait` works."""
+    try:
         ours.set_result(theirs.result())
+    except BaseException as error:  # noqa: BLE001  in a thread of dask's: whoever waits has to hear of it
+        line = " ".join(f"{type(error).__name__}: {error}".split())
+        if type(error).__name__ == "KilledWorker":
+            ours.set_result(Failed(Status.CRASHED, f"dask gave up on it: {line}"))
+        else:
+            ours.set_exception(ExecutorError(f"the dask cluster was lost: {line}; the same command goes on from here"))
 
 
-def _run(job: Job) -> Outcome:
-    """Run a job with the keeper of this thread."""
-    keeper: Keeper = _of_thread.keeper
-    return keeper.run(job)
+_keepers: dict[tuple[str, int], Keeper] = {}
+"""In a dask worker: the keepers of every run, one per thread."""
 
 
-def _run_alone(job: Job) -> Outcome:
-    """Run a job with the keeper of this dask worker."""
-    if not hasattr(_of_thread, "keeper"):
-        _of_thread.keeper = Keeper()
-    return _run(job)
+def _run_for(token: str, job: Job) -> Outcome:
+    """Run a job of a run with the keeper that this thread of a dask worker has for it."""
+    return _keepers.setdefault((token, threading.get_ident()), Keeper()).run(job)
+
+
+def _dismiss(token: str) -> None:
+    """End what a dask worker does for a run."""
+    for key in [key for key in _keepers if key[0] == token]:
+        _keepers.pop(key).close()
 
 
 def _describe(token: str) -> tuple[bool, str, str]:
     """What a run wants to know of a dask worker: whether it sees a file, its code, its machine."""
-    return Path(token).exists(), core_code(), machine()
+    return Path(token).exists(), code_here(), machine()
 
 
 def executor(name: str, scheduler: str | None, slots: int, store: Path, log: Path) -> Executor:

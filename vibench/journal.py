@@ -43,8 +43,15 @@ def claimed(folder: Path) -> Iterator[None]:
         yield
 
 
-UNWRITABLE = {sqlite3.SQLITE_FULL, sqlite3.SQLITE_IOERR, sqlite3.SQLITE_READONLY, sqlite3.SQLITE_CANTOPEN}
-"""What SQLite says where the disk is full, gone, or not ours."""
+UNWRITABLE = {
+    sqlite3.SQLITE_FULL,
+    sqlite3.SQLITE_IOERR,
+    sqlite3.SQLITE_READONLY,
+    sqlite3.SQLITE_CANTOPEN,
+    sqlite3.SQLITE_BUSY,
+    sqlite3.SQLITE_CORRUPT,
+}
+"""What SQLite says where the disk is full, gone, or not ours, or another program holds or broke the file."""
 
 
 class Journal:
@@ -56,6 +63,8 @@ class Journal:
         The run folder; made if it does not exist.
     study
         What the numbers of the study depend on: results of another study are refused.
+    anew
+        Drop whatever is there, in the transaction that makes the tables.
 
     Raises
     ------
@@ -63,18 +72,27 @@ class Journal:
         If the folder holds something that is not a results file of this study and schema.
     """
 
-    def __init__(self, folder: Path, study: Mapping[str, Any]) -> None:
+    def __init__(self, folder: Path, study: Mapping[str, Any], *, anew: bool = False) -> None:
         path = folder / FILE
         try:
-            _refuse_other(path, study)
+            if not anew:
+                _refuse_other(path, study)
             folder.mkdir(parents=True, exist_ok=True)
             self._db = sqlite3.connect(path)
             self._db.execute("PRAGMA journal_mode=WAL")
-            self._db.execute("PRAGMA foreign_keys=ON")
             with self._db:
+                self._db.execute("BEGIN IMMEDIATE")
+                if anew:
+                    self._drop()
                 self._create(study)
+            self._db.execute("PRAGMA foreign_keys=ON")
         except (OSError, sqlite3.Error) as error:
             raise RequestError(f"output folder '{folder}' cannot be written: {error}") from None
+
+    def _drop(self) -> None:
+        names = self._db.execute("SELECT name FROM sqlite_master WHERE type = 'table' AND name NOT LIKE 'sqlite_%'")
+        for (name,) in names.fetchall():
+            self._db.execute(f'DROP TABLE "{name}"')
 
     def _create(self, study: Mapping[str, Any]) -> None:
         self._db.execute("CREATE TABLE IF NOT EXISTS meta (key TEXT PRIMARY KEY, value TEXT)")
@@ -131,8 +149,8 @@ class Journal:
         try:
             with self._db:
                 yield
-        except sqlite3.OperationalError as error:
-            if error.sqlite_errorcode & 0xFF not in UNWRITABLE:
+        except sqlite3.DatabaseError as error:
+            if getattr(error, "sqlite_errorcode", 0) & 0xFF not in UNWRITABLE:
                 raise
             raise StorageError(f"results cannot be written: {error}") from None
 

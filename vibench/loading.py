@@ -13,13 +13,17 @@ from typing import Any
 from vibench import tables
 from vibench.arrays import Array
 from vibench.errors import RequestError
+from vibench.isolation import Job, Keeper
 from vibench.matrix import Cell
 from vibench.problem import VariationalInequality, validation_parameters
 from vibench.reduced import ReducedModel
-from vibench.stage import Stage
+from vibench.stage import Done, Stage
 from vibench.stages import enrichment_stage, reduced_model
 from vibench.store import Store, usable_store
 from vibench.tables import results_file
+
+UNLIMITED = (1e6, 1e6, 1e6)
+"""Limits of stages that are made again: they went well before."""
 
 
 @dataclass(frozen=True)
@@ -79,13 +83,32 @@ class RecordedCell:
 
 
 def _provide(stage: Stage, store: Store) -> None:
-    """Make sure that the artefact of a stage is in the store."""
-    if store.get(stage.key) is not None:
-        return
-    for needed in stage.inputs():
-        _provide(needed, store)
-    result = stage.run(store)
-    store.put(stage.key, result.value, result.seconds, result.histories)
+    """Make sure that the artefact of a stage is in the store, made as a run would make it.
+
+    Raises
+    ------
+    RequestError
+        If it cannot be made.
+    """
+    missing: dict[str, Stage] = {}
+    _collect(stage, store, missing)
+    keeper = Keeper()
+    try:
+        with store.used():
+            for needed in missing.values():
+                outcome = keeper.run(Job(str(store.folder), needed, *UNLIMITED))
+                if not isinstance(outcome, Done):
+                    raise RequestError(f"what the cell needs cannot be made again: {outcome.reason}")
+    finally:
+        keeper.close()
+
+
+def _collect(stage: Stage, store: Store, missing: dict[str, Stage]) -> None:
+    """Add a stage and what it needs, if they are not in the store, in the order in which they are to be run."""
+    if stage.key not in missing and store.get(stage.key) is None:
+        for needed in stage.inputs():
+            _collect(needed, store, missing)
+        missing[stage.key] = stage
 
 
 def recorded_cells(run: str) -> list[RecordedCell]:

@@ -8,6 +8,7 @@ import os
 import platform
 from collections.abc import Iterator
 from pathlib import Path
+from typing import TextIO
 
 from vibench.errors import RequestError
 
@@ -39,14 +40,21 @@ def locked(path: Path, *, busy: str, shared: bool = False) -> Iterator[None]:
             fcntl.flock(file, (fcntl.LOCK_SH if shared else fcntl.LOCK_EX) | fcntl.LOCK_NB)
         except BlockingIOError:
             file.seek(0)
-            raise RequestError(f"{busy}{_holder(file.read())}") from None
-        if not shared:
-            file.truncate(0)
-            with contextlib.suppress(OSError):  # a full disk: the lock holds, nameless
-                file.write(f"process {os.getpid()} on {platform.node()}")
-                file.flush()
-        yield
+            holder = file.read()
+            raise RequestError(f"{busy} ({holder})" if holder else busy) from None
+        except OSError as error:
+            raise RequestError(f"'{path}' cannot be locked: {error.strerror}") from None
+        _note(file, "" if shared else f"process {os.getpid()} on {platform.node()}")
+        try:
+            yield
+        finally:
+            if not shared:
+                _note(file, "")
 
 
-def _holder(text: str) -> str:
-    return f" ({text})" if text else ""
+def _note(file: TextIO, holder: str) -> None:
+    """Write down who holds a lock; on a full disk it holds all the same."""
+    with contextlib.suppress(OSError):
+        file.truncate(0)
+        file.write(holder)
+        file.flush()

@@ -61,7 +61,7 @@ def load(kind: str, name: str) -> Any:
     where = f"{kind} '{name}' ({registered[name].value})"
     try:
         plugin = registered[name].load()
-    except Exception as error:  # noqa: BLE001  importing a plugin runs code of strangers
+    except (Exception, SystemExit) as error:  # noqa: BLE001  importing a plugin runs code of strangers
         line = " ".join(f"{type(error).__name__}: {error}".split())
         raise RequestError(f"{where} cannot be loaded: {line}") from None
     base = _BASES.get(kind)
@@ -87,9 +87,23 @@ def version(kind: str, name: str) -> str:
 
 @cache
 def code(kind: str, name: str) -> str:
-    """Version of a plugin with a hash of the package it is written in, so that edited code is not taken for the old."""
-    module = importlib.import_module(_registered(kind)[name].module)
-    return f"{version(kind, name)} {source_hash(Path(str(module.__file__)).parent)}"
+    """Version of a plugin with a hash of its package, or of its one module: edited code is not taken for the old.
+
+    Of a package the outermost one that has an `__init__.py` counts, with all that is below it.
+
+    Raises
+    ------
+    RequestError
+        If no plugin has that name.
+    """
+    registered = _registered(kind)
+    if name not in registered:
+        raise unknown_name(kind, name, registered)
+    module = importlib.import_module(registered[name].module)
+    source = Path(str(module.__file__))
+    while (source.parent / "__init__.py").is_file():
+        source = source.parent
+    return f"{version(kind, name)} {source_hash(source)}"
 
 
 def options(kind: str, name: str) -> list[Option]:

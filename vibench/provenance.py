@@ -66,9 +66,10 @@ def libraries() -> str:
     return ", ".join([f"python {platform.python_version()}", *(f"{name} {there}" for name, there in found.items())])
 
 
-def source_hash(folder: Path) -> str:
-    """Short hash of the Python sources directly in a folder."""
+def source_hash(source: Path) -> str:
+    """Short hash of a Python source, or of all of them in a folder and below it."""
     content = hashlib.sha256()
-    for path in sorted(folder.glob("*.py")):
-        content.update(path.name.encode() + b"\0" + path.read_bytes())
+    folder = source if source.is_dir() else source.parent
+    for path in sorted(source.rglob("*.py")) if source.is_dir() else [source]:
+        content.update(path.relative_to(folder).as_posix().encode() + b"\0" + path.read_bytes())
     return content.hexdigest()[:12]

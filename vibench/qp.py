@@ -129,6 +129,9 @@ def solve(
     for name, value, size in (("x", answer.x, len(program.f)), ("α", answer.alpha, len(program.g))):
         if value is not None and value.shape != (size,):
             raise NumericalError(f"the solver returned {name} of shape {value.shape}, expected ({size},)")
+    if not isinstance(answer.solver_status, str) or not isinstance(answer.iterations, int | np.integer | None):
+        found = f"{answer.solver_status!r:.40}, {answer.iterations!r:.40}"
+        raise NumericalError(f"the solver reports the status and iterations {found}; expected a text, a number or None")
     if answer.alpha is None:
         return answer
     alpha = cost * answer.alpha / rows

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import shutil
+import signal
+import threading
 from collections.abc import Iterable, Mapping, Sequence, Set
 from concurrent.futures import FIRST_COMPLETED, Future, wait
 from dataclasses import dataclass, field
@@ -14,7 +16,7 @@ from typing import Any, Protocol
 from vibench import plugins, provenance, qp
 from vibench.agreement import disagreement_rows
 from vibench.assembly import AssemblyStage
-from vibench.errors import RequestError, StorageError
+from vibench.errors import RequestError, StorageError, VibenchError
 from vibench.executors import Executor, executor
 from vibench.isolation import Job
 from vibench.journal import FILE, Journal, claimed, read_meta, study_of
@@ -28,6 +30,9 @@ from vibench.stages import enrichment_stage
 from vibench.store import History, Store, usable_store
 from vibench.study import Study
 from vibench.thresholds import threshold_rows
+
+LOOK = 5.0
+"""Seconds between two looks at whether the executor is still there."""
 
 LOG = "workers.log"
 """File in the run folder that takes what plugins and solvers print."""
@@ -116,7 +121,7 @@ def run_study(study: Study, folder: Path, observer: Observer, options: Options =
     with claimed(folder), store.used():
         if options.fresh:
             _clear(folder, study)
-        journal = Journal(folder, identity(study))
+        journal = Journal(folder, identity(study), anew=options.fresh)
         try:
             finished = journal.finished()
             todo = [cell for cell in cells if _to_do(cell, finished, options.retry)]
@@ -142,18 +147,15 @@ def _to_do(cell: Cell, finished: Mapping[str, tuple[str, str]], retry: bool) -> 
 
 
 def _clear(folder: Path, study: Study) -> None:
-    """Remove a study's earlier results, never those of a study with another name."""
+    """Remove what follows from a study's earlier results, never of those of a study with another name."""
     path = folder / FILE
-    if not path.is_file():
-        return
-    meta = read_meta(path)
+    meta = read_meta(path) if path.is_file() else {}
     there = study_of(path, meta).get("name") if meta else study.name
     if there != study.name:
         raise RequestError(f"'{folder}' holds results of the study '{there}'; --fresh removes only '{study.name}'")
-    for file in folder.glob(f"{FILE}*"):
-        file.unlink()
     for name in ("tables", "figures"):
         shutil.rmtree(folder / name, ignore_errors=True)
+    (folder / LOG).unlink(missing_ok=True)
 
 
 @dataclass
@@ -176,8 +178,9 @@ class _Run:
         available = set(qp.installed_solvers(plugins.names("QP solver")))
         unavailable = [cell for cell in todo if cell.solver not in available]
         runnable = [cell for cell in todo if cell.solver in available]
-        workers = self._workers() if runnable else None
+        workers: Executor | None = None
         try:
+            workers = self._workers() if runnable else None
             for cell in runnable:
                 assert workers is not None
                 stage = queries_stage(cell, self.study)
@@ -190,6 +193,7 @@ class _Run:
             if workers is not None:
                 self._loop(workers)
         except KeyboardInterrupt:
+            _deaf()
             return True
         finally:
             if workers is not None:
@@ -221,7 +225,8 @@ class _Run:
             for stage in self.plan.begin(workers.slots - len(running)):
                 job = Job(str(self.store.folder), stage, limits.query_seconds, limits.cell_seconds, limits.memory_gib)
                 running[workers.submit(job)] = stage
-            done, _ = wait(running, return_when=FIRST_COMPLETED)
+            done, _ = wait(running, timeout=LOOK, return_when=FIRST_COMPLETED)
+            workers.check()
             for future in done:
                 self._finish(running.pop(future), _outcome(future))
 
@@ -286,9 +291,17 @@ class _Run:
 def _outcome(future: Future[Any]) -> Done | Failed:
     try:
         result = future.result()
-    except Exception as error:  # noqa: BLE001  a cluster that lost the stage's workers again and again
-        return Failed(Status.CRASHED, " ".join(f"the executor lost it: {type(error).__name__}: {error}".split()))
+    except VibenchError:
+        raise
+    except Exception as error:  # noqa: BLE001  a stage or a result that does not travel between processes
+        return Failed(Status.ERROR, " ".join(f"{type(error).__name__}: {error}".split()))
     if isinstance(result, Unstored):
         raise StorageError(result.reason)
     assert isinstance(result, Done | Failed)  # what `Keeper.run` returns
     return result
+
+
+def _deaf() -> None:
+    """From now on Ctrl-C is not heard: the bookkeeping is finished, then the process ends."""
+    if threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGINT, signal.SIG_IGN)

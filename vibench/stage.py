@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass, fields
 from functools import cached_property, lru_cache
 from typing import Any
 
@@ -66,6 +66,15 @@ class Stage(ABC):
         """Name of the stage's artefact: its kind, and a hash of all that determines it, code and libraries included."""
         name = type(self).__name__.lower()
         return f"{name}-{digest([name, core_code(), libraries(), asdict(self)])}"  # type: ignore[call-overload]
+
+    def plugins(self) -> Iterator[Plugin]:
+        """The plugins that the stage and those it is described by depend on."""
+        for part in fields(self):  # type: ignore[arg-type]
+            value = getattr(self, part.name)
+            if isinstance(value, Plugin):
+                yield value
+            elif isinstance(value, Stage):
+                yield from value.plugins()
 
     @abstractmethod
     def inputs(self) -> tuple[Stage, ...]:

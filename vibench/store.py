@@ -72,7 +72,13 @@ class Store:
         self._recent: dict[str, Artefact] = {}
 
     def get(self, key: str) -> Artefact | None:
-        """The artefact stored under a key; `None` if there is none that is whole."""
+        """The artefact stored under a key; `None` if there is none that is whole.
+
+        Raises
+        ------
+        StorageError
+            If the folder cannot be read.
+        """
         if key in self._recent:
             return self._recent[key]
         try:
@@ -81,8 +87,10 @@ class Store:
             if hashlib.sha256(content[size:]).digest() != content[:size]:
                 return None  # cut off, or changed on the disk
             artefact = pickle.loads(content[size:])
-        except (OSError, pickle.UnpicklingError, EOFError, AttributeError, ImportError):
+        except (FileNotFoundError, pickle.UnpicklingError, EOFError, AttributeError, ImportError):
             return None  # not there, or of classes that are not there any more
+        except OSError as error:
+            raise StorageError(f"artefacts cannot be read from '{self.folder}': {error.strerror}") from None
         if not isinstance(artefact, Artefact):
             return None
         if len(self._recent) >= 64:
@@ -150,10 +158,11 @@ class Store:
             return freed
         with locked(self.folder / LOCK, busy=f"a run uses the artefacts in '{self.folder}'"):
             for path in [*self.folder.glob(f"*{SUFFIX}"), *self.folder.glob("*.part")]:
-                status = path.stat()
-                if path.suffix == ".part" or time.time() - status.st_mtime >= older_than:
-                    path.unlink()
-                    freed += status.st_size
+                with contextlib.suppress(FileNotFoundError):
+                    status = path.stat()
+                    if path.suffix == ".part" or time.time() - status.st_mtime >= older_than:
+                        path.unlink()
+                        freed += status.st_size
         return freed
 
     def _path(self, key: str) -> Path:

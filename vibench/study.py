@@ -21,7 +21,7 @@ from vibench.strategy import Stop
 
 Tolerance: TypeAlias = Annotated[float, Gt(0.0), Lt(1.0), AllowInfNan(False)]
 Size: TypeAlias = Annotated[int, Ge(1), Le(100_000)]
-Seconds: TypeAlias = Annotated[float, Gt(0.0), AllowInfNan(False)]
+Seconds: TypeAlias = Annotated[float, Gt(0.0), Le(1e7), AllowInfNan(False)]
 Tolerances: TypeAlias = Annotated[list[Tolerance], MinLen(1)]
 Sizes: TypeAlias = Annotated[list[Size], MinLen(1)]
 Name: TypeAlias = Annotated[str, MinLen(1)]

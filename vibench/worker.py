@@ -11,15 +11,16 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from functools import cache
+from functools import cache, partial
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any, TypeVar
 
 from threadpoolctl import threadpool_limits
 
-from vibench.errors import StorageError, VibenchError
-from vibench.isolation import Finished, Job, Progress, Watch
+from vibench import plugins
+from vibench.errors import NumericalError, StorageError, VibenchError
+from vibench.isolation import Finished, Job, Progress, Spent, Watch, code_here
 from vibench.qp import Status
 from vibench.stage import Done, Failed, PiecewiseStage, Unstored
 from vibench.store import Store
@@ -28,16 +29,22 @@ T = TypeVar("T")
 Send = Callable[[Any], None]
 
 
+class _ExhaustedError(Exception):
+    """Some work met the limit of the memory: this process goes no farther."""
+
+
 def main() -> None:
     """Serve the keeper at the other end of a socket until it hangs up."""
-    connection, log = Connection(int(sys.argv[1])), os.open(sys.argv[2], os.O_WRONLY | os.O_APPEND | os.O_CREAT)
+    socket, log = int(sys.argv[1]), os.open(sys.argv[2], os.O_WRONLY | os.O_APPEND | os.O_CREAT)
+    os.set_inheritable(socket, False)  # what plugins start does not hold it open
+    connection = Connection(socket)
     for stream in (1, 2):  # what plugins print is nobody's business, and must not look like ours
         os.dup2(log, stream)
     faulthandler.enable()
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threadpool_limits(1)
     threading.Thread(target=_follow, args=(os.getppid(),), daemon=True).start()
-    own = os.getpid()
+    own, first = os.getpid(), True
 
     def send(message: Any) -> None:
         if os.getpid() != own:  # a plugin forked, and this is the other one
@@ -49,25 +56,28 @@ def main() -> None:
             job, progress = connection.recv()
         except EOFError:
             return
-        faulthandler.dump_traceback_later(
-            2.0 * job.cell_seconds + 60.0, exit=True
-        )  # if nobody is left to enforce limits
+        if not first and _address_space() > 0.5 * job.memory_gib * 2**30:
+            send(Spent(None))
+            return
+        first = False
+        faulthandler.dump_traceback_later(2.0 * job.cell_seconds + 60.0, exit=True)  # should the keeper have died
         send(perform(job, progress, send))
         faulthandler.cancel_dump_traceback_later()
 
 
 def _follow(parent: int) -> None:
-    """End this process once its parent has: nobody would enforce its limits or want its results."""
+    """End this process, and what plugins started in it, once its parent has ended: nobody would enforce its limits."""
     while os.getppid() == parent:
         time.sleep(1.0)
-    os._exit(1)
+    os.killpg(0, signal.SIGKILL)
 
 
-def perform(job: Job, progress: Progress, send: Send) -> Done | Failed | Unstored:
+def perform(job: Job, progress: Progress, send: Send) -> Done | Failed | Unstored | Spent:
     """Run one stage; what a plugin raises becomes a reason, so that the rest of the matrix goes on."""
     start = time.perf_counter()
 
     def work() -> Done:
+        _check_code(job)
         store = _store(job.store)
         if isinstance(job.stage, PiecewiseStage):
             value = _pieces(job, store, progress, send)
@@ -80,6 +90,18 @@ def perform(job: Job, progress: Progress, send: Send) -> Done | Failed | Unstore
         return _guarded(job.memory_gib, work)
     except StorageError as error:
         return Unstored(str(error))
+    except _ExhaustedError:
+        return Spent(_out_of_memory(job))
+
+
+def _check_code(job: Job) -> None:
+    """Refuse a job that was planned with other code than there is here: the key of its artefact would lie."""
+    used = job.stage.plugins()
+    changed = [f"the {p.kind} '{p.name}'" for p in used if plugins.code(p.kind, p.name) != p.code]
+    if job.code != code_here():
+        changed.insert(0, "vibench or one of the libraries")
+    if changed:
+        raise NumericalError(f"{changed[0]} was changed since the run began; run the study again")
 
 
 def _pieces(job: Job, store: Store, progress: Progress, send: Send) -> Any:
@@ -90,11 +112,21 @@ def _pieces(job: Job, store: Store, progress: Progress, send: Send) -> Any:
     found = dict(progress.found)
     for number in range(stage.pieces):
         if number not in found and number not in progress.lost:
-            value = _guarded(job.memory_gib, lambda: pieces.piece(number, lambda on: send(Watch(number, on))))  # noqa: B023
+            watch = partial(_announce, send, number)
+            watch(False)
+            value = _guarded(job.memory_gib, partial(pieces.piece, number, watch))
             found[number] = pieces.lost(number, value) if isinstance(value, Failed) else value
             send(Finished(number, found[number]))
     found |= {number: pieces.lost(number, failed) for number, failed in progress.lost.items()}
     return pieces.finish([found[number] for number in range(stage.pieces)])
+
+
+def _announce(send: Send, number: int, on: bool) -> None:
+    send(Watch(number, on))
+
+
+def _out_of_memory(job: Job) -> Failed:
+    return Failed(Status.ERROR, f"out of memory: the limit is memory_gib = {job.memory_gib:g}")
 
 
 def _guarded(memory_gib: float, work: Callable[[], T]) -> T | Failed:
@@ -103,8 +135,8 @@ def _guarded(memory_gib: float, work: Callable[[], T]) -> T | Failed:
         with _memory_limit(memory_gib):
             return work()
     except MemoryError:
-        return Failed(Status.ERROR, f"out of memory: the limit is memory_gib = {memory_gib:g}")
-    except StorageError:
+        raise _ExhaustedError from None
+    except (StorageError, _ExhaustedError):
         raise
     except (Exception, SystemExit, KeyboardInterrupt) as error:  # noqa: BLE001  plugins may raise anything
         name = "" if isinstance(error, VibenchError) else f"{type(error).__name__}: "
