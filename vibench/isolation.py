@@ -175,25 +175,25 @@ class Keeper:
 
     def _run(self, job: Job) -> Done | Failed | Unstored:
         talk, limit, retried = _Talk(job), job.cell_seconds, False
+        found, lost = talk.progress.found, talk.progress.lost
         while True:
             try:
                 return self._attempt(talk, limit)
             except _DeathError as death:
                 self._kill()
-                piece, failed = talk.piece, death.failed
-                if failed is None:  # it only had to be replaced
+                if death.failed is None:  # it only had to be replaced
                     continue
-                if not isinstance(job.stage, PiecewiseStage) or limit > job.cell_seconds:
-                    return failed
-                if piece is not None:
-                    talk.progress.lost[piece] = failed
-                elif retried or not talk.progress.found:
-                    return failed
-                retried = retried or piece is None
+                if talk.piece is not None:
+                    lost[talk.piece] = death.failed
+                if not isinstance(job.stage, PiecewiseStage) or not (found or lost) or limit > job.cell_seconds:
+                    return death.failed
                 if talk.clock.seconds > job.cell_seconds:  # one more process may write down what there is
                     limit += talk.clock.seconds
-                    for late in set(range(job.stage.pieces)) - talk.progress.found.keys():
-                        talk.progress.lost.setdefault(late, _beyond("cell_seconds", job.cell_seconds))
+                    for late in set(range(job.stage.pieces)) - found.keys():
+                        lost.setdefault(late, _beyond("cell_seconds", job.cell_seconds))
+                elif talk.piece is None and retried:
+                    return death.failed
+                retried = retried or talk.piece is None
 
     def _attempt(self, talk: _Talk, limit: float) -> Done | Failed | Unstored:
         """One process's try at what is left of a stage."""
