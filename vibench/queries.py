@@ -166,7 +166,8 @@ class Queries(Pieces):
         row["offline_s"] = sum(row.values())
         row["offline_wall_s"] = sum(s.wall for parts in spent.values() for s in parts)
         row["hf_s"] = float(np.mean([s.cpu for s in self._reference.seconds]))
-        machines = {artefact.machine for found in artefacts.values() for artefact in found} | {machine()}
+        others = [self._artefact(stage) for stage in (self._stage.assembly, *self._stage.validation)]
+        machines = {artefact.machine for found in (*artefacts.values(), others) for artefact in found} | {machine()}
         return row | {"machine": "; ".join(sorted(machines))}
 
     def _artefact(self, stage: Stage) -> Artefact:
