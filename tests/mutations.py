@@ -225,14 +225,14 @@ FAULTS = (
     Fault(
         "limit-of-a-query-not-enforced",
         "vibench/isolation.py",
-        "elif time.monotonic() > min(own, deadline):",
-        "elif time.monotonic() > deadline:",
+        "if talk.clock.seconds > talk.own_limit:",
+        "if False:",
         ("tests/test_isolation.py",),
     ),
     Fault(
         "good-pieces-thrown-away",
         "vibench/isolation.py",
-        "progress.found[message.piece] = message.value",
+        "self.progress.found[message.piece] = message.value",
         "pass",
         ("tests/test_isolation.py",),
     ),
