@@ -1,4 +1,4 @@
-"""Fixtures shared by the tests that do no numerics."""
+"""What all tests share, and fixtures of those that run vibench."""
 
 from __future__ import annotations
 

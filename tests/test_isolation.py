@@ -134,6 +134,9 @@ def test_a_finish_that_dies_is_tried_once_more_with_what_is_there(run: Run) -> N
 
 def test_what_a_plugin_started_ends_with_its_process(run: Run, keeper: Keeper) -> None:
     assert isinstance(run(InPieces(("child",))), Done)
+    deadline = time.monotonic() + 10.0
+    while not sleepers() and time.monotonic() < deadline:  # a process that has just begun has no name yet
+        time.sleep(0.01)
     assert sleepers()
     keeper.close()
     assert not sleepers()

@@ -26,6 +26,11 @@ class NumericalError(VibenchError):
     """A computation cannot go on: a matrix that is not SPD, values that are not finite, no convergence."""
 
 
+def in_a_line(error: BaseException) -> str:
+    """The sort of an exception and its message, in one line."""
+    return " ".join(f"{type(error).__name__}: {error}".split())
+
+
 def unknown_name(kind: str, name: str, known: Iterable[str]) -> RequestError:
     """Build the error for a name nobody registered, with the nearest known one suggested."""
     choices = sorted(known)

@@ -7,14 +7,14 @@ import secrets
 import signal
 import threading
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from multiprocessing import resource_tracker
 from pathlib import Path
 from queue import SimpleQueue
 from typing import Any
 
-from vibench.errors import ExecutorError, RequestError
+from vibench.errors import ExecutorError, RequestError, in_a_line
 from vibench.isolation import Job, Keeper, code_here
 from vibench.provenance import machine
 from vibench.qp import Status
@@ -146,7 +146,7 @@ class Dask(Executor):
         try:
             found: dict[str, tuple[bool, str, str]] = self._client.run(_describe, str(token))
         except Exception as error:  # noqa: BLE001  whatever a worker without vibench answers
-            raise RequestError(f"the dask workers cannot run vibench: {type(error).__name__}: {error}") from None
+            raise RequestError(f"the dask workers cannot run vibench: {in_a_line(error)}") from None
         finally:
             token.unlink()
         if not found:
@@ -195,7 +195,7 @@ def _hand_over(theirs: Any, ours: Future[Outcome]) -> None:
     try:
         ours.set_result(theirs.result())
     except BaseException as error:  # noqa: BLE001  in a thread of dask's: whoever waits has to hear of it
-        line = " ".join(f"{type(error).__name__}: {error}".split())
+        line = in_a_line(error)
         if type(error).__name__ == "KilledWorker":
             ours.set_result(Failed(Status.CRASHED, f"dask gave up on it: {line}"))
         else:
@@ -224,8 +224,4 @@ def _describe(token: str) -> tuple[bool, str, str]:
 
 def executor(name: str, scheduler: str | None, slots: int, store: Path, log: Path) -> Executor:
     """The executor a run asks for: "local", or "dask" with the address of a scheduler or `None`."""
-    makers: dict[str, Callable[[], Executor]] = {
-        "local": lambda: Local(slots, log),
-        "dask": lambda: Dask(scheduler, slots, store),
-    }
-    return makers[name]()
+    return Dask(scheduler, slots, store) if name == "dask" else Local(slots, log)

@@ -14,7 +14,7 @@ from typing import Any, get_type_hints
 
 from pydantic import ConfigDict, TypeAdapter, ValidationError
 
-from vibench.errors import RequestError, unknown_name
+from vibench.errors import RequestError, in_a_line, unknown_name
 from vibench.problem import Problem
 from vibench.provenance import source_hash
 from vibench.qp import QPSolver
@@ -62,8 +62,7 @@ def load(kind: str, name: str) -> Any:
     try:
         plugin = registered[name].load()
     except (Exception, SystemExit) as error:  # noqa: BLE001  importing a plugin runs code of strangers
-        line = " ".join(f"{type(error).__name__}: {error}".split())
-        raise RequestError(f"{where} cannot be loaded: {line}") from None
+        raise RequestError(f"{where} cannot be loaded: {in_a_line(error)}") from None
     base = _BASES.get(kind)
     if base is not None and not (isinstance(plugin, type) and issubclass(plugin, base)):
         raise RequestError(f"{where} is not a subclass of {base.__qualname__}")

@@ -12,6 +12,7 @@ from vibench.agreement import slack, solution_row
 from vibench.arrays import Array
 from vibench.assess import Reference, errors
 from vibench.error_bounds import Stability, bounds
+from vibench.errors import in_a_line
 from vibench.problem import checked_assembly
 from vibench.qp import Answer, Status
 from vibench.reduced import ReducedModel, ReducedProblem
@@ -60,8 +61,7 @@ class Task:
         except MemoryError:
             raise
         except (Exception, SystemExit) as error:  # noqa: BLE001  a solver may raise anything; the row says what
-            reason = " ".join(f"{type(error).__name__}: {error}".split())
-            return row | {"status": Status.ERROR.value, "reason": reason}, None
+            return row | {"status": Status.ERROR.value, "reason": in_a_line(error)}, None
         status, reason, residuals = qp.judge(program, answer, self.accuracy)
         if solving.wall > self.query_seconds:
             status, reason = Status.TIMEOUT, f"took {solving.wall:.1f} s, the limit is {self.query_seconds:g} s"

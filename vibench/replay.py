@@ -15,7 +15,7 @@ import qpsolvers
 from vibench import plugins, qp
 from vibench.agreement import vectors
 from vibench.arrays import Array
-from vibench.errors import RequestError
+from vibench.errors import RequestError, in_a_line
 from vibench.loading import RecordedCell, recorded_cells
 from vibench.problem import VariationalInequality
 from vibench.qp import Answer, Status
@@ -69,7 +69,7 @@ def _solved(program: VariationalInequality, solver: str, accuracy: float, known:
     try:
         answer, seconds = median_seconds(lambda: qp.solve(program, solver, accuracy, plugins.qp_solver(solver)))
     except (Exception, SystemExit) as error:  # noqa: BLE001  a solver may raise anything; the line says what
-        claim = " ".join(f"{type(error).__name__}: {error}".split())
+        claim = in_a_line(error)
         return {"claims": claim, "status": Status.ERROR.value}
     return _line(program, answer, accuracy, known) | {"seconds": seconds.cpu}
 

@@ -16,7 +16,7 @@ from typing import Any, Protocol
 from vibench import plugins, provenance, qp
 from vibench.agreement import disagreement_rows
 from vibench.assembly import AssemblyStage
-from vibench.errors import RequestError, StorageError, VibenchError
+from vibench.errors import RequestError, StorageError, VibenchError, in_a_line
 from vibench.executors import Executor, executor
 from vibench.isolation import Job
 from vibench.journal import FILE, Journal, claimed, read_meta, study_of
@@ -294,7 +294,7 @@ def _outcome(future: Future[Any]) -> Done | Failed:
     except VibenchError:
         raise
     except Exception as error:  # noqa: BLE001  a stage or a result that does not travel between processes
-        return Failed(Status.ERROR, " ".join(f"{type(error).__name__}: {error}".split()))
+        return Failed(Status.ERROR, in_a_line(error))
     if isinstance(result, Unstored):
         raise StorageError(result.reason)
     assert isinstance(result, Done | Failed)  # what `Keeper.run` returns

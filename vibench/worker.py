@@ -19,7 +19,7 @@ from typing import Any, TypeVar
 from threadpoolctl import threadpool_limits
 
 from vibench import plugins
-from vibench.errors import NumericalError, StorageError, VibenchError
+from vibench.errors import NumericalError, StorageError, VibenchError, in_a_line
 from vibench.isolation import Finished, Job, Progress, Spent, Watch, code_here
 from vibench.qp import Status
 from vibench.stage import Done, Failed, PiecewiseStage, Unstored
@@ -138,9 +138,10 @@ def _guarded(memory_gib: float, work: Callable[[], T]) -> T | Failed:
         raise _ExhaustedError from None
     except (StorageError, _ExhaustedError):
         raise
+    except VibenchError as error:
+        return Failed(Status.ERROR, " ".join(str(error).split()))
     except (Exception, SystemExit, KeyboardInterrupt) as error:  # noqa: BLE001  plugins may raise anything
-        name = "" if isinstance(error, VibenchError) else f"{type(error).__name__}: "
-        return Failed(Status.ERROR, " ".join(f"{name}{error}".split()))
+        return Failed(Status.ERROR, in_a_line(error))
 
 
 @contextmanager

@@ -53,7 +53,7 @@ def main(folder: Path, study: str, more: Sequence[str]) -> int:
         slow |= way != next(iter(WAYS)) and seconds > ASKED * alone
         print(f"{way:20s} {seconds:8.1f} s  {seconds / alone:5.0%}", flush=True)
         assert_same_numbers(folder / "one-worker" / "run", place / "run")
-    print("all numbers besides times are the same")
+    print("numbers besides times are the same; those of solvers that do not repeat themselves, to round-off")
     return int(slow)
 
 
