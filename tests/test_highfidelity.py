@@ -65,9 +65,9 @@ def test_a_cycling_active_set_is_helped_and_the_help_is_recorded(monkeypatch: py
     assert alone.fallback == ""
     iterate, calls = highfidelity._active_set_iterations, []
 
-    def cycles_at_first(vi, active, solve_active):
+    def cycles_at_first(system, active):
         calls.append(active)
-        return None if len(calls) == 1 else iterate(vi, active, solve_active)
+        return None if len(calls) == 1 else iterate(system, active)
 
     monkeypatch.setattr(highfidelity, "_active_set_iterations", cycles_at_first)
     helped = highfidelity.solve(vi)

@@ -1,11 +1,19 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 import scipy.sparse as sp
 
 from numerics import Varying
-from vibench.linalg import orthonormal_range
-from vibench.supremizer import SupremizerCoordinates, constraint_classes, proportionality, supremizers
+from vibench import supremizer
+from vibench.supremizer import (
+    ContactCoordinates,
+    SpannedCoordinates,
+    constraint_classes,
+    proportionality,
+    supremizer_coordinates,
+    supremizers,
+)
 
 
 def test_a_supremizer_attains_its_own_norm() -> None:
@@ -18,19 +26,24 @@ def test_a_supremizer_attains_its_own_norm() -> None:
     assert np.all(v @ (B.T @ eta) <= problem.V.norm(v) * problem.V.norm(T) * (1.0 + 1e-12))
 
 
-def test_coordinates_are_an_isometry_that_leads_back_to_the_supremizers() -> None:
+@pytest.mark.parametrize("few", [0, 1000], ids=["spanned", "contact"])
+def test_coordinates_are_an_isometry_that_leads_back_to_the_supremizers(
+    monkeypatch: pytest.MonkeyPatch, few: int
+) -> None:
+    monkeypatch.setattr(supremizer, "FEW_SUPREMIZERS", few)
     problem = Varying()
     matrices = [problem.assemble(mu).B for mu in problem.training_set()]
     basis = problem.V.orthonormalise(np.random.default_rng(0).standard_normal((30, 4)))
-    space = SupremizerCoordinates(problem.V, basis, matrices)
     eta = np.random.default_rng(1).random((8, 5))
-    for B in matrices:
-        direct, coordinates = supremizers(problem.V, B, eta), space.supremizers(B, eta)
+    space, found = supremizer_coordinates(problem.V, basis, matrices, eta)
+    assert isinstance(space, ContactCoordinates if few else SpannedCoordinates)
+    assert np.allclose(space.plain.T @ space.plain, np.eye(4), atol=1e-12)
+    assert np.allclose(space.vectors(space.plain), basis, atol=1e-11)
+    for B, coordinates in zip(matrices, found, strict=True):
+        direct = supremizers(problem.V, B, eta)
         assert np.allclose(space.vectors(coordinates), direct, atol=1e-11)
         assert np.allclose(coordinates.T @ coordinates, problem.V.gram(direct, direct), atol=1e-11)
-        assert np.allclose(coordinates[:4], problem.V.gram(basis, direct), atol=1e-11)
-    assert np.allclose(space.vectors(space.plain), basis, atol=1e-11)
-    assert orthonormal_range(space.supremizers(matrices[0], np.eye(8))).shape[1] == 8
+        assert np.allclose(space.plain.T @ coordinates, problem.V.gram(basis, direct), atol=1e-11)
 
 
 def test_proportional_matrices_are_recognised_and_others_are_not() -> None:

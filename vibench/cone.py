@@ -74,8 +74,8 @@ def greedy_cone(snapshots: Array, W: InnerProduct, stop: Stop, subtract: Subtrac
     largest = float(norms.max(initial=0.0))
     if largest == 0.0:
         return Cone(np.zeros((W.dim, 0)), np.zeros(1), no_free(0))
-    maximum = LazyMaximum(norms / largest)
-    generators, in_whitened = np.zeros((W.dim, 0)), np.zeros((W.dim, 0))
+    distances = LazyDistances(whitened)
+    generators = np.zeros((W.dim, 0))
     pick, error = int(np.argmax(norms >= norms.max() * (1.0 - 1e-9))), 1.0
     errors, fallbacks = [error], []
     while not stop.reached(generators.shape[1], error) and error > REPRODUCED:
@@ -87,16 +87,80 @@ def greedy_cone(snapshots: Array, W: InnerProduct, stop: Stop, subtract: Subtrac
         if length <= REPRODUCED * norms[pick]:
             break
         generators = np.column_stack([generators, direction / length])
-        in_whitened = W.whiten(generators)
-        maximum.exclude(pick)
+        distances.widen(W.whiten(generators), pick)
         if generators.shape[1] == snapshots.shape[1]:
             errors.append(0.0)
             break
-        pick, error = maximum.next(
-            lambda q: _project_whitened(in_whitened, whitened[:, q]).distance / largest  # noqa: B023  called at once
-        )
+        pick, error = distances.next()
         errors.append(error)
     return Cone(generators, np.array(errors), no_free(generators.shape[1]), tuple(fallbacks))
+
+
+class LazyDistances:
+    """Largest distance of snapshots from a growing cone, relative to the largest norm, with few projections.
+
+    Any point of the cone bounds the distance from above. One is kept for every snapshot; where the cone grows, the
+    nearest combination of it and of the new generator takes its place, and one sweep over the generators, coordinate by
+    coordinate, brings it nearer still. Only where these bounds leave the choice open is a projection computed.
+
+    Parameters
+    ----------
+    whitened
+        Snapshots (m×Q) in coordinates in which the norm is Euclidean; not all zero.
+
+    Attributes
+    ----------
+    maximum
+        What chooses; it counts the projections.
+    """
+
+    def __init__(self, whitened: Array) -> None:
+        self._snapshots = whitened
+        norms = np.linalg.norm(whitened, axis=0)
+        self._largest = float(norms.max())
+        self._generators = np.zeros((whitened.shape[0], 0))
+        self._points = np.zeros((0, whitened.shape[1]))  # coefficients of a point of the cone for every snapshot
+        self.maximum = LazyMaximum(norms / self._largest)
+
+    def widen(self, generators: Array, taken: int) -> None:
+        """Take in the last of the generators (m×r, unit norm, whitened), which came from the snapshot `taken`."""
+        old, new = _two_dimensional(self._generators @ self._points, generators[:, -1], self._snapshots)
+        self._points = np.vstack([self._points * old, new])
+        self._generators = generators
+        slope = generators.T @ (self._snapshots - generators @ self._points)
+        for i, row in enumerate(generators.T @ generators):
+            step = np.maximum(slope[i], -self._points[i])
+            self._points[i] += step
+            slope -= row[:, None] * step
+        self.maximum.bound(np.linalg.norm(self._snapshots - generators @ self._points, axis=0) / self._largest)
+        self.maximum.exclude(taken)
+
+    def next(self) -> tuple[int, float]:
+        """Index of the snapshot farthest from the cone, and its distance; of those taken, none."""
+        return self.maximum.next(self._distance)
+
+    def _distance(self, q: int) -> float:
+        found = _project_whitened(self._generators, self._snapshots[:, q])
+        self._points[:, q] = found.coefficients
+        return found.distance / self._largest
+
+
+def _two_dimensional(points: Array, nu: Array, targets: Array) -> tuple[Array, Array]:
+    """Coefficients a, b ≥ 0 (Q,) of points (m×Q) and of the unit vector ν (m,) that come near targets (m×Q).
+
+    The nearest combination where both are positive, else that of one alone.
+    """
+    square, overlap = np.sum(points**2, axis=0), nu @ points
+    along, across = np.sum(points * targets, axis=0), nu @ targets
+    determinant = square - overlap**2
+    clear = determinant > 1e-8 * square
+    scale = np.where(clear, determinant, 1.0)
+    a, b = (along - overlap * across) / scale, (square * across - overlap * along) / scale
+    both = clear & (a >= 0.0) & (b >= 0.0)
+    alone = (np.maximum(across, 0.0) ** 2 > along**2 / np.where(square > 0.0, square, 1.0)) | (square == 0.0)
+    single_a = np.where(alone, 0.0, np.maximum(along, 0.0) / np.where(square > 0.0, square, 1.0))
+    single_b = np.where(alone, np.maximum(across, 0.0), 0.0)
+    return np.where(both, a, single_a), np.where(both, b, single_b)
 
 
 def orthogonality(generators: Array, W: InnerProduct) -> Array:

@@ -52,6 +52,10 @@ class LazyMaximum:
             fresh[p] = True
             self.evaluations += 1
 
+    def bound(self, bounds: Array) -> None:
+        """Take upper bounds (P,) of the indicators now into account, wherever they are below what is known."""
+        self._bounds = np.minimum(self._bounds, bounds)
+
     def exclude(self, index: int) -> None:
         """Never choose this index again."""
         self._bounds[index] = -np.inf

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
+from functools import cached_property, partial
 
 import numpy as np
 import scipy.linalg
@@ -12,16 +12,16 @@ import scipy.sparse as sp
 from scipy.sparse.linalg import splu
 
 from vibench import qp
-from vibench.arrays import Array, Indices, Mask
+from vibench.arrays import Array, Indices, Mask, SparseMatrix
+from vibench.condensation import Condensed, Pattern
 from vibench.errors import NumericalError
 from vibench.problem import Problem, VariationalInequality, checked_assembly
-from vibench.space import InnerProduct
 
 ACCURACY = 1e-10
 """Relative KKT accuracy of every snapshot."""
 
-CONDENSED_SHARE = 10
-"""Systems are condensed on the multipliers where there are this many times more displacements."""
+FEW = 0.5
+"""Systems are condensed on the constrained unknowns where these are no more than this share of all."""
 
 MAX_ITERATIONS = 100
 FALLBACK_SOLVER = "piqp"
@@ -51,22 +51,27 @@ class HighFidelitySolution:
 
 
 class Solver:
-    """Solves one problem at many parameters; a stiffness that does not depend on them is factorised once.
+    """Solves one problem at many parameters, each from the contact set of the nearest solved before.
 
     The primal–dual active set method (Hintermüller, Ito, Kunisch 2002) solves the equality-constrained system of the
     current active set until the set repeats itself; a set that cycles is replaced by that of an interior-point
-    solution, and the method goes on from there. Its answer has exact zeros off the active set.
+    solution, and the method goes on from there. Its answer has exact zeros off the active set. Systems are condensed
+    on the constrained unknowns where they are few, by one factorisation of all others; the order of elimination is
+    found once, and a stiffness that does not depend on the parameter is factorised once.
 
     Parameters
     ----------
     problem
-        Its declaration `constant` decides how the systems are solved: condensed on the multipliers where A is constant
-        and they are few, as sparse saddle-point systems elsewhere.
+        Its declarations `constant` and `contact_dofs` decide what is done once.
     """
 
     def __init__(self, problem: Problem) -> None:
         self._problem = problem
-        self._stiffness: InnerProduct | None = None
+        self._touched = problem.contact_dofs if problem.contact_dofs is not None else np.zeros(0, dtype=np.intp)
+        self._pattern: Pattern | None = None
+        self._system: Stiffness | None = None
+        self._width = np.maximum(problem.parameters.upper - problem.parameters.lower, np.finfo(float).tiny)
+        self._solved: list[tuple[Array, Mask]] = []
 
     def solve(self, mu: Array) -> HighFidelitySolution:
         """Assemble and solve at mu (d,).
@@ -77,17 +82,93 @@ class Solver:
             If the assembly is wrong, the solution does not reach `ACCURACY`, or the problem refuses it.
         """
         vi = checked_assembly(self._problem, mu)
-        few = CONDENSED_SHARE * vi.B.shape[0] <= vi.B.shape[1]
-        if few and "A" in self._problem.constant and self._stiffness is None:
-            self._stiffness = InnerProduct(vi.A)
-        found = solve(vi, self._stiffness)
+        found = solve(vi, self._stiffness(vi), self._nearest(mu))
         reason = self._problem.refuse(mu, found.u, found.lam)
         if reason:
             raise NumericalError(f"at mu = {mu.tolist()}: {reason}")
+        self._solved.append((mu, found.lam > 0.0))
         return found
 
+    def _nearest(self, mu: Array) -> Mask | None:
+        """Contact set of the solved parameter that is nearest, the box of parameters taken for a cube."""
+        if not self._solved:
+            return None
+        distances = [float(np.linalg.norm((mu - other) / self._width)) for other, _ in self._solved]
+        return self._solved[int(np.argmin(distances))][1]
 
-def solve(vi: VariationalInequality, stiffness: InnerProduct | None = None) -> HighFidelitySolution:
+    def _stiffness(self, vi: VariationalInequality) -> Stiffness:
+        touched = np.unique(sp.csr_array(vi.B).indices)
+        if not np.all(np.isin(touched, self._touched)):
+            self._touched, self._pattern = np.union1d(self._touched, touched), None
+        if self._pattern is None:
+            self._pattern, self._system = Pattern.of(vi.A, self._touched), None
+        if self._system is None or "A" not in self._problem.constant:
+            self._system = Stiffness(vi.A, self._pattern)
+        return self._system
+
+
+class Stiffness:
+    """A stiffness A as the active set method needs it, condensed on some unknowns.
+
+    Parameters
+    ----------
+    A
+        Sparse SPD (n×n).
+    pattern
+        Unknowns to condense on, all that B touches among them; by default all unknowns.
+    """
+
+    def __init__(self, A: SparseMatrix, pattern: Pattern | None = None) -> None:
+        few = pattern is not None and len(pattern.kept) <= FEW * A.shape[0]
+        everything = Pattern(np.arange(A.shape[0]), np.zeros(0, np.intp), np.zeros(0, np.intp))
+        self._pattern = pattern if few and pattern is not None else everything
+        self._condensed = Condensed(A, self._pattern)
+
+    @cached_property
+    def _compliance(self) -> Array:
+        """Ŝ⁻¹ (c×c)."""
+        try:
+            factor = scipy.linalg.cho_factor(self._condensed.matrix.toarray())
+        except np.linalg.LinAlgError:
+            raise NumericalError("A is not positive definite") from None
+        return np.asarray(scipy.linalg.cho_solve(factor, np.eye(len(self._pattern.kept))))
+
+    def system(self, vi: VariationalInequality) -> ActiveSystem:
+        """The equality-constrained systems of the active sets of `vi`, whose stiffness this is."""
+        condensed = self._condensed
+        load, free = condensed.load(vi.f)
+        B = sp.csr_array(sp.csc_array(vi.B)[:, self._pattern.kept])
+        solve_active = (
+            _condensed_twice(self._compliance, load, B, vi.g)
+            if condensed.dense
+            else partial(_saddle_point, condensed.matrix, load, B, vi.g)
+        )
+        return ActiveSystem(B, vi.g, solve_active, lambda u: condensed.expand(u, free))
+
+
+@dataclass(frozen=True)
+class ActiveSystem:
+    """What the active set method works on: everything in the c unknowns that are left.
+
+    Attributes
+    ----------
+    B, g
+        Constraints, B sparse (m×c).
+    solve_active
+        From the active constraints: u (c,) and λ (m,) with these as equalities and no other multiplier.
+    expand
+        All n unknowns from the c ones.
+    """
+
+    B: SparseMatrix
+    g: Array
+    solve_active: Callable[[Indices], tuple[Array, Array]]
+    expand: Callable[[Array], Array]
+
+
+def solve(
+    vi: VariationalInequality, stiffness: Stiffness | None = None, start: Mask | None = None
+) -> HighFidelitySolution:
     """Solve one variational inequality to `ACCURACY`; see `Solver`.
 
     Parameters
@@ -95,50 +176,49 @@ def solve(vi: VariationalInequality, stiffness: InnerProduct | None = None) -> H
     vi
         Sparse A, B and vectors f, g at one parameter.
     stiffness
-        A factorised as an inner product, where that has been done already.
+        Its A prepared, where that has been done already.
+    start
+        Constraints (m,) that are active at first; none by default.
 
     Raises
     ------
     NumericalError
         If neither the active set method nor its fallback reaches `ACCURACY`.
     """
-    solve_active = partial(_saddle_point, vi) if stiffness is None else _condensed(vi, stiffness)
-    found = _active_set_iterations(vi, np.zeros(vi.B.shape[0], dtype=bool), solve_active)
+    system = (stiffness or Stiffness(vi.A)).system(vi)
+    nothing = np.zeros(vi.B.shape[0], dtype=bool)
+    found = None if start is None else _active_set_iterations(system, start)
+    found = found or _active_set_iterations(system, nothing)
     fallback = ""
     if found is None:
         answer = qp.solve(vi, FALLBACK_SOLVER, ACCURACY)
         if answer.alpha is None or not np.all(np.isfinite(answer.alpha)):
             raise NumericalError(f"the high-fidelity problem was not solved: {answer.solver_status}")
-        found = _active_set_iterations(vi, answer.alpha > 1e-8 * np.max(answer.alpha, initial=0.0), solve_active)
+        found = _active_set_iterations(system, answer.alpha > 1e-8 * np.max(answer.alpha, initial=0.0))
         fallback = f"the active set cycled; first guess by {FALLBACK_SOLVER}"
     if found is None:
         raise NumericalError("no active set solves the high-fidelity problem; is it feasible?")
-    u, lam, iterations = found
+    kept, lam, iterations = found
+    u = system.expand(kept)
     residuals = qp.residuals(vi, u, lam)
     if not residuals.worst <= ACCURACY:
         raise NumericalError(f"the high-fidelity solution has residual {residuals.worst:.1e}, above {ACCURACY:.0e}")
     return HighFidelitySolution(u, lam, fallback, iterations, residuals)
 
 
-SolveActive = Callable[[Indices], tuple[Array, Array]]
-"""From the active constraints: u (n,) and λ (m,) with these as equalities and no other multiplier."""
-
-
-def _active_set_iterations(
-    vi: VariationalInequality, active: Mask, solve_active: SolveActive
-) -> tuple[Array, Array, int] | None:
-    """u, λ and iterations of the primal–dual active set method from a first guess (m,).
+def _active_set_iterations(system: ActiveSystem, active: Mask) -> tuple[Array, Array, int] | None:
+    """U (c,), λ (m,) and iterations of the primal–dual active set method from a first guess (m,).
 
     `None` if the sets repeat themselves without an answer, or one of them has dependent constraints.
     """
     seen: set[bytes] = set()
     for iteration in range(1, MAX_ITERATIONS + 1):
         try:
-            u, lam = solve_active(np.flatnonzero(active))
+            u, lam = system.solve_active(np.flatnonzero(active))
         except (RuntimeError, np.linalg.LinAlgError):  # an exactly singular system
             return None
         scale = np.max(np.abs(lam), initial=0.0)
-        violated = ~active & (vi.B @ u - vi.g > 1e-14 * np.max(np.abs(vi.g), initial=0.0))
+        violated = ~active & (system.B @ u - system.g > 1e-14 * np.max(np.abs(system.g), initial=0.0))
         kept = active & (lam > 1e-14 * scale)
         following = violated | kept
         if np.array_equal(following, active):
@@ -150,29 +230,29 @@ def _active_set_iterations(
     return None
 
 
-def _saddle_point(vi: VariationalInequality, active: Indices) -> tuple[Array, Array]:
+def _saddle_point(A: SparseMatrix, f: Array, B: SparseMatrix, g: Array, active: Indices) -> tuple[Array, Array]:
     """Solution for an active set by one sparse factorisation, refined once."""
-    n, k = vi.A.shape[0], len(active)
-    rows = sp.csr_array(vi.B)[active]
-    matrix = sp.csc_array(sp.block_array([[vi.A, rows.T], [rows, None]])) if k else sp.csc_array(vi.A)
-    right = np.concatenate([vi.f, vi.g[active]])
+    n, k = A.shape[0], len(active)
+    rows = B[active]
+    matrix = sp.csc_array(sp.block_array([[A, rows.T], [rows, None]])) if k else sp.csc_array(A)
+    right = np.concatenate([f, g[active]])
     factor = splu(matrix)
     solution = factor.solve(right)
     solution += factor.solve(right - matrix @ solution)
-    lam = np.zeros(vi.B.shape[0])
+    lam = np.zeros(B.shape[0])
     lam[active] = solution[n:]
     return solution[:n], lam
 
 
-def _condensed(vi: VariationalInequality, stiffness: InnerProduct) -> SolveActive:
-    """Solutions for active sets from B A⁻¹Bᵀ alone, formed once with the factor of A."""
-    free = stiffness.riesz(vi.f)
-    responses = stiffness.riesz(vi.B.T.toarray())
-    compliance = np.asarray(vi.B @ responses)
-    excess = vi.B @ free - vi.g
+def _condensed_twice(inverse: Array, f: Array, B: SparseMatrix, g: Array) -> Callable[[Indices], tuple[Array, Array]]:
+    """Solutions for active sets from the compliance of the constraints B S⁻¹Bᵀ alone; S⁻¹ (c×c) is dense."""
+    free = inverse @ f
+    responses = np.ascontiguousarray((B @ inverse).T)
+    compliance = np.asarray(B @ responses)
+    excess = B @ free - g
 
     def solve_active(active: Indices) -> tuple[Array, Array]:
-        lam = np.zeros(len(vi.g))
+        lam = np.zeros(len(g))
         if len(active):
             block = scipy.linalg.cho_factor(compliance[np.ix_(active, active)])
             lam[active] = scipy.linalg.cho_solve(block, excess[active])

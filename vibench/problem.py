@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from typing import ClassVar
 
 import numpy as np
+import scipy.sparse as sp
 
 from vibench.arrays import Array, Indices, SparseMatrix
 from vibench.errors import NumericalError
@@ -75,6 +76,22 @@ class VariationalInequality:
 
 
 @dataclass(frozen=True)
+class Contact:
+    """The constraint B u ≤ g in the unknowns it may touch.
+
+    Attributes
+    ----------
+    B
+        Sparse (m×k), a column for each of the problem's `contact_dofs`.
+    g
+        Bound (m,).
+    """
+
+    B: SparseMatrix
+    g: Array
+
+
+@dataclass(frozen=True)
 class Picture:
     """A solution to look at.
 
@@ -126,6 +143,25 @@ class Problem(ABC):
     @abstractmethod
     def assemble(self, mu: Array) -> VariationalInequality:
         """High-fidelity matrices and vectors at the parameter mu (d,)."""
+
+    @property
+    def contact_dofs(self) -> Indices | None:
+        """Unknowns that B(mu) may touch at any parameter, rising; `None` where a problem does not say."""
+        return None
+
+    def contact(self, mu: Array) -> Contact | None:  # noqa: ARG002
+        """The constraint at mu (d,) on `contact_dofs` alone, for problems that can assemble it at that cost."""
+        return None
+
+    def constraint(self, mu: Array) -> tuple[SparseMatrix, Array]:
+        """B (m×n) and g (m,) at mu (d,): from `contact` if there is one, else from everything."""
+        contact = self.contact(mu)
+        if contact is None or self.contact_dofs is None:
+            vi = self.assemble(mu)
+            return vi.B, vi.g
+        B = sp.csr_array(contact.B)
+        entries = (B.data, self.contact_dofs[B.indices], B.indptr)
+        return sp.csr_array(entries, shape=(B.shape[0], self.V.dim)), contact.g
 
     def multiplier_integrals(self) -> Array:
         """Integrals (m,) of the multiplier basis functions, the unit in which a constraint violation is a length.

@@ -6,19 +6,18 @@ from functools import cached_property
 
 import numpy as np
 import scipy.sparse as sp
-from scipy.sparse.linalg import splu, spsolve_triangular
 
-from vibench.arrays import Array, Indices, SparseMatrix
+from vibench.arrays import Array, SparseMatrix
 from vibench.errors import NumericalError
+from vibench.factor import SparseCholesky
 from vibench.linalg import orthonormal_range
 
 
 class InnerProduct:
     """The inner product ⟨u, v⟩ = uᵀ X v of a space, X sparse symmetric positive definite.
 
-    X = Pᵀ L D Lᵀ P is factorised once, without pivoting off the diagonal, so that F = D^½ Lᵀ P is a Cholesky factor
-    (X = FᵀF). "Whitened" coordinates F v carry the plain Euclidean inner product: singular values, QR and nonnegative
-    least squares are done there, and no digit is lost to squaring.
+    X = FᵀF is factorised once. "Whitened" coordinates F v carry the plain Euclidean inner product: singular values, QR
+    and nonnegative least squares are done there, and no digit is lost to squaring.
 
     Parameters
     ----------
@@ -56,16 +55,8 @@ class InnerProduct:
         return int(self.matrix.shape[0])
 
     @cached_property
-    def _factor(self) -> tuple[SparseMatrix, Array, Indices, SparseMatrix]:
-        """Unit lower L (CSC), √D (n,), the permutation and its inverse's SuperLU object."""
-        try:
-            lu = splu(self.matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
-        except RuntimeError as error:
-            raise NumericalError(f"{self._name} cannot be factorised: {error}") from None
-        pivots = lu.U.diagonal()
-        if not np.array_equal(lu.perm_r, lu.perm_c) or np.any(pivots <= 0.0):
-            raise NumericalError(f"{self._name} is not positive definite")
-        return sp.csc_array(lu.L), np.sqrt(pivots), np.argsort(lu.perm_c), lu
+    def _factor(self) -> SparseCholesky:
+        return SparseCholesky(self.matrix, self._name)
 
     def apply(self, u: Array) -> Array:
         """X u, for u (n,) or (n, k)."""
@@ -81,31 +72,19 @@ class InnerProduct:
 
     def riesz(self, functional: Array) -> Array:
         """Riesz representer X⁻¹ ℓ of functionals given as (n,) or (n, k)."""
-        return np.asarray(self._factor[3].solve(np.ascontiguousarray(functional)))
+        return self._factor.solve(functional)
 
     def whiten(self, u: Array) -> Array:
         """F u: coordinates in which the inner product is Euclidean; u (n,) or (n, k)."""
-        lower, root, order, _ = self._factor
-        y = lower.T @ u[order]
-        return np.asarray(root * y if y.ndim == 1 else root[:, None] * y)
+        return self._factor.up(u)
 
     def unwhiten(self, y: Array) -> Array:
         """F⁻¹ y, the inverse of `whiten`; y (n,) or (n, k)."""
-        lower, root, order, _ = self._factor
-        scaled = y / root if y.ndim == 1 else y / root[:, None]
-        u = np.empty_like(scaled)
-        if scaled.size:
-            u[order] = spsolve_triangular(lower.T, scaled, lower=False, unit_diagonal=True)
-        return u
+        return self._factor.up_inverse(y)
 
     def whiten_functional(self, functional: Array) -> Array:
         """F⁻ᵀ ℓ: whitened coordinates of the Riesz representer of ℓ (n,) or (n, k); Euclidean norms are dual norms."""
-        lower, root, order, _ = self._factor
-        permuted = np.ascontiguousarray(functional[order])
-        if not permuted.size:
-            return permuted
-        y = spsolve_triangular(lower, permuted, lower=True, unit_diagonal=True)
-        return np.asarray(y / root if y.ndim == 1 else y / root[:, None])
+        return self._factor.down_inverse(functional)
 
     def orthonormalise(self, u: Array, against: Array | None = None) -> Array:
         """Orthonormal basis of span(u), or of what u adds to the span of an orthonormal basis.

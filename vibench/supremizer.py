@@ -10,11 +10,18 @@ import scipy.linalg
 import scipy.sparse as sp
 
 from vibench.arrays import Array, Indices, SparseMatrix
+from vibench.factor import SparseCholesky, elimination_order
 from vibench.linalg import remove
 from vibench.space import InnerProduct
 
 PROPORTIONAL_RTOL = 1e-12
 """Two constraint matrices count as proportional when they differ by less than this, relative to their norm."""
+
+MARK_ATOL = 1e-10
+"""Marks of matrices that may be proportional differ by no more."""
+
+FEW_SUPREMIZERS = 2
+"""Coordinates are those of the supremizers themselves where there are this many times more touched unknowns."""
 
 
 def supremizers(V: InnerProduct, B: SparseMatrix, eta: Array) -> Array:
@@ -54,10 +61,12 @@ class ConstraintClasses:
 def constraint_classes(matrices: Sequence[SparseMatrix]) -> ConstraintClasses:
     """Sort matrices into classes of proportional ones."""
     representatives: list[SparseMatrix] = []
+    marks: list[Array] = []
     members, factors = [], []
     for matrix in matrices:
+        mark = _mark(matrix)
         for k, representative in enumerate(representatives):
-            factor = proportionality(matrix, representative)
+            factor = proportionality(matrix, representative) if _alike(mark, marks[k]) else None
             if factor is not None:
                 members.append(k)
                 factors.append(factor)
@@ -66,14 +75,22 @@ def constraint_classes(matrices: Sequence[SparseMatrix]) -> ConstraintClasses:
             members.append(len(representatives))
             factors.append(1.0)
             representatives.append(matrix)
+            marks.append(mark)
     return ConstraintClasses(tuple(representatives), np.array(members, dtype=np.intp), np.array(factors))
 
 
-class SupremizerCoordinates:
-    """Coordinates in the Euclidean space V_N + X_V⁻¹E, E the degrees of freedom that some B(mu) touches.
+def _mark(matrix: SparseMatrix) -> Array:
+    """A vector (m,) that proportional matrices share up to its sign, and others almost surely do not."""
+    probe = np.random.default_rng(0).standard_normal(matrix.shape[1])
+    return np.asarray(matrix @ probe) / ((sp.linalg.norm(matrix) * float(np.linalg.norm(probe))) or 1.0)
 
-    Every supremizer of every parameter lies in it, so greedy algorithms over supremizers run on arrays of dimension
-    N + dim E at most instead of n.
+
+def _alike(one: Array, other: Array) -> bool:
+    return min(float(np.abs(one - other).max(initial=0.0)), float(np.abs(one + other).max(initial=0.0))) <= MARK_ATOL
+
+
+class SpannedCoordinates:
+    """Euclidean coordinates in V_N + span of some vectors.
 
     Parameters
     ----------
@@ -81,29 +98,93 @@ class SupremizerCoordinates:
         Inner product of the primal space.
     basis
         V-orthonormal basis of V_N (n×N).
-    matrices
-        The constraint matrices (m×n) whose supremizers will be asked for.
+    vectors
+        Vectors (n×k) to be represented, of any rank.
+
+    Attributes
+    ----------
+    plain
+        Coordinates (d×N) of the basis of V_N, orthonormal.
+    represented
+        Coordinates (d×k) of the vectors.
     """
 
-    def __init__(self, V: InnerProduct, basis: Array, matrices: Sequence[SparseMatrix]) -> None:
+    def __init__(self, V: InnerProduct, basis: Array, vectors: Array) -> None:
         self._V = V
-        touched = np.zeros(V.dim, dtype=bool)
-        for matrix in matrices:
-            touched[np.unique(sp.csr_array(matrix).indices)] = True
-        self._touched = np.flatnonzero(touched)
-        unit = np.zeros((V.dim, len(self._touched)))
-        unit[self._touched, np.arange(len(self._touched))] = 1.0
-        representers = V.whiten_functional(unit)
-        fixed = V.whiten(basis)
-        q, r = scipy.linalg.qr(remove(fixed, representers), mode="economic")
+        fixed, whitened = V.whiten(basis), V.whiten(vectors)
+        q, r = np.linalg.qr(remove(fixed, whitened))
         self._whitened = np.hstack([fixed, q])
-        self._representers = np.vstack([fixed.T @ representers, r])
-        self.plain = np.eye(self._whitened.shape[1], fixed.shape[1])
-
-    def supremizers(self, B: SparseMatrix, eta: Array) -> Array:
-        """Coordinates (d×k) of T(mu)η, η (m×k); those of V_N itself are `plain` (d×N), the first N unit vectors."""
-        return np.asarray(self._representers @ np.asarray(B.T @ eta)[self._touched])
+        self.represented: Array = np.vstack([fixed.T @ whitened, r])
+        self.plain: Array = np.eye(self._whitened.shape[1], fixed.shape[1])
 
     def vectors(self, coordinates: Array) -> Array:
         """Vectors (n×k) with these coordinates (d×k)."""
         return self._V.unwhiten(self._whitened @ coordinates)
+
+
+class ContactCoordinates:
+    """Euclidean coordinates in V_N + X_V⁻¹E, E some degrees of freedom: every supremizer of every B that touches them.
+
+    X_V = FᵀF is factorised with E last. For every load r on E, F X_V⁻¹ r = F⁻ᵀ r is then F_EE⁻ᵀ r in its last entries
+    and zero before: no array larger than E is needed for it.
+
+    Parameters
+    ----------
+    V
+        Inner product of the primal space.
+    basis
+        V-orthonormal basis of V_N (n×N).
+    dofs
+        E, rising.
+
+    Attributes
+    ----------
+    plain
+        Coordinates (d×N) of the basis of V_N, orthonormal.
+    """
+
+    def __init__(self, V: InnerProduct, basis: Array, dofs: Indices) -> None:
+        self._factor = SparseCholesky(V.matrix, "X_V", elimination_order(V.matrix, dofs))
+        self._tail = self._factor.tail(len(dofs))
+        whitened = self._factor.up(basis)
+        split = V.dim - len(dofs)
+        self._others, r = np.linalg.qr(whitened[:split])
+        self.plain: Array = np.vstack([r, whitened[split:]])
+
+    def supremizers(self, loads: Array) -> Array:
+        """Coordinates (d×k) of X_V⁻¹ r for loads on E (|E|×k), such as the rows of Bᵀη there."""
+        on_contact = scipy.linalg.solve_triangular(self._tail, loads, trans="T", check_finite=False)
+        return np.vstack([np.zeros((self._others.shape[1], loads.shape[1])), on_contact])
+
+    def vectors(self, coordinates: Array) -> Array:
+        """Vectors (n×k) with these coordinates (d×k)."""
+        k = self._others.shape[1]
+        return self._factor.up_inverse(np.vstack([self._others @ coordinates[:k], coordinates[k:]]))
+
+
+Coordinates = SpannedCoordinates | ContactCoordinates
+
+
+def supremizer_coordinates(
+    V: InnerProduct, basis: Array, matrices: Sequence[SparseMatrix], eta: Array
+) -> tuple[Coordinates, list[Array]]:
+    """Coordinates in which greedy algorithms over supremizers run, and those (d×k) of T(mu)η for every matrix.
+
+    Parameters
+    ----------
+    V, basis
+        The primal space and a V-orthonormal basis of V_N (n×N).
+    matrices
+        Constraint matrices B(mu) (m×n).
+    eta
+        Multipliers (m×k).
+    """
+    loads = [np.asarray(B.T @ eta) for B in matrices]
+    touched = np.unique(np.concatenate([sp.csr_array(B).indices for B in matrices]))
+    count = eta.shape[1]
+    if FEW_SUPREMIZERS * count * len(matrices) <= len(touched):
+        space = SpannedCoordinates(V, basis, V.riesz(np.hstack(loads)))
+        return space, [space.represented[:, k * count : (k + 1) * count] for k in range(len(matrices))]
+    contact = ContactCoordinates(V, basis, touched)
+    found = contact.supremizers(np.hstack([load[touched] for load in loads]))
+    return contact, [found[:, k * count : (k + 1) * count] for k in range(len(matrices))]

@@ -10,8 +10,8 @@ from annotated_types import Ge, Gt, Le, Lt
 from skfem import Basis, BilinearForm, ElementTriP1, ElementVector
 from skfem.helpers import ddot, dot, eye, grad, sym_grad, trace
 
-from vibench.arrays import Array
-from vibench.problem import ParameterBox, Picture, Problem, VariationalInequality
+from vibench.arrays import Array, Indices
+from vibench.problem import Contact, ParameterBox, Picture, Problem, VariationalInequality
 from vibench.space import InnerProduct
 from vibench_problems.graded_mesh import quarter_disc
 from vibench_problems.mortar import coupling
@@ -108,9 +108,10 @@ class Hertz(Problem):
         self._all_stiffness = sp.csr_array(sp.block_diag(blocks))
         self._stiffness = self._all_stiffness[self.free][:, self.free]
         self._second = 2 * self.slave.mesh.p.shape[1]  # first degree of freedom of disc 2
-        self._contact_dofs = np.concatenate([2 * self.slave.zone + 1, self._second + 2 * self.master.zone + 1])
         self._lift = np.zeros(offset)
         self._lift[1 : self._second : 2], self._lift[self._second + 1 :: 2] = -approach, approach
+        zone = np.concatenate([2 * self.slave.zone + 1, self._second + 2 * self.master.zone + 1])
+        self._contact_dofs, self._contact_lift = np.searchsorted(self.free, zone), self._lift[zone]
         self.V = InnerProduct(sp.csr_array(sp.block_diag(norms))[self.free][:, self.free])
         self.W = InnerProduct(sp.diags_array(self.macro_lengths))
 
@@ -145,18 +146,20 @@ class Hertz(Problem):
         NumericalError
             If mu is so small that the arc of disc 2 does not face the whole potential contact zone.
         """
+        B, g = self.constraint(mu)
+        return VariationalInequality(A=self._stiffness, f=np.zeros(len(self.free)), B=B, g=g, lift=self._lift)
+
+    @property
+    def contact_dofs(self) -> Indices:
+        """Vertical displacements of the potential contact zones of both discs."""
+        return self._contact_dofs
+
+    def contact(self, mu: Array) -> Contact:
+        """The non-interpenetration condition on the potential contact zones."""
         upper, lower = self.points(mu)
         integrals = coupling(upper[:, self.slave.zone], lower[:, self.master.zone], self.quadrature)
-        values = sp.coo_array(sp.hstack([-integrals.slave, integrals.master]))
-        shape = (self.W.dim, len(self._lift))
-        B = sp.csr_array((values.data, (values.row, self._contact_dofs[values.col])), shape=shape)
-        return VariationalInequality(
-            A=self._stiffness,
-            f=np.zeros(len(self.free)),
-            B=B[:, self.free],
-            g=integrals.gap - B @ self._lift,
-            lift=self._lift,
-        )
+        B = sp.csr_array(sp.hstack([-integrals.slave, integrals.master]))
+        return Contact(B, integrals.gap - B @ self._contact_lift)
 
     def refuse(self, mu: Array, u: Array, lam: Array) -> str:  # noqa: ARG002
         """Contact that reaches the last macro-edge may go on beyond the potential contact zone."""

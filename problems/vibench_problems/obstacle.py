@@ -10,8 +10,8 @@ from annotated_types import Ge, Gt, Le
 from skfem import Basis, BilinearForm, ElementTriP1, LinearForm, MeshTri, condense, solve
 from skfem.helpers import dot, grad
 
-from vibench.arrays import Array, SparseMatrix
-from vibench.problem import ParameterBox, Picture, Problem, VariationalInequality
+from vibench.arrays import Array, Indices, SparseMatrix
+from vibench.problem import Contact, ParameterBox, Picture, Problem, VariationalInequality
 from vibench.space import InnerProduct
 from vibench_problems.disc_mesh import aspect_ratios, disc_in_square
 
@@ -90,11 +90,12 @@ class Obstacle(Problem):
         self.free = basis.complement_dofs(basis.get_dofs())
         self.disc_nodes = np.flatnonzero(np.linalg.norm(self.mesh.p, axis=0) <= RADIUS * (1.0 + 1e-9))
         laplacian, full_mass = stiffness.assemble(basis), mass.assemble(basis)
-        self._disc_mass = mass.assemble(disc)[self.disc_nodes].tocsr()
+        disc_mass = mass.assemble(disc)[self.disc_nodes][:, self.disc_nodes]
         self._disc_paraboloid = paraboloid.assemble(disc, intorder=4)[self.disc_nodes]
         self._modes = self._displacement_modes(laplacian, basis.get_dofs().all())
         self.V = InnerProduct((full_mass + length**2 * laplacian)[self.free][:, self.free])
-        self.W = InnerProduct(self._disc_mass[:, self.disc_nodes])
+        self.W = InnerProduct(disc_mass)
+        self._contact_dofs = np.searchsorted(self.free, self.disc_nodes)
 
     @property
     def nodes(self) -> int:
@@ -108,13 +109,23 @@ class Obstacle(Problem):
     def assemble(self, mu: Array) -> VariationalInequality:
         """Forms (37) to (40) on the mapped mesh; b = −∫ v η and g = −∫ ψ η, so that B u ≤ g says u ≥ ψ."""
         basis = Basis(MeshTri(self.points(mu), self.mesh.t, sort_t=False, validate=False), ElementTriP1())
-        area = mu[0] ** 2  # Jacobian of h on the disc, where it is affine
+        B, g = self.constraint(mu)
         return VariationalInequality(
             A=stiffness.assemble(basis)[self.free][:, self.free],
             f=self.load * unit_load.assemble(basis)[self.free],
-            B=-area * self._disc_mass[:, self.free],
-            g=-area * self.obstacle * self._disc_paraboloid,
+            B=B,
+            g=g,
         )
+
+    @property
+    def contact_dofs(self) -> Indices:
+        """The nodes of the disc."""
+        return self._contact_dofs
+
+    def contact(self, mu: Array) -> Contact:
+        """B and g on the disc, where h(mu) is affine: its Jacobian mu_1² is all that depends on the parameter."""
+        area = mu[0] ** 2
+        return Contact(-area * self.W.matrix, -area * self.obstacle * self._disc_paraboloid)
 
     def points(self, mu: Array) -> Array:
         """Nodes (2×nodes) of the mesh of Ω at mu: h(mu) of the reference nodes."""

@@ -11,7 +11,7 @@ from vibench.errors import NumericalError
 from vibench.greedy import TIE, LazyMaximum
 from vibench.linalg import orthonormal_range, remove, svd
 from vibench.strategy import Enrichment, Kind, Offline, PrimalStrategy
-from vibench.supremizer import SupremizerCoordinates, constraint_classes
+from vibench.supremizer import constraint_classes, supremizer_coordinates
 
 SMALL = 1e-10
 """Squares of sines below this are computed from residual vectors, not from the downdated Gram matrix."""
@@ -39,10 +39,9 @@ class OfflinePGA(PrimalStrategy):
         if tolerance is None:
             raise ValueError("the projected greedy algorithm needs a tolerance")
         problem = offline.problem
-        classes = constraint_classes([problem.assemble(mu).B for mu in offline.training])
-        space = SupremizerCoordinates(problem.V, offline.basis, classes.representatives)
-        modes = space.plain.shape[1]
-        targets = [_Target(space.supremizers(B, offline.span), modes) for B in classes.representatives]
+        different = constraint_classes([problem.constraint(mu)[0] for mu in offline.training]).representatives
+        space, supremizers = supremizer_coordinates(problem.V, offline.basis, different, offline.span)
+        targets = [_Target(found, space.plain) for found in supremizers]
         maximum = LazyMaximum(np.ones(len(targets)))
         grown, history = space.plain, []
         while True:
@@ -53,7 +52,7 @@ class OfflinePGA(PrimalStrategy):
             if grown.shape[1] == grown.shape[0]:
                 raise NumericalError(f"all supremizers leave σ = {sigma:.0e}, above the tolerance {tolerance:g}")
             grown = np.column_stack([grown, targets[worst].worst_direction(grown)])
-        added = space.vectors(grown[:, modes:])
+        added = space.vectors(grown[:, space.plain.shape[1] :])
         return Enrichment(Kind.FIXED, vectors=added, history={"sigma": np.array(history)})
 
 
@@ -64,10 +63,10 @@ class _Target:
     Its eigenvalues are squares of sines and keep half their digits, so small ones are computed from residuals again.
     """
 
-    def __init__(self, supremizers: Array, modes: int) -> None:
+    def __init__(self, supremizers: Array, plain: Array) -> None:
         self._basis = orthonormal_range(supremizers)
-        self._known = modes
-        outside = self._basis[modes:]  # coordinates beyond those of V_N
+        self._known = plain.shape[1]
+        outside = remove(plain, self._basis)
         self._gram = outside.T @ outside
 
     def sigma(self, space: Array) -> float:

@@ -1,0 +1,75 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import scipy.sparse as sp
+from hypothesis import given
+from hypothesis import strategies as st
+
+from numerics import Varying, spd
+from vibench import highfidelity
+from vibench.condensation import Condensed, Pattern
+from vibench.highfidelity import Solver, Stiffness
+from vibench.problem import VariationalInequality
+
+
+def sparse_spd(n: int, rng: np.random.Generator) -> sp.csc_array:
+    """A sparse SPD matrix in which most unknowns couple to few others."""
+    links = sp.random_array((n, n), density=1.0 / n, rng=rng)
+    return sp.csc_array(links @ links.T + sp.eye_array(n))
+
+
+@given(st.integers(0, 10_000), st.integers(0, 12))
+def test_equilibrium_with_the_kept_unknowns_given(seed: int, count: int) -> None:
+    rng = np.random.default_rng(seed)
+    A, f = sparse_spd(12, rng), rng.standard_normal(12)
+    kept = np.sort(rng.permutation(12)[:count])
+    others = np.setdiff1d(np.arange(12), kept)
+    condensed = Condensed(A, Pattern.of(A, kept))
+    dense = A.toarray()
+    inner = np.linalg.inv(dense[np.ix_(others, others)])
+    taken = dense[np.ix_(kept, others)] @ inner
+    assert np.allclose(condensed.matrix.toarray(), dense[np.ix_(kept, kept)] - taken @ dense[np.ix_(others, kept)])
+    load, free = condensed.load(f)
+    assert np.allclose(load, f[kept] - taken @ f[others])
+    u_kept = rng.standard_normal(count)
+    u = condensed.expand(u_kept, free)
+    assert np.allclose(u[kept], u_kept)
+    assert np.allclose((dense @ u - f)[others], 0.0, atol=1e-10)
+
+
+def test_a_load_that_changes_is_not_remembered() -> None:
+    A = sparse_spd(12, np.random.default_rng(0))
+    condensed = Condensed(A, Pattern.of(A, np.arange(3)))
+    one, two = np.ones(12), np.arange(12.0)
+    assert not np.allclose(condensed.load(one)[0], condensed.load(two)[0])
+    assert np.allclose(condensed.load(one)[0] + condensed.load(two)[0], condensed.load(one + two)[0])
+
+
+@given(st.integers(0, 10_000), st.integers(1, 6))
+def test_condensed_systems_have_the_solutions_of_the_whole_ones(seed: int, touched: int) -> None:
+    rng = np.random.default_rng(seed)
+    A, kept = sparse_spd(14, rng), np.sort(rng.permutation(14)[:touched])
+    B = np.zeros((touched, 14))
+    B[:, kept] = np.triu(spd(touched, rng))
+    vi = VariationalInequality(A, rng.standard_normal(14), sp.csr_array(B), 0.2 * rng.random(touched))
+    whole = highfidelity.solve(vi)
+    condensed = highfidelity.solve(vi, Stiffness(A, Pattern.of(A, kept)), start=rng.random(touched) > 0.5)
+    assert np.allclose(condensed.u, whole.u, atol=1e-9)
+    assert np.allclose(condensed.lam, whole.lam, atol=1e-9)
+
+
+@pytest.mark.parametrize("declared", [True, False])
+def test_a_sweep_gives_the_solutions_of_single_solves(declared: bool) -> None:
+    class Declaring(Varying):
+        contact_dofs = property(lambda self: np.arange(4, 26))
+
+    problem = (Declaring if declared else Varying)(n=60)
+    solver, iterations = Solver(problem), []
+    for mu in problem.training_set():
+        found, alone = solver.solve(mu), highfidelity.solve(problem.assemble(mu))
+        assert np.allclose(found.u, alone.u, atol=1e-10)
+        assert np.array_equal(found.lam > 0.0, alone.lam > 0.0)
+        iterations.append((found.iterations, alone.iterations))
+    warm, cold = np.sum(iterations[1:], axis=0)
+    assert warm < cold

@@ -1,0 +1,47 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import scipy.sparse as sp
+from hypothesis import given
+from hypothesis import strategies as st
+
+from numerics import spd
+from vibench.errors import NumericalError
+from vibench.factor import SparseCholesky, elimination_order
+
+
+@given(st.integers(0, 10_000), st.booleans())
+def test_the_factor_is_upper_triangular_in_its_order_and_gives_the_matrix(seed: int, chosen: bool) -> None:
+    rng = np.random.default_rng(seed)
+    X = spd(7, rng)
+    order = rng.permutation(7) if chosen else None
+    factor = SparseCholesky(sp.csc_array(X), order=order)
+    F = factor.up(np.eye(7))
+    assert np.allclose(F.T @ F, X)
+    assert np.allclose(F[:, factor.order], np.triu(F[:, factor.order]))
+    if order is not None:
+        assert np.array_equal(factor.order, order)
+    r = rng.standard_normal((7, 2))
+    assert np.allclose(factor.solve(r), np.linalg.solve(X, r))
+    assert np.allclose(factor.up_inverse(r), np.linalg.solve(F, r))
+    assert np.allclose(factor.down_inverse(r), np.linalg.solve(F.T, r))
+
+
+@given(st.integers(0, 10_000), st.integers(0, 7))
+def test_the_tail_is_a_factor_of_the_schur_complement(seed: int, count: int) -> None:
+    rng = np.random.default_rng(seed)
+    X = spd(7, rng)
+    last = rng.permutation(7)[:count]
+    factor = SparseCholesky(sp.csc_array(X), order=elimination_order(sp.csc_array(X), last))
+    assert np.array_equal(factor.order[7 - count :], last)
+    rest = np.setdiff1d(np.arange(7), last)
+    taken = X[np.ix_(last, rest)] @ np.linalg.solve(X[np.ix_(rest, rest)], X[np.ix_(rest, last)])
+    F = factor.tail(count)
+    assert np.allclose(F.T @ F, X[np.ix_(last, last)] - taken)
+
+
+@pytest.mark.parametrize("matrix", [-np.eye(3), np.diag([1.0, 0.0, 1.0]), np.array([[1.0, 2.0], [2.0, 1.0]])])
+def test_what_is_not_positive_definite_is_refused_by_name(matrix: np.ndarray) -> None:
+    with pytest.raises(NumericalError, match="the thing"):
+        SparseCholesky(sp.csc_array(matrix), "the thing")

@@ -1,0 +1,106 @@
+"""Systems with a sparse stiffness condensed on the few unknowns that constraints touch."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.sparse as sp
+
+from vibench.arrays import Array, Indices, SparseMatrix
+from vibench.factor import SparseCholesky, elimination_order
+
+
+@dataclass(frozen=True)
+class Pattern:
+    """Which unknowns are kept and how the others are eliminated; the same for all matrices of one sparsity pattern.
+
+    Attributes
+    ----------
+    kept
+        Unknowns c to condense on, rising.
+    order
+        Elimination order of all others, followed by the interface: the kept ones that couple to others.
+    interface
+        Where the interface is among the kept ones.
+    """
+
+    kept: Indices
+    order: Indices
+    interface: Indices
+
+    @classmethod
+    def of(cls, A: SparseMatrix, kept: Indices) -> Pattern:
+        """Pattern for matrices with the sparsity of A (n×n), symmetric positive definite."""
+        others = np.setdiff1d(np.arange(A.shape[0]), kept)
+        interface = np.unique(sp.csr_array(A)[others][:, kept].indices)
+        inside = np.union1d(others, kept[interface])
+        order = elimination_order(sp.csr_array(A)[inside][:, inside], np.searchsorted(inside, kept[interface]))
+        return cls(kept, inside[order], interface)
+
+
+class Condensed:
+    """One stiffness A, condensed: whatever is wanted of the kept unknowns takes arrays of their number alone.
+
+    Attributes
+    ----------
+    matrix
+        Schur complement Ŝ of the eliminated unknowns (c×c, sparse).
+    dense
+        Whether most of Ŝ is filled in.
+    """
+
+    def __init__(self, A: SparseMatrix, pattern: Pattern) -> None:
+        self._pattern, self._size = pattern, A.shape[0]
+        A, count = sp.csr_array(A), len(pattern.interface)
+        inside = A[pattern.order][:, pattern.order]
+        natural = np.arange(len(pattern.order))
+        self._factor = SparseCholesky(inside, "A", natural) if len(natural) else None
+        self._eliminated = len(natural) - count
+        upper = self._factor.tail(count) if self._factor is not None else np.zeros((0, 0))
+        self._schur = upper.T @ upper
+        self.dense = 2 * count > len(pattern.kept)
+        self.matrix = _with_block(sp.coo_array(A[pattern.kept][:, pattern.kept]), pattern.interface, self._schur)
+        self._loaded: tuple[Array, tuple[Array, Array]] | None = None
+
+    def load(self, f: Array) -> tuple[Array, Array]:
+        """Load (c,) on the kept unknowns that f (n,) amounts to, and what `expand` needs of f."""
+        if self._loaded is not None and np.array_equal(self._loaded[0], f):
+            return self._loaded[1]
+        order, interface = self._pattern.order, self._pattern.interface
+        right = f[order]
+        right[self._eliminated :] = 0.0
+        free = self._factor.solve(right) if self._factor is not None else right
+        condensed = f[self._pattern.kept]
+        condensed[interface] += self._schur @ free[self._eliminated :]
+        self._loaded = f, (condensed, free)
+        return self._loaded[1]
+
+    def expand(self, u_kept: Array, free: Array) -> Array:
+        """All unknowns (n,) from the kept ones (c,), equilibrium holding in the others."""
+        order, interface = self._pattern.order, self._pattern.interface
+        u = np.empty(self._size)
+        if self._factor is not None:
+            right = np.zeros(len(order))
+            right[self._eliminated :] = self._schur @ (u_kept[interface] - free[self._eliminated :])
+            u[order] = free + self._factor.solve(right)
+        u[self._pattern.kept] = u_kept
+        return u
+
+
+def _with_block(matrix: SparseMatrix, where: Indices, block: Array) -> SparseMatrix:
+    """A sparse matrix (CSC) with the rows and columns `where` of it replaced by a dense block."""
+    inside = np.zeros(matrix.shape[0], dtype=bool)
+    inside[where] = True
+    rows, columns = matrix.coords
+    stays = ~(inside[rows] & inside[columns])
+    return sp.csc_array(
+        (
+            np.concatenate([matrix.data[stays], block.ravel()]),
+            (
+                np.concatenate([rows[stays], np.repeat(where, len(where))]),
+                np.concatenate([columns[stays], np.tile(where, len(where))]),
+            ),
+        ),
+        shape=matrix.shape,
+    )

@@ -1,0 +1,113 @@
+"""Sparse symmetric positive definite matrices, factorised in an order of one's own choice."""
+
+from __future__ import annotations
+
+import numpy as np
+import scipy.sparse as sp
+from scipy.sparse.linalg import SuperLU, splu, spsolve_triangular
+
+from vibench.arrays import Array, Indices, SparseMatrix
+from vibench.errors import NumericalError
+
+_SYMMETRIC = {"diag_pivot_thresh": 0.0, "options": {"SymmetricMode": True}}
+
+
+class SparseCholesky:
+    """X = FᵀF for a sparse symmetric positive definite X (n×n), without pivoting off the diagonal.
+
+    Parameters
+    ----------
+    matrix
+        X; only its symmetry is taken for granted.
+    name
+        What to call it when it is refused.
+    order
+        Elimination order (n,), as `elimination_order` gives it; by default minimum degree.
+
+    Attributes
+    ----------
+    order
+        Unknowns in the order of their elimination, in which F is upper triangular.
+
+    Raises
+    ------
+    NumericalError
+        If X is not positive definite.
+    """
+
+    def __init__(self, matrix: SparseMatrix, name: str = "the matrix", order: Indices | None = None) -> None:
+        matrix = sp.csc_array(matrix)
+        if order is not None:
+            matrix = sp.csc_array(matrix[order][:, order])
+        try:
+            lu = splu(matrix, permc_spec="MMD_AT_PLUS_A" if order is None else "NATURAL", **_SYMMETRIC)
+        except RuntimeError as error:
+            raise NumericalError(f"{name} cannot be factorised: {error}") from None
+        pivots = lu.U.diagonal()
+        if not np.array_equal(lu.perm_r, lu.perm_c) or np.any(pivots <= 0.0):
+            raise NumericalError(f"{name} is not positive definite")
+        self._lu: SuperLU = lu
+        self._lower, self._root = sp.csc_array(lu.L), np.sqrt(pivots)
+        eliminated = np.argsort(lu.perm_c)
+        if order is not None and not np.array_equal(eliminated, np.arange(len(order))):
+            raise NumericalError(f"{name} was factorised in another order than asked for")  # SuperLU promises not to
+        self._given = order
+        self.order: Indices = eliminated if order is None else order
+
+    def solve(self, right: Array) -> Array:
+        """X⁻¹ r for right-hand sides (n,) or (n, k)."""
+        if self._given is None:
+            return np.asarray(self._lu.solve(np.ascontiguousarray(right)))
+        found = np.empty_like(right, dtype=float)
+        found[self._given] = self._lu.solve(np.ascontiguousarray(right[self._given]))
+        return found
+
+    def up(self, u: Array) -> Array:
+        """F u, for u (n,) or (n, k)."""
+        return _rows(self._root, self._lower.T @ u[self.order])
+
+    def up_inverse(self, y: Array) -> Array:
+        """F⁻¹ y, for y (n,) or (n, k)."""
+        scaled = _rows(1.0 / self._root, y)
+        u = np.empty_like(scaled)
+        if scaled.size:
+            u[self.order] = spsolve_triangular(self._lower.T, scaled, lower=False, unit_diagonal=True)
+        return u
+
+    def down_inverse(self, right: Array) -> Array:
+        """F⁻ᵀ r, for r (n,) or (n, k)."""
+        permuted = np.ascontiguousarray(right[self.order])
+        if not permuted.size:
+            return permuted
+        return _rows(1.0 / self._root, spsolve_triangular(self._lower, permuted, lower=True, unit_diagonal=True))
+
+    def tail(self, count: int) -> Array:
+        """The last block F_cc (count×count) of F, in the order of elimination: a factor of the Schur complement.
+
+        With c the last `count` unknowns, F_ccᵀF_cc is X_cc minus what the elimination of all others takes from it.
+        """
+        first = self._lower.shape[0] - count
+        block = sp.csr_array(self._lower)[first:][:, first:].toarray()
+        return np.asarray((block * self._root[first:]).T)
+
+
+def _rows(factors: Array, values: Array) -> Array:
+    return np.asarray(factors * values if values.ndim == 1 else factors[:, None] * values)
+
+
+def elimination_order(matrix: SparseMatrix, last: Indices) -> Indices:
+    """Order of elimination with little fill-in (minimum degree) that ends with some unknowns, in their order.
+
+    Parameters
+    ----------
+    matrix
+        A symmetric positive definite matrix (n×n) with the sparsity pattern in question.
+    last
+        Unknowns that come last.
+    """
+    matrix = sp.csc_array(matrix)
+    rest = np.setdiff1d(np.arange(matrix.shape[0]), last)
+    if not len(rest):
+        return np.asarray(last)
+    lu = splu(sp.csc_array(matrix[rest][:, rest]), permc_spec="MMD_AT_PLUS_A", **_SYMMETRIC)
+    return np.concatenate([rest[np.argsort(lu.perm_c)], last])
