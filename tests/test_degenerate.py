@@ -103,7 +103,7 @@ def rows(register, tmp_path):
         tolerance = 0.5 if primal == "offline-pga" else None
         strategy = Plugin("primal strategy", primal, "{}", "test")
         enrichment = EnrichmentStage(PODStage(problem, Stop(tolerance=1e-6)), cone, strategy, tolerance)
-        stage = QueriesStage(AssemblyStage(enrichment, "full", 3, 1), "piqp", 1e-8, 20.0)
+        stage = QueriesStage(AssemblyStage(enrichment, None, 3, 1), "piqp", 1e-8, 20.0)
         carry_out(stage, store)
         found: CellRows = value_of(store, stage)
         return found

@@ -30,7 +30,7 @@ def cell(primal: str, tolerance: float | None, solver: str = "piqp") -> QueriesS
         Plugin("primal strategy", primal, "{}", "test"),
         tolerance,
     )
-    return QueriesStage(AssemblyStage(enrichment, "full", 9, 3), solver, 1e-8, 20.0)
+    return QueriesStage(AssemblyStage(enrichment, None, 9, 3), solver, 1e-8, 20.0)
 
 
 @pytest.fixture(scope="module")

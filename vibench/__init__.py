@@ -5,10 +5,10 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from vibench.reduced import ReducedModel
+    from vibench.assembly import Model
 
 
-def load(run: str, cell: str) -> ReducedModel:
+def load(run: str, cell: str) -> Model:
     """The reduced model of a row of a run, ready for queries.
 
     Parameters

@@ -1,65 +1,157 @@
-"""The assembly stage: reduced problems at the validation parameters, timed, and judged by their inf-sup constants."""
+"""How queries are assembled, in full or reduced: what that takes offline, and what it takes per query."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
 
-from vibench.assess import constants_full, constants_on
-from vibench.infsup import InfSup, inf_sup_on
-from vibench.problem import checked_assembly, validation_parameters
-from vibench.stage import Result, Stage
-from vibench.stages import EnrichmentStage, reduced_model
+import numpy as np
+
+from vibench.matrix import Cell, Plugin
+from vibench.online import OnlineModel, Operators, obstacle_to_reduction, project_members
+from vibench.problem import MEMBERS, VariationalInequality, checked_assembly, training_parameters, validation_parameters
+from vibench.reduced import ReducedModel, project
+from vibench.separation import Member, Way, separate
+from vibench.stage import Result, Stage, build_problem, value_of
+from vibench.stages import EnrichmentStage, enrichment_stage, reduced_model
 from vibench.store import Store
-from vibench.strategy import Kind
-from vibench.timing import Seconds, median_seconds
+from vibench.timing import NO_TIME, Seconds, median_seconds, timed
+
+Model = ReducedModel | OnlineModel
+"""What gives the reduced problem at a parameter."""
+
+
+@dataclass(frozen=True)
+class Separation(Stage):
+    """How A, f, B, g can be evaluated without assembling all of them; it depends on the problem alone."""
+
+    problem: Plugin
+    tolerance: float
+
+    def inputs(self) -> tuple[Stage, ...]:
+        """Nothing comes before: the matrices of the training parameters are not kept."""
+        return ()
+
+    def run(self, store: Store) -> Result:  # noqa: ARG002
+        """A `Member` by name."""
+        problem = build_problem(self.problem)
+        return Result(*timed(lambda: separate(problem, training_parameters(problem), self.tolerance)))
+
+
+@dataclass(frozen=True)
+class Reduction:
+    """The projected members of a reduced model, or why there are none and queries are assembled in full."""
+
+    operators: Operators | None
+    why_full: str
+
+
+@dataclass(frozen=True)
+class ReductionStage(Stage):
+    """Projection of the separated members on the space of a reduced model."""
+
+    enrichment: EnrichmentStage
+    separation: Separation
+
+    def inputs(self) -> tuple[Stage, ...]:
+        """The reduced model and the members."""
+        return (self.enrichment, *self.enrichment.inputs(), self.separation)
+
+    def run(self, store: Store) -> Result:
+        """A `Reduction`."""
+        model, _, _ = reduced_model(store, self.enrichment)
+        members: Mapping[str, Member] = value_of(store, self.separation)
+        why = obstacle_to_reduction(model, members)
+        if why:
+            return Result(Reduction(None, why), NO_TIME)
+        operators, seconds = timed(lambda: project_members(model, members))
+        return Result(Reduction(operators, ""), seconds)
 
 
 @dataclass(frozen=True)
 class Assembled:
-    """What the queries of a reduced model have in common, whatever solves them.
+    """What assembling takes, whatever solves the queries.
 
     Attributes
     ----------
     seconds
         Median seconds of the assembly per validation parameter.
-    own, full, plain
-        Inf-sup constants per validation parameter: of the reduced pair, of the whole of V with the reduced cone (what
-        online supremizers reach), of V_N alone.
+    errors
+        Largest relative difference of a member of the reduced program from its Galerkin projection, per parameter; zero
+        where it is assembled in full.
     """
 
     seconds: tuple[Seconds, ...]
-    own: tuple[InfSup, ...]
-    full: tuple[InfSup, ...]
-    plain: tuple[InfSup, ...]
+    errors: tuple[float, ...]
 
 
 @dataclass(frozen=True)
 class AssemblyStage(Stage):
-    """Assembly of the reduced problems at the validation parameters: timed, and judged by its inf-sup constants."""
+    """Assembly of the reduced problems at the validation parameters, timed."""
 
     enrichment: EnrichmentStage
-    assembly: str
+    interpolation: float | None
     count: int
     seed: int
 
+    @property
+    def reduction(self) -> ReductionStage | None:
+        """What reduced assembly needs offline; `None` for assembly in full."""
+        if self.interpolation is None:
+            return None
+        return ReductionStage(self.enrichment, Separation(self.enrichment.pod.problem, self.interpolation))
+
     def inputs(self) -> tuple[Stage, ...]:
-        """Enrichment, and what it was built on."""
-        return (self.enrichment, *self.enrichment.inputs())
+        """Enrichment, what it was built on, and what reduced assembly needs."""
+        reduction = self.reduction
+        extra = () if reduction is None else (reduction, reduction.separation)
+        return (self.enrichment, *self.enrichment.inputs(), *extra)
 
     def run(self, store: Store) -> Result:
-        """Time every assembly and compute the constants of the spaces it leads to."""
-        model, basis, prepared = reduced_model(store, self.enrichment)
-        problem = model.problem
-        mus = validation_parameters(problem, self.count, self.seed)
-        measured, own, matrices = [], [], []
-        for mu in mus:
-            reduced, seconds = median_seconds(partial(model.assemble, mu))
-            measured.append(seconds)
-            matrices.append(checked_assembly(problem, mu).B)
-            if model.kind is Kind.PER_PARAMETER:
-                own.append(inf_sup_on(reduced.basis, matrices[-1], prepared))
-        if model.kind is not Kind.PER_PARAMETER:
-            own = constants_on(model.fixed_basis, matrices, prepared)
-        full, plain = constants_full(problem.V, matrices, prepared), constants_on(basis, matrices, prepared)
-        return Result(Assembled(tuple(measured), tuple(own), tuple(full), tuple(plain)))
+        """Time every assembly; compare reduced ones with full ones, untimed."""
+        model, _ = query_model(store, self)
+        seconds, errors = [], []
+        for mu in validation_parameters(model.problem, self.count, self.seed):
+            reduced, spent = median_seconds(partial(model.assemble, mu))
+            seconds.append(spent)
+            if isinstance(model, OnlineModel):
+                full = project(checked_assembly(model.problem, mu), reduced.basis, model.generators)
+                errors.append(_largest_difference(reduced.program, full))
+            else:
+                errors.append(0.0)
+        return Result(Assembled(tuple(seconds), tuple(errors)))
+
+
+def _largest_difference(found: VariationalInequality, exact: VariationalInequality) -> float:
+    pairs = [(getattr(found, name), getattr(exact, name)) for name in MEMBERS]
+    return max(float(np.linalg.norm(one - other)) / (float(np.linalg.norm(other)) or 1.0) for one, other in pairs)
+
+
+def query_model(store: Store, stage: AssemblyStage) -> tuple[Model, str]:
+    """The model that queries ask, and why it assembles in full although reduced assembly was asked for."""
+    model, _, _ = reduced_model(store, stage.enrichment)
+    if stage.reduction is None:
+        return model, ""
+    reduction: Reduction = value_of(store, stage.reduction)
+    if reduction.operators is None:
+        return model, f"assembled in full: {reduction.why_full}"
+    return OnlineModel(model, reduction.operators), ""
+
+
+def assembly_columns(store: Store, stage: AssemblyStage) -> dict[str, float | int | None]:
+    """Columns of a cell: tolerance, training error and number of terms of every member; none for assembly in full."""
+    if stage.reduction is None:
+        return {}
+    members: Mapping[str, Member] = value_of(store, stage.reduction.separation)
+    summed = {name: member for name, member in members.items() if member.terms}
+    return {
+        "interpolation_tol": stage.interpolation,
+        "interpolation_error": max((member.error for member in summed.values()), default=0.0),
+        **{f"terms_{name}": len(m.rows) if m.way is Way.INTERPOLATED else 0 for name, m in summed.items()},
+    }
+
+
+def assembly_stage(cell: Cell) -> AssemblyStage:
+    """The stage that times the assembly of a cell's queries."""
+    return AssemblyStage(enrichment_stage(cell), cell.interpolation, cell.validation, cell.seed)

@@ -37,6 +37,7 @@ class SparseCholesky:
 
     def __init__(self, matrix: SparseMatrix, name: str = "the matrix", order: Indices | None = None) -> None:
         matrix = sp.csc_array(matrix)
+        self._made_from = matrix, name, order
         if order is not None:
             matrix = sp.csc_array(matrix[order][:, order])
         try:
@@ -53,6 +54,10 @@ class SparseCholesky:
             raise NumericalError(f"{name} was factorised in another order than asked for")  # SuperLU promises not to
         self._given = order
         self.order: Indices = eliminated if order is None else order
+
+    def __reduce__(self) -> tuple[type[SparseCholesky], tuple[SparseMatrix, str, Indices | None]]:
+        """Factorise anew where it is unpickled: SuperLU objects do not travel."""
+        return SparseCholesky, self._made_from
 
     def solve(self, right: Array) -> Array:
         """X⁻¹ r for right-hand sides (n,) or (n, k)."""

@@ -12,13 +12,12 @@ from typing import Any
 
 from vibench import tables
 from vibench.arrays import Array
+from vibench.assembly import Model, assembly_stage, query_model
 from vibench.errors import RequestError
 from vibench.isolation import Job, Keeper
 from vibench.matrix import Cell
 from vibench.problem import VariationalInequality, validation_parameters
-from vibench.reduced import ReducedModel
 from vibench.stage import Done, Stage
-from vibench.stages import enrichment_stage, reduced_model
 from vibench.store import Store, usable_store
 from vibench.tables import results_file
 
@@ -47,7 +46,7 @@ class RecordedCell:
         return Cell.from_definition(self.row["definition"])
 
     @cached_property
-    def model(self) -> ReducedModel:
+    def model(self) -> Model:
         """The reduced model; stages whose artefacts are gone are run again.
 
         Raises
@@ -60,9 +59,11 @@ class RecordedCell:
                 f"cell {self.row['cell']} was computed by other code, or with another version of its solver; "
                 "run its study again"
             )
-        store, enrichment = usable_store(), enrichment_stage(self.cell)
-        _provide(enrichment, store)
-        return reduced_model(store, enrichment)[0]
+        store, assembly = usable_store(), assembly_stage(self.cell)
+        for stage in (assembly.enrichment, assembly.reduction):
+            if stage is not None:
+                _provide(stage, store)
+        return query_model(store, assembly)[0]
 
     @cached_property
     def parameters(self) -> Array:

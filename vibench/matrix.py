@@ -57,7 +57,8 @@ class Plugin:
 class Cell:
     """One cell: problem × dual strategy × primal strategy × tolerances × QP solver × assembly.
 
-    `seed`, `validation` and `accuracy` are the study's; labels are for reading and no part of the identity.
+    `interpolation` is the tolerance of reduced assembly, `None` for assembly in full. `seed`, `validation` and
+    `accuracy` are the study's; labels are for reading and no part of the identity.
     """
 
     problem: Plugin
@@ -68,6 +69,7 @@ class Cell:
     primal_tol: float | None
     solver: str
     assembly: str
+    interpolation: float | None
     seed: int
     validation: int
     accuracy: float
@@ -116,7 +118,8 @@ class Cell:
         problem, dual, primal = self.labels
         tolerance = "" if self.primal_tol is None else f" {self.primal_tol:g}"
         sizes = f"{_stop(self.pod, 'N')}, {_stop(self.cone, 'R')}"
-        return f"{problem} · {dual} · {primal}{tolerance} · {sizes} · {self.solver}"
+        assembly = "" if self.assembly == "full" else f" · {self.assembly}"
+        return f"{problem} · {dual} · {primal}{tolerance} · {sizes} · {self.solver}{assembly}"
 
 
 def _stop(stop: Stop, size: str) -> str:
@@ -144,6 +147,7 @@ def expand(study: Study) -> list[Cell]:
                     primal_tol=tolerance,
                     solver=solver,
                     assembly=assembly,
+                    interpolation=study.interpolation if assembly == "reduced" else None,
                     seed=study.seed,
                     validation=study.validation,
                     accuracy=study.accuracy,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import ClassVar
 
@@ -116,6 +116,13 @@ class Picture:
     multiplier_name: str
 
 
+MEMBERS = ("A", "f", "B", "g")
+"""The members of a `VariationalInequality` that depend on the parameter."""
+
+Sampler = Callable[[Array], Mapping[str, Array]]
+"""From a parameter mu (d,) to the values of entries chosen before, by member."""
+
+
 class Problem(ABC):
     """A parametrised variational inequality with its high-fidelity discretisation.
 
@@ -131,6 +138,8 @@ class Problem(ABC):
     """Inner product of the multiplier space, X_W (m×m), in a basis whose nonnegative coefficients are the cone W⁺."""
     constant: ClassVar[frozenset[str]] = frozenset()
     """Members of `VariationalInequality`, "A", "f", "B" or "g", that do not depend on mu and are factorised once."""
+    entrywise: ClassVar[frozenset[str]] = frozenset()
+    """Members that `sampler` evaluates entry by entry."""
 
     @abstractmethod
     def training_set(self) -> Array:
@@ -152,6 +161,26 @@ class Problem(ABC):
     def contact(self, mu: Array) -> Contact | None:  # noqa: ARG002
         """The constraint at mu (d,) on `contact_dofs` alone, for problems that can assemble it at that cost."""
         return None
+
+    @property
+    def has_contact(self) -> bool:
+        """Whether the problem defines `contact_dofs` and `contact`."""
+        return self.contact_dofs is not None and type(self).contact is not Problem.contact
+
+    def sampler(self, wanted: Mapping[str, tuple[Indices, Indices]]) -> Sampler:
+        """Function that gives chosen entries of the members named in `entrywise` at a parameter, at their cost alone.
+
+        Parameters
+        ----------
+        wanted
+            Rows and columns (k,) by member; columns are zero for the vectors f and g.
+
+        Returns
+        -------
+        callable
+            From mu (d,) to the values (k,) by member.
+        """
+        raise NotImplementedError(f"{type(self).__name__} declares {sorted(self.entrywise)} and has no sampler")
 
     def constraint(self, mu: Array) -> tuple[SparseMatrix, Array]:
         """B (m×n) and g (m,) at mu (d,): from `contact` if there is one, else from everything."""

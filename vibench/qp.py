@@ -14,6 +14,7 @@ from typing import Any, Protocol
 
 import numpy as np
 import qpsolvers
+import scipy.linalg
 import scipy.sparse as sp
 from scipy.optimize import nnls
 
@@ -93,7 +94,11 @@ class Residuals:
 
 
 def solve(
-    program: VariationalInequality, solver: str, accuracy: float, extra: Mapping[str, QPSolver] | None = None
+    program: VariationalInequality,
+    solver: str,
+    accuracy: float,
+    extra: Mapping[str, QPSolver] | None = None,
+    factor: Array | None = None,
 ) -> Answer:
     """Solve a quadratic program with a solver known by name.
 
@@ -110,6 +115,8 @@ def solve(
         Relative accuracy, passed on in the solver's own words (`vibench.solver_settings`).
     extra
         Solvers registered through the entry point group `vibench.qp_solvers`.
+    factor
+        Cholesky factor (lower) of a dense A, where it is known: what is solved then is the dual.
 
     Raises
     ------
@@ -118,6 +125,8 @@ def solve(
     """
     if not len(program.f):
         return Answer(np.zeros(0), np.zeros(len(program.g)), "nothing to solve: no unknowns")
+    if factor is not None:
+        return _through_the_dual(program, factor, solver, accuracy, extra)
     rows, cost = row_norms(program.B), _scale(program.f)
     scaled = VariationalInequality(program.A / cost, program.f / cost, _divide_rows(program.B, rows), program.g / rows)
     if extra and solver in extra:
@@ -136,6 +145,28 @@ def solve(
         return answer
     alpha = cost * answer.alpha / rows
     return replace(answer, alpha=np.maximum(alpha, 0.0), negative=-min(float(np.min(alpha, initial=0.0)), 0.0))
+
+
+def _through_the_dual(
+    program: VariationalInequality, factor: Array, solver: str, accuracy: float, extra: Mapping[str, QPSolver] | None
+) -> Answer:
+    """Solution of a dense program with A = L Lᵀ through its dual, in as many unknowns as there are constraints.
+
+    The multipliers minimise ½ αᵀ(B A⁻¹Bᵀ)α − (B A⁻¹f − g)ᵀα over α ≥ 0; then x = A⁻¹(f − Bᵀα).
+    """
+    right = np.column_stack([program.B.T, program.f])
+    half = scipy.linalg.solve_triangular(factor, right, lower=True, check_finite=False)
+    constraints, load = half[:, :-1], half[:, -1]
+    count = len(program.g)
+    dual = VariationalInequality(
+        A=constraints.T @ constraints, f=constraints.T @ load - program.g, B=-np.eye(count), g=np.zeros(count)
+    )
+    answer = solve(dual, solver, accuracy, extra)
+    if answer.x is None:
+        return answer
+    alpha = np.maximum(answer.x, 0.0)
+    x = scipy.linalg.solve_triangular(factor, load - constraints @ alpha, lower=True, trans="T", check_finite=False)
+    return replace(answer, x=x, alpha=alpha, negative=-min(float(np.min(answer.x, initial=0.0)), 0.0))
 
 
 @dataclass(frozen=True)

@@ -9,15 +9,16 @@ from dataclasses import dataclass
 import numpy as np
 
 from vibench.arrays import Array
-from vibench.assembly import Assembled, AssemblyStage
+from vibench.assembly import Assembled, AssemblyStage, assembly_columns, query_model
 from vibench.assess import Reference
+from vibench.constants import FullConstants, OwnConstants, PlainConstants
 from vibench.error_bounds import Stability
 from vibench.infsup import InfSup
 from vibench.provenance import machine
 from vibench.qp import Status
 from vibench.query import Row, Task
 from vibench.stage import Failed, Pieces, PiecewiseStage, Stage, value_of
-from vibench.stages import reduced_model
+from vibench.stages import ReducedCone
 from vibench.store import Artefact, Store
 from vibench.strategy import Kind
 from vibench.sweeps import ReferenceConstants, gather, sweep, training
@@ -60,6 +61,16 @@ class QueriesStage(PiecewiseStage):
         return ReferenceConstants(self.assembly.enrichment.pod.problem, self.assembly.count, self.assembly.seed)
 
     @property
+    def constants(self) -> tuple[OwnConstants, FullConstants, PlainConstants]:
+        """The stages that know the inf-sup constants of the reduced pair, of V with the cone, and of V_N alone."""
+        enrichment, count, seed = self.assembly.enrichment, self.assembly.count, self.assembly.seed
+        return (
+            OwnConstants(enrichment, count, seed),
+            FullConstants(enrichment.cone, count, seed),
+            PlainConstants(enrichment.pod, enrichment.cone, count, seed),
+        )
+
+    @property
     def validation(self) -> tuple[Stage, ...]:
         """The high-fidelity sweep over the validation parameters."""
         return sweep(self.assembly.enrichment.pod.problem, "validation", self.assembly.count, self.assembly.seed)
@@ -67,7 +78,8 @@ class QueriesStage(PiecewiseStage):
     def inputs(self) -> tuple[Stage, ...]:
         """Everything the cell's rows are made from."""
         problem = self.assembly.enrichment.pod.problem
-        return (self.assembly, *self.assembly.inputs(), self.reference, *training(problem), *self.validation)
+        known = (*self.constants, self.reference, *training(problem), *self.validation)
+        return (self.assembly, *self.assembly.inputs(), *known)
 
     def begin(self, store: Store) -> Queries:
         """Bring the reduced model and the reference solutions back."""
@@ -81,7 +93,8 @@ class Queries(Pieces):
         self._slowdown = calibration().slowdown()
         self._stage, self._store = stage, store
         enrichment = stage.assembly.enrichment
-        self._model, _, self._prepared = reduced_model(store, enrichment)
+        self._model, self._note = query_model(store, stage.assembly)
+        self._cone: ReducedCone = value_of(store, enrichment.cone)
         snapshots = gather(store, training(enrichment.pod.problem))
         self._reference = gather(store, stage.validation)
         problem = self._model.problem
@@ -90,7 +103,8 @@ class Queries(Pieces):
             for space, columns in ((problem.V, snapshots.u), (problem.W, snapshots.lam))
         )
         self._assembled: Assembled = value_of(store, stage.assembly)
-        self._constants: list[Stability] = value_of(store, stage.reference)
+        self._own, self._full, self._plain = (value_of(store, known) for known in stage.constants)
+        self._stability: list[Stability] = value_of(store, stage.reference)
         self._task = Task(stage.solver, stage.accuracy, stage.query_seconds)
 
     def piece(self, number: int, watch: Callable[[bool], None]) -> Answered:
@@ -98,7 +112,7 @@ class Queries(Pieces):
         reference, k = self._reference, number
         exact = Reference(reference.u[:, k], reference.lam[:, k], *self._floors)
         found, solution = self._task.run(
-            self._model, reference.mu[k], exact, self._constants[k], self._assembled.seconds[k], watch
+            self._model, reference.mu[k], exact, self._stability[k], self._assembled.seconds[k], watch
         )
         return self._known(k) | found, solution and {"query": k} | solution
 
@@ -116,23 +130,23 @@ class Queries(Pieces):
 
     def _known(self, number: int) -> Row:
         """What is known of a query before it is asked: where, and the inf-sup constants there."""
-        reference, assembled = self._reference, self._assembled
+        reference = self._reference
         return (
             {f"mu_{i + 1}": float(value) for i, value in enumerate(reference.mu[number])}
             | {"hf_s": reference.seconds[number].cpu}
-            | _constants("beta_", assembled.own[number])
-            | _constants("beta_full_", assembled.full[number])
-            | _constants("beta_plain_", assembled.plain[number])
-            | _constants("beta_hf_", self._constants[number].inf_sup)
-            | {"bounds": assembled.own[number].sharp}
+            | _constants("beta_", self._own[number])
+            | _constants("beta_full_", self._full[number])
+            | _constants("beta_plain_", self._plain[number])
+            | _constants("beta_hf_", self._stability[number].inf_sup)
+            | {"bounds": self._own[number].sharp, "assembly_error": self._assembled.errors[number]}
         )
 
     def _sizes(self) -> Row:
         """Dimensions, fallbacks, memory."""
         enrichment = self._stage.assembly.enrichment
-        built, cone = value_of(self._store, enrichment), value_of(self._store, enrichment.cone)
+        built, cone = value_of(self._store, enrichment), self._cone
         size = value_of(self._store, enrichment.pod).basis.shape[1]
-        fallbacks = [*cone.cone.fallbacks, *built.fallbacks]
+        fallbacks = [*cone.cone.fallbacks, *built.fallbacks, *([self._note] if self._note else [])]
         for purpose, chunks in (("training", training(enrichment.pod.problem)), ("validation", self._stage.validation)):
             notes = [note for note in gather(self._store, chunks).fallbacks if note]
             fallbacks += [f"{len(notes)} of the {purpose} solutions: {notes[0]}"] if notes else []
@@ -144,8 +158,9 @@ class Queries(Pieces):
             "dim_W": self._model.problem.W.dim,
             "N": size,
             "R": cone.cone.size,
-            "rank": self._prepared.rank,
-            "enrichment": self._prepared.rank if built.kind is Kind.PER_PARAMETER else added,
+            "rank": cone.prepared.rank,
+            "enrichment": cone.prepared.rank if built.kind is Kind.PER_PARAMETER else added,
+            **assembly_columns(self._store, self._stage.assembly),
             "fallbacks": "; ".join(fallbacks),
             "peak_memory_mib": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
         }
@@ -153,16 +168,17 @@ class Queries(Pieces):
     def _offline(self) -> Row:
         """Seconds of the stages the cell would have had to run, and the machines that measured them."""
         enrichment = self._stage.assembly.enrichment
-        stages = {
+        reduction = self._stage.assembly.reduction
+        stages: dict[str, tuple[Stage, ...]] = {
             "snapshots": training(enrichment.pod.problem),
             "pod": (enrichment.pod,),
             "cone": (enrichment.cone,),
             "enrichment": (enrichment,),
+            "assembly": () if reduction is None else (reduction.separation, reduction),
         }
         artefacts = {name: [self._artefact(stage) for stage in parts] for name, parts in stages.items()}
         spent = {name: [artefact.seconds for artefact in found] for name, found in artefacts.items()}
         row: Row = {f"offline_{name}_s": sum(s.cpu for s in parts) for name, parts in spent.items()}
-        row["offline_assembly_s"] = 0.0
         row["offline_s"] = sum(row.values())
         row["offline_wall_s"] = sum(s.wall for parts in spent.values() for s in parts)
         row["hf_s"] = float(np.mean([s.cpu for s in self._reference.seconds]))
@@ -217,6 +233,7 @@ def summarise(rows: Sequence[Row], slowdown: float = 1.0) -> Row:
         "error_u_max": most("error_u"),
         "error_lambda_mean": mean("error_lambda"),
         "error_lambda_max": most("error_lambda"),
+        "assembly_error_max": most("assembly_error"),
         "violation_max": most("violation"),
         "residual_max": max((r for r in residuals if r is not None), default=None),
         "beta_span_min": min(row["beta_span"] for row in rows),

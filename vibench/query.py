@@ -10,12 +10,13 @@ from typing import Any
 from vibench import plugins, qp
 from vibench.agreement import slack, solution_row
 from vibench.arrays import Array
+from vibench.assembly import Model
 from vibench.assess import Reference, errors
 from vibench.error_bounds import Stability, bounds
 from vibench.errors import in_a_line
 from vibench.problem import checked_assembly
 from vibench.qp import Answer, Status
-from vibench.reduced import ReducedModel, ReducedProblem
+from vibench.reduced import ReducedProblem
 from vibench.timing import Seconds, median_seconds
 
 Row = dict[str, Any]
@@ -35,7 +36,7 @@ class Task:
 
     def run(
         self,
-        model: ReducedModel,
+        model: Model,
         mu: Array,
         exact: Reference,
         stability: Stability,
@@ -51,10 +52,10 @@ class Task:
         answers: list[Answer] = []
 
         def work() -> Answer:
-            answers.append(qp.solve(program, self.solver, self.accuracy, registered))
+            answers.append(qp.solve(program, self.solver, self.accuracy, registered, reduced.factor))
             return answers[-1]
 
-        row: Row = {"assemble_s": assembly.cpu}
+        row: Row = {"assemble_s": assembly.cpu, "form": "primal" if reduced.factor is None else "dual"}
         try:
             answer, solving = median_seconds(work, before=partial(watch, True))
             watch(False)
@@ -89,7 +90,7 @@ def _same(one: Answer, other: Answer) -> bool:
 
 
 def _assessed(
-    model: ReducedModel, mu: Array, reduced: ReducedProblem, x: Array, alpha: Array, exact: Reference, known: Stability
+    model: Model, mu: Array, reduced: ReducedProblem, x: Array, alpha: Array, exact: Reference, known: Stability
 ) -> Row:
     """Errors, their certified bounds and effectivities."""
     problem, vi = model.problem, checked_assembly(model.problem, mu)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,6 +11,7 @@ from vibench.arrays import Array
 from vibench.errors import NumericalError
 from vibench.problem import Problem, VariationalInequality, checked_assembly
 from vibench.strategy import Enrichment, Kind
+from vibench.supremizer import supremizers
 
 
 @dataclass(frozen=True)
@@ -19,13 +21,21 @@ class ReducedProblem:
     Attributes
     ----------
     program
-        Dense A (N'×N'), f (N',), B (R×N'), g (R,) in coordinates of `basis` and of the generators.
-    basis
-        V-orthonormal primal basis Z (n×N') at this parameter: u = Z x.
+        Dense A (N'×N'), f (N',), B (R×N'), g (R,) in coordinates of the primal basis and of the generators.
+    make_basis
+        Gives the primal basis, which only a reconstruction needs.
+    factor
+        Cholesky factor (lower, N'×N') of A, where it is known beforehand.
     """
 
     program: VariationalInequality
-    basis: Array
+    make_basis: Callable[[], Array]
+    factor: Array | None = None
+
+    @property
+    def basis(self) -> Array:
+        """V-orthonormal primal basis Z (n×N') at this parameter: u = Z x."""
+        return self.make_basis()
 
 
 class ReducedModel:
@@ -54,20 +64,23 @@ class ReducedModel:
         self.problem = problem
         self.generators = generators
         self.span = span
-        self._enrichment = enrichment
+        self.enrichment = enrichment
         self.fixed_basis = basis if enrichment.vectors is None else np.hstack([basis, enrichment.vectors])
 
     @property
     def kind(self) -> Kind:
         """How the enrichment depends on the parameter."""
-        return self._enrichment.kind
+        return self.enrichment.kind
 
     def primal_basis(self, vi: VariationalInequality) -> Array:
         """V-orthonormal basis Z (n×N') at the parameter of `vi`; V_N comes first."""
-        if self._enrichment.kind is not Kind.PER_PARAMETER or self._enrichment.supply is None:
+        V, enrichment = self.problem.V, self.enrichment
+        if enrichment.eta is not None:
+            added = supremizers(V, vi.B, enrichment.eta)
+        elif enrichment.supply is not None:
+            added = enrichment.supply(V, vi, self.span)
+        else:
             return self.fixed_basis
-        V = self.problem.V
-        added = self._enrichment.supply(V, vi, self.span)
         if added.ndim != 2 or added.shape[0] != V.dim:
             raise NumericalError(f"the enrichment supplied vectors of shape {added.shape}, expected ({V.dim}, count)")
         return np.hstack([self.fixed_basis, V.orthonormalise(added, self.fixed_basis)])
@@ -82,7 +95,7 @@ class ReducedModel:
         """
         vi = checked_assembly(self.problem, mu)
         Z = self.primal_basis(vi)
-        return ReducedProblem(project(vi, Z, self.generators), Z)
+        return ReducedProblem(project(vi, Z, self.generators), lambda: Z)
 
 
 def project(vi: VariationalInequality, Z: Array, chi: Array) -> VariationalInequality:

@@ -15,7 +15,7 @@ from typing import Any, Protocol
 
 from vibench import plugins, provenance, qp
 from vibench.agreement import disagreement_rows
-from vibench.assembly import AssemblyStage
+from vibench.assembly import assembly_stage
 from vibench.errors import RequestError, StorageError, VibenchError, in_a_line
 from vibench.executors import Executor, executor
 from vibench.isolation import Job
@@ -26,7 +26,6 @@ from vibench.plan import Plan
 from vibench.qp import Status
 from vibench.queries import CellRows, QueriesStage
 from vibench.stage import Done, Failed, PiecewiseStage, Stage, Unstored
-from vibench.stages import enrichment_stage
 from vibench.store import History, Store, usable_store
 from vibench.study import Study
 from vibench.thresholds import threshold_rows
@@ -67,8 +66,7 @@ def identity(study: Study) -> dict[str, Any]:
 
 def queries_stage(cell: Cell, study: Study) -> QueriesStage:
     """The last stage of a cell; its inputs lead to all others."""
-    assembly = AssemblyStage(enrichment_stage(cell), cell.assembly, cell.validation, cell.seed)
-    return QueriesStage(assembly, cell.solver, cell.accuracy, study.limits.query_seconds)
+    return QueriesStage(assembly_stage(cell), cell.solver, cell.accuracy, study.limits.query_seconds)
 
 
 @dataclass(frozen=True)

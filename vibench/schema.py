@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-VERSION = 3
+VERSION = 4
 """Schema version of a results file; a file of another version is refused."""
 
 KEYS: Mapping[str, str] = {
@@ -39,6 +39,12 @@ CELLS: Mapping[str, str] = {
     "rank": "INTEGER",
     "enrichment": "INTEGER",
     "enrichment_kind": "TEXT",
+    "interpolation_tol": "REAL",
+    "interpolation_error": "REAL",
+    "terms_A": "INTEGER",
+    "terms_f": "INTEGER",
+    "terms_B": "INTEGER",
+    "terms_g": "INTEGER",
     "offline_snapshots_s": "REAL",
     "offline_pod_s": "REAL",
     "offline_cone_s": "REAL",
@@ -58,6 +64,7 @@ CELLS: Mapping[str, str] = {
     "error_u_max": "REAL",
     "error_lambda_mean": "REAL",
     "error_lambda_max": "REAL",
+    "assembly_error_max": "REAL",
     "violation_max": "REAL",
     "residual_max": "REAL",
     "fallbacks": "TEXT",
@@ -73,7 +80,8 @@ CELLS: Mapping[str, str] = {
     "definition": "TEXT",
 }
 """`model` names the reduced model, which cells that differ in their solver alone share; `definition` is the cell in
-JSON."""
+JSON. `terms_…` counts the entries of a member that a reduced query samples, none where it does not depend on mu; it is
+empty where the member is assembled on the contact, or in full."""
 
 CONSTANTS = tuple(
     f"beta_{whose}{what}" for whose in ("", "full_", "plain_", "hf_") for what in ("span", "cone_lower", "cone_upper")
@@ -84,6 +92,8 @@ QUERIES: Mapping[str, str] = {
     "cell": "TEXT NOT NULL REFERENCES cells(cell) ON DELETE CASCADE",
     **KEYS,
     "query": "INTEGER",
+    "form": "TEXT",
+    "assembly_error": "REAL",
     "assemble_s": "REAL",
     "solve_s": "REAL",
     "total_s": "REAL",
@@ -112,7 +122,7 @@ QUERIES: Mapping[str, str] = {
     "repeatable": "INTEGER",
 }
 """Beside these a query has mu_1, mu_2, …, as many as its problem has parameters. Bounds are absolute; an effectivity is
-bound over absolute error."""
+bound over absolute error. `form` is the one in which the program was solved, "primal" or "dual"."""
 
 SOLUTIONS: Mapping[str, str] = {
     "cell": "TEXT NOT NULL REFERENCES cells(cell) ON DELETE CASCADE",

@@ -130,8 +130,10 @@ class Enrichment:
         None, fixed or per-parameter.
     vectors
         Fixed enrichment: vectors (n×S), V-orthonormal and orthogonal to V_N, nested.
+    eta
+        Per-parameter enrichment by supremizers: multipliers η (m×k) whose T(mu)η are added at every mu.
     supply
-        Per-parameter enrichment: how to get the vectors at a parameter.
+        Any other per-parameter enrichment: how to get the vectors at a parameter.
     history
         Quantity → values over steps, for the convergence figures.
     fallbacks
@@ -140,6 +142,7 @@ class Enrichment:
 
     kind: Kind
     vectors: Array | None = None
+    eta: Array | None = None
     supply: Supply | None = None
     history: Mapping[str, Array] = field(default_factory=dict)
     fallbacks: tuple[str, ...] = ()
@@ -147,8 +150,8 @@ class Enrichment:
     def __post_init__(self) -> None:
         if (self.vectors is not None) != (self.kind is Kind.FIXED):
             raise ValueError("a fixed enrichment, and no other, has vectors")
-        if (self.supply is not None) != (self.kind is Kind.PER_PARAMETER):
-            raise ValueError("a per-parameter enrichment, and no other, has a supply")
+        if (self.supply is not None) + (self.eta is not None) != (self.kind is Kind.PER_PARAMETER):
+            raise ValueError("a per-parameter enrichment, and no other, has either eta or a supply")
 
 
 class PrimalStrategy(ABC):

@@ -145,7 +145,8 @@ class Study(_Model):
     solvers: Solvers
     dual: Annotated[list[Entry], MinLen(1)]
     primal: Annotated[list[Entry], MinLen(1)]
-    assembly: Annotated[list[Literal["full"]], MinLen(1)] = ["full"]
+    assembly: Annotated[list[Literal["full", "reduced"]], MinLen(1)] = ["full"]
+    interpolation: Tolerance = 1e-6
     problem: Annotated[list[Entry], MinLen(1)]
     tolerances: Annotated[list[ToleranceTable], MinLen(1)]
     limits: Limits = Limits()

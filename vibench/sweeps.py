@@ -24,8 +24,8 @@ from vibench.stage import Result, Stage, build_problem, value_of
 from vibench.store import History, Store
 from vibench.timing import NO_TIME, Seconds, Stopwatch
 
-CHUNKS = 8
-"""Parts the parameters of a high-fidelity sweep are split into, whatever the number of jobs."""
+CHUNKS = 4
+"""Parts the parameters of a high-fidelity sweep are split into, whatever the number of jobs; each prepares anew."""
 
 
 @dataclass(frozen=True)

@@ -57,7 +57,19 @@ def export(path: Path, folder: Path) -> list[Path]:
 
 def in_order(frame: pd.DataFrame) -> pd.DataFrame:
     """Rows sorted by the columns that name them, loose tolerances first: the number of jobs does not change a table."""
-    names = (*KEYS, "primal_a", "primal_b", "primal_tol_a", "primal_tol_b", "stage", "quantity", "query", "step")
+    names = (
+        *KEYS,
+        "primal_a",
+        "primal_b",
+        "primal_tol_a",
+        "primal_tol_b",
+        "assembly_a",
+        "assembly_b",
+        "stage",
+        "quantity",
+        "query",
+        "step",
+    )
     by = [name for name in names if name in frame.columns]
     return frame.sort_values(
         by, ascending=["_tol" not in name for name in by], kind="stable", na_position="first", ignore_index=True
@@ -80,6 +92,7 @@ def summary(cells: pd.DataFrame) -> pd.DataFrame:
             "primal": cells["primal"],
             "δ": cells["primal_tol"],
             "solver": cells["solver"],
+            "assembly": cells["assembly"],
             "ok": ok,
             "N": cells["N"].astype("Int64"),
             "R": cells["R"].astype("Int64"),
@@ -105,7 +118,9 @@ def benefits(thresholds: pd.DataFrame) -> pd.DataFrame:
             "dual": frame["dual"],
             "solver": frame["solver"],
             "a": frame["primal_a"],
+            "assembly a": frame["assembly_a"],
             "b": frame["primal_b"],
+            "assembly b": frame["assembly_b"],
             "δ of b": frame["primal_tol_b"],
             "offline a [s]": frame["offline_a_s"],
             "online a [ms]": 1e3 * frame["online_a_s"],

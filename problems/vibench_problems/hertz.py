@@ -14,7 +14,7 @@ from vibench.arrays import Array, Indices
 from vibench.problem import Contact, ParameterBox, Picture, Problem, VariationalInequality
 from vibench.space import InnerProduct
 from vibench_problems.graded_mesh import quarter_disc
-from vibench_problems.mortar import coupling
+from vibench_problems.mortar import Pairing
 
 SLAVE_ANGLE = np.pi / 6.0
 """End of the potential contact zone on disc 1 [rad]: x ≤ 0.5 m."""
@@ -112,6 +112,9 @@ class Hertz(Problem):
         self._lift[1 : self._second : 2], self._lift[self._second + 1 :: 2] = -approach, approach
         zone = np.concatenate([2 * self.slave.zone + 1, self._second + 2 * self.master.zone + 1])
         self._contact_dofs, self._contact_lift = np.searchsorted(self.free, zone), self._lift[zone]
+        upper, lower = self.points(np.ones(1))
+        self._pairing = Pairing(upper[:, self.slave.zone], quadrature)
+        self._master_zone = lower[:, self.master.zone]  # at radius 1; every other is a multiple
         self.V = InnerProduct(sp.csr_array(sp.block_diag(norms))[self.free][:, self.free])
         self.W = InnerProduct(sp.diags_array(self.macro_lengths))
 
@@ -156,10 +159,8 @@ class Hertz(Problem):
 
     def contact(self, mu: Array) -> Contact:
         """The non-interpenetration condition on the potential contact zones."""
-        upper, lower = self.points(mu)
-        integrals = coupling(upper[:, self.slave.zone], lower[:, self.master.zone], self.quadrature)
-        B = sp.csr_array(sp.hstack([-integrals.slave, integrals.master]))
-        return Contact(B, integrals.gap - B @ self._contact_lift)
+        integrals = self._pairing.couple(mu[0] * self._master_zone)
+        return Contact(integrals.jump, integrals.gap - integrals.jump @ self._contact_lift)
 
     def refuse(self, mu: Array, u: Array, lam: Array) -> str:  # noqa: ARG002
         """Contact that reaches the last macro-edge may go on beyond the potential contact zone."""

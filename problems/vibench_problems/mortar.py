@@ -18,78 +18,95 @@ class Coupling:
 
     Attributes
     ----------
-    slave
-        ∫ v η for nodal values of v on the slave side (m×nodes).
-    master
-        ∫ (v∘φ) η for nodal values of v on the master side (m×nodes).
+    jump
+        ∫ (v∘φ − v) η for nodal values of v on the slave side and then on the master side (m×(slave + master nodes)).
     gap
         ∫ (y − y∘φ) η: the initial gap (m,).
     """
 
-    slave: SparseMatrix
-    master: SparseMatrix
+    jump: SparseMatrix
     gap: Array
 
 
-def coupling(slave: Array, master: Array, quadrature: Literal["exact"] | int) -> Coupling:
-    """Couple two polygons by the vertical projection φ, for P1 values and cell-wise constants on pairs of slave edges.
+class Pairing:
+    """A slave polygon, to be coupled to master polygons by the vertical projection φ.
 
-    Along a vertical projection both sides are piecewise linear in the abscissa, with kinks at the nodes of either:
-    "exact" cuts the slave edges at the projected master nodes, a number takes that many Gauss points per slave edge.
+    Values are P1 on both sides, multipliers constant on pairs of slave edges. Along a vertical projection both sides
+    are piecewise linear in the abscissa, with kinks at the nodes of either: "exact" cuts the slave edges at the
+    projected master nodes, a number takes that many Gauss points per slave edge. What is integrated on the slave side
+    alone is exact in both cases and does not depend on the master.
 
     Parameters
     ----------
-    slave, master
-        Nodes (2×k) of the polygons, abscissae rising from the axis.
+    slave
+        Nodes (2×s) of the slave polygon, abscissae rising from the axis.
     quadrature
         "exact", or Gauss points per slave edge.
-
-    Raises
-    ------
-    NumericalError
-        If the master side does not reach as far as the slave side.
     """
-    if master[0, -1] < slave[0, -1]:
-        raise NumericalError(
-            f"the pairing ends at x = {master[0, -1]:.4g} m, but the potential contact zone of disc 1 reaches "
-            f"x = {slave[0, -1]:.4g} m: the radius of disc 2 is too small"
+
+    def __init__(self, slave: Array, quadrature: Literal["exact"] | int) -> None:
+        self._slave = slave
+        widths, lengths = np.diff(slave[0]), np.linalg.norm(np.diff(slave, axis=1), axis=0)
+        self._stretch = lengths / widths
+        edges, nodes = np.arange(len(widths)), slave.shape[1]
+        self._macros = edges // 2
+        half = 0.5 * lengths
+        self._slave_entries = (
+            np.tile(self._macros, 2),
+            np.concatenate([edges, edges + 1]),
+            -np.concatenate([half, half]),
         )
-    edge, x, weight = _cut(slave, master) if quadrature == "exact" else _gauss(slave, int(quadrature))
-    on_slave, on_master = _interpolation(slave[0], edge, x), _interpolation(master[0], _edge_of(master[0], x), x)
-    sums = sp.csr_array((weight, (edge // 2, np.arange(len(x)))), shape=((slave.shape[1] - 1) // 2, len(x)))
-    gap = on_slave @ slave[1] - on_master @ master[1]
-    return Coupling(sp.csr_array(sums @ on_slave), sp.csr_array(sums @ on_master), np.asarray(sums @ gap))
+        height = half * (slave[1, :-1] + slave[1, 1:])
+        self._height = np.asarray(np.bincount(self._macros, height), float)
+        self._points = None if quadrature == "exact" else self._gauss(int(quadrature))
+        self._size = nodes
 
+    def couple(self, master: Array) -> Coupling:
+        """Couple to a master polygon (2×k), abscissae rising from the axis.
 
-def _lengths(polygon: Array) -> Array:
-    return np.asarray(np.linalg.norm(np.diff(polygon, axis=1), axis=0))
+        Raises
+        ------
+        NumericalError
+            If the master side does not reach as far as the slave side.
+        """
+        slave, size = self._slave, self._size
+        if master[0, -1] < slave[0, -1]:
+            raise NumericalError(
+                f"the pairing ends at x = {master[0, -1]:.4g} m, but the potential contact zone of disc 1 reaches "
+                f"x = {slave[0, -1]:.4g} m: the radius of disc 2 is too small"
+            )
+        macro, x, weight = self._points if self._points is not None else self._cut(master[0])
+        edge = _edge_of(master[0], x)
+        right = weight * (x - master[0, edge]) / np.diff(master[0])[edge]
+        left = weight - right
+        on_master = left * master[1, edge] + right * master[1, edge + 1]
+        height = np.asarray(np.bincount(macro, on_master, minlength=len(self._height)), float)
+        rows, columns, values = self._slave_entries
+        jump = sp.csr_array(
+            (
+                np.concatenate([values, left, right]),
+                (np.concatenate([rows, macro, macro]), np.concatenate([columns, size + edge, size + 1 + edge])),
+            ),
+            shape=(len(self._height), size + master.shape[1]),
+        )
+        return Coupling(jump, self._height - height)
 
+    def _cut(self, abscissae: Array) -> tuple[Indices, Array, Array]:
+        """Macro-edge, abscissa and weight of the midpoints of all segments between projected nodes."""
+        first, last = np.searchsorted(abscissae, self._slave[0, [0, -1]])
+        cuts = np.sort(np.concatenate([self._slave[0], abscissae[first:last]]), kind="stable")
+        x = 0.5 * (cuts[1:] + cuts[:-1])
+        edge = _edge_of(self._slave[0], x)
+        return self._macros[edge], x, np.diff(cuts) * self._stretch[edge]
 
-def _cut(slave: Array, master: Array) -> tuple[Indices, Array, Array]:
-    """Slave edge, abscissa and weight of the midpoints of all segments between projected nodes; exact for linears."""
-    inner = master[0][(master[0] > slave[0, 0]) & (master[0] < slave[0, -1])]
-    cuts = np.union1d(slave[0], inner)
-    x = 0.5 * (cuts[1:] + cuts[:-1])
-    edge = _edge_of(slave[0], x)
-    return edge, x, np.diff(cuts) * (_lengths(slave) / np.diff(slave[0]))[edge]
-
-
-def _gauss(slave: Array, count: int) -> tuple[Indices, Array, Array]:
-    """Slave edge, abscissa and weight of `count` Gauss points per edge."""
-    nodes, weights = np.polynomial.legendre.leggauss(count)
-    edge = np.repeat(np.arange(slave.shape[1] - 1), count)
-    t = np.tile(0.5 * (1.0 + nodes), slave.shape[1] - 1)
-    x = slave[0, edge] + t * np.diff(slave[0])[edge]
-    return edge, x, 0.5 * np.tile(weights, slave.shape[1] - 1) * _lengths(slave)[edge]
+    def _gauss(self, count: int) -> tuple[Indices, Array, Array]:
+        """Macro-edge, abscissa and weight of `count` Gauss points per slave edge."""
+        nodes, weights = np.polynomial.legendre.leggauss(count)
+        widths = np.diff(self._slave[0])
+        edge = np.repeat(np.arange(len(widths)), count)
+        x = self._slave[0, edge] + np.tile(0.5 * (1.0 + nodes), len(widths)) * widths[edge]
+        return self._macros[edge], x, 0.5 * np.tile(weights, len(widths)) * (widths * self._stretch)[edge]
 
 
 def _edge_of(abscissae: Array, x: Array) -> Indices:
     return np.clip(np.searchsorted(abscissae, x, side="right") - 1, 0, len(abscissae) - 2)
-
-
-def _interpolation(abscissae: Array, edge: Indices, x: Array) -> SparseMatrix:
-    """Matrix (points×nodes) of the P1 functions of a polygon at abscissae x on known edges."""
-    t = (x - abscissae[edge]) / np.diff(abscissae)[edge]
-    points = np.arange(len(x))
-    entries = (np.concatenate([1.0 - t, t]), (np.tile(points, 2), np.concatenate([edge, edge + 1])))
-    return sp.csr_array(entries, shape=(len(x), len(abscissae)))

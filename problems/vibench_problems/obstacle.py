@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Annotated, Literal
+from collections.abc import Callable, Mapping
+from functools import partial
+from typing import Annotated, ClassVar, Literal
 
 import numpy as np
 from annotated_types import Ge, Gt, Le
@@ -11,9 +12,10 @@ from skfem import Basis, BilinearForm, ElementTriP1, LinearForm, MeshTri, conden
 from skfem.helpers import dot, grad
 
 from vibench.arrays import Array, Indices, SparseMatrix
-from vibench.problem import Contact, ParameterBox, Picture, Problem, VariationalInequality
+from vibench.problem import Contact, ParameterBox, Picture, Problem, Sampler, VariationalInequality
 from vibench.space import InnerProduct
 from vibench_problems.disc_mesh import aspect_ratios, disc_in_square
+from vibench_problems.p1_entries import LoadEntries, StiffnessEntries
 
 RADIUS = 0.2
 """Radius of the reference disc ω̂ [m]."""
@@ -74,6 +76,8 @@ class Obstacle(Problem):
         units=("1", "m", "m"),
     )
 
+    entrywise: ClassVar[frozenset[str]] = frozenset({"A", "f", "B", "g"})
+
     def __init__(
         self,
         resolution: Literal["coarse", "medium", "paper", "fine"] | Annotated[int, Ge(150), Le(200_000)] = "paper",
@@ -127,11 +131,36 @@ class Obstacle(Problem):
         area = mu[0] ** 2
         return Contact(-area * self.W.matrix, -area * self.obstacle * self._disc_paraboloid)
 
+    def sampler(self, wanted: Mapping[str, tuple[Indices, Indices]]) -> Sampler:
+        """Entries of A and f from the triangles around them; B and g are mu_1² times what they are at mu_1 = 1."""
+        evaluated: dict[str, Callable[[Array], Array]] = {}
+        if "A" in wanted:
+            rows, columns = (self.free[places] for places in wanted["A"])
+            evaluated["A"] = StiffnessEntries(self._modes, self.mesh.t, rows, columns)
+        if "f" in wanted:
+            integrals = LoadEntries(self._modes, self.mesh.t, self.free[wanted["f"][0]])
+            evaluated["f"] = lambda weights: self.load * integrals(weights)
+        at_one = self.constraint(np.array([1.0, 0.0, 0.0]))
+        for name, member in zip(("B", "g"), at_one, strict=True):
+            if name in wanted:
+                rows, columns = wanted[name]
+                values = member[rows] if name == "g" else np.asarray(member[rows, columns]).ravel()
+                evaluated[name] = partial(_scaled, values)
+
+        def sample(mu: Array) -> Mapping[str, Array]:
+            weights = self._weights(mu)
+            return {name: entries(weights) for name, entries in evaluated.items()}
+
+        return sample
+
     def points(self, mu: Array) -> Array:
         """Nodes (2×nodes) of the mesh of Ω at mu: h(mu) of the reference nodes."""
-        scale, x, y = self._modes
-        moved = self.mesh.p + (mu[0] - 1.0) * scale
-        return np.asarray(moved + mu[1] * x + mu[2] * y)
+        return np.asarray(np.tensordot(self._weights(mu), self._modes, axes=1))
+
+    @staticmethod
+    def _weights(mu: Array) -> Array:
+        """Weights (4,) of the modes that the mesh is composed of."""
+        return np.array([1.0, mu[0] - 1.0, mu[1], mu[2]])
 
     def picture(self, mu: Array, u: Array, lam: Array) -> Picture:
         """The membrane's deflection on the mapped mesh and the contact pressure on the disc (paper, Figure 4)."""
@@ -145,12 +174,17 @@ class Obstacle(Problem):
         """Largest aspect ratio of the mapped mesh (paper, Figure 3; 1 for equilateral triangles)."""
         return {"aspect_ratio": float(aspect_ratios(self.points(mu), self.mesh.t).max())}
 
-    def _displacement_modes(self, laplacian: SparseMatrix, boundary: Array) -> tuple[Array, Array, Array]:
-        """Harmonic continuations (2×nodes each) of the disc's scaling and of its shifts along x and y."""
+    def _displacement_modes(self, laplacian: SparseMatrix, boundary: Array) -> Array:
+        """Reference nodes and harmonic continuations of the disc's scaling and of its shifts along x, y (4×2×nodes)."""
         fixed = np.union1d(boundary, self.disc_nodes)
         on_disc = np.zeros((3, self.nodes))
         on_disc[0:2, self.disc_nodes] = self.mesh.p[:, self.disc_nodes]
         on_disc[2, self.disc_nodes] = 1.0
         zero = np.zeros(self.nodes)
         x, y, one = (solve(*condense(laplacian, zero, x=values, D=fixed)) for values in on_disc)
-        return np.stack([x, y]), np.stack([one, zero]), np.stack([zero, one])
+        return np.stack([self.mesh.p, np.stack([x, y]), np.stack([one, zero]), np.stack([zero, one])])
+
+
+def _scaled(values: Array, weights: Array) -> Array:
+    """Times mu_1²; the second weight is mu_1 − 1."""
+    return np.asarray((1.0 + weights[1]) ** 2 * values)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Annotated, ClassVar, Literal
 
@@ -11,8 +11,8 @@ from annotated_types import Ge, Gt, Le
 from scipy.special import lambertw
 from skfem import Basis, ElementTriP1, MeshTri
 
-from vibench.arrays import Array
-from vibench.problem import ParameterBox, Picture, Problem, VariationalInequality
+from vibench.arrays import Array, Indices
+from vibench.problem import ParameterBox, Picture, Problem, Sampler, VariationalInequality
 from vibench.space import InnerProduct
 from vibench_problems.disc_mesh import rings_in_disc
 from vibench_problems.obstacle import mass, paraboloid, stiffness, unit_load
@@ -87,6 +87,7 @@ class Radial(Problem):
         names=("height", "curvature"), lower=np.array([0.14, 0.0]), upper=np.array([0.2, 0.25]), units=("m", "1/m")
     )
     constant: ClassVar[frozenset[str]] = frozenset({"A", "f", "B"})
+    entrywise: ClassVar[frozenset[str]] = frozenset({"g"})
 
     def __init__(
         self,
@@ -120,6 +121,12 @@ class Radial(Problem):
         return VariationalInequality(
             A=self._stiffness, f=self._load, B=self._coupling, g=mu[0] * self._one + mu[1] * self._square
         )
+
+    def sampler(self, wanted: Mapping[str, tuple[Indices, Indices]]) -> Sampler:
+        """Entries of g, the only member that depends on mu."""
+        rows = wanted["g"][0]
+        one, square = self._one[rows], self._square[rows]
+        return lambda mu: {"g": mu[0] * one + mu[1] * square}
 
     def exact(self, mu: Array) -> RadialSolution:
         """The solution in closed form at mu = (h, c)."""

@@ -1,12 +1,30 @@
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 import pytest
+import scipy.sparse as sp
 from hypothesis import given
 from hypothesis import strategies as st
 
 from vibench.errors import NumericalError
-from vibench_problems.mortar import coupling
+from vibench_problems.mortar import Pairing
+
+
+@dataclass(frozen=True)
+class Sides:
+    """The two sides of a coupling, apart."""
+
+    slave: sp.csr_array
+    master: sp.csr_array
+    gap: np.ndarray
+
+
+def coupling(slave: np.ndarray, master: np.ndarray, quadrature: str | int) -> Sides:
+    found = Pairing(slave, quadrature).couple(master)
+    assert found.jump.has_canonical_format
+    return Sides(-found.jump[:, : slave.shape[1]], found.jump[:, slave.shape[1] :], found.gap)
 
 
 def polygons(seed: int) -> tuple[np.ndarray, np.ndarray]:

@@ -1,0 +1,78 @@
+"""The stages that compute inf-sup constants at the validation parameters; each serves many cells."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from vibench.arrays import SparseMatrix
+from vibench.assess import constants_full, constants_on
+from vibench.infsup import inf_sup_on
+from vibench.problem import Problem, validation_parameters
+from vibench.stage import Result, Stage, build_problem, value_of
+from vibench.stages import ConeStage, EnrichmentStage, PODStage, reduced_model
+from vibench.store import Store
+from vibench.strategy import Kind
+
+
+@dataclass(frozen=True)
+class FullConstants(Stage):
+    """Constants of the whole of V with a reduced cone, what online supremizers reach: an `InfSup` per parameter."""
+
+    cone: ConeStage
+    count: int
+    seed: int
+
+    def inputs(self) -> tuple[Stage, ...]:
+        """The cone."""
+        return (self.cone,)
+
+    def run(self, store: Store) -> Result:
+        """Compute the constants."""
+        problem = build_problem(self.cone.problem)
+        matrices = _constraints(problem, self.count, self.seed)
+        return Result(constants_full(problem.V, matrices, value_of(store, self.cone).prepared))
+
+
+@dataclass(frozen=True)
+class PlainConstants(Stage):
+    """Constants of V_N alone with a reduced cone: an `InfSup` per parameter."""
+
+    pod: PODStage
+    cone: ConeStage
+    count: int
+    seed: int
+
+    def inputs(self) -> tuple[Stage, ...]:
+        """The basis and the cone."""
+        return (self.pod, self.cone)
+
+    def run(self, store: Store) -> Result:
+        """Compute the constants."""
+        matrices = _constraints(build_problem(self.pod.problem), self.count, self.seed)
+        return Result(constants_on(value_of(store, self.pod).basis, matrices, value_of(store, self.cone).prepared))
+
+
+@dataclass(frozen=True)
+class OwnConstants(Stage):
+    """Constants of the pair of spaces that a reduced model works with: an `InfSup` per parameter."""
+
+    enrichment: EnrichmentStage
+    count: int
+    seed: int
+
+    def inputs(self) -> tuple[Stage, ...]:
+        """The reduced model."""
+        return (self.enrichment, *self.enrichment.inputs())
+
+    def run(self, store: Store) -> Result:
+        """Compute the constants."""
+        model, _, cone = reduced_model(store, self.enrichment)
+        if model.kind is not Kind.PER_PARAMETER:
+            return Result(constants_on(model.fixed_basis, _constraints(model.problem, self.count, self.seed), cone))
+        mus = validation_parameters(model.problem, self.count, self.seed)
+        assembled = (model.problem.assemble(mu) for mu in mus)
+        return Result([inf_sup_on(model.primal_basis(vi), vi.B, cone) for vi in assembled])
+
+
+def _constraints(problem: Problem, count: int, seed: int) -> list[SparseMatrix]:
+    return [problem.constraint(mu)[0] for mu in validation_parameters(problem, count, seed)]
