@@ -51,10 +51,18 @@ def test_work_is_timed_once(clocks: Callable[..., None]) -> None:
     assert work.count == 1
 
 
-def test_the_median_of_the_repeats_counts_and_the_warm_up_does_not(clocks: Callable[..., None]) -> None:
-    clocks((0.9, 0.9), (0.5, 0.75), (0.125, 0.25), (0.25, 0.5), (0.375, 0.125), (0.0625, 0.625))
+def test_repeats_end_when_they_have_taken_enough(clocks: Callable[..., None]) -> None:
+    clocks((0.9, 0.9), (0.5, 0.5), (0.25, 0.25), (0.25, 0.25))
     work = Work()
-    assert median_seconds(work) == (1, Seconds(0.25, 0.5))
+    assert median_seconds(work) == (1, Seconds(0.25, 0.25))
+    assert work.count == 1 + 3
+
+
+def test_the_median_of_the_repeats_counts_and_the_warm_up_does_not(clocks: Callable[..., None]) -> None:
+    sixteenths = ((1, 1), (8, 12), (2, 4), (4, 8), (6, 2), (1, 10))
+    clocks(*((cpu / 256, wall / 256) for cpu, wall in sixteenths))
+    work = Work()
+    assert median_seconds(work) == (1, Seconds(4 / 256, 8 / 256))
     assert work.count == 1 + REPEATS
 
 

@@ -8,15 +8,19 @@ from functools import partial
 
 import numpy as np
 
+from vibench.arrays import Array
 from vibench.matrix import Cell, Plugin
 from vibench.online import OnlineModel, Operators, obstacle_to_reduction, project_members
 from vibench.problem import MEMBERS, VariationalInequality, checked_assembly, training_parameters, validation_parameters
 from vibench.reduced import ReducedModel, project
 from vibench.separation import Member, Way, separate
-from vibench.stage import Result, Stage, build_problem, value_of
+from vibench.stage import Result, Stage, assemblies, build_problem, value_of
 from vibench.stages import EnrichmentStage, enrichment_stage, reduced_model
 from vibench.store import Store
 from vibench.timing import NO_TIME, Seconds, median_seconds, timed
+
+ENOUGH = 0.01
+"""Seconds of repeats of a projection after which there are no more; a cell projects at many parameters."""
 
 Model = ReducedModel | OnlineModel
 """What gives the reduced problem at a parameter."""
@@ -70,18 +74,43 @@ class ReductionStage(Stage):
 
 
 @dataclass(frozen=True)
+class FormsStage(Stage):
+    """What assembling the high-fidelity matrices takes: median seconds per validation parameter."""
+
+    problem: Plugin
+    count: int
+    seed: int
+
+    def inputs(self) -> tuple[Stage, ...]:
+        """Nothing comes before."""
+        return ()
+
+    def run(self, store: Store) -> Result:  # noqa: ARG002
+        """Time every assembly; the same for all reduced models that assemble in full."""
+        problem = build_problem(self.problem)
+        mus = validation_parameters(problem, self.count, self.seed)
+        return Result(tuple(median_seconds(partial(checked_assembly, problem, mu))[1] for mu in mus))
+
+
+@dataclass(frozen=True)
 class Assembled:
-    """What assembling takes, whatever solves the queries.
+    """Reduced programs and what assembling them takes, whatever solves them.
 
     Attributes
     ----------
+    programs
+        One per validation parameter.
+    factor
+        Cholesky factor (lower) of their A, where it is the same in all and they are solved through the dual.
     seconds
-        Median seconds of the assembly per validation parameter.
+        Seconds of the assembly per validation parameter.
     errors
         Largest relative difference of a member of the reduced program from its Galerkin projection, per parameter; zero
         where it is assembled in full.
     """
 
+    programs: tuple[VariationalInequality, ...]
+    factor: Array | None
     seconds: tuple[Seconds, ...]
     errors: tuple[float, ...]
 
@@ -102,25 +131,38 @@ class AssemblyStage(Stage):
             return None
         return ReductionStage(self.enrichment, Separation(self.enrichment.pod.problem, self.interpolation))
 
+    @property
+    def forms(self) -> FormsStage:
+        """The stage that knows what high-fidelity matrices take."""
+        return FormsStage(self.enrichment.pod.problem, self.count, self.seed)
+
     def inputs(self) -> tuple[Stage, ...]:
-        """Enrichment, what it was built on, and what reduced assembly needs."""
+        """Enrichment, what it was built on, what the matrices take, and what reduced assembly needs."""
         reduction = self.reduction
         extra = () if reduction is None else (reduction, reduction.separation)
-        return (self.enrichment, *self.enrichment.inputs(), *extra)
+        return (self.enrichment, *self.enrichment.inputs(), self.forms, *extra)
 
     def run(self, store: Store) -> Result:
-        """Time every assembly; compare reduced ones with full ones, untimed."""
+        """Time every assembly; compare reduced ones with full ones, untimed.
+
+        In full it takes the high-fidelity matrices, which are timed once for all models, and their projection.
+        """
         model, _ = query_model(store, self)
-        seconds, errors = [], []
-        for mu in validation_parameters(model.problem, self.count, self.seed):
-            reduced, spent = median_seconds(partial(model.assemble, mu))
-            seconds.append(spent)
+        mus, kept = validation_parameters(model.problem, self.count, self.seed), assemblies(model.problem)
+        programs, seconds, errors, factor = [], [], [], None
+        for mu, matrices in zip(mus, value_of(store, self.forms), strict=True):
+            vi = kept.at(mu)
             if isinstance(model, OnlineModel):
-                full = project(checked_assembly(model.problem, mu), reduced.basis, model.generators)
+                reduced, spent = median_seconds(partial(model.assemble, mu))
+                full, factor = project(vi, reduced.basis, model.generators), reduced.factor
                 errors.append(_largest_difference(reduced.program, full))
             else:
+                reduced, projecting = median_seconds(partial(model.reduce, vi), enough=ENOUGH)
+                spent = matrices + projecting
                 errors.append(0.0)
-        return Result(Assembled(tuple(seconds), tuple(errors)))
+            programs.append(reduced.program)
+            seconds.append(spent)
+        return Result(Assembled(tuple(programs), factor, tuple(seconds), tuple(errors)))
 
 
 def _largest_difference(found: VariationalInequality, exact: VariationalInequality) -> float:

@@ -10,6 +10,7 @@ from scipy.optimize import nnls
 
 from vibench.arrays import Array
 from vibench.errors import NumericalError
+from vibench.factor import SparseCholesky
 from vibench.greedy import LazyMaximum
 from vibench.space import InnerProduct
 from vibench.strategy import Cone, Stop, no_free
@@ -32,6 +33,28 @@ class Projection:
 def project(generators: Array, theta: Array, W: InnerProduct) -> Projection:
     """Project θ (m,) on the cone of `generators` (m×R) in the W norm; a nonnegative least squares problem."""
     return _project_whitened(W.whiten(generators), W.whiten(theta))
+
+
+def onto_orthant(functional: Array, W: InnerProduct) -> Array:
+    """Projection (m,) on W⁺, nonnegative coefficients, of the Riesz representer of a functional (m,) in the W norm.
+
+    X_W π − s ≥ 0 and π ≥ 0 are complementary: an active set method, which starts where s is positive and keeps what is
+    not negative; should its sets repeat themselves, a nonnegative least squares solver takes over.
+    """
+    free, seen = functional > 0.0, set[bytes]()
+    while free.tobytes() not in seen:
+        seen.add(free.tobytes())
+        inside = np.flatnonzero(free)
+        found = np.zeros(W.dim)
+        if len(inside):
+            block = W.matrix[inside][:, inside]
+            found[inside] = SparseCholesky(block, "a block of X_W").solve(functional[inside])
+        rest = functional - W.apply(found)
+        following = np.where(free, found > 0.0, rest > 1e-14 * np.max(np.abs(functional), initial=0.0))
+        if np.array_equal(following, free):
+            return found
+        free = following
+    return project(np.eye(W.dim), W.riesz(functional), W).coefficients
 
 
 def _project_whitened(generators: Array, theta: Array) -> Projection:

@@ -8,7 +8,7 @@ from vibench.arrays import SparseMatrix
 from vibench.assess import constants_full, constants_on
 from vibench.infsup import inf_sup_on
 from vibench.problem import Problem, validation_parameters
-from vibench.stage import Result, Stage, build_problem, value_of
+from vibench.stage import Result, Stage, assemblies, build_problem, value_of
 from vibench.stages import ConeStage, EnrichmentStage, PODStage, reduced_model
 from vibench.store import Store
 from vibench.strategy import Kind
@@ -70,9 +70,9 @@ class OwnConstants(Stage):
         if model.kind is not Kind.PER_PARAMETER:
             return Result(constants_on(model.fixed_basis, _constraints(model.problem, self.count, self.seed), cone))
         mus = validation_parameters(model.problem, self.count, self.seed)
-        assembled = (model.problem.assemble(mu) for mu in mus)
+        assembled = (assemblies(model.problem).at(mu) for mu in mus)
         return Result([inf_sup_on(model.primal_basis(vi), vi.B, cone) for vi in assembled])
 
 
 def _constraints(problem: Problem, count: int, seed: int) -> list[SparseMatrix]:
-    return [problem.constraint(mu)[0] for mu in validation_parameters(problem, count, seed)]
+    return [assemblies(problem).at(mu).B for mu in validation_parameters(problem, count, seed)]

@@ -93,7 +93,7 @@ def bounds(problem: Problem, vi: VariationalInequality, stability: Stability, u:
         return Bounds(float("inf"), float("inf"))
     residual = float(np.linalg.norm(V.whiten_functional(vi.f - vi.A @ u - vi.B.T @ lam)))
     excess = vi.B @ u - vi.g
-    penetration = cone.project(np.eye(W.dim), W.riesz(excess), W).coefficients
+    penetration = cone.onto_orthant(excess, W)
     size = float(W.norm(penetration))
     mismatch = float(penetration @ W.apply(lam)) + max(0.0, -float(excess @ lam))
     half = (residual + size * gamma / beta) / (2.0 * alpha)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cached_property
+
 import numpy as np
 import scipy.sparse as sp
 from scipy.sparse.linalg import SuperLU, splu, spsolve_triangular
@@ -48,7 +50,7 @@ class SparseCholesky:
         if not np.array_equal(lu.perm_r, lu.perm_c) or np.any(pivots <= 0.0):
             raise NumericalError(f"{name} is not positive definite")
         self._lu: SuperLU = lu
-        self._lower, self._root = sp.csc_array(lu.L), np.sqrt(pivots)
+        self._root = np.sqrt(pivots)
         eliminated = np.argsort(lu.perm_c)
         if order is not None and not np.array_equal(eliminated, np.arange(len(order))):
             raise NumericalError(f"{name} was factorised in another order than asked for")  # SuperLU promises not to
@@ -58,6 +60,12 @@ class SparseCholesky:
     def __reduce__(self) -> tuple[type[SparseCholesky], tuple[SparseMatrix, str, Indices | None]]:
         """Factorise anew where it is unpickled: SuperLU objects do not travel."""
         return SparseCholesky, self._made_from
+
+    @cached_property
+    def _lower(self) -> SparseMatrix:
+        lower = sp.csc_array(self._lu.L)
+        lower.sort_indices()  # once, not at every triangular solve
+        return lower
 
     def solve(self, right: Array) -> Array:
         """X⁻¹ r for right-hand sides (n,) or (n, k)."""
@@ -91,8 +99,8 @@ class SparseCholesky:
 
         With c the last `count` unknowns, F_ccᵀF_cc is X_cc minus what the elimination of all others takes from it.
         """
-        first = self._lower.shape[0] - count
-        block = sp.csr_array(self._lower)[first:][:, first:].toarray()
+        first = len(self._root) - count
+        block = sp.csc_array(self._lu.L)[:, first:][first:].toarray()
         return np.asarray((block * self._root[first:]).T)
 
 

@@ -82,8 +82,13 @@ def inf_sup(on_span: Array, on_generators: Array, cone: Multipliers) -> InfSup:
         All zeros when there is no primal vector, infinite when there is no multiplier.
     """
     span = beta_span(on_span)
-    lower, upper, sharp = cone_interval(on_generators, cone.gram, span)
+    lower, upper, sharp = cone_interval(compressed(on_generators), cone.gram, span)
     return InfSup(span, lower, upper, sharp)
+
+
+def compressed(images: Array) -> Array:
+    """An isometric image of the columns (k×R) with no more rows than columns."""
+    return images if images.shape[0] <= images.shape[1] else np.asarray(np.linalg.qr(images, mode="r"))
 
 
 def beta_span(on_span: Array) -> float:
@@ -93,7 +98,7 @@ def beta_span(on_span: Array) -> float:
         return float("inf")
     if rows < rank:
         return 0.0
-    return float(singular_values(on_span)[-1])
+    return float(singular_values(compressed(on_span))[-1])
 
 
 def inf_sup_on(Z: Array, B: SparseMatrix, cone: Multipliers) -> InfSup:

@@ -217,6 +217,10 @@ class OnlineModel:
             raise NumericalError(f"the reduced problem has entries that are not finite at mu = {mu.tolist()}")
         return ReducedProblem(VariationalInequality(A, f, B, g), basis, operators.factor)
 
+    def basis_at(self, mu: Array, vi: VariationalInequality) -> Array:  # noqa: ARG002
+        """V-orthonormal primal basis Z (n×N') at mu, which only a reconstruction needs."""
+        return self.assemble(mu).basis
+
     def _constraint(self, samples: Samples, contact: Contact | None) -> Array:
         operators = self._operators
         if operators.B is not None:

@@ -212,6 +212,40 @@ class Problem(ABC):
         return {}
 
 
+class Assemblies:
+    """What a problem assembles, kept for assessments that look at the same parameters again and again.
+
+    Parameters
+    ----------
+    problem
+        The problem.
+    limit
+        Bytes to keep at most; what was asked for longest ago goes first.
+    """
+
+    def __init__(self, problem: Problem, limit: int = 2**28) -> None:
+        self._problem, self._limit = problem, limit
+        self._kept: dict[bytes, VariationalInequality] = {}
+        self._size = 0
+
+    def at(self, mu: Array) -> VariationalInequality:
+        """`checked_assembly` at mu (d,)."""
+        key = np.ascontiguousarray(mu, float).tobytes()
+        vi = self._kept.pop(key, None)
+        if vi is None:
+            vi = checked_assembly(self._problem, mu)
+            self._size += _bytes(vi)
+            while self._kept and self._size > self._limit:
+                self._size -= _bytes(self._kept.pop(next(iter(self._kept))))
+        self._kept[key] = vi
+        return vi
+
+
+def _bytes(vi: VariationalInequality) -> int:
+    """Memory of the matrices, as if none were shared."""
+    return int(12 * (vi.A.nnz + vi.B.nnz)) + vi.f.nbytes + vi.g.nbytes
+
+
 def check_coercive(problem: Problem, mu: Array) -> None:
     """Refuse a problem whose A is not symmetric positive definite at mu (d,).
 

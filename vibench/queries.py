@@ -16,7 +16,7 @@ from vibench.error_bounds import Stability
 from vibench.infsup import InfSup
 from vibench.provenance import machine
 from vibench.qp import Status
-from vibench.query import Row, Task
+from vibench.query import Asked, Row, Task
 from vibench.stage import Failed, Pieces, PiecewiseStage, Stage, value_of
 from vibench.stages import ReducedCone
 from vibench.store import Artefact, Store
@@ -111,9 +111,17 @@ class Queries(Pieces):
         """The rows of one query."""
         reference, k = self._reference, number
         exact = Reference(reference.u[:, k], reference.lam[:, k], *self._floors)
-        found, solution = self._task.run(
-            self._model, reference.mu[k], exact, self._stability[k], self._assembled.seconds[k], watch
+        assembled = self._assembled
+        asked = Asked(
+            self._model,
+            reference.mu[k],
+            assembled.programs[k],
+            assembled.factor,
+            assembled.seconds[k],
+            exact,
+            self._stability[k],
         )
+        found, solution = self._task.run(asked, watch)
         return self._known(k) | found, solution and {"query": k} | solution
 
     def lost(self, number: int, failed: Failed) -> Answered:
@@ -182,7 +190,10 @@ class Queries(Pieces):
         row["offline_s"] = sum(row.values())
         row["offline_wall_s"] = sum(s.wall for parts in spent.values() for s in parts)
         row["hf_s"] = float(np.mean([s.cpu for s in self._reference.seconds]))
-        others = [self._artefact(stage) for stage in (self._stage.assembly, *self._stage.validation)]
+        others = [
+            self._artefact(stage)
+            for stage in (self._stage.assembly, self._stage.assembly.forms, *self._stage.validation)
+        ]
         machines = {artefact.machine for found in (*artefacts.values(), others) for artefact in found} | {machine()}
         return row | {"machine": "; ".join(sorted(machines))}
 

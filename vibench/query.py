@@ -14,9 +14,9 @@ from vibench.assembly import Model
 from vibench.assess import Reference, errors
 from vibench.error_bounds import Stability, bounds
 from vibench.errors import in_a_line
-from vibench.problem import checked_assembly
+from vibench.problem import VariationalInequality
 from vibench.qp import Answer, Status
-from vibench.reduced import ReducedProblem
+from vibench.stage import assemblies
 from vibench.timing import Seconds, median_seconds
 
 Row = dict[str, Any]
@@ -27,6 +27,31 @@ UNMEASURABLE = 1e-8
 
 
 @dataclass(frozen=True)
+class Asked:
+    """One query before it is solved.
+
+    Attributes
+    ----------
+    model, mu
+        The reduced model and the parameter (d,).
+    program, factor
+        Its reduced program, and the Cholesky factor of A where it is known.
+    seconds
+        What assembling the program takes.
+    exact, stability
+        The high-fidelity solution and constants.
+    """
+
+    model: Model
+    mu: Array
+    program: VariationalInequality
+    factor: Array | None
+    seconds: Seconds
+    exact: Reference
+    stability: Stability
+
+
+@dataclass(frozen=True)
 class Task:
     """How the queries of a cell are solved and judged."""
 
@@ -34,28 +59,19 @@ class Task:
     accuracy: float
     query_seconds: float
 
-    def run(
-        self,
-        model: Model,
-        mu: Array,
-        exact: Reference,
-        stability: Stability,
-        assembly: Seconds,
-        watch: Callable[[bool], None],
-    ) -> tuple[Row, Row | None]:
+    def run(self, asked: Asked, watch: Callable[[bool], None]) -> tuple[Row, Row | None]:
         """The columns of one query, and of its solution if there is one.
 
-        `assembly` is what assembling takes; `watch` is told, untimed, when the solver begins and when it is back.
+        `watch` is told, untimed, when the solver begins and when it is back.
         """
-        reduced, registered = model.assemble(mu), plugins.qp_solver(self.solver)
-        program = reduced.program
+        program, assembly, registered = asked.program, asked.seconds, plugins.qp_solver(self.solver)
         answers: list[Answer] = []
 
         def work() -> Answer:
-            answers.append(qp.solve(program, self.solver, self.accuracy, registered, reduced.factor))
+            answers.append(qp.solve(program, self.solver, self.accuracy, registered, asked.factor))
             return answers[-1]
 
-        row: Row = {"assemble_s": assembly.cpu, "form": "primal" if reduced.factor is None else "dual"}
+        row: Row = {"assemble_s": assembly.cpu, "form": "primal" if asked.factor is None else "dual"}
         try:
             answer, solving = median_seconds(work, before=partial(watch, True))
             watch(False)
@@ -79,7 +95,7 @@ class Task:
         if residuals is None or answer.x is None or answer.alpha is None:
             return row, None
         row |= {"primal_residual": residuals.primal, "dual_residual": residuals.dual, "gap": residuals.gap}
-        row |= _assessed(model, mu, reduced, answer.x, answer.alpha, exact, stability)
+        row |= _assessed(asked, answer.x, answer.alpha)
         return row, solution_row(answer.x, answer.alpha, slack(program, answer.x, answer.alpha, self.accuracy))
 
 
@@ -89,12 +105,11 @@ def _same(one: Answer, other: Answer) -> bool:
     return all((a is b) if a is None or b is None else a.tobytes() == b.tobytes() for a, b in pairs)
 
 
-def _assessed(
-    model: Model, mu: Array, reduced: ReducedProblem, x: Array, alpha: Array, exact: Reference, known: Stability
-) -> Row:
+def _assessed(asked: Asked, x: Array, alpha: Array) -> Row:
     """Errors, their certified bounds and effectivities."""
-    problem, vi = model.problem, checked_assembly(model.problem, mu)
-    u, lam = reduced.basis @ x, model.generators @ alpha
+    model, mu, exact, known = asked.model, asked.mu, asked.exact, asked.stability
+    problem, vi = model.problem, assemblies(model.problem).at(mu)
+    u, lam = model.basis_at(mu, vi) @ x, model.generators @ alpha
     found = errors(problem, vi, exact, u, lam)
     row = {
         "error_u": found.u,

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
 from vibench.arrays import Array
 from vibench.errors import NumericalError
+from vibench.linalg import orthonormal_range
 from vibench.problem import Problem, VariationalInequality, checked_assembly
 from vibench.strategy import Enrichment, Kind
-from vibench.supremizer import supremizers
 
 
 @dataclass(frozen=True)
@@ -76,14 +77,25 @@ class ReducedModel:
         """V-orthonormal basis Z (n×N') at the parameter of `vi`; V_N comes first."""
         V, enrichment = self.problem.V, self.enrichment
         if enrichment.eta is not None:
-            added = supremizers(V, vi.B, enrichment.eta)
+            whitened = V.whiten_functional(np.asarray(vi.B.T @ enrichment.eta))  # those of T(mu)η
         elif enrichment.supply is not None:
             added = enrichment.supply(V, vi, self.span)
+            if added.ndim != 2 or added.shape[0] != V.dim:
+                raise NumericalError(
+                    f"the enrichment supplied vectors of shape {added.shape}, expected ({V.dim}, count)"
+                )
+            whitened = V.whiten(added)
         else:
             return self.fixed_basis
-        if added.ndim != 2 or added.shape[0] != V.dim:
-            raise NumericalError(f"the enrichment supplied vectors of shape {added.shape}, expected ({V.dim}, count)")
-        return np.hstack([self.fixed_basis, V.orthonormalise(added, self.fixed_basis)])
+        return np.hstack([self.fixed_basis, V.unwhiten(orthonormal_range(whitened, self._whitened_basis))])
+
+    def basis_at(self, mu: Array, vi: VariationalInequality) -> Array:  # noqa: ARG002
+        """The primal basis at mu, where `vi` is assembled."""
+        return self.primal_basis(vi)
+
+    @cached_property
+    def _whitened_basis(self) -> Array:
+        return self.problem.V.whiten(self.fixed_basis)
 
     def assemble(self, mu: Array) -> ReducedProblem:
         """Assemble at mu (d,) in full, as the paper does: high-fidelity matrices, then their projections.
@@ -93,7 +105,10 @@ class ReducedModel:
         NumericalError
             If what the problem assembles has the wrong shape or values that are not finite.
         """
-        vi = checked_assembly(self.problem, mu)
+        return self.reduce(checked_assembly(self.problem, mu))
+
+    def reduce(self, vi: VariationalInequality) -> ReducedProblem:
+        """Project what the problem assembled at a parameter."""
         Z = self.primal_basis(vi)
         return ReducedProblem(project(vi, Z, self.generators), lambda: Z)
 

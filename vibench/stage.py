@@ -10,7 +10,7 @@ from typing import Any
 
 from vibench.errors import NumericalError
 from vibench.matrix import Plugin, digest
-from vibench.problem import Problem
+from vibench.problem import Assemblies, Problem
 from vibench.provenance import core_code, libraries
 from vibench.qp import Status
 from vibench.store import History, Store
@@ -23,6 +23,12 @@ def build_problem(plugin: Plugin) -> Problem:
     problem = plugin.create()
     assert isinstance(problem, Problem)  # `plugins.load` refuses anything else
     return problem
+
+
+@lru_cache(maxsize=1)
+def assemblies(problem: Problem) -> Assemblies:
+    """What the problem in hand assembles, kept in this process; for whatever is not timed."""
+    return Assemblies(problem)
 
 
 @dataclass(frozen=True)

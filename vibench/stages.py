@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -10,7 +11,8 @@ import numpy as np
 from vibench.arrays import Array
 from vibench.cone import orthogonality
 from vibench.contracts import check_cone, check_enrichment
-from vibench.infsup import Multipliers, beta_span, multipliers
+from vibench.greedy import LazyMaximum
+from vibench.infsup import Multipliers, beta_span, compressed, multipliers
 from vibench.matrix import Cell, Plugin
 from vibench.pod import POD, pod
 from vibench.problem import training_parameters
@@ -18,7 +20,7 @@ from vibench.reduced import ReducedModel
 from vibench.stage import Result, Stage, build_problem, value_of
 from vibench.store import History, Store
 from vibench.strategy import Cone, Enrichment, Kind, Offline, Stop
-from vibench.supremizer import constraint_classes
+from vibench.supremizer import constraint_classes, supremizer_coordinates
 from vibench.sweeps import gather, training
 from vibench.timing import Stopwatch, timed
 
@@ -117,24 +119,37 @@ def _training_constants(
 ) -> list[History]:
     """Of a fixed enrichment: min over training mu of β_span after every vector; β_span of it and of V at every mu."""
     assert enrichment.vectors is not None  # a fixed enrichment has vectors
-    matrices = [offline.problem.assemble(mu).B for mu in offline.training]
-    classes = constraint_classes(matrices)
+    V = offline.problem.V
+    classes = constraint_classes([offline.problem.constraint(mu)[0] for mu in offline.training])
+    sizes = np.abs(classes.factors)
     Z = np.hstack([offline.basis, enrichment.vectors])
     images = [Z.T @ np.asarray(B.T @ prepared.span) for B in classes.representatives]
-    first = offline.basis.shape[1]
-    factor = [np.min(np.abs(classes.factors[classes.members == k])) for k in range(len(images))]
-    steps = [
-        min(c * beta_span(image[: first + s]) for c, image in zip(factor, images, strict=True))
-        for s in range(enrichment.vectors.shape[1] + 1)
-    ]
-    own = np.array([beta_span(image) for image in images])[classes.members] * np.abs(classes.factors)
-    V = offline.problem.V
-    full = np.array([beta_span(V.whiten_functional(np.asarray(B.T @ prepared.span))) for B in classes.representatives])
+    weights = [float(np.min(sizes[classes.members == k])) for k in range(len(images))]
+    steps = _smallest_over_steps(images, weights, offline.basis.shape[1])
+    _, supremizers = supremizer_coordinates(V, offline.basis, classes.representatives, prepared.span)
+    own, full = (np.array([beta_span(image) for image in found])[classes.members] for found in (images, supremizers))
     return [
         History(key, "beta_span_min", tuple(steps)),
-        History(key, "beta_span_training", tuple(own)),
-        History(key, "beta_full_span_training", tuple(full[classes.members] * np.abs(classes.factors))),
+        History(key, "beta_span_training", tuple(own * sizes)),
+        History(key, "beta_full_span_training", tuple(full * sizes)),
     ]
+
+
+def _smallest_over_steps(images: list[Array], weights: list[float], first: int) -> list[float]:
+    """The smallest β_span of the first `first`, `first` + 1, … rows of images (k×rank), each times its weight.
+
+    It only grows with the rows, so an earlier value bounds it from below and few are computed again.
+    """
+    triangles, known = [image[:0] for image in images], [0] * len(images)
+
+    def negative(p: int, rows: int) -> float:
+        triangles[p] = compressed(np.vstack([triangles[p], images[p][known[p] : rows]]))
+        known[p] = rows
+        return -weights[p] * beta_span(triangles[p])
+
+    smallest = LazyMaximum(np.zeros(len(images)))
+    last = images[0].shape[0]
+    return [-smallest.next(partial(negative, rows=rows))[1] for rows in range(first, last + 1)]
 
 
 def enrichment_stage(cell: Cell) -> EnrichmentStage:

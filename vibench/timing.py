@@ -14,10 +14,10 @@ import numpy as np
 T = TypeVar("T")
 
 REPEATS = 5
-"""Timed repeats of a query after one warm-up; the median counts."""
+"""Timed repeats after one warm-up; the median counts."""
 
 SLOW = 1.0
-"""A query that takes longer than this many seconds is timed once."""
+"""Seconds of repeats after which there are no more; what takes longer is timed once."""
 
 ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMEXPR_NUM_THREADS"), "1")
 """Environment in which numerical libraries start with one thread."""
@@ -55,10 +55,19 @@ def timed(work: Callable[[], T]) -> tuple[T, Seconds]:
     return result, watch.seconds()
 
 
-def median_seconds(work: Callable[[], T], before: Callable[[], None] = lambda: None) -> tuple[T, Seconds]:
-    """Result of some work and its seconds: one warm-up, then the median of `REPEATS`; the first run if it is slow.
+def median_seconds(
+    work: Callable[[], T], before: Callable[[], None] = lambda: None, enough: float = SLOW
+) -> tuple[T, Seconds]:
+    """Result of some work and its seconds: one warm-up, then the median of `REPEATS`, fewer if these take long.
 
-    `before` is called, untimed, before each of them.
+    Parameters
+    ----------
+    work
+        What is timed.
+    before
+        Called, untimed, before each run.
+    enough
+        Seconds of repeats after which there are no more; if the warm-up takes longer, it is what counts.
     """
 
     def once() -> tuple[T, Seconds]:
@@ -66,9 +75,11 @@ def median_seconds(work: Callable[[], T], before: Callable[[], None] = lambda: N
         return timed(work)
 
     result, first = once()
-    if first.wall > SLOW:
+    if first.wall > enough:
         return result, first
-    runs = [once()[1] for _ in range(REPEATS)]
+    runs: list[Seconds] = []
+    while len(runs) < REPEATS and sum(run.wall for run in runs) < enough:
+        runs.append(once()[1])
     return result, Seconds(statistics.median(r.cpu for r in runs), statistics.median(r.wall for r in runs))
 
 
