@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import scipy.sparse as sp
 
-from numerics import Varying
+from numerics import Varying, space
 from vibench import supremizer
 from vibench.supremizer import (
     ContactCoordinates,
@@ -44,6 +44,19 @@ def test_coordinates_are_an_isometry_that_leads_back_to_the_supremizers(
         assert np.allclose(space.vectors(coordinates), direct, atol=1e-11)
         assert np.allclose(coordinates.T @ coordinates, problem.V.gram(direct, direct), atol=1e-11)
         assert np.allclose(space.plain.T @ coordinates, problem.V.gram(basis, direct), atol=1e-11)
+
+
+@pytest.mark.parametrize("rank", [1, 2, 3])
+def test_vectors_that_depend_on_each_other_have_coordinates_in_an_orthonormal_basis_too(rank: int) -> None:
+    V, rng = space(9), np.random.default_rng(rank)
+    basis = V.orthonormalise(rng.standard_normal((9, 3)))
+    some = rng.standard_normal((9, rank))
+    vectors = np.hstack([some, basis @ rng.random((3, 1)), some @ rng.random((rank, 2)), rng.standard_normal((9, 2))])
+    found = SpannedCoordinates(V, basis, vectors)
+    assert np.allclose(found.vectors(found.represented), vectors, atol=1e-12)
+    assert np.allclose(found.vectors(found.plain), basis, atol=1e-12)
+    everything = found.vectors(np.eye(found.plain.shape[0]))
+    assert np.allclose(V.gram(everything, everything), np.eye(found.plain.shape[0]), atol=1e-12)
 
 
 def test_proportional_matrices_are_recognised_and_others_are_not() -> None:

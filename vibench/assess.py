@@ -8,10 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from vibench.arrays import Array, SparseMatrix
-from vibench.infsup import InfSup, Multipliers, inf_sup_full, inf_sup_on
+from vibench.infsup import InfSup, Multipliers, inf_sup, inf_sup_on
 from vibench.problem import Problem, VariationalInequality
 from vibench.space import InnerProduct
-from vibench.supremizer import constraint_classes
+from vibench.supremizer import constraint_classes, supremizer_images
 
 
 @dataclass(frozen=True)
@@ -79,7 +79,8 @@ def _over(value: float, scale: float) -> float:
 def constants_full(V: InnerProduct, matrices: Sequence[SparseMatrix], cone: Multipliers) -> list[InfSup]:
     """Constants of the whole of V at every B(mu) (m×n); matrices that are proportional share one computation."""
     classes = constraint_classes(matrices)
-    found = [inf_sup_full(V, B, cone) for B in classes.representatives]
+    image = supremizer_images(V, classes.representatives, cone.span.shape[1] + cone.chi.shape[1])
+    found = [inf_sup(image(B, cone.span), image(B, cone.chi), cone) for B in classes.representatives]
     return [found[k].scaled(c) for k, c in zip(classes.members, classes.factors, strict=True)]
 
 

@@ -17,6 +17,7 @@ from vibench.arrays import Array, SparseMatrix
 from vibench.cone_bounds import cone_interval
 from vibench.linalg import singular_values
 from vibench.space import InnerProduct
+from vibench.supremizer import on_basis
 
 
 @dataclass(frozen=True)
@@ -103,7 +104,7 @@ def beta_span(on_span: Array) -> float:
 
 def inf_sup_on(Z: Array, B: SparseMatrix, cone: Multipliers) -> InfSup:
     """Constants of a primal space with V-orthonormal basis Z (n×N') at the parameter of B (m×n)."""
-    return inf_sup(Z.T @ np.asarray(B.T @ cone.span), Z.T @ np.asarray(B.T @ cone.chi), cone)
+    return inf_sup(on_basis(Z, B, cone.span), on_basis(Z, B, cone.chi), cone)
 
 
 def inf_sup_full(V: InnerProduct, B: SparseMatrix, cone: Multipliers) -> InfSup:

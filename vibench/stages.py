@@ -20,7 +20,7 @@ from vibench.reduced import ReducedModel
 from vibench.stage import Result, Stage, build_problem, value_of
 from vibench.store import History, Store
 from vibench.strategy import Cone, Enrichment, Kind, Offline, Stop
-from vibench.supremizer import constraint_classes, supremizer_coordinates
+from vibench.supremizer import ConstraintClasses, constraint_classes, on_basis, supremizer_images
 from vibench.sweeps import gather, training
 from vibench.timing import Stopwatch, timed
 
@@ -86,6 +86,34 @@ class ConeStage(Stage):
 
 
 @dataclass(frozen=True)
+class Reached:
+    """The constraint matrices of the training set, and β_span of the whole of V with a cone at every parameter (P,)."""
+
+    classes: ConstraintClasses
+    full: Array
+
+
+@dataclass(frozen=True)
+class TrainingConstants(Stage):
+    """What no enrichment of V_N can surpass on the training set; assessed, not timed."""
+
+    cone: ConeStage
+
+    def inputs(self) -> tuple[Stage, ...]:
+        """The cone."""
+        return (self.cone,)
+
+    def run(self, store: Store) -> Result:
+        """A `Reached`."""
+        problem = build_problem(self.cone.problem)
+        span = value_of(store, self.cone).prepared.span
+        classes = constraint_classes([problem.constraint(mu)[0] for mu in training_parameters(problem)])
+        image = supremizer_images(problem.V, classes.representatives, span.shape[1])
+        found = np.array([beta_span(image(B, span)) for B in classes.representatives])
+        return Result(Reached(classes, found[classes.members] * np.abs(classes.factors)))
+
+
+@dataclass(frozen=True)
 class EnrichmentStage(Stage):
     """The primal strategy, offline."""
 
@@ -94,9 +122,14 @@ class EnrichmentStage(Stage):
     primal: Plugin
     tolerance: float | None
 
+    @property
+    def reached(self) -> TrainingConstants:
+        """The stage that knows what the whole of V reaches on the training set."""
+        return TrainingConstants(self.cone)
+
     def inputs(self) -> tuple[Stage, ...]:
-        """POD and cone; the training parameters come from the problem."""
-        return (self.pod, self.cone)
+        """POD, cone and what is to be reached; the training parameters come from the problem."""
+        return (self.pod, self.cone, self.reached)
 
     def run(self, store: Store) -> Result:
         """Build the enrichment; what it reaches on the training set is assessed, not timed."""
@@ -110,28 +143,25 @@ class EnrichmentStage(Stage):
         key = {"stage": "enrichment"}
         histories = [History(key, quantity, tuple(values)) for quantity, values in enrichment.history.items()]
         if enrichment.kind is Kind.FIXED:
-            histories += _training_constants(key, offline, enrichment, reduced.prepared)
+            histories += _training_constants(key, offline, enrichment, value_of(store, self.reached))
         return Result(enrichment, seconds, tuple(histories))
 
 
 def _training_constants(
-    key: dict[str, Any], offline: Offline, enrichment: Enrichment, prepared: Multipliers
+    key: dict[str, Any], offline: Offline, enrichment: Enrichment, reached: Reached
 ) -> list[History]:
     """Of a fixed enrichment: min over training mu of β_span after every vector; β_span of it and of V at every mu."""
     assert enrichment.vectors is not None  # a fixed enrichment has vectors
-    V = offline.problem.V
-    classes = constraint_classes([offline.problem.constraint(mu)[0] for mu in offline.training])
-    sizes = np.abs(classes.factors)
+    classes, sizes = reached.classes, np.abs(reached.classes.factors)
     Z = np.hstack([offline.basis, enrichment.vectors])
-    images = [Z.T @ np.asarray(B.T @ prepared.span) for B in classes.representatives]
+    images = [on_basis(Z, B, offline.span) for B in classes.representatives]
     weights = [float(np.min(sizes[classes.members == k])) for k in range(len(images))]
     steps = _smallest_over_steps(images, weights, offline.basis.shape[1])
-    _, supremizers = supremizer_coordinates(V, offline.basis, classes.representatives, prepared.span)
-    own, full = (np.array([beta_span(image) for image in found])[classes.members] for found in (images, supremizers))
+    own = np.array([beta_span(image) for image in images])[classes.members] * sizes
     return [
         History(key, "beta_span_min", tuple(steps)),
-        History(key, "beta_span_training", tuple(own * sizes)),
-        History(key, "beta_full_span_training", tuple(full * sizes)),
+        History(key, "beta_span_training", tuple(own)),
+        History(key, "beta_full_span_training", tuple(reached.full)),
     ]
 
 

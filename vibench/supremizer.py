@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,7 +11,6 @@ import scipy.sparse as sp
 
 from vibench.arrays import Array, Indices, SparseMatrix
 from vibench.factor import SparseCholesky, elimination_order
-from vibench.linalg import remove
 from vibench.space import InnerProduct
 
 PROPORTIONAL_RTOL = 1e-12
@@ -111,11 +110,10 @@ class SpannedCoordinates:
 
     def __init__(self, V: InnerProduct, basis: Array, vectors: Array) -> None:
         self._V = V
-        fixed, whitened = V.whiten(basis), V.whiten(vectors)
-        q, r = np.linalg.qr(remove(fixed, whitened))
-        self._whitened = np.hstack([fixed, q])
-        self.represented: Array = np.vstack([fixed.T @ whitened, r])
-        self.plain: Array = np.eye(self._whitened.shape[1], fixed.shape[1])
+        count = basis.shape[1]
+        self._whitened, r = np.linalg.qr(V.whiten(np.hstack([basis, vectors])))
+        self.plain: Array = r[:, :count]
+        self.represented: Array = r[:, count:]
 
     def vectors(self, coordinates: Array) -> Array:
         """Vectors (n×k) with these coordinates (d×k)."""
@@ -165,6 +163,30 @@ class ContactCoordinates:
 Coordinates = SpannedCoordinates | ContactCoordinates
 
 
+SupremizerImages = Callable[[SparseMatrix, Array], Array]
+"""From B (m×n) and η (m×k): an isometric image (d×k) of T(mu)η."""
+
+
+def supremizer_images(V: InnerProduct, matrices: Sequence[SparseMatrix], count: int) -> SupremizerImages:
+    """The cheapest way to norms and angles of T(mu)η for these matrices and `count` multipliers in all for each."""
+    touched = _touched(matrices)
+    if FEW_SUPREMIZERS * count * len(matrices) <= len(touched):
+        return lambda B, eta: V.whiten_functional(np.asarray(B.T @ eta))
+    contact = ContactCoordinates(V, np.zeros((V.dim, 0)), touched)
+    return lambda B, eta: contact.supremizers(np.asarray(B.T @ eta)[touched])
+
+
+def _touched(matrices: Sequence[SparseMatrix]) -> Indices:
+    """Unknowns that some of the matrices touch, rising."""
+    return np.unique(np.concatenate([sp.csr_array(B).indices for B in matrices]))
+
+
+def on_basis(Z: Array, B: SparseMatrix, eta: Array) -> Array:
+    """ZᵀBᵀη (N'×k) from the rows of Z (n×N') that B (m×n) touches."""
+    rows = _touched([B])
+    return np.asarray(Z[rows].T @ np.asarray(sp.csr_array(B)[:, rows].T @ eta))
+
+
 def supremizer_coordinates(
     V: InnerProduct, basis: Array, matrices: Sequence[SparseMatrix], eta: Array
 ) -> tuple[Coordinates, list[Array]]:
@@ -180,7 +202,7 @@ def supremizer_coordinates(
         Multipliers (m×k).
     """
     loads = [np.asarray(B.T @ eta) for B in matrices]
-    touched = np.unique(np.concatenate([sp.csr_array(B).indices for B in matrices]))
+    touched = _touched(matrices)
     count = eta.shape[1]
     if FEW_SUPREMIZERS * count * len(matrices) <= len(touched):
         space = SpannedCoordinates(V, basis, V.riesz(np.hstack(loads)))
