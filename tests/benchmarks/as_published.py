@@ -1,0 +1,234 @@
+"""Seconds of the algorithms as published (`published.py`) and of vibench's own, side by side in one process.
+
+    python tests/benchmarks/as_published.py obstacle|hertz [--repeats K] [--resolution paper] [--out FOLDER]
+
+Both sides do the same stages one after the other, K times in turn, each with the results of its own earlier stages, on
+one BLAS thread; CPU seconds, medians. Exit code 1 unless both come to the same models: sizes, σ, snapshots and errors.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import statistics
+import sys
+from collections import defaultdict
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+if __name__ == "__main__":  # before NumPy is imported
+    for library in ("OMP", "OPENBLAS", "MKL", "NUMEXPR"):
+        os.environ[f"{library}_NUM_THREADS"] = "1"
+
+import numpy as np
+import pandas as pd
+import published
+from sides import CASES, Ours, Published, Side
+
+from vibench import provenance, qp, tables
+from vibench.arrays import Array
+from vibench.timing import median_seconds, timed
+
+SEED = 2022
+STAGES = ("snapshots", "POD", "CPG", "mCPG", "PGA", "PGA, residuals kept", "reduction")
+TOTAL = ("snapshots", "POD", "mCPG", "PGA")
+"""What is done offline for a model with V_N + S^red."""
+TOTAL_NAME = "offline total: " + ", ".join(TOTAL)
+QUERIES = ("query online", "query offline", "query online, reduced", "query offline, reduced")
+BARE = "bare program of the reduced offline query"
+
+
+class Pair(NamedTuple):
+    """The same of both sides."""
+
+    published: Any
+    ours: Any
+
+
+Seconds = dict[str, Pair]
+"""CPU seconds of every repeat, by stage: two lists."""
+
+
+def measure_stages(sides: Pair, repeats: int) -> Seconds:
+    """Every stage on both sides in turn."""
+    seconds: Seconds = defaultdict(lambda: Pair([], []))
+    for name in STAGES:
+        for _ in range(repeats):
+            for side, spent in zip(sides, seconds[name], strict=True):
+                spent.append(timed(lambda: side.do(name))[1].cpu)  # noqa: B023  called at once
+        _tell(name, seconds[name])
+    for side in range(2):
+        seconds[TOTAL_NAME][side].extend(np.sum([seconds[name][side] for name in TOTAL], axis=0).tolist())
+    return seconds
+
+
+Figures = dict[str, Pair]
+
+
+def measure_queries(sides: Pair, mus: Array, repeats: int) -> tuple[Seconds, Figures]:
+    """Queries at every mu (P×d) on both sides in turn: seconds; means of the errors, and the worst residuals."""
+    seconds: Seconds = defaultdict(lambda: Pair([], []))
+    found: Figures = {}
+    problem = sides.published.problem
+    u, lam = published.snapshots(problem, mus)
+    for side in sides:
+        side.prepare()
+    for name in QUERIES:
+        error_u, error_lam, residual = Pair([], []), Pair([], []), Pair([], [])
+        for repeat in range(-1, repeats):  # the first is to warm up
+            for k, mu in enumerate(mus):
+                for i, side in enumerate(sides):
+                    (program, x, alpha, Z), spent = timed(lambda: side.answer(name, mu))  # noqa: B023  called at once
+                    if repeat >= 0:
+                        seconds[name][i].append(spent.cpu)
+                        continue
+                    error_u[i].append(_relative(problem.V.norm(u[:, k] - Z() @ x), problem.V.norm(u[:, k])))
+                    error_lam[i].append(
+                        _relative(problem.W.norm(lam[:, k] - side.chi @ alpha), problem.W.norm(lam[:, k]))
+                    )
+                    residual[i].append(qp.residuals(program, x, alpha).worst)
+        found[f"error of u, {name}"] = Pair(*map(statistics.mean, error_u))
+        found[f"error of λ, {name}"] = Pair(*map(statistics.mean, error_lam))
+        found[f"largest residual, {name}"] = Pair(*map(max, residual))
+        _tell(name, seconds[name])
+    for mu in mus:
+        spent = median_seconds(sides.ours.bare_program(mu))[1].cpu
+        for of_side in seconds[BARE]:
+            of_side.append(spent)
+    return seconds, found
+
+
+def _relative(value: Array, scale: Array) -> float:
+    return float(value / scale)
+
+
+def _tell(name: str, seconds: Pair) -> None:
+    medians = ", ".join(f"{statistics.median(spent):.3g} s" for spent in seconds)
+    print(f"{name}: {medians}", file=sys.stderr, flush=True)
+
+
+def sizes(sides: Pair) -> Figures:
+    """Dimensions, and σ over the training set as `published` computes it."""
+    added = [side.space.shape[1] - side.basis.shape[1] for side in sides]
+    return {
+        "N": Pair(*(side.basis.shape[1] for side in sides)),
+        "R of CPG": Pair(*(side.plain.shape[1] for side in sides)),
+        "R of mCPG": Pair(*(side.chi.shape[1] for side in sides)),
+        "vectors added by PGA": Pair(*added),
+        "largest σ": Pair(*map(largest_sigma, sides)),
+    }
+
+
+def largest_sigma(side: Side) -> float:
+    """Largest σ_S(mu) over the training set, equation (21)."""
+    X, factor = side.problem.V.matrix, published.factorise(side.problem.V.matrix)
+    largest = 0.0
+    for mu in side.problem.training_set():
+        Q = published.gram_schmidt(published.supremizers(factor, side.problem.assemble(mu).B, side.chi), X)
+        (E,) = published.residuals(X, [Q], side.space)
+        largest = max(largest, float(np.linalg.eigvalsh(E.T @ (X @ E))[-1]))
+    return float(np.sqrt(largest))
+
+
+Check = tuple[str, float, float]
+"""What must not be larger than what: a name, the figure, the bound."""
+
+
+def checks(sides: Pair, found: Figures) -> list[Check]:
+    """Whether both sides came to the same: figures and their bounds."""
+    case, problem = sides.published.case, sides.published.problem
+    names = ("N", "R of CPG", "R of mCPG")
+    result = [(f"difference of {name}", float(abs(found[name].ours - found[name].published)), 0.0) for name in names]
+    result += [("relative difference of the vectors added", _difference(found["vectors added by PGA"]), case.ties)]
+    result += [(f"σ, {side}", sigma, case.pga) for side, sigma in found["largest σ"]._asdict().items()]
+    for name, space in (("u", problem.V), ("lam", problem.W)):
+        one, other = (getattr(side, name) for side in sides)
+        worst = float(np.max(space.norm(one - other) / space.norm(one)))
+        result.append((f"relative difference of snapshots {'λ' if name == 'lam' else 'u'}", worst, 1e-7))
+    for query in QUERIES:
+        for symbol, bound in (("u", 0.01), ("λ", 0.05)):
+            name = f"error of {symbol}, {query}"
+            result.append((f"relative difference of the {name}", _difference(found[name]), bound))
+        for side, residual in found[f"largest residual, {query}"]._asdict().items():
+            result.append((f"largest residual, {query}, {side}", residual, 10.0 * sides.ours.accuracy))
+    return result
+
+
+def _difference(pair: Pair) -> float:
+    return abs(pair.ours - pair.published) / pair.published
+
+
+def broken(of: list[Check]) -> list[Check]:
+    """Checks that do not hold."""
+    return [check for check in of if not check[1] <= check[2]]
+
+
+def time_table(seconds: Seconds) -> pd.DataFrame:
+    """Medians and their ratio, by stage."""
+    rows = [(name, *(statistics.median(spent) for spent in pair), len(pair.ours)) for name, pair in seconds.items()]
+    frame = pd.DataFrame(rows, columns=["stage", "published [s]", "ours [s]", "times measured"])
+    frame.insert(3, "published / ours", frame["published [s]"] / frame["ours [s]"])
+    return frame
+
+
+def ratio_table(seconds: Seconds) -> pd.DataFrame:
+    """Ratios of medians that answer what a user would ask."""
+    published_, ours = ({name: statistics.median(pair[side]) for name, pair in seconds.items()} for side in range(2))
+    reduced = ours["query offline, reduced"]
+    rows = [
+        ("offline, as published over ours", published_[TOTAL_NAME] / ours[TOTAL_NAME]),
+        (
+            "offline with the reduction, as published over ours",
+            published_[TOTAL_NAME] / (ours[TOTAL_NAME] + ours["reduction"]),
+        ),
+        *(
+            (f"{name}, as published over ours", published_[name] / ours[name])
+            for name in ("CPG", "mCPG", "PGA", "PGA, residuals kept")
+        ),
+        ("offline query, our full over our reduced assembly", ours["query offline"] / reduced),
+        ("online query, our full over our reduced assembly", ours["query online"] / ours["query online, reduced"]),
+        ("online query as published over our reduced offline query", published_["query online"] / reduced),
+        ("our reduced offline query over the bare program in it", reduced / ours[BARE]),
+    ]
+    return pd.DataFrame(rows, columns=["ratio of medians", "found"])
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Measure, print, write; 1 if a check does not hold."""
+    parser = argparse.ArgumentParser(description=str(__doc__).splitlines()[0])
+    parser.add_argument("problem", choices=CASES)
+    parser.add_argument("--repeats", type=int, default=3)
+    parser.add_argument("--resolution", default="paper")
+    parser.add_argument("--solver", default="piqp", help="of our queries")
+    parser.add_argument("--accuracy", type=float, default=1e-10, help="of all queries")
+    parser.add_argument("--out", type=Path)
+    asked = parser.parse_args(arguments)
+    case = CASES[asked.problem]
+    resolution = int(asked.resolution) if asked.resolution.isdigit() else asked.resolution
+    problem = case.problem(resolution=resolution)
+    sides = Pair(*(side(problem, case, asked.solver, asked.accuracy) for side in (Published, Ours)))
+    seconds = measure_stages(sides, asked.repeats)
+    of_queries, found = measure_queries(sides, problem.validation_set(case.queries, SEED), asked.repeats)
+    found = sizes(sides) | found
+    verdicts = checks(sides, found)
+    times = time_table(seconds | of_queries)
+    versions = provenance.versions(asked.solver) | provenance.versions("cvxopt")
+    where = f"{provenance.machine()}; " + ", ".join(f"{name} {version}" for name, version in versions.items())
+    figures = pd.DataFrame([(name, *pair) for name, pair in found.items()], columns=["figure", "published", "ours"])
+    held = pd.DataFrame([(*v, "no" if v in broken(verdicts) else "yes") for v in verdicts])
+    held.columns = pd.Index(["check", "found", "at most", "holds"])
+    title = f"# {asked.problem}, resolution {resolution}: as published and ours\n\n{where}\n"
+    text = "\n".join([title, *map(tables.to_markdown, (times, ratio_table(seconds | of_queries), figures, held))])
+    print(text)
+    if asked.out:
+        asked.out.mkdir(parents=True, exist_ok=True)
+        name = asked.out / f"as-published-{asked.problem}"
+        name.with_suffix(".md").write_text(text, encoding="utf-8")
+        about = {"problem": asked.problem, "resolution": resolution, "solver": asked.solver, "machine": where}
+        name.with_suffix(".csv").write_text(tables.to_csv(times.assign(**about)), encoding="utf-8")
+    return int(bool(broken(verdicts)))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

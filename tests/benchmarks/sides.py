@@ -1,0 +1,201 @@
+"""The two sides that `as_published.py` compares: the algorithms as published, and vibench's own."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import published
+
+from vibench import qp
+from vibench.arrays import Array
+from vibench.highfidelity import Solver
+from vibench.infsup import multipliers
+from vibench.online import OnlineModel, project_members
+from vibench.pod import pod
+from vibench.problem import Problem
+from vibench.reduced import ReducedModel
+from vibench.separation import separate
+from vibench.strategy import Enrichment, Offline, Stop
+from vibench_problems.hertz import Hertz
+from vibench_problems.obstacle import Obstacle
+from vibench_strategies.cpg import CPG
+from vibench_strategies.mcpg import ModifiedCPG
+from vibench_strategies.offline_pga import OfflinePGA
+from vibench_strategies.online_supremizers import OnlineSupremizers
+
+
+@dataclass(frozen=True)
+class Case:
+    """One pair of reduced spaces of the paper.
+
+    Attributes
+    ----------
+    problem
+        Class of the problem.
+    pod, cone, pga
+        Where V_N and the cones stop, and δ_PGA.
+    queries
+        Number of validation parameters.
+    ties
+        Share by which numbers of supremizers may differ. Where B(mu) varies, many σ equal 1 at first, and which of the
+        vectors that belong to them is added depends on the basis of S_R(mu).
+    """
+
+    problem: type[Problem]
+    pod: Stop
+    cone: Stop
+    pga: float
+    queries: int
+    ties: float = 0.0
+
+
+CASES: Mapping[str, Case] = {
+    "obstacle": Case(Obstacle, Stop(tolerance=1e-3), Stop(tolerance=1e-2), 1e-3, 64),
+    "hertz": Case(Hertz, Stop(size=46), Stop(size=12), 0.3, 30, ties=0.05),
+}
+
+
+INTERPOLATION = 1e-6
+"""Tolerance of our reduced assembly."""
+
+
+def _method(name: str) -> str:
+    return name.lower().replace(",", "").replace(" ", "_")
+
+
+class Side:
+    """What one side has made so far, and how it goes on.
+
+    Attributes
+    ----------
+    u, lam
+        Snapshots (n×P), (m×P).
+    basis, plain, chi, space
+        V_N (n×N), generators of CPG and of mCPG (m×R), V_N + S^red (n×N').
+    """
+
+    u: Array
+    lam: Array
+    basis: Array
+    plain: Array
+    chi: Array
+    space: Array
+
+    def __init__(self, problem: Problem, case: Case, solver: str, accuracy: float) -> None:
+        """`solver` is that of our queries, `accuracy` that of all."""
+        self.problem, self.case, self.solver, self.accuracy = problem, case, solver, accuracy
+
+    def do(self, stage: str) -> None:
+        """One of the stages offline: snapshots, POD, CPG, …"""
+        getattr(self, _method(stage))()
+
+    def prepare(self) -> None:
+        """Make what queries need besides; not timed."""
+
+    def answer(self, query: str, mu: Array) -> published.Answer:
+        """A query at mu (d,)."""
+        answer: published.Answer = getattr(self, _method(query))(mu)
+        return answer
+
+
+class Published(Side):
+    """As published."""
+
+    def snapshots(self) -> None:
+        self.u, self.lam = published.snapshots(self.problem, self.problem.training_set())
+
+    def pod(self) -> None:
+        self.basis = published.pod(self.u, self.problem.V.matrix, self.case.pod)
+
+    def cpg(self) -> None:
+        self.plain = published.cpg(self.lam, self.problem.W.matrix, self.case.cone)
+
+    def mcpg(self) -> None:
+        self.chi = published.mcpg(self.lam, self.problem.W.matrix, self.case.cone)
+
+    def pga(self) -> None:
+        added = published.pga(self.problem, self.basis, self.chi, self.case.pga)
+        self.space = np.column_stack([self.basis, added])
+
+    def pga_residuals_kept(self) -> None:
+        published.pga(self.problem, self.basis, self.chi, self.case.pga, kept=True)
+
+    def reduction(self) -> None:
+        pass  # the paper assembles in full
+
+    def prepare(self) -> None:
+        self.factor = published.factorise(self.problem.V.matrix)
+
+    def query_online(self, mu: Array) -> published.Answer:
+        return published.query_online(self.problem, self.factor, self.basis, self.chi, mu, self.accuracy)
+
+    def query_offline(self, mu: Array) -> published.Answer:
+        return published.query_offline(self.problem, self.space, self.chi, mu, self.accuracy)
+
+    query_online_reduced, query_offline_reduced = query_online, query_offline
+
+
+class Ours(Side):
+    """vibench's own."""
+
+    def snapshots(self) -> None:
+        solver = Solver(self.problem)
+        found = [solver.solve(mu) for mu in self.problem.training_set()]
+        self.u, self.lam = np.column_stack([s.u for s in found]), np.column_stack([s.lam for s in found])
+
+    def pod(self) -> None:
+        self.basis = pod(self.u, self.problem.V, self.case.pod).basis
+
+    def cpg(self) -> None:
+        self.plain = CPG().reduce(self.lam, self.problem.W, self.case.cone).generators
+
+    def mcpg(self) -> None:
+        self.cone = ModifiedCPG().reduce(self.lam, self.problem.W, self.case.cone)
+        self.chi, self.span = self.cone.generators, multipliers(self.cone.generators, self.problem.W).span
+
+    def pga(self) -> None:
+        self.offline = Offline(self.problem, self.basis, self.cone, self.span, self.problem.training_set())
+        self.enrichment = OfflinePGA().build(self.offline, self.case.pga)
+        self.space = np.column_stack([self.basis, self.enrichment.vectors])
+
+    def pga_residuals_kept(self) -> None:
+        self.pga()
+
+    def reduction(self) -> None:
+        members = separate(self.problem, self.offline.training, INTERPOLATION)
+        model = self._model(self.enrichment)
+        self.fixed_reduced = OnlineModel(model, project_members(model, members))
+        self.members = members
+
+    def prepare(self) -> None:
+        self.fixed = self._model(self.enrichment)
+        self.per_parameter = self._model(OnlineSupremizers().build(self.offline, None))
+        operators = project_members(self.per_parameter, self.members)
+        self.per_parameter_reduced = OnlineModel(self.per_parameter, operators)
+
+    def query_online(self, mu: Array) -> published.Answer:
+        return self._answered(self.per_parameter, mu)
+
+    def query_offline(self, mu: Array) -> published.Answer:
+        return self._answered(self.fixed, mu)
+
+    def query_online_reduced(self, mu: Array) -> published.Answer:
+        return self._answered(self.per_parameter_reduced, mu)
+
+    def query_offline_reduced(self, mu: Array) -> published.Answer:
+        return self._answered(self.fixed_reduced, mu)
+
+    def bare_program(self, mu: Array) -> Callable[[], object]:
+        """Solving the program of a reduced offline query, and nothing else."""
+        reduced = self.fixed_reduced.assemble(mu)
+        return lambda: qp.solve(reduced.program, self.solver, self.accuracy, factor=reduced.factor)
+
+    def _model(self, enrichment: Enrichment) -> ReducedModel:
+        return ReducedModel(self.problem, self.basis, enrichment, self.chi, self.span)
+
+    def _answered(self, model: ReducedModel | OnlineModel, mu: Array) -> published.Answer:
+        reduced = model.assemble(mu)
+        found = qp.solve(reduced.program, self.solver, self.accuracy, factor=reduced.factor)
+        return reduced.program, found.x, found.alpha, reduced.make_basis
