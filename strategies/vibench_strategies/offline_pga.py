@@ -71,7 +71,12 @@ class _Target:
 
     def sigma(self, space: Array) -> float:
         """σ_S(mu): the largest sine of the principal angles between S_R(mu) and V_N + S (d×k, orthonormal)."""
-        return float(self._sines(space)[0][0]) if self._basis.size else 0.0
+        if not self._basis.size:
+            return 0.0
+        if space.shape[1] < self._basis.shape[1]:  # something in S_R(mu) is orthogonal to all of it
+            return 1.0
+        square = float(np.linalg.eigvalsh(self._left_by(space))[-1])
+        return float(np.sqrt(square)) if square >= SMALL else float(self._sines(space)[0][0])
 
     def worst_direction(self, space: Array) -> Array:
         """Unit vector (d,) of lines 5 to 7: the normalised residual of the worst v in S_R(mu).
@@ -88,12 +93,16 @@ class _Target:
         v = remove(space, v / np.linalg.norm(v))
         return np.asarray(v / np.linalg.norm(v))
 
-    def _sines(self, space: Array) -> tuple[Array, Array]:
-        """Sines (r,), falling, and the directions in S_R(mu) they belong to, as rows (r×r)."""
+    def _left_by(self, space: Array) -> Array:
+        """Gram matrix (r×r) of what V_N + S leaves of the basis; its eigenvalues are squares of sines."""
         rows = space[:, self._known :].T @ self._basis
         self._gram = self._gram - rows.T @ rows
         self._known = space.shape[1]
-        squares, vectors = np.linalg.eigh(self._gram)
+        return self._gram
+
+    def _sines(self, space: Array) -> tuple[Array, Array]:
+        """Sines (r,), falling, and the directions in S_R(mu) they belong to, as rows (r×r)."""
+        squares, vectors = np.linalg.eigh(self._left_by(space))
         if squares[-1] < SMALL:
             _, sines, right = svd(remove(space, self._basis))
             return sines, right

@@ -76,12 +76,15 @@ def measure_queries(sides: Pair, mus: Array, repeats: int) -> tuple[Seconds, Fig
         side.prepare()
     for name in QUERIES:
         error_u, error_lam, residual = Pair([], []), Pair([], []), Pair([], [])
-        for repeat in range(-1, repeats):  # the first is to warm up
+        for repeat in range(repeats):
             for k, mu in enumerate(mus):
                 for i, side in enumerate(sides):
-                    (program, x, alpha, Z), spent = timed(lambda: side.answer(name, mu))  # noqa: B023  called at once
-                    if repeat >= 0:
-                        seconds[name][i].append(spent.cpu)
+                    (program, x, alpha, Z), spent = median_seconds(
+                        lambda: side.answer(name, mu),  # noqa: B023  called at once
+                        enough=0.05,
+                    )
+                    seconds[name][i].append(spent.cpu)
+                    if repeat:
                         continue
                     error_u[i].append(_relative(problem.V.norm(u[:, k] - Z() @ x), problem.V.norm(u[:, k])))
                     error_lam[i].append(
