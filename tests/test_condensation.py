@@ -36,6 +36,10 @@ def test_equilibrium_with_the_kept_unknowns_given(seed: int, count: int) -> None
     u = condensed.expand(u_kept, free)
     assert np.allclose(u[kept], u_kept)
     assert np.allclose((dense @ u - f)[others], 0.0, atol=1e-10)
+    disturbed = u + rng.standard_normal(12) * np.isin(np.arange(12), others)
+    settled = disturbed + condensed.settle(f - dense @ disturbed)
+    assert np.array_equal(settled[kept], disturbed[kept])
+    assert np.allclose((dense @ settled - f)[others], 0.0, atol=1e-10)
 
 
 def test_a_load_that_changes_is_not_remembered() -> None:

@@ -87,6 +87,18 @@ class Condensed:
         u[self._pattern.kept] = u_kept
         return u
 
+    def settle(self, residual: Array) -> Array:
+        """Displacement (n,) of the unknowns not kept that takes a residual (n,) out of their equilibrium."""
+        order, found = self._pattern.order, np.zeros(self._size)
+        if self._factor is not None:
+            inside = residual[order]
+            inside[self._eliminated :] = 0.0
+            free = self._factor.solve(inside)
+            inside[: self._eliminated] = 0.0
+            inside[self._eliminated :] = -self._schur @ free[self._eliminated :]
+            found[order[: self._eliminated]] = (free + self._factor.solve(inside))[: self._eliminated]
+        return found
+
 
 def _with_block(matrix: SparseMatrix, where: Indices, block: Array) -> SparseMatrix:
     """A sparse matrix (CSC) with the rows and columns `where` of it replaced by a dense block."""

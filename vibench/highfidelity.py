@@ -125,13 +125,13 @@ class Stiffness:
         self._condensed = Condensed(A, self._pattern)
 
     @cached_property
-    def _compliance(self) -> Array:
-        """Ŝ⁻¹ (c×c)."""
+    def _dense(self) -> tuple[Array, Array]:
+        """Ŝ and its inverse (c×c)."""
+        matrix = self._condensed.matrix.toarray()
         try:
-            factor = scipy.linalg.cho_factor(self._condensed.matrix.toarray())
+            return matrix, scipy.linalg.cho_solve(scipy.linalg.cho_factor(matrix), np.eye(len(matrix)))
         except np.linalg.LinAlgError:
             raise NumericalError("A is not positive definite") from None
-        return np.asarray(scipy.linalg.cho_solve(factor, np.eye(len(self._pattern.kept))))
 
     def system(self, vi: VariationalInequality) -> ActiveSystem:
         """The equality-constrained systems of the active sets of `vi`, whose stiffness this is."""
@@ -139,11 +139,11 @@ class Stiffness:
         load, free = condensed.load(vi.f)
         B = sp.csr_array(sp.csc_array(vi.B)[:, self._pattern.kept])
         solve_active = (
-            _condensed_twice(self._compliance, load, B, vi.g)
+            _by_compliance(*self._dense, load, B, vi.g)
             if condensed.dense
             else partial(_saddle_point, condensed.matrix, load, B, vi.g)
         )
-        return ActiveSystem(B, vi.g, solve_active, lambda u: condensed.expand(u, free))
+        return ActiveSystem(B, vi.g, solve_active, lambda u: condensed.expand(u, free), condensed.settle)
 
 
 @dataclass(frozen=True)
@@ -158,12 +158,15 @@ class ActiveSystem:
         From the active constraints: u (c,) and λ (m,) with these as equalities and no other multiplier.
     expand
         All n unknowns from the c ones.
+    settle
+        Correction of the other unknowns (n,) that takes a residual (n,) out of their equilibrium.
     """
 
     B: SparseMatrix
     g: Array
     solve_active: Callable[[Indices], tuple[Array, Array]]
     expand: Callable[[Array], Array]
+    settle: Callable[[Array], Array]
 
 
 def solve(
@@ -201,6 +204,9 @@ def solve(
     kept, lam, iterations = found
     u = system.expand(kept)
     residuals = qp.residuals(vi, u, lam)
+    if residuals.dual > 0.5 * ACCURACY:  # what a large rigid displacement leaves
+        u = u + system.settle(vi.f - vi.A @ u - vi.B.T @ lam)
+        residuals = qp.residuals(vi, u, lam)
     if not residuals.worst <= ACCURACY:
         raise NumericalError(f"the high-fidelity solution has residual {residuals.worst:.1e}, above {ACCURACY:.0e}")
     return HighFidelitySolution(u, lam, fallback, iterations, residuals)
@@ -244,19 +250,24 @@ def _saddle_point(A: SparseMatrix, f: Array, B: SparseMatrix, g: Array, active: 
     return solution[:n], lam
 
 
-def _condensed_twice(inverse: Array, f: Array, B: SparseMatrix, g: Array) -> Callable[[Indices], tuple[Array, Array]]:
-    """Solutions for active sets from the compliance of the constraints B S⁻¹Bᵀ alone; S⁻¹ (c×c) is dense."""
-    free = inverse @ f
-    responses = np.ascontiguousarray((B @ inverse).T)
-    compliance = np.asarray(B @ responses)
-    excess = B @ free - g
+def _by_compliance(
+    S: Array, inverse: Array, f: Array, B: SparseMatrix, g: Array
+) -> Callable[[Indices], tuple[Array, Array]]:
+    """Solutions for active sets from what active constraints displace, S⁻¹B_aᵀ, refined once; S (c×c) is dense."""
 
     def solve_active(active: Indices) -> tuple[Array, Array]:
-        lam = np.zeros(len(g))
-        if len(active):
-            block = scipy.linalg.cho_factor(compliance[np.ix_(active, active)])
-            lam[active] = scipy.linalg.cho_solve(block, excess[active])
-            lam[active] += scipy.linalg.cho_solve(block, (excess - compliance @ lam)[active])
-        return free - responses @ lam, lam
+        rows, lam = B[active], np.zeros(len(g))
+        displaced = np.asarray(rows @ inverse)
+        factor = scipy.linalg.cho_factor(np.asarray(rows @ displaced.T)) if len(active) else None
+
+        def once(load: Array, bound: Array) -> tuple[Array, Array]:
+            free = inverse @ load
+            forces = bound if factor is None else scipy.linalg.cho_solve(factor, rows @ free - bound)
+            return free - forces @ displaced, forces
+
+        u, forces = once(f, g[active])
+        correction, more = once(f - S @ u - rows.T @ forces, g[active] - rows @ u)
+        lam[active] = forces + more
+        return u + correction, lam
 
     return solve_active
