@@ -70,6 +70,7 @@ class Cell:
     solver: str
     assembly: str
     interpolation: float | None
+    warm_start: bool
     seed: int
     validation: int
     accuracy: float
@@ -148,6 +149,7 @@ def expand(study: Study) -> list[Cell]:
                     solver=solver,
                     assembly=assembly,
                     interpolation=study.interpolation if assembly == "reduced" else None,
+                    warm_start=study.warm_start,
                     seed=study.seed,
                     validation=study.validation,
                     accuracy=study.accuracy,

@@ -15,6 +15,7 @@ from vibench.linalg import orthonormal_range
 from vibench.problem import MEMBERS, Contact, Problem, Sampler, VariationalInequality
 from vibench.reduced import ReducedModel, ReducedProblem
 from vibench.separation import Member, Way
+from vibench.strategy import Kind
 from vibench.supremizer import ContactCoordinates, Coordinates, SpannedCoordinates, supremizers
 
 Samples = Mapping[str, Array]
@@ -191,6 +192,11 @@ class OnlineModel:
     def fixed_basis(self) -> Array:
         """The part of the primal basis that does not depend on the parameter (n×(N+S))."""
         return self.model.fixed_basis
+
+    @property
+    def kind(self) -> Kind:
+        """How the enrichment depends on the parameter, in the coordinates that queries work in."""
+        return Kind.FIXED if self._operators.varying is None else Kind.PER_PARAMETER
 
     def assemble(self, mu: Array) -> ReducedProblem:
         """The reduced problem at mu (d,).

@@ -21,7 +21,7 @@ from scipy.optimize import nnls
 from vibench.arrays import Array, SparseMatrix
 from vibench.errors import NumericalError, unknown_name
 from vibench.problem import VariationalInequality
-from vibench.solver_settings import SETTINGS, settings_for
+from vibench.solver_settings import SETTINGS, settings_for, start_for
 
 ENERGY_FLOOR = 1e-4
 """The gap is relative to no less than this share of the energy that a steepest descent step would gain."""
@@ -99,6 +99,7 @@ def solve(
     accuracy: float,
     extra: Mapping[str, QPSolver] | None = None,
     factor: Array | None = None,
+    start: Answer | None = None,
 ) -> Answer:
     """Solve a quadratic program with a solver known by name.
 
@@ -117,6 +118,8 @@ def solve(
         Solvers registered through the entry point group `vibench.qp_solvers`.
     factor
         Cholesky factor (lower) of a dense A, where it is known: what is solved then is the dual.
+    start
+        Solution of a similar program with as many unknowns and constraints, for solvers that `takes_start`.
 
     Raises
     ------
@@ -126,7 +129,7 @@ def solve(
     if not len(program.f):
         return Answer(np.zeros(0), np.zeros(len(program.g)), "nothing to solve: no unknowns")
     if factor is not None:
-        return _through_the_dual(program, factor, solver, accuracy, extra)
+        return _through_the_dual(program, factor, solver, accuracy, extra, start)
     rows, cost = row_norms(program.B), _scale(program.f)
     scaled = VariationalInequality(program.A / cost, program.f / cost, _divide_rows(program.B, rows), program.g / rows)
     if extra and solver in extra:
@@ -134,7 +137,10 @@ def solve(
         if not isinstance(answer, Answer):
             raise NumericalError(f"the solver returned a {type(answer).__name__}, expected an Answer")
     else:
-        answer = _through_qpsolvers(scaled, solver, accuracy)
+        begin: Mapping[str, Any] = {}
+        if start is not None and takes_start(solver) and start.x is not None and start.alpha is not None:
+            begin = start_for(solver, start.x, rows * start.alpha / cost)
+        answer = _through_qpsolvers(scaled, solver, accuracy, begin)
     for name, value, size in (("x", answer.x, len(program.f)), ("α", answer.alpha, len(program.g))):
         if value is not None and value.shape != (size,):
             raise NumericalError(f"the solver returned {name} of shape {value.shape}, expected ({size},)")
@@ -148,7 +154,12 @@ def solve(
 
 
 def _through_the_dual(
-    program: VariationalInequality, factor: Array, solver: str, accuracy: float, extra: Mapping[str, QPSolver] | None
+    program: VariationalInequality,
+    factor: Array,
+    solver: str,
+    accuracy: float,
+    extra: Mapping[str, QPSolver] | None,
+    start: Answer | None,
 ) -> Answer:
     """Solution of a dense program with A = L Lᵀ through its dual, in as many unknowns as there are constraints.
 
@@ -161,7 +172,10 @@ def _through_the_dual(
     dual = VariationalInequality(
         A=constraints.T @ constraints, f=constraints.T @ load - program.g, B=-np.eye(count), g=np.zeros(count)
     )
-    answer = solve(dual, solver, accuracy, extra)
+    if start is not None and start.alpha is not None and start.x is not None:  # slack g − Bx of the constraints −α ≤ 0
+        slack = np.maximum(program.g - program.B @ start.x, 0.0)
+        start = replace(start, x=start.alpha, alpha=slack)
+    answer = solve(dual, solver, accuracy, extra, start=start)
     if answer.x is None:
         return answer
     alpha = np.maximum(answer.x, 0.0)
@@ -259,11 +273,18 @@ def check_solver_name(solver: str, extra: Iterable[str] = ()) -> None:
         raise unknown_name("QP solver", solver, known)
 
 
-def _through_qpsolvers(program: VariationalInequality, solver: str, accuracy: float) -> Answer:
+def takes_start(solver: str) -> bool:
+    """Whether a solver makes use of a solution to start from."""
+    return solver in SETTINGS and SETTINGS[solver].start is not None
+
+
+def _through_qpsolvers(
+    program: VariationalInequality, solver: str, accuracy: float, start: Mapping[str, Any]
+) -> Answer:
     problem = qpsolvers.Problem(_plain(program.A), -program.f, _plain(program.B), program.g)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # statuses come through the answer, and are verified by `judge`
-        solution = qpsolvers.solve_problem(problem, solver=solver, **settings_for(solver, accuracy))
+        solution = qpsolvers.solve_problem(problem, solver=solver, **settings_for(solver, accuracy), **start)
     status, iterations = SETTINGS[solver].report(solution)
     if solution.x is None or solution.z is None:
         return Answer(None, None, status, iterations)

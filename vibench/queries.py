@@ -14,6 +14,7 @@ from vibench.assess import Reference
 from vibench.constants import FullConstants, OwnConstants, PlainConstants
 from vibench.error_bounds import Stability
 from vibench.infsup import InfSup
+from vibench.problem import ParameterBox, VariationalInequality
 from vibench.provenance import machine
 from vibench.qp import Status
 from vibench.query import Asked, Row, Task
@@ -49,6 +50,7 @@ class QueriesStage(PiecewiseStage):
     solver: str
     accuracy: float
     query_seconds: float
+    warm_start: bool = False
 
     @property
     def pieces(self) -> int:
@@ -120,9 +122,22 @@ class Queries(Pieces):
             assembled.seconds[k],
             exact,
             self._stability[k],
+            self._before(k),
         )
         found, solution = self._task.run(asked, watch)
         return self._known(k) | found, solution and {"query": k} | solution
+
+    def _before(self, number: int) -> tuple[int, VariationalInequality] | None:
+        """The query before this one on a path through the parameters, where one starts from the solution of the other.
+
+        It is solved again for that: what a query starts from does not depend on who solved what before. Where the
+        primal basis changes with the parameter there is nothing to start from.
+        """
+        programs = self._assembled.programs
+        if not self._stage.warm_start or self._model.kind is Kind.PER_PARAMETER:
+            return None
+        before = path_before(self._reference.mu, self._model.problem.parameters)[number]
+        return None if before is None else (before, programs[before])
 
     def lost(self, number: int, failed: Failed) -> Answered:
         """The row of a query whose process hung or died."""
@@ -201,6 +216,18 @@ class Queries(Pieces):
         artefact = self._store.get(stage.key)
         assert artefact is not None  # an input of this stage
         return artefact
+
+
+def path_before(mus: Array, box: ParameterBox) -> list[int | None]:
+    """Of every parameter (P×d) the one before it on a path that goes on to the nearest not yet visited."""
+    scaled = (mus - box.lower) / np.maximum(box.upper - box.lower, np.finfo(float).tiny)
+    before: list[int | None] = [None] * len(mus)
+    left, here = set(range(1, len(mus))), 0
+    while left:
+        following = min(left, key=lambda k: (float(np.linalg.norm(scaled[k] - scaled[here])), k))
+        before[following], here = here, following
+        left.remove(following)
+    return before
 
 
 def _constants(prefix: str, constants: InfSup) -> Row:

@@ -40,6 +40,9 @@ class Asked:
         What assembling the program takes.
     exact, stability
         The high-fidelity solution and constants.
+    before
+        Program of the parameter whose solution the solver starts from, and the number of that query; `None` to start
+        from nothing.
     """
 
     model: Model
@@ -49,6 +52,7 @@ class Asked:
     seconds: Seconds
     exact: Reference
     stability: Stability
+    before: tuple[int, VariationalInequality] | None = None
 
 
 @dataclass(frozen=True)
@@ -67,12 +71,18 @@ class Task:
         program, assembly, registered = asked.program, asked.seconds, plugins.qp_solver(self.solver)
         answers: list[Answer] = []
 
+        row: Row = {"assemble_s": assembly.cpu, "form": "primal" if asked.factor is None else "dual"}
+        start: Answer | None = None
+
         def work() -> Answer:
-            answers.append(qp.solve(program, self.solver, self.accuracy, registered, asked.factor))
+            answers.append(qp.solve(program, self.solver, self.accuracy, registered, asked.factor, start))
             return answers[-1]
 
-        row: Row = {"assemble_s": assembly.cpu, "form": "primal" if asked.factor is None else "dual"}
         try:
+            if asked.before is not None and qp.takes_start(self.solver):
+                watch(True)
+                row["started_from"], similar = asked.before
+                start = qp.solve(similar, self.solver, self.accuracy, registered, asked.factor)
             answer, solving = median_seconds(work, before=partial(watch, True))
             watch(False)
         except MemoryError:

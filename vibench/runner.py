@@ -66,7 +66,7 @@ def identity(study: Study) -> dict[str, Any]:
 
 def queries_stage(cell: Cell, study: Study) -> QueriesStage:
     """The last stage of a cell; its inputs lead to all others."""
-    return QueriesStage(assembly_stage(cell), cell.solver, cell.accuracy, study.limits.query_seconds)
+    return QueriesStage(assembly_stage(cell), cell.solver, cell.accuracy, study.limits.query_seconds, cell.warm_start)
 
 
 @dataclass(frozen=True)

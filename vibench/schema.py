@@ -93,6 +93,7 @@ QUERIES: Mapping[str, str] = {
     **KEYS,
     "query": "INTEGER",
     "form": "TEXT",
+    "started_from": "INTEGER",
     "assembly_error": "REAL",
     "assemble_s": "REAL",
     "solve_s": "REAL",
@@ -122,7 +123,8 @@ QUERIES: Mapping[str, str] = {
     "repeatable": "INTEGER",
 }
 """Beside these a query has mu_1, mu_2, …, as many as its problem has parameters. Bounds are absolute; an effectivity is
-bound over absolute error. `form` is the one in which the program was solved, "primal" or "dual"."""
+bound over absolute error. `form` is the one in which the program was solved, "primal" or "dual"; `started_from` the
+query whose solution the solver started from, if any."""
 
 SOLUTIONS: Mapping[str, str] = {
     "cell": "TEXT NOT NULL REFERENCES cells(cell) ON DELETE CASCADE",

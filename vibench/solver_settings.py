@@ -12,6 +12,8 @@ from typing import Any
 
 import numpy as np
 
+from vibench.arrays import Array
+
 
 @dataclass(frozen=True)
 class SolverSettings:
@@ -21,6 +23,8 @@ class SolverSettings:
     ----------
     settings
         Keyword arguments for an accuracy.
+    start
+        Further keyword arguments for a solution x (n,), α (m,) of a similar program to start from, if it takes one.
     status, iterations
         Paths into `solution.extras` ("info.status") where the solver leaves its own words, "" where it leaves none.
     """
@@ -28,6 +32,7 @@ class SolverSettings:
     settings: Callable[[float], Mapping[str, Any]]
     status: str = ""
     iterations: str = ""
+    start: Callable[[Array, Array], Mapping[str, Any]] | None = None
 
     def report(self, solution: Any) -> tuple[str, int | None]:
         """Status in the solver's words and its number of iterations."""
@@ -44,6 +49,13 @@ def _follow(extras: Mapping[str, Any], path: str) -> Any:
         if value is None:
             return None
     return value if path else None
+
+
+def _proxqp_start(x: Array, alpha: Array) -> dict[str, Any]:
+    """Both parts of the solution; without `initial_guess` it would begin with a solution of its own."""
+    from proxsuite import proxqp  # noqa: PLC0415  the solver may be missing; others run without it
+
+    return {"initvals": x, "z": alpha, "initial_guess": proxqp.InitialGuess.WARM_START}
 
 
 SETTINGS: Mapping[str, SolverSettings] = {
@@ -70,11 +82,13 @@ SETTINGS: Mapping[str, SolverSettings] = {
         },
         status="info.status",
         iterations="info.iter",
+        start=_proxqp_start,
     ),
     "osqp": SolverSettings(  # a first-order method: its iteration limit decides between slow and inaccurate
         lambda accuracy: {"eps_abs": 0.1 * accuracy, "eps_rel": 0.3 * accuracy, "max_iter": 10_000},
         status="info.status",
         iterations="info.iter",
+        start=lambda x, _: {"initvals": x},
     ),
     "clarabel": SolverSettings(
         lambda accuracy: {"tol_gap_abs": 0.1 * accuracy, "tol_gap_rel": 0.1 * accuracy, "tol_feas": 0.1 * accuracy},
@@ -83,6 +97,7 @@ SETTINGS: Mapping[str, SolverSettings] = {
     "daqp": SolverSettings(
         lambda accuracy: {"primal_tol": 0.01 * accuracy, "dual_tol": 0.01 * accuracy, "zero_tol": 1e-14},
         iterations="iterations",
+        start=lambda x, _: {"initvals": x},
     ),
     "quadprog": SolverSettings(lambda _: {}, iterations="iterations"),
     "highs": SolverSettings(
@@ -105,3 +120,9 @@ SETTINGS: Mapping[str, SolverSettings] = {
 def settings_for(solver: str, accuracy: float) -> dict[str, Any]:
     """Keyword arguments that ask `solver` for a relative accuracy."""
     return dict(SETTINGS[solver].settings(accuracy))
+
+
+def start_for(solver: str, x: Array, alpha: Array) -> dict[str, Any]:
+    """Keyword arguments that let `solver` start from x (n,), α (m,); none if it cannot."""
+    start = SETTINGS[solver].start
+    return {} if start is None else dict(start(x, alpha))

@@ -147,6 +147,7 @@ class Study(_Model):
     primal: Annotated[list[Entry], MinLen(1)]
     assembly: Annotated[list[Literal["full", "reduced"]], MinLen(1)] = ["full"]
     interpolation: Tolerance = 1e-6
+    warm_start: bool = False
     problem: Annotated[list[Entry], MinLen(1)]
     tolerances: Annotated[list[ToleranceTable], MinLen(1)]
     limits: Limits = Limits()
