@@ -1,0 +1,200 @@
+"""How seconds and memory of every stage grow: over the mesh at fixed N and R, and over R at the paper's mesh.
+
+python results/scaling.py results/scaling
+
+Every problem and mesh is measured in a process of its own, on one thread. Memory is the peak resident set while a stage
+runs, everything before it included; queries are medians.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+if __name__ == "__main__":  # before NumPy is imported
+    from vibench.timing import ONE_THREAD
+
+    os.environ.update(ONE_THREAD)
+
+import matplotlib as mpl
+import numpy as np
+import pandas as pd
+from matplotlib.figure import Figure
+
+from vibench import plugins, provenance, qp, tables
+from vibench.figures import STYLE
+from vibench.highfidelity import Solver
+from vibench.infsup import multipliers
+from vibench.online import OnlineModel, project_members
+from vibench.pod import pod
+from vibench.reduced import ReducedModel
+from vibench.separation import separate
+from vibench.strategy import Offline, Stop
+from vibench.timing import median_seconds, timed
+
+ACCURACY = 1e-10
+QUERIES = 8
+SEED = 2022
+OFFLINE = ("mesh and forms", "snapshots", "POD", "mCPG", "PGA", "separation", "reduction")
+ONLINE = ("query, full", "query, reduced", "bare program")
+
+
+@dataclass(frozen=True)
+class Case:
+    """What is measured of one problem: numbers of nodes, and N, R and δ_PGA that stay the same."""
+
+    nodes: tuple[int | str, ...]
+    N: int
+    R: int
+    delta: float
+
+
+CASES = {
+    "obstacle": Case((400, 1200, "paper", "fine", 30_000, 60_000), 14, 43, 1e-3),
+    "hertz": Case((300, 1000, 3000, "paper", "fine", 30_000), 46, 12, 0.3),
+}
+SIZES = (10, 20, 40, 60, 80)
+"""R at the paper's mesh."""
+
+
+def measure(name: str, nodes: int | str, R: int, delta: float, N: int) -> Iterator[dict[str, Any]]:
+    """Rows of one problem and mesh: stage, seconds, peak memory."""
+    about: dict[str, Any] = {"problem": name, "R": R, "N": N}
+
+    def row(stage: str, work: Callable[[], Any], repeated: bool = False) -> tuple[Any, dict[str, Any]]:
+        Path("/proc/self/clear_refs").write_text("5", encoding="ascii")  # the peak begins anew
+        result, seconds = (median_seconds if repeated else timed)(work)
+        return result, about | {"stage": stage, "seconds": seconds.cpu, "memory_mib": _peak_memory()}
+
+    problem, found = row("mesh and forms", lambda: plugins.create("problem", name, {"resolution": nodes}))
+    about |= {"n": problem.V.dim, "m": problem.W.dim}
+    yield found | about
+    training, solver = problem.training_set(), Solver(problem)
+    solutions, found = row("snapshots", lambda: [solver.solve(mu) for mu in training])
+    yield found
+    u, lam = np.column_stack([s.u for s in solutions]), np.column_stack([s.lam for s in solutions])
+    basis, found = row("POD", lambda: pod(u, problem.V, Stop(size=N)).basis)
+    yield found
+    dual = plugins.create("dual strategy", "mcpg", {})
+    cone, found = row("mCPG", lambda: dual.reduce(lam, problem.W, Stop(size=R)))
+    yield found
+    span = multipliers(cone.generators, problem.W).span
+    offline = Offline(problem, basis, cone, span, training)
+    primal = plugins.create("primal strategy", "offline-pga", {})
+    enrichment, found = row("PGA", lambda: primal.build(offline, delta))
+    yield found | {"added": enrichment.vectors.shape[1]}
+    members, found = row("separation", lambda: separate(problem, training, 1e-6))
+    yield found
+    model = ReducedModel(problem, basis, enrichment, cone.generators, span)
+    operators, found = row("reduction", lambda: project_members(model, members))
+    yield found
+    online = OnlineModel(model, operators)
+    for mu in problem.validation_set(QUERIES, SEED):
+        reduced = online.assemble(mu)
+        for stage, asked in (("query, full", model), ("query, reduced", online)):
+            yield row(stage, lambda: _query(asked, mu), repeated=True)[1]  # noqa: B023  called at once
+        yield row("bare program", lambda: _solve(reduced), repeated=True)[1]  # noqa: B023
+
+
+def _query(model: Any, mu: Any) -> Any:
+    return _solve(model.assemble(mu))
+
+
+def _solve(reduced: Any) -> Any:
+    return qp.solve(reduced.program, "piqp", ACCURACY, factor=reduced.factor)
+
+
+def _peak_memory() -> float:
+    lines = Path("/proc/self/status").read_text(encoding="ascii").splitlines()
+    return next(float(line.split()[1]) for line in lines if line.startswith("VmHWM")) / 1024.0
+
+
+def all_rows() -> Iterator[dict[str, Any]]:
+    """Every measurement, each mesh in a process of its own."""
+    for name, case in CASES.items():
+        for nodes in case.nodes:
+            yield from _in_a_process("mesh", name, nodes, case.R, case.delta, case.N)
+        for R in SIZES:
+            yield from _in_a_process("R", name, "paper", R, case.delta, case.N)
+
+
+def _in_a_process(over: str, *arguments: Any) -> Iterator[dict[str, Any]]:
+    command = [sys.executable, __file__, "--one", json.dumps(arguments)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    if done.returncode:
+        sys.exit(f"{arguments}: {done.stderr}")
+    print(*arguments, file=sys.stderr, flush=True)
+    yield from ({"over": over} | json.loads(line) for line in done.stdout.splitlines())
+
+
+def table(rows: pd.DataFrame, what: str) -> pd.DataFrame:
+    """One line per problem and stage, one column per size; the exponent of a fit in the logarithms."""
+    lines = []
+    for (name, stage), group in rows.groupby(["problem", "stage"], sort=False):
+        size = "n" if group["over"].iloc[0] == "mesh" else "R"
+        points = group.groupby(size)[what].median()
+        slope = np.polyfit(np.log(points.index), np.log(points), 1)[0] if len(points) > 1 else np.nan
+        values = {f"{size} = {k}": value for k, value in points.items()}
+        lines.append({"problem": name, "stage": stage, **values, "exponent": slope})
+    return pd.DataFrame(lines)
+
+
+def draw(rows: pd.DataFrame, folder: Path) -> None:
+    """Seconds and memory over n and over R, logarithmic."""
+    with mpl.rc_context(STYLE):
+        for over, size in (("mesh", "n"), ("R", "R")):
+            figure = Figure(figsize=(10.0, 7.6), layout="constrained")
+            axes = figure.subplots(2, 2, sharex="col", squeeze=False)
+            for column, (name, group) in enumerate(rows[rows["over"] == over].groupby("problem", sort=False)):
+                for k, stage in enumerate((*OFFLINE, *ONLINE)):
+                    points = group[group["stage"] == stage].groupby(size)[["seconds", "memory_mib"]].median()
+                    style = {"marker": "os^Dv<>phX"[k], "linestyle": ("-", "--", ":", "-.")[k % 4], "markersize": 4}
+                    axes[0, column].loglog(points.index, points["seconds"], label=stage, **style)
+                    if stage in OFFLINE:
+                        axes[1, column].loglog(points.index, points["memory_mib"], label=stage, **style)
+                axes[0, column].set_title(name)
+                axes[1, column].set_xlabel("n, unknowns" if size == "n" else "R, generators")
+            axes[0, 0].set_ylabel("seconds")
+            axes[1, 0].set_ylabel("peak memory [MiB]")
+            figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside right center")
+            figure.savefig(folder / f"over-{size}.png")
+
+
+def main() -> None:
+    if sys.argv[1] == "--one":
+        for row in measure(*json.loads(sys.argv[2])):
+            print(json.dumps(row), flush=True)
+        return
+    folder = Path(sys.argv[1])
+    folder.mkdir(parents=True, exist_ok=True)
+    rows = pd.DataFrame(all_rows())
+    rows["n"] = rows["n"].fillna(rows.groupby(["over", "problem", "R"])["n"].ffill())
+    rows.to_csv(folder / "rows.csv", index=False, float_format="%.6g")
+    draw(rows, folder)
+    versions = ", ".join(f"{name} {text}" for name, text in provenance.versions("piqp").items())
+    parts = [
+        "# Growth of seconds and memory",
+        f"Made by `python results/scaling.py results/scaling`, on one machine: {provenance.machine()}; {versions}. "
+        "CPU seconds on one thread; an exponent is the slope of a least squares line through all points of a row, both "
+        "axes logarithmic. "
+        + "; ".join(f"{name}: N = {case.N}, R = {case.R}, δ_PGA = {case.delta:g}" for name, case in CASES.items())
+        + "; mCPG; queries by PIQP at accuracy 1e-10.",
+    ]
+    for over, size in (("mesh", "n"), ("R", "R")):
+        chosen = rows[rows["over"] == over]
+        parts += [f"## Over {size}", f"![over {size}](over-{size}.png)"]
+        for name, group in chosen.groupby("problem", sort=False):
+            offline = group[group["stage"].isin(OFFLINE)]
+            parts += [f"### {name}: seconds", tables.to_markdown(table(group, "seconds"))]
+            parts += [f"### {name}: peak memory [MiB]", tables.to_markdown(table(offline, "memory_mib"))]
+    (folder / "README.md").write_text("\n\n".join(part.strip() for part in parts) + "\n", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
