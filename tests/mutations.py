@@ -43,8 +43,8 @@ FAULTS = (
     Fault(
         "wrong-sign-of-b",
         "problems/vibench_problems/obstacle.py",
-        "B=-",
-        "B=+",
+        "Contact(-area * self.W.matrix,",
+        "Contact(area * self.W.matrix,",
         ("tests/problems/test_obstacle.py",),
     ),
     Fault(
@@ -78,8 +78,8 @@ FAULTS = (
     Fault(
         "lifting-forgotten",
         "problems/vibench_problems/hertz.py",
-        "g=integrals.gap - B @ self._lift,",
-        "g=integrals.gap,",
+        "integrals.gap - integrals.jump @ self._contact_lift)",
+        "integrals.gap)",
         ("tests/problems/test_hertz.py",),
     ),
     Fault(
@@ -242,6 +242,76 @@ FAULTS = (
         'self._db.execute("DELETE FROM cells WHERE cell = ?", (cell["cell"],))',
         "pass",
         ("tests/test_journal.py",),
+    ),
+    Fault(
+        "interpolation-point-off-by-one",
+        "vibench/interpolation.py",
+        "return Interpolation(points, cardinal,",
+        "return Interpolation(points - 1, cardinal,",
+        ("tests/test_interpolation.py",),
+    ),
+    Fault(
+        "half-of-a-symmetric-term",
+        "vibench/separation.py",
+        "return matrix + sp.triu(matrix, 1).T if self._symmetric else matrix",
+        "return matrix",
+        ("tests/test_separation.py",),
+    ),
+    Fault(
+        "patterns-told-apart-by-their-size",
+        "vibench/separation.py",
+        "all(np.array_equal(keys[0], key) for key in keys)",
+        "all(len(keys[0]) == len(key) for key in keys)",
+        ("tests/test_separation.py",),
+    ),
+    Fault(
+        "contact-load-dropped",
+        "vibench/online.py",
+        "added = orthonormal_range(represented[:, :k], space.plain)",
+        "added = orthonormal_range(represented[:, 1:k], space.plain)",
+        ("tests/test_online.py",),
+    ),
+    Fault(
+        "factor-not-transposed",
+        "vibench/qp.py",
+        'lower=True, trans="T", check_finite=False)',
+        "lower=True, check_finite=False)",
+        ("tests/test_qp.py",),
+    ),
+    Fault(
+        "condensed-load-without-the-interface",
+        "vibench/condensation.py",
+        "condensed[interface] += self._schur @ free[self._eliminated :]",
+        "pass",
+        ("tests/test_condensation.py",),
+    ),
+    Fault(
+        "bound-of-a-distance-too-small",
+        "vibench/cone.py",
+        "self.maximum.bound(np.linalg.norm(self._snapshots - generators @ self._points, axis=0) / self._largest)",
+        "self.maximum.bound(0.9 * np.linalg.norm(self._snapshots - generators @ self._points, axis=0) / self._largest)",
+        ("tests/test_cone.py",),
+    ),
+    Fault(
+        "sampler-with-the-wrong-weight",
+        "problems/vibench_problems/obstacle.py",
+        "return np.asarray((1.0 + weights[1]) ** 2 * values)",
+        "return np.asarray((1.0 + weights[1]) * values)",
+        ("tests/problems/test_p1_entries.py",),
+    ),
+    Fault(
+        "separation-not-paid-for",
+        "vibench/queries.py",
+        '"assembly": () if reduction is None else (reduction.separation, reduction),',
+        '"assembly": () if reduction is None else (reduction,),',
+        ("tests/test_assembly.py",),
+    ),
+    Fault(
+        "modes-instead-of-the-enriched-space",
+        "vibench/constants.py",
+        "constants_on(model.fixed_basis, _constraints",
+        "constants_on(model.fixed_basis[:, :1], _constraints",
+        ("tests/test_constants.py",),
     ),
 )
 

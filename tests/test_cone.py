@@ -8,9 +8,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from numerics import space
+from vibench import cone as cone_module
 from vibench.cone import greedy_cone, orthogonality, project
 from vibench.errors import NumericalError
-from vibench.strategy import Stop
+from vibench.highfidelity import Solver
+from vibench.space import InnerProduct
+from vibench.strategy import DualStrategy, Stop
+from vibench_problems.obstacle import Obstacle
+from vibench_strategies.cpg import CPG
+from vibench_strategies.mcpg import ModifiedCPG, removable_part
 
 seeds = st.integers(0, 10_000)
 
@@ -101,6 +107,39 @@ def test_greedy_picks_what_a_plain_greedy_picks(seed: int) -> None:
         left.remove(pick)
         chosen = np.column_stack([chosen, theta[:, pick] / X.norm(theta[:, pick])])
         assert np.allclose(chosen[:, r], cone.generators[:, r], atol=1e-12)
+
+
+@pytest.fixture(scope="module")
+def solved() -> tuple[np.ndarray, InnerProduct]:
+    """Multipliers of the membrane at all training parameters, and their space."""
+    problem = Obstacle(1200)
+    solver = Solver(problem)
+    return np.column_stack([solver.solve(mu).lam for mu in problem.training_set()]), problem.W
+
+
+@pytest.mark.parametrize("strategy", [CPG(), ModifiedCPG()], ids=["cpg", "mcpg"])
+def test_few_projections_find_the_generators_that_a_plain_greedy_finds(
+    monkeypatch: pytest.MonkeyPatch, solved: tuple[np.ndarray, InnerProduct], strategy: DualStrategy
+) -> None:
+    """What a plain greedy projects is every snapshot not yet taken, at every step."""
+    theta, W = solved
+    subtract = nothing if isinstance(strategy, CPG) else lambda chosen, chi: removable_part(chosen, chi, W)
+    largest, left = float(W.norm(theta).max()), list(range(theta.shape[1]))
+    plain, projected, distances = np.zeros((W.dim, 0)), 0, W.norm(theta)
+    for _ in range(20):
+        pick = left[int(np.argmax(distances >= distances.max() - 1e-9 * largest))]
+        left.remove(pick)
+        direction = theta[:, pick] - subtract(theta[:, pick], plain)[0]
+        plain = np.column_stack([plain, direction / W.norm(direction)])
+        distances = np.array([project(plain, theta[:, q], W).distance for q in left])
+        projected += len(left)
+    calls = []
+    whole = cone_module._project_whitened
+    monkeypatch.setattr(cone_module, "_project_whitened", lambda *data: (calls.append(1), whole(*data))[1])
+    cone = strategy.reduce(theta, W, Stop(size=20))
+    assert np.allclose(cone.generators, plain, atol=1e-8 * plain.max())
+    assert np.isclose(cone.errors[-1], distances.max() / largest, rtol=1e-6)
+    assert 20 <= len(calls) <= 0.15 * projected
 
 
 def test_stops_at_the_tolerance_or_the_size() -> None:

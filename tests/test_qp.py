@@ -15,10 +15,10 @@ from vibench.qp import Answer, Status
 seeds = st.integers(0, 10_000)
 
 
-def program(seed: int, n: int = 6, m: int = 4) -> VariationalInequality:
+def program(seed: int, n: int = 6, m: int = 4, sizes: tuple[int, int] = (-4, 4)) -> VariationalInequality:
     """A feasible program with rows and cost of very different sizes."""
     rng = np.random.default_rng(seed)
-    B = rng.standard_normal((m, n)) * 10.0 ** rng.integers(-4, 4, (m, 1))
+    B = rng.standard_normal((m, n)) * 10.0 ** rng.integers(*sizes, (m, 1))
     g = B @ rng.standard_normal(n) * 0.1 + np.abs(B).sum(axis=1) * 0.05
     return VariationalInequality(spd(n, rng), 1e-3 * rng.standard_normal(n) * 50.0, B, g)
 
@@ -92,6 +92,58 @@ def test_sparse_programs_go_through_the_same_door() -> None:
     answer = qp.solve(sparse, "piqp", 1e-9)
     assert np.allclose(answer.x, exact(vi)[0], atol=1e-7)
     assert qp.residuals(sparse, answer.x, answer.alpha).worst <= 1e-9
+
+
+@given(seeds, st.integers(1, 7), st.integers(0, 5))
+def test_with_a_factor_of_a_the_dual_is_solved_and_gives_the_same_solution(seed: int, n: int, m: int) -> None:
+    vi = program(seed, n, m, sizes=(0, 1))
+    asked = []
+
+    def watched(scaled: VariationalInequality, accuracy: float) -> Answer:
+        asked.append(len(scaled.f))
+        return qp.solve(scaled, "piqp", accuracy)
+
+    factor = np.linalg.cholesky(vi.A)
+    primal, dual = (qp.solve(vi, "watched", 1e-10, {"watched": watched}, L) for L in (None, factor))
+    assert asked == [n] + ([m] if m else [])  # the dual has as many unknowns as there are constraints
+    assert np.allclose(dual.x, primal.x, atol=1e-6 * max(1e-3, np.abs(primal.x).max()))
+    assert np.all(dual.alpha >= 0.0)
+    assert np.allclose(vi.B.T @ dual.alpha, vi.B.T @ primal.alpha, atol=1e-5 * max(1e-3, np.abs(vi.f).max()))
+    if m <= n:  # only then are they unique
+        assert np.allclose(dual.alpha, primal.alpha, atol=1e-4 * max(1e-3, np.abs(primal.alpha).max(initial=0.0)))
+    assert qp.residuals(vi, dual.x, dual.alpha).dual <= 1e-12  # x is made from α, whatever the solver did
+
+
+@pytest.mark.parametrize("solver", ["piqp", "proxqp", "osqp"])
+def test_the_dual_of_a_program_with_rows_of_very_different_sizes_is_solved_to_the_accuracy_asked_for(
+    solver: str,
+) -> None:
+    for seed in range(30):
+        vi = program(seed)
+        primal, dual = (qp.solve(vi, solver, 1e-9, factor=L) for L in (None, np.linalg.cholesky(vi.A)))
+        assert qp.judge(vi, primal, 1e-8)[0] is Status.OK
+        assert qp.judge(vi, dual, 1e-8)[:2] == (Status.OK, ""), seed
+        assert np.allclose(dual.x, exact(vi)[0], atol=1e-6 * max(1.0, np.abs(primal.x).max()))
+
+
+def test_negative_multipliers_of_a_dual_are_set_to_zero_and_reported() -> None:
+    vi = VariationalInequality(np.diag([2.0, 3.0]), np.array([2.0, 3.0]), np.eye(2), np.array([0.5, 2.0]))
+
+    def wrong(scaled: VariationalInequality, accuracy: float) -> Answer:
+        return Answer(np.array([1.0, -0.1]), np.zeros(2), "solved", 4)
+
+    answer = qp.solve(vi, "wrong", 1e-7, {"wrong": wrong}, np.diag(np.sqrt([2.0, 3.0])))
+    assert answer.alpha.tolist() == [1.0, 0.0]
+    assert np.allclose(answer.x, [0.5, 1.0])
+    assert np.isclose(answer.negative, 0.1)
+    assert (answer.solver_status, answer.iterations) == ("solved", 4)
+
+
+def test_a_solver_that_gives_up_on_the_dual_gives_no_solution() -> None:
+    vi = program(3)
+    answer = qp.solve(vi, "no", 1e-7, {"no": lambda *_: Answer(None, None, "gave up")}, np.linalg.cholesky(vi.A))
+    assert (answer.x, answer.alpha, answer.solver_status) == (None, None, "gave up")
+    assert qp.judge(vi, answer, 1e-7)[0] is Status.FAILED
 
 
 def test_a_program_without_constraints() -> None:

@@ -31,7 +31,7 @@ class Interpolation:
 
 
 def interpolate(snapshots: Array, tolerance: float) -> Interpolation:
-    """Discrete empirical interpolation of vectors (k×P), not all zero, with as few terms as the tolerance allows.
+    """Discrete empirical interpolation of vectors (k×P), not all zero, with few terms.
 
     The modes are those of a singular value decomposition, the points those of a pivoted QR factorisation of the modes
     (Q-DEIM, Drmač and Gugercin 2016; of matrices, matrix DEIM, Negri, Manzoni and Amsallem 2015).
@@ -41,19 +41,32 @@ def interpolate(snapshots: Array, tolerance: float) -> Interpolation:
     snapshots
         One vector per column.
     tolerance
-        Largest error of any column, relative to the longest.
+        Largest error of any column, relative to the longest. Fewer terms are looked for by bisection, as if errors only
+        fell with them; they do on the whole.
     """
     scale = float(np.linalg.norm(snapshots, axis=0).max())
     q, r = np.linalg.qr(snapshots)
-    left, sigma, _ = svd(r)
-    tails = np.append(np.sqrt(np.cumsum((sigma**2)[::-1])[::-1]), 0.0) / scale
+    left, sigma, right = svd(r)
+    squares = np.cumsum(((sigma[:, None] * right) ** 2)[::-1], axis=0)[::-1]  # what k modes leave of every column
+    best = np.append(np.sqrt(squares.max(axis=1)), 0.0) / scale
     rank = max(1, int(np.count_nonzero(sigma > np.finfo(float).eps * sigma[0])))
-    count = min(rank, max(1, int(np.argmax(tails <= tolerance))))
-    while True:
-        found = _with_terms(snapshots, q @ left[:, :count], scale)
-        if found.error <= tolerance or count == rank:
-            return found
-        count += 1
+    low = min(rank, max(1, int(np.argmax(best <= tolerance))))  # no interpolation does with fewer
+
+    def with_terms(count: int) -> Interpolation:
+        return _with_terms(snapshots, q @ left[:, :count], scale)
+
+    found, step, high = with_terms(low), 1, low
+    while found.error > tolerance and high < rank:
+        low, high, step = high + 1, min(high + step, rank), 2 * step
+        found = with_terms(high)
+    while found.error <= tolerance and low < high:
+        middle = (low + high) // 2
+        tried = with_terms(middle)
+        if tried.error <= tolerance:
+            found, high = tried, middle
+        else:
+            low = middle + 1
+    return found
 
 
 def _with_terms(snapshots: Array, modes: Array, scale: float) -> Interpolation:

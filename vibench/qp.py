@@ -165,22 +165,27 @@ def _through_the_dual(
 
     The multipliers minimise ½ αᵀ(B A⁻¹Bᵀ)α − (B A⁻¹f − g)ᵀα over α ≥ 0; then x = A⁻¹(f − Bᵀα).
     """
-    right = np.column_stack([program.B.T, program.f])
+    rows = row_norms(program.B)  # the dual would have their squares
+    right = np.column_stack([(program.B / rows[:, None]).T, program.f])
     half = scipy.linalg.solve_triangular(factor, right, lower=True, check_finite=False)
     constraints, load = half[:, :-1], half[:, -1]
     count = len(program.g)
     dual = VariationalInequality(
-        A=constraints.T @ constraints, f=constraints.T @ load - program.g, B=-np.eye(count), g=np.zeros(count)
+        A=constraints.T @ constraints,
+        f=constraints.T @ load - program.g / rows,
+        B=-np.eye(count),
+        g=np.zeros(count),
     )
     if start is not None and start.alpha is not None and start.x is not None:  # slack g − Bx of the constraints −α ≤ 0
-        slack = np.maximum(program.g - program.B @ start.x, 0.0)
-        start = replace(start, x=start.alpha, alpha=slack)
+        slack = np.maximum(program.g - program.B @ start.x, 0.0) / rows
+        start = replace(start, x=rows * start.alpha, alpha=slack)
     answer = solve(dual, solver, accuracy, extra, start=start)
     if answer.x is None:
         return answer
-    alpha = np.maximum(answer.x, 0.0)
-    x = scipy.linalg.solve_triangular(factor, load - constraints @ alpha, lower=True, trans="T", check_finite=False)
-    return replace(answer, x=x, alpha=alpha, negative=-min(float(np.min(answer.x, initial=0.0)), 0.0))
+    forces = np.maximum(answer.x, 0.0)
+    x = scipy.linalg.solve_triangular(factor, load - constraints @ forces, lower=True, trans="T", check_finite=False)
+    negative = -min(float(np.min(answer.x / rows, initial=0.0)), 0.0)
+    return replace(answer, x=x, alpha=forces / rows, negative=negative)
 
 
 @dataclass(frozen=True)

@@ -110,7 +110,7 @@ def _member(name: str, values: list[Any], problem: Problem, tolerance: float) ->
     if entries.constant:
         return constant(values[0])
     why = f"{name} depends on mu and the problem does not evaluate it entry by entry"
-    if name in problem.entrywise:
+    if name in problem.entrywise and len(values) > 1:
         found = interpolate(entries.values, tolerance)
         if len(found.points) <= max(1.0, COMPRESSED * len(values)):
             terms = tuple(entries.rebuilt(mode) for mode in found.modes.T)
@@ -134,10 +134,11 @@ class _Entries:
         else:
             self.values = self._of_matrices(values)
         spread = float(np.ptp(self.values, axis=1).max(initial=0.0))
-        self.constant = spread <= CONSTANT_RTOL * float(np.abs(self.values).max(initial=0.0))
+        enough = self.values.shape[1] > 1  # to tell what varies
+        self.constant = enough and spread <= CONSTANT_RTOL * float(np.abs(self.values).max(initial=0.0))
 
     def _of_matrices(self, matrices: list[SparseMatrix]) -> Array:
-        entries = [sp.coo_array(sp.triu(matrix) if self._symmetric else matrix) for matrix in matrices]
+        entries = [_canonical(sp.triu(matrix) if self._symmetric else matrix) for matrix in matrices]
         width = self._shape[1]
         keys = [entry.coords[0].astype(np.int64) * width + entry.coords[1] for entry in entries]
         pattern = keys[0] if all(np.array_equal(keys[0], key) for key in keys) else np.unique(np.concatenate(keys))
@@ -159,3 +160,10 @@ class _Entries:
             return values
         matrix = sp.csr_array((values, (self._rows, self._columns)), shape=self._shape)
         return matrix + sp.triu(matrix, 1).T if self._symmetric else matrix
+
+
+def _canonical(matrix: SparseMatrix) -> SparseMatrix:
+    """A copy in coordinates, row by row, in which every entry stands once."""
+    rows = sp.csr_array(matrix, copy=True)
+    rows.sum_duplicates()
+    return sp.coo_array(rows)
