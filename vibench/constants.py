@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
+
 from vibench.arrays import SparseMatrix
 from vibench.assess import constants_full, constants_on
 from vibench.infsup import inf_sup_on
@@ -12,6 +14,7 @@ from vibench.stage import Result, Stage, assemblies, build_problem, value_of
 from vibench.stages import ConeStage, EnrichmentStage, PODStage, reduced_model
 from vibench.store import Store
 from vibench.strategy import Kind
+from vibench.supremizer import constraint_classes
 
 
 @dataclass(frozen=True)
@@ -67,11 +70,18 @@ class OwnConstants(Stage):
     def run(self, store: Store) -> Result:
         """Compute the constants."""
         model, _, cone = reduced_model(store, self.enrichment)
-        if model.kind is not Kind.PER_PARAMETER:
-            return Result(constants_on(model.fixed_basis, _constraints(model.problem, self.count, self.seed), cone))
         mus = validation_parameters(model.problem, self.count, self.seed)
-        assembled = (assemblies(model.problem).at(mu) for mu in mus)
-        return Result([inf_sup_on(model.primal_basis(vi), vi.B, cone) for vi in assembled])
+        matrices = [assemblies(model.problem).at(mu).B for mu in mus]
+        if model.kind is not Kind.PER_PARAMETER:
+            return Result(constants_on(model.fixed_basis, matrices, cone))
+        kept = assemblies(model.problem)
+        if model.enrichment.eta is None:
+            return Result([inf_sup_on(model.primal_basis(kept.at(mu)), kept.at(mu).B, cone) for mu in mus])
+        classes = constraint_classes(matrices)  # supremizers of proportional matrices span the same space
+        firsts = [mus[int(np.argmax(classes.members == k))] for k in range(len(classes.representatives))]
+        bases = (model.primal_basis(kept.at(mu)) for mu in firsts)
+        found = [inf_sup_on(Z, B, cone) for Z, B in zip(bases, classes.representatives, strict=True)]
+        return Result([found[k].scaled(c) for k, c in zip(classes.members, classes.factors, strict=True)])
 
 
 def _constraints(problem: Problem, count: int, seed: int) -> list[SparseMatrix]:

@@ -28,6 +28,10 @@ def singular_values(a: Array) -> Array:
     return np.asarray(scipy.linalg.svd(a, compute_uv=False, lapack_driver="gesvd"))
 
 
+OVERLAP = 1e-13
+"""Inner products of unit vectors below this are round-off."""
+
+
 def orthonormal_range(y: Array, against: Array | None = None) -> Array:
     """Euclidean orthonormal basis of what the columns of y (n×k) add to orthonormal columns `against` (n×l).
 
@@ -47,7 +51,7 @@ def orthonormal_range(y: Array, against: Array | None = None) -> Array:
         return np.zeros((y.shape[0], 0))
     q, r, _ = scipy.linalg.qr(y, mode="economic", pivoting=True)
     q = q[:, np.abs(np.diag(r)) > RANK_RTOL]
-    if against is not None and q.size:
+    if against is not None and np.max(np.abs(against.T @ q), initial=0.0) > OVERLAP:  # small columns magnify round-off
         q, _ = np.linalg.qr(remove(against, q))
     return np.asarray(q)
 
