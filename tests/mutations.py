@@ -309,8 +309,8 @@ FAULTS = (
     Fault(
         "modes-instead-of-the-enriched-space",
         "vibench/constants.py",
-        "constants_on(model.fixed_basis, _constraints",
-        "constants_on(model.fixed_basis[:, :1], _constraints",
+        "constants_on(model.fixed_basis, matrices",
+        "constants_on(model.fixed_basis[:, :1], matrices",
         ("tests/test_constants.py",),
     ),
 )

@@ -96,7 +96,7 @@ class Operators:
         Φ itself (n×d), for reconstruction, where it is neither `varying` nor the model's fixed basis.
     factor
         Cholesky factor (lower, d×d) of a stiffness that does not depend on the parameter, on a fixed space of no fewer
-        dimensions than there are generators.
+        dimensions than there are generators, which are independent.
     """
 
     wanted: Mapping[str, tuple[Indices, Indices]]
@@ -131,7 +131,8 @@ def project_members(model: ReducedModel, members: Mapping[str, Member]) -> Opera
         Z = model.fixed_basis
     A = Projected.symmetric([Z.T @ np.asarray(term @ Z) for term in members["A"].terms], members["A"])
     contact = members["B"].way is Way.CONTACT
-    through_dual = A.constant and varying is None and A.shape[0] >= max(1, model.generators.shape[1])
+    count, rank = model.generators.shape[1], model.span.shape[1]
+    through_dual = A.constant and varying is None and A.shape[0] >= count == rank > 0  # or the dual is singular
     return Operators(
         wanted={name: (m.rows, m.columns) for name, m in members.items() if m.way is Way.INTERPOLATED},
         A=A,

@@ -1,0 +1,176 @@
+"""What the stages of a problem need from those before, made once by vibench's own functions; never timed here."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Hashable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, TypeVar
+
+import numpy as np
+import pytest
+
+from benchmarks.cases import USUAL, Case, Primal, Spaces
+from vibench import plugins
+from vibench.arrays import Array
+from vibench.assembly import Model
+from vibench.assess import Reference
+from vibench.contracts import check_cone, check_enrichment
+from vibench.errors import in_a_line
+from vibench.highfidelity import HighFidelitySolution, Solver
+from vibench.infsup import multipliers
+from vibench.online import OnlineModel, Operators, obstacle_to_reduction, project_members
+from vibench.pod import POD, pod
+from vibench.problem import (
+    Problem,
+    VariationalInequality,
+    checked_assembly,
+    training_parameters,
+    validation_parameters,
+)
+from vibench.reduced import ReducedModel
+from vibench.separation import Member, separate
+from vibench.stages import ReducedCone
+from vibench.strategy import Enrichment, Offline
+
+T = TypeVar("T")
+
+SEED = 2022
+QUERIES = 8
+"""Validation parameters that queries are asked at in turn."""
+
+INTERPOLATION = 1e-6
+"""Tolerance of the separation."""
+
+
+@dataclass(frozen=True)
+class Query:
+    """A validation parameter (d,), the matrices there, and the high-fidelity solution."""
+
+    mu: Array
+    vi: VariationalInequality
+    exact: Reference
+
+
+class Material:
+    """The problem of a case and what comes of it, each made when it is first asked for.
+
+    What cannot be made fails every benchmark that asks for it, with the same line.
+    """
+
+    def __init__(self, case: Case) -> None:
+        self.case = case
+        self._made: dict[Hashable, tuple[Any, str]] = {}
+
+    def _once(self, what: str, make: Callable[[], T], *which: Hashable) -> T:
+        key = (what, *which)
+        if key not in self._made:
+            try:
+                self._made[key] = make(), ""
+            except (Exception, SystemExit) as error:  # noqa: BLE001  plugins are code of strangers
+                self._made[key] = None, f"{self.case}, {what}: {in_a_line(error)}"
+        found, why = self._made[key]
+        if why:
+            pytest.fail(why, pytrace=False)
+        return found  # type: ignore[no-any-return]
+
+    @property
+    def problem(self) -> Problem:
+        return self._once("problem", lambda: plugins.create("problem", self.case.problem, self.case.options))
+
+    @property
+    def training(self) -> Array:
+        problem = self.problem
+        return self._once("training set", lambda: training_parameters(problem))
+
+    @property
+    def sweep(self) -> list[HighFidelitySolution]:
+        """High-fidelity solutions at the training parameters."""
+        problem, training = self.problem, self.training
+        return self._once("high-fidelity sweep", lambda: solve_all(problem, training))
+
+    @property
+    def snapshots(self) -> tuple[Array, Array]:
+        """Columns of u (n×P) and λ (m×P)."""
+        sweep = self.sweep
+        return self._once(
+            "snapshots", lambda: (np.column_stack([s.u for s in sweep]), np.column_stack([s.lam for s in sweep]))
+        )
+
+    def pod(self, spaces: Spaces = USUAL) -> POD:
+        V, u = self.problem.V, self.snapshots[0]
+        return self._once("POD", lambda: pod(u, V, spaces.pod), spaces.pod)
+
+    def cone(self, spaces: Spaces = USUAL) -> ReducedCone:
+        W, lam = self.problem.W, self.snapshots[1]
+
+        def make() -> ReducedCone:
+            found = plugins.create("dual strategy", spaces.dual, {}).reduce(lam, W, spaces.cone)
+            check_cone(found, W)
+            return ReducedCone(found, multipliers(found.generators, W))
+
+        return self._once(f"cone of {spaces.dual}", make, spaces.cone)
+
+    def offline(self, spaces: Spaces = USUAL) -> Offline:
+        """What primal strategies start from."""
+        reduced = self.cone(spaces)
+        return Offline(self.problem, self.pod(spaces).basis, reduced.cone, reduced.prepared.span, self.training)
+
+    def enrichment(self, primal: Primal, spaces: Spaces = USUAL) -> Enrichment:
+        offline = self.offline(spaces)
+
+        def make() -> Enrichment:
+            found = plugins.create("primal strategy", primal.name, {}).build(offline, primal.tolerance)
+            return check_enrichment(found, offline.problem.V, offline.basis)
+
+        return self._once(f"enrichment by {primal}", make, spaces)
+
+    def model(self, primal: Primal, spaces: Spaces = USUAL) -> ReducedModel:
+        """A new reduced model: it has nothing in store from earlier queries."""
+        return model_with(self.offline(spaces), self.enrichment(primal, spaces))
+
+    @property
+    def members(self) -> Mapping[str, Member]:
+        problem, training = self.problem, self.training
+        return self._once("separation", lambda: separate(problem, training, INTERPOLATION))
+
+    def operators(self, primal: Primal, spaces: Spaces = USUAL) -> Operators | str:
+        """The projected members, or why queries have to be assembled in full."""
+        model, members = self.model(primal, spaces), self.members
+        return self._once(
+            f"projection of members with {primal}",
+            lambda: obstacle_to_reduction(model, members) or project_members(model, members),
+            spaces,
+        )
+
+    def online(self, primal: Primal, spaces: Spaces = USUAL) -> tuple[Model, str]:
+        """A new model that assembles in the quickest way there is, and why that is in full; "" where it is not."""
+        model, operators = self.model(primal, spaces), self.operators(primal, spaces)
+        return (model, operators) if isinstance(operators, str) else (OnlineModel(model, operators), "")
+
+    @property
+    def queries(self) -> list[Query]:
+        problem, (u, lam) = self.problem, self.snapshots
+        floors = 1e-12 * float(problem.V.norm(u).max()), 1e-12 * float(problem.W.norm(lam).max())
+
+        def make() -> list[Query]:
+            mus = validation_parameters(problem, QUERIES, SEED)
+            exact = [Reference(s.u, s.lam, *floors) for s in solve_all(problem, mus)]
+            return [Query(mu, checked_assembly(problem, mu), known) for mu, known in zip(mus, exact, strict=True)]
+
+        return self._once("validation", make)
+
+
+def solve_all(problem: Problem, mus: Array) -> list[HighFidelitySolution]:
+    """High-fidelity solutions at parameters (P×d), one after the other."""
+    solver = Solver(problem)
+    return [solver.solve(mu) for mu in mus]
+
+
+def model_with(offline: Offline, enrichment: Enrichment) -> ReducedModel:
+    """The reduced model with an enrichment."""
+    return ReducedModel(offline.problem, offline.basis, enrichment, offline.cone.generators, offline.span)
+
+
+def spread(parameters: Array, count: int) -> Sequence[Array]:
+    """At most `count` of the parameters (P×d), the first, the last and some between."""
+    return [parameters[k] for k in np.unique(np.linspace(0, len(parameters) - 1, count).round().astype(int))]

@@ -1,0 +1,110 @@
+"""Timing by pytest-benchmark of work that is judged beforehand: what it reached is kept beside its seconds."""
+
+from __future__ import annotations
+
+import math
+import time
+import tracemalloc
+from collections.abc import Callable, Mapping
+from typing import Any, TypeVar
+
+import pytest
+from pytest_benchmark.fixture import BenchmarkFixture
+
+from vibench.timing import timed
+
+T = TypeVar("T")
+
+FEWEST, MOST = 3, 30
+"""Rounds of what is slow and of what is quick; one where a call takes `FEWEST` times what there is for all."""
+
+SHORTEST = 2e-3
+"""Seconds of a round: as many calls as it takes."""
+
+TRACED = 0.2
+"""Seconds up to which the peak of the memory is traced, in a run of its own: tracing slows down."""
+
+Info = Mapping[str, Any]
+"""What is kept of a benchmark: figures of its size; under "accuracy", those that should be small."""
+
+MARKS = [
+    pytest.mark.benchmark(timer=time.process_time),  # CPU seconds: whoever else uses the machine counts less
+    pytest.mark.filterwarnings("default", "ignore:Benchmark fixture was not used"),  # plugins may warn, or fail
+]
+"""For `pytestmark` of every file of benchmarks."""
+
+
+def measure(
+    benchmark: BenchmarkFixture,
+    group: str,
+    work: Callable[..., T],
+    judge: Callable[[T], Info],
+    fresh: Callable[[], Any] | None = None,
+    together: int = 1,
+) -> None:
+    """Do some work once to judge it, then, timed, as often as fits into `--benchmark-max-time`, within limits.
+
+    Parameters
+    ----------
+    benchmark
+        The fixture.
+    group
+        The table to list it in.
+    work
+        What is timed.
+    judge
+        What a result has reached; if it raises, nothing is timed.
+    fresh
+        Gives, untimed, a new argument of `work` for every round, where it takes one.
+    together
+        How many calls in succession make a round, because each does something else.
+    """
+    given = (lambda: (fresh(),)) if fresh else tuple
+    budget = float(benchmark._max_time)
+    result, seconds = _timed(work, given())
+    benchmark.group = group
+    benchmark.extra_info.update(plain(judge(result)))
+    if seconds <= TRACED:
+        benchmark.extra_info["peak_memory_mib"] = peak_memory(work, given())
+    if seconds < FEWEST * budget:
+        seconds = min(seconds, _timed(work, given())[1])  # the first call may have imported something
+    rounds, calls = _how_often(seconds, budget, together)
+    if fresh:
+        benchmark.pedantic(work, setup=lambda: (given(), {}), rounds=rounds)
+    else:
+        benchmark.pedantic(work, rounds=rounds, iterations=calls)
+
+
+def _timed(work: Callable[..., T], arguments: tuple[Any, ...]) -> tuple[T, float]:
+    result, seconds = timed(lambda: work(*arguments))
+    return result, seconds.wall
+
+
+def _how_often(seconds: float, budget: float, together: int) -> tuple[int, int]:
+    """Rounds, and calls in each, for work that takes some seconds."""
+    seconds = max(seconds, 1e-7)
+    calls = together * math.ceil(SHORTEST / (together * seconds))
+    if calls * seconds > budget:
+        calls = 1
+    least = FEWEST if seconds < FEWEST * budget else 1
+    return min(MOST, max(least, int(budget / (calls * seconds)))), calls
+
+
+def peak_memory(work: Callable[..., object], given: tuple[Any, ...]) -> float:
+    """MiB that Python and NumPy have allocated at most for some work."""
+    tracemalloc.start()
+    try:
+        work(*given)
+        return tracemalloc.get_traced_memory()[1] / 2**20
+    finally:
+        tracemalloc.stop()
+
+
+def plain(value: Any) -> Any:
+    """What JSON can hold: NumPy's numbers become Python's, those that are not finite become nothing."""
+    if isinstance(value, Mapping):
+        return {str(key): plain(part) for key, part in value.items()}
+    if isinstance(value, str | bool | None):
+        return value
+    number = value.item() if hasattr(value, "item") else value
+    return number if math.isfinite(number) else None

@@ -1,0 +1,190 @@
+"""What stages have reached, computed from their results and from nothing that they claim."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+
+import numpy as np
+
+from benchmarks.material import Material, Query, spread
+from benchmarks.measure import Info
+from vibench import cone, qp
+from vibench.arrays import Array
+from vibench.assembly import Model
+from vibench.assess import errors
+from vibench.highfidelity import HighFidelitySolution
+from vibench.linalg import remove, singular_values
+from vibench.pod import POD
+from vibench.problem import MEMBERS, VariationalInequality, checked_assembly
+from vibench.reduced import ReducedModel, ReducedProblem, project
+from vibench.separation import Member, Way
+from vibench.space import InnerProduct
+from vibench.strategy import Cone, Enrichment
+from vibench.supremizer import supremizers
+
+SOME = 9
+"""Training parameters at which a figure is computed that takes long."""
+
+RESIDUALS = {"primal": "primal_residual", "dual": "dual_residual", "gap": "gap"}
+
+
+def about(material: Material, **more: object) -> dict[str, object]:
+    """Problem, resolution and dimensions of the spaces; whatever else is to be said."""
+    case, problem = material.case, material.problem
+    found = {"problem": case.problem, "resolution": case.resolution, "n": problem.V.dim, "m": problem.W.dim}
+    return found | more
+
+
+def of_solutions(material: Material, solutions: Sequence[HighFidelitySolution]) -> Info:
+    """Of high-fidelity solutions."""
+    return about(
+        material,
+        solutions=len(solutions),
+        iterations=sum(s.iterations for s in solutions),
+        fallbacks=sum(bool(s.fallback) for s in solutions),
+        accuracy=worst(_residuals(s.residuals) for s in solutions),
+    )
+
+
+def of_pod(material: Material, found: POD) -> Info:
+    """Of V_N."""
+    V, u = material.problem.V, material.snapshots[0]
+    left = u - found.basis @ V.gram(found.basis, u)
+    tail = np.linalg.norm(V.norm(left)) / np.linalg.norm(V.norm(u))
+    accuracy = {"tail": tail, "orthonormality": orthonormality(found.basis, V)}
+    return about(material, N=found.basis.shape[1], accuracy=accuracy)
+
+
+def orthonormality(Z: Array, V: InnerProduct) -> float:
+    """Largest entry of ZᵀX_VZ − I."""
+    return float(np.abs(V.gram(Z, Z) - np.eye(Z.shape[1])).max(initial=0.0))
+
+
+def of_cone(material: Material, found: Cone) -> Info:
+    """Of a reduced cone: the largest distance of a snapshot, relative to the largest norm."""
+    W, lam = material.problem.W, material.snapshots[1]
+    generators = np.hstack([found.generators, -found.generators[:, found.free]])
+    largest = max((cone.project(generators, theta, W).distance for theta in lam.T), default=0.0)
+    error = largest / (float(W.norm(lam).max(initial=0.0)) or 1.0)
+    return about(material, R=found.size, fallbacks=len(found.fallbacks), accuracy={"projection_error": error})
+
+
+def of_enrichment(material: Material, found: Enrichment, model: ReducedModel) -> Info:
+    """Of an enrichment: σ of equation (21), the largest at some of the training parameters."""
+    sigma = max(_sigma(model, mu) for mu in spread(material.training, SOME))
+    added = 0 if found.vectors is None else found.vectors.shape[1]
+    return about(
+        material,
+        N=model.fixed_basis.shape[1] - added,
+        R=model.generators.shape[1],
+        enrichment=added,
+        kind=found.kind.value,
+        fallbacks=len(found.fallbacks),
+        accuracy={"sigma": sigma},
+    )
+
+
+def _sigma(model: ReducedModel, mu: Array) -> float:
+    """Largest sine between a supremizer at mu (d,) and the enriched space."""
+    V, vi = model.problem.V, checked_assembly(model.problem, mu)
+    wanted = V.whiten(V.orthonormalise(supremizers(V, vi.B, model.span)))
+    return float(singular_values(remove(V.whiten(model.primal_basis(vi)), wanted)).max(initial=0.0))
+
+
+def of_separation(material: Material, found: Mapping[str, Member]) -> Info:
+    """Of separated members: terms and ways; errors at validation parameters, no further than the problem samples."""
+    ways = {f"way_{name}": member.way.value for name, member in found.items()}
+    terms = {f"terms_{name}": len(member.terms) for name, member in found.items()}
+    return about(material, **ways, **terms, accuracy={"interpolation_error": _interpolation_error(material, found)})
+
+
+def _interpolation_error(material: Material, found: Mapping[str, Member]) -> float:
+    sampled = {name: m for name, m in found.items() if m.way is Way.INTERPOLATED}
+    if not sampled:
+        return 0.0
+    sampler = material.problem.sampler({name: (m.rows, m.columns) for name, m in sampled.items()})
+    largest = 0.0
+    for query in material.queries:
+        for name, theta in sampler(query.mu).items():
+            exact = getattr(query.vi, name)
+            summed = sum(value * term for value, term in zip(theta, sampled[name].terms, strict=True))
+            largest = max(largest, _norm(summed - exact) / (_norm(exact) or 1.0))
+    return largest
+
+
+def _norm(member: Array) -> float:
+    """Euclidean norm of the entries."""
+    return float(np.linalg.norm(member if isinstance(member, np.ndarray) else member.data))
+
+
+def of_programs(material: Material, model: Model) -> Info:
+    """Of the programs that a model assembles: difference from the projections on its basis, which is orthonormal."""
+    accuracy, program = [], None
+    for query in material.queries:
+        reduced = model.assemble(query.mu)
+        Z, program = reduced.basis, reduced.program
+        exact = project(query.vi, Z, model.generators)
+        difference = max(_difference(getattr(program, name), getattr(exact, name)) for name in MEMBERS)
+        accuracy.append({"difference": difference, "orthonormality": orthonormality(Z, material.problem.V)})
+    return about(material, **_shape(program), accuracy=worst(accuracy))
+
+
+def _difference(found: Array, exact: Array) -> float:
+    return float(np.linalg.norm(found - exact)) / (float(np.linalg.norm(exact)) or 1.0)
+
+
+Solve = Callable[[ReducedProblem], qp.Answer]
+
+
+def of_queries(material: Material, model: Model, solve: Solve, accuracy: float) -> Info:
+    """Of queries at all validation parameters: errors against high-fidelity solutions, residuals, the worst status."""
+    figures, statuses, reduced = [], [], None
+    for query in material.queries:
+        reduced = model.assemble(query.mu)
+        answer = solve(reduced)
+        status, reason, residuals = qp.judge(reduced.program, answer, accuracy)
+        statuses.append((status.severity, status.value, reason))
+        if residuals is not None and answer.x is not None and answer.alpha is not None:
+            u, lam = reduced.basis @ answer.x, model.generators @ answer.alpha
+            figures.append(_residuals(residuals) | _errors(material, query, u, lam))
+    _, status, reason = max(statuses)
+    form = "primal" if reduced is None or reduced.factor is None else "dual"
+    shape = _shape(None if reduced is None else reduced.program)
+    complete = worst(figures) if len(figures) == len(statuses) else {}
+    return about(material, **shape, form=form, status=status, reason=reason, accuracy=complete)
+
+
+def _errors(material: Material, query: Query, u: Array, lam: Array) -> dict[str, float]:
+    found = errors(material.problem, query.vi, query.exact, u, lam)
+    return {"error_u": found.u, "error_lambda": found.lam}
+
+
+def of_answer(program: VariationalInequality, answer: qp.Answer, accuracy: float) -> Info:
+    """Of what a QP solver answers."""
+    status, reason, residuals = qp.judge(program, answer, accuracy)
+    return {
+        **_shape(program),
+        "status": status.value,
+        "reason": reason,
+        "solver_status": answer.solver_status,
+        "iterations": answer.iterations,
+        "accuracy": {} if residuals is None else _residuals(residuals),
+    }
+
+
+def _shape(program: VariationalInequality | None) -> dict[str, int]:
+    """Unknowns N' and constraints R of a reduced program."""
+    return {} if program is None else {"dimension": len(program.f), "R": len(program.g)}
+
+
+def _residuals(found: qp.Residuals) -> dict[str, float]:
+    return {name: getattr(found, part) for part, name in RESIDUALS.items()}
+
+
+def worst(figures: Iterable[Mapping[str, float]]) -> dict[str, float]:
+    """The largest of every figure."""
+    found: dict[str, float] = {}
+    for some in figures:
+        for name, value in some.items():
+            found[name] = max(found.get(name, value), value) if value == value else value  # noqa: PLR0124  NaN
+    return found
