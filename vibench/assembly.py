@@ -19,7 +19,7 @@ from vibench.stages import EnrichmentStage, enrichment_stage, reduced_model
 from vibench.store import Store
 from vibench.timing import NO_TIME, Seconds, median_seconds, timed
 
-ENOUGH = 0.005
+ENOUGH = 0.003
 """Seconds of repeats of a projection after which there are no more; a cell projects at many parameters."""
 
 Model = ReducedModel | OnlineModel

@@ -4,15 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import numpy as np
 
 from vibench.arrays import Array
 from vibench.errors import NumericalError
+from vibench.factor import SparseCholesky
 from vibench.linalg import orthonormal_range
 from vibench.problem import Problem, VariationalInequality, checked_assembly
+from vibench.space import InnerProduct
 from vibench.strategy import Enrichment, Kind
+from vibench.supremizer import ContactCoordinates, contact_factor
 
 
 @dataclass(frozen=True)
@@ -76,6 +79,11 @@ class ReducedModel:
     def primal_basis(self, vi: VariationalInequality) -> Array:
         """V-orthonormal basis Z (n×N') at the parameter of `vi`; V_N comes first."""
         V, enrichment = self.problem.V, self.enrichment
+        if enrichment.eta is not None and self.problem.contact_dofs is not None:
+            contact = self._contact
+            loads = np.asarray(vi.B.T @ enrichment.eta)[self.problem.contact_dofs]
+            added = contact.vectors(orthonormal_range(contact.supremizers(loads), contact.plain))
+            return np.hstack([self.fixed_basis, added])
         if enrichment.eta is not None:
             whitened = V.whiten_functional(np.asarray(vi.B.T @ enrichment.eta))  # those of T(mu)η
         elif enrichment.supply is not None:
@@ -92,6 +100,13 @@ class ReducedModel:
     def basis_at(self, mu: Array, vi: VariationalInequality) -> Array:  # noqa: ARG002
         """The primal basis at mu, where `vi` is assembled."""
         return self.primal_basis(vi)
+
+    @cached_property
+    def _contact(self) -> ContactCoordinates:
+        """Coordinates of V_N and of all supremizers of a problem that says what its constraint touches."""
+        V, dofs = self.problem.V, self.problem.contact_dofs
+        assert dofs is not None  # asked for in this case alone
+        return ContactCoordinates(V, self.fixed_basis, dofs, _factor_of(V, dofs.astype(np.intp).tobytes()))
 
     @cached_property
     def _whitened_basis(self) -> Array:
@@ -111,6 +126,12 @@ class ReducedModel:
         """Project what the problem assembled at a parameter."""
         Z = self.primal_basis(vi)
         return ReducedProblem(project(vi, Z, self.generators), lambda: Z)
+
+
+@lru_cache(maxsize=1)
+def _factor_of(V: InnerProduct, dofs: bytes) -> tuple[SparseCholesky, Array]:
+    """X_V with the contact last: like V itself the same for all models of a problem."""
+    return contact_factor(V, np.frombuffer(dofs, np.intp))
 
 
 def project(vi: VariationalInequality, Z: Array, chi: Array) -> VariationalInequality:

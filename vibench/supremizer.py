@@ -134,6 +134,8 @@ class ContactCoordinates:
         V-orthonormal basis of V_N (n×N).
     dofs
         E, rising.
+    factor
+        X_V factorised with E last, where that has been done already (`contact_factor`).
 
     Attributes
     ----------
@@ -141,9 +143,10 @@ class ContactCoordinates:
         Coordinates (d×N) of the basis of V_N, orthonormal.
     """
 
-    def __init__(self, V: InnerProduct, basis: Array, dofs: Indices) -> None:
-        self._factor = SparseCholesky(V.matrix, "X_V", elimination_order(V.matrix, dofs))
-        self._tail = self._factor.tail(len(dofs))
+    def __init__(
+        self, V: InnerProduct, basis: Array, dofs: Indices, factor: tuple[SparseCholesky, Array] | None = None
+    ) -> None:
+        self._factor, self._tail = factor or contact_factor(V, dofs)
         whitened = self._factor.up(basis)
         split = V.dim - len(dofs)
         self._others, r = np.linalg.qr(whitened[:split])
@@ -158,6 +161,12 @@ class ContactCoordinates:
         """Vectors (n×k) with these coordinates (d×k)."""
         k = self._others.shape[1]
         return self._factor.up_inverse(np.vstack([self._others @ coordinates[:k], coordinates[k:]]))
+
+
+def contact_factor(V: InnerProduct, dofs: Indices) -> tuple[SparseCholesky, Array]:
+    """X_V factorised with some unknowns E last, and the last block F_EE (|E|×|E|) of the factor."""
+    factor = SparseCholesky(V.matrix, "X_V", elimination_order(V.matrix, dofs))
+    return factor, factor.tail(len(dofs))
 
 
 Coordinates = SpannedCoordinates | ContactCoordinates
