@@ -22,7 +22,7 @@ from vibench.errors import NumericalError
 from vibench.highfidelity import Solver
 from vibench.infsup import multipliers
 from vibench.linalg import singular_values
-from vibench.online import OnlineModel, obstacle_to_reduction, project_members
+from vibench.online import OnlineModel, why_in_full, project_members
 from vibench.problem import MEMBERS, Contact, Problem, VariationalInequality, checked_assembly
 from vibench.reduced import ReducedModel, project
 from vibench.separation import Way, separate
@@ -112,7 +112,7 @@ def reduced_model(problem: Problem, kind: str, modes: int, generators: int, mus:
 
 def online(model: ReducedModel, tolerance: float = 1e-11) -> OnlineModel:
     members = separate(model.problem, model.problem.training_set(), tolerance)
-    assert obstacle_to_reduction(model, members) == ""
+    assert why_in_full(model, members) == ""
     return OnlineModel(model, project_members(model, members))
 
 
@@ -258,11 +258,11 @@ def test_what_stands_in_the_way_of_reduction_is_said() -> None:
     problem = Varying()
     members = separate(problem, problem.training_set(), 1e-8)
     model = reduced_model(problem, "none", 3, 2, problem.training_set())
-    assert [reason.split()[0] for reason in obstacle_to_reduction(model, members).split("; ")] == ["A", "B", "g"]
+    assert [reason.split()[0] for reason in why_in_full(model, members).split("; ")] == ["A", "B", "g"]
     own = Enrichment(Kind.PER_PARAMETER, supply=lambda V, vi, span: supremizers(V, vi.B, span))
     roaming = ReducedModel(Rope("one"), model.fixed_basis, own, model.generators, model.span)
     fine = separate(Rope("one"), problem.training_set(), 1e-8)
-    assert obstacle_to_reduction(roaming, fine) == "the enrichment varies with mu in a way of its own"
+    assert why_in_full(roaming, fine) == "the enrichment varies with mu in a way of its own"
 
 
 @pytest.mark.parametrize("kind", KINDS)

@@ -10,7 +10,7 @@ import numpy as np
 
 from vibench.arrays import Array
 from vibench.matrix import Cell, Plugin
-from vibench.online import OnlineModel, Operators, obstacle_to_reduction, project_members
+from vibench.online import OnlineModel, Operators, why_in_full, project_members
 from vibench.problem import MEMBERS, VariationalInequality, checked_assembly, training_parameters, validation_parameters
 from vibench.reduced import ReducedModel, project
 from vibench.separation import Member, Way, separate
@@ -66,7 +66,7 @@ class ReductionStage(Stage):
         """A `Reduction`."""
         model, _, _ = reduced_model(store, self.enrichment)
         members: Mapping[str, Member] = value_of(store, self.separation)
-        why = obstacle_to_reduction(model, members)
+        why = why_in_full(model, members)
         if why:
             return Result(Reduction(None, why), NO_TIME)
         operators, seconds = timed(lambda: project_members(model, members))

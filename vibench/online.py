@@ -35,7 +35,7 @@ class Projected:
     constant
         Whether the only term is the member itself.
     unpack
-        Where the entries of a symmetric matrix are in its packed form (d², ); `None` where nothing is packed.
+        Where the entries of a symmetric matrix are in its packed form (d²,); `None` where nothing is packed.
     """
 
     terms: Array
@@ -110,7 +110,7 @@ class Operators:
     factor: Array | None
 
 
-def obstacle_to_reduction(model: ReducedModel, members: Mapping[str, Member]) -> str:
+def why_in_full(model: ReducedModel, members: Mapping[str, Member]) -> str:
     """Why queries of a model have to be assembled in full; "" if they have not."""
     if model.enrichment.supply is not None:
         return "the enrichment varies with mu in a way of its own"
@@ -118,7 +118,7 @@ def obstacle_to_reduction(model: ReducedModel, members: Mapping[str, Member]) ->
 
 
 def project_members(model: ReducedModel, members: Mapping[str, Member]) -> Operators:
-    """Project the members of a problem on what its reduced model lives in; see `obstacle_to_reduction`."""
+    """Project the members of a problem on what its reduced model lives in; see `why_in_full`."""
     problem, chi, eta = model.problem, model.generators, model.enrichment.eta
     varying = None if eta is None or len(members["B"].terms) == 1 else _supremizer_space(model, members["B"], eta)
     Z = basis = None

@@ -18,7 +18,7 @@ from vibench.contracts import check_cone, check_enrichment
 from vibench.errors import in_a_line
 from vibench.highfidelity import HighFidelitySolution, Solver
 from vibench.infsup import multipliers
-from vibench.online import OnlineModel, Operators, obstacle_to_reduction, project_members
+from vibench.online import OnlineModel, Operators, why_in_full, project_members
 from vibench.pod import POD, pod
 from vibench.problem import (
     Problem,
@@ -138,7 +138,7 @@ class Material:
         model, members = self.model(primal, spaces), self.members
         return self._once(
             f"projection of members with {primal}",
-            lambda: obstacle_to_reduction(model, members) or project_members(model, members),
+            lambda: why_in_full(model, members) or project_members(model, members),
             spaces,
         )
 
