@@ -22,7 +22,7 @@ from vibench.errors import NumericalError
 from vibench.highfidelity import Solver
 from vibench.infsup import multipliers
 from vibench.linalg import singular_values
-from vibench.online import OnlineModel, why_in_full, project_members
+from vibench.online import OnlineModel, project_members, why_in_full
 from vibench.problem import MEMBERS, Contact, Problem, VariationalInequality, checked_assembly
 from vibench.reduced import ReducedModel, project
 from vibench.separation import Way, separate

@@ -10,7 +10,7 @@ import numpy as np
 
 from vibench.arrays import Array
 from vibench.matrix import Cell, Plugin
-from vibench.online import OnlineModel, Operators, why_in_full, project_members
+from vibench.online import OnlineModel, Operators, project_members, why_in_full
 from vibench.problem import MEMBERS, VariationalInequality, checked_assembly, training_parameters, validation_parameters
 from vibench.reduced import ReducedModel, project
 from vibench.separation import Member, Way, separate

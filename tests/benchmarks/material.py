@@ -18,7 +18,7 @@ from vibench.contracts import check_cone, check_enrichment
 from vibench.errors import in_a_line
 from vibench.highfidelity import HighFidelitySolution, Solver
 from vibench.infsup import multipliers
-from vibench.online import OnlineModel, Operators, why_in_full, project_members
+from vibench.online import OnlineModel, Operators, project_members, why_in_full
 from vibench.pod import POD, pod
 from vibench.problem import (
     Problem,
