@@ -44,8 +44,6 @@ class Condensed:
 
     Attributes
     ----------
-    matrix
-        Schur complement Ŝ of the eliminated unknowns (c×c, sparse).
     dense
         Whether most of Ŝ is filled in.
     """
@@ -60,8 +58,20 @@ class Condensed:
         upper = self._factor.tail(count) if self._factor is not None else np.zeros((0, 0))
         self._schur = upper.T @ upper
         self.dense = 2 * count > len(pattern.kept)
-        self.matrix = _with_block(sp.coo_array(A[pattern.kept][:, pattern.kept]), pattern.interface, self._schur)
+        self._kept_block = A[pattern.kept][:, pattern.kept]
         self._loaded: tuple[Array, tuple[Array, Array]] | None = None
+
+    @property
+    def matrix(self) -> SparseMatrix:
+        """Schur complement Ŝ of the eliminated unknowns (c×c), sparse."""
+        return _with_block(sp.coo_array(self._kept_block), self._pattern.interface, self._schur)
+
+    @property
+    def array(self) -> Array:
+        """Ŝ as an array."""
+        found, interface = self._kept_block.toarray(), self._pattern.interface
+        found[np.ix_(interface, interface)] = self._schur
+        return np.asarray(found)
 
     def load(self, f: Array) -> tuple[Array, Array]:
         """Load (c,) on the kept unknowns that f (n,) amounts to, and what `expand` needs of f."""

@@ -125,13 +125,13 @@ class Stiffness:
         self._condensed = Condensed(A, self._pattern)
 
     @cached_property
-    def _dense(self) -> tuple[Array, Array]:
-        """Ŝ and its inverse (c×c)."""
-        matrix = self._condensed.matrix.toarray()
+    def _inverse(self) -> Array:
+        """Ŝ⁻¹ (c×c)."""
         try:
-            return matrix, scipy.linalg.cho_solve(scipy.linalg.cho_factor(matrix), np.eye(len(matrix)))
+            factor = scipy.linalg.cho_factor(self._condensed.array)
         except np.linalg.LinAlgError:
             raise NumericalError("A is not positive definite") from None
+        return np.asarray(scipy.linalg.cho_solve(factor, np.eye(len(self._pattern.kept))))
 
     def system(self, vi: VariationalInequality) -> ActiveSystem:
         """The equality-constrained systems of the active sets of `vi`, whose stiffness this is."""
@@ -139,7 +139,7 @@ class Stiffness:
         load, free = condensed.load(vi.f)
         B = sp.csr_array(sp.csc_array(vi.B)[:, self._pattern.kept])
         solve_active = (
-            _by_compliance(*self._dense, load, B, vi.g)
+            _by_compliance(self._inverse, load, B, vi.g)
             if condensed.dense
             else partial(_saddle_point, condensed.matrix, load, B, vi.g)
         )
@@ -250,24 +250,21 @@ def _saddle_point(A: SparseMatrix, f: Array, B: SparseMatrix, g: Array, active: 
     return solution[:n], lam
 
 
-def _by_compliance(
-    S: Array, inverse: Array, f: Array, B: SparseMatrix, g: Array
-) -> Callable[[Indices], tuple[Array, Array]]:
-    """Solutions for active sets from what active constraints displace, S⁻¹B_aᵀ, refined once; S (c×c) is dense."""
+def _by_compliance(inverse: Array, f: Array, B: SparseMatrix, g: Array) -> Callable[[Indices], tuple[Array, Array]]:
+    """Solutions for active sets from what active constraints displace, S⁻¹B_aᵀ; forces are refined once."""
+    free = inverse @ f
+    excess = B @ free - g
 
     def solve_active(active: Indices) -> tuple[Array, Array]:
         rows, lam = B[active], np.zeros(len(g))
+        if not len(active):
+            return free, lam
         displaced = np.asarray(rows @ inverse)
-        factor = scipy.linalg.cho_factor(np.asarray(rows @ displaced.T)) if len(active) else None
-
-        def once(load: Array, bound: Array) -> tuple[Array, Array]:
-            free = inverse @ load
-            forces = bound if factor is None else scipy.linalg.cho_solve(factor, rows @ free - bound)
-            return free - forces @ displaced, forces
-
-        u, forces = once(f, g[active])
-        correction, more = once(f - S @ u - rows.T @ forces, g[active] - rows @ u)
-        lam[active] = forces + more
-        return u + correction, lam
+        compliance = rows @ displaced.T.copy()
+        factor = scipy.linalg.cho_factor(compliance)
+        forces = scipy.linalg.cho_solve(factor, excess[active])
+        forces += scipy.linalg.cho_solve(factor, excess[active] - compliance @ forces)
+        lam[active] = forces
+        return free - forces @ displaced, lam
 
     return solve_active
