@@ -221,7 +221,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     figures = pd.DataFrame([(name, *pair) for name, pair in found.items()], columns=["figure", "published", "ours"])
     held = pd.DataFrame([(*v, "no" if v in broken(verdicts) else "yes") for v in verdicts])
     held.columns = pd.Index(["check", "found", "at most", "holds"])
-    title = f"# {asked.problem}, resolution {resolution}: as published and ours\n\n{where}\n"
+    command = f"python tests/benchmarks/as_published.py {asked.problem} --repeats {asked.repeats}"
+    title = f"# {asked.problem}, resolution {resolution}: as published and ours\n\n`{command}` on {where}\n"
     text = "\n".join([title, *map(tables.to_markdown, (times, ratio_table(seconds | of_queries), figures, held))])
     print(text)
     if asked.out:
