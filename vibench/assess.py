@@ -11,7 +11,7 @@ from vibench.arrays import Array, SparseMatrix
 from vibench.infsup import InfSup, Multipliers, inf_sup, inf_sup_on
 from vibench.problem import Problem, VariationalInequality
 from vibench.space import InnerProduct
-from vibench.supremizer import constraint_classes, supremizer_images
+from vibench.supremizer import ConstraintClasses, constraint_classes, supremizer_images
 
 
 @dataclass(frozen=True)
@@ -80,12 +80,17 @@ def constants_full(V: InnerProduct, matrices: Sequence[SparseMatrix], cone: Mult
     """Constants of the whole of V at every B(mu) (m×n); matrices that are proportional share one computation."""
     classes = constraint_classes(matrices)
     image = supremizer_images(V, classes.representatives, cone.span.shape[1] + cone.chi.shape[1])
-    found = [inf_sup(image(B, cone.span), image(B, cone.chi), cone) for B in classes.representatives]
-    return [found[k].scaled(c) for k, c in zip(classes.members, classes.factors, strict=True)]
+    return everywhere(
+        classes, [inf_sup(image(B, cone.span), image(B, cone.chi), cone) for B in classes.representatives]
+    )
 
 
 def constants_on(Z: Array, matrices: Sequence[SparseMatrix], cone: Multipliers) -> list[InfSup]:
     """Constants of one primal space with V-orthonormal basis Z (n×N') at every B(mu), likewise."""
     classes = constraint_classes(matrices)
-    found = [inf_sup_on(Z, B, cone) for B in classes.representatives]
+    return everywhere(classes, [inf_sup_on(Z, B, cone) for B in classes.representatives])
+
+
+def everywhere(classes: ConstraintClasses, found: Sequence[InfSup]) -> list[InfSup]:
+    """Constants of all matrices from those of the ones that stand for their classes."""
     return [found[k].scaled(c) for k, c in zip(classes.members, classes.factors, strict=True)]

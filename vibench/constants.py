@@ -4,10 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
-
 from vibench.arrays import SparseMatrix
-from vibench.assess import constants_full, constants_on
+from vibench.assess import constants_full, constants_on, everywhere
 from vibench.infsup import inf_sup_on
 from vibench.problem import Problem, validation_parameters
 from vibench.stage import Result, Stage, assemblies, build_problem, value_of
@@ -78,10 +76,9 @@ class OwnConstants(Stage):
         if model.enrichment.eta is None:
             return Result([inf_sup_on(model.primal_basis(kept.at(mu)), kept.at(mu).B, cone) for mu in mus])
         classes = constraint_classes(matrices)  # supremizers of proportional matrices span the same space
-        firsts = [mus[int(np.argmax(classes.members == k))] for k in range(len(classes.representatives))]
-        bases = (model.primal_basis(kept.at(mu)) for mu in firsts)
+        bases = (model.primal_basis(kept.at(mu)) for mu in mus[classes.firsts])
         found = [inf_sup_on(Z, B, cone) for Z, B in zip(bases, classes.representatives, strict=True)]
-        return Result([found[k].scaled(c) for k, c in zip(classes.members, classes.factors, strict=True)])
+        return Result(everywhere(classes, found))
 
 
 def _constraints(problem: Problem, count: int, seed: int) -> list[SparseMatrix]:

@@ -119,9 +119,9 @@ class Stiffness:
     """
 
     def __init__(self, A: SparseMatrix, pattern: Pattern | None = None) -> None:
-        few = pattern is not None and len(pattern.kept) <= FEW * A.shape[0]
-        everything = Pattern(np.arange(A.shape[0]), np.zeros(0, np.intp), np.zeros(0, np.intp))
-        self._pattern = pattern if few and pattern is not None else everything
+        if pattern is None or len(pattern.kept) > FEW * A.shape[0]:
+            pattern = Pattern(np.arange(A.shape[0]), np.zeros(0, np.intp), np.zeros(0, np.intp))
+        self._pattern = pattern
         self._condensed = Condensed(A, self._pattern)
 
     @cached_property
@@ -213,7 +213,7 @@ def solve(
 
 
 def _active_set_iterations(system: ActiveSystem, active: Mask) -> tuple[Array, Array, int] | None:
-    """U (c,), λ (m,) and iterations of the primal–dual active set method from a first guess (m,).
+    """Run the primal–dual active set method from a first guess (m,): u (c,), λ (m,) and iterations.
 
     `None` if the sets repeat themselves without an answer, or one of them has dependent constraints.
     """
@@ -260,7 +260,7 @@ def _by_compliance(inverse: Array, f: Array, B: SparseMatrix, g: Array) -> Calla
         if not len(active):
             return free, lam
         displaced = np.asarray(rows @ inverse)
-        compliance = rows @ displaced.T.copy()
+        compliance = rows @ displaced.T
         factor = scipy.linalg.cho_factor(compliance)
         forces = scipy.linalg.cho_solve(factor, excess[active])
         forces += scipy.linalg.cho_solve(factor, excess[active] - compliance @ forces)

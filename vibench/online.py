@@ -219,7 +219,7 @@ class OnlineModel:
         else:
             B = self._constraint(samples, contact)
             Z = operators.basis if operators.basis is not None else self.model.fixed_basis
-            basis = partial(_itself, Z)
+            basis = partial(np.asarray, Z)
         if not all(np.isfinite(member.sum()) for member in (A, f, B, g)):
             raise NumericalError(f"the reduced problem has entries that are not finite at mu = {mu.tolist()}")
         return ReducedProblem(VariationalInequality(A, f, B, g), basis, operators.factor)
@@ -257,7 +257,3 @@ def _on_generators(model: ReducedModel, contact: Contact | None) -> Array:
 def _congruent(A: Array, Y: Array) -> Array:
     found = Y.T @ (A @ Y)
     return np.asarray(0.5 * (found + found.T))
-
-
-def _itself(Z: Array) -> Array:
-    return Z

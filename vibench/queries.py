@@ -5,6 +5,7 @@ from __future__ import annotations
 import resource
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -127,6 +128,10 @@ class Queries(Pieces):
         found, solution = self._task.run(asked, watch)
         return self._known(k) | found, solution and {"query": k} | solution
 
+    @cached_property
+    def _path(self) -> list[int | None]:
+        return path_before(self._reference.mu, self._model.problem.parameters)
+
     def _before(self, number: int) -> tuple[int, VariationalInequality] | None:
         """The query before this one on a path through the parameters, where one starts from the solution of the other.
 
@@ -136,7 +141,7 @@ class Queries(Pieces):
         programs = self._assembled.programs
         if not self._stage.warm_start or self._model.kind is Kind.PER_PARAMETER:
             return None
-        before = path_before(self._reference.mu, self._model.problem.parameters)[number]
+        before = self._path[number]
         return None if before is None else (before, programs[before])
 
     def lost(self, number: int, failed: Failed) -> Answered:

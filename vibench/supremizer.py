@@ -56,6 +56,11 @@ class ConstraintClasses:
     members: Indices
     factors: Array
 
+    @property
+    def firsts(self) -> Indices:
+        """Of every class the matrix that stands for it."""
+        return np.unique(self.members, return_index=True)[1]
+
 
 def constraint_classes(matrices: Sequence[SparseMatrix]) -> ConstraintClasses:
     """Sort matrices into classes of proportional ones."""
