@@ -4,10 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
+
 from vibench.arrays import SparseMatrix
 from vibench.assess import constants_full, constants_on, everywhere
-from vibench.infsup import inf_sup_on
-from vibench.problem import Problem, validation_parameters
+from vibench.infsup import InfSup, Multipliers, inf_sup
+from vibench.problem import Problem, VariationalInequality, validation_parameters
+from vibench.reduced import ReducedModel
 from vibench.stage import Result, Stage, assemblies, build_problem, value_of
 from vibench.stages import ConeStage, EnrichmentStage, PODStage, reduced_model
 from vibench.store import Store
@@ -72,13 +75,16 @@ class OwnConstants(Stage):
         matrices = [assemblies(model.problem).at(mu).B for mu in mus]
         if model.kind is not Kind.PER_PARAMETER:
             return Result(constants_on(model.fixed_basis, matrices, cone))
-        kept = assemblies(model.problem)
         if model.enrichment.eta is None:
-            return Result([inf_sup_on(model.primal_basis(kept.at(mu)), kept.at(mu).B, cone) for mu in mus])
+            return Result([_constants_at(model, assemblies(model.problem).at(mu), cone) for mu in mus])
         classes = constraint_classes(matrices)  # supremizers of proportional matrices span the same space
-        bases = (model.primal_basis(kept.at(mu)) for mu in mus[classes.firsts])
-        found = [inf_sup_on(Z, B, cone) for Z, B in zip(bases, classes.representatives, strict=True)]
-        return Result(everywhere(classes, found))
+        at_firsts = (assemblies(model.problem).at(mu) for mu in mus[classes.firsts])
+        return Result(everywhere(classes, [_constants_at(model, vi, cone) for vi in at_firsts]))
+
+
+def _constants_at(model: ReducedModel, vi: VariationalInequality, cone: Multipliers) -> InfSup:
+    images = model.images(vi, np.hstack([cone.span, cone.chi]))
+    return inf_sup(images[:, : cone.rank], images[:, cone.rank :], cone)
 
 
 def _constraints(problem: Problem, count: int, seed: int) -> list[SparseMatrix]:

@@ -23,7 +23,7 @@ from typing import Any
 from vibench.provenance import core_code, libraries
 from vibench.qp import Status
 from vibench.stage import Done, Failed, PiecewiseStage, Stage, Unstored
-from vibench.timing import ONE_THREAD
+from vibench.timing import KEPT_MEMORY, ONE_THREAD
 
 POLL = 0.2
 """Seconds between two looks at the clock."""
@@ -266,5 +266,6 @@ def _obituary(process: subprocess.Popen[bytes]) -> str:
 
 
 def _environment(parent: Mapping[str, str]) -> dict[str, str]:
-    """One thread for numerical libraries, and the modules this process finds."""
-    return {**parent, **ONE_THREAD, "PYTHONPATH": os.pathsep.join(folder for folder in sys.path if folder)}
+    """One thread for numerical libraries, memory that is kept, and the modules this process finds."""
+    path = os.pathsep.join(folder for folder in sys.path if folder)
+    return {**parent, **ONE_THREAD, **KEPT_MEMORY, "PYTHONPATH": path}

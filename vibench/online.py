@@ -215,18 +215,18 @@ class OnlineModel:
         if operators.varying is not None:
             Y, B = self._enriched(operators.varying, samples, contact)
             A, f, B = _congruent(A, Y), Y.T @ f, B @ Y
-            basis = partial(operators.varying.vectors, Y)
+            lift = partial(_lifted, operators.varying, Y)
         else:
             B = self._constraint(samples, contact)
             Z = operators.basis if operators.basis is not None else self.model.fixed_basis
-            basis = partial(np.asarray, Z)
+            lift = partial(np.matmul, Z)
         if not all(np.isfinite(member.sum()) for member in (A, f, B, g)):
             raise NumericalError(f"the reduced problem has entries that are not finite at mu = {mu.tolist()}")
-        return ReducedProblem(VariationalInequality(A, f, B, g), basis, operators.factor)
+        return ReducedProblem(VariationalInequality(A, f, B, g), lift, operators.factor)
 
-    def basis_at(self, mu: Array, vi: VariationalInequality) -> Array:  # noqa: ARG002
-        """V-orthonormal primal basis Z (n×N') at mu, which only a reconstruction needs."""
-        return self.assemble(mu).basis
+    def lift(self, mu: Array, vi: VariationalInequality, x: Array) -> Array:  # noqa: ARG002
+        """Vectors u = Z x (n×k) with coordinates x (N'×k) at mu, which only a reconstruction needs."""
+        return self.assemble(mu).lift(x)
 
     def _constraint(self, samples: Samples, contact: Contact | None) -> Array:
         operators = self._operators
@@ -247,6 +247,11 @@ class OnlineModel:
         k = eta.shape[1]
         added = orthonormal_range(represented[:, :k], space.plain)
         return np.hstack([space.plain, added]), represented[:, k:].T
+
+
+def _lifted(space: Coordinates, Y: Array, x: Array) -> Array:
+    """Vectors (n×k) from coordinates (N'×k) in an orthonormal basis with coordinates Y (d×N')."""
+    return space.vectors(Y @ x)
 
 
 def _on_generators(model: ReducedModel, contact: Contact | None) -> Array:

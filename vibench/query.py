@@ -119,7 +119,7 @@ def _assessed(asked: Asked, x: Array, alpha: Array) -> Row:
     """Errors, their certified bounds and effectivities."""
     model, mu, exact, known = asked.model, asked.mu, asked.exact, asked.stability
     problem, vi = model.problem, assemblies(model.problem).at(mu)
-    u, lam = model.basis_at(mu, vi) @ x, model.generators @ alpha
+    u, lam = model.lift(mu, vi, x[:, None])[:, 0], model.generators @ alpha
     found = errors(problem, vi, exact, u, lam)
     row = {
         "error_u": found.u,

@@ -4,18 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import cached_property, partial
 
 import numpy as np
 
 from vibench.arrays import Array
 from vibench.errors import NumericalError
-from vibench.factor import SparseCholesky
 from vibench.linalg import orthonormal_range
 from vibench.problem import Problem, VariationalInequality, checked_assembly
-from vibench.space import InnerProduct
 from vibench.strategy import Enrichment, Kind
-from vibench.supremizer import ContactCoordinates, contact_factor
+from vibench.supremizer import ContactCoordinates, on_basis
 
 
 @dataclass(frozen=True)
@@ -26,20 +24,20 @@ class ReducedProblem:
     ----------
     program
         Dense A (N'×N'), f (N',), B (R×N'), g (R,) in coordinates of the primal basis and of the generators.
-    make_basis
-        Gives the primal basis, which only a reconstruction needs.
+    lift
+        From coordinates (N'×k) in the V-orthonormal primal basis Z at this parameter to vectors (n×k): u = Z x.
     factor
         Cholesky factor (lower, N'×N') of A, where it is known beforehand.
     """
 
     program: VariationalInequality
-    make_basis: Callable[[], Array]
+    lift: Callable[[Array], Array]
     factor: Array | None = None
 
     @property
     def basis(self) -> Array:
-        """V-orthonormal primal basis Z (n×N') at this parameter: u = Z x."""
-        return self.make_basis()
+        """Z (n×N')."""
+        return self.lift(np.eye(len(self.program.f)))
 
 
 class ReducedModel:
@@ -79,11 +77,8 @@ class ReducedModel:
     def primal_basis(self, vi: VariationalInequality) -> Array:
         """V-orthonormal basis Z (n×N') at the parameter of `vi`; V_N comes first."""
         V, enrichment = self.problem.V, self.enrichment
-        if enrichment.eta is not None and self.problem.contact_dofs is not None:
-            contact = self._contact
-            loads = np.asarray(vi.B.T @ enrichment.eta)[self.problem.contact_dofs]
-            added = contact.vectors(orthonormal_range(contact.supremizers(loads), contact.plain))
-            return np.hstack([self.fixed_basis, added])
+        if self._has_coordinates:
+            return np.hstack([self.fixed_basis, self._contact.vectors(self._added(vi))])
         if enrichment.eta is not None:
             whitened = V.whiten_functional(np.asarray(vi.B.T @ enrichment.eta))  # those of T(mu)η
         elif enrichment.supply is not None:
@@ -97,16 +92,40 @@ class ReducedModel:
             return self.fixed_basis
         return np.hstack([self.fixed_basis, V.unwhiten(orthonormal_range(whitened, self._whitened_basis))])
 
-    def basis_at(self, mu: Array, vi: VariationalInequality) -> Array:  # noqa: ARG002
-        """The primal basis at mu, where `vi` is assembled."""
-        return self.primal_basis(vi)
+    def lift(self, mu: Array, vi: VariationalInequality, x: Array) -> Array:  # noqa: ARG002
+        """Vectors u = Z x (n×k) with coordinates x (N'×k) at mu, where `vi` is assembled."""
+        if not self._has_coordinates:
+            return np.asarray(self.primal_basis(vi) @ x)
+        count = self.fixed_basis.shape[1]
+        return np.asarray(self.fixed_basis @ x[:count] + self._contact.vectors(self._added(vi) @ x[count:]))
+
+    def images(self, vi: VariationalInequality, eta: Array) -> Array:
+        """ZᵀBᵀη (N'×k) for multipliers η (m×k) at the parameter of `vi`."""
+        if not self._has_coordinates:
+            return on_basis(self.primal_basis(vi), vi.B, eta)
+        Y = np.hstack([self._contact.plain, self._added(vi)])
+        return np.asarray(Y.T @ self._supremizers(vi, eta))
+
+    @property
+    def _has_coordinates(self) -> bool:
+        """Whether V_N and all supremizers have coordinates in which bases are found without vectors of mesh size."""
+        return self.enrichment.eta is not None and self.problem.contact_dofs is not None
+
+    def _added(self, vi: VariationalInequality) -> Array:
+        """Orthonormal coordinates (d×S) of what the supremizers at the parameter of `vi` add to V_N."""
+        assert self.enrichment.eta is not None  # `_has_coordinates`
+        return orthonormal_range(self._supremizers(vi, self.enrichment.eta), self._contact.plain)
+
+    def _supremizers(self, vi: VariationalInequality, eta: Array) -> Array:
+        """Coordinates (d×k) of T(mu)η."""
+        return self._contact.supremizers(np.asarray(vi.B.T @ eta)[self.problem.contact_dofs])
 
     @cached_property
     def _contact(self) -> ContactCoordinates:
         """Coordinates of V_N and of all supremizers of a problem that says what its constraint touches."""
         V, dofs = self.problem.V, self.problem.contact_dofs
         assert dofs is not None  # asked for in this case alone
-        return ContactCoordinates(V, self.fixed_basis, dofs, _factor_of(V, dofs.astype(np.intp).tobytes()))
+        return ContactCoordinates(V, self.fixed_basis, dofs)
 
     @cached_property
     def _whitened_basis(self) -> Array:
@@ -125,13 +144,7 @@ class ReducedModel:
     def reduce(self, vi: VariationalInequality) -> ReducedProblem:
         """Project what the problem assembled at a parameter."""
         Z = self.primal_basis(vi)
-        return ReducedProblem(project(vi, Z, self.generators), lambda: Z)
-
-
-@lru_cache(maxsize=1)
-def _factor_of(V: InnerProduct, dofs: bytes) -> tuple[SparseCholesky, Array]:
-    """X_V with the contact last: like V itself the same for all models of a problem."""
-    return contact_factor(V, np.frombuffer(dofs, np.intp))
+        return ReducedProblem(project(vi, Z, self.generators), partial(np.matmul, Z))
 
 
 def project(vi: VariationalInequality, Z: Array, chi: Array) -> VariationalInequality:

@@ -12,7 +12,7 @@ from vibench.arrays import Array
 from vibench.cone import orthogonality
 from vibench.contracts import check_cone, check_enrichment
 from vibench.greedy import LazyMaximum
-from vibench.infsup import Multipliers, beta_span, compressed, multipliers
+from vibench.infsup import Multipliers, beta_span, multipliers
 from vibench.matrix import Cell, Plugin
 from vibench.pod import POD, pod
 from vibench.problem import training_parameters
@@ -23,6 +23,9 @@ from vibench.strategy import Cone, Enrichment, Kind, Offline, Stop
 from vibench.supremizer import ConstraintClasses, constraint_classes, on_basis, supremizer_images
 from vibench.sweeps import gather, training
 from vibench.timing import Stopwatch, timed
+
+GRAM_RTOL = 1e-8
+"""Eigenvalues of a Gram matrix below this fraction of the largest have lost half of their digits to round-off."""
 
 
 @dataclass(frozen=True)
@@ -168,14 +171,20 @@ def _training_constants(
 def _smallest_over_steps(images: list[Array], weights: list[float], first: int) -> list[float]:
     """The smallest β_span of the first `first`, `first` + 1, … rows of images (k×rank), each times its weight.
 
-    It only grows with the rows, so an earlier value bounds it from below and few are computed again.
+    It only grows with the rows, so an earlier value bounds it from below and few are computed again. Squares come from
+    Gram matrices that grow with the rows; where they would keep too few digits the rows themselves are asked.
     """
-    triangles, known = [image[:0] for image in images], [0] * len(images)
+    grams, known = [np.zeros((image.shape[1],) * 2) for image in images], [0] * len(images)
 
     def negative(p: int, rows: int) -> float:
-        triangles[p] = compressed(np.vstack([triangles[p], images[p][known[p] : rows]]))
-        known[p] = rows
-        return -weights[p] * beta_span(triangles[p])
+        image = images[p]
+        if not image.shape[1] or rows < image.shape[1]:
+            return -weights[p] * beta_span(image[:rows])
+        new, known[p] = image[known[p] : rows], rows
+        grams[p] = grams[p] + new.T @ new
+        squares = np.linalg.eigvalsh(grams[p])
+        sharp = squares[0] > GRAM_RTOL * squares[-1]
+        return -weights[p] * (float(np.sqrt(squares[0])) if sharp else beta_span(image[:rows]))
 
     smallest = LazyMaximum(np.zeros(len(images)))
     last = images[0].shape[0]

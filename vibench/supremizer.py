@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 import scipy.linalg
@@ -21,6 +22,9 @@ MARK_ATOL = 1e-10
 
 FEW_SUPREMIZERS = 2
 """Coordinates are those of the supremizers themselves where there are this many times more touched unknowns."""
+
+FACTORS = 3
+"""Factors with different unknowns last that are kept: of the training set, of the validation set, and as declared."""
 
 
 def supremizers(V: InnerProduct, B: SparseMatrix, eta: Array) -> Array:
@@ -139,8 +143,6 @@ class ContactCoordinates:
         V-orthonormal basis of V_N (n×N).
     dofs
         E, rising.
-    factor
-        X_V factorised with E last, where that has been done already (`contact_factor`).
 
     Attributes
     ----------
@@ -148,10 +150,8 @@ class ContactCoordinates:
         Coordinates (d×N) of the basis of V_N, orthonormal.
     """
 
-    def __init__(
-        self, V: InnerProduct, basis: Array, dofs: Indices, factor: tuple[SparseCholesky, Array] | None = None
-    ) -> None:
-        self._factor, self._tail = factor or contact_factor(V, dofs)
+    def __init__(self, V: InnerProduct, basis: Array, dofs: Indices) -> None:
+        self._factor, self._tail = contact_factor(V, dofs)
         whitened = self._factor.up(basis)
         split = V.dim - len(dofs)
         self._others, r = np.linalg.qr(whitened[:split])
@@ -169,9 +169,18 @@ class ContactCoordinates:
 
 
 def contact_factor(V: InnerProduct, dofs: Indices) -> tuple[SparseCholesky, Array]:
-    """X_V factorised with some unknowns E last, and the last block F_EE (|E|×|E|) of the factor."""
-    factor = SparseCholesky(V.matrix, "X_V", elimination_order(V.matrix, dofs))
-    return factor, factor.tail(len(dofs))
+    """X_V factorised with some unknowns E last, and the last block F_EE (|E|×|E|) of the factor.
+
+    Like the factor of V itself it is made once for all models of a problem.
+    """
+    return _contact_factor(V, dofs.astype(np.intp).tobytes())
+
+
+@lru_cache(maxsize=FACTORS)
+def _contact_factor(V: InnerProduct, dofs: bytes) -> tuple[SparseCholesky, Array]:
+    last = np.frombuffer(dofs, np.intp)
+    factor = SparseCholesky(V.matrix, "X_V", elimination_order(V.matrix, last))
+    return factor, factor.tail(len(last))
 
 
 Coordinates = SpannedCoordinates | ContactCoordinates
@@ -187,7 +196,7 @@ def supremizer_images(V: InnerProduct, matrices: Sequence[SparseMatrix], count: 
     if FEW_SUPREMIZERS * count * len(matrices) <= len(touched):
         return lambda B, eta: V.whiten_functional(np.asarray(B.T @ eta))
     contact = ContactCoordinates(V, np.zeros((V.dim, 0)), touched)
-    return lambda B, eta: contact.supremizers(np.asarray(B.T @ eta)[touched])
+    return lambda B, eta: contact.supremizers(_loads(B, touched, eta))
 
 
 def _touched(matrices: Sequence[SparseMatrix]) -> Indices:
@@ -198,7 +207,12 @@ def _touched(matrices: Sequence[SparseMatrix]) -> Indices:
 def on_basis(Z: Array, B: SparseMatrix, eta: Array) -> Array:
     """ZᵀBᵀη (N'×k) from the rows of Z (n×N') that B (m×n) touches."""
     rows = _touched([B])
-    return np.asarray(Z[rows].T @ np.asarray(sp.csr_array(B)[:, rows].T @ eta))
+    return np.asarray(Z[rows].T @ _loads(B, rows, eta))
+
+
+def _loads(B: SparseMatrix, dofs: Indices, eta: Array) -> Array:
+    """Bᵀη (|E|×k) on some unknowns E."""
+    return np.asarray(sp.csr_array(B)[:, dofs].T @ eta)
 
 
 def supremizer_coordinates(
@@ -215,12 +229,11 @@ def supremizer_coordinates(
     eta
         Multipliers (m×k).
     """
-    loads = [np.asarray(B.T @ eta) for B in matrices]
     touched = _touched(matrices)
     count = eta.shape[1]
     if FEW_SUPREMIZERS * count * len(matrices) <= len(touched):
-        space = SpannedCoordinates(V, basis, V.riesz(np.hstack(loads)))
+        space = SpannedCoordinates(V, basis, np.hstack([supremizers(V, B, eta) for B in matrices]))
         return space, [space.represented[:, k * count : (k + 1) * count] for k in range(len(matrices))]
     contact = ContactCoordinates(V, basis, touched)
-    found = contact.supremizers(np.hstack([load[touched] for load in loads]))
+    found = contact.supremizers(np.hstack([_loads(B, touched, eta) for B in matrices]))
     return contact, [found[:, k * count : (k + 1) * count] for k in range(len(matrices))]

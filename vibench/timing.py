@@ -22,6 +22,13 @@ SLOW = 1.0
 ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMEXPR_NUM_THREADS"), "1")
 """Environment in which numerical libraries start with one thread."""
 
+KEPT_MEMORY = {
+    "MALLOC_MMAP_THRESHOLD_": "33554432",
+    "MALLOC_TRIM_THRESHOLD_": "1073741824",
+    "MALLOC_TOP_PAD_": "67108864",
+}
+"""Environment in which glibc keeps up to 1 GiB that was freed: large arrays are not mapped page by page every time."""
+
 
 @dataclass(frozen=True)
 class Seconds:
