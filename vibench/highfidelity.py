@@ -81,7 +81,10 @@ class Solver:
         NumericalError
             If the assembly is wrong, the solution does not reach `ACCURACY`, or the problem refuses it.
         """
-        vi = checked_assembly(self._problem, mu)
+        return self.solve_assembled(mu, checked_assembly(self._problem, mu))
+
+    def solve_assembled(self, mu: Array, vi: VariationalInequality) -> HighFidelitySolution:
+        """Solve at mu (d,) what was assembled there."""
         found = solve(vi, self._stiffness(vi), self._nearest(mu))
         reason = self._problem.refuse(mu, found.u, found.lam)
         if reason:

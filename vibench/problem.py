@@ -246,15 +246,15 @@ def _bytes(vi: VariationalInequality) -> int:
     return int(12 * (vi.A.nnz + vi.B.nnz)) + vi.f.nbytes + vi.g.nbytes
 
 
-def check_coercive(problem: Problem, mu: Array) -> None:
-    """Refuse a problem whose A is not symmetric positive definite at mu (d,).
+def check_coercive(A: SparseMatrix, mu: Array) -> None:
+    """Refuse a stiffness A (n×n) that is not symmetric positive definite at mu (d,).
 
     Raises
     ------
     NumericalError
         Saying where, and what it is not.
     """
-    InnerProduct(problem.assemble(mu).A, f"A at mu = {mu.tolist()}")
+    InnerProduct(A, f"A at mu = {mu.tolist()}")
 
 
 def training_parameters(problem: Problem) -> Array:

@@ -62,10 +62,11 @@ class HighFidelity(Stage):
         seconds, fallbacks, solver = [], [], highfidelity.Solver(problem)
         for k, mu in enumerate(mus):
             watch = Stopwatch()
-            solution = solver.solve(mu)
+            vi = checked_assembly(problem, mu)
+            solution = solver.solve_assembled(mu, vi)
             seconds.append(watch.seconds())
             if k == 0 or "A" not in problem.constant:
-                check_coercive(problem, mu)
+                check_coercive(vi.A, mu)
             u[:, k], lam[:, k] = solution.u, solution.lam
             fallbacks.append(solution.fallback)
         solutions = Solutions(mus, u, lam, tuple(seconds), tuple(fallbacks))
