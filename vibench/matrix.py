@@ -11,6 +11,7 @@ from typing import Any
 
 from vibench import plugins
 from vibench.errors import RequestError
+from vibench.nested import NestedStrategy
 from vibench.provenance import core_code, solver_version
 from vibench.strategy import Stop
 from vibench.study import Entry, Study, ToleranceTable
@@ -58,7 +59,8 @@ class Cell:
     """One cell: problem × dual strategy × primal strategy × tolerances × QP solver × assembly.
 
     `interpolation` is the tolerance of reduced assembly, `None` for assembly in full. `seed`, `validation` and
-    `accuracy` are the study's; labels are for reading and no part of the identity.
+    `accuracy` are the study's. Labels are for reading and no part of the identity; nor is `along`, the tolerances in
+    the study of a nested primal strategy, which are reached on one way.
     """
 
     problem: Plugin
@@ -75,12 +77,13 @@ class Cell:
     validation: int
     accuracy: float
     labels: tuple[str, str, str]
+    along: tuple[float, ...] = ()
 
     @property
     def key(self) -> str:
         """Hash of everything that determines the cell's numbers, the code aside."""
         content = asdict(self)
-        del content["labels"]
+        del content["labels"], content["along"]
         for plugin in ("problem", "dual", "primal"):
             del content[plugin]["code"]
         return digest(content)
@@ -105,7 +108,7 @@ class Cell:
             content[axis] = replace(plugin, code=plugins.code(plugin.kind, plugin.name))
         for axis in ("pod", "cone"):
             content[axis] = Stop(**content[axis])
-        return cls(**content | {"labels": tuple(content["labels"])})
+        return cls(**content | {name: tuple(content[name]) for name in ("labels", "along")})
 
     @property
     def code(self) -> str:
@@ -137,6 +140,7 @@ def expand(study: Study) -> list[Cell]:
     """
     cells: dict[str, Cell] = {}
     for problem, table in product(study.problem, study.tolerances):
+        along = {entry.title: _along(entry, table) for entry in study.primal}
         for dual, pod, cone, primal, tolerance in _combinations(study, table):
             for assembly, solver in product(study.assembly, study.solver_names()):
                 cell = Cell(
@@ -154,11 +158,18 @@ def expand(study: Study) -> list[Cell]:
                     validation=study.validation,
                     accuracy=study.accuracy,
                     labels=(problem.title, dual.title, primal.title),
+                    along=along[primal.title],
                 )
                 cells.setdefault(cell.key, cell)
     if not cells:
         raise RequestError(f"study '{study.name}': the matrix is empty")
     return list(cells.values())
+
+
+def _along(primal: Entry, table: ToleranceTable) -> tuple[float, ...]:
+    if not issubclass(plugins.load("primal strategy", primal.name), NestedStrategy):
+        return ()
+    return tuple(sorted({value for value in table.of_primal(primal) if value is not None}, reverse=True))
 
 
 def _combinations(study: Study, table: ToleranceTable) -> Iterator[tuple[Entry, Stop, Stop, Entry, float | None]]:

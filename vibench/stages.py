@@ -14,6 +14,7 @@ from vibench.contracts import check_cone, check_enrichment
 from vibench.greedy import LazyMaximum
 from vibench.infsup import Multipliers, beta_span, multipliers
 from vibench.matrix import Cell, Plugin
+from vibench.nested import Grown, grow_through
 from vibench.pod import POD, pod
 from vibench.problem import training_parameters
 from vibench.reduced import ReducedModel
@@ -117,13 +118,37 @@ class TrainingConstants(Stage):
 
 
 @dataclass(frozen=True)
+class GrowthStage(Stage):
+    """A nested primal strategy, grown once through all its tolerances."""
+
+    pod: PODStage
+    cone: ConeStage
+    primal: Plugin
+    tolerances: tuple[float, ...]
+
+    def inputs(self) -> tuple[Stage, ...]:
+        """POD and cone."""
+        return (self.pod, self.cone)
+
+    def run(self, store: Store) -> Result:
+        """A `Grown`; its seconds are counted where its tolerances are."""
+        return Result(grow_through(self.primal.create(), _offline(store, self.pod, self.cone), self.tolerances))
+
+
+@dataclass(frozen=True)
 class EnrichmentStage(Stage):
-    """The primal strategy, offline."""
+    """The primal strategy, offline; `along` are the tolerances that a nested one is grown through."""
 
     pod: PODStage
     cone: ConeStage
     primal: Plugin
     tolerance: float | None
+    along: tuple[float, ...] = ()
+
+    @property
+    def growth(self) -> GrowthStage | None:
+        """The stage that builds it beside those of other tolerances."""
+        return GrowthStage(self.pod, self.cone, self.primal, self.along) if self.along else None
 
     @property
     def reached(self) -> TrainingConstants:
@@ -132,22 +157,30 @@ class EnrichmentStage(Stage):
 
     def inputs(self) -> tuple[Stage, ...]:
         """POD, cone and what is to be reached; the training parameters come from the problem."""
-        return (self.pod, self.cone, self.reached)
+        known = (self.pod, self.cone, self.reached)
+        return known if self.growth is None else (*known, self.growth)
 
     def run(self, store: Store) -> Result:
         """Build the enrichment; what it reaches on the training set is assessed, not timed."""
-        problem = build_problem(self.pod.problem)
-        basis: POD = value_of(store, self.pod)
-        reduced: ReducedCone = value_of(store, self.cone)
-        offline = Offline(problem, basis.basis, reduced.cone, reduced.prepared.span, training_parameters(problem))
-        strategy = self.primal.create()
-        enrichment, seconds = timed(lambda: strategy.build(offline, self.tolerance))
-        check_enrichment(enrichment, problem.V, basis.basis)
+        offline = _offline(store, self.pod, self.cone)
+        if self.growth is not None and self.tolerance is not None:
+            grown: Grown = value_of(store, self.growth)
+            enrichment, seconds = grown.at(self.tolerance)
+        else:
+            strategy = self.primal.create()
+            enrichment, seconds = timed(lambda: strategy.build(offline, self.tolerance))
+        check_enrichment(enrichment, offline.problem.V, offline.basis)
         key = {"stage": "enrichment"}
         histories = [History(key, quantity, tuple(values)) for quantity, values in enrichment.history.items()]
         if enrichment.kind is Kind.FIXED:
             histories += _training_constants(key, offline, enrichment, value_of(store, self.reached))
         return Result(enrichment, seconds, tuple(histories))
+
+
+def _offline(store: Store, pod: PODStage, cone: ConeStage) -> Offline:
+    problem, basis = build_problem(pod.problem), value_of(store, pod).basis
+    reduced: ReducedCone = value_of(store, cone)
+    return Offline(problem, basis, reduced.cone, reduced.prepared.span, training_parameters(problem))
 
 
 def _training_constants(
@@ -194,7 +227,7 @@ def _smallest_over_steps(images: list[Array], weights: list[float], first: int) 
 def enrichment_stage(cell: Cell) -> EnrichmentStage:
     """The stage that completes the reduced model of a cell."""
     cone = ConeStage(cell.problem, cell.dual, cell.cone)
-    return EnrichmentStage(PODStage(cell.problem, cell.pod), cone, cell.primal, cell.primal_tol)
+    return EnrichmentStage(PODStage(cell.problem, cell.pod), cone, cell.primal, cell.primal_tol, cell.along)
 
 
 def reduced_model(store: Store, stage: EnrichmentStage) -> tuple[ReducedModel, Array, Multipliers]:

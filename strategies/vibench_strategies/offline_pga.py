@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import ClassVar
+from collections.abc import Mapping
 
 import numpy as np
 
@@ -10,50 +10,75 @@ from vibench.arrays import Array
 from vibench.errors import NumericalError
 from vibench.greedy import TIE, LazyMaximum
 from vibench.linalg import orthonormal_range, remove, svd
-from vibench.strategy import Enrichment, Kind, Offline, PrimalStrategy
+from vibench.nested import Growth, NestedStrategy
+from vibench.strategy import Offline
 from vibench.supremizer import constraint_classes, supremizer_coordinates
 
 SMALL = 1e-10
 """Squares of sines below this are computed from residual vectors, not from the downdated Gram matrix."""
 
 
-class OfflinePGA(PrimalStrategy):
+class OfflinePGA(NestedStrategy):
     """PGA, Algorithm 1 of Niakh, Drouet, Ehrlacher and Ern (2022).
 
     The tolerance δ bounds σ_S(mu), equation (21), over the training set; β_S(mu) ≥ √(1 − δ²)·β_on(mu) follows.
     """
 
-    takes_tolerance: ClassVar[bool] = True
+    def begin(self, offline: Offline) -> ProjectedGreedy:
+        """Represent the supremizers of the training set in coordinates."""
+        return ProjectedGreedy(offline)
 
-    def build(self, offline: Offline, tolerance: float | None) -> Enrichment:
-        """Add the worst represented supremizer of the worst parameter until σ ≤ δ everywhere.
 
-        Training parameters whose constraint matrices are proportional share one supremizer space and count once.
-        σ only falls as S grows (Lemma 3.2), so the maximum is taken lazily.
+class ProjectedGreedy(Growth):
+    """Adds the worst represented supremizer of the worst parameter.
+
+    Training parameters whose constraint matrices are proportional share one supremizer space and count once. σ only
+    falls as S grows (Lemma 3.2), so the maximum is taken lazily.
+    """
+
+    def __init__(self, offline: Offline) -> None:
+        problem = offline.problem
+        different = constraint_classes([problem.constraint(mu)[0] for mu in offline.training]).representatives
+        self._space, supremizers = supremizer_coordinates(problem.V, offline.basis, different, offline.span)
+        self._grown = self._plain = self._space.plain
+        self._targets = [_Target(found, self._plain) for found in supremizers]
+        self._maximum = LazyMaximum(np.ones(len(self._targets)))
+        self._sigma: list[float] = []
+        self._assess()
+
+    @property
+    def count(self) -> int:
+        """Number of vectors."""
+        return self._grown.shape[1] - self._plain.shape[1]
+
+    def reached(self, tolerance: float) -> bool:
+        """Whether σ ≤ δ everywhere."""
+        return self._sigma[-1] <= tolerance
+
+    def grow(self) -> None:
+        """Add a vector, lines 5 to 7.
 
         Raises
         ------
         NumericalError
-            If the tolerance is not reached with every supremizer there is.
+            If every supremizer is represented.
         """
-        if tolerance is None:
-            raise ValueError("the projected greedy algorithm needs a tolerance")
-        problem = offline.problem
-        different = constraint_classes([problem.constraint(mu)[0] for mu in offline.training]).representatives
-        space, supremizers = supremizer_coordinates(problem.V, offline.basis, different, offline.span)
-        targets = [_Target(found, space.plain) for found in supremizers]
-        maximum = LazyMaximum(np.ones(len(targets)))
-        grown, history = space.plain, []
-        while True:
-            worst, sigma = maximum.next(lambda p: targets[p].sigma(grown))  # noqa: B023  called at once
-            history.append(sigma)
-            if sigma <= tolerance:
-                break
-            if grown.shape[1] == grown.shape[0]:
-                raise NumericalError(f"all supremizers leave σ = {sigma:.0e}, above the tolerance {tolerance:g}")
-            grown = np.column_stack([grown, targets[worst].worst_direction(grown)])
-        added = space.vectors(grown[:, space.plain.shape[1] :])
-        return Enrichment(Kind.FIXED, vectors=added, history={"sigma": np.array(history)})
+        if self._grown.shape[1] == self._grown.shape[0]:
+            raise NumericalError(f"all supremizers leave σ = {self._sigma[-1]:.0e}")
+        self._grown = np.column_stack([self._grown, self._targets[self._worst].worst_direction(self._grown)])
+        self._assess()
+
+    def vectors(self, first: int) -> Array:
+        """The vectors from their coordinates."""
+        return self._space.vectors(self._grown[:, self._plain.shape[1] + first :])
+
+    def history(self) -> Mapping[str, Array]:
+        """σ, the largest over the training set."""
+        return {"sigma": np.array(self._sigma)}
+
+    def _assess(self) -> None:
+        self._worst, sigma = self._maximum.next(lambda p: self._targets[p].sigma(self._grown))
+        self._sigma.append(sigma)
 
 
 class _Target:
