@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from numerics import spd
-from vibench import qp
+from vibench import judgement, qp
 from vibench.agreement import Recorded, Slack, allowed, compare, disagreement_rows, sentence, slack, solution_row
 from vibench.problem import VariationalInequality
 from vibench.schema import KEYS
@@ -32,7 +32,7 @@ def test_no_two_points_with_small_residuals_are_farther_apart_than_allowed(seed:
     """The accuracy is the largest residual of the two: what the theorem needs, and no more."""
     vi, rng = program(seed), np.random.default_rng(seed)
     first, second = random_answer(vi, rng, size), random_answer(vi, rng, size)
-    accuracy = max(qp.residuals(vi, *answer).worst for answer in (first, second))
+    accuracy = max(judgement.residuals(vi, *answer).worst for answer in (first, second))
     limit = allowed(slack(vi, *first, accuracy), slack(vi, *second, accuracy))
     assert np.linalg.norm(first[0] - second[0]) <= limit * (1.0 + 1e-9) + 1e-12
 

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from numerics import Varying, spd
 from vibench import highfidelity
 from vibench.condensation import Condensed, Pattern
+from vibench.errors import NumericalError
 from vibench.highfidelity import Solver, Stiffness
 from vibench.problem import VariationalInequality
 
@@ -66,7 +67,7 @@ def test_condensed_systems_have_the_solutions_of_the_whole_ones(seed: int, touch
 @pytest.mark.parametrize("declared", [True, False])
 def test_a_sweep_gives_the_solutions_of_single_solves(declared: bool) -> None:
     class Declaring(Varying):
-        contact_dofs = property(lambda self: np.arange(4, 26))
+        contact_dofs = property(lambda self: np.arange(8, 52))
 
     problem = (Declaring if declared else Varying)(n=60)
     solver, iterations = Solver(problem), []
@@ -77,3 +78,12 @@ def test_a_sweep_gives_the_solutions_of_single_solves(declared: bool) -> None:
         iterations.append((found.iterations, alone.iterations))
     warm, cold = np.sum(iterations[1:], axis=0)
     assert warm < cold
+
+
+def test_a_constraint_outside_the_declared_contact_is_refused() -> None:
+    class Declaring(Varying):
+        contact_dofs = property(lambda self: np.arange(14, 52))
+
+    problem = Declaring(n=60)
+    with pytest.raises(NumericalError, match="B touches 1 unknowns outside the declared contact_dofs, the first is 13"):
+        Solver(problem).solve(problem.training_set()[0])

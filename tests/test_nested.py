@@ -81,8 +81,8 @@ def test_cells_of_a_nested_strategy_know_its_tolerances_and_keep_their_identity(
     def cells(*tolerances: float) -> dict[float | None, tuple[str, tuple[float, ...]]]:
         table = {"pod": [0.1], "dual": [0.1], "primal": {"offline-pga": list(tolerances)}}
         study = Study.model_validate({
-            "name": "some", "validation": 3, "problem": ["obstacle"], "dual": ["cpg"], "primal": ["offline-pga", "decorrelated"],
-            "solvers": ["piqp"], "tolerances": [table],
+            "name": "some", "validation": 3, "problem": ["obstacle"], "dual": ["cpg"], "solvers": ["piqp"],
+            "primal": ["offline-pga", "decorrelated"], "tolerances": [table],
         })  # fmt: skip
         return {cell.primal_tol: (cell.key, cell.along) for cell in expand(study)}
 

@@ -17,7 +17,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from numerics import Varying
-from vibench import qp
+from vibench import judgement, qp
 from vibench.errors import NumericalError
 from vibench.highfidelity import Solver
 from vibench.infsup import multipliers
@@ -181,7 +181,7 @@ def test_without_modes_or_without_generators(constraint: str, kind: str, modes: 
         assert_same_program(model, reduced, mu, 1e-9)
         query = reduced.assemble(mu)
         answer = qp.solve(query.program, "piqp", 1e-10, factor=query.factor)
-        assert qp.judge(query.program, answer, 1e-8)[0] is qp.Status.OK
+        assert judgement.judge(query.program, answer, 1e-8)[0] is qp.Status.OK
 
 
 @given(st.integers(14, 40), st.integers(3, 9), st.integers(1, 5), st.integers(1, 5), st.sampled_from(WAYS))
@@ -249,7 +249,7 @@ def test_a_factor_comes_with_a_constant_stiffness_on_a_fixed_space(
     assert (query.factor is not None) == dual
     primal = qp.solve(query.program, "piqp", 1e-10)
     given = qp.solve(query.program, "piqp", 1e-10, factor=query.factor)
-    assert qp.judge(query.program, given, 1e-8)[0] is qp.Status.OK
+    assert judgement.judge(query.program, given, 1e-8)[0] is qp.Status.OK
     assert np.allclose(given.x, primal.x, atol=1e-7 * np.abs(primal.x).max())
     assert np.allclose(query.program.B.T @ given.alpha, query.program.B.T @ primal.alpha, atol=1e-6)
 
@@ -310,7 +310,7 @@ def test_reduced_queries_of_real_problems_are_as_good_as_full_ones(name: str, ki
         exact, errors = solver.solve(mu), []
         for query in (reduced.assemble(mu), model.assemble(mu)):
             answer = qp.solve(query.program, "piqp", 1e-9, factor=query.factor)
-            assert qp.judge(query.program, answer, 1e-8)[0] is qp.Status.OK
+            assert judgement.judge(query.program, answer, 1e-8)[0] is qp.Status.OK
             u, lam = query.basis @ answer.x, model.generators @ answer.alpha
             errors.append([float(problem.V.norm(u - exact.u)), float(problem.W.norm(lam - exact.lam))])
         assert np.allclose(errors[0], errors[1], rtol=0.01)

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from numerics import spd
-from vibench import qp
+from vibench import judgement, qp
 from vibench.errors import RequestError
 from vibench.problem import VariationalInequality
 from vibench.qp import Answer, Status
@@ -44,14 +44,14 @@ def exact(vi: VariationalInequality) -> tuple[np.ndarray, np.ndarray]:
 def test_residuals_vanish_at_the_solution_and_only_there(seed: int) -> None:
     vi = program(seed)
     x, alpha = exact(vi)
-    assert qp.residuals(vi, x, np.maximum(alpha, 0.0)).worst < 1e-8
-    moved = qp.residuals(vi, x + 0.1 * np.abs(x).max(), alpha)
+    assert judgement.residuals(vi, x, np.maximum(alpha, 0.0)).worst < 1e-8
+    moved = judgement.residuals(vi, x + 0.1 * np.abs(x).max(), alpha)
     assert max(moved.dual, moved.primal) > 1e-4
 
 
 def test_residuals_as_defined_by_hand() -> None:
     vi = VariationalInequality(A=2.0 * np.eye(2), f=np.array([2.0, 0.0]), B=np.array([[3.0, 4.0]]), g=np.array([1.0]))
-    found = qp.residuals(vi, np.array([1.0, 0.0]), np.array([0.5]))
+    found = judgement.residuals(vi, np.array([1.0, 0.0]), np.array([0.5]))
     assert np.isclose(found.primal, (3.0 - 1.0) / 5.0)  # row of norm 5; ‖g‖ in row units is 0.2, so the floor 1 counts
     assert np.isclose(found.dual, 2.0 / 2.0)  # Ax − f + Bᵀα = (1.5, 2); over max(2, 2, 2)
     assert np.isclose(found.gap, 0.5 / 2.0)  # 2 − 2 + 0.5 over max(1, 2, 0.5)
@@ -59,14 +59,14 @@ def test_residuals_as_defined_by_hand() -> None:
 
 def test_the_gap_of_a_solution_that_is_round_off_is_relative_to_the_energy_of_the_load() -> None:
     vi = VariationalInequality(A=2.0 * np.eye(2), f=np.array([2.0, 0.0]), B=np.array([[1.0, 0.0]]), g=np.zeros(1))
-    found = qp.residuals(vi, np.array([1e-17, 0.0]), np.array([2.0]))
+    found = judgement.residuals(vi, np.array([1e-17, 0.0]), np.array([2.0]))
     assert np.isclose(found.gap, 2e-17 / (1e-4 * 4.0**2 / (2.0 * 8.0)))  # 1e-17·2 over 1e-4 (fᵀf)²/2fᵀAf
 
 
 def test_without_unknowns_there_is_nothing_to_solve_but_something_to_violate() -> None:
     for bound, status in ((1.0, "ok"), (-1.0, "infeasible")):
         vi = VariationalInequality(np.zeros((0, 0)), np.zeros(0), np.zeros((1, 0)), np.array([bound]))
-        assert qp.judge(vi, qp.solve(vi, "osqp", 1e-8), 1e-8)[0] == status
+        assert judgement.judge(vi, qp.solve(vi, "osqp", 1e-8), 1e-8)[0] == status
 
 
 @pytest.mark.parametrize("solver", ["piqp", "proxqp", "osqp"])
@@ -77,7 +77,7 @@ def test_required_solvers_reach_the_accuracy_they_are_asked_for(solver: str, acc
         if abs(vi.f @ exact(vi)[0]) < 0.05 * np.abs(vi.f).max():
             continue  # the energy nearly vanishes, so a relative gap asks for more than the accuracy
         answer = qp.solve(vi, solver, accuracy)
-        status, reason, found = qp.judge(vi, answer, accuracy)
+        status, reason, found = judgement.judge(vi, answer, accuracy)
         assert status is Status.OK, (seed, reason)
         assert found is not None
         assert found.worst <= accuracy
@@ -91,7 +91,7 @@ def test_sparse_programs_go_through_the_same_door() -> None:
     sparse = VariationalInequality(sp.csc_array(vi.A), vi.f, sp.csr_array(vi.B), vi.g)
     answer = qp.solve(sparse, "piqp", 1e-9)
     assert np.allclose(answer.x, exact(vi)[0], atol=1e-7)
-    assert qp.residuals(sparse, answer.x, answer.alpha).worst <= 1e-9
+    assert judgement.residuals(sparse, answer.x, answer.alpha).worst <= 1e-9
 
 
 @given(seeds, st.integers(1, 7), st.integers(0, 5))
@@ -111,7 +111,7 @@ def test_with_a_factor_of_a_the_dual_is_solved_and_gives_the_same_solution(seed:
     assert np.allclose(vi.B.T @ dual.alpha, vi.B.T @ primal.alpha, atol=1e-5 * max(1e-3, np.abs(vi.f).max()))
     if m <= n:  # only then are they unique
         assert np.allclose(dual.alpha, primal.alpha, atol=1e-4 * max(1e-3, np.abs(primal.alpha).max(initial=0.0)))
-    assert qp.residuals(vi, dual.x, dual.alpha).dual <= 1e-12  # x is made from α, whatever the solver did
+    assert judgement.residuals(vi, dual.x, dual.alpha).dual <= 1e-12  # x is made from α, whatever the solver did
 
 
 @pytest.mark.parametrize("solver", ["piqp", "proxqp", "osqp"])
@@ -121,8 +121,8 @@ def test_the_dual_of_a_program_with_rows_of_very_different_sizes_is_solved_to_th
     for seed in range(30):
         vi = program(seed)
         primal, dual = (qp.solve(vi, solver, 1e-9, factor=L) for L in (None, np.linalg.cholesky(vi.A)))
-        assert qp.judge(vi, primal, 1e-8)[0] is Status.OK
-        assert qp.judge(vi, dual, 1e-8)[:2] == (Status.OK, ""), seed
+        assert judgement.judge(vi, primal, 1e-8)[0] is Status.OK
+        assert judgement.judge(vi, dual, 1e-8)[:2] == (Status.OK, ""), seed
         assert np.allclose(dual.x, exact(vi)[0], atol=1e-6 * max(1.0, np.abs(primal.x).max()))
 
 
@@ -143,13 +143,13 @@ def test_a_solver_that_gives_up_on_the_dual_gives_no_solution() -> None:
     vi = program(3)
     answer = qp.solve(vi, "no", 1e-7, {"no": lambda *_: Answer(None, None, "gave up")}, np.linalg.cholesky(vi.A))
     assert (answer.x, answer.alpha, answer.solver_status) == (None, None, "gave up")
-    assert qp.judge(vi, answer, 1e-7)[0] is Status.FAILED
+    assert judgement.judge(vi, answer, 1e-7)[0] is Status.FAILED
 
 
 def test_a_program_without_constraints() -> None:
     vi = VariationalInequality(np.eye(3), np.arange(3.0), np.zeros((0, 3)), np.zeros(0))
     answer = qp.solve(vi, "piqp", 1e-8)
-    assert qp.judge(vi, answer, 1e-8)[0] is Status.OK
+    assert judgement.judge(vi, answer, 1e-8)[0] is Status.OK
     assert np.allclose(answer.x, np.arange(3.0), atol=1e-7)
 
 
@@ -157,15 +157,15 @@ INFEASIBLE = VariationalInequality(np.eye(2), np.ones(2), np.array([[1.0, 0.0], 
 
 
 def test_infeasible_only_with_a_certificate_of_our_own() -> None:
-    alpha = qp.infeasibility_certificate(INFEASIBLE)
+    alpha = judgement.infeasibility_certificate(INFEASIBLE)
     assert alpha is not None
     assert np.all(alpha >= 0.0)
     assert np.allclose(INFEASIBLE.B.T @ alpha, 0.0)
     assert INFEASIBLE.g @ alpha < 0.0
-    assert qp.infeasibility_certificate(program(0)) is None
+    assert judgement.infeasibility_certificate(program(0)) is None
     nothing = Answer(None, None, "infeasible, I say")
-    assert qp.judge(INFEASIBLE, nothing, 1e-7)[0] is Status.INFEASIBLE
-    status, reason, found = qp.judge(program(0), nothing, 1e-7)
+    assert judgement.judge(INFEASIBLE, nothing, 1e-7)[0] is Status.INFEASIBLE
+    status, reason, found = judgement.judge(program(0), nothing, 1e-7)
     assert status is Status.FAILED
     assert "infeasible, I say" in reason
     assert found is None
@@ -175,13 +175,13 @@ def test_not_finite_is_seen_before_anything_else() -> None:
     vi = program(1)
     x, alpha = exact(vi)
     x[0] = np.nan
-    assert qp.judge(vi, Answer(x, alpha, "solved"), 1e-7)[0] is Status.NONFINITE
+    assert judgement.judge(vi, Answer(x, alpha, "solved"), 1e-7)[0] is Status.NONFINITE
 
 
 def test_a_claim_is_not_believed() -> None:
     vi = program(2)
     x, alpha = exact(vi)
-    status, reason, found = qp.judge(vi, Answer(x + 1e-3, alpha, "solved"), 1e-7)
+    status, reason, found = judgement.judge(vi, Answer(x + 1e-3, alpha, "solved"), 1e-7)
     assert status is Status.INACCURATE
     assert "solved" in reason
     assert "above 1e-07" in reason
@@ -194,7 +194,7 @@ def test_a_claim_is_not_believed() -> None:
 def test_one_residual_alone_makes_an_answer_inaccurate(load: float, x: float, alpha: float, name: str) -> None:
     """The program, min x² − load·x subject to x ≤ 1, has a solution: nothing here is infeasible."""
     vi = VariationalInequality(A=np.array([[2.0]]), f=np.array([load]), B=np.array([[1.0]]), g=np.ones(1))
-    status, reason, found = qp.judge(vi, Answer(np.array([x]), np.array([alpha]), "solved"), 1e-6)
+    status, reason, found = judgement.judge(vi, Answer(np.array([x]), np.array([alpha]), "solved"), 1e-6)
     assert status is Status.INACCURATE
     assert reason.startswith(f"{name} residual")
     assert [key for key in ("primal", "dual", "gap") if getattr(found, key) > 0.0] == [name]
@@ -210,7 +210,7 @@ def test_negative_multipliers_are_set_to_zero_and_reported() -> None:
     assert answer.alpha is not None
     assert answer.alpha.tolist() == [0.5, 0.0]
     assert np.isclose(answer.negative, 0.1)
-    assert "multipliers down to -1e-01" in qp.judge(vi, answer, 1e-7)[1]
+    assert "multipliers down to -1e-01" in judgement.judge(vi, answer, 1e-7)[1]
 
 
 def test_a_registered_solver_sees_scaled_data_and_its_answer_is_scaled_back() -> None:
@@ -225,7 +225,7 @@ def test_a_registered_solver_sees_scaled_data_and_its_answer_is_scaled_back() ->
     answer = qp.solve(vi, "brute", 1e-9, {"brute": brute})
     assert np.allclose(seen["rows"], 1.0)
     assert np.isclose(seen["f"], 1.0)
-    assert qp.residuals(vi, answer.x, answer.alpha).worst < 1e-9
+    assert judgement.residuals(vi, answer.x, answer.alpha).worst < 1e-9
 
 
 def test_names_are_checked_with_a_suggestion() -> None:

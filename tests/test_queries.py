@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from samples import carry_out
-from vibench import qp
+from vibench import judgement, qp
 from vibench.assembly import AssemblyStage
 from vibench.matrix import Plugin
 from vibench.problem import ParameterBox, VariationalInequality
@@ -51,7 +51,7 @@ def test_a_start_changes_the_way_and_not_the_answer(solver: str, dual: bool) -> 
     factor = np.linalg.cholesky(A) if dual else None
     cold = qp.solve(program, solver, 1e-8, factor=factor)
     warm = qp.solve(program, solver, 1e-8, factor=factor, start=cold)
-    assert qp.residuals(program, warm.x, warm.alpha).worst <= 1e-8
+    assert judgement.residuals(program, warm.x, warm.alpha).worst <= 1e-8
     assert np.allclose(warm.x, cold.x, atol=1e-6)
     assert qp.takes_start(solver) == (solver != "piqp")
     if solver == "osqp" and not dual:

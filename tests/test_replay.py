@@ -13,7 +13,7 @@ import qpsolvers
 from typer.testing import CliRunner
 
 import vibench
-from vibench import loading, qp, replay
+from vibench import judgement, loading, qp, replay
 from vibench.cli import app
 from vibench.errors import RequestError
 from vibench.loading import recorded_cell, recorded_cells
@@ -68,7 +68,7 @@ def test_stages_whose_artefacts_are_gone_are_run_again(run: Path, artefacts: Pat
     before = recorded_cell(str(run), key(run)).rows("queries")[1]["primal_residual"]
     recorded = recorded_cell(str(run), key(run))
     x, alpha = (np.frombuffer(recorded.rows("solutions")[1][name]) for name in ("x", "alpha"))
-    assert qp.residuals(recorded.program(1), x, alpha).primal == pytest.approx(before, rel=1e-6, abs=1e-15)
+    assert judgement.residuals(recorded.program(1), x, alpha).primal == pytest.approx(before, rel=1e-6, abs=1e-15)
 
 
 def test_replay_names_every_solver_and_keeps_the_program(run: Path, tmp_path: Path) -> None:

@@ -21,8 +21,9 @@ import numpy as np
 import pandas as pd
 
 from vibench.arrays import Array
+from vibench.judgement import scales
 from vibench.problem import VariationalInequality
-from vibench.qp import Status, row_norms, scales
+from vibench.qp import Status, row_norms
 from vibench.schema import DISAGREEMENTS, KEYS
 
 

@@ -11,7 +11,7 @@ import scipy.linalg
 import scipy.sparse as sp
 from scipy.sparse.linalg import splu
 
-from vibench import qp
+from vibench import judgement, qp
 from vibench.arrays import Array, Indices, Mask, SparseMatrix
 from vibench.condensation import Condensed, Pattern
 from vibench.errors import NumericalError
@@ -47,7 +47,7 @@ class HighFidelitySolution:
     lam: Array
     fallback: str
     iterations: int
-    residuals: qp.Residuals
+    residuals: judgement.Residuals
 
 
 class Solver:
@@ -79,7 +79,8 @@ class Solver:
         Raises
         ------
         NumericalError
-            If the assembly is wrong, the solution does not reach `ACCURACY`, or the problem refuses it.
+            If the assembly is wrong, the solution does not reach `ACCURACY`, or the problem refuses it; or if B touches
+            unknowns that the problem does not declare as its contact.
         """
         return self.solve_assembled(mu, checked_assembly(self._problem, mu))
 
@@ -101,7 +102,12 @@ class Solver:
 
     def _stiffness(self, vi: VariationalInequality) -> Stiffness:
         touched = np.unique(sp.csr_array(vi.B).indices)
-        if not np.all(np.isin(touched, self._touched)):
+        outside = np.setdiff1d(touched, self._touched)
+        if len(outside) and self._problem.contact_dofs is not None:
+            raise NumericalError(
+                f"B touches {len(outside)} unknowns outside the declared contact_dofs, the first is {outside[0]}"
+            )
+        if len(outside):
             self._touched, self._pattern = np.union1d(self._touched, touched), None
         if self._pattern is None:
             self._pattern, self._system = Pattern.of(vi.A, self._touched), None
@@ -206,10 +212,10 @@ def solve(
         raise NumericalError("no active set solves the high-fidelity problem; is it feasible?")
     kept, lam, iterations = found
     u = system.expand(kept)
-    residuals = qp.residuals(vi, u, lam)
+    residuals = judgement.residuals(vi, u, lam)
     if residuals.dual > 0.5 * ACCURACY:  # what a large rigid displacement leaves
         u = u + system.settle(vi.f - vi.A @ u - vi.B.T @ lam)
-        residuals = qp.residuals(vi, u, lam)
+        residuals = judgement.residuals(vi, u, lam)
     if not residuals.worst <= ACCURACY:
         raise NumericalError(f"the high-fidelity solution has residual {residuals.worst:.1e}, above {ACCURACY:.0e}")
     return HighFidelitySolution(u, lam, fallback, iterations, residuals)

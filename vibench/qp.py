@@ -16,15 +16,11 @@ import numpy as np
 import qpsolvers
 import scipy.linalg
 import scipy.sparse as sp
-from scipy.optimize import nnls
 
 from vibench.arrays import Array, SparseMatrix
 from vibench.errors import NumericalError, unknown_name
 from vibench.problem import VariationalInequality
 from vibench.solver_settings import SETTINGS, settings_for, start_for
-
-ENERGY_FLOOR = 1e-4
-"""The gap is relative to no less than this share of the energy that a steepest descent step would gain."""
 
 
 class Status(StrEnum):
@@ -67,32 +63,6 @@ class QPSolver(Protocol):
         """Solve to the relative accuracy asked for."""
 
 
-@dataclass(frozen=True)
-class Residuals:
-    """Relative residuals as the benchmark computes them, whatever the solver claims.
-
-    Attributes
-    ----------
-    primal
-        max (B x − g)₊ with every row in units of its own norm, over max(1, ‖g‖∞).
-    dual
-        ‖A x − f + Bᵀα‖∞ over max(‖A x‖∞, ‖f‖∞, ‖Bᵀα‖∞).
-    gap
-        |xᵀA x − fᵀx + gᵀα| over max(|½ xᵀA x|, |fᵀx|, |gᵀα|, `ENERGY_FLOOR` (fᵀf)² / 2fᵀA f). The last term is a share
-        of what one step of steepest descent from 0 gains: where constraints leave next to nothing of that energy, the
-        others are round-off.
-    """
-
-    primal: float
-    dual: float
-    gap: float
-
-    @property
-    def worst(self) -> float:
-        """The largest of the three."""
-        return max(self.primal, self.dual, self.gap)
-
-
 def solve(
     program: VariationalInequality,
     solver: str,
@@ -130,7 +100,7 @@ def solve(
         return Answer(np.zeros(0), np.zeros(len(program.g)), "nothing to solve: no unknowns")
     if factor is not None:
         return _through_the_dual(program, factor, solver, accuracy, extra, start)
-    rows, cost = row_norms(program.B), _scale(program.f)
+    rows, cost = row_norms(program.B), size(program.f)
     scaled = VariationalInequality(program.A / cost, program.f / cost, _divide_rows(program.B, rows), program.g / rows)
     if extra and solver in extra:
         answer = extra[solver](scaled, accuracy)
@@ -141,9 +111,9 @@ def solve(
         if start is not None and takes_start(solver) and start.x is not None and start.alpha is not None:
             begin = start_for(solver, start.x, rows * start.alpha / cost)
         answer = _through_qpsolvers(scaled, solver, accuracy, begin)
-    for name, value, size in (("x", answer.x, len(program.f)), ("α", answer.alpha, len(program.g))):
-        if value is not None and value.shape != (size,):
-            raise NumericalError(f"the solver returned {name} of shape {value.shape}, expected ({size},)")
+    for name, value, count in (("x", answer.x, len(program.f)), ("α", answer.alpha, len(program.g))):
+        if value is not None and value.shape != (count,):
+            raise NumericalError(f"the solver returned {name} of shape {value.shape}, expected ({count},)")
     if not isinstance(answer.solver_status, str) or not isinstance(answer.iterations, int | np.integer | None):
         found = f"{answer.solver_status!r:.40}, {answer.iterations!r:.40}"
         raise NumericalError(f"the solver reports the status and iterations {found}; expected a text, a number or None")
@@ -186,84 +156,6 @@ def _through_the_dual(
     x = scipy.linalg.solve_triangular(factor, load - constraints @ forces, lower=True, trans="T", check_finite=False)
     negative = -min(float(np.min(answer.x / rows, initial=0.0)), 0.0)
     return replace(answer, x=x, alpha=forces / rows, negative=negative)
-
-
-@dataclass(frozen=True)
-class Scales:
-    """What the residuals of a solution are relative to; the primal one in units of each row's own norm."""
-
-    primal: float
-    dual: float
-    gap: float
-
-
-def scales(program: VariationalInequality, x: Array, alpha: Array) -> Scales:
-    """Denominators of the residuals of x (n,), α (m,); see `Residuals`."""
-    A, f, B, g = program.A, program.f, program.B, program.g
-    Ax = A @ x
-    return Scales(
-        primal=max(1.0, _peak(g / row_norms(B))),
-        dual=max(_peak(Ax), _peak(f), _peak(B.T @ alpha)),
-        gap=max(abs(0.5 * float(x @ Ax)), abs(float(f @ x)), abs(float(g @ alpha)), ENERGY_FLOOR * _descent(A, f)),
-    )
-
-
-def _descent(A: SparseMatrix | Array, f: Array) -> float:
-    """(fᵀf)² / 2fᵀA f: the energy that the best multiple of f gains, a part of what A⁻¹f would."""
-    curvature = float(f @ (A @ f))
-    return 0.5 * float(f @ f) ** 2 / curvature if curvature > 0.0 else 0.0
-
-
-def residuals(program: VariationalInequality, x: Array, alpha: Array) -> Residuals:
-    """Relative residuals of x (n,), α (m,) ≥ 0; see `Residuals`."""
-    A, f, B, g = program.A, program.f, program.B, program.g
-    scale = scales(program, x, alpha)
-    Ax = A @ x
-    return Residuals(
-        primal=float(np.max((B @ x - g) / row_norms(B), initial=0.0)) / scale.primal,
-        dual=_ratio(_peak(Ax - f + B.T @ alpha), scale.dual),
-        gap=_ratio(abs(float(x @ Ax) - float(f @ x) + float(g @ alpha)), scale.gap),
-    )
-
-
-def judge(program: VariationalInequality, answer: Answer, accuracy: float) -> tuple[Status, str, Residuals | None]:
-    """Classify an answer by what we compute ourselves: status, reason ("" when ok), residuals if they exist."""
-    if answer.x is None or answer.alpha is None:
-        if infeasibility_certificate(program) is not None:
-            return Status.INFEASIBLE, "no point satisfies the constraints (certified)", None
-        return Status.FAILED, f"the solver returned nothing: {answer.solver_status}", None
-    if not (np.all(np.isfinite(answer.x)) and np.all(np.isfinite(answer.alpha))):
-        return Status.NONFINITE, f"the solution is not finite: {answer.solver_status}", None
-    found = residuals(program, answer.x, answer.alpha)
-    if found.worst <= accuracy:
-        return Status.OK, "", found
-    if found.primal > accuracy and infeasibility_certificate(program) is not None:
-        return Status.INFEASIBLE, "no point satisfies the constraints (certified)", found
-    name = max(("primal", "dual", "gap"), key=lambda key: getattr(found, key))
-    value = getattr(found, name)
-    clipped = f" after setting multipliers down to -{answer.negative:.0e} to zero" if answer.negative else ""
-    return (
-        Status.INACCURATE,
-        f"{name} residual {value:.1e} above {accuracy:.0e}{clipped}: {answer.solver_status}",
-        found,
-    )
-
-
-def infeasibility_certificate(program: VariationalInequality, tolerance: float = 1e-10) -> Array | None:
-    """α ≥ 0 with Bᵀα = 0 and gᵀα = −1 (Farkas), or `None` if no such α is found; dense programs only."""
-    if not isinstance(program.B, np.ndarray) or not len(program.g):
-        return None
-    rows = row_norms(program.B)
-    system = np.vstack([(program.B / rows[:, None]).T, program.g / rows / _scale(program.g / rows)])
-    target = np.zeros(system.shape[0])
-    target[-1] = -1.0
-    try:
-        alpha, distance = nnls(system, target, maxiter=30 * system.shape[1])
-    except RuntimeError:  # nnls gave up: no certificate
-        return None
-    if distance > tolerance * max(1.0, float(alpha.max(initial=0.0))):
-        return None
-    return np.asarray(alpha / rows)
 
 
 def installed_solvers(extra: Iterable[str] = ()) -> list[str]:
@@ -312,13 +204,11 @@ def _divide_rows(B: SparseMatrix | Array, rows: Array) -> SparseMatrix | Array:
     return B / rows[:, None] if isinstance(B, np.ndarray) else sp.diags_array(1.0 / rows) @ B
 
 
-def _peak(vector: Array) -> float:
+def peak(vector: Array) -> float:
+    """Largest entry in absolute value; 0 of an empty vector."""
     return float(np.max(np.abs(vector), initial=0.0))
 
 
-def _scale(vector: Array) -> float:
-    return _peak(vector) or 1.0
-
-
-def _ratio(numerator: float, denominator: float) -> float:
-    return numerator / denominator if denominator > 0.0 else numerator
+def size(vector: Array) -> float:
+    """What a vector is divided by to have a largest entry of 1; 1 for zero."""
+    return peak(vector) or 1.0

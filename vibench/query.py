@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
-from vibench import plugins, qp
+from vibench import judgement, plugins, qp
 from vibench.agreement import slack, solution_row
 from vibench.arrays import Array
 from vibench.assembly import Model
@@ -89,7 +89,7 @@ class Task:
             raise
         except (Exception, SystemExit) as error:  # noqa: BLE001  a solver may raise anything; the row says what
             return row | {"status": Status.ERROR.value, "reason": in_a_line(error)}, None
-        status, reason, residuals = qp.judge(program, answer, self.accuracy)
+        status, reason, residuals = judgement.judge(program, answer, self.accuracy)
         if solving.wall > self.query_seconds:
             status, reason = Status.TIMEOUT, f"took {solving.wall:.1f} s, the limit is {self.query_seconds:g} s"
         row |= {

@@ -12,7 +12,7 @@ import numpy as np
 import pandas as pd
 import qpsolvers
 
-from vibench import plugins, qp
+from vibench import judgement, plugins, qp
 from vibench.agreement import vectors
 from vibench.arrays import Array
 from vibench.errors import RequestError, in_a_line
@@ -75,7 +75,7 @@ def _solved(program: VariationalInequality, solver: str, accuracy: float, known:
 
 
 def _line(program: VariationalInequality, answer: Answer, accuracy: float, known: Array | None) -> dict[str, Any]:
-    status, _, residuals = qp.judge(program, answer, accuracy)
+    status, _, residuals = judgement.judge(program, answer, accuracy)
     line: dict[str, Any] = {"claims": answer.solver_status, "status": status.value, "iterations": answer.iterations}
     if residuals is not None:
         line |= {"primal": residuals.primal, "dual": residuals.dual, "gap": residuals.gap}

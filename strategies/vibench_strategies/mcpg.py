@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from vibench import qp
+from vibench import judgement, qp
 from vibench.arrays import Array
 from vibench.cone import greedy_cone
 from vibench.problem import VariationalInequality
@@ -63,7 +63,7 @@ def removable_part(theta: Array, generators: Array, W: InnerProduct) -> tuple[Ar
         answer = qp.solve(program, solver, ACCURACY)
         if answer.x is None or answer.alpha is None or not np.all(np.isfinite(np.append(answer.x, answer.alpha))):
             continue
-        found = qp.residuals(program, answer.x, answer.alpha).worst
+        found = judgement.residuals(program, answer.x, answer.alpha).worst
         if found < worst:
             best, worst = np.maximum(answer.x, 0.0), found
         if worst <= ACCEPTED:

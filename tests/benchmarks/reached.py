@@ -8,7 +8,7 @@ import numpy as np
 
 from benchmarks.material import Material, Query, spread
 from benchmarks.measure import Info
-from vibench import cone, qp
+from vibench import cone, judgement, qp
 from vibench.arrays import Array
 from vibench.assembly import Model
 from vibench.assess import errors
@@ -142,7 +142,7 @@ def of_queries(material: Material, model: Model, solve: Solve, accuracy: float) 
     for query in material.queries:
         reduced = model.assemble(query.mu)
         answer = solve(reduced)
-        status, reason, residuals = qp.judge(reduced.program, answer, accuracy)
+        status, reason, residuals = judgement.judge(reduced.program, answer, accuracy)
         statuses.append((status.severity, status.value, reason))
         if residuals is not None and answer.x is not None and answer.alpha is not None:
             u, lam = reduced.basis @ answer.x, model.generators @ answer.alpha
@@ -161,7 +161,7 @@ def _errors(material: Material, query: Query, u: Array, lam: Array) -> dict[str,
 
 def of_answer(program: VariationalInequality, answer: qp.Answer, accuracy: float) -> Info:
     """Of what a QP solver answers."""
-    status, reason, residuals = qp.judge(program, answer, accuracy)
+    status, reason, residuals = judgement.judge(program, answer, accuracy)
     return {
         **_shape(program),
         "status": status.value,
@@ -177,7 +177,7 @@ def _shape(program: VariationalInequality | None) -> dict[str, int]:
     return {} if program is None else {"dimension": len(program.f), "R": len(program.g)}
 
 
-def _residuals(found: qp.Residuals) -> dict[str, float]:
+def _residuals(found: judgement.Residuals) -> dict[str, float]:
     return {name: getattr(found, part) for part, name in RESIDUALS.items()}
 
 

@@ -198,4 +198,4 @@ class Ours(Side):
     def _answered(self, model: ReducedModel | OnlineModel, mu: Array) -> published.Answer:
         reduced = model.assemble(mu)
         found = qp.solve(reduced.program, self.solver, self.accuracy, factor=reduced.factor)
-        return reduced.program, found.x, found.alpha, reduced.make_basis
+        return reduced.program, found.x, found.alpha, lambda: reduced.basis

@@ -1,0 +1,123 @@
+"""What a solver's answer is worth: residuals, and a status that rests on them alone, whatever the solver claims."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import nnls
+
+from vibench.arrays import Array, SparseMatrix
+from vibench.problem import VariationalInequality
+from vibench.qp import Answer, Status, peak, row_norms, size
+
+ENERGY_FLOOR = 1e-4
+"""The gap is relative to no less than this share of the energy that a steepest descent step would gain."""
+
+
+@dataclass(frozen=True)
+class Residuals:
+    """Relative residuals as the benchmark computes them, whatever the solver claims.
+
+    Attributes
+    ----------
+    primal
+        max (B x − g)₊ with every row in units of its own norm, over max(1, ‖g‖∞).
+    dual
+        ‖A x − f + Bᵀα‖∞ over max(‖A x‖∞, ‖f‖∞, ‖Bᵀα‖∞).
+    gap
+        |xᵀA x − fᵀx + gᵀα| over max(|½ xᵀA x|, |fᵀx|, |gᵀα|, `ENERGY_FLOOR` (fᵀf)² / 2fᵀA f). The last term is a share
+        of what one step of steepest descent from 0 gains: where constraints leave next to nothing of that energy, the
+        others are round-off.
+    """
+
+    primal: float
+    dual: float
+    gap: float
+
+    @property
+    def worst(self) -> float:
+        """The largest of the three."""
+        return max(self.primal, self.dual, self.gap)
+
+
+@dataclass(frozen=True)
+class Scales:
+    """What the residuals of a solution are relative to; the primal one in units of each row's own norm."""
+
+    primal: float
+    dual: float
+    gap: float
+
+
+def scales(program: VariationalInequality, x: Array, alpha: Array) -> Scales:
+    """Denominators of the residuals of x (n,), α (m,); see `Residuals`."""
+    A, f, B, g = program.A, program.f, program.B, program.g
+    Ax = A @ x
+    return Scales(
+        primal=max(1.0, peak(g / row_norms(B))),
+        dual=max(peak(Ax), peak(f), peak(B.T @ alpha)),
+        gap=max(abs(0.5 * float(x @ Ax)), abs(float(f @ x)), abs(float(g @ alpha)), ENERGY_FLOOR * _descent(A, f)),
+    )
+
+
+def _descent(A: SparseMatrix | Array, f: Array) -> float:
+    """(fᵀf)² / 2fᵀA f: the energy that the best multiple of f gains, a part of what A⁻¹f would."""
+    curvature = float(f @ (A @ f))
+    return 0.5 * float(f @ f) ** 2 / curvature if curvature > 0.0 else 0.0
+
+
+def residuals(program: VariationalInequality, x: Array, alpha: Array) -> Residuals:
+    """Relative residuals of x (n,), α (m,) ≥ 0; see `Residuals`."""
+    A, f, B, g = program.A, program.f, program.B, program.g
+    scale = scales(program, x, alpha)
+    Ax = A @ x
+    return Residuals(
+        primal=float(np.max((B @ x - g) / row_norms(B), initial=0.0)) / scale.primal,
+        dual=_ratio(peak(Ax - f + B.T @ alpha), scale.dual),
+        gap=_ratio(abs(float(x @ Ax) - float(f @ x) + float(g @ alpha)), scale.gap),
+    )
+
+
+def judge(program: VariationalInequality, answer: Answer, accuracy: float) -> tuple[Status, str, Residuals | None]:
+    """Classify an answer by what we compute ourselves: status, reason ("" when ok), residuals if they exist."""
+    if answer.x is None or answer.alpha is None:
+        if infeasibility_certificate(program) is not None:
+            return Status.INFEASIBLE, "no point satisfies the constraints (certified)", None
+        return Status.FAILED, f"the solver returned nothing: {answer.solver_status}", None
+    if not (np.all(np.isfinite(answer.x)) and np.all(np.isfinite(answer.alpha))):
+        return Status.NONFINITE, f"the solution is not finite: {answer.solver_status}", None
+    found = residuals(program, answer.x, answer.alpha)
+    if found.worst <= accuracy:
+        return Status.OK, "", found
+    if found.primal > accuracy and infeasibility_certificate(program) is not None:
+        return Status.INFEASIBLE, "no point satisfies the constraints (certified)", found
+    name = max(("primal", "dual", "gap"), key=lambda key: getattr(found, key))
+    value = getattr(found, name)
+    clipped = f" after setting multipliers down to -{answer.negative:.0e} to zero" if answer.negative else ""
+    return (
+        Status.INACCURATE,
+        f"{name} residual {value:.1e} above {accuracy:.0e}{clipped}: {answer.solver_status}",
+        found,
+    )
+
+
+def infeasibility_certificate(program: VariationalInequality, tolerance: float = 1e-10) -> Array | None:
+    """α ≥ 0 with Bᵀα = 0 and gᵀα = −1 (Farkas), or `None` if no such α is found; dense programs only."""
+    if not isinstance(program.B, np.ndarray) or not len(program.g):
+        return None
+    rows = row_norms(program.B)
+    system = np.vstack([(program.B / rows[:, None]).T, program.g / rows / size(program.g / rows)])
+    target = np.zeros(system.shape[0])
+    target[-1] = -1.0
+    try:
+        alpha, distance = nnls(system, target, maxiter=30 * system.shape[1])
+    except RuntimeError:  # nnls gave up: no certificate
+        return None
+    if distance > tolerance * max(1.0, float(alpha.max(initial=0.0))):
+        return None
+    return np.asarray(alpha / rows)
+
+
+def _ratio(numerator: float, denominator: float) -> float:
+    return numerator / denominator if denominator > 0.0 else numerator
