@@ -13,11 +13,10 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
-import pictures
 
 from vibench import figures, tables
 from vibench.schema import TABLES
-from vibench.thresholds import benefit_threshold
+from vibench.thresholds import HIGH_FIDELITY, benefit_threshold
 
 
 @dataclass(frozen=True)
@@ -65,12 +64,6 @@ PAPER = {
 }
 """What the paper prints: title, δ_PGA of the offline enrichment, columns; seconds on its authors' machine."""
 
-PICTURES = {
-    "paper-obstacle": ("obstacle", ((0.9, 0.025, -0.025),)),
-    "paper-hertz": ("hertz", ((0.7,), (1.0,), (1.3,))),
-}
-"""Problem and parameters of the solutions to draw: the paper's Figures 4 and 10."""
-
 DUAL = "mcpg"
 SOLVER = "piqp"
 """Cone and solver whose seconds stand beside the paper's; the solver that leaves the fewest queries unsolved."""
@@ -86,8 +79,6 @@ def main() -> None:
         frame = tables.in_order(tables.read(path, table))
         frame.to_csv(target / f"{table}.csv", index=False, float_format="%.6g")
     figures.draw_all(path, target)
-    if target.name in PICTURES:
-        pictures.draw(*PICTURES[target.name], target)
     (target / "README.md").write_text(page(path, target), encoding="utf-8")
 
 
@@ -113,11 +104,21 @@ def page(path: Path, target: Path) -> str:
         + ("; the others:" if fell else "."),
         "\n".join(fell),
         tables.to_markdown(tables.summary(cells)),
+        *benefits(path),
         "## Figures",
         "\n".join(f"![{Path(name).stem}]({name})" for name in drawn),
         "Full tables: " + ", ".join(f"[{table}.csv]({table}.csv)" for table in TABLES) + ".",
     ]
     return "\n\n".join(part.strip() for part in parts if part) + "\n"
+
+
+def benefits(path: Path) -> list[str]:
+    """The section on benefit thresholds: from how many queries on an enrichment pays against another."""
+    thresholds = tables.read(path, "thresholds")
+    of_enrichments = thresholds[thresholds["primal_a"] != HIGH_FIDELITY]
+    if of_enrichments.empty:
+        return []
+    return ["## Benefit thresholds of fixed enrichments", tables.to_markdown(tables.benefits(of_enrichments))]
 
 
 def beside_the_paper(cells: pd.DataFrame, name: str) -> list[str]:

@@ -28,7 +28,7 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 from vibench import plugins, provenance, qp, tables
-from vibench.figures import STYLE
+from vibench.figures.style import STYLE
 from vibench.highfidelity import Solver
 from vibench.infsup import multipliers
 from vibench.online import OnlineModel, project_members

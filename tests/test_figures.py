@@ -6,18 +6,22 @@ import json
 import shutil
 import sqlite3
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
 from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import RendererAgg
 from matplotlib.figure import Figure
 from matplotlib.image import imread
 from matplotlib.lines import Line2D
 
-from vibench import figures, tables
-from vibench.figures import draw_all
+from vibench import tables
+from vibench.figures import FORMATS, OF_PROBLEM, constants, convergence, costs, draw_all
+from vibench.figures import problems as of_file
+from vibench.figures.style import save, styled
 from vibench.journal import FILE
 from vibench.study_file import load_study
 
@@ -55,14 +59,14 @@ def draw(results: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Draw
     """Function that draws the copy and gives every figure by the name of its file; nothing is rendered."""
     kept: Drawn = {}
 
-    def keep(figure: Figure, target: Path) -> None:
+    def keep(figure: Figure, target: Path, **_: object) -> None:
         target.touch(exist_ok=False)
         kept[target.stem] = figure
 
     def run() -> Drawn:
         monkeypatch.setattr(Figure, "savefig", keep)
         files = draw_all(results, tmp_path / "figures")
-        assert [path.stem for path in files] == list(kept)
+        assert [path.stem for path in files] == [name for name in kept for _ in FORMATS]
         assert sorted(path.name for path in files) == sorted(path.name for path in (tmp_path / "figures").iterdir())
         return kept
 
@@ -87,9 +91,11 @@ def problems() -> list[str]:
 def test_a_run_draws_its_figures(quick_run: Path) -> None:
     names = {path.stem for path in (quick_run / "figures").glob("*.png")}
     for problem in problems():
-        assert {f"{problem}-errors", f"{problem}-orthogonality"} <= names
+        assert {f"{problem}-{kind}" for kind in OF_PROBLEM if kind != "diagnostics"} <= names
         for dual in load_study("quick").dual:
             assert {f"{problem}-{dual.title}-enrichment", f"{problem}-{dual.title}-inf-sup"} <= names
+    assert "obstacle-diagnostics" in names
+    assert {path.stem for path in (quick_run / "figures").glob("*.svg")} == names
 
 
 def test_the_pictures_are_no_blank_sheets(quick_run: Path) -> None:
@@ -99,23 +105,52 @@ def test_the_pictures_are_no_blank_sheets(quick_run: Path) -> None:
         assert len(np.unique(np.round(255 * pixels) @ 256.0 ** np.arange(pixels.shape[2]))) > 20
 
 
+def panels(figure: Figure) -> list[Axes]:
+    """The panels of a figure, its colour bars left out."""
+    return [axes for axes in figure.axes if not isinstance(axes.get_label(), str) or "colorbar" not in axes.get_label()]
+
+
 def test_every_panel_has_data_and_labels(draw: Draw) -> None:
     drawn = draw()
     assert drawn
     for name, figure in drawn.items():
         assert figure.axes
-        for axes in figure.axes:
-            assert data_of(axes), name
+        for axes in panels(figure):
+            assert axes.has_data(), name
             assert axes.get_ylabel(), name
-        below = figure.axes[len(figure.axes) // 2 :] if name.endswith("inf-sup") else figure.axes
-        assert all(axes.get_xlabel() for axes in below), name
+            assert axes.get_xlabel(), name
 
 
-def test_lines_that_have_to_be_told_apart_have_names(draw: Draw) -> None:
+def test_nothing_is_clipped(draw: Draw) -> None:
     for name, figure in draw().items():
-        crowded = [axes for axes in figure.axes if len(axes.get_lines()) > 1]
-        assert all(line.get_label() for axes in crowded for line in axes.get_lines())
-        assert not crowded or any(axes.get_legend() is not None for axes in crowded), name
+        box = figure.get_tightbbox(RendererAgg(10, 10, figure.dpi))
+        wide, high = figure.get_size_inches()
+        assert box.x0 >= -0.01, name
+        assert box.y0 >= -0.01, name
+        assert box.x1 <= wide + 0.01, name
+        assert box.y1 <= high + 0.01, name
+
+
+def test_every_logarithmic_axis_has_ticks_to_read(draw: Draw) -> None:
+    for name, figure in draw().items():
+        for axes in panels(figure):
+            for axis, limits in ((axes.xaxis, axes.get_xlim()), (axes.yaxis, axes.get_ylim())):
+                inside = [tick for tick in axis.get_majorticklocs() if limits[0] <= tick <= limits[1]]
+                assert len(inside) >= 2, name
+
+
+def test_lines_that_have_to_be_told_apart_have_names_and_looks_of_their_own(draw: Draw) -> None:
+    for name, figure in draw().items():
+        for axes in panels(figure):
+            lines = [line for line in axes.get_lines() if not line.get_label().startswith("_")]
+            looks = {
+                (line.get_color(), str(line.get_linestyle()), line.get_marker(), line.get_markerfacecolor())
+                for line in lines
+            }
+            assert len(looks) == len({line.get_label() for line in lines}), name
+        named = {label for axes in figure.axes for label in axes.get_legend_handles_labels()[1]}
+        shown = {text.get_text() for legend in figure.legends for text in legend.get_texts()}
+        assert named == shown, name
 
 
 def test_projection_errors_are_those_of_the_histories(draw: Draw, results: Path) -> None:
@@ -177,7 +212,7 @@ def test_the_inf_sup_figure_shows_every_strategy_and_the_high_fidelity_pair(draw
 def test_a_constant_that_vanishes_is_named_though_it_cannot_be_drawn(draw: Draw) -> None:
     """β over the span of the decorrelated basis is zero in this run, which a logarithmic axis cannot show."""
     axes = draw()["obstacle-mcpg-inf-sup"].axes[0]
-    assert any(label == "decorrelated (0)" for label in axes.get_legend_handles_labels()[1])
+    assert any(label == "decorrelated (0 over span)" for label in axes.get_legend_handles_labels()[1])
 
 
 def test_without_queries_nothing_is_drawn(change: Callable[..., None], results: Path, tmp_path: Path) -> None:
@@ -272,20 +307,63 @@ def test_labels_that_differ_only_in_signs_get_files_of_their_own(change: Callabl
 @pytest.mark.parametrize("count", [7, 12])
 def test_there_is_a_style_for_every_strategy(count: int, results: Path) -> None:
     """However many strategies a study compares."""
-    histories = tables.read(results, "histories")
-    queries = tables.read(results, "queries")
-    cells = tables.read(results, "cells").set_index("cell")
-    queries["enrichment_kind"] = queries["cell"].map(cells["enrichment_kind"])
+    data = dict(of_file(results))["obstacle"]
 
     def many(frame: pd.DataFrame, column: str, original: str) -> pd.DataFrame:
         one = frame[frame[column] == original]
         return pd.concat([one.assign(**{column: f"{original}-{k:02d}", "artefact": str(k)}) for k in range(count)])
 
-    cones = many(histories[histories["problem"] == "obstacle"], "dual", "mcpg")
-    figure = figures.projection_errors(pd.concat([histories[histories["stage"] == "pod"], cones]))
-    assert len(figure.axes[1].get_lines()) == count
-    assert len(figures.orthogonality(cones).axes[0].get_lines()) == count
-    fixed = many(queries[queries["dual"] == "mcpg"], "primal", "offline-pga")
-    figure = figures.enrichment(many(histories[histories["dual"] == "mcpg"], "primal", "offline-pga"), fixed, cells)
-    assert len(figure.axes[0].get_lines()) == count
-    assert len(figures.inf_sup(fixed, cells).axes[0].get_lines()) == count + 1
+    cones = replace(data, histories=pd.concat([data.histories[data.histories["stage"] == "pod"],
+                                               many(data.histories, "dual", "mcpg")]))  # fmt: skip
+    assert len(convergence.projection_errors(cones).axes[1].get_lines()) == count
+    assert len(convergence.orthogonality(cones).axes[0].get_lines()) == count
+    mine = data.of_dual("mcpg")
+    fixed = replace(mine, queries=many(mine.queries, "primal", "offline-pga"),
+                    histories=many(mine.histories, "primal", "offline-pga"))  # fmt: skip
+    assert len(convergence.enrichment(fixed).axes[0].get_lines()) == count
+    assert len(constants.inf_sup(fixed).axes[0].get_lines()) == count + 1
+
+
+def test_thresholds_are_marked_where_the_lines_cross(results: Path) -> None:
+    data = dict(of_file(results))["obstacle"]
+    figure = costs.total_cost(data)
+    marks = [line for axes in figure.axes for line in axes.get_lines() if line.get_marker() in "<>"]
+    assert marks
+    for axes in figure.axes:
+        lines = [np.asarray(line.get_xydata()) for line in axes.get_lines() if line.get_marker() not in "<>"]
+        for mark in (line for line in axes.get_lines() if line.get_marker() in "<>"):
+            ((n, cost),) = mark.get_xydata()
+            if 1.0 <= n <= costs.MOST_QUERIES:
+                through = [np.interp(n, *line.T) for line in lines]
+                assert sum(np.isclose(value, cost, rtol=0.02) for value in through) >= 2
+
+
+def test_no_strategy_beats_those_on_the_front(results: Path) -> None:
+    rng = np.random.default_rng(0)
+    x, y = rng.random(40), rng.random(40)
+    front = np.column_stack(costs._front(x, y))
+    for point in zip(x, y, strict=True):
+        on = any(np.array_equal(point, other) for other in front)
+        beaten = np.any((x <= point[0]) & (y <= point[1]) & ((x < point[0]) | (y < point[1])))
+        assert on != beaten
+
+
+def test_a_profile_ends_at_the_share_that_was_solved(change: Callable[..., None], draw: Draw) -> None:
+    change("UPDATE queries SET status = 'failed' WHERE solver = 'osqp' AND problem = 'obstacle' AND query < 4")
+    profile = draw()["obstacle-solvers"].axes[1]
+    assert line_called(profile, "osqp").get_ydata()[-1] == pytest.approx(0.75)
+    assert line_called(profile, "piqp").get_ydata()[-1] == pytest.approx(1.0)
+    for line in profile.get_lines():
+        assert np.all(np.diff(line.get_ydata()) >= 0.0)
+
+
+def test_the_same_results_give_the_same_files(results: Path, tmp_path: Path) -> None:
+    data = dict(of_file(results))["hertz"]
+    for name, drawing in (("solutions", OF_PROBLEM["solutions"]), ("errors", OF_PROBLEM["errors"])):
+        files = []
+        for folder in ("one", "two"):
+            (tmp_path / folder).mkdir(exist_ok=True)
+            with styled():
+                files.append(save(drawing(data), tmp_path / folder, name))
+        for first, second in zip(*files, strict=True):
+            assert first.read_bytes() == second.read_bytes(), first.name

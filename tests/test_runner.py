@@ -189,7 +189,9 @@ def test_artefacts_are_shared_by_studies_and_seconds_only_on_their_machine(
     vibench: Vibench, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path / "cache"))
-    made = 2 * CHUNKS + 10  # high-fidelity solutions; POD, cone, enrichment; forms, assembly; five kinds of constants
+    made = (
+        2 * CHUNKS + 11
+    )  # high-fidelity solutions; pictures; POD, cone, enrichment; forms, assembly; five kinds of constants
     one = wire_study(solvers=["piqp", "careful"])
     two = one | {"name": "other", "accuracy": 1e-6}
     write_study(tmp_path, one, "one.toml")

@@ -131,6 +131,14 @@ class Journal:
             self._db.execute("DELETE FROM histories WHERE artefact = ?", (artefact,))
             self._insert("histories", rows)
 
+    def write_pictures(self, rows: Sequence[Mapping[str, Any]]) -> None:
+        """Write the pictures of a problem in place of its earlier ones."""
+        with self._writing():
+            for row in rows[:1]:
+                keys = (row["problem"], row["problem_options"])
+                self._db.execute("DELETE FROM pictures WHERE problem = ? AND problem_options = ?", keys)
+            self._insert("pictures", rows)
+
     def replace(self, table: str, rows: Sequence[Mapping[str, Any]]) -> None:
         """Replace the whole of a table that follows from the others."""
         with self._writing():

@@ -51,6 +51,10 @@ class HistoryNames:
                 return named | {"primal_tol": stage.tolerance}
         return {}
 
+    def problem(self, plugin: Plugin) -> str:
+        """The label of a problem."""
+        return self._labels[plugin]
+
     def _named(self, axis: str, plugin: Plugin) -> dict[str, Any]:
         return _plugin(axis, plugin, self._labels[plugin])
 

@@ -98,7 +98,7 @@ class Picture:
     Attributes
     ----------
     points, triangles
-        Mesh in the configuration to be drawn (2×p), (3×t).
+        Mesh in the configuration to be drawn (2×p), (3×t); on a line points (1×p) and no triangles.
     values, name
         Nodal values to colour it with (p,), and what they are, with their unit.
     positions, multiplier

@@ -2,31 +2,32 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 import signal
 import threading
-from collections.abc import Iterable, Mapping, Sequence, Set
+from collections.abc import Mapping, Sequence, Set
 from concurrent.futures import FIRST_COMPLETED, Future, wait
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Any, Protocol
 
-from vibench import plugins, provenance, qp
+from vibench import plugins, qp
 from vibench.agreement import disagreement_rows
 from vibench.assembly import assembly_stage
 from vibench.errors import RequestError, StorageError, VibenchError, in_a_line
 from vibench.executors import Executor, executor
 from vibench.isolation import Job
 from vibench.journal import FILE, Journal, claimed, read_meta, study_of
-from vibench.matrix import Cell, digest, expand
-from vibench.naming import HistoryNames, cell_columns
+from vibench.matrix import Cell, expand
+from vibench.naming import HistoryNames
+from vibench.pictures import PictureStage
 from vibench.plan import Plan
 from vibench.qp import Status
 from vibench.queries import CellRows, QueriesStage
+from vibench.recorder import Recorder
 from vibench.stage import Done, Failed, PiecewiseStage, Stage, Unstored
-from vibench.store import History, Store, usable_store
+from vibench.store import Store, usable_store
 from vibench.study import Study
 from vibench.thresholds import threshold_rows
 
@@ -123,7 +124,8 @@ def run_study(study: Study, folder: Path, observer: Observer, options: Options =
         try:
             finished = journal.finished()
             todo = [cell for cell in cells if _to_do(cell, finished, options.retry)]
-            run = _Run(study, folder, store, journal, observer, HistoryNames(cells), len(cells), options)
+            recorder = Recorder(study, journal, HistoryNames(cells))
+            run = _Run(study, folder, store, recorder, observer, len(cells), options)
             interrupted = run.execute(todo)
             keys = {cell.key for cell in cells}
             everything = journal.rows("cells")
@@ -163,9 +165,8 @@ class _Run:
     study: Study
     folder: Path
     store: Store
-    journal: Journal
+    recorder: Recorder
     observer: Observer
-    names: HistoryNames
     cell_count: int
     options: Options
     plan: Plan = field(default_factory=Plan)
@@ -183,7 +184,8 @@ class _Run:
                 assert workers is not None
                 stage = queries_stage(cell, self.study)
                 self.cells.setdefault(stage.key, []).append(cell)
-                self.plan.add_goal(stage, partial(self._is_there, workers.machines))
+                for goal in (stage, PictureStage(cell.problem)):
+                    self.plan.add_goal(goal, partial(self._is_there, workers.machines))
             slots = workers.slots if workers is not None else 0
             self.observer.start(self.cell_count, list(self.plan.stages.values()), len(unavailable), slots)
             for cell in unavailable:
@@ -213,7 +215,7 @@ class _Run:
         artefact = self.store.get(stage.key)
         if artefact is None or artefact.machine not in machines:
             return False
-        self._write_histories(stage, artefact.histories)
+        self.recorder.stage(stage, artefact.histories, self.store)
         return True
 
     def _loop(self, workers: Executor) -> None:
@@ -235,13 +237,17 @@ class _Run:
         self.observer.stage(stage, outcome.wall)
         if isinstance(stage, QueriesStage):
             for cell in self.cells[stage.key]:
-                self._write(cell, outcome.value)
+                self.observer.cell(cell, self.recorder.cell(cell, outcome.value))
         else:
-            self._write_histories(stage, outcome.histories)
+            self.recorder.stage(stage, outcome.histories, self.store)
         self.plan.done(stage)
 
     def _fail(self, stage: Stage, failed: Failed) -> None:
         """Give a row to every cell that needs a stage that failed."""
+        if isinstance(stage, PictureStage):
+            self.recorder.no_picture(stage, failed.reason)
+            self.plan.done(stage)
+            return
         if isinstance(stage, QueriesStage):
             without, reason = [stage], failed.reason
         else:
@@ -253,37 +259,7 @@ class _Run:
 
     def _fail_cell(self, cell: Cell, status: Status, reason: str) -> None:
         row = {"status": status.value, "reason": reason, "queries": cell.validation, "queries_ok": 0}
-        self._write(cell, CellRows(row, ()))
-
-    def _write(self, cell: Cell, found: CellRows) -> None:
-        keys = cell_columns(cell)
-        row = {"cell": cell.key, **keys, "machine": provenance.machine(), **found.cell, **self._provenance(cell)}
-        queries = [{"cell": cell.key, **keys, "query": k, **query} for k, query in enumerate(found.queries)]
-        self.journal.write_cell(row, queries, [{"cell": cell.key, **solution} for solution in found.solutions])
-        self.observer.cell(cell, row)
-
-    def _provenance(self, cell: Cell) -> dict[str, Any]:
-        return {
-            "seed": cell.seed,
-            "study_hash": digest(self.study.model_dump(mode="json")),
-            "code": cell.code,
-            "threads": 1,
-            "versions": json.dumps(provenance.versions(cell.solver), sort_keys=True),
-            "definition": cell.definition,
-        }
-
-    def _write_histories(self, stage: Stage, histories: Iterable[History]) -> None:
-        keys = self.names.columns(stage)
-        rows = []
-        for history in histories:
-            first = history.key.get("first_step", 0)
-            named = {name: value for name, value in history.key.items() if name != "first_step"}
-            rows += [
-                {"artefact": stage.key, **named, **keys, "quantity": history.quantity, "step": first + k, "value": v}
-                for k, v in enumerate(history.values)
-            ]
-        if rows:
-            self.journal.write_histories(stage.key, rows)
+        self.observer.cell(cell, self.recorder.cell(cell, CellRows(row, ())))
 
 
 def _outcome(future: Future[Any]) -> Done | Failed:

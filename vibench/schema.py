@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-VERSION = 4
+VERSION = 5
 """Schema version of a results file; a file of another version is refused."""
 
 KEYS: Mapping[str, str] = {
@@ -176,6 +176,17 @@ DISAGREEMENTS: Mapping[str, str] = {
 }
 """Every two solvers on one reduced model, over the queries both solved: relative differences of u in V."""
 
+PICTURES: Mapping[str, str] = {
+    "problem": "TEXT",
+    "problem_options": "TEXT",
+    "number": "INTEGER",
+    "title": "TEXT",
+    "names": "TEXT",
+    "data": "BLOB",
+    "reason": "TEXT",
+}
+"""High-fidelity solutions to look at (`vibench.pictures`), or why there is none."""
+
 TABLES: Mapping[str, Mapping[str, str]] = {
     "cells": CELLS,
     "queries": QUERIES,
@@ -185,5 +196,5 @@ TABLES: Mapping[str, Mapping[str, str]] = {
 }
 """The tables for reading; each is exported as CSV."""
 
-STORED: Mapping[str, Mapping[str, str]] = {**TABLES, "solutions": SOLUTIONS}
+STORED: Mapping[str, Mapping[str, str]] = {**TABLES, "solutions": SOLUTIONS, "pictures": PICTURES}
 """All tables of the results file."""
