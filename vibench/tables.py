@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sqlite3
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
@@ -146,6 +147,32 @@ def to_markdown(frame: pd.DataFrame) -> str:
     return f"{text}\n"
 
 
+def to_latex(frame: pd.DataFrame) -> str:
+    """A LaTeX tabular (package booktabs) with figures of three digits."""
+    heads = [_for_latex(str(name)) for name in frame.columns]
+    numeric = [pd.api.types.is_numeric_dtype(frame[name]) for name in frame.columns]
+    rows = [[_for_latex(cell_text(value)) for value in row] for row in frame.itertuples(index=False)]
+    body = [" & ".join(row) + r" \\" for row in rows]
+    columns = "".join("r" if right else "l" for right in numeric)
+    lines = [rf"\begin{{tabular}}{{{columns}}}", r"\toprule", " & ".join(heads) + r" \\", r"\midrule", *body]
+    return "\n".join([*lines, r"\bottomrule", r"\end{tabular}", ""])
+
+
+LATEX = {
+    **{sign: f"\\{sign}" for sign in "&%$#_{}"}, "\\": r"\textbackslash{}", "~": r"\textasciitilde{}",
+    "^": r"\textasciicircum{}", "µ": r"$\mu$", "β": r"$\beta$", "δ": r"$\delta$", "λ": r"$\lambda$", "σ": r"$\sigma$",
+}  # fmt: skip
+
+
+def _for_latex(text: str) -> str:
+    return "".join(LATEX.get(sign, sign) for sign in " ".join(text.split()))
+
+
+def to_json(frame: pd.DataFrame) -> str:
+    """A JSON array of objects with full precision; what is missing is null."""
+    return str(frame.to_json(orient="records", force_ascii=False, indent=1, double_precision=15)) + "\n"
+
+
 def _one_cell(text: str) -> str:
     """Text that does not end its cell or its line in Markdown."""
     return " ".join(text.split()).replace("|", "\\|")
@@ -160,16 +187,26 @@ def cell_text(value: Any) -> str:
     return str(value)
 
 
+def asked(row: Mapping[str, Any] | pd.Series, axis: str) -> str:
+    """The tolerance of "pod" or "dual", or the size where the study prescribed that."""
+    tolerance, count = row[f"{axis}_tol"], row[f"{axis}_size"]
+    return f"{'N' if axis == 'pod' else 'R'}={int(count)}" if pd.notna(count) else f"{tolerance:g}"
+
+
 def _asked(frame: pd.DataFrame, axis: str) -> list[str]:
-    """Tolerance, or the size where the study prescribed that."""
-    size = "N" if axis == "pod" else "R"
-    return [
-        f"{size}={int(count)}" if pd.notna(count) else f"{tolerance:g}"
-        for tolerance, count in zip(frame[f"{axis}_tol"], frame[f"{axis}_size"], strict=True)
-    ]
+    return [asked(row, axis) for row in frame[[f"{axis}_tol", f"{axis}_size"]].to_dict("records")]
 
 
 def _replace(path: Path, text: str) -> None:
     part = path.with_suffix(path.suffix + ".part")
     part.write_text(text, encoding="utf-8")
     part.replace(path)
+
+
+FORMS: Mapping[str, Callable[[pd.DataFrame], str]] = {
+    "markdown": to_markdown,
+    "csv": to_csv,
+    "latex": to_latex,
+    "json": to_json,
+}
+"""Ways to print a table where no person reads it on a terminal."""

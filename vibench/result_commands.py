@@ -1,0 +1,54 @@
+"""Commands on finished runs: a report to look at, and what changed between two runs."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Annotated, Literal
+
+import typer
+
+from vibench import diff, report, tables
+from vibench.printing import new_console, print_frame
+
+Form = Literal["terminal", "markdown", "csv", "latex", "json"]
+
+RunArgument = Annotated[str, typer.Argument(metavar="RUN", help="A run folder, or the name of a study run before.")]
+
+
+def write_report(
+    run: RunArgument,
+    out: Annotated[Path | None, typer.Option(help="The HTML file; report.html in the run folder unless given.")] = None,
+) -> None:
+    """Write what a run found as one HTML file that needs nothing else.
+
+    Example: vibench report quick && xdg-open runs/quick/report.html
+    """
+    path = tables.results_file(run)
+    target = report.write(path, out or path.parent / "report.html")
+    new_console().print(f"report: {target}", soft_wrap=True)
+
+
+def compare_runs(
+    a: Annotated[str, typer.Argument(metavar="A", help="A run folder or study: before.")],
+    b: Annotated[str, typer.Argument(metavar="B", help="Another: after.")],
+    limit: Annotated[float, typer.Option(min=1.0, help="Factor by which a number may get worse.")] = 1.25,
+    form: Annotated[Form, typer.Option("--format", help="How to print it.")] = "terminal",
+) -> None:
+    """Say what changed between two runs of a study; exit code 1 if something got worse.
+
+    Example: vibench diff runs/before runs/after --limit 1.1
+    """
+    one, two = tables.results_file(a), tables.results_file(b)
+    found = diff.compare(one, two, limit)
+    console = new_console()
+    if form != "terminal":
+        sys.stdout.write(tables.FORMS[form](found.changes))
+    else:
+        if len(found.changes):
+            print_frame(console, found.changes, f"{a} → {b}")
+        for note in found.notes:
+            console.print(note)
+        console.print(f"{len(found.changes)} changes beyond a factor of {limit:g}, {found.regressions} for the worse")
+    if found.regressions:
+        raise typer.Exit(1)
