@@ -17,6 +17,7 @@ from vibench.matrix import Cell, expand
 from vibench.printing import new_console, print_frame
 from vibench.progress import Report
 from vibench.qp import Status
+from vibench.result_commands import Form, compare_runs, write_report
 from vibench.runner import Options, Outcome, run_study
 from vibench.schema import TABLES
 from vibench.solver_settings import SETTINGS
@@ -104,9 +105,7 @@ def list_plugins(
 def show(
     run: Annotated[str, typer.Argument(metavar="RUN", help="A run folder, or the name of a study run before.")],
     table: Annotated[str, typer.Option(help=f"summary, benefits, {', '.join(TABLES)}.")] = "summary",
-    form: Annotated[
-        Literal["terminal", "markdown", "csv"], typer.Option("--format", help="How to print it.")
-    ] = "terminal",
+    form: Annotated[Form, typer.Option("--format", help="How to print it.")] = "terminal",
 ) -> None:
     """Print a table of a run."""
     path = tables.results_file(run)
@@ -121,7 +120,11 @@ def show(
     if form == "terminal":
         print_frame(new_console(), frame, f"{path.parent.name}: {table}")
     else:
-        sys.stdout.write(tables.to_csv(frame) if form == "csv" else tables.to_markdown(frame))
+        sys.stdout.write(tables.FORMS[form](frame))
+
+
+app.command("report")(write_report)
+app.command("diff")(compare_runs)
 
 
 @app.command("replay")

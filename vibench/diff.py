@@ -22,6 +22,8 @@ CONSTANTS = ("beta_span_min", "beta_cone_lower_min")
 ERRORS = ("error_u_mean", "error_u_max", "error_lambda_mean", "error_lambda_max", "violation_max")
 TIMES = ("offline_s", "online_s")
 
+COLUMNS = ["problem", "dual", "primal", "asked", "solver", "assembly", "what", "before", "after", "ratio", "verdict"]
+
 
 class Verdict(StrEnum):
     """What a change means."""
@@ -70,20 +72,7 @@ def compare(a: Path, b: Path, limit: float) -> Comparison:
         notes.append("times and thresholds of different machines are not compared")
     else:
         rows += list(_thresholds(tables.read(a, "thresholds"), tables.read(b, "thresholds"), limit))
-    columns = [
-        "problem",
-        "dual",
-        "primal",
-        "asked",
-        "solver",
-        "assembly",
-        "what",
-        "before",
-        "after",
-        "ratio",
-        "verdict",
-    ]
-    return Comparison(pd.DataFrame(rows, columns=columns), tuple(notes))
+    return Comparison(pd.DataFrame(rows, columns=COLUMNS), tuple(notes))
 
 
 def _cell(one: pd.Series, two: pd.Series, limit: float) -> Iterator[dict[str, Any]]:
@@ -98,8 +87,8 @@ def _cell(one: pd.Series, two: pd.Series, limit: float) -> Iterator[dict[str, An
     for name in CONSTANTS:
         yield from _changed(one, name, one[name], two[name], _judged(two[name], one[name], limit))
     for name in ERRORS:
-        floored = (max(value, ERROR_FLOOR) if pd.notna(value) else value for value in (one[name], two[name]))
-        yield from _changed(one, name, one[name], two[name], _judged(*floored, limit))
+        before, after = (max(value, ERROR_FLOOR) if pd.notna(value) else value for value in (one[name], two[name]))
+        yield from _changed(one, name, one[name], two[name], _judged(before, after, limit))
     if one["machine"] == two["machine"]:
         for name in TIMES:
             yield from _changed(one, name, one[name], two[name], _judged(one[name], two[name], limit))
