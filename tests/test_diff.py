@@ -1,0 +1,114 @@
+"""Two runs side by side: what got worse is found, and nothing else is."""
+
+from __future__ import annotations
+
+import shutil
+import sqlite3
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from vibench.diff import Verdict, compare
+from vibench.errors import RequestError
+from vibench.journal import FILE
+from vibench.result_commands import compare_runs
+
+Change = Callable[..., Path]
+
+
+@pytest.fixture
+def changed(quick_run: Path, tmp_path: Path) -> Change:
+    """Function that gives a copy of a real run with its results changed by SQL."""
+
+    def run(*statements: str) -> Path:
+        shutil.copy(quick_run / FILE, tmp_path / FILE)
+        db = sqlite3.connect(tmp_path / FILE)
+        for statement in statements:
+            db.execute(statement)
+        db.commit()
+        db.close()
+        return tmp_path / FILE
+
+    return run
+
+
+ONE = "solver = 'piqp' AND problem = 'hertz' AND dual = 'mcpg' AND primal = 'offline-pga'"
+
+
+def test_a_run_does_not_differ_from_itself(quick_run: Path) -> None:
+    found = compare(quick_run / FILE, quick_run / FILE, 1.0)
+    assert found.changes.empty
+    assert found.regressions == 0
+
+
+@pytest.mark.parametrize(
+    ("statement", "what", "verdict"),
+    [
+        (f"UPDATE cells SET queries_ok = queries_ok - 1 WHERE {ONE}", "queries ok", Verdict.WORSE),
+        (f"UPDATE cells SET error_lambda_mean = 2 * error_lambda_mean WHERE {ONE}", "error_lambda_mean", Verdict.WORSE),
+        (f"UPDATE cells SET error_u_max = 0.5 * error_u_max WHERE {ONE}", "error_u_max", Verdict.BETTER),
+        (f"UPDATE cells SET beta_span_min = 0.5 * beta_span_min WHERE {ONE}", "beta_span_min", Verdict.WORSE),
+        (f"UPDATE cells SET online_s = 2 * online_s WHERE {ONE}", "online_s", Verdict.WORSE),
+        (f"UPDATE cells SET offline_s = 0.5 * offline_s WHERE {ONE}", "offline_s", Verdict.BETTER),
+        (f"UPDATE cells SET enrichment = 2 * enrichment WHERE {ONE}", "enrichment", Verdict.WORSE),
+        (f"UPDATE cells SET enrichment = enrichment + 1 WHERE {ONE}", "enrichment", Verdict.CHANGED),
+        (f"UPDATE cells SET error_u_mean = NULL WHERE {ONE}", "error_u_mean", Verdict.WORSE),
+        (f"DELETE FROM cells WHERE {ONE}", "cell", Verdict.WORSE),
+    ],
+)
+def test_a_change_of_one_cell_is_told_with_its_meaning(
+    statement: str, what: str, verdict: Verdict, changed: Change, quick_run: Path
+) -> None:
+    found = compare(quick_run / FILE, changed(statement), 1.25)
+    (row,) = found.changes.to_dict("records")
+    assert (row["what"], row["verdict"]) == (what, verdict.value)
+    assert (row["problem"], row["dual"], row["primal"], row["solver"]) == ("hertz", "mcpg", "offline-pga", "piqp")
+
+
+def test_changes_within_the_limit_are_not_told(changed: Change, quick_run: Path) -> None:
+    after = changed("UPDATE cells SET online_s = 1.2 * online_s, error_u_mean = 1.2 * error_u_mean")
+    assert compare(quick_run / FILE, after, 1.25).changes.empty
+    assert compare(quick_run / FILE, after, 1.1).regressions == 2 * 36
+
+
+def test_errors_of_round_off_are_not_compared(changed: Change, tmp_path: Path) -> None:
+    before = changed("UPDATE cells SET error_u_mean = 1e-14").rename(tmp_path / "before.sqlite")
+    after = changed("UPDATE cells SET error_u_mean = 9e-14")
+    assert compare(before, after, 1.25).changes.empty
+
+
+def test_times_of_another_machine_are_left_out(changed: Change, quick_run: Path) -> None:
+    found = compare(quick_run / FILE, changed("UPDATE cells SET machine = 'other', online_s = 9 * online_s"), 1.25)
+    assert found.changes.empty
+    assert any("different machines" in note for note in found.notes)
+
+
+def test_a_threshold_that_moved_or_vanished_is_told(changed: Change, quick_run: Path) -> None:
+    where = "WHERE solver = 'piqp' AND problem = 'obstacle' AND dual = 'cpg' AND primal_a = 'high-fidelity'"
+    later = f"UPDATE thresholds SET benefit_threshold = 3 * benefit_threshold {where} AND primal_b = 'decorrelated'"
+    never = f"UPDATE thresholds SET benefit_threshold = NULL, meaning = 'never' {where} AND primal_b = 'offline-pga'"
+    found = compare(quick_run / FILE, changed(later, never), 1.25)
+    assert set(found.changes["primal"]) == {"decorrelated", "offline-pga"}
+    assert set(found.changes["what"]) == {"pays against high-fidelity"}
+    assert found.regressions == 2
+
+
+def test_a_new_cell_is_no_regression(changed: Change, quick_run: Path) -> None:
+    found = compare(changed(f"DELETE FROM cells WHERE {ONE}"), quick_run / FILE, 1.25)
+    (row,) = found.changes.to_dict("records")
+    assert (row["after"], row["verdict"]) == ("new", Verdict.CHANGED.value)
+
+
+def test_the_command_ends_with_one_where_something_got_worse(
+    changed: Change, quick_run: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    after = changed(f"UPDATE cells SET online_s = 2 * online_s WHERE {ONE}")
+    with pytest.raises(Exception, match="1") as ended:
+        compare_runs(str(quick_run), str(after), 1.25, "terminal")
+    assert getattr(ended.value, "exit_code", None) == 1
+    assert "1 for the worse" in capsys.readouterr().out
+    compare_runs(str(quick_run), str(quick_run), 1.25, "csv")
+    assert capsys.readouterr().out.startswith("problem,dual,primal,asked")
+    with pytest.raises(RequestError, match="no results in 'nowhere'"):
+        compare_runs(str(quick_run), "nowhere")
