@@ -25,6 +25,11 @@ MASTER_ANGLE = 0.83
 EDGES = {"coarse": 90, "medium": 240, "paper": 560, "fine": 1120}
 """Slave edges behind each named resolution; 560 give the paper's 6130 nodes at the default growth and ratio."""
 
+WITH_APPROACH = ParameterBox(
+    names=("radius", "approach"), lower=np.array([0.905, 0.075]), upper=np.array([1.125, 0.15]), units=("m", "m")
+)
+"""The parameters when the approach is one of them."""
+
 NODES_PER_EDGE = 6130 / EDGES["paper"]
 
 
@@ -42,12 +47,18 @@ def norm_form(u, v, w):  # type: ignore[no-untyped-def]
 
 
 class Hertz(Problem):
-    """Two quarter discs pressed together, the radius of the lower one the parameter.
+    """Two quarter discs pressed together, the radius mu_1 of the lower one the parameter.
 
     P1 displacements, multipliers constant on macro-edges of two slave edges (local average contact), pairing by the
     vertical projection in the physical configuration. Disc 2 is scaled about its apex, which changes neither its
     two-dimensional elastic energy nor the gap on the axis; the flats are moved by a rigid lifting, which loads nothing:
     A and f do not depend on mu, only B and g do.
+
+    The load d is a second parameter on request, after Benaceur, Ern and Ehrlacher (2020): radii from 0.905 to 1.125 m,
+    and 0.15 + 0.01 i m for what they call d. It is read here as what the flats approach each other by in all, 2d, with
+    0 ≤ i ≤ 15: d runs from 0.075 to 0.15 m, the 0.09 m of the later paper among them, strains stay small, and the
+    contact reaches x = 0.39 m of the 0.5 m that it may. If each flat moved by so much, the contact would leave the
+    potential contact zone from 0.22 m on.
 
     Parameters
     ----------
@@ -68,7 +79,7 @@ class Hertz(Problem):
     young, poisson
         E [Pa] and ν.
     approach
-        d [m]: each flat moves by d towards the other.
+        d [m]: each flat moves by d towards the other. Or "parameter": d is mu_2.
     gap
         γ₀ [m] between the apexes.
     """
@@ -86,11 +97,14 @@ class Hertz(Problem):
         length: Annotated[float, Gt(0.0)] = 1.0,
         young: Annotated[float, Gt(0.0)] = 15.0,
         poisson: Annotated[float, Ge(0.0), Lt(0.5)] = 0.35,
-        approach: Annotated[float, Gt(0.0)] = 0.09,
+        approach: Literal["parameter"] | Annotated[float, Gt(0.0)] = 0.09,
         gap: Annotated[float, Ge(0.0)] = 1e-3,
     ) -> None:
         edges = EDGES[resolution] if isinstance(resolution, str) else 2 * round(resolution / NODES_PER_EDGE / 2)
         self.quadrature, self.gap, self.young, self.poisson = quadrature, gap, young, poisson
+        self._approach = None if isinstance(approach, str) else approach
+        if self._approach is None:
+            self.parameters = WITH_APPROACH
         self.slave = quarter_disc(edges, SLAVE_ANGLE, growth)
         masters = round(ratio * edges * MASTER_ANGLE / SLAVE_ANGLE)
         self.master = quarter_disc(masters, MASTER_ANGLE, growth)
@@ -108,10 +122,10 @@ class Hertz(Problem):
         self._all_stiffness = sp.csr_array(sp.block_diag(blocks))
         self._stiffness = self._all_stiffness[self.free][:, self.free]
         self._second = 2 * self.slave.mesh.p.shape[1]  # first degree of freedom of disc 2
-        self._lift = np.zeros(offset)
-        self._lift[1 : self._second : 2], self._lift[self._second + 1 :: 2] = -approach, approach
+        self._unit_lift = np.zeros(offset)
+        self._unit_lift[1 : self._second : 2], self._unit_lift[self._second + 1 :: 2] = -1.0, 1.0
         zone = np.concatenate([2 * self.slave.zone + 1, self._second + 2 * self.master.zone + 1])
-        self._contact_dofs, self._contact_lift = np.searchsorted(self.free, zone), self._lift[zone]
+        self._contact_dofs, self._contact_lift = np.searchsorted(self.free, zone), self._unit_lift[zone]
         upper, lower = self.points(np.ones(1))
         self._pairing = Pairing(upper[:, self.slave.zone], quadrature)
         self._master_zone = lower[:, self.master.zone]  # at radius 1; every other is a multiple
@@ -130,8 +144,12 @@ class Hertz(Problem):
         return np.asarray(np.linalg.norm(np.diff(zone, axis=1), axis=0).reshape(-1, 2).sum(axis=1))
 
     def training_set(self) -> Array:
-        """The 81 radii 0.7 + 0.0075 i."""
-        return self.parameters.grid(81)
+        """The 81 radii 0.7 + 0.0075 i; or 12 radii 0.905 + 0.02 i times 16 approaches 0.075 + 0.005 j."""
+        return self.parameters.grid(81) if self._approach is not None else self.parameters.grid(12, 16)
+
+    def approach(self, mu: Array) -> float:
+        """What each flat moves by at mu, d [m]."""
+        return float(mu[1]) if self._approach is None else self._approach
 
     def points(self, mu: Array) -> tuple[Array, Array]:
         """Nodes (2×…) of disc 1 and of disc 2 at the radius mu[0], undeformed; the apexes on x = 0 at γ₀ and at 0."""
@@ -150,7 +168,7 @@ class Hertz(Problem):
             If mu is so small that the arc of disc 2 does not face the whole potential contact zone.
         """
         B, g = self.constraint(mu)
-        return VariationalInequality(A=self._stiffness, f=np.zeros(len(self.free)), B=B, g=g, lift=self._lift)
+        return VariationalInequality(A=self._stiffness, f=np.zeros(len(self.free)), B=B, g=g, lift=self._lift(mu))
 
     @property
     def contact_dofs(self) -> Indices:
@@ -160,7 +178,7 @@ class Hertz(Problem):
     def contact(self, mu: Array) -> Contact:
         """The non-interpenetration condition on the potential contact zones."""
         integrals = self._pairing.couple(mu[0] * self._master_zone)
-        return Contact(integrals.jump, integrals.gap - integrals.jump @ self._contact_lift)
+        return Contact(integrals.jump, integrals.gap - integrals.jump @ (self.approach(mu) * self._contact_lift))
 
     def refuse(self, mu: Array, u: Array, lam: Array) -> str:  # noqa: ARG002
         """Contact that reaches the last macro-edge may go on beyond the potential contact zone."""
@@ -168,22 +186,25 @@ class Hertz(Problem):
             return ""
         return "the contact reaches the end of the potential contact zone: a smaller approach d keeps it inside"
 
-    def displacement(self, u: Array) -> Array:
-        """Displacements (2×nodes) of both discs, the lifting included, disc 1 first."""
-        everywhere = self._lift.copy()
+    def _lift(self, mu: Array) -> Array:
+        return self.approach(mu) * self._unit_lift
+
+    def displacement(self, mu: Array, u: Array) -> Array:
+        """Displacements (2×nodes) of both discs at mu, the lifting included, disc 1 first."""
+        everywhere = self._lift(mu)
         everywhere[self.free] += u
         return np.asarray(everywhere.reshape(-1, 2).T)
 
-    def resultants(self, u: Array) -> tuple[float, float]:
+    def resultants(self, mu: Array, u: Array) -> tuple[float, float]:
         """Vertical forces [N/m] that the flats exert on disc 1 (downwards) and on disc 2 (upwards), half bodies."""
-        forces = self._all_stiffness @ self.displacement(u).T.ravel()
+        forces = self._all_stiffness @ self.displacement(mu, u).T.ravel()
         upper, lower = 2 * self.slave.flat + 1, self._second + 2 * self.master.flat + 1
         return -float(forces[upper].sum()), float(forces[lower].sum())
 
     def picture(self, mu: Array, u: Array, lam: Array) -> Picture:
         """Deformed discs coloured by the vertical displacement, and the contact pressure (paper, Figure 10)."""
         upper, lower = self.points(mu)
-        moved = self.displacement(u)
+        moved = self.displacement(mu, u)
         triangles = np.hstack([self.slave.mesh.t, self.master.mesh.t + self.slave.mesh.p.shape[1]])
         middles = upper[:1, self.slave.zone[1::2]]
         return Picture(

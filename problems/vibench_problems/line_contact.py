@@ -32,11 +32,11 @@ def theory(problem: Hertz, mu: Array, u: Array) -> LineContact:
     problem
         The problem.
     mu
-        Radius of disc 2 (1,).
+        The parameter, the radius of disc 2 first (d,).
     u
         Displacement (n,), for the load.
     """
-    load = sum(problem.resultants(u))
+    load = sum(problem.resultants(mu, u))
     modulus = problem.young / (2.0 * (1.0 - problem.poisson**2))
     radius = 1.0 / (1.0 + 1.0 / float(mu[0]))
     half_width = float(np.sqrt(4.0 * load * radius / (np.pi * modulus)))

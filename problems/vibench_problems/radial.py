@@ -14,8 +14,9 @@ from skfem import Basis, ElementTriP1, MeshTri
 from vibench.arrays import Array, Indices
 from vibench.problem import ParameterBox, Picture, Problem, Sampler, VariationalInequality
 from vibench.space import InnerProduct
+from vibench_problems.disc_map import stiffness
 from vibench_problems.disc_mesh import rings_in_disc
-from vibench_problems.obstacle import mass, paraboloid, stiffness, unit_load
+from vibench_problems.obstacle import mass, paraboloid, unit_load
 
 RINGS = {"coarse": 11, "medium": 20, "paper": 34, "fine": 68}
 """Rings of nodes behind each named resolution: 397, 1261, 3571 and 14 077 nodes."""

@@ -67,12 +67,12 @@ def test_equilibrium_and_no_interpenetration(mu: float, flats: str) -> None:
     found = Solver(problem).solve(np.array([mu]))
     vi = problem.assemble(np.array([mu]))
     assert found.residuals.worst <= 1e-10
-    upper, lower = problem.resultants(found.u)
+    upper, lower = problem.resultants(np.array([mu]), found.u)
     assert upper == pytest.approx(lower, rel=1e-8)
     assert upper == pytest.approx(problem.macro_lengths @ found.lam, rel=1e-8)
     assert np.max((vi.B @ found.u - vi.g) / problem.macro_lengths) < 1e-10
     assert np.all(found.lam >= 0.0)
-    moved = problem.displacement(found.u)
+    moved = problem.displacement(np.array([mu]), found.u)
     second = problem.slave.mesh.p.shape[1]
     assert np.allclose(moved[1, problem.slave.flat], -0.09)
     assert np.allclose(moved[1, second + problem.master.flat], 0.09)

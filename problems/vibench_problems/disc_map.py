@@ -1,0 +1,107 @@
+"""Maps of the square that scale, shift and, on request, bulge the disc in its middle; its outer boundary stays."""
+
+from __future__ import annotations
+
+from functools import partial
+
+import numpy as np
+from numpy.typing import NDArray
+from skfem import Basis, BilinearForm, ElementTriP1, MeshTri, condense, solve
+from skfem.helpers import dot, grad
+
+from vibench.arrays import Array, Indices, SparseMatrix
+
+DECAY = 6.0
+"""Exponent of the weight |x|^−DECAY under which the bulge is continued: stiff by the disc, soft by the boundary."""
+
+
+@BilinearForm
+def stiffness(u, v, _):  # type: ignore[no-untyped-def]
+    """∫ ∇u · ∇v."""
+    return dot(grad(u), grad(v))
+
+
+@BilinearForm
+def decaying_stiffness(u, v, w):  # type: ignore[no-untyped-def]
+    """∫ |x|^−DECAY ∇u · ∇v."""
+    return dot(w.x, w.x) ** (-0.5 * DECAY) * dot(grad(u), grad(v))
+
+
+class DiscMap:
+    """h(mu) at the nodes of a mesh that fits the disc ω̂ of radius r̂, linear in a few weights.
+
+    With z = x + iy, h(mu) is z ↦ mu_1 z + mu_2 + i mu_3 on ω̂. With `bulge` it is
+
+        z ↦ mu_1 (z + mu_4 z²/(2r̂)) + mu_2 + i mu_3,
+
+    which turns the disc into an egg that points along x. It is conformal there, so angles stay, and lengths change by
+    mu_1 |1 + mu_4 z/r̂|; it is injective for |mu_4| < 1, for its derivative has a positive real part on a convex set
+    (Noshiro and Warschawski). Outside, the displacement is continued to zero on the boundary: scaling and shifts
+    harmonically, the bulge under the weight |x|^−6, which keeps the triangles by the disc in shape. Where no triangle
+    turns over the whole map is injective, because it is the identity on the boundary.
+
+    Parameters
+    ----------
+    mesh
+        Triangulation of the square.
+    disc_nodes
+        Nodes of the closed disc, rising.
+    radius
+        r̂ [m].
+    bulge
+        Whether there is a mu_4.
+    """
+
+    def __init__(self, mesh: MeshTri, disc_nodes: Indices, radius: float, bulge: bool) -> None:
+        self._disc_nodes, self._bulge = disc_nodes, bulge
+        basis = Basis(mesh, ElementTriP1())
+        on_disc = mesh.p[:, disc_nodes]
+        continued = partial(self._continued, basis, stiffness.assemble(basis))
+        x, y, one = (continued(values) for values in (*on_disc, np.ones(len(disc_nodes))))
+        zero = np.zeros(mesh.p.shape[1])
+        modes = [mesh.p, np.stack([x, y]), np.stack([one, zero]), np.stack([zero, one])]
+        if bulge:
+            square = (on_disc[0] + 1j * on_disc[1]) ** 2 / (2.0 * radius)
+            continued = partial(self._continued, basis, decaying_stiffness.assemble(basis))
+            modes.append(np.stack([continued(square.real), continued(square.imag)]))
+        self.modes: Array = np.stack(modes)
+
+    def _continued(self, basis: Basis, form: SparseMatrix, values: Array) -> Array:
+        """What is `values` on the disc, zero on the boundary and of least energy in between (nodes,)."""
+        boundary, on_disc = basis.get_dofs().all(), np.zeros(basis.N)
+        on_disc[self._disc_nodes] = values
+        fixed = np.union1d(boundary, self._disc_nodes)
+        return np.asarray(solve(*condense(form, np.zeros(basis.N), x=on_disc, D=fixed)))
+
+    def weights(self, mu: Array) -> Array:
+        """Weights of the modes (4,), or (5,) with a bulge: 1, mu_1 − 1, mu_2, mu_3 and mu_1 mu_4."""
+        skew = [mu[0] * mu[3]] if self._bulge else []
+        return np.array([1.0, mu[0] - 1.0, mu[1], mu[2], *skew])
+
+    def points(self, mu: Array) -> Array:
+        """Nodes (2×nodes) at mu."""
+        return np.asarray(np.tensordot(self.weights(mu), self.modes, axes=1))
+
+    def areas(self, triangles: NDArray[np.integer]) -> Array:
+        """Areas of triangles (3×t) of the disc, over those at mu_1 = 1 and mu_4 = 0, by monomial (1×t or 3×t).
+
+        As the nodes move linearly in mu_1 and mu_1 mu_4, an area is Σ_k monomials_k · areas_k exactly.
+        """
+        (e1, e2), (f1, f2) = (
+            (mode[:, triangles[1]] - mode[:, triangles[0]], mode[:, triangles[2]] - mode[:, triangles[0]])
+            for mode in (self.modes[0], self.modes[-1])
+        )
+        unit = _cross(e1, e2)
+        found = [unit, _cross(e1, f2) + _cross(f1, e2), _cross(f1, f2)]
+        return np.stack(found if self._bulge else found[:1]) / unit
+
+    def monomials(self, weights: Array) -> Array:
+        """mu_1² (1,), or with a bulge mu_1², mu_1·mu_1 mu_4 and (mu_1 mu_4)² (3,)."""
+        scale = 1.0 + weights[1]
+        if not self._bulge:
+            return np.array([scale**2])
+        return np.array([scale**2, scale * weights[4], weights[4] ** 2])
+
+
+def _cross(u: Array, v: Array) -> Array:
+    return np.asarray(u[0] * v[1] - u[1] * v[0])
