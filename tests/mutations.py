@@ -43,8 +43,8 @@ FAULTS = (
     Fault(
         "wrong-sign-of-b",
         "problems/vibench_problems/obstacle.py",
-        "Contact(-area * self.W.matrix,",
-        "Contact(area * self.W.matrix,",
+        "self._on_disc(-areas @ self._masses)",
+        "self._on_disc(areas @ self._masses)",
         ("tests/problems/test_obstacle.py",),
     ),
     Fault(
@@ -78,9 +78,23 @@ FAULTS = (
     Fault(
         "lifting-forgotten",
         "problems/vibench_problems/hertz.py",
-        "integrals.gap - integrals.jump @ self._contact_lift)",
+        "integrals.gap - integrals.jump @ (self.approach(mu) * self._contact_lift))",
         "integrals.gap)",
         ("tests/problems/test_hertz.py",),
+    ),
+    Fault(
+        "approach-halved",
+        "problems/vibench_problems/hertz.py",
+        "return float(mu[1]) if",
+        "return 0.5 * float(mu[1]) if",
+        ("tests/problems/test_approach.py",),
+    ),
+    Fault(
+        "area-without-its-mixed-term",
+        "problems/vibench_problems/disc_map.py",
+        "_cross(e1, f2) + _cross(f1, e2)",
+        "_cross(e1, f2)",
+        ("tests/problems/test_bulge.py",),
     ),
     Fault(
         "sigma-not-updated",
@@ -295,8 +309,8 @@ FAULTS = (
     Fault(
         "sampler-with-the-wrong-weight",
         "problems/vibench_problems/obstacle.py",
-        "return np.asarray((1.0 + weights[1]) ** 2 * values)",
-        "return np.asarray((1.0 + weights[1]) * values)",
+        "return np.asarray(self._map.monomials(weights) @ terms)",
+        "return np.asarray(self._map.monomials(weights) @ terms / (1.0 + weights[1]))",
         ("tests/problems/test_p1_entries.py",),
     ),
     Fault(

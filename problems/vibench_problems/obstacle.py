@@ -143,8 +143,8 @@ class Obstacle(Problem):
         return int(self.mesh.p.shape[1])
 
     def training_set(self) -> Array:
-        """The 5×5×5 grid; with a bulge the 4×4×4×4 grid, on which A still interpolates to 2e-5 in between."""
-        return self.parameters.grid(4, 4, 4, 4) if self.bulge else self.parameters.grid(5, 5, 5)
+        """The 5×5×5 grid; with a bulge the 4×4×4×5 grid, on which A still interpolates to 1e-5 in between."""
+        return self.parameters.grid(4, 4, 4, 5) if self.bulge else self.parameters.grid(5, 5, 5)
 
     def assemble(self, mu: Array) -> VariationalInequality:
         """Forms (37) to (40) on the mapped mesh; b = −∫ v η and g = −∫ ψ η, so that B u ≤ g says u ≥ ψ."""
