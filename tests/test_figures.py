@@ -367,3 +367,10 @@ def test_the_same_results_give_the_same_files(results: Path, tmp_path: Path) -> 
                 files.append(save(drawing(data), tmp_path / folder, name))
         for first, second in zip(*files, strict=True):
             assert first.read_bytes() == second.read_bytes(), first.name
+
+
+def test_several_processes_draw_the_same_files(results: Path, tmp_path: Path) -> None:
+    one, two = (draw_all(results, tmp_path / f"{jobs}", ("svg",), jobs) for jobs in (1, 2))
+    assert [file.name for file in one] == [file.name for file in two]
+    for first, second in zip(one, two, strict=True):
+        assert first.read_bytes() == second.read_bytes(), first.name

@@ -79,7 +79,7 @@ def run(
     if outcome.interrupted:
         console.print(f"interrupted: {outcome.missing} cells have no row yet; the same command goes on from here")
         raise typer.Exit(130)
-    drawn = figures.draw_all(path, folder / "figures")
+    drawn = figures.draw_all(path, folder / "figures", jobs=min(options.jobs, provenance.cores()))
     _summarise(console, loaded, folder, outcome, drawn)
     if strict and any(row["status"] not in (Status.OK, Status.UNAVAILABLE) for row in outcome.rows):
         raise typer.Exit(1)

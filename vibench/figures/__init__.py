@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from concurrent.futures import ProcessPoolExecutor
+from itertools import islice, zip_longest
+from multiprocessing import get_context
 from pathlib import Path
 
 from matplotlib.figure import Figure
@@ -41,7 +44,7 @@ def drawings(path: Path) -> Iterator[tuple[str, Drawing, Data]]:
             yield from ((f"{name}-{file}-{kind}", draw, data.of_dual(dual)) for kind, draw in OF_DUAL.items())
 
 
-def draw_all(path: Path, folder: Path, formats: tuple[str, ...] = FORMATS) -> list[Path]:
+def draw_all(path: Path, folder: Path, formats: tuple[str, ...] = FORMATS, jobs: int = 1) -> list[Path]:
     """Draw what a results file has data for; returns the files written.
 
     Parameters
@@ -52,12 +55,23 @@ def draw_all(path: Path, folder: Path, formats: tuple[str, ...] = FORMATS) -> li
         Where the files go.
     formats
         What is written of every figure.
+    jobs
+        Processes to draw in, this one among them.
     """
-    files = []
-    for name, draw, data in drawings(path):
+    if jobs == 1:
+        return [file for files in _part(path, folder, formats, 0, 1) for file in files]
+    with ProcessPoolExecutor(jobs - 1, get_context("spawn")) as pool:
+        others = [pool.submit(_part, path, folder, formats, k, jobs) for k in range(1, jobs)]
+        parts = [_part(path, folder, formats, 0, jobs), *(other.result() for other in others)]
+    return [file for turn in zip_longest(*parts, fillvalue=[]) for files in turn for file in files]
+
+
+def _part(path: Path, folder: Path, formats: tuple[str, ...], first: int, step: int) -> list[list[Path]]:
+    """Draw every `step`-th figure from number `first` on; the files of each."""
+    written = []
+    for name, draw, data in islice(drawings(path), first, None, step):
         folder.mkdir(parents=True, exist_ok=True)
         with styled():
             figure = draw(data)
-            if figure is not None:
-                files += save(figure, folder, name, formats)
-    return files
+            written.append([] if figure is None else save(figure, folder, name, formats))
+    return written
