@@ -78,7 +78,7 @@ def main() -> None:
     for table in TABLES:
         frame = tables.in_order(tables.read(path, table))
         frame.to_csv(target / f"{table}.csv", index=False, float_format="%.6g")
-    figures.draw_all(path, target)
+    figures.draw_all(path, target, ("png",))
     (target / "README.md").write_text(page(path, target), encoding="utf-8")
 
 
