@@ -10,7 +10,8 @@ import pandas as pd
 import typer
 from rich.console import Console
 
-from vibench import agreement, figures, invariants, plugins, provenance, qp, replay, tables
+from vibench import agreement, figures, invariants, plugins, provenance, qp, replay, shell, tables
+from vibench.doctor import doctor
 from vibench.errors import RequestError, VibenchError, unknown_name
 from vibench.loading import recorded_cell
 from vibench.matrix import Cell, expand
@@ -32,16 +33,34 @@ app = typer.Typer(
     rich_markup_mode=None,
 )
 
+Run = Annotated[
+    str,
+    typer.Argument(metavar="RUN", help="A run folder, or the name of a study run before.", autocompletion=shell.runs),
+]
+
 LISTS = {"problems": "problem", "primal": "primal strategy", "dual": "dual strategy", "studies": "study"}
 
 
-@app.command()
+@app.command(epilog=shell.examples("run"))
 def run(
-    study: Annotated[str, typer.Argument(help="A registered study, or a TOML file.")] = "quick",
-    problem: Annotated[list[str] | None, typer.Option(help="Replace the problems of the study (repeatable).")] = None,
-    dual: Annotated[list[str] | None, typer.Option(help="Replace the dual strategies.")] = None,
-    primal: Annotated[list[str] | None, typer.Option(help="Replace the primal strategies.")] = None,
-    solver: Annotated[list[str] | None, typer.Option(help="Replace the QP solvers.")] = None,
+    study: Annotated[
+        str, typer.Argument(help="A registered study, or a TOML file.", autocompletion=shell.studies)
+    ] = "quick",
+    problem: Annotated[
+        list[str] | None,
+        typer.Option(help="Replace the problems of the study (repeatable).", autocompletion=shell.names("problem")),
+    ] = None,
+    dual: Annotated[
+        list[str] | None,
+        typer.Option(help="Replace the dual strategies.", autocompletion=shell.names("dual strategy")),
+    ] = None,
+    primal: Annotated[
+        list[str] | None,
+        typer.Option(help="Replace the primal strategies.", autocompletion=shell.names("primal strategy")),
+    ] = None,
+    solver: Annotated[
+        list[str] | None, typer.Option(help="Replace the QP solvers.", autocompletion=shell.solvers)
+    ] = None,
     pod_tol: Annotated[list[float] | None, typer.Option(help="Replace the tolerances (or sizes) of the POD.")] = None,
     dual_tol: Annotated[list[float] | None, typer.Option(help="Replace those of the dual strategies.")] = None,
     primal_tol: Annotated[list[float] | None, typer.Option(help="Replace those of the primal strategies.")] = None,
@@ -58,7 +77,7 @@ def run(
         str | None, typer.Option(metavar="ADDRESS", help="A dask scheduler; a cluster on this machine unless given.")
     ] = None,
 ) -> None:
-    """Run a study's matrix; an interrupted run goes on where it stopped."""
+    """Run a study's matrix. An interrupted run goes on where it stopped."""
     overrides = {
         "problem": problem, "dual": dual, "primal": primal, "solvers": solver,
         "pod": pod_tol, "dual_tol": dual_tol, "primal_tol": primal_tol,
@@ -85,13 +104,16 @@ def run(
         raise typer.Exit(1)
 
 
-@app.command("list")
+@app.command("list", epilog=shell.examples("list"))
 def list_plugins(
     what: Annotated[
-        str | None, typer.Argument(help="problems, primal, dual, solvers or studies; all of them unless given.")
+        str | None,
+        typer.Argument(
+            help="problems, primal, dual, solvers or studies; all of them unless given.", autocompletion=shell.lists
+        ),
     ] = None,
 ) -> None:
-    """List what is registered: names, what they are, and their options."""
+    """List what is registered. Names, what they are, and their options."""
     console = new_console()
     if what is not None and what not in (*LISTS, "solvers"):
         raise unknown_name("list", what, (*LISTS, "solvers"))
@@ -101,10 +123,12 @@ def list_plugins(
         print_frame(console, pd.DataFrame(rows, columns=columns), title)
 
 
-@app.command()
+@app.command(epilog=shell.examples("show"))
 def show(
-    run: Annotated[str, typer.Argument(metavar="RUN", help="A run folder, or the name of a study run before.")],
-    table: Annotated[str, typer.Option(help=f"summary, benefits, {', '.join(TABLES)}.")] = "summary",
+    run: Run,
+    table: Annotated[
+        str, typer.Option(help=f"summary, benefits, {', '.join(TABLES)}.", autocompletion=shell.table_names)
+    ] = "summary",
     form: Annotated[Form, typer.Option("--format", help="How to print it.")] = "terminal",
 ) -> None:
     """Print a table of a run."""
@@ -127,14 +151,16 @@ app.command("report")(write_report)
 app.command("diff")(compare_runs)
 
 
-@app.command("replay")
+@app.command("replay", epilog=shell.examples("replay"))
 def replay_query(
-    run: Annotated[str, typer.Argument(metavar="RUN", help="A run folder, or the name of a study run before.")],
-    cell: Annotated[str, typer.Argument(metavar="CELL", help="Key of a cell, or its beginning.")],
+    run: Run,
+    cell: Annotated[
+        str, typer.Argument(metavar="CELL", help="Key of a cell, or its beginning.", autocompletion=shell.cells)
+    ],
     query: Annotated[int | None, typer.Option(min=0, help="Which query; the worst of the cell unless given.")] = None,
     out: Annotated[Path | None, typer.Option(help="File for the program; in RUN/replay unless given.")] = None,
 ) -> None:
-    """Solve the quadratic program of one row again with every installed solver."""
+    """Solve the program of one query again with every solver."""
     recorded = recorded_cell(run, cell)
     number = replay.worst_query(recorded) if query is None else query
     file = out or recorded.path.parent / "replay" / f"{recorded.row['cell']}-{number}.npz"
@@ -145,12 +171,12 @@ def replay_query(
     console.print(f"the program, as qpsolvers reads it: {file}", soft_wrap=True)
 
 
-@app.command()
+@app.command(epilog=shell.examples("export-qps"))
 def export_qps(
-    run: Annotated[str, typer.Argument(metavar="RUN", help="A run folder, or the name of a study run before.")],
+    run: Run,
     folder: Annotated[Path, typer.Argument(metavar="DIR", help="A folder that is new, or empty.")],
 ) -> None:
-    """Write the reduced programs of a run and their solutions as a test set for QP solvers."""
+    """Write the programs of a run as a test set for QP solvers. With their solutions."""
     count = replay.export(run, folder)
     new_console().print(
         f"{count} programs in {folder / 'programs'}; `python {folder / replay.CHECKER}` rechecks every solution",
@@ -158,12 +184,12 @@ def export_qps(
     )
 
 
-@app.command()
+@app.command(epilog=shell.examples("clean"))
 def clean(
     older_than: Annotated[float, typer.Option(min=0.0, metavar="DAYS", help="Keep what is younger.")] = 0.0,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Only show what there is.")] = False,
 ) -> None:
-    """Show what the artefacts of all runs take on the disk, and free it; results stay."""
+    """Show what artefacts take on the disk, and free it. Results stay."""
     console, store = new_console(), usable_store()
     found = pd.DataFrame(store.contents(), columns=["stage", "MiB", "days"])
     found["MiB"], found["days"] = found["MiB"] / 2**20, found["days"] / 86400.0
@@ -174,6 +200,9 @@ def clean(
     if not dry_run:
         freed = store.clear(older_than * 86400.0)
         console.print(f"{freed / 2**20:.1f} MiB freed; what is needed again is computed again")
+
+
+app.command(epilog=shell.examples("doctor"))(doctor)
 
 
 def main() -> None:
