@@ -74,7 +74,8 @@ class TestFiles:
         for name in ("mine", "other"):
             Path("runs", name, FILE).touch()
         assert completed("vibench show ") == ["mine", "other"]
-        assert completed("vibench replay m") == ["mine"]
+        assert completed("vibench replay m") == completed("vibench report m") == ["mine"]
+        assert completed("vibench diff mine o") == ["other"]
 
     def test_cells_are_those_of_the_run_named_before(self, quick_run: Path) -> None:
         Path("runs").mkdir()

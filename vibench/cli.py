@@ -18,7 +18,7 @@ from vibench.matrix import Cell, expand
 from vibench.printing import new_console, print_frame
 from vibench.progress import Report
 from vibench.qp import Status
-from vibench.result_commands import Form, compare_runs, write_report
+from vibench.result_commands import Form, RunArgument, compare_runs, write_report
 from vibench.runner import Options, Outcome, run_study
 from vibench.schema import TABLES
 from vibench.solver_settings import SETTINGS
@@ -32,11 +32,6 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
 )
-
-Run = Annotated[
-    str,
-    typer.Argument(metavar="RUN", help="A run folder, or the name of a study run before.", autocompletion=shell.runs),
-]
 
 LISTS = {"problems": "problem", "primal": "primal strategy", "dual": "dual strategy", "studies": "study"}
 
@@ -125,7 +120,7 @@ def list_plugins(
 
 @app.command(epilog=shell.examples("show"))
 def show(
-    run: Run,
+    run: RunArgument,
     table: Annotated[
         str, typer.Option(help=f"summary, benefits, {', '.join(TABLES)}.", autocompletion=shell.table_names)
     ] = "summary",
@@ -153,7 +148,7 @@ app.command("diff")(compare_runs)
 
 @app.command("replay", epilog=shell.examples("replay"))
 def replay_query(
-    run: Run,
+    run: RunArgument,
     cell: Annotated[
         str, typer.Argument(metavar="CELL", help="Key of a cell, or its beginning.", autocompletion=shell.cells)
     ],
@@ -173,7 +168,7 @@ def replay_query(
 
 @app.command(epilog=shell.examples("export-qps"))
 def export_qps(
-    run: Run,
+    run: RunArgument,
     folder: Annotated[Path, typer.Argument(metavar="DIR", help="A folder that is new, or empty.")],
 ) -> None:
     """Write the programs of a run as a test set for QP solvers. With their solutions."""

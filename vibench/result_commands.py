@@ -8,12 +8,15 @@ from typing import Annotated, Literal
 
 import typer
 
-from vibench import diff, report, tables
+from vibench import diff, report, shell, tables
 from vibench.printing import new_console, print_frame
 
 Form = Literal["terminal", "markdown", "csv", "latex", "json"]
 
-RunArgument = Annotated[str, typer.Argument(metavar="RUN", help="A run folder, or the name of a study run before.")]
+RunArgument = Annotated[
+    str,
+    typer.Argument(metavar="RUN", help="A run folder, or the name of a study run before.", autocompletion=shell.runs),
+]
 
 
 def write_report(
@@ -30,8 +33,8 @@ def write_report(
 
 
 def compare_runs(
-    a: Annotated[str, typer.Argument(metavar="A", help="A run folder or study: before.")],
-    b: Annotated[str, typer.Argument(metavar="B", help="Another: after.")],
+    a: Annotated[str, typer.Argument(metavar="A", help="A run folder or study: before.", autocompletion=shell.runs)],
+    b: Annotated[str, typer.Argument(metavar="B", help="Another: after.", autocompletion=shell.runs)],
     limit: Annotated[float, typer.Option(min=1.0, help="Factor by which a number may get worse.")] = 1.25,
     form: Annotated[Form, typer.Option("--format", help="How to print it.")] = "terminal",
 ) -> None:
