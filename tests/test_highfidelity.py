@@ -89,3 +89,19 @@ def test_an_infeasible_problem_is_refused() -> None:
     vi = VariationalInequality(sp.csc_array(np.eye(2)), np.ones(2), B, np.array([-1.0, -1.0]))
     with pytest.raises(NumericalError):
         highfidelity.solve(vi)
+
+
+def test_a_contact_set_that_moves_node_by_node_is_followed_to_its_end() -> None:
+    """A soft rope on hills, every node of which is constrained: after Haasdonk, Salomon and Wohlmuth (2012)."""
+    half = 320
+    step, nodes = 0.5 / half, 2 * half - 1
+    x = step * np.arange(1, nodes + 1)
+    difference = sp.diags_array([1.0, -1.0], offsets=[0, -1], shape=(nodes + 1, nodes)).tocsr()
+    left, right = (part.T @ part / step for part in (difference[:half], difference[half:]))
+    obstacle = -0.2 * (np.sin(np.pi * x) - np.sin(3.0 * np.pi * x)) - 0.5
+    lumped = sp.diags_array(np.full(nodes, step)).tocsr()
+    vi = VariationalInequality(0.05 * left + 0.15 * right, np.full(nodes, -step), -lumped, -step * obstacle)
+    found = highfidelity.solve(vi)
+    assert found.iterations > highfidelity.MAX_ITERATIONS
+    assert found.fallback == ""
+    assert np.all(found.u >= obstacle - 1e-12)

@@ -24,6 +24,7 @@ FEW = 0.5
 """Systems are condensed on the constrained unknowns where these are no more than this share of all."""
 
 MAX_ITERATIONS = 100
+"""Systems tried at most, or one per constraint where there are more: the contact set may move node by node."""
 FALLBACK_SOLVER = "piqp"
 
 
@@ -227,7 +228,7 @@ def _active_set_iterations(system: ActiveSystem, active: Mask) -> tuple[Array, A
     `None` if the sets repeat themselves without an answer, or one of them has dependent constraints.
     """
     seen: set[bytes] = set()
-    for iteration in range(1, MAX_ITERATIONS + 1):
+    for iteration in range(1, max(MAX_ITERATIONS, len(active)) + 1):
         try:
             u, lam = system.solve_active(np.flatnonzero(active))
         except (RuntimeError, np.linalg.LinAlgError):  # an exactly singular system

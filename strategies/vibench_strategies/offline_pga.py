@@ -49,11 +49,11 @@ class ProjectedGreedy(Growth):
     @property
     def count(self) -> int:
         """Number of vectors."""
-        return self._grown.shape[1] - self._plain.shape[1]
+        return int(self._grown.shape[1] - self._plain.shape[1])
 
     def reached(self, tolerance: float) -> bool:
         """Whether σ ≤ δ everywhere."""
-        return self._sigma[-1] <= tolerance
+        return bool(self._sigma[-1] <= tolerance)
 
     def grow(self) -> None:
         """Add a vector, lines 5 to 7.
