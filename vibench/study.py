@@ -11,6 +11,7 @@ from pydantic import (
     BeforeValidator,
     ConfigDict,
     Discriminator,
+    Field,
     Tag,
     model_validator,
 )
@@ -60,21 +61,11 @@ class _Model(BaseModel):
 
 
 class Entry(_Model):
-    """One entry of an axis of plugins.
+    """One entry of an axis of plugins."""
 
-    Attributes
-    ----------
-    name
-        Name the plugin is registered under.
-    label
-        How tables call it; the name unless given.
-    options
-        Keyword arguments of its constructor.
-    """
-
-    name: Name
-    label: str = ""
-    options: dict[str, Any] = {}
+    name: Annotated[Name, Field(description="Name the plugin is registered under.")]
+    label: Annotated[str, Field(description="How tables call it; its name unless given.")] = ""
+    options: Annotated[dict[str, Any], Field(description="Keyword arguments of its constructor.")] = {}
 
     @model_validator(mode="before")
     @classmethod
@@ -90,11 +81,18 @@ class Entry(_Model):
 class ToleranceTable(_Model):
     """A grid of tolerances: the product of what is given."""
 
-    pod: Tolerances | None = None
-    N: Sizes | None = None
-    dual: PerStrategyTolerances | None = None
-    R: PerStrategySizes | None = None
-    primal: dict[str, Tolerances] = {}
+    pod: Annotated[Tolerances | None, Field(description="Tolerances δ_POD of the POD.")] = None
+    N: Annotated[Sizes | None, Field(description="Dimensions of V_N, in place of `pod`.")] = None
+    dual: Annotated[
+        PerStrategyTolerances | None, Field(description="Tolerances δ_dual of the cones: for all, or by strategy.")
+    ] = None
+    R: Annotated[
+        PerStrategySizes | None,
+        Field(description="Numbers of generators, in place of `dual`: for all, or by strategy."),
+    ] = None
+    primal: Annotated[
+        dict[str, Tolerances], Field(description="Tolerances δ of the primal strategies that take one, by strategy.")
+    ] = {}
 
     @model_validator(mode="after")
     def _one_of_each(self) -> ToleranceTable:
@@ -130,27 +128,47 @@ def _meant_for(values: Any, entry: Entry, key: str) -> list[Any]:
 class Limits(_Model):
     """What a query and a stage may take; a stage is everything of a cell that is computed in one go."""
 
-    query_seconds: Seconds = 20.0
-    cell_seconds: Seconds = 600.0
-    memory_gib: Annotated[float, Gt(0.0), Lt(1e6), AllowInfNan(False)] = 8.0
+    query_seconds: Annotated[Seconds, Field(description="Wall seconds of one solution of a query.")] = 20.0
+    cell_seconds: Annotated[Seconds, Field(description="Wall seconds of a stage; all queries of a cell are one.")] = (
+        600.0
+    )
+    memory_gib: Annotated[
+        float, Gt(0.0), Lt(1e6), AllowInfNan(False), Field(description="Address space of a worker process in GiB.")
+    ] = 8.0
 
 
 class Study(_Model):
     """A study file: the axes of the matrix and what all its cells share."""
 
-    name: Annotated[str, MinLen(1)]
-    seed: Annotated[int, Ge(0), Lt(2**63)] = 0
-    validation: Annotated[int, Ge(1), Le(100_000)]
-    accuracy: Annotated[float, Ge(1e-14), Le(1e-2), AllowInfNan(False)] = 1e-7
-    solvers: Solvers
-    dual: Annotated[list[Entry], MinLen(1)]
-    primal: Annotated[list[Entry], MinLen(1)]
-    assembly: Annotated[list[Literal["full", "reduced"]], MinLen(1)] = ["full"]
-    interpolation: Tolerance = 1e-6
-    warm_start: bool = False
-    problem: Annotated[list[Entry], MinLen(1)]
-    tolerances: Annotated[list[ToleranceTable], MinLen(1)]
-    limits: Limits = Limits()
+    name: Annotated[str, MinLen(1), Field(description="Name of the study; results go to `runs/` and this name.")]
+    seed: Annotated[int, Ge(0), Lt(2**63), Field(description="Seed of the validation set.")] = 0
+    validation: Annotated[
+        int, Ge(1), Le(100_000), Field(description="Number of validation parameters, on which every cell is judged.")
+    ]
+    accuracy: Annotated[
+        float,
+        Ge(1e-14),
+        Le(1e-2),
+        AllowInfNan(False),
+        Field(description="Relative accuracy every solver is asked for and every query is judged by."),
+    ] = 1e-7
+    solvers: Annotated[Solvers, Field(description="QP solvers; `available` for all that are installed.")]
+    dual: Annotated[list[Entry], MinLen(1), Field(description="Dual strategies.")]
+    primal: Annotated[list[Entry], MinLen(1), Field(description="Primal strategies.")]
+    assembly: Annotated[
+        list[Literal["full", "reduced"]], MinLen(1), Field(description="How queries are assembled.")
+    ] = ["full"]
+    interpolation: Annotated[
+        Tolerance, Field(description="Largest relative interpolation error accepted in reduced assembly.")
+    ] = 1e-6
+    warm_start: Annotated[
+        bool, Field(description="Whether solvers that can start from the solution of a neighbouring parameter.")
+    ] = False
+    problem: Annotated[list[Entry], MinLen(1), Field(description="Problems.")]
+    tolerances: Annotated[
+        list[ToleranceTable], MinLen(1), Field(description="Grids of tolerances; several of them add up.")
+    ]
+    limits: Annotated[Limits, Field(description="What a query and a stage may take.")] = Limits()
 
     @model_validator(mode="after")
     def _file_name(self) -> Study:
