@@ -203,6 +203,16 @@ _SOLUTIONS: Mapping[str, Column] = {
     "slack_constant": Column("V²", "Share c of its square."),
 }
 
+_PICTURES: Mapping[str, Column] = {
+    "problem": _KEYS["problem"],
+    "problem_options": _KEYS["problem_options"],
+    "number": Column("", "Number of the picture."),
+    "title": Column("", "Its parameter."),
+    "names": Column("", "What the field and the multiplier are, with their units, as JSON."),
+    "data": Column("", "Mesh, field and multiplier in single precision, a compressed archive of NumPy."),
+    "reason": Column("", "Why there is none, where there should be."),
+}
+
 COLUMNS: Mapping[str, Mapping[str, Column]] = {
     "cells": _CELLS,
     "queries": _QUERIES,
@@ -210,6 +220,7 @@ COLUMNS: Mapping[str, Mapping[str, Column]] = {
     "thresholds": _THRESHOLDS,
     "disagreements": _DISAGREEMENTS,
     "solutions": _SOLUTIONS,
+    "pictures": _PICTURES,
 }
 """The columns of the tables of `vibench.schema.STORED`."""
 
