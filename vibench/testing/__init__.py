@@ -1,0 +1,37 @@
+"""Checks for authors of plugins: what vibench takes for granted of a problem or a strategy, tried one by one.
+
+In a test of a plugin's own package:
+
+    from vibench.testing import check_problem
+
+    def test_the_rope_conforms() -> None:
+        check_problem(Rope)
+
+`check_problem`, `check_dual` and `check_primal` raise one `ConformanceError` that lists every failure, with what is
+wrong and where to look; `examine_problem`, `examine_dual` and `examine_primal` give the findings and raise nothing. All
+take a function that makes an instance, such as the class or `partial(Rope, nodes=20)`: two instances have to agree. The
+command `vibench check` prints the same findings.
+"""
+
+from __future__ import annotations
+
+from vibench.testing.duals import check_dual, examine_dual
+from vibench.testing.findings import ConformanceError, Finding, Verdict
+from vibench.testing.primals import check_primal, examine_primal
+from vibench.testing.problems import check_problem, examine_problem
+from vibench.testing.sample import MovingSupport, sample_offline, sample_snapshots
+
+__all__ = [
+    "ConformanceError",
+    "Finding",
+    "MovingSupport",
+    "Verdict",
+    "check_dual",
+    "check_primal",
+    "check_problem",
+    "examine_dual",
+    "examine_primal",
+    "examine_problem",
+    "sample_offline",
+    "sample_snapshots",
+]  # fmt: skip

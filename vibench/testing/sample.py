@@ -1,0 +1,108 @@
+"""A small problem to try strategies on, its snapshots, and a reduced model of it to enrich."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import scipy.sparse as sp
+
+from vibench import highfidelity
+from vibench.arrays import Array
+from vibench.cone import greedy_cone
+from vibench.infsup import multipliers
+from vibench.pod import pod
+from vibench.problem import ParameterBox, Problem, VariationalInequality
+from vibench.space import InnerProduct
+from vibench.strategy import Cone, Offline, Stop
+from vibench.testing.values import copied
+
+NODES, CONSTRAINTS = 40, 14
+"""Free nodes of the string, and constraints on it."""
+
+MODES, GENERATORS = 4, 6
+"""Dimensions of the reduced model that primal strategies enrich."""
+
+
+class MovingSupport(Problem):
+    """A string pressed on a parabolic support that moves and rises with the parameter.
+
+    The gap is controlled in means around points that move with the support, so that B, and with it every supremizer,
+    truly depends on mu.
+    """
+
+    parameters = ParameterBox(("position", "height"), np.array([-0.1, 0.0]), np.array([0.1, 0.04]), ("m", "m"))
+
+    def __init__(self) -> None:
+        h = 1.0 / (NODES + 1)
+        self._x = h * np.arange(1, NODES + 1)
+        off, diagonal = -np.ones(NODES - 1), 2.0 * np.ones(NODES)
+        self._stiffness = sp.csr_array(sp.diags_array([off, diagonal, off], offsets=[-1, 0, 1])) / h
+        self._load = np.full(NODES, -4.0 * h)
+        self._width = 0.5 / (CONSTRAINTS - 1)
+        sides = np.full(CONSTRAINTS - 1, self._width / 6.0)
+        middles = np.full(CONSTRAINTS, self._width * 2.0 / 3.0)
+        self.V = InnerProduct(self._stiffness + h * sp.eye_array(NODES), "X_V")
+        self.W = InnerProduct(sp.csr_array(sp.diags_array([sides, middles, sides], offsets=[-1, 0, 1])), "X_W")
+
+    def training_set(self) -> Array:
+        """The 5×5 grid."""
+        return self.parameters.grid(5, 5)
+
+    def assemble(self, mu: Array) -> VariationalInequality:
+        """Means of −u around 14 points are no larger than those of −ψ, ψ the support."""
+        centres = np.linspace(0.25, 0.75, CONSTRAINTS) + mu[0]
+        hats = np.maximum(0.0, 1.0 - np.abs(self._x[None, :] - centres[:, None]) / self._width)
+        weights = hats / len(self._x)
+        support = -0.2 + mu[1] - 0.8 * (self._x - 0.5 - mu[0]) ** 2
+        return VariationalInequality(self._stiffness, self._load, sp.csr_array(-weights), -weights @ support)
+
+
+def sample_snapshots() -> tuple[Array, InnerProduct]:
+    """Multipliers λ(mu_p) (m×P) of the sample problem at its training parameters, and the space W they live in."""
+    problem = MovingSupport()
+    return _solutions(problem)[1], problem.W
+
+
+def sample_offline(modes: int = MODES, generators: int = GENERATORS) -> Offline:
+    """A reduced model of the sample problem, of a POD and of snapshots chosen greedily, for strategies to enrich.
+
+    Parameters
+    ----------
+    modes, generators
+        N and R.
+    """
+    problem = MovingSupport()
+    u, lam = _solutions(problem)
+    cone = greedy_cone(lam, problem.W, Stop(size=generators), lambda theta, _: (np.zeros_like(theta), ""))
+    return offline_of(problem, pod(u, problem.V, Stop(size=modes)).basis, cone)
+
+
+def offline_of(problem: Problem, basis: Array, cone: Cone) -> Offline:
+    """What a primal strategy gets to work with: a problem, a basis of V_N (n×N) and a cone."""
+    span = multipliers(cone.generators, problem.W).span
+    return Offline(problem, basis, cone, span, problem.training_set())
+
+
+def copy_of(offline: Offline) -> Offline:
+    """The same with arrays of its own; the problem is shared."""
+    cone = offline.cone
+    own = Cone(cone.generators.copy(), cone.errors.copy(), cone.free.copy(), cone.fallbacks)
+    return Offline(offline.problem, offline.basis.copy(), own, offline.span.copy(), offline.training.copy())
+
+
+def arrays_of(offline: Offline) -> dict[str, Any]:
+    """All that a strategy could change, by where it is: its arrays, and copies of the matrices of the spaces."""
+    arrays = {
+        "basis": offline.basis, "span": offline.span, "training": offline.training,
+        "cone.generators": offline.cone.generators, "cone.errors": offline.cone.errors,
+    }  # fmt: skip
+    spaces = {f"problem.{name}.matrix": copied(getattr(offline.problem, name).matrix) for name in "VW"}
+    return {**arrays, **spaces}
+
+
+def _solutions(problem: Problem) -> tuple[Array, Array]:
+    """U (n×P) and λ (m×P) at the training parameters."""
+    solver = highfidelity.Solver(problem)
+    found = [solver.solve(mu) for mu in problem.training_set()]
+    return np.column_stack([each.u for each in found]), np.column_stack([each.lam for each in found])
