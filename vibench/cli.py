@@ -10,7 +10,7 @@ import pandas as pd
 import typer
 from rich.console import Console
 
-from vibench import agreement, figures, invariants, plugins, provenance, qp, replay, shell, tables
+from vibench import agreement, figures, invariants, plugin_commands, plugins, provenance, qp, replay, shell, tables
 from vibench.doctor import doctor
 from vibench.errors import RequestError, VibenchError, unknown_name
 from vibench.loading import recorded_cell
@@ -198,6 +198,7 @@ def clean(
 
 
 app.command(epilog=shell.examples("doctor"))(doctor)
+plugin_commands.add_commands(app)
 
 
 def main() -> None:

@@ -30,7 +30,11 @@ GROUPS: Mapping[str, str] = {
 FINITE = ConfigDict(allow_inf_nan=False)
 """No option of a plugin may be infinite or not a number."""
 
-_BASES: Mapping[str, type] = {"problem": Problem, "dual strategy": DualStrategy, "primal strategy": PrimalStrategy}
+BASES: Mapping[str, type] = {"problem": Problem, "dual strategy": DualStrategy, "primal strategy": PrimalStrategy}
+"""The abstract classes of plugins that are classes."""
+
+WORDS: Mapping[str, str] = {"problem": "problem", "primal": "primal strategy", "dual": "dual strategy"}
+"""These kinds as the command line calls them."""
 
 
 @dataclass(frozen=True)
@@ -63,7 +67,7 @@ def load(kind: str, name: str) -> Any:
         plugin = registered[name].load()
     except (Exception, SystemExit) as error:  # noqa: BLE001  importing a plugin runs code of strangers
         raise RequestError(f"{where} cannot be loaded: {in_a_line(error)}") from None
-    base = _BASES.get(kind)
+    base = BASES.get(kind)
     if base is not None and not (isinstance(plugin, type) and issubclass(plugin, base)):
         raise RequestError(f"{where} is not a subclass of {base.__qualname__}")
     if kind == "QP solver" and not callable(plugin):
@@ -122,22 +126,33 @@ def check_options(kind: str, name: str, given: Mapping[str, Any]) -> dict[str, A
     RequestError
         Naming the option, what was given and what is expected.
     """
-    known = {parameter.name: (parameter, annotation) for parameter, annotation in _parameters(load(kind, name))}
+    return checked_arguments(load(kind, name), f"{kind} '{name}'", given)
+
+
+def checked_arguments(plugin: type, what: str, given: Mapping[str, Any]) -> dict[str, Any]:
+    """Options as the annotations of a class ask for them, registered or not; `what` it is called in messages.
+
+    Raises
+    ------
+    RequestError
+        Naming the option, what was given and what is expected.
+    """
+    known = {parameter.name: (parameter, annotation) for parameter, annotation in _parameters(plugin)}
     for option in given:
         if option not in known:
-            raise unknown_name(f"option of {kind} '{name}'", option, known)
+            raise unknown_name(f"option of {what}", option, known)
     checked = {}
     for option, (parameter, annotation) in known.items():
         if option not in given:
             if parameter.default is inspect.Parameter.empty:
-                raise RequestError(f"{kind} '{name}' needs the option '{option}' ({_expected(annotation)})")
+                raise RequestError(f"{what} needs the option '{option}' ({_expected(annotation)})")
             continue
         try:
             text = json.dumps(given[option], default=str)
             checked[option] = TypeAdapter(annotation, config=FINITE).validate_json(text, strict=True)
         except ValidationError:
             raise RequestError(
-                f"option '{option}' of {kind} '{name}' is {given[option]!r}; expected {_expected(annotation)}"
+                f"option '{option}' of {what} is {given[option]!r}; expected {_expected(annotation)}"
             ) from None
     return checked
 
