@@ -58,7 +58,10 @@ def _dofs_fault(dofs: object, n: int) -> str:
 
 def _contact_fault(case: Case, dofs: Indices) -> str:
     for mu, found in zip(case.mus, case.assembled, strict=True):
-        contact = case.problem.contact(mu.copy())
+        given = mu.copy()
+        contact = case.problem.contact(given)
+        if what := difference(given, mu):
+            return f"contact changes the parameter it is given: {what} before; work on a copy of mu"
         if not isinstance(contact, Contact):
             return f"contact gives a {type(contact).__name__} {at(mu)}; expected a vibench.problem.Contact"
         fault = matrix_fault("contact.B", contact.B, (case.problem.W.dim, len(dofs)))

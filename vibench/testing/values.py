@@ -96,7 +96,7 @@ def why_not_pickled(thing: Any) -> str:
         return ""
     found = [name for name, value in getattr(thing, "__dict__", {}).items() if not _travels(value)]
     where = f": look at its {'attribute' if len(found) == 1 else 'attributes'} {', '.join(found)}" if found else ""
-    return f"a {type(thing).__name__} cannot be pickled ({reason}){where}"
+    return f"the {type(thing).__name__} cannot be pickled ({reason}){where}"
 
 
 def _travels(value: Any) -> bool:
