@@ -9,7 +9,7 @@ from pathlib import Path
 from string import Template
 
 from vibench import plugins
-from vibench.errors import RequestError
+from vibench.errors import RequestError, StorageError
 from vibench.plugins import GROUPS, WORDS
 from vibench.provenance import distribution_version
 
@@ -39,6 +39,8 @@ def write_package(kind: str, name: str, parent: Path) -> Path:
     ------
     RequestError
         If the name is no good or taken, or the folder exists.
+    StorageError
+        If there is no space, or no permission.
     """
     check_name(kind, name)
     target = parent / f"vibench-{name}"
@@ -49,6 +51,9 @@ def write_package(kind: str, name: str, parent: Path) -> Path:
     contents = _contents(kind, name)
     try:
         parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise RequestError(f"--out '{parent}' cannot be made: {error.strerror or error}") from None
+    try:
         with tempfile.TemporaryDirectory(dir=parent, prefix=".vibench-new-") as scratch:
             draft = Path(scratch) / target.name
             for path, text in contents.items():
@@ -56,7 +61,7 @@ def write_package(kind: str, name: str, parent: Path) -> Path:
                 (draft / path).write_text(text, encoding="utf-8")
             draft.rename(target)
     except OSError as error:
-        raise RequestError(f"'{target}' cannot be written: {error.strerror or error}") from None
+        raise StorageError(f"'{target}' cannot be written: {error.strerror or error}") from None
     return target
 
 
