@@ -13,7 +13,7 @@ from typing import Annotated, Any, Literal
 
 import typer
 
-from vibench import plugins, scaffold, testing
+from vibench import plugins, scaffold, shell, testing
 from vibench.errors import RequestError, in_a_line, unknown_name
 from vibench.plugins import BASES, WORDS
 from vibench.printing import new_console
@@ -34,13 +34,18 @@ class Target:
 
 def add_commands(app: typer.Typer) -> None:
     """Add the commands of this module to the command line."""
-    app.command("check")(check_plugin)
-    app.command("new")(new_plugin)
+    app.command("check", epilog=shell.examples("check"))(check_plugin)
+    app.command("new", epilog=shell.examples("new"))(new_plugin)
 
 
 def check_plugin(
     plugin: Annotated[
-        str, typer.Argument(metavar="PLUGIN", help="A name, KIND:NAME (problem, primal, dual), or MODULE:CLASS.")
+        str,
+        typer.Argument(
+            metavar="PLUGIN",
+            help="A name, KIND:NAME (problem, primal, dual), or MODULE:CLASS.",
+            autocompletion=shell.plugin_names,
+        ),
     ],
     option: Annotated[
         list[str] | None, typer.Option(metavar="KEY=VALUE", help="An option of the plugin (repeatable).")
@@ -49,10 +54,7 @@ def check_plugin(
         float, typer.Option(min=0.0, help="Longest time that one call of the plugin may take.")
     ] = testing.SECONDS,
 ) -> None:
-    """Check all that vibench takes for granted of a plugin; exit code 1 if a check fails.
-
-    Examples: vibench check rope --option nodes=20; vibench check primal:mine; vibench check my_package.rope:Rope
-    """
+    """Check all that vibench takes for granted of a plugin; exit code 1 if a check fails."""
     target = _target(plugin)
     given = dict(map(_option, option or []))
     what = f"{WORDS[target.kind]} '{target.name}'"
@@ -78,10 +80,7 @@ def new_plugin(
     name: Annotated[str, typer.Argument(metavar="NAME", help="What to register it as: a-z, 0-9 and hyphens.")],
     out: Annotated[Path, typer.Option(metavar="DIR", help="Folder in which the new folder is made.")] = Path(),
 ) -> None:
-    """Write a package with a new plugin that passes its checks as it is: installable, tested and registered.
-
-    Example: vibench new problem rope && pip install -e vibench-rope && vibench check rope
-    """
+    """Write a package with a new plugin that passes its checks as it is: installable, tested and registered."""
     folder = scaffold.write_package(kind, name, out)
     console = new_console()
     for line in (

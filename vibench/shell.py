@@ -28,6 +28,12 @@ EXAMPLES: Mapping[str, tuple[str, ...]] = {
     "show": ("vibench show quick", "vibench show quick --table benefits", "vibench show runs/quick --format csv"),
     "replay": ("vibench replay quick 3f9a", "vibench replay quick 3f9a --query 7"),
     "export-qps": ("vibench export-qps quick programs",),
+    "check": (
+        "vibench check my-problem --option resolution=medium",
+        "vibench check primal:mine",
+        "vibench check my_package.cable:Cable",
+    ),
+    "new": ("vibench new problem cable", "vibench new dual my-cone --out packages"),
     "clean": ("vibench clean --dry-run", "vibench clean --older-than 30"),
     "doctor": ("vibench doctor", "vibench doctor --out /scratch/runs"),
 }
@@ -46,6 +52,11 @@ def names(kind: str) -> Complete:
         return _beginning(incomplete, lambda: plugins.names(kind))
 
     return complete
+
+
+def plugin_names(incomplete: str) -> list[str]:
+    """Completes names of problems and strategies."""
+    return _beginning(incomplete, lambda: {name for kind in plugins.WORDS.values() for name in plugins.names(kind)})
 
 
 def studies(incomplete: str) -> list[str]:

@@ -4,13 +4,13 @@ In a test of a plugin's own package:
 
     from vibench.testing import check_problem
 
-    def test_the_rope_conforms() -> None:
-        check_problem(Rope)
+    def test_the_cable_conforms() -> None:
+        check_problem(Cable)
 
 `check_problem`, `check_dual` and `check_primal` raise one `ConformanceError` that lists every failure, with what is
 wrong and where to look; `examine_problem`, `examine_dual` and `examine_primal` give the findings and raise nothing. All
-take a function that makes an instance, such as the class or `partial(Rope, nodes=20)`: two instances have to agree. The
-command `vibench check` prints the same findings.
+take a function that makes an instance, such as the class or `partial(Cable, nodes=20)`: two instances have to agree.
+The command `vibench check` prints the same findings.
 """
 
 from __future__ import annotations

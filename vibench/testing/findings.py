@@ -117,7 +117,7 @@ def raised(error: BaseException) -> str:
 
 
 def plugin_line(error: BaseException) -> str:
-    """Where an exception left the plugin: "rope.py, line 12: self.V = …"; "" if it never was there."""
+    """Where an exception left the plugin: "cable.py, line 12: self.V = …"; "" if it never was there."""
     frames = [frame for frame in traceback.extract_tb(error.__traceback__) if not _is_library(frame.filename)]
     return f"{Path(frames[-1].filename).name}, line {frames[-1].lineno}: {frames[-1].line}" if frames else ""
 
