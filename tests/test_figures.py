@@ -215,6 +215,19 @@ def test_a_constant_that_vanishes_is_named_though_it_cannot_be_drawn(draw: Draw)
     assert any(label == "decorrelated (0 over span)" for label in axes.get_legend_handles_labels()[1])
 
 
+def test_a_logarithmic_panel_with_nothing_to_show_stays_empty(change: Callable[..., None], draw: Draw) -> None:
+    """A strategy that records no σ, and enrichments that leave β at zero."""
+    change(
+        "DELETE FROM histories WHERE quantity = 'sigma'",
+        "UPDATE histories SET value = 0.0 WHERE quantity = 'beta_span_min'",
+    )
+    sigma, beta, _ = draw()["obstacle-mcpg-enrichment"].axes[:3]
+    assert not sigma.get_lines()
+    for axes in (sigma, beta):
+        low, high = axes.get_ylim()
+        assert 0.0 < low < high
+
+
 def test_without_queries_nothing_is_drawn(change: Callable[..., None], results: Path, tmp_path: Path) -> None:
     change("DELETE FROM queries")
     assert draw_all(results, tmp_path / "figures") == []

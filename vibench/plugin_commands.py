@@ -54,7 +54,10 @@ def check_plugin(
         float, typer.Option(min=0.0, help="Longest time that one call of the plugin may take.")
     ] = testing.SECONDS,
 ) -> None:
-    """Check all that vibench takes for granted of a plugin; exit code 1 if a check fails."""
+    """Check a plugin: shapes, signs, tolerances, determinism, time.
+
+    One line for each thing that vibench takes for granted; exit code 1 if one of them does not hold.
+    """
     target = _target(plugin)
     given = dict(map(_option, option or []))
     what = f"{WORDS[target.kind]} '{target.name}'"
@@ -80,7 +83,10 @@ def new_plugin(
     name: Annotated[str, typer.Argument(metavar="NAME", help="What to register it as: a-z, 0-9 and hyphens.")],
     out: Annotated[Path, typer.Option(metavar="DIR", help="Folder in which the new folder is made.")] = Path(),
 ) -> None:
-    """Write a package with a new plugin that passes its checks as it is: installable, tested and registered."""
+    """Write a package with a new plugin, to install and edit.
+
+    It passes its tests as it is. Nothing is written over.
+    """
     folder = scaffold.write_package(kind, name, out)
     console = new_console()
     for line in (

@@ -164,9 +164,13 @@ def logarithmic(axes: Axes, which: str = "y") -> None:
 
 def _ticks(axes: Axes) -> None:
     """Enough ticks on logarithmic axes, few or many decades long; minor ones would take most of the time of drawing."""
-    for axis, limits in ((axes.xaxis, axes.get_xlim()), (axes.yaxis, axes.get_ylim())):
+    for name, axis in (("x", axes.xaxis), ("y", axes.yaxis)):
         if axis.get_scale() != "log":
             continue
+        limits = getattr(axes, f"get_{name}lim")()
+        if not 0.0 < limits[0] < limits[1]:  # nothing on it that can be shown
+            limits = (0.1, 1.0)
+            getattr(axes, f"set_{name}lim")(limits)
         axis.set_minor_locator(ticker.NullLocator())
         decades = math.log10(limits[1] / limits[0])
         if decades < FEW:
