@@ -142,8 +142,8 @@ def show(
         sys.stdout.write(tables.FORMS[form](frame))
 
 
-app.command("report")(write_report)
-app.command("diff")(compare_runs)
+app.command("report", epilog=shell.examples("report"))(write_report)
+app.command("diff", epilog=shell.examples("diff"))(compare_runs)
 
 
 @app.command("replay", epilog=shell.examples("replay"))

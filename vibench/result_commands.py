@@ -23,10 +23,7 @@ def write_report(
     run: RunArgument,
     out: Annotated[Path | None, typer.Option(help="The HTML file; report.html in the run folder unless given.")] = None,
 ) -> None:
-    """Write what a run found as one HTML file that needs nothing else.
-
-    Example: vibench report quick && xdg-open runs/quick/report.html
-    """
+    """Write what a run found as one HTML page."""
     path = tables.results_file(run)
     target = report.write(path, out or path.parent / "report.html")
     new_console().print(f"report: {target}", soft_wrap=True)
@@ -38,10 +35,7 @@ def compare_runs(
     limit: Annotated[float, typer.Option(min=1.0, help="Factor by which a number may get worse.")] = 1.25,
     form: Annotated[Form, typer.Option("--format", help="How to print it.")] = "terminal",
 ) -> None:
-    """Say what changed between two runs of a study; exit code 1 if something got worse.
-
-    Example: vibench diff runs/before runs/after --limit 1.1
-    """
+    """Say what changed between two runs; exit with 1 if for the worse."""
     one, two = tables.results_file(a), tables.results_file(b)
     found = diff.compare(one, two, limit)
     console = new_console()

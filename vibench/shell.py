@@ -26,6 +26,8 @@ EXAMPLES: Mapping[str, tuple[str, ...]] = {
     ),
     "list": ("vibench list", "vibench list solvers"),
     "show": ("vibench show quick", "vibench show quick --table benefits", "vibench show runs/quick --format csv"),
+    "report": ("vibench report quick", "vibench report runs/quick --out quick.html"),
+    "diff": ("vibench diff runs/before runs/after", "vibench diff runs/before runs/after --limit 1.1 --format json"),
     "replay": ("vibench replay quick 3f9a", "vibench replay quick 3f9a --query 7"),
     "export-qps": ("vibench export-qps quick programs",),
     "check": (
