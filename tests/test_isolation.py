@@ -187,7 +187,7 @@ def test_a_talkative_job_can_be_stopped(keeper: Keeper, tmp_path: Path) -> None:
     ("how", "status"), [("sleep", Status.TIMEOUT), ("exit", Status.CRASHED), ("interrupt", Status.ERROR)]
 )
 def test_what_is_not_of_a_piece_costs_the_cell(run: Run, where: str, how: str, status: Status) -> None:
-    found = run(InPieces(("fine",), **{where: how}), cell=1.5)
+    found = run(InPieces(("fine",), **{where: how}), cell=1.5 if how == "sleep" else 20.0)
     assert isinstance(found, Failed)
     assert found.status is status
 

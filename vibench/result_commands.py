@@ -35,7 +35,7 @@ def compare_runs(
     limit: Annotated[float, typer.Option(min=1.0, help="Factor by which a number may get worse.")] = 1.25,
     form: Annotated[Form, typer.Option("--format", help="How to print it.")] = "terminal",
 ) -> None:
-    """Say what changed between two runs; exit with 1 if for the worse."""
+    """Say what changed between two runs; 1 if for the worse."""
     one, two = tables.results_file(a), tables.results_file(b)
     found = diff.compare(one, two, limit)
     console = new_console()
