@@ -8,12 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import nnls
 
-from vibench.arrays import Array
+from vibench.arrays import Array, Mask
 from vibench.errors import NumericalError
 from vibench.factor import SparseCholesky
 from vibench.greedy import LazyMaximum
 from vibench.space import InnerProduct
-from vibench.strategy import Cone, Stop, no_free
+from vibench.strategy import Cone, Stop, no_free, rays
 
 REPRODUCED = 1e-12
 """Relative distances below this are round-off."""
@@ -67,7 +67,12 @@ def _project_whitened(generators: Array, theta: Array) -> Projection:
     return Projection(np.asarray(coefficients), float(distance))
 
 
-def greedy_cone(snapshots: Array, W: InnerProduct, stop: Stop, subtract: Subtract) -> Cone:
+def nothing(theta: Array, _: Array) -> tuple[Array, str]:
+    """Leave nothing of a snapshot θ (m,) out."""
+    return np.zeros_like(theta), ""
+
+
+def greedy_cone(snapshots: Array, W: InnerProduct, stop: Stop, subtract: Subtract = nothing) -> Cone:
     """Greedy cone with the relative maximum criterion (paper, Algorithm 2 and Remark 4.3).
 
     Each step takes the snapshot farthest from the present cone and adds the direction of what `subtract` leaves of
@@ -90,8 +95,7 @@ def greedy_cone(snapshots: Array, W: InnerProduct, stop: Stop, subtract: Subtrac
     NumericalError
         If a snapshot has a negative coefficient: it would not be in W⁺.
     """
-    if snapshots.size and snapshots.min() < 0.0:
-        raise NumericalError(f"a multiplier snapshot has the negative coefficient {snapshots.min():.1e}")
+    refuse_negative(snapshots)
     whitened = W.whiten(snapshots)
     norms = np.linalg.norm(whitened, axis=0)
     largest = float(norms.max(initial=0.0))
@@ -117,6 +121,55 @@ def greedy_cone(snapshots: Array, W: InnerProduct, stop: Stop, subtract: Subtrac
         pick, error = distances.next()
         errors.append(error)
     return Cone(generators, np.array(errors), no_free(generators.shape[1]), tuple(fallbacks))
+
+
+def refuse_negative(snapshots: Array) -> None:
+    """Refuse snapshots (m×Q) outside W⁺.
+
+    Raises
+    ------
+    NumericalError
+        If a coefficient is negative.
+    """
+    if np.min(snapshots, initial=0.0) < 0.0:
+        raise NumericalError(f"a multiplier snapshot has the negative coefficient {snapshots.min():.1e}")
+
+
+def normalised(snapshots: Array, W: InnerProduct) -> Array:
+    """Snapshots (m×Q) in W⁺ with unit norm in W, without those that are zero.
+
+    Raises
+    ------
+    NumericalError
+        If a coefficient is negative.
+    """
+    refuse_negative(snapshots)
+    norms = W.norm(snapshots)
+    return np.asarray(snapshots[:, norms > 0.0] / norms[norms > 0.0])
+
+
+def projection_errors(generators: Array, snapshots: Array, W: InnerProduct) -> Array:
+    """e(r) for r = 0 … R: the largest distance of a snapshot from the cone of the first r generators.
+
+    Relative to the largest norm of a snapshot, as in equations (13) and (34); for cones that no greedy algorithm made.
+
+    Parameters
+    ----------
+    generators
+        Unit vectors (m×R).
+    snapshots
+        θ_q (m×Q); where all are zero, so are the errors.
+    W
+        Inner product of the multiplier space.
+    """
+    errors = np.zeros(generators.shape[1] + 1)
+    if np.any(snapshots):
+        distances, whitened = LazyDistances(W.whiten(snapshots)), W.whiten(generators)
+        errors[0] = 1.0
+        for r in range(1, len(errors)):
+            distances.widen(whitened[:, :r])
+            errors[r] = distances.next()[1]
+    return errors
 
 
 class LazyDistances:
@@ -145,8 +198,8 @@ class LazyDistances:
         self._points = np.zeros((0, whitened.shape[1]))  # coefficients of a point of the cone for every snapshot
         self.maximum = LazyMaximum(norms / self._largest)
 
-    def widen(self, generators: Array, taken: int) -> None:
-        """Take in the last of the generators (m×r, unit norm, whitened), which came from the snapshot `taken`."""
+    def widen(self, generators: Array, taken: int | None = None) -> None:
+        """Take in the last of the generators (m×r, unit norm, whitened); the snapshot `taken` is in the cone by now."""
         old, new = _two_dimensional(self._generators @ self._points, generators[:, -1], self._snapshots)
         self._points = np.vstack([self._points * old, new])
         self._generators = generators
@@ -156,11 +209,16 @@ class LazyDistances:
             self._points[i] += step
             slope -= row[:, None] * step
         self.maximum.bound(np.linalg.norm(self._snapshots - generators @ self._points, axis=0) / self._largest)
-        self.maximum.exclude(taken)
+        if taken is not None:
+            self.maximum.exclude(taken)
 
     def next(self) -> tuple[int, float]:
         """Index of the snapshot farthest from the cone, and its distance; of those taken, none."""
         return self.maximum.next(self._distance)
+
+    def residual(self, q: int) -> Array:
+        """What the best known point of the cone leaves of a snapshot (m,); that of `next` is its projection."""
+        return np.asarray(self._snapshots[:, q] - self._generators @ self._points[:, q])
 
     def _distance(self, q: int) -> float:
         found = _project_whitened(self._generators, self._snapshots[:, q])
@@ -186,7 +244,12 @@ def _two_dimensional(points: Array, nu: Array, targets: Array) -> tuple[Array, A
     return np.where(both, a, single_a), np.where(both, b, single_b)
 
 
-def orthogonality(generators: Array, W: InnerProduct) -> Array:
-    """e_orth(r) for r = 0 … R−1: distance of generator r+1 from the cone of the first r (paper, equation (41))."""
+def orthogonality(generators: Array, W: InnerProduct, free: Mask | None = None) -> Array:
+    """e_orth(r) for r = 0 … R−1: distance of generator r+1 from the cone of the first r (paper, equation (41)).
+
+    `free` says which generators (R,) may be used with either sign; none by default.
+    """
     whitened = W.whiten(generators)
-    return np.array([_project_whitened(whitened[:, :r], whitened[:, r]).distance for r in range(whitened.shape[1])])
+    free = no_free(whitened.shape[1]) if free is None else free
+    cones = (rays(whitened[:, :r], free[:r]) for r in range(whitened.shape[1]))
+    return np.array([_project_whitened(cone, whitened[:, r]).distance for r, cone in enumerate(cones)])

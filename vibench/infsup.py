@@ -13,11 +13,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from vibench.arrays import Array, SparseMatrix
+from vibench.arrays import Array, Mask, SparseMatrix
 from vibench.cone_bounds import cone_interval
 from vibench.linalg import singular_values
 from vibench.space import InnerProduct
+from vibench.strategy import no_free
 from vibench.supremizer import on_basis
+
+UNSIGNED = "span"
+"""Name of the lower bound of a cone with free generators, β_span; no other is known to hold for it."""
 
 
 @dataclass(frozen=True)
@@ -32,11 +36,14 @@ class Multipliers:
         W-orthonormal basis of span χ (m×rank), from a rank-revealing factorisation.
     gram
         G (R×R).
+    free
+        Which generators may be used with either sign (R,).
     """
 
     chi: Array
     span: Array
     gram: Array
+    free: Mask
 
     @property
     def rank(self) -> int:
@@ -59,10 +66,11 @@ class InfSup:
         return InfSup(size * self.span, size * self.cone_lower, size * self.cone_upper, self.sharp)
 
 
-def multipliers(chi: Array, W: InnerProduct) -> Multipliers:
-    """Prepare generators (m×R) of unit norm."""
+def multipliers(chi: Array, W: InnerProduct, free: Mask | None = None) -> Multipliers:
+    """Prepare generators (m×R) of unit norm; `free` says which may be used with either sign (R,), none by default."""
     whitened = W.whiten(chi)
-    return Multipliers(chi, W.orthonormalise(chi), whitened.T @ whitened)
+    free = no_free(chi.shape[1]) if free is None else free
+    return Multipliers(chi, W.orthonormalise(chi), whitened.T @ whitened, free)
 
 
 def inf_sup(on_span: Array, on_generators: Array, cone: Multipliers) -> InfSup:
@@ -83,7 +91,11 @@ def inf_sup(on_span: Array, on_generators: Array, cone: Multipliers) -> InfSup:
         All zeros when there is no primal vector, infinite when there is no multiplier.
     """
     span = beta_span(on_span)
+    if np.any(cone.free) and np.all(cone.free):  # the cone is its span
+        return InfSup(span, span, span, f"{UNSIGNED}/{UNSIGNED}")
     lower, upper, sharp = cone_interval(compressed(on_generators), cone.gram, span)
+    if np.any(cone.free):  # nonnegative coefficients are some of those allowed: only upper bounds hold
+        return InfSup(span, span, upper, f"{UNSIGNED}/{sharp.split('/')[1]}")
     return InfSup(span, lower, upper, sharp)
 
 

@@ -2,8 +2,9 @@
 
 Whole space ≥ own space ≥ V_N alone, whole space ≥ high-fidelity pair, own = whole space for per-parameter enrichments,
 cone ≥ span; certified error bounds ≥ errors. The order is exact for the span; of intervals over the cone, the upper end
-of the larger constant is compared with the lower end of the smaller. Round-off is allowed for, in units of the constant
-of the whole space, which is no larger than the norm of the form.
+of the larger constant is compared with the lower end of the smaller. A reduced cone with free generators is not in W⁺,
+and its constant is compared with that of the high-fidelity pair over the span alone. Round-off is allowed for, in units
+of the constant of the whole space, which is no larger than the norm of the form.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ import numpy as np
 import pandas as pd
 
 from vibench.cone_bounds import ABSOLUTE, RELATIVE
+from vibench.infsup import UNSIGNED
 from vibench.schema import CONSTANTS
 from vibench.strategy import Kind
 
@@ -48,14 +50,16 @@ def violations(queries: pd.DataFrame, kinds: pd.Series) -> list[Violation]:
         How the enrichment of each cell depends on the parameter, by cell.
     """
     numbers = queries[[*CONSTANTS, *EFFECTIVITIES]].astype(float)
-    return list(_found(numbers, queries["cell"].map(kinds)))
+    signed = ~queries["bounds"].fillna("").str.startswith(f"{UNSIGNED}/")
+    return list(_found(numbers, queries["cell"].map(kinds), signed))
 
 
-def _found(queries: pd.DataFrame, kind: pd.Series) -> Iterator[Violation]:
+def _found(queries: pd.DataFrame, kind: pd.Series, signed: pd.Series) -> Iterator[Violation]:
     scale = queries["beta_full_cone_upper"]
     for larger, smaller in ORDER:
-        for what in (("span", "span"), ("cone_upper", "cone_lower")):
-            yield from _at_least(queries, f"beta_{larger}{what[0]}", f"beta_{smaller}{what[1]}", scale)
+        inside = signed if smaller == "hf_" else signed | True
+        yield from _at_least(queries, f"beta_{larger}span", f"beta_{smaller}span", scale)
+        yield from _at_least(queries[inside], f"beta_{larger}cone_upper", f"beta_{smaller}cone_lower", scale[inside])
     for whose in ("", "full_", "plain_", "hf_"):
         yield from _at_least(queries, f"beta_{whose}cone_upper", f"beta_{whose}span", scale)
         yield from _at_least(queries, f"beta_{whose}cone_upper", f"beta_{whose}cone_lower", scale)

@@ -52,7 +52,8 @@ class ReducedModel:
     enrichment
         What the primal strategy adds.
     generators
-        χ (m×R), unit norm in W.
+        χ (m×R), unit norm in W, all with nonnegative coefficients: those that are free stand there with either sign
+        (`Cone.rays`), so that their two inequalities make an equality.
     span
         W-orthonormal basis of span χ (m×rank), what per-parameter enrichments are computed from.
 

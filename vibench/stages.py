@@ -76,7 +76,7 @@ class ConeStage(Stage):
         spent = watch.seconds()
         check_cone(cone, W)
         watch = Stopwatch()
-        found = ReducedCone(cone, multipliers(cone.generators, W))
+        found = ReducedCone(cone, multipliers(cone.generators, W, cone.free))
         seconds = spent + watch.seconds()
         key = {"stage": "cone"}
         return Result(
@@ -84,7 +84,7 @@ class ConeStage(Stage):
             seconds,
             (
                 History(key, "error", tuple(cone.errors)),
-                History(key, "e_orth", tuple(orthogonality(cone.generators, W))),
+                History(key, "e_orth", tuple(orthogonality(cone.generators, W, cone.free))),
             ),
         )
 
@@ -238,7 +238,7 @@ def reduced_model(store: Store, stage: EnrichmentStage) -> tuple[ReducedModel, A
         build_problem(stage.pod.problem),
         basis.basis,
         value_of(store, stage),
-        reduced.cone.generators,
+        reduced.cone.rays,
         reduced.prepared.span,
     )
     return model, basis.basis, reduced.prepared

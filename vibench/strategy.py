@@ -54,9 +54,9 @@ class Cone:
     Attributes
     ----------
     generators
-        χ (m×R), coefficientwise nonnegative unless free, unit norm in W, nested: the first r are the cone of size r.
+        χ (m×R), coefficientwise nonnegative unless free, unit norm in W.
     errors
-        Relative largest projection error e(r) for r = 0 … R (equations (13), (34)).
+        Relative largest projection error e(r) of the cone of the first r generators, r = 0 … R (equations (13), (34)).
     free
         Which generators may be used with either sign (R,), none in an ordinary cone.
     fallbacks
@@ -72,6 +72,11 @@ class Cone:
     def size(self) -> int:
         """Number R of generators."""
         return int(self.generators.shape[1])
+
+    @property
+    def rays(self) -> Array:
+        """Generators (m×(R+F)) of the same cone with nonnegative coefficients: free ones also with the other sign."""
+        return rays(self.generators, self.free)
 
 
 class DualStrategy(ABC):
@@ -163,6 +168,11 @@ class PrimalStrategy(ABC):
     @abstractmethod
     def build(self, offline: Offline, tolerance: float | None) -> Enrichment:
         """Enrichment of `offline.basis`; `tolerance` is `None` exactly for strategies that take none."""
+
+
+def rays(generators: Array, free: Mask) -> Array:
+    """Generators (m×R), and after them the opposites of those that are free (R,)."""
+    return np.hstack([generators, -generators[:, free]])
 
 
 def no_free(count: int) -> Mask:

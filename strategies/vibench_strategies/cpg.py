@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import numpy as np
-
 from vibench.arrays import Array
 from vibench.cone import greedy_cone
 from vibench.space import InnerProduct
@@ -15,8 +13,4 @@ class CPG(DualStrategy):
 
     def reduce(self, snapshots: Array, W: InnerProduct, stop: Stop) -> Cone:
         """Add the snapshot farthest from the cone, normalised, until the largest relative distance is small enough."""
-        return greedy_cone(snapshots, W, stop, subtract=_nothing)
-
-
-def _nothing(theta: Array, _: Array) -> tuple[Array, str]:
-    return np.zeros_like(theta), ""
+        return greedy_cone(snapshots, W, stop)

@@ -106,7 +106,7 @@ class Material:
         def make() -> ReducedCone:
             found = plugins.create("dual strategy", spaces.dual, {}).reduce(lam, W, spaces.cone)
             check_cone(found, W)
-            return ReducedCone(found, multipliers(found.generators, W))
+            return ReducedCone(found, multipliers(found.generators, W, found.free))
 
         return self._once(f"cone of {spaces.dual}", make, spaces.cone)
 
@@ -168,7 +168,7 @@ def solve_all(problem: Problem, mus: Array) -> list[HighFidelitySolution]:
 
 def model_with(offline: Offline, enrichment: Enrichment) -> ReducedModel:
     """The reduced model with an enrichment."""
-    return ReducedModel(offline.problem, offline.basis, enrichment, offline.cone.generators, offline.span)
+    return ReducedModel(offline.problem, offline.basis, enrichment, offline.cone.rays, offline.span)
 
 
 def spread(parameters: Array, count: int) -> Sequence[Array]:

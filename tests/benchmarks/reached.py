@@ -63,8 +63,7 @@ def orthonormality(Z: Array, V: InnerProduct) -> float:
 def of_cone(material: Material, found: Cone) -> Info:
     """Of a reduced cone: the largest distance of a snapshot, relative to the largest norm."""
     W, lam = material.problem.W, material.snapshots[1]
-    generators = np.hstack([found.generators, -found.generators[:, found.free]])
-    largest = max((cone.project(generators, theta, W).distance for theta in lam.T), default=0.0)
+    largest = max((cone.project(found.rays, theta, W).distance for theta in lam.T), default=0.0)
     error = largest / (float(W.norm(lam).max(initial=0.0)) or 1.0)
     return about(material, R=found.size, fallbacks=len(found.fallbacks), accuracy={"projection_error": error})
 

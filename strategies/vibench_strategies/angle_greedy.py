@@ -1,0 +1,23 @@
+"""Angle greedy: snapshots as generators, chosen by their direction alone."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from vibench.arrays import Array
+from vibench.cone import greedy_cone, normalised, projection_errors
+from vibench.space import InnerProduct
+from vibench.strategy import Cone, DualStrategy, Stop
+
+
+class AngleGreedy(DualStrategy):
+    """Angle greedy algorithm of Haasdonk, Salomon and Wohlmuth (2012) and Burkovska et al. (2015).
+
+    A tolerance bounds the sine of the angle between every snapshot and the cone: its distance relative to its own norm,
+    not to the largest. The errors of the cone are relative to the largest norm, as everywhere.
+    """
+
+    def reduce(self, snapshots: Array, W: InnerProduct, stop: Stop) -> Cone:
+        """Add the snapshot that makes the largest angle with the cone until all angles are small enough."""
+        cone = greedy_cone(normalised(snapshots, W), W, stop)
+        return replace(cone, errors=projection_errors(cone.generators, snapshots, W))

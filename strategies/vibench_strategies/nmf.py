@@ -1,0 +1,56 @@
+"""Nonnegative matrix factorisation of the multiplier snapshots."""
+
+from __future__ import annotations
+
+import warnings
+from typing import Annotated
+
+import numpy as np
+from annotated_types import Ge, Lt
+from sklearn.decomposition import NMF
+from sklearn.exceptions import ConvergenceWarning
+
+from vibench.arrays import Array
+from vibench.cone import normalised, projection_errors, refuse_negative
+from vibench.errors import NumericalError
+from vibench.linalg import singular_values
+from vibench.space import InnerProduct
+from vibench.strategy import Cone, DualStrategy, Stop, no_free
+
+
+class NonnegativeFactors(DualStrategy):
+    """NMF, as Balajewicz, Amsallem and Farhat (2016) compress multipliers; factorised by scikit-learn.
+
+    The factorisation minimises the sum of squares in a lumped norm, the diagonal of X_W, since whitening by a
+    consistent mass matrix would destroy signs; the cone is judged in the norm of W. R is the smallest that meets a
+    tolerance.
+    """
+
+    def __init__(self, seed: Annotated[int, Ge(0), Lt(2**32)] = 0, iterations: Annotated[int, Ge(1)] = 200) -> None:
+        self.seed, self.iterations = seed, iterations
+
+    def reduce(self, snapshots: Array, W: InnerProduct, stop: Stop) -> Cone:
+        """Factorise, with one generator more each time, from where the best linear space could meet the tolerance."""
+        refuse_negative(snapshots)
+        sigma, norms = singular_values(W.whiten(snapshots)), W.norm(snapshots)
+        means = np.sqrt(np.append(np.cumsum(sigma[::-1] ** 2)[::-1], 0.0) / max(1, len(norms)))
+        first = stop.first_reached(means / (np.max(norms, initial=0.0) or 1.0))  # no largest distance is below the mean
+        best, most = np.inf, min(W.dim, int(np.count_nonzero(norms)))
+        for size in range(most if first is None else min(first, most), most + 1):
+            cone = self._factorised(snapshots, W, size)
+            best = min(best, cone.errors[-1])
+            if stop.size is not None or cone.errors[-1] <= (stop.tolerance or 0.0):
+                return cone
+        raise NumericalError(f"no factorisation reaches {stop}: the best of up to {most} generators leaves {best:.1e}")
+
+    def _factorised(self, snapshots: Array, W: InnerProduct, size: int) -> Cone:
+        if not size:
+            return Cone(np.zeros((W.dim, 0)), projection_errors(np.zeros((W.dim, 0)), snapshots, W), no_free(0))
+        weights, scale = np.sqrt(W.matrix.diagonal())[:, None], float(snapshots.max())
+        method = NMF(size, init="nndsvd", max_iter=self.iterations, random_state=self.seed)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", ConvergenceWarning)  # said below
+            generators = normalised(method.fit_transform(weights * (snapshots / scale)) / weights, W)
+        notes = [f"the factorisation was stopped after {method.n_iter_} iterations"]
+        errors = projection_errors(generators, snapshots, W)
+        return Cone(generators, errors, no_free(generators.shape[1]), tuple(notes[method.n_iter_ < self.iterations :]))

@@ -1,0 +1,38 @@
+"""A face of the high-fidelity cone: single coordinate directions as generators."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from vibench.arrays import Array
+from vibench.cone import REPRODUCED, LazyDistances, refuse_negative
+from vibench.greedy import TIE
+from vibench.space import InnerProduct
+from vibench.strategy import Cone, DualStrategy, Stop, no_free
+
+
+class Orthant(DualStrategy):
+    """The multiplier's own degrees of freedom, those where the snapshots have most.
+
+    Restricting the multiplier to some of its degrees of freedom is what Fauque, Ramière and Ryckelynck (2018) do, on a
+    reduced integration domain; here a matching pursuit (Mallat and Zhang 1993) with coefficients α ≥ 0 chooses them.
+    """
+
+    def reduce(self, snapshots: Array, W: InnerProduct, stop: Stop) -> Cone:
+        """Add the direction that has the largest share in the residual of the snapshot farthest from the cone."""
+        refuse_negative(snapshots)
+        units = np.eye(W.dim) / np.sqrt(W.matrix.diagonal())
+        if not np.any(snapshots):
+            return Cone(units[:, :0], np.zeros(1), no_free(0))
+        whitened, chosen = W.whiten(units), list[int]()
+        distances = LazyDistances(W.whiten(snapshots))
+        farthest, error = distances.next()
+        errors = [error]
+        while not stop.reached(len(chosen), errors[-1]) and errors[-1] > REPRODUCED:
+            shares = whitened.T @ distances.residual(farthest)
+            shares[chosen] = -np.inf  # round-off apart they have none
+            chosen.append(int(np.argmax(shares >= shares.max() * (1.0 - TIE))))
+            distances.widen(whitened[:, chosen])
+            farthest, error = distances.next()
+            errors.append(error)
+        return Cone(units[:, chosen], np.array(errors), no_free(len(chosen)))

@@ -1,0 +1,30 @@
+"""Negative control: a linear space of multipliers, without any sign."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from vibench.arrays import Array
+from vibench.linalg import RANK_RTOL, svd
+from vibench.space import InnerProduct
+from vibench.strategy import Cone, DualStrategy, Stop
+
+
+class PODDual(DualStrategy):
+    """Negative control, not to be used: POD of the multipliers, as if equations were to be reduced.
+
+    Nothing represents λ ≥ 0: all generators are free, reduced inequalities become equalities, and the reduced
+    multiplier may pull. No linear space leaves less of the snapshots (equations (10), (11) of Niakh et al. 2022, in W).
+    """
+
+    def reduce(self, snapshots: Array, W: InnerProduct, stop: Stop) -> Cone:
+        """Leading modes, until the largest relative distance of a snapshot from their span is small enough."""
+        modes, sigma, right = svd(W.whiten(snapshots))
+        rank = int(np.count_nonzero(sigma > RANK_RTOL * np.max(sigma, initial=0.0)))
+        squares = (sigma[:rank, None] * right[:rank]) ** 2
+        left = np.vstack([np.cumsum(squares[::-1], axis=0)[::-1], np.zeros(snapshots.shape[1])])
+        distances = np.sqrt(np.max(left, axis=1, initial=0.0))
+        errors = distances / (distances[0] or 1.0)
+        reached = stop.first_reached(errors)
+        size = rank if reached is None else reached
+        return Cone(W.unwhiten(modes[:, :size]), errors[: size + 1], np.ones(size, dtype=bool))
