@@ -70,7 +70,7 @@ FAULTS = (
     ),
     Fault(
         "coefficientwise-constraint-dropped",
-        "strategies/vibench_strategies/mcpg.py",
+        "vibench/removal.py",
         "B=np.vstack([-np.eye(count), usable[support]]),\n        g=np.concatenate([np.zeros(count), theta[support]]),",
         "B=-np.eye(count),\n        g=np.zeros(count),",
         ("tests/strategies",),

@@ -12,11 +12,12 @@ from vibench import cone as cone_module
 from vibench.cone import greedy_cone, orthogonality, project
 from vibench.errors import NumericalError
 from vibench.highfidelity import Solver
+from vibench.removal import removable_part
 from vibench.space import InnerProduct
 from vibench.strategy import DualStrategy, Stop
 from vibench_problems.obstacle import Obstacle
 from vibench_strategies.cpg import CPG
-from vibench_strategies.mcpg import ModifiedCPG, removable_part
+from vibench_strategies.mcpg import ModifiedCPG
 
 seeds = st.integers(0, 10_000)
 

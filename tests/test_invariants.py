@@ -7,12 +7,13 @@ import pytest
 from vibench.invariants import EFFECTIVITIES, violations
 from vibench.schema import CONSTANTS
 
-GOOD = dict.fromkeys(CONSTANTS, 0.1) | dict.fromkeys(EFFECTIVITIES, 1.0)
+GOOD: dict[str, float | str] = dict.fromkeys(CONSTANTS, 0.1) | dict.fromkeys(EFFECTIVITIES, 1.0)
 GOOD |= {f"beta_full_{what}": 0.2 for what in ("span", "cone_lower", "cone_upper")}
+GOOD |= {"bounds": "L0/U0"}
 KINDS = pd.Series({"a": "fixed", "b": "per-parameter"})
 
 
-def rows(**changed: float) -> pd.DataFrame:
+def rows(**changed: float | str) -> pd.DataFrame:
     online = GOOD | {f"beta_{what}": 0.2 for what in ("span", "cone_lower", "cone_upper")}
     return pd.DataFrame([{"cell": "a", **GOOD, **changed}, {"cell": "b", **online}])
 
@@ -47,3 +48,11 @@ def test_per_parameter_enrichments_must_reach_the_whole_space() -> None:
     frame.loc[1, "beta_span"] = 0.19
     found = violations(frame, KINDS)
     assert [str(v) for v in found] == ["beta_span ≥ beta_full_span is violated in 1 rows, by up to 1.0e-02"]
+
+
+def test_a_cone_with_free_generators_is_compared_with_the_high_fidelity_pair_over_the_span_alone() -> None:
+    above = {"beta_hf_cone_lower": 0.3, "beta_hf_cone_upper": 0.3}
+    assert [v.invariant for v in violations(rows(**above), KINDS)] == ["beta_full_cone_upper ≥ beta_hf_cone_lower"]
+    assert violations(rows(**above, bounds="span/span"), KINDS) == []
+    found = violations(rows(**above, bounds="span/U1", beta_hf_span=0.25), KINDS)
+    assert [v.invariant for v in found] == ["beta_full_span ≥ beta_hf_span"]

@@ -8,13 +8,13 @@ import numpy as np
 from annotated_types import Ge
 
 from vibench.arrays import Array
-from vibench.cone import greedy_cone, projection_errors
+from vibench.cone import greedy_cone, project, projection_errors
+from vibench.removal import removable_part
 from vibench.space import InnerProduct
 from vibench.strategy import Cone, DualStrategy, Stop, no_free
-from vibench_strategies.mcpg import removable_part
 
-MOVED = 1e-9
-"""A generator from which less than this share of its norm can be removed stays as it is."""
+ROUND_OFF = 1e-9
+"""A generator that loses less than this share of its norm stays as it is; one no farther from the others is dropped."""
 
 
 class EnlargedCPG(DualStrategy):
@@ -34,12 +34,15 @@ class EnlargedCPG(DualStrategy):
             moved, i = False, 0
             while i < chi.shape[1]:
                 others = np.delete(chi, i, axis=1)
+                if project(others, chi[:, i], W).distance <= ROUND_OFF:
+                    moved, chi = True, others
+                    continue
                 part, note = removable_part(chi[:, i], others, W)
                 notes += [f"sweep {sweep}, generator {i + 1}: {note}"] if note else []
-                rest = chi[:, i] - part
-                if W.norm(part) > MOVED:
-                    moved, chi = True, np.insert(others, i, rest / W.norm(rest), axis=1) if rest.any() else others
-                i += bool(rest.any())
+                if W.norm(part) > ROUND_OFF:
+                    rest = chi[:, i] - part
+                    moved, chi = True, np.insert(others, i, rest / W.norm(rest), axis=1)
+                i += 1
             if not moved:
                 break
         else:

@@ -26,7 +26,7 @@ class NonnegativeFactors(DualStrategy):
     tolerance.
     """
 
-    def __init__(self, seed: Annotated[int, Ge(0), Lt(2**32)] = 0, iterations: Annotated[int, Ge(1)] = 200) -> None:
+    def __init__(self, seed: Annotated[int, Ge(0), Lt(2**32)] = 0, iterations: Annotated[int, Ge(1)] = 1000) -> None:
         self.seed, self.iterations = seed, iterations
 
     def reduce(self, snapshots: Array, W: InnerProduct, stop: Stop) -> Cone:
@@ -51,6 +51,6 @@ class NonnegativeFactors(DualStrategy):
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", ConvergenceWarning)  # said below
             generators = normalised(method.fit_transform(weights * (snapshots / scale)) / weights, W)
-        notes = [f"the factorisation was stopped after {method.n_iter_} iterations"]
-        errors = projection_errors(generators, snapshots, W)
-        return Cone(generators, errors, no_free(generators.shape[1]), tuple(notes[method.n_iter_ < self.iterations :]))
+        stopped = method.n_iter_ >= self.iterations
+        notes = (f"the factorisation was stopped after {method.n_iter_} iterations",) if stopped else ()
+        return Cone(generators, projection_errors(generators, snapshots, W), no_free(generators.shape[1]), notes)

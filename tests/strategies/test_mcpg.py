@@ -11,10 +11,11 @@ from vibench import qp
 from vibench.cone import project
 from vibench.problem import VariationalInequality
 from vibench.qp import Answer
+from vibench.removal import removable_part
 from vibench.space import InnerProduct
 from vibench.strategy import Stop
 from vibench_strategies.cpg import CPG
-from vibench_strategies.mcpg import ModifiedCPG, removable_part
+from vibench_strategies.mcpg import ModifiedCPG
 
 seeds = st.integers(0, 10_000)
 EUCLID = InnerProduct(sp.eye_array(3))

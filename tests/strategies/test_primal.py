@@ -8,15 +8,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from enriching import Plain, offline
 from numerics import Varying
-from vibench import highfidelity
 from vibench.errors import NumericalError
 from vibench.greedy import LazyMaximum
 from vibench.highfidelity import Solver
 from vibench.infsup import inf_sup_full, inf_sup_on, multipliers
 from vibench.linalg import orthonormal_range, remove, singular_values
 from vibench.pod import pod
-from vibench.strategy import Cone, Kind, Offline, Stop, no_free
+from vibench.strategy import Kind, Offline, Stop
 from vibench.supremizer import supremizers
 from vibench_problems.hertz import Hertz
 from vibench_problems.obstacle import Obstacle
@@ -25,17 +25,6 @@ from vibench_strategies.decorrelated import Decorrelated
 from vibench_strategies.mcpg import ModifiedCPG
 from vibench_strategies.offline_pga import OfflinePGA
 from vibench_strategies.online_supremizers import OnlineSupremizers
-
-
-def offline(problem, count: int, modes: int, generators: int) -> Offline:
-    """A reduced setting from some training solutions."""
-    training = problem.training_set()
-    solved = [highfidelity.solve(problem.assemble(mu)) for mu in training[:: max(1, len(training) // count)]]
-    u, lam = np.column_stack([s.u for s in solved]), np.column_stack([s.lam for s in solved])
-    basis = problem.V.orthonormalise(u)[:, :modes]
-    chi = lam[:, :generators] / problem.W.norm(lam[:, :generators])
-    cone = Cone(chi, np.ones(1), no_free(generators))
-    return Offline(problem, basis, cone, multipliers(chi, problem.W).span, training)
 
 
 @pytest.fixture(scope="module")
@@ -156,14 +145,6 @@ def test_the_tolerance_between_offline_and_online_constants(obstacle: Offline) -
             B = problem.assemble(mu).B
             loss = 1.0 - inf_sup_on(Z, B, cone).span / inf_sup_full(problem.V, B, cone).span
             assert -1e-9 <= loss <= 1.0 - np.sqrt(1.0 - delta**2) + 1e-9
-
-
-class Plain(LazyMaximum):
-    """Evaluates everything at every step."""
-
-    def next(self, evaluate: Callable[[int], float]) -> tuple[int, float]:
-        self.bound(np.array([evaluate(p) for p in range(len(self._bounds))]))
-        return super().next(lambda p: float(self._bounds[p]))
 
 
 def test_lazy_and_plain_pga_choose_the_same_vectors(monkeypatch: pytest.MonkeyPatch, varying: Offline) -> None:
