@@ -164,6 +164,8 @@ class PrimalStrategy(ABC):
 
     takes_tolerance: ClassVar[bool] = False
     """Whether a study gives this strategy a tolerance axis."""
+    larger_is_tighter: bool = False
+    """Whether the larger of two tolerances asks for more, as a share that is to be reached does."""
 
     @abstractmethod
     def build(self, offline: Offline, tolerance: float | None) -> Enrichment:

@@ -18,6 +18,8 @@ class InfSupGreedy(NestedStrategy):
     what the whole of V gives. The larger it is the more vectors it takes.
     """
 
+    larger_is_tighter = True
+
     def begin(self, offline: Offline) -> LeastStable:
         """Represent the supremizers of the training set in coordinates."""
         return LeastStable(offline)

@@ -21,7 +21,7 @@ class OfflinePGA(NestedStrategy):
     """
 
     def __init__(self, stop: Literal["sigma", "beta"] = "sigma") -> None:
-        self.stop = stop
+        self.stop, self.larger_is_tighter = stop, stop == "beta"
 
     def begin(self, offline: Offline) -> ProjectedGreedy:
         """Represent the supremizers of the training set in coordinates."""

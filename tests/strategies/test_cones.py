@@ -18,6 +18,7 @@ from vibench.errors import NumericalError
 from vibench.removal import removable_part
 from vibench.space import InnerProduct
 from vibench.strategy import Cone, DualStrategy, Stop, rays
+from vibench.testing import check_dual
 from vibench_strategies import enlarged_cpg
 from vibench_strategies.angle_greedy import AngleGreedy
 from vibench_strategies.cpg import CPG
@@ -53,6 +54,11 @@ def errors_one_by_one(cone: Cone, theta: Array, X: InnerProduct) -> Array:
     largest = float(X.norm(theta).max(initial=0.0)) or 1.0
     cones = [rays(cone.generators[:, :r], cone.free[:r]) for r in range(cone.size + 1)]
     return np.array([max((project(chi, q, X).distance for q in theta.T), default=0.0) for chi in cones]) / largest
+
+
+@pytest.mark.parametrize("create", [type(strategy) for strategy in STRATEGIES.values()], ids=STRATEGIES.keys())
+def test_they_conform(create: type[DualStrategy]) -> None:
+    check_dual(create)
 
 
 @ALL

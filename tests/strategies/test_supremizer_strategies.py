@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 import pytest
@@ -22,6 +23,7 @@ from vibench.nested import NestedStrategy, grow_through
 from vibench.pod import pod
 from vibench.strategy import Cone, Offline, Stop, no_free
 from vibench.supremizer import supremizers
+from vibench.testing import check_primal
 from vibench_problems.hertz import Hertz
 from vibench_problems.obstacle import Obstacle
 from vibench_strategies import infsup_greedy, offline_pga
@@ -188,6 +190,15 @@ def test_tolerances_in_any_order_cut_one_growth(varying: Offline, strategy: Nest
     counts = [grown.at(tolerance)[0].vectors.shape[1] for tolerance in (0.3, 0.6, 0.9)]
     assert counts == sorted(counts, reverse=isinstance(strategy, PODSupremizers))
     assert len(set(counts)) > 1
+
+
+@pytest.mark.parametrize(
+    "create",
+    [InfSupGreedy, partial(OfflinePGA, stop="beta"), OfflinePGA, PODSupremizers],
+    ids=["inf-sup", "β", "σ", "POD"],
+)
+def test_they_conform(create: Callable[[], NestedStrategy]) -> None:
+    check_primal(create)
 
 
 @pytest.mark.parametrize(

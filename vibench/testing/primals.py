@@ -63,7 +63,7 @@ def examine_primal(
         Longest time that one construction may take.
     """
     name_of(create)
-    case = _Case(create, offline or sample_offline(), sorted(tolerances, reverse=True), seconds)
+    case = _Case(create, offline or sample_offline(), tolerances, seconds)
     return examine([
         Check("construction", case.construction),
         Check("tolerance", case.tolerance, ("construction",)),
@@ -83,14 +83,19 @@ class _Case:
     """A primal strategy under examination; it is given copies."""
 
     def __init__(
-        self, create: Callable[[], PrimalStrategy], offline: Offline, tolerances: list[float], limit: float
+        self, create: Callable[[], PrimalStrategy], offline: Offline, tolerances: Sequence[float], limit: float
     ) -> None:
-        self._create, self._offline, self._tolerances, self._limit = create, offline, tolerances, limit
+        self._create, self._offline, self._asked, self._limit = create, offline, tolerances, limit
         self._times: list[float] = []
 
     @cached_property
     def _strategy(self) -> PrimalStrategy:
         return self._create()
+
+    @cached_property
+    def _tolerances(self) -> list[float]:
+        """From loose to tight."""
+        return sorted(self._asked, reverse=not self._strategy.larger_is_tighter)
 
     @cached_property
     def _built(self) -> list[tuple[float | None, Enrichment]]:
