@@ -150,7 +150,7 @@ def test_it_ends_in_ok_rows(rows, case: type[Wire], dual: str, primal: str) -> N
 OTHERS = ["angle-greedy", "dictionary", "enlarged-cpg", "nmf", "orthant", "pod-dual"]
 
 
-@pytest.mark.parametrize("case", SIZES)
+@pytest.mark.parametrize("case", [NoContact, AllInContact])
 @pytest.mark.parametrize(
     ("dual", "primal"),
     [*((dual, "infsup-greedy") for dual in OTHERS), ("mcpg", "infsup-greedy"), ("mcpg", "pod-supremizers")],
@@ -159,7 +159,7 @@ def test_other_strategies_end_in_ok_rows(rows, case: type[Wire], dual: str, prim
     found = rows(case, dual, primal).cell
     assert (found["status"], found["queries_ok"]) == ("ok", 3)
     assert 0.0 <= found["error_u_mean"] < 0.1
-    if case in (NoContact, NoLoad):
+    if case is NoContact:
         assert (found["R"], found["error_lambda_mean"]) == (0, 0.0)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -40,7 +41,8 @@ def varying() -> Offline:
 
 @pytest.fixture(scope="module")
 def obstacle() -> Offline:
-    return offline(Obstacle("coarse"), 12, 5, 9)
+    data = offline(Obstacle("coarse"), 12, 5, 9)
+    return replace(data, training=data.training[::12])  # all of them share one supremizer space
 
 
 @pytest.fixture(scope="module")
@@ -73,7 +75,7 @@ ON_BETA = pytest.mark.parametrize("strategy", [InfSupGreedy(), OfflinePGA(stop="
 
 
 @ON_BETA
-@pytest.mark.parametrize("rho", [0.2, 0.7, 0.99])
+@pytest.mark.parametrize("rho", [0.2, 0.9])
 @pytest.mark.parametrize("setting", ["varying", "obstacle"])
 def test_the_share_is_kept_at_every_training_parameter_and_not_with_a_vector_less(
     request, setting: str, strategy: NestedStrategy, rho: float
@@ -97,7 +99,7 @@ def test_the_share_is_kept_at_every_training_parameter_and_not_with_a_vector_les
     st.integers(1, 4),
     st.floats(0.05, 0.99),
 )
-@settings(max_examples=25)
+@settings(max_examples=15)
 def test_the_share_is_kept_on_any_small_problem(
     n: int, m: int, count: int, modes: int, generators: int, rho: float
 ) -> None:
