@@ -8,7 +8,7 @@ from functools import partial
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from enriching import Plain, offline
@@ -57,11 +57,13 @@ def hertz() -> Offline:
 
 
 def shares(data: Offline, added: Array) -> Array:
-    """β_S/β_on over the span at every training parameter, from bases of mesh size."""
+    """β_S/β_on over the span at every training parameter, from bases of mesh size; 1 where β_on is round-off."""
     V, cone = data.problem.V, multipliers(data.cone.generators, data.problem.W)
     Z = np.hstack([data.basis, added])
     forms = [data.problem.assemble(mu).B for mu in data.training]
-    return np.array([inf_sup_on(Z, B, cone).span / inf_sup_full(V, B, cone).span for B in forms])
+    online = np.array([inf_sup_full(V, B, cone).span for B in forms])
+    own = np.array([inf_sup_on(Z, B, cone).span for B in forms])
+    return np.where(online > 1e-12, own / online, 1.0)
 
 
 def whitened_supremizers(data: Offline) -> list[Array]:
@@ -99,6 +101,7 @@ def test_the_share_is_kept_at_every_training_parameter_and_not_with_a_vector_les
     st.integers(1, 4),
     st.floats(0.05, 0.99),
 )
+@example(n=12, m=9, count=4, modes=2, generators=4, rho=0.5)  # β_on vanishes at the last parameter
 @settings(max_examples=15)
 def test_the_share_is_kept_on_any_small_problem(
     n: int, m: int, count: int, modes: int, generators: int, rho: float
