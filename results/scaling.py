@@ -176,6 +176,11 @@ def main() -> None:
     rows = pd.DataFrame(all_rows())
     rows["n"] = rows["n"].fillna(rows.groupby(["over", "problem", "R"])["n"].ffill())
     rows.to_csv(folder / "rows.csv", index=False, float_format="%.6g")
+    page(rows, folder)
+
+
+def page(rows: pd.DataFrame, folder: Path) -> None:
+    """Figures and tables of the measurements."""
     draw(rows, folder)
     versions = ", ".join(f"{name} {text}" for name, text in provenance.versions("piqp").items())
     parts = [

@@ -231,7 +231,7 @@ def supremizer_coordinates(
     """
     touched = _touched(matrices)
     count = eta.shape[1]
-    if FEW_SUPREMIZERS * count * len(matrices) <= len(touched):
+    if V.dim * count * len(matrices) <= len(touched) ** 2:  # a QR factorisation is cheaper than dense solves on contact
         space = SpannedCoordinates(V, basis, np.hstack([supremizers(V, B, eta) for B in matrices]))
         return space, [space.represented[:, k * count : (k + 1) * count] for k in range(len(matrices))]
     contact = ContactCoordinates(V, basis, touched)
