@@ -54,6 +54,8 @@ def test_a_run_does_not_differ_from_itself(quick_run: Path) -> None:
         (f"UPDATE cells SET enrichment = 2 * enrichment WHERE {ONE}", "enrichment", Verdict.WORSE),
         (f"UPDATE cells SET enrichment = enrichment + 1 WHERE {ONE}", "enrichment", Verdict.CHANGED),
         (f"UPDATE cells SET error_u_mean = NULL WHERE {ONE}", "error_u_mean", Verdict.WORSE),
+        (f"UPDATE cells SET beta_span_min = NULL WHERE {ONE}", "beta_span_min", Verdict.WORSE),
+        (f"UPDATE cells SET status = 'crashed' WHERE {ONE}", "status", Verdict.WORSE),
         (f"DELETE FROM cells WHERE {ONE}", "cell", Verdict.WORSE),
     ],
 )
@@ -84,14 +86,47 @@ def test_times_of_another_machine_are_left_out(changed: Change, quick_run: Path)
     assert any("different machines" in note for note in found.notes)
 
 
-def test_a_threshold_that_moved_or_vanished_is_told(changed: Change, quick_run: Path) -> None:
-    where = "WHERE solver = 'piqp' AND problem = 'obstacle' AND dual = 'cpg' AND primal_a = 'high-fidelity'"
-    later = f"UPDATE thresholds SET benefit_threshold = 3 * benefit_threshold {where} AND primal_b = 'decorrelated'"
-    never = f"UPDATE thresholds SET benefit_threshold = NULL, meaning = 'never' {where} AND primal_b = 'offline-pga'"
-    found = compare(quick_run / FILE, changed(later, never), 1.25)
+THRESHOLD = "WHERE solver = 'piqp' AND problem = 'obstacle' AND dual = 'cpg' AND primal_a = 'high-fidelity'"
+
+
+def test_a_threshold_is_worse_where_its_own_side_got_slower(changed: Change, quick_run: Path) -> None:
+    later = "benefit_threshold = 3 * benefit_threshold, offline_b_s = 3 * offline_b_s"
+    found = compare(
+        quick_run / FILE,
+        changed(
+            f"UPDATE thresholds SET {later} {THRESHOLD} AND primal_b = 'decorrelated'",
+            "UPDATE thresholds SET benefit_threshold = NULL, meaning = 'never', online_b_s = 9 * online_b_s "
+            f"{THRESHOLD} AND primal_b = 'offline-pga'",
+        ),
+        1.25,
+    )
     assert set(found.changes["primal"]) == {"decorrelated", "offline-pga"}
     assert set(found.changes["what"]) == {"pays against high-fidelity"}
     assert found.regressions == 2
+
+
+def test_a_competitor_that_got_quicker_is_no_regression(changed: Change, quick_run: Path) -> None:
+    later = "benefit_threshold = 3 * benefit_threshold, online_a_s = online_a_s / 3"
+    found = compare(quick_run / FILE, changed(f"UPDATE thresholds SET {later} {THRESHOLD}"), 1.25)
+    assert len(found.changes) == 3
+    assert found.regressions == 0
+
+
+def test_what_was_missing_and_is_there_is_no_regression(changed: Change, quick_run: Path) -> None:
+    before = changed(f"UPDATE cells SET beta_span_min = NULL, beta_cone_lower_min = NULL WHERE {ONE}")
+    assert compare(before, quick_run / FILE, 1.25).regressions == 0
+
+
+def test_constants_of_round_off_are_not_compared(changed: Change, tmp_path: Path) -> None:
+    before = changed("UPDATE cells SET beta_span_min = 9e-17").rename(tmp_path / "before.sqlite")
+    assert compare(before, changed("UPDATE cells SET beta_span_min = 1e-17"), 1.25).changes.empty
+
+
+def test_columns_without_any_value_are_no_obstacle(changed: Change, quick_run: Path) -> None:
+    emptied = changed(
+        "UPDATE thresholds SET primal_tol_b = NULL, dual_tol = NULL", "UPDATE cells SET primal_tol = NULL"
+    )
+    compare(quick_run / FILE, emptied, 1.25)
 
 
 def test_a_new_cell_is_no_regression(changed: Change, quick_run: Path) -> None:

@@ -387,3 +387,32 @@ def test_several_processes_draw_the_same_files(results: Path, tmp_path: Path) ->
     assert [file.name for file in one] == [file.name for file in two]
     for first, second in zip(one, two, strict=True):
         assert first.read_bytes() == second.read_bytes(), first.name
+
+
+def test_the_tightest_enrichment_is_the_one_that_went_farthest(results: Path) -> None:
+    """Whichever way its tolerance runs, and however many training parameters there are."""
+    mine = dict(of_file(results))["obstacle"].of_dual("mcpg")
+    steps = mine.histories[mine.histories["stage"] == "enrichment"]
+    longer = steps[steps["quantity"].isin(["sigma", "beta_span_min"])]
+    last = longer[longer["step"] == longer["step"].max()].assign(step=longer["step"].max() + 1)
+    tighter = pd.concat([steps, last]).assign(primal_tol=0.9, artefact="tighter")
+    both = pd.concat([steps, tighter])
+    assert set(convergence._tightest(both)) == {0.9}
+    assert set(convergence._tightest(pd.concat([steps.assign(primal_tol=0.95), tighter]))) == {0.9}
+
+
+def test_one_label_with_two_options_is_two_strategies(change: Callable[..., None], draw: Draw) -> None:
+    change(*(f"UPDATE {table} SET primal_options = '{{\"k\": 1}}' WHERE solver = 'osqp' AND primal = 'decorrelated'"
+             for table in ("cells", "queries")))  # fmt: skip
+    labels = draw()["obstacle-mcpg-inf-sup"].axes[0].get_legend_handles_labels()[1]
+    assert sum(label.startswith("decorrelated (") for label in labels) == 2
+
+
+def test_a_solver_that_never_answered_is_in_the_profile(change: Callable[..., None], draw: Draw) -> None:
+    nothing = "solve_s = NULL, status = 'error', primal_residual = NULL, dual_residual = NULL, gap = NULL"
+    change(f"UPDATE queries SET {nothing} WHERE solver = 'osqp' AND problem = 'obstacle'")
+    assert line_called(draw()["obstacle-solvers"].axes[1], "osqp").get_ydata()[-1] == 0.0
+
+
+def test_twelve_kinds_have_twelve_looks() -> None:
+    assert len({(point["color"], point["marker"]) for point in (costs._point(k, 0) for k in range(12))}) == 12

@@ -168,7 +168,7 @@ HISTORY = {"artefact": "pod-1", "stage": "pod", "quantity": "error", "step": 0, 
 
 def test_histories_replace_those_of_their_artefact(journal: Journal) -> None:
     journal.write_histories("pod-1", [HISTORY, HISTORY | {"step": 1, "value": 0.5}])
-    journal.write_histories("pod-2", [HISTORY | {"artefact": "pod-2"}])
+    journal.write_histories("pod-2", [HISTORY | {"artefact": "pod-2", "pod_tol": 0.75}])
     journal.write_histories("pod-1", [HISTORY | {"value": 0.25}])
     found = sorted((row["artefact"], row["step"], row["value"]) for row in journal.rows("histories"))
     assert found == [("pod-1", 0, 0.25), ("pod-2", 0, 1.0)]
@@ -292,3 +292,22 @@ def test_a_database_that_cannot_be_opened_is_refused(tmp_path: Path, monkeypatch
     line = refusal(lambda: Journal(tmp_path / "run", STUDY))
     assert "cannot be written" in line
     assert "locked" in line
+
+
+def test_histories_of_other_code_give_way_and_parts_of_a_sweep_stay(tmp_path: Path) -> None:
+    journal = Journal(tmp_path, {"name": "some"})
+
+    def rows(artefact: str, stage: str, first: int, count: int) -> list[dict[str, Any]]:
+        keys = {"artefact": artefact, "stage": stage, "problem": "wire", "quantity": "error"}
+        return [keys | {"step": first + k, "value": 1.0} for k in range(count)]
+
+    journal.write_histories("old", rows("old", "pod", 0, 5))
+    journal.write_histories("new", rows("new", "pod", 0, 3))
+    for first, artefact in ((0, "a"), (4, "b"), (0, "c")):
+        journal.write_histories(artefact, rows(artefact, "training", first, 4), parts=True)
+    found = [(row["stage"], row["artefact"], row["step"]) for row in journal.rows("histories")]
+    journal.close()
+    assert sorted(found) == sorted(
+        [("pod", "new", k) for k in range(3)] + [("training", "c", k) for k in range(4)]
+        + [("training", "b", k) for k in range(4, 8)]
+    )  # fmt: skip

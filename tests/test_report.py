@@ -143,6 +143,7 @@ def test_every_failure_has_its_reason_and_nothing_is_markup(quick_run: Path, tmp
     db = sqlite3.connect(tmp_path / FILE)
     reason = "<script>alert('the solver said & did nothing')</script>"
     db.execute("UPDATE cells SET status = 'failed', reason = ? WHERE solver = 'osqp'", (reason,))
+    db.execute("UPDATE queries SET status = 'failed', reason = 'one of many' WHERE solver = 'osqp' AND query = 5")
     db.execute("INSERT INTO pictures (problem, problem_options, number, reason) VALUES ('wire', '{}', 0, 'no <mesh>')")
     db.commit()
     failed = db.execute("SELECT count(*) FROM cells WHERE solver = 'osqp'").fetchone()[0]
@@ -151,6 +152,8 @@ def test_every_failure_has_its_reason_and_nothing_is_markup(quick_run: Path, tmp
     assert page.count("&lt;script&gt;alert(&#39;the solver said &amp; did nothing&#39;)&lt;/script&gt;") >= failed
     assert "<script>alert" not in page
     assert f"{failed} cells did not end ok." in page
+    assert page.count("one of many") >= failed
+    assert page.count("no picture of ") == 1
     assert "no picture of wire: no &lt;mesh&gt;" in page
 
 

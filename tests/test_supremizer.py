@@ -26,17 +26,17 @@ def test_a_supremizer_attains_its_own_norm() -> None:
     assert np.all(v @ (B.T @ eta) <= problem.V.norm(v) * problem.V.norm(T) * (1.0 + 1e-12))
 
 
-@pytest.mark.parametrize("few", [0, 1000], ids=["spanned", "contact"])
+@pytest.mark.parametrize("cost", [0.0, 1e9], ids=["spanned", "contact"])
 def test_coordinates_are_an_isometry_that_leads_back_to_the_supremizers(
-    monkeypatch: pytest.MonkeyPatch, few: int
+    monkeypatch: pytest.MonkeyPatch, cost: float
 ) -> None:
-    monkeypatch.setattr(supremizer, "FEW_SUPREMIZERS", few)
+    monkeypatch.setattr(supremizer, "SPANNING", cost)
     problem = Varying()
     matrices = [problem.assemble(mu).B for mu in problem.training_set()]
     basis = problem.V.orthonormalise(np.random.default_rng(0).standard_normal((30, 4)))
     eta = np.random.default_rng(1).random((8, 5))
     space, found = supremizer_coordinates(problem.V, basis, matrices, eta)
-    assert isinstance(space, ContactCoordinates if few else SpannedCoordinates)
+    assert isinstance(space, ContactCoordinates if cost else SpannedCoordinates)
     assert np.allclose(space.plain.T @ space.plain, np.eye(4), atol=1e-12)
     assert np.allclose(space.vectors(space.plain), basis, atol=1e-11)
     for B, coordinates in zip(matrices, found, strict=True):

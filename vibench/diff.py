@@ -11,11 +11,15 @@ from typing import Any
 import pandas as pd
 
 from vibench import tables
+from vibench.qp import Status
 from vibench.schema import KEYS, THRESHOLDS
 from vibench.thresholds import Meaning
 
 ERROR_FLOOR = 1e-10
 """Errors below this are round-off: their ratio says nothing."""
+
+CONSTANT_FLOOR = 1e-12
+"""The same of inf-sup constants."""
 
 DIMENSIONS = ("N", "R", "rank", "enrichment")
 CONSTANTS = ("beta_span_min", "beta_cone_lower_min")
@@ -49,9 +53,9 @@ class Comparison:
 def compare(a: Path, b: Path, limit: float) -> Comparison:
     """Compare two results files cell by cell; cells of the same definition are the same cell.
 
-    Worse is: a cell that is gone, fewer queries ok, an error, a time or a threshold larger than `limit` times what it
-    was, a constant smaller by that factor, more vectors by that factor. Times count only where both were measured on
-    the same machine.
+    Worse is: a cell that is gone, fewer queries ok, a worse status, an error or a time larger than `limit` times what
+    it was, a constant smaller by that factor, more vectors by that factor, a threshold later by that factor because
+    the way it belongs to got slower. Times count only where both were measured on the same machine.
 
     Parameters
     ----------
@@ -77,18 +81,18 @@ def compare(a: Path, b: Path, limit: float) -> Comparison:
 
 def _cell(one: pd.Series, two: pd.Series, limit: float) -> Iterator[dict[str, Any]]:
     if one["queries_ok"] != two["queries_ok"]:
-        verdict = Verdict.WORSE if two["queries_ok"] < one["queries_ok"] else Verdict.BETTER
-        yield _row(one, "queries ok", one["queries_ok"], two["queries_ok"], verdict)
+        fewer = two["queries_ok"] < one["queries_ok"]
+        yield _row(one, "queries ok", one["queries_ok"], two["queries_ok"], Verdict.WORSE if fewer else Verdict.BETTER)
     if one["status"] != two["status"]:
-        yield _row(one, "status", one["status"], two["status"], Verdict.CHANGED)
+        severities = Status(one["status"]).severity, Status(two["status"]).severity
+        yield _row(one, "status", one["status"], two["status"], _judged(*severities, 1.0) or Verdict.CHANGED)
     for name in DIMENSIONS:
         if not _equal(one[name], two[name]):
             yield _row(one, name, one[name], two[name], _judged(one[name], two[name], limit) or Verdict.CHANGED)
-    for name in CONSTANTS:
-        yield from _changed(one, name, one[name], two[name], _judged(two[name], one[name], limit))
-    for name in ERRORS:
-        before, after = (max(value, ERROR_FLOOR) if pd.notna(value) else value for value in (one[name], two[name]))
-        yield from _changed(one, name, one[name], two[name], _judged(before, after, limit))
+    for names, floor, more in ((CONSTANTS, CONSTANT_FLOOR, True), (ERRORS, ERROR_FLOOR, False)):
+        for name in names:
+            verdict = _judged(_floored(one[name], floor), _floored(two[name], floor), limit, more_is_better=more)
+            yield from _changed(one, name, one[name], two[name], verdict)
     if one["machine"] == two["machine"]:
         for name in TIMES:
             yield from _changed(one, name, one[name], two[name], _judged(one[name], two[name], limit))
@@ -101,26 +105,34 @@ def _thresholds(one: pd.DataFrame, two: pd.DataFrame, limit: float) -> Iterator[
         what = f"pays against {row['primal_a']}"
         named = row.rename({"primal_b": "primal", "assembly_b": "assembly", "primal_tol_b": "primal_tol"})
         before, after = (_said(row[f"meaning_{k}"], row[f"benefit_threshold_{k}"]) for k in ("one", "two"))
-        if row["meaning_one"] != row["meaning_two"]:
-            worse = row["meaning_two"] == Meaning.NEVER or row["meaning_one"] == Meaning.AT_ONCE
-            yield _row(named, what, before, after, Verdict.WORSE if worse else Verdict.CHANGED)
-        elif row["meaning_one"] == Meaning.FROM:
-            verdict = _judged(row["benefit_threshold_one"], row["benefit_threshold_two"], limit)
-            if verdict:
-                yield _row(named, what, before, after, verdict)
+        moved = Verdict.CHANGED if row["meaning_one"] != row["meaning_two"] else _judged(
+            row["benefit_threshold_one"], row["benefit_threshold_two"], limit,
+            more_is_better=row["meaning_one"] == Meaning.UNTIL,
+        )  # fmt: skip
+        own = [_judged(row[f"{phase}_b_s_one"], row[f"{phase}_b_s_two"], limit) for phase in ("offline", "online")]
+        if moved and Verdict.WORSE not in own:  # what it is compared with became quicker, or nothing got worse
+            moved = moved if moved is Verdict.BETTER else Verdict.CHANGED
+        elif moved is Verdict.CHANGED and row["meaning_two"] == Meaning.NEVER:
+            moved = Verdict.WORSE
+        yield from _changed(named, what, before, after, moved)
 
 
 def _said(meaning: str, number: float) -> str:
     return meaning if pd.isna(number) else f"{meaning} {number:.0f}"
 
 
-def _judged(before: Any, after: Any, limit: float) -> Verdict | None:
-    """What becomes of a number of which less is better; `None` within the limit."""
+def _floored(value: Any, floor: float) -> Any:
+    return max(value, floor) if pd.notna(value) else value
+
+
+def _judged(before: Any, after: Any, limit: float, *, more_is_better: bool = False) -> Verdict | None:
+    """What becomes of a number of which less, or more, is better; `None` within the limit. To vanish is worse."""
     if pd.isna(before) or pd.isna(after):
         return None if pd.isna(before) and pd.isna(after) else Verdict.WORSE if pd.isna(after) else Verdict.CHANGED
-    if after > limit * before:
+    small, large = (before, after) if not more_is_better else (after, before)
+    if large > limit * small:
         return Verdict.WORSE
-    return Verdict.BETTER if before > limit * after else None
+    return Verdict.BETTER if small > limit * large else None
 
 
 def _changed(cell: pd.Series, what: str, before: Any, after: Any, verdict: Verdict | None) -> Iterator[dict[str, Any]]:

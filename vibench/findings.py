@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
 import pandas as pd
 
 from vibench import agreement, invariants, tables
@@ -68,7 +70,7 @@ def _stability(group: pd.DataFrame) -> Iterator[str]:
     """What enrichments do for the inf-sup constant over the span, and for the error of the multiplier."""
     plain = group[group["enrichment_kind"] == Kind.NONE]
     online = group[group["enrichment_kind"] == Kind.PER_PARAMETER].dropna(subset=["beta_span_min"])
-    if len(plain) and pd.notna(plain["beta_span_min"].iloc[0]):
+    if len(plain) and np.isfinite(plain["beta_span_min"].iloc[0]):
         row = plain.iloc[0]
         zero = row["beta_span_min"] < ZERO
         value = "is zero" if zero else f"is {row['beta_span_min']:.3g}"
@@ -76,10 +78,10 @@ def _stability(group: pd.DataFrame) -> Iterator[str]:
             f"Without enrichment min β over the span {value}, over the cone at least {row['beta_cone_lower_min']:.3g}; "
             f"the mean error of λ is {row['error_lambda_mean']:.3g}."
         )
-    fixed = group[group["enrichment_kind"] == Kind.FIXED].dropna(subset=["beta_span_min"])
+    fixed = group[(group["enrichment_kind"] == Kind.FIXED) & np.isfinite(group["beta_span_min"])]
     for row in _one_assembly(fixed).itertuples():
         reached = ""
-        if len(online) and online["beta_span_min"].iloc[0] > ZERO:
+        if len(online) and ZERO < online["beta_span_min"].iloc[0] < np.inf:
             best = online.iloc[0]
             share = 100.0 * row.beta_span_min / best["beta_span_min"]
             reached = f", {share:.0f} % of what {best['primal']} reach with {best['enrichment']:.0f}"
@@ -94,8 +96,8 @@ def _one_assembly(cells: pd.DataFrame) -> pd.DataFrame:
 
 
 def _costs(group: pd.DataFrame, data: Data) -> Iterator[str]:
-    """The quickest query, and from how many queries on it pays."""
-    timed = group[group["online_s"].notna() & (group["queries_ok"] > 0)]
+    """The quickest queries of a cell without failures, and from how many of them on it pays."""
+    timed = group[group["online_s"].notna() & (group["queries_ok"] == group["queries"])]
     if timed.empty:
         return
     row = timed.loc[timed["online_s"].idxmin()]
@@ -114,13 +116,13 @@ def _costs(group: pd.DataFrame, data: Data) -> Iterator[str]:
         & (data.thresholds["offline_b_s"] == row["offline_s"])
     ]
     for threshold in against.head(1).itertuples():
-        number = "" if pd.isna(threshold.benefit_threshold) else f" {threshold.benefit_threshold:.0f} queries"
+        number = "" if pd.isna(threshold.benefit_threshold) else f" {math.ceil(threshold.benefit_threshold)} queries"
         yield f"Against high-fidelity solutions {name} pays {threshold.meaning}{number}."
 
 
 def _solvers(data: Data) -> Iterator[str]:
     """Who solved how much, and how fast."""
-    for solver, mine in data.queries.groupby("solver", sort=False):
-        fine = mine[mine["status"] == Status.OK]
-        median = f", in {1e3 * fine['solve_s'].median():.3g} ms at the median" if len(fine) else ""
-        yield f"{solver} answered {len(fine)} of {len(mine)} queries{median}."
+    for solver, cells in data.cells.groupby("solver", sort=False):
+        queries = data.queries[(data.queries["solver"] == solver) & (data.queries["status"] == Status.OK)]
+        median = f", in {1e3 * queries['solve_s'].median():.3g} ms at the median" if len(queries) else ""
+        yield f"{solver} answered {len(queries)} of {cells['queries'].fillna(0).sum():.0f} queries{median}."

@@ -14,9 +14,12 @@ import numpy as np
 
 from vibench.errors import RequestError, StorageError
 from vibench.locking import locked
-from vibench.schema import STORED, VERSION
+from vibench.schema import HISTORY_KEYS, STORED, VERSION
 
 FILE = "results.sqlite"
+
+NAMED = ("stage", "quantity", *HISTORY_KEYS)
+"""Columns that say whose a history is, and of what."""
 
 LOCK = ".lock"
 """File in a run folder that the run holds."""
@@ -101,6 +104,8 @@ class Journal:
             self._db.execute(f"CREATE TABLE IF NOT EXISTS {table} ({declared})")
         for table in ("queries", "solutions"):
             self._db.execute(f"CREATE INDEX IF NOT EXISTS {table}_of_cell ON {table}(cell)")
+        self._db.execute(f"CREATE INDEX IF NOT EXISTS histories_named ON histories({', '.join(NAMED)})")
+        self._db.execute("CREATE INDEX IF NOT EXISTS histories_of ON histories(artefact)")
         entries = {"schema": str(VERSION), "study": json.dumps(study, sort_keys=True)}
         self._db.executemany("INSERT OR REPLACE INTO meta VALUES (?, ?)", entries.items())
 
@@ -125,10 +130,19 @@ class Journal:
             self._insert("queries", queries)
             self._insert("solutions", solutions)
 
-    def write_histories(self, artefact: str, rows: Sequence[Mapping[str, Any]]) -> None:
-        """Write the histories of one artefact in place of its earlier ones."""
+    def write_histories(self, artefact: str, rows: Sequence[Mapping[str, Any]], *, parts: bool = False) -> None:
+        """Write the histories of one artefact in place of its earlier ones, and of those that other code made.
+
+        `parts` says that others have steps of the same histories, which are kept.
+        """
+        named = {tuple(row.get(name) for name in NAMED) for row in rows}
+        steps = [row["step"] for row in rows]
+        within = f" AND step BETWEEN {min(steps)} AND {max(steps)}" if parts and steps else ""
+        same = " AND ".join(f'"{name}" IS ?' for name in NAMED)
         with self._writing():
             self._db.execute("DELETE FROM histories WHERE artefact = ?", (artefact,))
+            for values in named:
+                self._db.execute(f"DELETE FROM histories WHERE {same}{within}", tuple(map(_plain, values)))
             self._insert("histories", rows)
 
     def write_pictures(self, rows: Sequence[Mapping[str, Any]]) -> None:

@@ -68,7 +68,8 @@ def _checked(picture: Picture) -> Picture:
         Naming the member that does not.
     """
     count, places = picture.points.shape[-1], picture.positions.shape[-1]
-    mesh = picture.triangles.shape[0] == 3 and int(np.max(picture.triangles, initial=-1)) < count
+    corners = picture.triangles
+    mesh = corners.shape[0] == 3 and bool(np.all((corners >= 0) & (corners < count)))
     fits = {
         "points": picture.points.ndim == 2 and len(picture.points) in (1, 2),
         "triangles": len(picture.points) == 1 or mesh,
@@ -109,9 +110,10 @@ class Shown:
 def read(path: Path) -> Iterator[Shown]:
     """The pictures of a results file."""
     for row in tables.read(path, "pictures").to_dict("records"):
-        picture = _unpacked(row["data"], row["names"]) if row["data"] is not None else None
+        picture = _unpacked(row["data"], row["names"]) if isinstance(row["data"], bytes) else None
         key = (str(row["problem"]), str(row["problem_options"]))
-        yield Shown(key, row["title"] or "", picture, row["reason"] or "")
+        title, reason = (text if isinstance(text, str) else "" for text in (row["title"], row["reason"]))
+        yield Shown(key, title, picture, reason)
 
 
 def _packed(picture: Picture) -> bytes:

@@ -16,6 +16,7 @@ from vibench.queries import CellRows
 from vibench.stage import Stage, value_of
 from vibench.store import History, Store
 from vibench.study import Study
+from vibench.sweeps import HighFidelity
 
 
 @dataclass(frozen=True)
@@ -66,4 +67,4 @@ class Recorder:
                 for k, v in enumerate(history.values)
             ]
         if rows:
-            self.journal.write_histories(stage.key, rows)
+            self.journal.write_histories(stage.key, rows, parts=isinstance(stage, HighFidelity))

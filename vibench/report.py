@@ -43,6 +43,10 @@ FAILED = [
 """Columns of the table of failures."""
 
 
+FAILED_QUERY = ["cell", "query", "problem", "dual", "primal", "primal_tol", "solver", "assembly", "status", "reason"]
+"""Columns of the table of single queries that failed."""
+
+
 @dataclass(frozen=True)
 class Entry:
     """A table's cell: as it is sorted, as it is printed, and its class."""
@@ -92,7 +96,7 @@ def html(path: Path) -> str:
     """The report of a results file."""
     environment = Environment(loader=PackageLoader("vibench"), autoescape=True, undefined=StrictUndefined)
     grid = environment.get_template("grid.html.j2")
-    cells, shown = tables.read(path, "cells"), list(_tables(path))
+    cells, queries, shown = tables.read(path, "cells"), tables.read(path, "queries"), list(_tables(path))
     return environment.get_template("report.html.j2").render(
         study=study_of(path, read_meta(path)).get("name", path.parent.name),
         sections=[("findings", "Findings"), ("failures", "What fell short")]
@@ -100,7 +104,9 @@ def html(path: Path) -> str:
         + [("figures", "Figures")],
         facts=list(_facts(path, cells)),
         findings=_by_heading(findings(path)),
+        cells=len(cells),
         failures=_grid("failed", "", "", cells[cells["status"] != Status.OK][FAILED]),
+        queries=_grid("queries", "", "", queries[queries["status"] != Status.OK][FAILED_QUERY]),
         missing=[f"no picture of {one.key[0]}: {one.reason}" for one in pictures.read(path) if one.reason],
         tables=shown,
         figures=list(_figures(path)),
@@ -150,7 +156,7 @@ def _grid(name: str, title: str, said: str, frame: pd.DataFrame) -> Grid:
 def _entry(value: Any) -> Entry:
     text = tables.cell_text(value)
     number = isinstance(value, Real) and not isinstance(value, bool)
-    plain = "" if not text else repr(float(value)) if number else text
+    plain = "" if not text else repr(float(value)).replace("inf", "Infinity") if number else text
     return Entry(plain, text, "number" if number else "long" if len(text) > LONG else "")
 
 

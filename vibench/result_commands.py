@@ -10,6 +10,7 @@ import typer
 
 from vibench import diff, report, shell, tables
 from vibench.printing import new_console, print_frame
+from vibench.runner import REPORT
 
 Form = Literal["terminal", "markdown", "csv", "latex", "json"]
 
@@ -25,7 +26,7 @@ def write_report(
 ) -> None:
     """Write what a run found as one HTML page."""
     path = tables.results_file(run)
-    target = report.write(path, out or path.parent / "report.html")
+    target = report.write(path, out or path.parent / REPORT)
     new_console().print(f"report: {target}", soft_wrap=True)
 
 

@@ -34,6 +34,9 @@ from vibench.thresholds import threshold_rows
 LOOK = 5.0
 """Seconds between two looks at whether the executor is still there."""
 
+REPORT = "report.html"
+"""File in the run folder that `vibench report` writes unless told otherwise."""
+
 LOG = "workers.log"
 """File in the run folder that takes what plugins and solvers print."""
 
@@ -155,7 +158,8 @@ def _clear(folder: Path, study: Study) -> None:
         raise RequestError(f"'{folder}' holds results of the study '{there}'; --fresh removes only '{study.name}'")
     for name in ("tables", "figures"):
         shutil.rmtree(folder / name, ignore_errors=True)
-    (folder / LOG).unlink(missing_ok=True)
+    for name in (LOG, REPORT):
+        (folder / name).unlink(missing_ok=True)
 
 
 @dataclass

@@ -23,6 +23,10 @@ MARK_ATOL = 1e-10
 FEW_SUPREMIZERS = 2
 """Coordinates are those of the supremizers themselves where there are this many times more touched unknowns."""
 
+SPANNING = 1.0
+"""Greedy algorithms run in the span of the supremizers where a QR factorisation of all of them, n×k, times this is no
+dearer than dense solves with the contact's factor."""
+
 FACTORS = 3
 """Factors with different unknowns last that are kept: of the training set, of the validation set, and as declared."""
 
@@ -231,7 +235,7 @@ def supremizer_coordinates(
     """
     touched = _touched(matrices)
     count = eta.shape[1]
-    if V.dim * count * len(matrices) <= len(touched) ** 2:  # a QR factorisation is cheaper than dense solves on contact
+    if SPANNING * V.dim * count * len(matrices) <= len(touched) ** 2:
         space = SpannedCoordinates(V, basis, np.hstack([supremizers(V, B, eta) for B in matrices]))
         return space, [space.represented[:, k * count : (k + 1) * count] for k in range(len(matrices))]
     contact = ContactCoordinates(V, basis, touched)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import sqlite3
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -12,7 +13,7 @@ import pandas as pd
 
 from vibench.errors import RequestError
 from vibench.journal import FILE, read_meta
-from vibench.schema import KEYS, TABLES, VERSION
+from vibench.schema import KEYS, STORED, TABLES, VERSION
 
 SUMMARY = "summary"
 
@@ -39,9 +40,13 @@ def read(path: Path, table: str) -> pd.DataFrame:
     """One table of a results file, cells in the order they were first written."""
     db = sqlite3.connect(f"file:{quote(str(path))}?mode=ro", uri=True)
     try:
-        return pd.read_sql_query(f"SELECT * FROM {table}", db)
+        frame = pd.read_sql_query(f"SELECT * FROM {table}", db)
     finally:
         db.close()
+    for name, kind in STORED.get(table, {}).items():
+        if kind.startswith(("REAL", "INTEGER")) and frame[name].dtype == object:  # nothing but NULL
+            frame[name] = frame[name].astype(float)
+    return frame
 
 
 def export(path: Path, folder: Path) -> list[Path]:
@@ -169,8 +174,19 @@ def _for_latex(text: str) -> str:
 
 
 def to_json(frame: pd.DataFrame) -> str:
-    """A JSON array of objects with full precision; what is missing is null."""
-    return str(frame.to_json(orient="records", force_ascii=False, indent=1, double_precision=15)) + "\n"
+    """A JSON array of objects with full precision; what is missing is null, and infinity the text "inf"."""
+    rows = [
+        {str(name): _for_json(value) for name, value in zip(frame.columns, row, strict=True)}
+        for row in frame.itertuples(index=False)
+    ]
+    return json.dumps(rows, ensure_ascii=False, indent=1) + "\n"
+
+
+def _for_json(value: Any) -> Any:
+    if value is None or value is pd.NA or value != value:  # noqa: PLR0124  NaN
+        return None
+    plain = value.item() if hasattr(value, "item") else value
+    return str(plain) if plain in (float("inf"), float("-inf")) else plain
 
 
 def _one_cell(text: str) -> str:

@@ -51,7 +51,7 @@ def _style(k: int) -> int:
 
 
 def _loosest(group: pd.DataFrame) -> pd.DataFrame:
-    """Of every fixed enrichment the one with the fewest vectors."""
+    """Of every fixed enrichment the tolerance that leaves the smallest constants."""
     fixed = group[group["enrichment_kind"] == Kind.FIXED]
     reached = fixed.groupby(["primal", "primal_tol"], dropna=False)["beta_span"].mean().reset_index()
     kept = reached.sort_values("beta_span").drop_duplicates("primal")
@@ -72,7 +72,8 @@ def _draw(axes: tuple[Axes, Axes], rows: pd.DataFrame, prefix: str, k: int, name
     top, below = axes
     x = np.arange(1, len(rows) + 1)
     span = rows[f"{prefix}span"].to_numpy(float)
-    zero = bool(np.all(span[np.isfinite(span)] < VANISHES))
+    known = span[np.isfinite(span)]
+    zero = len(known) > 0 and bool(np.all(known < VANISHES))
     plot(top, x, positive(span, VANISHES), k, f"{name} (0 over span)" if zero else name)
     lower, upper = rows[f"{prefix}cone_lower"].to_numpy(float), rows[f"{prefix}cone_upper"].to_numpy(float)
     plot(below, x, positive(upper, VANISHES), k)

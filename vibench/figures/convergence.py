@@ -113,7 +113,8 @@ def _labels(queries: pd.DataFrame) -> list[str]:
 
 def _tightest(steps: pd.DataFrame) -> pd.Series:
     """Of every row the tolerance at which its strategy went farthest."""
-    reach = steps.groupby(["primal", "primal_tol"])["step"].max()
+    grown = steps[steps["quantity"] == "beta_span_min"]  # a value per vector
+    reach = grown.groupby(["primal", "primal_tol"])["step"].max()
     if reach.empty:
         return pd.Series(np.nan, index=steps.index)
     farthest = {primal: of_primal.idxmax()[1] for primal, of_primal in reach.groupby(level=0)}

@@ -18,6 +18,9 @@ ERRORS = (("error_u_mean", "mean relative error of u"), ("error_lambda_mean", "m
 MOST_QUERIES = 1e6
 """Total cost is drawn up to this number of queries."""
 
+ABREAST = 6
+"""Panels in a row."""
+
 
 def dimension(data: Data) -> Figure | None:
     """Errors against the dimension of the reduced problem, N + S + R."""
@@ -64,7 +67,7 @@ def _point(k: int, dual: int) -> dict[str, Any]:
     return {
         "linestyle": "none",
         "color": COLOURS[k % len(COLOURS)],
-        "marker": MARKERS[k % len(MARKERS)],
+        "marker": MARKERS[(k + k // len(COLOURS)) % len(MARKERS)],
         "markersize": 5,
         "markerfacecolor": faces[dual % len(faces)],
         "markeredgewidth": 1.0 + dual // len(faces),
@@ -85,19 +88,20 @@ def total_cost(data: Data) -> Figure | None:
     if cells.empty:
         return None
     thresholds = data.thresholds[data.thresholds["solver"] == cells["solver"].iloc[0]]
-    asked, duals = pairs(cells), list(dict.fromkeys(cells["dual"]))
-    sheet = Sheet(len(duals), len(asked), f"{data.problem}, {cells['solver'].iloc[0]}: total cost")
+    shown = [(dual, pair, mine) for dual, group in cells.groupby("dual", sort=False) for pair, mine in pairs(group)]
+    columns = min(len(shown), ABREAST)
+    rows = -(-len(shown) // columns)
+    sheet = Sheet(rows, columns, f"{data.problem}, {cells['solver'].iloc[0]}: total cost")
     names: dict[str, int] = {}
-    for row, dual in enumerate(duals):
-        for column, (pair, of_pair) in enumerate(asked):
-            panel = sheet.at(row, column)
-            mine = of_pair[of_pair["dual"] == dual]
-            _lines(panel, mine, names)
-            _marks(panel, mine, thresholds[thresholds["dual"] == dual])
-            title = f"{dual}, {pair_title(pair, mine)}"
-            panel.set(xlabel="number of queries", ylabel="offline + online [s]", title=title)
-            panel.set_xlim(1.0, MOST_QUERIES)
-            logarithmic(panel, "xy")
+    for panel, (dual, pair, mine) in zip(sheet.panels, shown, strict=False):
+        _lines(panel, mine, names)
+        _marks(panel, mine, thresholds[thresholds["dual"] == dual])
+        title = f"{dual}, {pair_title(pair, mine)}"
+        panel.set(xlabel="number of queries", ylabel="offline + online [s]", title=title)
+        panel.set_xlim(1.0, MOST_QUERIES)
+        logarithmic(panel, "xy")
+    for panel in sheet.panels[len(shown) :]:
+        panel.set_axis_off()
     return sheet.finish()
 
 
@@ -127,6 +131,8 @@ def _marks(panel: Axes, cells: pd.DataFrame, thresholds: pd.DataFrame) -> None:
         if b is None or b.offline_s != row.offline_b_s or not between or pd.isna(row.benefit_threshold):
             continue
         n = row.benefit_threshold
+        if not 1.0 <= n <= MOST_QUERIES:
+            continue
         label_once = "benefit threshold: from here" if row.meaning == Meaning.FROM else "benefit threshold: until here"
         marker = ">" if row.meaning == Meaning.FROM else "<"
         panel.plot(

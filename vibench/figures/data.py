@@ -49,6 +49,8 @@ def problems(path: Path) -> Iterator[tuple[str, Data]]:
     read = {name: tables.in_order(tables.read(path, name)) for name in TABLES}
     if read["queries"].empty:
         return
+    for axis in ("dual", "primal"):
+        _tell_apart(axis, [read[name] for name in ("cells", "queries", "histories")])
     kinds = read["cells"].set_index("cell")["enrichment_kind"]
     read["queries"]["enrichment_kind"] = read["queries"]["cell"].map(kinds)
     shown = tuple(pictures.read(path))
@@ -60,6 +62,19 @@ def problems(path: Path) -> Iterator[tuple[str, Data]]:
         )
         mine = tuple(one for one in shown if one.key == key)
         yield name, Data(str(key[0]), cells, queries, histories, thresholds, mine)
+
+
+def _tell_apart(axis: str, frames: list[pd.DataFrame]) -> None:
+    """Number labels that a plugin bears with different options."""
+    options: dict[str, dict[str, int]] = {}
+    for frame in frames:
+        for name, given in frame[[axis, f"{axis}_options"]].dropna().drop_duplicates().itertuples(index=False):
+            options.setdefault(name, {}).setdefault(given, len(options[name]) + 1)
+    shared = {name for name, known in options.items() if len(known) > 1}
+    for frame in frames:
+        rows = frame[axis].isin(shared)
+        named = zip(frame.loc[rows, axis], frame.loc[rows, f"{axis}_options"], strict=True)
+        frame.loc[rows, axis] = [f"{name} ({options[name][given]})" for name, given in named]
 
 
 def pairs(frame: pd.DataFrame) -> list[tuple[Any, pd.DataFrame]]:

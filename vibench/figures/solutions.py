@@ -37,12 +37,12 @@ def _field(axes: Axes, picture: Picture) -> None:
     if len(picture.points) == 1:
         order = np.argsort(picture.points[0])
         axes.plot(picture.points[0][order], picture.values[order], color=line(0)["color"])
-        axes.set(xlabel="x [m]", ylabel=picture.name)
+        axes.set(xlabel="x", ylabel=picture.name)
         return
     mesh = Triangulation(picture.points[0], picture.points[1], picture.triangles.T)
     colours = axes.tripcolor(mesh, picture.values, shading="gouraud", cmap=MAP, rasterized=True)
     axes.set_aspect("equal", adjustable="datalim")
-    axes.set(xlabel="x [m]", ylabel="y [m]")
+    axes.set(xlabel="x", ylabel="y")
     axes.grid(visible=False)
     _bar(axes, colours, picture.name)
 
@@ -52,13 +52,13 @@ def _multiplier(axes: Axes, picture: Picture) -> None:
     if len(picture.positions) == 1:
         order = np.argsort(picture.positions[0])
         axes.plot(picture.positions[0][order], picture.multiplier[order], drawstyle="steps-mid", color=line(1)["color"])
-        axes.set(xlabel="x [m]", ylabel=picture.multiplier_name)
+        axes.set(xlabel="x", ylabel=picture.multiplier_name)
         return
     x, y = picture.positions
     size = float(np.clip(3000.0 / max(len(x), 1), 4.0, 40.0))
     points = axes.scatter(x, y, c=picture.multiplier, s=size, cmap=MAP, rasterized=True)
     axes.set_aspect("equal", adjustable="datalim")
-    axes.set(xlabel="x [m]", ylabel="y [m]")
+    axes.set(xlabel="x", ylabel="y")
     _bar(axes, points, picture.multiplier_name)
 
 

@@ -29,9 +29,9 @@ def solvers(data: Data) -> Figure | None:
     A profile is the share of programs solved to the accuracy asked for within a factor of the time of the fastest
     solver of that program; failures are at infinity, so that a solver's curve ends at the share it solved.
     """
-    queries = data.queries[data.queries["solver"].isin(_ran(data.queries))]
+    queries = data.queries
     names = list(dict.fromkeys(queries["solver"]))
-    if not names:
+    if not queries["solve_s"].notna().any():
         return None
     sheet = Sheet(1, 2, f"{data.problem}: QP solvers")
     left, right = sheet.panels
@@ -39,11 +39,6 @@ def solvers(data: Data) -> Figure | None:
     left.axhline(_asked(data.cells), color="0.4", linewidth=0.8, linestyle=(0, (1, 2)), label="accuracy asked for")
     _profile(right, queries, names)
     return sheet.finish()
-
-
-def _ran(queries: pd.DataFrame) -> list[str]:
-    there = queries[queries["solve_s"].notna()]
-    return list(there["solver"].unique())
 
 
 def _asked(cells: pd.DataFrame) -> float:
@@ -54,9 +49,9 @@ def _accuracy(panel: Axes, queries: pd.DataFrame, names: list[str]) -> None:
     """A point per reduced model and solver: median time over its queries, and the largest residual of any."""
     for k, solver in enumerate(names):
         mine = queries[(queries["solver"] == solver) & queries["solve_s"].notna()]
-        worst = mine[RESIDUALS].max(axis=1).fillna(np.inf)
+        worst = mine[RESIDUALS].max(axis=1)
         found = mine.assign(worst=worst).groupby("cell").agg(time=("solve_s", "median"), worst=("worst", "max"))
-        finite = found[np.isfinite(found["worst"])]
+        finite = found[np.isfinite(found["worst"])]  # a query without an answer has no residual
         style = line(k) | {"linestyle": "none", "markevery": None}
         panel.plot(1e3 * finite["time"], np.maximum(finite["worst"], EXACT), label=solver, **style)
     panel.set(xlabel="median time of a program [ms]", ylabel="largest residual of a model's queries")

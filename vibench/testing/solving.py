@@ -72,14 +72,16 @@ def pictures(case: Case) -> Iterator[str]:
 
 
 def _picture_faults(picture: Picture, m: int) -> Iterator[str]:
-    count = np.shape(picture.points)[-1]
+    count, line = np.shape(picture.points)[-1], np.shape(picture.points)[:1] == (1,)
     where: Array = picture.positions
-    expected = {"points": (2, count), "values": (count,), "positions": (1 if np.shape(where)[:1] == (1,) else 2, m),
-                "multiplier": (m,)}  # fmt: skip
+    expected = {"points": (1 if line else 2, count), "values": (count,), "multiplier": (m,),
+                "positions": (1 if np.shape(where)[:1] == (1,) else 2, m)}  # fmt: skip
     for name, shape in expected.items():
         if fault := array_fault(f"the picture's {name}", getattr(picture, name), shape):
             yield fault
     triangles = np.asarray(picture.triangles)
+    if line:
+        return
     if triangles.ndim != 2 or len(triangles) != 3 or not np.issubdtype(triangles.dtype, np.integer):
         yield f"the picture's triangles are {triangles.dtype} of shape {triangles.shape}; expected indices (3, t)"
     elif triangles.size and (triangles.min() < 0 or triangles.max() >= count):
