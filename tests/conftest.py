@@ -85,10 +85,13 @@ def plugins_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def vibench(command: str, plugins_folder: Path) -> Vibench:
-    """Function that runs the installed command in a folder."""
+    """Function that runs the installed command in a folder; it draws where a test is about figures."""
 
-    def run(folder: Path, *arguments: str, plugins: Path = plugins_folder) -> subprocess.CompletedProcess[str]:
-        with started([command, *arguments], folder, plugins) as process:
+    def run(
+        folder: Path, *arguments: str, plugins: Path = plugins_folder, figures: bool = False
+    ) -> subprocess.CompletedProcess[str]:
+        plain = ["--no-figures"] if arguments[:1] == ("run",) and not figures else []
+        with started([command, *arguments, *plain], folder, plugins) as process:
             out, err = process.communicate(timeout=120)
         return subprocess.CompletedProcess(arguments, process.returncode, out, err)
 

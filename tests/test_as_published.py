@@ -20,7 +20,7 @@ import as_published
 import published
 
 
-@pytest.mark.parametrize(("problem", "nodes"), [("obstacle", 200), ("hertz", 700)])
+@pytest.mark.parametrize(("problem", "nodes"), [("obstacle", 200), pytest.param("hertz", 700, marks=pytest.mark.long)])
 def test_both_sides_come_to_the_same_models(problem: str, nodes: int, tmp_path: Path, capsys) -> None:
     arguments = [problem, "--resolution", str(nodes), "--repeats", "1", "--out", str(tmp_path)]
     assert as_published.main(arguments) == 0, capsys.readouterr().out

@@ -33,7 +33,7 @@ SOLVERS = ["piqp", "careful", "gives-up"]
 def first(vibench: Vibench, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Folder of a study with a finished run of three cells, one of which is not ok."""
     folder = tmp_path_factory.mktemp("first")
-    done = vibench(folder, "run", write_study(folder, wire_study(solvers=SOLVERS)), "--jobs", "1")
+    done = vibench(folder, "run", write_study(folder, wire_study(solvers=SOLVERS)), "--jobs", "1", figures=True)
     assert done.returncode == 0, done.stderr
     assert [row["status"] for row in rows(folder / "runs" / "wire")] == ["ok", "ok", "failed"]
     return folder

@@ -65,6 +65,7 @@ def run(
     fresh: Annotated[bool, typer.Option("--fresh", help="Begin from nothing, not from earlier results.")] = False,
     retry: Annotated[bool, typer.Option("--retry", help="Also redo cells that did not end ok.")] = False,
     strict: Annotated[bool, typer.Option("--strict", help="Exit with 1 if a cell is not ok or unavailable.")] = False,
+    draw: Annotated[bool, typer.Option("--figures/--no-figures", help="Draw the figures in the end.")] = True,
     executor: Annotated[
         Literal["local", "dask"], typer.Option(help="Processes of this machine, or the workers of a dask cluster.")
     ] = "local",
@@ -93,7 +94,7 @@ def run(
     if outcome.interrupted:
         console.print(f"interrupted: {outcome.missing} cells have no row yet; the same command goes on from here")
         raise typer.Exit(130)
-    drawn = figures.draw_all(path, folder / "figures", jobs=min(options.jobs, provenance.cores()))
+    drawn = figures.draw_all(path, folder / "figures", jobs=min(options.jobs, provenance.cores())) if draw else []
     _summarise(console, loaded, folder, outcome, drawn)
     if strict and any(row["status"] not in (Status.OK, Status.UNAVAILABLE) for row in outcome.rows):
         raise typer.Exit(1)
