@@ -11,15 +11,13 @@ from typing import Any
 import pandas as pd
 
 from vibench import tables
+from vibench.infsup import VANISHES
 from vibench.qp import Status
 from vibench.schema import KEYS, THRESHOLDS
 from vibench.thresholds import Meaning
 
 ERROR_FLOOR = 1e-10
 """Errors below this are round-off: their ratio says nothing."""
-
-CONSTANT_FLOOR = 1e-12
-"""The same of inf-sup constants."""
 
 DIMENSIONS = ("N", "R", "rank", "enrichment")
 CONSTANTS = ("beta_span_min", "beta_cone_lower_min")
@@ -89,7 +87,7 @@ def _cell(one: pd.Series, two: pd.Series, limit: float) -> Iterator[dict[str, An
     for name in DIMENSIONS:
         if not _equal(one[name], two[name]):
             yield _row(one, name, one[name], two[name], _judged(one[name], two[name], limit) or Verdict.CHANGED)
-    for names, floor, more in ((CONSTANTS, CONSTANT_FLOOR, True), (ERRORS, ERROR_FLOOR, False)):
+    for names, floor, more in ((CONSTANTS, VANISHES, True), (ERRORS, ERROR_FLOOR, False)):
         for name in names:
             verdict = _judged(_floored(one[name], floor), _floored(two[name], floor), limit, more_is_better=more)
             yield from _changed(one, name, one[name], two[name], verdict)

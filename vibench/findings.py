@@ -12,12 +12,10 @@ import pandas as pd
 
 from vibench import agreement, invariants, tables
 from vibench.figures.data import Data, best_solver, label, pair_title, pairs, problems
+from vibench.infsup import VANISHES
 from vibench.qp import Status
 from vibench.strategy import Kind
 from vibench.thresholds import HIGH_FIDELITY
-
-ZERO = 1e-12
-"""Inf-sup constants below this are zero in floating point."""
 
 
 @dataclass(frozen=True)
@@ -72,7 +70,7 @@ def _stability(group: pd.DataFrame) -> Iterator[str]:
     online = group[group["enrichment_kind"] == Kind.PER_PARAMETER].dropna(subset=["beta_span_min"])
     if len(plain) and np.isfinite(plain["beta_span_min"].iloc[0]):
         row = plain.iloc[0]
-        zero = row["beta_span_min"] < ZERO
+        zero = row["beta_span_min"] < VANISHES
         value = "is zero" if zero else f"is {row['beta_span_min']:.3g}"
         yield (
             f"Without enrichment min β over the span {value}, over the cone at least {row['beta_cone_lower_min']:.3g}; "
@@ -81,7 +79,7 @@ def _stability(group: pd.DataFrame) -> Iterator[str]:
     fixed = group[(group["enrichment_kind"] == Kind.FIXED) & np.isfinite(group["beta_span_min"])]
     for row in _one_assembly(fixed).itertuples():
         reached = ""
-        if len(online) and ZERO < online["beta_span_min"].iloc[0] < np.inf:
+        if len(online) and VANISHES < online["beta_span_min"].iloc[0] < np.inf:
             best = online.iloc[0]
             share = 100.0 * row.beta_span_min / best["beta_span_min"]
             reached = f", {share:.0f} % of what {best['primal']} reach with {best['enrichment']:.0f}"

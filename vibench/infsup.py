@@ -24,6 +24,10 @@ UNSIGNED = "span"
 """Name of the lower bound of a cone with free generators, β_span; no other is known to hold for it."""
 
 
+VANISHES = 1e-12
+"""Constants below this are zero in floating point."""
+
+
 @dataclass(frozen=True)
 class Multipliers:
     """A reduced cone prepared once for every constant computed on it.

@@ -21,7 +21,7 @@ MARK_ATOL = 1e-10
 """Marks of matrices that may be proportional differ by no more."""
 
 FEW_SUPREMIZERS = 2
-"""Coordinates are those of the supremizers themselves where there are this many times more touched unknowns."""
+"""Norms and angles come from whitened supremizers where there are this many times more touched unknowns."""
 
 SPANNING = 1.0
 """Greedy algorithms run in the span of the supremizers where a QR factorisation of all of them, n×k, times this is no

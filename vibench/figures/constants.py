@@ -9,10 +9,8 @@ from matplotlib.figure import Figure
 
 from vibench.figures.data import Data, label, one_solver, pair_title, pairs
 from vibench.figures.style import BLACK, Sheet, counted, line, logarithmic, plot, positive
+from vibench.infsup import VANISHES
 from vibench.strategy import Kind
-
-VANISHES = 1e-12
-"""Constants below this are zero in floating point."""
 
 
 def inf_sup(data: Data) -> Figure:
