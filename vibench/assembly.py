@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 
@@ -12,11 +12,12 @@ from vibench.arrays import Array
 from vibench.matrix import Cell, Plugin
 from vibench.online import OnlineModel, Operators, project_members, why_in_full
 from vibench.problem import MEMBERS, VariationalInequality, checked_assembly, training_parameters, validation_parameters
-from vibench.reduced import ReducedModel, project
+from vibench.reduced import ReducedModel, beginning, project
 from vibench.separation import Member, Way, separate
 from vibench.stage import Result, Stage, assemblies, build_problem, value_of
-from vibench.stages import EnrichmentStage, enrichment_stage, reduced_model
+from vibench.stages import EnrichmentStage, GrowthStage, enrichment_stage, grown_model, reduced_model
 from vibench.store import Store
+from vibench.strategy import Kind
 from vibench.timing import NO_TIME, Seconds, median_seconds, timed
 
 Model = ReducedModel | OnlineModel
@@ -90,6 +91,25 @@ class FormsStage(Stage):
 
 
 @dataclass(frozen=True)
+class Projections(Stage):
+    """Programs of everything a nested strategy grew, in full; those of its tolerances are their beginnings."""
+
+    growth: GrowthStage
+    count: int
+    seed: int
+
+    def inputs(self) -> tuple[Stage, ...]:
+        """The growth and what it was built on."""
+        return (self.growth, *self.growth.inputs())
+
+    def run(self, store: Store) -> Result:
+        """One program per validation parameter; not timed."""
+        model = grown_model(store, self.growth)
+        mus, kept = validation_parameters(model.problem, self.count, self.seed), assemblies(model.problem)
+        return Result(tuple(model.reduce(kept.at(mu)).program for mu in mus))
+
+
+@dataclass(frozen=True)
 class Assembled:
     """Reduced programs and what assembling them takes, whatever solves them.
 
@@ -133,37 +153,66 @@ class AssemblyStage(Stage):
         """The stage that knows what high-fidelity matrices take."""
         return FormsStage(self.enrichment.pod.problem, self.count, self.seed)
 
+    @property
+    def projections(self) -> Projections | None:
+        """What knows the programs in full of an enrichment that others are the beginnings of."""
+        growth = self.enrichment.growth
+        return None if growth is None else Projections(growth, self.count, self.seed)
+
     def inputs(self) -> tuple[Stage, ...]:
-        """Enrichment, what it was built on, what the matrices take, and what reduced assembly needs."""
-        reduction = self.reduction
+        """Enrichment, what it was built on, what the matrices take, and what is known of full and reduced assembly."""
+        reduction, projections = self.reduction, self.projections
+        known = () if projections is None else (projections,)
         extra = () if reduction is None else (reduction, reduction.separation)
-        return (self.enrichment, *self.enrichment.inputs(), self.forms, *extra)
+        return (self.enrichment, *self.enrichment.inputs(), self.forms, *known, *extra)
 
     def run(self, store: Store) -> Result:
-        """Time every assembly; compare reduced ones with full ones, untimed.
-
-        In full it takes the high-fidelity matrices, which are timed once for all models, and their projection, which
-        is timed once per parameter after a warm-up at the first: a cell's figure is over all parameters anyway.
-        """
+        """Time every assembly; compare reduced ones with full ones, untimed."""
         model, _ = query_model(store, self)
-        mus, kept = validation_parameters(model.problem, self.count, self.seed), assemblies(model.problem)
-        programs: list[VariationalInequality] = []
-        seconds, errors, factor = [], [], None
-        for mu, matrices in zip(mus, value_of(store, self.forms), strict=True):
-            vi = kept.at(mu)
-            if isinstance(model, OnlineModel):
-                reduced, spent = median_seconds(partial(model.assemble, mu))
-                full, factor = project(vi, reduced.basis, model.generators), reduced.factor
-                errors.append(_largest_difference(reduced.program, full))
-            else:
-                if not programs:
-                    model.reduce(vi)
-                reduced, projecting = timed(partial(model.reduce, vi))
-                spent = matrices + projecting
-                errors.append(0.0)
-            programs.append(reduced.program)
-            seconds.append(spent)
-        return Result(Assembled(tuple(programs), factor, tuple(seconds), tuple(errors)))
+        mus = validation_parameters(model.problem, self.count, self.seed)
+        known = None if self.projections is None else value_of(store, self.projections)
+        if isinstance(model, OnlineModel):
+            return Result(_reduced(model, mus, known))
+        return Result(_in_full(model, mus, value_of(store, self.forms), known))
+
+
+Known = Sequence[VariationalInequality] | None
+"""Programs in full of a space that begins with that of a model, one per parameter."""
+
+
+def _reduced(model: OnlineModel, mus: Array, known: Known) -> Assembled:
+    """Assemble without arrays of mesh size at every parameter; how far the members are from their projections."""
+    matrices = assemblies(model.problem)
+    programs, seconds, errors, factor = [], [], [], None
+    for k, mu in enumerate(mus):
+        found, spent = median_seconds(partial(model.assemble, mu))
+        factor = found.factor
+        full = known and beginning(known[k], len(found.program.f))
+        errors.append(
+            _largest_difference(found.program, full or project(matrices.at(mu), found.basis, model.generators))
+        )
+        programs.append(found.program)
+        seconds.append(spent)
+    return Assembled(tuple(programs), factor, tuple(seconds), tuple(errors))
+
+
+def _in_full(model: ReducedModel, mus: Array, forms: Sequence[Seconds], known: Known) -> Assembled:
+    """Assemble the high-fidelity matrices, which are timed once for all models, and project them.
+
+    On a space that does not vary a projection takes as long at every parameter: it is timed at the first.
+    """
+    matrices, varies = assemblies(model.problem), model.kind is Kind.PER_PARAMETER
+    first, projecting = median_seconds(partial(model.reduce, matrices.at(mus[0])))
+    programs, seconds = [], []
+    for k, mu in enumerate(mus):
+        if known:
+            program = beginning(known[k], len(first.program.f))
+        else:
+            found, spent = timed(partial(model.reduce, matrices.at(mu)))
+            program, projecting = found.program, spent if varies else projecting
+        programs.append(program)
+        seconds.append(forms[k] + projecting)
+    return Assembled(tuple(programs), None, tuple(seconds), (0.0,) * len(mus))
 
 
 def _largest_difference(found: VariationalInequality, exact: VariationalInequality) -> float:

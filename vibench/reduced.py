@@ -152,3 +152,9 @@ def project(vi: VariationalInequality, Z: Array, chi: Array) -> VariationalInequ
     """Galerkin projection on span Z (n×N') and the cone of χ (m×R): dense A, f, B, g."""
     A = Z.T @ np.asarray(vi.A @ Z)
     return VariationalInequality(A=0.5 * (A + A.T), f=Z.T @ vi.f, B=chi.T @ np.asarray(vi.B @ Z), g=chi.T @ vi.g)
+
+
+def beginning(program: VariationalInequality, size: int) -> VariationalInequality:
+    """The program on the first `size` vectors of a basis, out of that on all of them."""
+    A, B = (np.ascontiguousarray(member) for member in (program.A[:size, :size], program.B[:, :size]))
+    return VariationalInequality(A, program.f[:size].copy(), B, program.g)

@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import partial
-from typing import Any
 
 import numpy as np
 
 from vibench.arrays import Array
 from vibench.cone import orthogonality
 from vibench.contracts import check_cone, check_enrichment
-from vibench.greedy import LazyMaximum
+from vibench.images import Images
 from vibench.infsup import Multipliers, beta_span, multipliers
 from vibench.matrix import Cell, Plugin
 from vibench.nested import Grown, grow_through
@@ -24,9 +22,6 @@ from vibench.strategy import Cone, Enrichment, Kind, Offline, Stop
 from vibench.supremizer import ConstraintClasses, constraint_classes, on_basis, supremizer_images
 from vibench.sweeps import gather, training
 from vibench.timing import Stopwatch, timed
-
-GRAM_RTOL = 1e-8
-"""Eigenvalues of a Gram matrix below this fraction of the largest have lost half of their digits to round-off."""
 
 
 @dataclass(frozen=True)
@@ -90,11 +85,19 @@ class ConeStage(Stage):
 
 
 @dataclass(frozen=True)
-class Reached:
-    """The constraint matrices of the training set, and β_span of the whole of V with a cone at every parameter (P,)."""
+class TrainingConstraints(Stage):
+    """The constraint matrices of the training set, sorted into classes; for what is assessed, not timed."""
 
-    classes: ConstraintClasses
-    full: Array
+    problem: Plugin
+
+    def inputs(self) -> tuple[Stage, ...]:
+        """Nothing comes before."""
+        return ()
+
+    def run(self, store: Store) -> Result:  # noqa: ARG002
+        """The `ConstraintClasses`."""
+        problem = build_problem(self.problem)
+        return Result(constraint_classes([problem.constraint(mu)[0] for mu in training_parameters(problem)]))
 
 
 @dataclass(frozen=True)
@@ -103,18 +106,28 @@ class TrainingConstants(Stage):
 
     cone: ConeStage
 
+    @property
+    def constraints(self) -> TrainingConstraints:
+        """The stage that knows the constraint matrices."""
+        return TrainingConstraints(self.cone.problem)
+
     def inputs(self) -> tuple[Stage, ...]:
-        """The cone."""
-        return (self.cone,)
+        """The cone and the constraint matrices."""
+        return (self.cone, self.constraints)
 
     def run(self, store: Store) -> Result:
-        """A `Reached`."""
-        problem = build_problem(self.cone.problem)
-        span = value_of(store, self.cone).prepared.span
-        classes = constraint_classes([problem.constraint(mu)[0] for mu in training_parameters(problem)])
-        image = supremizer_images(problem.V, classes.representatives, span.shape[1])
-        found = np.array([beta_span(image(B, span)) for B in classes.representatives])
-        return Result(Reached(classes, found[classes.members] * np.abs(classes.factors)))
+        """β_span of the whole of V with the cone at every parameter (P,)."""
+        span, classes = value_of(store, self.cone).prepared.span, value_of(store, self.constraints)
+        image = supremizer_images(build_problem(self.cone.problem).V, classes.representatives, span.shape[1])
+        return Result(classes.everywhere([beta_span(image(B, span)) for B in classes.representatives]))
+
+
+@dataclass(frozen=True)
+class AssessedGrowth:
+    """A growth, and the smallest β_span over the training set after every vector (S+1,)."""
+
+    grown: Grown
+    steps: Array
 
 
 @dataclass(frozen=True)
@@ -126,13 +139,21 @@ class GrowthStage(Stage):
     primal: Plugin
     tolerances: tuple[float, ...]
 
+    @property
+    def constraints(self) -> TrainingConstraints:
+        """The stage that knows the constraint matrices of the training set."""
+        return TrainingConstraints(self.cone.problem)
+
     def inputs(self) -> tuple[Stage, ...]:
-        """POD and cone."""
-        return (self.pod, self.cone)
+        """POD, cone and the constraint matrices."""
+        return (self.pod, self.cone, self.constraints)
 
     def run(self, store: Store) -> Result:
-        """A `Grown`; its seconds are counted where its tolerances are."""
-        return Result(grow_through(self.primal.create(), _offline(store, self.pod, self.cone), self.tolerances))
+        """An `AssessedGrowth`; its seconds are counted where its tolerances are."""
+        offline = _offline(store, self.pod, self.cone)
+        grown = grow_through(self.primal.create(), offline, self.tolerances)
+        images = _images(offline, grown.vectors, value_of(store, self.constraints))
+        return Result(AssessedGrowth(grown, images.over_steps(offline.basis.shape[1])))
 
 
 @dataclass(frozen=True)
@@ -157,71 +178,44 @@ class EnrichmentStage(Stage):
 
     def inputs(self) -> tuple[Stage, ...]:
         """POD, cone and what is to be reached; the training parameters come from the problem."""
-        known = (self.pod, self.cone, self.reached)
+        known = (self.pod, self.cone, self.reached, self.reached.constraints)
         return known if self.growth is None else (*known, self.growth)
 
     def run(self, store: Store) -> Result:
         """Build the enrichment; what it reaches on the training set is assessed, not timed."""
-        offline = _offline(store, self.pod, self.cone)
+        offline, steps = _offline(store, self.pod, self.cone), None
         if self.growth is not None and self.tolerance is not None:
-            grown: Grown = value_of(store, self.growth)
-            enrichment, seconds = grown.at(self.tolerance)
+            growth: AssessedGrowth = value_of(store, self.growth)
+            enrichment, seconds = growth.grown.at(self.tolerance)
+            steps = growth.steps
         else:
             strategy = self.primal.create()
             enrichment, seconds = timed(lambda: strategy.build(offline, self.tolerance))
         check_enrichment(enrichment, offline.problem.V, offline.basis)
-        key = {"stage": "enrichment"}
-        histories = [History(key, quantity, tuple(values)) for quantity, values in enrichment.history.items()]
-        if enrichment.kind is Kind.FIXED:
-            histories += _training_constants(key, offline, enrichment, value_of(store, self.reached))
+        found = {quantity: tuple(values) for quantity, values in enrichment.history.items()}
+        if enrichment.vectors is not None:
+            images = _images(offline, enrichment.vectors, value_of(store, self.reached.constraints))
+            steps = images.over_steps(offline.basis.shape[1]) if steps is None else steps
+            found |= {
+                "beta_span_min": tuple(steps[: enrichment.vectors.shape[1] + 1]),
+                "beta_span_training": tuple(images.beta_span()),
+                "beta_full_span_training": tuple(value_of(store, self.reached)),
+            }
+        histories = (History({"stage": "enrichment"}, quantity, values) for quantity, values in found.items())
         return Result(enrichment, seconds, tuple(histories))
 
 
 def _offline(store: Store, pod: PODStage, cone: ConeStage) -> Offline:
+    """What a primal strategy builds on."""
     problem, basis = build_problem(pod.problem), value_of(store, pod).basis
     reduced: ReducedCone = value_of(store, cone)
     return Offline(problem, basis, reduced.cone, reduced.prepared.span, training_parameters(problem))
 
 
-def _training_constants(
-    key: dict[str, Any], offline: Offline, enrichment: Enrichment, reached: Reached
-) -> list[History]:
-    """Of a fixed enrichment: min over training mu of β_span after every vector; β_span of it and of V at every mu."""
-    assert enrichment.vectors is not None  # a fixed enrichment has vectors
-    classes, sizes = reached.classes, np.abs(reached.classes.factors)
-    Z = np.hstack([offline.basis, enrichment.vectors])
-    images = [on_basis(Z, B, offline.span) for B in classes.representatives]
-    weights = [float(np.min(sizes[classes.members == k])) for k in range(len(images))]
-    steps = _smallest_over_steps(images, weights, offline.basis.shape[1])
-    own = np.array([beta_span(image) for image in images])[classes.members] * sizes
-    return [
-        History(key, "beta_span_min", tuple(steps)),
-        History(key, "beta_span_training", tuple(own)),
-        History(key, "beta_full_span_training", tuple(reached.full)),
-    ]
-
-
-def _smallest_over_steps(images: list[Array], weights: list[float], first: int) -> list[float]:
-    """The smallest β_span of the first `first`, `first` + 1, … rows of images (k×rank), each times its weight.
-
-    It only grows with the rows, so an earlier value bounds it from below and few are computed again. Squares come from
-    Gram matrices that grow with the rows; where they would keep too few digits the rows themselves are asked.
-    """
-    grams, known = [np.zeros((image.shape[1],) * 2) for image in images], [0] * len(images)
-
-    def negative(p: int, rows: int) -> float:
-        image = images[p]
-        if not image.shape[1] or rows < image.shape[1]:
-            return -weights[p] * beta_span(image[:rows])
-        new, known[p] = image[known[p] : rows], rows
-        grams[p] = grams[p] + new.T @ new
-        squares = np.linalg.eigvalsh(grams[p])
-        sharp = squares[0] > GRAM_RTOL * squares[-1]
-        return -weights[p] * (float(np.sqrt(squares[0])) if sharp else beta_span(image[:rows]))
-
-    smallest = LazyMaximum(np.zeros(len(images)))
-    last = images[0].shape[0]
-    return [-smallest.next(partial(negative, rows=rows))[1] for rows in range(first, last + 1)]
+def _images(offline: Offline, vectors: Array, classes: ConstraintClasses) -> Images:
+    """ZᵀBᵀη of V_N and vectors (n×S) for every class of the training set, η orthonormal in span χ."""
+    Z = np.hstack([offline.basis, vectors])
+    return Images([on_basis(Z, B, offline.span) for B in classes.representatives], classes)
 
 
 def enrichment_stage(cell: Cell) -> EnrichmentStage:
@@ -233,12 +227,16 @@ def enrichment_stage(cell: Cell) -> EnrichmentStage:
 def reduced_model(store: Store, stage: EnrichmentStage) -> tuple[ReducedModel, Array, Multipliers]:
     """The reduced model of an enrichment, the basis of V_N it extends and the prepared multipliers."""
     basis: POD = value_of(store, stage.pod)
-    reduced: ReducedCone = value_of(store, stage.cone)
-    model = ReducedModel(
-        build_problem(stage.pod.problem),
-        basis.basis,
-        value_of(store, stage),
-        reduced.cone.rays,
-        reduced.prepared.span,
-    )
-    return model, basis.basis, reduced.prepared
+    model = _model(store, stage.pod, stage.cone, value_of(store, stage))
+    return model, basis.basis, value_of(store, stage.cone).prepared
+
+
+def grown_model(store: Store, stage: GrowthStage) -> ReducedModel:
+    """The reduced model with everything that was grown."""
+    growth: AssessedGrowth = value_of(store, stage)
+    return _model(store, stage.pod, stage.cone, Enrichment(Kind.FIXED, vectors=growth.grown.vectors))
+
+
+def _model(store: Store, pod: PODStage, cone: ConeStage, enrichment: Enrichment) -> ReducedModel:
+    basis, reduced = value_of(store, pod).basis, value_of(store, cone)
+    return ReducedModel(build_problem(pod.problem), basis, enrichment, reduced.cone.rays, reduced.prepared.span)

@@ -69,6 +69,10 @@ class ConstraintClasses:
         """Of every class the matrix that stands for it."""
         return np.unique(self.members, return_index=True)[1]
 
+    def everywhere(self, constants: Sequence[float]) -> Array:
+        """At every p (P,) an inf-sup constant that is known of every representative."""
+        return np.array(constants)[self.members] * np.abs(self.factors)
+
 
 def constraint_classes(matrices: Sequence[SparseMatrix]) -> ConstraintClasses:
     """Sort matrices into classes of proportional ones."""
