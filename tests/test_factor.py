@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import pickle
+
 import numpy as np
 import pytest
 import scipy.sparse as sp
@@ -26,6 +28,17 @@ def test_the_factor_is_upper_triangular_in_its_order_and_gives_the_matrix(seed: 
     assert np.allclose(factor.solve(r), np.linalg.solve(X, r))
     assert np.allclose(factor.up_inverse(r), np.linalg.solve(F, r))
     assert np.allclose(factor.down_inverse(r), np.linalg.solve(F.T, r))
+
+
+@given(st.integers(0, 10_000), st.integers(0, 7), st.integers(0, 3))
+def test_taking_the_last_unknowns_for_coupled_changes_nothing(seed: int, count: int, columns: int) -> None:
+    rng = np.random.default_rng(seed)
+    X, last = sp.csc_array(spd(7, rng)), rng.permutation(7)[:count]
+    order = elimination_order(X, last)
+    factor = pickle.loads(pickle.dumps(SparseCholesky(X, order=order, dense=count)))
+    y = rng.standard_normal((7, columns)) if columns else rng.standard_normal(7)
+    assert np.allclose(factor.up(factor.up_inverse(y)), y)
+    assert np.allclose(factor.up_inverse(y), SparseCholesky(X, order=order).up_inverse(y))
 
 
 @given(st.integers(0, 10_000), st.integers(0, 7))

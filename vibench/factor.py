@@ -5,6 +5,7 @@ from __future__ import annotations
 from functools import cached_property
 
 import numpy as np
+import scipy.linalg
 import scipy.sparse as sp
 from scipy.sparse.linalg import SuperLU, splu, spsolve_triangular
 
@@ -26,6 +27,8 @@ class SparseCholesky:
         What to call it when it is refused.
     order
         Elimination order (n,), as `elimination_order` gives it; by default minimum degree.
+    dense
+        How many of the unknowns eliminated last couple to each other almost all: F is taken for full there.
 
     Attributes
     ----------
@@ -38,9 +41,11 @@ class SparseCholesky:
         If X is not positive definite.
     """
 
-    def __init__(self, matrix: SparseMatrix, name: str = "the matrix", order: Indices | None = None) -> None:
+    def __init__(
+        self, matrix: SparseMatrix, name: str = "the matrix", order: Indices | None = None, dense: int = 0
+    ) -> None:
         matrix = sp.csc_array(matrix)
-        self._made_from = matrix, name, order
+        self._made_from = matrix, name, order, dense
         if order is not None:
             matrix = sp.csc_array(matrix[order][:, order])
         try:
@@ -55,10 +60,10 @@ class SparseCholesky:
         eliminated = np.argsort(lu.perm_c)
         if order is not None and not np.array_equal(eliminated, np.arange(len(order))):
             raise NumericalError(f"{name} was factorised in another order than asked for")  # SuperLU promises not to
-        self._given = order
+        self._given, self._sparse = order, matrix.shape[0] - dense
         self.order: Indices = eliminated if order is None else order
 
-    def __reduce__(self) -> tuple[type[SparseCholesky], tuple[SparseMatrix, str, Indices | None]]:
+    def __reduce__(self) -> tuple[type[SparseCholesky], tuple[SparseMatrix, str, Indices | None, int]]:
         """Factorise anew where it is unpickled: SuperLU objects do not travel."""
         return SparseCholesky, self._made_from
 
@@ -67,6 +72,15 @@ class SparseCholesky:
         lower = sp.csc_array(self._lu.L)
         lower.sort_indices()  # once, not at every triangular solve
         return lower
+
+    @cached_property
+    def _blocks(self) -> tuple[SparseMatrix, SparseMatrix, Array]:
+        """Transposes of the lower factor's sparse blocks, that of the first unknowns and the coupling; dense F."""
+        split = self._sparse
+        first = sp.csc_array(self._lower[:, :split])
+        corner, coupling = sp.csc_array(first[:split]), sp.csc_array(first[split:])
+        corner.sort_indices()
+        return corner.T, coupling.T, np.asfortranarray(self.tail(len(self._root) - split))
 
     def solve(self, right: Array) -> Array:
         """X⁻¹ r for right-hand sides (n,) or (n, k)."""
@@ -82,10 +96,13 @@ class SparseCholesky:
 
     def up_inverse(self, y: Array) -> Array:
         """F⁻¹ y, for y (n,) or (n, k)."""
-        scaled = _rows(1.0 / self._root, y)
-        u = np.empty_like(scaled)
-        if scaled.size:
-            u[self.order] = spsolve_triangular(self._lower.T, scaled, lower=False, unit_diagonal=True)
+        split, u = self._sparse, np.empty_like(y, dtype=float)
+        corner, coupling, tail = self._blocks
+        last = scipy.linalg.solve_triangular(tail, y[split:], check_finite=False) if len(tail) else y[split:]
+        u[self.order[split:]] = last
+        first = _rows(1.0 / self._root[:split], y[:split]) - coupling @ last
+        if first.size:
+            u[self.order[:split]] = spsolve_triangular(corner, first, lower=False, unit_diagonal=True)
         return u
 
     def down_inverse(self, right: Array) -> Array:

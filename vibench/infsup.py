@@ -120,7 +120,8 @@ def beta_span(on_span: Array) -> float:
 
 def inf_sup_on(Z: Array, B: SparseMatrix, cone: Multipliers) -> InfSup:
     """Constants of a primal space with V-orthonormal basis Z (n×N') at the parameter of B (m×n)."""
-    return inf_sup(on_basis(Z, B, cone.span), on_basis(Z, B, cone.chi), cone)
+    images = on_basis(Z, B, np.hstack([cone.span, cone.chi]))
+    return inf_sup(images[:, : cone.rank], images[:, cone.rank :], cone)
 
 
 def inf_sup_full(V: InnerProduct, B: SparseMatrix, cone: Multipliers) -> InfSup:

@@ -187,7 +187,7 @@ def contact_factor(V: InnerProduct, dofs: Indices) -> tuple[SparseCholesky, Arra
 @lru_cache(maxsize=FACTORS)
 def _contact_factor(V: InnerProduct, dofs: bytes) -> tuple[SparseCholesky, Array]:
     last = np.frombuffer(dofs, np.intp)
-    factor = SparseCholesky(V.matrix, "X_V", elimination_order(V.matrix, last))
+    factor = SparseCholesky(V.matrix, "X_V", elimination_order(V.matrix, last), len(last))
     return factor, factor.tail(len(last))
 
 
