@@ -32,6 +32,10 @@ class Images:
     of_classes: Sequence[Array]
     classes: ConstraintClasses
 
+    def first(self, rows: int) -> Images:
+        """Those of the first vectors of Z alone."""
+        return Images([image[:rows] for image in self.of_classes], self.classes)
+
     def beta_span(self) -> Array:
         """β_span at every parameter (P,)."""
         return self.classes.everywhere([beta_span(image) for image in self.of_classes])

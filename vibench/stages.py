@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -124,10 +125,21 @@ class TrainingConstants(Stage):
 
 @dataclass(frozen=True)
 class AssessedGrowth:
-    """A growth, and the smallest β_span over the training set after every vector (S+1,)."""
+    """A growth, and what it reaches on the training set.
+
+    Attributes
+    ----------
+    grown
+        The vectors and where they passed the tolerances.
+    steps
+        The smallest β_span after every vector (S+1,).
+    training
+        β_span at every parameter (P,) by the tolerance that was reached.
+    """
 
     grown: Grown
     steps: Array
+    training: Mapping[float, Array]
 
 
 @dataclass(frozen=True)
@@ -152,8 +164,10 @@ class GrowthStage(Stage):
         """An `AssessedGrowth`; its seconds are counted where its tolerances are."""
         offline = _offline(store, self.pod, self.cone)
         grown = grow_through(self.primal.create(), offline, self.tolerances)
-        images = _images(offline, grown.vectors, value_of(store, self.constraints))
-        return Result(AssessedGrowth(grown, images.over_steps(offline.basis.shape[1])))
+        check_enrichment(Enrichment(Kind.FIXED, vectors=grown.vectors), offline.problem.V, offline.basis)
+        images, size = _images(offline, grown.vectors, value_of(store, self.constraints)), offline.basis.shape[1]
+        training = {tolerance: images.first(size + m.count).beta_span() for tolerance, m in grown.milestones.items()}
+        return Result(AssessedGrowth(grown, images.over_steps(size), training))
 
 
 @dataclass(frozen=True)
@@ -183,25 +197,24 @@ class EnrichmentStage(Stage):
 
     def run(self, store: Store) -> Result:
         """Build the enrichment; what it reaches on the training set is assessed, not timed."""
-        offline, steps = _offline(store, self.pod, self.cone), None
         if self.growth is not None and self.tolerance is not None:
             growth: AssessedGrowth = value_of(store, self.growth)
             enrichment, seconds = growth.grown.at(self.tolerance)
-            steps = growth.steps
+            reached = {"beta_span_min": growth.steps[: growth.grown.milestones[self.tolerance].count + 1]}
+            reached |= {"beta_span_training": growth.training[self.tolerance]}
         else:
-            strategy = self.primal.create()
+            offline, strategy = _offline(store, self.pod, self.cone), self.primal.create()
             enrichment, seconds = timed(lambda: strategy.build(offline, self.tolerance))
-        check_enrichment(enrichment, offline.problem.V, offline.basis)
-        found = {quantity: tuple(values) for quantity, values in enrichment.history.items()}
-        if enrichment.vectors is not None:
-            images = _images(offline, enrichment.vectors, value_of(store, self.reached.constraints))
-            steps = images.over_steps(offline.basis.shape[1]) if steps is None else steps
-            found |= {
-                "beta_span_min": tuple(steps[: enrichment.vectors.shape[1] + 1]),
-                "beta_span_training": tuple(images.beta_span()),
-                "beta_full_span_training": tuple(value_of(store, self.reached)),
-            }
-        histories = (History({"stage": "enrichment"}, quantity, values) for quantity, values in found.items())
+            check_enrichment(enrichment, offline.problem.V, offline.basis)
+            reached = {}
+            if enrichment.vectors is not None:
+                images = _images(offline, enrichment.vectors, value_of(store, self.reached.constraints))
+                reached = {"beta_span_min": images.over_steps(offline.basis.shape[1])}
+                reached |= {"beta_span_training": images.beta_span()}
+        if reached:
+            reached |= {"beta_full_span_training": value_of(store, self.reached)}
+        found = (dict(enrichment.history) | reached).items()
+        histories = (History({"stage": "enrichment"}, quantity, tuple(values)) for quantity, values in found)
         return Result(enrichment, seconds, tuple(histories))
 
 
