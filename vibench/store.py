@@ -82,11 +82,12 @@ class Store:
         if key in self._recent:
             return self._recent[key]
         try:
-            content = self._path(key).read_bytes()
+            whole = memoryview(self._path(key).read_bytes())
             size = hashlib.sha256().digest_size
-            if hashlib.sha256(content[size:]).digest() != content[:size]:
+            digest, content = whole[:size], whole[size:]
+            if hashlib.sha256(content).digest() != digest:
                 return None  # cut off, or changed on the disk
-            artefact = pickle.loads(content[size:])
+            artefact = pickle.loads(content)
         except (FileNotFoundError, pickle.UnpicklingError, EOFError, AttributeError, ImportError):
             return None  # not there, or of classes that are not there any more
         except OSError as error:
