@@ -199,20 +199,21 @@ def _reduced(model: OnlineModel, mus: Array, known: Known) -> Assembled:
 def _in_full(model: ReducedModel, mus: Array, forms: Sequence[Seconds], known: Known) -> Assembled:
     """Assemble the high-fidelity matrices, which are timed once for all models, and project them.
 
-    On a space that does not vary a projection takes as long at every parameter: it is timed at the first.
+    On a space that does not vary a projection takes as long at every parameter, and is timed at the first.
     """
-    matrices, varies = assemblies(model.problem), model.kind is Kind.PER_PARAMETER
-    first, projecting = median_seconds(partial(model.reduce, matrices.at(mus[0])))
-    programs, seconds = [], []
-    for k, mu in enumerate(mus):
-        if known:
-            program = beginning(known[k], len(first.program.f))
-        else:
-            found, spent = timed(partial(model.reduce, matrices.at(mu)))
-            program, projecting = found.program, spent if varies else projecting
-        programs.append(program)
-        seconds.append(forms[k] + projecting)
-    return Assembled(tuple(programs), None, tuple(seconds), (0.0,) * len(mus))
+    matrices = assemblies(model.problem)
+    at_first = partial(model.reduce, matrices.at(mus[0]))
+    if model.kind is Kind.PER_PARAMETER:
+        at_first()  # what is made once for all parameters
+        each = [timed(partial(model.reduce, matrices.at(mu))) for mu in mus]
+        programs, projecting = [found.program for found, _ in each], [seconds for _, seconds in each]
+    else:
+        first, seconds = median_seconds(at_first)
+        size, projecting = len(first.program.f), [seconds] * len(mus)
+        whole = known or [model.reduce(matrices.at(mu)).program for mu in mus]
+        programs = [beginning(program, size) for program in whole]
+    total = tuple(form + spent for form, spent in zip(forms, projecting, strict=True))
+    return Assembled(tuple(programs), None, total, (0.0,) * len(mus))
 
 
 def _largest_difference(found: VariationalInequality, exact: VariationalInequality) -> float:

@@ -20,7 +20,7 @@ from vibench.provenance import machine
 from vibench.qp import Status
 from vibench.query import Asked, Row, Task
 from vibench.stage import Failed, Pieces, PiecewiseStage, Stage, value_of
-from vibench.stages import ReducedCone
+from vibench.stages import ReducedCone, enrichment_of
 from vibench.store import Artefact, Store
 from vibench.strategy import Kind
 from vibench.sweeps import ReferenceConstants, gather, sweep, training
@@ -172,7 +172,7 @@ class Queries(Pieces):
     def _sizes(self) -> Row:
         """Dimensions, fallbacks, memory."""
         enrichment = self._stage.assembly.enrichment
-        built, cone = value_of(self._store, enrichment), self._cone
+        built, cone = enrichment_of(self._store, enrichment), self._cone
         size = value_of(self._store, enrichment.pod).basis.shape[1]
         fallbacks = [*cone.cone.fallbacks, *built.fallbacks, *([self._note] if self._note else [])]
         for purpose, chunks in (("training", training(enrichment.pod.problem)), ("validation", self._stage.validation)):

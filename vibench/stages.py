@@ -196,7 +196,7 @@ class EnrichmentStage(Stage):
         return known if self.growth is None else (*known, self.growth)
 
     def run(self, store: Store) -> Result:
-        """Build the enrichment; what it reaches on the training set is assessed, not timed."""
+        """Build the enrichment, which `enrichment_of` gives; what it reaches on the training set is not timed."""
         if self.growth is not None and self.tolerance is not None:
             growth: AssessedGrowth = value_of(store, self.growth)
             enrichment, seconds = growth.grown.at(self.tolerance)
@@ -215,7 +215,7 @@ class EnrichmentStage(Stage):
             reached |= {"beta_full_span_training": value_of(store, self.reached)}
         found = (dict(enrichment.history) | reached).items()
         histories = (History({"stage": "enrichment"}, quantity, tuple(values)) for quantity, values in found)
-        return Result(enrichment, seconds, tuple(histories))
+        return Result(enrichment if self.growth is None else None, seconds, tuple(histories))
 
 
 def _offline(store: Store, pod: PODStage, cone: ConeStage) -> Offline:
@@ -231,6 +231,15 @@ def _images(offline: Offline, vectors: Array, classes: ConstraintClasses) -> Ima
     return Images([on_basis(Z, B, offline.span) for B in classes.representatives], classes)
 
 
+def enrichment_of(store: Store, stage: EnrichmentStage) -> Enrichment:
+    """The enrichment of a stage that has been run; the beginning of a growth is stored with the growth alone."""
+    if stage.growth is None or stage.tolerance is None:
+        found: Enrichment = value_of(store, stage)
+        return found
+    growth: AssessedGrowth = value_of(store, stage.growth)
+    return growth.grown.at(stage.tolerance)[0]
+
+
 def enrichment_stage(cell: Cell) -> EnrichmentStage:
     """The stage that completes the reduced model of a cell."""
     cone = ConeStage(cell.problem, cell.dual, cell.cone)
@@ -240,7 +249,7 @@ def enrichment_stage(cell: Cell) -> EnrichmentStage:
 def reduced_model(store: Store, stage: EnrichmentStage) -> tuple[ReducedModel, Array, Multipliers]:
     """The reduced model of an enrichment, the basis of V_N it extends and the prepared multipliers."""
     basis: POD = value_of(store, stage.pod)
-    model = _model(store, stage.pod, stage.cone, value_of(store, stage))
+    model = _model(store, stage.pod, stage.cone, enrichment_of(store, stage))
     return model, basis.basis, value_of(store, stage.cone).prepared
 
 
