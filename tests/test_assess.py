@@ -1,12 +1,16 @@
 from __future__ import annotations
 
+from dataclasses import astuple
+
 import numpy as np
+import pytest
 import scipy.sparse as sp
 
 from numerics import Varying
 from vibench import highfidelity
 from vibench.assess import Reference, constants_full, constants_on, errors
-from vibench.infsup import inf_sup_full, inf_sup_on, multipliers
+from vibench.error_bounds import Stability, bounds, extreme_quotients
+from vibench.infsup import inf_sup_full, inf_sup_on, multipliers, nodal_multipliers
 
 
 def test_errors_as_defined() -> None:
@@ -14,10 +18,10 @@ def test_errors_as_defined() -> None:
     mu = np.array([0.5])
     vi = problem.assemble(mu)
     exact = highfidelity.solve(vi)
-    reference = Reference(exact.u, exact.lam, 0.0, 0.0)
+    reference = Reference(exact.u[:, None], exact.lam[:, None], 0.0, 0.0)
     rng = np.random.default_rng(0)
     du, dlam = 1e-3 * rng.standard_normal(30), 1e-2 * rng.standard_normal(8)
-    found = errors(problem, vi, reference, exact.u + du, exact.lam + dlam)
+    (found,) = errors(problem, [vi], reference, (exact.u + du)[:, None], (exact.lam + dlam)[:, None])
     X, Y, A = problem.V.matrix, problem.W.matrix, vi.A
     assert np.isclose(found.u, np.sqrt((du @ (X @ du)) / (exact.u @ (X @ exact.u))))
     assert np.isclose(found.lam, np.sqrt((dlam @ (Y @ dlam)) / (exact.lam @ (Y @ exact.lam))))
@@ -25,7 +29,7 @@ def test_errors_as_defined() -> None:
     integrals = Y @ np.ones(8)
     assert np.isclose(found.violation, max(0.0, np.max((vi.B @ (exact.u + du) - vi.g) / integrals)))
     assert np.isclose(found.complementarity, exact.lam @ (vi.B @ du), atol=1e-12)
-    nothing = errors(problem, vi, reference, exact.u, exact.lam)
+    (nothing,) = errors(problem, [vi], reference, exact.u[:, None], exact.lam[:, None])
     assert (nothing.u, nothing.lam, nothing.energy) == (0.0, 0.0, 0.0)
     assert nothing.violation < 1e-10
 
@@ -33,10 +37,29 @@ def test_errors_as_defined() -> None:
 def test_a_solution_below_the_floor_is_measured_against_the_floor() -> None:
     problem = Varying()
     vi = problem.assemble(np.array([0.5]))
-    lam = np.zeros(8)
+    u, lam = np.zeros((30, 1)), np.zeros((8, 1))
     lam[0] = 1e-3
-    found = errors(problem, vi, Reference(np.zeros(30), np.zeros(8), 1.0, 2.0), np.zeros(30), lam)
-    assert np.isclose(found.lam, float(problem.W.norm(lam)) / 2.0)
+    (found,) = errors(problem, [vi], Reference(u, 0.0 * lam, 1.0, 2.0), u, lam)
+    assert np.isclose(found.lam, float(problem.W.norm(lam)[0]) / 2.0)
+
+
+def test_errors_and_bounds_of_many_queries_are_those_of_each() -> None:
+    problem, rng = Varying(), np.random.default_rng(3)
+    mus = [np.array([value]) for value in (0.1, 0.5, 0.9)]
+    vis = [problem.assemble(mu) for mu in mus]
+    exact = [highfidelity.solve(vi) for vi in vis]
+    reference = Reference(np.column_stack([s.u for s in exact]), np.column_stack([s.lam for s in exact]), 0.0, 0.0)
+    u = reference.u + 1e-3 * rng.standard_normal(reference.u.shape)
+    lam = reference.lam + 1e-2 * rng.random(reference.lam.shape)
+    cone = nodal_multipliers(problem.W)
+    known = [Stability(inf_sup_full(problem.V, vi.B, cone), *extreme_quotients(vi.A, problem.V)) for vi in vis]
+    together, certified = errors(problem, vis, reference, u, lam), bounds(problem, vis, known, u, lam)
+    for k, vi in enumerate(vis):
+        (alone,) = errors(problem, [vi], reference.at([k]), u[:, [k]], lam[:, [k]])
+        assert astuple(together[k]) == pytest.approx(astuple(alone), rel=1e-10, abs=1e-12)
+        (bound,) = bounds(problem, [vi], [known[k]], u[:, [k]], lam[:, [k]])
+        assert certified[k] is not None
+        assert astuple(certified[k]) == pytest.approx(astuple(bound), rel=1e-10)
 
 
 def test_constants_shared_by_proportional_matrices_are_those_of_each() -> None:

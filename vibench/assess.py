@@ -16,7 +16,7 @@ from vibench.supremizer import ConstraintClasses, constraint_classes, supremizer
 
 @dataclass(frozen=True)
 class Reference:
-    """High-fidelity solution u (n,), λ (m,) at one parameter, and the floors of the relative errors.
+    """High-fidelity solutions, columns of u (n×P) and λ (m×P), and the floors of the relative errors.
 
     The floors are 1e-12 of the largest training norms: below them a solution counts as zero.
     """
@@ -25,6 +25,10 @@ class Reference:
     lam: Array
     floor_u: float
     floor_lam: float
+
+    def at(self, numbers: Sequence[int]) -> Reference:
+        """Those at some of the parameters."""
+        return Reference(self.u[:, numbers], self.lam[:, numbers], self.floor_u, self.floor_lam)
 
 
 @dataclass(frozen=True)
@@ -52,24 +56,34 @@ class Errors:
     complementarity: float
 
 
-def errors(problem: Problem, vi: VariationalInequality, reference: Reference, u: Array, lam: Array) -> Errors:
-    """Errors of a reduced u (n,) and λ (m,) at the parameter of `vi`."""
+def errors(
+    problem: Problem, vis: Sequence[VariationalInequality], reference: Reference, u: Array, lam: Array
+) -> list[Errors]:
+    """Errors of reduced u (n×P) and λ (m×P), column by column at the parameters of `vis`."""
     V, W = problem.V, problem.W
     du, dlam = u - reference.u, lam - reference.lam
-    norm_u = max(float(V.norm(reference.u)), reference.floor_u)
-    norm_lam = max(float(W.norm(reference.lam)), reference.floor_lam)
-    energy = np.sqrt(max(float(reference.u @ (vi.A @ reference.u)), 0.0))
-    excess = vi.B @ u - vi.g
-    error_u, error_lam = float(V.norm(du)), float(W.norm(dlam))
-    return Errors(
-        u=_over(error_u, norm_u),
-        lam=_over(error_lam, norm_lam),
-        energy=_over(np.sqrt(max(float(du @ (vi.A @ du)), 0.0)), energy),
-        absolute_u=error_u,
-        absolute_lam=error_lam,
-        violation=float(np.max(excess / problem.multiplier_integrals(), initial=0.0)),
-        complementarity=float(reference.lam @ excess),
-    )
+    norm_u = np.maximum(V.norm(reference.u), reference.floor_u)
+    norm_lam = np.maximum(W.norm(reference.lam), reference.floor_lam)
+    error_u, error_lam, integrals = V.norm(du), W.norm(dlam), problem.multiplier_integrals()
+    found = []
+    for k, vi in enumerate(vis):
+        excess = vi.B @ u[:, k] - vi.g
+        found.append(
+            Errors(
+                u=_over(float(error_u[k]), float(norm_u[k])),
+                lam=_over(float(error_lam[k]), float(norm_lam[k])),
+                energy=_over(_energy(vi, du[:, k]), _energy(vi, reference.u[:, k])),
+                absolute_u=float(error_u[k]),
+                absolute_lam=float(error_lam[k]),
+                violation=float(np.max(excess / integrals, initial=0.0)),
+                complementarity=float(reference.lam[:, k] @ excess),
+            )
+        )
+    return found
+
+
+def _energy(vi: VariationalInequality, u: Array) -> float:
+    return float(np.sqrt(max(float(u @ (vi.A @ u)), 0.0)))
 
 
 def _over(value: float, scale: float) -> float:

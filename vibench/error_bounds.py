@@ -19,6 +19,7 @@ c₂ = (δ_s1 δ_r/β + δ_s2)/α,
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -80,19 +81,27 @@ def extreme_quotients(A: SparseMatrix, V: InnerProduct) -> tuple[float, float]:
     return (1.0 - MARGIN) * float(smallest), (1.0 + MARGIN) * float(largest)
 
 
-def bounds(problem: Problem, vi: VariationalInequality, stability: Stability, u: Array, lam: Array) -> Bounds | None:
-    """Δ_u and Δ_λ of a reduced solution u (n,), λ (m,) at the parameter of `vi`; see the module.
+def bounds(
+    problem: Problem, vis: Sequence[VariationalInequality], known: Sequence[Stability], u: Array, lam: Array
+) -> list[Bounds | None]:
+    """Δ_u and Δ_λ of reduced u (n×P), λ (m×P), column by column at the parameters of `vis`; see the module.
 
     Infinite where β_HF over the span is zero; `None` where λ is not in W⁺ and nothing is certified.
     """
+    left = [vi.f - vi.A @ u[:, k] - vi.B.T @ lam[:, k] for k, vi in enumerate(vis)]
+    residuals = np.linalg.norm(problem.V.whiten_functional(np.column_stack(left)), axis=0)
+    return [
+        _bound(problem.W, vi.B @ u[:, k] - vi.g, lam[:, k], float(residuals[k]), known[k]) for k, vi in enumerate(vis)
+    ]
+
+
+def _bound(W: InnerProduct, excess: Array, lam: Array, residual: float, stability: Stability) -> Bounds | None:
+    """The bounds from s (m,), λ_N (m,) and δ_r."""
     if np.min(lam, initial=0.0) < 0.0:
         return None
-    V, W = problem.V, problem.W
     alpha, gamma, beta = stability.coercivity, stability.continuity, stability.inf_sup.span
     if beta <= 0.0:
         return Bounds(float("inf"), float("inf"))
-    residual = float(np.linalg.norm(V.whiten_functional(vi.f - vi.A @ u - vi.B.T @ lam)))
-    excess = vi.B @ u - vi.g
     penetration = cone.onto_orthant(excess, W)
     size = float(W.norm(penetration))
     mismatch = float(penetration @ W.apply(lam)) + max(0.0, -float(excess @ lam))

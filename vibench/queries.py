@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import resource
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 
+from vibench.agreement import vectors
 from vibench.arrays import Array
 from vibench.assembly import Assembled, AssemblyStage, assembly_columns, query_model
 from vibench.assess import Reference
@@ -18,7 +19,7 @@ from vibench.infsup import InfSup
 from vibench.problem import ParameterBox, VariationalInequality
 from vibench.provenance import machine
 from vibench.qp import Status
-from vibench.query import Asked, Row, Task
+from vibench.query import Asked, Row, Task, assess
 from vibench.stage import Failed, Pieces, PiecewiseStage, Stage, value_of
 from vibench.stages import ReducedCone, enrichment_of
 from vibench.store import Artefact, Store
@@ -112,19 +113,8 @@ class Queries(Pieces):
 
     def piece(self, number: int, watch: Callable[[bool], None]) -> Answered:
         """The rows of one query."""
-        reference, k = self._reference, number
-        exact = Reference(reference.u[:, k], reference.lam[:, k], *self._floors)
-        assembled = self._assembled
-        asked = Asked(
-            self._model,
-            reference.mu[k],
-            assembled.programs[k],
-            assembled.factor,
-            assembled.seconds[k],
-            exact,
-            self._stability[k],
-            self._before(k),
-        )
+        assembled, k = self._assembled, number
+        asked = Asked(assembled.programs[k], assembled.factor, assembled.seconds[k], self._before(k))
         found, solution = self._task.run(asked, watch)
         return self._known(k) | found, solution and {"query": k} | solution
 
@@ -151,10 +141,23 @@ class Queries(Pieces):
 
     def finish(self, pieces: Sequence[Answered]) -> CellRows:
         """All rows; the cell's are means and extremes over the queries."""
-        rows, solutions = [row for row, _ in pieces], [solution for _, solution in pieces if solution is not None]
+        solutions = {k: solution for k, (_, solution) in enumerate(pieces) if solution is not None}
+        assessed = dict(zip(solutions, self._assess(solutions), strict=True))
+        rows = [row | assessed.get(k, {}) for k, (row, _) in enumerate(pieces)]
         slowdown = max(self._slowdown, calibration().slowdown())
         found = summarise(rows, slowdown)
-        return CellRows(found | self._sizes() | self._offline(), tuple(rows), tuple(solutions))
+        return CellRows(found | self._sizes() | self._offline(), tuple(rows), tuple(solutions.values()))
+
+    def _assess(self, solutions: Mapping[int, Row]) -> list[Row]:
+        """What comparing the solutions of some queries with the high-fidelity ones gives, row by row."""
+        numbers, reference = list(solutions), self._reference
+        return assess(
+            self._model,
+            reference.mu[numbers],
+            [vectors(solution) for solution in solutions.values()],
+            Reference(reference.u, reference.lam, *self._floors).at(numbers),
+            [self._stability[k] for k in numbers],
+        )
 
     def _known(self, number: int) -> Row:
         """What is known of a query before it is asked: where, and the inf-sup constants there."""

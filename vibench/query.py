@@ -1,22 +1,25 @@
-"""One query: a reduced problem solved (timed), judged, and compared with the high-fidelity solution (not timed)."""
+"""Queries: a reduced problem solved (timed) and judged, and solutions compared with the high-fidelity ones (not)."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
+
+import numpy as np
 
 from vibench import judgement, plugins, qp
 from vibench.agreement import slack, solution_row
 from vibench.arrays import Array
 from vibench.assembly import Model
-from vibench.assess import Reference, errors
-from vibench.error_bounds import Stability, bounds
+from vibench.assess import Errors, Reference, errors
+from vibench.error_bounds import Bounds, Stability, bounds
 from vibench.errors import in_a_line
 from vibench.problem import VariationalInequality
 from vibench.qp import Answer, Status
 from vibench.stage import assemblies
+from vibench.strategy import Kind
 from vibench.timing import Seconds, median_seconds
 
 Row = dict[str, Any]
@@ -32,26 +35,18 @@ class Asked:
 
     Attributes
     ----------
-    model, mu
-        The reduced model and the parameter (d,).
     program, factor
-        Its reduced program, and the Cholesky factor of A where it is known.
+        The reduced program, and the Cholesky factor of A where it is known.
     seconds
         What assembling the program takes.
-    exact, stability
-        The high-fidelity solution and constants.
     before
         Program of the parameter whose solution the solver starts from, and the number of that query; `None` to start
         from nothing.
     """
 
-    model: Model
-    mu: Array
     program: VariationalInequality
     factor: Array | None
     seconds: Seconds
-    exact: Reference
-    stability: Stability
     before: tuple[int, VariationalInequality] | None = None
 
 
@@ -105,7 +100,6 @@ class Task:
         if residuals is None or answer.x is None or answer.alpha is None:
             return row, None
         row |= {"primal_residual": residuals.primal, "dual_residual": residuals.dual, "gap": residuals.gap}
-        row |= _assessed(asked, answer.x, answer.alpha)
         return row, solution_row(answer.x, answer.alpha, slack(program, answer.x, answer.alpha, self.accuracy))
 
 
@@ -115,26 +109,38 @@ def _same(one: Answer, other: Answer) -> bool:
     return all((a is b) if a is None or b is None else a.tobytes() == b.tobytes() for a, b in pairs)
 
 
-def _assessed(asked: Asked, x: Array, alpha: Array) -> Row:
-    """Errors, their certified bounds and effectivities."""
-    model, mu, exact, known = asked.model, asked.mu, asked.exact, asked.stability
-    problem, vi = model.problem, assemblies(model.problem).at(mu)
-    u, lam = model.lift(mu, vi, x[:, None])[:, 0], model.generators @ alpha
-    found = errors(problem, vi, exact, u, lam)
+def assess(
+    model: Model, mus: Array, answers: Sequence[tuple[Array, Array]], exact: Reference, known: Sequence[Stability]
+) -> list[Row]:
+    """Errors of solutions (x, α), one per parameter of `mus` (P×d), their certified bounds and effectivities."""
+    if not answers:
+        return []
+    problem = model.problem
+    vis = [assemblies(problem).at(mu) for mu in mus]
+    if model.kind is Kind.PER_PARAMETER:
+        asked = zip(mus, vis, answers, strict=True)
+        u = np.hstack([model.lift(mu, vi, x[:, None]) for mu, vi, (x, _) in asked])
+    else:
+        u = model.lift(mus[0], vis[0], np.column_stack([x for x, _ in answers]))
+    lam = model.generators @ np.column_stack([alpha for _, alpha in answers])
+    found = zip(errors(problem, vis, exact, u, lam), bounds(problem, vis, known, u, lam), strict=True)
+    return [_columns(error, bound) for error, bound in found]
+
+
+def _columns(error: Errors, bound: Bounds | None) -> Row:
     row = {
-        "error_u": found.u,
-        "error_lambda": found.lam,
-        "error_energy": found.energy,
-        "error_u_absolute": found.absolute_u,
-        "error_lambda_absolute": found.absolute_lam,
-        "violation": found.violation,
-        "complementarity": found.complementarity,
+        "error_u": error.u,
+        "error_lambda": error.lam,
+        "error_energy": error.energy,
+        "error_u_absolute": error.absolute_u,
+        "error_lambda_absolute": error.absolute_lam,
+        "violation": error.violation,
+        "complementarity": error.complementarity,
     }
-    certified = bounds(problem, vi, known, u, lam)
-    if certified is not None:
-        row |= {"bound_u": certified.u, "bound_lambda": certified.lam}
-        if found.u > UNMEASURABLE:
-            row["effectivity_u"] = certified.u / found.absolute_u
-        if found.lam > UNMEASURABLE:
-            row["effectivity_lambda"] = certified.lam / found.absolute_lam
+    if bound is not None:
+        row |= {"bound_u": bound.u, "bound_lambda": bound.lam}
+        if error.u > UNMEASURABLE:
+            row["effectivity_u"] = bound.u / error.absolute_u
+        if error.lam > UNMEASURABLE:
+            row["effectivity_lambda"] = bound.lam / error.absolute_lam
     return row

@@ -154,7 +154,7 @@ class Material:
 
         def make() -> list[Query]:
             mus = validation_parameters(problem, QUERIES, SEED)
-            exact = [Reference(s.u, s.lam, *floors) for s in solve_all(problem, mus)]
+            exact = [Reference(s.u[:, None], s.lam[:, None], *floors) for s in solve_all(problem, mus)]
             return [Query(mu, checked_assembly(problem, mu), known) for mu, known in zip(mus, exact, strict=True)]
 
         return self._once("validation", make)

@@ -154,7 +154,7 @@ def of_queries(material: Material, model: Model, solve: Solve, accuracy: float) 
 
 
 def _errors(material: Material, query: Query, u: Array, lam: Array) -> dict[str, float]:
-    found = errors(material.problem, query.vi, query.exact, u, lam)
+    (found,) = errors(material.problem, [query.vi], query.exact, u[:, None], lam[:, None])
     return {"error_u": found.u, "error_lambda": found.lam}
 
 
