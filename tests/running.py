@@ -123,7 +123,7 @@ def assert_same_numbers(one: Path, other: Path) -> None:
             pd.testing.assert_frame_equal(*close, rtol=1e-5, atol=1e-9)
 
 
-UNSOLVED = ("cell", "model", "N", "R", "rank", "enrichment", "dim_", "beta_", "mu_", "code", "definition")
+UNSOLVED = ("cell", "model", "N", "R", "rank", "gram", "enrichment", "dim_", "beta_", "mu_", "code", "definition")
 """How the columns begin that do not depend on what a solver answers."""
 
 

@@ -105,6 +105,33 @@ def test_histories_of_the_offline_stages(store: Store) -> None:
     assert np.isclose(min(own), added["beta_span_min"][-1])
 
 
+@pytest.mark.parametrize("interpolation", [None, 1e-6])
+def test_a_cell_grown_along_others_is_the_cell_alone(store: Store, tmp_path: Path, interpolation: float | None) -> None:
+    alone = cell("offline-pga", 0.5)
+    enrichment = replace(alone.assembly.enrichment, along=(0.3, 0.5, 0.9))
+    grown = replace(alone, assembly=replace(alone.assembly, enrichment=enrichment, interpolation=interpolation))
+    beside = Store(tmp_path)
+    carry_out(grown, beside)
+    expected, found = value_of(store, alone).cell, value_of(beside, grown).cell
+    assert found["enrichment"] == expected["enrichment"] > 0
+    assert beside.get(enrichment.key).value is None  # its vectors are stored with the growth
+    for name in ("error_u_mean", "error_lambda_mean", "beta_span_min", "beta_cone_upper_min"):
+        assert found[name] == pytest.approx(expected[name], rel=1e-6), name
+    assert found["assembly_error_max"] < 1e-5
+    histories = [
+        {h.quantity: h.values for h in some.get(stage.key).histories}
+        for some, stage in ((store, alone.assembly.enrichment), (beside, enrichment))
+    ]
+    assert histories[0].keys() == histories[1].keys()
+    for quantity, values in histories[0].items():
+        assert histories[1][quantity] == pytest.approx(values, rel=1e-9), quantity
+    if interpolation is None:
+        programs = [value_of(some, c.assembly).programs for some, c in ((store, alone), (beside, grown))]
+        for one, other in zip(*programs, strict=True):
+            assert np.allclose(one.A, other.A, rtol=1e-10, atol=1e-13)
+            assert np.allclose(one.B, other.B, rtol=1e-10, atol=1e-13)
+
+
 def test_the_model_behind_a_cell_is_ready_for_queries(store: Store) -> None:
     model, basis, prepared = reduced_model(store, cell("online-supremizers", None).assembly.enrichment)
     assert model.kind is Kind.PER_PARAMETER
@@ -132,6 +159,9 @@ def test_rows_of_a_cell(store: Store, primal: str, tolerance: float | None, kind
     enrichment = store.get(cell(primal, tolerance).assembly.enrichment.key)
     assert rows.cell["offline_enrichment_s"] == enrichment.seconds.cpu
     assert rows.cell["online_s"] == pytest.approx(rows.cell["online_assemble_s"] + rows.cell["online_solve_s"])
+    chi = value_of(store, cell(primal, tolerance).assembly.enrichment.cone).cone.generators
+    gram = chi.T @ (PROBLEM.create().W.matrix @ chi)
+    assert rows.cell["gram_condition"] == pytest.approx(np.linalg.cond(gram), rel=1e-6)
     expected = {"none": 0, "per-parameter": rows.cell["rank"]}
     if kind in expected:
         assert rows.cell["enrichment"] == expected[kind]

@@ -60,6 +60,7 @@ _CELLS: Mapping[str, Column] = {
     "N": Column("", "Dimension of V_N."),
     "R": Column("", "Generators of the cone."),
     "rank": Column("", "Numerical rank of the generators: dimension of their span."),
+    "gram_condition": Column("", "Condition number of the Gram matrix of the generators in W."),
     "enrichment": Column("", "Vectors added to V_N; of an enrichment per parameter, the rank of the generators."),
     "enrichment_kind": Column("", "none, fixed or per-parameter."),
     "interpolation_tol": Column(

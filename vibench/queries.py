@@ -190,6 +190,7 @@ class Queries(Pieces):
             "N": size,
             "R": cone.cone.size,
             "rank": cone.prepared.rank,
+            "gram_condition": float(np.linalg.cond(cone.prepared.gram)) if cone.cone.size else None,
             "enrichment": cone.prepared.rank if built.kind is Kind.PER_PARAMETER else added,
             **assembly_columns(self._store, self._stage.assembly),
             "fallbacks": "; ".join(fallbacks),

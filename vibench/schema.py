@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-VERSION = 5
+VERSION = 6
 """Schema version of a results file; a file of another version is refused."""
 
 KEYS: Mapping[str, str] = {
@@ -37,6 +37,7 @@ CELLS: Mapping[str, str] = {
     "N": "INTEGER",
     "R": "INTEGER",
     "rank": "INTEGER",
+    "gram_condition": "REAL",
     "enrichment": "INTEGER",
     "enrichment_kind": "TEXT",
     "interpolation_tol": "REAL",

@@ -1,0 +1,267 @@
+"""What the study `field` found: tables, figures, and who wins by which measure.
+
+vibench run field --no-figures && python results/field.py runs/field results/field
+
+Everything is computed from the results file: β_S and β_on at the training parameters from the histories, the rest from
+the cells.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from matplotlib.figure import Figure
+
+from vibench import tables
+from vibench.figures.data import label
+from vibench.figures.style import COLOURS, MARKERS, Sheet, logarithmic, plot, save, styled
+
+SHARES = (0.3, 0.5, 0.7, 0.9)
+REFERENCE = "mcpg"
+CONTROL = "pod-dual (negative control)"
+"""Not in the cone: drawn, and no competitor."""
+
+HUES = (*COLOURS, "0.6")
+PAIR = ["problem", "pod_tol", "dual_tol"]
+CELL = [*PAIR, "dual", "primal", "primal_tol"]
+
+
+@dataclass(frozen=True)
+class Field:
+    """The run.
+
+    Attributes
+    ----------
+    cells
+        One row per cell.
+    steps
+        One row per enrichment and number of vectors: the smallest β_S over the training set as a share of the smallest
+        β_on there.
+    """
+
+    cells: pd.DataFrame
+    steps: pd.DataFrame
+
+    @classmethod
+    def read(cls, path: Path) -> Field:
+        """From a results file."""
+        cells = tables.in_order(tables.read(path, "cells"))
+        histories = tables.read(path, "histories")
+        histories = histories[histories["stage"] == "enrichment"]
+        online = histories[histories["quantity"] == "beta_full_span_training"].groupby("artefact")["value"].min()
+        steps = histories[histories["quantity"] == "beta_span_min"].copy()
+        steps["share"] = steps["value"] / steps["artefact"].map(online)
+        return cls(cells, steps.sort_values(["artefact", "step"]))
+
+    def longest(self) -> Iterator[tuple[tuple[Any, ...], pd.DataFrame]]:
+        """Of every strategy the enrichment with most vectors, in the order of the cells: its key and its steps.
+
+        The key is problem, both tolerances, dual and primal strategy.
+        """
+        strategies = [*PAIR, "dual", "primal"]
+        grouped = dict(list(self.steps.groupby(strategies)))
+        for key in self.cells[strategies].drop_duplicates().itertuples(index=False, name=None):
+            if key in grouped:
+                last = grouped[key].groupby("artefact")["step"].max().idxmax()
+                yield key, grouped[key][grouped[key]["artefact"] == last]
+
+    @property
+    def tight(self) -> pd.DataFrame:
+        """Cells at the tighter of the two accuracies."""
+        return self.cells[self.cells["pod_tol"] == self.cells["pod_tol"].min()]
+
+
+def vectors(field: Field) -> pd.DataFrame:
+    """How many vectors every fixed enrichment takes for the shares of β_on, one after the other."""
+    rows: dict[tuple[Any, ...], dict[str, str]] = {}
+    for key, steps in field.longest():
+        share = steps["share"].to_numpy()
+        reached = [next((str(k) for k, value in enumerate(share) if value >= s), "–") for s in SHARES]
+        rows.setdefault(key[:4], {})[key[4]] = " / ".join(reached)
+    found = pd.DataFrame.from_dict(rows, orient="index")
+    found.index = pd.MultiIndex.from_tuples(found.index, names=[*PAIR, "dual"])
+    return found.reset_index()
+
+
+def cones(field: Field) -> pd.DataFrame:
+    """What the dual strategies give: size, conditioning, seconds, and errors with online supremizers."""
+    chosen = field.cells[(field.cells["primal"] == "online-supremizers") & (field.cells["assembly"] == "full")]
+    return pd.DataFrame(
+        {
+            **{name: chosen[name] for name in [*PAIR, "dual", "R", "rank"]},
+            "condition of G": chosen["gram_condition"],
+            "cone [s]": chosen["offline_cone_s"],
+            "error u": chosen["error_u_mean"],
+            "error λ": chosen["error_lambda_mean"],
+            "fallbacks": chosen["fallbacks"].fillna(""),
+        }
+    )
+
+
+def primals(field: Field) -> pd.DataFrame:
+    """What the primal strategies give with the cone of mcpg: share of β_on in the end, errors, seconds."""
+    chosen = field.tight[field.tight["dual"] == REFERENCE]
+    full, reduced = (chosen[chosen["assembly"] == assembly].set_index(CELL) for assembly in ("full", "reduced"))
+    ends = field.steps.groupby(CELL, dropna=False)["share"].last()
+    rows = []
+    for key, cell in full.iterrows():
+        share = 1.0 if cell["enrichment_kind"] == "per-parameter" else ends.get(key)
+        rows.append(
+            dict(zip(CELL, key, strict=True))
+            | {
+                "N": cell["N"],
+                "added": cell["enrichment"],
+                "share of β_on": share,
+                "error u": cell["error_u_mean"],
+                "error λ": cell["error_lambda_mean"],
+                "enrichment [s]": cell["offline_enrichment_s"],
+                "reduction [s]": reduced.loc[[key]]["offline_assembly_s"].iloc[0],
+                "query, full [ms]": 1e3 * cell["online_s"],
+                "query, reduced [ms]": 1e3 * reduced.loc[[key]]["online_s"].iloc[0],
+            }
+        )
+    return pd.DataFrame(rows).drop(columns=["pod_tol", "dual_tol", "dual"])
+
+
+def front(cells: pd.DataFrame, cost: pd.Series, error: str) -> pd.DataFrame:
+    """Cells with every query ok that no other beats in cost and error both, cheapest first; without the control."""
+    fine = (cells["status"] == "ok") & (cells["dual"] != CONTROL)
+    ordered = cells.assign(cost=cost)[fine].sort_values(["cost", error])
+    best = ordered[error].cummin().shift(fill_value=np.inf)
+    return ordered[ordered[error] < best]
+
+
+def fronts(field: Field) -> pd.DataFrame:
+    """The best there is for the multiplier, by dimension and by milliseconds of a reduced query."""
+    rows = []
+    reduced = field.cells[field.cells["assembly"] == "reduced"]
+    for problem, cells in reduced.groupby("problem", sort=False):
+        costs = {"N + S + R": _dimension(cells), "query [ms]": 1e3 * cells["online_s"]}
+        for measure, cost in costs.items():
+            for _, cell in front(cells, cost, "error_lambda_mean").iterrows():
+                strategies = {"dual": cell["dual"], "primal": label(cell["primal"], cell["primal_tol"])}
+                errors = {"error u": cell["error_u_mean"], "error λ": cell["error_lambda_mean"]}
+                rows.append({"problem": problem, "cost": measure, "is": cell["cost"]} | strategies | errors)
+    return pd.DataFrame(rows)
+
+
+def _dimension(cells: pd.DataFrame) -> pd.Series:
+    return cells["N"] + cells["enrichment"].fillna(0) + cells["R"]
+
+
+def failures(field: Field) -> pd.DataFrame:
+    """Every cell that is not ok."""
+    short = field.cells[field.cells["status"] != "ok"]
+    return short[[*CELL, "assembly", "status", "queries_ok", "reason"]]
+
+
+def shares_drawn(field: Field) -> Figure:
+    """Share of β_on over vectors, one line per primal strategy, with the cone of mcpg."""
+    chosen = [(key, steps) for key, steps in field.longest() if key[3] == REFERENCE]
+    pairs = list(dict.fromkeys(key[:3] for key, _ in chosen))
+    sheet = Sheet(1, len(pairs), "Smallest β_S over the training set as a share of the smallest β_on, cone of mcpg")
+    for panel, pair in zip(sheet.panels, pairs, strict=True):
+        for k, (key, steps) in enumerate((key, steps) for key, steps in chosen if key[:3] == pair):
+            plot(panel, steps["step"], steps["share"], k, key[4])
+        panel.set(
+            title=f"{pair[0]}, δ_POD = {pair[1]:g}, δ = {pair[2]:g}", xlabel="vectors added", ylabel="share of β_on"
+        )
+    return sheet.finish()
+
+
+def scatter(field: Field, cost: Callable[[pd.DataFrame], pd.Series], xlabel: str, title: str) -> Figure:
+    """Errors of the multiplier over a cost: colours say which cone, markers which enrichment, the line who is best."""
+    cells = field.cells[(field.cells["assembly"] == "reduced") & field.cells["error_lambda_mean"].notna()]
+    duals, primals = list(dict.fromkeys(cells["dual"])), list(dict.fromkeys(cells["primal"]))
+    names = list(dict.fromkeys(cells["problem"]))
+    sheet = Sheet(1, len(names), title)
+    for panel, problem in zip(sheet.panels, names, strict=True):
+        mine = cells[cells["problem"] == problem]
+        for k, dual in enumerate(duals):
+            panel.plot([], [], color=HUES[k % len(HUES)], linewidth=3, label=dual)
+        for k, primal in enumerate(primals):
+            panel.plot([], [], color="0.3", linestyle="none", marker=MARKERS[k % len(MARKERS)], label=primal)
+        for (dual, primal), group in mine.groupby(["dual", "primal"], sort=False):
+            panel.plot(
+                cost(group),
+                group["error_lambda_mean"],
+                linestyle="none",
+                color=HUES[duals.index(dual) % len(HUES)],
+                marker=MARKERS[primals.index(primal) % len(MARKERS)],
+                markersize=4,
+            )
+        best = front(mine, cost(mine), "error_lambda_mean")
+        panel.plot(
+            best["cost"], best["error_lambda_mean"], color="0.6", linewidth=0.8, drawstyle="steps-post", zorder=0
+        )
+        panel.set(title=problem, xlabel=xlabel, ylabel="mean relative error of λ")
+        logarithmic(panel, "xy")
+    return sheet.finish()
+
+
+SECTIONS: dict[str, tuple[str, Callable[[Field], pd.DataFrame]]] = {
+    "Cones": (
+        "Errors are those with online supremizers, which are stable as far as the cone allows; G is the Gram matrix of "
+        "the generators in W.",
+        cones,
+    ),
+    "Enrichments": (
+        f"Cone of {REFERENCE}, the tighter accuracy. The share is min β_S over min β_on, both over the span and on the "
+        "training set; 1 where supremizers are added at every parameter.",
+        primals,
+    ),
+    "Vectors for a share of β_on": (
+        f"The first numbers of vectors with which the smallest β_S over the training set is {SHARES[0]}, {SHARES[1]}, "
+        f"{SHARES[2]}, {SHARES[3]} of the smallest β_on; a dash where no tolerance of the study got there.",
+        vectors,
+    ),
+    "The best by dimension and by time": (
+        f"Cells that none beats in both, assembled reduced, all queries ok; {CONTROL} does not compete.",
+        fronts,
+    ),
+    "Cells that are not ok": ("", failures),
+}
+
+
+def main(run: Path, folder: Path) -> None:
+    """Write the page and its figures."""
+    path = run / "results.sqlite"
+    field = Field.read(path)
+    folder.mkdir(parents=True, exist_ok=True)
+    drawn = {
+        "shares": lambda: shares_drawn(field),
+        "dimension": lambda: scatter(field, _dimension, "dimension N + S + R", "Error of λ against dimension"),
+        "time": lambda: scatter(
+            field, lambda cells: 1e3 * cells["online_s"], "query, reduced [ms]", "Error of λ against online time"
+        ),
+    }
+    with styled():
+        for name, draw in drawn.items():
+            save(draw(), folder, name, ("png",))
+    text = [f"# The whole field\n\n{made(field)}"]
+    text += [f"![{name}]({name}.png)" for name in drawn]
+    for title, (said, table) in SECTIONS.items():
+        found = table(field)
+        text.append(f"## {title}\n\n{said}\n\n{tables.to_markdown(found) if len(found) else 'None.'}")
+    (folder / "README.md").write_text("\n\n".join(text) + "\n", encoding="utf-8")
+    field.cells.drop(columns=["definition", "versions"]).to_csv(folder / "cells.csv", index=False)
+
+
+def made(field: Field) -> str:
+    """Where the page comes from."""
+    fine = int((field.cells["status"] == "ok").sum())
+    return (
+        "Made by `vibench run field --no-figures && python results/field.py runs/field results/field`, on "
+        f"{', '.join(sorted(set(field.cells['machine'])))}. {len(field.cells)} cells, {fine} with every query ok. "
+        "Seconds are CPU seconds on one thread."
+    )
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]), Path(sys.argv[2]))
