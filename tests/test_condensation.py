@@ -20,13 +20,13 @@ def sparse_spd(n: int, rng: np.random.Generator) -> sp.csc_array:
     return sp.csc_array(links @ links.T + sp.eye_array(n))
 
 
-@given(st.integers(0, 10_000), st.integers(0, 12))
-def test_equilibrium_with_the_kept_unknowns_given(seed: int, count: int) -> None:
+@given(st.integers(0, 10_000), st.integers(0, 12), st.booleans())
+def test_equilibrium_with_the_kept_unknowns_given(seed: int, count: int, reused: bool) -> None:
     rng = np.random.default_rng(seed)
     A, f = sparse_spd(12, rng), rng.standard_normal(12)
     kept = np.sort(rng.permutation(12)[:count])
     others = np.setdiff1d(np.arange(12), kept)
-    condensed = Condensed(A, Pattern.of(A, kept))
+    condensed = Condensed(A, Pattern.of(A, kept), reused=reused)
     dense = A.toarray()
     inner = np.linalg.inv(dense[np.ix_(others, others)])
     taken = dense[np.ix_(kept, others)] @ inner

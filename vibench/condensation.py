@@ -42,18 +42,25 @@ class Pattern:
 class Condensed:
     """One stiffness A, condensed: whatever is wanted of the kept unknowns takes arrays of their number alone.
 
+    Parameters
+    ----------
+    A, pattern
+        The matrix (n×n), and what to condense it on.
+    reused
+        Whether many solutions will be expanded, so that preparing for it pays.
+
     Attributes
     ----------
     dense
         Whether most of Ŝ is filled in.
     """
 
-    def __init__(self, A: SparseMatrix, pattern: Pattern) -> None:
-        self._pattern, self._size = pattern, A.shape[0]
+    def __init__(self, A: SparseMatrix, pattern: Pattern, *, reused: bool = False) -> None:
+        self._pattern, self._size, self._reused = pattern, A.shape[0], reused
         A, count = sp.csr_array(A), len(pattern.interface)
         inside = A[pattern.order][:, pattern.order]
         natural = np.arange(len(pattern.order))
-        self._factor = SparseCholesky(inside, "A", natural) if len(natural) else None
+        self._factor = SparseCholesky(inside, "A", natural, count) if len(natural) else None
         self._eliminated = len(natural) - count
         upper = self._factor.tail(count) if self._factor is not None else np.zeros((0, 0))
         self._schur = upper.T @ upper
@@ -91,9 +98,7 @@ class Condensed:
         order, interface = self._pattern.order, self._pattern.interface
         u = np.empty(self._size)
         if self._factor is not None:
-            right = np.zeros(len(order))
-            right[self._eliminated :] = self._schur @ (u_kept[interface] - free[self._eliminated :])
-            u[order] = free + self._factor.solve(right)
+            u[order] = free + self._extended(self._factor, u_kept[interface] - free[self._eliminated :])
         u[self._pattern.kept] = u_kept
         return u
 
@@ -104,10 +109,17 @@ class Condensed:
             inside = residual[order]
             inside[self._eliminated :] = 0.0
             free = self._factor.solve(inside)
-            inside[: self._eliminated] = 0.0
-            inside[self._eliminated :] = -self._schur @ free[self._eliminated :]
-            found[order[: self._eliminated]] = (free + self._factor.solve(inside))[: self._eliminated]
+            settled = free + self._extended(self._factor, -free[self._eliminated :])
+            found[order[: self._eliminated]] = settled[: self._eliminated]
         return found
+
+    def _extended(self, factor: SparseCholesky, interface: Array) -> Array:
+        """Unknowns in the order of elimination that are given on the interface and in equilibrium elsewhere."""
+        if self._reused:
+            return factor.extend(interface)
+        right = np.zeros(len(self._pattern.order))
+        right[self._eliminated :] = self._schur @ interface
+        return factor.solve(right)
 
 
 def _with_block(matrix: SparseMatrix, where: Indices, block: Array) -> SparseMatrix:

@@ -105,6 +105,15 @@ class SparseCholesky:
             u[self.order[:split]] = spsolve_triangular(corner, first, lower=False, unit_diagonal=True)
         return u
 
+    def extend(self, last: Array) -> Array:
+        """Solution (n,) or (n, k) of X u = 0 in all rows but those eliminated last, where u is given (`dense`, k)."""
+        split, u = self._sparse, np.zeros((len(self._root), *last.shape[1:]))
+        corner, coupling, _ = self._blocks
+        u[self.order[split:]] = last
+        if split and last.size:
+            u[self.order[:split]] = spsolve_triangular(corner, -(coupling @ last), lower=False, unit_diagonal=True)
+        return u
+
     def down_inverse(self, right: Array) -> Array:
         """F⁻ᵀ r, for r (n,) or (n, k)."""
         permuted = np.ascontiguousarray(right[self.order])

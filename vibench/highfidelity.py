@@ -113,7 +113,7 @@ class Solver:
         if self._pattern is None:
             self._pattern, self._system = Pattern.of(vi.A, self._touched), None
         if self._system is None or "A" not in self._problem.constant:
-            self._system = Stiffness(vi.A, self._pattern)
+            self._system = Stiffness(vi.A, self._pattern, reused="A" in self._problem.constant)
         return self._system
 
 
@@ -126,13 +126,15 @@ class Stiffness:
         Sparse SPD (n×n).
     pattern
         Unknowns to condense on, all that B touches among them; by default all unknowns.
+    reused
+        Whether it is that of many solutions.
     """
 
-    def __init__(self, A: SparseMatrix, pattern: Pattern | None = None) -> None:
+    def __init__(self, A: SparseMatrix, pattern: Pattern | None = None, *, reused: bool = False) -> None:
         if pattern is None or len(pattern.kept) > FEW * A.shape[0]:
             pattern = Pattern(np.arange(A.shape[0]), np.zeros(0, np.intp), np.zeros(0, np.intp))
         self._pattern = pattern
-        self._condensed = Condensed(A, self._pattern)
+        self._condensed = Condensed(A, self._pattern, reused=reused)
 
     @cached_property
     def _inverse(self) -> Array:
@@ -141,7 +143,7 @@ class Stiffness:
             factor = scipy.linalg.cho_factor(self._condensed.array)
         except np.linalg.LinAlgError:
             raise NumericalError("A is not positive definite") from None
-        return np.asarray(scipy.linalg.cho_solve(factor, np.eye(len(self._pattern.kept))))
+        return np.ascontiguousarray(scipy.linalg.cho_solve(factor, np.eye(len(self._pattern.kept))))
 
     def system(self, vi: VariationalInequality) -> ActiveSystem:
         """The equality-constrained systems of the active sets of `vi`, whose stiffness this is."""
