@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import fcntl
 import os
+import shutil
 import subprocess
 import sys
 import sysconfig
@@ -14,9 +15,10 @@ from pathlib import Path
 import pytest
 from hypothesis import settings
 
-from running import Vibench, started
+from running import Vibench, execute, started
 from samples import install_fakes
 from vibench import cli, plugins
+from vibench.journal import FILE
 from vibench.store import CACHE_VARIABLE
 
 settings.register_profile("any machine", deadline=None)
@@ -52,6 +54,23 @@ def quick_run(command: str, tmp_path_factory: pytest.TempPathFactory) -> Path:
             assert done.returncode == 0, done.stderr
             (folder / "printed.txt").write_text(done.stdout, encoding="utf-8")
     return folder
+
+
+Changed = Callable[..., Path]
+
+
+@pytest.fixture
+def changed(quick_run: Path, tmp_path: Path) -> Changed:
+    """Function that gives a new copy of the results of a real run, changed by SQL."""
+
+    def copy(*statements: str) -> Path:
+        folder = tmp_path / "changed"
+        folder.mkdir(exist_ok=True)
+        shutil.copy(quick_run / FILE, folder / FILE)
+        execute(folder, *statements)
+        return folder / FILE
+
+    return copy
 
 
 Register = Callable[..., None]

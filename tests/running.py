@@ -49,10 +49,12 @@ def rows(folder: Path, table: str = "cells") -> list[dict[str, Any]]:
         db.close()
 
 
-def execute(folder: Path, statement: str) -> None:
+def execute(folder: Path, *statements: str) -> None:
+    """Change the results in a folder by SQL."""
     db = sqlite3.connect(folder / FILE)
     db.execute("PRAGMA foreign_keys=ON")
-    db.execute(statement)
+    for statement in statements:
+        db.execute(statement)
     db.commit()
     db.close()
 

@@ -2,36 +2,15 @@
 
 from __future__ import annotations
 
-import shutil
-import sqlite3
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
+from conftest import Changed
 from vibench.diff import Verdict, compare
 from vibench.errors import RequestError
 from vibench.journal import FILE
 from vibench.result_commands import compare_runs
-
-Change = Callable[..., Path]
-
-
-@pytest.fixture
-def changed(quick_run: Path, tmp_path: Path) -> Change:
-    """Function that gives a copy of a real run with its results changed by SQL."""
-
-    def run(*statements: str) -> Path:
-        shutil.copy(quick_run / FILE, tmp_path / FILE)
-        db = sqlite3.connect(tmp_path / FILE)
-        for statement in statements:
-            db.execute(statement)
-        db.commit()
-        db.close()
-        return tmp_path / FILE
-
-    return run
-
 
 ONE = "solver = 'piqp' AND problem = 'hertz' AND dual = 'mcpg' AND primal = 'offline-pga'"
 
@@ -60,7 +39,7 @@ def test_a_run_does_not_differ_from_itself(quick_run: Path) -> None:
     ],
 )
 def test_a_change_of_one_cell_is_told_with_its_meaning(
-    statement: str, what: str, verdict: Verdict, changed: Change, quick_run: Path
+    statement: str, what: str, verdict: Verdict, changed: Changed, quick_run: Path
 ) -> None:
     found = compare(quick_run / FILE, changed(statement), 1.25)
     (row,) = found.changes.to_dict("records")
@@ -68,19 +47,19 @@ def test_a_change_of_one_cell_is_told_with_its_meaning(
     assert (row["problem"], row["dual"], row["primal"], row["solver"]) == ("hertz", "mcpg", "offline-pga", "piqp")
 
 
-def test_changes_within_the_limit_are_not_told(changed: Change, quick_run: Path) -> None:
+def test_changes_within_the_limit_are_not_told(changed: Changed, quick_run: Path) -> None:
     after = changed("UPDATE cells SET online_s = 1.2 * online_s, error_u_mean = 1.2 * error_u_mean")
     assert compare(quick_run / FILE, after, 1.25).changes.empty
     assert compare(quick_run / FILE, after, 1.1).regressions == 2 * 36
 
 
-def test_errors_of_round_off_are_not_compared(changed: Change, tmp_path: Path) -> None:
+def test_errors_of_round_off_are_not_compared(changed: Changed, tmp_path: Path) -> None:
     before = changed("UPDATE cells SET error_u_mean = 1e-14").rename(tmp_path / "before.sqlite")
     after = changed("UPDATE cells SET error_u_mean = 9e-14")
     assert compare(before, after, 1.25).changes.empty
 
 
-def test_times_of_another_machine_are_left_out(changed: Change, quick_run: Path) -> None:
+def test_times_of_another_machine_are_left_out(changed: Changed, quick_run: Path) -> None:
     found = compare(quick_run / FILE, changed("UPDATE cells SET machine = 'other', online_s = 9 * online_s"), 1.25)
     assert found.changes.empty
     assert any("different machines" in note for note in found.notes)
@@ -89,7 +68,7 @@ def test_times_of_another_machine_are_left_out(changed: Change, quick_run: Path)
 THRESHOLD = "WHERE solver = 'piqp' AND problem = 'obstacle' AND dual = 'cpg' AND primal_a = 'high-fidelity'"
 
 
-def test_a_threshold_is_worse_where_its_own_side_got_slower(changed: Change, quick_run: Path) -> None:
+def test_a_threshold_is_worse_where_its_own_side_got_slower(changed: Changed, quick_run: Path) -> None:
     later = "benefit_threshold = 3 * benefit_threshold, offline_b_s = 3 * offline_b_s"
     found = compare(
         quick_run / FILE,
@@ -105,38 +84,38 @@ def test_a_threshold_is_worse_where_its_own_side_got_slower(changed: Change, qui
     assert found.regressions == 2
 
 
-def test_a_competitor_that_got_quicker_is_no_regression(changed: Change, quick_run: Path) -> None:
+def test_a_competitor_that_got_quicker_is_no_regression(changed: Changed, quick_run: Path) -> None:
     later = "benefit_threshold = 3 * benefit_threshold, online_a_s = online_a_s / 3"
     found = compare(quick_run / FILE, changed(f"UPDATE thresholds SET {later} {THRESHOLD}"), 1.25)
     assert len(found.changes) == 3
     assert found.regressions == 0
 
 
-def test_what_was_missing_and_is_there_is_no_regression(changed: Change, quick_run: Path) -> None:
+def test_what_was_missing_and_is_there_is_no_regression(changed: Changed, quick_run: Path) -> None:
     before = changed(f"UPDATE cells SET beta_span_min = NULL, beta_cone_lower_min = NULL WHERE {ONE}")
     assert compare(before, quick_run / FILE, 1.25).regressions == 0
 
 
-def test_constants_of_round_off_are_not_compared(changed: Change, tmp_path: Path) -> None:
+def test_constants_of_round_off_are_not_compared(changed: Changed, tmp_path: Path) -> None:
     before = changed("UPDATE cells SET beta_span_min = 9e-17").rename(tmp_path / "before.sqlite")
     assert compare(before, changed("UPDATE cells SET beta_span_min = 1e-17"), 1.25).changes.empty
 
 
-def test_columns_without_any_value_are_no_obstacle(changed: Change, quick_run: Path) -> None:
+def test_columns_without_any_value_are_no_obstacle(changed: Changed, quick_run: Path) -> None:
     emptied = changed(
         "UPDATE thresholds SET primal_tol_b = NULL, dual_tol = NULL", "UPDATE cells SET primal_tol = NULL"
     )
     compare(quick_run / FILE, emptied, 1.25)
 
 
-def test_a_new_cell_is_no_regression(changed: Change, quick_run: Path) -> None:
+def test_a_new_cell_is_no_regression(changed: Changed, quick_run: Path) -> None:
     found = compare(changed(f"DELETE FROM cells WHERE {ONE}"), quick_run / FILE, 1.25)
     (row,) = found.changes.to_dict("records")
     assert (row["after"], row["verdict"]) == ("new", Verdict.CHANGED.value)
 
 
 def test_the_command_ends_with_one_where_something_got_worse(
-    changed: Change, quick_run: Path, capsys: pytest.CaptureFixture[str]
+    changed: Changed, quick_run: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     after = changed(f"UPDATE cells SET online_s = 2 * online_s WHERE {ONE}")
     with pytest.raises(Exception, match="1") as ended:

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import json
-import shutil
-import sqlite3
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -18,37 +17,27 @@ from matplotlib.figure import Figure
 from matplotlib.image import imread
 from matplotlib.lines import Line2D
 
+from conftest import Changed
+from running import execute
 from vibench import tables
 from vibench.figures import FORMATS, OF_PROBLEM, constants, convergence, costs, draw_all
 from vibench.figures import problems as of_file
 from vibench.figures.style import save, styled
-from vibench.journal import FILE
 from vibench.study_file import load_study
 
 Drawn = dict[str, Figure]
 
 
 @pytest.fixture
-def results(quick_run: Path, tmp_path: Path) -> Path:
+def results(changed: Changed) -> Path:
     """A copy of the results of a real run, free to be changed."""
-    (tmp_path / "run").mkdir()
-    for file in quick_run.glob(f"{FILE}*"):
-        shutil.copy(file, tmp_path / "run")
-    return tmp_path / "run" / FILE
+    return changed()
 
 
 @pytest.fixture
 def change(results: Path) -> Callable[..., None]:
     """Function that runs SQL on the copy."""
-
-    def run(*statements: str) -> None:
-        db = sqlite3.connect(results)
-        for statement in statements:
-            db.execute(statement)
-        db.commit()
-        db.close()
-
-    return run
+    return partial(execute, results.parent)
 
 
 Draw = Callable[[], Drawn]

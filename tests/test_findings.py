@@ -3,31 +3,24 @@
 from __future__ import annotations
 
 import math
-import shutil
-import sqlite3
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
+from conftest import Changed
 from vibench import tables
 from vibench.findings import findings
 from vibench.journal import FILE
 
 
 @pytest.fixture
-def said(quick_run: Path, tmp_path: Path) -> Callable[..., dict[str, list[str]]]:
+def said(changed: Changed) -> Callable[..., dict[str, list[str]]]:
     """Function that gives the findings of a changed copy of a real run, by what they are about."""
 
     def run(*statements: str) -> dict[str, list[str]]:
-        shutil.copy(quick_run / FILE, tmp_path / FILE)
-        db = sqlite3.connect(tmp_path / FILE)
-        for statement in statements:
-            db.execute(statement)
-        db.commit()
-        db.close()
         found: dict[str, list[str]] = {}
-        for finding in findings(tmp_path / FILE):
+        for finding in findings(changed(*statements)):
             found.setdefault(finding.about, []).append(finding.text)
         return found
 

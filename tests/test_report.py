@@ -6,13 +6,13 @@ import json
 import os
 import re
 import shutil
-import sqlite3
 import subprocess
 from html.parser import HTMLParser
 from pathlib import Path
 
 import pytest
 
+from conftest import Changed
 from vibench import report, tables
 from vibench.figures import drawings
 from vibench.findings import findings
@@ -138,17 +138,15 @@ def test_findings_tables_and_facts_are_in_it(made: Path, quick_run: Path) -> Non
     assert "Nothing: every query of every cell is ok." in page
 
 
-def test_every_failure_has_its_reason_and_nothing_is_markup(quick_run: Path, tmp_path: Path) -> None:
-    shutil.copy(quick_run / FILE, tmp_path / FILE)
-    db = sqlite3.connect(tmp_path / FILE)
-    reason = "<script>alert('the solver said & did nothing')</script>"
-    db.execute("UPDATE cells SET status = 'failed', reason = ? WHERE solver = 'osqp'", (reason,))
-    db.execute("UPDATE queries SET status = 'failed', reason = 'one of many' WHERE solver = 'osqp' AND query = 5")
-    db.execute("INSERT INTO pictures (problem, problem_options, number, reason) VALUES ('wire', '{}', 0, 'no <mesh>')")
-    db.commit()
-    failed = db.execute("SELECT count(*) FROM cells WHERE solver = 'osqp'").fetchone()[0]
-    db.close()
-    page = report.html(tmp_path / FILE)
+def test_every_failure_has_its_reason_and_nothing_is_markup(changed: Changed) -> None:
+    reason = "<script>alert(''the solver said & did nothing'')</script>"
+    results = changed(
+        f"UPDATE cells SET status = 'failed', reason = '{reason}' WHERE solver = 'osqp'",
+        "UPDATE queries SET status = 'failed', reason = 'one of many' WHERE solver = 'osqp' AND query = 5",
+        "INSERT INTO pictures (problem, problem_options, number, reason) VALUES ('wire', '{}', 0, 'no <mesh>')",
+    )
+    failed = int((tables.read(results, "cells")["solver"] == "osqp").sum())
+    page = report.html(results)
     assert page.count("&lt;script&gt;alert(&#39;the solver said &amp; did nothing&#39;)&lt;/script&gt;") >= failed
     assert "<script>alert" not in page
     assert f"{failed} cells did not end ok." in page
@@ -157,14 +155,9 @@ def test_every_failure_has_its_reason_and_nothing_is_markup(quick_run: Path, tmp
     assert "no picture of wire: no &lt;mesh&gt;" in page
 
 
-def test_a_run_without_any_query_has_a_report(quick_run: Path, tmp_path: Path) -> None:
-    shutil.copy(quick_run / FILE, tmp_path / FILE)
-    db = sqlite3.connect(tmp_path / FILE)
-    for table in ("queries", "thresholds", "disagreements", "histories", "pictures"):
-        db.execute(f"DELETE FROM {table}")
-    db.execute("UPDATE cells SET status = 'unavailable', reason = 'not installed', queries_ok = 0, online_s = NULL")
-    db.commit()
-    db.close()
-    page = report.html(tmp_path / FILE)
+def test_a_run_without_any_query_has_a_report(changed: Changed) -> None:
+    emptied = [f"DELETE FROM {name}" for name in ("queries", "thresholds", "disagreements", "histories", "pictures")]
+    lost = "UPDATE cells SET status = 'unavailable', reason = 'not installed', queries_ok = 0, online_s = NULL"
+    page = report.html(changed(*emptied, lost))
     assert "There is nothing to draw" in page
     assert "0 with every query ok" in page
