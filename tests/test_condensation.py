@@ -8,9 +8,10 @@ from hypothesis import strategies as st
 
 from numerics import Varying, spd
 from vibench import highfidelity
+from vibench.active_systems import Stiffness
 from vibench.condensation import Condensed, Pattern
 from vibench.errors import NumericalError
-from vibench.highfidelity import Solver, Stiffness
+from vibench.highfidelity import Solver
 from vibench.problem import VariationalInequality
 
 

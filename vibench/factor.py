@@ -46,7 +46,7 @@ class SparseCholesky:
     ) -> None:
         matrix = sp.csc_array(matrix)
         self._made_from = matrix, name, order, dense
-        if order is not None:
+        if order is not None and not np.array_equal(order, np.arange(len(order))):
             matrix = sp.csc_array(matrix[order][:, order])
         try:
             lu = splu(matrix, permc_spec="MMD_AT_PLUS_A" if order is None else "NATURAL", **_SYMMETRIC)

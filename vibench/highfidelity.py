@@ -2,29 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property, partial
 
 import numpy as np
-import scipy.linalg
 import scipy.sparse as sp
-from scipy.sparse.linalg import splu
 
 from vibench import judgement, qp
-from vibench.arrays import Array, Indices, Mask, SparseMatrix
-from vibench.condensation import Condensed, Pattern
+from vibench.active_systems import ActiveSystem, Stiffness
+from vibench.arrays import Array, Mask
+from vibench.condensation import Pattern
 from vibench.errors import NumericalError
 from vibench.problem import Problem, VariationalInequality, checked_assembly
 
 ACCURACY = 1e-10
 """Relative KKT accuracy of every snapshot."""
 
-FEW = 0.5
-"""Systems are condensed on the constrained unknowns where these are no more than this share of all."""
-
 MAX_ITERATIONS = 100
 """Systems tried at most, or one per constraint where there are more: the contact set may move node by node."""
+
 FALLBACK_SOLVER = "piqp"
 
 
@@ -117,70 +112,6 @@ class Solver:
         return self._system
 
 
-class Stiffness:
-    """A stiffness A as the active set method needs it, condensed on some unknowns.
-
-    Parameters
-    ----------
-    A
-        Sparse SPD (n×n).
-    pattern
-        Unknowns to condense on, all that B touches among them; by default all unknowns.
-    reused
-        Whether it is that of many solutions.
-    """
-
-    def __init__(self, A: SparseMatrix, pattern: Pattern | None = None, *, reused: bool = False) -> None:
-        if pattern is None or len(pattern.kept) > FEW * A.shape[0]:
-            pattern = Pattern(np.arange(A.shape[0]), np.zeros(0, np.intp), np.zeros(0, np.intp))
-        self._pattern = pattern
-        self._condensed = Condensed(A, self._pattern, reused=reused)
-
-    @cached_property
-    def _inverse(self) -> Array:
-        """Ŝ⁻¹ (c×c)."""
-        try:
-            factor = scipy.linalg.cho_factor(self._condensed.array)
-        except np.linalg.LinAlgError:
-            raise NumericalError("A is not positive definite") from None
-        return np.ascontiguousarray(scipy.linalg.cho_solve(factor, np.eye(len(self._pattern.kept))))
-
-    def system(self, vi: VariationalInequality) -> ActiveSystem:
-        """The equality-constrained systems of the active sets of `vi`, whose stiffness this is."""
-        condensed = self._condensed
-        load, free = condensed.load(vi.f)
-        B = sp.csr_array(sp.csc_array(vi.B)[:, self._pattern.kept])
-        solve_active = (
-            _by_compliance(self._inverse, load, B, vi.g)
-            if condensed.dense
-            else partial(_saddle_point, condensed.matrix, load, B, vi.g)
-        )
-        return ActiveSystem(B, vi.g, solve_active, lambda u: condensed.expand(u, free), condensed.settle)
-
-
-@dataclass(frozen=True)
-class ActiveSystem:
-    """What the active set method works on: everything in the c unknowns that are left.
-
-    Attributes
-    ----------
-    B, g
-        Constraints, B sparse (m×c).
-    solve_active
-        From the active constraints: u (c,) and λ (m,) with these as equalities and no other multiplier.
-    expand
-        All n unknowns from the c ones.
-    settle
-        Correction of the other unknowns (n,) that takes a residual (n,) out of their equilibrium.
-    """
-
-    B: SparseMatrix
-    g: Array
-    solve_active: Callable[[Indices], tuple[Array, Array]]
-    expand: Callable[[Array], Array]
-    settle: Callable[[Array], Array]
-
-
 def solve(
     vi: VariationalInequality, stiffness: Stiffness | None = None, start: Mask | None = None
 ) -> HighFidelitySolution:
@@ -246,37 +177,3 @@ def _active_set_iterations(system: ActiveSystem, active: Mask) -> tuple[Array, A
         seen.add(following.tobytes())
         active = following
     return None
-
-
-def _saddle_point(A: SparseMatrix, f: Array, B: SparseMatrix, g: Array, active: Indices) -> tuple[Array, Array]:
-    """Solution for an active set by one sparse factorisation, refined once."""
-    n, k = A.shape[0], len(active)
-    rows = B[active]
-    matrix = sp.csc_array(sp.block_array([[A, rows.T], [rows, None]])) if k else sp.csc_array(A)
-    right = np.concatenate([f, g[active]])
-    factor = splu(matrix)
-    solution = factor.solve(right)
-    solution += factor.solve(right - matrix @ solution)
-    lam = np.zeros(B.shape[0])
-    lam[active] = solution[n:]
-    return solution[:n], lam
-
-
-def _by_compliance(inverse: Array, f: Array, B: SparseMatrix, g: Array) -> Callable[[Indices], tuple[Array, Array]]:
-    """Solutions for active sets from what active constraints displace, S⁻¹B_aᵀ; forces are refined once."""
-    free = inverse @ f
-    excess = B @ free - g
-
-    def solve_active(active: Indices) -> tuple[Array, Array]:
-        rows, lam = B[active], np.zeros(len(g))
-        if not len(active):
-            return free, lam
-        displaced = np.asarray(rows @ inverse)
-        compliance = rows @ displaced.T
-        factor = scipy.linalg.cho_factor(compliance)
-        forces = scipy.linalg.cho_solve(factor, excess[active])
-        forces += scipy.linalg.cho_solve(factor, excess[active] - compliance @ forces)
-        lam[active] = forces
-        return free - forces @ displaced, lam
-
-    return solve_active

@@ -1,0 +1,199 @@
+"""The systems that an active set method solves: a stiffness, condensed, and a set of constraints as equalities."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import scipy.linalg
+import scipy.sparse as sp
+from scipy.sparse.linalg import splu
+
+from vibench.arrays import Array, Indices, SparseMatrix
+from vibench.condensation import Condensed, Pattern
+from vibench.errors import NumericalError
+from vibench.problem import VariationalInequality
+
+FEW = 0.5
+"""Systems are condensed on the constrained unknowns where these are no more than this share of all."""
+
+BORDER = 16
+"""Constraints by which an active set may differ from one that is factorised, for the factor to be used again."""
+
+ROUND_OFF = 1e-12
+"""Entries of a bordered system below this, relative to what they were made from, may be nothing."""
+
+
+class Stiffness:
+    """A stiffness A as the active set method needs it, condensed on some unknowns.
+
+    Parameters
+    ----------
+    A
+        Sparse SPD (n×n).
+    pattern
+        Unknowns to condense on, all that B touches among them; by default all unknowns.
+    reused
+        Whether it is that of many solutions.
+    """
+
+    def __init__(self, A: SparseMatrix, pattern: Pattern | None = None, *, reused: bool = False) -> None:
+        if pattern is None or len(pattern.kept) > FEW * A.shape[0]:
+            pattern = Pattern(np.arange(A.shape[0]), np.zeros(0, np.intp), np.zeros(0, np.intp))
+        self._pattern = pattern
+        self._condensed = Condensed(A, self._pattern, reused=reused)
+
+    @cached_property
+    def _inverse(self) -> Array:
+        """Ŝ⁻¹ (c×c)."""
+        try:
+            factor = scipy.linalg.cho_factor(self._condensed.array)
+        except np.linalg.LinAlgError:
+            raise NumericalError("A is not positive definite") from None
+        return np.ascontiguousarray(scipy.linalg.cho_solve(factor, np.eye(len(self._pattern.kept))))
+
+    def system(self, vi: VariationalInequality) -> ActiveSystem:
+        """The equality-constrained systems of the active sets of `vi`, whose stiffness this is."""
+        condensed = self._condensed
+        load, free = condensed.load(vi.f)
+        B = sp.csr_array(sp.csc_array(vi.B)[:, self._pattern.kept])
+        solve_active = (
+            _by_compliance(self._inverse, load, B, vi.g)
+            if condensed.dense
+            else SaddlePoint(condensed.matrix, load, B, vi.g)
+        )
+        return ActiveSystem(B, vi.g, solve_active, lambda u: condensed.expand(u, free), condensed.settle)
+
+
+@dataclass(frozen=True)
+class ActiveSystem:
+    """What the active set method works on: everything in the c unknowns that are left.
+
+    Attributes
+    ----------
+    B, g
+        Constraints, B sparse (m×c).
+    solve_active
+        From the active constraints: u (c,) and λ (m,) with these as equalities and no other multiplier.
+    expand
+        All n unknowns from the c ones.
+    settle
+        Correction of the other unknowns (n,) that takes a residual (n,) out of their equilibrium.
+    """
+
+    B: SparseMatrix
+    g: Array
+    solve_active: Callable[[Indices], tuple[Array, Array]]
+    expand: Callable[[Array], Array]
+    settle: Callable[[Array], Array]
+
+
+class SaddlePoint:
+    """Solutions for active sets of a sparse system, refined once.
+
+    One set is factorised; sets that differ from it in few constraints are solved for with the same factor, bordered by
+    a column per constraint that has come (its row of B) or gone (a slack, with no force).
+
+    Parameters
+    ----------
+    A, f
+        Stiffness, sparse SPD (c×c), and load (c,).
+    B, g
+        Constraints, B sparse (m×c), and their bounds (m,).
+    """
+
+    def __init__(self, A: SparseMatrix, f: Array, B: SparseMatrix, g: Array) -> None:
+        self._A, self._f, self._B, self._g = A, f, B, g
+        self._base = np.zeros(0, dtype=np.intp)
+        self._factorised: _Factorised | None = None
+
+    def __call__(self, active: Indices) -> tuple[Array, Array]:
+        """The solution u (c,), λ (m,) with these constraints as equalities and no other force.
+
+        Raises
+        ------
+        RuntimeError
+            If they are dependent.
+        """
+        found = None
+        if self._factorised is not None and len(np.setxor1d(active, self._base)) <= BORDER:
+            found = self._bordered(self._factorised, active)
+        if found is None:
+            rows = self._B[active]
+            matrix = sp.block_array([[self._A, rows.T], [rows, None]]) if len(active) else self._A
+            self._base, self._factorised = active, _Factorised(sp.csc_array(matrix))
+            found = self._bordered(self._factorised, active)
+        assert found is not None  # without a border there is nothing that could be dependent
+        return found
+
+    def _bordered(self, known: _Factorised, active: Indices) -> tuple[Array, Array] | None:
+        """The solution from what is factorised; `None` where the border is not clearly independent."""
+        n, base = self._A.shape[0], self._base
+        come, gone = np.setdiff1d(active, base), np.flatnonzero(~np.isin(base, active))
+        border = np.zeros((n + len(base), len(come) + len(gone)))
+        border[:n, : len(come)] = self._B[come].toarray().T
+        border[n + gone, len(come) + np.arange(len(gone))] = 1.0
+        given = np.concatenate([self._g[come], np.zeros(len(gone))])
+        found = known.solve(border, np.concatenate([self._f, self._g[base]]), given)
+        if found is None:
+            return None
+        lam = np.zeros(self._B.shape[0])
+        lam[base], lam[come] = found[0][n:], found[1][: len(come)]
+        lam[base[gone]] = 0.0
+        return found[0][:n], lam
+
+
+class _Factorised:
+    """A symmetric system K (k×k), factorised, that can be bordered."""
+
+    def __init__(self, matrix: SparseMatrix) -> None:
+        self._matrix, self._factor = matrix, splu(matrix)
+
+    def solve(self, border: Array, right: Array, given: Array) -> tuple[Array, Array] | None:
+        """The x (k,) and y (d,) with K x + C y = r and Cᵀx = s; `None` where Cᵀ K⁻¹ C is not clearly regular."""
+        solved = self._factor.solve(border) if border.size else border
+        schur = border.T @ solved
+        if not _regular(schur, np.linalg.norm(border, axis=0) * np.linalg.norm(solved, axis=0)):
+            return None
+
+        def once(load: Array, values: Array) -> tuple[Array, Array]:
+            alone = self._factor.solve(load)
+            y = np.linalg.solve(schur, border.T @ alone - values)
+            return alone - solved @ y, y
+
+        x, y = once(right, given)
+        dx, dy = once(right - self._matrix @ x - border @ y, given - border.T @ x)
+        return x + dx, y + dy
+
+
+def _regular(schur: Array, sizes: Array) -> bool:
+    """Whether a symmetric matrix (d×d) is far from singular, its diagonal being no round-off of products of `sizes`."""
+    if not len(schur):
+        return True
+    diagonal = np.abs(np.diag(schur))
+    if np.any(diagonal <= ROUND_OFF * sizes):
+        return False
+    scale = np.sqrt(diagonal)
+    return bool(np.linalg.cond(schur / np.outer(scale, scale)) < 1.0 / np.sqrt(ROUND_OFF))
+
+
+def _by_compliance(inverse: Array, f: Array, B: SparseMatrix, g: Array) -> Callable[[Indices], tuple[Array, Array]]:
+    """Solutions for active sets from what active constraints displace, S⁻¹B_aᵀ; forces are refined once."""
+    free = inverse @ f
+    excess = B @ free - g
+
+    def solve_active(active: Indices) -> tuple[Array, Array]:
+        rows, lam = B[active], np.zeros(len(g))
+        if not len(active):
+            return free, lam
+        displaced = np.asarray(rows @ inverse)
+        compliance = rows @ displaced.T
+        factor = scipy.linalg.cho_factor(compliance)
+        forces = scipy.linalg.cho_solve(factor, excess[active])
+        forces += scipy.linalg.cho_solve(factor, excess[active] - compliance @ forces)
+        lam[active] = forces
+        return free - forces @ displaced, lam
+
+    return solve_active
