@@ -225,7 +225,7 @@ FAULTS = (
     Fault(
         "checksum-not-verified",
         "vibench/store.py",
-        "if hashlib.sha256(content[size:]).digest() != content[:size]:",
+        "if hashlib.sha256(content).digest() != digest:",
         "if False:",
         ("tests/test_store.py",),
     ),
@@ -298,6 +298,27 @@ FAULTS = (
         "condensed[interface] += self._schur @ free[self._eliminated :]",
         "pass",
         ("tests/test_condensation.py",),
+    ),
+    Fault(
+        "extension-with-the-wrong-sign",
+        "vibench/factor.py",
+        "spsolve_triangular(corner, -(coupling @ last), lower=False",
+        "spsolve_triangular(corner, coupling @ last, lower=False",
+        ("tests/test_condensation.py",),
+    ),
+    Fault(
+        "forces-where-contact-has-ended",
+        "vibench/active_systems.py",
+        "given = np.concatenate([self._g[come], np.zeros(len(gone))])",
+        "given = np.concatenate([self._g[come], np.ones(len(gone))])",
+        ("tests/test_active_systems.py",),
+    ),
+    Fault(
+        "programs-of-too-large-a-space",
+        "vibench/reduced.py",
+        "(program.A[:size, :size], program.B[:, :size])",
+        "(program.A[-size:, -size:], program.B[:, -size:])",
+        ("tests/test_stages.py",),
     ),
     Fault(
         "bound-of-a-distance-too-small",
