@@ -11,7 +11,7 @@ from mkdocs.exceptions import PluginError
 from mkdocs.structure.files import File
 from reference import GENERATED
 
-FIGURES = ("paper-obstacle", "paper-hertz")
+FIGURES = ("paper-obstacle", "paper-hertz", "field")
 ELSEWHERE = re.compile(
     r"""<(?:script|img|iframe|link\s[^>]*rel=["']?stylesheet)[^>]*(?:src|href)=["']?(?:https?:)?//"""
 )

@@ -165,7 +165,9 @@ def shares_drawn(field: Field) -> Figure:
     """Share of β_on over vectors, one line per primal strategy, with the cone of mcpg."""
     chosen = [(key, steps) for key, steps in field.longest() if key[3] == REFERENCE]
     pairs = list(dict.fromkeys(key[:3] for key, _ in chosen))
-    sheet = Sheet(1, len(pairs), "Smallest β_S over the training set as a share of the smallest β_on, cone of mcpg")
+    sheet = Sheet(
+        2, -(-len(pairs) // 2), "Smallest β_S over the training set as a share of the smallest β_on, cone of mcpg"
+    )
     for panel, pair in zip(sheet.panels, pairs, strict=True):
         for k, (key, steps) in enumerate((key, steps) for key, steps in chosen if key[:3] == pair):
             plot(panel, steps["step"], steps["share"], k, key[4])
@@ -235,9 +237,9 @@ def main(run: Path, folder: Path) -> None:
     field = Field.read(path)
     folder.mkdir(parents=True, exist_ok=True)
     drawn = {
-        "shares": lambda: shares_drawn(field),
-        "dimension": lambda: scatter(field, _dimension, "dimension N + S + R", "Error of λ against dimension"),
-        "time": lambda: scatter(
+        "field-shares": lambda: shares_drawn(field),
+        "field-dimension": lambda: scatter(field, _dimension, "dimension N + S + R", "Error of λ against dimension"),
+        "field-time": lambda: scatter(
             field, lambda cells: 1e3 * cells["online_s"], "query, reduced [ms]", "Error of λ against online time"
         ),
     }
