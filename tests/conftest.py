@@ -61,7 +61,7 @@ Changed = Callable[..., Path]
 
 @pytest.fixture
 def changed(quick_run: Path, tmp_path: Path) -> Changed:
-    """Function that gives a new copy of the results of a real run, changed by SQL."""
+    """Function that gives a copy of the results of a real run, changed by SQL; the next one takes its place."""
 
     def copy(*statements: str) -> Path:
         folder = tmp_path / "changed"

@@ -11,29 +11,36 @@ from vibench import active_systems
 from vibench.active_systems import SaddlePoint
 
 
-@given(st.integers(0, 10_000), st.lists(st.sets(st.integers(0, 5)), min_size=1, max_size=5), st.integers(0, 6))
-def test_solutions_are_those_of_the_whole_system(seed: int, sets: list[set[int]], border: int) -> None:
+@given(
+    st.integers(0, 10_000),
+    st.lists(st.sets(st.integers(0, 5)), min_size=1, max_size=5),
+    st.integers(0, 6),
+    st.sampled_from([1e-6, 1.0, 2e11]),
+)
+def test_solutions_are_those_of_the_whole_system(seed: int, sets: list[set[int]], border: int, young: float) -> None:
     rng = np.random.default_rng(seed)
-    A, B, f, g = spd(8, rng), rng.standard_normal((6, 8)), rng.standard_normal(8), rng.standard_normal(6)
+    A, f = young * spd(8, rng), young * rng.standard_normal(8)
+    B, g = rng.standard_normal((6, 8)), rng.standard_normal(6)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(active_systems, "BORDER", border)
         solve = SaddlePoint(sp.csc_array(A), f, sp.csr_array(B), g)
         for chosen in sets:
             active = np.array(sorted(chosen), dtype=np.intp)
             rows = B[active]
-            whole = np.block([[A, rows.T], [rows, np.zeros((len(active),) * 2)]])
-            expected = np.linalg.solve(whole, np.concatenate([f, g[active]]))
+            whole = np.block([[A / young, rows.T], [rows, np.zeros((len(active),) * 2)]])
+            expected = np.linalg.solve(whole, np.concatenate([f / young, g[active]]))
             u, lam = solve(active)
             assert np.allclose(u, expected[:8], atol=1e-8)
-            assert np.allclose(lam[active], expected[8:], atol=1e-8)
+            assert np.allclose(lam[active] / young, expected[8:], atol=1e-8)
             assert not np.any(np.delete(lam, active))
 
 
-def test_sets_that_differ_little_are_not_factorised_again(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("young", [1e-12, 1.0, 2e11])
+def test_sets_that_differ_little_are_not_factorised_again(monkeypatch: pytest.MonkeyPatch, young: float) -> None:
     made = []
     monkeypatch.setattr(active_systems, "splu", lambda matrix: made.append(matrix.shape) or sp.linalg.splu(matrix))
     rng = np.random.default_rng(0)
-    solve = SaddlePoint(sp.csc_array(spd(40, rng)), np.ones(40), sp.eye_array(40).tocsr(), np.zeros(40))
+    solve = SaddlePoint(sp.csc_array(young * spd(40, rng)), young * np.ones(40), sp.eye_array(40).tocsr(), np.zeros(40))
     for active in (np.arange(20), np.arange(3, 22), np.arange(20), np.arange(20 + active_systems.BORDER + 1)):
         solve(active)
     assert made == [(60, 60), (77, 77)]

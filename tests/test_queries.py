@@ -12,11 +12,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from samples import carry_out
-from vibench import judgement, qp
+from vibench import judgement, qp, queries
 from vibench.assembly import AssemblyStage
 from vibench.matrix import Plugin
 from vibench.problem import ParameterBox, VariationalInequality
 from vibench.queries import QueriesStage, path_before
+from vibench.query import assess
 from vibench.stage import value_of
 from vibench.stages import ConeStage, EnrichmentStage, PODStage
 from vibench.store import Store
@@ -56,6 +57,28 @@ def test_a_start_changes_the_way_and_not_the_answer(solver: str, dual: bool) -> 
     assert qp.takes_start(solver) == (solver != "piqp")
     if solver == "osqp" and not dual:
         assert warm.iterations <= cold.iterations
+
+
+def test_a_query_whose_assessment_fails_costs_itself(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    cone = ConeStage(PROBLEM, Plugin("dual strategy", "cpg", "{}", "test"), Stop(size=3))
+    primal = Plugin("primal strategy", "decorrelated", "{}", "test")
+    enrichment = EnrichmentStage(PODStage(PROBLEM, Stop(size=4)), cone, primal, None)
+    stage, store = QueriesStage(AssemblyStage(enrichment, None, 4, 1), "piqp", 1e-6, 20.0), Store(tmp_path)
+    carry_out(stage, store)
+    whole, bad = value_of(store, stage), float(PROBLEM.create().validation_set(4, 1)[2, 0])
+
+    def unlucky(model: object, mus: np.ndarray, *others: object) -> list[dict[str, object]]:
+        if bad in mus[:, 0]:
+            raise ArithmeticError("nothing to compare with")
+        return assess(model, mus, *others)
+
+    monkeypatch.setattr(queries, "assess", unlucky)
+    found = stage.run(store).value
+    assert [row["status"] for row in found.queries] == ["ok", "ok", "error", "ok"]
+    assert "in the assessment: ArithmeticError: nothing to compare with" in found.queries[2]["reason"]
+    assert found.cell["queries_ok"] == 3
+    for k in (0, 1, 3):
+        assert found.queries[k]["error_u"] == pytest.approx(whole.queries[k]["error_u"], rel=1e-9)
 
 
 def test_rows_say_which_query_they_started_from(tmp_path: Path) -> None:

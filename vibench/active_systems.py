@@ -15,6 +15,7 @@ from vibench.arrays import Array, Indices, SparseMatrix
 from vibench.condensation import Condensed, Pattern
 from vibench.errors import NumericalError
 from vibench.problem import VariationalInequality
+from vibench.qp import row_norms
 
 FEW = 0.5
 """Systems are condensed on the constrained unknowns where these are no more than this share of all."""
@@ -23,7 +24,7 @@ BORDER = 16
 """Constraints by which an active set may differ from one that is factorised, for the factor to be used again."""
 
 ROUND_OFF = 1e-12
-"""Entries of a bordered system below this, relative to what they were made from, may be nothing."""
+"""Entries of a bordered system below this, relative to what they were made from, may be nothing but that."""
 
 
 class Stiffness:
@@ -105,7 +106,12 @@ class SaddlePoint:
     """
 
     def __init__(self, A: SparseMatrix, f: Array, B: SparseMatrix, g: Array) -> None:
-        self._A, self._f, self._B, self._g = A, f, B, g
+        self._size = 1.0 / np.sqrt(A.diagonal())  # displacements and forces get one unit
+        scaled = sp.diags_array(self._size)
+        B = B @ scaled
+        self._force = 1.0 / row_norms(B)
+        self._A, self._f = scaled @ A @ scaled, self._size * f
+        self._B, self._g = sp.csr_array(sp.diags_array(self._force) @ B), self._force * g
         self._base = np.zeros(0, dtype=np.intp)
         self._factorised: _Factorised | None = None
 
@@ -142,14 +148,23 @@ class SaddlePoint:
         lam = np.zeros(self._B.shape[0])
         lam[base], lam[come] = found[0][n:], found[1][: len(come)]
         lam[base[gone]] = 0.0
-        return found[0][:n], lam
+        return self._size * found[0][:n], self._force * lam
 
 
 class _Factorised:
-    """A symmetric system K (k×k), factorised, that can be bordered."""
+    """A symmetric system K (k×k), equilibrated and factorised, that can be bordered.
+
+    Raises
+    ------
+    RuntimeError
+        If it is singular up to round-off.
+    """
 
     def __init__(self, matrix: SparseMatrix) -> None:
         self._matrix, self._factor = matrix, splu(matrix)
+        pivots = np.abs(self._factor.U.diagonal())
+        if np.min(pivots, initial=np.inf) <= ROUND_OFF * np.max(pivots, initial=0.0):
+            raise RuntimeError("the system is singular: its constraints are dependent")
 
     def solve(self, border: Array, right: Array, given: Array) -> tuple[Array, Array] | None:
         """The x (k,) and y (d,) with K x + C y = r and Cᵀx = s; `None` where Cᵀ K⁻¹ C is not clearly regular."""

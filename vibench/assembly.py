@@ -18,7 +18,7 @@ from vibench.stage import Result, Stage, assemblies, build_problem, value_of
 from vibench.stages import EnrichmentStage, GrowthStage, enrichment_stage, grown_model, reduced_model
 from vibench.store import Store
 from vibench.strategy import Kind
-from vibench.timing import NO_TIME, Seconds, median_seconds, timed
+from vibench.timing import NO_TIME, REPEATS, Seconds, median_of, median_seconds, timed
 
 Model = ReducedModel | OnlineModel
 """What gives the reduced problem at a parameter."""
@@ -176,11 +176,11 @@ class AssemblyStage(Stage):
         return Result(_in_full(model, mus, value_of(store, self.forms), known))
 
 
-Known = Sequence[VariationalInequality] | None
-"""Programs in full of a space that begins with that of a model, one per parameter."""
+InFull = Sequence[VariationalInequality] | None
+"""Programs in full of a space that begins with that of a model, one per parameter, if they are known."""
 
 
-def _reduced(model: OnlineModel, mus: Array, known: Known) -> Assembled:
+def _reduced(model: OnlineModel, mus: Array, known: InFull) -> Assembled:
     """Assemble without arrays of mesh size at every parameter; how far the members are from their projections."""
     matrices = assemblies(model.problem)
     programs, seconds, errors, factor = [], [], [], None
@@ -196,22 +196,20 @@ def _reduced(model: OnlineModel, mus: Array, known: Known) -> Assembled:
     return Assembled(tuple(programs), factor, tuple(seconds), tuple(errors))
 
 
-def _in_full(model: ReducedModel, mus: Array, forms: Sequence[Seconds], known: Known) -> Assembled:
+def _in_full(model: ReducedModel, mus: Array, forms: Sequence[Seconds], known: InFull) -> Assembled:
     """Assemble the high-fidelity matrices, which are timed once for all models, and project them.
 
-    On a space that does not vary a projection takes as long at every parameter, and is timed at the first.
+    After a warm-up the projection is timed once at every parameter. On a space that does not vary it takes as long at
+    each, and the median over the first parameters counts for all, where the programs are known already.
     """
-    matrices = assemblies(model.problem)
-    at_first = partial(model.reduce, matrices.at(mus[0]))
-    if model.kind is Kind.PER_PARAMETER:
-        at_first()  # what is made once for all parameters
-        each = [timed(partial(model.reduce, matrices.at(mu))) for mu in mus]
-        programs, projecting = [found.program for found, _ in each], [seconds for _, seconds in each]
-    else:
-        first, seconds = median_seconds(at_first)
-        size, projecting = len(first.program.f), [seconds] * len(mus)
-        whole = known or [model.reduce(matrices.at(mu)).program for mu in mus]
-        programs = [beginning(program, size) for program in whole]
+    matrices, model_of_one = assemblies(model.problem), model.kind is not Kind.PER_PARAMETER
+    size = len(model.reduce(matrices.at(mus[0])).program.f)
+    timed_at = mus[:REPEATS] if known and model_of_one else mus
+    each = [timed(partial(model.reduce, matrices.at(mu))) for mu in timed_at]
+    projecting = [seconds for _, seconds in each]
+    if model_of_one:
+        projecting = [median_of(projecting)] * len(mus)
+    programs = [beginning(program, size) for program in known] if known else [found.program for found, _ in each]
     total = tuple(form + spent for form, spent in zip(forms, projecting, strict=True))
     return Assembled(tuple(programs), None, total, (0.0,) * len(mus))
 

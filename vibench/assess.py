@@ -1,4 +1,4 @@
-"""Assessment of a query: errors and inf-sup constants. Nothing here is timed."""
+"""Assessment of queries: errors and inf-sup constants. Nothing here is timed."""
 
 from __future__ import annotations
 

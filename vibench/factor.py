@@ -77,6 +77,8 @@ class SparseCholesky:
     def _blocks(self) -> tuple[SparseMatrix, SparseMatrix, Array]:
         """Transposes of the lower factor's sparse blocks, that of the first unknowns and the coupling; dense F."""
         split = self._sparse
+        if split == len(self._root):
+            return self._lower.T, sp.csc_array((split, 0)), np.zeros((0, 0))
         first = sp.csc_array(self._lower[:, :split])
         corner, coupling = sp.csc_array(first[:split]), sp.csc_array(first[split:])
         corner.sort_indices()
@@ -106,8 +108,8 @@ class SparseCholesky:
         return u
 
     def extend(self, last: Array) -> Array:
-        """Solution (n,) or (n, k) of X u = 0 in all rows but those eliminated last, where u is given (`dense`, k)."""
-        split, u = self._sparse, np.zeros((len(self._root), *last.shape[1:]))
+        """Solution (n,) of X u = 0 in all rows but those of the `dense` unknowns, where u is given (dense,)."""
+        split, u = self._sparse, np.zeros(len(self._root))
         corner, coupling, _ = self._blocks
         u[self.order[split:]] = last
         if split and last.size:

@@ -15,6 +15,7 @@ from vibench.assembly import Assembled, AssemblyStage, assembly_columns, query_m
 from vibench.assess import Reference
 from vibench.constants import FullConstants, OwnConstants, PlainConstants
 from vibench.error_bounds import Stability
+from vibench.errors import in_a_line
 from vibench.infsup import InfSup
 from vibench.problem import ParameterBox, VariationalInequality
 from vibench.provenance import machine
@@ -149,7 +150,26 @@ class Queries(Pieces):
         return CellRows(found | self._sizes() | self._offline(), tuple(rows), tuple(solutions.values()))
 
     def _assess(self, solutions: Mapping[int, Row]) -> list[Row]:
-        """What comparing the solutions of some queries with the high-fidelity ones gives, row by row."""
+        """What comparing the solutions of some queries with the high-fidelity ones gives, row by row.
+
+        Where that fails for all together it is done one by one, and the rows that it fails for say so.
+        """
+        try:
+            return self._assessed(solutions)
+        except MemoryError:
+            raise
+        except Exception:  # noqa: BLE001  whatever it is, it may be of one query alone
+            return [row for k, solution in solutions.items() for row in self._alone(k, solution)]
+
+    def _alone(self, number: int, solution: Row) -> list[Row]:
+        try:
+            return self._assessed({number: solution})
+        except MemoryError:
+            raise
+        except Exception as error:  # noqa: BLE001  the row says what
+            return [{"status": Status.ERROR.value, "reason": f"in the assessment: {in_a_line(error)}"}]
+
+    def _assessed(self, solutions: Mapping[int, Row]) -> list[Row]:
         numbers, reference = list(solutions), self._reference
         return assess(
             self._model,
@@ -190,7 +210,7 @@ class Queries(Pieces):
             "N": size,
             "R": cone.cone.size,
             "rank": cone.prepared.rank,
-            "gram_condition": float(np.linalg.cond(cone.prepared.gram)) if cone.cone.size else None,
+            "gram_condition": cone.gram_condition,
             "enrichment": cone.prepared.rank if built.kind is Kind.PER_PARAMETER else added,
             **assembly_columns(self._store, self._stage.assembly),
             "fallbacks": "; ".join(fallbacks),

@@ -45,10 +45,11 @@ class PODStage(Stage):
 
 @dataclass(frozen=True)
 class ReducedCone:
-    """A cone with what every constant and every enrichment computed from it shares."""
+    """A cone, what every constant and enrichment computed from it shares, and the condition of its Gram matrix."""
 
     cone: Cone
     prepared: Multipliers
+    gram_condition: float | None
 
 
 @dataclass(frozen=True)
@@ -72,8 +73,9 @@ class ConeStage(Stage):
         spent = watch.seconds()
         check_cone(cone, W)
         watch = Stopwatch()
-        found = ReducedCone(cone, multipliers(cone.generators, W, cone.free))
+        prepared = multipliers(cone.generators, W, cone.free)
         seconds = spent + watch.seconds()
+        found = ReducedCone(cone, prepared, float(np.linalg.cond(prepared.gram)) if cone.size else None)
         key = {"stage": "cone"}
         return Result(
             found,
@@ -164,7 +166,6 @@ class GrowthStage(Stage):
         """An `AssessedGrowth`; its seconds are counted where its tolerances are."""
         offline = _offline(store, self.pod, self.cone)
         grown = grow_through(self.primal.create(), offline, self.tolerances)
-        check_enrichment(Enrichment(Kind.FIXED, vectors=grown.vectors), offline.problem.V, offline.basis)
         images, size = _images(offline, grown.vectors, value_of(store, self.constraints)), offline.basis.shape[1]
         training = {tolerance: images.first(size + m.count).beta_span() for tolerance, m in grown.milestones.items()}
         return Result(AssessedGrowth(grown, images.over_steps(size), training))
@@ -197,13 +198,16 @@ class EnrichmentStage(Stage):
 
     def run(self, store: Store) -> Result:
         """Build the enrichment, which `enrichment_of` gives; what it reaches on the training set is not timed."""
-        if self.growth is not None and self.tolerance is not None:
+        offline = _offline(store, self.pod, self.cone)
+        if self.growth is not None:
+            assert self.tolerance is not None  # a nested strategy is given one
             growth: AssessedGrowth = value_of(store, self.growth)
             enrichment, seconds = growth.grown.at(self.tolerance)
             reached = {"beta_span_min": growth.steps[: growth.grown.milestones[self.tolerance].count + 1]}
             reached |= {"beta_span_training": growth.training[self.tolerance]}
+            check_enrichment(enrichment, offline.problem.V, offline.basis)
         else:
-            offline, strategy = _offline(store, self.pod, self.cone), self.primal.create()
+            strategy = self.primal.create()
             enrichment, seconds = timed(lambda: strategy.build(offline, self.tolerance))
             check_enrichment(enrichment, offline.problem.V, offline.basis)
             reached = {}
@@ -233,9 +237,10 @@ def _images(offline: Offline, vectors: Array, classes: ConstraintClasses) -> Ima
 
 def enrichment_of(store: Store, stage: EnrichmentStage) -> Enrichment:
     """The enrichment of a stage that has been run; the beginning of a growth is stored with the growth alone."""
-    if stage.growth is None or stage.tolerance is None:
+    if stage.growth is None:
         found: Enrichment = value_of(store, stage)
         return found
+    assert stage.tolerance is not None  # a nested strategy is given one
     growth: AssessedGrowth = value_of(store, stage.growth)
     return growth.grown.at(stage.tolerance)[0]
 

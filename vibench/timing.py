@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import statistics
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache
 from typing import TypeVar
@@ -87,7 +87,12 @@ def median_seconds(
     runs: list[Seconds] = []
     while len(runs) < REPEATS and sum(run.wall for run in runs) < enough:
         runs.append(once()[1])
-    return result, Seconds(statistics.median(r.cpu for r in runs), statistics.median(r.wall for r in runs))
+    return result, median_of(runs)
+
+
+def median_of(runs: Sequence[Seconds]) -> Seconds:
+    """Median CPU and median wall seconds."""
+    return Seconds(statistics.median(r.cpu for r in runs), statistics.median(r.wall for r in runs))
 
 
 class Calibration:
