@@ -106,7 +106,8 @@ class SaddlePoint:
     """
 
     def __init__(self, A: SparseMatrix, f: Array, B: SparseMatrix, g: Array) -> None:
-        self._size = 1.0 / np.sqrt(A.diagonal())  # displacements and forces get one unit
+        stiffness = np.abs(A.diagonal())
+        self._size = 1.0 / np.sqrt(np.where(stiffness > 0.0, stiffness, 1.0))  # one unit for displacements and forces
         scaled = sp.diags_array(self._size)
         B = B @ scaled
         self._force = 1.0 / row_norms(B)
@@ -121,7 +122,7 @@ class SaddlePoint:
         Raises
         ------
         RuntimeError
-            If they are dependent.
+            If their system is exactly singular.
         """
         found = None
         if self._factorised is not None and len(np.setxor1d(active, self._base)) <= BORDER:
@@ -157,14 +158,11 @@ class _Factorised:
     Raises
     ------
     RuntimeError
-        If it is singular up to round-off.
+        If it is exactly singular; what is so up to round-off may have a solution all the same, which is verified.
     """
 
     def __init__(self, matrix: SparseMatrix) -> None:
         self._matrix, self._factor = matrix, splu(matrix)
-        pivots = np.abs(self._factor.U.diagonal())
-        if np.min(pivots, initial=np.inf) <= ROUND_OFF * np.max(pivots, initial=0.0):
-            raise RuntimeError("the system is singular: its constraints are dependent")
 
     def solve(self, border: Array, right: Array, given: Array) -> tuple[Array, Array] | None:
         """The x (k,) and y (d,) with K x + C y = r and Cᵀx = s; `None` where Cᵀ K⁻¹ C is not clearly regular."""
