@@ -60,6 +60,11 @@ class ConeStage(Stage):
     dual: Plugin
     stop: Stop
 
+    @property
+    def constraints(self) -> TrainingConstraints:
+        """The stage that knows the constraint matrices of the training set, for what is computed on the cone."""
+        return TrainingConstraints(self.problem)
+
     def inputs(self) -> tuple[Stage, ...]:
         """The training sweep."""
         return training(self.problem)
@@ -109,18 +114,13 @@ class TrainingConstants(Stage):
 
     cone: ConeStage
 
-    @property
-    def constraints(self) -> TrainingConstraints:
-        """The stage that knows the constraint matrices."""
-        return TrainingConstraints(self.cone.problem)
-
     def inputs(self) -> tuple[Stage, ...]:
         """The cone and the constraint matrices."""
-        return (self.cone, self.constraints)
+        return (self.cone, self.cone.constraints)
 
     def run(self, store: Store) -> Result:
         """β_span of the whole of V with the cone at every parameter (P,)."""
-        span, classes = value_of(store, self.cone).prepared.span, value_of(store, self.constraints)
+        span, classes = value_of(store, self.cone).prepared.span, value_of(store, self.cone.constraints)
         image = supremizer_images(build_problem(self.cone.problem).V, classes.representatives, span.shape[1])
         return Result(classes.everywhere([beta_span(image(B, span)) for B in classes.representatives]))
 
@@ -153,20 +153,15 @@ class GrowthStage(Stage):
     primal: Plugin
     tolerances: tuple[float, ...]
 
-    @property
-    def constraints(self) -> TrainingConstraints:
-        """The stage that knows the constraint matrices of the training set."""
-        return TrainingConstraints(self.cone.problem)
-
     def inputs(self) -> tuple[Stage, ...]:
         """POD, cone and the constraint matrices."""
-        return (self.pod, self.cone, self.constraints)
+        return (self.pod, self.cone, self.cone.constraints)
 
     def run(self, store: Store) -> Result:
         """An `AssessedGrowth`; its seconds are counted where its tolerances are."""
         offline = _offline(store, self.pod, self.cone)
         grown = grow_through(self.primal.create(), offline, self.tolerances)
-        images, size = _images(offline, grown.vectors, value_of(store, self.constraints)), offline.basis.shape[1]
+        images, size = _images(offline, grown.vectors, value_of(store, self.cone.constraints)), offline.basis.shape[1]
         training = {tolerance: images.first(size + m.count).beta_span() for tolerance, m in grown.milestones.items()}
         return Result(AssessedGrowth(grown, images.over_steps(size), training))
 
@@ -193,7 +188,7 @@ class EnrichmentStage(Stage):
 
     def inputs(self) -> tuple[Stage, ...]:
         """POD, cone and what is to be reached; the training parameters come from the problem."""
-        known = (self.pod, self.cone, self.reached, self.reached.constraints)
+        known = (self.pod, self.cone, self.reached, self.cone.constraints)
         return known if self.growth is None else (*known, self.growth)
 
     def run(self, store: Store) -> Result:
@@ -212,7 +207,7 @@ class EnrichmentStage(Stage):
             check_enrichment(enrichment, offline.problem.V, offline.basis)
             reached = {}
             if enrichment.vectors is not None:
-                images = _images(offline, enrichment.vectors, value_of(store, self.reached.constraints))
+                images = _images(offline, enrichment.vectors, value_of(store, self.cone.constraints))
                 reached = {"beta_span_min": images.over_steps(offline.basis.shape[1])}
                 reached |= {"beta_span_training": images.beta_span()}
         if reached:
