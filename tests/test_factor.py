@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import pickle
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -39,6 +40,19 @@ def test_taking_the_last_unknowns_for_coupled_changes_nothing(seed: int, count: 
     y = rng.standard_normal((7, columns)) if columns else rng.standard_normal(7)
     assert np.allclose(factor.up(factor.up_inverse(y)), y)
     assert np.allclose(factor.up_inverse(y), SparseCholesky(X, order=order).up_inverse(y))
+
+
+@given(st.integers(0, 10_000), st.integers(0, 7), st.integers(0, 3), st.sampled_from([0, 1000]))
+def test_all_unknowns_follow_from_the_last(seed: int, count: int, columns: int, denser: int) -> None:
+    rng = np.random.default_rng(seed)
+    scale, last = np.diag(rng.uniform(0.5, 2.0, 7)), rng.permutation(7)[:count]
+    X = sp.csc_array(scale @ (3.0 * np.eye(7) - np.eye(7, k=1) - np.eye(7, k=-1)) @ scale)  # few depend on each other
+    given_there = rng.standard_normal((count, columns) if columns else count)
+    with mock.patch("vibench.factor.DENSER", denser):  # by solving, and by a full matrix
+        u = SparseCholesky(X, order=elimination_order(X, last), dense=count).extend(given_there)
+    rest = np.setdiff1d(np.arange(7), last)
+    assert np.allclose((X @ u)[rest], 0.0)
+    assert np.array_equal(u[last], given_there)
 
 
 @given(st.integers(0, 10_000), st.integers(0, 7))

@@ -15,6 +15,10 @@ from vibench.errors import NumericalError
 _SYMMETRIC = {"diag_pivot_thresh": 0.0, "panel_size": 1, "options": {"SymmetricMode": True}}
 """No pivoting off the diagonal; panels of one column are the fastest for the matrices of plane meshes."""
 
+DENSER = 8
+"""What follows from the last unknowns comes from a full matrix where it has no more than this many times the entries of
+the sparse factor: a product does far more operations in the same time than a triangular solve."""
+
 
 class SparseCholesky:
     """X = FᵀF for a sparse symmetric positive definite X (n×n), without pivoting off the diagonal.
@@ -108,13 +112,28 @@ class SparseCholesky:
         return u
 
     def extend(self, last: Array) -> Array:
-        """Solution (n,) of X u = 0 in all rows but those of the `dense` unknowns, where u is given (dense,)."""
-        split, u = self._sparse, np.zeros(len(self._root))
+        """Solution (n,) or (n, k) of X u = 0 in all rows but those of the `dense` unknowns, where u is given."""
+        split, u = self._sparse, np.zeros((len(self._root), *last.shape[1:]))
         corner, coupling, _ = self._blocks
         u[self.order[split:]] = last
         if split and last.size:
-            u[self.order[:split]] = spsolve_triangular(corner, -(coupling @ last), lower=False, unit_diagonal=True)
+            where, extension = self._extension
+            u[self.order[:split]] = (
+                spsolve_triangular(corner, -(coupling @ last), lower=False, unit_diagonal=True)
+                if extension is None
+                else extension @ last[where]
+            )
         return u
+
+    @cached_property
+    def _extension(self) -> tuple[Indices, Array | None]:
+        """The `dense` unknowns that others depend on (c,), and how these follow; `None` where to solve is cheaper."""
+        corner, coupling, _ = self._blocks
+        where = np.unique(coupling.indices)
+        if self._sparse * len(where) > DENSER * (corner.nnz + coupling.nnz):
+            return where, None
+        right = -coupling[:, where].toarray()
+        return where, spsolve_triangular(corner, right, lower=False, unit_diagonal=True)
 
     def down_inverse(self, right: Array) -> Array:
         """F⁻ᵀ r, for r (n,) or (n, k)."""

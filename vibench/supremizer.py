@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 
 import numpy as np
 import scipy.linalg
@@ -173,7 +173,13 @@ class ContactCoordinates:
     def vectors(self, coordinates: Array) -> Array:
         """Vectors (n×k) with these coordinates (d×k)."""
         k = self._others.shape[1]
-        return self._factor.up_inverse(np.vstack([self._others @ coordinates[:k], coordinates[k:]]))
+        last = scipy.linalg.solve_triangular(self._tail, coordinates[k:], check_finite=False)
+        return np.asarray(self._off_contact @ coordinates[:k] + self._factor.extend(last))
+
+    @cached_property
+    def _off_contact(self) -> Array:
+        """Vectors (n×N) whose coordinates are the first N unit vectors; they are zero on E."""
+        return self._factor.up_inverse(np.vstack([self._others, np.zeros((len(self._tail), self._others.shape[1]))]))
 
 
 def contact_factor(V: InnerProduct, dofs: Indices) -> tuple[SparseCholesky, Array]:
