@@ -344,8 +344,8 @@ FAULTS = (
     Fault(
         "modes-instead-of-the-enriched-space",
         "vibench/constants.py",
-        "constants_on(model.fixed_basis, matrices",
-        "constants_on(model.fixed_basis[:, :1], matrices",
+        "constants_on(model.fixed_basis, classes",
+        "constants_on(model.fixed_basis[:, :1], classes",
         ("tests/test_constants.py",),
     ),
 )

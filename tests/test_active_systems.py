@@ -10,7 +10,9 @@ from hypothesis import strategies as st
 
 from numerics import spd
 from vibench import active_systems
-from vibench.active_systems import SaddlePoint
+from vibench.active_systems import SaddlePoint, Stiffness
+from vibench.condensation import Pattern
+from vibench.errors import NumericalError
 
 
 @given(
@@ -65,3 +67,15 @@ def test_a_stiffness_that_is_not_definite_is_for_others_to_refuse() -> None:
     u, lam = SaddlePoint(A, np.ones(3), sp.csr_array(np.eye(3)), np.zeros(3))(np.array([0]))
     assert np.allclose((A @ u + lam)[1:], 1.0)
     assert np.isclose(u[0], 0.0)
+
+
+@pytest.mark.parametrize("coupled", [0, 3], ids=["sparse", "dense"])
+@pytest.mark.parametrize("kept", [0, 3], ids=["nothing kept", "three kept"])
+def test_what_is_left_after_elimination_shows_whether_a_stiffness_is_definite(coupled: int, kept: int) -> None:
+    A = sp.block_diag([4.0 * np.eye(6), np.diag([4.0, 5.0, 6.0])]).toarray()
+    A[:coupled, 6 : 6 + coupled] = A[6 : 6 + coupled, :coupled] = np.eye(coupled)
+    pattern = Pattern.of(sp.csr_array(A), np.arange(9 - kept, 9)) if kept else None
+    Stiffness(sp.csr_array(A), pattern).check_definite("A somewhere")
+    A[8, 8] = 0.2 if coupled else -1.0  # a quarter is taken from it where it is coupled
+    with pytest.raises(NumericalError, match=r"A( somewhere)? is not positive definite"):
+        Stiffness(sp.csr_array(A), pattern).check_definite("A somewhere")

@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import scipy.sparse as sp
@@ -105,3 +107,14 @@ def test_a_contact_set_that_moves_node_by_node_is_followed_to_its_end() -> None:
     assert found.iterations > highfidelity.MAX_ITERATIONS
     assert found.fallback == ""
     assert np.all(found.u >= obstacle - 1e-12)
+
+
+def test_a_stiffness_that_is_not_symmetric_is_refused_and_where() -> None:
+    problem, mu = Varying(), np.array([0.5])
+    solver, vi = highfidelity.Solver(problem), problem.assemble(mu)
+    solver.solve_assembled(mu, vi)
+    solver.check_coercive(mu, vi)
+    crooked = vi.A.tolil()
+    crooked[0, 1] *= 1.001
+    with pytest.raises(NumericalError, match=r"A at mu = \[0.5\] is not symmetric"):
+        solver.check_coercive(mu, replace(vi, A=sp.csc_array(crooked)))

@@ -14,6 +14,7 @@ from scipy.sparse.linalg import splu
 from vibench.arrays import Array, Indices, SparseMatrix
 from vibench.condensation import Condensed, Pattern
 from vibench.errors import NumericalError
+from vibench.factor import SparseCholesky
 from vibench.problem import VariationalInequality
 from vibench.qp import row_norms
 
@@ -45,6 +46,19 @@ class Stiffness:
             pattern = Pattern(np.arange(A.shape[0]), np.zeros(0, np.intp), np.zeros(0, np.intp))
         self._pattern = pattern
         self._condensed = Condensed(A, self._pattern, reused=reused)
+
+    def check_definite(self, name: str) -> None:
+        """Refuse an A that is not positive definite: what is left to be shown once the others are eliminated.
+
+        Raises
+        ------
+        NumericalError
+            Calling A by `name`.
+        """
+        if self._condensed.dense:
+            self._inverse  # noqa: B018  no other has one
+        else:
+            SparseCholesky(self._condensed.matrix, name)
 
     @cached_property
     def _inverse(self) -> Array:

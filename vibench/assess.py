@@ -7,11 +7,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from vibench.arrays import Array, SparseMatrix
+from vibench.arrays import Array
 from vibench.infsup import InfSup, Multipliers, inf_sup, inf_sup_on
 from vibench.problem import Problem, VariationalInequality
 from vibench.space import InnerProduct
-from vibench.supremizer import ConstraintClasses, constraint_classes, supremizer_images
+from vibench.supremizer import ConstraintClasses, supremizer_images
 
 
 @dataclass(frozen=True)
@@ -90,18 +90,16 @@ def _over(value: float, scale: float) -> float:
     return value / scale if scale > 0.0 else value
 
 
-def constants_full(V: InnerProduct, matrices: Sequence[SparseMatrix], cone: Multipliers) -> list[InfSup]:
+def constants_full(V: InnerProduct, classes: ConstraintClasses, cone: Multipliers) -> list[InfSup]:
     """Constants of the whole of V at every B(mu) (m×n); matrices that are proportional share one computation."""
-    classes = constraint_classes(matrices)
     image = supremizer_images(V, classes.representatives, cone.span.shape[1] + cone.chi.shape[1])
     return everywhere(
         classes, [inf_sup(image(B, cone.span), image(B, cone.chi), cone) for B in classes.representatives]
     )
 
 
-def constants_on(Z: Array, matrices: Sequence[SparseMatrix], cone: Multipliers) -> list[InfSup]:
+def constants_on(Z: Array, classes: ConstraintClasses, cone: Multipliers) -> list[InfSup]:
     """Constants of one primal space with V-orthonormal basis Z (n×N') at every B(mu), likewise."""
-    classes = constraint_classes(matrices)
     return everywhere(classes, [inf_sup_on(Z, B, cone) for B in classes.representatives])
 
 

@@ -13,6 +13,7 @@ from vibench.arrays import Array, Mask
 from vibench.condensation import Pattern
 from vibench.errors import NumericalError
 from vibench.problem import Problem, VariationalInequality, checked_assembly
+from vibench.space import check_symmetric
 
 ACCURACY = 1e-10
 """Relative KKT accuracy of every snapshot."""
@@ -88,6 +89,25 @@ class Solver:
             raise NumericalError(f"at mu = {mu.tolist()}: {reason}")
         self._solved.append((mu, found.lam > 0.0))
         return found
+
+    def check_coercive(self, mu: Array, vi: VariationalInequality) -> None:
+        """Refuse a stiffness that is not symmetric positive definite.
+
+        Parameters
+        ----------
+        mu
+            Where (d,).
+        vi
+            What was solved last: most of the work has been done for that.
+
+        Raises
+        ------
+        NumericalError
+            Saying at which mu, and what it is not.
+        """
+        name = f"A at mu = {mu.tolist()}"
+        check_symmetric(vi.A, name)
+        (self._system or self._stiffness(vi)).check_definite(name)
 
     def _nearest(self, mu: Array) -> Mask | None:
         """Contact set of the solved parameter that is nearest, the box of parameters taken for a cube."""

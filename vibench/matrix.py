@@ -6,6 +6,7 @@ import hashlib
 import json
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, replace
+from functools import cached_property
 from itertools import product
 from typing import Any
 
@@ -79,7 +80,7 @@ class Cell:
     labels: tuple[str, str, str]
     along: tuple[float, ...] = ()
 
-    @property
+    @cached_property
     def key(self) -> str:
         """Hash of everything that determines the cell's numbers, the code aside."""
         content = asdict(self)

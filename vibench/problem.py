@@ -230,31 +230,26 @@ class Assemblies:
 
     def at(self, mu: Array) -> VariationalInequality:
         """`checked_assembly` at mu (d,)."""
-        key = np.ascontiguousarray(mu, float).tobytes()
-        vi = self._kept.pop(key, None)
-        if vi is None:
-            vi = checked_assembly(self._problem, mu)
-            self._size += _bytes(vi)
-            while self._kept and self._size > self._limit:
-                self._size -= _bytes(self._kept.pop(next(iter(self._kept))))
-        self._kept[key] = vi
+        vi = self._kept.get(_key(mu))
+        return self.keep(mu, checked_assembly(self._problem, mu) if vi is None else vi)
+
+    def keep(self, mu: Array, vi: VariationalInequality) -> VariationalInequality:
+        """Take in what was assembled at mu (d,), or asked for once more; gives it back."""
+        before = self._kept.pop(_key(mu), None)
+        self._size += _bytes(vi) - (0 if before is None else _bytes(before))
+        while self._kept and self._size > self._limit:
+            self._size -= _bytes(self._kept.pop(next(iter(self._kept))))
+        self._kept[_key(mu)] = vi
         return vi
+
+
+def _key(mu: Array) -> bytes:
+    return np.ascontiguousarray(mu, float).tobytes()
 
 
 def _bytes(vi: VariationalInequality) -> int:
     """Memory of the matrices, as if none were shared."""
     return int(12 * (vi.A.nnz + vi.B.nnz)) + vi.f.nbytes + vi.g.nbytes
-
-
-def check_coercive(A: SparseMatrix, mu: Array) -> None:
-    """Refuse a stiffness A (n×n) that is not symmetric positive definite at mu (d,).
-
-    Raises
-    ------
-    NumericalError
-        Saying where, and what it is not.
-    """
-    InnerProduct(A, f"A at mu = {mu.tolist()}")
 
 
 def training_parameters(problem: Problem) -> Array:

@@ -38,6 +38,7 @@ def versions(solver: str) -> dict[str, str]:
     return {"python": platform.python_version(), **found, solver: solver_version(solver)}
 
 
+@cache
 def distribution_version(name: str) -> str:
     """Version of an installed distribution, "" where it is not installed."""
     try:

@@ -13,7 +13,7 @@ from vibench.agreement import vectors
 from vibench.arrays import Array
 from vibench.assembly import Assembled, AssemblyStage, assembly_columns, query_model
 from vibench.assess import Reference
-from vibench.constants import FullConstants, OwnConstants, PlainConstants
+from vibench.constants import FullConstants, OwnConstants, PlainConstants, ValidationConstraints
 from vibench.error_bounds import Stability
 from vibench.errors import in_a_line
 from vibench.infsup import InfSup
@@ -68,11 +68,12 @@ class QueriesStage(PiecewiseStage):
     @property
     def constants(self) -> tuple[OwnConstants, FullConstants, PlainConstants]:
         """The stages that know the inf-sup constants of the reduced pair, of V with the cone, and of V_N alone."""
-        enrichment, count, seed = self.assembly.enrichment, self.assembly.count, self.assembly.seed
+        enrichment = self.assembly.enrichment
+        constraints = ValidationConstraints(enrichment.pod.problem, self.assembly.count, self.assembly.seed)
         return (
-            OwnConstants(enrichment, count, seed),
-            FullConstants(enrichment.cone, count, seed),
-            PlainConstants(enrichment.pod, enrichment.cone, count, seed),
+            OwnConstants(enrichment, constraints),
+            FullConstants(enrichment.cone, constraints),
+            PlainConstants(enrichment.pod, enrichment.cone, constraints),
         )
 
     @property

@@ -35,14 +35,7 @@ class InnerProduct:
     def __init__(self, matrix: SparseMatrix, name: str = "the Gram matrix") -> None:
         self.matrix = sp.csc_array(matrix)
         self._name = name
-        rows, columns = self.matrix.shape
-        if rows != columns:
-            raise NumericalError(f"{name} must be square, it is {rows}×{columns}")
-        if not np.all(np.isfinite(self.matrix.data)):
-            raise NumericalError(f"{name} has entries that are not finite")
-        scale = abs(self.matrix).max() if self.matrix.nnz else 0.0
-        if rows and abs(self.matrix - self.matrix.T).max() > 1e-12 * scale:
-            raise NumericalError(f"{name} is not symmetric")
+        check_symmetric(self.matrix, name)
         self._factor  # noqa: B018  an indefinite matrix is refused here, not at its first use
 
     def __getstate__(self) -> dict[str, object]:
@@ -106,3 +99,21 @@ class InnerProduct:
         """
         fixed = np.zeros((self.dim, 0)) if against is None else self.whiten(against)
         return self.unwhiten(orthonormal_range(self.whiten(u), fixed))
+
+
+def check_symmetric(matrix: SparseMatrix, name: str) -> None:
+    """Refuse a matrix that is not square, not finite or not symmetric up to round-off.
+
+    Raises
+    ------
+    NumericalError
+        Naming it and what it is not.
+    """
+    rows, columns = matrix.shape
+    if rows != columns:
+        raise NumericalError(f"{name} must be square, it is {rows}×{columns}")
+    if not np.all(np.isfinite(matrix.data)):
+        raise NumericalError(f"{name} has entries that are not finite")
+    scale = abs(matrix).max() if matrix.nnz else 0.0
+    if rows and abs(matrix - matrix.T).max() > 1e-12 * scale:
+        raise NumericalError(f"{name} is not symmetric")

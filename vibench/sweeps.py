@@ -15,13 +15,13 @@ from vibench.infsup import nodal_multipliers
 from vibench.matrix import Plugin
 from vibench.problem import (
     Problem,
-    check_coercive,
     checked_assembly,
     training_parameters,
     validation_parameters,
 )
-from vibench.stage import Result, Stage, build_problem, value_of
+from vibench.stage import Result, Stage, assemblies, build_problem, value_of
 from vibench.store import History, Store
+from vibench.supremizer import constraint_classes
 from vibench.timing import NO_TIME, Seconds, Stopwatch
 
 CHUNKS = 4
@@ -66,7 +66,7 @@ class HighFidelity(Stage):
             solution = solver.solve_assembled(mu, vi)
             seconds.append(watch.seconds())
             if k == 0 or "A" not in problem.constant:
-                check_coercive(vi.A, mu)
+                solver.check_coercive(mu, vi)
             u[:, k], lam[:, k] = solution.u, solution.lam
             fallbacks.append(solution.fallback)
         solutions = Solutions(mus, u, lam, tuple(seconds), tuple(fallbacks))
@@ -125,8 +125,10 @@ class ReferenceConstants(Stage):
     def run(self, store: Store) -> Result:  # noqa: ARG002
         """One `Stability` per parameter."""
         problem = build_problem(self.problem)
-        assembled = [checked_assembly(problem, mu) for mu in validation_parameters(problem, self.count, self.seed)]
-        inf_sup = constants_full(problem.V, [vi.B for vi in assembled], nodal_multipliers(problem.W))
+        mus = validation_parameters(problem, self.count, self.seed)
+        assembled = [assemblies(problem).at(mu) for mu in mus]
+        classes = constraint_classes([vi.B for vi in assembled])
+        inf_sup = constants_full(problem.V, classes, nodal_multipliers(problem.W))
         different = assembled[:1] if "A" in problem.constant else assembled
         quotients = [extreme_quotients(vi.A, problem.V) for vi in different] * (len(assembled) // len(different))
         return Result([Stability(found, *extremes) for found, extremes in zip(inf_sup, quotients, strict=True)])
