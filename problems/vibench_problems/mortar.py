@@ -48,18 +48,15 @@ class Pairing:
         self._slave = slave
         widths, lengths = np.diff(slave[0]), np.linalg.norm(np.diff(slave, axis=1), axis=0)
         self._stretch = lengths / widths
-        edges, nodes = np.arange(len(widths)), slave.shape[1]
+        edges = np.arange(len(widths))
         self._macros = edges // 2
         half = 0.5 * lengths
-        self._slave_entries = (
-            np.tile(self._macros, 2),
-            np.concatenate([edges, edges + 1]),
-            -np.concatenate([half, half]),
-        )
+        places = np.tile(self._macros, 2), np.concatenate([edges, edges + 1])
+        self._on_slave = sp.csr_array((-np.concatenate([half, half]), places))
+        self._slave_rows = np.repeat(np.arange(self._on_slave.shape[0]), np.diff(self._on_slave.indptr))
         height = half * (slave[1, :-1] + slave[1, 1:])
         self._height = np.asarray(np.bincount(self._macros, height), float)
         self._points = None if quadrature == "exact" else self._gauss(int(quadrature))
-        self._size = nodes
 
     def couple(self, master: Array) -> Coupling:
         """Couple to a master polygon (2×k), abscissae rising from the axis.
@@ -69,35 +66,48 @@ class Pairing:
         NumericalError
             If the master side does not reach as far as the slave side.
         """
-        slave, size = self._slave, self._size
+        slave = self._slave
         if master[0, -1] < slave[0, -1]:
             raise NumericalError(
                 f"the pairing ends at x = {master[0, -1]:.4g} m, but the potential contact zone of disc 1 reaches "
                 f"x = {slave[0, -1]:.4g} m: the radius of disc 2 is too small"
             )
-        macro, x, weight = self._points if self._points is not None else self._cut(master[0])
-        edge = _edge_of(master[0], x)
+        macro, edge, x, weight = self._cut(master[0]) if self._points is None else self._facing(self._points, master[0])
         right = weight * (x - master[0, edge]) / np.diff(master[0])[edge]
         left = weight - right
         on_master = left * master[1, edge] + right * master[1, edge + 1]
         height = np.asarray(np.bincount(macro, on_master, minlength=len(self._height)), float)
-        rows, columns, values = self._slave_entries
-        jump = sp.csr_array(
-            (
-                np.concatenate([values, left, right]),
-                (np.concatenate([rows, macro, macro]), np.concatenate([columns, size + edge, size + 1 + edge])),
-            ),
-            shape=(len(self._height), size + master.shape[1]),
-        )
+        jump = self._beside_slave(*_by_row(macro, edge, left, right), master.shape[1])
         return Coupling(jump, self._height - height)
 
-    def _cut(self, abscissae: Array) -> tuple[Indices, Array, Array]:
-        """Macro-edge, abscissa and weight of the midpoints of all segments between projected nodes."""
-        first, last = np.searchsorted(abscissae, self._slave[0, [0, -1]])
-        cuts = np.sort(np.concatenate([self._slave[0], abscissae[first:last]]), kind="stable")
+    def _beside_slave(self, rows: Indices, nodes: Indices, values: Array, count: int) -> SparseMatrix:
+        """The entries of the slave side, then those of `count` master nodes, rising by row and node."""
+        known = self._on_slave
+        before = np.concatenate([[0], np.cumsum(np.bincount(rows, minlength=known.shape[0]))])
+        mine = np.arange(known.nnz) + before[self._slave_rows]
+        theirs = np.arange(len(rows)) + known.indptr[rows + 1]
+        data, columns = np.empty(known.nnz + len(rows)), np.empty(known.nnz + len(rows), dtype=known.indices.dtype)
+        data[mine], columns[mine] = known.data, known.indices
+        data[theirs], columns[theirs] = values, known.shape[1] + nodes
+        pointers = (known.indptr + before).astype(columns.dtype)
+        return sp.csr_array((data, columns, pointers), shape=(known.shape[0], known.shape[1] + count))
+
+    def _cut(self, abscissae: Array) -> tuple[Indices, Indices, Array, Array]:
+        """Macro-edge, master edge, abscissa and weight of the midpoints of all segments between projected nodes."""
+        nodes = self._slave[0]
+        first, last = np.searchsorted(abscissae, nodes[[0, -1]])
+        both = np.concatenate([nodes, abscissae[first:last]])
+        order = np.argsort(both, kind="stable")
+        cuts, begun = both[order], np.cumsum(order < len(nodes))[:-1]  # slave edges that have begun before each segment
+        facing = np.maximum(first + np.arange(len(begun)) - begun, 0)  # of all others the last master node
         x = 0.5 * (cuts[1:] + cuts[:-1])
-        edge = _edge_of(self._slave[0], x)
-        return self._macros[edge], x, np.diff(cuts) * self._stretch[edge]
+        return self._macros[begun - 1], facing, x, np.diff(cuts) * self._stretch[begun - 1]
+
+    @staticmethod
+    def _facing(points: tuple[Indices, Array, Array], abscissae: Array) -> tuple[Indices, Indices, Array, Array]:
+        """Macro-edge, master edge, abscissa and weight of given points on the slave side."""
+        macro, x, weight = points
+        return macro, np.clip(np.searchsorted(abscissae, x, side="right") - 1, 0, len(abscissae) - 2), x, weight
 
     def _gauss(self, count: int) -> tuple[Indices, Array, Array]:
         """Macro-edge, abscissa and weight of `count` Gauss points per slave edge."""
@@ -108,5 +118,14 @@ class Pairing:
         return self._macros[edge], x, 0.5 * np.tile(weights, len(widths)) * (widths * self._stretch)[edge]
 
 
-def _edge_of(abscissae: Array, x: Array) -> Indices:
-    return np.clip(np.searchsorted(abscissae, x, side="right") - 1, 0, len(abscissae) - 2)
+def _by_row(rows: Indices, edges: Indices, left: Array, right: Array) -> tuple[Indices, Indices, Array]:
+    """Rows, nodes and sums of what points give to the two nodes of their edges, both rising from point to point."""
+    further = np.diff(edges)
+    step = np.where((np.diff(rows) > 0) | (further > 1), 2, further)  # what nodes two points share is summed
+    place = np.concatenate([[0], np.cumsum(step)])
+    count = int(place[-1]) + 2
+    sums = np.asarray(np.bincount(place, left, count) + np.bincount(place + 1, right, count), float)
+    of_row, node = np.empty(count, dtype=np.intp), np.empty(count, dtype=np.intp)
+    of_row[place], node[place] = rows, edges
+    of_row[place + 1], node[place + 1] = rows, edges + 1
+    return of_row, node, sums
