@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from numerics import Varying, spd
 from vibench import highfidelity
 from vibench.active_systems import Stiffness
-from vibench.condensation import Condensed, Pattern
+from vibench.condensation import Condensed, Pattern, Submatrix
 from vibench.errors import NumericalError
 from vibench.highfidelity import Solver
 from vibench.problem import VariationalInequality
@@ -42,6 +42,20 @@ def test_equilibrium_with_the_kept_unknowns_given(seed: int, count: int, reused:
     settled = disturbed + condensed.settle(f - dense @ disturbed)
     assert np.array_equal(settled[kept], disturbed[kept])
     assert np.allclose((dense @ settled - f)[others], 0.0, atol=1e-10)
+
+
+@given(st.integers(0, 10_000), st.integers(0, 12))
+def test_submatrices_follow_their_matrix_through_changes_of_its_sparsity(seed: int, count: int) -> None:
+    rng = np.random.default_rng(seed)
+    chosen = rng.permutation(12)[:count]
+    submatrix, A = Submatrix(chosen), sp.csr_array(sparse_spd(12, rng))
+    unsorted = A[::-1][:, rng.permutation(12)]
+    for matrix in (A, 2.0 * A, unsorted, A, sp.csr_array(sparse_spd(12, rng))):
+        found = submatrix.of(matrix)
+        assert np.array_equal(found.toarray(), matrix.toarray()[np.ix_(chosen, chosen)])
+        found.data[:] = np.nan
+        for used in (found, matrix):  # as libraries do
+            used.sort_indices()
 
 
 def test_a_load_that_changes_is_not_remembered() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import scipy.sparse as sp
@@ -29,6 +30,16 @@ class Pattern:
     order: Indices
     interface: Indices
 
+    @cached_property
+    def eliminated(self) -> Submatrix:
+        """What is factorised: all in `order`."""
+        return Submatrix(self.order)
+
+    @cached_property
+    def kept_block(self) -> Submatrix:
+        """The kept ones among themselves."""
+        return Submatrix(self.kept)
+
     @classmethod
     def of(cls, A: SparseMatrix, kept: Indices) -> Pattern:
         """Pattern for matrices with the sparsity of A (n×n), symmetric positive definite."""
@@ -37,6 +48,31 @@ class Pattern:
         inside = np.union1d(others, kept[interface])
         order = elimination_order(sp.csr_array(A)[inside][:, inside], np.searchsorted(inside, kept[interface]))
         return cls(kept, inside[order], interface)
+
+
+class Submatrix:
+    """Some rows and columns of square matrices; where one has the sparsity of the last, its entries are only copied.
+
+    Parameters
+    ----------
+    chosen
+        Which, in the order in which they are wanted.
+    """
+
+    def __init__(self, chosen: Indices) -> None:
+        self._chosen = chosen
+        self._known: tuple[Indices, Indices] | None = None
+
+    def of(self, A: SparseMatrix) -> SparseMatrix:
+        """Those of A (CSR)."""
+        places = A.indptr, A.indices
+        if self._known is None or not all(map(np.array_equal, self._known, places)):
+            self._known = A.indptr.copy(), A.indices.copy()  # libraries sort in place
+            numbered = sp.csr_array((np.arange(A.nnz), *reversed(places)), shape=A.shape)
+            self._numbers = numbered[self._chosen][:, self._chosen]
+            self._numbers.sort_indices()
+        found = self._numbers
+        return sp.csr_array((A.data[found.data], found.indices.copy(), found.indptr.copy()), shape=found.shape)
 
 
 class Condensed:
@@ -58,14 +94,13 @@ class Condensed:
     def __init__(self, A: SparseMatrix, pattern: Pattern, *, reused: bool = False) -> None:
         self._pattern, self._size, self._reused = pattern, A.shape[0], reused
         A, count = sp.csr_array(A), len(pattern.interface)
-        inside = A[pattern.order][:, pattern.order]
         natural = np.arange(len(pattern.order))
-        self._factor = SparseCholesky(inside, "A", natural, count) if len(natural) else None
+        self._factor = SparseCholesky(pattern.eliminated.of(A).T, "A", natural, count) if len(natural) else None
         self._eliminated = len(natural) - count
         upper = self._factor.tail(count) if self._factor is not None else np.zeros((0, 0))
         self._schur = upper.T @ upper
         self.dense = 2 * count > len(pattern.kept)
-        self._kept_block = A[pattern.kept][:, pattern.kept]
+        self._kept_block = pattern.kept_block.of(A)
         self._loaded: tuple[Array, tuple[Array, Array]] | None = None
 
     @property

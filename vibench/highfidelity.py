@@ -68,7 +68,8 @@ class Solver:
         self._pattern: Pattern | None = None
         self._system: Stiffness | None = None
         self._width = np.maximum(problem.parameters.upper - problem.parameters.lower, np.finfo(float).tiny)
-        self._solved: list[tuple[Array, Mask]] = []
+        self._solved: list[Array] = []
+        self._active: list[Mask] = []
 
     def solve(self, mu: Array) -> HighFidelitySolution:
         """Assemble and solve at mu (d,).
@@ -87,7 +88,8 @@ class Solver:
         reason = self._problem.refuse(mu, found.u, found.lam)
         if reason:
             raise NumericalError(f"at mu = {mu.tolist()}: {reason}")
-        self._solved.append((mu, found.lam > 0.0))
+        self._solved.append(mu)
+        self._active.append(found.lam > 0.0)
         return found
 
     def check_coercive(self, mu: Array, vi: VariationalInequality) -> None:
@@ -111,10 +113,10 @@ class Solver:
 
     def _nearest(self, mu: Array) -> Mask | None:
         """Contact set of the solved parameter that is nearest, the box of parameters taken for a cube."""
-        if not self._solved:
+        if not self._active:
             return None
-        distances = [float(np.linalg.norm((mu - other) / self._width)) for other, _ in self._solved]
-        return self._solved[int(np.argmin(distances))][1]
+        distances = np.linalg.norm((np.array(self._solved) - mu) / self._width, axis=1)
+        return self._active[int(np.argmin(distances))]
 
     def _stiffness(self, vi: VariationalInequality) -> Stiffness:
         touched = np.unique(sp.csr_array(vi.B).indices)
