@@ -118,3 +118,12 @@ def test_a_stiffness_that_is_not_symmetric_is_refused_and_where() -> None:
     crooked[0, 1] *= 1.001
     with pytest.raises(NumericalError, match=r"A at mu = \[0.5\] is not symmetric"):
         solver.check_coercive(mu, replace(vi, A=sp.csc_array(crooked)))
+
+
+def test_constraints_that_touch_nothing_leave_a_linear_problem() -> None:
+    problem, mu = Varying(), np.array([0.5])
+    vi = problem.assemble(mu)
+    free = replace(vi, B=sp.csr_array(vi.B.shape), g=np.ones(len(vi.g)))
+    found = highfidelity.Solver(problem).solve_assembled(mu, free)
+    assert np.allclose(found.u, np.linalg.solve(vi.A.toarray(), vi.f))
+    assert not found.lam.any()

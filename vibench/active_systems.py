@@ -122,11 +122,10 @@ class SaddlePoint:
     def __init__(self, A: SparseMatrix, f: Array, B: SparseMatrix, g: Array) -> None:
         stiffness = np.abs(A.diagonal())
         self._size = 1.0 / np.sqrt(np.where(stiffness > 0.0, stiffness, 1.0))  # one unit for displacements and forces
-        scaled = sp.diags_array(self._size)
-        B = B @ scaled
+        B = _scaled(np.ones(len(g)), sp.csr_array(B), self._size)
         self._force = 1.0 / row_norms(B)
-        self._A, self._f = scaled @ A @ scaled, self._size * f
-        self._B, self._g = sp.csr_array(sp.diags_array(self._force) @ B), self._force * g
+        self._A, self._f = _scaled(self._size, sp.csr_array(A), self._size), self._size * f
+        self._B, self._g = _scaled(self._force, B, np.ones(len(f))), self._force * g
         self._base = np.zeros(0, dtype=np.intp)
         self._factorised: _Factorised | None = None
 
@@ -142,9 +141,7 @@ class SaddlePoint:
         if self._factorised is not None and len(np.setxor1d(active, self._base)) <= BORDER:
             found = self._bordered(self._factorised, active)
         if found is None:
-            rows = self._B[active]
-            matrix = sp.block_array([[self._A, rows.T], [rows, None]]) if len(active) else self._A
-            self._base, self._factorised = active, _Factorised(sp.csc_array(matrix))
+            self._base, self._factorised = active, _Factorised(_saddle(self._A, self._B[active]))
             found = self._bordered(self._factorised, active)
         assert found is not None  # without a border there is nothing that could be dependent
         return found
@@ -164,6 +161,27 @@ class SaddlePoint:
         lam[base], lam[come] = found[0][n:], found[1][: len(come)]
         lam[base[gone]] = 0.0
         return self._size * found[0][:n], self._force * lam
+
+
+def _scaled(rows: Array, matrix: SparseMatrix, columns: Array) -> SparseMatrix:
+    """A matrix (CSR) with its rows and columns multiplied by factors."""
+    data = np.repeat(rows, np.diff(matrix.indptr)) * matrix.data * columns[matrix.indices]
+    return sp.csr_array((data, matrix.indices, matrix.indptr), shape=matrix.shape)
+
+
+def _saddle(A: SparseMatrix, B: SparseMatrix) -> SparseMatrix:
+    """[[A, Bᵀ], [B, 0]] (CSC) of a symmetric A (c×c) and of B (m×c), both CSR."""
+    below = sp.csc_array(B)
+    ends = A.indptr + below.indptr  # of the columns of A, each with one of B below it
+    last = int(ends[-1])
+    data, rows = np.empty(last + B.nnz), np.empty(last + B.nnz, dtype=A.indices.dtype)
+    upper = np.arange(A.nnz) + np.repeat(below.indptr[:-1], np.diff(A.indptr))
+    lower = np.arange(B.nnz) + np.repeat(A.indptr[1:], np.diff(below.indptr))
+    data[upper], rows[upper] = A.data, A.indices
+    data[lower], rows[lower] = below.data, A.shape[0] + below.indices
+    data[last:], rows[last:] = B.data, B.indices
+    size = A.shape[0] + B.shape[0]
+    return sp.csc_array((data, rows, np.concatenate([ends, last + B.indptr[1:]])), shape=(size, size))
 
 
 class _Factorised:
