@@ -119,14 +119,16 @@ class Solver:
         return self._active[int(np.argmin(distances))]
 
     def _stiffness(self, vi: VariationalInequality) -> Stiffness:
-        touched = np.unique(sp.csr_array(vi.B).indices)
-        outside = np.setdiff1d(touched, self._touched)
+        touched = np.zeros(vi.A.shape[0], dtype=bool)
+        touched[sp.csr_array(vi.B).indices] = True
+        touched[self._touched] = False
+        outside = np.flatnonzero(touched)
         if len(outside) and self._problem.contact_dofs is not None:
             raise NumericalError(
                 f"B touches {len(outside)} unknowns outside the declared contact_dofs, the first is {outside[0]}"
             )
         if len(outside):
-            self._touched, self._pattern = np.union1d(self._touched, touched), None
+            self._touched, self._pattern = np.union1d(self._touched, outside), None
         if self._pattern is None:
             self._pattern, self._system = Pattern.of(vi.A, self._touched), None
         if self._system is None or "A" not in self._problem.constant:

@@ -50,14 +50,32 @@ class Scales:
     gap: float
 
 
+@dataclass(frozen=True)
+class _Products:
+    """What scales and residuals of x (n,), α (m,) are made from: norms of the rows of B (m,), A x and Bᵀα (n,)."""
+
+    norms: Array
+    Ax: Array
+    force: Array
+
+    @classmethod
+    def of(cls, program: VariationalInequality, x: Array, alpha: Array) -> _Products:
+        return cls(row_norms(program.B), program.A @ x, program.B.T @ alpha)
+
+
 def scales(program: VariationalInequality, x: Array, alpha: Array) -> Scales:
     """Denominators of the residuals of x (n,), α (m,); see `Residuals`."""
-    A, f, B, g = program.A, program.f, program.B, program.g
-    Ax = A @ x
+    return _scales(program, x, alpha, _Products.of(program, x, alpha))
+
+
+def _scales(program: VariationalInequality, x: Array, alpha: Array, known: _Products) -> Scales:
+    A, f, g = program.A, program.f, program.g
     return Scales(
-        primal=max(1.0, peak(g / row_norms(B))),
-        dual=max(peak(Ax), peak(f), peak(B.T @ alpha)),
-        gap=max(abs(0.5 * float(x @ Ax)), abs(float(f @ x)), abs(float(g @ alpha)), ENERGY_FLOOR * _descent(A, f)),
+        primal=max(1.0, peak(g / known.norms)),
+        dual=max(peak(known.Ax), peak(f), peak(known.force)),
+        gap=max(
+            abs(0.5 * float(x @ known.Ax)), abs(float(f @ x)), abs(float(g @ alpha)), ENERGY_FLOOR * _descent(A, f)
+        ),
     )
 
 
@@ -69,13 +87,13 @@ def _descent(A: SparseMatrix | Array, f: Array) -> float:
 
 def residuals(program: VariationalInequality, x: Array, alpha: Array) -> Residuals:
     """Relative residuals of x (n,), α (m,) ≥ 0; see `Residuals`."""
-    A, f, B, g = program.A, program.f, program.B, program.g
-    scale = scales(program, x, alpha)
-    Ax = A @ x
+    f, B, g = program.f, program.B, program.g
+    known = _Products.of(program, x, alpha)
+    scale = _scales(program, x, alpha, known)
     return Residuals(
-        primal=float(np.max((B @ x - g) / row_norms(B), initial=0.0)) / scale.primal,
-        dual=_ratio(peak(Ax - f + B.T @ alpha), scale.dual),
-        gap=_ratio(abs(float(x @ Ax) - float(f @ x) + float(g @ alpha)), scale.gap),
+        primal=float(np.max((B @ x - g) / known.norms, initial=0.0)) / scale.primal,
+        dual=_ratio(peak(known.Ax - f + known.force), scale.dual),
+        gap=_ratio(abs(float(x @ known.Ax) - float(f @ x) + float(g @ alpha)), scale.gap),
     )
 
 
