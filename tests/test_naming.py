@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from samples import STUDY, changed, write_study
+from vibench.constants import ReferenceConstants
 from vibench.matrix import Cell, expand
 from vibench.naming import HistoryNames, cell_columns
 from vibench.runner import queries_stage
@@ -18,7 +19,7 @@ from vibench.stages import ConeStage, EnrichmentStage, PODStage
 from vibench.strategy import Stop
 from vibench.study import Study
 from vibench.study_file import load_study
-from vibench.sweeps import HighFidelity, ReferenceConstants
+from vibench.sweeps import HighFidelity
 
 
 @pytest.fixture

@@ -10,6 +10,7 @@ import scipy.linalg
 from samples import carry_out
 from vibench import sweeps
 from vibench.assembly import AssemblyStage
+from vibench.constants import ReferenceConstants, ValidationConstraints
 from vibench.errors import NumericalError
 from vibench.matrix import Plugin
 from vibench.queries import QueriesStage, summarise
@@ -17,7 +18,7 @@ from vibench.stage import value_of
 from vibench.stages import ConeStage, EnrichmentStage, PODStage, reduced_model
 from vibench.store import Store
 from vibench.strategy import Kind, Stop
-from vibench.sweeps import CHUNKS, HighFidelity, ReferenceConstants, gather, sweep, training
+from vibench.sweeps import CHUNKS, HighFidelity, gather, sweep, training
 from vibench.timing import NO_TIME
 
 PROBLEM = Plugin("problem", "obstacle", '{"resolution": 200}', "test")
@@ -181,7 +182,7 @@ def test_a_slow_query_is_a_timeout(store: Store) -> None:
 
 
 def test_the_reference_constants_are_those_of_every_parameter(store: Store) -> None:
-    constants = value_of(store, ReferenceConstants(PROBLEM, 9, 3))
+    constants = value_of(store, ReferenceConstants(ValidationConstraints(PROBLEM, 9, 3)))
     mus = PROBLEM.create().validation_set(9, 3)
     scaled = [c.inf_sup.span / mu[0] ** 2 for c, mu in zip(constants, mus, strict=True)]  # B = mu_1² times one matrix
     assert np.allclose(scaled, scaled[0], rtol=1e-9)

@@ -7,7 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from vibench.assess import constants_full, constants_on, everywhere
-from vibench.infsup import InfSup, Multipliers, inf_sup
+from vibench.error_bounds import Stability, extreme_quotients
+from vibench.infsup import InfSup, Multipliers, inf_sup, nodal_multipliers
 from vibench.matrix import Plugin
 from vibench.problem import VariationalInequality, validation_parameters
 from vibench.reduced import ReducedModel
@@ -35,6 +36,27 @@ class ValidationConstraints(Stage):
         problem = build_problem(self.problem)
         mus = validation_parameters(problem, self.count, self.seed)
         return Result(constraint_classes([assemblies(problem).at(mu).B for mu in mus]))
+
+
+@dataclass(frozen=True)
+class ReferenceConstants(Stage):
+    """Constants of the high-fidelity problem: β_HF, coercivity and continuity; a `Stability` per parameter."""
+
+    constraints: ValidationConstraints
+
+    def inputs(self) -> tuple[Stage, ...]:
+        """The constraint matrices."""
+        return (self.constraints,)
+
+    def run(self, store: Store) -> Result:
+        """Compute the constants."""
+        problem, known = build_problem(self.constraints.problem), self.constraints
+        inf_sup = constants_full(problem.V, value_of(store, known), nodal_multipliers(problem.W))
+        mus = validation_parameters(problem, known.count, known.seed)
+        different = mus[:1] if "A" in problem.constant else mus
+        quotients = [extreme_quotients(assemblies(problem).at(mu).A, problem.V) for mu in different]
+        quotients *= len(mus) // len(different)
+        return Result([Stability(found, *extremes) for found, extremes in zip(inf_sup, quotients, strict=True)])
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ from vibench.agreement import vectors
 from vibench.arrays import Array
 from vibench.assembly import Assembled, AssemblyStage, assembly_columns, query_model
 from vibench.assess import Reference
-from vibench.constants import FullConstants, OwnConstants, PlainConstants, ValidationConstraints
+from vibench.constants import FullConstants, OwnConstants, PlainConstants, ReferenceConstants, ValidationConstraints
 from vibench.error_bounds import Stability
 from vibench.errors import in_a_line
 from vibench.infsup import InfSup
@@ -25,7 +25,7 @@ from vibench.stage import Failed, Pieces, PiecewiseStage, Stage, value_of
 from vibench.stages import ReducedCone, enrichment_of
 from vibench.store import Artefact, Store
 from vibench.strategy import Kind
-from vibench.sweeps import ReferenceConstants, gather, sweep, training
+from vibench.sweeps import gather, sweep, training
 from vibench.timing import calibration
 
 DISTURBED = 1.3
@@ -63,13 +63,16 @@ class QueriesStage(PiecewiseStage):
     @property
     def reference(self) -> ReferenceConstants:
         """The stage that knows the constants of the high-fidelity problem."""
-        return ReferenceConstants(self.assembly.enrichment.pod.problem, self.assembly.count, self.assembly.seed)
+        return ReferenceConstants(self._constraints)
+
+    @property
+    def _constraints(self) -> ValidationConstraints:
+        return ValidationConstraints(self.assembly.enrichment.pod.problem, self.assembly.count, self.assembly.seed)
 
     @property
     def constants(self) -> tuple[OwnConstants, FullConstants, PlainConstants]:
         """The stages that know the inf-sup constants of the reduced pair, of V with the cone, and of V_N alone."""
-        enrichment = self.assembly.enrichment
-        constraints = ValidationConstraints(enrichment.pod.problem, self.assembly.count, self.assembly.seed)
+        enrichment, constraints = self.assembly.enrichment, self._constraints
         return (
             OwnConstants(enrichment, constraints),
             FullConstants(enrichment.cone, constraints),

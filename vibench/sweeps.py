@@ -9,9 +9,6 @@ import numpy as np
 
 from vibench import highfidelity
 from vibench.arrays import Array
-from vibench.assess import constants_full
-from vibench.error_bounds import Stability, extreme_quotients
-from vibench.infsup import nodal_multipliers
 from vibench.matrix import Plugin
 from vibench.problem import (
     Problem,
@@ -19,9 +16,8 @@ from vibench.problem import (
     training_parameters,
     validation_parameters,
 )
-from vibench.stage import Result, Stage, assemblies, build_problem, value_of
+from vibench.stage import Result, Stage, build_problem, value_of
 from vibench.store import History, Store
-from vibench.supremizer import constraint_classes
 from vibench.timing import NO_TIME, Seconds, Stopwatch
 
 CHUNKS = 4
@@ -108,27 +104,3 @@ def gather(store: Store, chunks: tuple[Stage, ...]) -> Solutions:
         tuple(s for part in parts for s in part.seconds),
         tuple(note for part in parts for note in part.fallbacks),
     )
-
-
-@dataclass(frozen=True)
-class ReferenceConstants(Stage):
-    """Constants of the high-fidelity problem at the validation parameters: β_HF, coercivity and continuity."""
-
-    problem: Plugin
-    count: int
-    seed: int
-
-    def inputs(self) -> tuple[Stage, ...]:
-        """Nothing comes before."""
-        return ()
-
-    def run(self, store: Store) -> Result:  # noqa: ARG002
-        """One `Stability` per parameter."""
-        problem = build_problem(self.problem)
-        mus = validation_parameters(problem, self.count, self.seed)
-        assembled = [assemblies(problem).at(mu) for mu in mus]
-        classes = constraint_classes([vi.B for vi in assembled])
-        inf_sup = constants_full(problem.V, classes, nodal_multipliers(problem.W))
-        different = assembled[:1] if "A" in problem.constant else assembled
-        quotients = [extreme_quotients(vi.A, problem.V) for vi in different] * (len(assembled) // len(different))
-        return Result([Stability(found, *extremes) for found, extremes in zip(inf_sup, quotients, strict=True)])
