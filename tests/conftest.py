@@ -107,11 +107,11 @@ def vibench(command: str, plugins_folder: Path) -> Vibench:
     """Function that runs the installed command in a folder; it draws where a test is about figures."""
 
     def run(
-        folder: Path, *arguments: str, plugins: Path = plugins_folder, figures: bool = False
+        folder: Path, *arguments: str, plugins: Path = plugins_folder, figures: bool = False, timeout: float = 120.0
     ) -> subprocess.CompletedProcess[str]:
         plain = ["--no-figures"] if arguments[:1] == ("run",) and not figures else []
         with started([command, *arguments, *plain], folder, plugins) as process:
-            out, err = process.communicate(timeout=120)
+            out, err = process.communicate(timeout=timeout)
         return subprocess.CompletedProcess(arguments, process.returncode, out, err)
 
     return run

@@ -160,6 +160,16 @@ def test_a_run_in_which_nothing_works_comes_to_its_end(vibench: Vibench, tmp_pat
     assert "2 cells, 0 ok, 2 fell short" in done.stdout
 
 
+def test_a_problem_that_fails_first_leaves_the_one_beside_it_alone(vibench: Vibench, tmp_path: Path) -> None:
+    """What the good problem waits for is not dropped when the stages of the bad one fail before it could begin."""
+    study = wire_study(problem=["wire-raises", "wire"], primal=["decorrelated", "online-supremizers"])
+    done = vibench(tmp_path, "run", write_study(tmp_path, study), "--jobs", "1", timeout=60)
+    assert (done.returncode, done.stderr) == (0, "")
+    found = {(row["problem"], row["primal"]): row["status"] for row in rows(tmp_path / "runs" / "wire")}
+    statuses = {"wire-raises": "error", "wire": "ok"}
+    assert found == {(problem, primal): status for problem, status in statuses.items() for primal in study["primal"]}
+
+
 def test_the_number_of_jobs_changes_no_result(vibench: Vibench, tmp_path: Path) -> None:
     study = wire_study(
         problem=[{"name": "wire", "label": "long", "options": {"nodes": 40}}],

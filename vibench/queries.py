@@ -87,7 +87,7 @@ class QueriesStage(PiecewiseStage):
     def inputs(self) -> tuple[Stage, ...]:
         """Everything the cell's rows are made from."""
         problem = self.assembly.enrichment.pod.problem
-        known = (*self.constants, self.reference, *training(problem), *self.validation)
+        known = (self._constraints, *self.constants, self.reference, *training(problem), *self.validation)
         return (self.assembly, *self.assembly.inputs(), *known)
 
     def begin(self, store: Store) -> Queries:
