@@ -6,9 +6,9 @@ import json
 from collections.abc import Iterable, Mapping
 from typing import Any
 
-from vibench.columns import BENEFITS, COLUMNS, PARAMETER, SUMMARY, UNITS, Column
-from vibench.schema import STORED
-from vibench.study import Study
+from vibench.results.columns import BENEFITS, COLUMNS, PARAMETER, SUMMARY, UNITS, Column
+from vibench.results.schema import STORED
+from vibench.study.spec import Study
 
 KINDS = {"integer": "int", "number": "float", "string": "text", "boolean": "true or false"}
 SIGNS = {"exclusiveMinimum": ">", "minimum": "≥", "exclusiveMaximum": "<", "maximum": "≤"}

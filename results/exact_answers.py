@@ -8,8 +8,8 @@ from __future__ import annotations
 import numpy as np
 import pandas as pd
 
-from vibench import tables
-from vibench.highfidelity import Solver
+from vibench.highfidelity.active_set import HighFidelitySolver
+from vibench.results import tables
 from vibench_problems.radial import Radial
 
 RINGS = (8, 16, 32, 64)
@@ -29,7 +29,7 @@ def main() -> None:
     rows, before = [], None
     for rings in RINGS:
         problem = Radial(3 * rings**2)
-        solver, found = Solver(problem), []
+        solver, found = HighFidelitySolver(problem), []
         for mu in PARAMETERS:
             solution = solver.solve(mu)
             radius = problem.contact_radius(solution.lam) / problem.exact(mu).contact_radius - 1.0

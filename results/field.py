@@ -18,9 +18,9 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
-from vibench import tables
-from vibench.figures.data import label
-from vibench.figures.style import COLOURS, MARKERS, Sheet, logarithmic, plot, save, styled
+from vibench.report.figures.data import label
+from vibench.report.figures.style import COLOURS, MARKERS, Sheet, logarithmic, plot, save, styled
+from vibench.results import tables
 
 SHARES = (0.3, 0.5, 0.7, 0.9)
 REFERENCE = "mcpg"

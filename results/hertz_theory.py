@@ -8,8 +8,8 @@ from __future__ import annotations
 import numpy as np
 import pandas as pd
 
-from vibench import tables
-from vibench.highfidelity import Solver
+from vibench.highfidelity.active_set import HighFidelitySolver
+from vibench.results import tables
 from vibench_problems.hertz import Hertz
 from vibench_problems.line_contact import measured, theory
 
@@ -31,7 +31,7 @@ def main() -> None:
     rows = []
     for multipliers, growth, approach in CASES:
         problem = Hertz(round(multipliers * 2 * 6130 / 560), growth=growth, approach=approach)
-        solver = Solver(problem)
+        solver = HighFidelitySolver(problem)
         for mu in RADII:
             found = solver.solve(np.array([mu]))
             ours, exact = measured(problem, np.array([mu]), found.lam), theory(problem, np.array([mu]), found.u)

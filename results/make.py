@@ -14,9 +14,10 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from vibench import figures, tables
-from vibench.schema import TABLES
-from vibench.thresholds import HIGH_FIDELITY, benefit_threshold
+from vibench.report import figures
+from vibench.results import tables
+from vibench.results.break_even import HIGH_FIDELITY, break_even
+from vibench.results.schema import TABLES
 
 
 @dataclass(frozen=True)
@@ -139,7 +140,7 @@ def comparison(cells: pd.DataFrame, name: str) -> pd.DataFrame:
         pair = mine[np.logical_and.reduce([mine[key] == value for key, value in column.ask.items()])]
         on = pair[pair["enrichment_kind"] == "per-parameter"].iloc[0]
         off = pair[pair["primal_tol"] == tight].iloc[0]
-        ours = benefit_threshold(on["offline_s"], on["online_s"], off["offline_s"], off["online_s"])
+        ours = break_even(on["offline_s"], on["online_s"], off["offline_s"], off["online_s"])
         rows.append(
             {
                 "asked for": ", ".join(f"{key} = {value:g}" for key, value in column.ask.items()),

@@ -27,15 +27,18 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
-from vibench import plugins, provenance, qp, tables
-from vibench.figures.style import STYLE
-from vibench.highfidelity import Solver
-from vibench.infsup import multipliers
-from vibench.online import OnlineModel, project_members
-from vibench.pod import pod
-from vibench.reduced import ReducedModel
-from vibench.separation import separate
-from vibench.strategy import Offline, Stop
+from vibench import provenance
+from vibench.highfidelity.active_set import HighFidelitySolver
+from vibench.interfaces.strategies import Offline, Stop
+from vibench.model.affine import affine_decomposition
+from vibench.model.galerkin import ReducedModel
+from vibench.model.hyperreduced import OnlineModel, project_members
+from vibench.qp.solve import solve_qp
+from vibench.reduction.pod import pod
+from vibench.report.figures.style import STYLE
+from vibench.results import tables
+from vibench.stability.infsup import multipliers
+from vibench.study import registry
 from vibench.timing import median_seconds, timed
 
 ACCURACY = 1e-10
@@ -72,24 +75,24 @@ def measure(name: str, nodes: int | str, R: int, delta: float, N: int) -> Iterat
         result, seconds = (median_seconds if repeated else timed)(work)
         return result, about | {"stage": stage, "seconds": seconds.cpu, "memory_mib": _peak_memory()}
 
-    problem, found = row("mesh and forms", lambda: plugins.create("problem", name, {"resolution": nodes}))
+    problem, found = row("mesh and forms", lambda: registry.create("problem", name, {"resolution": nodes}))
     about |= {"n": problem.V.dim, "m": problem.W.dim}
     yield found | about
-    training, solver = problem.training_set(), Solver(problem)
+    training, solver = problem.training_set(), HighFidelitySolver(problem)
     solutions, found = row("snapshots", lambda: [solver.solve(mu) for mu in training])
     yield found
     u, lam = np.column_stack([s.u for s in solutions]), np.column_stack([s.lam for s in solutions])
     basis, found = row("POD", lambda: pod(u, problem.V, Stop(size=N)).basis)
     yield found
-    dual = plugins.create("dual strategy", "mcpg", {})
+    dual = registry.create("dual strategy", "mcpg", {})
     cone, found = row("mCPG", lambda: dual.reduce(lam, problem.W, Stop(size=R)))
     yield found
     span = multipliers(cone.generators, problem.W).span
     offline = Offline(problem, basis, cone, span, training)
-    primal = plugins.create("primal strategy", "offline-pga", {})
+    primal = registry.create("primal strategy", "offline-pga", {})
     enrichment, found = row("PGA", lambda: primal.build(offline, delta))
     yield found | {"added": enrichment.vectors.shape[1]}
-    members, found = row("separation", lambda: separate(problem, training, 1e-6))
+    members, found = row("separation", lambda: affine_decomposition(problem, training, 1e-6))
     yield found
     model = ReducedModel(problem, basis, enrichment, cone.generators, span)
     operators, found = row("reduction", lambda: project_members(model, members))
@@ -107,7 +110,7 @@ def _query(model: Any, mu: Any) -> Any:
 
 
 def _solve(reduced: Any) -> Any:
-    return qp.solve(reduced.program, "piqp", ACCURACY, factor=reduced.factor)
+    return solve_qp(reduced.program, "piqp", ACCURACY, factor=reduced.factor)
 
 
 def _peak_memory() -> float:

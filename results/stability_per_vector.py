@@ -8,16 +8,17 @@ from __future__ import annotations
 import numpy as np
 import pandas as pd
 
-from vibench import plugins, tables
 from vibench.arrays import Array
-from vibench.cone import project
-from vibench.highfidelity import Solver
-from vibench.infsup import beta_span, multipliers
-from vibench.nested import NestedStrategy, grow_through
-from vibench.pod import pod
-from vibench.space import InnerProduct
-from vibench.strategy import Offline, Stop
-from vibench.supremizer import constraint_classes, on_basis, supremizer_images
+from vibench.highfidelity.active_set import HighFidelitySolver
+from vibench.interfaces.strategies import Offline, Stop
+from vibench.linalg.inner_product import InnerProduct
+from vibench.reduction.cones import project_on_cone
+from vibench.reduction.nested import NestedStrategy, grow_through
+from vibench.reduction.pod import pod
+from vibench.reduction.supremizers import constraint_classes, projected_supremizers, supremizer_images
+from vibench.results import tables
+from vibench.stability.infsup import beta_span, multipliers
+from vibench.study import registry
 
 DIMENSIONS = {"hertz": (46, 12), "obstacle": (45, 50)}
 """N and R, prescribed: Hertz as in the paper; obstacle as POD and cones at 1e-4 and 1e-2 have them here and there."""
@@ -45,7 +46,7 @@ def counts(data: Offline, vectors: Array) -> dict[str, int | None]:
     classes = constraint_classes([data.problem.constraint(mu)[0] for mu in data.training])
     image = supremizer_images(data.problem.V, classes.representatives, data.span.shape[1])
     online = np.array([beta_span(image(B, data.span)) for B in classes.representatives])
-    images = [on_basis(np.hstack([data.basis, vectors]), B, data.span) for B in classes.representatives]
+    images = [projected_supremizers(np.hstack([data.basis, vectors]), B, data.span) for B in classes.representatives]
     first = data.basis.shape[1]
     reached = [
         min(beta_span(rows[: first + k]) / beta for rows, beta in zip(images, online, strict=True))
@@ -56,10 +57,10 @@ def counts(data: Offline, vectors: Array) -> dict[str, int | None]:
 
 def conditions(name: str, size: int, lam: Array, W: InnerProduct) -> list[dict[str, object]]:
     """One row for every dual strategy."""
-    given = plugins.create("dual strategy", "cpg", {}).reduce(lam, W, Stop(size=size)).generators
+    given = registry.create("dual strategy", "cpg", {}).reduce(lam, W, Stop(size=size)).generators
     rows: list[dict[str, object]] = []
-    for dual in plugins.names("dual strategy"):
-        cone = plugins.create("dual strategy", dual, {}).reduce(lam, W, Stop(size=size))
+    for dual in registry.names("dual strategy"):
+        cone = registry.create("dual strategy", dual, {}).reduce(lam, W, Stop(size=size))
         gram = W.gram(cone.generators, cone.generators)
         rows.append(
             {
@@ -68,7 +69,7 @@ def conditions(name: str, size: int, lam: Array, W: InnerProduct) -> list[dict[s
                 "R": cone.size,
                 "error": float(cone.errors[-1]),
                 "condition": float(np.linalg.cond(gram)),
-                "lost of cpg": max(project(cone.rays, nu, W).distance for nu in given.T),
+                "lost of cpg": max(project_on_cone(cone.rays, nu, W).distance for nu in given.T),
                 "fallbacks": len(cone.fallbacks),
             }
         )
@@ -78,15 +79,15 @@ def conditions(name: str, size: int, lam: Array, W: InnerProduct) -> list[dict[s
 def main() -> None:
     shares, cones = [], []
     for name, (modes, size) in DIMENSIONS.items():
-        problem = plugins.create("problem", name, {"resolution": "paper"})
-        training, solver = problem.training_set(), Solver(problem)
+        problem = registry.create("problem", name, {"resolution": "paper"})
+        training, solver = problem.training_set(), HighFidelitySolver(problem)
         solved = [solver.solve(mu) for mu in training]
         basis = pod(np.column_stack([s.u for s in solved]), problem.V, Stop(size=modes)).basis
         lam = np.column_stack([s.lam for s in solved])
-        cone = plugins.create("dual strategy", "mcpg", {}).reduce(lam, problem.W, Stop(size=size))
+        cone = registry.create("dual strategy", "mcpg", {}).reduce(lam, problem.W, Stop(size=size))
         data = Offline(problem, basis, cone, multipliers(cone.generators, problem.W).span, training)
         for primal, tolerance in ENRICHMENTS.items():
-            strategy: NestedStrategy = plugins.create("primal strategy", primal, {})
+            strategy: NestedStrategy = registry.create("primal strategy", primal, {})
             vectors = grow_through(strategy, data, [tolerance]).at(tolerance)[0].vectors
             assert vectors is not None
             shares.append({"problem": name, "N": modes, "R": size, "primal": primal} | counts(data, vectors))

@@ -8,18 +8,19 @@ import shutil
 import subprocess
 import sys
 import sysconfig
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from importlib.metadata import EntryPoint
 from pathlib import Path
 
 import pytest
 from hypothesis import settings
-
-from running import Vibench, execute, started
+from running import Changed, Main, Register, Vibench, execute, started
 from samples import install_fakes
-from vibench import cli, plugins
-from vibench.journal import FILE
-from vibench.store import CACHE_VARIABLE
+
+from vibench.cli import main as main_module
+from vibench.results.database import FILE
+from vibench.stages.artefacts import CACHE_VARIABLE
+from vibench.study import registry
 
 settings.register_profile("any machine", deadline=None)
 settings.load_profile("any machine")
@@ -56,9 +57,6 @@ def quick_run(command: str, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-Changed = Callable[..., Path]
-
-
 @pytest.fixture
 def changed(quick_run: Path, tmp_path: Path) -> Changed:
     """Function that gives a copy of the results of a real run, changed by SQL; the next one takes its place."""
@@ -73,20 +71,17 @@ def changed(quick_run: Path, tmp_path: Path) -> Changed:
     return copy
 
 
-Register = Callable[..., None]
-
-
 @pytest.fixture
 def register(monkeypatch: pytest.MonkeyPatch) -> Iterator[Register]:
     """Function that makes entry points, given as (group, name, value), the only ones there are."""
 
     def forget() -> None:
-        plugins._registered.cache_clear()
-        plugins.code.cache_clear()
+        registry._registered.cache_clear()
+        registry.code.cache_clear()
 
     def replace(*entries: tuple[str, str, str]) -> None:
         found = [EntryPoint(name=name, group=group, value=value) for group, name, value in entries]
-        monkeypatch.setattr(plugins, "entry_points", lambda *, group: [e for e in found if e.group == group])
+        monkeypatch.setattr(registry, "entry_points", lambda *, group: [e for e in found if e.group == group])
         forget()
 
     forget()
@@ -117,9 +112,6 @@ def vibench(command: str, plugins_folder: Path) -> Vibench:
     return run
 
 
-Main = Callable[..., tuple[int, str, str]]
-
-
 @pytest.fixture
 def main(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> Main:
     """Function that calls the command in an empty folder; gives exit code, what was printed, and errors."""
@@ -129,7 +121,7 @@ def main(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tm
     def call(*arguments: str) -> tuple[int, str, str]:
         monkeypatch.setattr(sys, "argv", ["vibench", *arguments])
         with pytest.raises(SystemExit) as caught:
-            cli.main()
+            main_module.main()
         printed = capsys.readouterr()
         return int(caught.value.code or 0), printed.out, printed.err
 

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from skfem import Basis, BilinearForm, ElementTriP1, MeshTri, condense, solve
 from skfem.helpers import dot, grad
 
-from vibench.arrays import Array, Indices, SparseMatrix
+from vibench import Array, Indices, SparseMatrix
 
 DECAY = 6.0
 """Exponent of the weight |x|^−DECAY under which the bulge is continued: stiff by the disc, soft by the boundary."""

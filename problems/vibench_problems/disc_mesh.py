@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 from scipy.spatial import Delaunay
 from skfem import MeshTri
 
-from vibench.arrays import Array
+from vibench import Array
 
 SMOOTHING_SWEEPS = 20
 

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.spatial import Delaunay
 from skfem import MeshTri
 
-from vibench.arrays import Array, Indices
+from vibench import Array, Indices
 
 COARSEST = 0.2
 """Largest element size, in radii."""

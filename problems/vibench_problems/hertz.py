@@ -10,9 +10,7 @@ from annotated_types import Ge, Gt, Le, Lt
 from skfem import Basis, BilinearForm, ElementTriP1, ElementVector
 from skfem.helpers import ddot, dot, eye, grad, sym_grad, trace
 
-from vibench.arrays import Array, Indices
-from vibench.problem import Contact, ParameterBox, Picture, Problem, VariationalInequality
-from vibench.space import InnerProduct
+from vibench import Array, Contact, Indices, InnerProduct, ParameterBox, Picture, Problem, VariationalInequality
 from vibench_problems.graded_mesh import quarter_disc
 from vibench_problems.mortar import Pairing
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from vibench.arrays import Array
+from vibench import Array
 from vibench_problems.hertz import Hertz
 
 

@@ -8,8 +8,7 @@ from typing import Literal
 import numpy as np
 import scipy.sparse as sp
 
-from vibench.arrays import Array, Indices, SparseMatrix
-from vibench.errors import NumericalError
+from vibench import Array, Indices, NumericalError, SparseMatrix
 
 
 @dataclass(frozen=True)

@@ -12,9 +12,18 @@ from annotated_types import Ge, Gt, Le
 from skfem import Basis, BilinearForm, ElementTriP1, LinearForm, MeshTri
 from skfem.helpers import dot
 
-from vibench.arrays import Array, Indices, SparseMatrix
-from vibench.problem import Contact, ParameterBox, Picture, Problem, Sampler, VariationalInequality
-from vibench.space import InnerProduct
+from vibench import (
+    Array,
+    Contact,
+    Indices,
+    InnerProduct,
+    ParameterBox,
+    Picture,
+    Problem,
+    Sampler,
+    SparseMatrix,
+    VariationalInequality,
+)
 from vibench_problems.disc_map import DiscMap, stiffness
 from vibench_problems.disc_mesh import aspect_ratios, disc_in_square
 from vibench_problems.p1_entries import LoadEntries, StiffnessEntries

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from vibench.arrays import Array, Indices
+from vibench import Array, Indices
 
 
 class StiffnessEntries:

@@ -11,9 +11,7 @@ from annotated_types import Ge, Gt, Le
 from scipy.special import lambertw
 from skfem import Basis, ElementTriP1, MeshTri
 
-from vibench.arrays import Array, Indices
-from vibench.problem import ParameterBox, Picture, Problem, Sampler, VariationalInequality
-from vibench.space import InnerProduct
+from vibench import Array, Indices, InnerProduct, ParameterBox, Picture, Problem, Sampler, VariationalInequality
 from vibench_problems.disc_map import stiffness
 from vibench_problems.disc_mesh import rings_in_disc
 from vibench_problems.obstacle import mass, paraboloid, unit_load

@@ -4,10 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from vibench.arrays import Array
-from vibench.cone import greedy_cone, normalised, projection_errors
-from vibench.space import InnerProduct
-from vibench.strategy import Cone, DualStrategy, Stop
+from vibench import Array, Cone, DualStrategy, InnerProduct, Stop, greedy_cone, normalised, projection_errors
 
 
 class AngleGreedy(DualStrategy):

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-from vibench.arrays import Array
-from vibench.cone import greedy_cone
-from vibench.space import InnerProduct
-from vibench.strategy import Cone, DualStrategy, Stop
+from vibench import Array, Cone, DualStrategy, InnerProduct, Stop, greedy_cone
 
 
 class CPG(DualStrategy):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from vibench.strategy import Enrichment, Kind, Offline, PrimalStrategy
+from vibench import Enrichment, Kind, Offline, PrimalStrategy
 
 
 class Decorrelated(PrimalStrategy):

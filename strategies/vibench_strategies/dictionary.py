@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-from vibench.arrays import Array
-from vibench.cone import normalised, projection_errors
-from vibench.space import InnerProduct
-from vibench.strategy import Cone, DualStrategy, Stop, no_free
+from vibench import Array, Cone, DualStrategy, InnerProduct, Stop, no_free, normalised, projection_errors
 
 
 class Dictionary(DualStrategy):

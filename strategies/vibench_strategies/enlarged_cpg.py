@@ -7,11 +7,18 @@ from typing import Annotated
 import numpy as np
 from annotated_types import Ge
 
-from vibench.arrays import Array
-from vibench.cone import greedy_cone, project, projection_errors
-from vibench.removal import removable_part
-from vibench.space import InnerProduct
-from vibench.strategy import Cone, DualStrategy, Stop, no_free
+from vibench import (
+    Array,
+    Cone,
+    DualStrategy,
+    InnerProduct,
+    Stop,
+    greedy_cone,
+    no_free,
+    project_on_cone,
+    projection_errors,
+)
+from vibench.reduction.removal import removable_part
 
 ROUND_OFF = 1e-9
 """A generator that loses less than this share of its norm stays as it is; one no farther from the others is dropped."""
@@ -34,7 +41,7 @@ class EnlargedCPG(DualStrategy):
             moved, i = False, 0
             while i < chi.shape[1]:
                 others = np.delete(chi, i, axis=1)
-                if project(others, chi[:, i], W).distance <= ROUND_OFF:
+                if project_on_cone(others, chi[:, i], W).distance <= ROUND_OFF:
                     moved, chi = True, others
                     continue
                 part, note = removable_part(chi[:, i], others, W)

@@ -4,11 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from vibench.arrays import Array
-from vibench.greedy import LazyMaximum
-from vibench.nested import NestedStrategy
-from vibench.strategy import Offline
-from vibench.supremizer_spaces import Shares, SupremizerGrowth
+from vibench import Array, LazyMaximum, NestedStrategy, Offline
+from vibench.reduction.supremizer_spaces import Shares, SupremizerGrowth
 
 
 class InfSupGreedy(NestedStrategy):

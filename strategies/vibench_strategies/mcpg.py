@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-from vibench.arrays import Array
-from vibench.cone import greedy_cone
-from vibench.removal import removable_part
-from vibench.space import InnerProduct
-from vibench.strategy import Cone, DualStrategy, Stop
+from vibench import Array, Cone, DualStrategy, InnerProduct, Stop, greedy_cone
+from vibench.reduction.removal import removable_part
 
 
 class ModifiedCPG(DualStrategy):

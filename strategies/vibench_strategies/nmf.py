@@ -10,12 +10,19 @@ from annotated_types import Ge, Lt
 from sklearn.decomposition import NMF
 from sklearn.exceptions import ConvergenceWarning
 
-from vibench.arrays import Array
-from vibench.cone import normalised, projection_errors, refuse_negative
-from vibench.errors import NumericalError
-from vibench.linalg import singular_values
-from vibench.space import InnerProduct
-from vibench.strategy import Cone, DualStrategy, Stop, no_free
+from vibench import (
+    Array,
+    Cone,
+    DualStrategy,
+    InnerProduct,
+    NumericalError,
+    Stop,
+    no_free,
+    normalised,
+    projection_errors,
+    refuse_negative,
+    singular_values,
+)
 
 
 class NonnegativeFactors(DualStrategy):

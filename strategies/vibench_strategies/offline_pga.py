@@ -6,11 +6,8 @@ from typing import Literal
 
 import numpy as np
 
-from vibench.arrays import Array
-from vibench.greedy import LazyMaximum
-from vibench.nested import NestedStrategy
-from vibench.strategy import Offline
-from vibench.supremizer_spaces import Angles, Shares, SupremizerGrowth
+from vibench import Array, LazyMaximum, NestedStrategy, Offline
+from vibench.reduction.supremizer_spaces import Angles, Shares, SupremizerGrowth
 
 
 class OfflinePGA(NestedStrategy):

@@ -4,11 +4,18 @@ from __future__ import annotations
 
 import numpy as np
 
-from vibench.arrays import Array
-from vibench.cone import REPRODUCED, LazyDistances, refuse_negative
-from vibench.greedy import TIE
-from vibench.space import InnerProduct
-from vibench.strategy import Cone, DualStrategy, Stop, no_free
+from vibench import (
+    REPRODUCED,
+    TIE,
+    Array,
+    Cone,
+    DualStrategy,
+    InnerProduct,
+    LazyDistances,
+    Stop,
+    no_free,
+    refuse_negative,
+)
 
 
 class Orthant(DualStrategy):

@@ -4,10 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from vibench.arrays import Array
-from vibench.linalg import RANK_RTOL, svd
-from vibench.space import InnerProduct
-from vibench.strategy import Cone, DualStrategy, Stop
+from vibench import RANK_RTOL, Array, Cone, DualStrategy, InnerProduct, Stop, svd
 
 
 class PODDual(DualStrategy):

@@ -4,11 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from vibench.arrays import Array
-from vibench.linalg import RANK_RTOL, orthonormal_range, remove, svd
-from vibench.nested import NestedStrategy
-from vibench.strategy import Offline
-from vibench.supremizer_spaces import SupremizerGrowth
+from vibench import RANK_RTOL, Array, NestedStrategy, Offline, orthonormal_range, project_out, svd
+from vibench.reduction.supremizer_spaces import SupremizerGrowth
 
 
 class PODSupremizers(NestedStrategy):
@@ -31,7 +28,7 @@ class SupremizerModes(SupremizerGrowth):
         super().__init__(offline)
         weights = np.sqrt(self.shared_by)
         bases = [c * orthonormal_range(found) for c, found in zip(weights, self.supremizers, strict=True)]
-        self._modes, sigma, _ = svd(remove(self.plain, np.hstack(bases)))
+        self._modes, sigma, _ = svd(project_out(self.plain, np.hstack(bases)))
         squares = np.where(sigma > RANK_RTOL * weights.max(), sigma, 0.0) ** 2
         tails = np.sqrt(np.append(np.cumsum(squares[::-1])[::-1], 0.0))
         self._tails = tails / (tails[0] or 1.0)

@@ -26,8 +26,10 @@ import pandas as pd
 import published
 from sides import CASES, Ours, Published, Side
 
-from vibench import judgement, provenance, tables
+from vibench import provenance
 from vibench.arrays import Array
+from vibench.qp import verification
+from vibench.results import tables
 from vibench.timing import median_seconds, timed
 
 SEED = 2022
@@ -90,7 +92,7 @@ def measure_queries(sides: Pair, mus: Array, repeats: int) -> tuple[Seconds, Fig
                     error_lam[i].append(
                         _relative(problem.W.norm(lam[:, k] - side.chi @ alpha), problem.W.norm(lam[:, k]))
                     )
-                    residual[i].append(judgement.residuals(program, x, alpha).worst)
+                    residual[i].append(verification.kkt_residuals(program, x, alpha).worst)
         found[f"error of u, {name}"] = Pair(*map(statistics.mean, error_u))
         found[f"error of λ, {name}"] = Pair(*map(statistics.mean, error_lam))
         found[f"largest residual, {name}"] = Pair(*map(max, residual))

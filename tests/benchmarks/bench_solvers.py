@@ -11,8 +11,10 @@ from benchmarks import reached
 from benchmarks.cases import ACCURACIES, ENRICHED, Case, Size
 from benchmarks.material import Material
 from benchmarks.measure import MARKS, Info, measure
-from vibench import plugins, qp
-from vibench.reduced import ReducedProblem
+from vibench.model.galerkin import ReducedProblem
+from vibench.qp.solution import QPSolution
+from vibench.qp.solve import solve_qp
+from vibench.study import registry
 
 pytestmark = MARKS
 
@@ -27,17 +29,17 @@ def reduced_problem(material: Material, size: Size) -> ReducedProblem:
 def test_solver(
     benchmark: BenchmarkFixture, materials: Callable[[Case], Material], size: Size, solver: str, accuracy: float
 ) -> None:
-    registered = plugins.qp_solver(solver)
+    registered = registry.qp_solver(solver)
     reduced = reduced_problem(materials(size.case), size)
     form = "primal" if reduced.factor is None else "dual"
 
-    def judge(answer: qp.Answer) -> Info:
+    def judge(answer: QPSolution) -> Info:
         found = reached.of_answer(reduced.program, answer, accuracy)
         return {"solver": solver, "asked": accuracy, "form": form, "N": size.N, **found}
 
     measure(
         benchmark,
         f"QP of {size}",
-        lambda: qp.solve(reduced.program, solver, accuracy, registered, reduced.factor),
+        lambda: solve_qp(reduced.program, solver, accuracy, registered, reduced.factor),
         judge,
     )

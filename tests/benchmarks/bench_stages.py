@@ -12,16 +12,18 @@ from benchmarks import reached
 from benchmarks.cases import USUAL, Primal
 from benchmarks.material import INTERPOLATION, QUERIES, Material, model_with, solve_all
 from benchmarks.measure import MARKS, Info, measure
-from vibench import plugins, qp
 from vibench.arrays import Array
-from vibench.assembly import Model
-from vibench.contracts import check_cone, check_enrichment
-from vibench.highfidelity import Solver
-from vibench.online import OnlineModel, Operators, project_members
-from vibench.pod import pod
-from vibench.reduced import ReducedProblem
-from vibench.separation import separate
-from vibench.strategy import Cone, Enrichment
+from vibench.highfidelity.active_set import HighFidelitySolver
+from vibench.interfaces.strategies import Cone, Enrichment
+from vibench.interfaces.validation import check_cone, check_enrichment
+from vibench.model.affine import affine_decomposition
+from vibench.model.galerkin import ReducedProblem
+from vibench.model.hyperreduced import OnlineModel, Operators, project_members
+from vibench.qp.solution import QPSolution
+from vibench.qp.solve import solve_qp
+from vibench.reduction.pod import pod
+from vibench.stages.assembly import Model
+from vibench.study import registry
 
 pytestmark = MARKS
 
@@ -37,7 +39,7 @@ def test_high_fidelity_solution(benchmark: BenchmarkFixture, material: Material)
         "high-fidelity solution",
         lambda solver: solver.solve(mu),
         lambda found: reached.of_solutions(material, [found]),
-        lambda: Solver(problem),
+        lambda: HighFidelitySolver(problem),
     )
 
 
@@ -59,7 +61,7 @@ def test_pod(benchmark: BenchmarkFixture, material: Material) -> None:
 
 def test_cone(benchmark: BenchmarkFixture, material: Material, dual: str) -> None:
     W, (_, lam) = material.problem.W, material.snapshots
-    strategy = plugins.create("dual strategy", dual, {})
+    strategy = registry.create("dual strategy", dual, {})
 
     def judge(found: Cone) -> Info:
         return reached.of_cone(material, check_cone(found, W))
@@ -69,7 +71,7 @@ def test_cone(benchmark: BenchmarkFixture, material: Material, dual: str) -> Non
 
 def test_enrichment(benchmark: BenchmarkFixture, material: Material, primal: Primal) -> None:
     offline = material.offline()
-    strategy = plugins.create("primal strategy", primal.name, {})
+    strategy = registry.create("primal strategy", primal.name, {})
 
     def judge(found: Enrichment) -> Info:
         check_enrichment(found, offline.problem.V, offline.basis)
@@ -83,7 +85,7 @@ def test_separation(benchmark: BenchmarkFixture, material: Material) -> None:
     measure(
         benchmark,
         "separation",
-        lambda: separate(problem, training, INTERPOLATION),
+        lambda: affine_decomposition(problem, training, INTERPOLATION),
         lambda found: reached.of_separation(material, found),
     )
 
@@ -133,10 +135,10 @@ def test_query(benchmark: BenchmarkFixture, material: Material, primal: Primal) 
     model, why = material.online(primal)
     mus = _in_turn(material)
 
-    def solve(reduced: ReducedProblem) -> qp.Answer:
-        return qp.solve(reduced.program, SOLVER, ACCURACY, factor=reduced.factor)
+    def solve(reduced: ReducedProblem) -> QPSolution:
+        return solve_qp(reduced.program, SOLVER, ACCURACY, factor=reduced.factor)
 
-    def judge(_: qp.Answer) -> Info:
+    def judge(_: QPSolution) -> Info:
         assembly = f"full: {why}" if why else "reduced"
         return {**reached.of_queries(material, model, solve, ACCURACY), "solver": SOLVER, "assembly": assembly}
 

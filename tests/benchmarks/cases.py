@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from vibench import plugins
 from vibench.errors import RequestError
-from vibench.strategy import Stop
+from vibench.interfaces.strategies import Stop
+from vibench.study import registry
 
 Resolution = str | int
 """A name that a problem knows, or a number of nodes."""
@@ -98,7 +98,7 @@ def problem_cases(problems: Sequence[str], wanted: Sequence[Resolution]) -> list
 def knows(problem: str, resolution: Resolution) -> bool:
     """Whether a problem has such a resolution; one that cannot be loaded has none."""
     try:
-        plugins.check_options("problem", problem, {"resolution": resolution})
+        registry.check_options("problem", problem, {"resolution": resolution})
     except RequestError:
         return False
     return True
@@ -106,11 +106,11 @@ def knows(problem: str, resolution: Resolution) -> bool:
 
 def primal_cases() -> list[Primal]:
     """Every registered primal strategy, at all `TOLERANCES` if it takes one."""
-    return [Primal(name, tolerance) for name in plugins.names("primal strategy") for tolerance in _tolerances(name)]
+    return [Primal(name, tolerance) for name in registry.names("primal strategy") for tolerance in _tolerances(name)]
 
 
 def _tolerances(primal: str) -> tuple[float | None, ...]:
     try:
-        return TOLERANCES if plugins.load("primal strategy", primal).takes_tolerance else (None,)
+        return TOLERANCES if registry.load("primal strategy", primal).takes_tolerance else (None,)
     except RequestError:  # its benchmarks fail, and say why
         return (None,)

@@ -19,7 +19,7 @@ from typing import Any
 
 import pandas as pd
 
-from vibench import tables
+from vibench.results import tables
 
 LIMIT = 1.25
 """Ratio of medians above which something is slower; what noise there is on the machine has to fit below it."""

@@ -12,8 +12,10 @@ from threadpoolctl import threadpool_limits
 
 from benchmarks.cases import SIZES, Case, Resolution, knows, primal_cases, problem_cases
 from benchmarks.material import Material
-from vibench import plugins, provenance, qp
+from vibench import provenance
 from vibench.errors import RequestError, unknown_name
+from vibench.qp.solve import installed_solvers
+from vibench.study import registry
 from vibench.timing import ONE_THREAD
 
 os.environ.update(ONE_THREAD)  # for libraries that are loaded later; `one_thread` sees to the others
@@ -38,7 +40,7 @@ def pytest_configure(config: pytest.Config) -> None:
         _problems(config)
         _solvers(config)
         for resolution in _resolutions(config):
-            if not any(knows(problem, resolution) for problem in plugins.names("problem")):
+            if not any(knows(problem, resolution) for problem in registry.names("problem")):
                 raise RequestError(f"no problem has the resolution {resolution!r}")
     except RequestError as error:
         raise pytest.UsageError(str(error)) from None
@@ -49,7 +51,7 @@ def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
     problems = _problems(metafunc.config)
     axes: dict[str, Callable[[], list[Any]]] = {
         "case": lambda: problem_cases(problems, _resolutions(metafunc.config)),
-        "dual": lambda: plugins.names("dual strategy"),
+        "dual": lambda: registry.names("dual strategy"),
         "primal": primal_cases,
         "size": lambda: [size for size in SIZES if size.case.problem in problems],
         "solver": lambda: _solvers(metafunc.config),
@@ -60,11 +62,11 @@ def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
 
 
 def _problems(config: pytest.Config) -> list[str]:
-    return _chosen(config, "problems", "problem", plugins.names("problem"))
+    return _chosen(config, "problems", "problem", registry.names("problem"))
 
 
 def _solvers(config: pytest.Config) -> list[str]:
-    return _chosen(config, "solvers", "QP solver", qp.installed_solvers(plugins.names("QP solver")))
+    return _chosen(config, "solvers", "QP solver", installed_solvers(registry.names("QP solver")))
 
 
 def _chosen(config: pytest.Config, option: str, kind: str, known: list[str]) -> list[str]:

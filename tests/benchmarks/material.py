@@ -10,27 +10,27 @@ import numpy as np
 import pytest
 
 from benchmarks.cases import USUAL, Case, Primal, Spaces
-from vibench import plugins
 from vibench.arrays import Array
-from vibench.assembly import Model
-from vibench.assess import Reference
-from vibench.contracts import check_cone, check_enrichment
 from vibench.errors import in_a_line
-from vibench.highfidelity import HighFidelitySolution, Solver
-from vibench.infsup import multipliers
-from vibench.online import OnlineModel, Operators, project_members, why_in_full
-from vibench.pod import POD, pod
-from vibench.problem import (
-    Problem,
-    VariationalInequality,
+from vibench.highfidelity.active_set import HighFidelitySolution, HighFidelitySolver
+from vibench.interfaces.problem import Problem, VariationalInequality
+from vibench.interfaces.strategies import Enrichment, Offline
+from vibench.interfaces.validation import (
+    check_cone,
+    check_enrichment,
     checked_assembly,
     training_parameters,
     validation_parameters,
 )
-from vibench.reduced import ReducedModel
-from vibench.separation import Member, separate
-from vibench.stages import ReducedCone
-from vibench.strategy import Enrichment, Offline
+from vibench.model.affine import Member, affine_decomposition
+from vibench.model.errors import Reference
+from vibench.model.galerkin import ReducedModel
+from vibench.model.hyperreduced import OnlineModel, Operators, project_members, why_in_full
+from vibench.reduction.pod import POD, pod
+from vibench.stability.infsup import multipliers
+from vibench.stages.assembly import Model
+from vibench.stages.offline import ReducedCone
+from vibench.study import registry
 
 T = TypeVar("T")
 
@@ -75,7 +75,7 @@ class Material:
 
     @property
     def problem(self) -> Problem:
-        return self._once("problem", lambda: plugins.create("problem", self.case.problem, self.case.options))
+        return self._once("problem", lambda: registry.create("problem", self.case.problem, self.case.options))
 
     @property
     def training(self) -> Array:
@@ -104,7 +104,7 @@ class Material:
         W, lam = self.problem.W, self.snapshots[1]
 
         def make() -> ReducedCone:
-            found = plugins.create("dual strategy", spaces.dual, {}).reduce(lam, W, spaces.cone)
+            found = registry.create("dual strategy", spaces.dual, {}).reduce(lam, W, spaces.cone)
             check_cone(found, W)
             return ReducedCone(found, multipliers(found.generators, W, found.free), None)
 
@@ -119,7 +119,7 @@ class Material:
         offline = self.offline(spaces)
 
         def make() -> Enrichment:
-            found = plugins.create("primal strategy", primal.name, {}).build(offline, primal.tolerance)
+            found = registry.create("primal strategy", primal.name, {}).build(offline, primal.tolerance)
             return check_enrichment(found, offline.problem.V, offline.basis)
 
         return self._once(f"enrichment by {primal}", make, spaces)
@@ -131,7 +131,7 @@ class Material:
     @property
     def members(self) -> Mapping[str, Member]:
         problem, training = self.problem, self.training
-        return self._once("separation", lambda: separate(problem, training, INTERPOLATION))
+        return self._once("separation", lambda: affine_decomposition(problem, training, INTERPOLATION))
 
     def operators(self, primal: Primal, spaces: Spaces = USUAL) -> Operators | str:
         """The projected members, or why queries have to be assembled in full."""
@@ -162,7 +162,7 @@ class Material:
 
 def solve_all(problem: Problem, mus: Array) -> list[HighFidelitySolution]:
     """High-fidelity solutions at parameters (P×d), one after the other."""
-    solver = Solver(problem)
+    solver = HighFidelitySolver(problem)
     return [solver.solve(mu) for mu in mus]
 
 

@@ -16,8 +16,8 @@ import scipy.sparse as sp
 from scipy.sparse.linalg import SuperLU, splu
 
 from vibench.arrays import Array, Mask, SparseMatrix
-from vibench.problem import Problem, VariationalInequality
-from vibench.strategy import Stop
+from vibench.interfaces.problem import Problem, VariationalInequality
+from vibench.interfaces.strategies import Stop
 
 TIE = 1e-9
 """Relative values that differ by less count as equal; the smallest index wins."""

@@ -8,19 +8,22 @@ import numpy as np
 
 from benchmarks.material import Material, Query, spread
 from benchmarks.measure import Info
-from vibench import cone, judgement, qp
 from vibench.arrays import Array
-from vibench.assembly import Model
-from vibench.assess import errors
-from vibench.highfidelity import HighFidelitySolution
-from vibench.linalg import remove, singular_values
-from vibench.pod import POD
-from vibench.problem import MEMBERS, VariationalInequality, checked_assembly
-from vibench.reduced import ReducedModel, ReducedProblem, project
-from vibench.separation import Member, Way
-from vibench.space import InnerProduct
-from vibench.strategy import Cone, Enrichment
-from vibench.supremizer import supremizers
+from vibench.highfidelity.active_set import HighFidelitySolution
+from vibench.interfaces.problem import MEMBERS, VariationalInequality
+from vibench.interfaces.strategies import Cone, Enrichment
+from vibench.interfaces.validation import checked_assembly
+from vibench.linalg.dense import project_out, singular_values
+from vibench.linalg.inner_product import InnerProduct
+from vibench.model.affine import Evaluation, Member
+from vibench.model.errors import errors
+from vibench.model.galerkin import ReducedModel, ReducedProblem, project
+from vibench.qp import verification
+from vibench.qp.solution import QPSolution
+from vibench.reduction import cones
+from vibench.reduction.pod import POD
+from vibench.reduction.supremizers import supremizers
+from vibench.stages.assembly import Model
 
 SOME = 9
 """Training parameters at which a figure is computed that takes long."""
@@ -63,7 +66,7 @@ def orthonormality(Z: Array, V: InnerProduct) -> float:
 def of_cone(material: Material, found: Cone) -> Info:
     """Of a reduced cone: the largest distance of a snapshot, relative to the largest norm."""
     W, lam = material.problem.W, material.snapshots[1]
-    largest = max((cone.project(found.rays, theta, W).distance for theta in lam.T), default=0.0)
+    largest = max((cones.project_on_cone(found.rays, theta, W).distance for theta in lam.T), default=0.0)
     error = largest / (float(W.norm(lam).max(initial=0.0)) or 1.0)
     return about(material, R=found.size, fallbacks=len(found.fallbacks), accuracy={"projection_error": error})
 
@@ -87,7 +90,7 @@ def _sigma(model: ReducedModel, mu: Array) -> float:
     """Largest sine between a supremizer at mu (d,) and the enriched space."""
     V, vi = model.problem.V, checked_assembly(model.problem, mu)
     wanted = V.whiten(V.orthonormalise(supremizers(V, vi.B, model.span)))
-    return float(singular_values(remove(V.whiten(model.primal_basis(vi)), wanted)).max(initial=0.0))
+    return float(singular_values(project_out(V.whiten(model.primal_basis(vi)), wanted)).max(initial=0.0))
 
 
 def of_separation(material: Material, found: Mapping[str, Member]) -> Info:
@@ -98,7 +101,7 @@ def of_separation(material: Material, found: Mapping[str, Member]) -> Info:
 
 
 def _interpolation_error(material: Material, found: Mapping[str, Member]) -> float:
-    sampled = {name: m for name, m in found.items() if m.way is Way.INTERPOLATED}
+    sampled = {name: m for name, m in found.items() if m.way is Evaluation.INTERPOLATED}
     if not sampled:
         return 0.0
     sampler = material.problem.sampler({name: (m.rows, m.columns) for name, m in sampled.items()})
@@ -132,7 +135,7 @@ def _difference(found: Array, exact: Array) -> float:
     return float(np.linalg.norm(found - exact)) / (float(np.linalg.norm(exact)) or 1.0)
 
 
-Solve = Callable[[ReducedProblem], qp.Answer]
+Solve = Callable[[ReducedProblem], QPSolution]
 
 
 def of_queries(material: Material, model: Model, solve: Solve, accuracy: float) -> Info:
@@ -141,7 +144,7 @@ def of_queries(material: Material, model: Model, solve: Solve, accuracy: float) 
     for query in material.queries:
         reduced = model.assemble(query.mu)
         answer = solve(reduced)
-        status, reason, residuals = judgement.judge(reduced.program, answer, accuracy)
+        status, reason, residuals = verification.verify(reduced.program, answer, accuracy)
         statuses.append((status.severity, status.value, reason))
         if residuals is not None and answer.x is not None and answer.alpha is not None:
             u, lam = reduced.basis @ answer.x, model.generators @ answer.alpha
@@ -158,9 +161,9 @@ def _errors(material: Material, query: Query, u: Array, lam: Array) -> dict[str,
     return {"error_u": found.u, "error_lambda": found.lam}
 
 
-def of_answer(program: VariationalInequality, answer: qp.Answer, accuracy: float) -> Info:
+def of_answer(program: VariationalInequality, answer: QPSolution, accuracy: float) -> Info:
     """Of what a QP solver answers."""
-    status, reason, residuals = judgement.judge(program, answer, accuracy)
+    status, reason, residuals = verification.verify(program, answer, accuracy)
     return {
         **_shape(program),
         "status": status.value,
@@ -176,7 +179,7 @@ def _shape(program: VariationalInequality | None) -> dict[str, int]:
     return {} if program is None else {"dimension": len(program.f), "R": len(program.g)}
 
 
-def _residuals(found: judgement.Residuals) -> dict[str, float]:
+def _residuals(found: verification.Residuals) -> dict[str, float]:
     return {name: getattr(found, part) for part, name in RESIDUALS.items()}
 
 

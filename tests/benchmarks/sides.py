@@ -8,16 +8,16 @@ from dataclasses import dataclass
 import numpy as np
 import published
 
-from vibench import qp
 from vibench.arrays import Array
-from vibench.highfidelity import Solver
-from vibench.infsup import multipliers
-from vibench.online import OnlineModel, project_members
-from vibench.pod import pod
-from vibench.problem import Problem
-from vibench.reduced import ReducedModel
-from vibench.separation import separate
-from vibench.strategy import Enrichment, Offline, Stop
+from vibench.highfidelity.active_set import HighFidelitySolver
+from vibench.interfaces.problem import Problem
+from vibench.interfaces.strategies import Enrichment, Offline, Stop
+from vibench.model.affine import affine_decomposition
+from vibench.model.galerkin import ReducedModel
+from vibench.model.hyperreduced import OnlineModel, project_members
+from vibench.qp.solve import solve_qp
+from vibench.reduction.pod import pod
+from vibench.stability.infsup import multipliers
 from vibench_problems.hertz import Hertz
 from vibench_problems.obstacle import Obstacle
 from vibench_strategies.cpg import CPG
@@ -141,7 +141,7 @@ class Ours(Side):
     """vibench's own."""
 
     def snapshots(self) -> None:
-        solver = Solver(self.problem)
+        solver = HighFidelitySolver(self.problem)
         found = [solver.solve(mu) for mu in self.problem.training_set()]
         self.u, self.lam = np.column_stack([s.u for s in found]), np.column_stack([s.lam for s in found])
 
@@ -164,7 +164,7 @@ class Ours(Side):
         self.pga()
 
     def reduction(self) -> None:
-        members = separate(self.problem, self.offline.training, INTERPOLATION)
+        members = affine_decomposition(self.problem, self.offline.training, INTERPOLATION)
         model = self._model(self.enrichment)
         self.fixed_reduced = OnlineModel(model, project_members(model, members))
         self.members = members
@@ -190,12 +190,12 @@ class Ours(Side):
     def bare_program(self, mu: Array) -> Callable[[], object]:
         """Solving the program of a reduced offline query, and nothing else."""
         reduced = self.fixed_reduced.assemble(mu)
-        return lambda: qp.solve(reduced.program, self.solver, self.accuracy, factor=reduced.factor)
+        return lambda: solve_qp(reduced.program, self.solver, self.accuracy, factor=reduced.factor)
 
     def _model(self, enrichment: Enrichment) -> ReducedModel:
         return ReducedModel(self.problem, self.basis, enrichment, self.chi, self.span)
 
     def _answered(self, model: ReducedModel | OnlineModel, mu: Array) -> published.Answer:
         reduced = model.assemble(mu)
-        found = qp.solve(reduced.program, self.solver, self.accuracy, factor=reduced.factor)
+        found = solve_qp(reduced.program, self.solver, self.accuracy, factor=reduced.factor)
         return reduced.program, found.x, found.alpha, lambda: reduced.basis

@@ -15,8 +15,8 @@ The command `vibench check` prints the same findings.
 
 from __future__ import annotations
 
+from vibench.testing.checks import SECONDS, ConformanceError, Finding, Verdict
 from vibench.testing.duals import check_dual, examine_dual
-from vibench.testing.findings import SECONDS, ConformanceError, Finding, Verdict
 from vibench.testing.primals import check_primal, examine_primal
 from vibench.testing.problems import check_problem, examine_problem
 from vibench.testing.sample import MovingSupport, sample_offline, sample_snapshots

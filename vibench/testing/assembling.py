@@ -9,14 +9,11 @@ import scipy.linalg
 
 from vibench.arrays import Array, SparseMatrix
 from vibench.errors import NumericalError
-from vibench.problem import MEMBERS, VariationalInequality
-from vibench.separation import CONSTANT_RTOL
-from vibench.space import InnerProduct
-from vibench.testing.case import Case
-from vibench.testing.continuity import find_jump
-from vibench.testing.findings import Note, raised
-from vibench.testing.spaces import undeclarable
-from vibench.testing.values import (
+from vibench.interfaces.problem import MEMBERS, VariationalInequality
+from vibench.linalg.inner_product import InnerProduct
+from vibench.model.affine import CONSTANT_RTOL
+from vibench.testing.checks import Note, raised
+from vibench.testing.comparisons import (
     Members,
     array_fault,
     asymmetry,
@@ -29,6 +26,9 @@ from vibench.testing.values import (
     pickled,
     why_not_pickled,
 )
+from vibench.testing.continuity import find_jump
+from vibench.testing.problem_case import Case
+from vibench.testing.spaces import undeclarable
 
 SYMMETRY_RTOL = 1e-12
 """How far a symmetric matrix may be from its transpose, relative to its largest entry."""
@@ -48,7 +48,7 @@ def assembly(case: Case) -> Iterator[str]:
             yield f"assemble fails {at(mu)}: {raised(error)}"
             return
         if not isinstance(vi, VariationalInequality):
-            yield f"assemble gives a {type(vi).__name__} {at(mu)}; expected a vibench.problem.VariationalInequality"
+            yield f"assemble gives a {type(vi).__name__} {at(mu)}; expected a vibench.VariationalInequality"
             return
         found = [
             fault

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from itertools import count
 
-from vibench.testing.values import Members, difference, peak
+from vibench.testing.comparisons import Members, difference, peak
 
 JUMP = 1e-3
 """Smallest jump that is looked for, relative to the largest entry of a member."""

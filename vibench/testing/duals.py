@@ -8,14 +8,14 @@ from functools import cached_property
 import numpy as np
 
 from vibench.arrays import Array
-from vibench.cone import project
-from vibench.contracts import check_cone
 from vibench.errors import NumericalError, VibenchError
-from vibench.space import InnerProduct
-from vibench.strategy import Cone, DualStrategy, Stop
-from vibench.testing.findings import SECONDS, Check, Finding, Note, examine, name_of, require, too_long
+from vibench.interfaces.strategies import Cone, DualStrategy, Stop
+from vibench.interfaces.validation import check_cone
+from vibench.linalg.inner_product import InnerProduct
+from vibench.reduction.cones import project_on_cone
+from vibench.testing.checks import SECONDS, Check, Finding, Note, examine, name_of, require, too_long
+from vibench.testing.comparisons import array_fault, copied, difference, pickled, why_not_pickled
 from vibench.testing.sample import sample_snapshots
-from vibench.testing.values import array_fault, copied, difference, pickled, why_not_pickled
 from vibench.timing import timed
 
 TOLERANCES = (0.3, 0.1, 0.01)
@@ -120,7 +120,7 @@ class _Case:
         """It can be made."""
         strategy: object = self._strategy
         if not isinstance(strategy, DualStrategy):
-            yield f"a {type(strategy).__name__} was made; expected a subclass of vibench.strategy.DualStrategy"
+            yield f"a {type(strategy).__name__} was made; expected a subclass of vibench.DualStrategy"
 
     def cone(self) -> Iterator[str]:
         """What is handed over is a cone in W⁺, of unit generators."""
@@ -260,7 +260,7 @@ def _distances(cone: Cone, r: int, snapshots: Array, W: InnerProduct) -> Array:
         return np.zeros(snapshots.shape[1])
     chi, free = cone.generators[:, :r], cone.free[:r]
     both = np.hstack([chi, -chi[:, free]])
-    return np.array([project(both, theta, W).distance for theta in snapshots.T]) / largest
+    return np.array([project_on_cone(both, theta, W).distance for theta in snapshots.T]) / largest
 
 
 def _different(one: Cone, other: Cone) -> str:

@@ -8,11 +8,11 @@ import numpy as np
 import scipy.sparse as sp
 
 from vibench.arrays import Array, Indices
-from vibench.problem import MEMBERS, Contact, Problem
-from vibench.testing.case import Case
-from vibench.testing.findings import Note
+from vibench.interfaces.problem import MEMBERS, Contact, Problem
+from vibench.testing.checks import Note
+from vibench.testing.comparisons import array_fault, at, copied, difference, entry, matrix_fault, peak
+from vibench.testing.problem_case import Case
 from vibench.testing.spaces import undeclarable
-from vibench.testing.values import array_fault, at, copied, difference, entry, matrix_fault, peak
 
 PARTIAL_RTOL = 1e-10
 """How far an entry may be from what is assembled in full, relative to the largest entry of the member."""
@@ -63,7 +63,7 @@ def _contact_fault(case: Case, dofs: Indices) -> str:
         if what := difference(given, mu):
             return f"contact changes the parameter it is given: {what} before; work on a copy of mu"
         if not isinstance(contact, Contact):
-            return f"contact gives a {type(contact).__name__} {at(mu)}; expected a vibench.problem.Contact"
+            return f"contact gives a {type(contact).__name__} {at(mu)}; expected a vibench.Contact"
         fault = matrix_fault("contact.B", contact.B, (case.problem.W.dim, len(dofs)))
         fault = fault or array_fault("contact.g", contact.g, (case.problem.W.dim,))
         if fault:

@@ -9,14 +9,14 @@ from itertools import pairwise
 import numpy as np
 
 from vibench.arrays import Array
-from vibench.contracts import ROUND_OFF, check_enrichment
 from vibench.errors import NumericalError, VibenchError
-from vibench.nested import NestedStrategy, grow_through
-from vibench.space import InnerProduct
-from vibench.strategy import Cone, Enrichment, Kind, Offline, PrimalStrategy, no_free
-from vibench.testing.findings import SECONDS, Check, Finding, Note, examine, name_of, raised, require, too_long
+from vibench.interfaces.strategies import Cone, Enrichment, Kind, Offline, PrimalStrategy, no_free
+from vibench.interfaces.validation import ROUND_OFF, check_enrichment
+from vibench.linalg.inner_product import InnerProduct
+from vibench.reduction.nested import NestedStrategy, grow_through
+from vibench.testing.checks import SECONDS, Check, Finding, Note, examine, name_of, raised, require, too_long
+from vibench.testing.comparisons import array_fault, at, difference, pickled, why_not_pickled
 from vibench.testing.sample import arrays_of, copy_of, offline_of, sample_offline
-from vibench.testing.values import array_fault, at, difference, pickled, why_not_pickled
 from vibench.timing import timed
 
 TOLERANCES = (0.9, 0.5, 0.1)
@@ -112,7 +112,7 @@ class _Case:
         """It can be made."""
         strategy: object = self._strategy
         if not isinstance(strategy, PrimalStrategy):
-            yield f"a {type(strategy).__name__} was made; expected a subclass of vibench.strategy.PrimalStrategy"
+            yield f"a {type(strategy).__name__} was made; expected a subclass of vibench.PrimalStrategy"
 
     def tolerance(self) -> Iterator[str]:
         """A tolerance is accepted exactly if `takes_tolerance` says so."""
@@ -160,7 +160,7 @@ class _Case:
         except NumericalError as error:
             return f"{error}{_where(found, V, offline.basis)}"
         if not isinstance(found.kind, Kind):
-            return f"the kind is {found.kind!r}; expected a vibench.strategy.Kind"
+            return f"the kind is {found.kind!r}; expected a vibench.Kind"
         if found.eta is not None:
             fault = array_fault("eta", found.eta, (offline.problem.W.dim, np.shape(found.eta)[-1]))
             if fault:

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from functools import partial
 
-from vibench.problem import Problem
+from vibench.interfaces.problem import Problem
 from vibench.testing import assembling, partial_assembly, solving, spaces
-from vibench.testing.case import Case
-from vibench.testing.findings import SECONDS, Check, Finding, examine, name_of, require, too_long
+from vibench.testing.checks import SECONDS, Check, Finding, examine, name_of, require, too_long
+from vibench.testing.problem_case import Case
 
 CHECKS: tuple[tuple[str, Callable[[Case], Iterator[str]], tuple[str, ...]], ...] = (
     ("construction", spaces.construction, ()),

@@ -7,15 +7,15 @@ from typing import Any
 import numpy as np
 import scipy.sparse as sp
 
-from vibench import highfidelity
 from vibench.arrays import Array
-from vibench.cone import greedy_cone
-from vibench.infsup import multipliers
-from vibench.pod import pod
-from vibench.problem import ParameterBox, Problem, VariationalInequality
-from vibench.space import InnerProduct
-from vibench.strategy import Cone, Offline, Stop
-from vibench.testing.values import copied
+from vibench.highfidelity import active_set
+from vibench.interfaces.problem import ParameterBox, Problem, VariationalInequality
+from vibench.interfaces.strategies import Cone, Offline, Stop
+from vibench.linalg.inner_product import InnerProduct
+from vibench.reduction.cones import greedy_cone
+from vibench.reduction.pod import pod
+from vibench.stability.infsup import multipliers
+from vibench.testing.comparisons import copied
 
 NODES, CONSTRAINTS = 40, 14
 """Free nodes of the string, and constraints on it."""
@@ -103,6 +103,6 @@ def arrays_of(offline: Offline) -> dict[str, Any]:
 
 def _solutions(problem: Problem) -> tuple[Array, Array]:
     """U (n×P) and λ (m×P) at the training parameters."""
-    solver = highfidelity.Solver(problem)
+    solver = active_set.HighFidelitySolver(problem)
     found = [solver.solve(mu) for mu in problem.training_set()]
     return np.column_stack([each.u for each in found]), np.column_stack([each.lam for each in found])

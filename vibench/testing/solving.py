@@ -6,13 +6,14 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from vibench import highfidelity
 from vibench.arrays import Array, Indices
 from vibench.errors import NumericalError
-from vibench.problem import Picture, training_parameters
-from vibench.testing.case import Case
-from vibench.testing.findings import Note
-from vibench.testing.values import array_fault, at
+from vibench.highfidelity import active_set
+from vibench.interfaces.problem import Picture
+from vibench.interfaces.validation import training_parameters
+from vibench.testing.checks import Note
+from vibench.testing.comparisons import array_fault, at
+from vibench.testing.problem_case import Case
 
 SOLVED = 5
 """Training parameters solved at; more of them, up to ten times as many, while no constraint is active."""
@@ -21,7 +22,7 @@ SOLVED = 5
 def solution(case: Case) -> Iterator[str]:
     """High-fidelity solutions are found, with multipliers in W⁺ that are not all zero."""
     mus = training_parameters(case.problem)
-    solver, worst, contacts, tried, fallbacks = highfidelity.Solver(case.problem), 0.0, 0, 0, 0
+    solver, worst, contacts, tried, fallbacks = active_set.HighFidelitySolver(case.problem), 0.0, 0, 0, 0
     for k in _spread(len(mus)):
         if tried >= SOLVED and contacts:
             break
@@ -58,7 +59,7 @@ def pictures(case: Case) -> Iterator[str]:
     for name, value in case.problem.diagnostics(mu.copy()).items():
         if not isinstance(name, str) or not np.isscalar(value) or not np.isfinite(float(value)):  # type: ignore[arg-type]
             yield f"diagnostics gives {value!r} for {name!r} {at(mu)}; expected a finite number for a name"
-    found = highfidelity.Solver(case.problem).solve(mu.copy())
+    found = active_set.HighFidelitySolver(case.problem).solve(mu.copy())
     u, lam = found.u.copy(), found.lam.copy()
     picture = case.problem.picture(mu.copy(), u, lam)
     if not (np.array_equal(u, found.u) and np.array_equal(lam, found.lam)):
@@ -66,7 +67,7 @@ def pictures(case: Case) -> Iterator[str]:
     if picture is None:
         yield Note("no picture")
     elif not isinstance(picture, Picture):
-        yield f"picture gives a {type(picture).__name__}; expected a vibench.problem.Picture or None"
+        yield f"picture gives a {type(picture).__name__}; expected a vibench.Picture or None"
     else:
         yield from _picture_faults(picture, len(lam))
 

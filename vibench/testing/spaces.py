@@ -8,11 +8,12 @@ import numpy as np
 
 from vibench.arrays import Array
 from vibench.errors import NumericalError
-from vibench.problem import MEMBERS, ParameterBox, Problem, training_parameters, validation_parameters
-from vibench.space import InnerProduct
-from vibench.testing.case import Case
-from vibench.testing.findings import Note, plugin_line
-from vibench.testing.values import array_fault, at, difference, matrix_fault
+from vibench.interfaces.problem import MEMBERS, ParameterBox, Problem
+from vibench.interfaces.validation import training_parameters, validation_parameters
+from vibench.linalg.inner_product import InnerProduct
+from vibench.testing.checks import Note, plugin_line
+from vibench.testing.comparisons import array_fault, at, difference, matrix_fault
+from vibench.testing.problem_case import Case
 
 OUTSIDE_RTOL = 1e-12
 """How far a parameter may be outside the box, relative to the box."""
@@ -33,7 +34,7 @@ def construction(case: Case) -> Iterator[str]:
         yield f"{space}{error} ({place})"
         return
     if not isinstance(problem, Problem):
-        yield f"a {type(problem).__name__} was made; expected a subclass of vibench.problem.Problem"
+        yield f"a {type(problem).__name__} was made; expected a subclass of vibench.Problem"
 
 
 def spaces(case: Case) -> Iterator[str]:
@@ -41,7 +42,7 @@ def spaces(case: Case) -> Iterator[str]:
     for name in ("V", "W"):
         space = getattr(case.problem, name, None)
         if not isinstance(space, InnerProduct):
-            yield f"{name} is a {type(space).__name__}; expected a vibench.space.InnerProduct"
+            yield f"{name} is a {type(space).__name__}; expected a vibench.InnerProduct"
             continue
         if space.dim == 0:
             yield f"{name} has dimension 0; {'no unknown is free' if name == 'V' else 'there is no constraint'}"
@@ -68,7 +69,7 @@ def parameters(case: Case) -> Iterator[str]:
     """The box is one."""
     box = case.problem.parameters
     if not isinstance(box, ParameterBox):
-        yield f"parameters is a {type(box).__name__}; expected a vibench.problem.ParameterBox"
+        yield f"parameters is a {type(box).__name__}; expected a vibench.ParameterBox"
         return
     if isinstance(box.names, str) or not box.names or not all(isinstance(name, str) and name for name in box.names):
         yield f"the names of the parameters are {box.names!r}; expected a tuple of texts, one for each parameter"

@@ -9,11 +9,17 @@ import numpy as np
 import pytest
 import scipy.sparse as sp
 
-from vibench.arrays import Array
-from vibench.contracts import check_enrichment
-from vibench.problem import Problem, VariationalInequality
-from vibench.strategy import Cone, Enrichment, Offline, no_free
-from vibench.supremizer import supremizers
+from vibench import (
+    Array,
+    Cone,
+    Enrichment,
+    Offline,
+    Problem,
+    VariationalInequality,
+    check_enrichment,
+    no_free,
+    supremizers,
+)
 from vibench_rope.fixed_supremizers import FixedSupremizers
 from vibench_rope.rope import Rope
 

@@ -8,9 +8,7 @@ import numpy as np
 import pytest
 from scipy.optimize import brentq, fsolve
 
-from vibench.arrays import Array
-from vibench.highfidelity import Solver
-from vibench.problem import MEMBERS
+from vibench import MEMBERS, Array, HighFidelitySolver
 from vibench_rope.rope import FIRM, Rope
 
 PARAMETERS = [np.array(mu) for mu in ((0.05, 0.0), (0.1, 0.1), (0.15, 0.3))]
@@ -57,7 +55,7 @@ class Exact:
 @pytest.mark.parametrize("mu", PARAMETERS, ids=str)
 def test_the_rope_leaves_the_hills_where_the_tangent_conditions_say(mu: Array) -> None:
     rope, exact = Rope(), Exact(mu)
-    found = Solver(rope).solve(mu)
+    found = HighFidelitySolver(rope).solve(mu)
     touching = rope.x[found.lam > 0.0]
     left, right = touching[touching < 0.5], touching[touching > 0.5]
     ends = np.array([left[0], left[-1], right[0], right[-1]])
@@ -69,14 +67,14 @@ def test_the_deflection_converges_with_the_second_power_of_the_mesh_width(mu: Ar
     exact = Exact(mu)
     for half in (20, 40, 80, 160):
         rope = Rope(half)
-        error = np.abs(Solver(rope).solve(mu).u - exact.u(rope.x)).max()
+        error = np.abs(HighFidelitySolver(rope).solve(mu).u - exact.u(rope.x)).max()
         assert error < 5.0 * rope.step**2, half
 
 
 @pytest.mark.parametrize("mu", PARAMETERS, ids=str)
 def test_hills_carry_the_rope_and_what_its_curvature_presses(mu: Array) -> None:
     rope = Rope()
-    found, exact = Solver(rope).solve(mu), Exact(mu)
+    found, exact = HighFidelitySolver(rope).solve(mu), Exact(mu)
     a, b, c, d = exact.contact
     nu = np.where(rope.x < 0.5, mu[0], FIRM)
     curvature = 0.2 * np.pi**2 * (np.sin(np.pi * rope.x) - 9.0 * np.sin(3.0 * np.pi * rope.x))
@@ -101,7 +99,7 @@ def test_a_small_rope_has_the_one_contact_set_that_satisfies_the_conditions(mu: 
         if np.all(B @ u <= vi.g + 1e-12) and np.all(lam >= -1e-12):
             answers.append((u, np.array(active)))
     assert len(answers) == 1
-    found = Solver(rope).solve(mu)
+    found = HighFidelitySolver(rope).solve(mu)
     np.testing.assert_allclose(found.u, answers[0][0], rtol=0.0, atol=1e-12)
     np.testing.assert_array_equal(found.lam > 0.0, answers[0][1])
 

@@ -7,8 +7,7 @@ from typing import Annotated
 import numpy as np
 from annotated_types import Ge
 
-from vibench.strategy import Enrichment, Kind, Offline, PrimalStrategy
-from vibench.supremizer import supremizers
+from vibench import Enrichment, Kind, Offline, PrimalStrategy, supremizers
 
 
 class FixedSupremizers(PrimalStrategy):

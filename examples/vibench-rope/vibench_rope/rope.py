@@ -9,9 +9,7 @@ import numpy as np
 import scipy.sparse as sp
 from annotated_types import Ge, Le
 
-from vibench.arrays import Array, Indices
-from vibench.problem import ParameterBox, Problem, Sampler, VariationalInequality
-from vibench.space import InnerProduct
+from vibench import Array, Indices, InnerProduct, ParameterBox, Problem, Sampler, VariationalInequality
 
 FIRM = 0.15
 """Elasticity ν₀ of the right half [N]."""

@@ -1,0 +1,117 @@
+"""Runs that are killed at random moments, and full disks: nothing is lost, and a later run completes the rest."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import random
+import signal
+import sqlite3
+import subprocess
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pytest
+from running import Vibench, assert_same_numbers, rows, started
+from samples import wire_study, write_study
+
+from vibench.results.database import FILE
+from vibench.stages.artefacts import CACHE_VARIABLE
+
+STUDY = wire_study(
+    problem=[{"name": "wire", "label": f"{nodes}", "options": {"nodes": nodes}} for nodes in (20, 40)],
+    dual=["cpg", "mcpg"],
+    primal=["decorrelated", "online-supremizers", "offline-pga"],
+    solvers=["piqp", "osqp", "gives-up"],
+    tolerances=[{"pod": [1e-2, 1e-3], "dual": [1e-2], "primal": {"offline-pga": [0.5, 0.1]}}],
+)
+CELLS = 2 * 2 * 4 * 3 * 2
+OPTIONS = ("run", "study.toml", "--jobs", "2", "--out", "out")
+
+
+@dataclass(frozen=True)
+class Undisturbed:
+    """A run that nothing happened to: its folder, and how long it took."""
+
+    folder: Path
+    seconds: float
+
+
+@pytest.fixture(scope="module")
+def undisturbed(vibench: Vibench, tmp_path_factory: pytest.TempPathFactory) -> Undisturbed:
+    folder, start = tmp_path_factory.mktemp("undisturbed"), time.monotonic()
+    write_study(folder, STUDY)
+    assert vibench(folder, *OPTIONS).returncode == 0
+    assert len(rows(folder / "out")) == CELLS
+    return Undisturbed(folder / "out", time.monotonic() - start)
+
+
+@pytest.fixture
+def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder with the study, and artefacts of its own."""
+    monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path / "cache"))
+    write_study(tmp_path, STUDY)
+    return tmp_path
+
+
+def seen(folder: Path) -> dict[str, dict[str, Any]]:
+    """The cells that have a row; none where a run did not come so far as to make the table."""
+    with contextlib.suppress(sqlite3.OperationalError):
+        return {row["cell"]: row for row in rows(folder)} if (folder / FILE).is_file() else {}
+    return {}
+
+
+def kill_at_random(command: str, place: Path, plugins: Path, out: str, rng: random.Random, within: float) -> bool:
+    """Begin a run and kill it, or all its processes, within some seconds; `False` if it was quicker."""
+    with started([command, *OPTIONS[:-1], out], place, plugins) as process:
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            process.wait(timeout=within * rng.random())
+        if process.returncode is not None:
+            assert process.returncode == 0
+            return False
+        if rng.random() < 0.5:
+            process.kill()
+        else:
+            os.killpg(process.pid, signal.SIGKILL)
+        process.wait()
+    return True
+
+
+@pytest.mark.parametrize("kills", [2, pytest.param(50, marks=pytest.mark.long)])
+def test_a_run_that_is_killed_again_and_again_loses_and_doubles_nothing(
+    kills: int, undisturbed: Undisturbed, command: str, plugins_folder: Path, vibench: Vibench, place: Path
+) -> None:
+    rng, killed, number, at_work = random.Random(kills), 0, 0, 0
+    while killed < kills:
+        number += 1
+        out, known = f"out{number}", {}
+        while killed < kills and kill_at_random(command, place, plugins_folder, out, rng, 0.8 * undisturbed.seconds):
+            killed += 1
+            found = seen(place / out)
+            assert {key: found.get(key) for key in known} == known  # not one that was there is gone, or another one
+            at_work += len(found) > len(known)
+            known = found
+        done = vibench(place, *OPTIONS[:-1], out)
+        assert (done.returncode, done.stderr) == (0, "")
+        assert {key: seen(place / out)[key] for key in known} == known
+        assert_same_numbers(undisturbed.folder, place / out)
+    assert at_work > 0 or kills < 10
+
+
+@pytest.mark.parametrize("kib", [*(pytest.param(kib, marks=pytest.mark.long) for kib in (1, 12, 40, 300)), 100])
+def test_a_full_disk_stops_a_run_with_one_line_and_a_later_one_completes_it(
+    kib: int, undisturbed: Undisturbed, command: str, plugins_folder: Path, vibench: Vibench, place: Path
+) -> None:
+    """No file may be longer than so many KiB, which is how a disk of that size looks to every process of the run."""
+    limited = ["bash", "-c", f'ulimit -f {kib}; exec "$0" "$@"', command, *OPTIONS]
+    with started(limited, place, plugins_folder) as process:
+        _, errors = process.communicate(timeout=120)
+    assert process.returncode in (1, 2)
+    assert errors.startswith("vibench: ")
+    assert "cannot be written" in errors
+    assert errors.count("\n") == 1
+    done = vibench(place, *OPTIONS)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert_same_numbers(undisturbed.folder, place / "out")

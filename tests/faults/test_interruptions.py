@@ -1,0 +1,117 @@
+"""Runs that are stopped in the middle, and go on."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import time
+from pathlib import Path
+
+import pandas as pd
+import pytest
+from running import (
+    Vibench,
+    read_until,
+    rows,
+    run_again,
+    started,
+    workers,
+)
+from samples import wire_study, write_study
+
+
+@pytest.fixture
+def waiting(tmp_path: Path) -> Path:
+    """Folder of a study of two cells; the second waits for a file "go on" there."""
+    waits = {"name": "cone-waits", "options": {"file": str(tmp_path / "go on")}}
+    write_study(tmp_path, wire_study(dual=["cpg", waits]))
+    return tmp_path
+
+
+@pytest.mark.parametrize(("kill", "code"), [(signal.SIGINT, 130), (signal.SIGKILL, -9)], ids=["interrupted", "killed"])
+def test_a_run_that_was_stopped_goes_on_later(
+    kill: signal.Signals, code: int, command: str, plugins_folder: Path, vibench: Vibench, waiting: Path
+) -> None:
+    with started([command, "run", "study.toml", "--jobs", "2"], waiting, plugins_folder) as process:
+        read_until(process, "[1/2] ok")
+        os.killpg(process.pid, kill)  # the workers too, as a terminal does
+        out, err = process.communicate(timeout=60)
+    assert process.returncode == code
+    assert err == ""
+    folder = waiting / "runs" / "wire"
+    before = rows(folder)
+    assert [row["dual"] for row in before] == ["cpg"]
+    if kill is signal.SIGINT:
+        assert "interrupted: 1 cells have no row yet" in out
+        assert len(pd.read_csv(folder / "tables" / "cells.csv")) == 1
+
+    (waiting / "go on").touch()
+    printed, after = run_again(vibench, waiting)
+    assert "2 cells, 1 to run" in printed
+    assert after[0] == before[0]
+    assert [(row["dual"], row["status"]) for row in after] == [("cpg", "ok"), ("cone-waits", "ok")]
+    assert len(rows(folder, "queries")) == 6
+
+
+def test_workers_do_not_see_ctrl_c(command: str, plugins_folder: Path, waiting: Path) -> None:
+    """A terminal tells the group of the command; from the moment on which they come to life, workers are in others."""
+    (waiting / "go on").touch()
+    groups: set[int] = set()
+    with started([command, "run", "study.toml", "--jobs", "2"], waiting, plugins_folder) as process:
+        while process.poll() is None:
+            for worker in workers(process.pid):
+                with contextlib.suppress(ProcessLookupError):
+                    groups.add(os.getpgid(worker))
+            time.sleep(0.005)
+        _, err = process.communicate(timeout=10)
+    assert (process.returncode, err) == (0, "")
+    assert len(groups) == 2
+    assert process.pid not in groups
+
+
+def test_a_second_interrupt_changes_nothing(command: str, plugins_folder: Path, waiting: Path) -> None:
+    with started([command, "run", "study.toml", "--jobs", "2"], waiting, plugins_folder) as process:
+        read_until(process, "[1/2] ok")
+        for _ in range(20):
+            with contextlib.suppress(ProcessLookupError):
+                os.killpg(process.pid, signal.SIGINT)
+            time.sleep(0.01)
+        out, err = process.communicate(timeout=60)
+    assert (process.returncode, err) == (130, "")
+    assert "interrupted: 1 cells have no row yet; the same command goes on from here" in out
+    assert len(rows(waiting / "runs" / "wire")) == 1
+
+
+def test_a_run_that_is_terminated_leaves_no_worker_behind(command: str, plugins_folder: Path, waiting: Path) -> None:
+    """As where a terminal is closed, or a scheduler ends a job: only the command itself is told."""
+    with started([command, "run", "study.toml", "--jobs", "2"], waiting, plugins_folder) as process:
+        read_until(process, "[1/2] ok")
+        left = set(workers(process.pid))
+        assert left
+        process.terminate()
+        process.wait(timeout=60)
+        for _ in range(100):
+            left = {worker for worker in left if Path(f"/proc/{worker}").exists()}
+            if not left:
+                return
+            time.sleep(0.1)
+        pytest.fail("a worker goes on")
+
+
+def test_two_runs_do_not_write_into_one_folder(
+    command: str, plugins_folder: Path, vibench: Vibench, waiting: Path
+) -> None:
+    with started([command, "run", "study.toml", "--jobs", "2"], waiting, plugins_folder) as process:
+        read_until(process, "[1/2] ok")
+        for options in ((), ("--fresh",)):
+            second = vibench(waiting, "run", "study.toml", *options)
+            assert second.returncode == 2
+            assert f"another run writes into 'runs/wire' (process {process.pid} on" in second.stderr
+        refused = vibench(waiting, "clean")
+        assert refused.returncode == 2
+        assert "a run uses the artefacts in" in refused.stderr
+        (waiting / "go on").touch()
+        out, err = process.communicate(timeout=60)
+    assert (process.returncode, err) == (0, "")
+    assert "2 cells, 2 ok" in out

@@ -1,0 +1,273 @@
+"""A matrix of plugins of a third party that misbehave in every way."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+import pytest
+from running import (
+    Vibench,
+    rows,
+)
+from samples import wire_study, write_study
+
+BAD_PROBLEMS: Mapping[str, tuple[set[str], str]] = {
+    "wire-raises": ({"error"}, "in highfidelity: ArithmeticError: the wire snapped"),
+    "wire-nan": ({"error"}, "in highfidelity: f has entries that are not finite at mu = ["),
+    "wire-shape": ({"error"}, "in highfidelity: g has shape (11,) at mu = ["),
+    "wire-indefinite": ({"error"}, "not positive definite"),
+    "wire-broken": ({"error"}, "in highfidelity: OSError: no wire in stock"),
+    "wire-hungry": ({"error"}, "out of memory: the limit is memory_gib = 8"),
+    "wire-sleeps": ({"timeout"}, "in highfidelity: stopped after cell_seconds = 12 s"),
+    "wire-exits": ({"crashed"}, "in highfidelity: the worker process died with exit code 3"),
+    "wire-segfaults": ({"crashed"}, "in highfidelity: the worker process died with signal SIGSEGV"),
+    "wire-infeasible": ({"error"}, "in highfidelity: no active set solves the high-fidelity problem; is it feasible?"),
+    "wire-crooked": ({"error"}, "in highfidelity: X_V is not positive definite"),
+}
+BAD_DUALS: Mapping[str, tuple[set[str], str]] = {
+    "cone-raises": ({"error"}, "in cone: LookupError: no generator found"),
+    "cone-waits": ({"timeout"}, "in cone: stopped after cell_seconds = 12 s"),
+    "cone-nan": ({"error"}, "in cone: the generators have entries that are not finite"),
+    "cone-shape": ({"error"}, "in cone: the generators have shape (11, 2), expected (12, count)"),
+    "cone-negative": ({"error"}, "in cone: a generator has the negative coefficient -"),
+    "cone-long": ({"error"}, "in cone: the generators do not all have unit norm in W"),
+    "cone-nothing": ({"error"}, "in cone: the dual strategy returned a NoneType, expected a Cone"),
+}
+BAD_PRIMALS: Mapping[str, tuple[set[str], str]] = {
+    "enrichment-raises": ({"error"}, "in enrichment: LookupError: no vector found"),
+    "enrichment-nan": ({"error"}, "in enrichment: the vectors of the enrichment have entries that are not finite"),
+    "enrichment-shape": ({"error"}, "in enrichment: the vectors of the enrichment have shape (11, 1), expected (12, "),
+    "enrichment-long": ({"error"}, "in enrichment: the vectors of the enrichment are not orthonormal in V"),
+    "enrichment-supply": ({"error"}, "in assembly: the enrichment supplied vectors of shape (12,), expected (12, "),
+    "enrichment-nothing": ({"error"}, "in enrichment: the primal strategy returned a NoneType, expected an Enrichm"),
+}
+BAD_SOLVERS: Mapping[str, tuple[set[str], str]] = {
+    "raises": ({"error"}, "RuntimeError: the solver gave in"),
+    "nothing": ({"error"}, "NumericalError: the solver returned a NoneType, expected a QPSolution"),
+    "gives-up": ({"failed"}, "the solver returned nothing: gave up"),
+    "nan": ({"nonfinite"}, "not finite"),
+    "wrong": ({"inaccurate"}, "residual"),
+    "wrong-length": ({"error"}, "3 of 3 queries"),
+    "dies": ({"crashed"}, "exit code 7"),
+    "segfaults": ({"crashed"}, "died with signal SIGSEGV"),
+    "hangs": ({"timeout"}, "stopped after query_seconds = 0.5 s"),
+    "hungry": ({"error"}, "out of memory: the limit is memory_gib = 8"),
+    "leaves": ({"error"}, "SystemExit: 3"),
+    "ecos": ({"unavailable"}, "the QP solver 'ecos' is not installed"),
+}
+FINE: Mapping[str, list[str]] = {
+    "problem": ["wire", "wire-chatty"], "dual": ["cpg"], "primal": ["decorrelated", "enrichment-counts"],
+    "solver": ["piqp", "careful", "counts", "chatty"],
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Run:
+    """Two runs that ended: their folders, their exit codes, and what they said."""
+
+    folders: list[Path]
+    codes: list[int]
+    printed: list[str]
+    errors: list[str]
+
+    def rows(self, table: str = "cells") -> list[dict[str, Any]]:
+        return [row for folder in self.folders for row in rows(folder, table)]
+
+
+def bad(name: str, plugin: str) -> dict[str, Any]:
+    """The plugin that is broken in the way its label ends with."""
+    return {"name": plugin, "label": name, "options": {"how": name.rpartition("-")[2]}}
+
+
+@pytest.fixture(scope="module")
+def run(vibench: Vibench, tmp_path_factory: pytest.TempPathFactory) -> Run:
+    """Two matrices in which almost everything goes wrong: one of problems, one of strategies and solvers."""
+    folder = tmp_path_factory.mktemp("misbehaviour")
+    waits = {"name": "cone-waits", "options": {"file": str(folder / "never")}}
+    duals = [bad(name, "cone-bad") for name in list(BAD_DUALS)[2:]]
+    primals = [bad(name, "enrichment-bad") for name in list(BAD_PRIMALS)[1:]]
+    limits = {"cell_seconds": 12.0, "query_seconds": 0.5}
+    studies = [
+        wire_study(
+            problem=[*FINE["problem"], *BAD_PROBLEMS],
+            dual=FINE["dual"],
+            primal=FINE["primal"],
+            solvers=FINE["solver"],
+            limits=limits,
+        ),
+        wire_study(
+            dual=[*FINE["dual"], "cone-raises", waits, *duals],
+            primal=["decorrelated", "enrichment-raises", *primals],
+            solvers=[*FINE["solver"], *BAD_SOLVERS],
+            limits=limits,
+        ),
+    ]
+    found = Run([], [], [], [])
+    for number, study in enumerate(studies):
+        path = write_study(folder, study, f"{number}.toml")
+        done = vibench(folder, "run", path, "--jobs", "2", "--out", str(number))
+        found.folders.append(folder / str(number))
+        found.codes.append(done.returncode)
+        found.printed.append(done.stdout)
+        found.errors.append(done.stderr)
+    return found
+
+
+@pytest.fixture(scope="module")
+def cells(run: Run) -> pd.DataFrame:
+    """Their cells; those that are in both count once."""
+    found = pd.DataFrame(run.rows()).set_index(["problem", "dual", "primal", "solver"])
+    return found[~found.index.duplicated()].sort_index()
+
+
+def test_every_cell_has_a_row(cells: pd.DataFrame) -> None:
+    problems = ([*FINE["problem"], *BAD_PROBLEMS], FINE["dual"], FINE["primal"], FINE["solver"])
+    strategies = (
+        ["wire"],
+        [*FINE["dual"], *BAD_DUALS],
+        ["decorrelated", *BAD_PRIMALS],
+        [*FINE["solver"], *BAD_SOLVERS],
+    )
+    expected = pd.MultiIndex.from_product(problems).union(pd.MultiIndex.from_product(strategies))
+    assert sorted(cells.index) == sorted(expected)
+
+
+def test_the_runs_are_complete_all_the_same(run: Run) -> None:
+    assert run.codes == [0, 0]
+
+
+def test_nothing_is_said_on_standard_error(run: Run) -> None:
+    assert run.errors == ["", ""]
+
+
+def test_what_plugins_print_is_kept_out_of_the_way(run: Run) -> None:
+    assert not any("past Python" in printed for printed in run.printed)
+    log = (run.folders[0] / "workers.log").read_text()
+    for words in (
+        "assembling [",
+        "careful",
+        "written past Python",
+        "solving",
+        "solving past Python",
+        "Fatal Python error: Seg",
+    ):
+        assert words in log
+
+
+def test_what_misbehaves_takes_nothing_else_along(cells: pd.DataFrame) -> None:
+    fine = cells.loc[list(pd.MultiIndex.from_product(FINE.values()))]
+    assert set(fine["status"]) == {"ok"}
+    assert set(fine["queries_ok"]) == {3}
+    assert set(fine["reason"]) == {""}
+
+
+@pytest.mark.parametrize("problem", BAD_PROBLEMS)
+def test_a_problem_that_misbehaves_costs_its_cells(problem: str, cells: pd.DataFrame) -> None:
+    statuses, reason = BAD_PROBLEMS[problem]
+    mine = cells.loc[(problem, "cpg", "decorrelated")]
+    assert set(mine["status"]) == statuses
+    assert all(reason in found for found in mine["reason"]), set(mine["reason"])
+
+
+@pytest.mark.parametrize("dual", BAD_DUALS)
+def test_a_dual_strategy_that_misbehaves_costs_its_cells(dual: str, cells: pd.DataFrame) -> None:
+    statuses, reason = BAD_DUALS[dual]
+    mine = cells.xs(("wire", dual), level=("problem", "dual")).drop("ecos", level="solver")
+    assert set(mine["status"]) == statuses
+    assert all(found.startswith(reason) for found in mine["reason"]), set(mine["reason"])
+
+
+@pytest.mark.parametrize("primal", BAD_PRIMALS)
+def test_a_primal_strategy_that_misbehaves_costs_its_cells(primal: str, cells: pd.DataFrame) -> None:
+    statuses, reason = BAD_PRIMALS[primal]
+    mine = cells.loc[("wire", "cpg", primal)].drop("ecos")
+    assert set(mine["status"]) == statuses
+    assert all(found.startswith(reason) for found in mine["reason"]), set(mine["reason"])
+
+
+@pytest.mark.parametrize("solver", BAD_SOLVERS)
+def test_a_solver_that_misbehaves_costs_its_cells(solver: str, cells: pd.DataFrame) -> None:
+    statuses, reason = BAD_SOLVERS[solver]
+    mine = cells.xs(("wire", "cpg", solver), level=("problem", "dual", "solver")).loc[["decorrelated"]]
+    assert set(mine["status"]) <= statuses
+    assert all(reason in found for found in mine["reason"]), set(mine["reason"])
+    assert set(mine["queries_ok"]) == {0}
+    assert mine["online_s"].isna().all()
+
+
+def test_a_solver_that_is_not_installed_is_unavailable_everywhere(cells: pd.DataFrame) -> None:
+    assert set(cells.xs("ecos", level="solver")["status"]) == {"unavailable"}
+
+
+def test_every_reason_is_one_line(cells: pd.DataFrame, run: Run) -> None:
+    reasons = [*cells["reason"], *(row["reason"] for row in run.rows("queries"))]
+    assert [reason for reason in reasons if "\n" in reason] == []
+    assert all(cells["reason"][cells["status"] != "ok"])
+
+
+def test_every_cell_says_where_its_numbers_come_from(cells: pd.DataFrame) -> None:
+    for name in ("seed", "study_hash", "code", "machine", "threads", "versions"):
+        assert cells[name].notna().all(), name
+        assert (cells[name] != "").all(), name
+
+
+def test_queries_that_were_asked_have_rows_of_their_own(run: Run) -> None:
+    queries = pd.DataFrame(rows(run.folders[1], "queries"))
+    solvers = {*FINE["solver"], "raises", "nothing", "gives-up", "nan", "wrong"}
+    assert solvers <= set(queries["solver"])
+    assert set(queries.groupby("cell")["query"].apply(tuple)) == {(0, 1, 2)}
+    assert set(queries[queries["solver"] == "raises"]["status"]) == {"error"}
+    assert queries["mu_1"].between(4.0, 8.0).all()
+
+
+def test_whole_numbers_are_stored_as_whole_numbers(run: Run) -> None:
+    """A plugin may count with NumPy's integers."""
+    counts = [row["iterations"] for row in run.rows("queries") if row["solver"] == "counts"]
+    assert counts
+    assert set(counts) == {3}
+    known = [row for row in rows(run.folders[0], "histories") if row["quantity"] == "steps"]
+    assert [row["value"] for row in known if row["problem"] == "wire"] == [0, 1, 2]
+
+
+def test_progress_counts_up_to_the_number_of_cells(run: Run) -> None:
+    for folder, printed in zip(run.folders, run.printed, strict=True):
+        counted = [(int(k), int(n)) for k, n in re.findall(r"^\[(\d+)/(\d+)\]", printed, re.MULTILINE)]
+        count = len(rows(folder))
+        assert counted == [(k + 1, count) for k in range(count)]
+
+
+def test_the_end_names_what_fell_short(run: Run) -> None:
+    for folder, printed in zip(run.folders, run.printed, strict=True):
+        statuses = [row["status"] for row in rows(folder)]
+        fine = statuses.count("ok")
+        assert f"{len(statuses)} cells, {fine} ok, {len(statuses) - fine} fell short" in printed
+        for status in set(statuses) - {"ok"}:
+            assert re.search(rf"^{status}: ", printed, re.MULTILINE)
+
+
+def test_the_tables_are_written(run: Run) -> None:
+    for folder in run.folders:
+        tables, count = folder / "tables", len(rows(folder))
+        assert len(pd.read_csv(tables / "cells.csv")) == count
+        assert len((tables / "summary.md").read_text(encoding="utf-8").splitlines()) == count + 2
+        assert len(pd.read_csv(tables / "queries.csv")) == len(rows(folder, "queries"))
+
+
+def test_queries_that_went_well_before_the_solver_died_are_kept(vibench: Vibench, tmp_path: Path) -> None:
+    study = wire_study(solvers=["dies-sometimes", "piqp"], tolerances=[{"N": [3], "dual": [1e-2]}])
+    done = vibench(tmp_path, "run", write_study(tmp_path, study), "--jobs", "1", "--out", "out")
+    assert (done.returncode, done.stderr) == (0, "")
+    cell, other = rows(tmp_path / "out")
+    assert (cell["status"], cell["queries_ok"]) == ("crashed", 1)
+    assert cell["reason"].startswith("2 of 3 queries, first mu=(4.343): the worker process died with signal SIGKILL")
+    lost, kept = [[q for q in rows(tmp_path / "out", "queries") if q["cell"] == c["cell"]] for c in (cell, other)]
+    assert [query["status"] for query in lost] == ["crashed", "crashed", "ok"]
+    assert lost[2]["error_u"] == pytest.approx(kept[2]["error_u"])
+    for query, reference in zip(lost, kept, strict=True):
+        for name in ("mu_1", "hf_s", "beta_span", "beta_full_cone_lower", "beta_hf_span", "bounds"):
+            assert query[name] == reference[name]

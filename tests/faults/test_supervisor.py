@@ -1,0 +1,261 @@
+"""Worker processes that hang, die or are told to stop: what is kept, what is said, and how soon."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from fake_stages import InPieces, OfAPlugin, Whole
+
+from vibench.execution import supervisor
+from vibench.execution.supervisor import Job, StoppedError, Supervisor
+from vibench.qp.status import Status
+from vibench.stages.artefacts import Store
+from vibench.stages.base import Done, Failed, Stage, Unstored
+from vibench.study import registry
+from vibench.study.cells import Plugin
+
+Run = Callable[..., "Done | Failed | Unstored"]
+
+
+@pytest.fixture
+def keeper() -> Iterator[Supervisor]:
+    made = Supervisor()
+    yield made
+    made.close()
+
+
+@pytest.fixture
+def run(keeper: Supervisor, tmp_path: Path) -> Run:
+    """Function that runs a stage under limits."""
+
+    def go(stage: Stage, query: float = 1.0, cell: float = 30.0) -> Done | Failed | Unstored:
+        return keeper.run(Job(str(tmp_path), stage, query, cell, 8.0))
+
+    return go
+
+
+def test_a_stage_that_goes_well_is_stored(run: Run, tmp_path: Path) -> None:
+    stage = Whole("fine")
+    assert isinstance(run(stage), Done)
+    found = Store(tmp_path).get(stage.key)
+    assert found is not None
+    assert found.value == "fine"
+
+
+def test_the_process_is_kept_from_one_stage_to_the_next(run: Run) -> None:
+    processes = {run(InPieces(("fine",) * k)).value[0][1] for k in (1, 2, 3)}
+    assert len(processes) == 1
+    assert os.getpid() not in processes
+
+
+@pytest.mark.parametrize("how", ["sleep", "hang"])
+def test_a_piece_beyond_its_limit_costs_itself(run: Run, how: str) -> None:
+    found = run(InPieces(("fine", how, "fine", "fine")), query=1.0)
+    assert isinstance(found, Done)
+    assert [number for number, _ in found.value] == [0, 1, 2, 3]
+    assert found.value[1][1] == Failed(Status.TIMEOUT, "stopped after query_seconds = 1 s")
+    assert all(isinstance(process, int) for number, process in found.value if number != 1)
+
+
+@pytest.mark.parametrize(("how", "words"), [("exit", "exit code 5"), ("segfault", "signal SIGSEGV")])
+def test_a_piece_that_kills_its_process_costs_itself(run: Run, how: str, words: str) -> None:
+    found = run(InPieces((how, "fine", how, "fine")))
+    assert isinstance(found, Done)
+    for number in (0, 2):
+        assert found.value[number][1] == Failed(Status.CRASHED, f"the worker process died with {words}")
+    assert found.value[1][1] != found.value[3][1]  # each death takes another process
+
+
+def test_what_a_piece_raises_costs_itself(run: Run) -> None:
+    found = run(InPieces(("interrupt", "fine")))
+    assert isinstance(found, Done)
+    assert found.value[0][1].status is Status.ERROR
+    assert "KeyboardInterrupt" in found.value[0][1].reason
+
+
+def test_beyond_the_limit_of_the_cell_the_pieces_done_are_kept(run: Run) -> None:
+    start = time.monotonic()
+    found = run(InPieces(("fine", "fine", "sleep", "fine")), query=60.0, cell=4.0)
+    assert time.monotonic() - start < 4.0 + 5.0
+    assert isinstance(found, Done)
+    assert [isinstance(value, Failed) for _, value in found.value] == [False, False, True, True]
+    assert found.value[3][1] == Failed(Status.TIMEOUT, "stopped after cell_seconds = 4 s")
+
+
+def test_a_piece_that_dies_before_it_is_watched_costs_itself(run: Run) -> None:
+    found = run(InPieces(("fine", "fine", "fine"), unwatched=("", "exit", "")))
+    assert isinstance(found, Done)
+    assert [isinstance(value, Failed) for _, value in found.value] == [False, True, False]
+
+
+def test_many_quick_pieces_have_the_limit_of_the_cell_too(run: Run) -> None:
+    start = time.monotonic()
+    found = run(InPieces(("moment",) * 400), cell=4.0)
+    assert time.monotonic() - start < 4.0 + 5.0
+    assert isinstance(found, Done)
+    lost = [value for _, value in found.value if isinstance(value, Failed)]
+    assert 300 < len(lost) < 400
+    assert set(lost) == {Failed(Status.TIMEOUT, "stopped after cell_seconds = 4 s")}
+
+
+def test_a_death_beyond_the_limit_is_not_the_reason_of_pieces_never_asked(run: Run) -> None:
+    found = run(InPieces(("fine", "sleep", "exit", "fine")), query=600.0, cell=4.0)
+    assert isinstance(found, Done)
+    assert {value.status for _, value in found.value[1:]} == {Status.TIMEOUT}
+
+
+def test_a_process_without_memory_is_replaced(run: Run) -> None:
+    found = run(InPieces(("fine", "hunger", "fine")))
+    assert isinstance(found, Done)
+    assert found.value[1][1] == Failed(Status.ERROR, "out of memory: the limit is memory_gib = 8")
+    assert found.value[0][1] != found.value[2][1]
+    starved = run(Whole("hunger"))
+    assert isinstance(starved, Failed)
+    assert "out of memory" in starved.reason
+    assert isinstance(run(Whole("fine")), Done)
+
+
+def test_a_finish_that_dies_is_tried_once_more_with_what_is_there(run: Run) -> None:
+    found = run(InPieces(("fine", "fine"), at_end="exit"))
+    assert isinstance(found, Failed)
+    assert found.status is Status.CRASHED
+
+
+def test_what_a_plugin_started_ends_with_its_process(run: Run, keeper: Supervisor) -> None:
+    assert isinstance(run(InPieces(("child",))), Done)
+    deadline = time.monotonic() + 10.0
+    while not sleepers() and time.monotonic() < deadline:  # a process that has just begun has no name yet
+        time.sleep(0.01)
+    assert sleepers()
+    keeper.close()
+    assert not sleepers()
+
+
+def sleepers() -> list[str]:
+    found = []
+    for path in Path("/proc").glob("[0-9]*/cmdline"):
+        with contextlib.suppress(OSError):
+            found += [str(path)] if path.read_bytes() == b"sleep\x00601\x00" else []
+    return found
+
+
+def test_a_plugin_that_is_not_the_one_planned_with_is_refused(run: Run) -> None:
+    """Its result would be stored under the hash of the other."""
+    known = Plugin("problem", "obstacle", "{}", registry.code("problem", "obstacle"))
+    assert isinstance(run(OfAPlugin(OfAPlugin(problem=known))), Done)
+    other = replace(known, code="older")
+    found = run(OfAPlugin(OfAPlugin(problem=other)))
+    assert isinstance(found, Failed)
+    assert found.reason == "the problem 'obstacle' was changed since the run began; run the study again"
+
+
+def test_another_vibench_than_planned_with_is_refused(keeper: Supervisor, tmp_path: Path) -> None:
+    found = keeper.run(replace(Job(str(tmp_path), Whole("fine"), 1.0, 30.0, 8.0), code="older"))
+    assert isinstance(found, Failed)
+    assert "vibench or one of the libraries was changed" in found.reason
+
+
+def test_a_suspended_run_is_not_late(monkeypatch: pytest.MonkeyPatch) -> None:
+    clock = supervisor._Clock()
+    now = time.monotonic()
+    monkeypatch.setattr(supervisor.time, "monotonic", lambda: now + 3600.0)
+    assert clock.tick() <= 1.0
+
+
+def test_a_talkative_job_can_be_stopped(keeper: Supervisor, tmp_path: Path) -> None:
+    job = Job(str(tmp_path), InPieces(("moment",) * 2000), 1.0, 600.0, 8.0)
+    threading.Timer(2.0, keeper.stop).start()
+    start = time.monotonic()
+    with pytest.raises(StoppedError):
+        keeper.run(job)
+    assert time.monotonic() - start < 5.0
+
+
+@pytest.mark.parametrize("where", ["at_begin", "at_end"])
+@pytest.mark.parametrize(
+    ("how", "status"), [("sleep", Status.TIMEOUT), ("exit", Status.CRASHED), ("interrupt", Status.ERROR)]
+)
+def test_what_is_not_of_a_piece_costs_the_cell(run: Run, where: str, how: str, status: Status) -> None:
+    found = run(InPieces(("fine",), **{where: how}), cell=1.5 if how == "sleep" else 20.0)
+    assert isinstance(found, Failed)
+    assert found.status is status
+
+
+@pytest.mark.parametrize(
+    ("how", "status"), [("sleep", Status.TIMEOUT), ("hang", Status.TIMEOUT), ("segfault", Status.CRASHED)]
+)
+def test_a_whole_stage_that_hangs_or_dies_is_said_so(run: Run, how: str, status: Status) -> None:
+    found = run(Whole(how), cell=1.5)
+    assert isinstance(found, Failed)
+    assert found.status is status
+    assert isinstance(run(Whole("fine")), Done)  # the next one has a new process
+
+
+def test_a_process_that_forks_answers_once(run: Run) -> None:
+    for _ in range(3):
+        found = run(InPieces(("fine", "fork", "fine")))
+        assert isinstance(found, Done)
+        assert len({process for _, process in found.value}) == 1
+
+
+def test_what_cannot_be_stored_is_not_the_fault_of_the_stage(keeper: Supervisor, tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    found = keeper.run(Job(str(tmp_path / "file"), Whole("fine"), 1.0, 30.0, 8.0))
+    assert isinstance(found, Unstored)
+    assert "cannot be written" in found.reason
+
+
+def test_a_keeper_that_is_closed_stops_at_once_and_leaves_nobody(keeper: Supervisor, tmp_path: Path) -> None:
+    diary = tmp_path / "diary"
+    job = Job(str(tmp_path), Whole("hang", str(diary)), 1.0, 600.0, 8.0)
+    stopped: list[bool] = []
+
+    def work() -> None:
+        with pytest.raises(StoppedError):
+            keeper.run(job)
+        stopped.append(True)
+
+    thread = threading.Thread(target=work)
+    thread.start()
+    while not (diary.exists() and diary.read_text().endswith("\n")):
+        time.sleep(0.05)
+    worker = int(diary.read_text().split()[0])
+    keeper.close()
+    thread.join(timeout=5.0)
+    assert stopped == [True]
+    with pytest.raises(ProcessLookupError):
+        os.kill(worker, 0)
+
+
+def test_a_worker_does_not_outlive_its_supervisor(tmp_path: Path) -> None:
+    """Not even one that sleeps in a plugin, when the supervisor's process is killed."""
+    diary = tmp_path / "diary"
+    code = (
+        "from vibench.execution.supervisor import *; from fake_stages import Whole\n"
+        f"Supervisor().run(Job({str(tmp_path)!r}, Whole('sleep', {str(diary)!r}), 1.0, 600.0, 8.0))"
+    )
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
+    process = subprocess.Popen([sys.executable, "-c", code], env=environment)
+    while not (diary.exists() and diary.read_text().endswith("\n")):
+        time.sleep(0.05)
+        assert process.poll() is None
+    worker = int(diary.read_text().split()[0])
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    for _ in range(600):  # a busy machine takes its time
+        try:
+            os.kill(worker, 0)
+        except ProcessLookupError:
+            return
+        time.sleep(0.1)
+    pytest.fail("the worker goes on")

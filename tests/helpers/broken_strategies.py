@@ -1,0 +1,241 @@
+"""Strategies that are wrong, each in one way; what `vibench check` has to find, and nothing else."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import ClassVar
+
+import numpy as np
+
+from vibench import (
+    Array,
+    Cone,
+    DualStrategy,
+    Enrichment,
+    Growth,
+    InnerProduct,
+    Kind,
+    NestedStrategy,
+    Offline,
+    PrimalStrategy,
+    Stop,
+    greedy_cone,
+    project_on_cone,
+    supremizers,
+)
+
+
+class Greedy(DualStrategy):
+    """The snapshot farthest from the cone, as often as needed."""
+
+    def reduce(self, snapshots: Array, W: InnerProduct, stop: Stop) -> Cone:
+        return greedy_cone(snapshots, W, stop, lambda theta, _: (np.zeros_like(theta), ""))
+
+
+class NegativeGenerators(Greedy):
+    """Generators with the last one taken out of them; directions that are no multipliers."""
+
+    def reduce(self, snapshots: Array, W: InnerProduct, stop: Stop) -> Cone:
+        cone = super().reduce(snapshots, W, stop)
+        chi = cone.generators.copy()
+        chi[3, -1] = -0.01
+        return replace(cone, generators=chi / W.norm(chi))
+
+
+class Misses(Greedy):
+    """Stops at twice the tolerance, and says so."""
+
+    def reduce(self, snapshots: Array, W: InnerProduct, stop: Stop) -> Cone:
+        return super().reduce(snapshots, W, stop if stop.tolerance is None else Stop(tolerance=2.0 * stop.tolerance))
+
+
+class Boasts(Greedy):
+    """Claims smaller errors than it makes, but for the first and the last."""
+
+    def reduce(self, snapshots: Array, W: InnerProduct, stop: Stop) -> Cone:
+        cone = super().reduce(snapshots, W, stop)
+        errors = cone.errors.copy()
+        errors[1:-1] *= 0.5
+        return replace(cone, errors=errors)
+
+
+class LastErrorAlone(Greedy):
+    """Says how good the cone is, and nothing of smaller ones; which is all right."""
+
+    def reduce(self, snapshots: Array, W: InnerProduct, stop: Stop) -> Cone:
+        cone = super().reduce(snapshots, W, stop)
+        return replace(cone, generators=cone.generators[:, ::-1].copy(), errors=cone.errors[-1:])
+
+
+class OneErrorTooFew(Greedy):
+    def reduce(self, snapshots: Array, W: InnerProduct, stop: Stop) -> Cone:
+        cone = super().reduce(snapshots, W, stop)
+        return replace(cone, errors=cone.errors[1:]) if cone.size > 1 else cone
+
+
+class Long(Greedy):
+    def reduce(self, snapshots: Array, W: InnerProduct, stop: Stop) -> Cone:
+        cone = super().reduce(snapshots, W, stop)
+        return replace(cone, generators=cone.generators * 2.0)
+
+
+class Oversized(Greedy):
+    """Two generators at least."""
+
+    def reduce(self, snapshots: Array, W: InnerProduct, stop: Stop) -> Cone:
+        return super().reduce(snapshots, W, Stop(size=2) if stop.size == 1 else stop)
+
+
+class Draws(Greedy):
+    """Sums the snapshots up with weights that are drawn each time."""
+
+    def reduce(self, snapshots: Array, W: InnerProduct, stop: Stop) -> Cone:
+        weights = 1.0 + 1e-12 * np.random.default_rng().random(snapshots.shape[0])
+        cone = super().reduce(snapshots, W, stop)
+        chi = cone.generators * weights[:, None]
+        return replace(cone, generators=chi / W.norm(chi))
+
+
+class Normalises(Greedy):
+    """Divides the snapshots it is given by their norms."""
+
+    def reduce(self, snapshots: Array, W: InnerProduct, stop: Stop) -> Cone:
+        cone = super().reduce(snapshots.copy(), W, stop)
+        norms = W.norm(snapshots)
+        snapshots /= np.where(norms > 0.0, norms, 1.0)
+        return cone
+
+
+class DividesByZero(DualStrategy):
+    """Every snapshot is a generator, a zero one as well."""
+
+    def reduce(self, snapshots: Array, W: InnerProduct, stop: Stop) -> Cone:
+        count = snapshots.shape[1] if stop.size is None else stop.size
+        with np.errstate(invalid="ignore"):
+            chi = snapshots[:, :count] / W.norm(snapshots[:, :count])
+        distances = (
+            [project_on_cone(chi, theta, W).distance for theta in snapshots.T] if np.all(np.isfinite(chi)) else [0.0]
+        )
+        error = max(distances) / max(float(W.norm(snapshots).max()), 1e-300)
+        return Cone(chi, np.array([error]), np.zeros(chi.shape[1], dtype=bool))
+
+
+class UnpicklableDual(Greedy):
+    def __init__(self) -> None:
+        self.weight = lambda theta: theta
+
+
+class Supremizing(PrimalStrategy):
+    """All supremizers of the first training parameters, the more the tighter the tolerance."""
+
+    takes_tolerance: ClassVar[bool] = True
+
+    def build(self, offline: Offline, tolerance: float | None) -> Enrichment:
+        return Enrichment(Kind.FIXED, vectors=self.vectors(offline, self.count(float(tolerance))))  # type: ignore[arg-type]
+
+    def count(self, tolerance: float) -> int:
+        return round(5.0 * (1.0 - tolerance))
+
+    def vectors(self, offline: Offline, count: int) -> Array:
+        V, problem = offline.problem.V, offline.problem
+        found = [supremizers(V, problem.constraint(mu)[0], offline.span) for mu in offline.training[:count]]
+        return V.orthonormalise(np.hstack([np.zeros((V.dim, 0)), *found]), offline.basis)
+
+
+class NotOrthogonal(Supremizing):
+    """Orthonormal in the Euclidean sense."""
+
+    def vectors(self, offline: Offline, count: int) -> Array:
+        return np.linalg.qr(super().vectors(offline, count))[0]
+
+
+class AsksForATolerance(Supremizing):
+    """Forgets to say that it takes one."""
+
+    takes_tolerance: ClassVar[bool] = False
+
+
+class NeedsNone(Supremizing):
+    """Takes a tolerance, and is content without."""
+
+    def build(self, offline: Offline, tolerance: float | None) -> Enrichment:
+        return super().build(offline, tolerance or 0.5)
+
+
+class Fewer(Supremizing):
+    def count(self, tolerance: float) -> int:
+        return round(5.0 * tolerance)
+
+
+class KindOfTwo(Supremizing):
+    def build(self, offline: Offline, tolerance: float | None) -> Enrichment:
+        assert tolerance is not None
+        return Enrichment(Kind.NONE) if tolerance > 0.8 else super().build(offline, tolerance)
+
+
+class DrawsVectors(Supremizing):
+    def vectors(self, offline: Offline, count: int) -> Array:
+        V = offline.problem.V
+        return V.orthonormalise(np.random.default_rng().standard_normal((V.dim, count)), offline.basis)
+
+
+class ChangesTheBasis(Supremizing):
+    def vectors(self, offline: Offline, count: int) -> Array:
+        found = super().vectors(offline, count)
+        offline.basis[:, 0] *= -1.0
+        return found
+
+
+class NoMultiplier(Supremizing):
+    """Fails where the cone is empty."""
+
+    def vectors(self, offline: Offline, count: int) -> Array:
+        assert offline.span.shape[1] > 0, "no multiplier"
+        return super().vectors(offline, count)
+
+
+class SuppliesFunction(PrimalStrategy):
+    """Supplies what cannot travel between processes."""
+
+    def build(self, offline: Offline, tolerance: float | None) -> Enrichment:
+        return Enrichment(Kind.PER_PARAMETER, supply=lambda V, vi, span: supremizers(V, vi.B, span))
+
+
+def one_vector(V: InnerProduct, vi: object, span: Array) -> Array:
+    return np.ones(V.dim)
+
+
+class SuppliesAVector(PrimalStrategy):
+    def build(self, offline: Offline, tolerance: float | None) -> Enrichment:
+        return Enrichment(Kind.PER_PARAMETER, supply=one_vector)
+
+
+class Restarts(NestedStrategy):
+    """Says it is nested, and begins with another vector at every tolerance."""
+
+    def begin(self, offline: Offline) -> Growth:
+        return _Backwards(offline)
+
+
+class _Backwards(Growth):
+    def __init__(self, offline: Offline) -> None:
+        V, problem = offline.problem.V, offline.problem
+        B, _ = problem.constraint(offline.training[0])
+        self._found = V.orthonormalise(supremizers(V, B, offline.span), offline.basis)
+        self._count = 0
+
+    @property
+    def count(self) -> int:
+        return self._count
+
+    def reached(self, tolerance: float) -> bool:
+        return self._count >= min(round(4.0 * (1.0 - tolerance)), self._found.shape[1])
+
+    def grow(self) -> None:
+        self._count += 1
+
+    def vectors(self, first: int) -> Array:
+        return self._found[:, : self._count][:, ::-1][:, first:]
+
+    def history(self) -> dict[str, Array]:
+        return {}

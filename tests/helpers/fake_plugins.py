@@ -1,0 +1,272 @@
+"""Plugins of a third party that the runner is tried on: a small problem, and one plugin for every way to misbehave."""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import re
+import signal
+import sys
+import time
+from pathlib import Path
+from typing import Annotated, Literal
+
+import numpy as np
+import scipy.sparse as sp
+from annotated_types import Ge, Le
+
+from vibench import (
+    Array,
+    Cone,
+    DualStrategy,
+    Enrichment,
+    InnerProduct,
+    Kind,
+    Offline,
+    ParameterBox,
+    PrimalStrategy,
+    Problem,
+    QPSolution,
+    Stop,
+    VariationalInequality,
+    greedy_cone,
+    solve_qp,
+)
+
+
+class Wire(Problem):
+    """A wire between two fixed ends, pressed with a force mu on a flat support."""
+
+    parameters = ParameterBox(("force",), np.array([4.0]), np.array([8.0]), ("N/m",))
+
+    def __init__(self, nodes: Annotated[int, Ge(4), Le(500)] = 12, depth: float = 0.2) -> None:
+        self.step, self.depth = 1.0 / (nodes + 1), depth
+        ones = np.ones(nodes - 1)
+        self.stiffness = (
+            sp.csr_array(sp.diags_array([2.0 * np.ones(nodes), -ones, -ones], offsets=[0, 1, -1])) / self.step
+        )
+        self.mass = sp.csr_array(sp.diags_array(np.full(nodes, self.step)))
+        self.V = InnerProduct(self.stiffness + self.mass)
+        self.W = InnerProduct(self.mass)
+
+    def training_set(self) -> Array:
+        return self.parameters.grid(9)
+
+    def assemble(self, mu: Array) -> VariationalInequality:
+        load = np.full(self.V.dim, -mu[0] * self.step)
+        return VariationalInequality(self.stiffness, load, -self.mass, np.full(self.W.dim, self.depth * self.step))
+
+
+class Raises(Wire):
+    def assemble(self, mu: Array) -> VariationalInequality:
+        raise ArithmeticError("the wire\nsnapped")
+
+
+class NotANumber(Wire):
+    def assemble(self, mu: Array) -> VariationalInequality:
+        vi = super().assemble(mu)
+        return VariationalInequality(vi.A, vi.f * np.nan, vi.B, vi.g)
+
+
+class WrongShape(Wire):
+    def assemble(self, mu: Array) -> VariationalInequality:
+        vi = super().assemble(mu)
+        return VariationalInequality(vi.A, vi.f, vi.B, vi.g[:-1])
+
+
+class Indefinite(Wire):
+    def assemble(self, mu: Array) -> VariationalInequality:
+        vi = super().assemble(mu)
+        return VariationalInequality(-vi.A, vi.f, vi.B, vi.g)
+
+
+class Broken(Wire):
+    def __init__(self) -> None:
+        raise OSError("no wire in stock")
+
+
+class Hungry(Wire):
+    def __init__(self) -> None:
+        super().__init__()
+        self.meal = np.ones(2**36)
+
+
+class Sleeps(Wire):
+    def assemble(self, mu: Array) -> VariationalInequality:
+        time.sleep(3600)
+        return super().assemble(mu)
+
+
+class Exits(Wire):
+    def assemble(self, mu: Array) -> VariationalInequality:
+        os._exit(3)
+
+
+class Segfaults(Wire):
+    def assemble(self, mu: Array) -> VariationalInequality:
+        segfault()
+        return super().assemble(mu)
+
+
+class Infeasible(Wire):
+    def assemble(self, mu: Array) -> VariationalInequality:
+        vi = super().assemble(mu)
+        both = sp.csr_array(sp.vstack([vi.B[:6], -vi.B[:6]]))
+        return VariationalInequality(vi.A, vi.f, both, np.full(12, -1.0))
+
+
+class CrookedSpace(Wire):
+    def __init__(self) -> None:
+        super().__init__()
+        self.V = InnerProduct(self.stiffness - 1e3 * self.mass, "X_V")
+
+
+class Chatty(Wire):
+    """Prints, writes past Python, forks, and is right all the same."""
+
+    forked = False
+
+    def assemble(self, mu: Array) -> VariationalInequality:
+        print("assembling", mu)
+        print("careful", file=sys.stderr)
+        os.write(1, b"written past Python\n")
+        if not self.forked:
+            self.forked = True
+            os.fork()  # two go on from here
+        return super().assemble(mu)
+
+
+def segfault() -> None:
+    ctypes.string_at(0)
+
+
+class BadCone(DualStrategy):
+    """Returns a cone that is broken in the way asked for."""
+
+    def __init__(self, how: Literal["nan", "shape", "negative", "long", "nothing"]) -> None:
+        self.how = how
+
+    def reduce(self, snapshots: Array, W: InnerProduct, stop: Stop) -> Cone:
+        chi = snapshots[:, :2] / W.norm(snapshots[:, :2])
+        broken = {"nan": chi * np.nan, "shape": chi[1:], "negative": -chi, "long": 2.0 * chi, "nothing": None}[self.how]
+        if broken is None:
+            return None  # type: ignore[return-value]
+        return Cone(broken, np.ones(1), np.zeros(2, dtype=bool))
+
+
+class BadVectors(PrimalStrategy):
+    """Returns vectors that are broken in the way asked for."""
+
+    def __init__(self, how: Literal["nan", "shape", "long", "supply", "nothing"]) -> None:
+        self.how = how
+
+    def build(self, offline: Offline, tolerance: float | None) -> Enrichment:
+        if self.how == "supply":
+            return Enrichment(Kind.PER_PARAMETER, supply=flat_supply)
+        if self.how == "nothing":
+            return None  # type: ignore[return-value]
+        one = offline.problem.V.orthonormalise(np.ones((offline.problem.V.dim, 1)), offline.basis)
+        broken = {"nan": one * np.nan, "shape": one[1:], "long": 2.0 * one}[self.how]
+        return Enrichment(Kind.FIXED, vectors=broken)
+
+
+def flat_supply(V: InnerProduct, vi: VariationalInequality, span: Array) -> Array:
+    return np.ones(V.dim)
+
+
+class RaisingCone(DualStrategy):
+    def reduce(self, snapshots: Array, W: InnerProduct, stop: Stop) -> Cone:
+        raise LookupError("no generator found")
+
+
+class WaitingCone(DualStrategy):
+    """Reduces as CPG does, once a file exists."""
+
+    def __init__(self, file: str) -> None:
+        self.file = Path(file)
+
+    def reduce(self, snapshots: Array, W: InnerProduct, stop: Stop) -> Cone:
+        while not self.file.exists():
+            time.sleep(0.05)
+        return greedy_cone(snapshots, W, stop, lambda theta, _: (np.zeros_like(theta), ""))
+
+
+class RaisingEnrichment(PrimalStrategy):
+    def build(self, offline: Offline, tolerance: float | None) -> Enrichment:
+        raise LookupError("no vector found")
+
+
+class CountingEnrichment(PrimalStrategy):
+    """Adds nothing, and reports a history of whole numbers."""
+
+    def build(self, offline: Offline, tolerance: float | None) -> Enrichment:
+        return Enrichment(Kind.NONE, history={"steps": np.arange(3)})
+
+
+def careful(program: VariationalInequality, accuracy: float) -> QPSolution:
+    return solve_qp(program, "piqp", accuracy)
+
+
+def raises(program: VariationalInequality, accuracy: float) -> QPSolution:
+    raise RuntimeError("the solver\ngave in")
+
+
+def nothing(program: VariationalInequality, accuracy: float) -> QPSolution:
+    return None  # type: ignore[return-value]
+
+
+def gives_up(program: VariationalInequality, accuracy: float) -> QPSolution:
+    return QPSolution(None, None, "gave up")
+
+
+def not_a_number(program: VariationalInequality, accuracy: float) -> QPSolution:
+    return QPSolution(np.full(len(program.f), np.nan), np.zeros(len(program.g)), "solved")
+
+
+def wrong(program: VariationalInequality, accuracy: float) -> QPSolution:
+    return QPSolution(np.zeros(len(program.f)), np.zeros(len(program.g)), "solved")
+
+
+def wrong_length(program: VariationalInequality, accuracy: float) -> QPSolution:
+    return QPSolution(np.zeros(len(program.f) + 1), np.zeros(len(program.g)), "solved")
+
+
+def numpy_count(program: VariationalInequality, accuracy: float) -> QPSolution:
+    found = solve_qp(program, "piqp", accuracy)
+    return QPSolution(found.x, found.alpha, found.solver_status, np.int64(3))
+
+
+def dies(program: VariationalInequality, accuracy: float) -> QPSolution:
+    os._exit(7)
+
+
+def hangs(program: VariationalInequality, accuracy: float) -> QPSolution:
+    """In native code that keeps every other thread of its process waiting."""
+    re.fullmatch("(a|a)*b", "a" * 200)
+    return careful(program, accuracy)
+
+
+def segfaults(program: VariationalInequality, accuracy: float) -> QPSolution:
+    segfault()
+    return careful(program, accuracy)
+
+
+def dies_sometimes(program: VariationalInequality, accuracy: float) -> QPSolution:
+    """Where the force is below 6 N/m: one mode carries the load, and the data are scaled to a load of 1."""
+    if np.abs(program.A).max() > 0.6:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return careful(program, accuracy)
+
+
+def hungry(program: VariationalInequality, accuracy: float) -> QPSolution:
+    return QPSolution(np.ones(2**36), np.ones(3), "solved")
+
+
+def chatty(program: VariationalInequality, accuracy: float) -> QPSolution:
+    print("solving")
+    os.write(2, b"solving past Python\n")
+    return careful(program, accuracy)
+
+
+def leaves(program: VariationalInequality, accuracy: float) -> QPSolution:
+    sys.exit(3)

@@ -1,0 +1,134 @@
+"""Stages that misbehave, for the keeper of worker processes; importable there."""
+
+from __future__ import annotations
+
+import os
+import re
+import signal
+import subprocess
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import fake_plugins
+import numpy as np
+
+from vibench.stages.artefacts import Store
+from vibench.stages.base import Failed, Pieces, PiecewiseStage, Result, Stage
+from vibench.study.cells import Plugin
+from vibench.timing import Seconds
+
+
+def misbehave(how: str) -> None:
+    """Do what the word says."""
+    if how == "sleep":
+        time.sleep(3600)
+    elif how == "hang":  # in native code, no other thread of the process runs
+        re.fullmatch("(a|a)*b", "a" * 200)
+    elif how == "exit":
+        os._exit(5)
+    elif how == "segfault":
+        fake_plugins.segfault()
+    elif how == "interrupt":
+        raise KeyboardInterrupt
+    elif how == "fork":
+        os.fork()
+    elif how == "hunger":
+        np.ones(2**36)
+    elif how == "child":  # which would outlive its parent
+        subprocess.Popen(["sleep", "601"])
+    elif how == "moment":
+        time.sleep(0.05)
+
+
+@dataclass(frozen=True)
+class Whole(Stage):
+    """A stage in one piece; it notes that it was begun."""
+
+    how: str
+    diary: str = ""
+
+    def inputs(self) -> tuple[Stage, ...]:
+        return ()
+
+    def run(self, store: Store) -> Result:
+        if self.diary:
+            with Path(self.diary).open("a") as file:
+                file.write(f"{os.getpid()} {os.getppid()}\n")
+        misbehave(self.how)
+        return Result(self.how, Seconds(1.0, 1.0))
+
+
+@dataclass(frozen=True)
+class OfAPlugin(Stage):
+    """A stage that depends on a plugin, below another stage."""
+
+    below: OfAPlugin | None = None
+    problem: Plugin | None = None
+
+    def inputs(self) -> tuple[Stage, ...]:
+        return ()
+
+    def run(self, store: Store) -> Result:
+        return Result("fine")
+
+
+@dataclass(frozen=True)
+class KillsItsParent(Stage):
+    """Kills the process that keeps the worker, the first time it is run."""
+
+    diary: str
+
+    def inputs(self) -> tuple[Stage, ...]:
+        return ()
+
+    def run(self, store: Store) -> Result:
+        first = not Path(self.diary).exists()
+        with Path(self.diary).open("a") as file:
+            file.write("begun\n")
+        if first:
+            os.kill(os.getppid(), signal.SIGKILL)
+            time.sleep(3600)
+        return Result("survived")
+
+
+@dataclass(frozen=True)
+class InPieces(PiecewiseStage):
+    """Every piece does what its word says, and what the one in `unwatched` says before the keeper is told."""
+
+    hows: tuple[str, ...]
+    at_begin: str = ""
+    at_end: str = ""
+    unwatched: tuple[str, ...] = ()
+
+    @property
+    def pieces(self) -> int:
+        return len(self.hows)
+
+    def inputs(self) -> tuple[Stage, ...]:
+        return ()
+
+    def begin(self, store: Store) -> Pieces:
+        misbehave(self.at_begin)
+        return Work(self)
+
+
+class Work(Pieces):
+    def __init__(self, stage: InPieces) -> None:
+        self.stage = stage
+
+    def piece(self, number: int, watch: Callable[[bool], None]) -> Any:
+        misbehave(self.stage.unwatched[number] if self.stage.unwatched else "")
+        watch(True)
+        misbehave(self.stage.hows[number])
+        watch(False)
+        return number, os.getpid()
+
+    def lost(self, number: int, failed: Failed) -> Any:
+        return number, failed
+
+    def finish(self, pieces: Sequence[Any]) -> Any:
+        misbehave(self.stage.at_end)
+        return list(pieces)

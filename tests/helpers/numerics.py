@@ -1,0 +1,74 @@
+"""Test data shared by the numerical tests: random spaces and a small problem whose constraints vary."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import scipy.sparse as sp
+
+from vibench import Array, InnerProduct, ParameterBox, Problem, VariationalInequality
+
+
+def spd(n: int, rng: np.random.Generator, spread: float = 10.0) -> Array:
+    """A dense symmetric positive definite matrix with eigenvalues in [1, spread]."""
+    q, _ = np.linalg.qr(rng.standard_normal((n, n)))
+    return (q * np.linspace(1.0, spread, n)) @ q.T
+
+
+def space(n: int, seed: int = 0) -> InnerProduct:
+    """A random inner product."""
+    return InnerProduct(sp.csc_array(spd(n, np.random.default_rng(seed))))
+
+
+class Varying(Problem):
+    """A string over an obstacle whose constraints rotate with the parameter, so that B(mu) truly varies."""
+
+    parameters = ParameterBox(("angle",), np.array([0.0]), np.array([1.0]), ("1",))
+
+    def __init__(self, n: int = 30, m: int = 8, count: int = 7) -> None:
+        self.count = count
+        laplacian = sp.diags_array([2.0 * np.ones(n), -np.ones(n - 1), -np.ones(n - 1)], offsets=[0, 1, -1]) * (n + 1)
+        self._laplacian = sp.csc_array(laplacian)
+        self._n, self._m = n, m
+        self.V = InnerProduct(laplacian + sp.eye_array(n) / (n + 1))
+        self.W = InnerProduct(
+            sp.diags_array([4.0 * np.ones(m), np.ones(m - 1), np.ones(m - 1)], offsets=[0, 1, -1]) / (6.0 * m)
+        )
+
+    def training_set(self) -> Array:
+        return self.parameters.grid(self.count)
+
+    def assemble(self, mu: Array) -> VariationalInequality:
+        x = np.linspace(0.0, 1.0, self._n + 2)[1:-1]
+        centres = np.linspace(0.25, 0.75, self._m) + 0.1 * mu[0] * np.sin(7.0 * np.arange(self._m))
+        hats = np.maximum(0.0, 1.0 - np.abs(x[None, :] - centres[:, None]) * (self._n + 1) / (2.0 + mu[0]))
+        weights = hats / self._m
+        return VariationalInequality(
+            A=self._laplacian * (1.0 + mu[0]),
+            f=-np.ones(self._n) / (self._n + 1) * 8.0,
+            B=sp.csr_array(-weights),
+            g=weights @ (0.3 + 0.2 * x * mu[0]),
+        )
+
+
+def fitted_rate(widths: Sequence[float], errors: Sequence[float]) -> float:
+    """Slope of the errors over the mesh widths, both logarithmic."""
+    return float(np.polyfit(np.log(widths), np.log(errors), 1)[0])
+
+
+def exact(vi: VariationalInequality) -> tuple[np.ndarray, np.ndarray]:
+    """Solution by trying every active set."""
+    m = len(vi.g)
+    for bits in range(2**m):
+        active = [i for i in range(m) if bits >> i & 1]
+        C = vi.B[active]
+        kkt = np.block([[vi.A, C.T], [C, np.zeros((len(active), len(active)))]])
+        solution = np.linalg.lstsq(kkt, np.concatenate([vi.f, vi.g[active]]), rcond=None)[0]
+        x, lam = solution[: len(vi.f)], solution[len(vi.f) :]
+        scale = np.abs(vi.B).sum(axis=1)
+        if np.all(lam >= -1e-9 * (1.0 + np.abs(lam).max(initial=0.0))) and np.all(vi.B @ x - vi.g <= 1e-10 * scale):
+            alpha = np.zeros(m)
+            alpha[active] = lam
+            return x, alpha
+    raise AssertionError("no active set")

@@ -1,0 +1,161 @@
+"""Running the command as a user would, and looking at what it leaves behind."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import sqlite3
+import subprocess
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+
+from vibench.results.database import FILE
+from vibench.results.schema import KEYS, TABLES
+
+Vibench = Callable[..., "subprocess.CompletedProcess[str]"]
+"""Runs the installed command in a folder."""
+
+Main = Callable[..., tuple[int, str, str]]
+"""Calls the command in this process: exit code, what was printed, and errors."""
+
+Register = Callable[..., None]
+"""Makes entry points, given as (group, name, value), the only ones there are."""
+
+Changed = Callable[..., Path]
+"""Gives a copy of the results of a real run, changed by SQL."""
+
+
+@contextlib.contextmanager
+def started(command: list[str], folder: Path, plugins: Path) -> Iterator[subprocess.Popen[str]]:
+    """A process that leads a group of its own; whoever is left of the group at the end is killed."""
+    process = subprocess.Popen(
+        command,
+        cwd=folder,
+        env=os.environ | {"PYTHONPATH": str(plugins), "PYTHONUNBUFFERED": "1"},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
+    try:
+        yield process
+    finally:
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(process.pid, signal.SIGKILL)
+        process.communicate()
+
+
+def rows(folder: Path, table: str = "cells") -> list[dict[str, Any]]:
+    """The rows of a results file, in the order they were written."""
+    db = sqlite3.connect(folder / FILE)
+    db.row_factory = sqlite3.Row
+    try:
+        return [dict(row) for row in db.execute(f"SELECT rowid, * FROM {table} ORDER BY rowid")]
+    finally:
+        db.close()
+
+
+def execute(folder: Path, *statements: str) -> None:
+    """Change the results in a folder by SQL."""
+    db = sqlite3.connect(folder / FILE)
+    db.execute("PRAGMA foreign_keys=ON")
+    for statement in statements:
+        db.execute(statement)
+    db.commit()
+    db.close()
+
+
+def by_solver(folder: Path) -> dict[str, dict[str, Any]]:
+    return {row["solver"]: row for row in rows(folder)}
+
+
+def run_again(vibench: Vibench, folder: Path, *options: str, **more: Any) -> tuple[str, list[dict[str, Any]]]:
+    """Run the study of a folder once more; gives what was printed and the rows of the cells."""
+    done = vibench(folder, "run", "study.toml", "--jobs", "1", *options, **more)
+    assert done.returncode == 0, done.stderr
+    return done.stdout, rows(folder / "runs" / "wire")
+
+
+def read_until(process: subprocess.Popen[str], words: str) -> None:
+    """Read what a process prints until some words come."""
+    assert process.stdout is not None
+    printed = ""
+    while words not in printed:
+        line = process.stdout.readline()
+        assert line, f"the run ended: {printed}"
+        printed += line
+
+
+def workers(pid: int) -> list[int]:
+    """The worker processes that a process started."""
+    found: list[int] = []
+    for children in Path(f"/proc/{pid}/task").glob("*/children"):
+        with contextlib.suppress(FileNotFoundError, ProcessLookupError):
+            numbers = children.read_text().split()
+            found += [
+                int(number)
+                for number in numbers
+                if "vibench.execution.worker" in Path(f"/proc/{number}/cmdline").read_text()
+            ]
+    return found
+
+
+MEASURED = ("_s", "peak_memory_mib", "slowdown", "disturbed", "benefit_threshold", "meaning")
+"""How the columns end that hold seconds, memory, or what follows from them."""
+
+
+def numbers(folder: Path) -> dict[str, pd.DataFrame]:
+    """The tables of a run without seconds, memory, and what follows from them; in an order of their own."""
+    found = {table: pd.read_csv(folder / "tables" / f"{table}.csv") for table in TABLES}
+    return {
+        table: frame[[name for name in frame.columns if not name.endswith(MEASURED)]] for table, frame in found.items()
+    }
+
+
+def assert_same_numbers(one: Path, other: Path) -> None:
+    """Two runs of a study that differ in nothing but their times.
+
+    To the last bit, but for solvers that in one of the runs gave two answers to the same program: of theirs, queries
+    that are ok in both runs are the same to round-off, and whatever does not depend on the solver is the same.
+    """
+    ours, theirs = numbers(one), numbers(other)
+    queries = pd.concat([ours["queries"], theirs["queries"]])
+    shaky = set(queries.loc[queries["repeatable"] == 0, "solver"])
+    for table, frame in ours.items():
+        assert len(frame) > 0, table
+        (ours_exact, ours_loose), (theirs_exact, theirs_loose) = (_split(t, shaky) for t in (frame, theirs[table]))
+        pd.testing.assert_frame_equal(ours_exact, theirs_exact, check_exact=True)
+        given = [name for name in frame.columns if name in KEYS or name.startswith(UNSOLVED)]
+        pd.testing.assert_frame_equal(ours_loose[given], theirs_loose[given], check_exact=True)
+        if table == "queries":
+            fine = (ours_loose["status"] == "ok") & (theirs_loose["status"] == "ok")
+            close = [part[fine].drop(columns=["repeatable", "iterations"]) for part in (ours_loose, theirs_loose)]
+            pd.testing.assert_frame_equal(*close, rtol=1e-5, atol=1e-9)
+
+
+UNSOLVED = ("cell", "model", "N", "R", "rank", "gram", "enrichment", "dim_", "beta_", "mu_", "code", "definition")
+"""How the columns begin that do not depend on what a solver answers."""
+
+
+def _split(frame: pd.DataFrame, shaky: set[str]) -> tuple[pd.DataFrame, pd.DataFrame]:
+    """Rows without the solvers whose answers vary, and rows with them."""
+    solvers = frame.columns.intersection(["solver", "solver_a", "solver_b"])
+    theirs = frame[solvers].isin(shaky).any(axis=1)
+    return frame[~theirs], frame[theirs]
+
+
+def refused(outcome: tuple[int, str, str], *words: str) -> str:
+    """The one line of a request that was refused; fails unless it was, and holds these words."""
+    code, out, err = outcome
+    assert code == 2, err
+    assert out == ""
+    assert err.endswith("\n")
+    assert len(err.splitlines()) == 1, err
+    assert err.startswith("vibench: ")
+    assert "Traceback" not in err
+    assert [word for word in words if word not in err] == [], err
+    return err

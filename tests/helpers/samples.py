@@ -1,0 +1,173 @@
+"""Test data of the tests that do no numerics: study files, rows of the results, third-party packages."""
+
+from __future__ import annotations
+
+import copy
+import json
+import shutil
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import fake_plugins
+
+from vibench.results.schema import CELLS, QUERIES
+from vibench.stages.artefacts import Store
+from vibench.stages.base import Stage
+
+STUDY: Mapping[str, Any] = {
+    "name": "sample",
+    "seed": 7,
+    "validation": 3,
+    "accuracy": 1e-7,
+    "solvers": ["piqp", "osqp"],
+    "dual": ["cpg", "mcpg"],
+    "primal": ["decorrelated", "offline-pga"],
+    "problem": [{"name": "obstacle", "options": {"resolution": "coarse"}}],
+    "tolerances": [{"pod": [1e-2, 1e-3], "dual": [1e-1], "primal": {"offline-pga": [0.5, 0.3, 0.1]}}],
+}
+"""A study that uses every axis."""
+
+REMOVE = object()
+"""Stands for a key that is taken away."""
+
+
+def changed(content: Mapping[str, Any], *path: str | int, to: Any) -> dict[str, Any]:
+    """A copy of a study's content with one value replaced, added or (`REMOVE`) taken away."""
+    result = copy.deepcopy(dict(content))
+    place: Any = result
+    for step in path[:-1]:
+        place = place[step]
+    if to is REMOVE:
+        del place[path[-1]]
+    elif isinstance(place, list) and path[-1] == len(place):
+        place.append(to)
+    else:
+        place[path[-1]] = to
+    return result
+
+
+def toml(content: Mapping[str, Any]) -> str:
+    """A study's content as TOML."""
+    return "".join(f"{_quoted(key)} = {_value(value)}\n" for key, value in content.items())
+
+
+def _value(value: Any) -> str:
+    if isinstance(value, Mapping):
+        return "{ " + ", ".join(f"{_quoted(k)} = {_value(v)}" for k, v in value.items()) + " }"
+    if isinstance(value, list):
+        return "[" + ", ".join(map(_value, value)) + "]"
+    if isinstance(value, str):
+        return _quoted(value)
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    return repr(value) if isinstance(value, int | float) else value.isoformat()
+
+
+def _quoted(text: str) -> str:
+    return json.dumps(text, ensure_ascii=False).replace("\x7f", "\\u007f")
+
+
+def write_study(folder: Path, content: Mapping[str, Any] = STUDY, name: str = "study.toml") -> str:
+    """A study file in a folder; returns its path."""
+    path = folder / name
+    path.write_text(toml(content), encoding="utf-8")
+    return str(path)
+
+
+def cell_row(cell: str = "c1", **columns: Any) -> dict[str, Any]:
+    """A row of the cells table in which every column is filled."""
+    samples = {"TEXT": "text", "REAL": 0.5, "INTEGER": 3}
+    row = {name: samples[kind.split()[0]] for name, kind in CELLS.items()}
+    return row | {"cell": cell, "status": "ok", "enrichment_kind": "fixed"} | columns
+
+
+def query_rows(cell: str = "c1", count: int = 2, **columns: Any) -> list[dict[str, Any]]:
+    """Rows of the queries table in which every column is filled, for a problem with two parameters."""
+    samples = {"TEXT": "text", "REAL": 0.5, "INTEGER": 3}
+    row = {name: samples[kind.split()[0]] for name, kind in QUERIES.items()}
+    return [
+        row | {"cell": cell, "query": k, "mu_1": 0.1 * k, "mu_2": 2.0 + k, "status": "ok"} | columns
+        for k in range(count)
+    ]
+
+
+FAKES: Mapping[str, Mapping[str, str]] = {
+    "vibench.problems": {
+        "wire": "Wire",
+        "wire-raises": "Raises",
+        "wire-nan": "NotANumber",
+        "wire-shape": "WrongShape",
+        "wire-indefinite": "Indefinite",
+        "wire-broken": "Broken",
+        "wire-hungry": "Hungry",
+        "wire-sleeps": "Sleeps",
+        "wire-exits": "Exits",
+        "wire-segfaults": "Segfaults",
+        "wire-infeasible": "Infeasible",
+        "wire-crooked": "CrookedSpace",
+        "wire-chatty": "Chatty",
+    },
+    "vibench.dual_strategies": {"cone-raises": "RaisingCone", "cone-waits": "WaitingCone", "cone-bad": "BadCone"},
+    "vibench.primal_strategies": {
+        "enrichment-raises": "RaisingEnrichment",
+        "enrichment-counts": "CountingEnrichment",
+        "enrichment-bad": "BadVectors",
+    },
+    "vibench.qp_solvers": {
+        "careful": "careful",
+        "raises": "raises",
+        "nothing": "nothing",
+        "gives-up": "gives_up",
+        "nan": "not_a_number",
+        "wrong": "wrong",
+        "wrong-length": "wrong_length",
+        "counts": "numpy_count",
+        "dies": "dies",
+        "leaves": "leaves",
+        "hangs": "hangs",
+        "segfaults": "segfaults",
+        "dies-sometimes": "dies_sometimes",
+        "hungry": "hungry",
+        "chatty": "chatty",
+    },
+}
+"""What the third-party package registers: group → name → member of `fake_plugins`."""
+
+
+def install_fakes(folder: Path) -> Path:
+    """Lay the third-party package out in a folder as an installer would; returns the folder."""
+    folder.mkdir(parents=True)
+    shutil.copy(str(fake_plugins.__file__), folder)
+    information = folder / "fake_plugins-1.0.dist-info"
+    information.mkdir()
+    (information / "METADATA").write_text("Metadata-Version: 2.1\nName: fake-plugins\nVersion: 1.0\n")
+    lines: list[str] = []
+    for group, members in FAKES.items():
+        lines += [f"[{group}]", *(f"{name} = fake_plugins:{member}" for name, member in members.items())]
+    (information / "entry_points.txt").write_text("\n".join(lines) + "\n")
+    return folder
+
+
+def wire_study(**axes: Any) -> dict[str, Any]:
+    """A study of the third party's small problem, of one cell unless axes are given."""
+    content = {
+        "name": "wire",
+        "seed": 3,
+        "validation": 3,
+        "solvers": ["piqp"],
+        "dual": ["cpg"],
+        "primal": ["decorrelated"],
+        "problem": ["wire"],
+        "tolerances": [{"pod": [1e-3], "dual": [1e-2]}],
+    }
+    return content | axes
+
+
+def carry_out(stage: Stage, store: Store) -> None:
+    """Run a stage after all it needs, as the runner does."""
+    for needed in stage.inputs():
+        if store.get(needed.key) is None:
+            carry_out(needed, store)
+    result = stage.run(store)
+    store.put(stage.key, result.value, result.seconds, result.histories)

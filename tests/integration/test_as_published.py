@@ -1,0 +1,67 @@
+"""The algorithms as published, written around cvxopt, and vibench's own come to the same models."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+import scipy.sparse as sp
+from numerics import space
+from scipy.optimize import nnls
+
+pytest.importorskip("cvxopt", reason="the algorithms as published leave every quadratic program to cvxopt")
+sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
+
+import as_published
+import published
+
+
+@pytest.mark.parametrize(("problem", "nodes"), [("obstacle", 200), pytest.param("hertz", 700, marks=pytest.mark.long)])
+def test_both_sides_come_to_the_same_models(problem: str, nodes: int, tmp_path: Path, capsys) -> None:
+    arguments = [problem, "--resolution", str(nodes), "--repeats", "1", "--out", str(tmp_path)]
+    assert as_published.main(arguments) == 0, capsys.readouterr().out
+    times = pd.read_csv(tmp_path / f"as-published-{problem}.csv")
+    assert set(times["stage"]) == {
+        *as_published.STAGES,
+        *as_published.QUERIES,
+        as_published.TOTAL_NAME,
+        as_published.BARE,
+    }
+    assert (times.loc[times["stage"] != "reduction", ["published [s]", "ours [s]"]] > 0.0).all(axis=None)
+    assert (tmp_path / f"as-published-{problem}.md").read_text(encoding="utf-8") in capsys.readouterr().out
+
+
+def test_a_figure_above_its_bound_or_none_at_all_breaks_a_check() -> None:
+    fine, above, none = ("fine", 1.0, 1.0), ("above", 1.1, 1.0), ("none", float("nan"), 1.0)
+    assert as_published.broken([fine, above, none]) == [above, none]
+
+
+def test_gram_schmidt_drops_what_adds_nothing() -> None:
+    X = space(9).matrix
+    Y = np.random.default_rng(1).standard_normal((9, 5))
+    Y[:, 3] = Y[:, 0] - 2.0 * Y[:, 2]
+    kept = Y.copy()
+    fixed = published.gram_schmidt(Y[:, :1], X)
+    added = published.gram_schmidt(Y, X, fixed)
+    Z = np.column_stack([fixed, added])
+    np.testing.assert_array_equal(Y, kept)
+    np.testing.assert_allclose(Z.T @ X @ Z, np.eye(4), atol=1e-13)
+    np.testing.assert_allclose(published.project_out(Y, Z, X @ Z), 0.0, atol=1e-13)
+
+
+def test_distances_from_a_cone_are_those_of_nonnegative_least_squares() -> None:
+    rng = np.random.default_rng(2)
+    chi, theta = rng.random((12, 4)), rng.random(12)
+    expected = nnls(chi, theta)[1]
+    assert published._distance(chi.T @ chi, chi.T @ theta, theta @ theta) == pytest.approx(expected, rel=1e-9)
+
+
+def test_line_9_leaves_nothing_that_could_still_be_taken_out() -> None:
+    """θ₁ = (1, 1, 0), θ₂ = (1, 2, 1): ν₂ ∝ (0, 1, 1). A generator beyond the support of θ takes no part."""
+    chi = np.array([[1.0, 1.0, 0.0, 0.0], [1.0, 1.0, 1.0, 1.0]]).T
+    rest = published._line_9(np.array([1.0, 2.0, 1.0, 0.0]), chi, sp.eye_array(4))
+    np.testing.assert_allclose(rest / rest.max(), [0.0, 1.0, 1.0, 0.0], atol=1e-9)
+    assert rest[3] == 0.0

@@ -1,0 +1,226 @@
+"""The documentation is true: its code runs, its tables are complete, its rules are those that studies are held to."""
+
+from __future__ import annotations
+
+import copy
+import importlib.util
+import re
+import sys
+import tomllib
+from collections.abc import Iterator
+from itertools import pairwise
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import pandas as pd
+import pytest
+from pydantic import BaseModel
+from running import Main, Vibench, rows
+from samples import toml
+
+from vibench.cli.main import app
+from vibench.errors import RequestError
+from vibench.results import columns, schema, tables
+from vibench.study.reader import load_study
+from vibench.study.registry import GROUPS
+from vibench.study.spec import Entry, Limits, Study, ToleranceTable
+
+DOCS = Path(__file__).parents[2] / "docs"
+PAGES = sorted(DOCS.rglob("*.md"))
+EXTEND = sorted((DOCS / "extend").glob("*.md"))
+
+BLOCK = re.compile(r"^```(\w+)(?: title=\"([^\"]+)\")?\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+
+
+def blocks(page: Path) -> list[tuple[str, str, str]]:
+    """The code of a page: language, title or "", text."""
+    return BLOCK.findall(page.read_text(encoding="utf-8"))
+
+
+@pytest.fixture(scope="module")
+def reference() -> ModuleType:
+    """The module that makes tables for the pages."""
+    spec = importlib.util.spec_from_file_location("reference", DOCS / "reference.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.fixture(scope="module")
+def package(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The package of the pages, as an installer would lay it out, with its study beside it."""
+    folder = tmp_path_factory.mktemp("documented")
+    (folder / "vibench_mine").mkdir()
+    (folder / "vibench_mine" / "__init__.py").touch()
+    parts: dict[str, str] = {}
+    for page in EXTEND:
+        for _, title, text in blocks(page):
+            if title:
+                parts[title] = parts.get(title, "") + text
+    for title, text in parts.items():
+        (folder / "vibench_mine" / title if title.endswith(".py") else folder / title).write_text(
+            text, encoding="utf-8"
+        )
+    project = tomllib.loads(parts["pyproject.toml"])["project"]
+    information = folder / "vibench_mine-0.1.0.dist-info"
+    information.mkdir()
+    (information / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {project['name']}\nVersion: 0.1.0\n")
+    lines: list[str] = []
+    for group, entries in project["entry-points"].items():
+        lines += [f"[{group}]", *(f"{name} = {value}" for name, value in entries.items())]
+    (information / "entry_points.txt").write_text("\n".join(lines) + "\n")
+    return folder
+
+
+@pytest.fixture
+def importable(package: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    monkeypatch.syspath_prepend(str(package))
+    yield
+    for name in [name for name in sys.modules if name.split(".")[0] == "vibench_mine"]:
+        del sys.modules[name]
+
+
+SNIPPETS = [
+    pytest.param(text, id=f"{page.stem}-{number}")
+    for page in EXTEND
+    for number, (language, title, text) in enumerate(blocks(page))
+    if language == "python" and not title
+]
+
+
+@pytest.mark.usefixtures("importable")
+@pytest.mark.parametrize("text", SNIPPETS)
+def test_what_a_page_looks_at_is_as_it_says(text: str) -> None:
+    exec(compile(text, "<documentation>", "exec"), {"__name__": "documentation"})
+
+
+def test_the_package_of_the_pages_has_a_plugin_of_every_kind(package: Path) -> None:
+    project = tomllib.loads((package / "pyproject.toml").read_text())["project"]
+    assert {*project["entry-points"], GROUPS["study"]} == set(GROUPS.values())
+
+
+def test_the_plugins_of_the_pages_run_through_the_whole_benchmark(
+    package: Path, vibench: Vibench, tmp_path: Path
+) -> None:
+    study = tomllib.loads((package / "mine.toml").read_text())
+    registered = tomllib.loads((package / "pyproject.toml").read_text())["project"]["entry-points"]
+    for axis, group in (("dual", "vibench.dual_strategies"), ("primal", "vibench.primal_strategies")):
+        assert set(study[axis]) == set(registered[group])
+    (tmp_path / "mine.toml").write_text(toml(study), encoding="utf-8")
+    done = vibench(tmp_path, "run", "mine.toml", "--jobs", "2", plugins=package)
+    assert done.returncode == 0, done.stderr
+    assert "invariants of the constants and the error bounds hold in all" in done.stdout
+    cells = rows(tmp_path / "runs" / "mine")
+    assert len(cells) == 2 * 2 * 4 * 2
+    assert {(cell["status"], cell["reason"]) for cell in cells} == {("ok", "")}
+    assert {cell["primal"]: cell["enrichment_kind"] for cell in cells} == {
+        "centre": "fixed",
+        "pivoted": "fixed",
+        "at-every-query": "per-parameter",
+        "unconstrained": "per-parameter",
+    }
+    for cell in cells:
+        can_be_reduced = cell["problem"] == "separable-cable" and cell["primal"] != "unconstrained"
+        assert (cell["fallbacks"] == "") is can_be_reduced, cell
+        assert cell["beta_span_min"] > 0.0
+    assert sum(row["flagged"] for row in rows(tmp_path / "runs" / "mine", "disagreements")) == 0
+
+
+def test_every_column_of_every_table_has_a_unit_and_a_meaning() -> None:
+    described = {table: list(of_table) for table, of_table in columns.COLUMNS.items()}
+    assert described == {table: list(of_table) for table, of_table in schema.STORED.items()}
+    everything = [
+        column
+        for of_table in (*columns.COLUMNS.values(), columns.SUMMARY, columns.BENEFITS)
+        for column in of_table.values()
+    ]
+    for column in [*everything, columns.PARAMETER]:
+        assert column.unit in columns.UNITS
+        assert column.meaning.strip().endswith((".", "…"))
+
+
+@pytest.mark.parametrize("name", [name for name, kind in schema.QUERIES.items() if name.endswith("_s")])
+def test_seconds_are_in_seconds(name: str) -> None:
+    assert columns.COLUMNS["queries"][name].unit == "s"
+
+
+def test_the_tables_for_reading_have_the_columns_that_are_described() -> None:
+    empty = {name: pd.DataFrame(columns=list(schema.STORED[name])) for name in ("cells", "thresholds")}
+    assert list(tables.summary(empty["cells"]).columns) == list(columns.SUMMARY)
+    assert list(tables.benefits(empty["thresholds"]).columns) == list(columns.BENEFITS)
+
+
+@pytest.mark.parametrize("model", [Study, ToleranceTable, Entry, Limits])
+def test_every_field_of_a_study_file_is_described_and_in_the_reference(
+    model: type[BaseModel], reference: ModuleType
+) -> None:
+    page = reference.study_fields()
+    for name, field in model.model_fields.items():
+        assert field.description, name
+        assert re.search(rf"^\| `{name}` \| .+ \| .* \| {re.escape(field.description)} \|$", page, re.MULTILINE), name
+
+
+@pytest.mark.parametrize("table", schema.STORED)
+def test_the_reference_has_a_line_for_every_column(table: str, reference: ModuleType) -> None:
+    page = reference.GENERATED[table]()
+    names = re.findall(r"^\| `([^`]+)` ", page, re.MULTILINE)
+    parameters = ["mu_1, mu_2, …"] if table == "queries" else []
+    assert names == [*schema.STORED[table], *parameters]
+
+
+def test_every_generated_part_is_in_a_page(reference: ModuleType) -> None:
+    text = "".join(page.read_text(encoding="utf-8") for page in PAGES)
+    assert set(re.findall(r"<!-- generated: ([\w-]+) -->", text)) == set(reference.GENERATED)
+
+
+STUDY_PAGE = blocks(DOCS / "study.md")
+EXAMPLE = next(text for _, title, text in STUDY_PAGE if title == "my-study.toml")
+RULES = [
+    pytest.param(change[2], refused[2], id=refused[2].split(":")[0][:40])
+    for change, refused in pairwise(STUDY_PAGE)
+    if change[0] == "toml" and refused[0] == "text"
+]
+
+
+def test_the_example_of_the_reference_is_a_study(tmp_path: Path) -> None:
+    path = tmp_path / "my-study.toml"
+    path.write_text(EXAMPLE, encoding="utf-8")
+    load_study(str(path))
+    assert set(tomllib.loads(EXAMPLE)) == set(Study.model_fields)
+
+
+@pytest.mark.parametrize(("change", "refused"), RULES)
+def test_a_rule_of_the_reference_is_a_rule(change: str, refused: str, tmp_path: Path) -> None:
+    content: dict[str, Any] = copy.deepcopy(tomllib.loads(EXAMPLE)) | tomllib.loads(change)
+    path = tmp_path / "my-study.toml"
+    path.write_text(toml(content), encoding="utf-8")
+    with pytest.raises(RequestError) as caught:
+        load_study(str(path))
+    assert str(caught.value) == f"{path}: {refused.strip()}"
+
+
+def test_there_are_rules() -> None:
+    assert len(RULES) >= 5
+
+
+COMMAND = re.compile(r"^\s*(?:\.venv/bin/)?vibench ([a-z-]+)(.*)$", re.MULTILINE)
+
+
+def test_every_command_of_the_pages_exists_with_its_options(main: Main) -> None:
+    known = {command.name or command.callback.__name__.replace("_", "-") for command in app.registered_commands}
+    asked = {
+        (name, option)
+        for page in PAGES
+        for language, _, text in blocks(page)
+        if language == "sh"
+        for name, rest in COMMAND.findall(text)
+        for option in ["", *re.findall(r"--[a-z-]+", rest)]
+    }
+    assert {name for name, _ in asked} <= known
+    for name in sorted({name for name, _ in asked}):
+        code, printed, _ = main(name, "--help")
+        assert code == 0
+        assert [option for command, option in asked if command == name and option not in printed] == []

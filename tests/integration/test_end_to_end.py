@@ -1,0 +1,95 @@
+"""The whole matrix through the command line, judged by the invariants that every row must keep."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from vibench.results import tables
+from vibench.results.invariants import violations
+
+
+@pytest.fixture(scope="module")
+def queries(quick_run: Path) -> pd.DataFrame:
+    frame = tables.read(quick_run / "results.sqlite", "queries")
+    kinds = tables.read(quick_run / "results.sqlite", "cells").set_index("cell")["enrichment_kind"]
+    return frame.assign(kind=frame["cell"].map(kinds))
+
+
+def test_every_cell_of_the_quick_matrix_has_a_row(quick_run: Path) -> None:
+    cells = tables.read(quick_run / "results.sqlite", "cells")
+    assert len(cells) == 2 * 2 * 3 * 3
+    assert set(cells["problem"]) == {"obstacle", "hertz"}
+    assert set(cells["primal"]) == {"decorrelated", "online-supremizers", "offline-pga"}
+    assert cells[["problem", "dual", "primal", "primal_tol", "solver"]].duplicated().sum() == 0
+    assert (cells["queries"] == 16).all()
+
+
+def test_every_ok_query_is_as_accurate_as_the_study_asks(queries: pd.DataFrame) -> None:
+    ok = queries[queries["status"] == "ok"]
+    assert len(ok) > 0.9 * len(queries)
+    assert ok[["primal_residual", "dual_residual", "gap"]].max().max() <= 1e-7
+    assert (queries[queries["status"] != "ok"]["reason"] != "").all()
+    assert ok["error_u"].max() < 0.01
+
+
+def test_invariants_of_the_inf_sup_constants_hold_in_every_row(quick_run: Path, queries: pd.DataFrame) -> None:
+    kinds = tables.read(quick_run / "results.sqlite", "cells").set_index("cell")["enrichment_kind"]
+    assert violations(queries, kinds) == []
+    for kind, prefix in (("per-parameter", "beta_full_"), ("none", "beta_plain_")):
+        some = queries[queries["kind"] == kind]
+        for what in ("span", "cone_lower", "cone_upper"):
+            assert np.allclose(some[f"beta_{what}"], some[f"{prefix}{what}"], rtol=1e-8, atol=1e-14)
+
+
+def test_span_constants_vanish_exactly_below_the_rank(quick_run: Path, queries: pd.DataFrame) -> None:
+    cells = tables.read(quick_run / "results.sqlite", "cells").set_index("cell")
+    short = cells["N"] + cells["enrichment"] < cells["rank"]
+    assert short.any()
+    assert not short.all()
+    vanishes = queries["beta_span"].to_numpy() == 0.0
+    assert np.array_equal(vanishes, short.loc[queries["cell"]].to_numpy())
+
+
+def test_fixed_enrichments_keep_their_promise_on_the_validation_set(queries: pd.DataFrame) -> None:
+    """Obstacle: all parameters share one supremizer space, so the bound of the training set holds everywhere."""
+    fixed = queries[(queries["kind"] == "fixed") & (queries["problem"] == "obstacle")]
+    bound = np.sqrt(1.0 - fixed["primal_tol"] ** 2)
+    assert (fixed["beta_span"] >= bound * fixed["beta_full_span"] * (1.0 - 1e-9)).all()
+    assert (fixed["beta_cone_upper"] >= bound * fixed["beta_full_cone_lower"] * (1.0 - 1e-9)).all()
+
+
+def test_solvers_agree_on_what_they_solved(queries: pd.DataFrame) -> None:
+    """Inf-sup constants do not depend on the solver at all, errors of u only in the digits of the accuracy."""
+    keys = ["problem", "dual", "primal", "primal_tol", "query"]
+    ok = queries[queries["status"] == "ok"]
+    spread = ok.groupby(keys, dropna=False)[["error_u", "beta_span"]].agg(lambda values: values.max() - values.min())
+    assert spread["beta_span"].max() == 0.0
+    assert spread["error_u"].max() < 3e-4
+
+
+@pytest.mark.parametrize("problem", ["obstacle", "hertz"])
+def test_the_modified_cone_is_no_larger_and_better_conditioned(quick_run: Path, problem: str) -> None:
+    cells = tables.read(quick_run / "results.sqlite", "cells")
+    sizes = cells[cells["problem"] == problem].groupby("dual")["R"].first()
+    assert sizes["mcpg"] <= sizes["cpg"]
+    histories = tables.read(quick_run / "results.sqlite", "histories")
+    orth = histories[(histories["quantity"] == "e_orth") & (histories["problem"] == problem)]
+    common = orth.groupby("dual")["step"].max().min()
+    medians = orth[(orth["step"] > 0) & (orth["step"] <= common)].groupby("dual")["value"].median()
+    assert medians["mcpg"] > medians["cpg"]
+
+
+def test_fixed_enrichments_keep_their_promise_on_the_training_set_of_both_problems(quick_run: Path) -> None:
+    histories = tables.read(quick_run / "results.sqlite", "histories")
+    keys = ["problem", "dual", "primal", "primal_tol", "step"]
+    own, full = (
+        histories[histories["quantity"] == quantity].set_index(keys)["value"].sort_index()
+        for quantity in ("beta_span_training", "beta_full_span_training")
+    )
+    assert len(own) == 2 * (125 + 81)
+    bound = np.sqrt(1.0 - own.index.get_level_values("primal_tol").to_numpy() ** 2)
+    assert np.all(own.to_numpy() >= bound * full.to_numpy() * (1.0 - 1e-9))

@@ -1,0 +1,142 @@
+"""The example package: installed as a third party's, found by its entry points, run beside the built-in ones."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+import sysconfig
+import venv
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+from samples import write_study
+from sources import SOURCES, mentions
+
+from vibench.interfaces.problem import MEMBERS
+from vibench.results.database import FILE
+from vibench.results.tables import read
+from vibench.stages.artefacts import CACHE_VARIABLE
+
+EXAMPLE = Path(__file__).parents[2] / "examples" / "vibench-rope"
+
+Python = Callable[..., "subprocess.CompletedProcess[str]"]
+
+BUILT_IN = ("decorrelated", "online-supremizers", "offline-pga")
+OWN = "fixed-supremizers"
+
+STUDY: dict[str, Any] = {
+    "name": "rope-here",
+    "seed": 3,
+    "validation": 3,
+    "solvers": ["piqp"],
+    "dual": ["cpg", "mcpg"],
+    "primal": [*BUILT_IN, OWN],
+    "assembly": ["full", "reduced"],
+    "problem": [{"name": "rope", "options": {"half": 16}}],
+    "tolerances": [{"pod": [1e-2], "dual": [1e-1], "primal": {"offline-pga": [0.5]}}],
+}
+
+
+@pytest.fixture(scope="module")
+def example(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A copy of the package; what builds and tests leave behind is not left in the checkout."""
+    rubbish = shutil.ignore_patterns("__pycache__", ".*", "dist")
+    return Path(shutil.copytree(EXAMPLE, tmp_path_factory.mktemp("example") / "vibench-rope", ignore=rubbish))
+
+
+@pytest.fixture(scope="module")
+def python(example: Path, artefacts: Path) -> Python:
+    """Function that runs the Python of a new environment: what is installed here, and the example."""
+    folder = example.with_name("environment")
+    venv.create(folder, symlinks=True)
+    interpreter = folder / "bin" / "python"
+    site = folder / "lib" / f"python{sys.version_info.major}.{sys.version_info.minor}" / "site-packages"
+    here = dict.fromkeys(sysconfig.get_path(name) for name in ("purelib", "platlib"))
+    (site / "here.pth").write_text("".join(f"import site; site.addsitedir({place!r})\n" for place in here))
+
+    def run(*arguments: str, where: Path = example.parent) -> subprocess.CompletedProcess[str]:
+        clean = {name: value for name, value in os.environ.items() if not name.startswith(("PYTHON", "PIP_"))}
+        environment = clean | {CACHE_VARIABLE: str(artefacts.parent)}
+        command = [str(interpreter), *arguments]
+        done = subprocess.run(command, cwd=where, env=environment, capture_output=True, text=True, check=False)
+        assert done.returncode == 0, done.stdout + done.stderr
+        return done
+
+    quietly = ("--quiet", "--disable-pip-version-check", "--no-index", "--no-deps", "--no-build-isolation")
+    run("-m", "pip", "install", *quietly, str(example))
+    return run
+
+
+@pytest.fixture(scope="module")
+def cells(python: Python, command: str, example: Path) -> tuple[pd.DataFrame, pd.DataFrame, str]:
+    """Cells and queries of a small study of the rope, and what the run printed."""
+    done = python(command, "run", write_study(example.parent, STUDY), "--jobs", "1", "--strict")
+    path = example.parent / "runs" / STUDY["name"] / FILE
+    return read(path, "cells"), read(path, "queries"), done.stdout
+
+
+def test_the_package_is_found_through_its_entry_points_alone(python: Python, command: str) -> None:
+    *cells, last = python(command, "run", "rope", "--dry-run").stdout.splitlines()
+    assert last == "32 cells"
+    assert sum(f" {OWN} " in cell for cell in cells) == 8
+    assert [source.stem for source in SOURCES for name in ("rope", OWN) if mentions(name, source.read_text())] == []
+
+
+def test_every_cell_of_the_rope_is_ok_and_has_its_row(cells: tuple[pd.DataFrame, pd.DataFrame, str]) -> None:
+    found, queries, printed = cells
+    assert set(found["status"]) == {"ok"}
+    assert set(zip(found["dual"], found["primal"], found["assembly"], strict=True)) == {
+        (dual, primal, way) for dual in STUDY["dual"] for primal in STUDY["primal"] for way in STUDY["assembly"]
+    }
+    assert len(found) == 16
+    assert len(queries) == 16 * STUDY["validation"]
+    assert "invariants of the constants and the error bounds hold in all 48 queries" in printed
+    reduced = found[found["assembly"] == "reduced"]
+    assert {name: set(reduced[f"terms_{name}"]) for name in MEMBERS} == {"A": {2}, "f": {0}, "B": {0}, "g": {2}}
+    assert set(reduced["fallbacks"]) == {""}
+
+
+def test_what_is_added_once_is_as_stable_on_the_rope_as_what_is_added_at_every_query(
+    cells: tuple[pd.DataFrame, pd.DataFrame, str],
+) -> None:
+    found, queries, _ = cells
+    rows = queries.merge(found[["cell", "dual", "primal", "assembly"]], on="cell", suffixes=("", "_of_cell"))
+    keys = ["dual", "assembly", "query"]
+    ours, online, plain = (
+        rows[rows["primal"] == name].sort_values(keys, ignore_index=True)
+        for name in (OWN, "online-supremizers", "decorrelated")
+    )
+    assert len(ours) == len(online) == len(plain) == 4 * STUDY["validation"]
+    np.testing.assert_allclose(ours["beta_span"], online["beta_span"], rtol=1e-8)
+    np.testing.assert_allclose(ours["error_lambda"], online["error_lambda"], rtol=1e-4, atol=1e-9)
+    assert (ours["beta_span"] > 1e-3).all()
+    assert (plain["beta_span"] < ours["beta_span"]).any()
+
+
+def test_the_tables_have_the_strategy_of_the_package(
+    cells: tuple[pd.DataFrame, pd.DataFrame, str], example: Path
+) -> None:
+    shown = [line.split() for line in cells[2].splitlines()]
+    assert sum(len(words) > 2 and words[1] == OWN for words in shown) == 4
+    compared = pd.read_csv(example.parent / "runs" / STUDY["name"] / "tables" / "thresholds.csv")
+    assert {("online-supremizers", OWN), ("online-supremizers", "offline-pga")} <= set(
+        zip(compared["primal_a"], compared["primal_b"], strict=True)
+    )
+
+
+def test_the_tests_of_the_package_pass_where_it_is_installed(python: Python, example: Path) -> None:
+    done = python("-m", "pytest", "-p", "no:cacheprovider", where=example)
+    assert " passed" in done.stdout
+
+
+@pytest.mark.parametrize(("file", "limit"), [("rope", 80), ("fixed_supremizers", 50)])
+def test_a_plugin_stays_as_short_as_it_is_said_to_be(file: str, limit: int) -> None:
+    count = len((EXAMPLE / "vibench_rope" / f"{file}.py").read_text(encoding="utf-8").splitlines())
+    assert count < limit
+    assert f"| {count:5d} |" in (EXAMPLE / "README.md").read_text(encoding="utf-8")

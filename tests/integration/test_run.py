@@ -1,0 +1,239 @@
+"""Running a matrix through the command line."""
+
+from __future__ import annotations
+
+import hashlib
+import pickle
+import re
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import pandas as pd
+import pytest
+from running import (
+    Vibench,
+    assert_same_numbers,
+    by_solver,
+    execute,
+    rows,
+    run_again,
+)
+from samples import wire_study, write_study
+
+from vibench.results.database import FILE
+from vibench.results.schema import TABLES
+from vibench.stages.artefacts import CACHE_VARIABLE, SUFFIX, Store
+from vibench.stages.snapshots import CHUNKS
+
+SOLVERS = ["piqp", "careful", "gives-up"]
+
+
+@pytest.fixture(scope="module")
+def first(vibench: Vibench, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Folder of a study with a finished run of three cells, one of which is not ok."""
+    folder = tmp_path_factory.mktemp("first")
+    done = vibench(folder, "run", write_study(folder, wire_study(solvers=SOLVERS)), "--jobs", "1", figures=True)
+    assert done.returncode == 0, done.stderr
+    assert [row["status"] for row in rows(folder / "runs" / "wire")] == ["ok", "ok", "failed"]
+    return folder
+
+
+@pytest.fixture
+def again(first: Path, tmp_path: Path) -> Path:
+    """A copy of it."""
+    shutil.copytree(first, tmp_path / "again")
+    return tmp_path / "again"
+
+
+def test_the_results_are_where_the_study_is_named(first: Path) -> None:
+    folder = first / "runs" / "wire"
+    assert (folder / FILE).is_file()
+    assert sorted(path.name for path in (folder / "tables").iterdir()) == sorted(
+        [*(f"{table}.csv" for table in TABLES), "summary.md"]
+    )
+    assert list((folder / "figures").glob("*.png"))
+
+
+def test_a_second_run_does_nothing_new(vibench: Vibench, again: Path) -> None:
+    before = {table: rows(again / "runs" / "wire", table) for table in TABLES if table != "histories"}
+    printed, _ = run_again(vibench, again)
+    assert "3 cells, 0 to run, 0 stages" in printed
+    assert {table: rows(again / "runs" / "wire", table) for table in before} == before
+    assert "3 cells, 2 ok, 1 fell short" in printed
+
+
+def test_retry_redoes_what_was_not_ok(vibench: Vibench, again: Path) -> None:
+    before = by_solver(again / "runs" / "wire")
+    printed, after = run_again(vibench, again, "--retry")
+    assert "3 cells, 1 to run, 1 stages" in printed
+    assert [row["solver"] for row in after if row != before[row["solver"]]] == ["gives-up"]
+    assert len(rows(again / "runs" / "wire", "queries")) == 9
+
+
+def test_fresh_starts_over_and_leaves_the_notes_somebody_made(vibench: Vibench, again: Path) -> None:
+    execute(again / "runs" / "wire", "UPDATE cells SET reason = 'old'")
+    (again / "runs" / "wire" / "notes.txt").write_text("precious")
+    printed, after = run_again(vibench, again, "--fresh")
+    assert "3 cells, 3 to run" in printed
+    assert len(after) == 3
+    assert "old" not in {row["reason"] for row in after}
+    assert (again / "runs" / "wire" / "notes.txt").read_text() == "precious"
+
+
+def test_a_cell_without_row_is_done_again(vibench: Vibench, again: Path, artefacts: Path) -> None:
+    """With those artefacts it needs that are gone."""
+    folder = again / "runs" / "wire"
+    execute(folder, "DELETE FROM cells WHERE solver = 'careful'")
+    lost = list(artefacts.glob("podstage-*"))
+    for artefact in lost:
+        artefact.unlink()
+    before = by_solver(folder)
+    printed, after = run_again(vibench, again)
+    assert "3 cells, 1 to run, 2 stages" in printed
+    assert any(artefact.exists() for artefact in lost)
+    assert {row["solver"]: row["status"] for row in after} == {"piqp": "ok", "careful": "ok", "gives-up": "failed"}
+    assert [row for row in after if row["solver"] != "careful"] == [before["piqp"], before["gives-up"]]
+    assert len(rows(folder, "queries")) == 9
+
+
+def test_other_cells_join_those_of_the_same_study(vibench: Vibench, again: Path) -> None:
+    printed, after = run_again(vibench, again, "--solver", "osqp", "--pod-tol", "0.1")
+    assert "1 cells, 1 to run" in printed
+    assert [row["solver"] for row in after] == [*SOLVERS, "osqp"]
+    assert len(pd.read_csv(again / "runs" / "wire" / "tables" / "cells.csv")) == 4
+
+
+@pytest.mark.parametrize(("solvers", "code"), [(["piqp", "gives-up"], 1), (["piqp", "careful", "ecos"], 0)])
+def test_strict_fails_where_a_cell_is_not_ok(solvers: list[str], code: int, vibench: Vibench, again: Path) -> None:
+    chosen = [option for solver in solvers for option in ("--solver", solver)]
+    done = vibench(again, "run", "study.toml", "--strict", "--jobs", "1", *chosen)
+    assert done.returncode == code
+    assert done.stderr == ""
+
+
+@pytest.fixture
+def edited_plugins(plugins_folder: Path, tmp_path: Path) -> Path:
+    """The third-party package with another version of its source."""
+    shutil.copytree(plugins_folder, tmp_path / "edited")
+    with (tmp_path / "edited" / "fake_plugins.py").open("a", encoding="utf-8") as source:
+        source.write("\n\ngives_up = careful\n")
+    return tmp_path / "edited"
+
+
+def test_a_plugin_that_was_edited_is_run_again(vibench: Vibench, again: Path, edited_plugins: Path) -> None:
+    """Problem and solvers come from the package that was edited, and one of them now does its work."""
+    printed, after = run_again(vibench, again, plugins=edited_plugins)
+    assert "3 cells, 3 to run" in printed
+    assert [row["status"] for row in after] == ["ok"] * 3
+
+
+def test_a_solver_that_leaves_takes_only_its_cell_along(vibench: Vibench, tmp_path: Path) -> None:
+    """`sys.exit` in a plugin ends neither the run nor the other cells."""
+    done = vibench(tmp_path, "run", write_study(tmp_path, wire_study(solvers=["leaves", "piqp"])), "--jobs", "1")
+    assert done.returncode == 0
+    found = by_solver(tmp_path / "runs" / "wire")
+    assert {solver: row["status"] for solver, row in found.items()} == {"leaves": "error", "piqp": "ok"}
+    assert "SystemExit" in found["leaves"]["reason"]
+
+
+def test_too_little_memory_is_a_reason(vibench: Vibench, tmp_path: Path) -> None:
+    """Less than a worker needs to come to life; numerical libraries may then wait until their time is over."""
+    study = wire_study(limits={"memory_gib": 0.05, "cell_seconds": 5.0})
+    done = vibench(tmp_path, "run", write_study(tmp_path, study), "--jobs", "1")
+    assert "Traceback" not in done.stderr
+    assert done.returncode == 0
+    (row,) = rows(tmp_path / "runs" / "wire")
+    assert row["status"] in ("error", "crashed", "timeout")
+    assert row["reason"]
+
+
+def test_a_run_in_which_nothing_works_comes_to_its_end(vibench: Vibench, tmp_path: Path) -> None:
+    """One problem raises, and of the other every query takes too long."""
+    study = wire_study(problem=["wire-raises", "wire"], limits={"query_seconds": 1e-9})
+    done = vibench(tmp_path, "run", write_study(tmp_path, study), "--jobs", "1")
+    assert (done.returncode, done.stderr) == (0, "")
+    found = {row["problem"]: row for row in rows(tmp_path / "runs" / "wire")}
+    assert {problem: row["status"] for problem, row in found.items()} == {"wire-raises": "error", "wire": "timeout"}
+    assert "the limit is 1e-09 s" in found["wire"]["reason"]
+    assert {row["queries_ok"] for row in found.values()} == {0}
+    assert "2 cells, 0 ok, 2 fell short" in done.stdout
+
+
+def test_a_problem_that_fails_first_leaves_the_one_beside_it_alone(vibench: Vibench, tmp_path: Path) -> None:
+    """What the good problem waits for is not dropped when the stages of the bad one fail before it could begin."""
+    study = wire_study(problem=["wire-raises", "wire"], primal=["decorrelated", "online-supremizers"])
+    done = vibench(tmp_path, "run", write_study(tmp_path, study), "--jobs", "1", timeout=60)
+    assert (done.returncode, done.stderr) == (0, "")
+    found = {(row["problem"], row["primal"]): row["status"] for row in rows(tmp_path / "runs" / "wire")}
+    statuses = {"wire-raises": "error", "wire": "ok"}
+    assert found == {(problem, primal): status for problem, status in statuses.items() for primal in study["primal"]}
+
+
+def test_the_number_of_jobs_changes_no_result(vibench: Vibench, tmp_path: Path) -> None:
+    study = wire_study(
+        problem=[{"name": "wire", "label": "long", "options": {"nodes": 40}}],
+        dual=["cpg", "mcpg"],
+        primal=["online-supremizers", "offline-pga"],
+        solvers=["piqp", "osqp", "gives-up"],
+        tolerances=[{"pod": [1e-3], "dual": [1e-2], "primal": {"offline-pga": [0.5]}}],
+    )
+    write_study(tmp_path, study)
+    for jobs in ("1", "2"):
+        done = vibench(tmp_path, "run", "study.toml", "--jobs", jobs, "--out", jobs, "--fresh")
+        assert done.returncode == 0, done.stderr
+    assert_same_numbers(tmp_path / "1", tmp_path / "2")
+
+
+def of_another_machine(artefacts: Path) -> None:
+    """Make all artefacts look as if they had been made elsewhere."""
+    store = Store(artefacts)
+    for path in artefacts.glob(f"*{SUFFIX}"):
+        found = store.get(path.name.removesuffix(SUFFIX))
+        assert found is not None
+        content = pickle.dumps(replace(found, machine="elsewhere"))
+        path.write_bytes(hashlib.sha256(content).digest() + content)
+
+
+def test_artefacts_are_shared_by_studies_and_seconds_only_on_their_machine(
+    vibench: Vibench, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path / "cache"))
+    # high-fidelity solutions; pictures; POD, cone, enrichment; forms, assembly; constraints twice; five constants
+    made = 2 * CHUNKS + 13
+    one = wire_study(solvers=["piqp", "careful"])
+    two = one | {"name": "other", "accuracy": 1e-6}
+    write_study(tmp_path, one, "one.toml")
+    write_study(tmp_path, two, "two.toml")
+
+    def stages(*options: str) -> int:
+        done = vibench(tmp_path, "run", *options, "--jobs", "1")
+        assert (done.returncode, done.stderr) == (0, "")
+        return int(re.search(r"to run, (\d+) stages", done.stdout)[1])
+
+    assert stages("one.toml") == made + 2
+    assert stages("two.toml") == 2  # only the queries of its two cells
+    assert stages("one.toml", "--out", "again") == 2
+    assert stages("one.toml", "--out", "anew", "--fresh") == made + 2
+    assert_same_numbers(tmp_path / "again", tmp_path / "anew")
+    again, anew = (rows(tmp_path / folder)[0]["offline_s"] for folder in ("again", "anew"))
+    assert again == rows(tmp_path / "runs" / "wire")[0]["offline_s"] != anew  # measured again only where made anew
+    of_another_machine(tmp_path / "cache" / "artefacts")
+    assert stages("one.toml", "--out", "here") == made + 2
+    assert rows(tmp_path / "here")[0]["machine"] == rows(tmp_path / "again")[0]["machine"]
+
+
+def test_clean_shows_and_frees_what_artefacts_take(
+    vibench: Vibench, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path / "cache"))
+    vibench(tmp_path, "run", write_study(tmp_path, wire_study()), "--jobs", "1")
+    artefacts = tmp_path / "cache" / "artefacts"
+    count = len(list(artefacts.glob(f"*{SUFFIX}")))
+    for options, left in ((("--dry-run",), count), (("--older-than", "1"), count), ((), 0)):
+        done = vibench(tmp_path, "clean", *options)
+        assert (done.returncode, done.stderr) == (0, "")
+        assert re.search(rf"highfidelity +{2 * CHUNKS} ", done.stdout)
+        assert len(list(artefacts.glob(f"*{SUFFIX}"))) == left
+    assert "MiB freed" in done.stdout
+    assert (tmp_path / "runs" / "wire" / FILE).exists()

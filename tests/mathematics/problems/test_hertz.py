@@ -1,0 +1,148 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from vibench.errors import NumericalError
+from vibench.highfidelity.active_set import HighFidelitySolver, solve_high_fidelity
+from vibench.interfaces.strategies import Offline, Stop
+from vibench.reduction.pod import pod
+from vibench.reduction.supremizers import proportionality
+from vibench.stability.infsup import inf_sup_full, inf_sup_on, multipliers
+from vibench_problems.hertz import Hertz
+from vibench_problems.line_contact import measured, theory
+from vibench_strategies.mcpg import ModifiedCPG
+from vibench_strategies.offline_pga import OfflinePGA
+
+RADII = (0.7, 1.0, 1.3)
+
+
+def differences(problem: Hertz, mu: float) -> tuple[float, float]:
+    """Relative differences of half-width and peak pressure from the theory of line contact."""
+    found = HighFidelitySolver(problem).solve(np.array([mu]))
+    return measured(problem, np.array([mu]), found.lam).differences(theory(problem, np.array([mu]), found.u))
+
+
+@pytest.fixture(scope="module")
+def coarse() -> Hertz:
+    return Hertz("coarse")
+
+
+def test_sizes_of_the_paper() -> None:
+    problem = Hertz("paper")
+    assert problem.nodes == pytest.approx(6130, rel=0.03)
+    assert problem.W.dim == 280
+    assert len(problem.slave.zone) == 561
+    assert problem.training_set().ravel() == pytest.approx(0.7 + 0.0075 * np.arange(81))
+
+
+@pytest.mark.parametrize(("resolution", "nodes"), [("coarse", 1000), (2000, 2000), (4000, 4000)])
+def test_resolutions(resolution: str | int, nodes: int) -> None:
+    assert Hertz(resolution).nodes == pytest.approx(nodes, rel=0.05)
+
+
+@pytest.mark.parametrize("mu", RADII)
+def test_small_loads_agree_with_the_theory(mu: float) -> None:
+    problem = Hertz(3065, growth=1.05, approach=0.01)
+    assert problem.W.dim == 140
+    width, peak = differences(problem, mu)
+    assert abs(width) < 0.005
+    assert abs(peak) < 0.005
+
+
+def test_the_load_of_the_paper_agrees_less_and_less_with_the_approach() -> None:
+    errors = {}
+    for approach in (0.09, 0.045, 0.02):
+        problem = Hertz(3065, growth=1.2, approach=approach)
+        errors[approach] = np.abs(differences(problem, 1.0))
+    assert np.all(errors[0.09] < 0.05)
+    assert np.all(errors[0.045] < errors[0.09])
+    assert np.all(errors[0.02] < errors[0.045])
+
+
+@pytest.mark.parametrize("flats", ["free", "clamped"])
+@pytest.mark.parametrize("mu", RADII)
+def test_equilibrium_and_no_interpenetration(mu: float, flats: str) -> None:
+    problem = Hertz("coarse", flats=flats)
+    found = HighFidelitySolver(problem).solve(np.array([mu]))
+    vi = problem.assemble(np.array([mu]))
+    assert found.residuals.worst <= 1e-10
+    upper, lower = problem.resultants(np.array([mu]), found.u)
+    assert upper == pytest.approx(lower, rel=1e-8)
+    assert upper == pytest.approx(problem.macro_lengths @ found.lam, rel=1e-8)
+    assert np.max((vi.B @ found.u - vi.g) / problem.macro_lengths) < 1e-10
+    assert np.all(found.lam >= 0.0)
+    moved = problem.displacement(np.array([mu]), found.u)
+    second = problem.slave.mesh.p.shape[1]
+    assert np.allclose(moved[1, problem.slave.flat], -0.09)
+    assert np.allclose(moved[1, second + problem.master.flat], 0.09)
+    assert np.allclose(moved[0, problem.slave.axis], 0.0)
+    assert np.allclose(moved[0, problem.slave.flat], 0.0) == (flats == "clamped")
+
+
+def test_a_and_f_are_constant_as_declared_and_b_truly_varies(coarse: Hertz) -> None:
+    one, two = (coarse.assemble(np.array([mu])) for mu in (0.8, 1.1))
+    assert coarse.constant == {"A", "f"}
+    assert abs(one.A - two.A).max() == 0.0
+    assert np.array_equal(one.f, two.f)
+    assert proportionality(one.B, two.B) is None
+    assert not np.allclose(one.g, two.g)
+
+
+def test_scaling_a_disc_leaves_its_energy_unchanged(coarse: Hertz) -> None:
+    """What makes A constant: the two-dimensional stiffness of a body does not know its size."""
+    larger = Hertz("coarse")
+    found = HighFidelitySolver(coarse).solve(np.array([1.0]))
+    assert found.u @ (larger.assemble(np.array([0.7])).A @ found.u) == pytest.approx(
+        found.u @ (coarse.assemble(np.array([1.3])).A @ found.u)
+    )
+
+
+def test_condensed_and_sparse_solutions_agree(coarse: Hertz) -> None:
+    mu = np.array([0.93])
+    condensed, sparse = HighFidelitySolver(coarse).solve(mu), solve_high_fidelity(coarse.assemble(mu))
+    assert np.allclose(condensed.u, sparse.u, atol=1e-12)
+    assert np.allclose(condensed.lam, sparse.lam, atol=1e-9)
+
+
+def test_a_load_scales_with_youngs_modulus(coarse: Hertz) -> None:
+    stiff = Hertz("coarse", young=30.0)
+    mu = np.array([1.0])
+    one, two = HighFidelitySolver(coarse).solve(mu), HighFidelitySolver(stiff).solve(mu)
+    assert np.allclose(one.u, two.u, atol=1e-12)
+    assert np.allclose(2.0 * one.lam, two.lam, rtol=1e-8)
+
+
+def test_contact_beyond_the_zone_and_pairing_beyond_the_disc_are_refused(coarse: Hertz) -> None:
+    with pytest.raises(NumericalError, match="reaches the end of the potential contact zone"):
+        HighFidelitySolver(Hertz("coarse", approach=0.3)).solve(np.array([1.0]))
+    with pytest.raises(NumericalError, match="the radius of disc 2 is too small"):
+        coarse.assemble(np.array([0.6]))
+
+
+def test_online_and_offline_enrichment_differ_where_b_varies(coarse: Hertz) -> None:
+    training = coarse.training_set()[::8]
+    solver = HighFidelitySolver(coarse)
+    solved = [solver.solve(mu) for mu in training]
+    basis = pod(np.column_stack([s.u for s in solved]), coarse.V, Stop(size=3)).basis
+    cone = ModifiedCPG().reduce(np.column_stack([s.lam for s in solved]), coarse.W, Stop(size=5))
+    prepared = multipliers(cone.generators, coarse.W)
+    added = OfflinePGA().build(Offline(coarse, basis, cone, prepared.span, training), 0.6).vectors
+    assert added.shape[1] > prepared.rank  # one parameter's supremizers are not enough
+    Z = np.hstack([basis, added])
+    for mu in training:
+        B = coarse.assemble(mu).B
+        own, full = inf_sup_on(Z, B, prepared), inf_sup_full(coarse.V, B, prepared)
+        assert own.span >= 0.8 * full.span * (1.0 - 1e-9)
+
+
+def test_the_picture_shows_deformed_discs_and_pressures(coarse: Hertz) -> None:
+    mu = np.array([1.2])
+    found = HighFidelitySolver(coarse).solve(mu)
+    picture = coarse.picture(mu, found.u, found.lam)
+    assert picture.points.shape == (2, coarse.nodes)
+    assert picture.triangles.max() == coarse.nodes - 1
+    assert picture.positions.shape == (1, 45)
+    assert picture.positions[0, np.argmax(picture.multiplier)] < 0.1
+    assert picture.points[1].max() == pytest.approx(1.001 - 0.09)
+    assert picture.points[1].min() == pytest.approx(-1.2 + 0.09)

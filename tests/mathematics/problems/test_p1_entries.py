@@ -1,0 +1,130 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from vibench.interfaces.problem import Problem
+from vibench_problems.hertz import Hertz
+from vibench_problems.obstacle import Obstacle
+from vibench_problems.p1_entries import LoadEntries, StiffnessEntries
+from vibench_problems.radial import Radial
+
+OBSTACLE, RADIAL, HERTZ = Obstacle(200), Radial(300), Hertz("coarse")
+seeds = st.integers(0, 10_000)
+
+TRIANGLE = np.array([[[0.0, 4.0, 0.0], [0.0, 0.0, 3.0]], [[0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]])
+"""By weight: a triangle with legs 4 and 3, and what makes the legs longer by 1."""
+
+
+def parameters(problem: Problem, seed: int) -> np.ndarray:
+    return problem.parameters.sample(1, seed)[0]
+
+
+def entries_of_a(seed: int, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Places of non-zeros of A, diagonal ones among them, some twice."""
+    A = OBSTACLE.assemble(OBSTACLE.training_set()[0]).A.tocoo()
+    chosen = np.random.default_rng(seed).integers(A.nnz, size=count)
+    diagonal = np.arange(seed % 7, seed % 7 + 3)
+    return np.append(A.coords[0][chosen], diagonal), np.append(A.coords[1][chosen], diagonal)
+
+
+@given(seeds, st.integers(0, 20))
+def test_entries_of_the_obstacle_are_those_of_what_is_assembled(seed: int, count: int) -> None:
+    rng = np.random.default_rng(seed)
+    n, m = OBSTACLE.V.dim, OBSTACLE.W.dim
+    bound = rng.integers(m, size=count)
+    wanted = {
+        "A": entries_of_a(seed, count),
+        "f": (rng.integers(n, size=count), np.zeros(count, dtype=np.intp)),
+        "B": (bound, OBSTACLE.contact_dofs[rng.integers(m, size=count)]),
+        "g": (bound, np.zeros(count, dtype=np.intp)),
+    }
+    sample = OBSTACLE.sampler(wanted)
+    for mu in OBSTACLE.parameters.sample(2, seed):
+        found, vi = sample(mu), OBSTACLE.assemble(mu)
+        assert set(found) == set(wanted)
+        for name, (rows, columns) in wanted.items():
+            member = getattr(vi, name)
+            exact = member[rows] if member.ndim == 1 else member.toarray()[rows, columns]
+            assert np.allclose(found[name], exact, rtol=1e-11, atol=1e-14)
+
+
+def test_every_entry_of_a_matrix_and_a_vector() -> None:
+    """Nodes at the boundary and those with many triangles are among them."""
+    mu = parameters(OBSTACLE, 3)
+    vi = OBSTACLE.assemble(mu)
+    A = vi.A.tocoo()
+    found = OBSTACLE.sampler({"A": A.coords, "f": (np.arange(OBSTACLE.V.dim), np.zeros(OBSTACLE.V.dim, np.intp))})(mu)
+    assert np.allclose(found["A"], A.data, atol=1e-12)
+    assert np.allclose(found["f"], vi.f, rtol=1e-12)
+
+
+@pytest.mark.parametrize("names", [("A",), ("f",), ("B", "g"), ()])
+def test_only_what_is_wanted_is_evaluated(names: tuple[str, ...]) -> None:
+    places = np.array([3, 5]), np.array([3, 5])
+    sample = OBSTACLE.sampler(dict.fromkeys(names, places))
+    assert sorted(sample(parameters(OBSTACLE, 0))) == sorted(names)
+
+
+def test_options_of_the_obstacle_are_in_the_entries() -> None:
+    mu, places = np.array([1.1, 0.02, -0.03]), (np.arange(6), np.zeros(6, np.intp))
+    wanted = {"f": places, "g": places}
+    one, two = (Obstacle(200, load=load, obstacle=load).sampler(wanted)(mu) for load in (-1.0, -3.0))
+    for name in wanted:
+        assert np.allclose(two[name], 3.0 * one[name], rtol=1e-14)
+
+
+@pytest.mark.parametrize("weights", [(1.0, 0.0), (1.0, 0.5), (2.0, -1.0)])
+def test_a_right_triangle_by_hand(weights: tuple[float, float]) -> None:
+    """With legs a along x and b along y: ∇φ of the node at the right angle is −(1/a, 1/b), area ab/2."""
+    triangles, (a, b) = np.array([[0], [1], [2]]), weights @ np.array([[4.0, 3.0], [1.0, 1.0]])
+    exact = 0.5 * np.array([
+        [b / a + a / b, -b / a, -a / b],
+        [-b / a, b / a, 0.0],
+        [-a / b, 0.0, a / b],
+    ])  # fmt: skip
+    rows, columns = np.indices((3, 3)).reshape(2, -1)
+    for order in ([0, 1, 2], [1, 2, 0], [0, 2, 1]):  # the last is clockwise
+        found = StiffnessEntries(TRIANGLE, triangles[order], rows, columns)(np.array(weights))
+        assert np.allclose(found.reshape(3, 3), exact)
+        assert np.allclose(LoadEntries(TRIANGLE, triangles[order], np.arange(3))(np.array(weights)), a * b / 6.0)
+
+
+@given(seeds, st.integers(1, 8))
+def test_entries_of_the_bound_of_the_radial_problem_are_those_of_what_is_assembled(seed: int, count: int) -> None:
+    rows = np.random.default_rng(seed).integers(RADIAL.W.dim, size=count)
+    sample = RADIAL.sampler({"g": (rows, np.zeros(count, dtype=np.intp))})
+    for mu in RADIAL.parameters.sample(2, seed):
+        assert np.allclose(sample(mu)["g"], RADIAL.assemble(mu).g[rows], rtol=1e-14)
+
+
+@pytest.mark.parametrize("problem", [OBSTACLE, HERTZ], ids=["obstacle", "hertz"])
+@given(seeds)
+def test_contact_is_the_constraint_on_the_unknowns_it_touches(problem: Problem, seed: int) -> None:
+    mu = parameters(problem, seed)
+    contact, vi, dofs = problem.contact(mu), problem.assemble(mu), problem.contact_dofs
+    assert problem.has_contact
+    assert np.all(np.diff(dofs) > 0)
+    B = vi.B.toarray()
+    assert contact.B.shape == (problem.W.dim, len(dofs))
+    assert np.allclose(contact.B.toarray(), B[:, dofs], rtol=1e-13, atol=1e-15)
+    assert np.allclose(contact.g, vi.g, rtol=1e-12, atol=1e-16)
+    outside = np.setdiff1d(np.arange(problem.V.dim), dofs)
+    assert not np.any(B[:, outside])
+    assert len(outside) > 0
+
+
+def test_what_has_no_contact_says_so() -> None:
+    assert not RADIAL.has_contact
+    assert RADIAL.contact(parameters(RADIAL, 0)) is None
+    B, g = RADIAL.constraint(parameters(RADIAL, 0))
+    vi = RADIAL.assemble(parameters(RADIAL, 0))
+    assert abs(B - vi.B).max() == 0.0
+    assert np.array_equal(g, vi.g)
+
+
+def test_entries_of_a_problem_that_only_declares_them_are_refused() -> None:
+    with pytest.raises(NotImplementedError, match=r"Hertz declares \[\] and has no sampler"):
+        HERTZ.sampler({"A": (np.zeros(1, np.intp), np.zeros(1, np.intp))})

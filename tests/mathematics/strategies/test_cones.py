@@ -1,0 +1,264 @@
+"""Dual strategies beside the plain and the modified greedy: what all of them promise, and what each one is."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+import scipy.sparse as sp
+from families import W, families
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from vibench.arrays import Array
+from vibench.errors import NumericalError
+from vibench.interfaces.strategies import Cone, DualStrategy, Stop, rays
+from vibench.interfaces.validation import check_cone
+from vibench.linalg.inner_product import InnerProduct
+from vibench.reduction.cones import project_on_cone
+from vibench.reduction.removal import removable_part
+from vibench.testing import check_dual
+from vibench_strategies import enlarged_cpg
+from vibench_strategies.angle_greedy import AngleGreedy
+from vibench_strategies.cpg import CPG
+from vibench_strategies.dictionary import Dictionary
+from vibench_strategies.enlarged_cpg import EnlargedCPG
+from vibench_strategies.nmf import NonnegativeFactors
+from vibench_strategies.orthant import Orthant
+from vibench_strategies.pod_dual import PODDual
+
+STRATEGIES: dict[str, DualStrategy] = {
+    "angle-greedy": AngleGreedy(),
+    "dictionary": Dictionary(),
+    "enlarged-cpg": EnlargedCPG(),
+    "nmf": NonnegativeFactors(),
+    "orthant": Orthant(),
+    "pod-dual": PODDual(),
+}
+
+ALL = pytest.mark.parametrize("strategy", STRATEGIES.values(), ids=STRATEGIES.keys())
+
+
+def bumps(count: int = 12, m: int = 40) -> tuple[Array, InnerProduct]:
+    """Shifted and scaled bumps with exact zeros, and the mass matrix of their mesh."""
+    x = np.linspace(0.0, 1.0, m)
+    centres, widths = np.linspace(0.35, 0.65, count), 0.15 + 0.1 * np.sin(np.arange(count))
+    theta = np.maximum(0.0, 1.0 - ((x[:, None] - centres) / widths) ** 2)
+    mass = sp.diags_array([4.0 * np.ones(m), np.ones(m - 1), np.ones(m - 1)], offsets=[0, 1, -1]) / (6.0 * m)
+    return theta, InnerProduct(mass)
+
+
+def errors_one_by_one(cone: Cone, theta: Array, X: InnerProduct) -> Array:
+    """e(r) for r = 0 … R, every snapshot projected on every cone."""
+    largest = float(X.norm(theta).max(initial=0.0)) or 1.0
+    cones = [rays(cone.generators[:, :r], cone.free[:r]) for r in range(cone.size + 1)]
+    return (
+        np.array([max((project_on_cone(chi, q, X).distance for q in theta.T), default=0.0) for chi in cones]) / largest
+    )
+
+
+@pytest.mark.parametrize("create", [type(strategy) for strategy in STRATEGIES.values()], ids=STRATEGIES.keys())
+def test_they_conform(create: type[DualStrategy]) -> None:
+    check_dual(create)
+
+
+@ALL
+@given(theta=families(), size=st.integers(0, 9))
+@settings(max_examples=30)
+def test_a_size_gives_a_cone_that_keeps_its_promises(strategy: DualStrategy, theta: Array, size: int) -> None:
+    cone = check_cone(strategy.reduce(theta, W, Stop(size=size)), W)
+    assert cone.size <= size
+    assert cone.errors.shape == (cone.size + 1,)
+    assert np.all(np.diff(cone.errors) <= 1e-9)
+    assert np.allclose(cone.errors, errors_one_by_one(cone, theta, W), atol=1e-7)
+
+
+@ALL
+@given(theta=families(), tolerance=st.floats(1e-3, 0.9))
+@settings(max_examples=30)
+def test_a_tolerance_is_met(strategy: DualStrategy, theta: Array, tolerance: float) -> None:
+    if isinstance(strategy, NonnegativeFactors):
+        tolerance = max(tolerance, 0.3)  # a factorisation may end in a local minimum, see below
+    cone = check_cone(strategy.reduce(theta, W, Stop(tolerance=tolerance)), W)
+    assert cone.errors[-1] <= tolerance
+    assert np.isclose(cone.errors[-1], errors_one_by_one(cone, theta, W)[-1], atol=1e-7)
+    if isinstance(strategy, Orthant | PODDual) and cone.size:
+        assert cone.errors[-2] > tolerance
+
+
+@ALL
+@pytest.mark.parametrize("stop", [Stop(size=5), Stop(tolerance=5e-2)])
+def test_the_same_snapshots_give_the_same_cone_to_the_last_bit(strategy: DualStrategy, stop: Stop) -> None:
+    theta, X = bumps()
+    one, other = (strategy.reduce(theta.copy(), X, stop) for _ in range(2))
+    assert np.array_equal(one.generators, other.generators)
+    assert np.array_equal(one.errors, other.errors)
+    assert one.fallbacks == other.fallbacks
+
+
+@ALL
+@pytest.mark.parametrize("theta", [np.zeros((12, 0)), np.zeros((12, 3))], ids=["no snapshot", "no contact"])
+@pytest.mark.parametrize("stop", [Stop(size=2), Stop(tolerance=0.1)], ids=str)
+def test_no_snapshot_and_no_contact_give_an_empty_cone(strategy: DualStrategy, theta: Array, stop: Stop) -> None:
+    cone = check_cone(strategy.reduce(theta, W, stop), W)
+    assert cone.size == 0
+    assert np.array_equal(cone.errors, [0.0])
+
+
+@pytest.mark.parametrize("name", sorted(set(STRATEGIES) - {"pod-dual"}))
+def test_a_negative_snapshot_is_refused(name: str) -> None:
+    theta = np.eye(12)[:, :3]
+    theta[5, 1] = -1e-3
+    with pytest.raises(NumericalError, match=r"negative coefficient -1\.0e-03"):
+        STRATEGIES[name].reduce(theta, W, Stop(size=1))
+
+
+@given(families(), st.floats(1e-3, 0.9))
+@settings(max_examples=50)
+def test_angle_greedy_stops_at_the_angle_of_every_single_snapshot(theta: Array, tolerance: float) -> None:
+    cone = AngleGreedy().reduce(theta, W, Stop(tolerance=tolerance))
+    norms = W.norm(theta)
+    lengths = norms[norms > 0.0]
+    sines = [
+        [
+            project_on_cone(cone.generators[:, :r], q, W).distance / length
+            for q, length in zip(theta.T[norms > 0.0], lengths, strict=True)
+        ]
+        for r in range(cone.size + 1)
+    ]
+    if len(lengths):
+        assert max(sines[-1]) <= tolerance + 1e-8
+        assert all(max(before) > tolerance - 1e-8 for before in sines[:-1])
+    directions = theta[:, norms > 0.0] / lengths
+    for r, generator in enumerate(cone.generators.T):  # each is the direction that was farthest
+        picked = np.flatnonzero(np.abs(directions - generator[:, None]).max(axis=0) < 1e-14)
+        assert max(sines[r][q] for q in picked) >= max(sines[r]) - 1e-8
+
+
+def test_angle_greedy_takes_a_small_snapshot_of_its_own_direction_and_cpg_leaves_it() -> None:
+    theta = np.zeros((12, 2))
+    theta[2:5, 0], theta[9, 1] = 1.0, 1e-4
+    assert CPG().reduce(theta, W, Stop(tolerance=1e-2)).size == 1
+    assert AngleGreedy().reduce(theta, W, Stop(tolerance=1e-2)).size == 2
+
+
+@pytest.mark.parametrize("stop", [Stop(tolerance=0.5), Stop(size=99), Stop(size=3)], ids=str)
+def test_the_dictionary_holds_all_snapshots_in_their_order(stop: Stop) -> None:
+    theta, X = bumps()
+    theta = np.insert(theta, 1, 0.0, axis=1)
+    cone = Dictionary().reduce(theta, X, stop)
+    expected = np.delete(theta, 1, axis=1)[:, : stop.size]
+    assert np.allclose(cone.generators, expected / X.norm(expected), atol=1e-15)
+
+
+def test_the_orthant_takes_the_direction_that_the_farthest_snapshot_lacks_most() -> None:
+    """Brute force: all snapshots projected at every step, all directions compared."""
+    theta, X = bumps(6, 20)
+    units = np.eye(20) / X.norm(np.eye(20))
+    cone = Orthant().reduce(theta, X, Stop(tolerance=1e-9))
+    chosen = np.zeros((20, 0))
+    for generator in cone.generators.T:
+        found = [project_on_cone(chosen, q, X) for q in theta.T]
+        worst = int(np.argmax([p.distance for p in found]))
+        rest = theta[:, worst] - chosen @ found[worst].coefficients
+        i = int(np.flatnonzero(generator)[0])
+        assert np.allclose(generator, units[:, i], atol=1e-14)
+        assert X.gram(units, rest)[i] >= X.gram(units, rest).max() * (1.0 - 1e-8)
+        chosen = np.column_stack([chosen, generator])
+    assert cone.size == len(np.flatnonzero(theta.any(axis=1)))
+    assert cone.errors[-1] < 1e-9
+
+
+@given(families())
+@settings(max_examples=50)
+def test_the_enlarged_cone_contains_that_of_cpg_and_nothing_moves_any_more(theta: Array) -> None:
+    given_cone, cone = (s.reduce(theta, W, Stop(size=theta.shape[1])) for s in (CPG(), EnlargedCPG()))
+    assert cone.size <= given_cone.size
+    for generator in given_cone.generators.T:
+        assert project_on_cone(cone.generators, generator, W).distance <= 1e-8
+    if not cone.fallbacks:
+        for i in range(cone.size):
+            part, _ = removable_part(cone.generators[:, i], np.delete(cone.generators, i, axis=1), W)
+            assert W.norm(part) <= 1e-8
+
+
+def test_enlarged_generators_are_better_conditioned_and_leave_less_of_the_snapshots() -> None:
+    theta, X = bumps(25)
+    given_cone, cone = (s.reduce(theta, X, Stop(size=8)) for s in (CPG(), EnlargedCPG()))
+    one, other = (np.linalg.cond(X.gram(c.generators, c.generators)) for c in (given_cone, cone))
+    assert other < 0.1 * one
+    assert cone.errors[-1] <= given_cone.errors[-1] * (1.0 + 1e-9)
+    assert cone.fallbacks == ()
+
+
+def test_a_sweep_that_is_not_enough_is_recorded() -> None:
+    theta, X = bumps(25)
+    assert EnlargedCPG(sweeps=1).reduce(theta, X, Stop(size=8)).fallbacks == ("generators still moved in sweep 1",)
+
+
+def test_a_step_that_is_only_feasible_is_recorded(monkeypatch: pytest.MonkeyPatch) -> None:
+    whole: Callable[..., tuple[Array, str]] = enlarged_cpg.removable_part
+    monkeypatch.setattr(enlarged_cpg, "removable_part", lambda *data: (whole(*data)[0], "not optimal"))
+    theta, X = bumps(5)
+    notes = EnlargedCPG().reduce(theta, X, Stop(size=3)).fallbacks
+    assert notes[0] == "sweep 1, generator 1: not optimal"
+
+
+def test_a_generator_that_the_others_contain_is_dropped(monkeypatch: pytest.MonkeyPatch) -> None:
+    """CPG itself chooses none; a greedy algorithm that knew the others only later would."""
+    a, b, c = np.eye(12)[:, 0], np.eye(12)[:, 4], np.eye(12)[:, 8]
+    chi = np.column_stack([a, a + b, b, c])
+    monkeypatch.setattr(
+        enlarged_cpg, "greedy_cone", lambda *_: Cone(chi / W.norm(chi), np.ones(5), np.zeros(4, dtype=bool))
+    )
+    cone = EnlargedCPG().reduce(chi, W, Stop(size=4))
+    assert cone.size == 3
+    assert cone.errors[-1] < 1e-9
+
+
+def test_nmf_takes_the_smallest_number_of_generators_that_meets_the_tolerance() -> None:
+    theta, X = bumps(25)
+    strategy = NonnegativeFactors()
+    cone = strategy.reduce(theta, X, Stop(tolerance=2e-2))
+    shorter = [strategy.reduce(theta, X, Stop(size=size)).errors[-1] for size in range(cone.size)]
+    assert min(shorter) > 2e-2 >= cone.errors[-1]
+    assert cone.size >= 3
+
+
+def test_nmf_does_not_depend_on_how_long_basis_functions_are() -> None:
+    """The lumped norm makes it a factorisation of functions: the same ones in another basis have the same cone."""
+    theta, X = bumps()
+    sizes = np.linspace(0.1, 10.0, 40)
+    scaled = InnerProduct(sp.diags_array(1.0 / sizes) @ X.matrix @ sp.diags_array(1.0 / sizes))
+    one = NonnegativeFactors().reduce(theta, X, Stop(size=4))
+    other = NonnegativeFactors().reduce(sizes[:, None] * theta, scaled, Stop(size=4))
+    assert np.allclose(sizes[:, None] * one.generators, other.generators, rtol=1e-6, atol=1e-9)
+    assert np.allclose(one.errors, other.errors, rtol=1e-6)
+
+
+def test_a_factorisation_that_was_stopped_is_recorded() -> None:
+    theta, X = bumps()
+    assert NonnegativeFactors(iterations=1).reduce(theta, X, Stop(size=4)).fallbacks == (
+        "the factorisation was stopped after 1 iterations",
+    )
+    assert NonnegativeFactors(iterations=100_000).reduce(theta, X, Stop(size=2)).fallbacks == ()
+
+
+def test_a_tolerance_that_no_factorisation_reaches_ends_with_a_reason() -> None:
+    theta, X = bumps()
+    with pytest.raises(
+        NumericalError, match=r"no factorisation reaches tolerance 1e-14: the best of up to 12 generators"
+    ):
+        NonnegativeFactors(iterations=2).reduce(theta, X, Stop(tolerance=1e-14))
+
+
+@given(families(), st.integers(0, 8))
+@settings(max_examples=50)
+def test_pod_dual_is_free_of_signs_and_no_linear_space_leaves_less_in_the_mean(theta: Array, size: int) -> None:
+    cone = PODDual().reduce(theta, W, Stop(size=size))
+    assert np.all(cone.free)
+    assert np.allclose(W.gram(cone.generators, cone.generators), np.eye(cone.size), atol=1e-10)
+    rest = W.whiten(theta - cone.generators @ W.gram(cone.generators, theta))
+    sigma = np.linalg.svd(W.whiten(theta), compute_uv=False)
+    assert np.isclose(np.linalg.norm(rest), np.linalg.norm(sigma[cone.size :]), atol=1e-9 * (1.0 + sigma[0]))

@@ -1,0 +1,245 @@
+"""Fixed enrichments by supremizers that look at the inf-sup constant, or at all supremizers at once."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+import pytest
+from enriching import Plain, offline
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+from numerics import Varying
+
+from vibench.arrays import Array
+from vibench.errors import NumericalError
+from vibench.highfidelity.active_set import HighFidelitySolver
+from vibench.interfaces.strategies import Cone, Offline, Stop, no_free
+from vibench.interfaces.validation import check_enrichment
+from vibench.linalg.dense import orthonormal_range, project_out, singular_values
+from vibench.reduction.lazy_greedy import LazyMaximum
+from vibench.reduction.nested import NestedStrategy, grow_through
+from vibench.reduction.pod import pod
+from vibench.reduction.supremizers import supremizers
+from vibench.stability.infsup import inf_sup_full, inf_sup_on, multipliers
+from vibench.testing import check_primal
+from vibench_problems.hertz import Hertz
+from vibench_problems.obstacle import Obstacle
+from vibench_strategies import infsup_greedy, offline_pga
+from vibench_strategies.infsup_greedy import InfSupGreedy
+from vibench_strategies.mcpg import ModifiedCPG
+from vibench_strategies.offline_pga import OfflinePGA
+from vibench_strategies.pod_supremizers import PODSupremizers
+
+
+@pytest.fixture(scope="module")
+def varying() -> Offline:
+    return offline(Varying(count=9), 9, 3, 4)
+
+
+@pytest.fixture(scope="module")
+def obstacle() -> Offline:
+    data = offline(Obstacle("coarse"), 12, 5, 9)
+    return replace(data, training=data.training[::12])  # all of them share one supremizer space
+
+
+@pytest.fixture(scope="module")
+def hertz() -> Offline:
+    """Ten modes, twelve generators, two discs: 81 parameters with a supremizer space each."""
+    problem = Hertz("coarse")
+    training, solver = problem.training_set(), HighFidelitySolver(problem)
+    solved = [solver.solve(mu) for mu in training]
+    basis = pod(np.column_stack([s.u for s in solved]), problem.V, Stop(size=10)).basis
+    cone = ModifiedCPG().reduce(np.column_stack([s.lam for s in solved]), problem.W, Stop(size=12))
+    return Offline(problem, basis, cone, multipliers(cone.generators, problem.W).span, training)
+
+
+def shares(data: Offline, added: Array) -> Array:
+    """β_S/β_on over the span at every training parameter, from bases of mesh size; 1 where β_on is round-off."""
+    V, cone = data.problem.V, multipliers(data.cone.generators, data.problem.W)
+    Z = np.hstack([data.basis, added])
+    forms = [data.problem.assemble(mu).B for mu in data.training]
+    online = np.array([inf_sup_full(V, B, cone).span for B in forms])
+    own = np.array([inf_sup_on(Z, B, cone).span for B in forms])
+    return np.where(online > 1e-12, own / online, 1.0)
+
+
+def whitened_supremizers(data: Offline) -> list[Array]:
+    """Whitened orthonormal bases of S_R(mu) at every training parameter."""
+    V = data.problem.V
+    forms = [data.problem.assemble(mu).B for mu in data.training]
+    return [orthonormal_range(V.whiten(supremizers(V, B, data.span))) for B in forms]
+
+
+ON_BETA = pytest.mark.parametrize("strategy", [InfSupGreedy(), OfflinePGA(stop="beta")], ids=["inf-sup", "PGA"])
+
+
+@ON_BETA
+@pytest.mark.parametrize("rho", [0.2, 0.9])
+@pytest.mark.parametrize("setting", ["varying", "obstacle"])
+def test_the_share_is_kept_at_every_training_parameter_and_not_with_a_vector_less(
+    request, setting: str, strategy: NestedStrategy, rho: float
+) -> None:
+    data: Offline = request.getfixturevalue(setting)
+    found = check_enrichment(strategy.build(data, rho), data.problem.V, data.basis)
+    own = found.history["beta_share"]
+    assert np.all(np.diff(own) >= -1e-9)
+    assert len(own) == found.vectors.shape[1] + 1 > 1
+    kept = shares(data, found.vectors)
+    assert kept.min() >= rho * (1.0 - 1e-9)
+    assert np.isclose(kept.min(), own[-1], rtol=1e-8)
+    assert shares(data, found.vectors[:, :-1]).min() < rho
+
+
+@given(
+    st.integers(12, 40),
+    st.integers(3, 9),
+    st.integers(1, 6),
+    st.integers(1, 5),
+    st.integers(1, 4),
+    st.floats(0.05, 0.99),
+)
+@example(n=12, m=9, count=4, modes=2, generators=4, rho=0.5)  # β_on vanishes at the last parameter
+@settings(max_examples=15)
+def test_the_share_is_kept_on_any_small_problem(
+    n: int, m: int, count: int, modes: int, generators: int, rho: float
+) -> None:
+    data = offline(Varying(n, m, count), count, modes, min(generators, count))
+    for strategy in (InfSupGreedy(), OfflinePGA(stop="beta")):
+        found = check_enrichment(strategy.build(data, rho), data.problem.V, data.basis)
+        assert shares(data, found.vectors).min() >= rho * (1.0 - 1e-8)
+
+
+def test_the_stop_on_beta_adds_the_same_vectors_and_knows_when_less_would_do(varying: Offline) -> None:
+    on_sigma, on_beta = OfflinePGA().build(varying, 0.6), OfflinePGA(stop="beta").build(varying, 0.8)
+    count = on_beta.vectors.shape[1]
+    assert count <= on_sigma.vectors.shape[1]  # σ ≤ 0.6 guarantees a share of 0.8
+    assert np.array_equal(on_beta.vectors, on_sigma.vectors[:, :count])
+    assert np.array_equal(on_beta.history["sigma"], on_sigma.history["sigma"][: count + 1])
+    assert "beta_share" not in on_sigma.history
+
+
+def test_every_vector_is_the_supremizer_of_the_least_stable_multiplier(hertz: Offline) -> None:
+    """Brute force: all parameters at every step, the minimiser by an eigenproblem on vectors of mesh size."""
+    V = hertz.problem.V
+    forms = [hertz.problem.assemble(mu).B for mu in hertz.training]
+    loads = [V.whiten(supremizers(V, B, hertz.span)) for B in forms]
+    online = np.array([singular_values(T)[-1] for T in loads])
+    found = InfSupGreedy().build(hertz, 0.7)
+    everything = V.whiten(np.hstack([hertz.basis, found.vectors]))
+    first = hertz.span.shape[1]  # with fewer vectors β_S is zero, on a whole space
+    assert everything.shape[1] >= first + 5
+    for size in range(first, everything.shape[1]):
+        Z, vector = everything[:, :size], everything[:, size]
+        values = [np.linalg.svd(Z.T @ T) for T in loads]
+        kept = np.array([sines[-1] for _, sines, _ in values]) / online
+        worst = int(np.argmin(kept))
+        expected = project_out(Z, loads[worst] @ values[worst][2][-1])
+        assert np.isclose(abs(vector @ expected), np.linalg.norm(expected), rtol=1e-6)
+        assert np.isclose(kept[worst], found.history["beta_share"][size - hertz.basis.shape[1]], rtol=1e-8)
+
+
+@pytest.mark.parametrize(
+    ("module", "strategy"),
+    [(infsup_greedy, InfSupGreedy()), (offline_pga, OfflinePGA(stop="beta"))],
+    ids=["inf-sup", "PGA"],
+)
+def test_lazy_and_plain_choose_the_same_vectors_and_lazy_looks_less_often(
+    monkeypatch: pytest.MonkeyPatch, hertz: Offline, module, strategy: NestedStrategy
+) -> None:
+    made: dict[type[LazyMaximum], int] = {}
+
+    def counting(kind: type[LazyMaximum]) -> type[LazyMaximum]:
+        class Counted(kind):  # type: ignore[misc, valid-type]
+            def next(self, evaluate: Callable[[int], float]) -> tuple[int, float]:
+                return super().next(lambda p: (made.update({kind: made.get(kind, 0) + 1}), evaluate(p))[1])
+
+        return Counted
+
+    found = []
+    for kind in (LazyMaximum, Plain):
+        monkeypatch.setattr(module, "LazyMaximum", counting(kind))
+        found.append(strategy.build(hertz, 0.8))
+    assert np.allclose(found[0].vectors, found[1].vectors, atol=1e-8)
+    assert np.allclose(found[0].history["beta_share"], found[1].history["beta_share"], atol=1e-9)
+    assert made[LazyMaximum] < 0.5 * made[Plain]
+
+
+@pytest.mark.parametrize("setting", ["varying", "obstacle"])
+def test_pod_supremizers_are_the_modes_of_all_supremizers_and_the_tail_is_a_sum_of_squared_sines(
+    request, setting: str
+) -> None:
+    data: Offline = request.getfixturevalue(setting)
+    V, bases = data.problem.V, whitened_supremizers(request.getfixturevalue(setting))
+    left = project_out(V.whiten(data.basis), np.hstack(bases))
+    modes, sigma, _ = np.linalg.svd(left, full_matrices=False)
+    found = check_enrichment(PODSupremizers().build(data, 0.05), V, data.basis)
+    tail, count = found.history["tail"], found.vectors.shape[1]
+    assert tail[-1] <= 0.05 < tail[-2]
+    angles = singular_values(modes[:, :count].T @ V.whiten(found.vectors))
+    assert np.allclose(angles, 1.0, atol=1e-8)
+    for k in range(count + 1):
+        Z = np.hstack([V.whiten(data.basis), V.whiten(found.vectors[:, :k])])
+        sines = np.concatenate([singular_values(project_out(Z, basis)) for basis in bases])
+        assert np.isclose(tail[k], np.linalg.norm(sines) / np.linalg.norm(sigma), atol=1e-9)
+
+
+@pytest.mark.parametrize("strategy", [InfSupGreedy(), OfflinePGA(stop="beta"), PODSupremizers()])
+def test_tolerances_in_any_order_cut_one_growth(varying: Offline, strategy: NestedStrategy) -> None:
+    grown = grow_through(strategy, varying, [0.6, 0.9, 0.3])
+    for tolerance in (0.3, 0.6, 0.9):
+        alone, passed = strategy.build(varying, tolerance), grown.at(tolerance)[0]
+        assert np.allclose(alone.vectors, passed.vectors, atol=1e-12)
+    counts = [grown.at(tolerance)[0].vectors.shape[1] for tolerance in (0.3, 0.6, 0.9)]
+    assert counts == sorted(counts, reverse=isinstance(strategy, PODSupremizers))
+    assert len(set(counts)) > 1
+
+
+@pytest.mark.parametrize(
+    "create",
+    [InfSupGreedy, partial(OfflinePGA, stop="beta"), OfflinePGA, PODSupremizers],
+    ids=["inf-sup", "β", "σ", "POD"],
+)
+def test_they_conform(create: Callable[[], NestedStrategy]) -> None:
+    check_primal(create)
+
+
+@pytest.mark.parametrize(
+    ("strategy", "tolerance", "reason"),
+    [
+        (InfSupGreedy(), 1.5, r"tolerance 1.5 is not reached: all supremizers leave 1 of β_on"),
+        (OfflinePGA(stop="beta"), 1.5, r"tolerance 1.5 is not reached: all supremizers leave σ = "),
+        (PODSupremizers(), -1.0, r"tolerance -1 is not reached: all supremizers leave 0e\+00 of themselves"),
+    ],
+)
+def test_what_nobody_can_reach_ends_with_a_reason(
+    varying: Offline, strategy: NestedStrategy, tolerance: float, reason: str
+) -> None:
+    with pytest.raises(NumericalError, match=reason):
+        strategy.build(varying, tolerance)
+
+
+@pytest.mark.parametrize("strategy", [InfSupGreedy(), OfflinePGA(stop="beta"), OfflinePGA(), PODSupremizers()])
+def test_without_generators_nothing_is_added(varying: Offline, strategy: NestedStrategy) -> None:
+    empty = np.zeros((varying.problem.W.dim, 0))
+    data = Offline(varying.problem, varying.basis, Cone(empty, np.zeros(1), no_free(0)), empty, varying.training)
+    assert strategy.build(data, 0.5).vectors.shape == (varying.problem.V.dim, 0)
+
+
+def test_a_parameter_at_which_no_enrichment_can_be_stable_does_not_hold_up_the_others(varying: Offline) -> None:
+    """One multiplier presses on nothing, so β_on = 0 there, and its share is none."""
+
+    class Loose(Varying):
+        def assemble(self, mu: Array):
+            found = super().assemble(mu)
+            if mu[0] == 0.0:
+                B = found.B.tolil()
+                B[3] = 0.0
+                return type(found)(found.A, found.f, B.tocsr(), found.g)
+            return found
+
+    data = Offline(Loose(count=9), varying.basis, varying.cone, np.eye(8)[:, 2:5], varying.training)
+    found = InfSupGreedy().build(data, 0.8)
+    assert 0 < found.vectors.shape[1] < 27

@@ -1,0 +1,187 @@
+"""Degenerate input through the whole chain: nothing to reduce, no contact, contact everywhere, copies, near copies."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from fake_plugins import Wire
+from samples import carry_out
+
+from vibench.arrays import Array
+from vibench.errors import NumericalError
+from vibench.interfaces.problem import VariationalInequality
+from vibench.interfaces.strategies import Stop
+from vibench.stages.artefacts import Store
+from vibench.stages.assembly import AssemblyStage
+from vibench.stages.base import value_of
+from vibench.stages.cell_queries import CellRows, QueriesStage
+from vibench.stages.offline import ConeStage, EnrichmentStage, PODStage
+from vibench.study import registry
+from vibench.study.cells import Plugin
+
+
+class NoContact(Wire):
+    def __init__(self) -> None:
+        super().__init__(depth=10.0)
+
+
+class AllInContact(Wire):
+    """The support pushes the whole wire up."""
+
+    def __init__(self) -> None:
+        super().__init__(depth=-0.1)
+
+
+class Resting(Wire):
+    """The wire lies on its support from the beginning: u = 0 and all energies with it, λ the load."""
+
+    def __init__(self) -> None:
+        super().__init__(depth=0.0)
+
+
+class NoLoad(Wire):
+    def assemble(self, mu: Array) -> VariationalInequality:
+        vi = super().assemble(mu)
+        return VariationalInequality(vi.A, 0.0 * vi.f, vi.B, vi.g)
+
+
+class OneSnapshot(Wire):
+    def training_set(self) -> Array:
+        return np.array([[6.0]])
+
+
+class Copies(Wire):
+    def training_set(self) -> Array:
+        return np.array([[7.0], [5.0], [7.0], [5.0], [5.0]])
+
+
+class NearlyParallel(Wire):
+    def training_set(self) -> Array:
+        return 6.0 * (1.0 + 1e-11 * np.arange(6.0))[:, None]
+
+
+class NoSnapshot(Wire):
+    def training_set(self) -> Array:
+        return np.zeros((0, 1))
+
+
+class FlatSnapshots(Wire):
+    def training_set(self) -> Array:
+        return np.array([5.0, 6.0, 7.0])
+
+
+class LostSnapshot(Wire):
+    def training_set(self) -> Array:
+        return np.array([[5.0], [np.nan]])
+
+
+class ShortValidation(Wire):
+    def validation_set(self, count: int, seed: int) -> Array:
+        return super().validation_set(count, seed)[1:]
+
+
+CASES = [member for member in list(vars().values()) if isinstance(member, type) and issubclass(member, Wire)]
+EVERYTHING = [
+    *(("vibench.problems", case.__name__, f"{__name__}:{case.__name__}") for case in CASES),
+    ("vibench.dual_strategies", "cpg", "vibench_strategies.cpg:CPG"),
+    ("vibench.dual_strategies", "mcpg", "vibench_strategies.mcpg:ModifiedCPG"),
+    ("vibench.primal_strategies", "decorrelated", "vibench_strategies.decorrelated:Decorrelated"),
+    ("vibench.primal_strategies", "online-supremizers", "vibench_strategies.online_supremizers:OnlineSupremizers"),
+    ("vibench.primal_strategies", "offline-pga", "vibench_strategies.offline_pga:OfflinePGA"),
+    ("vibench.dual_strategies", "angle-greedy", "vibench_strategies.angle_greedy:AngleGreedy"),
+    ("vibench.dual_strategies", "dictionary", "vibench_strategies.dictionary:Dictionary"),
+    ("vibench.dual_strategies", "enlarged-cpg", "vibench_strategies.enlarged_cpg:EnlargedCPG"),
+    ("vibench.dual_strategies", "nmf", "vibench_strategies.nmf:NonnegativeFactors"),
+    ("vibench.dual_strategies", "orthant", "vibench_strategies.orthant:Orthant"),
+    ("vibench.dual_strategies", "pod-dual", "vibench_strategies.pod_dual:PODDual"),
+    ("vibench.primal_strategies", "infsup-greedy", "vibench_strategies.infsup_greedy:InfSupGreedy"),
+    ("vibench.primal_strategies", "pod-supremizers", "vibench_strategies.pod_supremizers:PODSupremizers"),
+]
+
+
+@pytest.fixture
+def rows(register, tmp_path):
+    """Function that runs one cell of a case and returns its rows."""
+    register(*EVERYTHING)
+    store = Store(tmp_path)
+
+    def run(case: type[Wire], dual: str, primal: str) -> CellRows:
+        problem = Plugin("problem", case.__name__, "{}", registry.code("problem", case.__name__))
+        stop = Stop(tolerance=1e-3 if dual == "nmf" else 1e-6)  # an iteration, which ends long before round-off
+        cone = ConeStage(problem, Plugin("dual strategy", dual, "{}", "test"), stop)
+        tolerance = None if primal in {"decorrelated", "online-supremizers"} else 0.5
+        strategy = Plugin("primal strategy", primal, "{}", "test")
+        enrichment = EnrichmentStage(PODStage(problem, Stop(tolerance=1e-6)), cone, strategy, tolerance)
+        stage = QueriesStage(AssemblyStage(enrichment, None, 3, 1), "piqp", 1e-8, 20.0)
+        carry_out(stage, store)
+        found: CellRows = value_of(store, stage)
+        return found
+
+    return run
+
+
+SIZES = {
+    NoContact: (1, 0),
+    AllInContact: (1, 2),
+    NoLoad: (0, 0),
+    OneSnapshot: (1, 1),
+    Copies: (2, 2),
+    NearlyParallel: (1, 1),
+}
+"""N and R; two generators where everything is in contact: the pull of the ends does not grow with the load."""
+
+
+@pytest.mark.parametrize("case", SIZES)
+@pytest.mark.parametrize("dual", ["cpg", "mcpg"])
+@pytest.mark.parametrize("primal", ["decorrelated", "online-supremizers", "offline-pga"])
+def test_it_ends_in_ok_rows(rows, case: type[Wire], dual: str, primal: str) -> None:
+    found = rows(case, dual, primal).cell
+    assert (found["status"], found["queries_ok"]) == ("ok", 3)
+    assert (found["N"], found["R"]) == SIZES[case]
+    assert found["enrichment"] == (0 if primal == "decorrelated" else min(found["enrichment"], found["rank"]))
+    assert 0.0 <= found["error_u_mean"] < 0.1
+    if case in (NoContact, NoLoad):
+        assert found["error_u_mean"] < 1e-9
+        assert found["error_lambda_mean"] == 0.0
+    if case is AllInContact and primal != "decorrelated":
+        assert found["error_lambda_mean"] < 1e-6
+
+
+OTHERS = ["angle-greedy", "dictionary", "enlarged-cpg", "nmf", "orthant", "pod-dual"]
+
+
+@pytest.mark.parametrize("case", [NoContact, AllInContact])
+@pytest.mark.parametrize(
+    ("dual", "primal"),
+    [*((dual, "infsup-greedy") for dual in OTHERS), ("mcpg", "infsup-greedy"), ("mcpg", "pod-supremizers")],
+)
+def test_other_strategies_end_in_ok_rows(rows, case: type[Wire], dual: str, primal: str) -> None:
+    found = rows(case, dual, primal).cell
+    assert (found["status"], found["queries_ok"]) == ("ok", 3)
+    assert 0.0 <= found["error_u_mean"] < 0.1
+    if case is NoContact:
+        assert (found["R"], found["error_lambda_mean"]) == (0, 0.0)
+
+
+@pytest.mark.parametrize("primal", ["decorrelated", "online-supremizers", "offline-pga"])
+def test_a_solution_that_is_zero_up_to_round_off_is_a_snapshot(rows, primal: str) -> None:
+    """All energies vanish, so the gap has nothing of its own size to be relative to."""
+    found = rows(Resting, "mcpg", primal)
+    assert found.cell["R"] == 1
+    assert len(found.queries) == 3
+    for query in found.queries:
+        assert query["gap"] < 1e-3  # 1e-7 of the energy the load would gain without the support
+
+
+@pytest.mark.parametrize(
+    ("case", "line"),
+    [
+        (NoSnapshot, r"training_set has shape \(0, 1\), expected \(P, 1\) with P > 0"),
+        (FlatSnapshots, r"training_set has shape \(3,\), expected \(P, 1\) with P > 0"),
+        (LostSnapshot, "training_set has parameters that are not finite"),
+        (ShortValidation, r"validation_set has shape \(2, 1\), expected \(3, 1\)"),
+    ],
+)
+def test_parameters_nobody_can_train_or_validate_on_are_refused(rows, case: type[Wire], line: str) -> None:
+    with pytest.raises(NumericalError, match=line):
+        rows(case, "cpg", "decorrelated")

@@ -1,0 +1,124 @@
+"""Words that a shell completes, and the examples of `--help`."""
+
+from __future__ import annotations
+
+import os
+import shlex
+import subprocess
+from pathlib import Path
+from typing import Any
+
+import pytest
+import typer
+from running import Main, Register
+
+from vibench.cli import completion
+from vibench.cli import main as main_module
+from vibench.qp.settings import SETTINGS
+from vibench.results import tables
+from vibench.results.database import FILE
+from vibench.results.schema import TABLES
+from vibench.study import registry
+
+GROUP: Any = typer.main.get_command(main_module.app)
+
+
+def completed(line: str) -> list[str]:
+    """What the last word of a command line may become, asked as bash asks."""
+    *before, last = line.split(" ")[1:]
+    command, words = GROUP, list(before)
+    context = command.make_context("vibench", [], resilient_parsing=True)
+    if words:
+        command = command.get_command(context, words.pop(0))
+        context = command.make_context(command.name, words, parent=context, resilient_parsing=True)
+    option = next((p for p in command.params if before and before[-1] in p.opts), None)
+    arguments = [p for p in command.params if p.param_type_name == "argument" and context.params.get(p.name) is None]
+    return [item.value for item in (option or arguments[0]).shell_complete(context, last)]
+
+
+@pytest.mark.parametrize(
+    ("line", "words"),
+    [
+        ("vibench run quick --problem ob", ["obstacle"]),
+        ("vibench run quick --dual ", registry.names("dual strategy")),
+        ("vibench run quick --primal o", ["offline-pga", "online-supremizers"]),
+        ("vibench run quick --solver ", sorted(SETTINGS)),
+        ("vibench list s", ["solvers", "studies"]),
+        ("vibench show quick --table th", ["thresholds"]),
+        ("vibench show quick --table s", ["summary"]),
+    ],
+)
+def test_values_are_completed_with_what_there_is(line: str, words: list[str]) -> None:
+    assert completed(line) == words
+
+
+def test_the_lists_and_tables_offered_are_all_there_are() -> None:
+    assert set(completion.lists("")) == {*main_module.LISTS, "solvers"}
+    assert set(completion.table_names("")) == {"summary", "benefits", *TABLES}
+
+
+class TestFiles:
+    @pytest.fixture(autouse=True)
+    def _here(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.chdir(tmp_path)
+
+    def test_studies_are_those_registered_and_the_files_here(self) -> None:
+        Path("papers").mkdir()
+        for name in ("paper-mine.toml", "paper-notes.txt", "papers/radial.toml"):
+            Path(name).touch()
+        assert completion.studies("paper-") == ["paper-hertz", "paper-mine.toml", "paper-obstacle"]
+        assert completion.studies("papers/") == ["papers/radial.toml"]
+        assert completion.studies(f"{Path.cwd()}/papers/r") == [f"{Path.cwd()}/papers/radial.toml"]
+        assert completion.studies("nowhere/") == []
+
+    def test_runs_are_the_folders_with_results(self) -> None:
+        for name in ("mine", "more", "other"):
+            Path("runs", name).mkdir(parents=True)
+        for name in ("mine", "other"):
+            Path("runs", name, FILE).touch()
+        assert completed("vibench show ") == ["mine", "other"]
+        assert completed("vibench replay m") == completed("vibench report m") == ["mine"]
+        assert completed("vibench diff mine o") == ["other"]
+
+    def test_cells_are_those_of_the_run_named_before(self, quick_run: Path) -> None:
+        Path("runs").mkdir()
+        Path("runs/quick").symlink_to(quick_run)
+        keys = sorted(tables.read(quick_run / FILE, "cells")["cell"])
+        assert completed("vibench replay quick ") == keys
+        assert completed(f"vibench replay quick {keys[0][:6]}") == [keys[0]]
+        assert completed("vibench replay nothing ") == []
+        Path("runs/broken").mkdir()
+        Path("runs/broken", FILE).write_text("no database")
+        assert completed("vibench replay broken ") == []
+
+
+def test_a_name_that_two_packages_register_spoils_no_prompt(register: Register) -> None:
+    register(("vibench.problems", "mine", "one:Problem"), ("vibench.problems", "mine", "other:Problem"))
+    assert completed("vibench run quick --problem ") == []
+
+
+def test_the_installed_command_completes_for_bash(command: str, tmp_path: Path) -> None:
+    asked = {"_VIBENCH_COMPLETE": "complete_bash", "COMP_WORDS": "vibench run paper-", "COMP_CWORD": "2"}
+    done = subprocess.run([command], cwd=tmp_path, env=os.environ | asked, capture_output=True, text=True, check=False)
+    assert (done.stdout.split(), done.stderr) == (["paper-hertz", "paper-obstacle"], "")
+
+
+@pytest.mark.parametrize("name", completion.EXAMPLES)
+def test_help_ends_with_examples_that_are_commands(name: str, main: Main, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
+    code, out, _ = main(name, "--help")
+    assert code == 0
+    examples = completion.EXAMPLES[name]
+    assert [line.strip() for line in out.splitlines()[-len(examples) - 1 :]] == ["Examples:", *examples]
+    assert max(map(len, out.splitlines())) <= 80
+    for example in examples:
+        program, command, *arguments = shlex.split(example)
+        assert (program, command) == ("vibench", name)
+        GROUP.get_command(None, name).make_context(name, arguments)
+
+
+def test_the_overview_cuts_no_command_short(main: Main, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
+    _, out, _ = main("--help")
+    lines = {line.split()[0]: line for line in out.splitlines() if line.startswith("  ")}
+    assert [name for name in completion.EXAMPLES if lines[name].endswith("...")] == []

@@ -1,0 +1,345 @@
+"""The command line: what is wrong with a request is one line and exit code 2, and nothing is started."""
+
+from __future__ import annotations
+
+import csv
+import importlib.metadata
+import io
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from running import Main, Register, refused
+from samples import STUDY, changed, write_study
+
+from vibench.cli import main as module
+from vibench.qp.settings import SETTINGS
+from vibench.results.database import FILE
+from vibench.results.schema import TABLES
+from vibench.results.tables import read
+from vibench.study import registry
+from vibench.study.cells import expand
+from vibench.study.reader import load_study
+
+
+@pytest.fixture
+def _nothing_starts(monkeypatch: pytest.MonkeyPatch) -> None:
+    def started(*_: object, **__: object) -> None:
+        raise AssertionError("a stage was run")
+
+    monkeypatch.setattr("vibench.execution.run._Run.execute", started)
+
+
+RUN = {
+    "unknown study": (["qick"], ["no study is called 'qick'", "did you mean 'quick'"]),
+    "missing file": (["no.toml"], ["no.toml", "does not exist"]),
+    "unknown option": (["--sovler", "piqp"], ["--sovler"]),
+    "option without value": (["--dual"], ["--dual"]),
+    "one study too many": (["quick", "quick"], ["quick"]),
+    "jobs no number": (["--jobs", "many"], ["--jobs"]),
+    "jobs negative": (["--jobs", "-1"], ["--jobs"]),
+    "jobs no integer": (["--jobs", "1.5"], ["--jobs"]),
+    "tolerance no number": (["--pod-tol", "small"], ["--pod-tol"]),
+    "tolerance zero": (["--pod-tol", "0"], ["pod", "greater than 0"]),
+    "tolerance nan": (["--dual-tol", "nan"], ["dual", "finite"]),
+    "tolerance inf": (["--primal-tol", "inf"], ["primal", "finite"]),
+    "tolerance above one": (["--primal-tol", "2"], ["primal", "less than 1"]),
+    "unknown problem": (["--problem", "obstcale"], ["did you mean 'obstacle'"]),
+    "unknown dual strategy": (["--dual", "mcgp"], ["did you mean 'mcpg'"]),
+    "unknown primal strategy": (["--primal", "decorelated"], ["did you mean 'decorrelated'"]),
+    "unknown solver": (["--solver", "oqsp"], ["did you mean 'osqp'"]),
+}
+
+
+@pytest.mark.usefixtures("_nothing_starts")
+@pytest.mark.parametrize("case", RUN)
+def test_a_wrong_run_is_refused_in_one_line(case: str, main: Main) -> None:
+    arguments, words = RUN[case]
+    refused(main("run", *arguments), *words)
+    assert list(Path.cwd().iterdir()) == []
+
+
+OTHER = {
+    "unknown command": (["rnu"], ["rnu"]),
+    "unknown global option": (["--colour"], ["--colour"]),
+    "unknown list": (["list", "problem"], ["did you mean 'problems'"]),
+    "run of nothing": (["show", "nothing"], ["no results in 'nothing'", FILE]),
+    "show without run": (["show"], ["RUN"]),
+}
+
+
+@pytest.mark.parametrize("case", OTHER)
+def test_other_wrong_requests_are_refused_in_one_line(case: str, main: Main) -> None:
+    arguments, words = OTHER[case]
+    refused(main(*arguments), *words)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["--table", "summray"], ["did you mean 'summary'"]),
+        (["--format", "xml"], ["--format", "xml", "markdown"]),
+        (["--tabel", "cells"], ["--tabel"]),
+    ],
+)
+def test_a_table_that_is_not_there_is_refused(
+    arguments: list[str], words: list[str], main: Main, quick_run: Path
+) -> None:
+    refused(main("show", str(quick_run), *arguments), *words)
+
+
+def test_a_wrong_study_file_is_refused(main: Main, tmp_path: Path) -> None:
+    path = write_study(tmp_path, changed(STUDY, "sed", to=3))
+    refused(main("run", path), path, "did you mean 'seed'")
+
+
+def test_a_wrong_key_of_two_lines_is_refused_in_one(main: Main, tmp_path: Path) -> None:
+    refused(main("run", write_study(tmp_path, changed(STUDY, "see\nd", to=3))), "did you mean")
+
+
+def test_a_missing_tolerance_is_refused(main: Main, tmp_path: Path) -> None:
+    path = write_study(tmp_path, changed(STUDY, "tolerances", 0, "primal", to={}))
+    refused(main("run", path), "tolerances.primal", "offline-pga")
+
+
+@pytest.mark.usefixtures("_nothing_starts")
+class TestOutputFolder:
+    def test_a_file_is_refused(self, main: Main) -> None:
+        Path("taken").touch()
+        refused(main("run", "--out", "taken"), "'taken'", "is a file")
+
+    def test_a_place_below_a_file_is_refused(self, main: Main) -> None:
+        Path("taken").touch()
+        refused(main("run", "--out", "taken/below"), "taken/below", "cannot be written")
+
+    @pytest.mark.parametrize("fresh", [[], ["--fresh"]])
+    def test_a_folder_with_other_things_is_refused(self, fresh: list[str], main: Main) -> None:
+        Path("full").mkdir()
+        Path("full/notes.txt").write_text("precious")
+        refused(main("run", "--out", "full", *fresh), "'full'", "not empty")
+        assert Path("full/notes.txt").read_text() == "precious"
+
+    @pytest.mark.parametrize("fresh", [[], ["--fresh"]])
+    @pytest.mark.parametrize("content", ["hello", "SQLite format 3\0 and then nothing"])
+    def test_a_foreign_results_file_is_refused_and_kept(self, fresh: list[str], content: str, main: Main) -> None:
+        Path("foreign").mkdir()
+        Path("foreign", FILE).write_text(content)
+        Path("foreign/notes.txt").write_text("precious")
+        refused(main("run", "--out", "foreign", *fresh), "foreign", FILE)
+        assert Path("foreign", FILE).read_text() == content
+        assert Path("foreign/notes.txt").read_text() == "precious"
+
+    @pytest.mark.parametrize("fresh", [[], ["--fresh"]])
+    def test_results_of_another_study_are_refused_and_kept(
+        self, fresh: list[str], main: Main, quick_run: Path, tmp_path: Path
+    ) -> None:
+        shutil.copytree(quick_run, "other")
+        refused(main("run", write_study(tmp_path), "--out", "other", *fresh), "other", "study", "quick", "sample")
+        assert len(read(Path("other", FILE), "cells")) == len(expand(load_study("quick")))
+
+    def test_another_seed_is_another_study(self, main: Main, quick_run: Path, tmp_path: Path) -> None:
+        shutil.copytree(quick_run, "other")
+        text = registry.study_path("quick").read_text(encoding="utf-8")
+        path = tmp_path / "seeded.toml"
+        path.write_text(text.replace("seed = 2022", "seed = 2023"), encoding="utf-8")
+        refused(main("run", str(path), "--out", "other"), "seed 2022 instead of 2023")
+
+    @pytest.mark.skipif(not Path("/proc").is_dir(), reason="needs a folder nobody can write to")
+    def test_a_folder_that_cannot_be_made_is_refused(self, main: Main) -> None:
+        refused(main("run", "--out", "/proc/vibench"), "/proc/vibench", "cannot be written")
+
+    def test_a_name_too_long_is_refused(self, main: Main) -> None:
+        refused(main("run", "--out", "a" * 300), "output folder")
+
+    def test_the_folder_of_the_study_is_checked_too(self, main: Main) -> None:
+        Path("runs").mkdir()
+        Path("runs/quick").touch()
+        refused(main("run"), "runs/quick", "is a file")
+
+
+@pytest.mark.usefixtures("_nothing_starts")
+@pytest.mark.parametrize(("option", "group"), [("--problem", "problems"), ("--solver", "qp_solvers")])
+def test_a_plugin_that_cannot_be_loaded_is_refused(option: str, group: str, main: Main, register: Register) -> None:
+    ours = [
+        (entry.group, entry.name, entry.value)
+        for entry in importlib.metadata.distribution("vibench").entry_points
+        if entry.group.startswith("vibench.")
+    ]
+    register(*ours, (f"vibench.{group}", "broken", "no_such_module:member"))
+    refused(main("run", option, "broken"), "'broken'", "no_such_module")
+
+
+def test_one_broken_plugin_does_not_hide_the_others_from_the_list(main: Main, register: Register) -> None:
+    ours = [
+        (entry.group, entry.name, entry.value)
+        for entry in importlib.metadata.distribution("vibench").entry_points
+        if entry.group == "vibench.problems"
+    ]
+    register(*ours, ("vibench.problems", "broken", "no_such_module:Problem"))
+    code, out, _ = main("list", "problems")
+    assert code == 0
+    assert "obstacle" in out
+    assert "broken" in out
+    assert "no_such_module" in out
+
+
+def test_without_arguments_the_help_is_printed(main: Main) -> None:
+    _, out, err = main()
+    assert len((out + err).splitlines()) > 10
+    for command in ("run", "list", "show"):
+        assert f"\n  {command} " in out + err
+
+
+@pytest.mark.parametrize("command", [[], ["run"], ["list"], ["show"]])
+def test_help_is_no_error(command: list[str], main: Main) -> None:
+    code, out, err = main(*command, "--help")
+    assert (code, err) == (0, "")
+    assert "Usage: " in out
+    assert "--help" in out
+
+
+def test_help_names_every_option_of_run(main: Main) -> None:
+    _, out, _ = main("run", "--help")
+    options = ("problem", "dual", "primal", "solver", "pod-tol", "dual-tol", "primal-tol", "out", "jobs")
+    for option in (*options, "dry-run", "fresh", "retry", "strict"):
+        assert f"--{option}" in out
+
+
+@pytest.mark.usefixtures("_nothing_starts")
+def test_a_dry_run_lists_the_matrix_and_does_nothing_else(main: Main) -> None:
+    code, out, err = main("run", "quick", "--dry-run")
+    assert (code, err) == (0, "")
+    cells = expand(load_study("quick"))
+    *lines, last = out.splitlines()
+    assert lines == [f"{cell.key}  {cell}" for cell in cells]
+    assert last == f"{len(cells)} cells"
+    assert list(Path.cwd().iterdir()) == []
+
+
+@pytest.mark.usefixtures("_nothing_starts")
+def test_a_dry_run_leaves_earlier_results_alone(main: Main, quick_run: Path) -> None:
+    before = {path: path.stat().st_mtime_ns for path in quick_run.rglob("*") if path.is_file()}
+    assert main("run", "quick", "--dry-run", "--fresh", "--out", str(quick_run))[0] == 0
+    assert {path: path.stat().st_mtime_ns for path in quick_run.rglob("*") if path.is_file()} == before
+
+
+REPLACED: dict[str, tuple[list[str], Callable[[Any], Any], Any]] = {
+    # what is replaced: (options, what is looked at, its only value)
+    "dual": (["--dual", "cpg"], lambda cell: cell.dual.name, "cpg"),
+    "solver": (["--solver", "daqp"], lambda cell: cell.solver, "daqp"),
+    "primal": (["--primal", "offline-pga", "--primal-tol", "0.3"], lambda cell: cell.primal_tol, 0.3),
+    "pod": (["--pod-tol", "0.01"], lambda cell: cell.pod.tolerance, 0.01),
+    "cone": (["--dual-tol", "0.1"], lambda cell: cell.cone.tolerance, 0.1),
+    "problem": (["--problem", "obstacle"], lambda cell: cell.problem.name, "obstacle"),
+}
+
+
+@pytest.mark.parametrize("axis", REPLACED)
+def test_options_replace_axes(axis: str, main: Main, monkeypatch: pytest.MonkeyPatch) -> None:
+    listed: list[Any] = []
+    monkeypatch.setattr(module, "_list_matrix", lambda _, cells: listed.extend(cells))
+    options, look, value = REPLACED[axis]
+    assert main("run", "quick", "--dry-run", *options)[0] == 0
+    assert {look(cell) for cell in listed} == {value}
+
+
+def test_options_may_be_repeated(main: Main) -> None:
+    _, out, _ = main("run", "quick", "--dry-run", "--solver", "piqp", "--solver", "daqp", "--dual", "cpg")
+    assert {line.split(" · ")[-1] for line in out.splitlines()[:-1]} == {"piqp", "daqp"}
+
+
+def test_list_shows_every_plugin_and_its_options(main: Main) -> None:
+    code, out, err = main("list")
+    assert (code, err) == (0, "")
+    for kind in module.LISTS.values():
+        for name in registry.names(kind):
+            assert name in out
+    for option in registry.options("problem", "obstacle"):
+        assert f"{option.name}: " in out
+    assert "'coarse', 'medium'" in out
+
+
+@pytest.mark.parametrize(("what", "kind"), module.LISTS.items())
+def test_one_list_shows_only_its_own(what: str, kind: str, main: Main) -> None:
+    code, out, _ = main("list", what)
+    assert code == 0
+    assert out.startswith(what)
+    assert all(name in out for name in registry.names(kind))
+    assert [title for title in (*module.LISTS, "solvers") if title != what and f"\n{title}" in out] == []
+
+
+def test_the_list_of_solvers_says_which_are_installed(main: Main) -> None:
+    _, out, _ = main("list", "solvers")
+    rows = {line.split()[0]: line for line in out.splitlines() if line.split()}
+    assert set(SETTINGS) <= set(rows)
+    for name in ("piqp", "proxqp", "osqp"):
+        assert "not installed" not in rows[name]
+
+
+def test_the_list_of_studies_counts_their_cells(main: Main) -> None:
+    _, out, _ = main("list", "studies")
+    assert f"{len(expand(load_study('quick')))} cells" in out
+
+
+def test_show_prints_the_summary(main: Main, quick_run: Path) -> None:
+    code, out, err = main("show", str(quick_run))
+    assert (code, err) == (0, "")
+    frame = read(quick_run / FILE, "cells")
+    lines = [line for line in out.splitlines() if any(solver in line for solver in frame["solver"].unique())]
+    assert len(lines) == len(frame)
+    assert "…" not in out
+
+
+def test_a_run_ends_with_the_summary_and_says_where_things_are(quick_run: Path) -> None:
+    printed = (quick_run / "printed.txt").read_text(encoding="utf-8")
+    fine = read(quick_run / FILE, "cells")["status"] == "ok"
+    assert f"{len(fine)} cells, {fine.sum()} ok, {len(fine) - fine.sum()} fell short" in printed
+    assert str(quick_run / FILE) in printed
+    assert "online [ms]" in printed
+    assert "\x1b" not in printed
+
+
+@pytest.mark.parametrize("table", ["summary", "benefits", *TABLES])
+def test_show_prints_every_table_as_csv(table: str, main: Main, quick_run: Path) -> None:
+    code, out, err = main("show", str(quick_run), "--table", table, "--format", "csv")
+    assert (code, err) == (0, "")
+    rows = list(csv.DictReader(io.StringIO(out)))
+    source = {"summary": "cells", "benefits": "thresholds"}.get(table, table)
+    assert len(rows) == len(read(quick_run / FILE, source)) > 0
+    if table == source:
+        assert [name for name in rows[0] if not name.startswith("mu_")] == list(TABLES[table])
+
+
+@pytest.mark.parametrize("table", ["summary", "benefits", "cells"])
+def test_show_prints_markdown(table: str, main: Main, quick_run: Path) -> None:
+    code, out, _ = main("show", str(quick_run), "--table", table, "--format", "markdown")
+    assert code == 0
+    lines = out.splitlines()
+    assert all(line.startswith("|") and line.endswith("|") for line in lines)
+    assert len({line.count("|") for line in lines}) == 1
+
+
+@pytest.mark.parametrize("table", ["summary", "benefits", "histories"])
+def test_show_prints_on_a_terminal(table: str, main: Main, quick_run: Path) -> None:
+    code, out, _ = main("show", str(quick_run), "--table", table)
+    assert code == 0
+    assert out.startswith(f"{quick_run.name}: {table}")
+
+
+def test_show_finds_a_run_by_its_name(main: Main, quick_run: Path) -> None:
+    Path("runs").mkdir()
+    Path("runs/quick").symlink_to(quick_run)
+    code, out, _ = main("show", "quick", "--format", "csv")
+    assert code == 0
+    assert len(out.splitlines()) == 1 + len(read(quick_run / FILE, "cells"))
+
+
+def test_an_error_that_nobody_foresaw_is_not_hidden(main: Main, monkeypatch: pytest.MonkeyPatch) -> None:
+    def broken(*_: object) -> None:
+        raise ZeroDivisionError
+
+    monkeypatch.setattr(module, "load_study", broken)
+    with pytest.raises(ZeroDivisionError):
+        main("run")

@@ -1,0 +1,226 @@
+"""Progress: the time left, durations in words, and what is printed where there is no terminal."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Callable
+from itertools import pairwise
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from rich.console import Console
+from samples import STUDY, changed, write_study
+
+from vibench.cli.progress import Report, TimeLeft, duration
+from vibench.execution.run import queries_stage
+from vibench.interfaces.strategies import Stop
+from vibench.stages.base import Stage
+from vibench.stages.cell_queries import QueriesStage
+from vibench.stages.offline import PODStage
+from vibench.stages.snapshots import CHUNKS, HighFidelity
+from vibench.study.cells import Cell, Plugin, expand
+from vibench.study.reader import load_study
+
+PROBLEM = Plugin("problem", "p", "{}", "")
+PODS: list[Stage] = [PODStage(PROBLEM, Stop(size=k)) for k in range(1, 5)]
+CHUNK: list[Stage] = [HighFidelity(PROBLEM, "training", 0, 0, chunk) for chunk in range(CHUNKS)]
+
+
+@pytest.fixture
+def cells(tmp_path: Path) -> list[Cell]:
+    content = changed(changed(STUDY, "primal", to=["decorrelated"]), "problem", 0, "label", to="[red]membrane")
+    return expand(load_study(write_study(tmp_path, content)))
+
+
+@pytest.fixture
+def queries(cells: list[Cell]) -> list[Stage]:
+    study = load_study("quick")
+    return [queries_stage(cell, study) for cell in cells]
+
+
+def test_nothing_is_known_before_a_stage_is_done() -> None:
+    assert TimeLeft(PODS, 1).seconds() is None
+
+
+def test_stages_of_one_sort_are_taken_to_last_as_long() -> None:
+    left = TimeLeft(PODS, 1)
+    left.done(PODS[0], 2.0)
+    assert left.seconds() == pytest.approx(6.0)
+    left.done(PODS[1], 4.0)
+    assert left.seconds() == pytest.approx(2 * 3.0)
+
+
+def test_a_sort_never_seen_is_taken_to_last_as_the_mean_of_all() -> None:
+    left = TimeLeft([*PODS[:2], *CHUNK[:4]], 1)
+    left.done(PODS[0], 3.0)
+    assert left.seconds() == pytest.approx(3.0 + 4 * 3.0)
+    left.done(CHUNK[0], 1.0)
+    assert left.seconds() == pytest.approx(3.0 + 3 * 1.0)
+
+
+def test_workers_share_what_is_left() -> None:
+    left = TimeLeft(PODS, 3)
+    left.done(PODS[0], 2.0)
+    assert left.seconds() == pytest.approx(2.0)
+
+
+def test_solvers_are_told_apart(queries: list[Stage]) -> None:
+    fast = [stage for stage in queries if isinstance(stage, QueriesStage) and stage.solver == "piqp"]
+    slow = [stage for stage in queries if isinstance(stage, QueriesStage) and stage.solver == "osqp"]
+    left = TimeLeft([*fast[:3], *slow[:3]], 1)
+    left.done(fast[0], 1.0)
+    left.done(slow[0], 10.0)
+    assert left.seconds() == pytest.approx(2 * 1.0 + 2 * 10.0)
+
+
+def test_nothing_is_left_when_all_is_done() -> None:
+    left = TimeLeft(PODS, 1)
+    for stage in PODS:
+        left.done(stage, 2.0)
+    assert left.seconds() == 0.0
+    left.done(PODS[0], 2.0)
+    assert left.seconds() == 0.0
+
+
+@pytest.mark.parametrize(
+    ("seconds", "words"),
+    [
+        (0.0, "0 s"), (40.2, "40 s"), (89.4, "89 s"), (91.0, "2 min"), (180.0, "3 min"), (5300.0, "88 min"),
+        (5400.0, "1 h 30 min"), (4800.0, "80 min"), (7200.0, "2 h 0 min"), (90000.0, "25 h 0 min"),
+    ],
+)  # fmt: skip
+def test_durations_are_said_in_words(seconds: float, words: str) -> None:
+    assert duration(seconds) == words
+
+
+@given(st.floats(0.0, 1e7))
+def test_a_duration_in_words_is_about_the_duration(seconds: float) -> None:
+    words = duration(seconds).split()
+    units = {"s": 1.0, "min": 60.0, "h": 3600.0}
+    said = sum(int(number) * units[unit] for number, unit in pairwise(words) if number.isdigit())
+    assert abs(said - seconds) <= max(0.5, 30.0 * (seconds >= 90))
+
+
+@pytest.fixture
+def report() -> Callable[..., tuple[Report, io.StringIO]]:
+    """Function that gives a report and what it prints."""
+
+    def make(*, terminal: bool = False) -> tuple[Report, io.StringIO]:
+        printed = io.StringIO()
+        return Report(Console(file=printed, force_terminal=terminal, width=120)), printed
+
+    return make
+
+
+Make = Callable[..., tuple[Report, io.StringIO]]
+OK = {"status": "ok", "reason": ""}
+
+
+def test_the_beginning_says_what_is_to_be_done(report: Make, queries: list[Stage]) -> None:
+    made, printed = report()
+    made.start(20, [*queries[:3], *PODS], 0, 2)
+    assert printed.getvalue() == "20 cells, 3 to run, 7 stages on 2 workers\n"
+
+
+def test_one_worker_is_no_workers(report: Make) -> None:
+    made, printed = report()
+    made.start(1, PODS, 0, 1)
+    assert printed.getvalue() == "1 cells, 0 to run, 4 stages on 1 worker\n"
+
+
+def test_where_nothing_is_to_be_done_nobody_works(report: Make) -> None:
+    made, printed = report()
+    made.start(1, [], 0, 0)
+    assert printed.getvalue() == "1 cells, 0 to run, 0 stages\n"
+
+
+def test_high_fidelity_parts_are_reported_sweep_by_sweep(report: Make) -> None:
+    made, printed = report()
+    made.start(1, CHUNK, 0, 2)
+    for chunk in CHUNK[:-1]:
+        made.stage(chunk, 0.1)
+    assert "high-fidelity" not in printed.getvalue()
+    made.stage(CHUNK[-1], 0.1)
+    assert f"high-fidelity solutions: {CHUNKS} of {CHUNKS} parts" in printed.getvalue()
+
+
+def test_other_stages_are_not_reported(report: Make) -> None:
+    made, printed = report()
+    made.start(1, PODS, 0, 2)
+    before = printed.getvalue()
+    made.stage(PODS[0], 0.1)
+    assert printed.getvalue() == before
+
+
+def test_every_cell_has_a_line(report: Make, cells: list[Cell], queries: list[Stage]) -> None:
+    made, printed = report()
+    made.start(len(cells), queries, 0, 2)
+    made.cell(cells[0], OK)
+    made.cell(cells[1], {"status": "timeout", "reason": "took [bold]long"})
+    lines = printed.getvalue().splitlines()
+    assert lines[1] == f"[1/{len(queries)}] ok: {cells[0]}"
+    assert lines[2] == f"[2/{len(queries)}] timeout: {cells[1]} (took [bold]long)"
+    assert "[red]membrane" in lines[1]
+
+
+def test_a_long_line_stays_one_line(report: Make, cells: list[Cell], queries: list[Stage]) -> None:
+    made, printed = report()
+    made.start(1, queries[:1], 0, 2)
+    made.cell(cells[0], {"status": "error", "reason": "word " * 100})
+    assert len(printed.getvalue().splitlines()) == 2
+
+
+def test_the_time_left_is_said_once_known(report: Make, cells: list[Cell], queries: list[Stage]) -> None:
+    made, printed = report()
+    made.start(len(cells), queries, 0, 1)
+    made.stage(queries[0], 20.0)
+    made.cell(cells[0], OK)
+    same = sum(isinstance(stage, QueriesStage) for stage in queries) - 1
+    assert f"about {duration(20.0 * same)} left" in printed.getvalue()
+
+
+def test_less_than_a_second_left_is_not_said(report: Make, cells: list[Cell], queries: list[Stage]) -> None:
+    made, printed = report()
+    made.start(len(cells), queries[:2], 0, 2)
+    made.stage(queries[0], 0.2)
+    made.cell(cells[0], OK)
+    assert "left" not in printed.getvalue()
+
+
+def test_plain_lines_where_there_is_no_terminal(report: Make, cells: list[Cell], queries: list[Stage]) -> None:
+    made, printed = report()
+    with made:
+        made.start(len(cells), [*CHUNK, *queries], 0, 2)
+        for stage in (*CHUNK, *queries):
+            made.stage(stage, 3.0)
+        for cell in cells:
+            made.cell(cell, OK)
+    text = printed.getvalue()
+    assert "\x1b" not in text
+    assert "\r" not in text
+    assert len(text.splitlines()) == 1 + 1 + len(cells)
+
+
+def test_a_terminal_gets_a_bar_and_only_what_fell_short(report: Make, cells: list[Cell], queries: list[Stage]) -> None:
+    made, printed = report(terminal=True)
+    with made:
+        made.start(len(cells), queries, 0, 2)
+        made.stage(queries[0], 30.0)
+        made.cell(cells[0], OK)
+        made.cell(cells[1], {"status": "error", "reason": "broke"})
+    text = printed.getvalue()
+    assert "\x1b" in text
+    assert f"1/{len(queries)}" in text
+    assert "left" in text
+    assert f"error: {cells[1]}" in text
+    assert f"ok: {cells[0]}" not in text
+
+
+def test_a_terminal_gets_no_bar_where_nothing_is_to_be_done(report: Make) -> None:
+    made, printed = report(terminal=True)
+    with made:
+        made.start(3, [], 0, 0)
+    assert "stages" in printed.getvalue()
+    assert "0:00:00" not in printed.getvalue()

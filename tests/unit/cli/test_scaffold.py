@@ -1,0 +1,173 @@
+"""`vibench new`: packages that install, pass their own tests and give rows as they are; bad names leave nothing."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import tomllib
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from running import Main, refused, rows
+
+from vibench.cli import scaffold
+from vibench.errors import RequestError
+from vibench.study import registry
+
+NAMES = {"problem": "my-rope", "primal": "tied", "dual": "cone"}
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """One new package of every kind."""
+    parent = tmp_path_factory.mktemp("new")
+    return {kind: scaffold.write_package(kind, name, parent) for kind, name in NAMES.items()}
+
+
+Run = Callable[..., "subprocess.CompletedProcess[str]"]
+
+
+@pytest.fixture(scope="module")
+def installed(written: dict[str, Path], tmp_path_factory: pytest.TempPathFactory) -> Run:
+    """Function that runs Python where the new packages are installed, and not their sources but their wheels."""
+    site = tmp_path_factory.mktemp("site")
+    pip = ["-m", "pip", "install", "--quiet", "--disable-pip-version-check", "--no-index", "--no-deps"]
+    build = [*pip, "--no-build-isolation", "--target", str(site), *map(str, written.values())]
+    subprocess.run([sys.executable, *build], check=True, capture_output=True, text=True)
+
+    def run(*arguments: str, folder: Path) -> subprocess.CompletedProcess[str]:
+        environment = os.environ | {"PYTHONPATH": str(site)}
+        command = [sys.executable, *arguments]
+        return subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=False)
+
+    return run
+
+
+COMMAND = ("-c", "from vibench.cli.main import main; main()")
+
+
+def test_the_tests_of_new_packages_are_green(written: dict[str, Path], installed: Run, tmp_path: Path) -> None:
+    tests = [str(folder / "tests") for folder in written.values()]
+    done = installed("-m", "pytest", "-q", "-p", "no:cacheprovider", "-W", "error", *tests, folder=tmp_path)
+    assert done.returncode == 0, done.stdout
+    assert "6 passed" in done.stdout
+
+
+def test_new_plugins_pass_their_checks_as_they_are(installed: Run, tmp_path: Path) -> None:
+    code = (
+        "import sys\nfrom vibench.cli.plugin_commands import check_plugin\nfor name in sys.argv[1:]: check_plugin(name)"
+    )
+    done = installed("-c", code, *NAMES.values(), folder=tmp_path)
+    assert done.returncode == 0, done.stdout + done.stderr
+    for kind, name in NAMES.items():
+        assert f"{registry.WORDS[kind]} '{name}'" in done.stdout
+    assert done.stdout.count("passed, 0 failed, 0 skipped") == len(NAMES)
+
+
+def test_new_plugins_give_rows_without_an_edit(installed: Run, tmp_path: Path) -> None:
+    axes = ["--problem", "my-rope", "--dual", "cone", "--primal", "tied", "--primal-tol", "0.5", "--solver", "piqp"]
+    done = installed(*COMMAND, "run", "quick", *axes, "--out", "out", "--jobs", "1", folder=tmp_path)
+    assert done.returncode == 0, done.stdout + done.stderr
+    (row,) = rows(tmp_path / "out")
+    assert (row["status"], row["queries_ok"]) == ("ok", row["queries"])
+    assert row["error_u_mean"] < 0.01
+    assert row["enrichment"] > 0
+
+
+def test_a_new_package_registers_its_plugin_under_its_name(written: dict[str, Path]) -> None:
+    for kind, folder in written.items():
+        project = tomllib.loads((folder / "pyproject.toml").read_text())["project"]
+        assert (folder.name, project["name"]) == (f"vibench-{NAMES[kind]}",) * 2
+        ((group, entries),) = project["entry-points"].items()
+        assert group == registry.GROUPS[registry.WORDS[kind]]
+        ((name, value),) = entries.items()
+        assert name == NAMES[kind]
+        module, cls = value.split(":")
+        source = scaffold.module_file(folder, kind, name)
+        assert source == folder / "src" / f"{module.replace('.', '/')}.py"
+        assert f"class {cls}(" in source.read_text()
+
+
+def test_new_packages_keep_to_the_rules_of_ruff(written: dict[str, Path]) -> None:
+    rules = ["--isolated", "--no-cache", "--line-length", "110", "--select", "E,F,W,I,UP,B"]
+    for folder in written.values():
+        command = [sys.executable, "-m", "ruff", "check", *rules, "."]
+        done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
+        assert done.returncode == 0, done.stdout
+
+
+def test_the_command_says_what_to_do_next(main: Main) -> None:
+    code, out, err = main("new", "dual", "my-cone", "--out", "below/here")
+    assert (code, err) == (0, "")
+    folder = Path("below/here/vibench-my-cone")
+    assert folder.is_dir()
+    assert f"pip install -e {folder}\n" in out
+    assert "vibench check dual:my-cone\n" in out
+    assert str(folder / "src/vibench_my_cone/strategy.py") in out
+
+
+BAD = ["", "Rope", "1rope", "rope_1", "rope-", "-rope", "my--rope", "ro pe", "../rope", "röpe", "rope\n", "a" * 41]
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_a_name_that_cannot_be_one_is_refused(name: str, main: Main) -> None:
+    refused(main("new", "problem", "--", name), "cannot be the name of a plugin", "such as 'my-problem'")
+    assert list(Path.cwd().iterdir()) == []
+
+
+@given(st.from_regex(scaffold.NAME) | st.text(max_size=12))
+def test_a_name_that_is_accepted_is_good_everywhere(name: str) -> None:
+    try:
+        scaffold.check_name("dual", name)
+    except RequestError:
+        return
+    assert f"vibench_{name.replace('-', '_')}".isidentifier()
+    assert name == name.lower() == name.strip()
+    assert name.isascii()
+
+
+def test_names_that_are_taken_are_refused(main: Main) -> None:
+    taken = registry.names("problem")[0]
+    refused(main("new", "problem", taken), f"there is a problem '{taken}' already", "choose another name")
+    refused(main("new", "primal", "strategies"), "vibench itself has a package of that name")
+    assert list(Path.cwd().iterdir()) == []
+    assert main("new", "dual", taken)[0] == 0
+
+
+def test_an_existing_folder_is_left_alone(main: Main) -> None:
+    Path("vibench-rope").mkdir()
+    Path("vibench-rope/notes.txt").write_text("precious")
+    refused(main("new", "problem", "rope"), "'vibench-rope' exists already", "--out")
+    assert Path("vibench-rope/notes.txt").read_text() == "precious"
+    assert [path.name for path in Path.cwd().iterdir()] == ["vibench-rope"]
+
+
+def test_a_file_is_no_folder_to_write_in(main: Main) -> None:
+    Path("file").touch()
+    refused(main("new", "problem", "rope", "--out", "file"), "'file' is a file; expected a folder")
+    refused(main("new", "problem", "rope", "--out", "file/below"), "'file/below' cannot be made")
+
+
+def test_a_kind_that_is_none_is_refused(main: Main) -> None:
+    refused(main("new", "solver", "rope"), "solver", "problem")
+
+
+def test_nothing_is_left_of_a_package_that_could_not_be_written(main: Main, monkeypatch: pytest.MonkeyPatch) -> None:
+    written = 0
+    write = Path.write_text
+
+    def full(path: Path, *arguments: object, **more: object) -> int:
+        nonlocal written
+        written += 1
+        if written == 3:
+            raise OSError(28, "No space left on device")
+        return write(path, *arguments, **more)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(Path, "write_text", full)
+    code, out, err = main("new", "problem", "rope")
+    assert (code, out, err) == (1, "", "vibench: 'vibench-rope' cannot be written: No space left on device\n")
+    assert list(Path.cwd().iterdir()) == []

@@ -1,0 +1,69 @@
+"""Solvers on the small program: who solves it, who does not, and who takes the process along."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from vibench.cli.solver_check import ACCURACY, UNKNOWNS, attempt, attempts, program
+from vibench.qp.solve import installed_solvers, solve_qp
+from vibench.qp.status import Status
+from vibench.study import registry
+
+
+@pytest.fixture
+def _fakes(plugins_folder: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    monkeypatch.syspath_prepend(str(plugins_folder))
+    registry._registered.cache_clear()
+    yield
+    registry._registered.cache_clear()
+
+
+def test_the_program_has_constraints_that_hold_and_constraints_that_do_not_matter() -> None:
+    wire = program()
+    free = np.linalg.solve(wire.A, wire.f)
+    assert np.any(wire.B @ free > wire.g)
+    answer = solve_qp(wire, "piqp", ACCURACY)
+    assert answer.x is not None
+    active = np.abs(wire.B @ answer.x - wire.g) < 1e-6 * wire.g
+    assert 0 < active.sum() < UNKNOWNS
+
+
+def test_every_installed_solver_solves_the_program() -> None:
+    found = attempts(installed_solvers())
+    assert list(found) == installed_solvers()
+    for trial in found.values():
+        assert (trial.status, trial.reason) == (Status.OK, "")
+        assert trial.residual is not None
+        assert 0.0 < trial.residual <= ACCURACY
+
+
+@pytest.mark.usefixtures("_fakes")
+def test_what_goes_wrong_is_said_and_costs_nobody_else_a_trial() -> None:
+    found = attempts(["wrong", "raises", "leaves", "segfaults", "careful", "dies", "chatty"])
+    assert list(found) == ["wrong", "raises", "leaves", "segfaults", "careful", "dies", "chatty"]
+    assert {name: trial.status for name, trial in found.items()} == {
+        "wrong": Status.INACCURATE, "raises": Status.ERROR, "leaves": Status.ERROR, "segfaults": Status.CRASHED,
+        "careful": Status.OK, "dies": Status.CRASHED, "chatty": Status.OK,
+    }  # fmt: skip
+    assert found["raises"].reason == "RuntimeError: the solver gave in"
+    assert "SystemExit" in found["leaves"].reason
+    assert "7" in found["dies"].reason
+
+
+@pytest.mark.usefixtures("_fakes")
+def test_a_solver_that_hangs_is_stopped() -> None:
+    trial = attempts(["hangs"], seconds=1.0)["hangs"]
+    assert (trial.status, trial.residual) == (Status.TIMEOUT, None)
+    assert "1 s" in trial.reason
+
+
+@pytest.mark.usefixtures("_fakes")
+def test_a_wrong_answer_is_not_believed() -> None:
+    trial = attempt("wrong")
+    assert trial.status is Status.INACCURATE
+    assert trial.residual is not None
+    assert trial.residual > ACCURACY

@@ -1,0 +1,171 @@
+"""Where stages run: the same numbers on a dask cluster, and what becomes of workers that die or are of no use."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import time
+from collections.abc import Iterator
+from concurrent.futures import wait
+from pathlib import Path
+
+import pytest
+from distributed import LocalCluster
+from fake_stages import KillsItsParent, Whole
+from running import Vibench, assert_same_numbers, read_until, started
+from samples import wire_study, write_study
+
+from vibench.errors import ExecutorError, RequestError
+from vibench.execution import dask
+from vibench.execution.dask import Dask
+from vibench.execution.executors import Local
+from vibench.execution.supervisor import Job
+from vibench.stages.artefacts import Store
+from vibench.stages.base import Done, Stage
+
+
+def elsewhere(_: str) -> tuple[bool, str, str]:
+    """What a worker says that does not see the folder of the artefacts."""
+    return dask._describe("/on/another/machine")
+
+
+def job(stage: Stage, store: Path) -> Job:
+    return Job(str(store), stage, 1.0, 60.0, 8.0)
+
+
+@pytest.fixture(scope="module")
+def cluster() -> Iterator[LocalCluster]:
+    """A cluster as somebody might have it, with TCP between its processes."""
+    with LocalCluster(
+        n_workers=2, threads_per_worker=1, protocol="tcp", dashboard_address="127.0.0.1:0", silence_logs="CRITICAL"
+    ) as made:
+        yield made
+
+
+def test_local_workers_run_side_by_side(tmp_path: Path) -> None:
+    workers = Local(2, tmp_path / "log")
+    try:
+        stages = [Whole(f"fine {k}", str(tmp_path / "diary")) for k in range(6)]
+        done = wait([workers.submit(job(stage, tmp_path)) for stage in stages], timeout=60).done
+        assert all(isinstance(future.result(), Done) for future in done)
+        assert len(done) == 6
+    finally:
+        workers.close()
+    processes = {line.split()[0] for line in (tmp_path / "diary").read_text().splitlines()}
+    assert len(processes) == 2
+    for process in processes:
+        with pytest.raises(ProcessLookupError):
+            os.kill(int(process), 0)
+    assert not (tmp_path / "log").exists()  # nothing was printed
+
+
+def test_a_cluster_somebody_has_is_used_and_left_alone(cluster: LocalCluster, tmp_path: Path) -> None:
+    for k in range(2):
+        workers = Dask(cluster.scheduler_address, 1, tmp_path)
+        try:
+            assert workers.slots == 2
+            stage = Whole(f"fine {k}")
+            assert isinstance(workers.submit(job(stage, tmp_path)).result(timeout=60), Done)
+            assert Store(tmp_path).get(stage.key) is not None
+            endless = workers.submit(job(Whole("sleep", str(tmp_path / f"diary {k}")), tmp_path))
+            while not (tmp_path / f"diary {k}").exists():
+                time.sleep(0.05)
+        finally:
+            workers.close()
+        worker = int((tmp_path / f"diary {k}").read_text().split()[0])
+        with pytest.raises(ProcessLookupError):  # nothing of ours goes on there
+            os.kill(worker, 0)
+        with pytest.raises(ExecutorError):
+            endless.result(timeout=10)
+    assert list(tmp_path.glob("*.part")) == []
+
+
+def test_a_dask_worker_that_dies_is_survived(cluster: LocalCluster, tmp_path: Path) -> None:
+    workers = Dask(cluster.scheduler_address, 1, tmp_path)
+    try:
+        stages = [KillsItsParent(str(tmp_path / f"diary {k}")) for k in range(2)]
+        futures = [workers.submit(job(stage, tmp_path)) for stage in stages]
+        for k, future in enumerate(futures):
+            assert isinstance(future.result(timeout=90), Done)
+            assert len((tmp_path / f"diary {k}").read_text().splitlines()) >= 2  # it was begun again
+    finally:
+        workers.close()
+
+
+def test_workers_with_another_vibench_are_refused(
+    cluster: LocalCluster, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(dask, "code_here", lambda: "mine")
+    with pytest.raises(RequestError, match=r"the dask worker tcp://.* has other code: .* instead of mine"):
+        Dask(cluster.scheduler_address, 1, tmp_path)
+
+
+def test_workers_that_do_not_see_the_artefacts_are_refused(
+    cluster: LocalCluster, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(dask, "_describe", elsewhere)
+    with pytest.raises(RequestError, match="does not see the artefacts"):
+        Dask(cluster.scheduler_address, 1, tmp_path)
+
+
+def test_a_cluster_that_is_shut_down_stops_the_run_with_a_line_and_it_goes_on_without(
+    command: str, plugins_folder: Path, vibench: Vibench, tmp_path: Path
+) -> None:
+    waits = {"name": "cone-waits", "options": {"file": str(tmp_path / "go on")}}
+    path = write_study(tmp_path, wire_study(dual=["cpg", waits]))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(plugins_folder)  # which processes that are spawned inherit
+        cluster = LocalCluster(n_workers=2, threads_per_worker=1, protocol="tcp", dashboard_address="127.0.0.1:0")
+    options = ["run", path, "--executor", "dask", "--scheduler", cluster.scheduler_address]
+    with started([command, *options], tmp_path, plugins_folder) as process:
+        read_until(process, "[1/2] ok")
+        cluster.close()
+        _, err = process.communicate(timeout=90)
+    assert process.returncode == 1
+    assert err.splitlines()[-1].startswith("vibench: the dask ")
+    assert err.splitlines()[-1].endswith("the same command goes on from here")
+    (tmp_path / "go on").touch()
+    done = vibench(tmp_path, "run", path)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert "2 cells, 1 to run" in done.stdout
+    assert "2 cells, 2 ok" in done.stdout
+
+
+def test_a_scheduler_that_does_not_answer_is_named(vibench: Vibench, tmp_path: Path) -> None:
+    path = write_study(tmp_path, wire_study())
+    done = vibench(tmp_path, "run", path, "--executor", "dask", "--scheduler", "tcp://127.0.0.1:9")
+    assert done.returncode == 2
+    assert re.fullmatch(r"vibench: no dask scheduler answers at 'tcp://127.0.0.1:9'.*\n", done.stderr)
+
+
+def test_a_scheduler_without_dask_is_refused(vibench: Vibench, tmp_path: Path) -> None:
+    done = vibench(tmp_path, "run", write_study(tmp_path, wire_study()), "--scheduler", "tcp://127.0.0.1:9")
+    assert (done.returncode, done.stderr) == (
+        2, "vibench: --scheduler tcp://127.0.0.1:9 is for --executor dask\n",
+    )  # fmt: skip
+
+
+def test_without_dask_the_extra_is_named(command: str, tmp_path: Path) -> None:
+    (tmp_path / "hidden").mkdir()
+    (tmp_path / "hidden" / "distributed.py").write_text("raise ImportError('not here')\n")
+    path = write_study(tmp_path, wire_study(problem=["obstacle"]))
+    environment = os.environ | {"PYTHONPATH": str(tmp_path / "hidden")}
+    arguments = [command, "run", path, "--executor", "dask"]
+    done = subprocess.run(arguments, env=environment, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.returncode == 2
+    assert "install vibench with its extra 'cluster'" in done.stderr
+
+
+def test_dask_changes_no_number(vibench: Vibench, tmp_path: Path) -> None:
+    study = wire_study(
+        problem=[{"name": "wire", "options": {"nodes": 40}}],
+        primal=["online-supremizers", "offline-pga"],
+        solvers=["piqp", "osqp", "gives-up"],
+        tolerances=[{"pod": [1e-3], "dual": [1e-2], "primal": {"offline-pga": [0.5]}}],
+    )
+    path = write_study(tmp_path, study)
+    for executor in ("local", "dask"):
+        done = vibench(tmp_path, "run", path, "--jobs", "2", "--executor", executor, "--out", executor, "--fresh")
+        assert (done.returncode, done.stderr) == (0, "")
+    assert_same_numbers(tmp_path / "local", tmp_path / "dask")

@@ -1,0 +1,104 @@
+"""The columns that name a cell or a history."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from samples import STUDY, changed, write_study
+
+from vibench.execution.row_keys import HistoryNames, cell_columns
+from vibench.execution.run import queries_stage
+from vibench.interfaces.strategies import Stop
+from vibench.results.schema import HISTORY_KEYS, KEYS
+from vibench.stages.base import Stage
+from vibench.stages.infsup_constants import ReferenceConstants
+from vibench.stages.offline import ConeStage, EnrichmentStage, PODStage
+from vibench.stages.snapshots import HighFidelity
+from vibench.study.cells import Cell, expand
+from vibench.study.reader import load_study
+from vibench.study.spec import Study
+
+
+@pytest.fixture
+def study(tmp_path: Path) -> Study:
+    """A study in which every axis has a label of its own."""
+    content = changed(STUDY, "problem", 0, "label", to="membrane")
+    content = changed(content, "dual", to=[{"name": "mcpg", "label": "widened"}])
+    content = changed(content, "primal", to=[{"name": "offline-pga", "label": "greedy"}])
+    return load_study(write_study(tmp_path, content))
+
+
+@pytest.fixture
+def cell(study: Study) -> Cell:
+    return expand(study)[0]
+
+
+def stages_of(stage: Stage) -> Iterator[Stage]:
+    yield stage
+    for needed in stage.inputs():
+        yield from stages_of(needed)
+
+
+def first(stages: Sequence[Stage], sort: type) -> Stage:
+    return next(stage for stage in stages if type(stage) is sort)
+
+
+@pytest.fixture
+def stages(cell: Cell, study: Study) -> list[Stage]:
+    return list(stages_of(queries_stage(cell, study)))
+
+
+def test_a_cell_is_named_by_the_key_columns(cell: Cell) -> None:
+    columns = cell_columns(cell)
+    assert tuple(columns) == tuple(KEYS)
+    assert columns == {
+        "problem": "membrane", "problem_options": '{"resolution": "coarse"}', "dual": "widened", "dual_options": "{}",
+        "primal": "greedy", "primal_options": "{}", "pod_tol": 1e-2, "pod_size": None, "dual_tol": 1e-1,
+        "dual_size": None, "primal_tol": 0.5, "solver": "piqp", "assembly": "full",
+    }  # fmt: skip
+
+
+def test_prescribed_sizes_have_columns_of_their_own(cell: Cell) -> None:
+    columns = cell_columns(replace(cell, pod=Stop(size=5), cone=Stop(size=4)))
+    assert [columns[name] for name in ("pod_tol", "pod_size", "dual_tol", "dual_size")] == [None, 5, None, 4]
+
+
+PROBLEM = {"problem", "problem_options"}
+POD = PROBLEM | {"pod_tol", "pod_size"}
+CONE = PROBLEM | {"dual", "dual_options", "dual_tol", "dual_size"}
+
+
+@pytest.mark.parametrize(
+    ("sort", "names"),
+    [
+        (HighFidelity, PROBLEM),
+        (PODStage, POD),
+        (ConeStage, CONE),
+        (EnrichmentStage, POD | CONE | {"primal", "primal_options", "primal_tol"}),
+        (ReferenceConstants, set()),
+    ],
+)
+def test_a_history_is_named_by_what_its_stage_depends_on(
+    sort: type, names: set[str], cell: Cell, stages: list[Stage]
+) -> None:
+    columns = HistoryNames([cell]).columns(first(stages, sort))
+    assert set(columns) == names
+    assert set(columns) <= set(HISTORY_KEYS)
+    of_cell = cell_columns(cell)
+    assert columns == {name: of_cell[name] for name in names}
+
+
+def test_every_stage_of_every_cell_has_names(study: Study) -> None:
+    cells = expand(study)
+    names = HistoryNames(cells)
+    for cell in cells:
+        for stage in stages_of(queries_stage(cell, study)):
+            assert set(names.columns(stage)) <= set(HISTORY_KEYS)
+
+
+def test_the_first_of_two_labels_names_the_history(cell: Cell, stages: list[Stage]) -> None:
+    other = replace(cell, labels=("x", "y", "z"), solver="osqp")
+    assert HistoryNames([cell, other]).columns(first(stages, PODStage))["problem"] == "membrane"

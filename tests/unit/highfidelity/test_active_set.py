@@ -1,0 +1,128 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import scipy.sparse as sp
+from hypothesis import given
+from hypothesis import strategies as st
+from numerics import Varying, exact, spd
+
+from vibench.errors import NumericalError
+from vibench.highfidelity import active_set
+from vibench.interfaces.problem import VariationalInequality
+
+
+def string(n: int, gap: float, load: float) -> VariationalInequality:
+    """−u″ = −load on (0, 1), u ≥ −gap, with lumped constraints on every inner node."""
+    h = 1.0 / (n + 1)
+    A = sp.diags_array([2.0 * np.ones(n), -np.ones(n - 1), -np.ones(n - 1)], offsets=[0, 1, -1]) / h
+    return VariationalInequality(sp.csc_array(A), -load * h * np.ones(n), -h * sp.eye_array(n), h * gap * np.ones(n))
+
+
+def test_the_string_on_a_table_against_its_closed_form() -> None:
+    """Contact from s on with s = √(2 gap/load); u = −gap + load (s − x)²/2 before; the multiplier is the load."""
+    gap, load, n = 0.02, 1.0, 999
+    solution = active_set.solve_high_fidelity(string(n, gap, load))
+    s = np.sqrt(2.0 * gap / load)
+    x = np.linspace(0.0, 1.0, n + 2)[1:-1]
+    nearest = np.minimum(x, 1.0 - x)
+    exact_u = np.where(nearest < s, -gap + 0.5 * load * (s - nearest) ** 2, -gap)
+    assert np.abs(solution.u - exact_u).max() < 2e-6
+    inside = nearest > s + 2e-3
+    assert np.allclose(solution.lam[inside], load, rtol=1e-8)
+    assert np.all(solution.lam[nearest < s - 2e-3] == 0.0)
+
+
+@given(st.integers(0, 10_000))
+def test_every_solution_is_that_of_the_right_active_set(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    vi = VariationalInequality(spd(7, rng), rng.standard_normal(7), rng.standard_normal((4, 7)), rng.random(4) * 0.2)
+    sparse = VariationalInequality(sp.csc_array(vi.A), vi.f, sp.csr_array(vi.B), vi.g)
+    found = active_set.solve_high_fidelity(sparse)
+    x, alpha = exact(vi)
+    assert np.allclose(found.u, x, atol=1e-8)
+    assert np.allclose(found.lam, alpha, atol=1e-7)
+    assert found.residuals.worst <= 1e-10
+
+
+def test_kkt_conditions_hold_with_exact_zeros() -> None:
+    problem = Varying()
+    for mu in problem.training_set():
+        vi = problem.assemble(mu)
+        found = active_set.solve_high_fidelity(vi)
+        assert np.abs(vi.A @ found.u + vi.B.T @ found.lam - vi.f).max() <= 1e-10 * np.abs(vi.f).max()
+        assert np.all(found.lam >= 0.0)
+        gap = vi.B @ found.u - vi.g
+        assert gap.max() <= 1e-10
+        assert np.all((found.lam == 0.0) | (np.abs(gap) <= 1e-10))
+        assert 0 < np.count_nonzero(found.lam) < 8
+
+
+def test_a_cycling_active_set_is_helped_and_the_help_is_recorded(monkeypatch: pytest.MonkeyPatch) -> None:
+    vi = string(50, 0.02, 1.0)
+    alone = active_set.solve_high_fidelity(vi)
+    assert alone.fallback == ""
+    iterate, calls = active_set._active_set_iterations, []
+
+    def cycles_at_first(system, active):
+        calls.append(active)
+        return None if len(calls) == 1 else iterate(system, active)
+
+    monkeypatch.setattr(active_set, "_active_set_iterations", cycles_at_first)
+    helped = active_set.solve_high_fidelity(vi)
+    assert "cycled" in helped.fallback
+    assert np.allclose(helped.u, alone.u, atol=1e-12)
+    assert np.array_equal(helped.lam == 0.0, alone.lam == 0.0)
+
+
+def test_no_active_constraint_and_all_active() -> None:
+    free = active_set.solve_high_fidelity(string(20, 10.0, 1.0))
+    assert np.all(free.lam == 0.0)
+    pressed = active_set.solve_high_fidelity(string(20, 0.0, 1.0))
+    assert np.allclose(pressed.lam, 1.0)
+    assert np.abs(pressed.u).max() < 1e-15
+
+
+def test_an_infeasible_problem_is_refused() -> None:
+    B = sp.csr_array(np.array([[1.0, 0.0], [-1.0, 0.0]]))
+    vi = VariationalInequality(sp.csc_array(np.eye(2)), np.ones(2), B, np.array([-1.0, -1.0]))
+    with pytest.raises(NumericalError):
+        active_set.solve_high_fidelity(vi)
+
+
+def test_a_contact_set_that_moves_node_by_node_is_followed_to_its_end() -> None:
+    """A soft rope on hills, every node of which is constrained: after Haasdonk, Salomon and Wohlmuth (2012)."""
+    half = 320
+    step, nodes = 0.5 / half, 2 * half - 1
+    x = step * np.arange(1, nodes + 1)
+    difference = sp.diags_array([1.0, -1.0], offsets=[0, -1], shape=(nodes + 1, nodes)).tocsr()
+    left, right = (part.T @ part / step for part in (difference[:half], difference[half:]))
+    obstacle = -0.2 * (np.sin(np.pi * x) - np.sin(3.0 * np.pi * x)) - 0.5
+    lumped = sp.diags_array(np.full(nodes, step)).tocsr()
+    vi = VariationalInequality(0.05 * left + 0.15 * right, np.full(nodes, -step), -lumped, -step * obstacle)
+    found = active_set.solve_high_fidelity(vi)
+    assert found.iterations > active_set.MAX_ITERATIONS
+    assert found.fallback == ""
+    assert np.all(found.u >= obstacle - 1e-12)
+
+
+def test_a_stiffness_that_is_not_symmetric_is_refused_and_where() -> None:
+    problem, mu = Varying(), np.array([0.5])
+    solver, vi = active_set.HighFidelitySolver(problem), problem.assemble(mu)
+    solver.solve_assembled(mu, vi)
+    solver.check_coercive(mu, vi)
+    crooked = vi.A.tolil()
+    crooked[0, 1] *= 1.001
+    with pytest.raises(NumericalError, match=r"A at mu = \[0.5\] is not symmetric"):
+        solver.check_coercive(mu, replace(vi, A=sp.csc_array(crooked)))
+
+
+def test_constraints_that_touch_nothing_leave_a_linear_problem() -> None:
+    problem, mu = Varying(), np.array([0.5])
+    vi = problem.assemble(mu)
+    free = replace(vi, B=sp.csr_array(vi.B.shape), g=np.ones(len(vi.g)))
+    found = active_set.HighFidelitySolver(problem).solve_assembled(mu, free)
+    assert np.allclose(found.u, np.linalg.solve(vi.A.toarray(), vi.f))
+    assert not found.lam.any()

@@ -1,0 +1,71 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import scipy.sparse as sp
+from numerics import Varying
+
+from vibench.errors import NumericalError
+from vibench.interfaces.problem import ParameterBox, VariationalInequality
+from vibench.interfaces.validation import checked_assembly
+from vibench.stages.assemblies import Assemblies
+
+BOX = ParameterBox(("a", "b"), np.array([0.0, -1.0]), np.array([1.0, 3.0]), ("1", "m"))
+
+
+def test_grid_runs_over_the_last_parameter_first_and_reaches_the_bounds() -> None:
+    grid = BOX.grid(2, 3)
+    assert grid.tolist() == [[0, -1], [0, 1], [0, 3], [1, -1], [1, 1], [1, 3]]
+
+
+def test_samples_lie_in_the_box_and_depend_on_nothing_but_the_seed() -> None:
+    sample = BOX.sample(50, seed=7)
+    assert np.all((sample >= BOX.lower) & (sample <= BOX.upper))
+    assert np.array_equal(sample, BOX.sample(50, seed=7))
+    assert not np.array_equal(sample, BOX.sample(50, seed=8))
+    assert np.array_equal(sample[:10], BOX.sample(10, seed=7))
+
+
+def test_an_ordinary_assembly_passes() -> None:
+    problem = Varying()
+    vi = checked_assembly(problem, np.array([0.3]))
+    assert vi.B.shape == (8, 30)
+    assert np.isclose(problem.multiplier_integrals().sum(), problem.W.matrix.sum())
+
+
+@pytest.mark.parametrize(
+    ("member", "wrong", "message"),
+    [
+        ("A", lambda vi: vi.A[:-1], r"A has shape \(29, 30\).*ask for \(30, 30\)"),
+        ("g", lambda vi: np.append(vi.g, 1.0), r"g has shape \(9,\)"),
+        ("f", lambda vi: vi.f * np.nan, "f has entries that are not finite"),
+        ("B", lambda vi: sp.csr_array(vi.B * np.inf), "B has entries that are not finite"),
+    ],
+)
+def test_a_wrong_assembly_is_named(monkeypatch: pytest.MonkeyPatch, member, wrong, message) -> None:
+    problem = Varying()
+    good = problem.assemble(np.array([0.3]))
+    with np.errstate(invalid="ignore"):
+        bad: VariationalInequality = replace(good, **{member: wrong(good)})
+    monkeypatch.setattr(problem, "assemble", lambda mu: bad)
+    with pytest.raises(NumericalError, match=message):
+        checked_assembly(problem, np.array([0.3]))
+
+
+def test_assemblies_are_kept_up_to_a_limit_and_those_of_longest_ago_go_first() -> None:
+    problem = Varying()
+    one, two, three = (np.array([value]) for value in (0.2, 0.5, 0.8))
+    given_before = problem.assemble(one)
+    size = 12 * (given_before.A.nnz + given_before.B.nnz) + given_before.f.nbytes + given_before.g.nbytes
+    kept = Assemblies(problem, limit=int(2.5 * size))
+    assert kept.keep(one, given_before) is given_before
+    assert kept.keep(one, given_before) is given_before  # counted once
+    second = kept.at(two)
+    assert kept.at(one) is given_before
+    assert kept.at(two) is second
+    kept.at(one)
+    kept.at(three)  # for which the second has to go
+    assert kept.at(one) is given_before
+    assert kept.at(two) is not second

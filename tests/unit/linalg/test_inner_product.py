@@ -1,0 +1,80 @@
+from __future__ import annotations
+
+import pickle
+
+import numpy as np
+import pytest
+import scipy.sparse as sp
+from hypothesis import given
+from hypothesis import strategies as st
+from numerics import space, spd
+
+from vibench.errors import NumericalError
+from vibench.linalg.inner_product import InnerProduct
+
+seeds = st.integers(0, 10_000)
+
+
+@given(seeds, st.integers(1, 20))
+def test_whitening_carries_the_inner_product(seed: int, n: int) -> None:
+    X = space(n, seed)
+    rng = np.random.default_rng(seed)
+    u, v = rng.standard_normal((n, 3)), rng.standard_normal((n, 2))
+    assert np.allclose(X.whiten(u).T @ X.whiten(v), X.gram(u, v), atol=1e-11)
+    assert np.allclose(X.gram(u, v), u.T @ X.matrix.toarray() @ v, atol=1e-11)
+    assert np.allclose(X.unwhiten(X.whiten(u)), u, atol=1e-12)
+    assert np.allclose(X.norm(u), np.sqrt(np.diag(X.gram(u, u))))
+
+
+@given(seeds, st.integers(1, 20))
+def test_riesz_representer_represents(seed: int, n: int) -> None:
+    X = space(n, seed)
+    rng = np.random.default_rng(seed)
+    functional, v = rng.standard_normal(n), rng.standard_normal((n, 4))
+    assert np.allclose(X.gram(X.riesz(functional), v), functional @ v, atol=1e-11)
+    whitened = X.whiten_functional(functional)
+    assert np.allclose(whitened, X.whiten(X.riesz(functional)), atol=1e-12)
+    assert np.isclose(np.linalg.norm(whitened), np.sqrt(functional @ X.riesz(functional)))
+
+
+@given(seeds)
+def test_orthonormalisation_keeps_the_span_and_leaves_out_what_is_there(seed: int) -> None:
+    X = space(15, seed)
+    rng = np.random.default_rng(seed)
+    first = X.orthonormalise(rng.standard_normal((15, 4)))
+    added = X.orthonormalise(np.hstack([rng.standard_normal((15, 3)), first]), first)
+    Z = np.hstack([first, added])
+    assert Z.shape == (15, 7)
+    assert np.allclose(X.gram(Z, Z), np.eye(7), atol=1e-12)
+
+
+def test_empty_bases_are_fine() -> None:
+    X = space(5)
+    nothing = np.zeros((5, 0))
+    assert X.orthonormalise(nothing).shape == (5, 0)
+    assert X.orthonormalise(np.zeros((5, 2))).shape == (5, 0)
+    assert X.gram(nothing, nothing).shape == (0, 0)
+    assert X.whiten_functional(nothing).shape == (5, 0)
+
+
+@pytest.mark.parametrize(
+    ("matrix", "message"),
+    [
+        (np.array([[1.0, 2.0], [2.0, 1.0]]), "not positive definite"),
+        (np.array([[1.0, 0.5], [0.0, 1.0]]), "not symmetric"),
+        (np.ones((2, 3)), "must be square"),
+        (np.array([[np.nan, 0.0], [0.0, 1.0]]), "not finite"),
+        (np.zeros((2, 2)), "factorised|not positive definite"),
+        (-spd(3, np.random.default_rng(0)), "not positive definite"),
+    ],
+)
+def test_what_is_no_inner_product_is_refused(matrix: np.ndarray, message: str) -> None:
+    with pytest.raises(NumericalError, match=message):
+        InnerProduct(sp.csc_array(matrix))
+
+
+def test_an_inner_product_travels_between_processes() -> None:
+    X = space(6)
+    u = np.arange(6.0)
+    copy = pickle.loads(pickle.dumps(X))
+    assert np.array_equal(copy.whiten(u), X.whiten(u))

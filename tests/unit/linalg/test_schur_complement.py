@@ -1,0 +1,104 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import scipy.sparse as sp
+from hypothesis import given
+from hypothesis import strategies as st
+from numerics import Varying, spd
+
+from vibench.errors import NumericalError
+from vibench.highfidelity import active_set
+from vibench.highfidelity.active_set import HighFidelitySolver
+from vibench.highfidelity.kkt_systems import Stiffness
+from vibench.interfaces.problem import VariationalInequality
+from vibench.linalg.schur_complement import Condensed, Pattern, Submatrix
+
+
+def sparse_spd(n: int, rng: np.random.Generator) -> sp.csc_array:
+    """A sparse SPD matrix in which most unknowns couple to few others."""
+    links = sp.random_array((n, n), density=1.0 / n, rng=rng)
+    return sp.csc_array(links @ links.T + sp.eye_array(n))
+
+
+@given(st.integers(0, 10_000), st.integers(0, 12), st.booleans())
+def test_equilibrium_with_the_kept_unknowns_given(seed: int, count: int, reused: bool) -> None:
+    rng = np.random.default_rng(seed)
+    A, f = sparse_spd(12, rng), rng.standard_normal(12)
+    kept = np.sort(rng.permutation(12)[:count])
+    others = np.setdiff1d(np.arange(12), kept)
+    condensed = Condensed(A, Pattern.of(A, kept), reused=reused)
+    dense = A.toarray()
+    inner = np.linalg.inv(dense[np.ix_(others, others)])
+    taken = dense[np.ix_(kept, others)] @ inner
+    assert np.allclose(condensed.matrix.toarray(), dense[np.ix_(kept, kept)] - taken @ dense[np.ix_(others, kept)])
+    load, free = condensed.load(f)
+    assert np.allclose(load, f[kept] - taken @ f[others])
+    u_kept = rng.standard_normal(count)
+    u = condensed.expand(u_kept, free)
+    assert np.allclose(u[kept], u_kept)
+    assert np.allclose((dense @ u - f)[others], 0.0, atol=1e-10)
+    disturbed = u + rng.standard_normal(12) * np.isin(np.arange(12), others)
+    settled = disturbed + condensed.settle(f - dense @ disturbed)
+    assert np.array_equal(settled[kept], disturbed[kept])
+    assert np.allclose((dense @ settled - f)[others], 0.0, atol=1e-10)
+
+
+@given(st.integers(0, 10_000), st.integers(0, 12))
+def test_submatrices_follow_their_matrix_through_changes_of_its_sparsity(seed: int, count: int) -> None:
+    rng = np.random.default_rng(seed)
+    chosen = rng.permutation(12)[:count]
+    submatrix, A = Submatrix(chosen), sp.csr_array(sparse_spd(12, rng))
+    unsorted = A[::-1][:, rng.permutation(12)]
+    for matrix in (A, 2.0 * A, unsorted, A, sp.csr_array(sparse_spd(12, rng))):
+        found = submatrix.of(matrix)
+        assert np.array_equal(found.toarray(), matrix.toarray()[np.ix_(chosen, chosen)])
+        found.data[:] = np.nan
+        for used in (found, matrix):  # as libraries do
+            used.sort_indices()
+
+
+def test_a_load_that_changes_is_not_remembered() -> None:
+    A = sparse_spd(12, np.random.default_rng(0))
+    condensed = Condensed(A, Pattern.of(A, np.arange(3)))
+    one, two = np.ones(12), np.arange(12.0)
+    assert not np.allclose(condensed.load(one)[0], condensed.load(two)[0])
+    assert np.allclose(condensed.load(one)[0] + condensed.load(two)[0], condensed.load(one + two)[0])
+
+
+@given(st.integers(0, 10_000), st.integers(1, 6))
+def test_condensed_systems_have_the_solutions_of_the_whole_ones(seed: int, touched: int) -> None:
+    rng = np.random.default_rng(seed)
+    A, kept = sparse_spd(14, rng), np.sort(rng.permutation(14)[:touched])
+    B = np.zeros((touched, 14))
+    B[:, kept] = np.triu(spd(touched, rng))
+    vi = VariationalInequality(A, rng.standard_normal(14), sp.csr_array(B), 0.2 * rng.random(touched))
+    whole = active_set.solve_high_fidelity(vi)
+    condensed = active_set.solve_high_fidelity(vi, Stiffness(A, Pattern.of(A, kept)), start=rng.random(touched) > 0.5)
+    assert np.allclose(condensed.u, whole.u, atol=1e-9)
+    assert np.allclose(condensed.lam, whole.lam, atol=1e-9)
+
+
+@pytest.mark.parametrize("declared", [True, False])
+def test_a_sweep_gives_the_solutions_of_single_solves(declared: bool) -> None:
+    class Declaring(Varying):
+        contact_dofs = property(lambda self: np.arange(8, 52))
+
+    problem = (Declaring if declared else Varying)(n=60)
+    solver, iterations = HighFidelitySolver(problem), []
+    for mu in problem.training_set():
+        found, alone = solver.solve(mu), active_set.solve_high_fidelity(problem.assemble(mu))
+        assert np.allclose(found.u, alone.u, atol=1e-10)
+        assert np.array_equal(found.lam > 0.0, alone.lam > 0.0)
+        iterations.append((found.iterations, alone.iterations))
+    warm, cold = np.sum(iterations[1:], axis=0)
+    assert warm < cold
+
+
+def test_a_constraint_outside_the_declared_contact_is_refused() -> None:
+    class Declaring(Varying):
+        contact_dofs = property(lambda self: np.arange(14, 52))
+
+    problem = Declaring(n=60)
+    with pytest.raises(NumericalError, match="B touches 1 unknowns outside the declared contact_dofs, the first is 13"):
+        HighFidelitySolver(problem).solve(problem.training_set()[0])

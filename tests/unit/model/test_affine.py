@@ -1,0 +1,248 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import scipy.sparse as sp
+from hypothesis import given
+from hypothesis import strategies as st
+from numerics import Varying, spd
+
+from vibench.errors import NumericalError
+from vibench.interfaces.problem import MEMBERS, Contact, VariationalInequality
+from vibench.model.affine import Evaluation, affine_decomposition
+
+NEW = np.array([0.37])
+
+
+class Counting(Varying):
+    """Counts what is assembled; its constraint touches few unknowns."""
+
+    def __init__(self, count: int = 7) -> None:
+        super().__init__(count=count)
+        self.assembled: list[float] = []
+        self.contacts: list[float] = []
+
+    def assemble(self, mu: np.ndarray) -> VariationalInequality:
+        self.assembled.append(float(mu[0]))
+        return super().assemble(mu)
+
+
+class Touching(Counting):
+    """Gives its constraint on the unknowns it touches."""
+
+    contact_dofs = property(lambda self: np.arange(2, 28))
+
+    def contact(self, mu: np.ndarray) -> Contact:
+        self.contacts.append(float(mu[0]))
+        vi = super().assemble(mu)
+        self.assembled.pop()
+        return Contact(vi.B[:, self.contact_dofs], vi.g)
+
+
+class Summed(Varying):
+    """A(mu) = Σ mu^q A_q and B(mu) = B_0 + max(0, mu − ½) B_1, zeros not stored, so that their patterns change."""
+
+    entrywise = frozenset({"A", "B"})
+
+    def __init__(self, seed: int = 0, powers: int = 3, count: int = 9) -> None:
+        super().__init__(12, 5, count)
+        rng = np.random.default_rng(seed)
+        self.powers = [
+            spd(12, rng) * (abs(np.subtract.outer(np.arange(12), np.arange(12))) <= q) for q in range(powers)
+        ]
+        halves = rng.random((5, 12)) < 0.5
+        self.constraints = [rng.random((5, 12)) * halves, rng.random((5, 12)) * ~halves]
+
+    def assemble(self, mu: np.ndarray) -> VariationalInequality:
+        vi = super().assemble(mu)
+        A = sum(mu[0] ** q * term for q, term in enumerate(self.powers))
+        B = self.constraints[0] + max(0.0, mu[0] - 0.5) * self.constraints[1]
+        return VariationalInequality(sp.csr_array(A), vi.f, sp.csr_array(B), vi.g)
+
+
+def declaring(base: type[Varying], **declarations: frozenset[str]) -> type[Varying]:
+    """A problem class that declares more."""
+    return type("Declaring", (base,), declarations)
+
+
+def dense(member: object) -> np.ndarray:
+    return member if isinstance(member, np.ndarray) else member.toarray()  # type: ignore[attr-defined]
+
+
+def rebuilt(member, value) -> np.ndarray:
+    """Σ θ_q · terms_q with θ_q the entries of a member that is known."""
+    value = dense(value)
+    sampled = value[member.rows] if value.ndim == 1 else value[member.rows, member.columns]
+    return sum(theta * dense(term) for theta, term in zip(sampled, member.terms, strict=True))
+
+
+def test_what_is_declared_constant_is_assembled_once_and_believed() -> None:
+    problem = declaring(Counting, constant=frozenset(MEMBERS))()
+    training = problem.training_set()
+    members = affine_decomposition(problem, training, 1e-8)
+    assert problem.assembled == [training[0, 0]]
+    first = Varying().assemble(training[0])
+    for name in MEMBERS:  # although they do vary
+        assert members[name].way is Evaluation.CONSTANT
+        assert np.array_equal(dense(members[name].terms[0]), dense(getattr(first, name)))
+        assert len(members[name].rows) == 0
+
+
+def test_where_only_the_constraint_varies_nothing_else_is_assembled() -> None:
+    problem = declaring(Touching, constant=frozenset({"A", "f"}))()
+    training = problem.training_set()
+    members = affine_decomposition(problem, training, 1e-8)
+    assert problem.assembled == [training[0, 0]]
+    assert problem.contacts == training.ravel().tolist()
+    assert {name: member.way for name, member in members.items()} == {
+        "A": Evaluation.CONSTANT,
+        "f": Evaluation.CONSTANT,
+        "B": Evaluation.CONTACT,
+        "g": Evaluation.CONTACT,
+    }
+
+
+def test_members_that_do_not_vary_are_found_whatever_is_declared() -> None:
+    for base in (Varying, declaring(Varying, entrywise=frozenset({"f"}))):
+        member = affine_decomposition(base(), base().training_set(), 1e-8)["f"]
+        assert member.way is Evaluation.CONSTANT
+        assert np.array_equal(member.terms[0], Varying().assemble(NEW).f)
+        assert member.error == 0.0
+
+
+def test_a_member_that_varies_little_is_not_constant() -> None:
+    class Trembling(Varying):
+        def assemble(self, mu: np.ndarray) -> VariationalInequality:
+            vi = super().assemble(mu)
+            return VariationalInequality(vi.A, vi.f * (1.0 + 1e-11 * mu[0]), vi.B, vi.g)
+
+    assert affine_decomposition(Trembling(), Trembling().training_set(), 1e-8)["f"].way is Evaluation.FULL
+
+
+def test_by_a_factor_is_one_term() -> None:
+    problem = declaring(Varying, entrywise=frozenset({"A"}))()
+    member = affine_decomposition(problem, problem.training_set(), 1e-12)["A"]
+    assert member.way is Evaluation.INTERPOLATED
+    assert len(member.terms) == len(member.rows) == len(member.columns) == 1
+    A = problem.assemble(NEW).A
+    assert np.allclose(rebuilt(member, A), A.toarray(), rtol=1e-12)
+
+
+@given(st.integers(0, 10_000), st.integers(2, 4))
+def test_a_symmetric_matrix_with_few_terms_is_rebuilt_in_full(seed: int, powers: int) -> None:
+    problem = Summed(seed, powers)
+    member = affine_decomposition(problem, problem.training_set(), 1e-11)["A"]
+    assert member.way is Evaluation.INTERPOLATED
+    assert len(member.terms) == powers
+    assert np.all(member.rows <= member.columns)
+    for term in member.terms:
+        assert np.array_equal(dense(term), dense(term).T)
+    for mu in (NEW, np.array([0.93])):
+        A = problem.assemble(mu).A.toarray()
+        assert np.allclose(rebuilt(member, A), A, atol=1e-9 * np.abs(A).max())
+
+
+def test_an_asymmetric_constraint_whose_pattern_changes_is_rebuilt_in_full() -> None:
+    problem = Summed()
+    stored = {problem.assemble(mu).B.nnz for mu in problem.training_set()}
+    assert len(stored) == 2
+    member = affine_decomposition(problem, problem.training_set(), 1e-12)["B"]
+    assert member.way is Evaluation.INTERPOLATED
+    assert len(member.terms) == 2
+    for mu in (NEW, np.array([0.5]), np.array([0.93])):
+        B = problem.assemble(mu).B
+        assert np.allclose(rebuilt(member, B), B.toarray(), atol=1e-13)
+
+
+def test_patterns_of_equal_size_in_different_places_are_told_apart() -> None:
+    class Moving(Varying):
+        entrywise = frozenset({"B"})
+
+        def assemble(self, mu: np.ndarray) -> VariationalInequality:
+            vi = super().assemble(mu)
+            row = np.arange(self._m)
+            B = sp.csr_array((np.full(self._m, 2.0), (row, row + (3 if mu[0] > 0.5 else 0))), shape=vi.B.shape)
+            return VariationalInequality(vi.A, vi.f, B, vi.g)
+
+    problem = Moving()
+    member = affine_decomposition(problem, problem.training_set(), 1e-12)["B"]
+    assert len(member.terms) == 2
+    for mu in problem.training_set():
+        B = problem.assemble(mu).B
+        assert np.allclose(rebuilt(member, B), B.toarray(), atol=1e-14)
+
+
+def test_vectors_are_interpolated_and_meet_the_tolerance() -> None:
+    problem = declaring(Varying, entrywise=frozenset({"g"}))()
+    for tolerance in (1e-1, 1e-2):
+        member = affine_decomposition(problem, problem.training_set(), tolerance)["g"]
+        assert member.way is Evaluation.INTERPOLATED
+        assert not member.columns.any()
+        values = [problem.assemble(mu).g for mu in problem.training_set()]
+        errors = [np.linalg.norm(rebuilt(member, g) - g) for g in values]
+        assert np.isclose(member.error, max(errors) / max(np.linalg.norm(g) for g in values), rtol=1e-6)
+        assert 0.0 < member.error <= tolerance
+
+
+def test_a_constraint_with_contact_is_left_to_it_unless_it_is_constant_or_interpolated() -> None:
+    members = affine_decomposition(Touching(), Touching().training_set(), 1e-8)
+    assert (members["B"].way, members["g"].way) == (Evaluation.CONTACT, Evaluation.CONTACT)
+    assert members["B"].terms == members["g"].terms == ()
+    assert members["B"].why == ""
+    assert members["A"].way is Evaluation.FULL  # contact says nothing of A
+    assert members["f"].way is Evaluation.CONSTANT
+    entrywise = declaring(Touching, entrywise=frozenset({"g"}))()
+    members = affine_decomposition(entrywise, entrywise.training_set(), 1e-2)
+    assert (members["B"].way, members["g"].way) == (Evaluation.CONTACT, Evaluation.INTERPOLATED)
+    believed = declaring(Touching, constant=frozenset({"A", "f", "g"}))()
+    members = affine_decomposition(believed, believed.training_set(), 1e-2)
+    assert (members["B"].way, members["g"].way) == (Evaluation.CONTACT, Evaluation.CONSTANT)
+
+
+@pytest.mark.parametrize("name", ["A", "B", "g"])
+def test_what_cannot_be_evaluated_apart_is_assembled_in_full_and_the_reason_names_it(name: str) -> None:
+    member = affine_decomposition(Varying(), Varying().training_set(), 1e-8)[name]
+    assert member.way is Evaluation.FULL
+    assert member.why == f"{name} depends on mu and the problem does not evaluate it entry by entry"
+    assert member.terms == ()
+
+
+def test_contact_that_does_not_say_which_unknowns_it_touches_is_not_used() -> None:
+    class Vague(Touching):
+        contact_dofs = None
+
+    member = affine_decomposition(Vague(), Vague().training_set(), 1e-8)["B"]
+    assert member.way is Evaluation.FULL
+    assert member.why.startswith("B depends on mu")
+
+
+def test_members_that_interpolation_does_not_compress_are_not_interpolated() -> None:
+    problem = declaring(Counting, entrywise=frozenset({"B"}))()
+    member = affine_decomposition(problem, problem.training_set(), 1e-10)["B"]
+    assert member.way is Evaluation.FULL
+    assert member.why == "B depends on mu, and interpolation needs 7 terms for 7 parameters"
+    touching = declaring(Touching, entrywise=frozenset({"B"}))()
+    assert affine_decomposition(touching, touching.training_set(), 1e-10)["B"].way is Evaluation.CONTACT
+    assert affine_decomposition(problem, problem.training_set(), 0.3)["B"].way is Evaluation.INTERPOLATED
+
+
+@pytest.mark.parametrize(("powers", "compressed"), [(3, True), (4, False)])
+def test_interpolation_may_take_three_quarters_of_the_training_parameters(powers: int, compressed: bool) -> None:
+    problem = Summed(powers=powers, count=4)
+    member = affine_decomposition(problem, problem.training_set(), 1e-11)["A"]
+    assert member.way is (Evaluation.INTERPOLATED if compressed else Evaluation.FULL)
+
+
+def test_members_come_in_their_order() -> None:
+    problem = declaring(Touching, constant=frozenset({"g"}))()
+    assert tuple(affine_decomposition(problem, problem.training_set(), 1e-8)) == MEMBERS
+
+
+def test_an_assembly_that_is_not_finite_is_refused() -> None:
+    class Broken(Varying):
+        def assemble(self, mu: np.ndarray) -> VariationalInequality:
+            vi = super().assemble(mu)
+            return VariationalInequality(vi.A, vi.f * (np.nan if mu[0] > 0.5 else 1.0), vi.B, vi.g)
+
+    with pytest.raises(NumericalError, match=r"f has entries that are not finite at mu = \[0\.66"):
+        affine_decomposition(Broken(), Broken().training_set(), 1e-8)

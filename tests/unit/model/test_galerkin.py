@@ -1,0 +1,101 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numerics import Varying
+
+from vibench.highfidelity import active_set
+from vibench.interfaces.strategies import Enrichment, Kind
+from vibench.model.galerkin import ReducedModel, project
+from vibench.qp.solve import solve_qp
+from vibench.reduction.supremizers import supremizers
+from vibench.stability.infsup import multipliers
+
+
+@pytest.fixture(scope="module")
+def solved():
+    problem = Varying()
+    mus = problem.training_set()
+    solutions = [active_set.solve_high_fidelity(problem.assemble(mu)) for mu in mus]
+    return problem, mus, solutions
+
+
+def model(problem, solutions, enrichment: Enrichment) -> ReducedModel:
+    chi = np.column_stack([s.lam for s in solutions])
+    cone = multipliers(chi / problem.W.norm(chi), problem.W)
+    basis = problem.V.orthonormalise(np.column_stack([s.u for s in solutions]))
+    return ReducedModel(problem, basis, enrichment, cone.chi, cone.span)
+
+
+def test_projection_is_galerkin(solved) -> None:
+    problem, mus, _ = solved
+    vi = problem.assemble(mus[2])
+    rng = np.random.default_rng(0)
+    Z, chi = rng.standard_normal((30, 3)), rng.random((8, 2))
+    found = project(vi, Z, chi)
+    x, alpha = rng.standard_normal(3), rng.random(2)
+    assert np.isclose(x @ found.A @ x, (Z @ x) @ (vi.A @ (Z @ x)))
+    assert np.isclose(found.f @ x, vi.f @ (Z @ x))
+    assert np.isclose(alpha @ found.B @ x, (chi @ alpha) @ (vi.B @ (Z @ x)))
+    assert np.isclose(found.g @ alpha, vi.g @ (chi @ alpha))
+    assert np.array_equal(found.A, found.A.T)
+
+
+@pytest.mark.parametrize("kind", [Kind.NONE, Kind.FIXED, Kind.PER_PARAMETER])
+def test_a_training_snapshot_is_reproduced_when_it_is_in_the_spaces(solved, kind: Kind) -> None:
+    problem, mus, solutions = solved
+    enrichment = {
+        Kind.NONE: Enrichment(Kind.NONE),
+        Kind.FIXED: Enrichment(Kind.FIXED, vectors=np.zeros((30, 0))),
+        Kind.PER_PARAMETER: Enrichment(Kind.PER_PARAMETER, supply=lambda V, vi, span: supremizers(V, vi.B, span)),
+    }[kind]
+    reduced = model(problem, solutions, enrichment)
+    for mu, exact in zip(mus, solutions, strict=True):
+        query = reduced.assemble(mu)
+        answer = solve_qp(query.program, "piqp", 1e-10)
+        assert np.allclose(query.basis @ answer.x, exact.u, atol=1e-8)
+        if kind is Kind.PER_PARAMETER:  # only a stable pair makes the multiplier unique
+            assert np.allclose(reduced.generators @ answer.alpha, exact.lam, atol=1e-4)
+
+
+@given(st.integers(14, 40), st.integers(3, 8), st.integers(1, 6), st.integers(0, 5))
+@settings(max_examples=30)
+def test_any_training_snapshot_in_the_spaces_is_reproduced(n: int, m: int, count: int, which: int) -> None:
+    """With supremizers the pair is stable, so u ∈ V_N' and λ in the cone make both the solution of the reduced QP."""
+    problem = Varying(n, m, count)
+    mus = problem.training_set()
+    solutions = [active_set.solve_high_fidelity(problem.assemble(mu)) for mu in mus]
+    contact = [s for s in solutions if s.lam.any()]
+    if not contact:
+        return
+    online = Enrichment(Kind.PER_PARAMETER, supply=lambda V, vi, span: supremizers(V, vi.B, span))
+    chi = np.column_stack([s.lam for s in contact])
+    cone = multipliers(chi / problem.W.norm(chi), problem.W)
+    basis = problem.V.orthonormalise(np.column_stack([s.u for s in solutions]))
+    reduced = ReducedModel(problem, basis, online, cone.chi, cone.span)
+    exact = solutions[which % count]
+    query = reduced.assemble(mus[which % count])
+    answer = solve_qp(query.program, "piqp", 1e-12)
+    u, lam = query.basis @ answer.x, reduced.generators @ answer.alpha
+    assert problem.V.norm(u - exact.u) <= 1e-6 * problem.V.norm(exact.u)
+    assert problem.W.norm(lam - exact.lam) <= 1e-4 * max(problem.W.norm(s.lam) for s in contact)
+
+
+def test_bases_are_orthonormal_and_v_n_comes_first(solved) -> None:
+    problem, mus, solutions = solved
+    online = Enrichment(Kind.PER_PARAMETER, supply=lambda V, vi, span: supremizers(V, vi.B, span))
+    reduced = model(problem, solutions[:2], online)
+    bases = [reduced.primal_basis(problem.assemble(mu)) for mu in mus[:2]]
+    for Z in bases:
+        assert np.allclose(problem.V.gram(Z, Z), np.eye(Z.shape[1]), atol=1e-11)
+        assert np.array_equal(Z[:, :2], reduced.fixed_basis)
+    assert not np.allclose(bases[0], bases[1])
+
+
+def test_an_enrichment_is_what_its_kind_says() -> None:
+    with pytest.raises(ValueError, match="fixed enrichment"):
+        Enrichment(Kind.NONE, vectors=np.zeros((3, 1)))
+    with pytest.raises(ValueError, match="per-parameter enrichment"):
+        Enrichment(Kind.PER_PARAMETER)

@@ -1,0 +1,398 @@
+"""Queries without arrays of mesh size give the programs of queries in full."""
+
+from __future__ import annotations
+
+import pickle
+import sys
+import tracemalloc
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
+
+import numpy as np
+import pytest
+import scipy.sparse as sp
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numerics import Varying
+
+from vibench.errors import NumericalError
+from vibench.highfidelity.active_set import HighFidelitySolver
+from vibench.interfaces.problem import MEMBERS, Contact, Problem, VariationalInequality
+from vibench.interfaces.strategies import Enrichment, Kind
+from vibench.interfaces.validation import checked_assembly
+from vibench.linalg.dense import singular_values
+from vibench.model.affine import Evaluation, affine_decomposition
+from vibench.model.galerkin import ReducedModel, project
+from vibench.model.hyperreduced import OnlineModel, project_members, why_in_full
+from vibench.qp import verification
+from vibench.qp.solve import solve_qp
+from vibench.qp.status import Status
+from vibench.reduction.supremizers import supremizers
+from vibench.stability.infsup import multipliers
+from vibench_problems.hertz import Hertz
+from vibench_problems.obstacle import Obstacle
+
+KINDS = ("none", "fixed", "per-parameter")
+WAYS = ("constant", "one", "several", "contact")
+NEW = (np.array([0.13]), np.array([0.58]), np.array([0.97]))
+
+
+class Rope(Varying):
+    """A string whose members depend on mu in the ways asked for; every entry can be asked for.
+
+    `constraint` says how B does: not at all, by a factor, in three terms, or by hats that move, given on the unknowns
+    that they touch. A has one term or two, f two.
+    """
+
+    def __init__(self, constraint: str, stiffness: str = "several", n: int = 30, m: int = 8) -> None:
+        super().__init__(n, m, 9)
+        self.way, self.x = constraint, np.linspace(0.0, 1.0, n + 2)[1:-1]
+        self.entrywise = frozenset({"A", "f"} if constraint == "contact" else MEMBERS)
+        self._terms = {
+            "A": [self._laplacian, 30.0 * sp.csr_array(sp.diags_array(1.0 + self.x))],
+            "f": [-8.0 / (n + 1) * np.ones(n), -self.x],
+            "B": [super(Rope, self).assemble(np.array([mu])).B for mu in (0.0, 0.4, 0.8)],
+            "g": [0.05 * np.ones(m), 0.02 * np.arange(m)],
+        }
+        if stiffness == "constant":
+            self._terms["A"].pop()
+        self._terms["B"] = self._terms["B"][: 3 if constraint == "several" else 1]
+
+    def factors(self, name: str, t: float) -> list[float]:
+        found = {"f": [1.0, t], "g": [1.0, t], "A": [1.0, t**2], "B": [1.0, t, np.sin(3.0 * t)]}[name]
+        return [1.0 + t**2] if name == "B" and self.way == "one" else found[: len(self._terms[name])]
+
+    def assemble(self, mu: np.ndarray) -> VariationalInequality:
+        t = float(mu[0])
+        found = {
+            name: sum(c * term for c, term in zip(self.factors(name, t), terms, strict=True))
+            for name, terms in self._terms.items()
+        }
+        if self.way == "contact":
+            vi = super().assemble(mu)
+            found |= {"B": vi.B, "g": vi.g}
+        return VariationalInequality(**found)
+
+    @property
+    def contact_dofs(self) -> np.ndarray | None:
+        """Those within reach of hats that stay within 0.1 of where they are at mu = 0."""
+        reach = 0.25 + 0.1 + 3.0 / (self._n + 1)
+        return np.flatnonzero(np.abs(self.x - 0.5) < reach) if self.way == "contact" else None
+
+    def contact(self, mu: np.ndarray) -> Contact | None:
+        vi = super().assemble(mu)
+        return Contact(vi.B[:, self.contact_dofs], vi.g) if self.way == "contact" else None
+
+    def sampler(self, wanted: Mapping[str, tuple[np.ndarray, np.ndarray]]) -> Callable[[np.ndarray], dict[str, Any]]:
+        entries = {
+            name: np.array([
+                term[rows] if term.ndim == 1 else np.asarray(term[rows, columns]).ravel() for term in self._terms[name]
+            ])
+            for name, (rows, columns) in wanted.items()
+        }  # fmt: skip
+        return lambda mu: {name: self.factors(name, float(mu[0])) @ terms for name, terms in entries.items()}
+
+
+def reduced_model(problem: Problem, kind: str, modes: int, generators: int, mus: np.ndarray) -> ReducedModel:
+    """A reduced model from some solutions; the fixed enrichment is the supremizers at the first parameter."""
+    solver = HighFidelitySolver(problem)
+    found = [solver.solve(mu) for mu in mus]
+    lam = np.column_stack([s.lam for s in found])
+    lam = lam[:, lam.any(axis=0)][:, :generators]
+    cone = multipliers(lam / problem.W.norm(lam), problem.W)
+    basis = problem.V.orthonormalise(np.column_stack([s.u for s in found]))[:, :modes]
+    if kind == "none":
+        enrichment = Enrichment(Kind.NONE)
+    elif kind == "fixed":
+        first = supremizers(problem.V, problem.assemble(mus[0]).B, cone.span)
+        enrichment = Enrichment(Kind.FIXED, vectors=problem.V.orthonormalise(first, basis))
+    else:
+        enrichment = Enrichment(Kind.PER_PARAMETER, eta=cone.span)
+    return ReducedModel(problem, basis, enrichment, cone.chi, cone.span)
+
+
+def online(model: ReducedModel, tolerance: float = 1e-11) -> OnlineModel:
+    members = affine_decomposition(model.problem, model.problem.training_set(), tolerance)
+    assert why_in_full(model, members) == ""
+    return OnlineModel(model, project_members(model, members))
+
+
+def assert_same_program(model: ReducedModel, reduced: OnlineModel, mu: np.ndarray, accuracy: float) -> None:
+    """The program is that of the full assembly, projected on the same basis; the basis is as good."""
+    V, found, vi = model.problem.V, reduced.assemble(mu), checked_assembly(model.problem, mu)
+    Z, own = found.basis, model.primal_basis(vi)
+    assert Z.shape == own.shape
+    assert np.allclose(V.gram(Z, Z), np.eye(Z.shape[1]), atol=1e-10)
+    assert np.allclose(Z[:, : model.fixed_basis.shape[1]], model.fixed_basis, atol=1e-10)
+    assert np.allclose(singular_values(V.gram(Z, own)), 1.0, atol=max(1e-9, 10.0 * accuracy))
+    exact = project(vi, Z, model.generators)
+    for name in MEMBERS:
+        one, other = getattr(found.program, name), getattr(exact, name)
+        assert one.shape == other.shape
+        assert np.linalg.norm(one - other) <= accuracy * np.linalg.norm(other), name
+    assert np.array_equal(found.program.A, found.program.A.T)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("constraint", WAYS)
+@pytest.mark.parametrize("stiffness", ["constant", "several"])
+def test_programs_are_those_of_the_full_assembly(constraint: str, stiffness: str, kind: str) -> None:
+    problem = Rope(constraint, stiffness)
+    members = affine_decomposition(problem, problem.training_set(), 1e-11)
+    assert [len(members[name].terms) for name in "AB"] == [
+        {"constant": 1, "several": 2}[stiffness],
+        {"constant": 1, "one": 1, "several": 3, "contact": 0}[constraint],
+    ]
+    model = reduced_model(problem, kind, 3, 2, problem.training_set()[:5])
+    reduced = online(model)
+    for mu in NEW:
+        assert_same_program(model, reduced, mu, 1e-9)
+
+
+class Mixed(Rope):
+    """Gives a constraint of three terms on the contact, too."""
+
+    contact_dofs = property(lambda self: np.unique(sum(abs(term) for term in self._terms["B"]).indices))
+
+    def contact(self, mu: np.ndarray) -> Contact:
+        vi = self.assemble(mu)
+        return Contact(vi.B[:, self.contact_dofs], vi.g)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize(("entrywise", "on_contact"), [("AfB", "g"), ("Afg", "B"), ("Af", "Bg"), ("AfBg", "")])
+def test_members_on_the_contact_and_interpolated_ones_go_together(entrywise: str, on_contact: str, kind: str) -> None:
+    problem = Mixed("several")
+    problem.entrywise = frozenset(entrywise)
+    members = affine_decomposition(problem, problem.training_set(), 1e-11)
+    assert {name for name in MEMBERS if members[name].way is Evaluation.CONTACT} == set(on_contact)
+    model = reduced_model(problem, kind, 3, 2, problem.training_set()[:5])
+    for mu in NEW:
+        assert_same_program(model, OnlineModel(model, project_members(model, members)), mu, 1e-9)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("constraint", WAYS)
+@pytest.mark.parametrize(("modes", "generators"), [(3, 0), (0, 2), (0, 0)])
+def test_without_modes_or_without_generators(constraint: str, kind: str, modes: int, generators: int) -> None:
+    problem = Rope(constraint, "constant")
+    model = reduced_model(problem, kind, modes, generators, problem.training_set()[:5])
+    reduced = online(model)
+    for mu in NEW[:2]:
+        assert_same_program(model, reduced, mu, 1e-9)
+        query = reduced.assemble(mu)
+        answer = solve_qp(query.program, "piqp", 1e-10, factor=query.factor)
+        assert verification.verify(query.program, answer, 1e-8)[0] is Status.OK
+
+
+@given(st.integers(14, 40), st.integers(3, 9), st.integers(1, 5), st.integers(1, 5), st.sampled_from(WAYS))
+@settings(max_examples=40)
+def test_programs_of_spaces_that_depend_on_mu_are_right_in_all_dimensions(
+    n: int, m: int, modes: int, generators: int, constraint: str
+) -> None:
+    """Where supremizers of several terms are as many as unknowns, too."""
+    model = reduced_model(Rope(constraint, n=n, m=m), "per-parameter", modes, generators, np.linspace(0, 1, 5)[:, None])
+    reduced = online(model)
+    for mu in NEW[:2]:
+        assert_same_program(model, reduced, mu, 1e-8)
+
+
+def test_a_loose_tolerance_gives_a_program_that_is_as_inexact() -> None:
+    problem = Rope("several")
+    model = reduced_model(problem, "none", 3, 2, problem.training_set()[:5])
+    members = affine_decomposition(problem, problem.training_set(), 0.2)
+    assert members["B"].error > 1e-3
+    reduced, mu = OnlineModel(model, project_members(model, members)), NEW[0]
+    exact = model.assemble(mu).program.B
+    assert 1e-3 < np.linalg.norm(reduced.assemble(mu).program.B - exact) / np.linalg.norm(exact) < 0.5
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("constraint", WAYS)
+def test_operators_travel(constraint: str, kind: str) -> None:
+    problem = Rope(constraint)
+    model = reduced_model(problem, kind, 3, 2, problem.training_set()[:5])
+    operators = project_members(model, affine_decomposition(problem, problem.training_set(), 1e-11))
+    here, there = OnlineModel(model, operators), OnlineModel(model, pickle.loads(pickle.dumps(operators)))
+    for mu in NEW:
+        one, other = here.assemble(mu), there.assemble(mu)
+        for name in MEMBERS:
+            assert np.array_equal(getattr(one.program, name), getattr(other.program, name))
+        assert np.allclose(one.basis, other.basis, atol=1e-12)
+
+
+def test_an_unpickled_factor_is_still_that_of_a() -> None:
+    problem = Rope("contact", "constant")
+    model = reduced_model(problem, "fixed", 3, 2, problem.training_set()[:5])
+    operators = project_members(model, affine_decomposition(problem, problem.training_set(), 1e-11))
+    query = OnlineModel(model, pickle.loads(pickle.dumps(operators))).assemble(NEW[0])
+    assert np.allclose(query.factor @ query.factor.T, query.program.A, rtol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("stiffness", "constraint", "kind", "modes", "dual"),
+    [
+        ("constant", "contact", "none", 4, True),
+        ("constant", "contact", "none", 2, False),  # fewer unknowns than generators
+        ("constant", "contact", "fixed", 2, True),
+        ("constant", "one", "per-parameter", 2, True),  # one space of supremizers: it does not vary
+        ("constant", "contact", "per-parameter", 4, False),
+        ("constant", "several", "per-parameter", 4, False),
+        ("several", "contact", "none", 4, False),
+    ],
+)
+def test_a_factor_comes_with_a_constant_stiffness_on_a_fixed_space(
+    stiffness: str, constraint: str, kind: str, modes: int, dual: bool
+) -> None:
+    problem = Rope(constraint, stiffness)
+    model = reduced_model(problem, kind, modes, 3, problem.training_set()[:5])
+    query = online(model).assemble(NEW[1])
+    assert (query.factor is not None) == dual
+    primal = solve_qp(query.program, "piqp", 1e-10)
+    given = solve_qp(query.program, "piqp", 1e-10, factor=query.factor)
+    assert verification.verify(query.program, given, 1e-8)[0] is Status.OK
+    assert np.allclose(given.x, primal.x, atol=1e-7 * np.abs(primal.x).max())
+    assert np.allclose(query.program.B.T @ given.alpha, query.program.B.T @ primal.alpha, atol=1e-6)
+
+
+def test_what_stands_in_the_way_of_reduction_is_said() -> None:
+    problem = Varying()
+    members = affine_decomposition(problem, problem.training_set(), 1e-8)
+    model = reduced_model(problem, "none", 3, 2, problem.training_set())
+    assert [reason.split()[0] for reason in why_in_full(model, members).split("; ")] == ["A", "B", "g"]
+    own = Enrichment(Kind.PER_PARAMETER, supply=lambda V, vi, span: supremizers(V, vi.B, span))
+    roaming = ReducedModel(Rope("one"), model.fixed_basis, own, model.generators, model.span)
+    fine = affine_decomposition(Rope("one"), problem.training_set(), 1e-8)
+    assert why_in_full(roaming, fine) == "the enrichment varies with mu in a way of its own"
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize(
+    ("constraint", "member"), [("several", name) for name in MEMBERS] + [("contact", "contact"), ("contact", "A")]
+)
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+@pytest.mark.filterwarnings("ignore:invalid value encountered")
+def test_values_that_are_not_finite_are_refused(
+    monkeypatch: pytest.MonkeyPatch, constraint: str, member: str, kind: str, value: float
+) -> None:
+    problem = Rope(constraint)
+    reduced = online(reduced_model(problem, kind, 3, 2, problem.training_set()[:5]))
+    sampler, contact = problem.sampler, problem.contact
+
+    def spoiled(wanted):
+        sample = sampler(wanted)
+        return lambda mu: {name: found * (value if name == member else 1.0) for name, found in sample(mu).items()}
+
+    monkeypatch.setattr(problem, "sampler", spoiled)
+    if member == "contact":
+        monkeypatch.setattr(problem, "contact", lambda mu: Contact(contact(mu).B * value, contact(mu).g))
+    with pytest.raises(NumericalError, match=r"not finite at mu = \[0\.58\]"):
+        reduced.assemble(NEW[1])
+
+
+@cache
+def separated(name: str, tolerance: float) -> tuple[Problem, Mapping[str, Any]]:
+    """A problem that vibench ships, with its members; of the finest mesh only some of the training set is used."""
+    problem = {"obstacle": lambda: Obstacle(400), "hertz": lambda: Hertz("coarse")}[name]()
+    return problem, affine_decomposition(problem, problem.training_set(), tolerance)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("name", ["obstacle", "hertz"])
+def test_reduced_queries_of_real_problems_are_as_good_as_full_ones(name: str, kind: str) -> None:
+    problem, members = separated(name, 1e-6)
+    ways = {"obstacle": [Evaluation.INTERPOLATED] * 4, "hertz": [Evaluation.CONSTANT] * 2 + [Evaluation.CONTACT] * 2}[
+        name
+    ]
+    assert [members[member].way for member in MEMBERS] == ways
+    training = problem.training_set()
+    model = reduced_model(problem, kind, 5, 4, training[np.linspace(0, len(training) - 1, 6).astype(int)])
+    reduced, solver = OnlineModel(model, project_members(model, members)), HighFidelitySolver(problem)
+    for mu in problem.validation_set(4, 5):
+        assert_same_program(model, reduced, mu, 1e-5)
+        exact, errors = solver.solve(mu), []
+        for query in (reduced.assemble(mu), model.assemble(mu)):
+            answer = solve_qp(query.program, "piqp", 1e-9, factor=query.factor)
+            assert verification.verify(query.program, answer, 1e-8)[0] is Status.OK
+            u, lam = query.basis @ answer.x, model.generators @ answer.alpha
+            errors.append([float(problem.V.norm(u - exact.u)), float(problem.W.norm(lam - exact.lam))])
+        assert np.allclose(errors[0], errors[1], rtol=0.01)
+
+
+@dataclass(frozen=True)
+class Step:
+    """The line that adds most to the memory in use while it runs: bytes, and where it is."""
+
+    size: int
+    where: str
+
+
+def largest_step(work: Callable[[], object]) -> Step:
+    """Largest memory that one line adds; what a line calls is a line of its own where it is Python."""
+    largest, last, place = Step(0, ""), 0, ""
+
+    def trace(frame: Any, event: str, _: object) -> Any:
+        nonlocal largest, last, place
+        _, peak = tracemalloc.get_traced_memory()
+        if peak - last > largest.size:
+            largest = Step(peak - last, place)
+        tracemalloc.reset_peak()
+        last, place = tracemalloc.get_traced_memory()[0], f"{frame.f_code.co_filename}:{frame.f_lineno}"
+        return trace
+
+    before = sys.gettrace()
+    tracemalloc.start()
+    sys.settrace(trace)
+    try:
+        work()
+    finally:
+        sys.settrace(before)
+        tracemalloc.stop()
+    return largest
+
+
+def test_the_instrument_sees_the_largest_of_several_arrays_and_no_sum_of_them() -> None:
+    def work() -> float:
+        kept = [np.ones(1000) for _ in range(5)]
+        brief = float(np.ones(5000).sum())
+        return brief + kept[0][0]
+
+    assert 40_000 <= largest_step(work).size < 48_000
+
+
+@cache
+def large(name: str) -> tuple[Problem, Mapping[str, Any]]:
+    """A problem on a mesh so large that its vectors stand out; its members are interpolated loosely."""
+    problem: Problem = {
+        "obstacle": lambda: Obstacle("paper"),
+        "hertz": lambda: Hertz("paper"),
+        "small hertz": lambda: Hertz("coarse"),
+        "rope": lambda: Rope("several", n=3000),
+    }[name]()
+    return problem, affine_decomposition(problem, problem.training_set()[:: 1 if name == "rope" else 5], 1e-2)
+
+
+@pytest.mark.parametrize(
+    ("name", "kind", "dim", "generators"),
+    [
+        ("obstacle", "none", 3391, 4),
+        ("obstacle", "fixed", 3391, 4),
+        ("obstacle", "per-parameter", 3391, 4),
+        ("hertz", "none", 12_171, 4),
+        ("hertz", "fixed", 12_171, 4),
+        ("small hertz", "per-parameter", 2002, 2),  # about 200 coordinates per vector, 1100 on the large mesh
+        ("rope", "per-parameter", 3000, 4),
+    ],
+)
+def test_a_query_makes_no_array_of_mesh_size(name: str, kind: str, dim: int, generators: int) -> None:
+    problem, members = large(name)
+    assert problem.V.dim == dim
+    training = problem.training_set()
+    model = reduced_model(problem, kind, 4, generators, training[np.linspace(0, len(training) - 1, 5).astype(int)])
+    reduced, mu = OnlineModel(model, project_members(model, members)), problem.validation_set(1, 0)[0]
+    reduced.assemble(mu)  # what is set up once is set up
+    found = largest_step(lambda: reduced.assemble(mu))
+    assert 0 < found.size < 8 * dim, found
+    assert largest_step(lambda: model.assemble(mu)).size > 8 * dim

@@ -1,0 +1,225 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import scipy.sparse as sp
+from hypothesis import given
+from hypothesis import strategies as st
+from numerics import exact, spd
+
+from vibench.errors import RequestError
+from vibench.interfaces.problem import VariationalInequality
+from vibench.qp import verification
+from vibench.qp.solution import QPSolution
+from vibench.qp.solve import check_solver_name, solve_qp
+from vibench.qp.status import Status
+
+seeds = st.integers(0, 10_000)
+
+
+def program(seed: int, n: int = 6, m: int = 4, sizes: tuple[int, int] = (-4, 4)) -> VariationalInequality:
+    """A feasible program with rows and cost of very different sizes."""
+    rng = np.random.default_rng(seed)
+    B = rng.standard_normal((m, n)) * 10.0 ** rng.integers(*sizes, (m, 1))
+    g = B @ rng.standard_normal(n) * 0.1 + np.abs(B).sum(axis=1) * 0.05
+    return VariationalInequality(spd(n, rng), 1e-3 * rng.standard_normal(n) * 50.0, B, g)
+
+
+@given(seeds)
+def test_residuals_vanish_at_the_solution_and_only_there(seed: int) -> None:
+    vi = program(seed)
+    x, alpha = exact(vi)
+    assert verification.kkt_residuals(vi, x, np.maximum(alpha, 0.0)).worst < 1e-8
+    moved = verification.kkt_residuals(vi, x + 0.1 * np.abs(x).max(), alpha)
+    assert max(moved.dual, moved.primal) > 1e-4
+
+
+def test_residuals_as_defined_by_hand() -> None:
+    vi = VariationalInequality(A=2.0 * np.eye(2), f=np.array([2.0, 0.0]), B=np.array([[3.0, 4.0]]), g=np.array([1.0]))
+    found = verification.kkt_residuals(vi, np.array([1.0, 0.0]), np.array([0.5]))
+    assert np.isclose(found.primal, (3.0 - 1.0) / 5.0)  # row of norm 5; ‖g‖ in row units is 0.2, so the floor 1 counts
+    assert np.isclose(found.dual, 2.0 / 2.0)  # Ax − f + Bᵀα = (1.5, 2); over max(2, 2, 2)
+    assert np.isclose(found.gap, 0.5 / 2.0)  # 2 − 2 + 0.5 over max(1, 2, 0.5)
+
+
+def test_the_gap_of_a_solution_that_is_round_off_is_relative_to_the_energy_of_the_load() -> None:
+    vi = VariationalInequality(A=2.0 * np.eye(2), f=np.array([2.0, 0.0]), B=np.array([[1.0, 0.0]]), g=np.zeros(1))
+    found = verification.kkt_residuals(vi, np.array([1e-17, 0.0]), np.array([2.0]))
+    assert np.isclose(found.gap, 2e-17 / (1e-4 * 4.0**2 / (2.0 * 8.0)))  # 1e-17·2 over 1e-4 (fᵀf)²/2fᵀAf
+
+
+def test_without_unknowns_there_is_nothing_to_solve_but_something_to_violate() -> None:
+    for bound, status in ((1.0, "ok"), (-1.0, "infeasible")):
+        vi = VariationalInequality(np.zeros((0, 0)), np.zeros(0), np.zeros((1, 0)), np.array([bound]))
+        assert verification.verify(vi, solve_qp(vi, "osqp", 1e-8), 1e-8)[0] == status
+
+
+@pytest.mark.parametrize("solver", ["piqp", "proxqp", "osqp"])
+@pytest.mark.parametrize("accuracy", [1e-5, 1e-7])
+def test_required_solvers_reach_the_accuracy_they_are_asked_for(solver: str, accuracy: float) -> None:
+    for seed in range(30):
+        vi = program(seed)
+        if abs(vi.f @ exact(vi)[0]) < 0.05 * np.abs(vi.f).max():
+            continue  # the energy nearly vanishes, so a relative gap asks for more than the accuracy
+        answer = solve_qp(vi, solver, accuracy)
+        status, reason, found = verification.verify(vi, answer, accuracy)
+        assert status is Status.OK, (seed, reason)
+        assert found is not None
+        assert found.worst <= accuracy
+        assert answer.iterations is not None
+        x, _ = exact(vi)
+        assert np.allclose(answer.x, x, atol=200.0 * accuracy * (1.0 + np.abs(x).max()))
+
+
+def test_sparse_programs_go_through_the_same_door() -> None:
+    vi = program(3)
+    sparse = VariationalInequality(sp.csc_array(vi.A), vi.f, sp.csr_array(vi.B), vi.g)
+    answer = solve_qp(sparse, "piqp", 1e-9)
+    assert np.allclose(answer.x, exact(vi)[0], atol=1e-7)
+    assert verification.kkt_residuals(sparse, answer.x, answer.alpha).worst <= 1e-9
+
+
+@given(seeds, st.integers(1, 7), st.integers(0, 5))
+def test_with_a_factor_of_a_the_dual_is_solved_and_gives_the_same_solution(seed: int, n: int, m: int) -> None:
+    vi = program(seed, n, m, sizes=(0, 1))
+    asked = []
+
+    def watched(scaled: VariationalInequality, accuracy: float) -> QPSolution:
+        asked.append(len(scaled.f))
+        return solve_qp(scaled, "piqp", accuracy)
+
+    factor = np.linalg.cholesky(vi.A)
+    primal, dual = (solve_qp(vi, "watched", 1e-10, {"watched": watched}, L) for L in (None, factor))
+    assert asked == [n] + ([m] if m else [])  # the dual has as many unknowns as there are constraints
+    assert np.allclose(dual.x, primal.x, atol=1e-6 * max(1e-3, np.abs(primal.x).max()))
+    assert np.all(dual.alpha >= 0.0)
+    assert np.allclose(vi.B.T @ dual.alpha, vi.B.T @ primal.alpha, atol=1e-5 * max(1e-3, np.abs(vi.f).max()))
+    if m <= n:  # only then are they unique
+        assert np.allclose(dual.alpha, primal.alpha, atol=1e-4 * max(1e-3, np.abs(primal.alpha).max(initial=0.0)))
+    assert verification.kkt_residuals(vi, dual.x, dual.alpha).dual <= 1e-12  # x is made from α, whatever the solver did
+
+
+@pytest.mark.parametrize("solver", ["piqp", "proxqp", "osqp"])
+def test_the_dual_of_a_program_with_rows_of_very_different_sizes_is_solved_to_the_accuracy_asked_for(
+    solver: str,
+) -> None:
+    for seed in range(30):
+        vi = program(seed)
+        primal, dual = (solve_qp(vi, solver, 1e-9, factor=L) for L in (None, np.linalg.cholesky(vi.A)))
+        assert verification.verify(vi, primal, 1e-8)[0] is Status.OK
+        assert verification.verify(vi, dual, 1e-8)[:2] == (Status.OK, ""), seed
+        assert np.allclose(dual.x, exact(vi)[0], atol=1e-6 * max(1.0, np.abs(primal.x).max()))
+
+
+def test_negative_multipliers_of_a_dual_are_set_to_zero_and_reported() -> None:
+    vi = VariationalInequality(np.diag([2.0, 3.0]), np.array([2.0, 3.0]), np.eye(2), np.array([0.5, 2.0]))
+
+    def wrong(scaled: VariationalInequality, accuracy: float) -> QPSolution:
+        return QPSolution(np.array([1.0, -0.1]), np.zeros(2), "solved", 4)
+
+    answer = solve_qp(vi, "wrong", 1e-7, {"wrong": wrong}, np.diag(np.sqrt([2.0, 3.0])))
+    assert answer.alpha.tolist() == [1.0, 0.0]
+    assert np.allclose(answer.x, [0.5, 1.0])
+    assert np.isclose(answer.negative, 0.1)
+    assert (answer.solver_status, answer.iterations) == ("solved", 4)
+
+
+def test_a_solver_that_gives_up_on_the_dual_gives_no_solution() -> None:
+    vi = program(3)
+    answer = solve_qp(vi, "no", 1e-7, {"no": lambda *_: QPSolution(None, None, "gave up")}, np.linalg.cholesky(vi.A))
+    assert (answer.x, answer.alpha, answer.solver_status) == (None, None, "gave up")
+    assert verification.verify(vi, answer, 1e-7)[0] is Status.FAILED
+
+
+def test_a_program_without_constraints() -> None:
+    vi = VariationalInequality(np.eye(3), np.arange(3.0), np.zeros((0, 3)), np.zeros(0))
+    answer = solve_qp(vi, "piqp", 1e-8)
+    assert verification.verify(vi, answer, 1e-8)[0] is Status.OK
+    assert np.allclose(answer.x, np.arange(3.0), atol=1e-7)
+
+
+INFEASIBLE = VariationalInequality(np.eye(2), np.ones(2), np.array([[1.0, 0.0], [-1.0, 0.0]]), np.array([-1.0, -1.0]))
+
+
+def test_infeasible_only_with_a_certificate_of_our_own() -> None:
+    alpha = verification.infeasibility_certificate(INFEASIBLE)
+    assert alpha is not None
+    assert np.all(alpha >= 0.0)
+    assert np.allclose(INFEASIBLE.B.T @ alpha, 0.0)
+    assert INFEASIBLE.g @ alpha < 0.0
+    assert verification.infeasibility_certificate(program(0)) is None
+    nothing = QPSolution(None, None, "infeasible, I say")
+    assert verification.verify(INFEASIBLE, nothing, 1e-7)[0] is Status.INFEASIBLE
+    status, reason, found = verification.verify(program(0), nothing, 1e-7)
+    assert status is Status.FAILED
+    assert "infeasible, I say" in reason
+    assert found is None
+
+
+def test_not_finite_is_seen_before_anything_else() -> None:
+    vi = program(1)
+    x, alpha = exact(vi)
+    x[0] = np.nan
+    assert verification.verify(vi, QPSolution(x, alpha, "solved"), 1e-7)[0] is Status.NONFINITE
+
+
+def test_a_claim_is_not_believed() -> None:
+    vi = program(2)
+    x, alpha = exact(vi)
+    status, reason, found = verification.verify(vi, QPSolution(x + 1e-3, alpha, "solved"), 1e-7)
+    assert status is Status.INACCURATE
+    assert "solved" in reason
+    assert "above 1e-07" in reason
+    assert found is not None
+
+
+@pytest.mark.parametrize(
+    ("load", "x", "alpha", "name"), [(2.0, 0.5, 1.0, "gap"), (6.0, 3.0, 0.0, "primal")], ids=["gap", "primal"]
+)
+def test_one_residual_alone_makes_an_answer_inaccurate(load: float, x: float, alpha: float, name: str) -> None:
+    """The program, min x² − load·x subject to x ≤ 1, has a solution: nothing here is infeasible."""
+    vi = VariationalInequality(A=np.array([[2.0]]), f=np.array([load]), B=np.array([[1.0]]), g=np.ones(1))
+    status, reason, found = verification.verify(vi, QPSolution(np.array([x]), np.array([alpha]), "solved"), 1e-6)
+    assert status is Status.INACCURATE
+    assert reason.startswith(f"{name} residual")
+    assert [key for key in ("primal", "dual", "gap") if getattr(found, key) > 0.0] == [name]
+
+
+def test_negative_multipliers_are_set_to_zero_and_reported() -> None:
+    vi = VariationalInequality(np.eye(2), np.ones(2), np.array([[1.0, 0.0], [0.0, 1.0]]), np.array([0.5, 0.5]))
+
+    def wrong(scaled: VariationalInequality, accuracy: float) -> QPSolution:
+        return QPSolution(np.array([0.5, 0.5]), np.array([0.5, -0.1]), "solved")
+
+    answer = solve_qp(vi, "wrong", 1e-7, {"wrong": wrong})
+    assert answer.alpha is not None
+    assert answer.alpha.tolist() == [0.5, 0.0]
+    assert np.isclose(answer.negative, 0.1)
+    assert "multipliers down to -1e-01" in verification.verify(vi, answer, 1e-7)[1]
+
+
+def test_a_registered_solver_sees_scaled_data_and_its_answer_is_scaled_back() -> None:
+    vi = program(5)
+    seen = {}
+
+    def brute(scaled: VariationalInequality, accuracy: float) -> QPSolution:
+        seen["rows"] = np.linalg.norm(scaled.B, axis=1)
+        seen["f"] = np.abs(scaled.f).max()
+        return QPSolution(*exact(scaled), "found")
+
+    answer = solve_qp(vi, "brute", 1e-9, {"brute": brute})
+    assert np.allclose(seen["rows"], 1.0)
+    assert np.isclose(seen["f"], 1.0)
+    assert verification.kkt_residuals(vi, answer.x, answer.alpha).worst < 1e-9
+
+
+def test_names_are_checked_with_a_suggestion() -> None:
+    check_solver_name("piqp")
+    check_solver_name("mine", ["mine"])
+    with pytest.raises(RequestError, match="no QP solver is called 'proxpq'; did you mean 'proxqp'"):
+        check_solver_name("proxpq")
+
+
+def test_severities_follow_the_order_of_the_statuses() -> None:
+    order = [Status.OK, Status.INACCURATE, Status.FAILED, Status.CRASHED, Status.UNAVAILABLE]
+    assert sorted(order[2:] + order[:2], key=lambda status: status.severity) == order

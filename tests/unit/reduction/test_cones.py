@@ -1,0 +1,192 @@
+from __future__ import annotations
+
+from itertools import combinations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from numerics import space
+
+from vibench.errors import NumericalError
+from vibench.highfidelity.active_set import HighFidelitySolver
+from vibench.interfaces.strategies import DualStrategy, Stop
+from vibench.linalg.inner_product import InnerProduct
+from vibench.reduction import cones as cone_module
+from vibench.reduction.cones import greedy_cone, orthogonality, project_on_cone
+from vibench.reduction.removal import removable_part
+from vibench_problems.obstacle import Obstacle
+from vibench_strategies.cpg import CPG
+from vibench_strategies.mcpg import ModifiedCPG
+
+seeds = st.integers(0, 10_000)
+
+
+def nothing(theta: np.ndarray, _: np.ndarray) -> tuple[np.ndarray, str]:
+    return np.zeros_like(theta), ""
+
+
+def snapshots(seed: int, m: int = 8, count: int = 7) -> np.ndarray:
+    """Nonnegative vectors with exact zeros."""
+    rng = np.random.default_rng(seed)
+    return rng.random((m, count)) * (rng.random((m, count)) < 0.6)
+
+
+def distance_by_faces(generators: np.ndarray, theta: np.ndarray, X) -> float:
+    """Distance from a cone by trying every face."""
+    best = float(X.norm(theta))
+    for size in range(1, generators.shape[1] + 1):
+        for face in combinations(range(generators.shape[1]), size):
+            chosen = X.whiten(generators[:, face])
+            alpha, *_ = np.linalg.lstsq(chosen, X.whiten(theta), rcond=None)
+            if np.all(alpha >= -1e-12):
+                best = min(best, float(np.linalg.norm(chosen @ alpha - X.whiten(theta))))
+    return best
+
+
+@given(seeds)
+def test_projection_meets_its_optimality_conditions(seed: int) -> None:
+    X = space(8, seed)
+    rng = np.random.default_rng(seed)
+    chi, theta = rng.random((8, 4)), rng.standard_normal(8)
+    found = project_on_cone(chi, theta, X)
+    rest = theta - chi @ found.coefficients
+    assert np.all(found.coefficients >= 0.0)
+    assert np.isclose(found.distance, X.norm(rest))
+    assert np.all(X.gram(chi, rest) <= 1e-9)
+    assert abs(found.coefficients @ X.gram(chi, rest)) <= 1e-9
+
+
+@given(seeds)
+def test_projection_is_the_nearest_point_over_all_faces(seed: int) -> None:
+    X = space(6, seed)
+    rng = np.random.default_rng(seed)
+    chi, theta = rng.random((6, 4)), rng.standard_normal(6)
+    assert np.isclose(project_on_cone(chi, theta, X).distance, distance_by_faces(chi, theta, X), atol=1e-9)
+
+
+@given(seeds, st.floats(1e-6, 1e6))
+def test_projection_scales_and_is_idempotent(seed: int, factor: float) -> None:
+    X = space(6, seed)
+    rng = np.random.default_rng(seed)
+    chi, theta = rng.random((6, 3)), rng.standard_normal(6)
+    image = chi @ project_on_cone(chi, theta, X).coefficients
+    assert np.isclose(
+        project_on_cone(chi, factor * theta, X).distance, factor * project_on_cone(chi, theta, X).distance, rtol=1e-8
+    )
+    assert project_on_cone(chi, image, X).distance <= 1e-10 * max(1.0, float(X.norm(theta)))
+
+
+def test_projection_on_an_empty_cone() -> None:
+    X = space(4)
+    assert np.isclose(project_on_cone(np.zeros((4, 0)), np.ones(4), X).distance, X.norm(np.ones(4)))
+
+
+@given(seeds)
+def test_greedy_errors_fall_and_are_the_largest_distances(seed: int) -> None:
+    X, theta = space(8, seed), snapshots(seed)
+    largest = float(X.norm(theta).max())
+    if largest == 0.0:
+        return
+    cone = greedy_cone(theta, X, Stop(size=5), nothing)
+    assert np.all(np.diff(cone.errors) <= 1e-12)
+    assert np.allclose(X.norm(cone.generators), 1.0)
+    for r in range(cone.size + 1):
+        distances = [project_on_cone(cone.generators[:, :r], q, X).distance for q in theta.T]
+        assert np.isclose(max(distances) / largest, cone.errors[r], atol=1e-8)
+
+
+@given(seeds)
+def test_greedy_picks_what_a_plain_greedy_picks(seed: int) -> None:
+    X, theta = space(8, seed), snapshots(seed)
+    if not np.any(theta):
+        return
+    cone = greedy_cone(theta, X, Stop(tolerance=1e-6), nothing)
+    chosen = np.zeros((8, 0))
+    left = list(range(theta.shape[1]))
+    for r in range(cone.size):
+        distances = np.array([project_on_cone(chosen, theta[:, q], X).distance for q in left])
+        pick = left[int(np.argmax(distances >= distances.max() - 1e-9 * X.norm(theta).max()))]
+        left.remove(pick)
+        chosen = np.column_stack([chosen, theta[:, pick] / X.norm(theta[:, pick])])
+        assert np.allclose(chosen[:, r], cone.generators[:, r], atol=1e-12)
+
+
+@pytest.fixture(scope="module")
+def solved() -> tuple[np.ndarray, InnerProduct]:
+    """Multipliers of the membrane at all training parameters, and their space."""
+    problem = Obstacle(1200)
+    solver = HighFidelitySolver(problem)
+    return np.column_stack([solver.solve(mu).lam for mu in problem.training_set()]), problem.W
+
+
+@pytest.mark.parametrize("strategy", [CPG(), ModifiedCPG()], ids=["cpg", "mcpg"])
+def test_few_projections_find_the_generators_that_a_plain_greedy_finds(
+    monkeypatch: pytest.MonkeyPatch, solved: tuple[np.ndarray, InnerProduct], strategy: DualStrategy
+) -> None:
+    """What a plain greedy projects is every snapshot not yet taken, at every step."""
+    theta, W = solved
+    subtract = nothing if isinstance(strategy, CPG) else lambda chosen, chi: removable_part(chosen, chi, W)
+    largest, left = float(W.norm(theta).max()), list(range(theta.shape[1]))
+    plain, projected, distances = np.zeros((W.dim, 0)), 0, W.norm(theta)
+    for _ in range(20):
+        pick = left[int(np.argmax(distances >= distances.max() - 1e-9 * largest))]
+        left.remove(pick)
+        direction = theta[:, pick] - subtract(theta[:, pick], plain)[0]
+        plain = np.column_stack([plain, direction / W.norm(direction)])
+        distances = np.array([project_on_cone(plain, theta[:, q], W).distance for q in left])
+        projected += len(left)
+    calls = []
+    whole = cone_module._project_whitened
+    monkeypatch.setattr(cone_module, "_project_whitened", lambda *data: (calls.append(1), whole(*data))[1])
+    cone = strategy.reduce(theta, W, Stop(size=20))
+    assert np.allclose(cone.generators, plain, atol=1e-8 * plain.max())
+    assert np.isclose(cone.errors[-1], distances.max() / largest, rtol=1e-6)
+    assert 20 <= len(calls) <= 0.15 * projected
+
+
+def test_stops_at_the_tolerance_or_the_size() -> None:
+    X = space(5)
+    theta = np.eye(5)[:, :4] * np.array([1.0, 0.5, 0.1, 0.001])
+    loose = greedy_cone(theta, X, Stop(tolerance=0.3), nothing)
+    assert loose.errors[-1] <= 0.3 < loose.errors[-2]
+    assert greedy_cone(theta, X, Stop(size=3), nothing).size == 3
+
+
+def test_ends_where_everything_is_reproduced() -> None:
+    X = space(4)
+    one = np.array([1.0, 2.0, 0.0, 1.0])
+    cone = greedy_cone(np.column_stack([one, 2.0 * one, one]), X, Stop(tolerance=1e-9), nothing)
+    assert cone.size == 1
+    assert greedy_cone(np.column_stack([one, 2.0 * one, one]), X, Stop(size=3), nothing).size == 1
+    everything = greedy_cone(np.eye(4)[:, :2], X, Stop(size=9), nothing)
+    assert everything.size == 2
+    assert everything.errors[-1] == 0.0
+
+
+def test_duplicated_snapshots_go_to_the_smallest_index() -> None:
+    X = space(4)
+    a, b = np.array([1.0, 0.0, 0.0, 0.0]), np.array([0.0, 1.0, 1.0, 0.0])
+    cone = greedy_cone(np.column_stack([a, b, b, a]), X, Stop(size=2), nothing)
+    picked = {tuple(column > 0.0) for column in cone.generators.T}
+    assert picked == {tuple(a > 0.0), tuple(b > 0.0)}
+
+
+@pytest.mark.parametrize("theta", [np.zeros((4, 0)), np.zeros((4, 3))])
+def test_no_snapshot_or_no_contact_gives_an_empty_cone(theta: np.ndarray) -> None:
+    assert greedy_cone(theta, space(4), Stop(tolerance=0.1), nothing).size == 0
+
+
+def test_a_negative_snapshot_is_refused() -> None:
+    with pytest.raises(NumericalError, match=r"negative coefficient -1\.0e-03"):
+        greedy_cone(np.array([[1.0], [-1e-3]]), space(2), Stop(tolerance=0.1), nothing)
+
+
+def test_orthogonality_is_the_distance_to_the_cone_before() -> None:
+    X = space(3)
+    chi = np.random.default_rng(0).random((3, 3))
+    chi /= X.norm(chi)
+    values = orthogonality(chi, X)
+    assert np.isclose(values[0], 1.0)
+    for r in (1, 2):
+        assert np.isclose(values[r], distance_by_faces(chi[:, :r], chi[:, r], X), atol=1e-10)

@@ -1,0 +1,406 @@
+"""Figures: every one of a real run is drawn and shows the numbers of its results file."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import RendererAgg
+from matplotlib.figure import Figure
+from matplotlib.image import imread
+from matplotlib.lines import Line2D
+from running import Changed, execute
+
+from vibench.report.figures import FORMATS, OF_PROBLEM, constants, convergence, costs, draw_all
+from vibench.report.figures import problems as of_file
+from vibench.report.figures.style import save, styled
+from vibench.results import tables
+from vibench.study.reader import load_study
+
+Drawn = dict[str, Figure]
+
+
+@pytest.fixture
+def results(changed: Changed) -> Path:
+    """A copy of the results of a real run, free to be changed."""
+    return changed()
+
+
+@pytest.fixture
+def change(results: Path) -> Callable[..., None]:
+    """Function that runs SQL on the copy."""
+    return partial(execute, results.parent)
+
+
+Draw = Callable[[], Drawn]
+
+
+@pytest.fixture
+def draw(results: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Draw:
+    """Function that draws the copy and gives every figure by the name of its file; nothing is rendered."""
+    kept: Drawn = {}
+
+    def keep(figure: Figure, target: Path, **_: object) -> None:
+        target.touch(exist_ok=False)
+        kept[target.stem] = figure
+
+    def run() -> Drawn:
+        monkeypatch.setattr(Figure, "savefig", keep)
+        files = draw_all(results, tmp_path / "figures")
+        assert [path.stem for path in files] == [name for name in kept for _ in FORMATS]
+        assert sorted(path.name for path in files) == sorted(path.name for path in (tmp_path / "figures").iterdir())
+        return kept
+
+    return run
+
+
+def data_of(axes: Axes) -> list[np.ndarray]:
+    """The finite values of every line with data."""
+    values = [np.asarray(line.get_ydata(), float) for line in axes.get_lines()]
+    return [found[np.isfinite(found)] for found in values if np.isfinite(found).any()]
+
+
+def line_called(axes: Axes, label: str) -> Line2D:
+    (line,) = [line for line in axes.get_lines() if line.get_label() == label]
+    return line
+
+
+def problems() -> list[str]:
+    return [entry.title for entry in load_study("quick").problem]
+
+
+def test_a_run_draws_its_figures(quick_run: Path) -> None:
+    names = {path.stem for path in (quick_run / "figures").glob("*.png")}
+    for problem in problems():
+        assert {f"{problem}-{kind}" for kind in OF_PROBLEM if kind != "diagnostics"} <= names
+        for dual in load_study("quick").dual:
+            assert {f"{problem}-{dual.title}-enrichment", f"{problem}-{dual.title}-inf-sup"} <= names
+    assert "obstacle-diagnostics" in names
+    assert {path.stem for path in (quick_run / "figures").glob("*.svg")} == names
+
+
+def test_the_pictures_are_no_blank_sheets(quick_run: Path) -> None:
+    for path in (quick_run / "figures").glob("*.png"):
+        pixels = imread(path)
+        assert min(pixels.shape[:2]) > 300
+        assert len(np.unique(np.round(255 * pixels) @ 256.0 ** np.arange(pixels.shape[2]))) > 20
+
+
+def panels(figure: Figure) -> list[Axes]:
+    """The panels of a figure, its colour bars left out."""
+    return [axes for axes in figure.axes if not isinstance(axes.get_label(), str) or "colorbar" not in axes.get_label()]
+
+
+def test_every_panel_has_data_and_labels(draw: Draw) -> None:
+    drawn = draw()
+    assert drawn
+    for name, figure in drawn.items():
+        assert figure.axes
+        for axes in panels(figure):
+            assert axes.has_data(), name
+            assert axes.get_ylabel(), name
+            assert axes.get_xlabel(), name
+
+
+def test_nothing_is_clipped(draw: Draw) -> None:
+    for name, figure in draw().items():
+        box = figure.get_tightbbox(RendererAgg(10, 10, figure.dpi))
+        wide, high = figure.get_size_inches()
+        assert box.x0 >= -0.01, name
+        assert box.y0 >= -0.01, name
+        assert box.x1 <= wide + 0.01, name
+        assert box.y1 <= high + 0.01, name
+
+
+def test_every_logarithmic_axis_has_ticks_to_read(draw: Draw) -> None:
+    for name, figure in draw().items():
+        for axes in panels(figure):
+            for axis, limits in ((axes.xaxis, axes.get_xlim()), (axes.yaxis, axes.get_ylim())):
+                inside = [tick for tick in axis.get_majorticklocs() if limits[0] <= tick <= limits[1]]
+                assert len(inside) >= 2, name
+
+
+def test_lines_that_have_to_be_told_apart_have_names_and_looks_of_their_own(draw: Draw) -> None:
+    for name, figure in draw().items():
+        for axes in panels(figure):
+            lines = [line for line in axes.get_lines() if not line.get_label().startswith("_")]
+            looks = {
+                (line.get_color(), str(line.get_linestyle()), line.get_marker(), line.get_markerfacecolor())
+                for line in lines
+            }
+            assert len(looks) == len({line.get_label() for line in lines}), name
+        named = {label for axes in figure.axes for label in axes.get_legend_handles_labels()[1]}
+        shown = {text.get_text() for legend in figure.legends for text in legend.get_texts()}
+        assert named == shown, name
+
+
+def test_projection_errors_are_those_of_the_histories(draw: Draw, results: Path) -> None:
+    histories, drawn = tables.read(results, "histories"), draw()
+    for problem in problems():
+        pod, cones = drawn[f"{problem}-errors"].axes
+        mine = histories[(histories["problem"] == problem) & (histories["quantity"] == "error")]
+        (line,) = pod.get_lines()
+        expected = mine[mine["stage"] == "pod"].set_index("step")["value"]
+        np.testing.assert_array_equal(line.get_ydata(), expected.loc[np.asarray(line.get_xdata())])
+        assert np.all(np.diff(line.get_ydata()) <= 0.0)
+        assert line.get_ydata()[0] == pytest.approx(1.0)
+        for dual in load_study("quick").dual:
+            line = line_called(cones, dual.title)
+            cone = mine[(mine["stage"] == "cone") & (mine["dual"] == dual.title)].sort_values("step")
+            np.testing.assert_array_equal(line.get_ydata(), cone["value"])
+            assert line.get_ydata()[-1] <= 1e-2
+        assert {axes.get_yscale() for axes in (pod, cones)} == {"log"}
+
+
+def test_orthogonality_has_a_line_per_dual_strategy(draw: Draw) -> None:
+    drawn = draw()
+    for problem in problems():
+        (axes,) = drawn[f"{problem}-orthogonality"].axes
+        assert [line.get_label() for line in axes.get_lines()] == sorted(e.title for e in load_study("quick").dual)
+        for values in data_of(axes):
+            assert values[0] == pytest.approx(1.0)
+            assert np.all((values > 0.0) & (values <= 1.0 + 1e-12))
+
+
+def test_the_enrichment_shows_sigma_and_beta(draw: Draw, results: Path) -> None:
+    queries, drawn = tables.read(results, "queries"), draw()
+    for problem in problems():
+        for dual in load_study("quick").dual:
+            sigma, beta, validation = drawn[f"{problem}-{dual.title}-enrichment"].axes
+            assert np.all(np.diff(data_of(sigma)[0]) <= 1e-12)
+            assert data_of(sigma)[0][-1] <= 0.5
+            assert data_of(beta)[0][-1] > 0.0
+            mine = queries[(queries["problem"] == problem) & (queries["dual"] == dual.title)]
+            fixed = mine[mine["primal_tol"].notna() & (mine["solver"] == "piqp")]
+            np.testing.assert_allclose(data_of(validation)[0], np.sort(fixed["beta_span"]))
+
+
+def test_the_inf_sup_figure_shows_every_strategy_and_the_high_fidelity_pair(draw: Draw, results: Path) -> None:
+    queries, drawn = tables.read(results, "queries"), draw()
+    for problem in problems():
+        for dual in load_study("quick").dual:
+            span, cone = drawn[f"{problem}-{dual.title}-inf-sup"].axes
+            _, labels = span.get_legend_handles_labels()
+            for primal in load_study("quick").primal:
+                assert any(label.startswith(primal.title) for label in labels)
+            exact = queries[(queries["problem"] == problem) & (queries["solver"] == "piqp")]
+            found = np.sort(np.asarray(line_called(span, "high-fidelity").get_ydata(), float))
+            one = exact[(exact["dual"] == dual.title) & (exact["primal_tol"].notna())]
+            np.testing.assert_allclose(found, np.sort(one["beta_hf_span"]))
+            assert len(cone.get_lines()) == len(labels)
+
+
+def test_a_constant_that_vanishes_is_named_though_it_cannot_be_drawn(draw: Draw) -> None:
+    """β over the span of the decorrelated basis is zero in this run, which a logarithmic axis cannot show."""
+    axes = draw()["obstacle-mcpg-inf-sup"].axes[0]
+    assert any(label == "decorrelated (0 over span)" for label in axes.get_legend_handles_labels()[1])
+
+
+def test_a_logarithmic_panel_with_nothing_to_show_stays_empty(change: Callable[..., None], draw: Draw) -> None:
+    """A strategy that records no σ, and enrichments that leave β at zero."""
+    change(
+        "DELETE FROM histories WHERE quantity = 'sigma'",
+        "UPDATE histories SET value = 0.0 WHERE quantity = 'beta_span_min'",
+    )
+    sigma, beta, _ = draw()["obstacle-mcpg-enrichment"].axes[:3]
+    assert not sigma.get_lines()
+    for axes in (sigma, beta):
+        low, high = axes.get_ylim()
+        assert 0.0 < low < high
+
+
+def test_without_queries_nothing_is_drawn(change: Callable[..., None], results: Path, tmp_path: Path) -> None:
+    change("DELETE FROM queries")
+    assert draw_all(results, tmp_path / "figures") == []
+
+
+def test_cells_that_failed_do_not_stop_the_others(change: Callable[..., None], draw: Draw) -> None:
+    change(
+        "DELETE FROM queries WHERE solver = 'osqp' OR primal = 'online-supremizers'",
+        "UPDATE cells SET status = 'error', N = NULL, R = NULL, enrichment_kind = NULL"
+        " WHERE solver = 'osqp' OR primal = 'online-supremizers'",
+    )
+    drawn = draw()
+    assert "obstacle-mcpg-inf-sup" in drawn
+    assert "obstacle-mcpg-enrichment" in drawn
+
+
+def test_a_solver_that_failed_takes_no_strategy_out_of_a_figure(change: Callable[..., None], draw: Draw) -> None:
+    change("DELETE FROM queries WHERE solver = 'osqp' AND primal != 'decorrelated'")
+    _, labels = draw()["obstacle-mcpg-inf-sup"].axes[0].get_legend_handles_labels()
+    assert any(label.startswith("online-supremizers") for label in labels)
+
+
+def test_without_a_fixed_enrichment_there_is_no_enrichment_figure(change: Callable[..., None], draw: Draw) -> None:
+    change("DELETE FROM queries WHERE primal = 'offline-pga'")
+    drawn = draw()
+    assert not [name for name in drawn if name.endswith("enrichment")]
+    assert "obstacle-mcpg-inf-sup" in drawn
+
+
+def test_without_cones_the_other_figures_are_drawn(change: Callable[..., None], draw: Draw) -> None:
+    """As where every snapshot has no contact: no generator, so no e_orth."""
+    change("DELETE FROM histories WHERE stage = 'cone'")
+    assert "obstacle-mcpg-inf-sup" in draw()
+
+
+def test_a_fixed_enrichment_without_tolerance_is_named_without_one(change: Callable[..., None], draw: Draw) -> None:
+    change(*(f"UPDATE {table} SET primal_tol = NULL" for table in ("cells", "queries", "histories")))
+    for name, figure in draw().items():
+        for axes in figure.axes:
+            assert not [label for label in axes.get_legend_handles_labels()[1] if "nan" in label], name
+
+
+def test_prescribed_sizes_are_drawn_too(change: Callable[..., None], draw: Draw) -> None:
+    sizes = "pod_tol = NULL, pod_size = 13, dual_tol = NULL, dual_size = 20"
+    change(
+        f"UPDATE queries SET {sizes}", f"UPDATE cells SET {sizes}",
+        f"UPDATE histories SET {sizes} WHERE stage = 'enrichment'",
+    )  # fmt: skip
+    figure = draw()["obstacle-mcpg-enrichment"]
+    assert all(data_of(axes) for axes in figure.axes)
+
+
+def test_two_pairs_of_tolerances_get_two_panels(change: Callable[..., None], draw: Draw) -> None:
+    change(
+        "UPDATE queries SET pod_tol = 0.1 WHERE solver = 'osqp'", "UPDATE cells SET pod_tol = 0.1 WHERE solver = 'osqp'"
+    )
+    drawn = draw()
+    assert len(drawn["obstacle-mcpg-inf-sup"].axes) == 4
+    assert len(drawn["obstacle-mcpg-enrichment"].axes) == 6
+
+
+def test_entries_that_share_a_label_get_files_of_their_own(change: Callable[..., None], draw: Draw) -> None:
+    other = json.dumps({"resolution": 500})
+    change(
+        f"UPDATE queries SET problem_options = '{other}' WHERE solver = 'osqp'",
+        f"UPDATE cells SET problem_options = '{other}' WHERE solver = 'osqp'",
+        "INSERT INTO histories SELECT * FROM histories",
+        f"UPDATE histories SET problem_options = '{other}' WHERE rowid % 2 = 0",
+    )
+    drawn = draw()
+    assert {"obstacle-1-errors", "obstacle-2-errors", "obstacle-1-mcpg-inf-sup", "obstacle-2-mcpg-inf-sup"} <= set(
+        drawn
+    )
+
+
+@pytest.mark.parametrize("label", ["a/b", "../up", "a\\b", "m·CPG, δ = 0.1", "x" * 300])
+def test_any_label_makes_a_file_in_the_folder(label: str, change: Callable[..., None], draw: Draw) -> None:
+    change(*(f"UPDATE {table} SET dual = '{label}' WHERE dual = 'mcpg'" for table in ("cells", "queries", "histories")))
+    assert sum(name.endswith("inf-sup") for name in draw()) == 2 * len(problems())
+
+
+def test_labels_that_differ_only_in_signs_get_files_of_their_own(change: Callable[..., None], draw: Draw) -> None:
+    for old, new in (("mcpg", "a/b"), ("cpg", "a:b")):
+        change(
+            *(f"UPDATE {table} SET dual = '{new}' WHERE dual = '{old}'" for table in ("cells", "queries", "histories"))
+        )
+    assert sum(name.endswith("inf-sup") for name in draw()) == 2 * len(problems())
+
+
+@pytest.mark.parametrize("count", [7, 12])
+def test_there_is_a_style_for_every_strategy(count: int, results: Path) -> None:
+    """However many strategies a study compares."""
+    data = dict(of_file(results))["obstacle"]
+
+    def many(frame: pd.DataFrame, column: str, original: str) -> pd.DataFrame:
+        one = frame[frame[column] == original]
+        return pd.concat([one.assign(**{column: f"{original}-{k:02d}", "artefact": str(k)}) for k in range(count)])
+
+    cones = replace(data, histories=pd.concat([data.histories[data.histories["stage"] == "pod"],
+                                               many(data.histories, "dual", "mcpg")]))  # fmt: skip
+    assert len(convergence.projection_errors(cones).axes[1].get_lines()) == count
+    assert len(convergence.orthogonality(cones).axes[0].get_lines()) == count
+    mine = data.of_dual("mcpg")
+    fixed = replace(mine, queries=many(mine.queries, "primal", "offline-pga"),
+                    histories=many(mine.histories, "primal", "offline-pga"))  # fmt: skip
+    assert len(convergence.enrichment(fixed).axes[0].get_lines()) == count
+    assert len(constants.inf_sup(fixed).axes[0].get_lines()) == count + 1
+
+
+def test_thresholds_are_marked_where_the_lines_cross(results: Path) -> None:
+    data = dict(of_file(results))["obstacle"]
+    figure = costs.total_cost(data)
+    marks = [line for axes in figure.axes for line in axes.get_lines() if line.get_marker() in "<>"]
+    assert marks
+    for axes in figure.axes:
+        lines = [np.asarray(line.get_xydata()) for line in axes.get_lines() if line.get_marker() not in "<>"]
+        for mark in (line for line in axes.get_lines() if line.get_marker() in "<>"):
+            ((n, cost),) = mark.get_xydata()
+            if 1.0 <= n <= costs.MOST_QUERIES:
+                through = [np.interp(n, *line.T) for line in lines]
+                assert sum(np.isclose(value, cost, rtol=0.02) for value in through) >= 2
+
+
+def test_no_strategy_beats_those_on_the_front(results: Path) -> None:
+    rng = np.random.default_rng(0)
+    x, y = rng.random(40), rng.random(40)
+    front = np.column_stack(costs._front(x, y))
+    for point in zip(x, y, strict=True):
+        on = any(np.array_equal(point, other) for other in front)
+        beaten = np.any((x <= point[0]) & (y <= point[1]) & ((x < point[0]) | (y < point[1])))
+        assert on != beaten
+
+
+def test_a_profile_ends_at_the_share_that_was_solved(change: Callable[..., None], draw: Draw) -> None:
+    change("UPDATE queries SET status = 'failed' WHERE solver = 'osqp' AND problem = 'obstacle' AND query < 4")
+    profile = draw()["obstacle-solvers"].axes[1]
+    assert line_called(profile, "osqp").get_ydata()[-1] == pytest.approx(0.75)
+    assert line_called(profile, "piqp").get_ydata()[-1] == pytest.approx(1.0)
+    for line in profile.get_lines():
+        assert np.all(np.diff(line.get_ydata()) >= 0.0)
+
+
+def test_the_same_results_give_the_same_files(results: Path, tmp_path: Path) -> None:
+    data = dict(of_file(results))["hertz"]
+    for name, drawing in (("solutions", OF_PROBLEM["solutions"]), ("errors", OF_PROBLEM["errors"])):
+        files = []
+        for folder in ("one", "two"):
+            (tmp_path / folder).mkdir(exist_ok=True)
+            with styled():
+                files.append(save(drawing(data), tmp_path / folder, name))
+        for first, second in zip(*files, strict=True):
+            assert first.read_bytes() == second.read_bytes(), first.name
+
+
+def test_several_processes_draw_the_same_files(results: Path, tmp_path: Path) -> None:
+    one, two = (draw_all(results, tmp_path / f"{jobs}", ("svg",), jobs) for jobs in (1, 2))
+    assert [file.name for file in one] == [file.name for file in two]
+    for first, second in zip(one, two, strict=True):
+        assert first.read_bytes() == second.read_bytes(), first.name
+
+
+def test_the_tightest_enrichment_is_the_one_that_went_farthest(results: Path) -> None:
+    """Whichever way its tolerance runs, and however many training parameters there are."""
+    mine = dict(of_file(results))["obstacle"].of_dual("mcpg")
+    steps = mine.histories[mine.histories["stage"] == "enrichment"]
+    longer = steps[steps["quantity"].isin(["sigma", "beta_span_min"])]
+    last = longer[longer["step"] == longer["step"].max()].assign(step=longer["step"].max() + 1)
+    tighter = pd.concat([steps, last]).assign(primal_tol=0.9, artefact="tighter")
+    both = pd.concat([steps, tighter])
+    assert set(convergence._tightest(both)) == {0.9}
+    assert set(convergence._tightest(pd.concat([steps.assign(primal_tol=0.95), tighter]))) == {0.9}
+
+
+def test_one_label_with_two_options_is_two_strategies(change: Callable[..., None], draw: Draw) -> None:
+    change(*(f"UPDATE {table} SET primal_options = '{{\"k\": 1}}' WHERE solver = 'osqp' AND primal = 'decorrelated'"
+             for table in ("cells", "queries")))  # fmt: skip
+    labels = draw()["obstacle-mcpg-inf-sup"].axes[0].get_legend_handles_labels()[1]
+    assert sum(label.startswith("decorrelated (") for label in labels) == 2
+
+
+def test_a_solver_that_never_answered_is_in_the_profile(change: Callable[..., None], draw: Draw) -> None:
+    nothing = "solve_s = NULL, status = 'error', primal_residual = NULL, dual_residual = NULL, gap = NULL"
+    change(f"UPDATE queries SET {nothing} WHERE solver = 'osqp' AND problem = 'obstacle'")
+    assert line_called(draw()["obstacle-solvers"].axes[1], "osqp").get_ydata()[-1] == 0.0
+
+
+def test_twelve_kinds_have_twelve_looks() -> None:
+    assert len({(point["color"], point["marker"]) for point in (costs._point(k, 0) for k in range(12))}) == 12

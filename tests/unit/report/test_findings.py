@@ -1,0 +1,77 @@
+"""Findings: every sentence says what the tables say, and nothing is said that they do not support."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from running import Changed
+
+from vibench.report.findings import findings
+from vibench.results import tables
+from vibench.results.database import FILE
+
+
+@pytest.fixture
+def said(changed: Changed) -> Callable[..., dict[str, list[str]]]:
+    """Function that gives the findings of a changed copy of a real run, by what they are about."""
+
+    def run(*statements: str) -> dict[str, list[str]]:
+        found: dict[str, list[str]] = {}
+        for finding in findings(changed(*statements)):
+            found.setdefault(finding.about, []).append(finding.text)
+        return found
+
+    return run
+
+
+Said = Callable[..., dict[str, list[str]]]
+
+
+def test_a_whole_run_is_called_whole(said: Said) -> None:
+    whole = said()[""]
+    assert whole[0].startswith("36 cells, 36 with every query ok; 576 of 576 queries")
+    assert "hold in all 576 queries" in whole[1]
+    assert whole[2].startswith("Solvers that were ok on the same reduced problem agree")
+
+
+def test_what_fell_short_is_counted(said: Said) -> None:
+    ruined = "UPDATE cells SET status = 'inaccurate', queries_ok = 10 WHERE solver = 'osqp'"
+    assert said(ruined)[""][0].startswith("36 cells, 24 with every query ok; 504 of 576 queries")
+
+
+def test_a_violated_invariant_is_not_hidden(said: Said) -> None:
+    broken = "UPDATE queries SET beta_span = 9 WHERE query = 3 AND problem = 'hertz' AND solver = 'piqp'"
+    assert any(text.startswith("Invariants of the constants") and "violated" in text for text in said(broken)[""])
+
+
+def test_stability_and_cost_are_those_of_the_tables(said: Said, quick_run: Path) -> None:
+    cells = tables.read(quick_run / FILE, "cells")
+    mine = cells[(cells["problem"] == "obstacle") & (cells["dual"] == "mcpg")]
+    size = mine.iloc[0]
+    texts = said()[f"obstacle, mcpg, (N, R) = ({size['N']:.0f}, {size['R']:.0f})"]
+    assert texts[0].startswith("Without enrichment min β over the span is zero")
+    quickest = mine.groupby("solver")["online_s"].mean().idxmin()
+    of_solver = mine[mine["solver"] == quickest].set_index("primal")
+    pga, online = of_solver.loc["offline-pga"], of_solver.loc["online-supremizers"]
+    share = 100.0 * pga["beta_span_min"] / online["beta_span_min"]
+    assert any(f"adds {pga['enrichment']:.0f} vectors" in text and f"{share:.0f} % of what" in text for text in texts)
+    best = of_solver["online_s"].min()
+    assert any(f"{1e3 * best:.3g} ms" in text and text.startswith("The quickest query") for text in texts)
+    thresholds = tables.read(quick_run / FILE, "thresholds")
+    numbers = thresholds[(thresholds["problem"] == "obstacle") & (thresholds["dual"] == "mcpg")]["benefit_threshold"]
+    (pays,) = [text for text in texts if text.startswith("Against high-fidelity")]
+    assert any(f"from {math.ceil(number)} queries" in pays for number in numbers.dropna())
+
+
+def test_without_a_plain_basis_nothing_is_said_of_it(said: Said) -> None:
+    gone = [f"DELETE FROM {table} WHERE primal = 'decorrelated'" for table in ("queries", "cells")]
+    everything = [text for texts in said(*gone).values() for text in texts]
+    assert not [text for text in everything if text.startswith("Without enrichment")]
+
+
+def test_a_solver_that_answered_nothing_has_no_median(said: Said) -> None:
+    failed = "UPDATE queries SET status = 'failed', solve_s = NULL WHERE solver = 'osqp' AND problem = 'hertz'"
+    assert "osqp answered 0 of 96 queries." in said(failed)["hertz, solvers"]

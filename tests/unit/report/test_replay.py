@@ -1,0 +1,131 @@
+"""Replay and export of the reduced programs of a run, through the command line and from Python."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+import qpsolvers
+from typer.testing import CliRunner
+
+import vibench
+from vibench.cli.main import app
+from vibench.errors import RequestError
+from vibench.execution.recorded_cell import RecordedCell, recorded_cell, recorded_cells
+from vibench.qp import verification
+from vibench.qp.solve import installed_solvers, solve_qp
+from vibench.report import replay
+
+STUDY = """
+name = "small"
+seed = 1
+validation = 3
+accuracy = 1e-7
+solvers = ["piqp", "osqp"]
+dual = ["mcpg"]
+primal = ["online-supremizers", "offline-pga"]
+[[problem]]
+name = "radial-obstacle"
+options = { resolution = 200 }
+[[tolerances]]
+pod = [1e-2]
+dual = [1e-1]
+primal = { offline-pga = [0.5] }
+"""
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("replayed")
+    (folder / "study.toml").write_text(STUDY)
+    done = CliRunner().invoke(app, ["run", str(folder / "study.toml"), "--out", str(folder / "run"), "--jobs", "1"])
+    assert done.exit_code == 0, done.output
+    return folder / "run"
+
+
+def key(run: Path, solver: str = "piqp") -> str:
+    cells = pd.read_csv(run / "tables" / "cells.csv")
+    return str(cells[(cells["solver"] == solver) & (cells["primal"] == "offline-pga")]["cell"].iloc[0])
+
+
+def test_a_recorded_cell_solves_as_it_did(run: Path) -> None:
+    recorded = recorded_cell(str(run), key(run))
+    solutions = recorded.rows("solutions")
+    assert sorted(solutions) == [0, 1, 2]
+    for query in solutions:
+        again = solve_qp(recorded.program(query), "piqp", 1e-7)
+        x = np.frombuffer(solutions[query]["x"])
+        assert np.array_equal(again.x, x)
+    model = vibench.load(str(run), key(run)[:8])
+    assert model.fixed_basis.shape[1] == recorded.row["N"] + recorded.row["enrichment"]
+
+
+def test_stages_whose_artefacts_are_gone_are_run_again(run: Path, artefacts: Path) -> None:
+    for file in artefacts.glob("*stage-*"):
+        file.unlink()
+    before = recorded_cell(str(run), key(run)).rows("queries")[1]["primal_residual"]
+    recorded = recorded_cell(str(run), key(run))
+    x, alpha = (np.frombuffer(recorded.rows("solutions")[1][name]) for name in ("x", "alpha"))
+    assert verification.kkt_residuals(recorded.program(1), x, alpha).primal == pytest.approx(
+        before, rel=1e-6, abs=1e-15
+    )
+
+
+def test_replay_names_every_solver_and_keeps_the_program(run: Path, tmp_path: Path) -> None:
+    recorded = recorded_cell(str(run), key(run, "osqp"))
+    frame = replay.replay(recorded, 2, tmp_path / "program.npz").set_index("solver")
+    assert frame.index[0] == "osqp (recorded)"
+    assert set(frame.index[1:]) == set(installed_solvers())
+    assert frame.loc["piqp", "status"] == "ok"
+    assert frame.loc["osqp", "distance"] == pytest.approx(0.0, abs=1e-12)
+    stored = recorded.rows("queries")[2]
+    for column, name in (("primal", "primal_residual"), ("dual", "dual_residual"), ("gap", "gap")):
+        assert frame.loc["osqp (recorded)", column] == pytest.approx(stored[name], rel=1e-6, abs=1e-14)
+    program = qpsolvers.Problem.load(str(tmp_path / "program.npz"))
+    assert np.array_equal(program.P, recorded.program(2).A)
+    assert np.array_equal(program.q, -recorded.program(2).f)
+
+
+def test_the_exported_set_is_rechecked_by_a_script_that_knows_nothing_of_vibench(run: Path, tmp_path: Path) -> None:
+    done = CliRunner().invoke(app, ["export-qps", str(run), str(tmp_path / "set")])
+    assert done.exit_code == 0, done.output
+    assert "6 programs" in done.output  # two reduced models, three queries
+    script = tmp_path / "set" / replay.CHECKER
+    assert "import vibench" not in script.read_text()
+    assert "from vibench" not in script.read_text()
+
+    def check() -> subprocess.CompletedProcess[str]:
+        return subprocess.run(
+            [sys.executable, "-I", str(script)], cwd=tmp_path, capture_output=True, text=True, check=False
+        )
+
+    fine = check()
+    assert (fine.returncode, fine.stdout.strip()) == (0, "12 solutions, 12 claimed ok, 0 wrong")
+    file = next((tmp_path / "set" / "solutions").glob("*.npz"))
+    arrays = dict(np.load(file))
+    arrays["x_piqp"] = arrays["x_piqp"] * (1.0 + 1e-4)
+    np.savez(file, **arrays)
+    spoilt = check()
+    assert spoilt.returncode == 1
+    assert "1 wrong" in spoilt.stdout
+    assert CliRunner().invoke(app, ["export-qps", str(run), str(tmp_path / "set")]).exit_code != 0
+
+
+def test_wrong_requests_are_one_line(run: Path, tmp_path: Path) -> None:
+    with pytest.raises(RequestError, match=r"0 cells of .* begin with 'nothing'"):
+        recorded_cell(str(run), "nothing")
+    with pytest.raises(RequestError, match="4 cells"):
+        recorded_cell(str(run), "")
+    recorded = recorded_cell(str(run), key(run))
+    with pytest.raises(RequestError, match="no query 3; it has 0 to 2"):
+        replay.replay(recorded, 3, tmp_path / "p.npz")
+    with pytest.raises(RequestError, match=r"must end in \.npz"):
+        replay.replay(recorded, 0, tmp_path / "p.txt")
+    assert len(recorded_cells(str(run))) == 4
+    other = RecordedCell(recorded.path, {**recorded.row, "code": "another"})
+    with pytest.raises(RequestError, match="computed by other code"):
+        _ = other.model

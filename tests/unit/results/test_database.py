@@ -1,0 +1,313 @@
+"""The results file: one transaction a cell, and no mixture of studies."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import sqlite3
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from samples import cell_row, query_rows
+
+from vibench.errors import RequestError
+from vibench.results import database as module
+from vibench.results.database import FILE, ResultsDatabase, claimed, read_meta
+from vibench.results.schema import CELLS, TABLES, VERSION
+
+STUDY = {"name": "sample", "seed": 1, "validation": 4, "accuracy": 1e-7}
+
+
+@pytest.fixture
+def journal(tmp_path: Path) -> Iterator[ResultsDatabase]:
+    """The results of a new study."""
+    made = ResultsDatabase(tmp_path / "run", STUDY)
+    yield made
+    made.close()
+
+
+def seen(folder: Path, table: str) -> list[tuple[Any, ...]]:
+    """The rows of a table as another process sees them."""
+    db = sqlite3.connect(folder / FILE)
+    try:
+        return db.execute(f"SELECT * FROM {table}").fetchall()
+    finally:
+        db.close()
+
+
+def refusal(action: Callable[[], object]) -> str:
+    with pytest.raises(RequestError) as caught:
+        action()
+    line = str(caught.value)
+    assert "\n" not in line
+    return line
+
+
+def claim(folder: Path) -> None:
+    with claimed(folder):
+        pass
+
+
+def test_a_folder_has_one_run_at_a_time(tmp_path: Path) -> None:
+    """The second one is told who the first is; a folder that was claimed before is no foreign one."""
+    with claimed(tmp_path / "run"):
+        assert f"another run writes into '{tmp_path / 'run'}' (process {os.getpid()} on" in refusal(
+            lambda: claim(tmp_path / "run")
+        )
+    claim(tmp_path / "run")
+
+
+def test_a_new_folder_gets_every_table(journal: ResultsDatabase, tmp_path: Path) -> None:
+    for table in TABLES:
+        assert journal.rows(table) == []
+    assert read_meta(tmp_path / "run" / FILE)["schema"] == str(VERSION)
+
+
+def test_a_cell_and_its_queries_come_back_as_written(journal: ResultsDatabase, tmp_path: Path) -> None:
+    cell, queries = cell_row(), query_rows(count=3)
+    journal.write_cell(cell, queries)
+    assert journal.rows("cells") == [cell]
+    assert journal.rows("queries") == queries
+    assert len(seen(tmp_path / "run", "queries")) == 3
+
+
+def test_missing_columns_are_null(journal: ResultsDatabase) -> None:
+    journal.write_cell({"cell": "c1", "status": "error"}, [])
+    (row,) = journal.rows("cells")
+    assert row == dict.fromkeys(CELLS) | {"cell": "c1", "status": "error"}
+
+
+def test_columns_are_added_for_every_parameter(journal: ResultsDatabase) -> None:
+    journal.write_cell(cell_row("c1"), [row | {"mu_3": 3.0} for row in query_rows("c1", 1)])
+    journal.write_cell(cell_row("c2"), query_rows("c2", 1, mu_1=9.0))
+    first, second = journal.rows("queries")
+    assert (first["mu_1"], first["mu_2"], first["mu_3"]) == (0.0, 2.0, 3.0)
+    assert (second["mu_1"], second["mu_2"], second["mu_3"]) == (9.0, 2.0, None)
+
+
+def test_columns_of_parameters_are_found_again(journal: ResultsDatabase, tmp_path: Path) -> None:
+    journal.write_cell(cell_row("c1"), query_rows("c1"))
+    again = ResultsDatabase(tmp_path / "run", STUDY)
+    again.write_cell(cell_row("c2"), query_rows("c2"))
+    assert len(again.rows("queries")) == 4
+    again.close()
+
+
+def test_any_other_new_column_is_an_error(journal: ResultsDatabase) -> None:
+    with pytest.raises(sqlite3.Error):
+        journal.write_cell(cell_row(), query_rows(surprise=1.0))
+    assert journal.rows("cells") == []
+
+
+@pytest.mark.parametrize("fault", [{"status": None}, {"gap": object()}], ids=["forbidden null", "no number"])
+@pytest.mark.parametrize("position", [0, 2])
+def test_a_failing_write_leaves_neither_cell_nor_queries(
+    fault: dict[str, Any], position: int, journal: ResultsDatabase, tmp_path: Path
+) -> None:
+    queries = query_rows(count=3)
+    queries[position] |= fault
+    with pytest.raises(sqlite3.Error):
+        journal.write_cell(cell_row(), queries)
+    for table in ("cells", "queries"):
+        assert journal.rows(table) == []
+        assert seen(tmp_path / "run", table) == []
+
+
+def test_a_failing_rewrite_leaves_the_earlier_rows(journal: ResultsDatabase) -> None:
+    journal.write_cell(cell_row(), query_rows())
+    before = journal.rows("cells"), journal.rows("queries")
+    with pytest.raises(sqlite3.Error):
+        journal.write_cell(cell_row(status="error"), [*query_rows(count=1), *query_rows(status=None)])
+    assert (journal.rows("cells"), journal.rows("queries")) == before
+
+
+def test_a_rewritten_cell_has_only_its_new_queries(journal: ResultsDatabase) -> None:
+    journal.write_cell(cell_row("c1", status="error"), query_rows("c1", 4))
+    journal.write_cell(cell_row("c2"), query_rows("c2", 2))
+    journal.write_cell(cell_row("c1"), query_rows("c1", 1, gap=0.25))
+    assert {row["cell"]: row["status"] for row in journal.rows("cells")} == {"c1": "ok", "c2": "ok"}
+    assert sorted((row["cell"], row["query"]) for row in journal.rows("queries")) == [("c1", 0), ("c2", 0), ("c2", 1)]
+    assert [row["gap"] for row in journal.rows("queries") if row["cell"] == "c1"] == [0.25]
+
+
+def test_queries_need_their_cell(journal: ResultsDatabase) -> None:
+    with pytest.raises(sqlite3.IntegrityError):
+        journal.write_cell(cell_row("c1"), query_rows("of nobody"))
+
+
+def test_finished_tells_status_and_code(journal: ResultsDatabase) -> None:
+    journal.write_cell(cell_row("c1", status="ok", code="new"), [])
+    journal.write_cell(cell_row("c2", status="timeout", code="old"), [])
+    assert journal.finished() == {"c1": ("ok", "new"), "c2": ("timeout", "old")}
+
+
+def test_what_was_written_is_there_for_the_next_run(journal: ResultsDatabase, tmp_path: Path) -> None:
+    journal.write_cell(cell_row(), query_rows())
+    journal.close()
+    again = ResultsDatabase(tmp_path / "run", STUDY)
+    assert len(again.finished()) == 1
+    assert len(again.rows("queries")) == 2
+    again.close()
+
+
+def test_a_run_that_dies_loses_no_written_cell(journal: ResultsDatabase, tmp_path: Path) -> None:
+    """What a copy of the folder holds while the journal is open is what a crash would leave."""
+    journal.write_cell(cell_row(), query_rows())
+    shutil.copytree(tmp_path / "run", tmp_path / "copy")
+    again = ResultsDatabase(tmp_path / "copy", STUDY)
+    assert len(again.rows("cells")) == 1
+    assert len(again.rows("queries")) == 2
+    again.close()
+
+
+HISTORY = {"artefact": "pod-1", "stage": "pod", "quantity": "error", "step": 0, "value": 1.0}
+
+
+def test_histories_replace_those_of_their_artefact(journal: ResultsDatabase) -> None:
+    journal.write_histories("pod-1", [HISTORY, HISTORY | {"step": 1, "value": 0.5}])
+    journal.write_histories("pod-2", [HISTORY | {"artefact": "pod-2", "pod_tol": 0.75}])
+    journal.write_histories("pod-1", [HISTORY | {"value": 0.25}])
+    found = sorted((row["artefact"], row["step"], row["value"]) for row in journal.rows("histories"))
+    assert found == [("pod-1", 0, 0.25), ("pod-2", 0, 1.0)]
+
+
+def test_a_failing_write_of_histories_leaves_the_earlier_ones(journal: ResultsDatabase) -> None:
+    journal.write_histories("pod-1", [HISTORY])
+    with pytest.raises(sqlite3.Error):
+        journal.write_histories("pod-1", [HISTORY | {"step": 1}, HISTORY | {"surprise": 1}])
+    assert [row["step"] for row in journal.rows("histories")] == [0]
+
+
+def test_thresholds_replace_all_earlier_ones(journal: ResultsDatabase) -> None:
+    row = {"problem": "p", "benefit_threshold": 3.0, "meaning": "from"}
+    journal.replace("thresholds", [row, row])
+    journal.replace("thresholds", [row | {"benefit_threshold": 4.0}])
+    assert [row["benefit_threshold"] for row in journal.rows("thresholds")] == [4.0]
+
+
+def test_numbers_of_numpy_are_stored_as_numbers(journal: ResultsDatabase) -> None:
+    """SQLite would take NumPy's integers for bytes."""
+    journal.write_cell(cell_row(N=np.int64(12)), query_rows(count=1, iterations=np.int32(7)))
+    journal.write_histories("pod-1", [HISTORY | {"value": np.int64(2)}])
+    assert journal.rows("cells")[0]["N"] == 12
+    assert journal.rows("queries")[0]["iterations"] == 7
+    assert journal.rows("histories")[0]["value"] == 2
+
+
+@pytest.mark.parametrize(("key", "value"), [("name", "other"), ("seed", 2), ("validation", 5), ("accuracy", 1e-8)])
+def test_results_of_another_study_are_refused(key: str, value: Any, journal: ResultsDatabase, tmp_path: Path) -> None:
+    line = refusal(lambda: ResultsDatabase(tmp_path / "run", STUDY | {key: value}))
+    assert str(tmp_path / "run") in line
+    assert "another study" in line
+    assert f"{key} {STUDY[key]!r} instead of {value!r}" in line
+
+
+def test_results_of_another_schema_are_refused(
+    journal: ResultsDatabase, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(module, "VERSION", VERSION + 1)
+    line = refusal(lambda: ResultsDatabase(tmp_path / "run", STUDY))
+    assert f"schema {VERSION}" in line
+    assert str(VERSION + 1) in line
+
+
+def test_a_refused_folder_is_left_as_it_was(journal: ResultsDatabase, tmp_path: Path) -> None:
+    journal.write_cell(cell_row(), query_rows())
+    journal.close()
+    before = (tmp_path / "run" / FILE).read_bytes()
+    refusal(lambda: ResultsDatabase(tmp_path / "run", STUDY | {"seed": 2}))
+    assert (tmp_path / "run" / FILE).read_bytes() == before
+
+
+def test_a_file_in_place_of_the_folder_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    assert "is a file" in refusal(lambda: claim(tmp_path / "file"))
+    assert "cannot be written" in refusal(lambda: claim(tmp_path / "file" / "below"))
+    assert "cannot be written" in refusal(lambda: ResultsDatabase(tmp_path / "file" / "below", STUDY))
+
+
+def test_a_folder_with_other_things_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "notes.txt").touch()
+    line = refusal(lambda: claim(tmp_path))
+    assert "not empty" in line
+    assert FILE in line
+    assert [path.name for path in tmp_path.iterdir()] == ["notes.txt"]
+
+
+def test_an_empty_folder_will_do(tmp_path: Path) -> None:
+    made = ResultsDatabase(tmp_path, STUDY)
+    made.write_cell(cell_row(), [])
+    assert len(made.rows("cells")) == 1
+    made.close()
+
+
+@pytest.mark.parametrize("content", [b"hello", b"SQLite format 3\x00 and then nothing"], ids=["text", "cut off"])
+def test_a_file_that_is_no_database_is_refused(content: bytes, tmp_path: Path) -> None:
+    (tmp_path / FILE).write_bytes(content)
+    line = refusal(lambda: ResultsDatabase(tmp_path, STUDY))
+    assert FILE in line
+    assert "not a results file" in line
+    assert (tmp_path / FILE).read_bytes() == content
+
+
+def test_a_database_of_something_else_is_refused(tmp_path: Path) -> None:
+    db = sqlite3.connect(tmp_path / FILE)
+    db.execute("CREATE TABLE notes (text TEXT)")
+    db.close()
+    assert "not a results file" in refusal(lambda: ResultsDatabase(tmp_path, STUDY))
+
+
+def test_a_results_file_with_a_broken_study_is_refused(journal: ResultsDatabase, tmp_path: Path) -> None:
+    db = sqlite3.connect(tmp_path / "run" / FILE)
+    db.execute("UPDATE meta SET value = 'nonsense' WHERE key = 'study'")
+    db.commit()
+    db.close()
+    assert FILE in refusal(lambda: ResultsDatabase(tmp_path / "run", STUDY))
+
+
+def test_a_file_left_empty_by_a_killed_run_is_taken_over(tmp_path: Path) -> None:
+    (tmp_path / FILE).touch()
+    made = ResultsDatabase(tmp_path, STUDY)
+    assert made.finished() == {}
+    made.close()
+
+
+def test_a_name_no_folder_can_have_is_refused(tmp_path: Path) -> None:
+    assert "output folder" in refusal(lambda: ResultsDatabase(tmp_path / ("a" * 300), STUDY))
+
+
+@pytest.mark.skipif(not Path("/proc").is_dir(), reason="needs a folder nobody can write to")
+def test_a_folder_that_cannot_be_made_is_refused() -> None:
+    assert "cannot be written" in refusal(lambda: ResultsDatabase(Path("/proc/vibench"), STUDY))
+
+
+def test_a_database_that_cannot_be_opened_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def locked(*_: object, **__: object) -> None:
+        raise sqlite3.OperationalError("database is locked")
+
+    monkeypatch.setattr(module.sqlite3, "connect", locked)
+    line = refusal(lambda: ResultsDatabase(tmp_path / "run", STUDY))
+    assert "cannot be written" in line
+    assert "locked" in line
+
+
+def test_histories_of_other_code_give_way_and_parts_of_a_sweep_stay(tmp_path: Path) -> None:
+    journal = ResultsDatabase(tmp_path, {"name": "some"})
+
+    def rows(artefact: str, stage: str, first: int, count: int) -> list[dict[str, Any]]:
+        keys = {"artefact": artefact, "stage": stage, "problem": "wire", "quantity": "error"}
+        return [keys | {"step": first + k, "value": 1.0} for k in range(count)]
+
+    journal.write_histories("old", rows("old", "pod", 0, 5))
+    journal.write_histories("new", rows("new", "pod", 0, 3))
+    for first, artefact in ((0, "a"), (4, "b"), (0, "c")):
+        journal.write_histories(artefact, rows(artefact, "training", first, 4), parts=True)
+    found = [(row["stage"], row["artefact"], row["step"]) for row in journal.rows("histories")]
+    journal.close()
+    assert sorted(found) == sorted(
+        [("pod", "new", k) for k in range(3)] + [("training", "c", k) for k in range(4)]
+        + [("training", "b", k) for k in range(4, 8)]
+    )  # fmt: skip

@@ -1,0 +1,95 @@
+"""Pictures: of the right solutions, the same when read back, and a reason where there is none."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from fake_plugins import Wire
+from samples import carry_out
+
+from vibench.arrays import Array
+from vibench.errors import NumericalError
+from vibench.interfaces.problem import Picture
+from vibench.results import pictures
+from vibench.results.database import FILE, ResultsDatabase
+from vibench.results.pictures import Shown
+from vibench.stages import base
+from vibench.stages.artefacts import Store
+from vibench.stages.pictures import PictureStage
+from vibench.study.cells import Plugin
+
+OBSTACLE = Plugin("problem", "obstacle", '{"resolution": 200}', "test")
+KEYS = {"problem": "membrane", "problem_options": OBSTACLE.options}
+
+
+@pytest.fixture(scope="module")
+def drawn(tmp_path_factory: pytest.TempPathFactory) -> tuple[tuple[str, Picture], ...]:
+    store, made = Store(tmp_path_factory.mktemp("pictures")), PictureStage(OBSTACLE)
+    carry_out(made, store)
+    return tuple(base.value_of(store, made))
+
+
+def test_the_corners_and_the_middle_of_the_parameters_are_shown(drawn: tuple[tuple[str, Picture], ...]) -> None:
+    assert [title for title, _ in drawn] == [
+        "scale = 0.8, centre_x = -0.05 m, centre_y = -0.05 m",
+        "scale = 1, centre_x = 0 m, centre_y = 0 m",
+        "scale = 1.2, centre_x = 0.05 m, centre_y = 0.05 m",
+    ]
+
+
+def test_what_is_shown_are_the_solutions_there(drawn: tuple[tuple[str, Picture], ...]) -> None:
+    middle = drawn[1][1]
+    assert middle.values.min() < -0.02  # the membrane hangs
+    assert middle.multiplier.max() > 0.0  # and rests on the obstacle
+    assert np.all(middle.multiplier >= 0.0)
+
+
+def test_pictures_read_back_are_those_written(drawn: tuple[tuple[str, Picture], ...], tmp_path: Path) -> None:
+    journal = ResultsDatabase(tmp_path, {"name": "some"})
+    for _ in range(2):  # a second run writes in place of the first
+        journal.write_pictures(pictures.rows(KEYS, drawn))
+    journal.close()
+    found = list(pictures.read(tmp_path / FILE))
+    assert [(one.key, one.title, one.reason) for one in found] == [
+        (("membrane", OBSTACLE.options), title, "") for title, _ in drawn
+    ]
+    for one, (_, picture) in zip(found, drawn, strict=True):
+        assert one.picture is not None
+        assert (one.picture.name, one.picture.multiplier_name) == (picture.name, picture.multiplier_name)
+        assert np.array_equal(one.picture.triangles, picture.triangles)
+        for name in ("points", "values", "positions", "multiplier"):
+            np.testing.assert_allclose(getattr(one.picture, name), getattr(picture, name), rtol=1e-6, atol=1e-12)
+
+
+def test_a_picture_that_could_not_be_made_has_its_reason(tmp_path: Path) -> None:
+    journal = ResultsDatabase(tmp_path, {"name": "some"})
+    journal.write_pictures(pictures.missing(KEYS, "the camera broke"))
+    journal.close()
+    assert list(pictures.read(tmp_path / FILE)) == [Shown(("membrane", OBSTACLE.options), "", None, "the camera broke")]
+
+
+class Drawing(Wire):
+    """A wire that draws itself on a line, one array of the wrong shape."""
+
+    wrong = ""
+
+    def picture(self, mu: Array, u: Array, lam: Array) -> Picture:
+        x = np.linspace(0.0, 1.0, self.V.dim)[None]
+        arrays = {"points": x, "values": u, "positions": x, "multiplier": lam, "triangles": np.zeros((3, 0), int)}
+        if self.wrong:
+            arrays[self.wrong] = np.zeros((3, 4))
+        return Picture(**arrays, name="u [m]", multiplier_name="λ [N]")
+
+
+@pytest.mark.parametrize("wrong", ["points", "values", "positions", "multiplier"])
+def test_an_array_of_the_wrong_shape_is_named(wrong: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    wire = Plugin("problem", "wire", "{}", "test")
+    for module in ("vibench.stages.pictures", "vibench.stages.snapshots"):
+        monkeypatch.setattr(f"{module}.build_problem", lambda _: Drawing())
+    store = Store(tmp_path)
+    carry_out(PictureStage(wire), store)
+    monkeypatch.setattr(Drawing, "wrong", wrong)
+    with pytest.raises(NumericalError, match=f"picture has .*{wrong}.* of the wrong shape"):
+        PictureStage(wire).run(store)

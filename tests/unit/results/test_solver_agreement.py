@@ -1,0 +1,82 @@
+from __future__ import annotations
+
+import numpy as np
+import pandas as pd
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from numerics import spd
+
+from vibench.interfaces.problem import VariationalInequality
+from vibench.qp import verification
+from vibench.qp.accuracy_bounds import Slack, allowed, slack
+from vibench.qp.solve import solve_qp
+from vibench.results.schema import KEYS
+from vibench.results.solver_agreement import Recorded, compare, disagreement_rows, sentence, solution_row
+
+
+def program(seed: int, n: int = 6, m: int = 4) -> VariationalInequality:
+    rng = np.random.default_rng(seed)
+    return VariationalInequality(
+        spd(n, rng), rng.standard_normal(n), rng.standard_normal((m, n)), rng.standard_normal(m) + 0.5
+    )
+
+
+def random_answer(vi: VariationalInequality, rng: np.random.Generator, size: float) -> tuple[np.ndarray, np.ndarray]:
+    """The solution, moved by about `size`."""
+    exact = solve_qp(vi, "piqp", 1e-12)
+    x = exact.x * (1.0 + size * rng.standard_normal(len(vi.f)))
+    return x, np.maximum(exact.alpha * (1.0 + size * rng.standard_normal(len(vi.g))), 0.0)
+
+
+@given(st.integers(0, 300), st.sampled_from([1e-8, 1e-4, 1e-2]))
+def test_no_two_points_with_small_residuals_are_farther_apart_than_allowed(seed: int, size: float) -> None:
+    """The accuracy is the largest residual of the two: what the theorem needs, and no more."""
+    vi, rng = program(seed), np.random.default_rng(seed)
+    first, second = random_answer(vi, rng, size), random_answer(vi, rng, size)
+    accuracy = max(verification.kkt_residuals(vi, *answer).worst for answer in (first, second))
+    limit = allowed(slack(vi, *first, accuracy), slack(vi, *second, accuracy))
+    assert np.linalg.norm(first[0] - second[0]) <= limit * (1.0 + 1e-9) + 1e-12
+
+
+def test_what_is_allowed_shrinks_with_the_accuracy() -> None:
+    vi = program(1)
+    x, alpha = random_answer(vi, np.random.default_rng(0), 0.0)
+    limits = [allowed(*[slack(vi, x, alpha, accuracy)] * 2) for accuracy in (1e-4, 1e-6, 1e-8)]
+    assert limits[0] > 5.0 * limits[1] > 25.0 * limits[2] > 0.0
+    flat = VariationalInequality(np.zeros((6, 6)), vi.f, vi.B, vi.g)
+    assert slack(flat, x, alpha, 1e-6) == Slack(np.inf, np.inf)
+
+
+def answer(solver: str, query: int, *x: float) -> Recorded:
+    return Recorded(solver, query, np.array(x), Slack(0.01, 0.0))
+
+
+def test_two_solvers_far_apart_are_flagged_at_their_query() -> None:
+    answers = [answer("b", 0, 1.0, 0.0), answer("b", 3, 0.0, 2.0), answer("b", 4, 1.0, 1.0)]
+    answers += [answer("a", 0, 1.0, 0.01), answer("a", 3, 0.0, 2.5), answer("a", 9, 5.0, 5.0)]
+    (row,) = compare(answers)
+    assert (row["solver_a"], row["solver_b"], row["queries"]) == ("a", "b", 2)
+    assert (row["flagged"], row["query_flagged"], row["query_worst"]) == (1, 3, 3)
+    assert row["difference_max"] == pytest.approx(0.5 / 2.5)
+    assert row["allowed_worst"] == pytest.approx(0.02 / 2.5)
+
+
+def test_only_ok_answers_of_the_same_reduced_model_are_compared() -> None:
+    def cell(key: str, solver: str, model: str | None) -> dict[str, object]:
+        return dict.fromkeys(KEYS) | {"cell": key, "solver": solver, "model": model, "dual": f"of {model}"}
+
+    cells = [cell("1", "a", "m"), cell("2", "b", "m"), cell("3", "b", "other"), cell("4", "c", None)]
+    queries = [{"cell": str(c), "query": q, "status": "ok"} for c in (1, 2, 3) for q in (0, 1)]
+    queries[3]["status"] = "inaccurate"  # cell 2, query 1
+    x = np.array([1.0, 2.0])
+    solutions = [{"cell": q["cell"], "query": q["query"], **solution_row(x, x, Slack(0.0, 0.0))} for q in queries]
+    (row,) = disagreement_rows(cells, queries, solutions)
+    assert (row["dual"], row["queries"], row["flagged"], row["difference_max"]) == ("of m", 1, 0, 0.0)
+
+
+def test_the_audit_in_a_line() -> None:
+    row = {"queries": 5, "difference_max": 1e-4, "solver_a": "x", "solver_b": "y", "flagged": 0}
+    assert "no two solvers" in sentence(pd.DataFrame())
+    assert "agree in all 5 comparisons: u differs by at most 1.0e-04 (x and y)" in sentence(pd.DataFrame([row]))
+    assert "more than the accuracy allows in 2 of 5" in sentence(pd.DataFrame([row | {"flagged": 2}]))

@@ -1,0 +1,252 @@
+"""Tables: found, read, put in order, written, and printed for reading."""
+
+from __future__ import annotations
+
+import csv
+import io
+import sqlite3
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from samples import cell_row, query_rows
+
+from vibench.errors import RequestError
+from vibench.results import tables
+from vibench.results.break_even import break_even_rows
+from vibench.results.database import FILE, ResultsDatabase
+from vibench.results.schema import CELLS, HISTORIES, KEYS, QUERIES, TABLES, THRESHOLDS, VERSION
+from vibench.results.tables import (
+    benefits,
+    cell_text,
+    export,
+    in_order,
+    read,
+    results_file,
+    summary,
+    to_csv,
+    to_markdown,
+)
+from vibench.study.cells import expand
+from vibench.study.reader import load_study
+
+STUDY = {"name": "sample", "seed": 1, "validation": 4, "accuracy": 1e-7}
+
+CELL = cell_row(
+    problem="box", dual="greedy", primal="plain", pod_tol=1e-3, pod_size=None, dual_tol=1e-2, dual_size=None,
+    primal_tol=None, solver="piqp", queries=4, queries_ok=4, N=12, R=7, enrichment=3, offline_s=1.5, online_s=0.0025,
+)  # fmt: skip
+
+
+def cells(*changes: dict[str, Any]) -> pd.DataFrame:
+    return pd.DataFrame([CELL | {"cell": str(k)} | change for k, change in enumerate(changes)], columns=list(CELLS))
+
+
+@pytest.fixture
+def run(tmp_path: Path) -> Path:
+    """A run folder with two cells, one of which never got an answer."""
+    journal = ResultsDatabase(tmp_path / "runs" / "sample", STUDY)
+    missing = dict.fromkeys(CELLS) | {"cell": "c2", "status": "error", "reason": "broke", "queries": 4, "queries_ok": 0}
+    journal.write_cell(CELL | {"cell": "c1"}, query_rows("c1", 4, gap=1.0 / 3.0))
+    journal.write_cell(missing | {name: CELL[name] for name in KEYS} | {"solver": "osqp"}, [])
+    journal.write_histories("pod-1", [{"artefact": "pod-1", "quantity": "error", "step": 0, "value": 1.0}])
+    journal.replace("thresholds", break_even_rows(journal.rows("cells")))
+    journal.replace("disagreements", [{"solver_a": "osqp", "solver_b": "piqp", "queries": 4, "flagged": 0}])
+    journal.close()
+    return tmp_path / "runs" / "sample"
+
+
+def test_a_run_is_found_by_folder_by_file_and_by_name(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert results_file(str(run)) == run / FILE
+    assert results_file(str(run / FILE)) == run / FILE
+    monkeypatch.chdir(run.parent.parent)
+    assert results_file("sample").resolve() == run / FILE
+
+
+def test_where_nothing_was_run_there_is_nothing_to_read(tmp_path: Path) -> None:
+    with pytest.raises(RequestError, match=r"no results in '.*nothing'.*results\.sqlite"):
+        results_file(str(tmp_path / "nothing"))
+
+
+def test_a_file_that_is_no_database_is_refused(tmp_path: Path) -> None:
+    (tmp_path / FILE).write_text("hello")
+    with pytest.raises(RequestError, match="not a results file"):
+        results_file(str(tmp_path))
+
+
+def test_another_schema_is_refused(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(tables, "VERSION", VERSION + 1)
+    with pytest.raises(RequestError, match=f"schema {VERSION}.*reads {VERSION + 1}"):
+        results_file(str(run))
+
+
+@pytest.mark.parametrize("table", TABLES)
+def test_a_table_is_read_with_all_its_columns(table: str, run: Path) -> None:
+    frame = read(run / FILE, table)
+    assert [name for name in frame.columns if not name.startswith("mu_")] == list(TABLES[table])
+    assert len(frame) == {"cells": 2, "queries": 4}.get(table, 1)
+
+
+def test_reading_changes_nothing(run: Path) -> None:
+    before = (run / FILE).read_bytes()
+    with pytest.raises((sqlite3.Error, pd.errors.DatabaseError)):
+        read(run / FILE, "cells; DELETE FROM cells")
+    read(run / FILE, "queries")
+    assert (run / FILE).read_bytes() == before
+
+
+def test_reading_leaves_no_files_behind(run: Path) -> None:
+    before = sorted(path.name for path in run.iterdir())
+    for table in TABLES:
+        read(run / FILE, table)
+    assert sorted(path.name for path in run.iterdir()) == before
+
+
+def test_everything_is_exported(run: Path, tmp_path: Path) -> None:
+    files = export(run / FILE, tmp_path / "out" / "tables")
+    names = [*(f"{table}.csv" for table in TABLES), "summary.md"]
+    assert [path.name for path in files] == names
+    assert sorted(path.name for path in (tmp_path / "out" / "tables").iterdir()) == sorted(names)
+    assert all(path.read_text(encoding="utf-8").strip() for path in files)
+
+
+def test_exporting_again_replaces_the_files(run: Path, tmp_path: Path) -> None:
+    for path in export(run / FILE, tmp_path / "tables"):
+        path.write_text("old")
+    for path in export(run / FILE, tmp_path / "tables"):
+        assert path.read_text() != "old"
+
+
+@pytest.mark.parametrize("table", TABLES)
+def test_csv_holds_every_digit(table: str, run: Path, tmp_path: Path) -> None:
+    export(run / FILE, tmp_path)
+    with (tmp_path / f"{table}.csv").open(encoding="utf-8", newline="") as file:
+        found = list(csv.DictReader(file))
+    expected = in_order(read(run / FILE, table))
+    assert len(found) == len(expected)
+    for name in expected:
+        if pd.api.types.is_numeric_dtype(expected[name]):
+            values = [float(row[name] or "nan") for row in found]
+            np.testing.assert_array_equal(values, expected[name].to_numpy(float))
+
+
+def test_rows_are_in_the_order_of_their_keys() -> None:
+    frame = cells({"solver": "b"}, {"dual": "a"}, {"problem": "a"}, {"solver": "a"}, {"primal": "z"})
+    assert list(in_order(frame)["cell"]) == ["2", "1", "3", "0", "4"]
+
+
+def test_loose_tolerances_come_first() -> None:
+    frame = cells({"pod_tol": 1e-4}, {"pod_tol": 1e-2}, {"pod_tol": 1e-3}, {"primal_tol": 0.5}, {"primal_tol": 0.9})
+    assert list(in_order(frame)["pod_tol"]) == sorted(frame["pod_tol"], reverse=True)
+    assert list(in_order(frame[3:])["primal_tol"]) == [0.9, 0.5]
+
+
+def test_small_prescribed_sizes_come_first() -> None:
+    frame = cells(*({"pod_tol": None, "pod_size": size} for size in (9, 3, 12)))
+    assert list(in_order(frame)["pod_size"]) == [3, 9, 12]
+
+
+@given(st.permutations(range(8)))
+def test_the_order_does_not_depend_on_who_was_first(order: list[int]) -> None:
+    frame = cells(*({"solver": s, "dual": d, "pod_tol": t} for s in "ab" for d in "xy" for t in (0.1, 0.01)))
+    shuffled = frame.iloc[order]
+    assert list(in_order(shuffled)["cell"]) == list(in_order(frame)["cell"])
+
+
+def test_the_summary_has_a_line_for_every_cell(run: Path) -> None:
+    frame = summary(read(run / FILE, "cells"))
+    first, second = frame.to_dict("records")
+    assert (first["solver"], first["ok"]) == ("osqp", "0/4 error")
+    assert (second["solver"], second["ok"]) == ("piqp", "4/4")
+    assert (second["N"], second["R"], second["added"]) == (12, 7, 3)
+    assert (second["δ_POD"], second["δ_dual"]) == ("0.001", "0.01")
+    assert (second["offline [s]"], second["online [ms]"]) == (1.5, 2.5)
+    assert pd.isna(first["N"])
+
+
+def test_the_summary_says_prescribed_sizes() -> None:
+    frame = summary(cells({"pod_tol": None, "pod_size": 9, "dual_tol": None, "dual_size": 4}))
+    assert (frame["δ_POD"][0], frame["δ_dual"][0]) == ("N=9", "R=4")
+
+
+def test_the_benefits_say_from_when_on_a_strategy_pays() -> None:
+    a = CELL | {"cell": "a", "enrichment_kind": "per-parameter", "primal": "varying", "online_s": 0.004, "hf_s": 0.1}
+    b = CELL | {"cell": "b", "enrichment_kind": "fixed", "primal": "fixed", "offline_s": 2.5, "hf_s": 0.1}
+    frame = benefits(pd.DataFrame(break_even_rows([a, b]), columns=list(THRESHOLDS)))
+    paired = frame[(frame["a"] == "varying") & (frame["b"] == "fixed")].iloc[0]
+    assert paired["b pays"] == f"from {(2.5 - 1.5) / (0.004 - 0.0025):.0f}"
+    assert (paired["offline a [s]"], paired["online a [ms]"], paired["online b [ms]"]) == (1.5, 4.0, 2.5)
+    assert len(frame) == 3
+
+
+def test_benefits_without_a_number_are_words() -> None:
+    slow = CELL | {"hf_s": 0.001, "enrichment_kind": "none"}
+    assert list(benefits(pd.DataFrame(break_even_rows([slow]), columns=list(THRESHOLDS)))["b pays"]) == ["never"]
+
+
+def test_tables_of_nothing_are_empty() -> None:
+    assert summary(cells()).empty
+    assert benefits(pd.DataFrame(columns=list(THRESHOLDS))).empty
+    for columns in (CELLS, QUERIES, HISTORIES):
+        assert in_order(pd.DataFrame(columns=list(columns))).empty
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [
+        (3, "3"), (3.0, "3"), (0.0, "0"), (0.123456, "0.123"), (1234567.0, "1.23e+06"), (1e-7, "1e-07"), (None, ""),
+        (float("nan"), ""), (pd.NA, ""), (np.float64(2.5), "2.5"), (np.int64(4), "4"), ("word", "word"), ("", ""),
+        (float("inf"), "inf"), (-2.0, "-2"), (999999.0, "999999"),
+    ],
+)  # fmt: skip
+def test_values_are_printed_with_three_digits(value: Any, text: str) -> None:
+    assert cell_text(value) == text
+
+
+def test_csv_quotes_what_it_must() -> None:
+    frame = pd.DataFrame({"name": ["a,b", 'c"d', "e\nf"], "value": [1.0 / 3.0, None, 1e-300]})
+    header, *rows = csv.reader(io.StringIO(to_csv(frame)))
+    assert header == ["name", "value"]
+    assert [(name, float(value or "inf")) for name, value in rows] == [
+        ("a,b", 1.0 / 3.0), ('c"d', float("inf")), ("e\nf", 1e-300),
+    ]  # fmt: skip
+
+
+def test_markdown_has_a_line_per_row() -> None:
+    lines = to_markdown(pd.DataFrame({"name": ["a", "007"], "value": [0.123456, None]})).splitlines()
+    assert [[word.strip() for word in line.strip("|").split("|")] for line in lines if "--" not in line] == [
+        ["name", "value"], ["a", "0.123"], ["007", ""],
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize("text", ["a|b", "a\nb"])
+def test_markdown_survives_what_would_end_a_cell(text: str) -> None:
+    lines = to_markdown(pd.DataFrame({"name": [text, "c"], "value": [1, 2]})).splitlines()
+    assert len(lines) == 4
+    assert {line.replace("\\|", "").count("|") for line in lines} == {3}
+
+
+def test_a_real_run_exports_its_whole_matrix(quick_run: Path) -> None:
+    expected = expand(load_study("quick"))
+    frame = pd.read_csv(quick_run / "tables" / "cells.csv")
+    assert set(frame["cell"]) == {cell.key for cell in expected}
+    assert len(pd.read_csv(quick_run / "tables" / "queries.csv")) == frame["queries"].sum()
+    written = (quick_run / "tables" / "summary.md").read_text(encoding="utf-8")
+    assert len(written.splitlines()) == len(expected) + 2
+
+
+def test_a_real_run_times_what_its_cells_are_made_of(quick_run: Path) -> None:
+    frame = read(quick_run / FILE, "cells")
+    parts = [f"offline_{part}_s" for part in ("snapshots", "pod", "cone", "enrichment", "assembly")]
+    np.testing.assert_allclose(frame[parts].sum(axis=1), frame["offline_s"])
+    np.testing.assert_allclose(frame["online_assemble_s"] + frame["online_solve_s"], frame["online_s"])
+    queries = read(quick_run / FILE, "queries")
+    fine = queries[queries["status"] == "ok"].groupby("cell")
+    np.testing.assert_allclose(fine["total_s"].mean().loc[frame["cell"]], frame["online_s"])
+    np.testing.assert_array_equal(fine.size().loc[frame["cell"]], frame["queries_ok"])
+    np.testing.assert_allclose(queries.groupby("cell")["hf_s"].mean().loc[frame["cell"]], frame["hf_s"])
+    assert (frame[["offline_snapshots_s", "online_s", "hf_s"]] > 0.0).all(axis=None)

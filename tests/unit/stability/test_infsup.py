@@ -1,0 +1,83 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import scipy.linalg
+import scipy.sparse as sp
+from hypothesis import given
+from hypothesis import strategies as st
+from numerics import Varying, space
+
+from vibench.linalg.inner_product import InnerProduct
+from vibench.reduction.supremizers import supremizers
+from vibench.stability.infsup import beta_span, inf_sup_full, inf_sup_on, multipliers, nodal_multipliers
+
+seeds = st.integers(0, 10_000)
+
+
+@given(seeds)
+def test_the_span_constant_is_the_smallest_generalised_singular_value(seed: int) -> None:
+    W = space(6, seed)
+    rng = np.random.default_rng(seed)
+    chi = rng.random((6, 3))
+    cone = multipliers(chi / W.norm(chi), W)
+    image = rng.standard_normal((5, 6))
+    smallest = scipy.linalg.eigh(
+        (image @ cone.chi).T @ (image @ cone.chi), cone.gram, eigvals_only=True, subset_by_index=[0, 0]
+    )[0]
+    assert np.isclose(beta_span(image @ cone.span), np.sqrt(max(smallest, 0.0)), rtol=1e-6, atol=1e-7)
+
+
+def test_the_span_constant_is_zero_exactly_below_the_rank_and_honest_at_it() -> None:
+    W = space(6)
+    chi = np.random.default_rng(0).random((6, 3))
+    chi = np.column_stack([chi, chi[:, 0] + chi[:, 1]])  # rank 3 of 4
+    cone = multipliers(chi / W.norm(chi), W)
+    assert cone.rank == 3
+    assert beta_span(np.ones((2, 3))) == 0.0
+    assert beta_span(np.eye(3)) == 1.0
+    assert beta_span(np.zeros((4, 0))) == np.inf
+
+
+@pytest.mark.parametrize("mu", [0.0, 0.5, 1.0])
+def test_the_order_of_the_constants(mu: float) -> None:
+    """Full ≥ own ≥ plain, full ≥ high-fidelity, own = full with all supremizers, cone ≥ span."""
+    problem = Varying()
+    B = problem.assemble(np.array([mu])).B
+    rng = np.random.default_rng(1)
+    chi = rng.random((8, 3))
+    cone = multipliers(chi / problem.W.norm(chi), problem.W)
+    V = problem.V
+    plain = V.orthonormalise(rng.standard_normal((30, 2)))
+    own = np.hstack([plain, V.orthonormalise(supremizers(V, B, cone.span[:, :2]), plain)])
+    online = np.hstack([plain, V.orthonormalise(supremizers(V, B, cone.span), plain)])
+    small, middle, large = (inf_sup_on(Z, B, cone) for Z in (plain, own, online))
+    full, hf = inf_sup_full(V, B, cone), inf_sup_full(V, B, nodal_multipliers(problem.W))
+    for bigger, smaller in ((middle, small), (full, middle), (full, hf)):
+        assert bigger.span >= smaller.span - 1e-12
+        assert bigger.cone_upper >= smaller.cone_lower - 1e-12
+    assert np.isclose(large.span, full.span, rtol=1e-10)
+    assert np.isclose(large.cone_upper, full.cone_upper, rtol=1e-10)
+    for found in (small, middle, large, full, hf):
+        assert found.cone_upper >= found.span - 1e-12
+        assert found.cone_lower <= found.cone_upper
+    assert np.isclose(full.scaled(-2.0).span, 2.0 * full.span)
+
+
+def test_the_high_fidelity_constant_against_the_dense_eigenproblem() -> None:
+    problem = Varying()
+    B = problem.assemble(np.array([0.7])).B
+    S = (B @ np.linalg.solve(problem.V.matrix.toarray(), B.T.toarray())).astype(float)
+    smallest = scipy.linalg.eigh(S, problem.W.matrix.toarray(), eigvals_only=True)[0]
+    found = inf_sup_full(problem.V, B, nodal_multipliers(problem.W))
+    assert np.isclose(found.span, np.sqrt(smallest), rtol=1e-8)
+
+
+def test_nearly_parallel_generators_do_not_push_the_constant_below_the_high_fidelity_one() -> None:
+    V, W = InnerProduct(sp.eye_array(6)), InnerProduct(sp.eye_array(4))
+    B = sp.csr_array(np.eye(4, 6) * np.array([[1.0], [0.5], [0.1], [0.01]]))
+    base = np.array([1.0, 1.0, 1.0, 0.0])
+    chi = np.column_stack([base, base + 1e-9 * np.array([0.0, 1.0, 0.0, 0.0]), base + np.array([0.0, 0.0, 1.0, 0.0])])
+    cone = multipliers(chi / W.norm(chi), W)
+    assert cone.rank == 3
+    assert inf_sup_full(V, B, cone).span >= 0.1 * (1.0 - 1e-6)

@@ -1,0 +1,164 @@
+"""Artefacts: whole or not there, and only those of this machine."""
+
+from __future__ import annotations
+
+import hashlib
+import pickle
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from vibench.errors import RequestError, StorageError
+from vibench.stages import artefacts as module
+from vibench.stages.artefacts import SUFFIX, Artefact, History, Store
+from vibench.timing import Seconds
+
+TIME = Seconds(1.5, 2.5)
+HISTORY = History({"stage": "pod"}, "error", (1.0, 0.5))
+
+
+def files(folder: Path) -> list[str]:
+    return sorted(path.name for path in folder.iterdir())
+
+
+def test_what_is_put_is_got_by_another_process(tmp_path: Path) -> None:
+    Store(tmp_path / "new").put("key", np.arange(3.0), TIME, (HISTORY,))
+    found = Store(tmp_path / "new").get("key")
+    assert found is not None
+    np.testing.assert_array_equal(found.value, [0.0, 1.0, 2.0])
+    assert (found.seconds, found.histories) == (TIME, (HISTORY,))
+    assert files(tmp_path / "new") == [f"key{SUFFIX}"]
+
+
+def test_what_was_never_put_is_missing(tmp_path: Path) -> None:
+    assert Store(tmp_path).get("key") is None
+    assert Store(tmp_path / "nowhere").get("key") is None
+
+
+def test_what_was_missing_is_found_later(tmp_path: Path) -> None:
+    reader = Store(tmp_path)
+    assert reader.get("key") is None
+    Store(tmp_path).put("key", 1, TIME, ())
+    found = reader.get("key")
+    assert found is not None
+    assert found.value == 1
+
+
+def test_an_artefact_says_which_machine_measured_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "machine", lambda: "there")
+    Store(tmp_path).put("key", 1, TIME, ())
+    monkeypatch.setattr(module, "machine", lambda: "here")
+    found = Store(tmp_path).get("key")
+    assert found is not None
+    assert found.machine == "there"
+
+
+def test_what_cannot_be_written_leaves_nothing_behind(tmp_path: Path) -> None:
+    with pytest.raises((pickle.PicklingError, AttributeError)):
+        Store(tmp_path).put("key", lambda: 0, TIME, ())
+    assert files(tmp_path) == []
+
+
+def test_what_cannot_be_written_leaves_the_earlier_artefact(tmp_path: Path) -> None:
+    Store(tmp_path).put("key", 1, TIME, ())
+    with pytest.raises((pickle.PicklingError, AttributeError)):
+        Store(tmp_path).put("key", lambda: 0, TIME, ())
+    found = Store(tmp_path).get("key")
+    assert found is not None
+    assert found.value == 1
+
+
+def test_an_artefact_is_not_seen_before_it_is_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A process that dies while it writes leaves no file under the key."""
+
+    class Killed(BaseException):
+        pass
+
+    def die(*_: object, **__: object) -> None:
+        assert Store(tmp_path).get("key") is None
+        raise Killed
+
+    monkeypatch.setattr(module.os, "fsync", die)
+    with pytest.raises(Killed):
+        Store(tmp_path).put("key", 1, TIME, ())
+    assert files(tmp_path) == []
+
+
+def with_checksum(content: bytes) -> bytes:
+    return hashlib.sha256(content).digest() + content
+
+
+def flip_a_bit(path: Path) -> None:
+    """In the numbers, where a pickle would not notice."""
+    content = bytearray(path.read_bytes())
+    content[len(content) // 2] ^= 1
+    path.write_bytes(bytes(content))
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        lambda path: path.write_bytes(b""),
+        lambda path: path.write_bytes(path.read_bytes()[:-20]),
+        lambda path: path.write_bytes(b"nonsense"),
+        lambda path: path.write_bytes(with_checksum(pickle.dumps({"value": 1}))),
+        flip_a_bit,
+    ],
+    ids=["empty", "cut off", "nonsense", "another object", "one bit"],
+)
+def test_a_damaged_artefact_counts_as_missing(damage: Callable[[Path], object], tmp_path: Path) -> None:
+    Store(tmp_path).put("key", list(range(100)), TIME, ())
+    damage(tmp_path / f"key{SUFFIX}")
+    assert Store(tmp_path).get("key") is None
+
+
+def test_many_artefacts_are_all_found(tmp_path: Path) -> None:
+    """More than are kept in memory at a time."""
+    store = Store(tmp_path)
+    for k in range(200):
+        store.put(f"key-{k}", k, TIME, ())
+    for _ in range(2):
+        for k in range(200):
+            found = store.get(f"key-{k}")
+            assert isinstance(found, Artefact)
+            assert found.value == k
+
+
+def test_a_full_disk_is_said_in_a_line_and_leaves_what_was_there(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    Store(tmp_path).put("key", 1, TIME, ())
+
+    def full(_: int) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(module.os, "fsync", full)
+    with pytest.raises(StorageError, match=f"artefacts cannot be written to '{tmp_path}': No space left on device"):
+        Store(tmp_path).put("key", 2, TIME, ())
+    found = Store(tmp_path).get("key")
+    assert found is not None
+    assert found.value == 1
+    assert files(tmp_path) == [f"key{SUFFIX}"]
+
+
+def test_what_is_stored_is_counted_and_cleared(tmp_path: Path) -> None:
+    store = Store(tmp_path)
+    store.put("podstage-1", 1, TIME, ())
+    store.put("conestage-1", list(range(1000)), TIME, ())
+    (tmp_path / "left by a killed run.part").write_bytes(b"12345")
+    counted = {sort: size for sort, size, _ in store.contents()}
+    assert counted == {path.name.split("-")[0]: path.stat().st_size for path in tmp_path.glob(f"*{SUFFIX}")}
+    assert store.clear(older_than=3600.0) == 5
+    assert store.clear() == sum(counted.values())
+    assert store.contents() == []
+    assert Store(tmp_path / "nowhere").clear() == 0
+
+
+def test_what_runs_use_is_not_cleared(tmp_path: Path) -> None:
+    one, two = Store(tmp_path), Store(tmp_path)
+    one.put("key", 1, TIME, ())
+    with one.used(), two.used(), pytest.raises(RequestError, match="a run uses the artefacts in"):
+        two.clear()
+    assert one.get("key") is not None

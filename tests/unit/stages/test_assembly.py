@@ -1,0 +1,229 @@
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from running import Register
+from samples import carry_out
+
+from vibench.interfaces.problem import MEMBERS
+from vibench.interfaces.strategies import Stop
+from vibench.interfaces.validation import checked_assembly
+from vibench.model.affine import Evaluation
+from vibench.model.galerkin import ReducedModel, project
+from vibench.model.hyperreduced import OnlineModel
+from vibench.stages.artefacts import Store
+from vibench.stages.assembly import AssemblyStage, Separation, assembly_columns, query_model
+from vibench.stages.base import value_of
+from vibench.stages.cell_queries import QueriesStage
+from vibench.stages.offline import ConeStage, EnrichmentStage, PODStage
+from vibench.study.cells import Plugin
+
+OBSTACLE = Plugin("problem", "obstacle", '{"resolution": 200}', "test")
+RADIAL = Plugin("problem", "radial-obstacle", '{"resolution": 300}', "test")
+HERTZ = Plugin("problem", "hertz", '{"resolution": 300}', "test")
+WIRE = Plugin("problem", "wire", "{}", "test")
+TOLERANCE = 1e-6
+QUERIES = 3
+
+
+def cell(
+    problem: Plugin, primal: str, interpolation: float | None, tolerance: float | None = None, dual: str = "mcpg"
+) -> QueriesStage:
+    enrichment = EnrichmentStage(
+        PODStage(problem, Stop(size=6)),
+        ConeStage(problem, Plugin("dual strategy", dual, "{}", "test"), Stop(size=3)),
+        Plugin("primal strategy", primal, "{}", "test"),
+        tolerance,
+    )
+    return QueriesStage(AssemblyStage(enrichment, interpolation, QUERIES, 3), "piqp", 1e-8, 20.0)
+
+
+CELLS = {
+    "obstacle": cell(OBSTACLE, "decorrelated", TOLERANCE),
+    "obstacle, fixed": cell(OBSTACLE, "offline-pga", TOLERANCE, 0.5),
+    "obstacle, full": cell(OBSTACLE, "decorrelated", None),
+    "obstacle, loose": cell(OBSTACLE, "decorrelated", 1e-2),
+    "radial": cell(RADIAL, "online-supremizers", TOLERANCE),
+    "hertz": cell(HERTZ, "decorrelated", TOLERANCE),
+    "hertz, per-parameter": cell(HERTZ, "online-supremizers", TOLERANCE),
+    "hertz, full": cell(HERTZ, "decorrelated", None),
+}
+
+
+@pytest.fixture(scope="module")
+def store(tmp_path_factory: pytest.TempPathFactory) -> Store:
+    store = Store(tmp_path_factory.mktemp("assembly"))
+    for stage in CELLS.values():
+        carry_out(stage, store)
+    return store
+
+
+@pytest.fixture
+def wire_store(register: Register, tmp_path: Path) -> Store:
+    """A store with a cell of a problem that declares nothing, asked for in reduced assembly."""
+    register(
+        ("vibench.problems", "wire", "fake_plugins:Wire"),
+        ("vibench.dual_strategies", "mcpg", "vibench_strategies.mcpg:ModifiedCPG"),
+        ("vibench.primal_strategies", "decorrelated", "vibench_strategies.decorrelated:Decorrelated"),
+    )
+    store = Store(tmp_path)
+    carry_out(wire(TOLERANCE), store)
+    carry_out(wire(None), store)
+    return store
+
+
+def wire(interpolation: float | None) -> QueriesStage:
+    """A cell of few modes and generators."""
+    found = cell(WIRE, "decorrelated", interpolation)
+    enrichment = replace(
+        found.assembly.enrichment,
+        pod=PODStage(WIRE, Stop(tolerance=1e-2)),
+        cone=replace(found.assembly.enrichment.cone, stop=Stop(tolerance=1e-2)),
+    )
+    return replace(found, assembly=replace(found.assembly, enrichment=enrichment))
+
+
+def test_rows_of_an_interpolated_problem(store: Store) -> None:
+    rows = value_of(store, CELLS["obstacle"])
+    members = value_of(store, CELLS["obstacle"].assembly.reduction.separation)
+    assert rows.cell["status"] == "ok"
+    assert rows.cell["interpolation_tol"] == TOLERANCE
+    assert {name: rows.cell[f"terms_{name}"] for name in "fBg"} == {"f": 7, "B": 1, "g": 1}
+    assert rows.cell["terms_A"] == len(members["A"].rows) > 20
+    assert rows.cell["interpolation_error"] == members["A"].error == max(m.error for m in members.values())
+    assert 0.0 < rows.cell["interpolation_error"] <= TOLERANCE
+    errors = [row["assembly_error"] for row in rows.queries]
+    assert rows.cell["assembly_error_max"] == max(errors)
+    assert 0.0 < min(errors) < max(errors) < 1e-3
+    assert {row["form"] for row in rows.queries} == {"primal"}
+    assert rows.cell["fallbacks"] == ""
+
+
+def test_a_looser_tolerance_has_fewer_terms_and_larger_errors(store: Store) -> None:
+    tight, loose = (value_of(store, CELLS[name]).cell for name in ("obstacle", "obstacle, loose"))
+    assert loose["terms_A"] < tight["terms_A"]
+    assert TOLERANCE < loose["interpolation_error"] <= 1e-2
+    assert loose["assembly_error_max"] > 10.0 * tight["assembly_error_max"]
+
+
+@pytest.mark.parametrize("name", ["obstacle", "radial", "hertz", "hertz, per-parameter"])
+def test_the_error_of_an_assembly_is_that_of_the_worst_member(store: Store, name: str) -> None:
+    stage = CELLS[name].assembly
+    model, note = query_model(store, stage)
+    assert note == ""
+    assert isinstance(model, OnlineModel)
+    mus = model.problem.validation_set(QUERIES, 3)
+    for mu, error in zip(mus, value_of(store, stage).errors, strict=True):
+        found = model.assemble(mu)
+        exact = project(checked_assembly(model.problem, mu), found.basis, model.generators)
+        pairs = [(getattr(found.program, member), getattr(exact, member)) for member in MEMBERS]
+        worst = max(np.linalg.norm(a - b) / (np.linalg.norm(b) or 1.0) for a, b in pairs)
+        assert np.isclose(error, worst, rtol=1e-6, atol=1e-14)
+
+
+@pytest.mark.parametrize(
+    ("name", "form"),
+    [
+        ("obstacle", "primal"),  # A depends on mu
+        ("obstacle, full", "primal"),
+        ("hertz, full", "primal"),
+        ("radial", "dual"),
+        ("hertz", "dual"),
+        ("hertz, per-parameter", "primal"),  # the space depends on mu
+    ],
+)
+def test_a_constant_stiffness_on_a_fixed_space_is_solved_through_the_dual(store: Store, name: str, form: str) -> None:
+    rows = value_of(store, CELLS[name])
+    assert rows.cell["status"] == "ok"
+    assert {row["form"] for row in rows.queries} == {form}
+
+
+@pytest.mark.parametrize(("one", "other"), [("obstacle", "obstacle, full"), ("hertz", "hertz, full")])
+def test_errors_of_queries_are_those_of_full_assembly(store: Store, one: str, other: str) -> None:
+    reduced, full = value_of(store, CELLS[one]), value_of(store, CELLS[other])
+    for a, b in zip(reduced.queries, full.queries, strict=True):
+        for column in ("error_u", "error_lambda", "beta_span"):
+            assert a[column] == pytest.approx(b[column], rel=0.01)
+
+
+@pytest.mark.parametrize("name", ["hertz", "hertz, per-parameter"])
+def test_columns_of_a_problem_with_contact(store: Store, name: str) -> None:
+    """B and g have no terms: they are assembled on the contact."""
+    assert assembly_columns(store, CELLS[name].assembly) == {
+        "interpolation_tol": TOLERANCE,
+        "interpolation_error": 0.0,
+        "terms_A": 0,
+        "terms_f": 0,
+    }
+    assert all(row["assembly_error"] < 1e-11 for row in value_of(store, CELLS[name]).queries)
+
+
+def test_columns_of_a_problem_whose_bound_alone_varies(store: Store) -> None:
+    columns = assembly_columns(store, CELLS["radial"].assembly)
+    assert {name: columns[f"terms_{name}"] for name in MEMBERS} == {"A": 0, "f": 0, "B": 0, "g": 2}
+
+
+@pytest.mark.parametrize("name", ["obstacle, full", "hertz, full"])
+def test_assembly_in_full_has_no_offline_part_and_no_error(store: Store, name: str) -> None:
+    stage = CELLS[name].assembly
+    rows = value_of(store, CELLS[name])
+    assert assembly_columns(store, stage) == {}
+    assert stage.reduction is None
+    assert isinstance(query_model(store, stage)[0], ReducedModel)
+    assert rows.cell["offline_assembly_s"] == 0.0
+    assert "interpolation_tol" not in rows.cell
+    assert [row["assembly_error"] for row in rows.queries] == [0.0] * QUERIES
+
+
+@pytest.mark.parametrize("name", ["obstacle", "hertz", "radial"])
+def test_reduced_assembly_costs_its_separation_and_its_projection(store: Store, name: str) -> None:
+    reduction = CELLS[name].assembly.reduction
+    spent = [store.get(stage.key).seconds.cpu for stage in (reduction.separation, reduction)]
+    assert min(spent) > 0.0
+    row = value_of(store, CELLS[name]).cell
+    assert row["offline_assembly_s"] == pytest.approx(sum(spent))
+    parts = ("snapshots", "pod", "cone", "enrichment", "assembly")
+    assert row["offline_s"] == pytest.approx(sum(row[f"offline_{part}_s"] for part in parts))
+
+
+def test_what_an_assembly_took_is_what_its_queries_say(store: Store) -> None:
+    stage = CELLS["hertz"]
+    seconds = [s.cpu for s in value_of(store, stage.assembly).seconds]
+    assert [row["assemble_s"] for row in value_of(store, stage).queries] == seconds
+    assert min(seconds) > 0.0
+
+
+def test_the_separation_of_a_problem_serves_every_reduced_model() -> None:
+    one, other = (CELLS[name].assembly.reduction for name in ("obstacle", "obstacle, fixed"))
+    assert one.key != other.key
+    assert one.separation.key == other.separation.key
+    assert one.separation.key != CELLS["obstacle, loose"].assembly.reduction.separation.key
+    assert one.separation.key != CELLS["hertz"].assembly.reduction.separation.key
+    assert one.separation.inputs() == ()
+    assert one.separation in CELLS["obstacle"].inputs()
+    assert CELLS["obstacle"].assembly.key != CELLS["obstacle, full"].assembly.key
+
+
+def test_a_problem_that_declares_nothing_is_assembled_in_full_and_the_reason_is_told(wire_store: Store) -> None:
+    why = "f depends on mu and the problem does not evaluate it entry by entry"
+    stage = wire(TOLERANCE)
+    members = value_of(wire_store, Separation(WIRE, TOLERANCE))
+    assert [members[name].way for name in MEMBERS] == [
+        Evaluation.CONSTANT,
+        Evaluation.FULL,
+        Evaluation.CONSTANT,
+        Evaluation.CONSTANT,
+    ]
+    rows, full = value_of(wire_store, stage), value_of(wire_store, wire(None))
+    assert rows.cell["status"] == "ok"
+    assert rows.cell["fallbacks"] == f"assembled in full: {why}"
+    assert full.cell["fallbacks"] == ""
+    assert isinstance(query_model(wire_store, stage.assembly)[0], ReducedModel)
+    assert {name for name in rows.cell if name.startswith("terms_")} == {"terms_A", "terms_B", "terms_g"}
+    for one, other in zip(rows.queries, full.queries, strict=True):
+        assert one["assembly_error"] == 0.0
+        assert one["form"] == "primal"
+        assert one["error_u"] == other["error_u"]

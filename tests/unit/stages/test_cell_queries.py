@@ -1,0 +1,101 @@
+"""Queries that start from the solution before them on a path through the parameters."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from samples import carry_out
+
+from vibench.interfaces.problem import ParameterBox, VariationalInequality
+from vibench.interfaces.strategies import Stop
+from vibench.qp import verification
+from vibench.qp.solve import solve_qp, takes_start
+from vibench.stages import cell_queries
+from vibench.stages.artefacts import Store
+from vibench.stages.assembly import AssemblyStage
+from vibench.stages.base import value_of
+from vibench.stages.cell_queries import QueriesStage, path_before
+from vibench.stages.offline import ConeStage, EnrichmentStage, PODStage
+from vibench.stages.query import assess
+from vibench.study.cells import Plugin
+
+BOX = ParameterBox(("a", "b"), np.array([0.0, 0.0]), np.array([1.0, 100.0]), ("1", "1"))
+PROBLEM = Plugin("problem", "radial-obstacle", '{"resolution": 200}', "test")
+
+
+@given(st.integers(0, 10_000), st.integers(1, 12))
+def test_a_path_visits_every_parameter_once_and_goes_on_to_the_nearest(seed: int, count: int) -> None:
+    mus = BOX.sample(count, seed)
+    before = path_before(mus, BOX)
+    after = {one: k for k, one in enumerate(before) if one is not None}
+    path = [0]
+    while path[-1] in after:
+        path.append(after[path[-1]])
+    assert before[0] is None
+    assert sorted(path) == list(range(count))
+    scaled = mus / BOX.upper
+    for step, (here, there) in enumerate(pairwise(path)):
+        apart = np.linalg.norm(scaled[path[step + 1 :]] - scaled[here], axis=1)
+        assert np.linalg.norm(scaled[there] - scaled[here]) == pytest.approx(apart.min())
+
+
+@pytest.mark.parametrize("solver", ["piqp", "proxqp", "osqp"])
+@pytest.mark.parametrize("dual", [False, True])
+def test_a_start_changes_the_way_and_not_the_answer(solver: str, dual: bool) -> None:
+    rng = np.random.default_rng(3)
+    A = np.diag(1.0 + rng.random(5))
+    program = VariationalInequality(A, rng.standard_normal(5), rng.standard_normal((3, 5)), 0.1 * rng.random(3))
+    factor = np.linalg.cholesky(A) if dual else None
+    cold = solve_qp(program, solver, 1e-8, factor=factor)
+    warm = solve_qp(program, solver, 1e-8, factor=factor, start=cold)
+    assert verification.kkt_residuals(program, warm.x, warm.alpha).worst <= 1e-8
+    assert np.allclose(warm.x, cold.x, atol=1e-6)
+    assert takes_start(solver) == (solver != "piqp")
+    if solver == "osqp" and not dual:
+        assert warm.iterations <= cold.iterations
+
+
+def test_a_query_whose_assessment_fails_costs_itself(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    cone = ConeStage(PROBLEM, Plugin("dual strategy", "cpg", "{}", "test"), Stop(size=3))
+    primal = Plugin("primal strategy", "decorrelated", "{}", "test")
+    enrichment = EnrichmentStage(PODStage(PROBLEM, Stop(size=4)), cone, primal, None)
+    stage, store = QueriesStage(AssemblyStage(enrichment, None, 4, 1), "piqp", 1e-6, 20.0), Store(tmp_path)
+    carry_out(stage, store)
+    whole, bad = value_of(store, stage), float(PROBLEM.create().validation_set(4, 1)[2, 0])
+
+    def unlucky(model: object, mus: np.ndarray, *others: object) -> list[dict[str, object]]:
+        if bad in mus[:, 0]:
+            raise ArithmeticError("nothing to compare with")
+        return assess(model, mus, *others)
+
+    monkeypatch.setattr(cell_queries, "assess", unlucky)
+    found = stage.run(store).value
+    assert [row["status"] for row in found.queries] == ["ok", "ok", "error", "ok"]
+    assert "in the assessment: ArithmeticError: nothing to compare with" in found.queries[2]["reason"]
+    assert found.cell["queries_ok"] == 3
+    for k in (0, 1, 3):
+        assert found.queries[k]["error_u"] == pytest.approx(whole.queries[k]["error_u"], rel=1e-9)
+
+
+def test_rows_say_which_query_they_started_from(tmp_path: Path) -> None:
+    cone = ConeStage(PROBLEM, Plugin("dual strategy", "cpg", "{}", "test"), Stop(size=3))
+    primal = Plugin("primal strategy", "decorrelated", "{}", "test")
+    enrichment = EnrichmentStage(PODStage(PROBLEM, Stop(size=4)), cone, primal, None)
+    assembly = AssemblyStage(enrichment, None, 4, 1)
+    stage, store, started = QueriesStage(assembly, "osqp", 1e-6, 20.0), Store(tmp_path), {}
+    for warm, solver in ((False, "osqp"), (True, "osqp"), (True, "piqp")):
+        asked = replace(stage, warm_start=warm, solver=solver)
+        carry_out(asked, store)
+        rows = value_of(store, asked).queries
+        assert {row["status"] for row in rows} == {"ok"}
+        started[warm, solver] = [row.get("started_from") for row in rows]
+    problem = PROBLEM.create()
+    assert started[False, "osqp"] == started[True, "piqp"] == [None] * 4
+    assert started[True, "osqp"] == path_before(problem.validation_set(4, 1), problem.parameters)
+    assert started[True, "osqp"].count(None) == 1

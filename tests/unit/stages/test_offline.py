@@ -1,0 +1,233 @@
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import scipy.linalg
+from samples import carry_out
+
+from vibench.errors import NumericalError
+from vibench.interfaces.strategies import Kind, Stop
+from vibench.stages import snapshots
+from vibench.stages.artefacts import Store
+from vibench.stages.assembly import AssemblyStage
+from vibench.stages.base import value_of
+from vibench.stages.cell_queries import QueriesStage, summarise
+from vibench.stages.infsup_constants import ReferenceConstants, ValidationConstraints
+from vibench.stages.offline import ConeStage, EnrichmentStage, PODStage, reduced_model
+from vibench.stages.snapshots import CHUNKS, HighFidelity, gather, sweep, training
+from vibench.study.cells import Plugin
+from vibench.timing import NO_TIME
+
+PROBLEM = Plugin("problem", "obstacle", '{"resolution": 200}', "test")
+
+
+def cell(primal: str, tolerance: float | None, solver: str = "piqp") -> QueriesStage:
+    enrichment = EnrichmentStage(
+        PODStage(PROBLEM, Stop(tolerance=1e-2)),
+        ConeStage(PROBLEM, Plugin("dual strategy", "mcpg", "{}", "test"), Stop(tolerance=5e-2)),
+        Plugin("primal strategy", primal, "{}", "test"),
+        tolerance,
+    )
+    return QueriesStage(AssemblyStage(enrichment, None, 9, 3), solver, 1e-8, 20.0)
+
+
+@pytest.fixture(scope="module")
+def store(tmp_path_factory: pytest.TempPathFactory) -> Store:
+    store = Store(tmp_path_factory.mktemp("stages"))
+    for primal, tolerance in (("decorrelated", None), ("online-supremizers", None), ("offline-pga", 0.5)):
+        carry_out(cell(primal, tolerance), store)
+    return store
+
+
+def test_keys_say_what_determines_a_stage_and_nothing_else() -> None:
+    one = cell("offline-pga", 0.5)
+    assert one.key == cell("offline-pga", 0.5).key
+    other_solver = cell("offline-pga", 0.5, "osqp")
+    assert other_solver.key != one.key
+    assert other_solver.assembly.key == one.assembly.key
+    assert replace(one, accuracy=1e-9).assembly.key == one.assembly.key
+    looser = cell("offline-pga", 0.6)
+    assert looser.assembly.key != one.assembly.key
+    assert looser.assembly.enrichment.pod.key == one.assembly.enrichment.pod.key
+    edited = replace(PROBLEM, code="edited")
+    assert PODStage(edited, Stop(size=3)).key != PODStage(PROBLEM, Stop(size=3)).key
+    keys = {
+        PODStage(PROBLEM, Stop(size=3)).key,
+        PODStage(PROBLEM, Stop(size=4)).key,
+        *(c.key for c in training(PROBLEM)),
+    }
+    assert len(keys) == 2 + CHUNKS
+
+
+def test_chunks_make_up_the_whole_sweep_in_order(store: Store) -> None:
+    found = gather(store, training(PROBLEM))
+    problem = PROBLEM.create()
+    assert np.array_equal(found.mu, problem.training_set())
+    assert found.u.shape == (problem.V.dim, 125)
+    assert len(found.seconds) == len(found.fallbacks) == 125
+    assert all(s.cpu > 0.0 for s in found.seconds)
+    validation = gather(store, sweep(PROBLEM, "validation", 9, 3))
+    assert np.array_equal(validation.mu, problem.validation_set(9, 3))
+
+
+def test_few_parameters_leave_empty_chunks(tmp_path: Path) -> None:
+    store = Store(tmp_path)
+    chunks = sweep(PROBLEM, "validation", 3, 1)
+    for chunk in chunks:
+        carry_out(chunk, store)
+    assert gather(store, chunks).mu.shape == (3, 3)
+
+
+def test_diagnostics_are_kept_beside_the_solutions(store: Store) -> None:
+    steps = {}
+    for chunk in training(PROBLEM):
+        for history in store.get(chunk.key).histories:
+            assert history.quantity == "aspect_ratio"
+            steps |= {history.key["first_step"] + k: v for k, v in enumerate(history.values)}
+    assert sorted(steps) == list(range(125))
+    assert min(steps.values()) >= 1.0
+
+
+def test_histories_of_the_offline_stages(store: Store) -> None:
+    stage = cell("offline-pga", 0.5).assembly.enrichment
+    pod = {h.quantity: h.values for h in store.get(stage.pod.key).histories}
+    cone = {h.quantity: h.values for h in store.get(stage.cone.key).histories}
+    added = {h.quantity: h.values for h in store.get(stage.key).histories}
+    vectors = value_of(store, stage).vectors.shape[1]
+    assert len(pod["error"]) == 126
+    assert len(cone["e_orth"]) + 1 == len(cone["error"])
+    assert len(added["sigma"]) == len(added["beta_span_min"]) == vectors + 1
+    own, full = np.array(added["beta_span_training"]), np.array(added["beta_full_span_training"])
+    assert len(own) == len(full) == 125
+    assert np.all(own >= np.sqrt(1.0 - 0.5**2) * full * (1.0 - 1e-9))
+    assert np.isclose(min(own), added["beta_span_min"][-1])
+
+
+@pytest.mark.parametrize("interpolation", [None, 1e-6])
+def test_a_cell_grown_along_others_is_the_cell_alone(store: Store, tmp_path: Path, interpolation: float | None) -> None:
+    alone = cell("offline-pga", 0.5)
+    enrichment = replace(alone.assembly.enrichment, along=(0.3, 0.5, 0.9))
+    grown = replace(alone, assembly=replace(alone.assembly, enrichment=enrichment, interpolation=interpolation))
+    beside = Store(tmp_path)
+    carry_out(grown, beside)
+    expected, found = value_of(store, alone).cell, value_of(beside, grown).cell
+    assert found["enrichment"] == expected["enrichment"] > 0
+    assert beside.get(enrichment.key).value is None  # its vectors are stored with the growth
+    for name in ("error_u_mean", "error_lambda_mean", "beta_span_min", "beta_cone_upper_min"):
+        assert found[name] == pytest.approx(expected[name], rel=1e-6), name
+    assert found["assembly_error_max"] < 1e-5
+    histories = [
+        {h.quantity: h.values for h in some.get(stage.key).histories}
+        for some, stage in ((store, alone.assembly.enrichment), (beside, enrichment))
+    ]
+    assert histories[0].keys() == histories[1].keys()
+    for quantity, values in histories[0].items():
+        assert histories[1][quantity] == pytest.approx(values, rel=1e-9), quantity
+    if interpolation is None:
+        programs = [value_of(some, c.assembly).programs for some, c in ((store, alone), (beside, grown))]
+        for one, other in zip(*programs, strict=True):
+            assert np.allclose(one.A, other.A, rtol=1e-10, atol=1e-13)
+            assert np.allclose(one.B, other.B, rtol=1e-10, atol=1e-13)
+
+
+def test_the_model_behind_a_cell_is_ready_for_queries(store: Store) -> None:
+    model, basis, prepared = reduced_model(store, cell("online-supremizers", None).assembly.enrichment)
+    assert model.kind is Kind.PER_PARAMETER
+    query = model.assemble(np.array([1.05, 0.01, -0.03]))
+    assert query.basis.shape[1] == basis.shape[1] + prepared.rank
+    assert query.program.B.shape == (prepared.chi.shape[1], query.basis.shape[1])
+
+
+@pytest.mark.parametrize(
+    ("primal", "tolerance", "kind"),
+    [("decorrelated", None, "none"), ("online-supremizers", None, "per-parameter"), ("offline-pga", 0.5, "fixed")],
+)
+def test_rows_of_a_cell(store: Store, primal: str, tolerance: float | None, kind: str) -> None:
+    rows = value_of(store, cell(primal, tolerance))
+    assert rows.cell["enrichment_kind"] == kind
+    assert rows.cell["status"] == "ok"
+    assert rows.cell["queries"] == rows.cell["queries_ok"] == len(rows.queries) == 9
+    parts = ("snapshots", "pod", "cone", "enrichment", "assembly")
+    assert rows.cell["offline_s"] == pytest.approx(sum(rows.cell[f"offline_{part}_s"] for part in parts))
+    snapshots = sum((store.get(chunk.key).seconds for chunk in training(PROBLEM)), NO_TIME)
+    assert rows.cell["offline_snapshots_s"] == pytest.approx(snapshots.cpu)
+    assert rows.cell["offline_snapshots_s"] == pytest.approx(
+        sum(s.cpu for s in gather(store, training(PROBLEM)).seconds)
+    )
+    enrichment = store.get(cell(primal, tolerance).assembly.enrichment.key)
+    assert rows.cell["offline_enrichment_s"] == enrichment.seconds.cpu
+    assert rows.cell["online_s"] == pytest.approx(rows.cell["online_assemble_s"] + rows.cell["online_solve_s"])
+    chi = value_of(store, cell(primal, tolerance).assembly.enrichment.cone).cone.generators
+    gram = chi.T @ (PROBLEM.create().W.matrix @ chi)
+    assert rows.cell["gram_condition"] == pytest.approx(np.linalg.cond(gram), rel=1e-6)
+    expected = {"none": 0, "per-parameter": rows.cell["rank"]}
+    if kind in expected:
+        assert rows.cell["enrichment"] == expected[kind]
+    for row in rows.queries:
+        assert row["total_s"] == row["assemble_s"] + row["solve_s"]
+        assert row["error_u"] < 0.05
+        assert max(row["primal_residual"], row["dual_residual"], row["gap"]) <= 1e-8
+
+
+def test_a_slow_query_is_a_timeout(store: Store) -> None:
+    impatient = replace(cell("decorrelated", None), query_seconds=1e-9)
+    rows = impatient.run(store).value
+    assert rows.cell["status"] == "timeout"
+    assert rows.cell["queries_ok"] == 0
+    assert "the limit is 1e-09 s" in rows.queries[0]["reason"]
+    assert rows.cell["online_s"] is None
+
+
+def test_the_reference_constants_are_those_of_every_parameter(store: Store) -> None:
+    constants = value_of(store, ReferenceConstants(ValidationConstraints(PROBLEM, 9, 3)))
+    mus = PROBLEM.create().validation_set(9, 3)
+    scaled = [c.inf_sup.span / mu[0] ** 2 for c, mu in zip(constants, mus, strict=True)]  # B = mu_1² times one matrix
+    assert np.allclose(scaled, scaled[0], rtol=1e-9)
+    assert scaled[0] > 0.0
+    problem = PROBLEM.create()
+    for c, mu in zip(constants, mus, strict=True):
+        values = scipy.linalg.eigh(problem.assemble(mu).A.toarray(), problem.V.matrix.toarray(), eigvals_only=True)
+        assert 0.998 * values[0] <= c.coercivity <= values[0]
+        assert values[-1] <= c.continuity <= 1.002 * values[-1]
+
+
+def test_a_missing_artefact_is_named(tmp_path: Path) -> None:
+    stage = PODStage(PROBLEM, Stop(size=2))
+    with pytest.raises(NumericalError, match=stage.key):
+        value_of(Store(tmp_path), stage)
+
+
+def test_a_problem_without_diagnostics_has_no_such_history(monkeypatch: pytest.MonkeyPatch) -> None:
+    problem = PROBLEM.create()
+    monkeypatch.setattr(problem, "diagnostics", lambda mu: {})
+    monkeypatch.setattr(snapshots, "build_problem", lambda plugin: problem)
+    assert HighFidelity(PROBLEM, "validation", 2, 0, 0).run(None).histories == ()
+
+
+def query(status: str, error: float | None = 1.0, **columns) -> dict:
+    base = {"status": status, "reason": "" if status == "ok" else f"it was {status}", "mu_1": 0.5}
+    constants = {f"beta_{what}": 0.2 for what in ("span", "cone_lower", "cone_upper")}
+    return base | constants | {"error_u": error, "total_s": 1.0, "total_wall_s": 1.1} | columns
+
+
+def test_means_are_over_the_ok_queries_and_the_worst_status_names_the_cell() -> None:
+    found = summarise([query("ok", 1.0), query("ok", 3.0), query("inaccurate", 100.0), query("failed", None)])
+    assert found["status"] == "failed"
+    assert found["reason"] == "1 of 4 queries, first mu=(0.5): it was failed"
+    assert (found["queries"], found["queries_ok"]) == (4, 2)
+    assert (found["error_u_mean"], found["error_u_max"]) == (2.0, 3.0)
+    assert found["disturbed"] == 0
+
+
+def test_without_an_ok_query_there_are_no_means() -> None:
+    found = summarise([query("nonfinite", None)])
+    assert found["error_u_mean"] is None
+    assert found["residual_max"] is None
+    assert found["beta_span_min"] == 0.2
+
+
+def test_wall_seconds_far_above_cpu_seconds_mark_a_disturbed_machine() -> None:
+    assert summarise([query("ok", total_s=1.0, total_wall_s=1.6)])["disturbed"] == 1

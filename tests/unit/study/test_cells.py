@@ -1,0 +1,246 @@
+"""The matrix of a study: how many cells, which ones, and what identifies them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import fields, replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from running import Register
+from samples import REMOVE, STUDY, changed, write_study
+
+from vibench.errors import RequestError
+from vibench.interfaces.strategies import Stop
+from vibench.study import cells as module
+from vibench.study.cells import Cell, Plugin, digest, expand
+from vibench.study.reader import load_study
+
+Expand = Callable[[Mapping[str, Any]], list[Cell]]
+
+
+@pytest.fixture
+def cells_of(tmp_path: Path) -> Expand:
+    """Function that gives the cells of a study's content."""
+    return lambda content: expand(load_study(write_study(tmp_path, content)))
+
+
+def test_the_matrix_is_the_product_of_the_axes(cells_of: Expand) -> None:
+    cells = cells_of(STUDY)
+    plain = [cell for cell in cells if cell.primal.name == "decorrelated"]
+    assert len(plain) == 2 * 2 * 2  # pod × dual × solvers
+    assert len(cells) - len(plain) == 2 * 2 * 2 * 3  # and × primal tolerances
+    assert len({cell.key for cell in cells}) == len(cells)
+
+
+def test_a_strategy_without_tolerance_is_not_repeated(cells_of: Expand) -> None:
+    few, many = (
+        cells_of(changed(STUDY, "tolerances", 0, "primal", to={"offline-pga": values}))
+        for values in ([0.5], [0.5, 0.4, 0.3, 0.2])
+    )
+    for cells in (few, many):
+        plain = [cell for cell in cells if cell.primal.name == "decorrelated"]
+        assert len(plain) == 8
+        assert {cell.primal_tol for cell in plain} == {None}
+    assert len(many) - len(few) == 3 * 8
+
+
+def test_every_combination_is_there_in_the_order_of_the_axes(cells_of: Expand) -> None:
+    cells = cells_of(changed(STUDY, "primal", to=["decorrelated"]))
+    assert [(cell.pod.tolerance, cell.dual.name, cell.solver) for cell in cells] == [
+        (pod, dual, solver) for pod in (1e-2, 1e-3) for dual in ("cpg", "mcpg") for solver in ("piqp", "osqp")
+    ]
+
+
+DUPLICATES = {
+    "a solver twice": ("solvers", ["piqp", "osqp", "piqp"]),
+    "a strategy twice": ("dual", ["cpg", "mcpg", "cpg"]),
+    "a strategy under two labels": ("dual", ["cpg", "mcpg", {"name": "cpg", "label": "the same"}]),
+    "a problem twice": ("problem", [*STUDY["problem"], *STUDY["problem"]]),
+    "a table twice": ("tolerances", [*STUDY["tolerances"], *STUDY["tolerances"]]),
+}
+
+
+@pytest.mark.parametrize("case", DUPLICATES)
+def test_duplicates_merge(case: str, cells_of: Expand) -> None:
+    axis, entries = DUPLICATES[case]
+    merged = [cell.key for cell in cells_of(changed(STUDY, axis, to=entries))]
+    assert merged == [cell.key for cell in cells_of(STUDY)]
+
+
+def test_tables_that_overlap_add_up_once(cells_of: Expand) -> None:
+    first = STUDY["tolerances"][0]
+    second = {"pod": [1e-3, 1e-4], "dual": [1e-1, 1e-2], "primal": {"offline-pga": [0.5]}}
+    both = {cell.key for cell in cells_of(changed(STUDY, "tolerances", to=[first, second]))}
+    alone = [{cell.key for cell in cells_of(changed(STUDY, "tolerances", to=[table]))} for table in (first, second)]
+    assert both == alone[0] | alone[1]
+    assert alone[0] & alone[1]
+
+
+def test_prescribed_sizes_take_the_place_of_tolerances(cells_of: Expand) -> None:
+    table = {"N": [5, 6, 7], "R": [3], "primal": {"offline-pga": [0.5]}}
+    cells = cells_of(changed(STUDY, "tolerances", to=[table]))
+    assert len(cells) == 3 * 2 * 2 * 2
+    assert {cell.pod for cell in cells} == {Stop(size=5), Stop(size=6), Stop(size=7)}
+    assert {cell.cone for cell in cells} == {Stop(size=3)}
+
+
+@pytest.mark.parametrize(("key", "make"), [("dual", lambda v: Stop(tolerance=v)), ("R", lambda v: Stop(size=v))])
+def test_dual_tolerances_and_sizes_may_differ_by_strategy(
+    key: str, make: Callable[[Any], Stop], cells_of: Expand
+) -> None:
+    values: dict[str, list[Any]] = {"dual": [0.1, 0.2, 0.3], "R": [1, 2, 3]}[key]
+    table = {"pod": [1e-3], key: {"cpg": values[:1], "mcpg": values[1:]}, "primal": {"offline-pga": [0.5]}}
+    found = {(cell.dual.name, cell.cone) for cell in cells_of(changed(STUDY, "tolerances", to=[table]))}
+    assert found == {("cpg", make(values[0])), ("mcpg", make(values[1])), ("mcpg", make(values[2]))}
+
+
+def test_tolerances_may_go_by_label(cells_of: Expand) -> None:
+    content = changed(STUDY, "dual", to=[{"name": "cpg", "label": "plain"}, "mcpg"])
+    content = changed(content, "tolerances", 0, "dual", to={"plain": [0.1], "mcpg": [0.2]})
+    assert {(cell.labels[1], cell.cone.tolerance) for cell in cells_of(content)} == {("plain", 0.1), ("mcpg", 0.2)}
+
+
+@pytest.mark.parametrize("primal", [REMOVE, {}])
+def test_a_strategy_that_takes_a_tolerance_must_be_given_one(primal: Any, cells_of: Expand) -> None:
+    with pytest.raises(RequestError, match=r"tolerances\.primal.*'offline-pga'.*tolerance"):
+        cells_of(changed(STUDY, "tolerances", 0, "primal", to=primal))
+
+
+def test_the_refusal_of_a_missing_tolerance_names_the_file(tmp_path: Path) -> None:
+    path = write_study(tmp_path, changed(STUDY, "tolerances", 0, "primal", to=REMOVE))
+    with pytest.raises(RequestError) as caught:
+        expand(load_study(path))
+    assert path in str(caught.value)
+
+
+@pytest.mark.parametrize("values", [{"cpg": [0.1]}, {}])
+def test_every_dual_strategy_must_be_given_a_tolerance(values: dict[str, Any], cells_of: Expand) -> None:
+    with pytest.raises(RequestError, match=r"tolerances\.dual.*'m?cpg'"):
+        cells_of(changed(STUDY, "tolerances", 0, "dual", to=values))
+
+
+SAMPLE = Cell(
+    problem=Plugin("problem", "p", '{"a": 1}', "package 1"),
+    dual=Plugin("dual strategy", "d", "{}", "package 1"),
+    primal=Plugin("primal strategy", "q", "{}", "package 1"),
+    pod=Stop(tolerance=1e-3),
+    cone=Stop(size=4),
+    primal_tol=0.5,
+    solver="piqp",
+    assembly="full",
+    interpolation=None,
+    warm_start=False,
+    seed=1,
+    validation=8,
+    accuracy=1e-7,
+    labels=("P", "D", "Q"),
+)
+
+OTHER: Mapping[str, Mapping[str, Any]] = {
+    "problem": {"problem": replace(SAMPLE.problem, name="other")},
+    "problem options": {"problem": replace(SAMPLE.problem, options='{"a": 2}')},
+    "dual": {"dual": replace(SAMPLE.dual, name="other")},
+    "dual options": {"dual": replace(SAMPLE.dual, options='{"a": 2}')},
+    "primal": {"primal": replace(SAMPLE.primal, name="other")},
+    "primal options": {"primal": replace(SAMPLE.primal, options='{"a": 2}')},
+    "pod": {"pod": Stop(tolerance=1e-4)},
+    "pod size": {"pod": Stop(size=4)},
+    "cone": {"cone": Stop(size=5)},
+    "cone tolerance": {"cone": Stop(tolerance=0.1)},
+    "primal_tol": {"primal_tol": 0.6},
+    "no primal_tol": {"primal_tol": None},
+    "solver": {"solver": "osqp"},
+    "assembly": {"assembly": "reduced"},
+    "interpolation": {"interpolation": 1e-6},
+    "warm start": {"warm_start": True},
+    "seed": {"seed": 2},
+    "validation": {"validation": 9},
+    "accuracy": {"accuracy": 1e-8},
+}
+
+
+def test_the_cases_cover_every_member_of_a_cell() -> None:
+    covered = {name for change in OTHER.values() for name in change}
+    assert covered | {"labels", "along"} == {field.name for field in fields(Cell)}
+
+
+@pytest.mark.parametrize("case", OTHER)
+def test_the_key_changes_with_what_determines_the_numbers(case: str) -> None:
+    assert replace(SAMPLE, **OTHER[case]).key != SAMPLE.key
+
+
+def test_no_two_changes_give_the_same_key() -> None:
+    assert len({replace(SAMPLE, **change).key for change in OTHER.values()}) == len(OTHER)
+
+
+def test_the_key_does_not_depend_on_labels_or_code() -> None:
+    assert replace(SAMPLE, labels=("x", "y", "z")).key == SAMPLE.key
+    newer = {axis: replace(getattr(SAMPLE, axis), code="package 2") for axis in ("problem", "dual", "primal")}
+    assert replace(SAMPLE, **newer).key == SAMPLE.key
+
+
+@pytest.mark.parametrize("axis", ["problem", "dual", "primal"])
+def test_the_code_changes_with_every_plugin(axis: str) -> None:
+    assert replace(SAMPLE, **{axis: replace(getattr(SAMPLE, axis), code="package 2")}).code != SAMPLE.code
+
+
+@pytest.mark.parametrize("what", ["core_code", "solver_version"])
+def test_the_code_changes_with_the_core_and_the_solver(what: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    before = SAMPLE.code
+    monkeypatch.setattr(module, what, lambda *_: "another version")
+    assert SAMPLE.code != before
+
+
+def test_the_code_changes_with_a_solver_of_a_plugin(
+    register: Register, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.syspath_prepend(tmp_path)
+    (tmp_path / "own_solver.py").write_text("def solve(program, accuracy): ...\n")
+    register(("vibench.qp_solvers", "mine", "own_solver:solve"))
+    mine = replace(SAMPLE, solver="mine")
+    before = mine.code, SAMPLE.code
+    (tmp_path / "own_solver.py").write_text("def solve(program, accuracy): return None\n")
+    register(("vibench.qp_solvers", "mine", "own_solver:solve"))
+    assert mine.code != before[0]
+    assert SAMPLE.code == before[1]
+
+
+def test_equal_options_give_one_cell(cells_of: Expand) -> None:
+    """A whole number where the plugin takes floats, and the order of options, change nothing."""
+    written = [{"length": 1.0, "load": -1.0}, {"load": -1, "length": 1.0}]
+    entries = [{"name": "obstacle", "options": {"resolution": "coarse"} | options} for options in written]
+    assert len(cells_of(changed(STUDY, "problem", to=entries))) == len(cells_of(STUDY))
+
+
+def test_defaults_written_out_give_the_same_cells(cells_of: Expand) -> None:
+    short, long = (
+        cells_of(changed(STUDY, "problem", 0, "options", to={"resolution": "coarse"} | options))
+        for options in ({}, {"length": 1.0})
+    )
+    assert [cell.key for cell in short] == [cell.key for cell in long]
+
+
+def test_a_cell_says_what_it_is() -> None:
+    assert str(SAMPLE) == "P · D · Q 0.5 · 0.001, R=4 · piqp"
+    assert str(replace(SAMPLE, primal_tol=None)) == "P · D · Q · 0.001, R=4 · piqp"
+
+
+def test_a_plugin_of_an_entry_is_created_with_its_options(cells_of: Expand) -> None:
+    problem = cells_of(changed(STUDY, "problem", 0, "options", to={"resolution": 200, "load": -2.0}))[0].problem
+    made = problem.create()
+    assert made.load == -2.0
+    assert 150 <= made.nodes <= 250
+
+
+@given(st.dictionaries(st.text(max_size=5), st.integers() | st.floats(allow_nan=False) | st.text(max_size=5)))
+def test_a_digest_does_not_depend_on_the_order_of_keys(content: dict[str, Any]) -> None:
+    assert digest(content) == digest(dict(reversed(content.items())))
+
+
+def test_digests_tell_contents_apart() -> None:
+    contents = [None, "", [], {}, 0, 1, "1", [1], {"1": 1}, {"1": "1"}]
+    assert len({digest(content) for content in contents}) == len(contents)

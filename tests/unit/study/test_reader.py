@@ -1,0 +1,389 @@
+"""Study files: what is refused, with which words, and what the options of the command line replace."""
+
+from __future__ import annotations
+
+import contextlib
+import datetime
+import tomllib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from samples import REMOVE, STUDY, changed, toml, write_study
+
+from vibench.errors import RequestError
+from vibench.study.cells import expand
+from vibench.study.reader import find_study, load_study
+from vibench.study.spec import Study
+
+JARGON = ("list[", "dict[", "literal[", "constrained", "instance of")
+"""Words of the validation library that mean nothing to the author of a study file."""
+
+
+def refusal(request: str, overrides: Mapping[str, Any] | None = None) -> str:
+    """The line a study is refused with."""
+    with pytest.raises(RequestError) as caught:
+        load_study(request, overrides)
+    line = str(caught.value)
+    assert line.strip()
+    assert "\n" not in line
+    return line
+
+
+def test_a_correct_study_is_read_as_written(tmp_path: Path) -> None:
+    study = load_study(write_study(tmp_path))
+    assert (study.name, study.seed, study.validation, study.accuracy) == ("sample", 7, 3, 1e-7)
+    assert study.solver_names() == ["piqp", "osqp"]
+    assert [entry.name for entry in study.dual] == ["cpg", "mcpg"]
+    assert study.problem[0].options == {"resolution": "coarse"}
+    assert study.tolerances[0].primal == {"offline-pga": [0.5, 0.3, 0.1]}
+    assert study.limits.query_seconds == 20.0
+
+
+def test_the_writer_of_the_tests_writes_toml() -> None:
+    assert tomllib.loads(toml(STUDY)) == STUDY
+
+
+TABLE = ("tolerances", 0)
+
+WRONG: Mapping[str, tuple[tuple[str | int, ...], Any, tuple[str, ...]]] = {
+    # what is wrong: (where, the wrong value, words that say the key and what is expected)
+    "name missing": (("name",), REMOVE, ("name", "required")),
+    "name empty": (("name",), "", ("name", "1 character")),
+    "name of no text": (("name",), 3, ("name", "string", "3")),
+    "name that leaves the folder": (("name",), "../elsewhere", ("name", "letters")),
+    "name that hides": (("name",), ".hidden", ("name", "letters")),
+    "seed negative": (("seed",), -1, ("seed", "greater than or equal to 0", "-1")),
+    "seed no integer": (("seed",), 1.5, ("seed", "integer", "1.5")),
+    "seed a truth value": (("seed",), True, ("seed", "integer")),
+    "seed text": (("seed",), "7", ("seed", "integer", "'7'")),
+    "seed beyond what a table holds": (("seed",), 2**63, ("seed", "less")),
+    "validation missing": (("validation",), REMOVE, ("validation", "required")),
+    "validation zero": (("validation",), 0, ("validation", "greater than or equal to 1")),
+    "accuracy nan": (("accuracy",), float("nan"), ("accuracy", "finite")),
+    "accuracy inf": (("accuracy",), float("inf"), ("accuracy", "finite")),
+    "accuracy zero": (("accuracy",), 0.0, ("accuracy", "greater than")),
+    "accuracy negative": (("accuracy",), -1e-7, ("accuracy", "greater than")),
+    "accuracy too loose": (("accuracy",), 0.5, ("accuracy", "less than")),
+    "solvers missing": (("solvers",), REMOVE, ("solvers", "required")),
+    "solvers empty": (("solvers",), [], ("solvers", "at least 1")),
+    "solvers one word": (("solvers",), "piqp", ("solvers", "'available'", "list", "'piqp'")),
+    "solvers a number": (("solvers",), 3, ("solvers", "'available'", "list")),
+    "solvers of numbers": (("solvers",), [3], ("solvers", "string")),
+    "solver unknown": (("solvers",), ["pipq"], ("QP solver", "'pipq'", "did you mean 'piqp'")),
+    "dual missing": (("dual",), REMOVE, ("dual", "required")),
+    "dual empty": (("dual",), [], ("dual", "at least 1")),
+    "dual no list": (("dual",), "cpg", ("dual", "list", "'cpg'")),
+    "dual of numbers": (("dual",), [1], ("dual.0", "found 1")),
+    "dual unknown": (("dual",), ["mcgp"], ("dual strategy", "'mcgp'", "did you mean 'mcpg'")),
+    "dual without name": (("dual",), [{"label": "x"}], ("dual.0.name", "required")),
+    "dual label a number": (("dual",), [{"name": "cpg", "label": 3}], ("dual.0.label", "string")),
+    "dual options no table": (("dual",), [{"name": "cpg", "options": 3}], ("dual.0.options", "found 3")),
+    "dual with options it has not": (("dual",), [{"name": "cpg", "options": {"x": 1}}], ("dual strategy 'cpg'", "'x'")),
+    "dual with a mistyped key": (("dual",), [{"name": "cpg", "lable": "x"}], ("'lable'", "did you mean 'label'")),
+    "primal empty": (("primal",), [], ("primal", "at least 1")),
+    "primal unknown": (("primal",), ["decorelated"], ("primal strategy", "did you mean 'decorrelated'")),
+    "assembly unknown": (("assembly",), ["fast"], ("assembly.0", "'full'", "'fast'")),
+    "assembly empty": (("assembly",), [], ("assembly", "at least 1")),
+    "problem missing": (("problem",), REMOVE, ("problem", "required")),
+    "problem empty": (("problem",), [], ("problem", "at least 1")),
+    "problem unknown": (("problem",), ["obstcale"], ("problem", "'obstcale'", "did you mean 'obstacle'")),
+    "option unknown": (("problem", 0, "options"), {"resolutoin": 1}, ("obstacle", "did you mean 'resolution'")),
+    "option of wrong type": (("problem", 0, "options"), {"length": "one"}, ("length", "'one'", "float > 0")),
+    "option out of range": (("problem", 0, "options"), {"length": -1.0}, ("length", "-1.0", "float > 0")),
+    "option of no choice": (("problem", 0, "options"), {"resolution": "huge"}, ("resolution", "'huge'", "'coarse'")),
+    "option too small": (("problem", 0, "options"), {"resolution": 5}, ("resolution", "5", "int ≥ 150")),
+    "option nan": (("problem", 0, "options"), {"load": float("nan")}, ("load", "nan", "float")),
+    "option a date": (("problem", 0, "options"), {"load": datetime.date(2022, 1, 1)}, ("load", "float")),
+    "tolerances missing": (("tolerances",), REMOVE, ("tolerances", "required")),
+    "tolerances empty": (("tolerances",), [], ("tolerances", "at least 1")),
+    "tolerances no list": (("tolerances",), {"pod": [1e-3]}, ("tolerances", "list")),
+    "pod nan": ((*TABLE, "pod"), [float("nan")], ("tolerances.0.pod.0", "finite")),
+    "pod inf": ((*TABLE, "pod"), [1e-3, float("inf")], ("tolerances.0.pod.1", "finite")),
+    "pod zero": ((*TABLE, "pod"), [0.0], ("tolerances.0.pod.0", "greater than 0")),
+    "pod negative": ((*TABLE, "pod"), [-1e-3], ("tolerances.0.pod.0", "greater than 0", "-0.001")),
+    "pod one": ((*TABLE, "pod"), [1.0], ("tolerances.0.pod.0", "less than 1")),
+    "pod text": ((*TABLE, "pod"), ["small"], ("tolerances.0.pod.0", "number", "'small'")),
+    "pod no list": ((*TABLE, "pod"), 1e-3, ("tolerances.0.pod", "list", "0.001")),
+    "pod empty": ((*TABLE, "pod"), [], ("tolerances.0.pod", "at least 1")),
+    "pod missing": ((*TABLE, "pod"), REMOVE, ("tolerances.0", "'pod'", "'N'")),
+    "pod and N": ((*TABLE, "N"), [3], ("tolerances.0", "either 'pod'", "'N'")),
+    "dual tolerance nan": ((*TABLE, "dual"), [float("nan")], ("tolerances.0.dual", "finite")),
+    "dual tolerance zero": ((*TABLE, "dual"), [0.0], ("tolerances.0.dual", "greater than 0")),
+    "dual tolerances empty": ((*TABLE, "dual"), [], ("tolerances.0.dual", "at least 1")),
+    "dual tolerance text": ((*TABLE, "dual"), "tight", ("tolerances.0.dual", "list", "'tight'")),
+    "dual tolerance missing": ((*TABLE, "dual"), REMOVE, ("tolerances.0", "'dual'", "'R'")),
+    "dual tolerance and R": ((*TABLE, "R"), [3], ("tolerances.0", "either 'dual'", "'R'")),
+    "dual tolerance of one strategy": (
+        (*TABLE, "dual"),
+        {"cpg": [0.0]},
+        ("tolerances.0.dual", "cpg", "greater than 0"),
+    ),
+    "no dual tolerance for one": ((*TABLE, "dual"), {"cpg": []}, ("tolerances.0.dual", "cpg", "at least 1")),
+    "dual tolerance of a stranger": ((*TABLE, "dual"), {"mcgp": [0.1]}, ("dual strategy", "did you mean 'mcpg'")),
+    "primal tolerance zero": ((*TABLE, "primal"), {"offline-pga": [0.0]}, ("primal.offline-pga.0", "greater than 0")),
+    "primal tolerances empty": ((*TABLE, "primal"), {"offline-pga": []}, ("primal.offline-pga", "at least 1")),
+    "primal tolerance of a stranger": ((*TABLE, "primal"), {"offline-gpa": [0.5]}, ("did you mean 'offline-pga'",)),
+    "primal tolerance for one that takes none": (
+        (*TABLE, "primal"),
+        {"decorrelated": [0.5], "offline-pga": [0.5]},
+        ("tolerances.primal", "'decorrelated'", "takes no tolerance"),
+    ),
+    "primal tolerance for nobody": ((*TABLE, "primal"), [0.5], ("tolerances.0.primal",)),
+    "limits no table": (("limits",), 3, ("limits", "found 3")),
+    "limit zero": (("limits",), {"query_seconds": 0.0}, ("limits.query_seconds", "greater than 0")),
+    "limit inf": (("limits",), {"cell_seconds": float("inf")}, ("limits.cell_seconds", "finite")),
+    "limit text": (("limits",), {"memory_gib": "8"}, ("limits.memory_gib", "number", "'8'")),
+    "limit beyond every machine": (("limits",), {"memory_gib": 1e300}, ("limits.memory_gib", "less than")),
+    "limit unknown": (("limits",), {"query_second": 1.0}, ("'query_second'", "did you mean 'query_seconds'")),
+    "key unknown": (("sed",), 7, ("'sed'", "did you mean 'seed'")),
+    "key unknown in a table": ((*TABLE, "pods"), [1e-3], ("'pods'", "did you mean 'pod'")),
+}
+
+
+@pytest.mark.parametrize("case", WRONG)
+def test_what_is_wrong_is_said_in_one_line(case: str, tmp_path: Path) -> None:
+    where, value, words = WRONG[case]
+    path = write_study(tmp_path, changed(STUDY, *where, to=value))
+    line = refusal(path)
+    assert line.startswith(f"{path}: ")
+    message = line.removeprefix(path)
+    assert [word for word in words if word.lower() not in message.lower()] == [], line
+    assert [word for word in JARGON if word in message] == [], line
+
+
+@pytest.mark.parametrize("size", ["N", "R"])
+@pytest.mark.parametrize(("value", "words"), [([0], "greater than"), ([1.5], "integer"), ([], "at least 1")])
+def test_prescribed_sizes_are_positive_integers(size: str, value: list[Any], words: str, tmp_path: Path) -> None:
+    tolerance = {"N": "pod", "R": "dual"}[size]
+    content = changed(changed(STUDY, *TABLE, tolerance, to=REMOVE), *TABLE, size, to=value)
+    line = refusal(write_study(tmp_path, content))
+    assert f"tolerances.0.{size}" in line
+    assert words in line
+    assert [word for word in JARGON if word in line] == [], line
+
+
+@pytest.mark.parametrize(("where", "key"), [((), "pod"), ((), "resolution"), (("limits",), "seed"), (TABLE, "name")])
+def test_a_key_in_the_wrong_place_is_not_suggested_again(
+    where: tuple[str | int, ...], key: str, tmp_path: Path
+) -> None:
+    content = changed(STUDY, "limits", to={})
+    line = refusal(write_study(tmp_path, changed(content, *where, key, to=1)))
+    assert f"'{key}'" in line
+    assert f"did you mean '{key}'" not in line
+
+
+def test_a_key_of_two_lines_is_refused_in_one(tmp_path: Path) -> None:
+    assert "did you mean 'seed'" in refusal(write_study(tmp_path, changed(STUDY, "see\nd", to=1)))
+
+
+def test_a_missing_file_is_named(tmp_path: Path) -> None:
+    path = str(tmp_path / "nowhere.toml")
+    line = refusal(path)
+    assert path in line
+    assert "does not exist" in line
+
+
+@pytest.mark.parametrize("name", ["folder", "folder.toml"])
+def test_a_folder_is_no_study(name: str, tmp_path: Path) -> None:
+    (tmp_path / name).mkdir()
+    line = refusal(str(tmp_path / name))
+    assert name in line
+    assert "not a file" in line
+
+
+def test_an_unknown_study_is_named_with_the_nearest() -> None:
+    assert "did you mean 'quick'" in refusal("qiuck")
+
+
+def test_a_name_too_long_for_a_file_is_refused() -> None:
+    assert "study" in refusal("a" * 300)
+
+
+@pytest.mark.parametrize("content", [b"\x00\x01\xff\xfe", b"\x89PNG\r\n\x1a\n", b"name = 'gr\xf6sse'"])
+def test_a_binary_file_is_refused(content: bytes, tmp_path: Path) -> None:
+    path = tmp_path / "study.toml"
+    path.write_bytes(content)
+    assert refusal(str(path)).startswith(f"{path}: ")
+
+
+INVALID = {
+    "no value": "seed =",
+    "a key twice": "seed = 1\nseed = 2",
+    "a table that becomes a list": "[problem]\n[[problem]]",
+    "no key": "= 3",
+    "an open string": "name = 'a",
+    "an endless number": "seed = " + "1" * 5000,
+    "endless nesting": "a = " + "[" * 9999,
+}
+
+
+@pytest.mark.parametrize("case", INVALID)
+def test_invalid_toml_is_refused_with_the_file(case: str, tmp_path: Path) -> None:
+    path = tmp_path / "study.toml"
+    path.write_text(INVALID[case])
+    line = refusal(str(path))
+    assert line.startswith(f"{path}: ")
+    assert "TOML" in line
+
+
+def test_invalid_toml_says_where(tmp_path: Path) -> None:
+    path = tmp_path / "study.toml"
+    path.write_text('name = "a"\nseed = = 3\n')
+    assert "line 2" in refusal(str(path))
+
+
+def test_available_stands_for_every_installed_solver(tmp_path: Path) -> None:
+    study = load_study(write_study(tmp_path, changed(STUDY, "solvers", to="available")))
+    assert {"piqp", "proxqp", "osqp"} <= set(study.solver_names())
+
+
+def test_find_study_knows_paths_and_names(tmp_path: Path) -> None:
+    path = write_study(tmp_path)
+    assert find_study(path) == Path(path)
+    assert find_study("quick").name == "quick.toml"
+
+
+def test_a_folder_does_not_hide_a_registered_study(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "quick").mkdir()  # what `vibench run --out quick` leaves
+    assert load_study("quick").name == "quick"
+
+
+def test_overrides_replace_whole_axes(tmp_path: Path) -> None:
+    given = {"dual": ["mcpg"], "primal": ["online-supremizers"], "solvers": ["proxqp"], "problem": ["obstacle"]}
+    study = load_study(write_study(tmp_path), given)
+    assert [entry.name for entry in study.dual] == ["mcpg"]
+    assert [entry.name for entry in study.primal] == ["online-supremizers"]
+    assert study.solver_names() == ["proxqp"]
+
+
+def test_overrides_keep_the_options_of_the_entry(tmp_path: Path) -> None:
+    study = load_study(write_study(tmp_path), {"problem": ["obstacle"]})
+    assert study.problem[0].options == {"resolution": "coarse"}
+
+
+def test_overrides_find_entries_by_label(tmp_path: Path) -> None:
+    entries = [
+        {"name": "obstacle", "label": "small", "options": {"resolution": "coarse"}},
+        {"name": "obstacle", "label": "large", "options": {"resolution": "paper"}},
+    ]
+    path = write_study(tmp_path, changed(STUDY, "problem", to=entries))
+    study = load_study(path, {"problem": ["large"]})
+    assert [(entry.title, entry.options["resolution"]) for entry in study.problem] == [("large", "paper")]
+
+
+def test_an_override_keeps_every_entry_with_its_name(tmp_path: Path) -> None:
+    entries = [{"name": "obstacle", "label": size, "options": {"resolution": size}} for size in ("coarse", "medium")]
+    study = load_study(
+        write_study(tmp_path, changed(STUDY, "problem", to=[*entries, "hertz"])), {"problem": ["obstacle"]}
+    )
+    assert [entry.title for entry in study.problem] == ["coarse", "medium"]
+
+
+def test_overrides_replace_tolerances_in_every_table(tmp_path: Path) -> None:
+    second = {"N": [4], "R": {"cpg": [2], "mcpg": [3]}, "primal": {"offline-pga": [0.9]}}
+    path = write_study(tmp_path, changed(STUDY, "tolerances", 1, to=second))
+    study = load_study(path, {"pod": [0.5], "dual_tol": [0.25, 0.125], "primal_tol": [0.75]})
+    assert len(study.tolerances) == 2
+    for table in study.tolerances:
+        assert (table.pod, table.N) == ([0.5], None)
+        assert (table.dual, table.R) == ([0.25, 0.125], None)
+        assert table.primal == {"offline-pga": [0.75]}
+
+
+def test_overrides_leave_the_other_axes_alone(tmp_path: Path) -> None:
+    path = write_study(tmp_path)
+    plain, replaced = load_study(path), load_study(path, {"pod": [0.5], "dual": []})
+    assert replaced.tolerances[0].pod == [0.5]
+    assert replaced.model_dump(exclude={"tolerances"}) == plain.model_dump(exclude={"tolerances"})
+    assert replaced.tolerances[0].dual == plain.tolerances[0].dual
+
+
+@pytest.mark.parametrize("there", [{}, {"primal": {}}])
+def test_a_strategy_and_its_tolerance_can_both_be_given_by_overrides(there: dict[str, Any], tmp_path: Path) -> None:
+    content = changed(STUDY, "tolerances", to=[{"pod": [1e-3], "dual": [1e-1]} | there])
+    path = write_study(tmp_path, changed(content, "primal", to=["decorrelated"]))
+    cells = expand(load_study(path, {"primal": ["offline-pga"], "primal_tol": [0.5]}))
+    assert {cell.primal_tol for cell in cells} == {0.5}
+
+
+def test_an_override_replaces_the_tolerance_of_a_strategy_the_table_leaves_out(tmp_path: Path) -> None:
+    content = changed(STUDY, *TABLE, "dual", to={"cpg": [0.1]})
+    cells = expand(load_study(write_study(tmp_path, content), {"dual": ["mcpg"], "dual_tol": [0.2]}))
+    assert {(cell.dual.name, cell.cone.tolerance) for cell in cells} == {("mcpg", 0.2)}
+
+
+@pytest.mark.parametrize(
+    ("overrides", "words"),
+    [
+        ({"pod": [float("nan")]}, ("pod", "finite")),
+        ({"dual_tol": [0.0]}, ("dual", "greater than 0")),
+        ({"primal_tol": [-1.0]}, ("primal", "greater than 0")),
+        ({"solvers": ["oqsp"]}, ("oqsp", "did you mean 'osqp'")),
+        ({"problem": ["obstcale"]}, ("did you mean 'obstacle'",)),
+        ({"primal": ["decorelated"]}, ("did you mean 'decorrelated'",)),
+    ],
+)
+def test_wrong_overrides_are_refused_and_said_to_be_overrides(
+    overrides: dict[str, Any], words: tuple[str, ...], tmp_path: Path
+) -> None:
+    line = refusal(write_study(tmp_path), overrides)
+    assert "options of the command line" in line
+    assert [word for word in words if word not in line] == [], line
+
+
+@pytest.mark.parametrize("name", ["quick", "paper-obstacle"])
+def test_the_registered_studies_load(name: str) -> None:
+    study = load_study(name)
+    assert study.name == name
+    assert expand(study)
+
+
+SCALARS = (
+    st.none().map(lambda _: REMOVE)
+    | st.booleans()
+    | st.integers(-(10**20), 10**20)
+    | st.floats()
+    | st.text(max_size=8)
+    | st.dates()
+    | st.sampled_from(["cpg", "mcpg", "obstacle", "piqp", "decorrelated", "offline-pga", "available", "full", "coarse"])
+)
+KEYS = st.text(max_size=6) | st.sampled_from(["pod", "N", "dual", "R", "primal", "name", "label", "options", "limits"])
+VALUES = st.recursive(
+    SCALARS.filter(lambda value: value is not REMOVE),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(KEYS, inner, max_size=3),
+    max_leaves=6,
+)
+
+
+def places(value: Any, here: tuple[str | int, ...] = ()) -> list[tuple[str | int, ...]]:
+    """Paths to everything inside a study's content."""
+    steps = value.items() if isinstance(value, Mapping) else enumerate(value) if isinstance(value, list) else ()
+    return [path for key, inner in steps for path in [(*here, key), *places(inner, (*here, key))]]
+
+
+@settings(max_examples=200, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(data=st.data())
+def test_no_mutation_of_a_study_raises_anything_but_a_refusal(data: st.DataObject, tmp_path: Path) -> None:
+    content: dict[str, Any] = changed(STUDY, "limits", to={"query_seconds": 5.0})
+    for _ in range(data.draw(st.integers(1, 2))):
+        where = data.draw(st.sampled_from(places(content) or [("name",)]))
+        added = data.draw(st.booleans()) and isinstance(where[-1], str)
+        path = (*where[:-1], data.draw(KEYS)) if added else where
+        content = changed(content, *path, to=data.draw(VALUES if added else SCALARS | VALUES))
+    with contextlib.suppress(RequestError):
+        study = load_study(write_study(tmp_path, content))
+        assert isinstance(study, Study)
+        assert expand(study)
+
+
+@settings(max_examples=100, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(content=st.binary(max_size=60) | st.text(max_size=60).map(str.encode))
+def test_no_file_raises_anything_but_a_refusal(content: bytes, tmp_path: Path) -> None:
+    path = tmp_path / "study.toml"
+    path.write_bytes(content)
+    assert refusal(str(path)).startswith(f"{path}: ")

@@ -1,0 +1,368 @@
+"""Plugins: found through entry points, refused with a reason, created from checked options."""
+
+from __future__ import annotations
+
+import datetime
+import importlib.metadata
+import sys
+import types
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import pytest
+from annotated_types import Ge, Gt, Le, Lt, MinLen
+from running import Register
+
+from vibench.errors import RequestError
+from vibench.interfaces.problem import Problem
+from vibench.interfaces.strategies import DualStrategy, PrimalStrategy
+from vibench.study import registry
+from vibench.study.cells import Plugin
+from vibench.study.reader import load_study
+
+HERE = __name__
+
+
+class Colour(StrEnum):
+    RED = "red"
+    BLUE = "blue"
+
+
+class Choosy(DualStrategy):
+    """A strategy with an option of every sort.
+
+    More about it.
+    """
+
+    def __init__(
+        self,
+        weight: Annotated[float, Gt(0.0), Lt(1.0)],
+        count: Annotated[int, Ge(1), Le(9)] = 3,
+        mode: Literal["slow", "fast"] = "slow",
+        grid: Literal["coarse", "fine"] | Annotated[int, Ge(2)] = "coarse",
+        exact: bool = False,
+        names: Annotated[list[str], MinLen(1)] = ["a"],  # noqa: B006  read only
+        point: tuple[float, float] = (0.0, 0.0),
+        colour: Colour = Colour.RED,
+        anything: Any = None,
+    ) -> None:
+        self.given = {
+            "weight": weight, "count": count, "mode": mode, "grid": grid, "exact": exact, "names": names,
+            "point": point, "colour": colour, "anything": anything,
+        }  # fmt: skip
+
+    def reduce(self, snapshots: Any, W: Any, stop: Any) -> Any:
+        raise NotImplementedError
+
+
+class Plain(DualStrategy):
+    def reduce(self, snapshots: Any, W: Any, stop: Any) -> Any:
+        raise NotImplementedError
+
+
+class Heir(Choosy):
+    pass
+
+
+@dataclass
+class Record(DualStrategy):
+    width: Annotated[float, Gt(0.0)] = 1.0
+
+    def reduce(self, snapshots: Any, W: Any, stop: Any) -> Any:
+        raise NotImplementedError
+
+
+class Open(DualStrategy):
+    def __init__(self, width: float = 1.0, **others: float) -> None:
+        self.given = {"width": width, **others}
+
+    def reduce(self, snapshots: Any, W: Any, stop: Any) -> Any:
+        raise NotImplementedError
+
+
+def no_strategy() -> None:
+    """A function where a class is asked for."""
+
+
+DUAL, GROUP = "dual strategy", "vibench.dual_strategies"
+
+
+@pytest.fixture
+def _own(register: Register) -> None:
+    members = ("Choosy", "Plain", "Heir", "Record", "Open")
+    register(*((GROUP, member.lower(), f"{HERE}:{member}") for member in members))
+
+
+def refusal(action: Callable[..., Any], *arguments: Any) -> str:
+    with pytest.raises(RequestError) as caught:
+        action(*arguments)
+    line = str(caught.value)
+    assert "\n" not in line
+    return line
+
+
+BASES: Mapping[str, type] = {"problem": Problem, DUAL: DualStrategy, "primal strategy": PrimalStrategy}
+
+
+@pytest.mark.parametrize("kind", BASES)
+def test_the_built_in_plugins_are_found_through_their_entry_points(kind: str) -> None:
+    entries = importlib.metadata.distribution("vibench").entry_points.select(group=registry.GROUPS[kind])
+    assert entries
+    for entry in entries:
+        assert entry.name in registry.names(kind)
+        assert issubclass(registry.load(kind, entry.name), BASES[kind])
+        assert registry.version(kind, entry.name) == f"vibench {importlib.metadata.version('vibench')}"
+
+
+def test_the_paper_s_strategies_and_problem_are_registered() -> None:
+    assert "obstacle" in registry.names("problem")
+    assert {"cpg", "mcpg"} <= set(registry.names(DUAL))
+    assert {"decorrelated", "online-supremizers", "offline-pga"} <= set(registry.names("primal strategy"))
+
+
+def test_registered_studies_are_files_that_load() -> None:
+    assert "quick" in registry.names("study")
+    for name in registry.names("study"):
+        assert registry.study_path(name).is_file()
+        assert load_study(name).name == name
+
+
+@pytest.mark.parametrize("kind", BASES)
+def test_every_built_in_plugin_has_a_summary_and_options_with_defaults(kind: str) -> None:
+    for name in registry.names(kind):
+        assert (registry.load(kind, name).__doc__ or "").strip()
+        assert all(option.expected and option.default for option in registry.options(kind, name))
+        assert registry.check_options(kind, name, {}) == {}
+
+
+def test_names_are_sorted(register: Register) -> None:
+    register(*((GROUP, name, f"{HERE}:Plain") for name in ("b", "c", "a")))
+    assert registry.names(DUAL) == ["a", "b", "c"]
+
+
+def test_groups_are_kept_apart(register: Register) -> None:
+    register((GROUP, "one", f"{HERE}:Plain"))
+    assert registry.names("problem") == []
+    assert "known: none" in refusal(registry.load, "problem", "one")
+
+
+def test_an_unknown_name_is_refused_with_the_nearest(register: Register) -> None:
+    register((GROUP, "plain", f"{HERE}:Plain"), (GROUP, "other", f"{HERE}:Plain"))
+    line = refusal(registry.load, DUAL, "plian")
+    assert "no dual strategy is called 'plian'" in line
+    assert "did you mean 'plain'" in line
+    assert "known: other, plain" in line
+
+
+def test_a_name_far_from_all_is_refused_without_a_guess(register: Register) -> None:
+    register((GROUP, "plain", f"{HERE}:Plain"))
+    assert "did you mean" not in refusal(registry.load, DUAL, "xyzzy")
+
+
+def test_two_packages_with_one_name_are_refused(register: Register) -> None:
+    register((GROUP, "plain", f"{HERE}:Plain"), (GROUP, "plain", f"{HERE}:Choosy"))
+    line = refusal(registry.names, DUAL)
+    assert "'plain'" in line
+    assert f"{HERE}:Plain" in line
+    assert f"{HERE}:Choosy" in line
+
+
+def test_one_entry_point_seen_twice_is_no_conflict(register: Register) -> None:
+    register((GROUP, "plain", f"{HERE}:Plain"), (GROUP, "plain", f"{HERE}:Plain"))
+    assert registry.load(DUAL, "plain") is Plain
+
+
+@pytest.mark.parametrize(
+    ("value", "words"),
+    [
+        ("no_such_module:Plain", "no_such_module"),
+        (f"{HERE}:NoSuchClass", "NoSuchClass"),
+        (f"{HERE}:no_strategy", "not a subclass of DualStrategy"),
+        (f"{HERE}:HERE", "not a subclass of DualStrategy"),
+        ("vibench.interfaces.strategies:PrimalStrategy", "not a subclass of DualStrategy"),
+    ],
+)
+def test_what_cannot_be_loaded_is_refused_with_its_entry_point(value: str, words: str, register: Register) -> None:
+    register((GROUP, "broken", value))
+    line = refusal(registry.load, DUAL, "broken")
+    assert "'broken'" in line
+    assert value in line
+    assert words in line
+
+
+@pytest.mark.parametrize("code", ["raise OSError('no licence')", "1 / 0", "def f(:"], ids=["raises", "fails", "syntax"])
+def test_a_module_that_fails_when_imported_is_refused(
+    code: str, register: Register, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "failing_plugin.py").write_text(f"{code}\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(sys.modules, "failing_plugin", raising=False)
+    register((GROUP, "failing", "failing_plugin:Plain"))
+    line = refusal(registry.load, DUAL, "failing")
+    assert "'failing'" in line
+    assert "failing_plugin:Plain" in line
+
+
+def test_a_solver_must_be_callable(register: Register) -> None:
+    register(("vibench.qp_solvers", "broken", f"{HERE}:HERE"))
+    assert "'broken'" in refusal(registry.load, "QP solver", "broken")
+
+
+def test_an_unused_solver_that_cannot_be_loaded_does_not_stop_a_study(register: Register, tmp_path: Path) -> None:
+    built_in = [
+        (entry.group, entry.name, entry.value)
+        for entry in importlib.metadata.distribution("vibench").entry_points
+        if entry.group.startswith("vibench.")
+    ]
+    register(*built_in, ("vibench.qp_solvers", "broken", "no_such_module:solve"))
+    assert load_study("quick").solver_names()
+
+
+def test_a_study_must_be_a_path(register: Register) -> None:
+    register(("vibench.studies", "broken", f"{HERE}:no_strategy"))
+    assert "'broken'" in refusal(registry.study_path, "broken")
+
+
+def test_a_registered_study_without_file_is_refused(register: Register, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "lost_study", types.SimpleNamespace(path=Path("/nowhere/lost.toml")))
+    register(("vibench.studies", "lost", "lost_study:path"))
+    assert "/nowhere/lost.toml" in refusal(load_study, "lost")
+
+
+def test_a_registered_solver_comes_as_a_callable(register: Register) -> None:
+    register(("vibench.qp_solvers", "mine", f"{HERE}:no_strategy"))
+    assert registry.qp_solver("mine") == {"mine": no_strategy}
+    assert registry.qp_solver("piqp") == {}
+
+
+ACCEPTED = [
+    {"weight": 0.5},
+    {"weight": 0.5, "count": 9},
+    {"weight": 0.5, "mode": "fast"},
+    {"weight": 0.5, "grid": "fine"},
+    {"weight": 0.5, "grid": 7},
+    {"weight": 0.5, "exact": True},
+    {"weight": 0.5, "names": ["x", "y"]},
+    {"weight": 0.5, "anything": {"deep": [1]}},
+]
+
+
+@pytest.mark.usefixtures("_own")
+@pytest.mark.parametrize("given", ACCEPTED, ids=str)
+def test_options_that_fit_reach_the_constructor(given: dict[str, Any]) -> None:
+    made = registry.create(DUAL, "choosy", given)
+    assert {name: made.given[name] for name in given} == given
+
+
+@pytest.mark.usefixtures("_own")
+def test_an_integer_will_do_where_a_float_is_asked_for() -> None:
+    assert isinstance(registry.check_options(DUAL, "record", {"width": 2})["width"], float)
+
+
+REFUSED = [
+    ({"weight": 0.0}, ("'weight'", "0.0", "float > 0 and < 1")),
+    ({"weight": 1.5}, ("'weight'", "1.5", "< 1")),
+    ({"weight": "half"}, ("'weight'", "'half'", "float")),
+    ({"weight": True}, ("'weight'", "True", "float")),
+    ({"weight": float("nan")}, ("'weight'", "nan", "float")),
+    ({"weight": 0.5, "count": 10}, ("'count'", "10", "int ≥ 1 and ≤ 9")),
+    ({"weight": 0.5, "count": 2.0}, ("'count'", "2.0", "int")),
+    ({"weight": 0.5, "mode": "quick"}, ("'mode'", "'quick'", "'slow', 'fast'")),
+    ({"weight": 0.5, "grid": 1}, ("'grid'", "1", "'coarse', 'fine' or int ≥ 2")),
+    ({"weight": 0.5, "exact": 1}, ("'exact'", "1", "bool")),
+    ({"weight": 0.5, "names": []}, ("'names'", "list")),
+    ({"weight": 0.5, "names": [1]}, ("'names'", "list")),
+    ({"weight": 0.5, "exact": datetime.date(2022, 1, 1)}, ("'exact'", "bool")),
+    ({"weight": 0.5, "wieght": 0.5}, ("'wieght'", "did you mean 'weight'")),
+    ({}, ("'weight'", "needs", "float > 0 and < 1")),
+]
+
+
+@pytest.mark.usefixtures("_own")
+@pytest.mark.parametrize(("given", "words"), REFUSED, ids=[str(given) for given, _ in REFUSED])
+def test_options_that_do_not_fit_are_refused_with_what_is_expected(
+    given: dict[str, Any], words: tuple[str, ...]
+) -> None:
+    line = refusal(registry.check_options, DUAL, "choosy", given)
+    assert "'choosy'" in line
+    assert [word for word in words if word not in line] == [], line
+
+
+@pytest.mark.usefixtures("_own")
+@pytest.mark.parametrize(
+    ("option", "given", "made"), [("point", [1.0, 2.0], (1.0, 2.0)), ("colour", "blue", Colour.BLUE)]
+)
+def test_what_toml_can_only_say_as_a_list_or_a_text_is_taken(option: str, given: Any, made: Any) -> None:
+    assert registry.create(DUAL, "choosy", {"weight": 0.5, option: given}).given[option] == made
+
+
+@pytest.mark.usefixtures("_own")
+@pytest.mark.parametrize(("option", "given"), [("point", [1.0]), ("point", [1.0, "x"]), ("colour", "green")])
+def test_lists_and_texts_of_the_wrong_kind_are_refused(option: str, given: Any) -> None:
+    assert f"'{option}'" in refusal(registry.check_options, DUAL, "choosy", {"weight": 0.5, option: given})
+
+
+@pytest.mark.usefixtures("_own")
+def test_a_plugin_without_constructor_takes_no_options() -> None:
+    assert registry.options(DUAL, "plain") == []
+    assert isinstance(registry.create(DUAL, "plain", {}), Plain)
+    assert "known: none" in refusal(registry.check_options, DUAL, "plain", {"x": 1})
+
+
+@pytest.mark.usefixtures("_own")
+def test_an_inherited_constructor_counts() -> None:
+    assert registry.options(DUAL, "heir") == registry.options(DUAL, "choosy")
+    assert registry.create(DUAL, "heir", {"weight": 0.5}).given["weight"] == 0.5
+
+
+@pytest.mark.usefixtures("_own")
+def test_a_dataclass_is_a_plugin() -> None:
+    assert registry.create(DUAL, "record", {"width": 2.0}) == Record(2.0)
+    assert "float > 0" in refusal(registry.check_options, DUAL, "record", {"width": -1.0})
+
+
+@pytest.mark.usefixtures("_own")
+def test_keyword_arguments_of_no_name_are_no_option_that_must_be_given() -> None:
+    assert registry.create(DUAL, "open", {"width": 2.0}).given == {"width": 2.0}
+
+
+@pytest.mark.usefixtures("_own")
+def test_options_are_listed_in_words() -> None:
+    listed = {option.name: (option.expected, option.default) for option in registry.options(DUAL, "choosy")}
+    assert listed["weight"] == ("float > 0 and < 1", "")
+    assert listed["count"] == ("int ≥ 1 and ≤ 9", "3")
+    assert listed["mode"] == ("'slow', 'fast'", "'slow'")
+    assert listed["grid"] == ("'coarse', 'fine' or int ≥ 2", "'coarse'")
+    assert listed["exact"] == ("bool", "False")
+    assert listed["anything"][0] == "any value"
+
+
+def test_the_version_of_an_unpackaged_plugin_is_unknown(register: Register) -> None:
+    register((GROUP, "plain", f"{HERE}:Plain"))
+    assert registry.version(DUAL, "plain") == "unknown"
+
+
+def test_the_code_of_a_plugin_follows_its_sources(
+    register: Register, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    package = tmp_path / "edited_plugin"
+    package.mkdir()
+    (package / "__init__.py").touch()
+    (package / "helper.py").write_text("x = 1\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    register((GROUP, "edited", "edited_plugin:Plain"), (GROUP, "plain", f"{HERE}:Plain"))
+    codes = [registry.code(DUAL, "edited"), registry.code(DUAL, "plain")]
+    (package / "helper.py").write_text("x = 2\n")
+    registry.code.cache_clear()
+    assert registry.code(DUAL, "edited") != codes[0]
+    assert registry.code(DUAL, "plain") == codes[1]
+
+
+@pytest.mark.usefixtures("_own")
+def test_a_plugin_made_in_a_stage_gets_its_options_back() -> None:
+    plugin = Plugin(DUAL, "choosy", '{"weight": 0.25, "grid": "fine"}', "")
+    assert plugin.create().given["weight"] == 0.25
+    assert plugin.create().given["grid"] == "fine"

@@ -1,0 +1,98 @@
+"""Where numbers come from: machine, versions and the code."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import platform
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+import vibench
+from vibench import provenance
+from vibench.provenance import core_code, cores, distribution_version, machine, solver_version, source_hash, versions
+from vibench.qp.settings import SETTINGS
+
+
+def test_the_machine_is_named_with_cores_memory_and_system() -> None:
+    text = machine()
+    assert f"{cores()} cores" in text
+    assert "GiB" in text
+    assert platform.system() in text
+    assert platform.machine() in text
+    assert "\n" not in text
+
+
+def test_there_is_a_core() -> None:
+    assert cores() >= 1
+
+
+@pytest.mark.parametrize("name", ["numpy", "scipy", "qpsolvers", "vibench"])
+def test_versions_are_those_installed(name: str) -> None:
+    found = versions("piqp")
+    assert found[name] == importlib.metadata.version(name)
+    assert found["python"] == platform.python_version()
+    assert found["piqp"] == importlib.metadata.version("piqp")
+
+
+def test_what_is_not_installed_has_no_version() -> None:
+    assert distribution_version("no-such-distribution") == ""
+    assert solver_version("no-such-solver") == ""
+
+
+@pytest.mark.parametrize("solver", ["piqp", "osqp", "proxqp"])
+def test_solvers_that_are_required_have_a_version(solver: str) -> None:
+    assert solver in SETTINGS
+    assert solver_version(solver)
+
+
+@pytest.fixture
+def sources(tmp_path: Path) -> Path:
+    """A folder with two sources."""
+    (tmp_path / "a.py").write_text("x = 1\n")
+    (tmp_path / "b.py").write_text("y = 2\n")
+    return tmp_path
+
+
+CHANGES: dict[str, Callable[[Path], object]] = {
+    "edited": lambda folder: (folder / "a.py").write_text("x = 2\n"),
+    "added": lambda folder: (folder / "c.py").write_text(""),
+    "removed": lambda folder: (folder / "b.py").unlink(),
+    "renamed": lambda folder: (folder / "b.py").rename(folder / "c.py"),
+    "moved from one to another": lambda folder: [
+        (folder / "a.py").write_text("x = 1\ny = 2\n"),
+        (folder / "b.py").write_text(""),
+    ],
+}
+
+
+@pytest.mark.parametrize("change", CHANGES)
+def test_the_hash_changes_with_the_sources(change: str, sources: Path) -> None:
+    before = source_hash(sources)
+    CHANGES[change](sources)
+    assert source_hash(sources) != before
+
+
+def test_the_hash_does_not_change_with_anything_else(sources: Path, tmp_path_factory: pytest.TempPathFactory) -> None:
+    before = source_hash(sources)
+    (sources / "__pycache__").mkdir()
+    (sources / "__pycache__" / "a.cpython-311.pyc").write_bytes(b"x")
+    (sources / "notes.txt").write_text("x")
+    assert source_hash(sources) == before
+    copy = tmp_path_factory.mktemp("other") / "copy"
+    shutil.copytree(sources, copy)
+    assert source_hash(copy) == before
+
+
+def test_the_code_of_the_core_is_its_version_and_its_sources() -> None:
+    version, _, digest = core_code().partition(" ")
+    assert version == importlib.metadata.version("vibench")
+    assert digest == source_hash(Path(str(vibench.__file__)).parent)
+
+
+def test_the_processor_is_named_without_cpuinfo(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(provenance.Path, "is_file", lambda _: False)
+    text = machine.__wrapped__()
+    assert text.split(",")[0].strip() in (platform.processor(), platform.machine())

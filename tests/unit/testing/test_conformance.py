@@ -1,0 +1,322 @@
+"""Conformance checks: what is right passes, and every fault is found by the check that is for it, which names it."""
+
+from __future__ import annotations
+
+import importlib.metadata
+from collections.abc import Mapping
+
+import broken_problems
+import broken_strategies
+import numpy as np
+import pytest
+import scipy.sparse as sp
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numerics import Varying
+from running import Main, refused
+
+from vibench import testing
+from vibench.interfaces.strategies import DualStrategy
+from vibench.study import registry
+from vibench.testing.checks import Check, Finding, Note, Verdict, examine
+from vibench.testing.continuity import JUMP, WIDTH, find_jump
+
+Case = tuple[str, list[str]]
+"""The one check that fails, and words of what it says."""
+
+THE_TWELVE: Mapping[str, Case] = {
+    "broken_problems:Asymmetric": (
+        "symmetry of A", ["A is not symmetric at mu = [4.0]", "entry (2, 3) is -12.996", "entry (3, 2) is -13"],
+    ),
+    "broken_problems:Indefinite": (
+        "definiteness of A", ["A is not positive definite at mu = [8.0]", "its smallest eigenvalue is -"],
+    ),
+    "broken_problems:NotFinite": ("assembly", ["f is not finite: entry 7 is nan", "at mu = [8.0]"]),
+    "broken_problems:WrongShape": ("assembly", ["B has shape (12, 11)", "ask for (12, 12)"]),
+    "broken_problems:IndefiniteNorm": (
+        "construction", ["X_V: ", "is not positive definite", "broken_problems.py, line", "self.V = InnerProduct("],
+    ),
+    "broken_problems:Jumps": ("continuity in mu", ["g jumps at mu = [5.432", "entry ", "0.0153846 against 0.0155385"]),
+    "broken_problems:Random": ("determinism", ["f is not the same when it is assembled again", "entry ", "at mu ="]),
+    "broken_problems:ChangesTheParameter": (
+        "no mutation", ["assemble changes the parameter it is given", "entry 0 is 4 against 8", "copy of mu"],
+    ),
+    "broken_strategies:NegativeGenerators": (
+        "cone", ["negative coefficient", "not declared free", "look at coefficient 3 of generator"],
+    ),
+    "broken_strategies:Misses": (
+        "tolerance", ["tolerance 0.1 is missed", "the cone of", "of snapshot", "the error claimed is"],
+    ),
+    "broken_problems:FalselyConstant": (
+        "independence of mu", ["f is declared `constant` and depends on mu", "entry 0", "at mu = [8.0]"],
+    ),
+    "broken_problems:PartlyWrong": (
+        "assembly on the contact", ["contact.g is not what is assembled in full at mu = [4.0]", "entry 0"],
+    ),
+}  # fmt: skip
+
+MORE_PROBLEMS: Mapping[str, Case] = {
+    "InfiniteMatrix": ("assembly", ["B is not finite: entry (5, 5) is inf"]),
+    "Integers": ("assembly", ["g has dtype int64", "expected float64"]),
+    "Column": ("assembly", ["f has shape (12, 1); expected (12,)"]),
+    "Dense": ("assembly", ["A is a ndarray", "scipy.sparse.csr_array(A)"]),
+    "RowList": ("assembly", ["B has the sparse format lil; expected CSR or CSC"]),
+    "NoInequality": ("assembly", ["assemble gives a tuple", "expected a vibench.VariationalInequality"]),
+    "Raises": ("assembly", ["assemble fails at mu = [8.0]: ArithmeticError: the wire snapped", "line ", "raise"]),
+    "IndefiniteDualNorm": ("construction", ["X_W is not positive definite", "self.W = "]),
+    "NormChangedLater": ("spaces", ["X_V is not positive definite", "changed after"]),
+    "NoSpace": ("spaces", ["V is a csr_array", "InnerProduct"]),
+    "NoConstraint": ("spaces", ["W has dimension 0", "no constraint"]),
+    "NoMeasure": ("spaces", ["multiplier_integrals has the value 0"]),
+    "JumpsAtTheCentre": ("continuity in mu", ["A jumps at mu = [6"]),
+    "Remembers": ("determinism", ["f is not the same when it is assembled again"]),
+    "CountsInstances": ("determinism", ["g is not the same in another instance"]),
+    "OneBuffer": ("no mutation", ["f of one parameter changes when another one is assembled", "hand out copies"]),
+    "ConstantOfNothing": ("independence of mu", ["`constant` names 'a'; expected A, f, B, g"]),
+    "ConstantText": ("independence of mu", ["`constant` is the text 'A'", "frozenset({'A'})"]),
+    "NoContact": ("assembly on the contact", ["contact gives a NoneType at mu = [4.0]"]),
+    "ContactOfNothing": ("assembly on the contact", ["`contact` is defined and `contact_dofs` is not"]),
+    "ContactChangesTheParameter": ("assembly on the contact", ["contact changes the parameter", "copy of mu"]),
+    "Overlooked": ("assembly on the contact", ["B touches 1 unknowns outside `contact_dofs`", "the first is 0"]),
+    "Falling": ("assembly on the contact", ["`contact_dofs` is not rising"]),
+    "SamplesWrong": ("assembly by entries", ["sampler gives another f", "at mu = [4.0]: entry 4 is 1 against -0.307"]),
+    "SamplesNothing": ("assembly by entries", ["NotImplementedError", "has no sampler"]),
+    "OneSample": ("training set", ["training_set is mu = [5.0] alone"]),
+    "Outside": ("training set", ["leaves the box: parameter 0, at mu = [3.0]", "'force' outside [4, 8]"]),
+    "Flat": ("training set", ["training_set has shape (6,), expected (P, 1)"]),
+    "OtherValidation": ("validation set", ["not the same for the same seed", "default_rng(seed)"]),
+    "BackwardsBox": ("parameters", ["lower bound 8 of the parameter 'force' is above its upper bound 4"]),
+    "NamedByText": ("parameters", ["the names of the parameters are 'force'; expected a tuple"]),
+    "Unpicklable": ("pickling", ["cannot be pickled", "attribute load"]),
+    "WrongSign": ("high-fidelity solution", ["no constraint is active at any of 9", "B u ≤ g"]),
+    "OutOfReach": ("high-fidelity solution", ["no solution at mu = [8.0]", "more than the wire bears"]),
+    "PaintsNothing": ("picture and diagnostics", ["values has shape (11,); expected (12,)", "name point 12"]),
+    "Unfinished": ("construction", ["abstract class Unfinished", "assemble"]),
+}  # fmt: skip
+
+MORE_STRATEGIES: Mapping[str, Case] = {
+    "Boasts": ("errors", ["tolerance 0.3: the error of 1 generators is given as", "the first 1 leave"]),
+    "OneErrorTooFew": ("cone", ["errors has shape (3,); expected e(0) … e(3), or e(3) alone"]),
+    "Long": ("cone", ["do not all have unit norm", "that of generator 0 is 2"]),
+    "Oversized": ("size", ["size 1 was asked for and the cone has 2 generators"]),
+    "Draws": ("determinism", ["tolerance 0.3: the generators are not the same when asked again: entry ("]),
+    "Normalises": ("no mutation", ["reduce changes the snapshots it is given: entry (", "work on a copy"]),
+    "DividesByZero": ("snapshots without contact", ["with a zero snapshot", "not finite", "look at generator 0"]),
+    "UnpicklableDual": ("pickling", ["cannot be pickled", "attribute weight"]),
+    "NotOrthogonal": ("enrichment", ["not orthonormal in V and orthogonal to V_N: the ", " of vector "]),
+    "AsksForATolerance": ("tolerance", ["without a tolerance", "TypeError", "says takes_tolerance = True"]),
+    "NeedsNone": ("tolerance", ["takes_tolerance is True, yet build(offline, None) gives an enrichment"]),
+    "Fewer": ("tighter tolerances", ["tolerance 0.1 gives 0 vectors, fewer than the", "of tolerance 0.5"]),
+    "KindOfTwo": ("kind", ["the kind depends on the tolerance: none at 0.9, fixed at"]),
+    "DrawsVectors": ("determinism", ["not the same when asked again: of the vectors, entry ("]),
+    "ChangesTheBasis": ("no mutation", ["build changes offline.basis: entry (", "work on a copy"]),
+    "NoMultiplier": ("model without contact", ["AssertionError: no multiplier", "broken_strategies.py, line"]),
+    "SuppliesFunction": ("pickling", ["the Enrichment cannot be pickled", "attribute supply"]),
+    "SuppliesAVector": ("enrichment", ["what the supply gives has shape (40,)"]),
+    "Restarts": ("nested growth", ["the vectors of tolerance 0.5 are not the beginning of those of 0.1"]),
+}  # fmt: skip
+
+
+def failures(findings: list[Finding]) -> dict[str, str]:
+    return {finding.check: finding.message for finding in findings if finding.verdict is Verdict.FAILED}
+
+
+def assert_found(found: Mapping[str, str], case: Case) -> None:
+    check, words = case
+    assert list(found) == [check]
+    assert [word for word in words if word not in found[check]] == [], found[check]
+
+
+@pytest.mark.parametrize("plugin", THE_TWELVE)
+def test_the_command_catches_a_fault_and_names_it(plugin: str, main: Main) -> None:
+    code, out, err = main("check", plugin)
+    assert (code, err) == (1, "")
+    found = dict(
+        line.removeprefix("failed   ").split(": ", 1) for line in out.splitlines() if line.startswith("failed")
+    )
+    assert_found(found, THE_TWELVE[plugin])
+    assert out.splitlines()[-1].endswith("skipped")
+    assert " 1 failed" in out.splitlines()[-1]
+
+
+@pytest.mark.parametrize("name", MORE_PROBLEMS)
+def test_a_fault_of_a_problem_is_found_by_the_check_that_is_for_it(name: str) -> None:
+    assert_found(failures(testing.examine_problem(getattr(broken_problems, name))), MORE_PROBLEMS[name])
+
+
+@pytest.mark.parametrize("name", MORE_STRATEGIES)
+def test_a_fault_of_a_strategy_is_found_by_the_check_that_is_for_it(name: str) -> None:
+    plugin = getattr(broken_strategies, name)
+    check = testing.examine_dual if issubclass(plugin, DualStrategy) else testing.examine_primal
+    assert_found(failures(check(plugin)), MORE_STRATEGIES[name])
+
+
+BUILT_IN = [
+    (word, entry.name)
+    for word, kind in registry.WORDS.items()
+    for entry in importlib.metadata.distribution("vibench").entry_points.select(group=registry.GROUPS[kind])
+]
+
+
+@pytest.mark.parametrize(("word", "name"), BUILT_IN)
+def test_a_built_in_plugin_passes_every_check(word: str, name: str, main: Main) -> None:
+    code, out, err = main("check", f"{word}:{name}")
+    assert (code, err) == (0, ""), out
+    assert out.startswith(f"{registry.WORDS[word]} '{name}'")
+    assert ("at resolution coarse" in out.splitlines()[0]) == (word == "problem")
+    assert out.splitlines()[-1].endswith("passed, 0 failed, 0 skipped")
+
+
+def test_what_the_broken_plugins_are_made_of_is_right() -> None:
+    for problem in (broken_problems.Declared, testing.MovingSupport, Varying):
+        testing.check_problem(problem)
+    for dual in (broken_strategies.Greedy, broken_strategies.LastErrorAlone):
+        testing.check_dual(dual)
+    testing.check_primal(broken_strategies.Supremizing)
+
+
+def test_one_error_lists_all_failures() -> None:
+    with pytest.raises(testing.ConformanceError) as caught:
+        testing.check_problem(broken_problems.Worse)
+    lines = str(caught.value).splitlines()
+    assert lines[0] == "Worse fails 2 of 18 checks"
+    assert [line.split(":")[0] for line in lines[1:]] == ["training set", "pickling"]
+
+
+def test_an_instance_is_refused_because_two_have_to_agree() -> None:
+    for check, instance in (
+        (testing.check_problem, broken_problems.Declared()),
+        (testing.check_dual, broken_strategies.Greedy()),
+        (testing.check_primal, broken_strategies.Supremizing()),
+    ):
+        with pytest.raises(TypeError, match=f"give the class {type(instance).__name__}"):
+            check(instance)  # type: ignore[operator]
+
+
+def test_snapshots_and_a_model_of_one_s_own_are_used() -> None:
+    snapshots, W = testing.sample_snapshots()
+    misses = testing.examine_dual(broken_strategies.Misses, snapshots[:, :2], W, tolerances=[1e-9], sizes=[1])
+    assert failures(misses) == {}  # two generators are all there is
+    offline = testing.sample_offline(modes=3, generators=2)
+    findings = testing.examine_primal(broken_strategies.Supremizing, offline, tolerances=[0.2, 0.8])
+    counts = next(finding.message for finding in findings if finding.check == "enrichment")
+    assert counts == "tolerance 0.8: fixed, 2 vectors; tolerance 0.2: fixed, 2 vectors"
+    with pytest.raises(TypeError, match="both snapshots and W"):
+        testing.check_dual(broken_strategies.Greedy, snapshots)
+
+
+@pytest.mark.parametrize("check", [testing.examine_dual, testing.examine_problem, testing.examine_primal])
+def test_whatever_takes_longer_than_the_limit_fails(check, monkeypatch: pytest.MonkeyPatch) -> None:
+    plugin = {
+        testing.examine_dual: broken_strategies.Greedy,
+        testing.examine_problem: broken_problems.Declared,
+        testing.examine_primal: broken_strategies.Supremizing,
+    }[check]
+    assert "above the limit of 0 s" in failures(check(plugin, seconds=0.0))["time"]
+
+
+def test_a_check_is_skipped_when_one_that_it_needs_did_not_pass() -> None:
+    findings = examine([
+        Check("first", lambda: ["wrong"]),
+        Check("second", lambda: [Note("fine")], ("first",)),
+        Check("third", lambda: ["wrong", "too"], ("second",)),
+        Check("fourth", lambda: [Note("fine")]),
+        Check("fifth", lambda: 1 / 0, ("fourth",)),  # type: ignore[arg-type,return-value]
+    ])  # fmt: skip
+    assert [finding.verdict.value for finding in findings] == ["failed", "skipped", "skipped", "passed", "failed"]
+    assert [finding.message for finding in findings[:4]] == ["wrong", "it needs 'first'", "it needs 'second'", "fine"]
+    assert findings[4].message.startswith("ZeroDivisionError")
+    assert "test_conformance.py, line" in findings[4].message
+
+
+def bent(t: float, kink: float, slope: float, size: float) -> dict[str, object]:
+    """A vector and a sparse matrix that have a kink, and where the vector jumps if `size` is not zero."""
+    value = np.sin(3.0 * t) + slope * abs(t - kink) + (size if t > kink else 0.0)
+    return {"f": np.array([1.0, value]), "A": sp.csr_array(np.diag([1.0 + t**2, abs(t - kink)]))}
+
+
+@settings(max_examples=30)
+@given(st.floats(0.001, 0.999), st.floats(-2.0, 2.0), st.floats(0.02, 3.0), st.sampled_from([-1.0, 1.0]))
+def test_a_jump_is_found_wherever_it_is(kink: float, slope: float, size: float, sign: float) -> None:
+    jump = find_jump(lambda t: bent(t, kink, slope, sign * size), {"f": 1.0, "A": 1.0})
+    assert jump is not None
+    assert jump.member == "f"
+    assert jump.left <= kink <= jump.right <= jump.left + WIDTH
+    assert jump.what.startswith("entry 1 is ")
+
+
+@settings(max_examples=20)
+@given(st.floats(0.0, 1.0), st.floats(-5.0, 5.0))
+def test_a_kink_is_no_jump(kink: float, slope: float) -> None:
+    assert find_jump(lambda t: bent(t, kink, slope, 0.0), {"f": 1.0, "A": 1.0}) is None
+
+
+@settings(max_examples=20)
+@given(st.floats(0.1, 0.9))
+def test_a_root_is_no_jump(place: float) -> None:
+    assert find_jump(lambda t: {"g": np.array([np.sqrt(abs(t - place))])}, {"g": 1.0}) is None
+
+
+def test_a_jump_that_is_too_small_is_not_looked_for() -> None:
+    assert find_jump(lambda t: {"g": np.array([1.0 + 0.9 * JUMP * (t > 0.3)])}, {"g": 1.0}) is None
+
+
+class TestRequests:
+    @pytest.mark.parametrize(
+        ("arguments", "words"),
+        [
+            (["obstcale"], ["no plugin is called 'obstcale'", "did you mean 'obstacle'"]),
+            (["dual:obstacle"], ["no dual strategy is called 'obstacle'", "known:", "mcpg"]),
+            (["no_module:Rope"], ["'no_module:Rope'", "cannot be imported", "no_module"]),
+            (["broken_problems:Jmups"], ["no class of the module broken_problems", "did you mean 'Jumps'"]),
+            (["running:Path"], ["'running:Path'", "no subclass of Problem, PrimalStrategy or DualStrategy"]),
+            (["some thing:Rope"], ["neither KIND:NAME", "MODULE:CLASS"]),
+            (["obstacle", "--option", "resolution"], ["'resolution'", "KEY=VALUE"]),
+            (["obstacle", "--option", "resolution=3"], ["option 'resolution' of problem 'obstacle' is 3", "int ≥ 150"]),
+            (["obstacle", "--option", "resoltion=coarse"], ["did you mean 'resolution'"]),
+            (["fake_plugins:BadCone"], ["dual strategy 'fake_plugins:BadCone' needs the option 'how'"]),
+            ([], ["PLUGIN"]),
+        ],
+    )
+    def test_a_plugin_that_is_not_there_is_refused_in_one_line(
+        self, arguments: list[str], words: list[str], main: Main
+    ) -> None:
+        refused(main("check", *arguments), *words)
+
+    def test_a_name_of_two_plugins_is_refused_until_the_kind_is_given(self, main: Main, register) -> None:
+        register(
+            ("vibench.problems", "twin", "broken_problems:Declared"),
+            ("vibench.dual_strategies", "twin", "broken_strategies:Greedy"),
+        )
+        refused(main("check", "twin"), "several plugins are called 'twin'", "problem:twin or dual:twin")
+        assert main("check", "dual:twin")[1].startswith("dual strategy 'twin'")
+
+    def test_options_reach_the_plugin(self, main: Main) -> None:
+        _, out, _ = main("check", "fake_plugins:Wire", "--option", "nodes=20", "--option", "depth=0.1")
+        assert "n = 20, m = 20" in out
+        code, out, _ = main("check", "fake_plugins:BadCone", "--option", "how=negative")
+        assert code == 1
+        assert "failed   cone: " in out
+
+    def test_another_resolution_than_coarse_is_taken_where_it_is_asked_for(self, main: Main) -> None:
+        code, out, _ = main("check", "obstacle", "--option", "resolution=200")
+        assert code == 0
+        assert out.splitlines()[0] == "problem 'obstacle'"
+        n = registry.create("problem", "obstacle", {"resolution": 200}).V.dim
+        assert f"n = {n}, " in out
+
+    def test_a_class_in_the_current_folder_is_found(self, main: Main, tmp_path) -> None:
+        source = "from broken_strategies import Greedy\n\nclass Mine(Greedy):\n    '''Mine.'''\n"
+        (tmp_path / "here" / "lying_around.py").write_text(source)
+        code, out, _ = main("check", "lying_around:Mine")
+        assert code == 0
+        assert out.startswith("dual strategy 'lying_around:Mine'")
+
+
+def test_every_broken_plugin_is_tried() -> None:
+    tried = {name.split(":")[1] for name in THE_TWELVE} | set(MORE_PROBLEMS) | set(MORE_STRATEGIES)
+    sound = {"Declared", "Changed", "Greedy", "LastErrorAlone", "Supremizing", "Worse"}
+    for module in (broken_problems, broken_strategies):
+        own = {name for name, value in vars(module).items() if getattr(value, "__module__", "") == module.__name__}
+        classes = {name for name in own if isinstance(vars(module)[name], type) and not name.startswith("_")}
+        assert classes - sound <= tried

@@ -1,0 +1,43 @@
+"""Tables on a terminal, or where there is none."""
+
+from __future__ import annotations
+
+import pandas as pd
+from rich import box
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+from vibench.results import tables
+
+WIDTH = 180
+"""Columns of a table where the output is no terminal."""
+
+
+def new_console() -> Console:
+    """A console for the standard output."""
+    console = Console(highlight=False)
+    return console if console.is_terminal else Console(highlight=False, width=WIDTH)
+
+
+def print_frame(console: Console, frame: pd.DataFrame, title: str) -> None:
+    """Print a table; text columns that say the same in every row go into the title, and nothing is cut off."""
+    shared = [name for name in frame.columns if len(frame) > 1 and _same_text(frame[name])]
+    title = ", ".join([title, *(f"{name} {tables.cell_text(frame[name].iloc[0])}" for name in shared)])
+    table = Table(title=Text(title), title_justify="left", pad_edge=False, padding=(0, 1, 0, 0), box=box.SIMPLE_HEAD)
+    shown = frame.drop(columns=shared)
+    rows = [[tables.cell_text(value) for value in row] for row in shown.itertuples(index=False)]
+    for k, name in enumerate(shown.columns):
+        widest = max((len(word) for row in rows for word in row[k].split()), default=1)
+        numeric = pd.api.types.is_numeric_dtype(shown[name])
+        table.add_column(Text(str(name)), justify="right" if numeric else "left", min_width=min(widest, 24))
+    for row in rows:
+        table.add_row(*map(Text, row))
+    unbounded = console.options.update(width=10 * WIDTH)
+    natural = console.measure(table, options=unbounded).maximum
+    console.width = max(console.width, min(natural, WIDTH))  # better a wrapped line than a cut one
+    console.print(table)
+
+
+def _same_text(column: pd.Series) -> bool:
+    return not pd.api.types.is_numeric_dtype(column) and column.nunique(dropna=False) == 1

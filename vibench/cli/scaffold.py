@@ -1,0 +1,124 @@
+"""New packages of plugins, made from templates."""
+
+from __future__ import annotations
+
+import re
+import tempfile
+from importlib.resources import files
+from pathlib import Path
+from string import Template
+
+from vibench.errors import RequestError, StorageError
+from vibench.provenance import distribution_version
+from vibench.study import registry
+from vibench.study.registry import GROUPS, WORDS
+
+MODULES = {"problem": "problem", "primal": "strategy", "dual": "strategy"}
+"""Module that holds the plugin."""
+
+NAME = re.compile(r"[a-z][a-z0-9]*(-[a-z0-9]+)*")
+LONGEST = 40
+
+TAKEN = ("problems", "strategies")
+"""Names whose packages would be called as those that come with vibench."""
+
+
+def write_package(kind: str, name: str, parent: Path) -> Path:
+    """Write the folder `vibench-NAME` into a folder, all of it or nothing; gives its path.
+
+    Parameters
+    ----------
+    kind
+        "problem", "primal" or "dual".
+    name
+        What the plugin is registered as.
+    parent
+        Folder for the new folder; made if it is not there.
+
+    Raises
+    ------
+    RequestError
+        If the name is no good or taken, or the folder exists.
+    StorageError
+        If there is no space, or no permission.
+    """
+    check_name(kind, name)
+    target = parent / f"vibench-{name}"
+    if target.exists() or target.is_symlink():
+        raise RequestError(f"'{target}' exists already; choose another name, or another folder with --out")
+    if parent.exists() and not parent.is_dir():
+        raise RequestError(f"--out '{parent}' is a file; expected a folder")
+    contents = _contents(kind, name)
+    try:
+        parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise RequestError(f"--out '{parent}' cannot be made: {error.strerror or error}") from None
+    try:
+        with tempfile.TemporaryDirectory(dir=parent, prefix=".vibench-new-") as scratch:
+            draft = Path(scratch) / target.name
+            for path, text in contents.items():
+                (draft / path).parent.mkdir(parents=True, exist_ok=True)
+                (draft / path).write_text(text, encoding="utf-8")
+            draft.rename(target)
+    except OSError as error:
+        raise StorageError(f"'{target}' cannot be written: {error.strerror or error}") from None
+    return target
+
+
+def check_name(kind: str, name: str) -> None:
+    """Refuse a name that cannot be that of a package, or that a plugin has already.
+
+    Raises
+    ------
+    RequestError
+        Saying why, and what would be right.
+    """
+    if not NAME.fullmatch(name) or len(name) > LONGEST:
+        raise RequestError(
+            f"'{name}' cannot be the name of a plugin: expected lower case letters and digits, in words joined by '-', "
+            f"a letter first, {LONGEST} characters at most, such as 'my-{kind}'"
+        )
+    if name in TAKEN:
+        raise RequestError(f"'{name}' cannot be the name of a plugin: vibench itself has a package of that name")
+    title = WORDS[kind]
+    if name in registry.names(title):
+        raise RequestError(
+            f"there is a {title} '{name}' already, in {registry.version(title, name)}; choose another name"
+        )
+
+
+def module_file(folder: Path, kind: str, name: str) -> Path:
+    """The module of a package that holds the plugin."""
+    return folder / "src" / _package(name) / f"{MODULES[kind]}.py"
+
+
+def _package(name: str) -> str:
+    return f"vibench_{name.replace('-', '_')}"
+
+
+def _contents(kind: str, name: str) -> dict[str, str]:
+    """The files of a package by their path."""
+    package, module = _package(name), MODULES[kind]
+    words = {
+        "name": name,
+        "package": package,
+        "module": module,
+        "cls": "".join(word.capitalize() for word in name.split("-")) + kind.capitalize(),
+        "kind": kind,
+        "title": WORDS[kind],
+        "group": GROUPS[WORDS[kind]],
+        "test": name.replace("-", "_"),
+        "version": distribution_version("vibench"),
+    }
+    sources = {
+        "pyproject.toml": "pyproject.toml",
+        "README.md": f"README-{kind}.md",
+        f"src/{package}/__init__.py": "__init__.py",
+        f"src/{package}/{module}.py": f"{kind}.py",
+        f"tests/test_{words['test']}.py": f"test_{kind}.py",
+    }
+    folder = files("vibench.cli") / "templates"
+    return {
+        path: Template((folder / f"{source}.template").read_text(encoding="utf-8")).substitute(words)
+        for path, source in sources.items()
+    }

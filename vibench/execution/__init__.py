@@ -1,0 +1,1 @@
+"""Running a study: the graph of stages, worker processes under supervision, and what is recorded when."""

@@ -1,0 +1,173 @@
+"""What happens inside a worker process: one stage at a time, on one thread, under a memory limit."""
+
+from __future__ import annotations
+
+import faulthandler
+import os
+import resource
+import signal
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import cache, partial
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import Any, TypeVar
+
+from threadpoolctl import threadpool_limits
+
+from vibench.errors import NumericalError, StorageError, VibenchError, in_a_line
+from vibench.execution.supervisor import Finished, Job, Progress, Spent, Watch, code_here
+from vibench.qp.status import Status
+from vibench.stages.artefacts import Store
+from vibench.stages.base import Done, Failed, PiecewiseStage, Unstored
+from vibench.study import registry
+
+T = TypeVar("T")
+Send = Callable[[Any], None]
+
+
+class _ExhaustedError(Exception):
+    """Some work met the limit of the memory: this process goes no farther."""
+
+
+def main() -> None:
+    """Serve the keeper at the other end of a socket until it hangs up."""
+    socket, log = int(sys.argv[1]), os.open(sys.argv[2], os.O_WRONLY | os.O_APPEND | os.O_CREAT)
+    os.set_inheritable(socket, False)  # what plugins start does not hold it open
+    connection = Connection(socket)
+    for stream in (1, 2):  # what plugins print is nobody's business, and must not look like ours
+        os.dup2(log, stream)
+    faulthandler.enable()
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threadpool_limits(1)
+    threading.Thread(target=_follow, args=(os.getppid(),), daemon=True).start()
+    own, first = os.getpid(), True
+
+    def send(message: Any) -> None:
+        if os.getpid() != own:  # a plugin forked, and this is the other one
+            os._exit(0)
+        connection.send(message)
+
+    while True:
+        try:
+            job, progress = connection.recv()
+        except EOFError:
+            return
+        if not first and _address_space() > 0.5 * job.memory_gib * 2**30:
+            send(Spent(None))
+            return
+        first = False
+        faulthandler.dump_traceback_later(2.0 * job.cell_seconds + 60.0, exit=True)  # should the keeper have died
+        send(perform(job, progress, send))
+        faulthandler.cancel_dump_traceback_later()
+
+
+def _follow(parent: int) -> None:
+    """End this process, and what plugins started in it, once its parent has ended: nobody would enforce its limits."""
+    while os.getppid() == parent:
+        time.sleep(1.0)
+    os.killpg(0, signal.SIGKILL)
+
+
+def perform(job: Job, progress: Progress, send: Send) -> Done | Failed | Unstored | Spent:
+    """Run one stage; what a plugin raises becomes a reason, so that the rest of the matrix goes on."""
+    start = time.perf_counter()
+
+    def work() -> Done:
+        _check_code(job)
+        store = _store(job.store)
+        if isinstance(job.stage, PiecewiseStage):
+            value = _pieces(job, store, progress, send)
+            return Done((), value, time.perf_counter() - start)
+        result = job.stage.run(store)
+        store.put(job.stage.key, result.value, result.seconds, result.histories)
+        return Done(result.histories, None, time.perf_counter() - start)
+
+    try:
+        return _guarded(job.memory_gib, work)
+    except StorageError as error:
+        return Unstored(str(error))
+    except _ExhaustedError:
+        return Spent(_out_of_memory(job))
+
+
+def _check_code(job: Job) -> None:
+    """Refuse a job that was planned with other code than there is here: the key of its artefact would lie."""
+    used = job.stage.plugins()
+    changed = [f"the {p.kind} '{p.name}'" for p in used if registry.code(p.kind, p.name) != p.code]
+    if job.code != code_here():
+        changed.insert(0, "vibench or one of the libraries")
+    if changed:
+        raise NumericalError(f"{changed[0]} was changed since the run began; run the study again")
+
+
+def _pieces(job: Job, store: Store, progress: Progress, send: Send) -> Any:
+    """What is still to be done of a piecewise stage, piece by piece; its value."""
+    stage = job.stage
+    assert isinstance(stage, PiecewiseStage)
+    pieces = stage.begin(store)
+    found = dict(progress.found)
+    for number in range(stage.pieces):
+        if number not in found and number not in progress.lost:
+            watch = partial(_announce, send, number)
+            watch(False)
+            value = _guarded(job.memory_gib, partial(pieces.piece, number, watch))
+            found[number] = pieces.lost(number, value) if isinstance(value, Failed) else value
+            send(Finished(number, found[number]))
+    found |= {number: pieces.lost(number, failed) for number, failed in progress.lost.items()}
+    return pieces.finish([found[number] for number in range(stage.pieces)])
+
+
+def _announce(send: Send, number: int, on: bool) -> None:
+    send(Watch(number, on))
+
+
+def _out_of_memory(job: Job) -> Failed:
+    return Failed(Status.ERROR, f"out of memory: the limit is memory_gib = {job.memory_gib:g}")
+
+
+def _guarded(memory_gib: float, work: Callable[[], T]) -> T | Failed:
+    """What some work gives, or why it gave nothing."""
+    try:
+        with _memory_limit(memory_gib):
+            return work()
+    except MemoryError:
+        raise _ExhaustedError from None
+    except (StorageError, _ExhaustedError):
+        raise
+    except VibenchError as error:
+        return Failed(Status.ERROR, " ".join(str(error).split()))
+    except (Exception, SystemExit, KeyboardInterrupt) as error:  # noqa: BLE001  plugins may raise anything
+        return Failed(Status.ERROR, in_a_line(error))
+
+
+@contextmanager
+def _memory_limit(gib: float) -> Iterator[None]:
+    """No more address space than this for some work; outside, the worker must be able to answer."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_AS)
+    limit = int(gib * 2**30)
+    if _address_space() > limit:
+        raise MemoryError
+    resource.setrlimit(resource.RLIMIT_AS, (limit if hard == resource.RLIM_INFINITY else min(limit, hard), hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_AS, (soft, hard))
+
+
+def _address_space() -> int:
+    """Bytes of address space in use, 0 where the system does not tell."""
+    statm = Path("/proc/self/statm")
+    return int(statm.read_text().split()[0]) * resource.getpagesize() if statm.is_file() else 0
+
+
+@cache
+def _store(folder: str) -> Store:
+    return Store(Path(folder))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,1 @@
+"""High-fidelity solutions: a primal–dual active set method and the KKT systems it solves."""

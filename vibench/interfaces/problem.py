@@ -1,0 +1,211 @@
+"""What a problem plugin is: a parametrised variational inequality on a high-fidelity pair of spaces."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import ClassVar
+
+import numpy as np
+import scipy.sparse as sp
+
+from vibench.arrays import Array, Indices, SparseMatrix
+from vibench.linalg.inner_product import InnerProduct
+
+
+@dataclass(frozen=True)
+class ParameterBox:
+    """The parameter domain D: a box.
+
+    Attributes
+    ----------
+    names
+        One name per parameter.
+    lower, upper
+        Bounds (d,).
+    units
+        One unit per parameter, "1" for a number.
+    """
+
+    names: tuple[str, ...]
+    lower: Array
+    upper: Array
+    units: tuple[str, ...]
+
+    @property
+    def dim(self) -> int:
+        """Number d of parameters."""
+        return len(self.names)
+
+    def grid(self, *counts: int) -> Array:
+        """Regular grid (P×d) with `counts` points per direction, the last direction running fastest."""
+        axes = [np.linspace(a, b, k) for a, b, k in zip(self.lower, self.upper, counts, strict=True)]
+        return np.stack([m.ravel() for m in np.meshgrid(*axes, indexing="ij")], axis=1)
+
+    def sample(self, count: int, seed: int) -> Array:
+        """`count` uniform random points (count×d), the same for the same seed."""
+        uniform = np.random.default_rng(seed).random((count, self.dim))
+        return np.asarray(self.lower + uniform * (self.upper - self.lower))
+
+
+@dataclass(frozen=True)
+class VariationalInequality:
+    """u = argmin ½ uᵀA u − fᵀu subject to B u ≤ g at one parameter (paper, equations (1), (2) and (7)).
+
+    Attributes
+    ----------
+    A
+        Stiffness, sparse SPD (n×n), on the free degrees of freedom.
+    f
+        Load (n,), the lift's share included.
+    B
+        Constraint, sparse (m×n), sign such that A u + Bᵀλ = f with λ ≥ 0.
+    g
+        Bound (m,), the lift's share included.
+    lift
+        Values that an inhomogeneous Dirichlet condition adds to u in pictures; `None` where there are none.
+    """
+
+    A: SparseMatrix
+    f: Array
+    B: SparseMatrix
+    g: Array
+    lift: Array | None = field(default=None)
+
+
+@dataclass(frozen=True)
+class Contact:
+    """The constraint B u ≤ g in the unknowns it may touch.
+
+    Attributes
+    ----------
+    B
+        Sparse (m×k), a column for each of the problem's `contact_dofs`.
+    g
+        Bound (m,).
+    """
+
+    B: SparseMatrix
+    g: Array
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A solution to look at.
+
+    Attributes
+    ----------
+    points, triangles
+        Mesh in the configuration to be drawn (2×p), (3×t); on a line points (1×p) and no triangles.
+    values, name
+        Nodal values to colour it with (p,), and what they are, with their unit.
+    positions, multiplier
+        Where the multiplier lives (1×m on a line, 2×m in the plane) and its values (m,).
+    multiplier_name
+        What the multiplier is, with its unit.
+    """
+
+    points: Array
+    triangles: Indices
+    values: Array
+    name: str
+    positions: Array
+    multiplier: Array
+    multiplier_name: str
+
+
+MEMBERS = ("A", "f", "B", "g")
+"""The members of a `VariationalInequality` that depend on the parameter."""
+
+Sampler = Callable[[Array], Mapping[str, Array]]
+"""From a parameter mu (d,) to the values of entries chosen before, by member."""
+
+
+class Problem(ABC):
+    """A parametrised variational inequality with its high-fidelity discretisation.
+
+    Constructor arguments are the plugin's options; their annotations check what a study file gives. A problem is
+    immutable once built, and `assemble` depends on nothing but the parameter.
+    """
+
+    parameters: ParameterBox
+    """Names, bounds and units of the parameters."""
+    V: InnerProduct
+    """Inner product of the primal space, X_V (n×n), independent of the parameter."""
+    W: InnerProduct
+    """Inner product of the multiplier space, X_W (m×m), in a basis whose nonnegative coefficients are the cone W⁺."""
+    constant: ClassVar[frozenset[str]] = frozenset()
+    """Members of `VariationalInequality`, "A", "f", "B" or "g", that do not depend on mu and are factorised once."""
+    entrywise: ClassVar[frozenset[str]] = frozenset()
+    """Members that `sampler` evaluates entry by entry."""
+
+    @abstractmethod
+    def training_set(self) -> Array:
+        """Parameters (P×d) the reduced model is trained on."""
+
+    def validation_set(self, count: int, seed: int) -> Array:
+        """Parameters (count×d) the reduced model is judged on; uniform in the box unless a problem knows better."""
+        return self.parameters.sample(count, seed)
+
+    @abstractmethod
+    def assemble(self, mu: Array) -> VariationalInequality:
+        """High-fidelity matrices and vectors at the parameter mu (d,)."""
+
+    @property
+    def contact_dofs(self) -> Indices | None:
+        """Unknowns that B(mu) may touch at any parameter, rising; `None` where a problem does not say."""
+        return None
+
+    def contact(self, mu: Array) -> Contact | None:  # noqa: ARG002
+        """The constraint at mu (d,) on `contact_dofs` alone, for problems that can assemble it at that cost."""
+        return None
+
+    @property
+    def has_contact(self) -> bool:
+        """Whether the problem defines `contact_dofs` and `contact`."""
+        return self.contact_dofs is not None and type(self).contact is not Problem.contact
+
+    def sampler(self, wanted: Mapping[str, tuple[Indices, Indices]]) -> Sampler:
+        """Function that gives chosen entries of the members named in `entrywise` at a parameter, at their cost alone.
+
+        Parameters
+        ----------
+        wanted
+            Rows and columns (k,) by member; columns are zero for the vectors f and g.
+
+        Returns
+        -------
+        callable
+            From mu (d,) to the values (k,) by member.
+        """
+        raise NotImplementedError(f"{type(self).__name__} declares {sorted(self.entrywise)} and has no sampler")
+
+    def constraint(self, mu: Array) -> tuple[SparseMatrix, Array]:
+        """B (m×n) and g (m,) at mu (d,): from `contact` if there is one, else from everything."""
+        contact = self.contact(mu)
+        if contact is None or self.contact_dofs is None:
+            vi = self.assemble(mu)
+            return vi.B, vi.g
+        B = sp.csr_array(contact.B)
+        entries = (B.data, self.contact_dofs[B.indices], B.indptr)
+        return sp.csr_array(entries, shape=(B.shape[0], self.V.dim)), contact.g
+
+    def multiplier_integrals(self) -> Array:
+        """Integrals (m,) of the multiplier basis functions, the unit in which a constraint violation is a length.
+
+        X_W applied to ones, which is right for every basis that sums to one in an L² product.
+        """
+        return self.W.apply(np.ones(self.W.dim))
+
+    def refuse(self, mu: Array, u: Array, lam: Array) -> str:  # noqa: ARG002
+        """Why the problem's model does not cover a high-fidelity solution u (n,), λ (m,) at mu (d,); "" if it does."""
+        return ""
+
+    def picture(self, mu: Array, u: Array, lam: Array) -> Picture | None:  # noqa: ARG002
+        """What to draw of a solution u (n,), λ (m,) at mu (d,); `None` where a problem has no picture."""
+        return None
+
+    def diagnostics(self, mu: Array) -> Mapping[str, float]:  # noqa: ARG002
+        """Figures worth keeping beside a high-fidelity solution at mu (d,), such as mesh quality; none by default."""
+        return {}

@@ -1,0 +1,182 @@
+"""What strategy plugins are: dual ones turn multiplier snapshots into a cone, primal ones enrich the primal basis."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from enum import StrEnum
+from typing import ClassVar
+
+import numpy as np
+
+from vibench.arrays import Array, Mask
+from vibench.interfaces.problem import Problem, VariationalInequality
+from vibench.linalg.inner_product import InnerProduct
+
+
+@dataclass(frozen=True)
+class Stop:
+    """When a nested construction stops: at a tolerance, or at a prescribed size; exactly one of the two.
+
+    Attributes
+    ----------
+    tolerance
+        Largest relative error accepted.
+    size
+        Number of vectors.
+    """
+
+    tolerance: float | None = None
+    size: int | None = None
+
+    def __post_init__(self) -> None:
+        if (self.tolerance is None) == (self.size is None):
+            raise ValueError("a Stop has either a tolerance or a size")
+
+    def reached(self, size: int, error: float) -> bool:
+        """Whether a construction with `size` vectors and this relative error is done."""
+        return error <= self.tolerance if self.tolerance is not None else size >= (self.size or 0)
+
+    def first_reached(self, errors: Array) -> int | None:
+        """Smallest k with `errors[k]` (error with k vectors) good enough; `None` if there is none."""
+        reached = [k for k, error in enumerate(errors) if self.reached(k, float(error))]
+        return reached[0] if reached else None
+
+    def __str__(self) -> str:
+        return f"tolerance {self.tolerance:g}" if self.tolerance is not None else f"size {self.size}"
+
+
+@dataclass(frozen=True)
+class Cone:
+    """A reduced multiplier cone K_R = { χ α : α ≥ 0 } (paper, equation (12)).
+
+    Attributes
+    ----------
+    generators
+        χ (m×R), coefficientwise nonnegative unless free, unit norm in W.
+    errors
+        Relative largest projection error e(r) of the cone of the first r generators, r = 0 … R (equations (13), (34)).
+    free
+        Which generators may be used with either sign (R,), none in an ordinary cone.
+    fallbacks
+        One line for every step that could not be done as the algorithm says.
+    """
+
+    generators: Array
+    errors: Array
+    free: Mask
+    fallbacks: tuple[str, ...] = ()
+
+    @property
+    def size(self) -> int:
+        """Number R of generators."""
+        return int(self.generators.shape[1])
+
+    @property
+    def rays(self) -> Array:
+        """Generators (m×(R+F)) of the same cone with nonnegative coefficients: free ones also with the other sign."""
+        return rays(self.generators, self.free)
+
+
+class DualStrategy(ABC):
+    """Turns multiplier snapshots into a reduced cone. Constructor arguments are the plugin's options."""
+
+    @abstractmethod
+    def reduce(self, snapshots: Array, W: InnerProduct, stop: Stop) -> Cone:
+        """Cone for snapshots λ(mu_p) (m×P, coefficientwise nonnegative), relative projection error as `stop` says."""
+
+
+class Kind(StrEnum):
+    """How an enrichment depends on the parameter; strategies are compared by this, never by name."""
+
+    NONE = "none"
+    FIXED = "fixed"
+    PER_PARAMETER = "per-parameter"
+
+
+@dataclass(frozen=True)
+class Offline:
+    """What a primal strategy may use offline.
+
+    Attributes
+    ----------
+    problem
+        The problem, for its spaces and its matrices at training parameters.
+    basis
+        V-orthonormal basis of V_N (n×N).
+    cone
+        The reduced cone.
+    span
+        W-orthonormal basis of span χ (m×rank), from a rank-revealing factorisation. S_R(mu) is the range of T(mu) on
+        it: where generators nearly coincide, T(mu)χ itself would lose directions to round-off.
+    training
+        Training parameters (P×d).
+    """
+
+    problem: Problem
+    basis: Array
+    cone: Cone
+    span: Array
+    training: Array
+
+
+Supply = Callable[[InnerProduct, VariationalInequality, Array], Array]
+"""Vectors (n×k) an enrichment adds at one parameter, from V, the assembled forms and `Offline.span`; picklable."""
+
+
+@dataclass(frozen=True)
+class Enrichment:
+    """What a primal strategy adds to V_N.
+
+    Attributes
+    ----------
+    kind
+        None, fixed or per-parameter.
+    vectors
+        Fixed enrichment: vectors (n×S), V-orthonormal and orthogonal to V_N, nested.
+    eta
+        Per-parameter enrichment by supremizers: multipliers η (m×k) whose T(mu)η are added at every mu.
+    supply
+        Any other per-parameter enrichment: how to get the vectors at a parameter.
+    history
+        Quantity → values over steps, for the convergence figures.
+    fallbacks
+        One line for every step that could not be done as the algorithm says.
+    """
+
+    kind: Kind
+    vectors: Array | None = None
+    eta: Array | None = None
+    supply: Supply | None = None
+    history: Mapping[str, Array] = field(default_factory=dict)
+    fallbacks: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        if (self.vectors is not None) != (self.kind is Kind.FIXED):
+            raise ValueError("a fixed enrichment, and no other, has vectors")
+        if (self.supply is not None) + (self.eta is not None) != (self.kind is Kind.PER_PARAMETER):
+            raise ValueError("a per-parameter enrichment, and no other, has either eta or a supply")
+
+
+class PrimalStrategy(ABC):
+    """Enriches the primal basis. Constructor arguments are the plugin's options."""
+
+    takes_tolerance: ClassVar[bool] = False
+    """Whether a study gives this strategy a tolerance axis."""
+    larger_is_tighter: bool = False
+    """Whether the larger of two tolerances asks for more, as a share that is to be reached does."""
+
+    @abstractmethod
+    def build(self, offline: Offline, tolerance: float | None) -> Enrichment:
+        """Enrichment of `offline.basis`; `tolerance` is `None` exactly for strategies that take none."""
+
+
+def rays(generators: Array, free: Mask) -> Array:
+    """Generators (m×R), and after them the opposites of those that are free (R,)."""
+    return np.hstack([generators, -generators[:, free]])
+
+
+def no_free(count: int) -> Mask:
+    """The `free` mask (count,) of an ordinary cone."""
+    return np.zeros(count, dtype=bool)

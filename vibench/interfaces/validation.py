@@ -1,0 +1,107 @@
+"""What strategy plugins hand over, checked before anything is made of it: the line names what is wrong."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from vibench.arrays import Array
+from vibench.errors import NumericalError
+from vibench.interfaces.problem import Problem, VariationalInequality
+from vibench.interfaces.strategies import Cone, Enrichment
+from vibench.linalg.inner_product import InnerProduct
+
+ROUND_OFF = 1e-8
+"""How far norms and angles may be from what they are promised to be."""
+
+
+def check_cone(cone: object, W: InnerProduct) -> Cone:
+    """A cone that keeps its promises: shape, finite, unit norms in W, in W⁺ unless free.
+
+    Raises
+    ------
+    NumericalError
+        Naming the promise that is broken.
+    """
+    if not isinstance(cone, Cone):
+        raise NumericalError(f"the dual strategy returned a {type(cone).__name__}, expected a Cone")
+    chi = _matrix("generators", cone.generators, W.dim)
+    if chi.shape[1] and np.max(np.abs(W.norm(chi) - 1.0)) > ROUND_OFF:
+        raise NumericalError("the generators do not all have unit norm in W")
+    if cone.free.shape != (chi.shape[1],):
+        raise NumericalError(f"'free' has shape {cone.free.shape} for {chi.shape[1]} generators")
+    smallest = float(np.min(chi[:, ~cone.free], initial=0.0))
+    if smallest < 0.0:
+        raise NumericalError(f"a generator has the negative coefficient {smallest:.1e} and is not declared free")
+    return cone
+
+
+def check_enrichment(enrichment: object, V: InnerProduct, basis: Array) -> Enrichment:
+    """An enrichment that keeps its promises: fixed vectors are finite, orthonormal in V and orthogonal to V_N.
+
+    Raises
+    ------
+    NumericalError
+        Naming the promise that is broken.
+    """
+    if not isinstance(enrichment, Enrichment):
+        raise NumericalError(f"the primal strategy returned a {type(enrichment).__name__}, expected an Enrichment")
+    if enrichment.vectors is not None:
+        vectors = _matrix("vectors of the enrichment", enrichment.vectors, V.dim)
+        off = V.gram(np.hstack([basis, vectors]), vectors)
+        off[basis.shape[1] :] -= np.eye(vectors.shape[1])
+        if np.max(np.abs(off), initial=0.0) > ROUND_OFF:
+            raise NumericalError("the vectors of the enrichment are not orthonormal in V and orthogonal to V_N")
+    return enrichment
+
+
+def _matrix(name: str, value: object, rows: int) -> Array:
+    if not isinstance(value, np.ndarray) or value.ndim != 2 or value.shape[0] != rows:
+        found = getattr(value, "shape", type(value).__name__)
+        raise NumericalError(f"the {name} have shape {found}, expected ({rows}, count)")
+    if not np.all(np.isfinite(value)):
+        raise NumericalError(f"the {name} have entries that are not finite")
+    return value
+
+
+def training_parameters(problem: Problem) -> Array:
+    """The training set (P×d), refused with a line if it is empty, of the wrong shape or not finite.
+
+    Raises
+    ------
+    NumericalError
+        Saying what was wrong and what would be right.
+    """
+    return _checked(problem, "training_set", np.asarray(problem.training_set(), float), None)
+
+
+def validation_parameters(problem: Problem, count: int, seed: int) -> Array:
+    """The validation set (count×d), checked likewise."""
+    return _checked(problem, "validation_set", np.asarray(problem.validation_set(count, seed), float), count)
+
+
+def _checked(problem: Problem, name: str, mus: Array, count: int | None) -> Array:
+    expected = f"({'P' if count is None else count}, {problem.parameters.dim}){' with P > 0' if count is None else ''}"
+    if mus.ndim != 2 or mus.shape[1] != problem.parameters.dim or not len(mus) or count not in (None, len(mus)):
+        raise NumericalError(f"{name} has shape {mus.shape}, expected {expected}")
+    if not np.all(np.isfinite(mus)):
+        raise NumericalError(f"{name} has parameters that are not finite")
+    return mus
+
+
+def checked_assembly(problem: Problem, mu: Array) -> VariationalInequality:
+    """`problem.assemble(mu)`, refused with a line that names the fault if shapes are wrong or values not finite.
+
+    Raises
+    ------
+    NumericalError
+        Naming the member, what was wrong and what would be right.
+    """
+    vi = problem.assemble(mu)
+    n, m = problem.V.dim, problem.W.dim
+    for name, value, shape in (("A", vi.A, (n, n)), ("f", vi.f, (n,)), ("B", vi.B, (m, n)), ("g", vi.g, (m,))):
+        if value.shape != shape:
+            raise NumericalError(f"{name} has shape {value.shape} at mu = {mu.tolist()}; the spaces ask for {shape}")
+        entries = value if isinstance(value, np.ndarray) else value.data
+        if not np.all(np.isfinite(entries)):
+            raise NumericalError(f"{name} has entries that are not finite at mu = {mu.tolist()}")
+    return vi

@@ -1,0 +1,119 @@
+"""Finite-dimensional Hilbert spaces given by a sparse Gram matrix: norms, Riesz, orthonormal bases, numerical rank."""
+
+from __future__ import annotations
+
+from functools import cached_property
+
+import numpy as np
+import scipy.sparse as sp
+
+from vibench.arrays import Array, SparseMatrix
+from vibench.errors import NumericalError
+from vibench.linalg.cholesky import SparseCholesky
+from vibench.linalg.dense import orthonormal_range
+
+
+class InnerProduct:
+    """The inner product ⟨u, v⟩ = uᵀ X v of a space, X sparse symmetric positive definite.
+
+    X = FᵀF is factorised once. "Whitened" coordinates F v carry the plain Euclidean inner product: singular values, QR
+    and nonnegative least squares are done there, and no digit is lost to squaring.
+
+    Parameters
+    ----------
+    matrix
+        X, sparse (n×n).
+    name
+        What to call it when it is refused.
+
+    Raises
+    ------
+    NumericalError
+        If X is not square, not finite, not symmetric or not positive definite.
+    """
+
+    def __init__(self, matrix: SparseMatrix, name: str = "the Gram matrix") -> None:
+        self.matrix = sp.csc_array(matrix)
+        self._name = name
+        check_symmetric(self.matrix, name)
+        self._factor  # noqa: B018  an indefinite matrix is refused here, not at its first use
+
+    def __getstate__(self) -> dict[str, object]:
+        """Leave the factorisation behind when pickled: SuperLU objects do not travel."""
+        return {"matrix": self.matrix, "_name": self._name}
+
+    @property
+    def dim(self) -> int:
+        """Dimension n of the space."""
+        return int(self.matrix.shape[0])
+
+    @cached_property
+    def _factor(self) -> SparseCholesky:
+        return SparseCholesky(self.matrix, self._name)
+
+    def apply(self, u: Array) -> Array:
+        """X u, for u (n,) or (n, k)."""
+        return np.asarray(self.matrix @ u)
+
+    def gram(self, u: Array, v: Array) -> Array:
+        """Matrix of inner products uᵀ X v (k×l) of the columns of u (n×k) and v (n×l)."""
+        return np.asarray(u.T @ self.apply(v))
+
+    def norm(self, u: Array) -> Array:
+        """Norms of u (n,) as a scalar array, or of every column of u (n×k) as (k,)."""
+        return np.asarray(np.linalg.norm(self.whiten(u), axis=0))
+
+    def riesz(self, functional: Array) -> Array:
+        """Riesz representer X⁻¹ ℓ of functionals given as (n,) or (n, k)."""
+        return self._factor.solve(functional)
+
+    def whiten(self, u: Array) -> Array:
+        """F u: coordinates in which the inner product is Euclidean; u (n,) or (n, k)."""
+        return self._factor.up(u)
+
+    def unwhiten(self, y: Array) -> Array:
+        """F⁻¹ y, the inverse of `whiten`; y (n,) or (n, k)."""
+        return self._factor.up_inverse(y)
+
+    def whiten_functional(self, functional: Array) -> Array:
+        """F⁻ᵀ ℓ: whitened coordinates of the Riesz representer of ℓ (n,) or (n, k); Euclidean norms are dual norms."""
+        return self._factor.down_inverse(functional)
+
+    def orthonormalise(self, u: Array, against: Array | None = None) -> Array:
+        """Orthonormal basis of span(u), or of what u adds to the span of an orthonormal basis.
+
+        Columns are scaled to unit norm, `against` is projected out twice, and the rank is revealed by a pivoted QR in
+        whitened coordinates; directions below `linalg.RANK_RTOL` of a unit vector are dropped.
+
+        Parameters
+        ----------
+        u
+            Vectors (n×k), of any rank.
+        against
+            Orthonormal vectors (n×l) to be orthogonal to; `None` for none.
+
+        Returns
+        -------
+        Array
+            Orthonormal vectors (n×r), r ≤ k.
+        """
+        fixed = np.zeros((self.dim, 0)) if against is None else self.whiten(against)
+        return self.unwhiten(orthonormal_range(self.whiten(u), fixed))
+
+
+def check_symmetric(matrix: SparseMatrix, name: str) -> None:
+    """Refuse a matrix that is not square, not finite or not symmetric up to round-off.
+
+    Raises
+    ------
+    NumericalError
+        Naming it and what it is not.
+    """
+    rows, columns = matrix.shape
+    if rows != columns:
+        raise NumericalError(f"{name} must be square, it is {rows}×{columns}")
+    if not np.all(np.isfinite(matrix.data)):
+        raise NumericalError(f"{name} has entries that are not finite")
+    scale = abs(matrix).max() if matrix.nnz else 0.0
+    if rows and abs(matrix - matrix.T).max() > 1e-12 * scale:
+        raise NumericalError(f"{name} is not symmetric")

@@ -1,0 +1,1 @@
+"""Reduced models: Galerkin projection, hyper-reduction, errors and error bounds."""

@@ -1,0 +1,170 @@
+"""How the members of a parametrised variational inequality can be evaluated without assembling all of it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import Any
+
+import numpy as np
+import scipy.sparse as sp
+
+from vibench.arrays import Array, Indices, SparseMatrix
+from vibench.interfaces.problem import MEMBERS, Problem, VariationalInequality
+from vibench.interfaces.validation import checked_assembly
+from vibench.model.deim import interpolate
+
+CONSTANT_RTOL = 1e-13
+"""A member that varies by less over the training set, relative to its largest entry, is constant."""
+
+COMPRESSED = 0.75
+"""Interpolation compresses where it needs no more terms than this share of the training parameters."""
+
+
+class Evaluation(StrEnum):
+    """How a member is evaluated at a parameter."""
+
+    CONSTANT = "constant"
+    INTERPOLATED = "interpolated"
+    CONTACT = "contact"
+    FULL = "full"
+
+
+@dataclass(frozen=True)
+class Member:
+    """One of A, f, B, g: Σ_q θ_q(mu) · terms_q, or not.
+
+    Attributes
+    ----------
+    way
+        How it is evaluated.
+    terms
+        Matrices or vectors; one for a constant member, none where there is no such sum.
+    rows, columns
+        Where the entries are (Q,) whose values at mu are the θ_q; `columns` is zero for vectors.
+    error
+        Largest relative error over the training set.
+    why
+        Why it has to be assembled in full; "" where it has not.
+    """
+
+    way: Evaluation
+    terms: tuple[Any, ...]
+    rows: Indices
+    columns: Indices
+    error: float = 0.0
+    why: str = ""
+
+
+_NONE = np.zeros(0, dtype=np.intp)
+
+
+def affine_decomposition(problem: Problem, training: Array, tolerance: float) -> dict[str, Member]:
+    """The members "A", "f", "B", "g", each in the cheapest way there is.
+
+    Declared constants are believed; the others are assembled at all training parameters. Those that turn out not to
+    vary are constants, too; those that a problem evaluates entry by entry are interpolated where that compresses, "by a
+    factor" being one term; B and g are left to `Problem.contact` where there is one.
+
+    Parameters
+    ----------
+    problem
+        What is to be evaluated.
+    training
+        Parameters (P×d).
+    tolerance
+        Largest relative interpolation error.
+    """
+    first = checked_assembly(problem, training[0])
+    found = {name: constant(getattr(first, name)) for name in MEMBERS if name in problem.constant}
+    varying = [name for name in MEMBERS if name not in found]
+    if not varying:
+        return found
+    assembled = _assembled(problem, training, varying)
+    for name in varying:
+        found[name] = _member(name, assembled[name], problem, tolerance)
+    return {name: found[name] for name in MEMBERS}
+
+
+def constant(value: Any) -> Member:
+    """A member that does not depend on the parameter."""
+    return Member(Evaluation.CONSTANT, (value,), _NONE, _NONE)
+
+
+def _assembled(problem: Problem, training: Array, names: Sequence[str]) -> Mapping[str, list[Any]]:
+    """The members of these names at all training parameters; only the constraint where nothing else is wanted."""
+    found: dict[str, list[Any]] = {name: [] for name in names}
+    for mu in training:
+        if set(names) <= {"B", "g"}:
+            B, g = problem.constraint(mu)
+            vi = VariationalInequality(A=None, f=g, B=B, g=g)
+        else:
+            vi = checked_assembly(problem, mu)
+        for name in names:
+            found[name].append(getattr(vi, name))
+    return found
+
+
+def _member(name: str, values: list[Any], problem: Problem, tolerance: float) -> Member:
+    entries = _Entries(values, symmetric=name == "A")
+    if entries.constant:
+        return constant(values[0])
+    why = f"{name} depends on mu and the problem does not evaluate it entry by entry"
+    if name in problem.entrywise and len(values) > 1:
+        found = interpolate(entries.values, tolerance)
+        if len(found.points) <= max(1.0, COMPRESSED * len(values)):
+            terms = tuple(entries.rebuilt(mode) for mode in found.modes.T)
+            rows, columns = entries.places(found.points)
+            return Member(Evaluation.INTERPOLATED, terms, rows, columns, found.error)
+        why = f"{name} depends on mu, and interpolation needs {len(found.points)} terms for {len(values)} parameters"
+    if name in ("B", "g") and problem.has_contact:
+        return Member(Evaluation.CONTACT, (), _NONE, _NONE)
+    return Member(Evaluation.FULL, (), _NONE, _NONE, why=why)
+
+
+class _Entries:
+    """The entries of a member at all training parameters, as columns (k×P) on their common pattern."""
+
+    def __init__(self, values: list[Any], symmetric: bool) -> None:
+        self._shape, self._symmetric = values[0].shape, symmetric
+        self._vector = isinstance(values[0], np.ndarray)
+        if self._vector:
+            self.values = np.column_stack(values)
+            self._rows, self._columns = np.arange(len(self.values)), np.zeros(len(self.values), np.intp)
+        else:
+            self.values = self._of_matrices(values)
+        spread = float(np.ptp(self.values, axis=1).max(initial=0.0))
+        enough = self.values.shape[1] > 1  # to tell what varies
+        self.constant = enough and spread <= CONSTANT_RTOL * float(np.abs(self.values).max(initial=0.0))
+
+    def _of_matrices(self, matrices: list[SparseMatrix]) -> Array:
+        entries = [_canonical(sp.triu(matrix) if self._symmetric else matrix) for matrix in matrices]
+        width = self._shape[1]
+        keys = [entry.coords[0].astype(np.int64) * width + entry.coords[1] for entry in entries]
+        pattern = keys[0] if all(np.array_equal(keys[0], key) for key in keys) else np.unique(np.concatenate(keys))
+        self._rows, self._columns = pattern // width, pattern % width
+        if pattern is keys[0]:
+            return np.column_stack([entry.data for entry in entries])
+        found = np.zeros((len(pattern), len(entries)))
+        for k, (key, entry) in enumerate(zip(keys, entries, strict=True)):
+            np.add.at(found[:, k], np.searchsorted(pattern, key), entry.data)
+        return found
+
+    def places(self, points: Indices) -> tuple[Indices, Indices]:
+        """Row and column of some entries."""
+        return self._rows[points], self._columns[points]
+
+    def rebuilt(self, values: Array) -> Any:
+        """The vector or matrix with these entries (k,)."""
+        if self._vector:
+            return values
+        matrix = sp.csr_array((values, (self._rows, self._columns)), shape=self._shape)
+        return matrix + sp.triu(matrix, 1).T if self._symmetric else matrix
+
+
+def _canonical(matrix: SparseMatrix) -> SparseMatrix:
+    """A copy in coordinates, row by row, in which every entry stands once."""
+    rows = sp.csr_array(matrix, copy=True)
+    rows.sum_duplicates()
+    return sp.coo_array(rows)

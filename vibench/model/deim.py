@@ -1,0 +1,77 @@
+"""Empirical interpolation of parametrised vectors and of the non-zeros of parametrised matrices."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.linalg
+
+from vibench.arrays import Array, Indices
+from vibench.linalg.dense import svd
+
+
+@dataclass(frozen=True)
+class Interpolation:
+    """v(mu) ≈ Σ_q v(mu)[points_q] · modes_q: a few entries of a vector tell all of it.
+
+    Attributes
+    ----------
+    points
+        Entries (Q,) to be evaluated, rising.
+    modes
+        Cardinal modes (k×Q): mode q is 1 at its own point and 0 at the others.
+    error
+        Largest relative Euclidean error over the vectors it was made from.
+    """
+
+    points: Indices
+    modes: Array
+    error: float
+
+
+def interpolate(snapshots: Array, tolerance: float) -> Interpolation:
+    """Discrete empirical interpolation of vectors (k×P), not all zero, with few terms.
+
+    The modes are those of a singular value decomposition, the points those of a pivoted QR factorisation of the modes
+    (Q-DEIM, Drmač and Gugercin 2016; of matrices, matrix DEIM, Negri, Manzoni and Amsallem 2015).
+
+    Parameters
+    ----------
+    snapshots
+        One vector per column.
+    tolerance
+        Largest error of any column, relative to the longest. Fewer terms are looked for by bisection, as if errors only
+        fell with them; they do on the whole.
+    """
+    scale = float(np.linalg.norm(snapshots, axis=0).max())
+    q, r = np.linalg.qr(snapshots)
+    left, sigma, right = svd(r)
+    squares = np.cumsum(((sigma[:, None] * right) ** 2)[::-1], axis=0)[::-1]  # what k modes leave of every column
+    best = np.append(np.sqrt(squares.max(axis=1)), 0.0) / scale
+    rank = max(1, int(np.count_nonzero(sigma > np.finfo(float).eps * sigma[0])))
+    low = min(rank, max(1, int(np.argmax(best <= tolerance))))  # no interpolation does with fewer
+
+    def with_terms(count: int) -> Interpolation:
+        return _with_terms(snapshots, q @ left[:, :count], scale)
+
+    found, step, high = with_terms(low), 1, low
+    while found.error > tolerance and high < rank:
+        low, high, step = high + 1, min(high + step, rank), 2 * step
+        found = with_terms(high)
+    while found.error <= tolerance and low < high:
+        middle = (low + high) // 2
+        tried = with_terms(middle)
+        if tried.error <= tolerance:
+            found, high = tried, middle
+        else:
+            low = middle + 1
+    return found
+
+
+def _with_terms(snapshots: Array, modes: Array, scale: float) -> Interpolation:
+    _, _, pivots = scipy.linalg.qr(modes.T, mode="economic", pivoting=True)
+    points = np.sort(pivots[: modes.shape[1]])
+    cardinal = np.linalg.solve(modes[points].T, modes.T).T
+    errors = np.linalg.norm(snapshots - cardinal @ snapshots[points], axis=0)
+    return Interpolation(points, cardinal, float(errors.max()) / scale)

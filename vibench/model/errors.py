@@ -1,0 +1,87 @@
+"""Errors of reduced solutions against high-fidelity ones."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from vibench.arrays import Array
+from vibench.interfaces.problem import Problem, VariationalInequality
+
+
+@dataclass(frozen=True)
+class Reference:
+    """High-fidelity solutions, columns of u (n×P) and λ (m×P), and the floors of the relative errors.
+
+    The floors are 1e-12 of the largest training norms: below them a solution counts as zero.
+    """
+
+    u: Array
+    lam: Array
+    floor_u: float
+    floor_lam: float
+
+    def at(self, numbers: Sequence[int]) -> Reference:
+        """Those at some of the parameters."""
+        return Reference(self.u[:, numbers], self.lam[:, numbers], self.floor_u, self.floor_lam)
+
+
+@dataclass(frozen=True)
+class Errors:
+    """How far a reduced solution is from the high-fidelity one at the same parameter.
+
+    Attributes
+    ----------
+    u, lam, energy
+        Relative, in the norms of V, of W and of A(mu).
+    absolute_u, absolute_lam
+        The first two before they are divided.
+    violation
+        Largest (B u_N − g)₊, each row over the integral of its multiplier function [unit of u].
+    complementarity
+        λᵀ(B u_N − g) with the high-fidelity multiplier.
+    """
+
+    u: float
+    lam: float
+    energy: float
+    absolute_u: float
+    absolute_lam: float
+    violation: float
+    complementarity: float
+
+
+def errors(
+    problem: Problem, vis: Sequence[VariationalInequality], reference: Reference, u: Array, lam: Array
+) -> list[Errors]:
+    """Errors of reduced u (n×P) and λ (m×P), column by column at the parameters of `vis`."""
+    V, W = problem.V, problem.W
+    du, dlam = u - reference.u, lam - reference.lam
+    norm_u = np.maximum(V.norm(reference.u), reference.floor_u)
+    norm_lam = np.maximum(W.norm(reference.lam), reference.floor_lam)
+    error_u, error_lam, integrals = V.norm(du), W.norm(dlam), problem.multiplier_integrals()
+    found = []
+    for k, vi in enumerate(vis):
+        excess = vi.B @ u[:, k] - vi.g
+        found.append(
+            Errors(
+                u=_over(float(error_u[k]), float(norm_u[k])),
+                lam=_over(float(error_lam[k]), float(norm_lam[k])),
+                energy=_over(_energy(vi, du[:, k]), _energy(vi, reference.u[:, k])),
+                absolute_u=float(error_u[k]),
+                absolute_lam=float(error_lam[k]),
+                violation=float(np.max(excess / integrals, initial=0.0)),
+                complementarity=float(reference.lam[:, k] @ excess),
+            )
+        )
+    return found
+
+
+def _energy(vi: VariationalInequality, u: Array) -> float:
+    return float(np.sqrt(max(float(u @ (vi.A @ u)), 0.0)))
+
+
+def _over(value: float, scale: float) -> float:
+    return value / scale if scale > 0.0 else value

@@ -1,0 +1,161 @@
+"""The reduced model: project, solve, reconstruct (paper, §2.2 and §2.3; MATH in the documentation, §4)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property, partial
+
+import numpy as np
+
+from vibench.arrays import Array
+from vibench.errors import NumericalError
+from vibench.interfaces.problem import Problem, VariationalInequality
+from vibench.interfaces.strategies import Enrichment, Kind
+from vibench.interfaces.validation import checked_assembly
+from vibench.linalg.dense import orthonormal_range
+from vibench.reduction.supremizers import ContactCoordinates, projected_supremizers
+
+
+@dataclass(frozen=True)
+class ReducedProblem:
+    """The reduced variational inequality at one parameter.
+
+    Attributes
+    ----------
+    program
+        Dense A (N'×N'), f (N',), B (R×N'), g (R,) in coordinates of the primal basis and of the generators.
+    lift
+        From coordinates (N'×k) in the V-orthonormal primal basis Z at this parameter to vectors (n×k): u = Z x.
+    factor
+        Cholesky factor (lower, N'×N') of A, where it is known beforehand.
+    """
+
+    program: VariationalInequality
+    lift: Callable[[Array], Array]
+    factor: Array | None = None
+
+    @property
+    def basis(self) -> Array:
+        """Z (n×N')."""
+        return self.lift(np.eye(len(self.program.f)))
+
+
+class ReducedModel:
+    """V_N + enrichment against a reduced cone.
+
+    Parameters
+    ----------
+    problem
+        The high-fidelity problem.
+    basis
+        V-orthonormal basis of V_N (n×N).
+    enrichment
+        What the primal strategy adds.
+    generators
+        χ (m×R), unit norm in W, all with nonnegative coefficients: those that are free stand there with either sign
+        (`Cone.rays`), so that their two inequalities make an equality.
+    span
+        W-orthonormal basis of span χ (m×rank), what per-parameter enrichments are computed from.
+
+    Attributes
+    ----------
+    fixed_basis
+        The part of the primal basis that does not depend on the parameter (n×(N+S)).
+    """
+
+    def __init__(self, problem: Problem, basis: Array, enrichment: Enrichment, generators: Array, span: Array) -> None:
+        self.problem = problem
+        self.generators = generators
+        self.span = span
+        self.enrichment = enrichment
+        self.fixed_basis = basis if enrichment.vectors is None else np.hstack([basis, enrichment.vectors])
+
+    @property
+    def kind(self) -> Kind:
+        """How the enrichment depends on the parameter."""
+        return self.enrichment.kind
+
+    def primal_basis(self, vi: VariationalInequality) -> Array:
+        """V-orthonormal basis Z (n×N') at the parameter of `vi`; V_N comes first."""
+        V, enrichment = self.problem.V, self.enrichment
+        if self._has_coordinates:
+            return np.hstack([self.fixed_basis, self._contact.vectors(self._added(vi))])
+        if enrichment.eta is not None:
+            whitened = V.whiten_functional(np.asarray(vi.B.T @ enrichment.eta))  # those of T(mu)η
+        elif enrichment.supply is not None:
+            added = enrichment.supply(V, vi, self.span)
+            if added.ndim != 2 or added.shape[0] != V.dim:
+                raise NumericalError(
+                    f"the enrichment supplied vectors of shape {added.shape}, expected ({V.dim}, count)"
+                )
+            whitened = V.whiten(added)
+        else:
+            return self.fixed_basis
+        return np.hstack([self.fixed_basis, V.unwhiten(orthonormal_range(whitened, self._whitened_basis))])
+
+    def lift(self, mu: Array, vi: VariationalInequality, x: Array) -> Array:  # noqa: ARG002
+        """Vectors u = Z x (n×k) with coordinates x (N'×k) at mu, where `vi` is assembled."""
+        if not self._has_coordinates:
+            return np.asarray(self.primal_basis(vi) @ x)
+        count = self.fixed_basis.shape[1]
+        return np.asarray(self.fixed_basis @ x[:count] + self._contact.vectors(self._added(vi) @ x[count:]))
+
+    def images(self, vi: VariationalInequality, eta: Array) -> Array:
+        """ZᵀBᵀη (N'×k) for multipliers η (m×k) at the parameter of `vi`."""
+        if not self._has_coordinates:
+            return projected_supremizers(self.primal_basis(vi), vi.B, eta)
+        Y = np.hstack([self._contact.plain, self._added(vi)])
+        return np.asarray(Y.T @ self._supremizers(vi, eta))
+
+    @property
+    def _has_coordinates(self) -> bool:
+        """Whether V_N and all supremizers have coordinates in which bases are found without vectors of mesh size."""
+        return self.enrichment.eta is not None and self.problem.contact_dofs is not None
+
+    def _added(self, vi: VariationalInequality) -> Array:
+        """Orthonormal coordinates (d×S) of what the supremizers at the parameter of `vi` add to V_N."""
+        assert self.enrichment.eta is not None  # `_has_coordinates`
+        return orthonormal_range(self._supremizers(vi, self.enrichment.eta), self._contact.plain)
+
+    def _supremizers(self, vi: VariationalInequality, eta: Array) -> Array:
+        """Coordinates (d×k) of T(mu)η."""
+        return self._contact.supremizers(np.asarray(vi.B.T @ eta)[self.problem.contact_dofs])
+
+    @cached_property
+    def _contact(self) -> ContactCoordinates:
+        """Coordinates of V_N and of all supremizers of a problem that says what its constraint touches."""
+        V, dofs = self.problem.V, self.problem.contact_dofs
+        assert dofs is not None  # asked for in this case alone
+        return ContactCoordinates(V, self.fixed_basis, dofs)
+
+    @cached_property
+    def _whitened_basis(self) -> Array:
+        return self.problem.V.whiten(self.fixed_basis)
+
+    def assemble(self, mu: Array) -> ReducedProblem:
+        """Assemble at mu (d,) in full, as the paper does: high-fidelity matrices, then their projections.
+
+        Raises
+        ------
+        NumericalError
+            If what the problem assembles has the wrong shape or values that are not finite.
+        """
+        return self.reduce(checked_assembly(self.problem, mu))
+
+    def reduce(self, vi: VariationalInequality) -> ReducedProblem:
+        """Project what the problem assembled at a parameter."""
+        Z = self.primal_basis(vi)
+        return ReducedProblem(project(vi, Z, self.generators), partial(np.matmul, Z))
+
+
+def project(vi: VariationalInequality, Z: Array, chi: Array) -> VariationalInequality:
+    """Galerkin projection on span Z (n×N') and the cone of χ (m×R): dense A, f, B, g."""
+    A = Z.T @ np.asarray(vi.A @ Z)
+    return VariationalInequality(A=0.5 * (A + A.T), f=Z.T @ vi.f, B=chi.T @ np.asarray(vi.B @ Z), g=chi.T @ vi.g)
+
+
+def beginning(program: VariationalInequality, size: int) -> VariationalInequality:
+    """The program on the first `size` vectors of a basis, out of that on all of them."""
+    A, B = (np.ascontiguousarray(member) for member in (program.A[:size, :size], program.B[:, :size]))
+    return VariationalInequality(A, program.f[:size].copy(), B, program.g)

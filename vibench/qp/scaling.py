@@ -1,0 +1,24 @@
+"""How quadratic programs are scaled."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from vibench.arrays import Array, SparseMatrix
+
+
+def row_norms(B: SparseMatrix | Array) -> Array:
+    """Euclidean norms (m,) of the rows, 1 where a row is zero."""
+    squares = (B * B).sum(axis=1) if isinstance(B, np.ndarray) else B.multiply(B).sum(axis=1)
+    norms = np.sqrt(np.asarray(squares, float).ravel())
+    return np.where(norms > 0.0, norms, 1.0)
+
+
+def peak(vector: Array) -> float:
+    """Largest entry in absolute value; 0 of an empty vector."""
+    return float(np.max(np.abs(vector), initial=0.0))
+
+
+def size(vector: Array) -> float:
+    """What a vector is divided by to have a largest entry of 1; 1 for zero."""
+    return peak(vector) or 1.0

@@ -1,0 +1,158 @@
+"""The one door to quadratic programming solvers; nothing that comes back through it is believed unverified.
+
+A quadratic program is a `VariationalInequality`, dense or sparse: min ½ xᵀA x − fᵀx subject to B x ≤ g, with
+multipliers α ≥ 0 such that A x + Bᵀα = f.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Iterable, Mapping
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import qpsolvers
+import scipy.linalg
+import scipy.sparse as sp
+
+from vibench.arrays import Array, SparseMatrix
+from vibench.errors import NumericalError, unknown_name
+from vibench.interfaces.problem import VariationalInequality
+from vibench.qp.scaling import row_norms, size
+from vibench.qp.settings import SETTINGS, settings_for, start_for
+from vibench.qp.solution import QPSolution, QPSolver
+
+
+def solve_qp(
+    program: VariationalInequality,
+    solver: str,
+    accuracy: float,
+    extra: Mapping[str, QPSolver] | None = None,
+    factor: Array | None = None,
+    start: QPSolution | None = None,
+) -> QPSolution:
+    """Solve a quadratic program with a solver known by name.
+
+    The data are scaled first, every constraint row to unit norm and the objective to ‖f‖∞ = 1, so that the absolute
+    tolerances of the solvers mean what the residuals of the benchmark measure; the answer is scaled back.
+
+    Parameters
+    ----------
+    program
+        A, f, B, g; dense, or sparse for solvers that take sparse data.
+    solver
+        A name that qpsolvers knows, or one of `extra`.
+    accuracy
+        Relative accuracy, passed on in the solver's own words (`vibench.qp.settings`).
+    extra
+        Solvers registered through the entry point group `vibench.qp_solvers`.
+    factor
+        Cholesky factor (lower) of a dense A, where it is known: what is solved then is the dual.
+    start
+        Solution of a similar program with as many unknowns and constraints, for solvers that `takes_start`.
+
+    Raises
+    ------
+    NumericalError
+        If what the solver returns is not a `QPSolution`, or has the wrong shape.
+    """
+    if not len(program.f):
+        return QPSolution(np.zeros(0), np.zeros(len(program.g)), "nothing to solve: no unknowns")
+    if factor is not None:
+        return _through_the_dual(program, factor, solver, accuracy, extra, start)
+    rows, cost = row_norms(program.B), size(program.f)
+    scaled = VariationalInequality(program.A / cost, program.f / cost, _divide_rows(program.B, rows), program.g / rows)
+    if extra and solver in extra:
+        answer = extra[solver](scaled, accuracy)
+        if not isinstance(answer, QPSolution):
+            raise NumericalError(f"the solver returned a {type(answer).__name__}, expected a QPSolution")
+    else:
+        begin: Mapping[str, Any] = {}
+        if start is not None and takes_start(solver) and start.x is not None and start.alpha is not None:
+            begin = start_for(solver, start.x, rows * start.alpha / cost)
+        answer = _through_qpsolvers(scaled, solver, accuracy, begin)
+    for name, value, count in (("x", answer.x, len(program.f)), ("α", answer.alpha, len(program.g))):
+        if value is not None and value.shape != (count,):
+            raise NumericalError(f"the solver returned {name} of shape {value.shape}, expected ({count},)")
+    if not isinstance(answer.solver_status, str) or not isinstance(answer.iterations, int | np.integer | None):
+        found = f"{answer.solver_status!r:.40}, {answer.iterations!r:.40}"
+        raise NumericalError(f"the solver reports the status and iterations {found}; expected a text, a number or None")
+    if answer.alpha is None:
+        return answer
+    alpha = cost * answer.alpha / rows
+    return replace(answer, alpha=np.maximum(alpha, 0.0), negative=-min(float(np.min(alpha, initial=0.0)), 0.0))
+
+
+def _through_the_dual(
+    program: VariationalInequality,
+    factor: Array,
+    solver: str,
+    accuracy: float,
+    extra: Mapping[str, QPSolver] | None,
+    start: QPSolution | None,
+) -> QPSolution:
+    """Solution of a dense program with A = L Lᵀ through its dual, in as many unknowns as there are constraints.
+
+    The multipliers minimise ½ αᵀ(B A⁻¹Bᵀ)α − (B A⁻¹f − g)ᵀα over α ≥ 0; then x = A⁻¹(f − Bᵀα).
+    """
+    rows = row_norms(program.B)  # the dual would have their squares
+    right = np.column_stack([(program.B / rows[:, None]).T, program.f])
+    half = scipy.linalg.solve_triangular(factor, right, lower=True, check_finite=False)
+    constraints, load = half[:, :-1], half[:, -1]
+    count = len(program.g)
+    dual = VariationalInequality(
+        A=constraints.T @ constraints,
+        f=constraints.T @ load - program.g / rows,
+        B=-np.eye(count),
+        g=np.zeros(count),
+    )
+    if start is not None and start.alpha is not None and start.x is not None:  # slack g − Bx of the constraints −α ≤ 0
+        slack = np.maximum(program.g - program.B @ start.x, 0.0) / rows
+        start = replace(start, x=rows * start.alpha, alpha=slack)
+    answer = solve_qp(dual, solver, accuracy, extra, start=start)
+    if answer.x is None:
+        return answer
+    forces = np.maximum(answer.x, 0.0)
+    x = scipy.linalg.solve_triangular(factor, load - constraints @ forces, lower=True, trans="T", check_finite=False)
+    negative = -min(float(np.min(answer.x / rows, initial=0.0)), 0.0)
+    return replace(answer, x=x, alpha=forces / rows, negative=negative)
+
+
+def installed_solvers(extra: Iterable[str] = ()) -> list[str]:
+    """Names of the solvers that can be run here; `extra` are those that plugins register."""
+    return sorted(set(qpsolvers.available_solvers) & set(SETTINGS) | set(extra))
+
+
+def check_solver_name(solver: str, extra: Iterable[str] = ()) -> None:
+    """Refuse a name that neither the settings table nor a plugin knows (installed or not is another question)."""
+    known = set(SETTINGS) | set(extra)
+    if solver not in known:
+        raise unknown_name("QP solver", solver, known)
+
+
+def takes_start(solver: str) -> bool:
+    """Whether a solver makes use of a solution to start from."""
+    return solver in SETTINGS and SETTINGS[solver].start is not None
+
+
+def _through_qpsolvers(
+    program: VariationalInequality, solver: str, accuracy: float, start: Mapping[str, Any]
+) -> QPSolution:
+    problem = qpsolvers.Problem(_plain(program.A), -program.f, _plain(program.B), program.g)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # statuses come through the answer, and are verified by `judge`
+        solution = qpsolvers.solve_problem(problem, solver=solver, **settings_for(solver, accuracy), **start)
+    status, iterations = SETTINGS[solver].report(solution)
+    if solution.x is None or solution.z is None:
+        return QPSolution(None, None, status, iterations)
+    return QPSolution(np.asarray(solution.x, float), np.asarray(solution.z, float), status, iterations)
+
+
+def _plain(matrix: Any) -> Any:
+    """Dense arrays as they are, sparse ones as the CSC matrices solvers ask for."""
+    return matrix if isinstance(matrix, np.ndarray) else sp.csc_matrix(matrix)
+
+
+def _divide_rows(B: SparseMatrix | Array, rows: Array) -> SparseMatrix | Array:
+    return B / rows[:, None] if isinstance(B, np.ndarray) else sp.diags_array(1.0 / rows) @ B

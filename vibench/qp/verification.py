@@ -1,0 +1,143 @@
+"""What a solver's answer is worth: residuals, and a status that rests on them alone, whatever the solver claims."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import nnls
+
+from vibench.arrays import Array, SparseMatrix
+from vibench.interfaces.problem import VariationalInequality
+from vibench.qp.scaling import peak, row_norms, size
+from vibench.qp.solution import QPSolution
+from vibench.qp.status import Status
+
+ENERGY_FLOOR = 1e-4
+"""The gap is relative to no less than this share of the energy that a steepest descent step would gain."""
+
+
+@dataclass(frozen=True)
+class Residuals:
+    """Relative residuals as the benchmark computes them, whatever the solver claims.
+
+    Attributes
+    ----------
+    primal
+        max (B x − g)₊ with every row in units of its own norm, over max(1, ‖g‖∞).
+    dual
+        ‖A x − f + Bᵀα‖∞ over max(‖A x‖∞, ‖f‖∞, ‖Bᵀα‖∞).
+    gap
+        |xᵀA x − fᵀx + gᵀα| over max(|½ xᵀA x|, |fᵀx|, |gᵀα|, `ENERGY_FLOOR` (fᵀf)² / 2fᵀA f). The last term is a share
+        of what one step of steepest descent from 0 gains: where constraints leave next to nothing of that energy, the
+        others are round-off.
+    """
+
+    primal: float
+    dual: float
+    gap: float
+
+    @property
+    def worst(self) -> float:
+        """The largest of the three."""
+        return max(self.primal, self.dual, self.gap)
+
+
+@dataclass(frozen=True)
+class Scales:
+    """What the residuals of a solution are relative to; the primal one in units of each row's own norm."""
+
+    primal: float
+    dual: float
+    gap: float
+
+
+@dataclass(frozen=True)
+class _Products:
+    """What scales and residuals of x (n,), α (m,) are made from: norms of the rows of B (m,), A x and Bᵀα (n,)."""
+
+    norms: Array
+    Ax: Array
+    force: Array
+
+    @classmethod
+    def of(cls, program: VariationalInequality, x: Array, alpha: Array) -> _Products:
+        return cls(row_norms(program.B), program.A @ x, program.B.T @ alpha)
+
+
+def scales(program: VariationalInequality, x: Array, alpha: Array) -> Scales:
+    """Denominators of the residuals of x (n,), α (m,); see `Residuals`."""
+    return _scales(program, x, alpha, _Products.of(program, x, alpha))
+
+
+def _scales(program: VariationalInequality, x: Array, alpha: Array, known: _Products) -> Scales:
+    A, f, g = program.A, program.f, program.g
+    return Scales(
+        primal=max(1.0, peak(g / known.norms)),
+        dual=max(peak(known.Ax), peak(f), peak(known.force)),
+        gap=max(
+            abs(0.5 * float(x @ known.Ax)), abs(float(f @ x)), abs(float(g @ alpha)), ENERGY_FLOOR * _descent(A, f)
+        ),
+    )
+
+
+def _descent(A: SparseMatrix | Array, f: Array) -> float:
+    """(fᵀf)² / 2fᵀA f: the energy that the best multiple of f gains, a part of what A⁻¹f would."""
+    curvature = float(f @ (A @ f))
+    return 0.5 * float(f @ f) ** 2 / curvature if curvature > 0.0 else 0.0
+
+
+def kkt_residuals(program: VariationalInequality, x: Array, alpha: Array) -> Residuals:
+    """Relative residuals of x (n,), α (m,) ≥ 0; see `Residuals`."""
+    f, B, g = program.f, program.B, program.g
+    known = _Products.of(program, x, alpha)
+    scale = _scales(program, x, alpha, known)
+    return Residuals(
+        primal=float(np.max((B @ x - g) / known.norms, initial=0.0)) / scale.primal,
+        dual=_ratio(peak(known.Ax - f + known.force), scale.dual),
+        gap=_ratio(abs(float(x @ known.Ax) - float(f @ x) + float(g @ alpha)), scale.gap),
+    )
+
+
+def verify(program: VariationalInequality, answer: QPSolution, accuracy: float) -> tuple[Status, str, Residuals | None]:
+    """Classify an answer by what we compute ourselves: status, reason ("" when ok), residuals if they exist."""
+    if answer.x is None or answer.alpha is None:
+        if infeasibility_certificate(program) is not None:
+            return Status.INFEASIBLE, "no point satisfies the constraints (certified)", None
+        return Status.FAILED, f"the solver returned nothing: {answer.solver_status}", None
+    if not (np.all(np.isfinite(answer.x)) and np.all(np.isfinite(answer.alpha))):
+        return Status.NONFINITE, f"the solution is not finite: {answer.solver_status}", None
+    found = kkt_residuals(program, answer.x, answer.alpha)
+    if found.worst <= accuracy:
+        return Status.OK, "", found
+    if found.primal > accuracy and infeasibility_certificate(program) is not None:
+        return Status.INFEASIBLE, "no point satisfies the constraints (certified)", found
+    name = max(("primal", "dual", "gap"), key=lambda key: getattr(found, key))
+    value = getattr(found, name)
+    clipped = f" after setting multipliers down to -{answer.negative:.0e} to zero" if answer.negative else ""
+    return (
+        Status.INACCURATE,
+        f"{name} residual {value:.1e} above {accuracy:.0e}{clipped}: {answer.solver_status}",
+        found,
+    )
+
+
+def infeasibility_certificate(program: VariationalInequality, tolerance: float = 1e-10) -> Array | None:
+    """α ≥ 0 with Bᵀα = 0 and gᵀα = −1 (Farkas), or `None` if no such α is found; dense programs only."""
+    if not isinstance(program.B, np.ndarray) or not len(program.g):
+        return None
+    rows = row_norms(program.B)
+    system = np.vstack([(program.B / rows[:, None]).T, program.g / rows / size(program.g / rows)])
+    target = np.zeros(system.shape[0])
+    target[-1] = -1.0
+    try:
+        alpha, distance = nnls(system, target, maxiter=30 * system.shape[1])
+    except RuntimeError:  # nnls gave up: no certificate
+        return None
+    if distance > tolerance * max(1.0, float(alpha.max(initial=0.0))):
+        return None
+    return np.asarray(alpha / rows)
+
+
+def _ratio(numerator: float, denominator: float) -> float:
+    return numerator / denominator if denominator > 0.0 else numerator

@@ -1,0 +1,1 @@
+"""Reduced bases: POD, projection on cones, supremizers, nested enrichments, lazy greedy selection."""

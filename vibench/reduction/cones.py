@@ -1,0 +1,255 @@
+"""Projection on polyhedral cones and the greedy construction of cones (paper, §4)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import nnls
+
+from vibench.arrays import Array, Mask
+from vibench.errors import NumericalError
+from vibench.interfaces.strategies import Cone, Stop, no_free, rays
+from vibench.linalg.cholesky import SparseCholesky
+from vibench.linalg.inner_product import InnerProduct
+from vibench.reduction.lazy_greedy import LazyMaximum
+
+REPRODUCED = 1e-12
+"""Relative distances below this are round-off."""
+
+Subtract = Callable[[Array, Array], tuple[Array, str]]
+"""From a snapshot θ (m,) and the generators so far (m×r): the part Υ ∈ K_r of θ to leave out, and a fallback note."""
+
+
+@dataclass(frozen=True)
+class Projection:
+    """Projection of θ on a cone: coefficients α ≥ 0 (R,) and the distance ‖θ − χα‖_W."""
+
+    coefficients: Array
+    distance: float
+
+
+def project_on_cone(generators: Array, theta: Array, W: InnerProduct) -> Projection:
+    """Project θ (m,) on the cone of `generators` (m×R) in the W norm; a nonnegative least squares problem."""
+    return _project_whitened(W.whiten(generators), W.whiten(theta))
+
+
+def project_on_orthant(functional: Array, W: InnerProduct) -> Array:
+    """Projection (m,) on W⁺, nonnegative coefficients, of the Riesz representer of a functional (m,) in the W norm.
+
+    X_W π − s ≥ 0 and π ≥ 0 are complementary: an active set method, which starts where s is positive and keeps what is
+    not negative; should its sets repeat themselves, a nonnegative least squares solver takes over.
+    """
+    free, seen = functional > 0.0, set[bytes]()
+    while free.tobytes() not in seen:
+        seen.add(free.tobytes())
+        inside = np.flatnonzero(free)
+        found = np.zeros(W.dim)
+        if len(inside):
+            block = W.matrix[inside][:, inside]
+            found[inside] = SparseCholesky(block, "a block of X_W").solve(functional[inside])
+        rest = functional - W.apply(found)
+        following = np.where(free, found > 0.0, rest > 1e-14 * np.max(np.abs(functional), initial=0.0))
+        if np.array_equal(following, free):
+            return found
+        free = following
+    return project_on_cone(np.eye(W.dim), W.riesz(functional), W).coefficients
+
+
+def _project_whitened(generators: Array, theta: Array) -> Projection:
+    if not generators.shape[1]:
+        return Projection(np.zeros(0), float(np.linalg.norm(theta)))
+    try:
+        coefficients, distance = nnls(generators, theta, maxiter=30 * generators.shape[1])
+    except RuntimeError as error:
+        raise NumericalError(f"projection on a cone of {generators.shape[1]} generators failed: {error}") from None
+    return Projection(np.asarray(coefficients), float(distance))
+
+
+def nothing(theta: Array, _: Array) -> tuple[Array, str]:
+    """Leave nothing of a snapshot θ (m,) out."""
+    return np.zeros_like(theta), ""
+
+
+def greedy_cone(snapshots: Array, W: InnerProduct, stop: Stop, subtract: Subtract = nothing) -> Cone:
+    """Greedy cone with the relative maximum criterion (paper, Algorithm 2 and Remark 4.3).
+
+    Each step takes the snapshot farthest from the present cone and adds the direction of what `subtract` leaves of
+    it. Cones are nested, so distances only fall and the maximum is taken lazily. It ends before `stop` where all
+    snapshots are reproduced to round-off (Remark 4.2).
+
+    Parameters
+    ----------
+    snapshots
+        θ_q (m×Q), coefficientwise nonnegative.
+    W
+        Inner product of the multiplier space.
+    stop
+        Relative largest projection error, or number of generators.
+    subtract
+        What to leave out of the chosen snapshot: nothing (Remark 4.3), or what line 9 of Algorithm 2 says.
+
+    Raises
+    ------
+    NumericalError
+        If a snapshot has a negative coefficient: it would not be in W⁺.
+    """
+    refuse_negative(snapshots)
+    whitened = W.whiten(snapshots)
+    norms = np.linalg.norm(whitened, axis=0)
+    largest = float(norms.max(initial=0.0))
+    if largest == 0.0:
+        return Cone(np.zeros((W.dim, 0)), np.zeros(1), no_free(0))
+    distances = LazyDistances(whitened)
+    generators = np.zeros((W.dim, 0))
+    pick, error = int(np.argmax(norms >= norms.max() * (1.0 - 1e-9))), 1.0
+    errors, fallbacks = [error], []
+    while not stop.reached(generators.shape[1], error) and error > REPRODUCED:
+        part, note = subtract(snapshots[:, pick], generators)
+        if note:
+            fallbacks.append(f"generator {generators.shape[1] + 1}: {note}")
+        direction = snapshots[:, pick] - part
+        length = float(W.norm(direction))
+        if length <= REPRODUCED * norms[pick]:
+            break
+        generators = np.column_stack([generators, direction / length])
+        distances.widen(W.whiten(generators), pick)
+        if generators.shape[1] == snapshots.shape[1]:
+            errors.append(0.0)
+            break
+        pick, error = distances.next()
+        errors.append(error)
+    return Cone(generators, np.array(errors), no_free(generators.shape[1]), tuple(fallbacks))
+
+
+def refuse_negative(snapshots: Array) -> None:
+    """Refuse snapshots (m×Q) outside W⁺.
+
+    Raises
+    ------
+    NumericalError
+        If a coefficient is negative.
+    """
+    if np.min(snapshots, initial=0.0) < 0.0:
+        raise NumericalError(f"a multiplier snapshot has the negative coefficient {snapshots.min():.1e}")
+
+
+def normalised(snapshots: Array, W: InnerProduct) -> Array:
+    """Snapshots (m×Q) in W⁺ with unit norm in W, without those that are zero.
+
+    Raises
+    ------
+    NumericalError
+        If a coefficient is negative.
+    """
+    refuse_negative(snapshots)
+    norms = W.norm(snapshots)
+    return np.asarray(snapshots[:, norms > 0.0] / norms[norms > 0.0])
+
+
+def projection_errors(generators: Array, snapshots: Array, W: InnerProduct) -> Array:
+    """e(r) for r = 0 … R: the largest distance of a snapshot from the cone of the first r generators.
+
+    Relative to the largest norm of a snapshot, as in equations (13) and (34); for cones that no greedy algorithm made.
+
+    Parameters
+    ----------
+    generators
+        Unit vectors (m×R).
+    snapshots
+        θ_q (m×Q); where all are zero, so are the errors.
+    W
+        Inner product of the multiplier space.
+    """
+    errors = np.zeros(generators.shape[1] + 1)
+    if np.any(snapshots):
+        distances, whitened = LazyDistances(W.whiten(snapshots)), W.whiten(generators)
+        errors[0] = 1.0
+        for r in range(1, len(errors)):
+            distances.widen(whitened[:, :r])
+            errors[r] = distances.next()[1]
+    return errors
+
+
+class LazyDistances:
+    """Largest distance of snapshots from a growing cone, relative to the largest norm, with few projections.
+
+    Any point of the cone bounds the distance from above. One is kept for every snapshot; where the cone grows, the
+    nearest combination of it and of the new generator takes its place, and one sweep over the generators, coordinate by
+    coordinate, brings it nearer still. Only where these bounds leave the choice open is a projection computed.
+
+    Parameters
+    ----------
+    whitened
+        Snapshots (m×Q) in coordinates in which the norm is Euclidean; not all zero.
+
+    Attributes
+    ----------
+    maximum
+        What chooses; it counts the projections.
+    """
+
+    def __init__(self, whitened: Array) -> None:
+        self._snapshots = whitened
+        norms = np.linalg.norm(whitened, axis=0)
+        self._largest = float(norms.max())
+        self._generators = np.zeros((whitened.shape[0], 0))
+        self._points = np.zeros((0, whitened.shape[1]))  # coefficients of a point of the cone for every snapshot
+        self.maximum = LazyMaximum(norms / self._largest)
+
+    def widen(self, generators: Array, taken: int | None = None) -> None:
+        """Take in the last of the generators (m×r, unit norm, whitened); the snapshot `taken` is in the cone by now."""
+        old, new = _two_dimensional(self._generators @ self._points, generators[:, -1], self._snapshots)
+        self._points = np.vstack([self._points * old, new])
+        self._generators = generators
+        slope = generators.T @ (self._snapshots - generators @ self._points)
+        for i, row in enumerate(generators.T @ generators):
+            step = np.maximum(slope[i], -self._points[i])
+            self._points[i] += step
+            slope -= row[:, None] * step
+        self.maximum.bound(np.linalg.norm(self._snapshots - generators @ self._points, axis=0) / self._largest)
+        if taken is not None:
+            self.maximum.exclude(taken)
+
+    def next(self) -> tuple[int, float]:
+        """Index of the snapshot farthest from the cone, and its distance; of those taken, none."""
+        return self.maximum.next(self._distance)
+
+    def residual(self, q: int) -> Array:
+        """What the best known point of the cone leaves of a snapshot (m,); that of `next` is its projection."""
+        return np.asarray(self._snapshots[:, q] - self._generators @ self._points[:, q])
+
+    def _distance(self, q: int) -> float:
+        found = _project_whitened(self._generators, self._snapshots[:, q])
+        self._points[:, q] = found.coefficients
+        return found.distance / self._largest
+
+
+def _two_dimensional(points: Array, nu: Array, targets: Array) -> tuple[Array, Array]:
+    """Coefficients a, b ≥ 0 (Q,) of points (m×Q) and of the unit vector ν (m,) that come near targets (m×Q).
+
+    The nearest combination where both are positive, else that of one alone.
+    """
+    square, overlap = np.sum(points**2, axis=0), nu @ points
+    along, across = np.sum(points * targets, axis=0), nu @ targets
+    determinant = square - overlap**2
+    clear = determinant > 1e-8 * square
+    scale = np.where(clear, determinant, 1.0)
+    a, b = (along - overlap * across) / scale, (square * across - overlap * along) / scale
+    both = clear & (a >= 0.0) & (b >= 0.0)
+    alone = (np.maximum(across, 0.0) ** 2 > along**2 / np.where(square > 0.0, square, 1.0)) | (square == 0.0)
+    single_a = np.where(alone, 0.0, np.maximum(along, 0.0) / np.where(square > 0.0, square, 1.0))
+    single_b = np.where(alone, np.maximum(across, 0.0), 0.0)
+    return np.where(both, a, single_a), np.where(both, b, single_b)
+
+
+def orthogonality(generators: Array, W: InnerProduct, free: Mask | None = None) -> Array:
+    """e_orth(r) for r = 0 … R−1: distance of generator r+1 from the cone of the first r (paper, equation (41)).
+
+    `free` says which generators (R,) may be used with either sign; none by default.
+    """
+    whitened = W.whiten(generators)
+    free = no_free(whitened.shape[1]) if free is None else free
+    cones = (rays(whitened[:, :r], free[:r]) for r in range(whitened.shape[1]))
+    return np.array([_project_whitened(cone, whitened[:, r]).distance for r, cone in enumerate(cones)])

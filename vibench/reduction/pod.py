@@ -1,0 +1,61 @@
+"""Proper orthogonal decomposition in a weighted inner product (paper, equations (10) and (11))."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from vibench.arrays import Array
+from vibench.errors import NumericalError
+from vibench.interfaces.strategies import Stop
+from vibench.linalg.dense import RANK_RTOL, svd
+from vibench.linalg.inner_product import InnerProduct
+
+
+@dataclass(frozen=True)
+class POD:
+    """A nested orthonormal basis.
+
+    Attributes
+    ----------
+    basis
+        V-orthonormal modes (n×N); the first k of them are the POD basis of dimension k.
+    errors
+        Relative tails e_POD(k) for k = 0 … number of snapshots (equation (11)).
+    """
+
+    basis: Array
+    errors: Array
+
+
+def pod(snapshots: Array, V: InnerProduct, stop: Stop) -> POD:
+    """POD of snapshots (n×P), by the singular value decomposition of the whitened snapshots.
+
+    Parameters
+    ----------
+    snapshots
+        Columns u(mu_p).
+    V
+        Inner product of the space.
+    stop
+        Relative tail, or number of modes.
+
+    Raises
+    ------
+    NumericalError
+        If more modes are asked for than the snapshots have numerical rank.
+    """
+    if not snapshots.shape[1]:
+        return POD(np.zeros((V.dim, 0)), np.zeros(1))
+    left, sigma, _ = svd(V.whiten(snapshots))
+    total = float(np.linalg.norm(sigma))
+    tails = np.append(np.sqrt(np.cumsum((sigma**2)[::-1])[::-1]), 0.0)
+    errors = tails / total if total > 0.0 else tails
+    rank = int(np.count_nonzero(sigma > RANK_RTOL * total))
+    size = stop.first_reached(errors)
+    if size is None or size > rank:
+        raise NumericalError(f"POD cannot give {stop}: the {snapshots.shape[1]} snapshots have rank {rank}")
+    modes = left[:, :size]
+    signs = np.where(np.take_along_axis(modes, np.abs(modes).argmax(axis=0)[None], axis=0)[0] < 0.0, -1.0, 1.0)
+    return POD(V.unwhiten(modes * signs), errors)

@@ -1,0 +1,253 @@
+"""Supremizers T(mu)η = X_V⁻¹ B(mu)ᵀη (paper, equation (15)) and the space that contains all of them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+
+import numpy as np
+import scipy.linalg
+import scipy.sparse as sp
+
+from vibench.arrays import Array, Indices, SparseMatrix
+from vibench.linalg.cholesky import SparseCholesky, elimination_order
+from vibench.linalg.inner_product import InnerProduct
+
+PROPORTIONAL_RTOL = 1e-12
+"""Two constraint matrices count as proportional when they differ by less than this, relative to their norm."""
+
+MARK_ATOL = 1e-10
+"""Marks of matrices that may be proportional differ by no more."""
+
+FEW_SUPREMIZERS = 2
+"""Norms and angles come from whitened supremizers where there are this many times more touched unknowns."""
+
+SPANNING = 1.0
+"""Greedy algorithms run in the span of the supremizers where a QR factorisation of all of them, n×k, times this is no
+dearer than dense solves with the contact's factor."""
+
+FACTORS = 3
+"""Factors with different unknowns last that are kept: of the training set, of the validation set, and as declared."""
+
+
+def supremizers(V: InnerProduct, B: SparseMatrix, eta: Array) -> Array:
+    """T(mu)η = X_V⁻¹ Bᵀη (n×k) for B (m×n) and multipliers η (m×k)."""
+    return V.riesz(np.asarray(B.T @ eta))
+
+
+def proportionality(B: SparseMatrix, reference: SparseMatrix) -> float | None:
+    """C with B = c·reference up to round-off, or `None`; c ≠ 0."""
+    norm = sp.linalg.norm(B)
+    square = float(reference.multiply(reference).sum())
+    if norm == 0.0 or square == 0.0:
+        return None
+    factor = float(B.multiply(reference).sum()) / square
+    return factor if factor and sp.linalg.norm(B - factor * reference) <= PROPORTIONAL_RTOL * norm else None
+
+
+@dataclass(frozen=True)
+class ConstraintClasses:
+    """Constraint matrices B(mu_p) sorted into classes of proportional ones, which share their supremizer space.
+
+    Attributes
+    ----------
+    representatives
+        One matrix per class, the first met.
+    members
+        Class of every p (P,).
+    factors
+        c_p (P,) with B(mu_p) = c_p · representatives[members[p]].
+    """
+
+    representatives: tuple[SparseMatrix, ...]
+    members: Indices
+    factors: Array
+
+    @property
+    def firsts(self) -> Indices:
+        """Of every class the matrix that stands for it."""
+        return np.unique(self.members, return_index=True)[1]
+
+    def everywhere(self, constants: Sequence[float]) -> Array:
+        """At every p (P,) an inf-sup constant that is known of every representative."""
+        return np.array(constants)[self.members] * np.abs(self.factors)
+
+
+def constraint_classes(matrices: Sequence[SparseMatrix]) -> ConstraintClasses:
+    """Sort matrices into classes of proportional ones."""
+    representatives: list[SparseMatrix] = []
+    marks: list[Array] = []
+    members, factors = [], []
+    for matrix in matrices:
+        mark = _mark(matrix)
+        for k, representative in enumerate(representatives):
+            factor = proportionality(matrix, representative) if _alike(mark, marks[k]) else None
+            if factor is not None:
+                members.append(k)
+                factors.append(factor)
+                break
+        else:
+            members.append(len(representatives))
+            factors.append(1.0)
+            representatives.append(matrix)
+            marks.append(mark)
+    return ConstraintClasses(tuple(representatives), np.array(members, dtype=np.intp), np.array(factors))
+
+
+def _mark(matrix: SparseMatrix) -> Array:
+    """A vector (m,) that proportional matrices share up to its sign, and others almost surely do not."""
+    probe = np.random.default_rng(0).standard_normal(matrix.shape[1])
+    return np.asarray(matrix @ probe) / ((sp.linalg.norm(matrix) * float(np.linalg.norm(probe))) or 1.0)
+
+
+def _alike(one: Array, other: Array) -> bool:
+    return min(float(np.abs(one - other).max(initial=0.0)), float(np.abs(one + other).max(initial=0.0))) <= MARK_ATOL
+
+
+class SpannedCoordinates:
+    """Euclidean coordinates in V_N + span of some vectors.
+
+    Parameters
+    ----------
+    V
+        Inner product of the primal space.
+    basis
+        V-orthonormal basis of V_N (n×N).
+    vectors
+        Vectors (n×k) to be represented, of any rank.
+
+    Attributes
+    ----------
+    plain
+        Coordinates (d×N) of the basis of V_N, orthonormal.
+    represented
+        Coordinates (d×k) of the vectors.
+    """
+
+    def __init__(self, V: InnerProduct, basis: Array, vectors: Array) -> None:
+        self._V = V
+        count = basis.shape[1]
+        self._whitened, r = np.linalg.qr(V.whiten(np.hstack([basis, vectors])))
+        self.plain: Array = r[:, :count]
+        self.represented: Array = r[:, count:]
+
+    def vectors(self, coordinates: Array) -> Array:
+        """Vectors (n×k) with these coordinates (d×k)."""
+        return self._V.unwhiten(self._whitened @ coordinates)
+
+
+class ContactCoordinates:
+    """Euclidean coordinates in V_N + X_V⁻¹E, E some degrees of freedom: every supremizer of every B that touches them.
+
+    X_V = FᵀF is factorised with E last. For every load r on E, F X_V⁻¹ r = F⁻ᵀ r is then F_EE⁻ᵀ r in its last entries
+    and zero before: no array larger than E is needed for it.
+
+    Parameters
+    ----------
+    V
+        Inner product of the primal space.
+    basis
+        V-orthonormal basis of V_N (n×N).
+    dofs
+        E, rising.
+
+    Attributes
+    ----------
+    plain
+        Coordinates (d×N) of the basis of V_N, orthonormal.
+    """
+
+    def __init__(self, V: InnerProduct, basis: Array, dofs: Indices) -> None:
+        self._factor, self._tail = contact_factor(V, dofs)
+        whitened = self._factor.up(basis)
+        split = V.dim - len(dofs)
+        self._others, r = np.linalg.qr(whitened[:split])
+        self.plain: Array = np.vstack([r, whitened[split:]])
+
+    def supremizers(self, loads: Array) -> Array:
+        """Coordinates (d×k) of X_V⁻¹ r for loads on E (|E|×k), such as the rows of Bᵀη there."""
+        on_contact = scipy.linalg.solve_triangular(self._tail, loads, trans="T", check_finite=False)
+        return np.vstack([np.zeros((self._others.shape[1], loads.shape[1])), on_contact])
+
+    def vectors(self, coordinates: Array) -> Array:
+        """Vectors (n×k) with these coordinates (d×k)."""
+        k = self._others.shape[1]
+        last = scipy.linalg.solve_triangular(self._tail, coordinates[k:], check_finite=False)
+        return np.asarray(self._off_contact @ coordinates[:k] + self._factor.extend(last))
+
+    @cached_property
+    def _off_contact(self) -> Array:
+        """Vectors (n×N) whose coordinates are the first N unit vectors; they are zero on E."""
+        return self._factor.up_inverse(np.vstack([self._others, np.zeros((len(self._tail), self._others.shape[1]))]))
+
+
+def contact_factor(V: InnerProduct, dofs: Indices) -> tuple[SparseCholesky, Array]:
+    """X_V factorised with some unknowns E last, and the last block F_EE (|E|×|E|) of the factor.
+
+    Like the factor of V itself it is made once for all models of a problem.
+    """
+    return _contact_factor(V, dofs.astype(np.intp).tobytes())
+
+
+@lru_cache(maxsize=FACTORS)
+def _contact_factor(V: InnerProduct, dofs: bytes) -> tuple[SparseCholesky, Array]:
+    last = np.frombuffer(dofs, np.intp)
+    factor = SparseCholesky(V.matrix, "X_V", elimination_order(V.matrix, last), len(last))
+    return factor, factor.tail(len(last))
+
+
+Coordinates = SpannedCoordinates | ContactCoordinates
+
+
+SupremizerImages = Callable[[SparseMatrix, Array], Array]
+"""From B (m×n) and η (m×k): an isometric image (d×k) of T(mu)η."""
+
+
+def supremizer_images(V: InnerProduct, matrices: Sequence[SparseMatrix], count: int) -> SupremizerImages:
+    """The cheapest way to norms and angles of T(mu)η for these matrices and `count` multipliers in all for each."""
+    touched = _touched(matrices)
+    if FEW_SUPREMIZERS * count * len(matrices) <= len(touched):
+        return lambda B, eta: V.whiten_functional(np.asarray(B.T @ eta))
+    contact = ContactCoordinates(V, np.zeros((V.dim, 0)), touched)
+    return lambda B, eta: contact.supremizers(_loads(B, touched, eta))
+
+
+def _touched(matrices: Sequence[SparseMatrix]) -> Indices:
+    """Unknowns that some of the matrices touch, rising."""
+    return np.unique(np.concatenate([sp.csr_array(B).indices for B in matrices]))
+
+
+def projected_supremizers(Z: Array, B: SparseMatrix, eta: Array) -> Array:
+    """ZᵀBᵀη (N'×k) from the rows of Z (n×N') that B (m×n) touches."""
+    rows = _touched([B])
+    return np.asarray(Z[rows].T @ _loads(B, rows, eta))
+
+
+def _loads(B: SparseMatrix, dofs: Indices, eta: Array) -> Array:
+    """Bᵀη (|E|×k) on some unknowns E."""
+    return np.asarray(sp.csr_array(B)[:, dofs].T @ eta)
+
+
+def supremizer_coordinates(
+    V: InnerProduct, basis: Array, matrices: Sequence[SparseMatrix], eta: Array
+) -> tuple[Coordinates, list[Array]]:
+    """Coordinates in which greedy algorithms over supremizers run, and those (d×k) of T(mu)η for every matrix.
+
+    Parameters
+    ----------
+    V, basis
+        The primal space and a V-orthonormal basis of V_N (n×N).
+    matrices
+        Constraint matrices B(mu) (m×n).
+    eta
+        Multipliers (m×k).
+    """
+    touched = _touched(matrices)
+    count = eta.shape[1]
+    if SPANNING * V.dim * count * len(matrices) <= len(touched) ** 2:
+        space = SpannedCoordinates(V, basis, np.hstack([supremizers(V, B, eta) for B in matrices]))
+        return space, [space.represented[:, k * count : (k + 1) * count] for k in range(len(matrices))]
+    contact = ContactCoordinates(V, basis, touched)
+    found = contact.supremizers(np.hstack([_loads(B, touched, eta) for B in matrices]))
+    return contact, [found[:, k * count : (k + 1) * count] for k in range(len(matrices))]

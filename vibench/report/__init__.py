@@ -1,0 +1,1 @@
+"""What a run found: findings, HTML report, figures, comparison of runs, replay and export of programs."""

@@ -1,0 +1,77 @@
+"""Figures of a run, drawn from its results file alone."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from concurrent.futures import ProcessPoolExecutor
+from itertools import islice, zip_longest
+from multiprocessing import get_context
+from pathlib import Path
+
+from matplotlib.figure import Figure
+
+from vibench.report.figures.constants import inf_sup
+from vibench.report.figures.convergence import diagnostics, enrichment, orthogonality, projection_errors
+from vibench.report.figures.costs import dimension, total_cost, work_precision
+from vibench.report.figures.data import Data, file_names, problems
+from vibench.report.figures.solutions import solutions
+from vibench.report.figures.solvers import solvers
+from vibench.report.figures.style import FORMATS, save, styled
+
+Drawing = Callable[[Data], Figure | None]
+
+OF_PROBLEM: dict[str, Drawing] = {
+    "solutions": solutions,
+    "diagnostics": diagnostics,
+    "errors": projection_errors,
+    "orthogonality": orthogonality,
+    "dimension": dimension,
+    "work-precision": work_precision,
+    "solvers": solvers,
+    "total-cost": total_cost,
+}
+"""Figures of every problem, by the end of the file's name; `None` where there is nothing to draw."""
+
+OF_DUAL: dict[str, Drawing] = {"enrichment": enrichment, "inf-sup": inf_sup}
+"""Figures of every problem and dual strategy."""
+
+
+def drawings(path: Path) -> Iterator[tuple[str, Drawing, Data]]:
+    """Every figure a results file may have: its name, the function that draws it, and what from."""
+    for name, data in problems(path):
+        yield from ((f"{name}-{kind}", draw, data) for kind, draw in OF_PROBLEM.items())
+        for dual, file in zip(data.duals, file_names(data.duals), strict=True):
+            yield from ((f"{name}-{file}-{kind}", draw, data.of_dual(dual)) for kind, draw in OF_DUAL.items())
+
+
+def draw_all(path: Path, folder: Path, formats: tuple[str, ...] = FORMATS, jobs: int = 1) -> list[Path]:
+    """Draw what a results file has data for; returns the files written.
+
+    Parameters
+    ----------
+    path
+        Results file.
+    folder
+        Where the files go.
+    formats
+        What is written of every figure.
+    jobs
+        Processes to draw in, this one among them.
+    """
+    if jobs == 1:
+        return [file for files in _part(path, folder, formats, 0, 1) for file in files]
+    with ProcessPoolExecutor(jobs - 1, get_context("spawn")) as pool:
+        others = [pool.submit(_part, path, folder, formats, k, jobs) for k in range(1, jobs)]
+        parts = [_part(path, folder, formats, 0, jobs), *(other.result() for other in others)]
+    return [file for turn in zip_longest(*parts, fillvalue=[]) for files in turn for file in files]
+
+
+def _part(path: Path, folder: Path, formats: tuple[str, ...], first: int, step: int) -> list[list[Path]]:
+    """Draw every `step`-th figure from number `first` on; the files of each."""
+    written = []
+    for name, draw, data in islice(drawings(path), first, None, step):
+        folder.mkdir(parents=True, exist_ok=True)
+        with styled():
+            figure = draw(data)
+            written.append([] if figure is None else save(figure, folder, name, formats))
+    return written

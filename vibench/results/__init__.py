@@ -1,0 +1,1 @@
+"""The results file: its columns, the database, and what is derived from its tables."""

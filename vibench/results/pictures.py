@@ -1,0 +1,71 @@
+"""Pictures of high-fidelity solutions: made by a stage of a run, kept in its results file, read back for figures."""
+
+from __future__ import annotations
+
+import io
+import json
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from vibench.interfaces.problem import Picture
+from vibench.results import tables
+
+ARRAYS = tuple(field.name for field in fields(Picture) if not field.name.endswith("name"))
+
+
+def rows(keys: Mapping[str, Any], drawn: Iterable[tuple[str, Picture]]) -> list[dict[str, Any]]:
+    """Rows of the pictures table: titles and pictures of the problem that `keys` name."""
+    return [
+        {
+            **keys,
+            "number": k,
+            "title": title,
+            "names": json.dumps([one.name, one.multiplier_name]),
+            "data": _packed(one),
+        }
+        for k, (title, one) in enumerate(drawn)
+    ]
+
+
+def missing(keys: Mapping[str, Any], reason: str) -> list[dict[str, Any]]:
+    """The row that says why there is no picture of the problem that `keys` name."""
+    return [{**keys, "number": 0, "reason": reason}]
+
+
+@dataclass(frozen=True)
+class Shown:
+    """A picture read back: whose it is, its title, and why it is not there if it is not."""
+
+    key: tuple[str, str]
+    title: str
+    picture: Picture | None
+    reason: str
+
+
+def read(path: Path) -> Iterator[Shown]:
+    """The pictures of a results file."""
+    for row in tables.read(path, "pictures").to_dict("records"):
+        picture = _unpacked(row["data"], row["names"]) if isinstance(row["data"], bytes) else None
+        key = (str(row["problem"]), str(row["problem_options"]))
+        title, reason = (text if isinstance(text, str) else "" for text in (row["title"], row["reason"]))
+        yield Shown(key, title, picture, reason)
+
+
+def _packed(picture: Picture) -> bytes:
+    """The arrays, in single precision, compressed."""
+    stream = io.BytesIO()
+    small = {name: getattr(picture, name) for name in ARRAYS}
+    kept = {name: value.astype(np.int32 if name == "triangles" else np.float32) for name, value in small.items()}
+    np.savez_compressed(stream, **kept)
+    return stream.getvalue()
+
+
+def _unpacked(data: bytes, names: str) -> Picture:
+    with np.load(io.BytesIO(data), allow_pickle=False) as found:
+        arrays = {name: found[name].astype(np.intp if name == "triangles" else float) for name in ARRAYS}
+    name, multiplier_name = json.loads(names)
+    return Picture(**arrays, name=name, multiplier_name=multiplier_name)

@@ -1,0 +1,97 @@
+"""Whether QP solvers that are both ok on the same reduced problem agree within what their accuracy allows."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from itertools import combinations
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from vibench.arrays import Array
+from vibench.qp.accuracy_bounds import Slack, allowed
+from vibench.qp.status import Status
+from vibench.results.schema import DISAGREEMENTS, KEYS
+
+
+def solution_row(x: Array, alpha: Array, left_open: Slack) -> dict[str, Any]:
+    """Columns of the solutions table."""
+    return {
+        "x": np.asarray(x, "<f8").tobytes(),
+        "alpha": np.asarray(alpha, "<f8").tobytes(),
+        "slack_linear": left_open.linear,
+        "slack_constant": left_open.constant,
+    }
+
+
+def vectors(row: Mapping[str, Any]) -> tuple[Array, Array]:
+    """The two vectors, x and α, of a row of the solutions table."""
+    return np.frombuffer(row["x"], "<f8"), np.frombuffer(row["alpha"], "<f8")
+
+
+@dataclass(frozen=True)
+class Recorded:
+    """An `ok` answer of one solver to one query: x (N',) and its slack."""
+
+    solver: str
+    query: int
+    x: Array
+    slack: Slack
+
+
+def disagreement_rows(
+    cells: Iterable[Mapping[str, Any]], queries: Iterable[Mapping[str, Any]], solutions: Iterable[Mapping[str, Any]]
+) -> list[dict[str, Any]]:
+    """Rows of the disagreements table from rows of the cells, queries and solutions tables."""
+    fine = {(row["cell"], row["query"]) for row in queries if row["status"] == Status.OK}
+    known = {cell["cell"]: cell for cell in cells if cell["model"]}
+    answers: dict[str, list[Recorded]] = {}
+    for row in solutions:
+        if (row["cell"], row["query"]) in fine:
+            cell, left_open = known[row["cell"]], Slack(row["slack_linear"], row["slack_constant"])
+            answer = Recorded(cell["solver"], row["query"], vectors(row)[0], left_open)
+            answers.setdefault(cell["model"], []).append(answer)
+    keys = {cell["model"]: {name: cell[name] for name in DISAGREEMENTS if name in KEYS} for cell in known.values()}
+    return [keys[model] | row for model, found in answers.items() for row in compare(found)]
+
+
+def sentence(disagreements: pd.DataFrame) -> str:
+    """The audit in a line."""
+    if disagreements.empty:
+        return "no two solvers were ok on the same reduced problem"
+    pairs, flagged = int(disagreements["queries"].sum()), int(disagreements["flagged"].sum())
+    worst = disagreements.loc[disagreements["difference_max"].idxmax()]
+    largest = f"u differs by at most {worst['difference_max']:.1e} ({worst['solver_a']} and {worst['solver_b']})"
+    if not flagged:
+        return f"solvers that were ok on the same reduced problem agree in all {pairs} comparisons: {largest}"
+    return f"solvers disagree by more than the accuracy allows in {flagged} of {pairs} comparisons: {largest}"
+
+
+def compare(answers: Iterable[Recorded]) -> Iterator[dict[str, Any]]:
+    """For every two solvers of one reduced model: how far apart they are, and how often farther than allowed."""
+    by_solver: dict[str, dict[int, Recorded]] = {}
+    for answer in answers:
+        by_solver.setdefault(answer.solver, {})[answer.query] = answer
+    for a, b in combinations(sorted(by_solver), 2):
+        common = sorted(by_solver[a].keys() & by_solver[b].keys())
+        if common:
+            yield {"solver_a": a, "solver_b": b, **_differences(by_solver[a], by_solver[b], common)}
+
+
+def _differences(a: Mapping[int, Recorded], b: Mapping[int, Recorded], queries: list[int]) -> dict[str, Any]:
+    apart = np.array([float(np.linalg.norm(a[k].x - b[k].x)) for k in queries])
+    limits = np.array([allowed(a[k].slack, b[k].slack) for k in queries])
+    sizes = np.array([float(np.linalg.norm(a[k].x)) for k in queries])
+    relative = apart / np.where(sizes > 0.0, sizes, 1.0)
+    far = apart > limits
+    worst = int(np.argmax(relative))
+    return {
+        "queries": len(queries),
+        "difference_max": float(relative[worst]),
+        "query_worst": queries[worst],
+        "allowed_worst": float(limits[worst] / (sizes[worst] or 1.0)),
+        "flagged": int(far.sum()),
+        "query_flagged": queries[int(np.argmax(far))] if far.any() else None,
+    }

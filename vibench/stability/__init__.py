@@ -1,0 +1,1 @@
+"""Inf-sup constants over the span and the cone of reduced multipliers."""

@@ -1,0 +1,28 @@
+"""Assessment of queries: errors and inf-sup constants. Nothing here is timed."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from vibench.arrays import Array
+from vibench.linalg.inner_product import InnerProduct
+from vibench.reduction.supremizers import ConstraintClasses, supremizer_images
+from vibench.stability.infsup import InfSup, Multipliers, inf_sup, inf_sup_on
+
+
+def constants_full(V: InnerProduct, classes: ConstraintClasses, cone: Multipliers) -> list[InfSup]:
+    """Constants of the whole of V at every B(mu) (m×n); matrices that are proportional share one computation."""
+    image = supremizer_images(V, classes.representatives, cone.span.shape[1] + cone.chi.shape[1])
+    return everywhere(
+        classes, [inf_sup(image(B, cone.span), image(B, cone.chi), cone) for B in classes.representatives]
+    )
+
+
+def constants_on(Z: Array, classes: ConstraintClasses, cone: Multipliers) -> list[InfSup]:
+    """Constants of one primal space with V-orthonormal basis Z (n×N') at every B(mu), likewise."""
+    return everywhere(classes, [inf_sup_on(Z, B, cone) for B in classes.representatives])
+
+
+def everywhere(classes: ConstraintClasses, found: Sequence[InfSup]) -> list[InfSup]:
+    """Constants of all matrices from those of the ones that stand for their classes."""
+    return [found[k].scaled(c) for k, c in zip(classes.members, classes.factors, strict=True)]

@@ -1,0 +1,1 @@
+"""Stages of a computation and their artefacts, from snapshots to the queries of a cell."""

@@ -1,0 +1,125 @@
+"""The stages that compute inf-sup constants at the validation parameters; each serves many cells."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from vibench.interfaces.problem import VariationalInequality
+from vibench.interfaces.strategies import Kind
+from vibench.interfaces.validation import validation_parameters
+from vibench.model.error_bounds import Stability, extreme_quotients
+from vibench.model.galerkin import ReducedModel
+from vibench.reduction.supremizers import ConstraintClasses, constraint_classes
+from vibench.stability.infsup import InfSup, Multipliers, inf_sup, nodal_multipliers
+from vibench.stability.over_parameters import constants_full, constants_on, everywhere
+from vibench.stages.artefacts import Store
+from vibench.stages.assemblies import assemblies
+from vibench.stages.base import Result, Stage, build_problem, value_of
+from vibench.stages.offline import ConeStage, EnrichmentStage, PODStage, reduced_model
+from vibench.study.cells import Plugin
+
+
+@dataclass(frozen=True)
+class ValidationConstraints(Stage):
+    """The constraint matrices of the validation set, sorted into classes."""
+
+    problem: Plugin
+    count: int
+    seed: int
+
+    def inputs(self) -> tuple[Stage, ...]:
+        """Nothing comes before."""
+        return ()
+
+    def run(self, store: Store) -> Result:  # noqa: ARG002
+        """The `ConstraintClasses`."""
+        problem = build_problem(self.problem)
+        mus = validation_parameters(problem, self.count, self.seed)
+        return Result(constraint_classes([assemblies(problem).at(mu).B for mu in mus]))
+
+
+@dataclass(frozen=True)
+class ReferenceConstants(Stage):
+    """Constants of the high-fidelity problem: β_HF, coercivity and continuity; a `Stability` per parameter."""
+
+    constraints: ValidationConstraints
+
+    def inputs(self) -> tuple[Stage, ...]:
+        """The constraint matrices."""
+        return (self.constraints,)
+
+    def run(self, store: Store) -> Result:
+        """Compute the constants."""
+        problem, known = build_problem(self.constraints.problem), self.constraints
+        inf_sup = constants_full(problem.V, value_of(store, known), nodal_multipliers(problem.W))
+        mus = validation_parameters(problem, known.count, known.seed)
+        different = mus[:1] if "A" in problem.constant else mus
+        quotients = [extreme_quotients(assemblies(problem).at(mu).A, problem.V) for mu in different]
+        quotients *= len(mus) // len(different)
+        return Result([Stability(found, *extremes) for found, extremes in zip(inf_sup, quotients, strict=True)])
+
+
+@dataclass(frozen=True)
+class FullConstants(Stage):
+    """Constants of the whole of V with a reduced cone, what online supremizers reach: an `InfSup` per parameter."""
+
+    cone: ConeStage
+    constraints: ValidationConstraints
+
+    def inputs(self) -> tuple[Stage, ...]:
+        """The cone and the constraint matrices."""
+        return (self.cone, self.constraints)
+
+    def run(self, store: Store) -> Result:
+        """Compute the constants."""
+        classes, cone = value_of(store, self.constraints), value_of(store, self.cone).prepared
+        return Result(constants_full(build_problem(self.cone.problem).V, classes, cone))
+
+
+@dataclass(frozen=True)
+class PlainConstants(Stage):
+    """Constants of V_N alone with a reduced cone: an `InfSup` per parameter."""
+
+    pod: PODStage
+    cone: ConeStage
+    constraints: ValidationConstraints
+
+    def inputs(self) -> tuple[Stage, ...]:
+        """The basis, the cone and the constraint matrices."""
+        return (self.pod, self.cone, self.constraints)
+
+    def run(self, store: Store) -> Result:
+        """Compute the constants."""
+        basis, classes = value_of(store, self.pod).basis, value_of(store, self.constraints)
+        return Result(constants_on(basis, classes, value_of(store, self.cone).prepared))
+
+
+@dataclass(frozen=True)
+class OwnConstants(Stage):
+    """Constants of the pair of spaces that a reduced model works with: an `InfSup` per parameter."""
+
+    enrichment: EnrichmentStage
+    constraints: ValidationConstraints
+
+    def inputs(self) -> tuple[Stage, ...]:
+        """The reduced model and the constraint matrices."""
+        return (self.enrichment, *self.enrichment.inputs(), self.constraints)
+
+    def run(self, store: Store) -> Result:
+        """Compute the constants."""
+        model, _, cone = reduced_model(store, self.enrichment)
+        classes: ConstraintClasses = value_of(store, self.constraints)
+        if model.kind is not Kind.PER_PARAMETER:
+            return Result(constants_on(model.fixed_basis, classes, cone))
+        mus = validation_parameters(model.problem, self.constraints.count, self.constraints.seed)
+        if model.enrichment.eta is None:
+            return Result([_constants_at(model, assemblies(model.problem).at(mu), cone) for mu in mus])
+        at_firsts = (assemblies(model.problem).at(mu) for mu in mus[classes.firsts])  # the others span the same space
+        return Result(everywhere(classes, [_constants_at(model, vi, cone) for vi in at_firsts]))
+
+
+def _constants_at(model: ReducedModel, vi: VariationalInequality, cone: Multipliers) -> InfSup:
+    images = model.images(vi, np.hstack([cone.span, cone.chi]))
+    return inf_sup(images[:, : cone.rank], images[:, cone.rank :], cone)

@@ -1,0 +1,75 @@
+"""Pictures of a few high-fidelity solutions of a problem."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from vibench.arrays import Array
+from vibench.errors import NumericalError
+from vibench.interfaces.problem import ParameterBox, Picture
+from vibench.stages.artefacts import Store
+from vibench.stages.base import Result, Stage, build_problem
+from vibench.stages.snapshots import gather, training
+from vibench.study.cells import Plugin
+
+CORNERS = (0.0, 0.5, 1.0)
+"""Where in the box of parameters solutions are looked at: its lower corner, its middle and its upper corner."""
+
+
+@dataclass(frozen=True)
+class PictureStage(Stage):
+    """Pictures of a few training solutions of a problem."""
+
+    problem: Plugin
+
+    def inputs(self) -> tuple[Stage, ...]:
+        """The training sweep."""
+        return training(self.problem)
+
+    def run(self, store: Store) -> Result:
+        """Titles and pictures, in the order of `CORNERS`; none of a problem that has no picture."""
+        problem, found = build_problem(self.problem), gather(store, self.inputs())
+        drawn = []
+        for k in _nearest(problem.parameters, found.mu):
+            picture = problem.picture(found.mu[k], found.u[:, k], found.lam[:, k])
+            if picture is not None:
+                drawn.append((_title(problem.parameters, found.mu[k]), _checked(picture)))
+        return Result(tuple(drawn))
+
+
+def _nearest(box: ParameterBox, mus: Array) -> list[int]:
+    """Training parameters (P×d) nearest to the corners and the middle of their box, each once."""
+    width = np.where(box.upper > box.lower, box.upper - box.lower, 1.0)
+    unit = (mus - box.lower) / width
+    return list(dict.fromkeys(int(np.argmin(np.linalg.norm(unit - corner, axis=1))) for corner in CORNERS))
+
+
+def _title(box: ParameterBox, mu: Array) -> str:
+    named = zip(box.names, mu, box.units, strict=True)
+    return ", ".join(f"{name} = {value:.3g}" + f" {unit}" * (unit not in ("", "1")) for name, value, unit in named)
+
+
+def _checked(picture: Picture) -> Picture:
+    """A picture whose arrays fit together.
+
+    Raises
+    ------
+    NumericalError
+        Naming the member that does not.
+    """
+    count, places = picture.points.shape[-1], picture.positions.shape[-1]
+    corners = picture.triangles
+    mesh = corners.shape[0] == 3 and bool(np.all((corners >= 0) & (corners < count)))
+    fits = {
+        "points": picture.points.ndim == 2 and len(picture.points) in (1, 2),
+        "triangles": len(picture.points) == 1 or mesh,
+        "values": picture.values.shape == (count,),
+        "positions": picture.positions.ndim == 2 and len(picture.positions) in (1, 2),
+        "multiplier": picture.multiplier.shape == (places,),
+    }
+    wrong = [name for name, right in fits.items() if not right]
+    if wrong:
+        raise NumericalError(f"the problem's picture has {' and '.join(wrong)} of the wrong shape")
+    return picture

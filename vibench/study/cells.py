@@ -1,0 +1,183 @@
+"""The matrix of a study: its cells, each with an identity that is the same whenever its numbers are."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass, replace
+from functools import cached_property
+from itertools import product
+from typing import Any
+
+from vibench.errors import RequestError
+from vibench.interfaces.strategies import Stop
+from vibench.provenance import core_code, solver_version
+from vibench.reduction.nested import NestedStrategy
+from vibench.study import registry
+from vibench.study.spec import Entry, Study, ToleranceTable
+
+
+def digest(content: Any) -> str:
+    """Short hash of anything JSON can hold, the same for equal content."""
+    text = json.dumps(content, sort_keys=True, separators=(",", ":"), ensure_ascii=True)
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+@dataclass(frozen=True)
+class Plugin:
+    """A plugin with its options, as an axis of a study names it.
+
+    Attributes
+    ----------
+    kind, name
+        What it is registered as.
+    options
+        Options as canonical JSON.
+    code
+        Distribution, version and a hash of the module it comes from.
+    """
+
+    kind: str
+    name: str
+    options: str
+    code: str
+
+    @classmethod
+    def from_entry(cls, kind: str, entry: Entry) -> Plugin:
+        """Plugin of an axis entry that has been checked."""
+        return cls(
+            kind,
+            entry.name,
+            registry.canonical_options(kind, entry.name, entry.options),
+            registry.code(kind, entry.name),
+        )
+
+    def create(self) -> Any:
+        """A new instance."""
+        return registry.create(self.kind, self.name, json.loads(self.options))
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One cell: problem × dual strategy × primal strategy × tolerances × QP solver × assembly.
+
+    `interpolation` is the tolerance of reduced assembly, `None` for assembly in full. `seed`, `validation` and
+    `accuracy` are the study's. Labels are for reading and no part of the identity; nor is `along`, the tolerances in
+    the study of a nested primal strategy, which are reached on one way.
+    """
+
+    problem: Plugin
+    dual: Plugin
+    primal: Plugin
+    pod: Stop
+    cone: Stop
+    primal_tol: float | None
+    solver: str
+    assembly: str
+    interpolation: float | None
+    warm_start: bool
+    seed: int
+    validation: int
+    accuracy: float
+    labels: tuple[str, str, str]
+    along: tuple[float, ...] = ()
+
+    @cached_property
+    def key(self) -> str:
+        """Hash of everything that determines the cell's numbers, the code aside."""
+        content = asdict(self)
+        del content["labels"], content["along"]
+        for plugin in ("problem", "dual", "primal"):
+            del content[plugin]["code"]
+        return digest(content)
+
+    @property
+    def definition(self) -> str:
+        """The cell as JSON, which `from_definition` reads."""
+        return json.dumps(asdict(self), sort_keys=True, ensure_ascii=False)
+
+    @classmethod
+    def from_definition(cls, text: str) -> Cell:
+        """The cell a definition describes, with its plugins as they are today.
+
+        Raises
+        ------
+        RequestError
+            If one of them is not installed any more.
+        """
+        content = json.loads(text)
+        for axis in ("problem", "dual", "primal"):
+            plugin = Plugin(**content[axis])
+            content[axis] = replace(plugin, code=registry.code(plugin.kind, plugin.name))
+        for axis in ("pod", "cone"):
+            content[axis] = Stop(**content[axis])
+        return cls(**content | {name: tuple(content[name]) for name in ("labels", "along")})
+
+    @property
+    def code(self) -> str:
+        """Hash of the code that computes the cell: the core, its plugins and its solver."""
+        plugins_used = [plugin.code for plugin in (self.problem, self.dual, self.primal)]
+        registered = self.solver in registry.names("QP solver")
+        solver = registry.code("QP solver", self.solver) if registered else solver_version(self.solver)
+        return digest([core_code(), *plugins_used, solver])
+
+    def __str__(self) -> str:
+        problem, dual, primal = self.labels
+        tolerance = "" if self.primal_tol is None else f" {self.primal_tol:g}"
+        sizes = f"{_stop(self.pod, 'N')}, {_stop(self.cone, 'R')}"
+        assembly = "" if self.assembly == "full" else f" · {self.assembly}"
+        return f"{problem} · {dual} · {primal}{tolerance} · {sizes} · {self.solver}{assembly}"
+
+
+def _stop(stop: Stop, size: str) -> str:
+    return f"{stop.tolerance:g}" if stop.tolerance is not None else f"{size}={stop.size}"
+
+
+def expand(study: Study) -> list[Cell]:
+    """All cells of a study, duplicates merged, in the order of its axes.
+
+    Raises
+    ------
+    RequestError
+        If there is none, or a strategy that takes a tolerance is given none.
+    """
+    cells: dict[str, Cell] = {}
+    for problem, table in product(study.problem, study.tolerances):
+        along = {entry.title: _along(entry, table) for entry in study.primal}
+        for dual, pod, cone, primal, tolerance in _combinations(study, table):
+            for assembly, solver in product(study.assembly, study.solver_names()):
+                cell = Cell(
+                    problem=Plugin.from_entry("problem", problem),
+                    dual=Plugin.from_entry("dual strategy", dual),
+                    primal=Plugin.from_entry("primal strategy", primal),
+                    pod=pod,
+                    cone=cone,
+                    primal_tol=tolerance,
+                    solver=solver,
+                    assembly=assembly,
+                    interpolation=study.interpolation if assembly == "reduced" else None,
+                    warm_start=study.warm_start,
+                    seed=study.seed,
+                    validation=study.validation,
+                    accuracy=study.accuracy,
+                    labels=(problem.title, dual.title, primal.title),
+                    along=along[primal.title],
+                )
+                cells.setdefault(cell.key, cell)
+    if not cells:
+        raise RequestError(f"study '{study.name}': the matrix is empty")
+    return list(cells.values())
+
+
+def _along(primal: Entry, table: ToleranceTable) -> tuple[float, ...]:
+    if not issubclass(registry.load("primal strategy", primal.name), NestedStrategy):
+        return ()
+    return tuple(sorted({value for value in table.of_primal(primal) if value is not None}, reverse=True))
+
+
+def _combinations(study: Study, table: ToleranceTable) -> Iterator[tuple[Entry, Stop, Stop, Entry, float | None]]:
+    pods = [Stop(tolerance=value) for value in table.pod or []] + [Stop(size=value) for value in table.N or []]
+    for pod, dual, primal in product(pods, study.dual, study.primal):
+        for cone, tolerance in product(table.of_dual(dual), table.of_primal(primal)):
+            yield dual, pod, cone, primal, tolerance

@@ -1,0 +1,216 @@
+"""Plugins found through entry points, created from options that their annotations check."""
+
+from __future__ import annotations
+
+import importlib
+import inspect
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cache
+from importlib.metadata import EntryPoint, entry_points
+from pathlib import Path
+from typing import Any, get_type_hints
+
+from pydantic import ConfigDict, TypeAdapter, ValidationError
+
+from vibench.errors import RequestError, in_a_line, unknown_name
+from vibench.interfaces.problem import Problem
+from vibench.interfaces.strategies import DualStrategy, PrimalStrategy
+from vibench.provenance import source_hash
+from vibench.qp.solution import QPSolver
+
+GROUPS: Mapping[str, str] = {
+    "problem": "vibench.problems",
+    "dual strategy": "vibench.dual_strategies",
+    "primal strategy": "vibench.primal_strategies",
+    "QP solver": "vibench.qp_solvers",
+    "study": "vibench.studies",
+}
+FINITE = ConfigDict(allow_inf_nan=False)
+"""No option of a plugin may be infinite or not a number."""
+
+BASES: Mapping[str, type] = {"problem": Problem, "dual strategy": DualStrategy, "primal strategy": PrimalStrategy}
+"""The abstract classes of plugins that are classes."""
+
+WORDS: Mapping[str, str] = {"problem": "problem", "primal": "primal strategy", "dual": "dual strategy"}
+"""These kinds as the command line calls them."""
+
+
+@dataclass(frozen=True)
+class Option:
+    """One option of a plugin: name, what is expected, default as text ("" when it must be given)."""
+
+    name: str
+    expected: str
+    default: str
+
+
+def names(kind: str) -> list[str]:
+    """Names registered for one kind of plugin, a key of `GROUPS`."""
+    return sorted(_registered(kind))
+
+
+def load(kind: str, name: str) -> Any:
+    """What a plugin's entry point refers to.
+
+    Raises
+    ------
+    RequestError
+        If no plugin has that name, it cannot be imported, or it is not of its kind.
+    """
+    registered = _registered(kind)
+    if name not in registered:
+        raise unknown_name(kind, name, registered)
+    where = f"{kind} '{name}' ({registered[name].value})"
+    try:
+        plugin = registered[name].load()
+    except (Exception, SystemExit) as error:  # noqa: BLE001  importing a plugin runs code of strangers
+        raise RequestError(f"{where} cannot be loaded: {in_a_line(error)}") from None
+    base = BASES.get(kind)
+    if base is not None and not (isinstance(plugin, type) and issubclass(plugin, base)):
+        raise RequestError(f"{where} is not a subclass of {base.__qualname__}")
+    if kind == "QP solver" and not callable(plugin):
+        raise RequestError(f"{where} is not callable")
+    if kind == "study" and not isinstance(plugin, str | Path):
+        raise RequestError(f"{where} is not the path of a study file")
+    return plugin
+
+
+def create(kind: str, name: str, options: Mapping[str, Any]) -> Any:
+    """Instance of a plugin, its options checked."""
+    return load(kind, name)(**check_options(kind, name, options))
+
+
+def version(kind: str, name: str) -> str:
+    """Distribution and version a plugin comes from, "vibench 0.1.0"."""
+    found = _registered(kind)[name].dist
+    return f"{found.name} {found.version}" if found is not None else "unknown"
+
+
+@cache
+def code(kind: str, name: str) -> str:
+    """Version of a plugin with a hash of its package, or of its one module: edited code is not taken for the old.
+
+    Of a package the outermost one that has an `__init__.py` counts, with all that is below it.
+
+    Raises
+    ------
+    RequestError
+        If no plugin has that name.
+    """
+    registered = _registered(kind)
+    if name not in registered:
+        raise unknown_name(kind, name, registered)
+    module = importlib.import_module(registered[name].module)
+    source = Path(str(module.__file__))
+    while (source.parent / "__init__.py").is_file():
+        source = source.parent
+    return f"{version(kind, name)} {source_hash(source)}"
+
+
+def options(kind: str, name: str) -> list[Option]:
+    """The options of a plugin, read from its constructor."""
+    found = []
+    for parameter, annotation in _parameters(load(kind, name)):
+        default = "" if parameter.default is inspect.Parameter.empty else repr(parameter.default)
+        found.append(Option(parameter.name, _expected(annotation), default))
+    return found
+
+
+def check_options(kind: str, name: str, given: Mapping[str, Any]) -> dict[str, Any]:
+    """Options as the annotations of the plugin's constructor ask for them.
+
+    Raises
+    ------
+    RequestError
+        Naming the option, what was given and what is expected.
+    """
+    return checked_arguments(load(kind, name), f"{kind} '{name}'", given)
+
+
+def checked_arguments(plugin: type, what: str, given: Mapping[str, Any]) -> dict[str, Any]:
+    """Options as the annotations of a class ask for them, registered or not; `what` it is called in messages.
+
+    Raises
+    ------
+    RequestError
+        Naming the option, what was given and what is expected.
+    """
+    known = {parameter.name: (parameter, annotation) for parameter, annotation in _parameters(plugin)}
+    for option in given:
+        if option not in known:
+            raise unknown_name(f"option of {what}", option, known)
+    checked = {}
+    for option, (parameter, annotation) in known.items():
+        if option not in given:
+            if parameter.default is inspect.Parameter.empty:
+                raise RequestError(f"{what} needs the option '{option}' ({_expected(annotation)})")
+            continue
+        try:
+            text = json.dumps(given[option], default=str)
+            checked[option] = TypeAdapter(annotation, config=FINITE).validate_json(text, strict=True)
+        except ValidationError:
+            raise RequestError(
+                f"option '{option}' of {what} is {given[option]!r}; expected {_expected(annotation)}"
+            ) from None
+    return checked
+
+
+def canonical_options(kind: str, name: str, given: Mapping[str, Any]) -> str:
+    """Options as JSON, the same for equal ones: those that say what is the default anyway are left out."""
+    defaults = {parameter.name: parameter.default for parameter, _ in _parameters(load(kind, name))}
+    adapter = TypeAdapter(dict[str, Any])
+    checked = check_options(kind, name, given)
+    kept = {option: value for option, value in checked.items() if value != defaults[option]}
+    return json.dumps(adapter.dump_python(kept, mode="json"), sort_keys=True)
+
+
+def qp_solver(name: str) -> dict[str, QPSolver]:
+    """The solver registered under this name by a plugin, keyed by it; nothing where qpsolvers has it."""
+    return {name: load("QP solver", name)} if name in names("QP solver") else {}
+
+
+def study_path(name: str) -> Path:
+    """File of a registered study."""
+    return Path(load("study", name))
+
+
+@cache
+def _registered(kind: str) -> dict[str, EntryPoint]:
+    found: dict[str, EntryPoint] = {}
+    for entry in entry_points(group=GROUPS[kind]):
+        other = found.get(entry.name)
+        if other is not None and other.value != entry.value:
+            raise RequestError(f"two packages register the {kind} '{entry.name}': {other.value} and {entry.value}")
+        found[entry.name] = entry
+    return found
+
+
+def _parameters(plugin: Any) -> list[tuple[inspect.Parameter, Any]]:
+    constructor = inspect.getattr_static(plugin, "__init__")
+    if constructor is object.__init__:
+        return []
+    hints = get_type_hints(constructor, include_extras=True)
+    parameters = list(inspect.signature(constructor).parameters.values())[1:]  # without self
+    named = [p for p in parameters if p.kind not in (p.VAR_POSITIONAL, p.VAR_KEYWORD)]
+    return [(p, hints.get(p.name, Any)) for p in named]
+
+
+def _expected(annotation: Any) -> str:
+    """An annotation in words: "float > 0.0", "'coarse', 'fine' or int ≥ 150"."""
+    schema = TypeAdapter(annotation).json_schema()
+    return " or ".join(_words(part) for part in schema.get("anyOf", [schema]))
+
+
+def _words(schema: Mapping[str, Any]) -> str:
+    if "enum" in schema:
+        return ", ".join(repr(value) for value in schema["enum"])
+    if "const" in schema:
+        return repr(schema["const"])
+    kind = {"integer": "int", "number": "float", "string": "str", "boolean": "bool", "array": "list"}.get(
+        str(schema.get("type", "")), str(schema.get("type", "any value"))
+    )
+    signs = {"exclusiveMinimum": ">", "minimum": "≥", "exclusiveMaximum": "<", "maximum": "≤"}
+    bounds = [f"{sign} {schema[key]:g}" for key, sign in signs.items() if key in schema]
+    return " ".join([kind, " and ".join(bounds)]).strip()
