@@ -57,8 +57,8 @@ FAULTS = (
     Fault(
         "generators-not-normalised",
         "vibench/reduction/cones.py",
-        "np.column_stack([generators, direction / length])",
-        "np.column_stack([generators, direction])",
+        "np.column_stack([self.generators, direction / length])",
+        "np.column_stack([self.generators, direction])",
         ("tests/unit/reduction/test_cones.py",),
     ),
     Fault(
@@ -70,8 +70,8 @@ FAULTS = (
     ),
     Fault(
         "coefficientwise-constraint-dropped",
-        "vibench/reduction/removal.py",
-        "B=np.vstack([-np.eye(count), usable[support]]),\n        g=np.concatenate([np.zeros(count), theta[support]]),",
+        "strategies/vibench_strategies/mcpg.py",
+        "B=np.vstack([-np.eye(count), generators[support]]),\n        g=np.concatenate([np.zeros(count), theta[support]]),",
         "B=-np.eye(count),\n        g=np.zeros(count),",
         ("tests/mathematics/strategies",),
     ),
@@ -98,7 +98,7 @@ FAULTS = (
     ),
     Fault(
         "sigma-not-updated",
-        "vibench/reduction/supremizer_spaces.py",
+        "strategies/vibench_strategies/offline_pga.py",
         "self._gram = self._gram - rows.T @ rows",
         "self._gram = self._gram",
         ("tests/mathematics/strategies",),
@@ -197,8 +197,8 @@ FAULTS = (
     Fault(
         "validated-on-the-training-set",
         "vibench/stages/snapshots.py",
-        'training_parameters(problem) if self.purpose == "training" else self._validation(problem)',
-        "training_parameters(problem)",
+        "return validation_parameters(problem, self.count, self.seed)",
+        "return training_parameters(problem)",
         ("tests/unit/stages/test_offline.py",),
     ),
     Fault(
@@ -337,7 +337,7 @@ FAULTS = (
     Fault(
         "separation-not-paid-for",
         "vibench/stages/cell_queries.py",
-        '"assembly": () if reduction is None else (reduction.separation, reduction),',
+        '"assembly": () if reduction is None else (reduction.decomposition, reduction),',
         '"assembly": () if reduction is None else (reduction,),',
         ("tests/unit/stages/test_assembly.py",),
     ),

@@ -32,7 +32,7 @@ from vibench.qp.settings import SETTINGS
 from vibench.qp.solve import installed_solvers
 from vibench.qp.status import Status
 from vibench.stages.artefacts import CACHE_VARIABLE, LOCK, Store, default_folder
-from vibench.stages.cell_queries import DISTURBED
+from vibench.stages.cell_summary import DISTURBED
 from vibench.study import registry
 from vibench.study.reader import load_study
 from vibench.timing import Calibration, Stopwatch

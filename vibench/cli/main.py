@@ -14,7 +14,7 @@ from vibench import provenance
 from vibench.cli import completion, plugin_commands
 from vibench.cli.console import new_console, print_frame
 from vibench.cli.doctor import doctor
-from vibench.cli.progress import Report
+from vibench.cli.progress import ProgressDisplay
 from vibench.cli.result_commands import Form, RunArgument, compare_runs, write_report
 from vibench.errors import RequestError, VibenchError, unknown_name
 from vibench.execution.recorded_cell import recorded_cell
@@ -95,8 +95,8 @@ def run(
         raise RequestError(f"--scheduler {scheduler} is for --executor dask")
     folder = out or Path("runs") / loaded.name
     options = Options(jobs or provenance.cores(), fresh, retry, executor, scheduler)
-    with Report(console) as report:
-        outcome = run_study(loaded, folder, report, options)
+    with ProgressDisplay(console) as progress:
+        outcome = run_study(loaded, folder, progress, options)
     path = tables.results_file(str(folder))
     tables.export(path, folder / "tables")
     if outcome.interrupted:

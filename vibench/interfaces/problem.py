@@ -139,6 +139,8 @@ class Problem(ABC):
     """Members of `VariationalInequality`, "A", "f", "B" or "g", that do not depend on mu and are factorised once."""
     entrywise: ClassVar[frozenset[str]] = frozenset()
     """Members that `sampler` evaluates entry by entry."""
+    requires: ClassVar[tuple[str, ...]] = ()
+    """Optional distributions it cannot do without; where one is not installed its cells are unavailable."""
 
     @abstractmethod
     def training_set(self) -> Array:

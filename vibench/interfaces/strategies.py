@@ -82,6 +82,9 @@ class Cone:
 class DualStrategy(ABC):
     """Turns multiplier snapshots into a reduced cone. Constructor arguments are the plugin's options."""
 
+    requires: ClassVar[tuple[str, ...]] = ()
+    """Optional distributions it cannot do without; where one is not installed its cells are unavailable."""
+
     @abstractmethod
     def reduce(self, snapshots: Array, W: InnerProduct, stop: Stop) -> Cone:
         """Cone for snapshots λ(mu_p) (m×P, coefficientwise nonnegative), relative projection error as `stop` says."""
@@ -162,6 +165,8 @@ class Enrichment:
 class PrimalStrategy(ABC):
     """Enriches the primal basis. Constructor arguments are the plugin's options."""
 
+    requires: ClassVar[tuple[str, ...]] = ()
+    """Optional distributions it cannot do without; where one is not installed its cells are unavailable."""
     takes_tolerance: ClassVar[bool] = False
     """Whether a study gives this strategy a tolerance axis."""
     larger_is_tighter: bool = False

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,13 +12,10 @@ from vibench.errors import NumericalError
 from vibench.interfaces.strategies import Cone, Stop, no_free, rays
 from vibench.linalg.cholesky import SparseCholesky
 from vibench.linalg.inner_product import InnerProduct
-from vibench.reduction.lazy_greedy import LazyMaximum
+from vibench.reduction.lazy_greedy import TIE, LazyMaximum
 
 REPRODUCED = 1e-12
 """Relative distances below this are round-off."""
-
-Subtract = Callable[[Array, Array], tuple[Array, str]]
-"""From a snapshot θ (m,) and the generators so far (m×r): the part Υ ∈ K_r of θ to leave out, and a fallback note."""
 
 
 @dataclass(frozen=True)
@@ -67,17 +63,11 @@ def _project_whitened(generators: Array, theta: Array) -> Projection:
     return Projection(np.asarray(coefficients), float(distance))
 
 
-def nothing(theta: Array, _: Array) -> tuple[Array, str]:
-    """Leave nothing of a snapshot θ (m,) out."""
-    return np.zeros_like(theta), ""
+class GrowingCone:
+    """A cone that grows by one generator at a time, and the snapshot that is farthest from it.
 
-
-def greedy_cone(snapshots: Array, W: InnerProduct, stop: Stop, subtract: Subtract = nothing) -> Cone:
-    """Greedy cone with the relative maximum criterion (paper, Algorithm 2 and Remark 4.3).
-
-    Each step takes the snapshot farthest from the present cone and adds the direction of what `subtract` leaves of
-    it. Cones are nested, so distances only fall and the maximum is taken lazily. It ends before `stop` where all
-    snapshots are reproduced to round-off (Remark 4.2).
+    Greedy algorithms with the relative maximum criterion (paper, equations (13) and (34)) are a loop over `farthest`
+    and `add`. Cones are nested, so distances only fall and the maximum is taken lazily.
 
     Parameters
     ----------
@@ -85,42 +75,79 @@ def greedy_cone(snapshots: Array, W: InnerProduct, stop: Stop, subtract: Subtrac
         θ_q (m×Q), coefficientwise nonnegative.
     W
         Inner product of the multiplier space.
-    stop
-        Relative largest projection error, or number of generators.
-    subtract
-        What to leave out of the chosen snapshot: nothing (Remark 4.3), or what line 9 of Algorithm 2 says.
+
+    Attributes
+    ----------
+    generators
+        Generators so far (m×r), unit norm.
+    farthest
+        Index of the snapshot farthest from the cone.
+    error
+        Its distance, relative to the largest norm of a snapshot.
 
     Raises
     ------
     NumericalError
         If a snapshot has a negative coefficient: it would not be in W⁺.
     """
-    refuse_negative(snapshots)
-    whitened = W.whiten(snapshots)
-    norms = np.linalg.norm(whitened, axis=0)
-    largest = float(norms.max(initial=0.0))
-    if largest == 0.0:
-        return Cone(np.zeros((W.dim, 0)), np.zeros(1), no_free(0))
-    distances = LazyDistances(whitened)
-    generators = np.zeros((W.dim, 0))
-    pick, error = int(np.argmax(norms >= norms.max() * (1.0 - 1e-9))), 1.0
-    errors, fallbacks = [error], []
-    while not stop.reached(generators.shape[1], error) and error > REPRODUCED:
-        part, note = subtract(snapshots[:, pick], generators)
+
+    def __init__(self, snapshots: Array, W: InnerProduct) -> None:
+        refuse_negative(snapshots)
+        whitened = W.whiten(snapshots)
+        self._W, self._norms = W, np.linalg.norm(whitened, axis=0)
+        self.generators = np.zeros((W.dim, 0))
+        largest = float(self._norms.max(initial=0.0))
+        self.error = 1.0 if largest else 0.0
+        self._errors, self._fallbacks = [self.error], list[str]()
+        if largest:
+            self.farthest = int(np.argmax(self._norms >= largest * (1.0 - TIE)))
+            self._distances = LazyDistances(whitened)
+
+    def reached(self, stop: Stop) -> bool:
+        """Whether the cone is large enough, or reproduces all snapshots to round-off."""
+        return stop.reached(self.generators.shape[1], self.error) or self.error <= REPRODUCED
+
+    def add(self, direction: Array, note: str = "") -> bool:
+        """Add the generator of a direction (m,), part of `farthest`; `False` where that is nothing but round-off.
+
+        `note` says what of the algorithm could not be done as it says.
+        """
         if note:
-            fallbacks.append(f"generator {generators.shape[1] + 1}: {note}")
-        direction = snapshots[:, pick] - part
-        length = float(W.norm(direction))
-        if length <= REPRODUCED * norms[pick]:
+            self._fallbacks.append(f"generator {self.generators.shape[1] + 1}: {note}")
+        length = float(self._W.norm(direction))
+        if length <= REPRODUCED * self._norms[self.farthest]:
+            return False
+        self.generators = np.column_stack([self.generators, direction / length])
+        self._distances.widen(self._W.whiten(self.generators), self.farthest)
+        if self.generators.shape[1] == len(self._norms):  # every snapshot has been taken
+            self.error = 0.0
+        else:
+            self.farthest, self.error = self._distances.next()
+        self._errors.append(self.error)
+        return True
+
+    def result(self) -> Cone:
+        """The cone, with its error for every number of generators."""
+        count = self.generators.shape[1]
+        return Cone(self.generators, np.array(self._errors), no_free(count), tuple(self._fallbacks))
+
+
+def greedy_cone(snapshots: Array, W: InnerProduct, stop: Stop) -> Cone:
+    """Cone of snapshots (m×Q) chosen greedily: CPG (paper, Remark 4.3, and Benaceur, Ern and Ehrlacher 2020).
+
+    Each step adds the snapshot farthest from the present cone, normalised. It ends before `stop` where all snapshots
+    are reproduced to round-off (Remark 4.2).
+
+    Raises
+    ------
+    NumericalError
+        If a snapshot has a negative coefficient: it would not be in W⁺.
+    """
+    cone = GrowingCone(snapshots, W)
+    while not cone.reached(stop):
+        if not cone.add(snapshots[:, cone.farthest]):
             break
-        generators = np.column_stack([generators, direction / length])
-        distances.widen(W.whiten(generators), pick)
-        if generators.shape[1] == snapshots.shape[1]:
-            errors.append(0.0)
-            break
-        pick, error = distances.next()
-        errors.append(error)
-    return Cone(generators, np.array(errors), no_free(generators.shape[1]), tuple(fallbacks))
+    return cone.result()
 
 
 def refuse_negative(snapshots: Array) -> None:

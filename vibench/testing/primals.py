@@ -232,7 +232,7 @@ class _Case:
                     f"the vectors of tolerance {tolerance:g} are not the beginning of those of "
                     f"{self._tolerances[-1]:g}: {what}"
                 )
-            if what := difference(grown.at(tolerance)[0].vectors, found.vectors, limit):
+            if what := difference(grown.at(grown.milestone(tolerance)).vectors, found.vectors, limit):
                 yield f"the vectors of tolerance {tolerance:g} are others when all are grown at once: {what}"
 
     def no_mutation(self) -> Iterator[str]:

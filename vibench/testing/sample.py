@@ -74,7 +74,7 @@ def sample_offline(modes: int = MODES, generators: int = GENERATORS) -> Offline:
     """
     problem = MovingSupport()
     u, lam = _solutions(problem)
-    cone = greedy_cone(lam, problem.W, Stop(size=generators), lambda theta, _: (np.zeros_like(theta), ""))
+    cone = greedy_cone(lam, problem.W, Stop(size=generators))
     return offline_of(problem, pod(u, problem.V, Stop(size=modes)).basis, cone)
 
 
