@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib.metadata
 import platform
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -99,24 +99,23 @@ PACKAGE = Path(str(vibench.__file__)).parent
 
 
 @pytest.fixture
-def edited(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Path]:
-    """Function that gives a copy of a module of the core with another line, in place of the core; `core_code` sees it."""
+def edited(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[str], None]]:
+    """Function that adds a line to a module of a copy of the core, which `core_code` takes for the core."""
     copy = tmp_path / "vibench"
     shutil.copytree(PACKAGE, copy, ignore=shutil.ignore_patterns("__pycache__"))
     monkeypatch.setattr(provenance, "__file__", str(copy / "provenance.py"))
 
-    def edit(module: str) -> Path:
+    def edit(module: str) -> None:
         with (copy / module).open("a", encoding="utf-8") as source:
             source.write("\n# another line\n")
         core_code.cache_clear()
-        return copy
 
     core_code.cache_clear()
     yield edit
     core_code.cache_clear()
 
 
-def test_the_code_of_the_core_is_its_version_and_a_hash_of_what_is_asked_for(edited: Callable[..., Path]) -> None:
+def test_the_code_of_the_core_is_its_version_and_a_hash_of_what_is_asked_for(edited: Callable[[str], None]) -> None:
     before = {parts: core_code(*parts) for parts in ((), ("linalg",), ("timing.py", "linalg"), NUMERICAL)}
     assert {code.partition(" ")[0] for code in before.values()} == {importlib.metadata.version("vibench")}
     assert len(set(before.values())) == len(before)
@@ -124,7 +123,7 @@ def test_the_code_of_the_core_is_its_version_and_a_hash_of_what_is_asked_for(edi
     assert all(core_code(*parts) != code for parts, code in before.items())
 
 
-def test_numbers_depend_on_the_rooms_that_compute_them_and_on_no_other(edited: Callable[..., Path]) -> None:
+def test_numbers_depend_on_the_rooms_that_compute_them_and_on_no_other(edited: Callable[[str], None]) -> None:
     before = core_code(*NUMERICAL)
     rooms = {path.name for path in PACKAGE.iterdir() if path.suffix == ".py" or (path / "__init__.py").is_file()}
     others = rooms - set(NUMERICAL)
