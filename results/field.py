@@ -249,7 +249,7 @@ def main(run: Path, folder: Path) -> None:
         for name, draw in drawn.items():
             for file in save(draw(), folder, name, ("png",)):
                 use_palette(file)
-    text = [f"# The whole field\n\n{made(field)}"]
+    text = [f"# Comparison of strategies\n\n{made(field)}"]
     text += [f"![{name}]({name}.png)" for name in drawn]
     for title, (said, table) in SECTIONS.items():
         found = table(field)
