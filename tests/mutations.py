@@ -71,7 +71,8 @@ FAULTS = (
     Fault(
         "coefficientwise-constraint-dropped",
         "strategies/vibench_strategies/mcpg.py",
-        "B=np.vstack([-np.eye(count), generators[support]]),\n        g=np.concatenate([np.zeros(count), theta[support]]),",
+        "B=np.vstack([-np.eye(count), generators[support]]),\n"
+        "        g=np.concatenate([np.zeros(count), theta[support]]),",
         "B=-np.eye(count),\n        g=np.zeros(count),",
         ("tests/mathematics/strategies",),
     ),

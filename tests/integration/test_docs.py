@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import importlib.util
+import pkgutil
 import re
 import sys
 import tomllib
@@ -26,7 +27,9 @@ from vibench.study.reader import load_study
 from vibench.study.registry import GROUPS
 from vibench.study.spec import Entry, Limits, Study, ToleranceTable
 
-DOCS = Path(__file__).parents[2] / "docs"
+ROOT = Path(__file__).parents[2]
+DOCS = ROOT / "docs"
+RESULTS = [ROOT / "README.md", *sorted((ROOT / "results").rglob("*.md"))]
 PAGES = sorted(DOCS.rglob("*.md"))
 EXTEND = sorted((DOCS / "extend").glob("*.md"))
 
@@ -204,6 +207,19 @@ def test_a_rule_of_the_reference_is_a_rule(change: str, refused: str, tmp_path: 
 
 def test_there_are_rules() -> None:
     assert len(RULES) >= 5
+
+
+MODULE = re.compile(r"\b(?:problems/|strategies/)?vibench(?:_problems|_strategies)?/[\w/]+\.py\b")
+NAME = re.compile(r"`vibench\.(\w+(?:\.\w+)*)`")
+
+
+@pytest.mark.parametrize("page", [*PAGES, *RESULTS], ids=lambda page: str(page.relative_to(ROOT)))
+def test_every_module_and_name_on_a_page_exists(page: Path) -> None:
+    text = page.read_text(encoding="utf-8")
+    assert [path for path in MODULE.findall(text) if not (ROOT / path).is_file()] == []
+    groups = {group.removeprefix("vibench.") for group in GROUPS.values()}
+    for name in set(NAME.findall(text)) - groups:
+        assert pkgutil.resolve_name(f"vibench.{name}") is not None
 
 
 COMMAND = re.compile(r"^\s*(?:\.venv/bin/)?vibench ([a-z-]+)(.*)$", re.MULTILINE)
