@@ -20,7 +20,7 @@ from vibench.reduction.supremizers import (
     projected_supremizers,
     supremizer_images,
 )
-from vibench.stability.growth import Images
+from vibench.stability.growth import ProjectedSupremizers
 from vibench.stability.infsup import Multipliers, beta_span, multipliers
 from vibench.stages.artefacts import History, Store
 from vibench.stages.base import Result, Stage, build_problem, value_of
@@ -228,10 +228,10 @@ def _offline(store: Store, pod: PODStage, cone: ConeStage) -> Offline:
     return Offline(problem, basis, reduced.cone, reduced.prepared.span, training_parameters(problem))
 
 
-def _images(offline: Offline, vectors: Array, classes: ConstraintClasses) -> Images:
+def _images(offline: Offline, vectors: Array, classes: ConstraintClasses) -> ProjectedSupremizers:
     """ZᵀBᵀη of V_N and vectors (n×S) for every class of the training set, η orthonormal in span χ."""
     Z = np.hstack([offline.basis, vectors])
-    return Images([projected_supremizers(Z, B, offline.span) for B in classes.representatives], classes)
+    return ProjectedSupremizers([projected_supremizers(Z, B, offline.span) for B in classes.representatives], classes)
 
 
 def enrichment_of(store: Store, stage: EnrichmentStage) -> Enrichment:
