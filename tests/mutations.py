@@ -183,8 +183,8 @@ FAULTS = (
     Fault(
         "bound-without-the-mismatch",
         "vibench/model/error_bounds.py",
-        "(size * residual / beta + mismatch) / alpha",
-        "(size * residual / beta) / alpha",
+        "(penetration_norm * residual / beta + complementarity) / alpha",
+        "(penetration_norm * residual / beta) / alpha",
         ("tests/unit/model/test_error_bounds.py",),
     ),
     Fault(
@@ -204,8 +204,8 @@ FAULTS = (
     Fault(
         "active-set-without-release",
         "vibench/highfidelity/active_set.py",
-        "kept = active & (lam > 1e-14 * scale)",
-        "kept = active",
+        "in_contact = active & (lam > 1e-14 * scale)",
+        "in_contact = active",
         ("tests/unit/highfidelity/test_active_set.py",),
     ),
     Fault(
@@ -295,7 +295,7 @@ FAULTS = (
     Fault(
         "condensed-load-without-the-interface",
         "vibench/linalg/schur_complement.py",
-        "condensed[interface] += self._schur @ free[self._eliminated :]",
+        "condensed[interface] += self._interface_schur @ particular[self._eliminated :]",
         "pass",
         ("tests/unit/linalg/test_schur_complement.py",),
     ),
@@ -309,8 +309,8 @@ FAULTS = (
     Fault(
         "forces-where-contact-has-ended",
         "vibench/highfidelity/kkt_systems.py",
-        "given = np.concatenate([self._g[come], np.zeros(len(gone))])",
-        "given = np.concatenate([self._g[come], np.ones(len(gone))])",
+        "values = np.concatenate([self._g[added], np.zeros(len(removed))])",
+        "values = np.concatenate([self._g[added], np.ones(len(removed))])",
         ("tests/unit/highfidelity/test_kkt_systems.py",),
     ),
     Fault(

@@ -160,7 +160,7 @@ class ContactCoordinates:
 
     def __init__(self, V: InnerProduct, basis: Array, dofs: Indices) -> None:
         self._factor, self._tail = contact_factor(V, dofs)
-        whitened = self._factor.up(basis)
+        whitened = self._factor.apply_factor(basis)
         split = V.dim - len(dofs)
         self._others, r = np.linalg.qr(whitened[:split])
         self.plain: Array = np.vstack([r, whitened[split:]])
@@ -179,7 +179,7 @@ class ContactCoordinates:
     @cached_property
     def _off_contact(self) -> Array:
         """Vectors (n×N) whose coordinates are the first N unit vectors; they are zero on E."""
-        return self._factor.up_inverse(np.vstack([self._others, np.zeros((len(self._tail), self._others.shape[1]))]))
+        return self._factor.solve_factor(np.vstack([self._others, np.zeros((len(self._tail), self._others.shape[1]))]))
 
 
 def contact_factor(V: InnerProduct, dofs: Indices) -> tuple[SparseCholesky, Array]:
@@ -194,7 +194,7 @@ def contact_factor(V: InnerProduct, dofs: Indices) -> tuple[SparseCholesky, Arra
 def _contact_factor(V: InnerProduct, dofs: bytes) -> tuple[SparseCholesky, Array]:
     last = np.frombuffer(dofs, np.intp)
     factor = SparseCholesky(V.matrix, "X_V", elimination_order(V.matrix, last), len(last))
-    return factor, factor.tail(len(last))
+    return factor, factor.trailing_factor(len(last))
 
 
 Coordinates = SpannedCoordinates | ContactCoordinates

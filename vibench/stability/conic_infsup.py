@@ -1,4 +1,4 @@
-"""The inf-sup constant over a cone as a certified interval: cheap bounds first, a semidefinite program for what is left.
+"""The inf-sup constant over a cone as a certified interval: cheap bounds first, then a semidefinite program.
 
 With C the projected supremizers of the generators, M = CᵀC and G the Gram matrix of the generators, the constant is
 min ‖Cα‖ / √(αᵀGα) over α ≥ 0. Lower bounds: L0, the constant over the span; L1, min_i yᵀc_i with y = Cα*/‖Cα*‖ and α*

@@ -12,9 +12,7 @@ from vibench.stability.infsup import beta_span
 
 
 @given(st.integers(0, 10_000), st.integers(0, 3), st.integers(1, 4), st.sampled_from([0.0, 1e-7, 1e-3, 1.0]))
-def test_steps_are_the_smallest_constants_of_every_leading_part(
-    seed: int, first: int, count: int, small: float
-) -> None:
+def test_steps_are_the_smallest_constants_of_leading_parts(seed: int, first: int, count: int, small: float) -> None:
     """Columns that nearly coincide would lose digits in Gram matrices."""
     rng = np.random.default_rng(seed)
     one, other = sp.csr_array(rng.standard_normal((3, 5))), sp.csr_array(rng.standard_normal((3, 5)))
