@@ -323,8 +323,8 @@ FAULTS = (
     Fault(
         "bound-of-a-distance-too-small",
         "vibench/reduction/cones.py",
-        "self.maximum.bound(np.linalg.norm(self._snapshots - generators @ self._points, axis=0) / self._largest)",
-        "self.maximum.bound(0.9 * np.linalg.norm(self._snapshots - generators @ self._points, axis=0) / self._largest)",
+        "np.linalg.norm(self._snapshots - generators @ self._coefficients, axis=0) / self._largest)",
+        "0.9 * np.linalg.norm(self._snapshots - generators @ self._coefficients, axis=0) / self._largest)",
         ("tests/unit/reduction/test_cones.py",),
     ),
     Fault(
