@@ -33,7 +33,7 @@ from vibench.highfidelity.active_set import HighFidelitySolver
 from vibench.interfaces.strategies import Offline, Stop
 from vibench.model.affine import affine_decomposition
 from vibench.model.galerkin import ReducedModel
-from vibench.model.hyperreduced import OnlineModel, project_members
+from vibench.model.hyperreduced import HyperReducedModel, hyper_reduce
 from vibench.qp.solve import solve_qp
 from vibench.reduction.pod import pod
 from vibench.report.figures.style import STYLE
@@ -96,9 +96,9 @@ def measure(name: str, nodes: int | str, R: int, delta: float, N: int) -> Iterat
     members, found = row("affine decomposition", lambda: affine_decomposition(problem, training, 1e-6))
     yield found
     model = ReducedModel(problem, basis, enrichment, cone.generators, span)
-    operators, found = row("reduction", lambda: project_members(model, members))
+    operators, found = row("reduction", lambda: hyper_reduce(model, members))
     yield found
-    online = OnlineModel(model, operators)
+    online = HyperReducedModel(model, operators)
     for mu in problem.validation_set(QUERIES, SEED):
         reduced = online.assemble(mu)
         for stage, reduced_model in (("query, full", model), ("query, reduced", online)):

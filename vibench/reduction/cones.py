@@ -1,4 +1,4 @@
-"""Projection on polyhedral cones and the greedy construction of cones (paper, §4)."""
+"""Projection on polyhedral cones, and the cone-projected greedy algorithms CPG and mCPG (paper, §4)."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from vibench.linalg.inner_product import InnerProduct
 from vibench.reduction.lazy_greedy import TIE, LazyMaximum
 
 REPRODUCED = 1e-12
-"""Relative distances below this are round-off."""
+"""A snapshot whose relative distance from the cone is below this is reproduced up to round-off."""
 
 
 @dataclass(frozen=True)
@@ -34,21 +34,21 @@ def project_on_cone(generators: Array, theta: Array, W: InnerProduct) -> Project
 def project_on_orthant(functional: Array, W: InnerProduct) -> Array:
     """Projection (m,) on W⁺, nonnegative coefficients, of the Riesz representer of a functional (m,) in the W norm.
 
-    X_W π − s ≥ 0 and π ≥ 0 are complementary: an active set method, which starts where s is positive and keeps what is
-    not negative; should its sets repeat themselves, a nonnegative least squares solver takes over.
+    X_W π − s ≥ 0 and π ≥ 0 are complementary. An active set method starts from the support of the positive part of s;
+    where its sets cycle, nonnegative least squares replaces it.
     """
     free, seen = functional > 0.0, set[bytes]()
     while free.tobytes() not in seen:
         seen.add(free.tobytes())
-        inside = np.flatnonzero(free)
-        found = np.zeros(W.dim)
-        if len(inside):
-            block = W.matrix[inside][:, inside]
-            found[inside] = SparseCholesky(block, "a block of X_W").solve(functional[inside])
-        rest = functional - W.apply(found)
-        following = np.where(free, found > 0.0, rest > 1e-14 * np.max(np.abs(functional), initial=0.0))
+        support = np.flatnonzero(free)
+        projection = np.zeros(W.dim)
+        if len(support):
+            block = W.matrix[support][:, support]
+            projection[support] = SparseCholesky(block, "a block of X_W").solve(functional[support])
+        residual = functional - W.apply(projection)
+        following = np.where(free, projection > 0.0, residual > 1e-14 * np.max(np.abs(functional), initial=0.0))
         if np.array_equal(following, free):
-            return found
+            return projection
         free = following
     return project_on_cone(np.eye(W.dim), W.riesz(functional), W).coefficients
 
@@ -100,6 +100,7 @@ class GrowingCone:
         self.error = 1.0 if largest else 0.0
         self._errors, self._fallbacks = [self.error], list[str]()
         if largest:
+            # Ties, as of mirrored snapshots, go to the smallest index, as in `LazyMaximum`.
             self.farthest = int(np.argmax(self._norms >= largest * (1.0 - TIE)))
             self._distances = LazyDistances(whitened)
 
@@ -116,9 +117,9 @@ class GrowingCone:
             self._fallbacks.append(f"generator {self.generators.shape[1] + 1}: {note}")
         length = float(self._W.norm(direction))
         if length <= REPRODUCED * self._norms[self.farthest]:
-            return False
+            return False  # normalised, it would be an arbitrary generator
         self.generators = np.column_stack([self.generators, direction / length])
-        self._distances.widen(self._W.whiten(self.generators), self.farthest)
+        self._distances.widen(self._W.whiten(self.generators), self.farthest)  # which is in the cone now (Remark 4.1)
         if self.generators.shape[1] == len(self._norms):  # every snapshot has been taken
             self.error = 0.0
         else:
@@ -151,7 +152,7 @@ def greedy_cone(snapshots: Array, W: InnerProduct, stop: Stop) -> Cone:
 
 
 def refuse_negative(snapshots: Array) -> None:
-    """Refuse snapshots (m×Q) outside W⁺.
+    """Refuse snapshots (m×Q) that are not in W⁺.
 
     Raises
     ------
@@ -178,7 +179,7 @@ def normalised(snapshots: Array, W: InnerProduct) -> Array:
 def projection_errors(generators: Array, snapshots: Array, W: InnerProduct) -> Array:
     """e(r) for r = 0 … R: the largest distance of a snapshot from the cone of the first r generators.
 
-    Relative to the largest norm of a snapshot, as in equations (13) and (34); for cones that no greedy algorithm made.
+    Relative to the largest norm of a snapshot, as in equations (13) and (34), for any cone.
 
     Parameters
     ----------
@@ -202,9 +203,9 @@ def projection_errors(generators: Array, snapshots: Array, W: InnerProduct) -> A
 class LazyDistances:
     """Largest distance of snapshots from a growing cone, relative to the largest norm, with few projections.
 
-    Any point of the cone bounds the distance from above. One is kept for every snapshot; where the cone grows, the
-    nearest combination of it and of the new generator takes its place, and one sweep over the generators, coordinate by
-    coordinate, brings it nearer still. Only where these bounds leave the choice open is a projection computed.
+    Any point of the cone bounds the distance from above. One point is stored for every snapshot. When the cone grows,
+    the point is replaced by its best combination with the new generator and improved by one sweep of coordinate
+    descent. A projection is computed only where these bounds do not decide the maximum.
 
     Parameters
     ----------
@@ -214,7 +215,7 @@ class LazyDistances:
     Attributes
     ----------
     maximum
-        What chooses; it counts the projections.
+        The lazy maximum; it counts the projections.
     """
 
     def __init__(self, whitened: Array) -> None:
@@ -222,52 +223,52 @@ class LazyDistances:
         norms = np.linalg.norm(whitened, axis=0)
         self._largest = float(norms.max())
         self._generators = np.zeros((whitened.shape[0], 0))
-        self._points = np.zeros((0, whitened.shape[1]))  # coefficients of a point of the cone for every snapshot
+        self._coefficients = np.zeros((0, whitened.shape[1]))  # of one point of the cone for every snapshot
         self.maximum = LazyMaximum(norms / self._largest)
 
     def widen(self, generators: Array, taken: int | None = None) -> None:
-        """Take in the last of the generators (m×r, unit norm, whitened); the snapshot `taken` is in the cone by now."""
-        old, new = _two_dimensional(self._generators @ self._points, generators[:, -1], self._snapshots)
-        self._points = np.vstack([self._points * old, new])
+        """Add the last of the generators (m×r, unit norm, whitened); the snapshot `taken` is never chosen again."""
+        old, new = _best_combination(self._generators @ self._coefficients, generators[:, -1], self._snapshots)
+        self._coefficients = np.vstack([self._coefficients * old, new])
         self._generators = generators
-        slope = generators.T @ (self._snapshots - generators @ self._points)
+        slope = generators.T @ (self._snapshots - generators @ self._coefficients)
         for i, row in enumerate(generators.T @ generators):
-            step = np.maximum(slope[i], -self._points[i])
-            self._points[i] += step
+            step = np.maximum(slope[i], -self._coefficients[i])
+            self._coefficients[i] += step
             slope -= row[:, None] * step
-        self.maximum.bound(np.linalg.norm(self._snapshots - generators @ self._points, axis=0) / self._largest)
+        self.maximum.bound(np.linalg.norm(self._snapshots - generators @ self._coefficients, axis=0) / self._largest)
         if taken is not None:
             self.maximum.exclude(taken)
 
     def next(self) -> tuple[int, float]:
-        """Index of the snapshot farthest from the cone, and its distance; of those taken, none."""
+        """Index of the snapshot farthest from the cone, and its distance, those taken excluded."""
         return self.maximum.next(self._distance)
 
     def residual(self, q: int) -> Array:
-        """What the best known point of the cone leaves of a snapshot (m,); that of `next` is its projection."""
-        return np.asarray(self._snapshots[:, q] - self._generators @ self._points[:, q])
+        """Snapshot minus its stored point of the cone (m,): for the index from `next`, minus its projection."""
+        return np.asarray(self._snapshots[:, q] - self._generators @ self._coefficients[:, q])
 
     def _distance(self, q: int) -> float:
         found = _project_whitened(self._generators, self._snapshots[:, q])
-        self._points[:, q] = found.coefficients
+        self._coefficients[:, q] = found.coefficients
         return found.distance / self._largest
 
 
-def _two_dimensional(points: Array, nu: Array, targets: Array) -> tuple[Array, Array]:
-    """Coefficients a, b ≥ 0 (Q,) of points (m×Q) and of the unit vector ν (m,) that come near targets (m×Q).
+def _best_combination(points: Array, nu: Array, targets: Array) -> tuple[Array, Array]:
+    """Coefficients a, b ≥ 0 (Q,) that minimise ‖a·point + b·ν − target‖; points, targets (m×Q), unit vector ν (m,).
 
-    The nearest combination where both are positive, else that of one alone.
+    The unconstrained minimiser where both are nonnegative, else the better one of a = 0 and b = 0.
     """
     square, overlap = np.sum(points**2, axis=0), nu @ points
-    along, across = np.sum(points * targets, axis=0), nu @ targets
+    on_point, on_nu = np.sum(points * targets, axis=0), nu @ targets
     determinant = square - overlap**2
-    clear = determinant > 1e-8 * square
-    scale = np.where(clear, determinant, 1.0)
-    a, b = (along - overlap * across) / scale, (square * across - overlap * along) / scale
-    both = clear & (a >= 0.0) & (b >= 0.0)
-    alone = (np.maximum(across, 0.0) ** 2 > along**2 / np.where(square > 0.0, square, 1.0)) | (square == 0.0)
-    single_a = np.where(alone, 0.0, np.maximum(along, 0.0) / np.where(square > 0.0, square, 1.0))
-    single_b = np.where(alone, np.maximum(across, 0.0), 0.0)
+    independent = determinant > 1e-8 * square
+    scale = np.where(independent, determinant, 1.0)
+    a, b = (on_point - overlap * on_nu) / scale, (square * on_nu - overlap * on_point) / scale
+    both = independent & (a >= 0.0) & (b >= 0.0)
+    nu_alone = (np.maximum(on_nu, 0.0) ** 2 > on_point**2 / np.where(square > 0.0, square, 1.0)) | (square == 0.0)
+    single_a = np.where(nu_alone, 0.0, np.maximum(on_point, 0.0) / np.where(square > 0.0, square, 1.0))
+    single_b = np.where(nu_alone, np.maximum(on_nu, 0.0), 0.0)
     return np.where(both, a, single_a), np.where(both, b, single_b)
 
 

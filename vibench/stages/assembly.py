@@ -12,9 +12,9 @@ from vibench.arrays import Array
 from vibench.interfaces.problem import MEMBERS, VariationalInequality
 from vibench.interfaces.strategies import Kind
 from vibench.interfaces.validation import checked_assembly, training_parameters, validation_parameters
-from vibench.model.affine import Evaluation, Member, affine_decomposition
-from vibench.model.galerkin import ReducedModel, beginning, project
-from vibench.model.hyperreduced import OnlineModel, Operators, project_members, why_in_full
+from vibench.model.affine import AffineMember, Evaluation, affine_decomposition
+from vibench.model.galerkin import ReducedModel, leading_part, project
+from vibench.model.hyperreduced import HyperReducedModel, Operators, hyper_reduce, reason_for_full_assembly
 from vibench.stages.artefacts import Store
 from vibench.stages.assemblies import assemblies
 from vibench.stages.base import Result, Stage, build_problem, value_of
@@ -22,7 +22,7 @@ from vibench.stages.enrichment import EnrichmentStage, GrowthStage, enrichment_s
 from vibench.study.cells import Cell, Plugin
 from vibench.timing import NO_TIME, REPEATS, Seconds, median_of, median_seconds, timed
 
-Model = ReducedModel | OnlineModel
+Model = ReducedModel | HyperReducedModel
 """What gives the reduced problem at a parameter."""
 
 
@@ -41,7 +41,7 @@ class AffineDecomposition(Stage):
         return ()
 
     def run(self, store: Store) -> Result:  # noqa: ARG002
-        """A `Member` by name."""
+        """An `AffineMember` by name."""
         problem = build_problem(self.problem)
         return Result(*timed(lambda: affine_decomposition(problem, training_parameters(problem), self.tolerance)))
 
@@ -71,11 +71,11 @@ class HyperReduction(Stage):
     def run(self, store: Store) -> Result:
         """A `Reduction`."""
         model = self.enrichment.model(store)
-        members: Mapping[str, Member] = value_of(store, self.decomposition)
-        why = why_in_full(model, members)
+        members: Mapping[str, AffineMember] = value_of(store, self.decomposition)
+        why = reason_for_full_assembly(model, members)
         if why:
             return Result(Reduction(None, why), NO_TIME)
-        operators, seconds = timed(lambda: project_members(model, members))
+        operators, seconds = timed(lambda: hyper_reduce(model, members))
         return Result(Reduction(operators, ""), seconds)
 
 
@@ -196,7 +196,7 @@ class AssemblyStage(Stage):
         model, _ = self.model(store)
         mus = validation_parameters(model.problem, self.count, self.seed)
         known = None if self.nested is None else value_of(store, self.nested)
-        if isinstance(model, OnlineModel):
+        if isinstance(model, HyperReducedModel):
             return Result(_reduced(model, mus, known))
         return Result(_in_full(model, mus, value_of(store, self.full_times), known))
 
@@ -208,13 +208,13 @@ class AssemblyStage(Stage):
         reduction: Reduction = value_of(store, self.reduction)
         if reduction.operators is None:
             return model, f"assembled in full: {reduction.why_full}"
-        return OnlineModel(model, reduction.operators), ""
+        return HyperReducedModel(model, reduction.operators), ""
 
     def columns(self, store: Store) -> dict[str, float | int | None]:
         """Columns of a cell: tolerance, training error and terms of every member; none for assembly in full."""
         if self.reduction is None:
             return {}
-        members: Mapping[str, Member] = value_of(store, self.reduction.decomposition)
+        members: Mapping[str, AffineMember] = value_of(store, self.reduction.decomposition)
         summed = {name: member for name, member in members.items() if member.terms}
         return {
             "interpolation_tol": self.interpolation,
@@ -227,14 +227,14 @@ InFull = Sequence[VariationalInequality] | None
 """Programs in full of a space that begins with that of a model, one per parameter, if they are known."""
 
 
-def _reduced(model: OnlineModel, mus: Array, known: InFull) -> ReducedPrograms:
+def _reduced(model: HyperReducedModel, mus: Array, known: InFull) -> ReducedPrograms:
     """Assemble without arrays of mesh size at every parameter; how far the members are from their projections."""
     matrices = assemblies(model.problem)
     programs, seconds, errors, factor = [], [], [], None
     for k, mu in enumerate(mus):
         found, spent = median_seconds(partial(model.assemble, mu))
         factor = found.factor
-        full = known and beginning(known[k], len(found.program.f))
+        full = known and leading_part(known[k], len(found.program.f))
         errors.append(
             _largest_difference(found.program, full or project(matrices.at(mu), found.basis, model.generators))
         )
@@ -256,7 +256,7 @@ def _in_full(model: ReducedModel, mus: Array, forms: Sequence[Seconds], known: I
     projecting = [seconds for _, seconds in each]
     if model_of_one:
         projecting = [median_of(projecting)] * len(mus)
-    programs = [beginning(program, size) for program in known] if known else [found.program for found, _ in each]
+    programs = [leading_part(program, size) for program in known] if known else [found.program for found, _ in each]
     total = tuple(form + spent for form, spent in zip(forms, projecting, strict=True))
     return ReducedPrograms(tuple(programs), None, total, (0.0,) * len(mus))
 

@@ -17,7 +17,7 @@ from vibench.reduction.supremizers import (
     ConstraintClasses,
     projected_supremizers,
 )
-from vibench.stability.growth import Images
+from vibench.stability.growth import ProjectedSupremizers
 from vibench.stages.artefacts import History, Store
 from vibench.stages.base import Result, Stage, build_problem, value_of
 from vibench.stages.offline import ConeStage, PODStage, ReducedCone, TrainingConstants
@@ -200,10 +200,10 @@ def _offline(store: Store, pod: PODStage, cone: ConeStage) -> Offline:
     return Offline(problem, basis, reduced.cone, reduced.prepared.span, training_parameters(problem))
 
 
-def _images(offline: Offline, vectors: Array, classes: ConstraintClasses) -> Images:
+def _images(offline: Offline, vectors: Array, classes: ConstraintClasses) -> ProjectedSupremizers:
     """ZᵀBᵀη of V_N and vectors (n×S) for every class of the training set, η orthonormal in span χ."""
     Z = np.hstack([offline.basis, vectors])
-    return Images([projected_supremizers(Z, B, offline.span) for B in classes.representatives], classes)
+    return ProjectedSupremizers([projected_supremizers(Z, B, offline.span) for B in classes.representatives], classes)
 
 
 def _model(store: Store, pod: PODStage, cone: ConeStage, enrichment: Enrichment) -> ReducedModel:

@@ -13,7 +13,7 @@ from vibench.interfaces.strategies import Stop
 from vibench.interfaces.validation import checked_assembly
 from vibench.model.affine import Evaluation
 from vibench.model.galerkin import ReducedModel, project
-from vibench.model.hyperreduced import OnlineModel
+from vibench.model.hyperreduced import HyperReducedModel
 from vibench.stages.artefacts import Store
 from vibench.stages.assembly import AffineDecomposition, AssemblyStage
 from vibench.stages.base import value_of
@@ -115,7 +115,7 @@ def test_the_error_of_an_assembly_is_that_of_the_worst_member(store: Store, name
     stage = CELLS[name].assembly
     model, note = stage.model(store)
     assert note == ""
-    assert isinstance(model, OnlineModel)
+    assert isinstance(model, HyperReducedModel)
     mus = model.problem.validation_set(QUERIES, 3)
     for mu, error in zip(mus, value_of(store, stage).errors, strict=True):
         found = model.assemble(mu)
