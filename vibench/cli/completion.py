@@ -11,8 +11,8 @@ import typer
 from vibench.errors import VibenchError
 from vibench.qp.settings import SETTINGS
 from vibench.results import tables
+from vibench.results.columns import TABLES
 from vibench.results.database import FILE
-from vibench.results.schema import TABLES
 from vibench.study import registry
 
 Complete = Callable[[str], list[str]]

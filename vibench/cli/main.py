@@ -24,7 +24,7 @@ from vibench.qp.solve import installed_solvers
 from vibench.qp.status import Status
 from vibench.report import figures, replay
 from vibench.results import invariants, tables
-from vibench.results.schema import TABLES
+from vibench.results.columns import TABLES
 from vibench.results.solver_agreement import sentence
 from vibench.stages.artefacts import usable_store
 from vibench.study import registry

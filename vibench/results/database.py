@@ -14,7 +14,7 @@ import numpy as np
 
 from vibench.errors import RequestError, StorageError
 from vibench.locking import locked
-from vibench.results.schema import HISTORY_KEYS, STORED, VERSION
+from vibench.results.columns import HISTORY_KEYS, STORED, VERSION
 
 FILE = "results.sqlite"
 
@@ -100,7 +100,7 @@ class ResultsDatabase:
     def _create(self, study: Mapping[str, Any]) -> None:
         self._db.execute("CREATE TABLE IF NOT EXISTS meta (key TEXT PRIMARY KEY, value TEXT)")
         for table, columns in STORED.items():
-            declared = ", ".join(f'"{name}" {kind}' for name, kind in columns.items())
+            declared = ", ".join(f'"{name}" {column.kind}' for name, column in columns.items())
             self._db.execute(f"CREATE TABLE IF NOT EXISTS {table} ({declared})")
         for table in ("queries", "solutions"):
             self._db.execute(f"CREATE INDEX IF NOT EXISTS {table}_of_cell ON {table}(cell)")

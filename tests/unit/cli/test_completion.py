@@ -16,8 +16,8 @@ from vibench.cli import completion
 from vibench.cli import main as main_module
 from vibench.qp.settings import SETTINGS
 from vibench.results import tables
+from vibench.results.columns import TABLES
 from vibench.results.database import FILE
-from vibench.results.schema import TABLES
 from vibench.study import registry
 
 GROUP: Any = typer.main.get_command(main_module.app)

@@ -15,8 +15,8 @@ from samples import cell_row, query_rows
 
 from vibench.errors import RequestError
 from vibench.results import database as module
+from vibench.results.columns import CELLS, TABLES, VERSION
 from vibench.results.database import FILE, ResultsDatabase, claimed, read_meta
-from vibench.results.schema import CELLS, TABLES, VERSION
 
 STUDY = {"name": "sample", "seed": 1, "validation": 4, "accuracy": 1e-7}
 
