@@ -17,17 +17,20 @@ from running import (
 from samples import wire_study, write_study
 
 BAD_PROBLEMS: Mapping[str, tuple[set[str], str]] = {
-    "wire-raises": ({"error"}, "in highfidelity: ArithmeticError: the wire snapped"),
-    "wire-nan": ({"error"}, "in highfidelity: f has entries that are not finite at mu = ["),
-    "wire-shape": ({"error"}, "in highfidelity: g has shape (11,) at mu = ["),
+    "wire-raises": ({"error"}, "in high-fidelity solutions: ArithmeticError: the wire snapped"),
+    "wire-nan": ({"error"}, "in high-fidelity solutions: f has entries that are not finite at mu = ["),
+    "wire-shape": ({"error"}, "in high-fidelity solutions: g has shape (11,) at mu = ["),
     "wire-indefinite": ({"error"}, "not positive definite"),
-    "wire-broken": ({"error"}, "in highfidelity: OSError: no wire in stock"),
+    "wire-broken": ({"error"}, "in high-fidelity solutions: OSError: no wire in stock"),
     "wire-hungry": ({"error"}, "out of memory: the limit is memory_gib = 8"),
-    "wire-sleeps": ({"timeout"}, "in highfidelity: stopped after cell_seconds = 12 s"),
-    "wire-exits": ({"crashed"}, "in highfidelity: the worker process died with exit code 3"),
-    "wire-segfaults": ({"crashed"}, "in highfidelity: the worker process died with signal SIGSEGV"),
-    "wire-infeasible": ({"error"}, "in highfidelity: no active set solves the high-fidelity problem; is it feasible?"),
-    "wire-crooked": ({"error"}, "in highfidelity: X_V is not positive definite"),
+    "wire-sleeps": ({"timeout"}, "in high-fidelity solutions: stopped after cell_seconds = 12 s"),
+    "wire-exits": ({"crashed"}, "in high-fidelity solutions: the worker process died with exit code 3"),
+    "wire-segfaults": ({"crashed"}, "in high-fidelity solutions: the worker process died with signal SIGSEGV"),
+    "wire-infeasible": (
+        {"error"},
+        "in high-fidelity solutions: no active set solves the high-fidelity problem; is it feasible?",
+    ),
+    "wire-crooked": ({"error"}, "in high-fidelity solutions: X_V is not positive definite"),
 }
 BAD_DUALS: Mapping[str, tuple[set[str], str]] = {
     "cone-raises": ({"error"}, "in cone: LookupError: no generator found"),

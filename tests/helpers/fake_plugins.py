@@ -174,6 +174,15 @@ def flat_supply(V: InnerProduct, vi: VariationalInequality, span: Array) -> Arra
     return np.ones(V.dim)
 
 
+class NeedyCone(DualStrategy):
+    """Needs a distribution that nobody has."""
+
+    requires = ("no-such-distribution",)
+
+    def reduce(self, snapshots: Array, W: InnerProduct, stop: Stop) -> Cone:
+        raise ImportError("no-such-distribution")
+
+
 class RaisingCone(DualStrategy):
     def reduce(self, snapshots: Array, W: InnerProduct, stop: Stop) -> Cone:
         raise LookupError("no generator found")

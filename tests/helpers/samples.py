@@ -78,14 +78,14 @@ def write_study(folder: Path, content: Mapping[str, Any] = STUDY, name: str = "s
 def cell_row(cell: str = "c1", **columns: Any) -> dict[str, Any]:
     """A row of the cells table in which every column is filled."""
     samples = {"TEXT": "text", "REAL": 0.5, "INTEGER": 3}
-    row = {name: samples[kind.split()[0]] for name, kind in CELLS.items()}
+    row = {name: samples[column.kind.split()[0]] for name, column in CELLS.items()}
     return row | {"cell": cell, "status": "ok", "enrichment_kind": "fixed"} | columns
 
 
 def query_rows(cell: str = "c1", count: int = 2, **columns: Any) -> list[dict[str, Any]]:
     """Rows of the queries table in which every column is filled, for a problem with two parameters."""
     samples = {"TEXT": "text", "REAL": 0.5, "INTEGER": 3}
-    row = {name: samples[kind.split()[0]] for name, kind in QUERIES.items()}
+    row = {name: samples[column.kind.split()[0]] for name, column in QUERIES.items()}
     return [
         row | {"cell": cell, "query": k, "mu_1": 0.1 * k, "mu_2": 2.0 + k, "status": "ok"} | columns
         for k in range(count)
@@ -108,7 +108,12 @@ FAKES: Mapping[str, Mapping[str, str]] = {
         "wire-crooked": "CrookedSpace",
         "wire-chatty": "Chatty",
     },
-    "vibench.dual_strategies": {"cone-raises": "RaisingCone", "cone-waits": "WaitingCone", "cone-bad": "BadCone"},
+    "vibench.dual_strategies": {
+        "cone-needs": "NeedyCone",
+        "cone-raises": "RaisingCone",
+        "cone-waits": "WaitingCone",
+        "cone-bad": "BadCone",
+    },
     "vibench.primal_strategies": {
         "enrichment-raises": "RaisingEnrichment",
         "enrichment-counts": "CountingEnrichment",

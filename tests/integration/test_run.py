@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 import hashlib
+import importlib.util
+import os
 import pickle
 import re
 import shutil
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -85,7 +89,7 @@ def test_a_cell_without_row_is_done_again(vibench: Vibench, again: Path, artefac
     """With those artefacts it needs that are gone."""
     folder = again / "runs" / "wire"
     execute(folder, "DELETE FROM cells WHERE solver = 'careful'")
-    lost = list(artefacts.glob("podstage-*"))
+    lost = list(artefacts.glob("pod-*"))
     for artefact in lost:
         artefact.unlink()
     before = by_solver(folder)
@@ -170,6 +174,69 @@ def test_a_problem_that_fails_first_leaves_the_one_beside_it_alone(vibench: Vibe
     assert found == {(problem, primal): status for problem, status in statuses.items() for primal in study["primal"]}
 
 
+def test_a_plugin_whose_requirements_are_missing_is_unavailable(vibench: Vibench, tmp_path: Path) -> None:
+    study = write_study(tmp_path, wire_study(dual=["cone-needs", "cpg"]))
+    done = vibench(tmp_path, "run", study, "--jobs", "1", "--strict")
+    assert (done.returncode, done.stderr) == (0, "")
+    found = {row["dual"]: row for row in rows(tmp_path / "runs" / "wire")}
+    assert {dual: row["status"] for dual, row in found.items()} == {"cone-needs": "unavailable", "cpg": "ok"}
+    reason = "the dual strategy 'cone-needs' needs no-such-distribution, which is not installed"
+    assert found["cone-needs"]["reason"] == reason
+
+
+@pytest.fixture(scope="module")
+def edited_core(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A copy of the core, to be edited; first on the path it takes the place of the one that is installed."""
+    folder = tmp_path_factory.mktemp("core")
+    package = Path(str(importlib.util.find_spec("vibench").submodule_search_locations[0]))
+    shutil.copytree(package, folder / "vibench", ignore=shutil.ignore_patterns("__pycache__"))
+    return folder
+
+
+def test_only_an_edit_of_what_computes_numbers_runs_anything_again(
+    command: str, plugins_folder: Path, edited_core: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A figure, a help text, the report and the results' tables may change: the run is complete, and its models open."""
+    monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path / "cache"))
+    study = write_study(tmp_path, wire_study())
+
+    def vibench(*arguments: str) -> str:
+        program = "import sys; from vibench.cli.main import main; sys.argv[0] = 'vibench'; main()"
+        path = os.pathsep.join(map(str, (edited_core, plugins_folder)))
+        done = subprocess.run(
+            [sys.executable, "-c", program, *arguments],
+            cwd=tmp_path, env=os.environ | {"PYTHONPATH": path}, capture_output=True, text=True, check=False,
+        )  # fmt: skip
+        assert (done.returncode, done.stderr) == (0, "")
+        return done.stdout
+
+    def edit(module: str) -> None:
+        with (edited_core / "vibench" / module).open("a", encoding="utf-8") as source:
+            source.write("\n# edited\n")
+
+    run = ("run", study, "--jobs", "1", "--no-figures")
+    assert "1 cells, 1 to run" in vibench(*run)
+    for module in (
+        "report/html.py",
+        "report/figures/style.py",
+        "cli/main.py",
+        "results/tables.py",
+        "testing/sample.py",
+    ):
+        edit(module)
+    assert "1 cells, 0 to run, 0 stages" in vibench(*run)
+    assert "3 programs" in vibench("export-qps", "wire", "programs")  # of the model as it was
+    edit("model/errors.py")  # determines the errors of the queries, and nothing before them
+    assert re.search(r"1 cells, 1 to run, (\d) stages", vibench(*run))
+    edit("reduction/pod.py")
+    stages = re.search(r"1 cells, 1 to run, (\d+) stages", vibench(*run))
+    assert stages is not None
+    edit("highfidelity/active_set.py")  # determines the snapshots, and with them everything
+    everything = re.search(r"1 cells, 1 to run, (\d+) stages", vibench(*run))
+    assert everything is not None
+    assert int(stages[1]) + 2 * CHUNKS <= int(everything[1])
+
+
 def test_the_number_of_jobs_changes_no_result(vibench: Vibench, tmp_path: Path) -> None:
     study = wire_study(
         problem=[{"name": "wire", "label": "long", "options": {"nodes": 40}}],
@@ -233,7 +300,7 @@ def test_clean_shows_and_frees_what_artefacts_take(
     for options, left in ((("--dry-run",), count), (("--older-than", "1"), count), ((), 0)):
         done = vibench(tmp_path, "clean", *options)
         assert (done.returncode, done.stderr) == (0, "")
-        assert re.search(rf"highfidelity +{2 * CHUNKS} ", done.stdout)
+        assert re.search(rf"high-fidelity-solutions +{2 * CHUNKS} ", done.stdout)
         assert len(list(artefacts.glob(f"*{SUFFIX}"))) == left
     assert "MiB freed" in done.stdout
     assert (tmp_path / "runs" / "wire" / FILE).exists()

@@ -178,14 +178,14 @@ def test_the_benefits_say_from_when_on_a_strategy_pays() -> None:
     b = CELL | {"cell": "b", "enrichment_kind": "fixed", "primal": "fixed", "offline_s": 2.5, "hf_s": 0.1}
     frame = benefits(pd.DataFrame(break_even_rows([a, b]), columns=list(THRESHOLDS)))
     paired = frame[(frame["a"] == "varying") & (frame["b"] == "fixed")].iloc[0]
-    assert paired["b pays"] == f"from {(2.5 - 1.5) / (0.004 - 0.0025):.0f}"
+    assert paired["break-even"] == f"from {(2.5 - 1.5) / (0.004 - 0.0025):.0f}"
     assert (paired["offline a [s]"], paired["online a [ms]"], paired["online b [ms]"]) == (1.5, 4.0, 2.5)
     assert len(frame) == 3
 
 
 def test_benefits_without_a_number_are_words() -> None:
     slow = CELL | {"hf_s": 0.001, "enrichment_kind": "none"}
-    assert list(benefits(pd.DataFrame(break_even_rows([slow]), columns=list(THRESHOLDS)))["b pays"]) == ["never"]
+    assert list(benefits(pd.DataFrame(break_even_rows([slow]), columns=list(THRESHOLDS)))["break-even"]) == ["never"]
 
 
 def test_tables_of_nothing_are_empty() -> None:

@@ -1,0 +1,73 @@
+"""What authors of plugins and users of the library import: from `vibench` itself, and lazily."""
+
+from __future__ import annotations
+
+import inspect
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import vibench
+
+ROOT = Path(__file__).parents[2]
+HEAVY = {"numpy", "scipy", "pandas", "matplotlib", "qpsolvers", "pydantic", "rich", "typer", "skfem", "sklearn"}
+
+AUTHORS = sorted(
+    path
+    for pattern in (
+        "problems/**/*.py",
+        "strategies/**/*.py",
+        "examples/**/*.py",
+        "vibench/cli/templates/*.template",
+        "docs/extend/*.md",
+        "docs/tutorial.md",
+        "README.md",
+    )
+    for path in ROOT.glob(pattern)
+)
+IMPORTED = re.compile(r"^[ ]*(?:from|import) (vibench(?:\.[a-z_]+)*)\b", re.MULTILINE)
+NAMES = re.compile(r"^[ ]*from vibench import (\([^)]*\)|[^\n]+)", re.MULTILINE)
+
+
+def test_there_are_sources_of_every_sort() -> None:
+    assert {path.suffix for path in AUTHORS} == {".py", ".template", ".md"}
+    assert len(AUTHORS) > 30
+
+
+@pytest.mark.parametrize("path", AUTHORS, ids=lambda path: path.name)
+def test_plugins_templates_and_pages_import_nothing_but_the_public_surface(path: Path) -> None:
+    text = path.read_text(encoding="utf-8")
+    assert set(IMPORTED.findall(text)) <= {"vibench", "vibench.testing"}
+    for names in NAMES.findall(text):
+        for name in names.strip("()").replace("\n", " ").split(","):
+            if name.strip():
+                assert name.strip() in vibench.__all__
+
+
+@pytest.mark.parametrize("name", sorted(vibench.__all__))
+def test_every_public_name_is_there_and_documented(name: str) -> None:
+    found = getattr(vibench, name)
+    assert found.__doc__ or not (inspect.isclass(found) or inspect.isfunction(found))
+
+
+def loaded(code: str) -> set[str]:
+    """The packages that a fresh interpreter has loaded after some code."""
+    script = f"import sys\n{code}\nprint(*sorted({{name.partition('.')[0] for name in sys.modules}}))"
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
+    return set(done.stdout.split())
+
+
+def test_importing_vibench_loads_nothing_heavy() -> None:
+    assert loaded("import vibench") & HEAVY == set()
+
+
+def test_naming_a_status_loads_no_solver() -> None:
+    assert loaded("from vibench import Status; Status.OK") & HEAVY == set()
+
+
+def test_reading_results_loads_no_stage_and_no_solver() -> None:
+    code = "import vibench.results.tables\nassert not any(name.startswith('vibench.stages') for name in sys.modules)"
+    assert loaded(code) & {"qpsolvers", "matplotlib", "skfem"} == set()
