@@ -182,14 +182,10 @@ def _ticks(axes: Axes) -> None:
             axis.set_major_locator(ticker.MaxNLocator(5))
         elif decades < DENSE:
             axis.set_major_locator(ticker.LogLocator(subs=(1.0, 2.0, 5.0)))
-        axis.set_major_formatter(ticker.FuncFormatter(_number if decades < DENSE else _power))
+        axis.set_major_formatter("{x:.3g}" if decades < DENSE else _power)
 
 
-def _number(value: float, _: int | None) -> str:
-    return f"{value:.3g}"
-
-
-def _power(value: float, _: int | None) -> str:
+def _power(value: float, _: float) -> str:
     return "10" + f"{round(math.log10(value))}".translate(SUPERSCRIPTS)
 
 
