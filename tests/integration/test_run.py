@@ -196,7 +196,7 @@ def edited_core(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_only_an_edit_of_what_computes_numbers_runs_anything_again(
     command: str, plugins_folder: Path, edited_core: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A figure, a help text, the report and the results' tables may change: the run is complete, and its models open."""
+    """Figures, help texts, the report and the tables may change: the run is complete, and its models open."""
     monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path / "cache"))
     study = write_study(tmp_path, wire_study())
 

@@ -1,4 +1,4 @@
-"""Two runs side by side: what changed in dimensions, constants, errors, times and thresholds, and what got worse."""
+"""Comparison of two runs: changes of dimensions, constants, errors, times and break-even, and regressions."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ import pandas as pd
 
 from vibench.qp.status import Status
 from vibench.results import tables
-from vibench.results.break_even import Meaning
-from vibench.results.columns import KEYS, THRESHOLDS
+from vibench.results.break_even import BreakEven, Meaning
+from vibench.results.columns import THRESHOLDS
 from vibench.stability.infsup import VANISHES
 
 ERROR_FLOOR = 1e-10
-"""Errors below this are round-off: their ratio says nothing."""
+"""Errors below this are round-off, and their ratio is meaningless."""
 
 DIMENSIONS = ("N", "R", "rank", "enrichment")
 CONSTANTS = ("beta_span_min", "beta_cone_lower_min")
@@ -28,118 +28,107 @@ COLUMNS = ["problem", "dual", "primal", "asked", "solver", "assembly", "what", "
 
 
 class Verdict(StrEnum):
-    """What a change means."""
+    """Whether a change is for the worse."""
 
     WORSE = "worse"
     BETTER = "better"
     CHANGED = "changed"
 
 
+Change = tuple[pd.Series, str, Any, Any, Verdict | None]
+"""Cell, column, values before and after, and the verdict; `None` without a change beyond the limit."""
+
+
 @dataclass(frozen=True)
 class Comparison:
-    """The changes between two runs, one row each, and what could not be compared."""
+    """The changes between two runs, one per row, and remarks on the extent of the comparison."""
 
     changes: pd.DataFrame
     notes: tuple[str, ...]
 
     @property
     def regressions(self) -> int:
-        """How many changes are for the worse."""
+        """Number of changes for the worse."""
         return int((self.changes["verdict"] == Verdict.WORSE).sum())
 
 
 def compare(a: Path, b: Path, limit: float) -> Comparison:
     """Compare two results files cell by cell; cells of the same definition are the same cell.
 
-    Worse is: a cell that is gone, fewer queries ok, a worse status, an error or a time larger than `limit` times what
-    it was, a constant smaller by that factor, more vectors by that factor, a threshold later by that factor because
-    the way it belongs to got slower. Times count only where both were measured on the same machine.
+    Changes for the worse are: a missing cell, fewer ok queries, a more severe status, an error, a time or a dimension
+    that grew by more than the factor `limit`, a constant that shrank by more than this factor, and a break-even that
+    moved by more than this factor because the reduced model itself became slower. Times are compared only where both
+    were measured on the same machine.
 
     Parameters
     ----------
     a, b
         Results files, before and after.
     limit
-        Factor above 1 that a number may change by.
+        Factor, at least 1, within which a number may change.
     """
     one, two = (tables.in_order(tables.read(path, "cells")).set_index("cell", drop=False) for path in (a, b))
     shared = [key for key in one.index if key in two.index]
-    rows = [_row(one.loc[key], "cell", "there", "gone", Verdict.WORSE) for key in one.index if key not in two.index]
-    rows += [_row(two.loc[key], "cell", "", "new", Verdict.CHANGED) for key in two.index if key not in one.index]
-    for key in shared:
-        rows += list(_cell(one.loc[key], two.loc[key], limit))
-    same_machine = all(one.loc[key, "machine"] == two.loc[key, "machine"] for key in shared)
+    changes: list[Change] = [
+        *((one.loc[key], "cell", "present", "gone", Verdict.WORSE) for key in one.index if key not in two.index),
+        *((two.loc[key], "cell", "", "new", Verdict.CHANGED) for key in two.index if key not in one.index),
+        *(change for key in shared for change in _cell(one.loc[key], two.loc[key], limit)),
+    ]
     notes = [f"{len(shared)} cells are in both runs"]
-    if not same_machine:
-        notes.append("times and thresholds of different machines are not compared")
+    if all(one.loc[key, "machine"] == two.loc[key, "machine"] for key in shared):
+        changes += _thresholds(tables.read(a, "thresholds"), tables.read(b, "thresholds"), limit)
     else:
-        rows += list(_thresholds(tables.read(a, "thresholds"), tables.read(b, "thresholds"), limit))
+        notes.append("times and break-even of different machines are not compared")
+    rows = [_row(cell, what, old, new, verdict) for cell, what, old, new, verdict in changes if verdict is not None]
     return Comparison(pd.DataFrame(rows, columns=COLUMNS), tuple(notes))
 
 
-def _cell(one: pd.Series, two: pd.Series, limit: float) -> Iterator[dict[str, Any]]:
-    if one["queries_ok"] != two["queries_ok"]:
-        fewer = two["queries_ok"] < one["queries_ok"]
-        yield _row(one, "queries ok", one["queries_ok"], two["queries_ok"], Verdict.WORSE if fewer else Verdict.BETTER)
-    if one["status"] != two["status"]:
-        severities = Status(one["status"]).severity, Status(two["status"]).severity
-        yield _row(one, "status", one["status"], two["status"], _judged(*severities, 1.0) or Verdict.CHANGED)
+def _cell(one: pd.Series, two: pd.Series, limit: float) -> Iterator[Change]:
+    before, after = one["queries_ok"], two["queries_ok"]
+    yield one, "queries ok", before, after, _verdict(before, after, 1.0, more_is_better=True)
+    before, after = Status(one["status"]), Status(two["status"])
+    yield one, "status", before, after, _verdict(before.severity, after.severity, 1.0)
     for name in DIMENSIONS:
-        if not _equal(one[name], two[name]):
-            yield _row(one, name, one[name], two[name], _judged(one[name], two[name], limit) or Verdict.CHANGED)
-    for names, floor, more in ((CONSTANTS, VANISHES, True), (ERRORS, ERROR_FLOOR, False)):
+        before, after = one[name], two[name]
+        moved = Verdict.CHANGED if before != after and pd.notna(before) else None
+        yield one, name, before, after, _verdict(before, after, limit) or moved
+    times = TIMES if one["machine"] == two["machine"] else ()
+    for names, floor, more in ((CONSTANTS, VANISHES, True), (ERRORS, ERROR_FLOOR, False), (times, 0.0, False)):
         for name in names:
-            verdict = _judged(_floored(one[name], floor), _floored(two[name], floor), limit, more_is_better=more)
-            yield from _changed(one, name, one[name], two[name], verdict)
-    if one["machine"] == two["machine"]:
-        for name in TIMES:
-            yield from _changed(one, name, one[name], two[name], _judged(one[name], two[name], limit))
+            before, after = one[name], two[name]
+            # Missing values stay NaN: `max` returns its first argument unless the second is larger.
+            verdict = _verdict(max(before, floor), max(after, floor), limit, more_is_better=more)
+            yield one, name, before, after, verdict
 
 
-def _thresholds(one: pd.DataFrame, two: pd.DataFrame, limit: float) -> Iterator[dict[str, Any]]:
-    keys = [name for name in THRESHOLDS if name in KEYS or name.rstrip("ab").endswith(("primal_", "tol_", "assembly_"))]
-    merged = one.merge(two, on=keys, suffixes=("_one", "_two"))
-    for _, row in merged.iterrows():
-        what = f"pays against {row['primal_a']}"
-        named = row.rename({"primal_b": "primal", "assembly_b": "assembly", "primal_tol_b": "primal_tol"})
-        before, after = (_said(row[f"meaning_{k}"], row[f"benefit_threshold_{k}"]) for k in ("one", "two"))
-        moved = Verdict.CHANGED if row["meaning_one"] != row["meaning_two"] else _judged(
-            row["benefit_threshold_one"], row["benefit_threshold_two"], limit,
-            more_is_better=row["meaning_one"] == Meaning.UNTIL,
-        )  # fmt: skip
-        own = [_judged(row[f"{phase}_b_s_one"], row[f"{phase}_b_s_two"], limit) for phase in ("offline", "online")]
-        if moved and Verdict.WORSE not in own:  # what it is compared with became quicker, or nothing got worse
-            moved = moved if moved is Verdict.BETTER else Verdict.CHANGED
-        elif moved is Verdict.CHANGED and row["meaning_two"] == Meaning.NEVER:
-            moved = Verdict.WORSE
-        yield from _changed(named, what, before, after, moved)
+def _thresholds(one: pd.DataFrame, two: pd.DataFrame, limit: float) -> Iterator[Change]:
+    keys = [name for name in THRESHOLDS if not name.endswith(("_s", "benefit_threshold", "meaning"))]
+    for _, row in one.merge(two, on=keys, suffixes=("_one", "_two")).iterrows():
+        before, after = (_break_even(row[f"benefit_threshold_{k}"], row[f"meaning_{k}"]) for k in ("one", "two"))
+        verdict: Verdict | None = Verdict.CHANGED
+        if before.meaning == after.meaning:
+            verdict = _verdict(before.number, after.number, limit, more_is_better=before.meaning == Meaning.UNTIL)
+        own = [_verdict(row[f"{phase}_b_s_one"], row[f"{phase}_b_s_two"], limit) for phase in ("offline", "online")]
+        if Verdict.WORSE not in own and verdict is Verdict.WORSE:  # because the model it is compared with became faster
+            verdict = Verdict.CHANGED
+        elif Verdict.WORSE in own and verdict is Verdict.CHANGED and after.meaning == Meaning.NEVER:
+            verdict = Verdict.WORSE
+        cell = row.rename({f"{name}_b": name for name in ("primal", "assembly", "primal_tol")})
+        yield cell, f"break-even against {row['primal_a']}", str(before), str(after), verdict
 
 
-def _said(meaning: str, number: float) -> str:
-    return meaning if pd.isna(number) else f"{meaning} {number:.0f}"
+def _break_even(number: float, meaning: str) -> BreakEven:
+    return BreakEven(None if pd.isna(number) else number, Meaning(meaning))
 
 
-def _floored(value: Any, floor: float) -> Any:
-    return max(value, floor) if pd.notna(value) else value
-
-
-def _judged(before: Any, after: Any, limit: float, *, more_is_better: bool = False) -> Verdict | None:
-    """What becomes of a number of which less, or more, is better; `None` within the limit. To vanish is worse."""
+def _verdict(before: Any, after: Any, limit: float, *, more_is_better: bool = False) -> Verdict | None:
+    """Verdict on a number that should be small, or large; a value that is gone is worse."""
     if pd.isna(before) or pd.isna(after):
         return None if pd.isna(before) and pd.isna(after) else Verdict.WORSE if pd.isna(after) else Verdict.CHANGED
     small, large = (before, after) if not more_is_better else (after, before)
     if large > limit * small:
         return Verdict.WORSE
     return Verdict.BETTER if small > limit * large else None
-
-
-def _changed(cell: pd.Series, what: str, before: Any, after: Any, verdict: Verdict | None) -> Iterator[dict[str, Any]]:
-    if verdict is not None:
-        yield _row(cell, what, before, after, verdict)
-
-
-def _equal(one: Any, two: Any) -> bool:
-    return bool(pd.isna(one) and pd.isna(two)) or one == two
 
 
 def _row(cell: pd.Series, what: str, before: Any, after: Any, verdict: Verdict) -> dict[str, Any]:

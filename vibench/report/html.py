@@ -1,4 +1,4 @@
-"""A run as one HTML file that needs nothing else: what was run, what was found, tables, figures, failures."""
+"""A run as one self-contained HTML page: setting, findings, failures, tables and figures."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ import inspect
 import io
 import json
 from collections.abc import Iterator
-from dataclasses import dataclass
 from numbers import Real
 from pathlib import Path
 from typing import Any
@@ -19,7 +18,7 @@ from markupsafe import Markup
 from vibench.qp.status import Status
 from vibench.report.figures import drawings
 from vibench.report.figures.style import WRITTEN, styled
-from vibench.report.findings import Finding, findings
+from vibench.report.findings import findings
 from vibench.results import pictures, tables
 from vibench.results.break_even import HIGH_FIDELITY
 from vibench.results.database import read_meta, study_of
@@ -27,57 +26,15 @@ from vibench.results.database import read_meta, study_of
 LONG = 48
 """Characters beyond which a text may be wrapped."""
 
-FAILED = [
-    "cell",
-    "problem",
-    "dual",
-    "primal",
-    "primal_tol",
-    "solver",
-    "assembly",
-    "status",
-    "queries_ok",
-    "queries",
-    "reason",
-]
-"""Columns of the table of failures."""
+IDENTITY = ["problem", "dual", "primal", "primal_tol", "solver", "assembly", "status"]
+"""Columns that cells and queries share in the tables of failures."""
 
-
-FAILED_QUERY = ["cell", "query", "problem", "dual", "primal", "primal_tol", "solver", "assembly", "status", "reason"]
-"""Columns of the table of single queries that failed."""
-
-
-@dataclass(frozen=True)
-class Entry:
-    """A table's cell: as it is sorted, as it is printed, and its class."""
-
-    value: str
-    text: str
-    kind: str
-
-
-@dataclass(frozen=True)
-class Grid:
-    """A table of the report."""
-
-    id: str
-    title: str
-    said: str
-    columns: list[str]
-    rows: list[list[Entry]]
-
-
-@dataclass(frozen=True)
-class Drawn:
-    """A figure of the report: its source is a data URI."""
-
-    name: str
-    said: str
-    source: str
+Table = tuple[str, str, str, pd.DataFrame]
+"""Identifier, title, caption and rows."""
 
 
 def write(path: Path, target: Path) -> Path:
-    """Write the report of a results file; it is whole or not there.
+    """Write the page of a results file; an interrupted call leaves no incomplete file under its name.
 
     Parameters
     ----------
@@ -87,35 +44,35 @@ def write(path: Path, target: Path) -> Path:
         The HTML file.
     """
     part = target.with_name(target.name + ".part")
-    part.write_text(html(path), encoding="utf-8")
+    part.write_text(page(path), encoding="utf-8")
     part.replace(target)
     return target
 
 
-def html(path: Path) -> str:
-    """The report of a results file."""
+def page(path: Path) -> str:
+    """The page of a results file."""
     environment = Environment(loader=PackageLoader("vibench.report"), autoescape=True, undefined=StrictUndefined)
     grid = environment.get_template("grid.html.j2")
-    cells, queries, shown = tables.read(path, "cells"), tables.read(path, "queries"), list(_tables(path))
+    cells, queries = tables.read(path, "cells"), tables.read(path, "queries")
+    study = study_of(path, read_meta(path))
+    by_subject: dict[str, list[str]] = {}
+    for finding in findings(path):
+        by_subject.setdefault(finding.about, []).append(finding.text)
     return environment.get_template("report.html.j2").render(
-        study=study_of(path, read_meta(path)).get("name", path.parent.name),
-        sections=[("findings", "Findings"), ("failures", "What fell short")]
-        + [(table.id, table.title) for table in shown]
-        + [("figures", "Figures")],
-        facts=list(_facts(path, cells)),
-        findings=_by_heading(findings(path)),
+        study=study.get("name", path.parent.name),
+        facts=list(_facts(study, cells)),
+        findings=by_subject,
         cells=len(cells),
-        failures=_grid("failed", "", "", cells[cells["status"] != Status.OK][FAILED]),
-        queries=_grid("queries", "", "", queries[queries["status"] != Status.OK][FAILED_QUERY]),
+        failed=cells[cells["status"] != Status.OK][["cell", *IDENTITY, "queries_ok", "queries", "reason"]],
+        failed_queries=queries[queries["status"] != Status.OK][["cell", "query", *IDENTITY, "reason"]],
         missing=[f"no picture of {one.key[0]}: {one.reason}" for one in pictures.read(path) if one.reason],
-        tables=shown,
+        tables=list(_tables(path, cells)),
         figures=list(_figures(path)),
-        grid=lambda table: Markup(grid.render(table=table)),
+        grid=lambda frame: Markup(grid.render(_grid(frame))),
     )
 
 
-def _facts(path: Path, cells: pd.DataFrame) -> Iterator[tuple[str, str]]:
-    study = study_of(path, read_meta(path))
+def _facts(study: dict[str, Any], cells: pd.DataFrame) -> Iterator[tuple[str, str]]:
     yield "study", ", ".join(f"{key} {value}" for key, value in study.items())
     for axis in ("problem", "dual", "primal", "solver", "assembly"):
         yield axis, ", ".join(str(name) for name in cells[axis].unique())
@@ -123,44 +80,42 @@ def _facts(path: Path, cells: pd.DataFrame) -> Iterator[tuple[str, str]]:
     yield "machine", "; ".join(str(name) for name in cells["machine"].unique())
     versions = {name: text for row in cells["versions"].dropna() for name, text in json.loads(row).items()}
     yield "versions", ", ".join(f"{name} {text}" for name, text in versions.items())
-    yield "seconds", "CPU seconds of one thread; offline times are sums of the stages a cell would have had to run"
+    yield "seconds", "CPU seconds of one thread; the offline time of a cell includes every stage it depends on"
 
 
-def _by_heading(found: list[Finding]) -> list[tuple[str, list[str]]]:
-    """Sentences under what they are about."""
-    headings = dict.fromkeys(finding.about for finding in found)
-    return [(about, [finding.text for finding in found if finding.about == about]) for about in headings]
-
-
-def _tables(path: Path) -> Iterator[Grid]:
-    said = "Errors are relative and means over the queries that are ok."
-    yield _grid("summary", "All cells", said, tables.summary(tables.read(path, "cells")))
+def _tables(path: Path, cells: pd.DataFrame) -> Iterator[Table]:
+    yield "summary", "All cells", "Errors are relative; they are means over the ok queries.", tables.summary(cells)
     thresholds = tables.read(path, "thresholds")
     model = thresholds["primal_a"] == HIGH_FIDELITY
-    said = "From how many queries on b pays against a."
-    for name, against, rows in (("enrichments", "between enrichments", ~model), ("model", "of reduced models", model)):
-        if rows.any():
-            yield _grid(name, f"Benefit thresholds {against}", said, tables.benefits(thresholds[rows]))
-    disagreements = tables.in_order(tables.read(path, "disagreements"))
+    caption = "When b is cheaper than a, offline and online together, by the number of queries."
+    for name, title, rows in (
+        ("enrichments", "Break-even between enrichments", thresholds[~model]),
+        ("model", "Break-even against the high-fidelity model", thresholds[model]),
+    ):
+        if len(rows):
+            yield name, title, caption, tables.benefits(rows)
+    disagreements = tables.in_order(tables.read(path, "disagreements")).drop(columns="problem_options")
     if len(disagreements):
-        said = "Every two solvers on one reduced model: relative differences of u in V, and what the accuracy allows."
-        yield _grid("disagreements", "Agreement of the solvers", said, disagreements.drop(columns="problem_options"))
+        caption = "Any two solvers on one reduced model: relative differences of u in V, and the differences allowed."
+        yield "disagreements", "Agreement of the solvers", caption, disagreements
 
 
-def _grid(name: str, title: str, said: str, frame: pd.DataFrame) -> Grid:
+def _grid(frame: pd.DataFrame) -> dict[str, Any]:
+    """Columns and rows of a table, without empty columns."""
     shown = frame.dropna(axis=1, how="all")
-    rows = [[_entry(value) for value in row] for row in shown.itertuples(index=False)]
-    return Grid(name, title, said, [str(column) for column in shown.columns], rows)
+    return {"columns": shown.columns, "rows": [map(_entry, row) for row in shown.itertuples(index=False)]}
 
 
-def _entry(value: Any) -> Entry:
+def _entry(value: Any) -> tuple[str, str, str]:
+    """A value as JavaScript sorts it, as it is printed, and its class."""
     text = tables.cell_text(value)
     number = isinstance(value, Real) and not isinstance(value, bool)
     plain = "" if not text else repr(float(value)).replace("inf", "Infinity") if number else text
-    return Entry(plain, text, "number" if number else "long" if len(text) > LONG else "")
+    return plain, text, "number" if number else "long" if len(text) > LONG else ""
 
 
-def _figures(path: Path) -> Iterator[Drawn]:
+def _figures(path: Path) -> Iterator[tuple[str, str, str]]:
+    """Name, caption and data URI of every figure."""
     for name, draw, data in drawings(path):
         with styled():
             figure = draw(data)
@@ -169,4 +124,4 @@ def _figures(path: Path) -> Iterator[Drawn]:
             stream = io.BytesIO()
             figure.savefig(stream, format="svg", **WRITTEN["svg"])
         source = "data:image/svg+xml;base64," + base64.b64encode(stream.getvalue()).decode("ascii")
-        yield Drawn(name, " ".join((inspect.getdoc(draw) or "").split()), source)
+        yield name, " ".join((inspect.getdoc(draw) or "").split()), source

@@ -1,15 +1,17 @@
-"""Recompute the residuals of every solution of this test set; needs NumPy, and nothing of the tool that wrote it.
+"""Recompute the residuals of every solution of this test set; needs only NumPy, not the program that exported it.
 
 Programs are min ½ xᵀPx + qᵀx subject to Gx ≤ h, in programs/NAME.npz; solutions x and multipliers z ≥ 0 of
-Px + q + Gᵀz = 0 are x_SOLVER and z_SOLVER in solutions/NAME.npz; rows.csv says what was claimed of each. With the rows
-of G and h divided by the norms of the rows of G, the relative residuals are
+Px + q + Gᵀz = 0 are x_SOLVER and z_SOLVER in solutions/NAME.npz; rows.csv holds the claimed status and residuals. The
+relative residuals are, with the rows of G and h divided by the norms of the rows of G in the primal one,
 
     primal  max(Gx − h)₊ / max(1, |h|∞)
-    dual    |Px + q + Gᵀz|∞ / max(|Px|∞, |q|∞, |Gᵀz|∞)      (P, q, G, z as they are)
-    gap     |xᵀPx + qᵀx + hᵀz| / max(½|xᵀPx|, |qᵀx|, |hᵀz|, 1e-4 (qᵀq)² / 2qᵀPq)  (likewise; the last one a share
-            of the energy that a step of steepest descent gains, for solutions that are zero up to round-off)
+    dual    |Px + q + Gᵀz|∞ / max(|Px|∞, |q|∞, |Gᵀz|∞)
+    gap     |xᵀPx + qᵀx + hᵀz| / max(½|xᵀPx|, |qᵀx|, |hᵀz|, 1e-4 (qᵀq)² / 2qᵀPq)
 
-Usage: python check.py [FOLDER]. Exit code 1 if a row that claims "ok" is not, or a claimed residual is another number.
+The last term is a share of the energy that a step of steepest descent gains; it serves solutions that vanish up to
+round-off.
+
+Usage: python check.py [FOLDER]. Exit code 1 if a row claims "ok" and is not, or a claimed residual is not reproduced.
 """
 
 from __future__ import annotations
@@ -21,7 +23,7 @@ from pathlib import Path
 import numpy as np
 
 ROUND_OFF = 1e-13
-"""Two computations of a residual may differ by this much."""
+"""Allowed difference between two computations of a residual."""
 
 
 def residuals(P: np.ndarray, q: np.ndarray, G: np.ndarray, h: np.ndarray, x: np.ndarray, z: np.ndarray) -> list[float]:
@@ -40,7 +42,7 @@ def residuals(P: np.ndarray, q: np.ndarray, G: np.ndarray, h: np.ndarray, x: np.
 
 
 def main(folder: Path) -> int:
-    """Check all rows; the number of those that are wrong."""
+    """Check all rows; returns the number of wrong ones."""
     wrong, count, fine = 0, 0, 0
     with (folder / "rows.csv").open(newline="") as file:
         for row in csv.DictReader(file):

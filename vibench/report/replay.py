@@ -1,10 +1,11 @@
-"""Quadratic programs of a run as files: one row solved again by every solver, or all of them as a test set."""
+"""Quadratic programs of a run as files: one query solved again by every solver, or all programs as a test set."""
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Iterator
+from functools import partial
 from importlib.resources import files
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +26,11 @@ from vibench.study import registry
 from vibench.timing import median_seconds
 
 CHECKER = "check.py"
-"""The script that goes with an exported test set; it needs NumPy and nothing else."""
+"""Script in an exported test set that recomputes its residuals; it needs only NumPy."""
+
+
+KEPT = ("status", "primal_residual", "dual_residual", "gap", "solver_status")
+"""Columns of a query that an exported test set repeats."""
 
 
 def worst_query(recorded: RecordedCell) -> int:
@@ -35,13 +40,13 @@ def worst_query(recorded: RecordedCell) -> int:
 
 
 def replay(recorded: RecordedCell, query: int, file: Path) -> pd.DataFrame:
-    """Write the program of one query to a file, and solve it with every solver installed here.
+    """Write the program of one query to a file, and solve it with every installed solver.
 
     Returns
     -------
     DataFrame
-        One line per solver, and a first one for the recorded answer if there is one: what the solver claims, what our
-        residuals say, seconds, and the distance of u in V from the recorded answer.
+        A row for the recorded solution, if there is one, and a row per solver: the status that the solver claims, the
+        verified status with residuals, seconds, and the distance of u in V from the recorded solution.
 
     Raises
     ------
@@ -49,7 +54,7 @@ def replay(recorded: RecordedCell, query: int, file: Path) -> pd.DataFrame:
         If the cell has no such query, or the file is no npz file.
     """
     if file.suffix != ".npz":
-        raise RequestError(f"'{file}': the program goes into an npz file, its name must end in .npz")
+        raise RequestError(f"'{file}': the program is written as an npz file, whose name must end in .npz")
     rows = recorded.rows("queries")
     if query not in rows:
         raise RequestError(f"cell {recorded.row['cell']} has no query {query}; it has 0 to {len(rows) - 1}")
@@ -60,44 +65,40 @@ def replay(recorded: RecordedCell, query: int, file: Path) -> pd.DataFrame:
     table: list[dict[str, Any]] = []
     if query in solutions:
         known, alpha = vectors(solutions[query])
-        answer = QPSolution(known, alpha, rows[query]["solver_status"] or "", rows[query]["iterations"])
-        name = f"{recorded.cell.solver} (recorded)"
-        table.append({"solver": name, **_line(program, answer, accuracy, None), "seconds": rows[query]["solve_s"]})
-    solvers = installed_solvers(registry.names("QP solver"))
-    table += [{"solver": solver, **_solved(program, solver, accuracy, known)} for solver in solvers]
+        solution = QPSolution(known, alpha, rows[query]["solver_status"] or "", rows[query]["iterations"])
+        line = _line(program, solution, accuracy, None) | {"seconds": rows[query]["solve_s"]}
+        table.append({"solver": f"{recorded.cell.solver} (recorded)"} | line)
+    for solver in installed_solvers(registry.names("QP solver")):
+        try:
+            solution, seconds = median_seconds(partial(solve_qp, program, solver, accuracy, registry.qp_solver(solver)))
+            line = _line(program, solution, accuracy, known) | {"seconds": seconds.cpu}
+        except (Exception, SystemExit) as error:  # noqa: BLE001  a solver may raise anything; its row says what
+            line = {"claims": in_a_line(error), "status": Status.ERROR.value}
+        table.append({"solver": solver} | line)
     return pd.DataFrame(table)
 
 
-def _solved(program: VariationalInequality, solver: str, accuracy: float, known: Array | None) -> dict[str, Any]:
-    try:
-        answer, seconds = median_seconds(lambda: solve_qp(program, solver, accuracy, registry.qp_solver(solver)))
-    except (Exception, SystemExit) as error:  # noqa: BLE001  a solver may raise anything; the line says what
-        claim = in_a_line(error)
-        return {"claims": claim, "status": Status.ERROR.value}
-    return _line(program, answer, accuracy, known) | {"seconds": seconds.cpu}
-
-
-def _line(program: VariationalInequality, answer: QPSolution, accuracy: float, known: Array | None) -> dict[str, Any]:
-    status, _, residuals = verification.verify(program, answer, accuracy)
-    line: dict[str, Any] = {"claims": answer.solver_status, "status": status.value, "iterations": answer.iterations}
+def _line(program: VariationalInequality, solution: QPSolution, accuracy: float, known: Array | None) -> dict[str, Any]:
+    status, _, residuals = verification.verify(program, solution, accuracy)
+    line: dict[str, Any] = {"claims": solution.solver_status, "status": status.value, "iterations": solution.iterations}
     if residuals is not None:
         line |= {"primal": residuals.primal, "dual": residuals.dual, "gap": residuals.gap}
-    if known is not None and answer.x is not None:
-        line["distance"] = float(np.linalg.norm(answer.x - known))
+    if known is not None and solution.x is not None:
+        line["distance"] = float(np.linalg.norm(solution.x - known))
     return line
 
 
 def write_program(program: VariationalInequality, file: Path) -> None:
-    """Write min ½xᵀPx + qᵀx, Gx ≤ h as qpsolvers does: an npz file with P, q, G, h."""
+    """Write min ½xᵀPx + qᵀx, Gx ≤ h in the format of qpsolvers: an npz file with P, q, G, h."""
     file.parent.mkdir(parents=True, exist_ok=True)
     qpsolvers.Problem(program.A, -program.f, program.B, program.g).save(str(file))
 
 
 def export(run: str, folder: Path) -> int:
-    """Write every reduced program of a run, every solution, and what vibench said of it; returns their number.
+    """Write every reduced program of a run, with its solutions and their verification; returns their number.
 
-    The folder holds `programs/NAME.npz` (P, q, G, h), `solutions/NAME.npz` (x_SOLVER, z_SOLVER for every cell that
-    solved it), `rows.csv` (one line per solution: status, accuracy, residuals) and `check.py`, which recomputes the
+    The folder holds `programs/NAME.npz` (P, q, G, h), `solutions/NAME.npz` (x_SOLVER, z_SOLVER for every cell with a
+    solution), `rows.csv` (a line per solution: status, accuracy, residuals) and `check.py`, which recomputes the
     residuals of every solution.
 
     Raises
@@ -106,43 +107,32 @@ def export(run: str, folder: Path) -> int:
         If there is no such run, the folder is not empty, or other code computed the run.
     """
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise RequestError(f"'{folder}' is there already and not an empty folder; choose another")
+        raise RequestError(f"'{folder}' exists and is not an empty folder; choose another")
     models: dict[str, list[RecordedCell]] = {}
     for recorded in recorded_cells(run):
         models.setdefault(recorded.row["model"], []).append(recorded)
-    lines: list[dict[str, Any]] = []
-    count = 0
-    for cells in models.values():
-        for name, program, solved in _programs(cells):
-            write_program(program, folder / "programs" / f"{name}.npz")
-            arrays = {f"{letter}_{row['solver']}": row[letter] for row in solved for letter in ("x", "z")}
-            (folder / "solutions").mkdir(exist_ok=True)
-            np.savez(folder / "solutions" / f"{name}.npz", **arrays)
-            lines += [{"program": name, **{k: v for k, v in row.items() if k not in ("x", "z")}} for row in solved]
-            count += 1
-    if not count:
+    programs = [rows for cells in models.values() for rows in _exported(cells, folder)]
+    if not programs:
         raise RequestError(f"no cell of '{run}' has a reduced program")
-    pd.DataFrame(lines).to_csv(folder / "rows.csv", index=False)
-    with (files("vibench.report") / "qps_checker.py").open("rb") as source, (folder / CHECKER).open("wb") as target:
-        shutil.copyfileobj(source, target)
-    return count
+    pd.DataFrame(chain.from_iterable(programs)).to_csv(folder / "rows.csv", index=False)
+    (folder / CHECKER).write_bytes((files("vibench.report") / "qps_checker.py").read_bytes())
+    return len(programs)
 
 
-def _programs(
-    cells: list[RecordedCell],
-) -> Iterator[tuple[str, VariationalInequality, list[dict[str, Any]]]]:
-    """Programs of one reduced model: a name, the program, and what its cells made of it."""
-    queries = [recorded.rows("queries") for recorded in cells]
-    solutions = [recorded.rows("solutions") for recorded in cells]
-    for query in sorted(set().union(*queries)):
-        solved = []
-        for recorded, of_queries, of_solutions in zip(cells, queries, solutions, strict=True):
-            if query in of_solutions:
-                x, alpha = vectors(of_solutions[query])
-                kept = ("status", "primal_residual", "dual_residual", "gap", "solver_status")
-                solved.append(
-                    {"solver": recorded.cell.solver, "cell": recorded.row["cell"], "accuracy": recorded.cell.accuracy}
-                    | {name: of_queries[query][name] for name in kept}
-                    | {"x": x, "z": alpha}
-                )
-        yield f"{cells[0].row['cell']}-{query}", cells[0].program(query), solved
+def _exported(cells: list[RecordedCell], folder: Path) -> Iterator[list[dict[str, Any]]]:
+    """Write the programs of one reduced model; yields the rows of every program, one per solution."""
+    tables = [(recorded, recorded.rows("queries"), recorded.rows("solutions")) for recorded in cells]
+    for query in sorted(set().union(*(queries for _, queries, _ in tables))):
+        name = f"{cells[0].row['cell']}-{query}"
+        write_program(cells[0].program(query), folder / "programs" / f"{name}.npz")
+        rows: list[dict[str, Any]] = []
+        arrays: dict[str, Any] = {}
+        for recorded, queries, solutions in tables:
+            if query in solutions:
+                solver, row = recorded.cell.solver, queries[query]
+                arrays[f"x_{solver}"], arrays[f"z_{solver}"] = vectors(solutions[query])
+                about = {"program": name, "solver": solver, "cell": recorded.row["cell"]}
+                rows.append(about | {"accuracy": recorded.cell.accuracy} | {key: row[key] for key in KEPT})
+        (folder / "solutions").mkdir(exist_ok=True)
+        np.savez(folder / "solutions" / f"{name}.npz", **arrays)
+        yield rows

@@ -80,7 +80,7 @@ def test_a_threshold_is_worse_where_its_own_side_got_slower(changed: Changed, qu
         1.25,
     )
     assert set(found.changes["primal"]) == {"decorrelated", "offline-pga"}
-    assert set(found.changes["what"]) == {"pays against high-fidelity"}
+    assert set(found.changes["what"]) == {"break-even against high-fidelity"}
     assert found.regressions == 2
 
 

@@ -136,7 +136,7 @@ def test_findings_tables_and_facts_are_in_it(made: Path, quick_run: Path) -> Non
     cells = tables.read(quick_run / FILE, "cells")
     assert cells["machine"].iloc[0] in page
     assert page.count("<tr>") > len(cells)
-    assert "Nothing: every query of every cell is ok." in page
+    assert "None: every query of every cell is ok." in page
 
 
 def test_every_failure_has_its_reason_and_nothing_is_markup(changed: Changed) -> None:
@@ -147,10 +147,10 @@ def test_every_failure_has_its_reason_and_nothing_is_markup(changed: Changed) ->
         "INSERT INTO pictures (problem, problem_options, number, reason) VALUES ('wire', '{}', 0, 'no <mesh>')",
     )
     failed = int((tables.read(results, "cells")["solver"] == "osqp").sum())
-    page = html.html(results)
+    page = html.page(results)
     assert page.count("&lt;script&gt;alert(&#39;the solver said &amp; did nothing&#39;)&lt;/script&gt;") >= failed
     assert "<script>alert" not in page
-    assert f"{failed} cells did not end ok." in page
+    assert f"{failed} cells are not ok." in page
     assert page.count("one of many") >= failed
     assert page.count("no picture of ") == 1
     assert "no picture of wire: no &lt;mesh&gt;" in page
@@ -159,6 +159,6 @@ def test_every_failure_has_its_reason_and_nothing_is_markup(changed: Changed) ->
 def test_a_run_without_any_query_has_a_report(changed: Changed) -> None:
     emptied = [f"DELETE FROM {name}" for name in ("queries", "thresholds", "disagreements", "histories", "pictures")]
     lost = "UPDATE cells SET status = 'unavailable', reason = 'not installed', queries_ok = 0, online_s = NULL"
-    page = html.html(changed(*emptied, lost))
+    page = html.page(changed(*emptied, lost))
     assert "There is nothing to draw" in page
     assert "0 with every query ok" in page

@@ -30,14 +30,14 @@ OF_PROBLEM: dict[str, Drawing] = {
     "solvers": solvers,
     "total-cost": total_cost,
 }
-"""Figures of every problem, by the end of the file's name; `None` where there is nothing to draw."""
+"""Figures of every problem, by the end of their file names; `None` where the run has no data for one."""
 
 OF_DUAL: dict[str, Drawing] = {"enrichment": enrichment, "inf-sup": inf_sup}
 """Figures of every problem and dual strategy."""
 
 
 def drawings(path: Path) -> Iterator[tuple[str, Drawing, Data]]:
-    """Every figure a results file may have: its name, the function that draws it, and what from."""
+    """Every figure a results file may have: its name, the function that draws it, and the data."""
     for name, data in problems(path):
         yield from ((f"{name}-{kind}", draw, data) for kind, draw in OF_PROBLEM.items())
         for dual, file in zip(data.duals, file_names(data.duals), strict=True):
@@ -45,18 +45,18 @@ def drawings(path: Path) -> Iterator[tuple[str, Drawing, Data]]:
 
 
 def draw_all(path: Path, folder: Path, formats: tuple[str, ...] = FORMATS, jobs: int = 1) -> list[Path]:
-    """Draw what a results file has data for; returns the files written.
+    """Draw every figure that a results file has data for; returns the files written.
 
     Parameters
     ----------
     path
         Results file.
     folder
-        Where the files go.
+        Folder of the files.
     formats
-        What is written of every figure.
+        Formats to write every figure in.
     jobs
-        Processes to draw in, this one among them.
+        Number of processes to draw in, this one included.
     """
     if jobs == 1:
         return [file for files in _part(path, folder, formats, 0, 1) for file in files]
@@ -67,7 +67,7 @@ def draw_all(path: Path, folder: Path, formats: tuple[str, ...] = FORMATS, jobs:
 
 
 def _part(path: Path, folder: Path, formats: tuple[str, ...], first: int, step: int) -> list[list[Path]]:
-    """Draw every `step`-th figure from number `first` on; the files of each."""
+    """Draw every `step`-th figure from number `first` on; returns the files of each."""
     written = []
     for name, draw, data in islice(drawings(path), first, None, step):
         folder.mkdir(parents=True, exist_ok=True)

@@ -1,4 +1,4 @@
-"""What strategies cost and what they give for it: errors against dimension and seconds, total cost and thresholds."""
+"""Errors against dimension and time of a query, and total cost against the number of queries."""
 
 from __future__ import annotations
 
@@ -9,17 +9,22 @@ import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from vibench.report.figures.data import Data, best_solver, label, pair_title, pairs
-from vibench.report.figures.style import BLACK, COLOURS, MARKERS, Sheet, logarithmic, plot
+from vibench.report.figures.data import Data, best_solver, by_dimensions, label
+from vibench.report.figures.style import BLACK, POINTS, Sheet, line, logarithmic, plot, style_of
 from vibench.results.break_even import HIGH_FIDELITY, Meaning
 
-ERRORS = (("error_u_mean", "mean relative error of u"), ("error_lambda_mean", "mean relative error of λ"))
+ERRORS = {"error_u_mean": "mean relative error of u", "error_lambda_mean": "mean relative error of λ"}
 
 MOST_QUERIES = 1e6
 """Total cost is drawn up to this number of queries."""
 
 ABREAST = 6
 """Panels in a row."""
+
+MARKS = {
+    Meaning.FROM: (">", "break-even: cheaper from here"),
+    Meaning.UNTIL: ("<", "break-even: cheaper until here"),
+}
 
 
 def dimension(data: Data) -> Figure | None:
@@ -31,30 +36,28 @@ def dimension(data: Data) -> Figure | None:
 
 
 def work_precision(data: Data) -> Figure | None:
-    """Errors against the seconds of a query: below and to the left is better; no strategy beats those on the line."""
+    """Errors against the time of a query; no cell is both faster and more accurate than those on the line."""
     cells = best_solver(data.cells)
-    return _scatter(data, cells, 1e3 * cells["online_s"], "mean time of a query [ms]", "work and precision", best=True)
+    x = 1e3 * cells["online_s"]
+    return _scatter(data, cells, x, "mean time of a query [ms]", "work and precision", with_front=True)
 
 
 def _scatter(
-    data: Data, cells: pd.DataFrame, x: pd.Series, xlabel: str, said: str, *, best: bool = False
+    data: Data, cells: pd.DataFrame, x: pd.Series, xlabel: str, title: str, *, with_front: bool = False
 ) -> Figure | None:
-    """One point per cell: colour and marker say which primal strategy and which assembly, the face which cone."""
-    known = cells[ERRORS[0][0]].notna() & x.notna()
+    """One point per cell: colour and marker for primal strategy and assembly, filling for the dual strategy."""
+    known = cells["error_u_mean"].notna() & x.notna()
     cells, x = cells[known], x[known]
     if cells.empty:
         return None
-    sheet = Sheet(1, 2, f"{data.problem}, {cells['solver'].iloc[0]}: {said}")
+    sheet = Sheet(1, 2, f"{data.problem}, {cells['solver'].iloc[0]}: {title}")
     kinds = list(dict.fromkeys(zip(cells["primal"], cells["assembly"], strict=True)))
-    duals = list(dict.fromkeys(cells["dual"]))
-    for panel, (column, ylabel) in zip(sheet.panels, ERRORS, strict=True):
-        for k, (primal, assembly) in enumerate(kinds):
-            for number, dual in enumerate(duals):
-                mine = (cells["primal"] == primal) & (cells["assembly"] == assembly) & (cells["dual"] == dual)
-                if mine.any():
-                    name = f"{label(primal, None, assembly)}, {dual}"
-                    panel.plot(x[mine], cells[column][mine], label=name, **_point(k, number))
-        if best:
+    duals = list(cells["dual"].unique())
+    for panel, (column, ylabel) in zip(sheet.panels, ERRORS.items(), strict=True):
+        for (primal, assembly, dual), mine in cells.groupby(["primal", "assembly", "dual"]):
+            point = _point(kinds.index((primal, assembly)), duals.index(dual))
+            panel.plot(x[mine.index], mine[column], label=f"{label(primal, None, assembly)}, {dual}", **point)
+        if with_front:
             front = _front(x.to_numpy(float), cells[column].to_numpy(float))
             panel.plot(*front, color="0.6", linewidth=0.8, drawstyle="steps-post", zorder=0)
         panel.set(xlabel=xlabel, ylabel=ylabel)
@@ -63,19 +66,14 @@ def _scatter(
 
 
 def _point(k: int, dual: int) -> dict[str, Any]:
-    faces = (COLOURS[k % len(COLOURS)], "white", "0.75")
-    return {
-        "linestyle": "none",
-        "color": COLOURS[k % len(COLOURS)],
-        "marker": MARKERS[(k + k // len(COLOURS)) % len(MARKERS)],
-        "markersize": 5,
-        "markerfacecolor": faces[dual % len(faces)],
-        "markeredgewidth": 1.0 + dual // len(faces),
-    }
+    style = line(k)
+    faces = (style["color"], "white", "0.75")
+    look = {"markersize": 5, "markerfacecolor": faces[dual % len(faces)], "markeredgewidth": 1.0 + dual // len(faces)}
+    return style | POINTS | look
 
 
 def _front(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Points that no other beats in both, from left to right."""
+    """The Pareto front of points to be small in x and y, from left to right."""
     order = np.lexsort((y, x))
     best = np.minimum.accumulate(y[order])
     kept = np.concatenate([[True], best[1:] < best[:-1]])
@@ -83,20 +81,20 @@ def _front(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def total_cost(data: Data) -> Figure | None:
-    """Seconds in all against the number of queries; marks where a way of reducing begins, or ends, to pay."""
+    """Offline and online seconds against the number of queries; triangles mark where two models break even."""
     cells = best_solver(data.cells)
     if cells.empty:
         return None
-    thresholds = data.thresholds[data.thresholds["solver"] == cells["solver"].iloc[0]]
-    shown = [(dual, pair, mine) for dual, group in cells.groupby("dual", sort=False) for pair, mine in pairs(group)]
+    shown = by_dimensions(cells)
     columns = min(len(shown), ABREAST)
-    rows = -(-len(shown) // columns)
-    sheet = Sheet(rows, columns, f"{data.problem}, {cells['solver'].iloc[0]}: total cost")
-    names: dict[str, int] = {}
-    for panel, (dual, pair, mine) in zip(sheet.panels, shown, strict=False):
-        _lines(panel, mine, names)
-        _marks(panel, mine, thresholds[thresholds["dual"] == dual])
-        title = f"{dual}, {pair_title(pair, mine)}"
+    sheet = Sheet(-(-len(shown) // columns), columns, f"{data.problem}, {cells['solver'].iloc[0]}: total cost")
+    styles: dict[str, int] = {}
+    for panel, (title, mine) in zip(sheet.panels, shown, strict=False):
+        # The most vectors stand for every strategy and assembly: a line per tolerance would hide the crossings.
+        added = mine.assign(added=mine["enrichment"].fillna(0)).sort_values("added", ascending=False, kind="stable")
+        most = added.drop_duplicates(["primal", "primal_options", "assembly"]).sort_index()
+        _lines(panel, most, styles)
+        _marks(panel, most, data.thresholds)
         panel.set(xlabel="number of queries", ylabel="offline + online [s]", title=title)
         panel.set_xlim(1.0, MOST_QUERIES)
         logarithmic(panel, "xy")
@@ -105,41 +103,21 @@ def total_cost(data: Data) -> Figure | None:
     return sheet.finish()
 
 
-def _lines(panel: Axes, cells: pd.DataFrame, names: dict[str, int]) -> None:
+def _lines(panel: Axes, cells: pd.DataFrame, styles: dict[str, int]) -> None:
     queries = np.geomspace(1.0, MOST_QUERIES, 61)
-    for number, cell in enumerate(_tightest(cells).itertuples()):
-        if number == 0:
-            plot(panel, queries, queries * cell.hf_s, BLACK, HIGH_FIDELITY)
+    plot(panel, queries, queries * cells["hf_s"].iloc[0], BLACK, HIGH_FIDELITY)
+    for cell in cells.itertuples():
         name = label(cell.primal, cell.primal_tol, cell.assembly)
-        k = names.setdefault(name, len(names) + (len(names) >= BLACK))
-        plot(panel, queries, cell.offline_s + queries * cell.online_s, k, name)
-
-
-def _tightest(cells: pd.DataFrame) -> pd.DataFrame:
-    """Of every strategy and assembly the cell with the most vectors."""
-    order = cells.assign(added=cells["enrichment"].fillna(0)).sort_values("added", ascending=False, kind="stable")
-    return order.drop_duplicates(["primal", "primal_options", "assembly"]).sort_index()
+        plot(panel, queries, cell.offline_s + queries * cell.online_s, style_of(name, styles), name)
 
 
 def _marks(panel: Axes, cells: pd.DataFrame, thresholds: pd.DataFrame) -> None:
-    """Where two of the lines cross: thresholds between them, at their cost."""
-    known = {(cell.primal, _number(cell.primal_tol), cell.assembly): cell for cell in _tightest(cells).itertuples()}
+    """Break-even points between the lines of a panel, at their cost."""
+    # Rows of `thresholds` lack the options of the primal strategies; measured seconds identify the cell all the same.
+    drawn = set(zip(cells["offline_s"], cells["online_s"], strict=True))
     for row in thresholds.itertuples():
-        b = known.get((row.primal_b, _number(row.primal_tol_b), row.assembly_b))
-        a = known.get((row.primal_a, _number(row.primal_tol_a), row.assembly_a))
-        between = row.primal_a == HIGH_FIDELITY or (a is not None and a.offline_s == row.offline_a_s)
-        if b is None or b.offline_s != row.offline_b_s or not between or pd.isna(row.benefit_threshold):
-            continue
-        n = row.benefit_threshold
-        if not 1.0 <= n <= MOST_QUERIES:
-            continue
-        label_once = "benefit threshold: from here" if row.meaning == Meaning.FROM else "benefit threshold: until here"
-        marker = ">" if row.meaning == Meaning.FROM else "<"
-        panel.plot(
-            [n], [row.offline_b_s + n * row.online_b_s], marker, color="black", markersize=5,
-            markerfacecolor="none", label=label_once, zorder=5,
-        )  # fmt: skip
-
-
-def _number(tolerance: float | None) -> float:
-    return -1.0 if tolerance is None or pd.isna(tolerance) else float(tolerance)
+        n, b = row.benefit_threshold, (row.offline_b_s, row.online_b_s)
+        between = row.primal_a == HIGH_FIDELITY or (row.offline_a_s, row.online_a_s) in drawn
+        if b in drawn and between and 1.0 <= n <= MOST_QUERIES:
+            marker, name = MARKS[row.meaning]
+            panel.plot(n, b[0] + n * b[1], marker, c="black", markersize=5, mfc="none", label=name, zorder=5)

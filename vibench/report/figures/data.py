@@ -1,10 +1,10 @@
-"""What figures are drawn from: the tables of one results file, problem by problem."""
+"""The tables of a results file, problem by problem, as figures and findings read them."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -12,18 +12,21 @@ import pandas as pd
 
 from vibench.results import pictures, tables
 
-PAIR = ["pod_tol", "pod_size", "dual_tol", "dual_size"]
-"""What asks for a pair of dimensions (N, R)."""
-
 TABLES = ("cells", "queries", "histories", "thresholds")
-"""What figures need of the results."""
+
+PAIR = ["pod_tol", "pod_size", "dual_tol", "dual_size"]
+"""Tolerances or prescribed sizes that determine the dimensions (N, R)."""
 
 PRIMAL = ["primal", "primal_options", "primal_tol"]
 
 
 @dataclass(frozen=True)
 class Data:
-    """The tables of one problem of a run; `queries` know the kind of their enrichment."""
+    """The tables of one problem of a run.
+
+    Each has a column `pair`, which is the same where the values of `PAIR` are; queries also have the columns
+    `enrichment_kind`, `N` and `R` of their cells.
+    """
 
     problem: str
     cells: pd.DataFrame
@@ -33,10 +36,9 @@ class Data:
     pictures: tuple[pictures.Shown, ...]
 
     def of_dual(self, dual: str) -> Data:
-        """What belongs to one dual strategy."""
-        frames = (self.cells, self.queries, self.histories, self.thresholds)
-        cells, queries, histories, thresholds = (frame[frame["dual"] == dual] for frame in frames)
-        return Data(self.problem, cells, queries, histories, thresholds, self.pictures)
+        """The rows of one dual strategy."""
+        frames = {name: getattr(self, name) for name in TABLES}
+        return replace(self, **{name: frame[frame["dual"] == dual] for name, frame in frames.items()})
 
     @property
     def duals(self) -> list[str]:
@@ -50,22 +52,22 @@ def problems(path: Path) -> Iterator[tuple[str, Data]]:
     if read["queries"].empty:
         return
     for axis in ("dual", "primal"):
-        _tell_apart(axis, [read[name] for name in ("cells", "queries", "histories")])
-    kinds = read["cells"].set_index("cell")["enrichment_kind"]
-    read["queries"]["enrichment_kind"] = read["queries"]["cell"].map(kinds)
+        _tell_apart(axis, [frame for frame in read.values() if axis in frame])
+    read["queries"] = read["queries"].merge(read["cells"][["cell", "enrichment_kind", "N", "R"]], "left", "cell")
+    for frame in read.values():
+        frame["pair"] = [str(pair) for pair in frame[PAIR].astype(float).itertuples(index=False, name=None)]
     shown = tuple(pictures.read(path))
     keys = list(dict.fromkeys(zip(read["queries"]["problem"], read["queries"]["problem_options"], strict=True)))
-    for name, key in zip(file_names([str(problem) for problem, _ in keys]), keys, strict=True):
-        cells, queries, histories, thresholds = (
-            frame[(frame["problem"] == key[0]) & (frame["problem_options"] == key[1])]
-            for frame in map(read.__getitem__, TABLES)
-        )
-        mine = tuple(one for one in shown if one.key == key)
-        yield name, Data(str(key[0]), cells, queries, histories, thresholds, mine)
+    for name, (problem, options) in zip(file_names([str(problem) for problem, _ in keys]), keys, strict=True):
+        mine = {
+            table: frame[(frame["problem"] == problem) & (frame["problem_options"] == options)]
+            for table, frame in read.items()
+        }
+        yield name, Data(str(problem), **mine, pictures=tuple(one for one in shown if one.key == (problem, options)))
 
 
 def _tell_apart(axis: str, frames: list[pd.DataFrame]) -> None:
-    """Number labels that a plugin bears with different options."""
+    """Number the labels of a plugin that occurs with different options."""
     options: dict[str, dict[str, int]] = {}
     for frame in frames:
         for name, given in frame[[axis, f"{axis}_options"]].dropna().drop_duplicates().itertuples(index=False):
@@ -77,30 +79,29 @@ def _tell_apart(axis: str, frames: list[pd.DataFrame]) -> None:
         frame.loc[rows, axis] = [f"{name} ({options[name][given]})" for name, given in named]
 
 
-def pairs(frame: pd.DataFrame) -> list[tuple[Any, pd.DataFrame]]:
-    """Rows by what asked for (N, R), in the order of the tables."""
-    return list(frame.groupby(PAIR, dropna=False, sort=False))
-
-
-def same(frame: pd.DataFrame, pair: tuple[Any, ...]) -> pd.Series:
-    """Rows of one pair."""
-    mask = pd.Series(True, index=frame.index)
-    for name, value in zip(PAIR, pair, strict=True):
-        mask &= frame[name].isna() if pd.isna(value) else frame[name] == value
-    return mask
-
-
-def pair_title(pair: tuple[Any, ...], cells: pd.DataFrame) -> str:
-    """(N, R) as they came out, for the cells of a pair."""
-    sizes = cells[same(cells, pair)][["N", "R"]].dropna()
+def dimensions(rows: pd.DataFrame) -> str:
+    """(N, R) of cells or queries of one pair, as a title."""
+    sizes = rows[["N", "R"]].dropna()
     if sizes.empty:
         return "(N, R) unknown"
     low, high = sizes.min().astype(int), sizes.max().astype(int)
     return "(N, R) = ({}, {})".format(*(f"{a}" if a == b else f"{a}–{b}" for a, b in zip(low, high, strict=True)))
 
 
+def by_dimensions(cells: pd.DataFrame) -> list[tuple[str, pd.DataFrame]]:
+    """Cells by dual strategy and pair, with the title of each group."""
+    groups = cells.groupby(["dual", "pair"], sort=False)
+    return [(f"{dual}, {dimensions(group)}", group) for (dual, _), group in groups]
+
+
+def by_strategy(rows: pd.DataFrame) -> Iterator[tuple[str, pd.DataFrame]]:
+    """Rows by primal strategy and tolerance, with the label of each group."""
+    for (primal, tolerance), group in rows.groupby(["primal", "primal_tol"], dropna=False):
+        yield label(primal, tolerance), group
+
+
 def label(name: Any, tolerance: Any = None, assembly: str = "full") -> str:
-    """A primal strategy with its tolerance."""
+    """A primal strategy with its tolerance and, unless it is full, its assembly."""
     with_tolerance = str(name) if pd.isna(tolerance) else f"{name}, δ = {tolerance:g}"
     return with_tolerance if assembly in ("full", "") else f"{with_tolerance}, {assembly}"
 
@@ -111,7 +112,7 @@ def one_solver(queries: pd.DataFrame) -> pd.DataFrame:
 
 
 def best_solver(cells: pd.DataFrame) -> pd.DataFrame:
-    """The cells of the solver that answered most queries well, the quickest of several."""
+    """The timed cells of the solver with the most ok queries; of several such solvers, the fastest."""
     timed = cells[cells["online_s"].notna()]
     if timed.empty:
         return timed
@@ -119,15 +120,23 @@ def best_solver(cells: pd.DataFrame) -> pd.DataFrame:
     return timed[timed["solver"] == known.sort_values(["ok", "seconds"], ascending=[False, True]).index[0]]
 
 
-def longest(lines: pd.DataFrame, by: list[str]) -> list[tuple[tuple[Any, ...], pd.DataFrame]]:
-    """The longest history of each group: a tolerance's history is the beginning of a tighter one's."""
-    found = []
-    for key, group in lines.groupby(by) if by else [((), lines)]:
-        if group.empty:
-            continue
-        last = group.groupby("artefact")["step"].max().idxmax()
-        found.append((key, group[group["artefact"] == last]))
-    return found
+def at_best_tolerance(rows: pd.DataFrame, score: pd.Series) -> pd.DataFrame:
+    """Rows of every primal strategy at the tolerance of its largest score, and all rows without a tolerance.
+
+    `score` has the index (primal, primal_tol); of equal scores the first counts.
+    """
+    best = score.sort_values(ascending=False, kind="stable").reset_index().drop_duplicates("primal")
+    tolerances = best.set_index("primal")["primal_tol"]
+    return rows[rows["primal_tol"].isna() | (rows["primal_tol"] == rows["primal"].map(tolerances))]
+
+
+def longest(histories: pd.DataFrame) -> Iterator[tuple[Any, pd.DataFrame]]:
+    """The longest history for each dual strategy.
+
+    It contains the others: POD and cones are nested, so a looser tolerance stops at an earlier step.
+    """
+    for dual, group in histories.groupby("dual", dropna=False):
+        yield dual, group[group["artefact"] == group.groupby("artefact")["step"].max().idxmax()]
 
 
 def file_names(labels: list[str]) -> list[str]:

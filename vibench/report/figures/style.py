@@ -1,11 +1,11 @@
-"""How figures look: panels of fixed size on a sheet, colours and lines that survive grey print, files."""
+"""Style of the figures: panels of fixed size, colours and lines legible in grey print, reproducible files."""
 
 from __future__ import annotations
 
 import math
 import textwrap
-from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from collections.abc import Iterable
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,21 +17,24 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
-"""Okabe and Ito's palette, told apart by colour-blind readers; lines and markers differ too."""
+"""Okabe and Ito's palette, which colour-blind readers can distinguish; lines and markers differ, too."""
 
 LINES: tuple[Any, ...] = ("-", "--", "-.", ":", (0, (5, 1)), (0, (3, 1, 1, 1)), (0, (1, 1)))
 MARKERS = "os^vDPX"
 BLACK = 6
-"""Index of the style kept for the high-fidelity model."""
+"""Index of the style reserved for the high-fidelity model."""
 
 MARKED = 9
-"""Markers on a line, so that it is known again in grey print."""
+"""Number of markers on a line, to identify it in grey print."""
+
+POINTS: dict[str, Any] = {"linestyle": "none", "markevery": None}
+"""Changes a line to points."""
 
 WRITTEN: dict[str, dict[str, Any]] = {
     "png": {"metadata": {"Software": None}, "pil_kwargs": {"compress_level": 3}},
     "svg": {"metadata": {"Date": None}},
 }
-"""How files are written: without a date, so that the same results give the same files."""
+"""Options of `savefig`: no date, so that the same results give the same files."""
 
 FORMATS = tuple(WRITTEN)
 
@@ -51,23 +54,23 @@ STYLE: Any = {
 }
 
 CHARACTER = 0.068
-"""Inches that a character of a legend takes on average."""
+"""Average width of a character of a legend, in inches."""
 
 TITLE_CHARACTER = 0.085
-"""The same of a title."""
+"""The same for a title."""
 
 DENSE = 2.2
-"""Decades below which a logarithmic axis has ticks at 1, 2 and 5."""
+"""Decades below which a logarithmic axis has ticks at 1, 2 and 5, labelled as plain numbers."""
 
 FEW = 0.6
-"""Decades below which it has the ticks of a linear one."""
+"""Decades below which it has the ticks of a linear axis."""
 
 SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
 @dataclass(frozen=True)
 class Layout:
-    """Sizes in inches: a panel, and the room around it for ticks, labels and its title."""
+    """Size of a panel and of the margins around it for ticks, labels and its title, in inches."""
 
     width: float = 3.1
     height: float = 2.5
@@ -78,14 +81,16 @@ class Layout:
 
 
 class Sheet:
-    """A figure of equal panels, with one legend below them all; nothing is measured, so nothing is clipped late.
+    """A figure of equal panels with one legend below them all.
+
+    Sizes follow from the layout and the number of characters of title and legend: no text is rendered to measure it.
 
     Parameters
     ----------
     rows, columns
-        How many panels.
+        Numbers of panels.
     title
-        What the figure shows, above everything.
+        Title of the whole figure.
     layout
         Sizes of a panel.
     """
@@ -93,66 +98,66 @@ class Sheet:
     def __init__(self, rows: int, columns: int, title: str = "", layout: Layout = Layout()) -> None:
         self._rows, self._columns, self._title, self._layout = rows, columns, title, layout
         self.figure = Figure()
-        grid = self.figure.subplots(rows, columns, squeeze=False)
-        self.panels: list[Axes] = list(grid.ravel())
-        self._arrange(0.0)
+        self.panels: list[Axes] = list(self.figure.subplots(rows, columns, squeeze=False).ravel())
 
     def at(self, row: int, column: int) -> Axes:
         """One panel."""
         return self.panels[row * self._columns + column]
 
     def finish(self) -> Figure:
-        """Set the ticks, and draw what is named in any panel, once, into a legend below; gives the figure."""
+        """Set ticks, sizes and a legend in which every label of the panels occurs once; returns the figure."""
+        layout = self._layout
+        column, row = layout.left + layout.width + layout.right, layout.above + layout.height + layout.below
+        wide = self._columns * column
+        legend = self._legend(wide)
+        lines = textwrap.wrap(self._title, int(wide / TITLE_CHARACTER))
+        high = self._rows * row + legend + 0.17 * len(lines) + 0.1
+        self.figure.set_size_inches(wide, high)
+        self.figure.suptitle("\n".join(lines), fontsize=10, x=0.08 / wide, y=1.0 - 0.06 / high, ha="left", va="top")
+        for k, panel in enumerate(self.panels):
+            down, along = divmod(k, self._columns)
+            left, bottom = along * column + layout.left, legend + (self._rows - 1 - down) * row + layout.below
+            panel.set_position((left / wide, bottom / high, layout.width / wide, layout.height / high))
+            _ticks(panel)
+        return self.figure
+
+    def _legend(self, wide: float) -> float:
+        """Draw the legend; returns its height."""
         named: dict[str, Any] = {}
         for panel in self.panels:
             for handle, label in zip(*panel.get_legend_handles_labels(), strict=True):
                 named.setdefault(label, handle)
-        for panel in self.panels:
-            _ticks(panel)
-        if named:
-            longest = max(map(len, named)) * CHARACTER + 0.6
-            columns = max(1, min(len(named), int(self._wide / longest)))
-            self._arrange(0.19 * math.ceil(len(named) / columns) + 0.12)
-            self.figure.legend(named.values(), named.keys(), loc="lower center", ncols=columns)
-        return self.figure
-
-    @property
-    def _wide(self) -> float:
-        layout = self._layout
-        return self._columns * (layout.left + layout.width + layout.right)
-
-    def _arrange(self, legend: float) -> None:
-        layout = self._layout
-        lines = textwrap.wrap(self._title, int(self._wide / TITLE_CHARACTER))
-        title = 0.17 * len(lines) + 0.1
-        row = layout.above + layout.height + layout.below
-        wide, high = self._wide, self._rows * row + legend + title
-        self.figure.set_size_inches(wide, high)
-        for k, panel in enumerate(self.panels):
-            down, along = divmod(k, self._columns)
-            left = along * (layout.left + layout.width + layout.right) + layout.left
-            bottom = legend + (self._rows - 1 - down) * row + layout.below
-            panel.set_position((left / wide, bottom / high, layout.width / wide, layout.height / high))
-        self.figure.suptitle("\n".join(lines), fontsize=10, x=0.08 / wide, y=1.0 - 0.06 / high, ha="left", va="top")
+        if not named:
+            return 0.0
+        longest = max(map(len, named)) * CHARACTER + 0.6
+        columns = max(1, min(len(named), int(wide / longest)))
+        self.figure.legend(named.values(), named.keys(), loc="lower center", ncols=columns)
+        return 0.19 * math.ceil(len(named) / columns) + 0.12
 
 
 def line(k: int, count: int = 0) -> dict[str, Any]:
-    """Colour, line and marker of the k-th thing in a panel; lines change when the colours have run out.
+    """Style k: colour, line and marker; lines and markers change where the colours repeat.
 
-    `count` is the number of points: of many only a few carry the marker.
+    `count` is the number of points; of many, only about `MARKED` carry the marker.
     """
+    colour, other = COLOURS[k % len(COLOURS)], k + k // len(COLOURS)
     return {
-        "color": COLOURS[k % len(COLOURS)],
-        "linestyle": LINES[(k + k // len(COLOURS)) % len(LINES)],
-        "marker": MARKERS[(k + k // len(COLOURS)) % len(MARKERS)],
+        "color": colour,
+        "linestyle": LINES[other % len(LINES)],
+        "marker": MARKERS[other % len(MARKERS)],
         "markersize": 3.5,
         "markevery": (k % 3, max(1, count // MARKED)),
-        "markerfacecolor": "white" if k % 2 else COLOURS[k % len(COLOURS)],
+        "markerfacecolor": "white" if k % 2 else colour,
     }
 
 
+def style_of(name: str, known: dict[str, int]) -> int:
+    """Style of a name in all panels of a figure; a new name takes the next one and is added to `known`."""
+    return known.setdefault(name, len(known) + (len(known) >= BLACK))
+
+
 def plot(axes: Axes, x: Any, y: Any, k: int, label: str | None = None, **more: Any) -> None:
-    """Draw the k-th line of a panel."""
+    """Draw a line in style k."""
     axes.plot(x, y, label=label, **line(k, len(x)) | more)
 
 
@@ -163,30 +168,24 @@ def logarithmic(axes: Axes, which: str = "y") -> None:
 
 
 def _ticks(axes: Axes) -> None:
-    """Enough ticks on logarithmic axes, few or many decades long; minor ones would take most of the time of drawing."""
+    """Set the ticks of logarithmic axes, however many decades they span."""
     for name, axis in (("x", axes.xaxis), ("y", axes.yaxis)):
         if axis.get_scale() != "log":
             continue
         limits = getattr(axes, f"get_{name}lim")()
-        if not 0.0 < limits[0] < limits[1]:  # nothing on it that can be shown
+        if not 0.0 < limits[0] < limits[1]:  # no positive value on this axis
             limits = (0.1, 1.0)
             getattr(axes, f"set_{name}lim")(limits)
-        axis.set_minor_locator(ticker.NullLocator())
+        axis.set_minor_locator(ticker.NullLocator())  # minor ticks would take most of the time of drawing
         decades = math.log10(limits[1] / limits[0])
         if decades < FEW:
             axis.set_major_locator(ticker.MaxNLocator(5))
         elif decades < DENSE:
             axis.set_major_locator(ticker.LogLocator(subs=(1.0, 2.0, 5.0)))
-        axis.set_major_formatter(ticker.FuncFormatter(_number if decades < DENSE else _power))
+        axis.set_major_formatter("{x:.3g}" if decades < DENSE else _power)
 
 
-def _number(value: float, _: int | None) -> str:
-    """A number as people write it."""
-    return f"{value:.3g}"
-
-
-def _power(value: float, _: int | None) -> str:
-    """A power of ten."""
+def _power(value: float, _: float) -> str:
     return "10" + f"{round(math.log10(value))}".translate(SUPERSCRIPTS)
 
 
@@ -196,22 +195,19 @@ def counted(axes: Axes) -> None:
 
 
 def positive(values: Any, floor: float = 0.0) -> np.ndarray[Any, np.dtype[np.float64]]:
-    """Values for a logarithmic axis: what is not above the floor is left out."""
+    """Values for a logarithmic axis; values up to the floor become NaN."""
     found = np.asarray(values, float)
     return np.where(found > floor, found, np.nan)
 
 
-@contextmanager
-def styled() -> Iterator[None]:
-    """Draw in the style of the figures."""
-    with mpl.rc_context(STYLE):
-        yield
+def styled() -> AbstractContextManager[None]:
+    """Context in which figures are made and written in the common style."""
+    return mpl.rc_context(STYLE)
 
 
 def save(figure: Figure, folder: Path, name: str, formats: Iterable[str] = FORMATS) -> list[Path]:
-    """Write a figure in every format; the same results give the same files."""
-    files = []
-    for form in formats:
-        files.append(folder / f"{name}.{form}")
-        figure.savefig(files[-1], **WRITTEN[form])
-    return files
+    """Write a figure in every format; returns the files."""
+    files = {form: folder / f"{name}.{form}" for form in formats}
+    for form, file in files.items():
+        figure.savefig(file, **WRITTEN[form])
+    return list(files.values())
