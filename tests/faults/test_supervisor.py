@@ -28,18 +28,18 @@ Run = Callable[..., "Done | Failed | Unstored"]
 
 
 @pytest.fixture
-def keeper() -> Iterator[Supervisor]:
+def watcher() -> Iterator[Supervisor]:
     made = Supervisor()
     yield made
     made.close()
 
 
 @pytest.fixture
-def run(keeper: Supervisor, tmp_path: Path) -> Run:
+def run(watcher: Supervisor, tmp_path: Path) -> Run:
     """Function that runs a stage under limits."""
 
     def go(stage: Stage, query: float = 1.0, cell: float = 30.0) -> Done | Failed | Unstored:
-        return keeper.run(Job(str(tmp_path), stage, query, cell, 8.0))
+        return watcher.run(Job(str(tmp_path), stage, query, cell, 8.0))
 
     return go
 
@@ -131,13 +131,13 @@ def test_a_finish_that_dies_is_tried_once_more_with_what_is_there(run: Run) -> N
     assert found.status is Status.CRASHED
 
 
-def test_what_a_plugin_started_ends_with_its_process(run: Run, keeper: Supervisor) -> None:
+def test_what_a_plugin_started_ends_with_its_process(run: Run, watcher: Supervisor) -> None:
     assert isinstance(run(InPieces(("child",))), Done)
     deadline = time.monotonic() + 10.0
     while not sleepers() and time.monotonic() < deadline:  # a process that has just begun has no name yet
         time.sleep(0.01)
     assert sleepers()
-    keeper.close()
+    watcher.close()
     assert not sleepers()
 
 
@@ -159,26 +159,25 @@ def test_a_plugin_that_is_not_the_one_planned_with_is_refused(run: Run) -> None:
     assert found.reason == "the problem 'obstacle' was changed since the run began; run the study again"
 
 
-def test_another_vibench_than_planned_with_is_refused(keeper: Supervisor, tmp_path: Path) -> None:
-    found = keeper.run(replace(Job(str(tmp_path), Whole("fine"), 1.0, 30.0, 8.0), code="older"))
+def test_another_vibench_than_planned_with_is_refused(watcher: Supervisor, tmp_path: Path) -> None:
+    found = watcher.run(replace(Job(str(tmp_path), Whole("fine"), 1.0, 30.0, 8.0), code="older"))
     assert isinstance(found, Failed)
     assert "vibench or one of the libraries was changed" in found.reason
 
 
-def test_a_suspended_run_is_not_late(monkeypatch: pytest.MonkeyPatch) -> None:
-    clock = supervisor._Clock()
+def test_a_suspended_run_is_not_late(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    state = supervisor._JobState(Job(str(tmp_path), Whole("fine"), 1.0, 30.0, 8.0))
     now = time.monotonic()
     monkeypatch.setattr(supervisor.time, "monotonic", lambda: now + 3600.0)
-    assert clock.tick() <= 1.0
+    state.tick()
+    assert 0.0 < state.seconds <= 1.0
 
 
-def test_a_talkative_job_can_be_stopped(keeper: Supervisor, tmp_path: Path) -> None:
+def test_a_talkative_job_can_be_stopped(watcher: Supervisor, tmp_path: Path) -> None:
     job = Job(str(tmp_path), InPieces(("moment",) * 2000), 1.0, 600.0, 8.0)
-    threading.Timer(2.0, keeper.stop).start()
-    start = time.monotonic()
-    with pytest.raises(StoppedError):
-        keeper.run(job)
-    assert time.monotonic() - start < 5.0
+    threading.Timer(2.0, watcher.stop).start()
+    with pytest.raises(StoppedError):  # long before its limits, which are ten minutes away
+        watcher.run(job)
 
 
 @pytest.mark.parametrize("where", ["at_begin", "at_end"])
@@ -208,21 +207,21 @@ def test_a_process_that_forks_answers_once(run: Run) -> None:
         assert len({process for _, process in found.value}) == 1
 
 
-def test_what_cannot_be_stored_is_not_the_fault_of_the_stage(keeper: Supervisor, tmp_path: Path) -> None:
+def test_what_cannot_be_stored_is_not_the_fault_of_the_stage(watcher: Supervisor, tmp_path: Path) -> None:
     (tmp_path / "file").touch()
-    found = keeper.run(Job(str(tmp_path / "file"), Whole("fine"), 1.0, 30.0, 8.0))
+    found = watcher.run(Job(str(tmp_path / "file"), Whole("fine"), 1.0, 30.0, 8.0))
     assert isinstance(found, Unstored)
     assert "cannot be written" in found.reason
 
 
-def test_a_keeper_that_is_closed_stops_at_once_and_leaves_nobody(keeper: Supervisor, tmp_path: Path) -> None:
+def test_a_keeper_that_is_closed_stops_at_once_and_leaves_nobody(watcher: Supervisor, tmp_path: Path) -> None:
     diary = tmp_path / "diary"
     job = Job(str(tmp_path), Whole("hang", str(diary)), 1.0, 600.0, 8.0)
     stopped: list[bool] = []
 
     def work() -> None:
         with pytest.raises(StoppedError):
-            keeper.run(job)
+            watcher.run(job)
         stopped.append(True)
 
     thread = threading.Thread(target=work)
@@ -230,7 +229,7 @@ def test_a_keeper_that_is_closed_stops_at_once_and_leaves_nobody(keeper: Supervi
     while not (diary.exists() and diary.read_text().endswith("\n")):
         time.sleep(0.05)
     worker = int(diary.read_text().split()[0])
-    keeper.close()
+    watcher.close()
     thread.join(timeout=5.0)
     assert stopped == [True]
     with pytest.raises(ProcessLookupError):

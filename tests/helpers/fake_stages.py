@@ -1,4 +1,4 @@
-"""Stages that misbehave, for the keeper of worker processes; importable there."""
+"""Stages that misbehave, for the supervisor of worker processes; importable there."""
 
 from __future__ import annotations
 
@@ -102,7 +102,7 @@ class KillsItsParent(Stage):
 
 @dataclass(frozen=True)
 class InPieces(PiecewiseStage):
-    """Every piece does what its word says, and what the one in `unwatched` says before the keeper is told."""
+    """Every piece does what its word says, and what the one in `unwatched` says before the supervisor is told."""
 
     label = "in pieces"
 

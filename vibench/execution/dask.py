@@ -131,19 +131,19 @@ def _hand_over(theirs: Any, ours: Future[Outcome]) -> None:
             ours.set_exception(ExecutorError(f"the dask cluster was lost: {line}; the same command goes on from here"))
 
 
-_keepers: dict[tuple[str, int], Supervisor] = {}
-"""In a dask worker: the keepers of every run, one per thread."""
+_supervisors: dict[tuple[str, int], Supervisor] = {}
+"""In a dask worker: the supervisors of every run, one per thread."""
 
 
 def _run_for(token: str, job: Job) -> Outcome:
-    """Run a job of a run with the keeper that this thread of a dask worker has for it."""
-    return _keepers.setdefault((token, threading.get_ident()), Supervisor()).run(job)
+    """Run a job of a run with the supervisor that this thread of a dask worker has for it."""
+    return _supervisors.setdefault((token, threading.get_ident()), Supervisor()).run(job)
 
 
 def _dismiss(token: str) -> None:
     """End what a dask worker does for a run."""
-    for key in [key for key in _keepers if key[0] == token]:
-        _keepers.pop(key).close()
+    for key in [key for key in _supervisors if key[0] == token]:
+        _supervisors.pop(key).close()
 
 
 def _describe(token: str) -> tuple[bool, str, str]:

@@ -1,4 +1,4 @@
-"""Where stages run: on this machine, or on the workers of a dask cluster; each in a process that a keeper watches."""
+"""Where stages run: here the worker processes of this machine; a dask cluster is another executor."""
 
 from __future__ import annotations
 
@@ -54,10 +54,10 @@ class Local(Executor):
     def __init__(self, slots: int, log: Path) -> None:
         self.slots, self.machines = slots, frozenset({machine()})
         self._log = log
-        self._keepers = [Supervisor(log) for _ in range(slots)]
+        self._supervisors = [Supervisor(log) for _ in range(slots)]
         self._free: SimpleQueue[Supervisor] = SimpleQueue()
-        for keeper in self._keepers:
-            self._free.put(keeper)
+        for supervisor in self._supervisors:
+            self._free.put(supervisor)
         self._threads = ThreadPoolExecutor(slots)
 
     def submit(self, job: Job) -> Future[Outcome]:
@@ -65,18 +65,18 @@ class Local(Executor):
         return self._threads.submit(self._run, job)
 
     def _run(self, job: Job) -> Outcome:
-        keeper = self._free.get()
+        supervisor = self._free.get()
         try:
-            return keeper.run(job)
+            return supervisor.run(job)
         finally:
-            self._free.put(keeper)
+            self._free.put(supervisor)
 
     def close(self) -> None:
         """End the worker processes."""
-        for keeper in self._keepers:
-            keeper.stop()
+        for supervisor in self._supervisors:
+            supervisor.stop()
         self._threads.shutdown(cancel_futures=True)
-        for keeper in self._keepers:
-            keeper.close()
+        for supervisor in self._supervisors:
+            supervisor.close()
         if self._log.is_file() and not self._log.stat().st_size:
             self._log.unlink()

@@ -1,4 +1,4 @@
-"""A recorded cell brought back to life: its reduced model, from artefacts, or made again where they are gone."""
+"""A recorded cell and its reduced model, loaded from artefacts, or made again where these are gone."""
 
 from __future__ import annotations
 
@@ -93,15 +93,15 @@ def _provide(stage: Stage, store: Store) -> None:
     """
     missing: dict[str, Stage] = {}
     _collect(stage, store, missing)
-    keeper = Supervisor()
+    supervisor = Supervisor()
     try:
         with store.used():
             for needed in missing.values():
-                outcome = keeper.run(Job(str(store.folder), needed, *UNLIMITED))
+                outcome = supervisor.run(Job(str(store.folder), needed, *UNLIMITED))
                 if not isinstance(outcome, Done):
                     raise RequestError(f"what the cell needs cannot be made again: {outcome.reason}")
     finally:
-        keeper.close()
+        supervisor.close()
 
 
 def _collect(stage: Stage, store: Store, missing: dict[str, Stage]) -> None:

@@ -300,7 +300,7 @@ def _outcome(future: Future[Any]) -> Done | Failed:
         return Failed(Status.ERROR, in_a_line(error))
     if isinstance(result, Unstored):
         raise StorageError(result.reason)
-    assert isinstance(result, Done | Failed)  # what `Keeper.run` returns
+    assert isinstance(result, Done | Failed)  # what `Supervisor.run` returns
     return result
 
 

@@ -1,7 +1,7 @@
-"""Stages in a process of their own, with hard limits: whatever becomes of the process, there is an answer.
+"""Stages in worker processes with hard limits: whatever becomes of a process, its job has an outcome.
 
-A keeper owns one worker process and talks to it through a socket. It follows what the worker announces, stops it where
-a limit is passed, and starts another one. Of a piecewise stage only the piece in hand is lost.
+A supervisor owns one worker process and talks to it through a socket. It follows what the worker reports, stops it when
+a limit is passed, and starts another one. Of a piecewise stage only the present piece is lost.
 """
 
 from __future__ import annotations
@@ -20,26 +20,26 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
-from vibench.provenance import core_code, libraries
+from vibench.provenance import NUMERICAL, core_code, libraries
 from vibench.qp.status import Status
 from vibench.stages.base import Done, Failed, PiecewiseStage, Stage, Unstored
 from vibench.timing import KEPT_MEMORY, ONE_THREAD
 
 POLL = 0.2
-"""Seconds between two looks at the clock."""
+"""Seconds between two checks of the limits."""
 
 GRACE = 2.0
-"""Seconds a process is given beyond the limit of a query, for what it does around it."""
+"""Seconds that a process has beyond the limit of a query, for the work around it."""
 
 
 def code_here() -> str:
-    """The code of vibench and of the libraries in this process."""
-    return f"{core_code()}; {libraries()}"
+    """The code of vibench that determines numbers, and the libraries, in this process."""
+    return f"{core_code(*NUMERICAL)}; {libraries()}"
 
 
 @dataclass(frozen=True)
 class Job:
-    """A stage to be run: where artefacts are, what a query and the whole of it may take, and with what code."""
+    """A stage to be run: where artefacts are, the limits of a query and of the stage, and with what code."""
 
     store: str
     stage: Stage
@@ -66,70 +66,66 @@ class Finished:
 
 
 @dataclass(frozen=True)
-class Spent:
-    """A worker has no memory left: for what it did (`failed`), or for anything new. It wants to be replaced."""
+class OutOfMemory:
+    """A worker has no memory left, for its work (`failed`) or for another job, and has to be replaced."""
 
     failed: Failed | None
 
 
 @dataclass
 class Progress:
-    """What is known of the pieces of a stage."""
+    """The pieces of a stage that are done, and those that are lost."""
 
     found: dict[int, Any] = field(default_factory=dict)
     lost: dict[int, Failed] = field(default_factory=dict)
 
 
 class StoppedError(Exception):
-    """The keeper was told to stop."""
+    """The supervisor was told to stop."""
 
 
-class _DeathError(Exception):
-    """The worker process ended without an answer, or has to be stopped; with what is to be said about it."""
+class _WorkerLostError(Exception):
+    """The worker process ended without an outcome or has to be stopped; without `failed` it is only replaced."""
 
     def __init__(self, failed: Failed | None) -> None:
         super().__init__()
         self.failed = failed
 
 
-class _Clock:
-    """Seconds of a job that went by while somebody looked: a night in which the run was suspended is one look."""
+class _JobState:
+    """What workers have reported of a job: its pieces, the present one, and when that one has to be stopped.
 
-    def __init__(self) -> None:
-        self.seconds, self._last = 0.0, time.monotonic()
-
-    def tick(self) -> float:
-        """Look at the clock; gives the seconds so far."""
-        now = time.monotonic()
-        self.seconds += min(now - self._last, 5.0 * POLL)
-        self._last = now
-        return self.seconds
-
-
-class _Talk:
-    """What workers have said of a job so far: its pieces, the one in hand, and when that one has to be stopped."""
+    Time counts in small steps: of a night in which the run was suspended only one step counts.
+    """
 
     def __init__(self, job: Job) -> None:
-        self.job, self.progress, self.clock = job, Progress(), _Clock()
+        self.job, self.progress = job, Progress()
+        self.seconds, self._last = 0.0, time.monotonic()
         self.begin()
 
     def begin(self) -> Progress:
-        """Another process begins; gives what it has to know."""
+        """Another process, or another piece, begins; returns what the process has to know."""
         self.piece: int | None = None
-        self.own_limit = float("inf")
+        self.piece_limit = float("inf")
         return self.progress
 
-    def hear(self, message: Any) -> Done | Failed | Unstored | None:
-        """Take a message of the worker in; gives the last one."""
+    def tick(self) -> None:
+        """Count the seconds since the last call."""
+        now = time.monotonic()
+        self.seconds += min(now - self._last, 5.0 * POLL)
+        self._last = now
+
+    def update(self, message: Any) -> Done | Failed | Unstored | None:
+        """Take in a message of the worker; returns the outcome if it is one."""
         match message:
             case Watch():
                 self.piece = message.piece
-                self.own_limit = self.clock.seconds + self.job.query_seconds + GRACE if message.on else float("inf")
+                self.piece_limit = self.seconds + self.job.query_seconds + GRACE if message.on else float("inf")
             case Finished():
                 self.progress.found[message.piece] = message.value
                 self.begin()
-            case Spent():
-                raise _DeathError(message.failed)
+            case OutOfMemory():
+                raise _WorkerLostError(message.failed)
             case Done() | Failed() | Unstored():
                 return message
         return None
@@ -174,69 +170,64 @@ class Supervisor:
         self._kill()
 
     def _run(self, job: Job) -> Done | Failed | Unstored:
-        talk, limit, retried = _Talk(job), job.cell_seconds, False
-        found, lost = talk.progress.found, talk.progress.lost
+        state, limit, retried = _JobState(job), job.cell_seconds, False
+        found, lost = state.progress.found, state.progress.lost
         while True:
             try:
-                return self._attempt(talk, limit)
-            except _DeathError as death:
+                return self._attempt(state, limit)
+            except _WorkerLostError as error:
                 self._kill()
-                if death.failed is None:  # it only had to be replaced
+                if error.failed is None:
                     continue
-                if talk.piece is not None:
-                    lost[talk.piece] = death.failed
+                if state.piece is not None:
+                    lost[state.piece] = error.failed
                 if not isinstance(job.stage, PiecewiseStage) or not (found or lost) or limit > job.cell_seconds:
-                    return death.failed
-                if talk.clock.seconds > job.cell_seconds:  # one more process may write down what there is
-                    limit += talk.clock.seconds
+                    return error.failed
+                if state.seconds > job.cell_seconds:  # one more process may finish the stage with the pieces there are
+                    limit += state.seconds
                     for late in set(range(job.stage.pieces)) - found.keys():
                         lost.setdefault(late, _beyond("cell_seconds", job.cell_seconds))
-                elif talk.piece is None and retried:
-                    return death.failed
-                retried = retried or talk.piece is None
+                elif state.piece is None and retried:  # it dies outside of any piece, again and again
+                    return error.failed
+                retried = retried or state.piece is None
 
-    def _attempt(self, talk: _Talk, limit: float) -> Done | Failed | Unstored:
-        """One process's try at what is left of a stage."""
-        job = talk.job
+    def _attempt(self, state: _JobState, limit: float) -> Done | Failed | Unstored:
+        """What one process makes of the rest of a stage."""
+        job = state.job
         try:
             connection, process = self._worker()
         except OSError as error:
             return Failed(Status.CRASHED, f"no worker process could be started: {error.strerror}")
         try:
-            connection.send((job, talk.begin()))
+            connection.send((job, state.begin()))
             while not self._stop.is_set():
                 if connection.poll(POLL):
-                    answer = talk.hear(connection.recv())
-                    if answer is not None:
-                        return answer
-                elif process.poll() is not None:  # what it left behind may hold the socket open
+                    outcome = state.update(connection.recv())
+                    if outcome is not None:
+                        return outcome
+                elif process.poll() is not None:  # a process that it started may hold the socket open
                     raise EOFError
-                if talk.clock.tick() > limit:
-                    raise _DeathError(_beyond("cell_seconds", job.cell_seconds))
-                if talk.clock.seconds > talk.own_limit:
-                    raise _DeathError(_beyond("query_seconds", job.query_seconds))
-        except (EOFError, OSError):  # the other end of the socket is gone
+                state.tick()
+                if state.seconds > limit:
+                    raise _WorkerLostError(_beyond("cell_seconds", job.cell_seconds))
+                if state.seconds > state.piece_limit:
+                    raise _WorkerLostError(_beyond("query_seconds", job.query_seconds))
+        except (EOFError, OSError):  # the other end of the socket is closed
             if not self._stop.is_set():
-                raise _DeathError(Failed(Status.CRASHED, _obituary(process))) from None
+                raise _WorkerLostError(Failed(Status.CRASHED, _cause_of_death(process))) from None
         raise StoppedError
 
     def _worker(self) -> tuple[Connection, subprocess.Popen[bytes]]:
-        """The worker process, which is started if there is none, and the connection to it.
+        """The worker process, started where there is none, and the connection to it.
 
-        It leads a group of its own: Ctrl-C on the terminal is not for it, and what plugins start ends with it.
+        It leads a process group of its own: Ctrl-C on the terminal does not reach it, and what plugins start ends too.
         """
         if self._connection is None or self._process is None:
             ours, theirs = socket.socketpair()
+            command = ["-P", "-m", "vibench.execution.worker", str(theirs.fileno()), str(self._log or os.devnull)]
             with theirs:
                 self._process = subprocess.Popen(
-                    [
-                        sys.executable,
-                        "-P",
-                        "-m",
-                        "vibench.execution.worker",
-                        str(theirs.fileno()),
-                        str(self._log or os.devnull),
-                    ],
+                    [sys.executable, *command],
                     env=_environment(os.environ),
                     pass_fds=[theirs.fileno()],
                     stdin=subprocess.DEVNULL,
@@ -260,12 +251,11 @@ def _beyond(name: str, limit: float) -> Failed:
     return Failed(Status.TIMEOUT, f"stopped after {name} = {limit:g} s")
 
 
-def _obituary(process: subprocess.Popen[bytes]) -> str:
-    """What a process that hung up died of."""
+def _cause_of_death(process: subprocess.Popen[bytes]) -> str:
     try:
         code = process.wait(timeout=5.0)
     except subprocess.TimeoutExpired:
-        return "the worker process hung up"
+        return "the worker process closed its connection"
     if code >= 0:
         return f"the worker process died with exit code {code}"
     known = {number.value: number.name for number in signal.Signals}
@@ -273,6 +263,6 @@ def _obituary(process: subprocess.Popen[bytes]) -> str:
 
 
 def _environment(parent: Mapping[str, str]) -> dict[str, str]:
-    """One thread for numerical libraries, memory that is kept, and the modules this process finds."""
+    """One thread for numerical libraries, freed memory kept, and the modules that this process finds."""
     path = os.pathsep.join(folder for folder in sys.path if folder)
     return {**parent, **ONE_THREAD, **KEPT_MEMORY, "PYTHONPATH": path}

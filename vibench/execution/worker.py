@@ -19,7 +19,7 @@ from typing import Any, TypeVar
 from threadpoolctl import threadpool_limits
 
 from vibench.errors import NumericalError, StorageError, VibenchError, in_a_line
-from vibench.execution.supervisor import Finished, Job, Progress, Spent, Watch, code_here
+from vibench.execution.supervisor import Finished, Job, OutOfMemory, Progress, Watch, code_here
 from vibench.qp.status import Status
 from vibench.stages.artefacts import Store
 from vibench.stages.base import Done, Failed, PiecewiseStage, Unstored
@@ -29,21 +29,21 @@ T = TypeVar("T")
 Send = Callable[[Any], None]
 
 
-class _ExhaustedError(Exception):
-    """Some work met the limit of the memory: this process goes no farther."""
+class _NoMemoryError(Exception):
+    """Some work met the limit of the memory; this process does not go on."""
 
 
 def main() -> None:
-    """Serve the keeper at the other end of a socket until it hangs up."""
+    """Serve the supervisor at the other end of a socket until it closes the connection."""
     socket, log = int(sys.argv[1]), os.open(sys.argv[2], os.O_WRONLY | os.O_APPEND | os.O_CREAT)
     os.set_inheritable(socket, False)  # what plugins start does not hold it open
     connection = Connection(socket)
-    for stream in (1, 2):  # what plugins print is nobody's business, and must not look like ours
+    for stream in (1, 2):  # what plugins print must not look like output of vibench
         os.dup2(log, stream)
     faulthandler.enable()
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threadpool_limits(1)
-    threading.Thread(target=_follow, args=(os.getppid(),), daemon=True).start()
+    threading.Thread(target=_end_with, args=(os.getppid(),), daemon=True).start()
     own, first = os.getpid(), True
 
     def send(message: Any) -> None:
@@ -57,23 +57,23 @@ def main() -> None:
         except EOFError:
             return
         if not first and _address_space() > 0.5 * job.memory_gib * 2**30:
-            send(Spent(None))
+            send(OutOfMemory(None))
             return
         first = False
-        faulthandler.dump_traceback_later(2.0 * job.cell_seconds + 60.0, exit=True)  # should the keeper have died
+        faulthandler.dump_traceback_later(2.0 * job.cell_seconds + 60.0, exit=True)  # in case the supervisor has died
         send(perform(job, progress, send))
         faulthandler.cancel_dump_traceback_later()
 
 
-def _follow(parent: int) -> None:
-    """End this process, and what plugins started in it, once its parent has ended: nobody would enforce its limits."""
+def _end_with(parent: int) -> None:
+    """End this process, and what plugins started in it, when its parent has ended and nobody enforces its limits."""
     while os.getppid() == parent:
         time.sleep(1.0)
     os.killpg(0, signal.SIGKILL)
 
 
-def perform(job: Job, progress: Progress, send: Send) -> Done | Failed | Unstored | Spent:
-    """Run one stage; what a plugin raises becomes a reason, so that the rest of the matrix goes on."""
+def perform(job: Job, progress: Progress, send: Send) -> Done | Failed | Unstored | OutOfMemory:
+    """Run one stage; what a plugin raises becomes a reason, and the rest of the matrix goes on."""
     start = time.perf_counter()
 
     def work() -> Done:
@@ -90,12 +90,12 @@ def perform(job: Job, progress: Progress, send: Send) -> Done | Failed | Unstore
         return _guarded(job.memory_gib, work)
     except StorageError as error:
         return Unstored(str(error))
-    except _ExhaustedError:
-        return Spent(_out_of_memory(job))
+    except _NoMemoryError:
+        return OutOfMemory(_out_of_memory(job))
 
 
 def _check_code(job: Job) -> None:
-    """Refuse a job that was planned with other code than there is here: the key of its artefact would lie."""
+    """Refuse a job that was planned with other code than there is here: its artefact would have the wrong key."""
     used = job.stage.plugins()
     changed = [f"the {p.kind} '{p.name}'" for p in used if registry.code(p.kind, p.name) != p.code]
     if job.code != code_here():
@@ -105,7 +105,7 @@ def _check_code(job: Job) -> None:
 
 
 def _pieces(job: Job, store: Store, progress: Progress, send: Send) -> Any:
-    """What is still to be done of a piecewise stage, piece by piece; its value."""
+    """Do what is left of a piecewise stage, piece by piece; returns its value."""
     stage = job.stage
     assert isinstance(stage, PiecewiseStage)
     pieces = stage.begin(store)
@@ -130,13 +130,13 @@ def _out_of_memory(job: Job) -> Failed:
 
 
 def _guarded(memory_gib: float, work: Callable[[], T]) -> T | Failed:
-    """What some work gives, or why it gave nothing."""
+    """The value of some work, or why it failed."""
     try:
         with _memory_limit(memory_gib):
             return work()
     except MemoryError:
-        raise _ExhaustedError from None
-    except (StorageError, _ExhaustedError):
+        raise _NoMemoryError from None
+    except (StorageError, _NoMemoryError):
         raise
     except VibenchError as error:
         return Failed(Status.ERROR, " ".join(str(error).split()))
@@ -146,7 +146,7 @@ def _guarded(memory_gib: float, work: Callable[[], T]) -> T | Failed:
 
 @contextmanager
 def _memory_limit(gib: float) -> Iterator[None]:
-    """No more address space than this for some work; outside, the worker must be able to answer."""
+    """Limit the address space for some work; outside of it the worker must be able to reply."""
     soft, hard = resource.getrlimit(resource.RLIMIT_AS)
     limit = int(gib * 2**30)
     if _address_space() > limit:
