@@ -17,6 +17,7 @@ from importlib.metadata import requires
 from pathlib import Path
 
 import numpy as np
+import typer
 from rich.table import Table
 from rich.text import Text
 from threadpoolctl import threadpool_info, threadpool_limits
@@ -84,7 +85,7 @@ def print_findings(out: Path) -> list[str]:
             broken += [finding.subject] * (finding.health is Health.BROKEN)
         console.print(title, style="bold")
         console.print(table)
-    console.print(f"broken: {', '.join(broken)}" if broken else "nothing is broken", markup=False, soft_wrap=True)
+    typer.echo(f"broken: {', '.join(broken)}" if broken else "nothing is broken")
     return broken
 
 
@@ -180,8 +181,7 @@ def machine() -> Iterator[Finding]:
     yield Finding("processor", provenance.machine())
     info = Path("/proc/meminfo")
     found = re.search(r"MemAvailable:\s*(\d+) kB", info.read_text()) if info.is_file() else None
-    total = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30
-    free = int(found[1]) / 2**20 if found else total
+    free = int(found[1]) / 2**20 if found else os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30
     yield Finding("free memory", f"{free:.1f} GiB", _note_if(free < MIN_GIB))
     for pool in threadpool_info():
         name = f"{pool['internal_api']} {pool.get('version') or ''}".strip()

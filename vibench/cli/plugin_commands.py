@@ -42,14 +42,10 @@ def check_plugin(
     plugin: Annotated[
         str,
         Argument(
-            metavar="PLUGIN",
-            help="A name, KIND:NAME (problem, primal, dual), or MODULE:CLASS.",
-            autocompletion=plugin_names,
+            metavar="PLUGIN", help="A name, problem|primal|dual:NAME, or MODULE:CLASS.", autocompletion=plugin_names
         ),
     ],
-    option: Annotated[
-        list[str] | None, Option(metavar="KEY=VALUE", help="An option of the plugin (repeatable).")
-    ] = None,
+    option: Annotated[list[str] | None, Option(metavar="KEY=VALUE", help="Option of the plugin (repeatable).")] = None,
     seconds: Annotated[float, Option(min=0.0, help="Longest time that one call of the plugin may take.")] = SECONDS,
 ) -> None:
     """Check a plugin: shapes, signs, tolerances, determinism, time.
