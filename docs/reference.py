@@ -6,8 +6,7 @@ import json
 from collections.abc import Iterable, Mapping
 from typing import Any
 
-from vibench.results.columns import BENEFITS, COLUMNS, PARAMETER, SUMMARY, UNITS, Column
-from vibench.results.schema import STORED
+from vibench.results.columns import CELLS, PARAMETER, STORED, THRESHOLDS, UNITS, Column, shown_columns
 from vibench.study.spec import Study
 
 KINDS = {"integer": "int", "number": "float", "string": "text", "boolean": "true or false"}
@@ -78,27 +77,28 @@ def units() -> str:
 
 def columns(table: str) -> str:
     """The columns of a table of the results, with SQLite's type, unit and meaning."""
-    described = dict(COLUMNS[table])
-    types = {name: kind.split()[0].lower() for name, kind in STORED[table].items()}
+    described = dict(STORED[table])
     if table == "queries":
         described["mu_1, mu_2, …"] = PARAMETER
-        types["mu_1, mu_2, …"] = "real"
-    rows = [(f"`{name}`", types[name], column.unit or "–", column.meaning) for name, column in described.items()]
+    rows = [(f"`{name}`", c.kind.split()[0].lower(), c.unit or "–", c.meaning) for name, c in described.items()]
     return markdown(("column", "type", "unit", "meaning"), rows)
 
 
 def summary() -> str:
     """The columns of the summary."""
-    return _for_reading(SUMMARY)
+    return _for_reading(CELLS)
 
 
 def benefits() -> str:
-    """The columns of the benefit thresholds for reading."""
-    return _for_reading(BENEFITS)
+    """The columns of the break-evens for reading."""
+    return _for_reading(THRESHOLDS)
 
 
-def _for_reading(described: Mapping[str, Column]) -> str:
-    rows = [(name, column.unit or "–", column.meaning) for name, column in described.items()]
+def _for_reading(table: Mapping[str, Column]) -> str:
+    rows = [
+        (c.heading, "ms" if c.heading.endswith("[ms]") else c.unit or "–", c.meaning)
+        for c in shown_columns(table).values()
+    ]
     return markdown(("column", "unit", "meaning"), rows)
 
 

@@ -1,9 +1,9 @@
-"""What the study `field` found: tables, figures, and who wins by which measure.
+"""Results of the study `field`: tables, figures, and the Pareto fronts of error against dimension and time.
 
 vibench run field --no-figures && python results/field.py runs/field results/field
 
-Everything is computed from the results file: β_S and β_on at the training parameters from the histories, the rest from
-the cells.
+Everything comes from the results file: β_S and β_on at the training parameters from the histories, the rest from the
+cells.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
+from palette import use_palette
 
 from vibench.report.figures.data import label
 from vibench.report.figures.style import COLOURS, MARKERS, Sheet, logarithmic, plot, save, styled
@@ -25,7 +26,7 @@ from vibench.results import tables
 SHARES = (0.3, 0.5, 0.7, 0.9)
 REFERENCE = "mcpg"
 CONTROL = "pod-dual (negative control)"
-"""Not in the cone: drawn, and no competitor."""
+"""Its generators are not in W⁺: it is drawn and left out of the fronts."""
 
 HUES = (*COLOURS, "0.6")
 PAIR = ["problem", "pod_tol", "dual_tol"]
@@ -34,7 +35,7 @@ CELL = [*PAIR, "dual", "primal", "primal_tol"]
 
 @dataclass(frozen=True)
 class Field:
-    """The run.
+    """Tables of a run.
 
     Attributes
     ----------
@@ -60,7 +61,7 @@ class Field:
         return cls(cells, steps.sort_values(["artefact", "step"]))
 
     def longest(self) -> Iterator[tuple[tuple[Any, ...], pd.DataFrame]]:
-        """Of every strategy the enrichment with most vectors, in the order of the cells: its key and its steps.
+        """Key and steps of the largest enrichment of every primal strategy, in the order of the cells.
 
         The key is problem, both tolerances, dual and primal strategy.
         """
@@ -78,7 +79,7 @@ class Field:
 
 
 def vectors(field: Field) -> pd.DataFrame:
-    """How many vectors every fixed enrichment takes for the shares of β_on, one after the other."""
+    """Numbers of vectors with which every fixed enrichment reaches the shares of β_on."""
     rows: dict[tuple[Any, ...], dict[str, str]] = {}
     for key, steps in field.longest():
         share = steps["share"].to_numpy()
@@ -90,7 +91,7 @@ def vectors(field: Field) -> pd.DataFrame:
 
 
 def cones(field: Field) -> pd.DataFrame:
-    """What the dual strategies give: size, conditioning, seconds, and errors with online supremizers."""
+    """Size, conditioning, seconds of every cone, and errors with online supremizers."""
     chosen = field.cells[(field.cells["primal"] == "online-supremizers") & (field.cells["assembly"] == "full")]
     return pd.DataFrame(
         {
@@ -105,7 +106,7 @@ def cones(field: Field) -> pd.DataFrame:
 
 
 def primals(field: Field) -> pd.DataFrame:
-    """What the primal strategies give with the cone of mcpg: share of β_on in the end, errors, seconds."""
+    """Final share of β_on, errors and seconds of every enrichment, with the cone of mcpg."""
     chosen = field.tight[field.tight["dual"] == REFERENCE]
     full, reduced = (chosen[chosen["assembly"] == assembly].set_index(CELL) for assembly in ("full", "reduced"))
     ends = field.steps.groupby(CELL, dropna=False)["share"].last()
@@ -130,7 +131,7 @@ def primals(field: Field) -> pd.DataFrame:
 
 
 def front(cells: pd.DataFrame, cost: pd.Series, error: str) -> pd.DataFrame:
-    """Cells with every query ok that no other beats in cost and error both, cheapest first; without the control."""
+    """Pareto front of cost and error: cells with every query ok, cheapest first, without the negative control."""
     fine = (cells["status"] == "ok") & (cells["dual"] != CONTROL)
     ordered = cells.assign(cost=cost)[fine].sort_values(["cost", error])
     best = ordered[error].cummin().shift(fill_value=np.inf)
@@ -138,7 +139,7 @@ def front(cells: pd.DataFrame, cost: pd.Series, error: str) -> pd.DataFrame:
 
 
 def fronts(field: Field) -> pd.DataFrame:
-    """The best there is for the multiplier, by dimension and by milliseconds of a reduced query."""
+    """Pareto fronts of the error of λ against dimension and against the milliseconds of a reduced query."""
     rows = []
     reduced = field.cells[field.cells["assembly"] == "reduced"]
     for problem, cells in reduced.groupby("problem", sort=False):
@@ -161,7 +162,7 @@ def failures(field: Field) -> pd.DataFrame:
     return short[[*CELL, "assembly", "status", "queries_ok", "reason"]]
 
 
-def shares_drawn(field: Field) -> Figure:
+def draw_shares(field: Field) -> Figure:
     """Share of β_on over vectors, one line per primal strategy, with the cone of mcpg."""
     chosen = [(key, steps) for key, steps in field.longest() if key[3] == REFERENCE]
     pairs = list(dict.fromkeys(key[:3] for key, _ in chosen))
@@ -178,7 +179,7 @@ def shares_drawn(field: Field) -> Figure:
 
 
 def scatter(field: Field, cost: Callable[[pd.DataFrame], pd.Series], xlabel: str, title: str) -> Figure:
-    """Errors of the multiplier over a cost: colours say which cone, markers which enrichment, the line who is best."""
+    """Errors of λ over a cost: one colour per cone, one marker per enrichment, the Pareto front as a line."""
     cells = field.cells[(field.cells["assembly"] == "reduced") & field.cells["error_lambda_mean"].notna()]
     duals, primals = list(dict.fromkeys(cells["dual"])), list(dict.fromkeys(cells["primal"]))
     names = list(dict.fromkeys(cells["problem"]))
@@ -209,22 +210,23 @@ def scatter(field: Field, cost: Callable[[pd.DataFrame], pd.Series], xlabel: str
 
 SECTIONS: dict[str, tuple[str, Callable[[Field], pd.DataFrame]]] = {
     "Cones": (
-        "Errors are those with online supremizers, which are stable as far as the cone allows; G is the Gram matrix of "
+        "Errors with online supremizers, which reach the inf-sup constants of the whole of V. G is the Gram matrix of "
         "the generators in W.",
         cones,
     ),
     "Enrichments": (
-        f"Cone of {REFERENCE}, the tighter accuracy. The share is min β_S over min β_on, both over the span and on the "
-        "training set; 1 where supremizers are added at every parameter.",
+        f"Cone of {REFERENCE}, tighter tolerances. The share is min β_S / min β_on, both over the span and on the "
+        "training set; it is 1 where supremizers are added at every parameter.",
         primals,
     ),
     "Vectors for a share of β_on": (
-        f"The first numbers of vectors with which the smallest β_S over the training set is {SHARES[0]}, {SHARES[1]}, "
-        f"{SHARES[2]}, {SHARES[3]} of the smallest β_on; a dash where no tolerance of the study got there.",
+        "Smallest numbers of vectors with which min β_S over the training set reaches the shares "
+        f"{', '.join(map(str, SHARES))} of min β_on; a dash where no tolerance of the study reaches the share.",
         vectors,
     ),
-    "The best by dimension and by time": (
-        f"Cells that none beats in both, assembled reduced, all queries ok; {CONTROL} does not compete.",
+    "Pareto fronts of the error of λ": (
+        f"Cells with reduced assembly and every query ok that no other cell beats in both cost and error; {CONTROL} is "
+        "left out.",
         fronts,
     ),
     "Cells that are not ok": ("", failures),
@@ -237,7 +239,7 @@ def main(run: Path, folder: Path) -> None:
     field = Field.read(path)
     folder.mkdir(parents=True, exist_ok=True)
     drawn = {
-        "field-shares": lambda: shares_drawn(field),
+        "field-shares": lambda: draw_shares(field),
         "field-dimension": lambda: scatter(field, _dimension, "dimension N + S + R", "Error of λ against dimension"),
         "field-time": lambda: scatter(
             field, lambda cells: 1e3 * cells["online_s"], "query, reduced [ms]", "Error of λ against online time"
@@ -245,8 +247,9 @@ def main(run: Path, folder: Path) -> None:
     }
     with styled():
         for name, draw in drawn.items():
-            save(draw(), folder, name, ("png",))
-    text = [f"# The whole field\n\n{made(field)}"]
+            for file in save(draw(), folder, name, ("png",)):
+                use_palette(file)
+    text = [f"# Comparison of strategies\n\n{made(field)}"]
     text += [f"![{name}]({name}.png)" for name in drawn]
     for title, (said, table) in SECTIONS.items():
         found = table(field)
@@ -256,12 +259,13 @@ def main(run: Path, folder: Path) -> None:
 
 
 def made(field: Field) -> str:
-    """Where the page comes from."""
+    """The command, the machine and the number of cells."""
     fine = int((field.cells["status"] == "ok").sum())
     return (
-        "Made by `vibench run field --no-figures && python results/field.py runs/field results/field`, on "
+        "Generated by `vibench run field --no-figures && python results/field.py runs/field results/field` on "
         f"{', '.join(sorted(set(field.cells['machine'])))}. {len(field.cells)} cells, {fine} with every query ok. "
-        "Seconds are CPU seconds on one thread."
+        "Seconds are CPU seconds on one thread. All columns of the cells: [cells.csv](cells.csv). `vibench run field` "
+        "leaves the tables of all queries and histories under `runs/field/tables`."
     )
 
 

@@ -1,4 +1,4 @@
-"""Put the tables and figures of a finished run under results/, with the paper's figures beside ours.
+"""Write the page of a finished run under results/: summary, break-even, figures, comparison with the paper.
 
 vibench run paper-obstacle && python results/make.py runs/paper-obstacle results/paper-obstacle
 """
@@ -13,11 +13,12 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
+from palette import use_palette
 
 from vibench.report import figures
+from vibench.report.figures.style import save, styled
 from vibench.results import tables
 from vibench.results.break_even import HIGH_FIDELITY, break_even
-from vibench.results.schema import TABLES
 
 
 @dataclass(frozen=True)
@@ -26,17 +27,17 @@ class Published:
 
     Attributes
     ----------
-    ask
-        What selects our cells: tolerances, or prescribed sizes.
+    prescribed
+        Tolerances or sizes of the cells to compare with.
     size
         (N, R) of the paper.
     offline, online
         Seconds of the offline phase and of one query, on and off.
     threshold
-        Benefit threshold.
+        Break-even: the number of queries from which the offline enrichment is cheaper in total.
     """
 
-    ask: dict[str, float]
+    prescribed: dict[str, float]
     size: tuple[int, int]
     offline: tuple[float, float]
     online: tuple[float, float]
@@ -45,7 +46,7 @@ class Published:
 
 PAPER = {
     "paper-obstacle": (
-        "Table 1 of Niakh, Drouet, Ehrlacher and Ern (2022), δ_PGA = 1e-3, beside ours",
+        "Comparison with Table 1 of Niakh, Drouet, Ehrlacher and Ern (2022), δ_PGA = 1e-3",
         1e-3,
         (
             Published({"pod_tol": 1e-3, "dual_tol": 1e-2}, (19, 50), (1112.0, 2296.0), (14.0, 2.4), 102),
@@ -54,7 +55,7 @@ PAPER = {
         ),
     ),
     "paper-hertz": (
-        "Table 2 of Niakh, Drouet, Ehrlacher and Ern (2022), δ_PGA = 0.3, beside ours",
+        "Comparison with Table 2 of Niakh, Drouet, Ehrlacher and Ern (2022), δ_PGA = 0.3",
         0.3,
         (
             Published({"pod_size": 3, "dual_size": 12}, (3, 12), (8490.0, 18098.0), (75.0, 18.0), 169),
@@ -63,11 +64,20 @@ PAPER = {
         ),
     ),
 }
-"""What the paper prints: title, δ_PGA of the offline enrichment, columns; seconds on its authors' machine."""
+"""Tables of the paper: title, δ_PGA of the offline enrichment, columns; seconds on its authors' machine."""
 
 DUAL = "mcpg"
 SOLVER = "piqp"
-"""Cone and solver whose seconds stand beside the paper's; the solver that leaves the fewest queries unsolved."""
+"""Cone and solver of the cells compared with the paper; the solver is the one with the fewest unsolved queries."""
+
+TABLES = ("cells", "thresholds", "disagreements")
+"""Tables written beside the page. Those of all queries and histories take megabytes and stay in the run folder."""
+
+FIGURES = {
+    "benefit": ("total-cost", "work-precision", "inf-sup"),
+    "hertz-quadrature": ("solutions", "errors"),
+}
+"""Kinds of figures on the page of a study; all of them on other pages."""
 
 
 def main() -> None:
@@ -78,80 +88,95 @@ def main() -> None:
     target.mkdir(parents=True)
     for table in TABLES:
         frame = tables.in_order(tables.read(path, table))
-        frame.to_csv(target / f"{table}.csv", index=False, float_format="%.6g")
-    figures.draw_all(path, target, ("png",))
+        if len(frame):
+            frame.to_csv(target / f"{table}.csv", index=False, float_format="%.6g")
+    draw(path, target)
     (target / "README.md").write_text(page(path, target), encoding="utf-8")
 
 
+def draw(path: Path, target: Path) -> None:
+    """Draw the figures of the page."""
+    for name, drawing, data in figures.drawings(path):
+        if not name.endswith(FIGURES.get(target.name, "")):
+            continue
+        with styled():
+            figure = drawing(data)
+            if figure is not None:
+                for file in save(figure, target, name, ("png",)):
+                    use_palette(file)
+
+
 def page(path: Path, target: Path) -> str:
-    """The README of the folder: how it was made, the comparison, the summary, what fell short, the figures."""
+    """The README of the folder: its origin, the comparison with the paper, the summary, failures, figures."""
     name, cells = target.name, tables.in_order(tables.read(path, "cells"))
     versions = {name: text for row in cells["versions"] for name, text in json.loads(row).items()}
     named = ", ".join(f"{name} {text}" for name, text in versions.items())
-    short = cells[cells["status"] != "ok"].groupby(["solver", "status"])
-    fell = [
-        f"- {solver}: {len(group)} cells {status}, {int((group['queries'] - group['queries_ok']).sum())} of "
-        f"{int(group['queries'].sum())} of their queries"
-        for (solver, status), group in short
+    not_ok = [
+        f"- {solver}: {len(group)} cells {status}, in which {int((group['queries'] - group['queries_ok']).sum())} of "
+        f"{int(group['queries'].sum())} queries are not ok"
+        for (solver, status), group in cells[cells["status"] != "ok"].groupby(["solver", "status"])
     ]
     drawn = sorted(file.name for file in target.glob("*.png"))
+    written = [table for table in TABLES if (target / f"{table}.csv").exists()]
     parts = [
         f"# {name}",
-        f"Made by `vibench run {name} && python results/make.py runs/{name} results/{name}`, on one machine: "
-        f"{cells['machine'].iloc[0]}; {named}. Seconds are CPU seconds on one thread.",
-        *(beside_the_paper(cells, name) if name in PAPER else []),
+        f"Generated by `vibench run {name} && python results/make.py runs/{name} results/{name}` on one machine: "
+        f"{cells['machine'].iloc[0]}; {named}. Seconds are CPU seconds on one thread. `vibench run {name}` leaves the "
+        f"tables of all queries and histories under `runs/{name}/tables` and all figures under `runs/{name}/figures`.",
+        *(comparison_with_the_paper(cells, name) if name in PAPER else []),
         "## All cells",
         f"{len(cells)} cells, {int((cells['status'] == 'ok').sum())} with every query ok"
-        + ("; the others:" if fell else "."),
-        "\n".join(fell),
+        + ("; the others:" if not_ok else "."),
+        "\n".join(not_ok),
         tables.to_markdown(tables.summary(cells)),
-        *benefits(path),
+        *break_evens(path),
         "## Figures",
         "\n".join(f"![{Path(name).stem}]({name})" for name in drawn),
-        "Full tables: " + ", ".join(f"[{table}.csv]({table}.csv)" for table in TABLES) + ".",
+        "Full tables: " + ", ".join(f"[{table}.csv]({table}.csv)" for table in written) + ".",
     ]
     return "\n\n".join(part.strip() for part in parts if part) + "\n"
 
 
-def benefits(path: Path) -> list[str]:
-    """The section on benefit thresholds: from how many queries on an enrichment pays against another."""
+def break_evens(path: Path) -> list[str]:
+    """The section on break-even: the number of queries from which one enrichment is cheaper in total than another."""
     thresholds = tables.read(path, "thresholds")
     of_enrichments = thresholds[thresholds["primal_a"] != HIGH_FIDELITY]
     if of_enrichments.empty:
         return []
-    return ["## Benefit thresholds of fixed enrichments", tables.to_markdown(tables.benefits(of_enrichments))]
+    return ["## Break-even of fixed enrichments", tables.to_markdown(tables.benefits(of_enrichments))]
 
 
-def beside_the_paper(cells: pd.DataFrame, name: str) -> list[str]:
+def comparison_with_the_paper(cells: pd.DataFrame, name: str) -> list[str]:
     """The section that compares with the paper."""
     return [
         f"## {PAPER[name][0]}",
         tables.to_markdown(comparison(cells, name)),
-        f"Ours: {SOLVER}, assembly in full as in the paper; the threshold by the same formula from our seconds.",
+        f"Columns of vibench: {SOLVER}, full assembly as in the paper; the break-even follows from its seconds by the "
+        "paper's formula.",
     ]
 
 
 def comparison(cells: pd.DataFrame, name: str) -> pd.DataFrame:
-    """One row per pair of dimensions: dimensions, times and benefit threshold, the paper's and ours."""
+    """One row per pair of dimensions: dimensions, seconds and break-even, of the paper and of vibench."""
     _, tight, columns = PAPER[name]
-    mine = cells[(cells["solver"] == SOLVER) & (cells["dual"] == DUAL)]
+    chosen = cells[(cells["solver"] == SOLVER) & (cells["dual"] == DUAL)]
     rows = []
     for column in columns:
-        pair = mine[np.logical_and.reduce([mine[key] == value for key, value in column.ask.items()])]
+        pair = chosen[np.logical_and.reduce([chosen[key] == value for key, value in column.prescribed.items()])]
         on = pair[pair["enrichment_kind"] == "per-parameter"].iloc[0]
         off = pair[pair["primal_tol"] == tight].iloc[0]
-        ours = break_even(on["offline_s"], on["online_s"], off["offline_s"], off["online_s"])
+        found = break_even(on["offline_s"], on["online_s"], off["offline_s"], off["online_s"])
         rows.append(
             {
-                "asked for": ", ".join(f"{key} = {value:g}" for key, value in column.ask.items()),
+                "prescribed": ", ".join(f"{key} = {value:g}" for key, value in column.prescribed.items()),
                 "(N, R)": f"({column.size[0]}, {column.size[1]})",
-                "ours": f"({on['N']:.0f}, {on['R']:.0f})",
+                "(N, R), vibench": f"({on['N']:.0f}, {on['R']:.0f})",
                 "offline on / off [s]": f"{column.offline[0]:.0f} / {column.offline[1]:.0f}",
-                "ours [s]": f"{on['offline_s']:.1f} / {off['offline_s']:.1f}",
+                "vibench [s]": f"{on['offline_s']:.1f} / {off['offline_s']:.1f}",
                 "query on / off [s]": f"{column.online[0]:g} / {column.online[1]:g}",
-                "ours [ms]": f"{1e3 * on['online_s']:.1f} / {1e3 * off['online_s']:.1f}",
-                "threshold": column.threshold,
-                "ours, threshold": str(ours),
+                "vibench [ms]": f"{1e3 * on['online_s']:.1f} / {1e3 * off['online_s']:.1f}",
+                "break-even": column.threshold,
+                "break-even, vibench": str(found),
             }
         )
     return pd.DataFrame(rows)

@@ -1,9 +1,9 @@
-"""How seconds and memory of every stage grow: over the mesh at fixed N and R, and over R at the paper's mesh.
+"""Growth of seconds and memory of every stage: over the mesh at fixed N and R, and over R at the paper's mesh.
 
 python results/scaling.py results/scaling
 
 Every problem and mesh is measured in a process of its own, on one thread. Memory is the peak resident set while a stage
-runs, everything before it included; queries are medians.
+runs and includes what earlier stages hold; seconds of queries are medians.
 """
 
 from __future__ import annotations
@@ -26,13 +26,14 @@ import matplotlib as mpl
 import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
+from palette import use_palette
 
 from vibench import provenance
 from vibench.highfidelity.active_set import HighFidelitySolver
 from vibench.interfaces.strategies import Offline, Stop
 from vibench.model.affine import affine_decomposition
 from vibench.model.galerkin import ReducedModel
-from vibench.model.hyperreduced import OnlineModel, project_members
+from vibench.model.hyperreduced import HyperReducedModel, hyper_reduce
 from vibench.qp.solve import solve_qp
 from vibench.reduction.pod import pod
 from vibench.report.figures.style import STYLE
@@ -44,13 +45,13 @@ from vibench.timing import median_seconds, timed
 ACCURACY = 1e-10
 QUERIES = 8
 SEED = 2022
-OFFLINE = ("mesh and forms", "snapshots", "POD", "mCPG", "PGA", "separation", "reduction")
-ONLINE = ("query, full", "query, reduced", "bare program")
+OFFLINE = ("mesh and forms", "snapshots", "POD", "mCPG", "PGA", "affine decomposition", "reduction")
+ONLINE = ("query, full", "query, reduced", "QP solution")
 
 
 @dataclass(frozen=True)
 class Case:
-    """What is measured of one problem: numbers of nodes, and N, R and δ_PGA that stay the same."""
+    """Numbers of nodes of one problem, and N, R and δ_PGA, which are fixed over the meshes."""
 
     nodes: tuple[int | str, ...]
     N: int
@@ -71,7 +72,7 @@ def measure(name: str, nodes: int | str, R: int, delta: float, N: int) -> Iterat
     about: dict[str, Any] = {"problem": name, "R": R, "N": N}
 
     def row(stage: str, work: Callable[[], Any], repeated: bool = False) -> tuple[Any, dict[str, Any]]:
-        Path("/proc/self/clear_refs").write_text("5", encoding="ascii")  # the peak begins anew
+        Path("/proc/self/clear_refs").write_text("5", encoding="ascii")  # resets the peak
         result, seconds = (median_seconds if repeated else timed)(work)
         return result, about | {"stage": stage, "seconds": seconds.cpu, "memory_mib": _peak_memory()}
 
@@ -92,17 +93,17 @@ def measure(name: str, nodes: int | str, R: int, delta: float, N: int) -> Iterat
     primal = registry.create("primal strategy", "offline-pga", {})
     enrichment, found = row("PGA", lambda: primal.build(offline, delta))
     yield found | {"added": enrichment.vectors.shape[1]}
-    members, found = row("separation", lambda: affine_decomposition(problem, training, 1e-6))
+    members, found = row("affine decomposition", lambda: affine_decomposition(problem, training, 1e-6))
     yield found
     model = ReducedModel(problem, basis, enrichment, cone.generators, span)
-    operators, found = row("reduction", lambda: project_members(model, members))
+    operators, found = row("reduction", lambda: hyper_reduce(model, members))
     yield found
-    online = OnlineModel(model, operators)
+    online = HyperReducedModel(model, operators)
     for mu in problem.validation_set(QUERIES, SEED):
         reduced = online.assemble(mu)
-        for stage, asked in (("query, full", model), ("query, reduced", online)):
-            yield row(stage, lambda: _query(asked, mu), repeated=True)[1]  # noqa: B023  called at once
-        yield row("bare program", lambda: _solve(reduced), repeated=True)[1]  # noqa: B023
+        for stage, reduced_model in (("query, full", model), ("query, reduced", online)):
+            yield row(stage, lambda: _query(reduced_model, mu), repeated=True)[1]  # noqa: B023  called at once
+        yield row("QP solution", lambda: _solve(reduced), repeated=True)[1]  # noqa: B023
 
 
 def _query(model: Any, mu: Any) -> Any:
@@ -167,6 +168,7 @@ def draw(rows: pd.DataFrame, folder: Path) -> None:
             axes[1, 0].set_ylabel("peak memory [MiB]")
             figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside right center")
             figure.savefig(folder / f"over-{size}.png")
+            use_palette(folder / f"over-{size}.png")
 
 
 def main() -> None:
@@ -188,9 +190,9 @@ def page(rows: pd.DataFrame, folder: Path) -> None:
     versions = ", ".join(f"{name} {text}" for name, text in provenance.versions("piqp").items())
     parts = [
         "# Growth of seconds and memory",
-        f"Made by `python results/scaling.py results/scaling`, on one machine: {provenance.machine()}; {versions}. "
-        "CPU seconds on one thread; an exponent is the slope of a least squares line through all points of a row, both "
-        "axes logarithmic. "
+        f"Generated by `python results/scaling.py results/scaling` on one machine: {provenance.machine()}; {versions}. "
+        "All measurements: [rows.csv](rows.csv). CPU seconds on one thread. An exponent is the slope of the least "
+        "squares line through all points of a row in logarithmic axes. "
         + "; ".join(f"{name}: N = {case.N}, R = {case.R}, δ_PGA = {case.delta:g}" for name, case in CASES.items())
         + "; mCPG; queries by PIQP at accuracy 1e-10.",
     ]

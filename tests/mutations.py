@@ -57,8 +57,8 @@ FAULTS = (
     Fault(
         "generators-not-normalised",
         "vibench/reduction/cones.py",
-        "np.column_stack([generators, direction / length])",
-        "np.column_stack([generators, direction])",
+        "np.column_stack([self.generators, direction / length])",
+        "np.column_stack([self.generators, direction])",
         ("tests/unit/reduction/test_cones.py",),
     ),
     Fault(
@@ -70,8 +70,9 @@ FAULTS = (
     ),
     Fault(
         "coefficientwise-constraint-dropped",
-        "vibench/reduction/removal.py",
-        "B=np.vstack([-np.eye(count), usable[support]]),\n        g=np.concatenate([np.zeros(count), theta[support]]),",
+        "strategies/vibench_strategies/mcpg.py",
+        "B=np.vstack([-np.eye(count), generators[support]]),\n"
+        "        g=np.concatenate([np.zeros(count), theta[support]]),",
         "B=-np.eye(count),\n        g=np.zeros(count),",
         ("tests/mathematics/strategies",),
     ),
@@ -98,7 +99,7 @@ FAULTS = (
     ),
     Fault(
         "sigma-not-updated",
-        "vibench/reduction/supremizer_spaces.py",
+        "strategies/vibench_strategies/offline_pga.py",
         "self._gram = self._gram - rows.T @ rows",
         "self._gram = self._gram",
         ("tests/mathematics/strategies",),
@@ -176,15 +177,15 @@ FAULTS = (
     Fault(
         "cone-interval-too-narrow",
         "vibench/stability/copositive.py",
-        "return max(0.0, float(np.min(M[touching] / G[touching])) - len(G) * negative)",
-        "return max(0.0, float(np.min(M[touching] / G[touching])))",
+        "return max(0.0, float(np.min(M[positive] / G[positive])) - len(G) * negative)",
+        "return max(0.0, float(np.min(M[positive] / G[positive])))",
         ("tests/unit/stability/test_conic_infsup.py",),
     ),
     Fault(
         "bound-without-the-mismatch",
         "vibench/model/error_bounds.py",
-        "(size * residual / beta + mismatch) / alpha",
-        "(size * residual / beta) / alpha",
+        "(penetration_norm * residual / beta + complementarity) / alpha",
+        "(penetration_norm * residual / beta) / alpha",
         ("tests/unit/model/test_error_bounds.py",),
     ),
     Fault(
@@ -197,15 +198,15 @@ FAULTS = (
     Fault(
         "validated-on-the-training-set",
         "vibench/stages/snapshots.py",
-        'training_parameters(problem) if self.purpose == "training" else self._validation(problem)',
-        "training_parameters(problem)",
+        "return validation_parameters(problem, self.count, self.seed)",
+        "return training_parameters(problem)",
         ("tests/unit/stages/test_offline.py",),
     ),
     Fault(
         "active-set-without-release",
         "vibench/highfidelity/active_set.py",
-        "kept = active & (lam > 1e-14 * scale)",
-        "kept = active",
+        "in_contact = active & (lam > 1e-14 * scale)",
+        "in_contact = active",
         ("tests/unit/highfidelity/test_active_set.py",),
     ),
     Fault(
@@ -295,7 +296,7 @@ FAULTS = (
     Fault(
         "condensed-load-without-the-interface",
         "vibench/linalg/schur_complement.py",
-        "condensed[interface] += self._schur @ free[self._eliminated :]",
+        "condensed[interface] += self._interface_schur @ particular[self._eliminated :]",
         "pass",
         ("tests/unit/linalg/test_schur_complement.py",),
     ),
@@ -309,8 +310,8 @@ FAULTS = (
     Fault(
         "forces-where-contact-has-ended",
         "vibench/highfidelity/kkt_systems.py",
-        "given = np.concatenate([self._g[come], np.zeros(len(gone))])",
-        "given = np.concatenate([self._g[come], np.ones(len(gone))])",
+        "values = np.concatenate([self._g[added], np.zeros(len(removed))])",
+        "values = np.concatenate([self._g[added], np.ones(len(removed))])",
         ("tests/unit/highfidelity/test_kkt_systems.py",),
     ),
     Fault(
@@ -323,8 +324,8 @@ FAULTS = (
     Fault(
         "bound-of-a-distance-too-small",
         "vibench/reduction/cones.py",
-        "self.maximum.bound(np.linalg.norm(self._snapshots - generators @ self._points, axis=0) / self._largest)",
-        "self.maximum.bound(0.9 * np.linalg.norm(self._snapshots - generators @ self._points, axis=0) / self._largest)",
+        "np.linalg.norm(self._snapshots - generators @ self._coefficients, axis=0) / self._largest)",
+        "0.9 * np.linalg.norm(self._snapshots - generators @ self._coefficients, axis=0) / self._largest)",
         ("tests/unit/reduction/test_cones.py",),
     ),
     Fault(
@@ -337,7 +338,7 @@ FAULTS = (
     Fault(
         "separation-not-paid-for",
         "vibench/stages/cell_queries.py",
-        '"assembly": () if reduction is None else (reduction.separation, reduction),',
+        '"assembly": () if reduction is None else (reduction.decomposition, reduction),',
         '"assembly": () if reduction is None else (reduction,),',
         ("tests/unit/stages/test_assembly.py",),
     ),

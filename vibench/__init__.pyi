@@ -42,6 +42,7 @@ from .qp.status import Status as Status
 from .qp.verification import kkt_residuals as kkt_residuals
 from .qp.verification import verify as verify
 from .reduction.cones import REPRODUCED as REPRODUCED
+from .reduction.cones import GrowingCone as GrowingCone
 from .reduction.cones import LazyDistances as LazyDistances
 from .reduction.cones import greedy_cone as greedy_cone
 from .reduction.cones import normalised as normalised
@@ -50,8 +51,8 @@ from .reduction.cones import projection_errors as projection_errors
 from .reduction.cones import refuse_negative as refuse_negative
 from .reduction.lazy_greedy import TIE as TIE
 from .reduction.lazy_greedy import LazyMaximum as LazyMaximum
-from .reduction.nested import Growth as Growth
 from .reduction.nested import NestedStrategy as NestedStrategy
+from .reduction.nested import Step as Step
 from .reduction.pod import POD as POD
 from .reduction.pod import pod as pod
 from .reduction.supremizers import constraint_classes as constraint_classes

@@ -9,8 +9,6 @@ from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
-import qpsolvers
-
 SOLVER_DISTRIBUTIONS = {"highs": "highspy", "proxqp": "proxsuite"}
 """Distributions of the solvers that are not called like their solver."""
 
@@ -53,18 +51,29 @@ def solver_version(solver: str) -> str:
     return distribution_version(SOLVER_DISTRIBUTIONS.get(solver, solver))
 
 
+NUMERICAL = (
+    "arrays.py", "errors.py", "timing.py", "linalg", "interfaces", "qp", "reduction", "stability", "highfidelity",
+    "model", "stages",
+)  # fmt: skip
+"""Rooms and modules whose code determines numbers; the others carry requests and records, and show them."""
+
+LIBRARIES = ("numpy", "scipy", "scikit-fem", "qpsolvers", "piqp", "proxsuite")
+"""Libraries that the numerical rooms compute with; the solver of a cell and what a plugin needs count with these."""
+
+
 @cache
-def core_code() -> str:
-    """Version of vibench with a hash of its core's sources."""
-    return f"{distribution_version('vibench')} {source_hash(Path(__file__).parent)}"
+def core_code(*parts: str) -> str:
+    """Version of vibench with a hash of some of its rooms and modules, of all its sources where none is named."""
+    package = Path(__file__).parent
+    hashes = "".join(source_hash(package / part) for part in parts or [""])
+    return f"{distribution_version('vibench')} {hashlib.sha256(hashes.encode()).hexdigest()[:12]}"
 
 
 @cache
 def libraries() -> str:
-    """Versions of the libraries that results of stages depend on, the QP solvers among them."""
-    names = ["numpy", "scipy", "scikit-fem", "qpsolvers", *qpsolvers.available_solvers]
-    found = {name: solver_version(name) for name in names}
-    return ", ".join([f"python {platform.python_version()}", *(f"{name} {there}" for name, there in found.items())])
+    """Versions of Python and of the libraries that results of stages depend on."""
+    found = [f"{name} {distribution_version(name)}" for name in LIBRARIES]
+    return ", ".join([f"python {platform.python_version()}", *found])
 
 
 def source_hash(source: Path) -> str:

@@ -1,4 +1,4 @@
-"""Cone projected greedy: the multiplier snapshots themselves as generators."""
+"""Cone projected greedy algorithm: the multiplier snapshots themselves as generators."""
 
 from __future__ import annotations
 

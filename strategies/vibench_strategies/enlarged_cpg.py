@@ -18,7 +18,7 @@ from vibench import (
     project_on_cone,
     projection_errors,
 )
-from vibench.reduction.removal import removable_part
+from vibench_strategies.mcpg import part_in_cone
 
 ROUND_OFF = 1e-9
 """A generator that loses less than this share of its norm stays as it is; one no farther from the others is dropped."""
@@ -44,7 +44,7 @@ class EnlargedCPG(DualStrategy):
                 if project_on_cone(others, chi[:, i], W).distance <= ROUND_OFF:
                     moved, chi = True, others
                     continue
-                part, note = removable_part(chi[:, i], others, W)
+                part, note = part_in_cone(chi[:, i], others, W)
                 notes += [f"sweep {sweep}, generator {i + 1}: {note}"] if note else []
                 if W.norm(part) > ROUND_OFF:
                     rest = chi[:, i] - part

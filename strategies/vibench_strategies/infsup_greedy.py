@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 
-from vibench import Array, LazyMaximum, NestedStrategy, Offline
-from vibench.reduction.supremizer_spaces import Shares, SupremizerGrowth
+from vibench import LazyMaximum, NestedStrategy, Offline, Step
+from vibench_strategies.supremizer_greedy import Shares, SupremizerSpace
 
 
 class InfSupGreedy(NestedStrategy):
@@ -17,34 +19,14 @@ class InfSupGreedy(NestedStrategy):
 
     larger_is_tighter = True
 
-    def begin(self, offline: Offline) -> LeastStable:
-        """Represent the supremizers of the training set in coordinates."""
-        return LeastStable(offline)
-
-
-class LeastStable(SupremizerGrowth):
-    """Adds T(mu)η* at the mu of the smallest β_S(mu)/β_on(mu), η* its minimiser; shares only rise, so lazily."""
-
-    def __init__(self, offline: Offline) -> None:
-        super().__init__(offline)
-        self._shares = [Shares(found) for found in self.supremizers]
-        self._maximum = LazyMaximum(np.ones(len(self._shares)))
-        self._missing: list[float] = []
-        self._assess()
-
-    def reached(self, tolerance: float) -> bool:
-        """Whether β_S ≥ ρ·β_on everywhere."""
-        return 1.0 - self._missing[-1] >= tolerance
-
-    def grow(self) -> None:
-        """Add the supremizer of the least stable multiplier."""
-        self.add(self._shares[self._worst].worst_supremizer(self.grown), f"{1.0 - self._missing[-1]:.3g} of β_on")
-        self._assess()
-
-    def history(self) -> dict[str, Array]:
-        """The smallest share of β_on over the training set."""
-        return {"beta_share": 1.0 - np.array(self._missing)}
-
-    def _assess(self) -> None:
-        self._worst, missing = self._maximum.next(lambda p: self._shares[p].missing(self.grown))
-        self._missing.append(missing)
+    def steps(self, offline: Offline) -> Iterator[Step]:
+        """Add T(mu)η* at the mu of the smallest β_S(mu)/β_on(mu), η* its minimiser."""
+        space = SupremizerSpace(offline)
+        shares = [Shares(found) for found in space.supremizers]
+        largest = LazyMaximum(np.ones(len(shares)))  # shares only rise as S grows
+        history: list[float] = []
+        while True:
+            p, missing = largest.next(lambda p: shares[p].missing(space.basis))
+            history.append(1.0 - missing)
+            yield space.step(history[-1], {"beta_share": history})
+            space.add(shares[p].worst_supremizer(space.basis), f"{history[-1]:.3g} of β_on")

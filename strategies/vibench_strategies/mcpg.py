@@ -1,14 +1,105 @@
-"""Modified cone projected greedy: generators widened by subtracting what the cone already has."""
+"""Modified cone projected greedy algorithm: a cone with generators widened by what the cone already contains."""
 
 from __future__ import annotations
 
-from vibench import Array, Cone, DualStrategy, InnerProduct, Stop, greedy_cone
-from vibench.reduction.removal import removable_part
+import numpy as np
+
+from vibench import (
+    Array,
+    Cone,
+    DualStrategy,
+    GrowingCone,
+    InnerProduct,
+    Mask,
+    Stop,
+    VariationalInequality,
+    kkt_residuals,
+    solve_qp,
+)
+
+SOLVERS = ("piqp", "proxqp")
+"""QP solvers tried for line 9, in this order."""
+
+ACCURACY = 1e-12
+ACCEPTED = 1e-9
+"""A solution of line 9 with a larger residual is recorded as a fallback; any feasible one keeps Remark 4.1."""
+
+ZERO = 1e-12
+"""Entries of θ − Υ below this share of max θ are round-off; left there, they would exclude generators later on."""
 
 
 class ModifiedCPG(DualStrategy):
     """mCPG, Algorithm 2 of Niakh, Drouet, Ehrlacher and Ern (2022)."""
 
     def reduce(self, snapshots: Array, W: InnerProduct, stop: Stop) -> Cone:
-        """Like CPG, but each new snapshot θ leaves its best part Υ in the cone, with θ − Υ ≥ 0, behind (line 9)."""
-        return greedy_cone(snapshots, W, stop, subtract=lambda theta, chi: removable_part(theta, chi, W))
+        """Like CPG, but of each new snapshot θ only θ − Υ ≥ 0 becomes a generator, Υ the part already in the cone."""
+        cone = GrowingCone(snapshots, W)
+        while not cone.reached(stop):
+            theta = snapshots[:, cone.farthest]  # lines 5 to 8: the snapshot with the largest projection error
+            upsilon, note = part_in_cone(theta, cone.generators, W)  # line 9
+            # Lines 10 and 11. Line 11 should read Span⁺{ν_r}, as the text says. Where θ − Υ vanishes the algorithm
+            # ends (Remark 4.2).
+            if not cone.add(theta - upsilon, note):
+                break
+        return cone.result()
+
+
+def part_in_cone(theta: Array, generators: Array, W: InnerProduct) -> tuple[Array, str]:
+    """Line 9 of Algorithm 2: the Υ of the cone closest to θ with θ − Υ ≥ 0 coefficientwise.
+
+    Parameters
+    ----------
+    theta
+        Snapshot θ ≥ 0 (m,).
+    generators
+        Generators ν ≥ 0 of the cone (m×r).
+    W
+        Inner product of the multiplier space.
+
+    Returns
+    -------
+    tuple
+        Υ (m,) such that θ − Υ has no negative entry, and exact zeros where round-off would leave less than `ZERO` of
+        its maximum; and a note, empty where Υ is optimal to `ACCEPTED`.
+    """
+    # A generator that is positive where θ is zero cannot take part. Without it, and on the support of θ alone, the
+    # problem has strictly feasible points; with it there are none, and QP solvers break down.
+    support = theta > 0.0
+    usable = generators[:, ~np.any(generators[~support] > 0.0, axis=0)]
+    if not usable.shape[1]:
+        return np.zeros_like(theta), ""
+    coefficients, residual = _least_squares(theta, usable, support, W)
+    part = usable @ coefficients
+    over = part > theta
+    if np.any(over):  # round-off of the solver; a shorter multiple is feasible exactly, up to the clamp below
+        shrink = float(np.min(theta[over] / part[over]))
+        part *= shrink if shrink < 1.0 - ACCEPTED else 1.0
+    rest = np.maximum(theta - part, 0.0)
+    rest[rest < ZERO * theta.max()] = 0.0
+    note = "" if residual <= ACCEPTED else f"line 9 solved only to {residual:.0e}, made feasible"
+    return theta - rest, note
+
+
+def _least_squares(theta: Array, generators: Array, support: Mask, W: InnerProduct) -> tuple[Array, float]:
+    """Coefficients α ≥ 0 (r,) that minimise ‖θ − Σ α_i ν_i‖_W with Σ α_i ν_i ≤ θ, and the largest KKT residual."""
+    whitened, target = W.whiten(generators), W.whiten(theta)
+    count = generators.shape[1]
+    program = VariationalInequality(
+        A=whitened.T @ whitened,
+        f=whitened.T @ target,
+        B=np.vstack([-np.eye(count), generators[support]]),
+        g=np.concatenate([np.zeros(count), theta[support]]),
+    )
+    best, smallest = np.zeros(count), np.inf
+    for solver in SOLVERS:
+        solution = solve_qp(program, solver, ACCURACY)
+        if solution.x is None or solution.alpha is None:
+            continue
+        if not np.all(np.isfinite(np.append(solution.x, solution.alpha))):
+            continue
+        residual = kkt_residuals(program, solution.x, solution.alpha).worst
+        if residual < smallest:
+            best, smallest = np.maximum(solution.x, 0.0), residual
+        if smallest <= ACCEPTED:
+            break
+    return best, smallest

@@ -7,8 +7,6 @@ from typing import Annotated
 
 import numpy as np
 from annotated_types import Ge, Lt
-from sklearn.decomposition import NMF
-from sklearn.exceptions import ConvergenceWarning
 
 from vibench import (
     Array,
@@ -33,8 +31,15 @@ class NonnegativeFactors(DualStrategy):
     tolerance.
     """
 
+    requires = ("scikit-learn",)
+
     def __init__(self, seed: Annotated[int, Ge(0), Lt(2**32)] = 0, iterations: Annotated[int, Ge(1)] = 1000) -> None:
+        # Imported here, since scikit-learn is optional, and not in `reduce`, whose seconds count.
+        from sklearn.decomposition import NMF  # noqa: PLC0415
+        from sklearn.exceptions import ConvergenceWarning  # noqa: PLC0415
+
         self.seed, self.iterations = seed, iterations
+        self._factorisation, self._not_converged = NMF, ConvergenceWarning
 
     def reduce(self, snapshots: Array, W: InnerProduct, stop: Stop) -> Cone:
         """Factorise, with one generator more each time, from where the best linear space could meet the tolerance."""
@@ -54,9 +59,9 @@ class NonnegativeFactors(DualStrategy):
         if not size:
             return Cone(np.zeros((W.dim, 0)), projection_errors(np.zeros((W.dim, 0)), snapshots, W), no_free(0))
         weights, scale = np.sqrt(W.matrix.diagonal())[:, None], float(snapshots.max())
-        method = NMF(size, init="nndsvd", max_iter=self.iterations, random_state=self.seed)
+        method = self._factorisation(size, init="nndsvd", max_iter=self.iterations, random_state=self.seed)
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", ConvergenceWarning)  # said below
+            warnings.simplefilter("ignore", self._not_converged)  # said below
             generators = normalised(method.fit_transform(weights * (snapshots / scale)) / weights, W)
         stopped = method.n_iter_ >= self.iterations
         notes = (f"the factorisation was stopped after {method.n_iter_} iterations",) if stopped else ()

@@ -1,13 +1,17 @@
-"""The projected greedy algorithm: one enrichment for all parameters, built offline."""
+"""Projected greedy algorithm: one enrichment for all parameters, built offline."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Literal
 
 import numpy as np
 
-from vibench import Array, LazyMaximum, NestedStrategy, Offline
-from vibench.reduction.supremizer_spaces import Angles, Shares, SupremizerGrowth
+from vibench import TIE, Array, LazyMaximum, NestedStrategy, Offline, Step, orthonormal_range, project_out, svd
+from vibench_strategies.supremizer_greedy import Shares, SupremizerSpace, canonical
+
+SMALL = 1e-10
+"""Squares of sines below this are computed from residual vectors, not from the downdated Gram matrix."""
 
 
 class OfflinePGA(NestedStrategy):
@@ -20,37 +24,76 @@ class OfflinePGA(NestedStrategy):
     def __init__(self, stop: Literal["sigma", "beta"] = "sigma") -> None:
         self.stop, self.larger_is_tighter = stop, stop == "beta"
 
-    def begin(self, offline: Offline) -> ProjectedGreedy:
-        """Represent the supremizers of the training set in coordinates."""
-        return ProjectedGreedy(offline, self.stop)
+    def steps(self, offline: Offline) -> Iterator[Step]:
+        """Algorithm 1, a vector at a time."""
+        space = SupremizerSpace(offline)  # lines 1 and 2: S_R(mu) of every training parameter; S = {0}
+        angles = [Angles(found, space.plain) for found in space.supremizers]
+        shares = [Shares(found) for found in space.supremizers] if self.stop == "beta" else []
+        # σ and the missing share of β_on only fall as S grows (Lemma 3.2), so both maxima are taken lazily.
+        largest, missing = LazyMaximum(np.ones(len(angles))), LazyMaximum(np.ones(len(shares)))
+        history: dict[str, list[float]] = {"sigma": []}
+        while True:
+            # Lines 3 and 4: the parameter whose supremizer space is represented worst by V_N + S.
+            p, sigma = largest.next(lambda p: angles[p].sigma(space.basis))
+            history["sigma"].append(sigma)
+            if shares:
+                share = 1.0 - missing.next(lambda p: shares[p].missing(space.basis))[1]
+                history.setdefault("beta_share", []).append(share)
+            yield space.step(history["beta_share"][-1] if shares else sigma, history)
+            # Lines 5 to 7: of that space the direction farthest from V_N + S, orthonormalised, becomes a vector of S.
+            space.add(angles[p].worst_direction(space.basis), f"σ = {sigma:.0e}")
 
 
-class ProjectedGreedy(SupremizerGrowth):
-    """Adds the worst represented supremizer of the worst parameter; σ only falls (Lemma 3.2), so lazily."""
+class Angles:
+    """One supremizer space S_R(mu): an orthonormal basis Q and the Gram matrix of what V_N + S leaves of it.
 
-    def __init__(self, offline: Offline, stop: str) -> None:
-        super().__init__(offline)
-        self._angles = [Angles(found, self.plain) for found in self.supremizers]
-        self._shares = [Shares(found) for found in self.supremizers] if stop == "beta" else []
-        self._maxima = LazyMaximum(np.ones(len(self._angles))), LazyMaximum(np.ones(len(self._shares)))
-        self._sigma, self._share = list[float](), list[float]()
-        self._assess()
+    The Gram matrix loses a rank-one term for every vector added to S, brought up to date only when it is used. Its
+    eigenvalues are squares of sines and keep half their digits, so small ones are computed from residuals again.
 
-    def reached(self, tolerance: float) -> bool:
-        """Whether σ ≤ δ, or β_S ≥ ρ·β_on, everywhere."""
-        return self._share[-1] >= tolerance if self._share else self._sigma[-1] <= tolerance
+    Parameters
+    ----------
+    supremizers
+        Coordinates (d×k) of vectors that span S_R(mu).
+    plain
+        Orthonormal coordinates (d×N) of V_N.
+    """
 
-    def grow(self) -> None:
-        """Add a vector, lines 5 to 7."""
-        self.add(self._angles[self._worst].worst_direction(self.grown), f"σ = {self._sigma[-1]:.0e}")
-        self._assess()
+    def __init__(self, supremizers: Array, plain: Array) -> None:
+        # T(mu)χ is numerically singular where generators nearly coincide: its null directions are dropped.
+        self._basis = orthonormal_range(supremizers)
+        self._known = plain.shape[1]
+        outside = project_out(plain, self._basis)
+        self._gram = outside.T @ outside
 
-    def history(self) -> dict[str, Array]:
-        """σ, the largest over the training set, and the smallest share of β_on where that is what counts."""
-        return {name: np.array(v) for name, v in (("sigma", self._sigma), ("beta_share", self._share)) if v}
+    def sigma(self, space: Array) -> float:
+        """σ_S(mu): the largest sine of the principal angles between S_R(mu) and V_N + S (d×k, orthonormal)."""
+        if not self._basis.size:
+            return 0.0
+        if space.shape[1] < self._basis.shape[1]:  # something in S_R(mu) is orthogonal to all of it
+            return 1.0
+        square = float(np.linalg.eigvalsh(self._left_by(space))[-1])
+        return float(np.sqrt(square)) if square >= SMALL else float(self._sines(space)[0][0])
 
-    def _assess(self) -> None:
-        self._worst, sigma = self._maxima[0].next(lambda p: self._angles[p].sigma(self.grown))
-        self._sigma.append(sigma)
-        if self._shares:
-            self._share.append(1.0 - self._maxima[1].next(lambda p: self._shares[p].missing(self.grown))[1])
+    def worst_direction(self, space: Array) -> Array:
+        """The unit vector v (d,) of S_R(mu) that makes the largest angle with V_N + S.
+
+        Many σ equal 1 while V_N + S is smaller than S_R(mu), and then `canonical` chooses.
+        """
+        sines, right = self._sines(space)
+        return np.asarray(self._basis @ canonical(right[sines >= sines[0] - TIE]))
+
+    def _left_by(self, space: Array) -> Array:
+        """Gram matrix (r×r) of what V_N + S leaves of the basis; its eigenvalues are squares of sines."""
+        rows = space[:, self._known :].T @ self._basis
+        self._gram = self._gram - rows.T @ rows
+        self._known = space.shape[1]
+        return self._gram
+
+    def _sines(self, space: Array) -> tuple[Array, Array]:
+        """Sines (r,), falling, and the directions in S_R(mu) they belong to, as rows (r×r)."""
+        # The full symmetric eigensolver: solvers for a part of the spectrum fail on clusters near 1.
+        squares, vectors = np.linalg.eigh(self._left_by(space))
+        if squares[-1] < SMALL:
+            _, sines, right = svd(project_out(space, self._basis))
+            return sines, right
+        return np.sqrt(np.maximum(squares[::-1], 0.0)), vectors.T[::-1]

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 
-from vibench import RANK_RTOL, Array, NestedStrategy, Offline, orthonormal_range, project_out, svd
-from vibench.reduction.supremizer_spaces import SupremizerGrowth
+from vibench import RANK_RTOL, NestedStrategy, Offline, Step, orthonormal_range, project_out, svd
+from vibench_strategies.supremizer_greedy import SupremizerSpace
 
 
 class PODSupremizers(NestedStrategy):
@@ -16,32 +18,16 @@ class PODSupremizers(NestedStrategy):
     and V_N + S, relative to that with V_N alone, and it is what the tolerance bounds.
     """
 
-    def begin(self, offline: Offline) -> SupremizerModes:
-        """Compute the modes."""
-        return SupremizerModes(offline)
-
-
-class SupremizerModes(SupremizerGrowth):
-    """Hands out mode by mode."""
-
-    def __init__(self, offline: Offline) -> None:
-        super().__init__(offline)
-        weights = np.sqrt(self.shared_by)
-        bases = [c * orthonormal_range(found) for c, found in zip(weights, self.supremizers, strict=True)]
-        self._modes, sigma, _ = svd(project_out(self.plain, np.hstack(bases)))
+    def steps(self, offline: Offline) -> Iterator[Step]:
+        """Add mode by mode."""
+        space = SupremizerSpace(offline)
+        weights = np.sqrt(space.shared_by)
+        bases = [c * orthonormal_range(found) for c, found in zip(weights, space.supremizers, strict=True)]
+        modes, sigma, _ = svd(project_out(space.plain, np.hstack(bases)))
         squares = np.where(sigma > RANK_RTOL * weights.max(), sigma, 0.0) ** 2
         tails = np.sqrt(np.append(np.cumsum(squares[::-1])[::-1], 0.0))
-        self._tails = tails / (tails[0] or 1.0)
-
-    def reached(self, tolerance: float) -> bool:
-        """Whether the relative tail is small enough."""
-        return bool(self._tails[self.count] <= tolerance)
-
-    def grow(self) -> None:
-        """Add the next mode."""
-        left = float(self._tails[self.count])
-        self.add(self._modes[:, self.count] if left else np.zeros(len(self._modes)), f"{left:.0e} of themselves")
-
-    def history(self) -> dict[str, Array]:
-        """The relative tail."""
-        return {"tail": self._tails[: self.count + 1]}
+        tails = tails / (tails[0] or 1.0)
+        while True:
+            count, left = space.count, float(tails[space.count])
+            yield space.step(left, {"tail": list(tails[: count + 1])})
+            space.add(modes[:, count] if left else np.zeros(len(modes)), f"{left:.0e} of themselves")

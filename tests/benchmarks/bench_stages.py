@@ -18,7 +18,7 @@ from vibench.interfaces.strategies import Cone, Enrichment
 from vibench.interfaces.validation import check_cone, check_enrichment
 from vibench.model.affine import affine_decomposition
 from vibench.model.galerkin import ReducedProblem
-from vibench.model.hyperreduced import OnlineModel, Operators, project_members
+from vibench.model.hyperreduced import HyperReducedModel, Operators, hyper_reduce
 from vibench.qp.solution import QPSolution
 from vibench.qp.solve import solve_qp
 from vibench.reduction.pod import pod
@@ -97,12 +97,12 @@ def test_projection_of_members(benchmark: BenchmarkFixture, material: Material, 
         pytest.skip(f"queries have to be assembled in full: {why}")
 
     def judge(found: Operators) -> Info:
-        return reached.of_programs(material, OnlineModel(material.model(primal), found))
+        return reached.of_programs(material, HyperReducedModel(material.model(primal), found))
 
     measure(
         benchmark,
         "projection of members",
-        lambda model: project_members(model, members),
+        lambda model: hyper_reduce(model, members),
         judge,
         lambda: material.model(primal),
     )

@@ -22,10 +22,10 @@ from vibench.interfaces.validation import (
     training_parameters,
     validation_parameters,
 )
-from vibench.model.affine import Member, affine_decomposition
+from vibench.model.affine import AffineMember, affine_decomposition
 from vibench.model.errors import Reference
 from vibench.model.galerkin import ReducedModel
-from vibench.model.hyperreduced import OnlineModel, Operators, project_members, why_in_full
+from vibench.model.hyperreduced import HyperReducedModel, Operators, hyper_reduce, reason_for_full_assembly
 from vibench.reduction.pod import POD, pod
 from vibench.stability.infsup import multipliers
 from vibench.stages.assembly import Model
@@ -129,7 +129,7 @@ class Material:
         return model_with(self.offline(spaces), self.enrichment(primal, spaces))
 
     @property
-    def members(self) -> Mapping[str, Member]:
+    def members(self) -> Mapping[str, AffineMember]:
         problem, training = self.problem, self.training
         return self._once("separation", lambda: affine_decomposition(problem, training, INTERPOLATION))
 
@@ -138,14 +138,14 @@ class Material:
         model, members = self.model(primal, spaces), self.members
         return self._once(
             f"projection of members with {primal}",
-            lambda: why_in_full(model, members) or project_members(model, members),
+            lambda: reason_for_full_assembly(model, members) or hyper_reduce(model, members),
             spaces,
         )
 
     def online(self, primal: Primal, spaces: Spaces = USUAL) -> tuple[Model, str]:
         """A new model that assembles in the quickest way there is, and why that is in full; "" where it is not."""
         model, operators = self.model(primal, spaces), self.operators(primal, spaces)
-        return (model, operators) if isinstance(operators, str) else (OnlineModel(model, operators), "")
+        return (model, operators) if isinstance(operators, str) else (HyperReducedModel(model, operators), "")
 
     @property
     def queries(self) -> list[Query]:

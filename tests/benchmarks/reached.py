@@ -15,7 +15,7 @@ from vibench.interfaces.strategies import Cone, Enrichment
 from vibench.interfaces.validation import checked_assembly
 from vibench.linalg.dense import project_out, singular_values
 from vibench.linalg.inner_product import InnerProduct
-from vibench.model.affine import Evaluation, Member
+from vibench.model.affine import AffineMember, Evaluation
 from vibench.model.errors import errors
 from vibench.model.galerkin import ReducedModel, ReducedProblem, project
 from vibench.qp import verification
@@ -93,14 +93,14 @@ def _sigma(model: ReducedModel, mu: Array) -> float:
     return float(singular_values(project_out(V.whiten(model.primal_basis(vi)), wanted)).max(initial=0.0))
 
 
-def of_separation(material: Material, found: Mapping[str, Member]) -> Info:
+def of_separation(material: Material, found: Mapping[str, AffineMember]) -> Info:
     """Of separated members: terms and ways; errors at validation parameters, no further than the problem samples."""
     ways = {f"way_{name}": member.way.value for name, member in found.items()}
     terms = {f"terms_{name}": len(member.terms) for name, member in found.items()}
     return about(material, **ways, **terms, accuracy={"interpolation_error": _interpolation_error(material, found)})
 
 
-def _interpolation_error(material: Material, found: Mapping[str, Member]) -> float:
+def _interpolation_error(material: Material, found: Mapping[str, AffineMember]) -> float:
     sampled = {name: m for name, m in found.items() if m.way is Evaluation.INTERPOLATED}
     if not sampled:
         return 0.0

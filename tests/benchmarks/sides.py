@@ -14,7 +14,7 @@ from vibench.interfaces.problem import Problem
 from vibench.interfaces.strategies import Enrichment, Offline, Stop
 from vibench.model.affine import affine_decomposition
 from vibench.model.galerkin import ReducedModel
-from vibench.model.hyperreduced import OnlineModel, project_members
+from vibench.model.hyperreduced import HyperReducedModel, hyper_reduce
 from vibench.qp.solve import solve_qp
 from vibench.reduction.pod import pod
 from vibench.stability.infsup import multipliers
@@ -166,14 +166,14 @@ class Ours(Side):
     def reduction(self) -> None:
         members = affine_decomposition(self.problem, self.offline.training, INTERPOLATION)
         model = self._model(self.enrichment)
-        self.fixed_reduced = OnlineModel(model, project_members(model, members))
+        self.fixed_reduced = HyperReducedModel(model, hyper_reduce(model, members))
         self.members = members
 
     def prepare(self) -> None:
         self.fixed = self._model(self.enrichment)
         self.per_parameter = self._model(OnlineSupremizers().build(self.offline, None))
-        operators = project_members(self.per_parameter, self.members)
-        self.per_parameter_reduced = OnlineModel(self.per_parameter, operators)
+        operators = hyper_reduce(self.per_parameter, self.members)
+        self.per_parameter_reduced = HyperReducedModel(self.per_parameter, operators)
 
     def query_online(self, mu: Array) -> published.Answer:
         return self._answered(self.per_parameter, mu)
@@ -195,7 +195,7 @@ class Ours(Side):
     def _model(self, enrichment: Enrichment) -> ReducedModel:
         return ReducedModel(self.problem, self.basis, enrichment, self.chi, self.span)
 
-    def _answered(self, model: ReducedModel | OnlineModel, mu: Array) -> published.Answer:
+    def _answered(self, model: ReducedModel | HyperReducedModel, mu: Array) -> published.Answer:
         reduced = model.assemble(mu)
         found = solve_qp(reduced.program, self.solver, self.accuracy, factor=reduced.factor)
         return reduced.program, found.x, found.alpha, lambda: reduced.basis

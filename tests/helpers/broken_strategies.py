@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
 from typing import ClassVar
 
@@ -12,12 +13,12 @@ from vibench import (
     Cone,
     DualStrategy,
     Enrichment,
-    Growth,
     InnerProduct,
     Kind,
     NestedStrategy,
     Offline,
     PrimalStrategy,
+    Step,
     Stop,
     greedy_cone,
     project_on_cone,
@@ -29,7 +30,7 @@ class Greedy(DualStrategy):
     """The snapshot farthest from the cone, as often as needed."""
 
     def reduce(self, snapshots: Array, W: InnerProduct, stop: Stop) -> Cone:
-        return greedy_cone(snapshots, W, stop, lambda theta, _: (np.zeros_like(theta), ""))
+        return greedy_cone(snapshots, W, stop)
 
 
 class NegativeGenerators(Greedy):
@@ -213,29 +214,10 @@ class SuppliesAVector(PrimalStrategy):
 class Restarts(NestedStrategy):
     """Says it is nested, and begins with another vector at every tolerance."""
 
-    def begin(self, offline: Offline) -> Growth:
-        return _Backwards(offline)
-
-
-class _Backwards(Growth):
-    def __init__(self, offline: Offline) -> None:
+    def steps(self, offline: Offline) -> Iterator[Step]:
         V, problem = offline.problem.V, offline.problem
         B, _ = problem.constraint(offline.training[0])
-        self._found = V.orthonormalise(supremizers(V, B, offline.span), offline.basis)
-        self._count = 0
-
-    @property
-    def count(self) -> int:
-        return self._count
-
-    def reached(self, tolerance: float) -> bool:
-        return self._count >= min(round(4.0 * (1.0 - tolerance)), self._found.shape[1])
-
-    def grow(self) -> None:
-        self._count += 1
-
-    def vectors(self, first: int) -> Array:
-        return self._found[:, : self._count][:, ::-1][:, first:]
-
-    def history(self) -> dict[str, Array]:
-        return {}
+        found = V.orthonormalise(supremizers(V, B, offline.span), offline.basis)
+        for count in range(found.shape[1] + 1):
+            measure = 0.0 if count == found.shape[1] else 1.0 - (count + 0.5) / 4.0
+            yield Step(count, measure, lambda first, count=count: found[:, :count][:, ::-1][:, first:], {})

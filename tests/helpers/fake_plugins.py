@@ -188,7 +188,7 @@ class WaitingCone(DualStrategy):
     def reduce(self, snapshots: Array, W: InnerProduct, stop: Stop) -> Cone:
         while not self.file.exists():
             time.sleep(0.05)
-        return greedy_cone(snapshots, W, stop, lambda theta, _: (np.zeros_like(theta), ""))
+        return greedy_cone(snapshots, W, stop)
 
 
 class RaisingEnrichment(PrimalStrategy):

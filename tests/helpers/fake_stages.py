@@ -47,6 +47,8 @@ def misbehave(how: str) -> None:
 class Whole(Stage):
     """A stage in one piece; it notes that it was begun."""
 
+    label = "whole"
+
     how: str
     diary: str = ""
 
@@ -65,11 +67,13 @@ class Whole(Stage):
 class OfAPlugin(Stage):
     """A stage that depends on a plugin, below another stage."""
 
+    label = "of a plugin"
+
     below: OfAPlugin | None = None
     problem: Plugin | None = None
 
     def inputs(self) -> tuple[Stage, ...]:
-        return ()
+        return () if self.below is None else (self.below,)
 
     def run(self, store: Store) -> Result:
         return Result("fine")
@@ -78,6 +82,8 @@ class OfAPlugin(Stage):
 @dataclass(frozen=True)
 class KillsItsParent(Stage):
     """Kills the process that keeps the worker, the first time it is run."""
+
+    label = "kills its parent"
 
     diary: str
 
@@ -97,6 +103,8 @@ class KillsItsParent(Stage):
 @dataclass(frozen=True)
 class InPieces(PiecewiseStage):
     """Every piece does what its word says, and what the one in `unwatched` says before the keeper is told."""
+
+    label = "in pieces"
 
     hows: tuple[str, ...]
     at_begin: str = ""

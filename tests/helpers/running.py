@@ -13,8 +13,8 @@ from typing import Any
 
 import pandas as pd
 
+from vibench.results.columns import KEYS, TABLES
 from vibench.results.database import FILE
-from vibench.results.schema import KEYS, TABLES
 
 Vibench = Callable[..., "subprocess.CompletedProcess[str]"]
 """Runs the installed command in a folder."""

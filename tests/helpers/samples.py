@@ -11,7 +11,7 @@ from typing import Any
 
 import fake_plugins
 
-from vibench.results.schema import CELLS, QUERIES
+from vibench.results.columns import CELLS, QUERIES
 from vibench.stages.artefacts import Store
 from vibench.stages.base import Stage
 

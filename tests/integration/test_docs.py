@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import importlib.util
+import pkgutil
 import re
 import sys
 import tomllib
@@ -21,12 +22,14 @@ from samples import toml
 
 from vibench.cli.main import app
 from vibench.errors import RequestError
-from vibench.results import columns, schema, tables
+from vibench.results import columns, tables
 from vibench.study.reader import load_study
 from vibench.study.registry import GROUPS
 from vibench.study.spec import Entry, Limits, Study, ToleranceTable
 
-DOCS = Path(__file__).parents[2] / "docs"
+ROOT = Path(__file__).parents[2]
+DOCS = ROOT / "docs"
+RESULTS = [ROOT / "README.md", *sorted((ROOT / "results").rglob("*.md"))]
 PAGES = sorted(DOCS.rglob("*.md"))
 EXTEND = sorted((DOCS / "extend").glob("*.md"))
 
@@ -130,27 +133,24 @@ def test_the_plugins_of_the_pages_run_through_the_whole_benchmark(
 
 
 def test_every_column_of_every_table_has_a_unit_and_a_meaning() -> None:
-    described = {table: list(of_table) for table, of_table in columns.COLUMNS.items()}
-    assert described == {table: list(of_table) for table, of_table in schema.STORED.items()}
-    everything = [
-        column
-        for of_table in (*columns.COLUMNS.values(), columns.SUMMARY, columns.BENEFITS)
-        for column in of_table.values()
-    ]
+    everything = [column for of_table in columns.STORED.values() for column in of_table.values()]
     for column in [*everything, columns.PARAMETER]:
         assert column.unit in columns.UNITS
         assert column.meaning.strip().endswith((".", "…"))
 
 
-@pytest.mark.parametrize("name", [name for name, kind in schema.QUERIES.items() if name.endswith("_s")])
+@pytest.mark.parametrize("name", [name for name in columns.QUERIES if name.endswith("_s")])
 def test_seconds_are_in_seconds(name: str) -> None:
-    assert columns.COLUMNS["queries"][name].unit == "s"
+    assert columns.QUERIES[name].unit == "s"
 
 
-def test_the_tables_for_reading_have_the_columns_that_are_described() -> None:
-    empty = {name: pd.DataFrame(columns=list(schema.STORED[name])) for name in ("cells", "thresholds")}
-    assert list(tables.summary(empty["cells"]).columns) == list(columns.SUMMARY)
-    assert list(tables.benefits(empty["thresholds"]).columns) == list(columns.BENEFITS)
+@pytest.mark.parametrize("table", ["cells", "thresholds"])
+def test_the_tables_for_reading_have_the_columns_that_are_described(table: str, reference: ModuleType) -> None:
+    empty = pd.DataFrame(columns=list(columns.STORED[table]))
+    name, view = {"cells": ("summary", tables.summary), "thresholds": ("benefits", tables.benefits)}[table]
+    headings = re.findall(r"^\| (?!column|---)([^|]+?) \|", reference.GENERATED[name](), re.MULTILINE)
+    assert list(view(empty).columns) == headings
+    assert len(headings) == len(set(headings)) > 10
 
 
 @pytest.mark.parametrize("model", [Study, ToleranceTable, Entry, Limits])
@@ -163,12 +163,12 @@ def test_every_field_of_a_study_file_is_described_and_in_the_reference(
         assert re.search(rf"^\| `{name}` \| .+ \| .* \| {re.escape(field.description)} \|$", page, re.MULTILINE), name
 
 
-@pytest.mark.parametrize("table", schema.STORED)
+@pytest.mark.parametrize("table", columns.STORED)
 def test_the_reference_has_a_line_for_every_column(table: str, reference: ModuleType) -> None:
     page = reference.GENERATED[table]()
     names = re.findall(r"^\| `([^`]+)` ", page, re.MULTILINE)
     parameters = ["mu_1, mu_2, …"] if table == "queries" else []
-    assert names == [*schema.STORED[table], *parameters]
+    assert names == [*columns.STORED[table], *parameters]
 
 
 def test_every_generated_part_is_in_a_page(reference: ModuleType) -> None:
@@ -204,6 +204,19 @@ def test_a_rule_of_the_reference_is_a_rule(change: str, refused: str, tmp_path: 
 
 def test_there_are_rules() -> None:
     assert len(RULES) >= 5
+
+
+MODULE = re.compile(r"\b(?:problems/|strategies/)?vibench(?:_problems|_strategies)?/[\w/]+\.py\b")
+NAME = re.compile(r"`vibench\.(\w+(?:\.\w+)*)`")
+
+
+@pytest.mark.parametrize("page", [*PAGES, *RESULTS], ids=lambda page: str(page.relative_to(ROOT)))
+def test_every_module_and_name_on_a_page_exists(page: Path) -> None:
+    text = page.read_text(encoding="utf-8")
+    assert [path for path in MODULE.findall(text) if not (ROOT / path).is_file()] == []
+    groups = {group.removeprefix("vibench.") for group in GROUPS.values()}
+    for name in set(NAME.findall(text)) - groups:
+        assert pkgutil.resolve_name(f"vibench.{name}") is not None
 
 
 COMMAND = re.compile(r"^\s*(?:\.venv/bin/)?vibench ([a-z-]+)(.*)$", re.MULTILINE)

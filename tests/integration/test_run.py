@@ -21,8 +21,8 @@ from running import (
 )
 from samples import wire_study, write_study
 
+from vibench.results.columns import TABLES
 from vibench.results.database import FILE
-from vibench.results.schema import TABLES
 from vibench.stages.artefacts import CACHE_VARIABLE, SUFFIX, Store
 from vibench.stages.snapshots import CHUNKS
 

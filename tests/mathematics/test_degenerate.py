@@ -14,8 +14,9 @@ from vibench.interfaces.strategies import Stop
 from vibench.stages.artefacts import Store
 from vibench.stages.assembly import AssemblyStage
 from vibench.stages.base import value_of
-from vibench.stages.cell_queries import CellRows, QueriesStage
-from vibench.stages.offline import ConeStage, EnrichmentStage, PODStage
+from vibench.stages.cell_queries import CellQueries, CellRows
+from vibench.stages.enrichment import SingleEnrichment
+from vibench.stages.offline import ConeStage, PODStage
 from vibench.study import registry
 from vibench.study.cells import Plugin
 
@@ -111,8 +112,8 @@ def rows(register, tmp_path):
         cone = ConeStage(problem, Plugin("dual strategy", dual, "{}", "test"), stop)
         tolerance = None if primal in {"decorrelated", "online-supremizers"} else 0.5
         strategy = Plugin("primal strategy", primal, "{}", "test")
-        enrichment = EnrichmentStage(PODStage(problem, Stop(tolerance=1e-6)), cone, strategy, tolerance)
-        stage = QueriesStage(AssemblyStage(enrichment, None, 3, 1), "piqp", 1e-8, 20.0)
+        enrichment = SingleEnrichment(PODStage(problem, Stop(tolerance=1e-6)), cone, strategy, tolerance)
+        stage = CellQueries(AssemblyStage(enrichment, None, 3, 1), "piqp", 1e-8, 20.0)
         carry_out(stage, store)
         found: CellRows = value_of(store, stage)
         return found

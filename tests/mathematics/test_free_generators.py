@@ -24,8 +24,9 @@ from vibench.stability.infsup import inf_sup, multipliers
 from vibench.stages.artefacts import Store
 from vibench.stages.assembly import AssemblyStage
 from vibench.stages.base import value_of
-from vibench.stages.cell_queries import CellRows, QueriesStage
-from vibench.stages.offline import ConeStage, EnrichmentStage, PODStage
+from vibench.stages.cell_queries import CellQueries, CellRows
+from vibench.stages.enrichment import SingleEnrichment
+from vibench.stages.offline import ConeStage, PODStage
 from vibench.study import registry
 from vibench.study.cells import Plugin
 
@@ -129,8 +130,8 @@ def test_rows_of_a_negative_control_are_ok_and_keep_the_invariants(store: Store,
     problem = plugin("problem", "hertz", '{"resolution": "coarse"}')
     cone = ConeStage(problem, plugin("dual strategy", "pod-dual"), Stop(tolerance=1e-2))
     pod, primal = PODStage(problem, Stop(tolerance=1e-3)), plugin("primal strategy", "infsup-greedy")
-    stage = QueriesStage(
-        AssemblyStage(EnrichmentStage(pod, cone, primal, 0.7), interpolation, 3, 1), "piqp", 1e-7, 20.0
+    stage = CellQueries(
+        AssemblyStage(SingleEnrichment(pod, cone, primal, 0.7), interpolation, 3, 1), "piqp", 1e-7, 20.0
     )
     carry_out(stage, store)
     found: CellRows = value_of(store, stage)

@@ -5,14 +5,23 @@ from __future__ import annotations
 import importlib.metadata
 import platform
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
 
 import vibench
 from vibench import provenance
-from vibench.provenance import core_code, cores, distribution_version, machine, solver_version, source_hash, versions
+from vibench.provenance import (
+    NUMERICAL,
+    core_code,
+    cores,
+    distribution_version,
+    machine,
+    solver_version,
+    source_hash,
+    versions,
+)
 from vibench.qp.settings import SETTINGS
 
 
@@ -86,10 +95,48 @@ def test_the_hash_does_not_change_with_anything_else(sources: Path, tmp_path_fac
     assert source_hash(copy) == before
 
 
-def test_the_code_of_the_core_is_its_version_and_its_sources() -> None:
-    version, _, digest = core_code().partition(" ")
-    assert version == importlib.metadata.version("vibench")
-    assert digest == source_hash(Path(str(vibench.__file__)).parent)
+PACKAGE = Path(str(vibench.__file__)).parent
+
+
+@pytest.fixture
+def edited(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[str], None]]:
+    """Function that adds a line to a module of a copy of the core, which `core_code` takes for the core."""
+    copy = tmp_path / "vibench"
+    shutil.copytree(PACKAGE, copy, ignore=shutil.ignore_patterns("__pycache__"))
+    monkeypatch.setattr(provenance, "__file__", str(copy / "provenance.py"))
+
+    def edit(module: str) -> None:
+        with (copy / module).open("a", encoding="utf-8") as source:
+            source.write("\n# another line\n")
+        core_code.cache_clear()
+
+    core_code.cache_clear()
+    yield edit
+    core_code.cache_clear()
+
+
+def test_the_code_of_the_core_is_its_version_and_a_hash_of_what_is_asked_for(edited: Callable[[str], None]) -> None:
+    before = {parts: core_code(*parts) for parts in ((), ("linalg",), ("timing.py", "linalg"), NUMERICAL)}
+    assert {code.partition(" ")[0] for code in before.values()} == {importlib.metadata.version("vibench")}
+    assert len(set(before.values())) == len(before)
+    edited("linalg/dense.py")
+    assert all(core_code(*parts) != code for parts, code in before.items())
+
+
+def test_numbers_depend_on_the_rooms_that_compute_them_and_on_no_other(edited: Callable[[str], None]) -> None:
+    before = core_code(*NUMERICAL)
+    rooms = {path.name for path in PACKAGE.iterdir() if path.suffix == ".py" or (path / "__init__.py").is_file()}
+    others = rooms - set(NUMERICAL)
+    assert others == {
+        "__init__.py", "provenance.py", "locking.py", "study", "results", "execution", "report", "testing", "cli",
+    }  # fmt: skip
+    for room in others:
+        edited(room if room.endswith(".py") else f"{room}/__init__.py")
+        assert core_code(*NUMERICAL) == before, room
+    for room in NUMERICAL:
+        edited(room if room.endswith(".py") else f"{room}/__init__.py")
+        assert core_code(*NUMERICAL) != before, room
+        before = core_code(*NUMERICAL)
 
 
 def test_the_processor_is_named_without_cpuinfo(monkeypatch: pytest.MonkeyPatch) -> None:

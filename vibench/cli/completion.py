@@ -12,7 +12,7 @@ from pathlib import Path
 import typer
 
 from vibench.errors import VibenchError
-from vibench.results.schema import TABLES
+from vibench.results.columns import TABLES
 
 EXAMPLES: Mapping[str, tuple[str, ...]] = {
     "run": (

@@ -31,7 +31,7 @@ from vibench.qp.settings import SETTINGS
 from vibench.qp.solve import installed_solvers
 from vibench.qp.status import Status
 from vibench.stages.artefacts import CACHE_VARIABLE, LOCK, Store, default_folder
-from vibench.stages.cell_queries import DISTURBED
+from vibench.stages.cell_summary import DISTURBED, WAITED
 from vibench.study import registry
 from vibench.study.reader import load_study
 from vibench.timing import Calibration, Stopwatch
@@ -41,9 +41,6 @@ MIN_GIB = 1.0
 
 MAX_OTHER_LOAD = 0.25
 """Share of the cores that other processes may use before timings are doubtful."""
-
-MAX_WALL_PER_CPU = 1.5
-"""Ratio of wall to CPU seconds above which `vibench.stages.cell_queries` marks a row as disturbed."""
 
 MEASURED_SECONDS = 0.5
 """Duration of the measurement of load and slowdown."""
@@ -239,7 +236,7 @@ def timings() -> Iterator[Finding]:
     for subject, found, doubtful in (
         ("other load", f"{others:.1f} of {cores} cores", others > MAX_OTHER_LOAD * cores),
         ("slowdown", f"{slowdown:.2f}; rows are marked above {DISTURBED}", slowdown > DISTURBED),
-        ("wall over CPU", f"{ratio:.2f}; rows are marked above {MAX_WALL_PER_CPU}", ratio > MAX_WALL_PER_CPU),
+        ("wall over CPU", f"{ratio:.2f}; rows are marked above {WAITED}", ratio > WAITED),
     ):
         yield Finding(subject, found, _note_if(doubtful))
         doubts += [subject] * doubtful

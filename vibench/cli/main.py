@@ -60,7 +60,7 @@ def run(
     """Run a study. An interrupted run resumes where it stopped."""
     from vibench import provenance
     from vibench.cli.console import new_console
-    from vibench.cli.progress import Report
+    from vibench.cli.progress import ProgressDisplay
     from vibench.execution.run import Options, run_study
     from vibench.qp.status import Status
     from vibench.report import figures
@@ -81,8 +81,8 @@ def run(
         raise RequestError(f"--scheduler {scheduler} is for --executor dask")
     folder = out or Path("runs") / loaded.name
     options = Options(jobs or provenance.cores(), fresh, retry, executor, scheduler)
-    with Report(new_console()) as report:
-        outcome = run_study(loaded, folder, report, options)
+    with ProgressDisplay(new_console()) as progress:
+        outcome = run_study(loaded, folder, progress, options)
     path = tables.results_file(str(folder))
     tables.export(path, folder / "tables")
     if outcome.interrupted:

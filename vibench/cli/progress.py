@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -10,24 +9,26 @@ from typing import Any
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
+from vibench.execution.run import Agenda
 from vibench.stages.base import Stage
-from vibench.stages.cell_queries import QueriesStage
-from vibench.stages.snapshots import CHUNKS, HighFidelity
 from vibench.study.cells import Cell
+
+LINE_EVERY = 4
+"""Parts of a stage that share one line of progress."""
 
 
 class TimeLeft:
     """Estimate of the seconds left from the mean wall seconds of the stages of each sort done so far."""
 
     def __init__(self, pending: Sequence[Stage], jobs: int) -> None:
-        self._left = Counter(_sort(stage) for stage in pending)
+        self._left = Counter(stage.sort for stage in pending)
         self._done: dict[str, list[float]] = {}
         self._jobs = jobs
 
     def done(self, stage: Stage, wall: float) -> None:
         """Count a finished stage."""
-        self._left[_sort(stage)] -= 1
-        self._done.setdefault(_sort(stage), []).append(wall)
+        self._left[stage.sort] -= 1
+        self._done.setdefault(stage.sort, []).append(wall)
 
     def seconds(self) -> float | None:
         """Seconds left, `None` before there is anything to judge by."""
@@ -42,10 +43,6 @@ class TimeLeft:
         return total / self._jobs
 
 
-def _sort(stage: Stage) -> str:
-    return f"{type(stage).__name__} {stage.solver}" if isinstance(stage, QueriesStage) else type(stage).__name__
-
-
 def duration(seconds: float) -> str:
     """A duration in words: "40 s", "3 min", "1 h 20 min"."""
     if seconds < 90:
@@ -54,39 +51,39 @@ def duration(seconds: float) -> str:
     return f"{minutes} min" if minutes < 90 else f"{minutes // 60} h {minutes % 60} min"
 
 
-class Report:
-    """Tells a person how a run goes on; the observer of `runner.run_study`."""
+class ProgressDisplay:
+    """Shows the progress of a run: a bar on a terminal, lines elsewhere; the observer of `run_study`."""
 
     def __init__(self, console: Console) -> None:
         self._console = console
         self._left = TimeLeft([], 1)
-        self._cells = self._total = self._chunks = self._all_chunks = 0
-        self._start = time.perf_counter()
+        self._cells = self._total = 0
+        self._parts: Counter[str] = Counter()
+        self._done: Counter[str] = Counter()
         self._bar: Progress | None = None
 
-    def __enter__(self) -> Report:
+    def __enter__(self) -> ProgressDisplay:
         return self
 
     def __exit__(self, *_: object) -> None:
         if self._bar is not None:
             self._bar.stop()
 
-    def start(self, cells: int, pending: Sequence[Stage], unavailable: int, workers: int) -> None:
-        """Say what is to be done; cells whose solver is not installed get their row without it."""
-        self._left = TimeLeft(pending, max(workers, 1))
-        todo = sum(isinstance(stage, QueriesStage) for stage in pending)
-        self._all_chunks = sum(isinstance(stage, HighFidelity) for stage in pending)
-        self._total = todo + unavailable
+    def start(self, agenda: Agenda) -> None:
+        """Say what is to be done; cells that are unavailable here get their row without it."""
+        self._left = TimeLeft(agenda.stages, max(agenda.workers, 1))
+        self._parts = Counter(stage.label for stage in agenda.stages if stage.partial)
+        self._total = agenda.to_run
+        workers = f" on {agenda.workers} worker{'s' * (agenda.workers != 1)}" * (agenda.workers > 0)
         self._console.print(
-            f"{cells} cells, {todo} to run, {len(pending)} stages"
-            + f" on {workers} worker{'s' * (workers != 1)}" * (workers > 0)
+            f"{agenda.cells} cells, {agenda.to_run - agenda.unavailable} to run, {len(agenda.stages)} stages{workers}"
         )
-        if self._console.is_terminal and pending:
+        if self._console.is_terminal and agenda.stages:
             columns = ("[progress.description]{task.description}", BarColumn(), MofNCompleteColumn())
             self._bar = Progress(
                 *columns, TimeElapsedColumn(), TextColumn("{task.fields[left]}"), console=self._console
             )
-            self._task = self._bar.add_task("stages", total=len(pending), left="")
+            self._task = self._bar.add_task("stages", total=len(agenda.stages), left="")
             self._bar.start()
 
     def stage(self, stage: Stage, wall: float) -> None:
@@ -94,12 +91,11 @@ class Report:
         self._left.done(stage, wall)
         if self._bar is not None:
             self._bar.update(self._task, advance=1, left=self._left_text())
-        elif isinstance(stage, HighFidelity):
-            self._chunks += 1
-            if self._chunks % CHUNKS == 0 or self._chunks == self._all_chunks:
-                self._console.print(
-                    f"high-fidelity solutions: {self._chunks} of {self._all_chunks} parts{self._left_text(', ')}"
-                )
+        elif stage.partial:  # the first stages of a run, which take long before a cell has its row
+            self._done[stage.label] += 1
+            done, parts = self._done[stage.label], self._parts[stage.label]
+            if done % LINE_EVERY == 0 or done == parts:
+                self._console.print(f"{stage.label}: {done} of {parts} parts{self._left_text(', ')}")
 
     def cell(self, cell: Cell, row: Mapping[str, Any]) -> None:
         """A cell has its row."""

@@ -10,7 +10,7 @@ from typer import Argument, Exit, Option, echo
 
 from vibench.cli.completion import cells, runs, table_names
 from vibench.errors import unknown_name
-from vibench.results.schema import TABLES
+from vibench.results.columns import TABLES
 
 Form = Literal["terminal", "markdown", "csv", "latex", "json"]
 FormOption = Annotated[Form, Option("--format", help="Output format.")]

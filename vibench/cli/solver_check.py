@@ -49,6 +49,8 @@ def program() -> VariationalInequality:
 class SolverTrials(PiecewiseStage, Pieces):
     """The program solved by one solver after the other. A solver is a piece; the pieces share no preparation."""
 
+    label = "QP solvers"
+
     solvers: tuple[str, ...]
 
     @property

@@ -1,28 +1,33 @@
-"""Which stages a run has to do, and in what order: a graph that shrinks as they end."""
+"""The graph of the stages of a run: which can begin, and what is lost with a stage that fails."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping, Set
 from dataclasses import dataclass, field
 
 from vibench.stages.base import Stage
 
 
 @dataclass
-class Plan:
-    """Stages by key; `waiting` says of each that has not begun which others it still waits for.
+class Graph:
+    """The stages that a run has to do, by key; goals are what it is for, every other stage is there for a goal.
 
-    Goals are what the run is for; every other stage is there because a goal needs it. A stage names all it needs in
-    `inputs`, not only the nearest.
+    Attributes
+    ----------
+    stages
+        All stages that were planned.
+    waiting
+        Of each that has not begun, the inputs that are not done.
     """
 
     stages: dict[str, Stage] = field(default_factory=dict)
     waiting: dict[str, set[str]] = field(default_factory=dict)
+    _inputs: dict[str, frozenset[str]] = field(default_factory=dict)
     _goals: set[str] = field(default_factory=set)
     _there: set[str] = field(default_factory=set)
 
     def add_goal(self, stage: Stage, is_there: Callable[[Stage], bool]) -> None:
-        """Plan a stage, and what it needs and is not there already; `is_there` is asked once of each."""
+        """Plan a stage, and what it needs that is not there already; `is_there` is called once for each."""
         self._goals.add(stage.key)
         self._add(stage, is_there)
 
@@ -36,7 +41,7 @@ class Plan:
             return False
         needed = {needed.key for needed in stage.inputs() if self._add(needed, is_there)}
         self.stages[stage.key] = stage
-        self.waiting[stage.key] = needed
+        self.waiting[stage.key], self._inputs[stage.key] = needed, frozenset(needed)
         return True
 
     def begin(self, count: int) -> Iterator[Stage]:
@@ -46,17 +51,37 @@ class Plan:
             yield self.stages[key]
 
     def done(self, stage: Stage) -> None:
-        """A stage went through."""
+        """Note that a stage succeeded."""
         for needed in self.waiting.values():
             needed.discard(stage.key)
 
     def lost(self, stage: Stage) -> list[Stage]:
-        """A stage did not go through; gives the goals that needed it, and drops what led to nothing else."""
-        gone = [key for key, needed in self.waiting.items() if stage.key in needed]
-        for key in gone:
-            del self.waiting[key]
-        wanted = self.waiting.keys() & self._goals
-        wanted = wanted.union(*(self.waiting[key] for key in wanted))
+        """Drop what cannot be done without a stage that failed, and what leads to no other goal.
+
+        Returns
+        -------
+        list
+            The goals that are lost, the stage itself among them if it is one.
+        """
+        used_by: dict[str, set[str]] = {}
+        for key, inputs in self._inputs.items():
+            for needed in inputs:
+                used_by.setdefault(needed, set()).add(key)
+        gone = _closure([stage.key], used_by)
+        lost = {key for key in self._goals & gone if key in self.waiting or key == stage.key}
+        wanted = _closure((self.waiting.keys() & self._goals) - gone, self._inputs)
         for key in self.waiting.keys() - wanted:
             del self.waiting[key]
-        return [self.stages[key] for key in gone if key in self._goals]
+        return [self.stages[key] for key in self.stages if key in lost]
+
+
+def _closure(keys: Iterable[str], edges: Mapping[str, Set[str]]) -> set[str]:
+    """The keys and all that can be reached from them."""
+    found: set[str] = set()
+    ahead = list(keys)
+    while ahead:
+        key = ahead.pop()
+        if key not in found:
+            found.add(key)
+            ahead += edges.get(key, ())
+    return found

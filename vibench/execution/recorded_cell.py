@@ -18,7 +18,7 @@ from vibench.interfaces.validation import validation_parameters
 from vibench.results import tables
 from vibench.results.tables import results_file
 from vibench.stages.artefacts import Store, usable_store
-from vibench.stages.assembly import Model, assembly_stage, query_model
+from vibench.stages.assembly import Model, assembly_stage
 from vibench.stages.base import Done, Stage
 from vibench.study.cells import Cell
 
@@ -61,10 +61,9 @@ class RecordedCell:
                 "run its study again"
             )
         store, assembly = usable_store(), assembly_stage(self.cell)
-        for stage in (assembly.enrichment, assembly.reduction):
-            if stage is not None:
-                _provide(stage, store)
-        return query_model(store, assembly)[0]
+        for stage in assembly.model_inputs:
+            _provide(stage, store)
+        return assembly.model(store)[0]
 
     @cached_property
     def parameters(self) -> Array:

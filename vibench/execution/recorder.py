@@ -1,50 +1,52 @@
-"""What a run leaves in its results file: rows of cells, histories and pictures, with where they come from."""
+"""What a run writes into its results file, and when: rows of cells, histories and pictures, with their provenance."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 from vibench import provenance
-from vibench.execution.row_keys import HistoryNames, cell_columns
-from vibench.results import pictures
+from vibench.execution.row_keys import axis_columns, cell_columns
 from vibench.results.database import ResultsDatabase
 from vibench.stages.artefacts import History, Store
-from vibench.stages.base import Stage, value_of
+from vibench.stages.base import Row, Stage, value_of
 from vibench.stages.cell_queries import CellRows
-from vibench.stages.pictures import PictureStage
-from vibench.stages.snapshots import HighFidelity
-from vibench.study.cells import Cell, digest
+from vibench.study.cells import Cell, Plugin, digest
 from vibench.study.spec import Study
 
 
 @dataclass(frozen=True)
 class Recorder:
-    """Writes what the stages of a study give."""
+    """Writes what the stages of a study give; `labels` are what its plugins are called."""
 
     study: Study
-    journal: ResultsDatabase
-    names: HistoryNames
+    database: ResultsDatabase
+    labels: Mapping[Plugin, str]
 
-    def cell(self, cell: Cell, found: CellRows) -> dict[str, Any]:
-        """Write the rows of a cell; gives its own."""
+    def cell(self, cell: Cell, found: CellRows) -> Row:
+        """Write the rows of a cell; returns its own."""
         keys = cell_columns(cell)
         row = {"cell": cell.key, **keys, "machine": provenance.machine(), **found.cell, **self._provenance(cell)}
         queries = [{"cell": cell.key, **keys, "query": k, **query} for k, query in enumerate(found.queries)]
-        self.journal.write_cell(row, queries, [{"cell": cell.key, **solution} for solution in found.solutions])
+        self.database.write_cell(row, queries, [{"cell": cell.key, **solution} for solution in found.solutions])
         return row
 
     def stage(self, stage: Stage, histories: Iterable[History], store: Store) -> None:
-        """Write what is to be kept of any other stage."""
+        """Write what is recorded of a stage that is stored."""
         self._histories(stage, histories)
-        if isinstance(stage, PictureStage):
-            self.journal.write_pictures(pictures.rows(self.names.columns(stage), value_of(store, stage)))
+        if type(stage).rows is not Stage.rows:  # the value is read only where rows are made of it
+            self._tables(stage, stage.rows(value_of(store, stage)))
 
-    def no_picture(self, stage: PictureStage, reason: str) -> None:
-        """Write why there is no picture of a problem."""
-        self.journal.write_pictures(pictures.missing(self.names.columns(stage), reason))
+    def failure(self, stage: Stage, reason: str) -> None:
+        """Write what is recorded of a stage that failed, beside the rows of the cells that need it."""
+        self._tables(stage, stage.failure_rows(reason))
+
+    def _tables(self, stage: Stage, tables: Mapping[str, Sequence[Row]]) -> None:
+        keys = axis_columns(stage.axes, self.labels)
+        for table, rows in tables.items():
+            self.database.replace_named(table, keys, [keys | row for row in rows])
 
     def _provenance(self, cell: Cell) -> dict[str, Any]:
         return {
@@ -57,14 +59,10 @@ class Recorder:
         }
 
     def _histories(self, stage: Stage, histories: Iterable[History]) -> None:
-        keys = self.names.columns(stage)
-        rows = []
+        keys = axis_columns(stage.axes, self.labels)
+        found = []
         for history in histories:
-            first = history.key.get("first_step", 0)
-            named = {name: value for name, value in history.key.items() if name != "first_step"}
-            rows += [
-                {"artefact": stage.key, **named, **keys, "quantity": history.quantity, "step": first + k, "value": v}
-                for k, v in enumerate(history.values)
-            ]
-        if rows:
-            self.journal.write_histories(stage.key, rows, parts=isinstance(stage, HighFidelity))
+            named = {"artefact": stage.key, "stage": history.stage, **keys, "quantity": history.quantity}
+            found.append([named | {"step": history.first_step + k, "value": v} for k, v in enumerate(history.values)])
+        if found:
+            self.database.write_histories(found, partial=stage.partial)

@@ -1,63 +1,39 @@
-"""The columns that name a cell or a history in the results."""
+"""The columns that name the rows of the results: of a cell, and of what a stage leaves."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 from vibench.interfaces.strategies import Stop
-from vibench.stages.base import Stage
-from vibench.stages.offline import ConeStage, EnrichmentStage, PODStage
-from vibench.stages.pictures import PictureStage
-from vibench.stages.snapshots import HighFidelity
-from vibench.study.cells import Cell, Plugin
+from vibench.study.cells import Axes, Cell, Plugin
 
 
 def cell_columns(cell: Cell) -> dict[str, Any]:
     """The key columns of a cell."""
-    problem, dual, primal = cell.labels
-    return {
-        **_plugin("problem", cell.problem, problem),
-        **_plugin("dual", cell.dual, dual),
-        **_plugin("primal", cell.primal, primal),
-        **_stop("pod", cell.pod),
-        **_stop("dual", cell.cone),
-        "primal_tol": cell.primal_tol,
-        "solver": cell.solver,
-        "assembly": cell.assembly,
-    }
+    labels = dict(zip((cell.problem, cell.dual, cell.primal), cell.labels, strict=True))
+    return {**axis_columns(cell.axes, labels), "solver": cell.solver, "assembly": cell.assembly}
 
 
-class HistoryNames:
-    """Key columns of histories: of those axes the stage depends on, labelled as the cells are."""
-
-    def __init__(self, cells: Iterable[Cell]) -> None:
-        self._labels: dict[Plugin, str] = {}
-        for cell in cells:
-            for plugin, label in zip((cell.problem, cell.dual, cell.primal), cell.labels, strict=True):
-                self._labels.setdefault(plugin, label)
-
-    def columns(self, stage: Stage) -> dict[str, Any]:
-        """The columns for one stage; those of axes it does not depend on are left out."""
-        match stage:
-            case HighFidelity() | PictureStage():
-                return self._named("problem", stage.problem)
-            case PODStage():
-                return self._named("problem", stage.problem) | _stop("pod", stage.stop)
-            case ConeStage():
-                named = self._named("problem", stage.problem) | self._named("dual", stage.dual)
-                return named | _stop("dual", stage.stop)
-            case EnrichmentStage():
-                named = self.columns(stage.pod) | self.columns(stage.cone) | self._named("primal", stage.primal)
-                return named | {"primal_tol": stage.tolerance}
-        return {}
-
-    def _named(self, axis: str, plugin: Plugin) -> dict[str, Any]:
-        return _plugin(axis, plugin, self._labels[plugin])
+def labels_of(cells: Iterable[Cell]) -> dict[Plugin, str]:
+    """What the plugins of a study are called in its results: their labels in the first cell that has them."""
+    found: dict[Plugin, str] = {}
+    for cell in cells:
+        for plugin, label in zip((cell.problem, cell.dual, cell.primal), cell.labels, strict=True):
+            found.setdefault(plugin, label)
+    return found
 
 
-def _plugin(axis: str, plugin: Plugin, label: str) -> dict[str, Any]:
-    return {axis: label, f"{axis}_options": plugin.options}
+def axis_columns(axes: Axes, labels: Mapping[Plugin, str]) -> dict[str, Any]:
+    """The key columns of some axes; those of axes that nothing depends on are left out."""
+    columns: dict[str, Any] = {}
+    for name, plugin in (("problem", axes.problem), ("dual", axes.dual), ("primal", axes.primal)):
+        if plugin is not None:
+            columns |= {name: labels[plugin], f"{name}_options": plugin.options}
+    for name, stop in (("pod", axes.pod), ("dual", axes.cone)):
+        if stop is not None:
+            columns |= _stop(name, stop)
+    return columns if axes.primal is None else columns | {"primal_tol": axes.primal_tol}
 
 
 def _stop(axis: str, stop: Stop) -> dict[str, Any]:

@@ -12,12 +12,12 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Protocol
 
-from vibench.errors import RequestError, StorageError, VibenchError, in_a_line
+from vibench.errors import ExecutorError, RequestError, StorageError, VibenchError, in_a_line
 from vibench.execution.dask import Dask
 from vibench.execution.executors import Executor, Local
-from vibench.execution.graph import Plan
+from vibench.execution.graph import Graph
 from vibench.execution.recorder import Recorder
-from vibench.execution.row_keys import HistoryNames
+from vibench.execution.row_keys import labels_of
 from vibench.execution.supervisor import Job
 from vibench.qp.solve import installed_solvers
 from vibench.qp.status import Status
@@ -25,16 +25,15 @@ from vibench.results.break_even import break_even_rows
 from vibench.results.database import FILE, ResultsDatabase, claimed, read_meta, study_of
 from vibench.results.solver_agreement import disagreement_rows
 from vibench.stages.artefacts import Store, usable_store
-from vibench.stages.assembly import assembly_stage
-from vibench.stages.base import Done, Failed, PiecewiseStage, Stage, Unstored
-from vibench.stages.cell_queries import CellRows, QueriesStage
+from vibench.stages.base import Done, Failed, Stage, Unstored
+from vibench.stages.cell_queries import CellRows, cell_queries
 from vibench.stages.pictures import PictureStage
 from vibench.study import registry
 from vibench.study.cells import Cell, expand
 from vibench.study.spec import Study
 
-LOOK = 5.0
-"""Seconds between two looks at whether the executor is still there."""
+CHECK_INTERVAL = 5.0
+"""Seconds after which a run that waits makes sure that the executor still runs."""
 
 REPORT = "report.html"
 """File in the run folder that `vibench report` writes unless told otherwise."""
@@ -43,11 +42,36 @@ LOG = "workers.log"
 """File in the run folder that takes what plugins and solvers print."""
 
 
-class Observer(Protocol):
-    """Who is told how a run goes on."""
+@dataclass(frozen=True)
+class Agenda:
+    """What a run has to do.
 
-    def start(self, cells: int, pending: Sequence[Stage], unavailable: int, workers: int) -> None:
-        """Of so many cells these stages have to be run, on so many workers; so many have a solver that is not there."""
+    Attributes
+    ----------
+    cells
+        Cells of the matrix.
+    to_run
+        Those that have no row yet.
+    unavailable
+        Those of them that cannot be run here, for want of a solver or of what a plugin needs.
+    stages
+        Stages that the others need.
+    workers
+        Number of worker processes.
+    """
+
+    cells: int
+    to_run: int
+    unavailable: int
+    stages: Sequence[Stage]
+    workers: int
+
+
+class Observer(Protocol):
+    """Shows the progress of a run."""
+
+    def start(self, agenda: Agenda) -> None:
+        """The run begins."""
 
     def stage(self, stage: Stage, wall: float) -> None:
         """A stage is done, after so many wall seconds."""
@@ -68,11 +92,6 @@ class Outcome:
 def identity(study: Study) -> dict[str, Any]:
     """What all numbers of a study depend on; results of another identity do not go into the same folder."""
     return {"name": study.name, "seed": study.seed, "validation": study.validation, "accuracy": study.accuracy}
-
-
-def queries_stage(cell: Cell, study: Study) -> QueriesStage:
-    """The last stage of a cell; its inputs lead to all others."""
-    return QueriesStage(assembly_stage(cell), cell.solver, cell.accuracy, study.limits.query_seconds, cell.warm_start)
 
 
 @dataclass(frozen=True)
@@ -110,7 +129,7 @@ def run_study(study: Study, folder: Path, observer: Observer, options: Options =
     folder
         Run folder; earlier results of the same study are continued.
     observer
-        Told about progress.
+        Shows the progress.
     options
         How to run it.
 
@@ -125,21 +144,20 @@ def run_study(study: Study, folder: Path, observer: Observer, options: Options =
     with claimed(folder), store.used():
         if options.fresh:
             _clear(folder, study)
-        journal = ResultsDatabase(folder, identity(study), anew=options.fresh)
+        database = ResultsDatabase(folder, identity(study), anew=options.fresh)
         try:
-            finished = journal.finished()
+            finished = database.finished()
             todo = [cell for cell in cells if _to_do(cell, finished, options.retry)]
-            recorder = Recorder(study, journal, HistoryNames(cells))
-            run = _Run(study, folder, store, recorder, observer, len(cells), options)
-            interrupted = run.execute(todo)
-            keys = {cell.key for cell in cells}
-            everything = journal.rows("cells")
-            journal.replace("thresholds", break_even_rows(everything))
-            journal.replace(
-                "disagreements", disagreement_rows(everything, journal.rows("queries"), journal.rows("solutions"))
+            run = _Run(study, folder, store, Recorder(study, database, labels_of(cells)), observer, options)
+            interrupted = run.execute(todo, len(cells))
+            everything = database.rows("cells")
+            database.replace("thresholds", break_even_rows(everything))
+            database.replace(
+                "disagreements", disagreement_rows(everything, database.rows("queries"), database.rows("solutions"))
             )
         finally:
-            journal.close()
+            database.close()
+    keys = {cell.key for cell in cells}
     rows = tuple(row for row in everything if row["cell"] in keys)
     return Outcome(rows, len(cells) - len(rows), interrupted)
 
@@ -166,40 +184,41 @@ def _clear(folder: Path, study: Study) -> None:
 
 @dataclass
 class _Run:
-    """One execution: which stages wait for which, and what to write when they end."""
+    """One execution of a study: the graph of its stages, and what is recorded when they end."""
 
     study: Study
     folder: Path
     store: Store
     recorder: Recorder
     observer: Observer
-    cell_count: int
     options: Options
-    plan: Plan = field(default_factory=Plan)
+    graph: Graph = field(default_factory=Graph)
     cells: dict[str, list[Cell]] = field(default_factory=dict)
+    """The cells whose rows a goal gives, by its key; cells may share one."""
 
-    def execute(self, todo: Sequence[Cell]) -> bool:
-        """Run the cells; returns whether Ctrl-C ended it."""
-        available = set(installed_solvers(registry.names("QP solver")))
-        unavailable = [cell for cell in todo if cell.solver not in available]
-        runnable = [cell for cell in todo if cell.solver in available]
+    def execute(self, todo: Sequence[Cell], count: int) -> bool:
+        """Run these cells of a matrix of `count`; returns whether Ctrl-C ended it."""
+        reasons = {cell.key: reason for cell in todo if (reason := unavailable(cell))}
+        runnable = [cell for cell in todo if cell.key not in reasons]
         workers: Executor | None = None
         try:
             workers = self._workers() if runnable else None
             for cell in runnable:
                 assert workers is not None
-                stage = queries_stage(cell, self.study)
-                self.cells.setdefault(stage.key, []).append(cell)
-                for goal in (stage, PictureStage(cell.problem)):
-                    self.plan.add_goal(goal, partial(self._is_there, workers.machines))
+                goal = cell_queries(cell, self.study.limits.query_seconds)
+                self.cells.setdefault(goal.key, []).append(cell)
+                for stage in (goal, PictureStage(cell.problem)):
+                    self.graph.add_goal(stage, partial(self._is_there, workers.machines))
             slots = workers.slots if workers is not None else 0
-            self.observer.start(self.cell_count, list(self.plan.stages.values()), len(unavailable), slots)
-            for cell in unavailable:
-                self._fail_cell(cell, Status.UNAVAILABLE, f"the QP solver '{cell.solver}' is not installed")
+            stages = list(self.graph.stages.values())
+            self.observer.start(Agenda(count, len(todo), len(reasons), stages, slots))
+            for cell in todo:
+                if cell.key in reasons:
+                    self._fail_cell(cell, Failed(Status.UNAVAILABLE, reasons[cell.key]))
             if workers is not None:
                 self._loop(workers)
         except KeyboardInterrupt:
-            _deaf()
+            _ignore_interrupts()
             return True
         finally:
             if workers is not None:
@@ -208,17 +227,16 @@ class _Run:
 
     def _workers(self) -> Executor:
         options = self.options
-        log = self.folder / LOG
         if options.executor == "dask":
             return Dask(options.scheduler, options.jobs, self.store.folder)
-        return Local(options.jobs, log)
+        return Local(options.jobs, self.folder / LOG)
 
     def _is_there(self, machines: Set[str], stage: Stage) -> bool:
-        """Whether a stage's artefact can be reused; its histories are written if so.
+        """Whether the artefact of a stage can be reused; its histories are recorded if so.
 
         Seconds count only where they were measured: an artefact of another machine is made anew.
         """
-        if self.options.fresh or isinstance(stage, PiecewiseStage):
+        if self.options.fresh or not stage.stored:
             return False
         artefact = self.store.get(stage.key)
         if artefact is None or artefact.machine not in machines:
@@ -229,45 +247,48 @@ class _Run:
     def _loop(self, workers: Executor) -> None:
         running: dict[Future[Any], Stage] = {}
         limits = self.study.limits
-        while self.plan.waiting or running:
-            for stage in self.plan.begin(workers.slots - len(running)):
+        while self.graph.waiting or running:
+            for stage in self.graph.begin(workers.slots - len(running)):
                 job = Job(str(self.store.folder), stage, limits.query_seconds, limits.cell_seconds, limits.memory_gib)
                 running[workers.submit(job)] = stage
-            done, _ = wait(running, timeout=LOOK, return_when=FIRST_COMPLETED)
+            if not running:
+                raise ExecutorError(
+                    f"{len(self.graph.waiting)} stages wait for others that nobody runs: a bug of vibench"
+                )
+            done, _ = wait(running, timeout=CHECK_INTERVAL, return_when=FIRST_COMPLETED)
             workers.check()
             for future in done:
                 self._finish(running.pop(future), _outcome(future))
 
     def _finish(self, stage: Stage, outcome: Done | Failed) -> None:
+        """Record the end of a stage; one that failed gives a row to every cell that needs it."""
         if isinstance(outcome, Failed):
-            self._fail(stage, outcome)
+            reason = outcome.reason if stage.key in self.cells else f"in {stage.label}: {outcome.reason}"
+            self.recorder.failure(stage, outcome.reason)
+            for goal in self.graph.lost(stage):
+                for cell in self.cells.get(goal.key, ()):
+                    self._fail_cell(cell, Failed(outcome.status, reason))
             return
         self.observer.stage(stage, outcome.wall)
-        if isinstance(stage, QueriesStage):
-            for cell in self.cells[stage.key]:
-                self.observer.cell(cell, self.recorder.cell(cell, outcome.value))
-        else:
+        if stage.stored:
             self.recorder.stage(stage, outcome.histories, self.store)
-        self.plan.done(stage)
+        for cell in self.cells.get(stage.key, ()):
+            self.observer.cell(cell, self.recorder.cell(cell, outcome.value))
+        self.graph.done(stage)
 
-    def _fail(self, stage: Stage, failed: Failed) -> None:
-        """Give a row to every cell that needs a stage that failed."""
-        if isinstance(stage, PictureStage):
-            self.recorder.no_picture(stage, failed.reason)
-            self.plan.done(stage)
-            return
-        if isinstance(stage, QueriesStage):
-            without, reason = [stage], failed.reason
-        else:
-            without = [goal for goal in self.plan.lost(stage) if isinstance(goal, QueriesStage)]
-            reason = f"in {type(stage).__name__.removesuffix('Stage').lower()}: {failed.reason}"
-        for goal in without:
-            for cell in self.cells[goal.key]:
-                self._fail_cell(cell, failed.status, reason)
-
-    def _fail_cell(self, cell: Cell, status: Status, reason: str) -> None:
-        row = {"status": status.value, "reason": reason, "queries": cell.validation, "queries_ok": 0}
+    def _fail_cell(self, cell: Cell, failed: Failed) -> None:
+        row = {"status": failed.status.value, "reason": failed.reason, "queries": cell.validation, "queries_ok": 0}
         self.observer.cell(cell, self.recorder.cell(cell, CellRows(row, ())))
+
+
+def unavailable(cell: Cell) -> str:
+    """Why a cell cannot be run on this machine: its solver, or what a plugin needs, is not installed; "" if it can."""
+    for plugin in (cell.problem, cell.dual, cell.primal):
+        missing = registry.missing(plugin.kind, plugin.name)
+        if missing:
+            return f"the {plugin.kind} '{plugin.name}' needs {', '.join(missing)}, which is not installed"
+    installed = installed_solvers(registry.names("QP solver"))
+    return "" if cell.solver in installed else f"the QP solver '{cell.solver}' is not installed"
 
 
 def _outcome(future: Future[Any]) -> Done | Failed:
@@ -283,7 +304,7 @@ def _outcome(future: Future[Any]) -> Done | Failed:
     return result
 
 
-def _deaf() -> None:
-    """From now on Ctrl-C is not heard: the bookkeeping is finished, then the process ends."""
+def _ignore_interrupts() -> None:
+    """Ignore Ctrl-C from now on: the results are completed, then the process ends."""
     if threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGINT, signal.SIG_IGN)

@@ -1,1 +1,1 @@
-"""High-fidelity solutions: a primal–dual active set method and the KKT systems it solves."""
+"""High-fidelity solutions: the primal–dual active set method and its KKT systems."""

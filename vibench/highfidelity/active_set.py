@@ -1,4 +1,4 @@
-"""High-fidelity solutions of the variational inequality (7): a primal–dual active set method, verified."""
+"""High-fidelity solutions of the variational inequality (7) by a verified primal–dual active set method."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ import scipy.sparse as sp
 
 from vibench.arrays import Array, Mask
 from vibench.errors import NumericalError
-from vibench.highfidelity.kkt_systems import ActiveSystem, Stiffness
+from vibench.highfidelity.kkt_systems import ActiveSetSystem, CondensedStiffness
 from vibench.interfaces.problem import Problem, VariationalInequality
 from vibench.interfaces.validation import checked_assembly
 from vibench.linalg.inner_product import check_symmetric
-from vibench.linalg.schur_complement import Pattern
+from vibench.linalg.schur_complement import EliminationPattern
 from vibench.qp import verification
 from vibench.qp.solve import solve_qp
 
@@ -21,7 +21,7 @@ ACCURACY = 1e-10
 """Relative KKT accuracy of every snapshot."""
 
 MAX_ITERATIONS = 100
-"""Systems tried at most, or one per constraint where there are more: the contact set may move node by node."""
+"""Largest number of iterations, or the number of constraints if larger: the contact set may move node by node."""
 
 FALLBACK_SOLVER = "piqp"
 
@@ -33,9 +33,9 @@ class HighFidelitySolution:
     Attributes
     ----------
     u, lam
-        Displacement (n,) and multiplier (m,), zero exactly off the contact set.
+        Displacement (n,) and multiplier (m,); the multiplier is exactly zero off the contact set.
     fallback
-        "" where the active set method found it alone; otherwise what had to help.
+        What was used besides the active set method; "" if nothing.
     iterations
         Linear systems solved by the active set method.
     residuals
@@ -50,25 +50,25 @@ class HighFidelitySolution:
 
 
 class HighFidelitySolver:
-    """Solves one problem at many parameters, each from the contact set of the nearest solved before.
+    """Solves one problem at many parameters, starting each from the contact set of the nearest parameter solved so far.
 
     The primal–dual active set method (Hintermüller, Ito, Kunisch 2002) solves the equality-constrained system of the
-    current active set until the set repeats itself; a set that cycles is replaced by that of an interior-point
-    solution, and the method goes on from there. Its answer has exact zeros off the active set. Systems are condensed
-    on the constrained unknowns where they are few, by one factorisation of all others; the order of elimination is
-    found once, and a stiffness that does not depend on the parameter is factorised once.
+    current active set until the set no longer changes. If the sets cycle, the method restarts from the active set of an
+    interior-point solution; it never returns that solution itself, since greedy cones need multipliers with exact zeros
+    off the contact set. Systems are condensed on the constrained unknowns where these are few. The elimination order is
+    computed once, and a stiffness that does not depend on the parameter is factorised once.
 
     Parameters
     ----------
     problem
-        Its declarations `constant` and `contact_dofs` decide what is done once.
+        Its declarations `constant` and `contact_dofs` decide what is computed once.
     """
 
     def __init__(self, problem: Problem) -> None:
         self._problem = problem
-        self._touched = problem.contact_dofs if problem.contact_dofs is not None else np.zeros(0, dtype=np.intp)
-        self._pattern: Pattern | None = None
-        self._system: Stiffness | None = None
+        self._constrained = problem.contact_dofs if problem.contact_dofs is not None else np.zeros(0, dtype=np.intp)
+        self._pattern: EliminationPattern | None = None
+        self._stiffness: CondensedStiffness | None = None
         self._width = np.maximum(problem.parameters.upper - problem.parameters.lower, np.finfo(float).tiny)
         self._solved: list[Array] = []
         self._active: list[Mask] = []
@@ -79,14 +79,14 @@ class HighFidelitySolver:
         Raises
         ------
         NumericalError
-            If the assembly is wrong, the solution does not reach `ACCURACY`, or the problem refuses it; or if B touches
-            unknowns that the problem does not declare as its contact.
+            If the assembly is invalid, the solution does not reach `ACCURACY`, the problem refuses it, or B touches
+            unknowns outside the declared `contact_dofs`.
         """
         return self.solve_assembled(mu, checked_assembly(self._problem, mu))
 
     def solve_assembled(self, mu: Array, vi: VariationalInequality) -> HighFidelitySolution:
-        """Solve at mu (d,) what was assembled there."""
-        found = solve_high_fidelity(vi, self._stiffness(vi), self._nearest(mu))
+        """Solve the variational inequality `vi` assembled at mu (d,)."""
+        found = solve_high_fidelity(vi, self._condensed(vi), self._nearest_contact_set(mu))
         reason = self._problem.refuse(mu, found.u, found.lam)
         if reason:
             raise NumericalError(f"at mu = {mu.tolist()}: {reason}")
@@ -100,46 +100,46 @@ class HighFidelitySolver:
         Parameters
         ----------
         mu
-            Where (d,).
+            Parameter (d,).
         vi
-            What was solved last: most of the work has been done for that.
+            The variational inequality solved last, whose factorisation is reused.
 
         Raises
         ------
         NumericalError
-            Saying at which mu, and what it is not.
+            Naming mu and the missing property.
         """
         name = f"A at mu = {mu.tolist()}"
         check_symmetric(vi.A, name)
-        (self._system or self._stiffness(vi)).check_definite(name)
+        (self._stiffness or self._condensed(vi)).check_definite(name)
 
-    def _nearest(self, mu: Array) -> Mask | None:
-        """Contact set of the solved parameter that is nearest, the box of parameters taken for a cube."""
+    def _nearest_contact_set(self, mu: Array) -> Mask | None:
+        """Contact set of the nearest parameter solved so far; distances are relative to the widths of the box."""
         if not self._active:
             return None
         distances = np.linalg.norm((np.array(self._solved) - mu) / self._width, axis=1)
         return self._active[int(np.argmin(distances))]
 
-    def _stiffness(self, vi: VariationalInequality) -> Stiffness:
-        touched = np.zeros(vi.A.shape[0], dtype=bool)
-        touched[sp.csr_array(vi.B).indices] = True
-        touched[self._touched] = False
-        outside = np.flatnonzero(touched)
+    def _condensed(self, vi: VariationalInequality) -> CondensedStiffness:
+        undeclared = np.zeros(vi.A.shape[0], dtype=bool)
+        undeclared[sp.csr_array(vi.B).indices] = True
+        undeclared[self._constrained] = False
+        outside = np.flatnonzero(undeclared)
         if len(outside) and self._problem.contact_dofs is not None:
             raise NumericalError(
                 f"B touches {len(outside)} unknowns outside the declared contact_dofs, the first is {outside[0]}"
             )
         if len(outside):
-            self._touched, self._pattern = np.union1d(self._touched, outside), None
+            self._constrained, self._pattern = np.union1d(self._constrained, outside), None
         if self._pattern is None:
-            self._pattern, self._system = Pattern.of(vi.A, self._touched), None
-        if self._system is None or "A" not in self._problem.constant:
-            self._system = Stiffness(vi.A, self._pattern, reused="A" in self._problem.constant)
-        return self._system
+            self._pattern, self._stiffness = EliminationPattern.of(vi.A, self._constrained), None
+        if self._stiffness is None or "A" not in self._problem.constant:
+            self._stiffness = CondensedStiffness(vi.A, self._pattern, reused="A" in self._problem.constant)
+        return self._stiffness
 
 
 def solve_high_fidelity(
-    vi: VariationalInequality, stiffness: Stiffness | None = None, start: Mask | None = None
+    vi: VariationalInequality, stiffness: CondensedStiffness | None = None, start: Mask | None = None
 ) -> HighFidelitySolution:
     """Solve one variational inequality to `ACCURACY`; see `HighFidelitySolver`.
 
@@ -148,19 +148,19 @@ def solve_high_fidelity(
     vi
         Sparse A, B and vectors f, g at one parameter.
     stiffness
-        Its A prepared, where that has been done already.
+        A condensed already; by default it is used as it is.
     start
-        Constraints (m,) that are active at first; none by default.
+        Initial active set (m,); empty by default.
 
     Raises
     ------
     NumericalError
         If neither the active set method nor its fallback reaches `ACCURACY`.
     """
-    system = (stiffness or Stiffness(vi.A)).system(vi)
-    nothing = np.zeros(vi.B.shape[0], dtype=bool)
+    system = (stiffness or CondensedStiffness(vi.A)).active_set_system(vi)
+    empty = np.zeros(vi.B.shape[0], dtype=bool)
     found = None if start is None else _active_set_iterations(system, start)
-    found = found or _active_set_iterations(system, nothing)
+    found = found or _active_set_iterations(system, empty)
     fallback = ""
     if found is None:
         answer = solve_qp(vi, FALLBACK_SOLVER, ACCURACY)
@@ -170,21 +170,21 @@ def solve_high_fidelity(
         fallback = f"the active set cycled; first guess by {FALLBACK_SOLVER}"
     if found is None:
         raise NumericalError("no active set solves the high-fidelity problem; is it feasible?")
-    kept, lam, iterations = found
-    u = system.expand(kept)
+    u_retained, lam, iterations = found
+    u = system.recover(u_retained)
     residuals = verification.kkt_residuals(vi, u, lam)
-    if residuals.dual > 0.5 * ACCURACY:  # what a large rigid displacement leaves
-        u = u + system.settle(vi.f - vi.A @ u - vi.B.T @ lam)
+    if residuals.dual > 0.5 * ACCURACY:  # a large rigid displacement amplifies round-off in the eliminated unknowns
+        u = u + system.correct_eliminated(vi.f - vi.A @ u - vi.B.T @ lam)
         residuals = verification.kkt_residuals(vi, u, lam)
     if not residuals.worst <= ACCURACY:
         raise NumericalError(f"the high-fidelity solution has residual {residuals.worst:.1e}, above {ACCURACY:.0e}")
     return HighFidelitySolution(u, lam, fallback, iterations, residuals)
 
 
-def _active_set_iterations(system: ActiveSystem, active: Mask) -> tuple[Array, Array, int] | None:
-    """Run the primal–dual active set method from a first guess (m,): u (c,), λ (m,) and iterations.
+def _active_set_iterations(system: ActiveSetSystem, active: Mask) -> tuple[Array, Array, int] | None:
+    """Run the primal–dual active set method from an initial active set (m,): u (c,), λ (m,) and iterations.
 
-    `None` if the sets repeat themselves without an answer, or one of them has dependent constraints.
+    `None` if the sets cycle or one of them has linearly dependent constraints.
     """
     seen: set[bytes] = set()
     for iteration in range(1, max(MAX_ITERATIONS, len(active)) + 1):
@@ -194,8 +194,8 @@ def _active_set_iterations(system: ActiveSystem, active: Mask) -> tuple[Array, A
             return None
         scale = np.max(np.abs(lam), initial=0.0)
         violated = ~active & (system.B @ u - system.g > 1e-14 * np.max(np.abs(system.g), initial=0.0))
-        kept = active & (lam > 1e-14 * scale)
-        following = violated | kept
+        in_contact = active & (lam > 1e-14 * scale)
+        following = violated | in_contact
         if np.array_equal(following, active):
             return u, lam, iteration
         if following.tobytes() in seen:

@@ -1,1 +1,1 @@
-"""What plugins are: problems, dual and primal strategies, what they exchange, and its validation."""
+"""Interfaces of plugins: problems, dual and primal strategies, their data, and its validation."""

@@ -1,4 +1,4 @@
-"""What a problem plugin is: a parametrised variational inequality on a high-fidelity pair of spaces."""
+"""The interface of problem plugins: a parametrised variational inequality on a high-fidelity pair of spaces."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class ParameterBox:
     lower, upper
         Bounds (d,).
     units
-        One unit per parameter, "1" for a number.
+        One unit per parameter, "1" if dimensionless.
     """
 
     names: tuple[str, ...]
@@ -39,7 +39,7 @@ class ParameterBox:
         return len(self.names)
 
     def grid(self, *counts: int) -> Array:
-        """Regular grid (P×d) with `counts` points per direction, the last direction running fastest."""
+        """Regular grid (P×d) with `counts` points per direction; the last parameter varies fastest."""
         axes = [np.linspace(a, b, k) for a, b, k in zip(self.lower, self.upper, counts, strict=True)]
         return np.stack([m.ravel() for m in np.meshgrid(*axes, indexing="ij")], axis=1)
 
@@ -58,13 +58,13 @@ class VariationalInequality:
     A
         Stiffness, sparse SPD (n×n), on the free degrees of freedom.
     f
-        Load (n,), the lift's share included.
+        Load (n,), including the contribution of the lift.
     B
         Constraint, sparse (m×n), sign such that A u + Bᵀλ = f with λ ≥ 0.
     g
-        Bound (m,), the lift's share included.
+        Bound (m,), including the contribution of the lift.
     lift
-        Values that an inhomogeneous Dirichlet condition adds to u in pictures; `None` where there are none.
+        Lifting of inhomogeneous Dirichlet data, added to u in pictures only; `None` for homogeneous data.
     """
 
     A: SparseMatrix
@@ -76,7 +76,7 @@ class VariationalInequality:
 
 @dataclass(frozen=True)
 class Contact:
-    """The constraint B u ≤ g in the unknowns it may touch.
+    """The constraint B u ≤ g on the contact unknowns.
 
     Attributes
     ----------
@@ -92,18 +92,18 @@ class Contact:
 
 @dataclass(frozen=True)
 class Picture:
-    """A solution to look at.
+    """A solution to be drawn.
 
     Attributes
     ----------
     points, triangles
         Mesh in the configuration to be drawn (2×p), (3×t); on a line points (1×p) and no triangles.
     values, name
-        Nodal values to colour it with (p,), and what they are, with their unit.
+        Nodal values of the colour map (p,), and their name with its unit.
     positions, multiplier
-        Where the multiplier lives (1×m on a line, 2×m in the plane) and its values (m,).
+        Points of the multiplier (1×m on a line, 2×m in the plane) and its values (m,).
     multiplier_name
-        What the multiplier is, with its unit.
+        Name of the multiplier, with its unit.
     """
 
     points: Array
@@ -119,7 +119,7 @@ MEMBERS = ("A", "f", "B", "g")
 """The members of a `VariationalInequality` that depend on the parameter."""
 
 Sampler = Callable[[Array], Mapping[str, Array]]
-"""From a parameter mu (d,) to the values of entries chosen before, by member."""
+"""From a parameter mu (d,) to the values of chosen entries, by member."""
 
 
 class Problem(ABC):
@@ -136,16 +136,18 @@ class Problem(ABC):
     W: InnerProduct
     """Inner product of the multiplier space, X_W (m×m), in a basis whose nonnegative coefficients are the cone W⁺."""
     constant: ClassVar[frozenset[str]] = frozenset()
-    """Members of `VariationalInequality`, "A", "f", "B" or "g", that do not depend on mu and are factorised once."""
+    """Members of `VariationalInequality`, "A", "f", "B" or "g", that do not depend on mu."""
     entrywise: ClassVar[frozenset[str]] = frozenset()
     """Members that `sampler` evaluates entry by entry."""
+    requires: ClassVar[tuple[str, ...]] = ()
+    """Optional distributions it cannot do without; where one is not installed its cells are unavailable."""
 
     @abstractmethod
     def training_set(self) -> Array:
         """Parameters (P×d) the reduced model is trained on."""
 
     def validation_set(self, count: int, seed: int) -> Array:
-        """Parameters (count×d) the reduced model is judged on; uniform in the box unless a problem knows better."""
+        """Parameters (count×d) the reduced model is validated on; uniformly random in the box by default."""
         return self.parameters.sample(count, seed)
 
     @abstractmethod
@@ -154,11 +156,11 @@ class Problem(ABC):
 
     @property
     def contact_dofs(self) -> Indices | None:
-        """Unknowns that B(mu) may touch at any parameter, rising; `None` where a problem does not say."""
+        """Contact unknowns: all columns where B(mu) may be non-zero at some mu, rising; `None` if not declared."""
         return None
 
     def contact(self, mu: Array) -> Contact | None:  # noqa: ARG002
-        """The constraint at mu (d,) on `contact_dofs` alone, for problems that can assemble it at that cost."""
+        """The constraint at mu (d,) on `contact_dofs`, assembled at that cost alone; `None` if not implemented."""
         return None
 
     @property
@@ -167,7 +169,7 @@ class Problem(ABC):
         return self.contact_dofs is not None and type(self).contact is not Problem.contact
 
     def sampler(self, wanted: Mapping[str, tuple[Indices, Indices]]) -> Sampler:
-        """Function that gives chosen entries of the members named in `entrywise` at a parameter, at their cost alone.
+        """Function that evaluates chosen entries of the members in `entrywise`, at the cost of these entries alone.
 
         Parameters
         ----------
@@ -182,7 +184,7 @@ class Problem(ABC):
         raise NotImplementedError(f"{type(self).__name__} declares {sorted(self.entrywise)} and has no sampler")
 
     def constraint(self, mu: Array) -> tuple[SparseMatrix, Array]:
-        """B (m×n) and g (m,) at mu (d,): from `contact` if there is one, else from everything."""
+        """B (m×n) and g (m,) at mu (d,), from `contact` if implemented, else from `assemble`."""
         contact = self.contact(mu)
         if contact is None or self.contact_dofs is None:
             vi = self.assemble(mu)
@@ -192,20 +194,20 @@ class Problem(ABC):
         return sp.csr_array(entries, shape=(B.shape[0], self.V.dim)), contact.g
 
     def multiplier_integrals(self) -> Array:
-        """Integrals (m,) of the multiplier basis functions, the unit in which a constraint violation is a length.
+        """Integrals (m,) of the multiplier basis functions; a constraint violation divided by them is a length.
 
-        X_W applied to ones, which is right for every basis that sums to one in an L² product.
+        By default X_W applied to ones, correct for an L² product and a basis that is a partition of unity.
         """
         return self.W.apply(np.ones(self.W.dim))
 
     def refuse(self, mu: Array, u: Array, lam: Array) -> str:  # noqa: ARG002
-        """Why the problem's model does not cover a high-fidelity solution u (n,), λ (m,) at mu (d,); "" if it does."""
+        """Why a high-fidelity solution u (n,), λ (m,) at mu (d,) is outside the scope of the model; "" if it is not."""
         return ""
 
     def picture(self, mu: Array, u: Array, lam: Array) -> Picture | None:  # noqa: ARG002
-        """What to draw of a solution u (n,), λ (m,) at mu (d,); `None` where a problem has no picture."""
+        """The picture of a solution u (n,), λ (m,) at mu (d,); `None` if not implemented."""
         return None
 
     def diagnostics(self, mu: Array) -> Mapping[str, float]:  # noqa: ARG002
-        """Figures worth keeping beside a high-fidelity solution at mu (d,), such as mesh quality; none by default."""
+        """Scalars recorded with a high-fidelity solution at mu (d,), such as mesh quality; none by default."""
         return {}

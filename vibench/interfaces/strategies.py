@@ -1,4 +1,4 @@
-"""What strategy plugins are: dual ones turn multiplier snapshots into a cone, primal ones enrich the primal basis."""
+"""The interfaces of strategy plugins: dual ones build a cone from multiplier snapshots, primal ones enrich V_N."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from vibench.linalg.inner_product import InnerProduct
 
 @dataclass(frozen=True)
 class Stop:
-    """When a nested construction stops: at a tolerance, or at a prescribed size; exactly one of the two.
+    """Stopping criterion of a nested construction: a tolerance or a prescribed size, exactly one of the two.
 
     Attributes
     ----------
     tolerance
-        Largest relative error accepted.
+        Largest accepted relative error.
     size
         Number of vectors.
     """
@@ -35,11 +35,11 @@ class Stop:
             raise ValueError("a Stop has either a tolerance or a size")
 
     def reached(self, size: int, error: float) -> bool:
-        """Whether a construction with `size` vectors and this relative error is done."""
+        """Whether a construction with `size` vectors and this relative error stops."""
         return error <= self.tolerance if self.tolerance is not None else size >= (self.size or 0)
 
     def first_reached(self, errors: Array) -> int | None:
-        """Smallest k with `errors[k]` (error with k vectors) good enough; `None` if there is none."""
+        """Smallest k at which `errors[k]`, the error with k vectors, meets the criterion; `None` if there is none."""
         reached = [k for k, error in enumerate(errors) if self.reached(k, float(error))]
         return reached[0] if reached else None
 
@@ -60,7 +60,7 @@ class Cone:
     free
         Which generators may be used with either sign (R,), none in an ordinary cone.
     fallbacks
-        One line for every step that could not be done as the algorithm says.
+        One line for every step that deviates from the algorithm.
     """
 
     generators: Array
@@ -75,20 +75,23 @@ class Cone:
 
     @property
     def rays(self) -> Array:
-        """Generators (m×(R+F)) of the same cone with nonnegative coefficients: free ones also with the other sign."""
+        """Generators (m×(R+F)) of the same cone with nonnegative coefficients: free ones appear with both signs."""
         return rays(self.generators, self.free)
 
 
 class DualStrategy(ABC):
-    """Turns multiplier snapshots into a reduced cone. Constructor arguments are the plugin's options."""
+    """Builds a reduced cone from multiplier snapshots. Constructor arguments are the plugin's options."""
+
+    requires: ClassVar[tuple[str, ...]] = ()
+    """Optional distributions it cannot do without; where one is not installed its cells are unavailable."""
 
     @abstractmethod
     def reduce(self, snapshots: Array, W: InnerProduct, stop: Stop) -> Cone:
-        """Cone for snapshots λ(mu_p) (m×P, coefficientwise nonnegative), relative projection error as `stop` says."""
+        """Cone for snapshots λ(mu_p) (m×P, coefficientwise nonnegative); `stop` bounds its projection error or size."""
 
 
 class Kind(StrEnum):
-    """How an enrichment depends on the parameter; strategies are compared by this, never by name."""
+    """How an enrichment depends on the parameter; break-even pairs strategies by this, never by name."""
 
     NONE = "none"
     FIXED = "fixed"
@@ -97,7 +100,7 @@ class Kind(StrEnum):
 
 @dataclass(frozen=True)
 class Offline:
-    """What a primal strategy may use offline.
+    """The offline data of a primal strategy.
 
     Attributes
     ----------
@@ -108,8 +111,8 @@ class Offline:
     cone
         The reduced cone.
     span
-        W-orthonormal basis of span χ (m×rank), from a rank-revealing factorisation. S_R(mu) is the range of T(mu) on
-        it: where generators nearly coincide, T(mu)χ itself would lose directions to round-off.
+        W-orthonormal basis of span χ (m×rank), from a rank-revealing factorisation. Use T(mu)·span and not T(mu)χ as
+        a basis of S_R(mu): where generators nearly coincide, T(mu)χ loses directions to round-off.
     training
         Training parameters (P×d).
     """
@@ -122,12 +125,12 @@ class Offline:
 
 
 Supply = Callable[[InnerProduct, VariationalInequality, Array], Array]
-"""Vectors (n×k) an enrichment adds at one parameter, from V, the assembled forms and `Offline.span`; picklable."""
+"""Vectors (n×k) of an enrichment at one parameter, from V, the assembled forms and `Offline.span`; picklable."""
 
 
 @dataclass(frozen=True)
 class Enrichment:
-    """What a primal strategy adds to V_N.
+    """The vectors that a primal strategy adds to V_N.
 
     Attributes
     ----------
@@ -136,13 +139,13 @@ class Enrichment:
     vectors
         Fixed enrichment: vectors (n×S), V-orthonormal and orthogonal to V_N, nested.
     eta
-        Per-parameter enrichment by supremizers: multipliers η (m×k) whose T(mu)η are added at every mu.
+        Per-parameter enrichment by supremizers: multipliers η (m×k); T(mu)η is added at every mu.
     supply
-        Any other per-parameter enrichment: how to get the vectors at a parameter.
+        Any other per-parameter enrichment: the function that computes its vectors.
     history
-        Quantity → values over steps, for the convergence figures.
+        Values over steps by quantity, for convergence figures.
     fallbacks
-        One line for every step that could not be done as the algorithm says.
+        One line for every step that deviates from the algorithm.
     """
 
     kind: Kind
@@ -162,18 +165,20 @@ class Enrichment:
 class PrimalStrategy(ABC):
     """Enriches the primal basis. Constructor arguments are the plugin's options."""
 
+    requires: ClassVar[tuple[str, ...]] = ()
+    """Optional distributions it cannot do without; where one is not installed its cells are unavailable."""
     takes_tolerance: ClassVar[bool] = False
-    """Whether a study gives this strategy a tolerance axis."""
+    """Whether studies vary a tolerance of this strategy."""
     larger_is_tighter: bool = False
-    """Whether the larger of two tolerances asks for more, as a share that is to be reached does."""
+    """Whether the larger of two tolerances is the stricter one, as for a share of β to be reached."""
 
     @abstractmethod
     def build(self, offline: Offline, tolerance: float | None) -> Enrichment:
-        """Enrichment of `offline.basis`; `tolerance` is `None` exactly for strategies that take none."""
+        """Enrichment of `offline.basis`; `tolerance` is `None` exactly for strategies without one."""
 
 
 def rays(generators: Array, free: Mask) -> Array:
-    """Generators (m×R), and after them the opposites of those that are free (R,)."""
+    """Generators (m×R), followed by the negatives of the free ones (R,)."""
     return np.hstack([generators, -generators[:, free]])
 
 

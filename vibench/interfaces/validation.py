@@ -1,4 +1,4 @@
-"""What strategy plugins hand over, checked before anything is made of it: the line names what is wrong."""
+"""Validation of what plugins return; every message names the fault and the expected value."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ from vibench.interfaces.strategies import Cone, Enrichment
 from vibench.linalg.inner_product import InnerProduct
 
 ROUND_OFF = 1e-8
-"""How far norms and angles may be from what they are promised to be."""
+"""Largest accepted deviation of norms from 1 and of inner products from 0."""
 
 
 def check_cone(cone: object, W: InnerProduct) -> Cone:
-    """A cone that keeps its promises: shape, finite, unit norms in W, in W⁺ unless free.
+    """Refuse a cone whose generators have the wrong shape, are not finite, of unit norm in W, or in W⁺ unless free.
 
     Raises
     ------
     NumericalError
-        Naming the promise that is broken.
+        Naming the violated property.
     """
     if not isinstance(cone, Cone):
         raise NumericalError(f"the dual strategy returned a {type(cone).__name__}, expected a Cone")
@@ -36,12 +36,12 @@ def check_cone(cone: object, W: InnerProduct) -> Cone:
 
 
 def check_enrichment(enrichment: object, V: InnerProduct, basis: Array) -> Enrichment:
-    """An enrichment that keeps its promises: fixed vectors are finite, orthonormal in V and orthogonal to V_N.
+    """Refuse an enrichment whose fixed vectors are not finite, orthonormal in V and orthogonal to V_N.
 
     Raises
     ------
     NumericalError
-        Naming the promise that is broken.
+        Naming the violated property.
     """
     if not isinstance(enrichment, Enrichment):
         raise NumericalError(f"the primal strategy returned a {type(enrichment).__name__}, expected an Enrichment")
@@ -64,18 +64,18 @@ def _matrix(name: str, value: object, rows: int) -> Array:
 
 
 def training_parameters(problem: Problem) -> Array:
-    """The training set (P×d), refused with a line if it is empty, of the wrong shape or not finite.
+    """The training set (P×d); refused if it is empty, has the wrong shape or is not finite.
 
     Raises
     ------
     NumericalError
-        Saying what was wrong and what would be right.
+        Naming the fault and the expected value.
     """
     return _checked(problem, "training_set", np.asarray(problem.training_set(), float), None)
 
 
 def validation_parameters(problem: Problem, count: int, seed: int) -> Array:
-    """The validation set (count×d), checked likewise."""
+    """The validation set (count×d), with the same checks."""
     return _checked(problem, "validation_set", np.asarray(problem.validation_set(count, seed), float), count)
 
 
@@ -89,18 +89,20 @@ def _checked(problem: Problem, name: str, mus: Array, count: int | None) -> Arra
 
 
 def checked_assembly(problem: Problem, mu: Array) -> VariationalInequality:
-    """`problem.assemble(mu)`, refused with a line that names the fault if shapes are wrong or values not finite.
+    """`problem.assemble(mu)`, refused if shapes are wrong or values not finite.
 
     Raises
     ------
     NumericalError
-        Naming the member, what was wrong and what would be right.
+        Naming the member, the fault and the expected value.
     """
     vi = problem.assemble(mu)
     n, m = problem.V.dim, problem.W.dim
     for name, value, shape in (("A", vi.A, (n, n)), ("f", vi.f, (n,)), ("B", vi.B, (m, n)), ("g", vi.g, (m,))):
         if value.shape != shape:
-            raise NumericalError(f"{name} has shape {value.shape} at mu = {mu.tolist()}; the spaces ask for {shape}")
+            raise NumericalError(
+                f"{name} has shape {value.shape} at mu = {mu.tolist()}; the spaces V and W require {shape}"
+            )
         entries = value if isinstance(value, np.ndarray) else value.data
         if not np.all(np.isfinite(entries)):
             raise NumericalError(f"{name} has entries that are not finite at mu = {mu.tolist()}")

@@ -1,4 +1,4 @@
-"""Sparse symmetric positive definite matrices, factorised in an order of one's own choice."""
+"""Cholesky factors of sparse symmetric positive definite matrices, with a chosen elimination order."""
 
 from __future__ import annotations
 
@@ -13,11 +13,12 @@ from vibench.arrays import Array, Indices, SparseMatrix
 from vibench.errors import NumericalError
 
 _SYMMETRIC = {"diag_pivot_thresh": 0.0, "panel_size": 1, "options": {"SymmetricMode": True}}
-"""No pivoting off the diagonal; panels of one column are the fastest for the matrices of plane meshes."""
+"""SuperLU without off-diagonal pivoting is a Cholesky factorisation; SciPy has no sparse one of its own. Panels of one
+column are the fastest for matrices of plane meshes."""
 
-DENSER = 8
-"""What follows from the last unknowns comes from a full matrix where it has no more than this many times the entries of
-the sparse factor: a product does far more operations in the same time than a triangular solve."""
+FILL_RATIO = 8
+"""A dense extension operator replaces triangular solves where it has at most this many times the entries of the sparse
+factor: a dense product does far more operations in the same time than a sparse triangular solve."""
 
 
 class SparseCholesky:
@@ -26,18 +27,18 @@ class SparseCholesky:
     Parameters
     ----------
     matrix
-        X; only its symmetry is taken for granted.
+        X; its symmetry is assumed and not checked.
     name
-        What to call it when it is refused.
+        Its name in error messages.
     order
-        Elimination order (n,), as `elimination_order` gives it; by default minimum degree.
+        Elimination order (n,), from `elimination_order`; by default minimum degree.
     dense
-        How many of the unknowns eliminated last couple to each other almost all: F is taken for full there.
+        Size of the trailing block of F that is stored as a dense matrix.
 
     Attributes
     ----------
     order
-        Unknowns in the order of their elimination, in which F is upper triangular.
+        Unknowns in elimination order, in which F is upper triangular.
 
     Raises
     ------
@@ -49,7 +50,7 @@ class SparseCholesky:
         self, matrix: SparseMatrix, name: str = "the matrix", order: Indices | None = None, dense: int = 0
     ) -> None:
         matrix = sp.csc_array(matrix)
-        self._made_from = matrix, name, order, dense
+        self._arguments = matrix, name, order, dense
         if order is not None and not np.array_equal(order, np.arange(len(order))):
             matrix = sp.csc_array(matrix[order][:, order])
         try:
@@ -63,57 +64,57 @@ class SparseCholesky:
         self._root = np.sqrt(pivots)
         eliminated = np.argsort(lu.perm_c)
         if order is not None and not np.array_equal(eliminated, np.arange(len(order))):
-            raise NumericalError(f"{name} was factorised in another order than asked for")  # SuperLU promises not to
-        self._given, self._sparse = order, matrix.shape[0] - dense
+            raise NumericalError(f"{name} was not factorised in the requested order")
+        self._requested_order, self._split = order, matrix.shape[0] - dense
         self.order: Indices = eliminated if order is None else order
 
     def __reduce__(self) -> tuple[type[SparseCholesky], tuple[SparseMatrix, str, Indices | None, int]]:
-        """Factorise anew where it is unpickled: SuperLU objects do not travel."""
-        return SparseCholesky, self._made_from
+        """Factorise again when unpickled: SuperLU objects cannot be pickled."""
+        return SparseCholesky, self._arguments
 
     @cached_property
     def _lower(self) -> SparseMatrix:
         lower = sp.csc_array(self._lu.L)
-        lower.sort_indices()  # once, not at every triangular solve
+        lower.sort_indices()  # here once; a triangular solve would sort every time
         return lower
 
     @cached_property
     def _blocks(self) -> tuple[SparseMatrix, SparseMatrix, Array]:
-        """Transposes of the lower factor's sparse blocks, that of the first unknowns and the coupling; dense F."""
-        split = self._sparse
+        """Leading and coupling block of the unit lower factor, transposed, and the dense trailing block of F."""
+        split = self._split
         if split == len(self._root):
             return self._lower.T, sp.csc_array((split, 0)), np.zeros((0, 0))
         first = sp.csc_array(self._lower[:, :split])
         corner, coupling = sp.csc_array(first[:split]), sp.csc_array(first[split:])
         corner.sort_indices()
-        return corner.T, coupling.T, np.asfortranarray(self.tail(len(self._root) - split))
+        return corner.T, coupling.T, np.asfortranarray(self.trailing_factor(len(self._root) - split))
 
     def solve(self, right: Array) -> Array:
         """X⁻¹ r for right-hand sides (n,) or (n, k)."""
-        if self._given is None:
+        if self._requested_order is None:
             return np.asarray(self._lu.solve(np.ascontiguousarray(right)))
         found = np.empty_like(right, dtype=float)
-        found[self._given] = self._lu.solve(np.ascontiguousarray(right[self._given]))
+        found[self._requested_order] = self._lu.solve(np.ascontiguousarray(right[self._requested_order]))
         return found
 
-    def up(self, u: Array) -> Array:
+    def apply_factor(self, u: Array) -> Array:
         """F u, for u (n,) or (n, k)."""
-        return _rows(self._root, self._lower.T @ u[self.order])
+        return _scale_rows(self._root, self._lower.T @ u[self.order])
 
-    def up_inverse(self, y: Array) -> Array:
+    def solve_factor(self, y: Array) -> Array:
         """F⁻¹ y, for y (n,) or (n, k)."""
-        split, u = self._sparse, np.empty_like(y, dtype=float)
+        split, u = self._split, np.empty_like(y, dtype=float)
         corner, coupling, tail = self._blocks
         last = scipy.linalg.solve_triangular(tail, y[split:], check_finite=False) if len(tail) else y[split:]
         u[self.order[split:]] = last
-        first = _rows(1.0 / self._root[:split], y[:split]) - coupling @ last
+        first = _scale_rows(1.0 / self._root[:split], y[:split]) - coupling @ last
         if first.size:
             u[self.order[:split]] = spsolve_triangular(corner, first, lower=False, unit_diagonal=True)
         return u
 
     def extend(self, last: Array) -> Array:
-        """Solution (n,) or (n, k) of X u = 0 in all rows but those of the `dense` unknowns, where u is given."""
-        split, u = self._sparse, np.zeros((len(self._root), *last.shape[1:]))
+        """Solution (n,) or (n, k) of X u = 0 in all rows but the last `dense` ones, with u given there."""
+        split, u = self._split, np.zeros((len(self._root), *last.shape[1:]))
         corner, coupling, _ = self._blocks
         u[self.order[split:]] = last
         if split and last.size:
@@ -127,44 +128,44 @@ class SparseCholesky:
 
     @cached_property
     def _extension(self) -> tuple[Indices, Array | None]:
-        """The `dense` unknowns that others depend on (c,), and how these follow; `None` where to solve is cheaper."""
+        """Those of the last `dense` unknowns that couple to others (c,); the extension from them, or `None`."""
         corner, coupling, _ = self._blocks
         where = np.unique(coupling.indices)
-        if self._sparse * len(where) > DENSER * (corner.nnz + coupling.nnz):
+        if self._split * len(where) > FILL_RATIO * (corner.nnz + coupling.nnz):
             return where, None
         right = -coupling[:, where].toarray()
         return where, spsolve_triangular(corner, right, lower=False, unit_diagonal=True)
 
-    def down_inverse(self, right: Array) -> Array:
+    def solve_factor_transposed(self, right: Array) -> Array:
         """F⁻ᵀ r, for r (n,) or (n, k)."""
         permuted = np.ascontiguousarray(right[self.order])
         if not permuted.size:
             return permuted
-        return _rows(1.0 / self._root, spsolve_triangular(self._lower, permuted, lower=True, unit_diagonal=True))
+        return _scale_rows(1.0 / self._root, spsolve_triangular(self._lower, permuted, lower=True, unit_diagonal=True))
 
-    def tail(self, count: int) -> Array:
-        """The last block F_cc (count×count) of F, in the order of elimination: a factor of the Schur complement.
+    def trailing_factor(self, count: int) -> Array:
+        """The trailing block F_cc (count×count) of F in elimination order.
 
-        With c the last `count` unknowns, F_ccᵀF_cc is X_cc minus what the elimination of all others takes from it.
+        F_ccᵀF_cc is the Schur complement of X on the last `count` unknowns c.
         """
         first = len(self._root) - count
         block = sp.csc_array(self._lu.L)[:, first:][first:].toarray()
         return np.asarray((block * self._root[first:]).T)
 
 
-def _rows(factors: Array, values: Array) -> Array:
+def _scale_rows(factors: Array, values: Array) -> Array:
     return np.asarray(factors * values if values.ndim == 1 else factors[:, None] * values)
 
 
 def elimination_order(matrix: SparseMatrix, last: Indices) -> Indices:
-    """Order of elimination with little fill-in (minimum degree) that ends with some unknowns, in their order.
+    """Elimination order with little fill-in (minimum degree) in which some unknowns come last, in their given order.
 
     Parameters
     ----------
     matrix
-        A symmetric positive definite matrix (n×n) with the sparsity pattern in question.
+        A symmetric positive definite matrix (n×n) with the sparsity pattern.
     last
-        Unknowns that come last.
+        Unknowns to eliminate last.
     """
     matrix = sp.csc_array(matrix)
     rest = np.setdiff1d(np.arange(matrix.shape[0]), last)

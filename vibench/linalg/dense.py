@@ -1,4 +1,4 @@
-"""Dense linear algebra that the small matrices of reduced models need to be done carefully."""
+"""Dense linear algebra for the small and often nearly rank-deficient matrices of reduced models."""
 
 from __future__ import annotations
 
@@ -9,6 +9,9 @@ from vibench.arrays import Array
 
 RANK_RTOL = 1e-12
 """Directions below this fraction of the largest one are round-off and are dropped from every orthonormal basis."""
+
+ORTHOGONALITY_ATOL = 1e-13
+"""Inner products of unit vectors below this are round-off."""
 
 
 def svd(a: Array) -> tuple[Array, Array, Array]:
@@ -28,15 +31,11 @@ def singular_values(a: Array) -> Array:
     return np.asarray(scipy.linalg.svd(a, compute_uv=False, lapack_driver="gesvd"))
 
 
-OVERLAP = 1e-13
-"""Inner products of unit vectors below this are round-off."""
-
-
 def orthonormal_range(y: Array, against: Array | None = None) -> Array:
-    """Euclidean orthonormal basis of what the columns of y (n×k) add to orthonormal columns `against` (n×l).
+    """Euclidean orthonormal basis of the columns of y (n×k), with orthonormal columns `against` (n×l) projected out.
 
-    Rank-revealing (pivoted QR); columns are judged relative to their own norm before `against` was projected out, so
-    that a small vector is not mistaken for a dependent one.
+    Rank-revealing (pivoted QR). The threshold is relative to the norm of each column before `against` is projected out:
+    a short column is not mistaken for a dependent one.
 
     Returns
     -------
@@ -51,13 +50,14 @@ def orthonormal_range(y: Array, against: Array | None = None) -> Array:
         return np.zeros((y.shape[0], 0))
     q, r, _ = scipy.linalg.qr(y, mode="economic", pivoting=True)
     q = q[:, np.abs(np.diag(r)) > RANK_RTOL]
-    if against is not None and np.max(np.abs(against.T @ q), initial=0.0) > OVERLAP:  # small columns magnify round-off
+    if against is not None and np.max(np.abs(against.T @ q), initial=0.0) > ORTHOGONALITY_ATOL:
+        # normalising a column of which little is left magnifies its round-off along `against`
         q, _ = np.linalg.qr(project_out(against, q))
     return np.asarray(q)
 
 
 def project_out(space: Array, y: Array) -> Array:
-    """(I − Π)y for orthonormal columns `space` (n×l) and y (n,) or (n×k); projected out twice, which is enough."""
+    """(I − Π)y for orthonormal columns `space` (n×l) and y (n,) or (n×k); applied twice against round-off."""
     for _ in range(2):
         y = y - space @ (space.T @ y)
     return y

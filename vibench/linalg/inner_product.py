@@ -1,4 +1,4 @@
-"""Finite-dimensional Hilbert spaces given by a sparse Gram matrix: norms, Riesz, orthonormal bases, numerical rank."""
+"""Inner products with a sparse Gram matrix: norms, Riesz representers, orthonormal bases, numerical rank."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ from vibench.linalg.dense import orthonormal_range
 class InnerProduct:
     """The inner product ⟨u, v⟩ = uᵀ X v of a space, X sparse symmetric positive definite.
 
-    X = FᵀF is factorised once. "Whitened" coordinates F v carry the plain Euclidean inner product: singular values, QR
-    and nonnegative least squares are done there, and no digit is lost to squaring.
+    X = FᵀF is factorised once. In whitened coordinates F v the inner product is Euclidean. Singular values, QR and
+    nonnegative least squares are computed there and not from Gram matrices, whose eigenvalues keep half the digits.
 
     Parameters
     ----------
     matrix
         X, sparse (n×n).
     name
-        What to call it when it is refused.
+        Its name in error messages.
 
     Raises
     ------
@@ -36,10 +36,10 @@ class InnerProduct:
         self.matrix = sp.csc_array(matrix)
         self._name = name
         check_symmetric(self.matrix, name)
-        self._factor  # noqa: B018  an indefinite matrix is refused here, not at its first use
+        self._factor  # noqa: B018  refuses an indefinite matrix here and not at its first use
 
     def __getstate__(self) -> dict[str, object]:
-        """Leave the factorisation behind when pickled: SuperLU objects do not travel."""
+        """Drop the factorisation: SuperLU objects cannot be pickled."""
         return {"matrix": self.matrix, "_name": self._name}
 
     @property
@@ -69,18 +69,18 @@ class InnerProduct:
 
     def whiten(self, u: Array) -> Array:
         """F u: coordinates in which the inner product is Euclidean; u (n,) or (n, k)."""
-        return self._factor.up(u)
+        return self._factor.apply_factor(u)
 
     def unwhiten(self, y: Array) -> Array:
         """F⁻¹ y, the inverse of `whiten`; y (n,) or (n, k)."""
-        return self._factor.up_inverse(y)
+        return self._factor.solve_factor(y)
 
     def whiten_functional(self, functional: Array) -> Array:
         """F⁻ᵀ ℓ: whitened coordinates of the Riesz representer of ℓ (n,) or (n, k); Euclidean norms are dual norms."""
-        return self._factor.down_inverse(functional)
+        return self._factor.solve_factor_transposed(functional)
 
     def orthonormalise(self, u: Array, against: Array | None = None) -> Array:
-        """Orthonormal basis of span(u), or of what u adds to the span of an orthonormal basis.
+        """Orthonormal basis of span(u), or of its part orthogonal to a given orthonormal basis.
 
         Columns are scaled to unit norm, `against` is projected out twice, and the rank is revealed by a pivoted QR in
         whitened coordinates; directions below `linalg.RANK_RTOL` of a unit vector are dropped.
@@ -88,7 +88,7 @@ class InnerProduct:
         Parameters
         ----------
         u
-            Vectors (n×k), of any rank.
+            Vectors (n×k), possibly linearly dependent.
         against
             Orthonormal vectors (n×l) to be orthogonal to; `None` for none.
 
@@ -107,7 +107,7 @@ def check_symmetric(matrix: SparseMatrix, name: str) -> None:
     Raises
     ------
     NumericalError
-        Naming it and what it is not.
+        Naming the matrix and the missing property.
     """
     rows, columns = matrix.shape
     if rows != columns:

@@ -1,4 +1,4 @@
-"""Systems with a sparse stiffness condensed on the few unknowns that constraints touch."""
+"""Static condensation: sparse systems reduced to the few unknowns that constraints involve."""
 
 from __future__ import annotations
 
@@ -13,147 +13,150 @@ from vibench.linalg.cholesky import SparseCholesky, elimination_order
 
 
 @dataclass(frozen=True)
-class Pattern:
-    """Which unknowns are kept and how the others are eliminated; the same for all matrices of one sparsity pattern.
+class EliminationPattern:
+    """Which unknowns are retained and in which order the others are eliminated, for one sparsity pattern.
 
     Attributes
     ----------
-    kept
-        Unknowns c to condense on, rising.
+    retained
+        Unknowns (c,) that the system is condensed on, rising.
     order
-        Elimination order of all others, followed by the interface: the kept ones that couple to others.
+        Elimination order of all others, followed by the interface: the retained unknowns that couple to others.
     interface
-        Where the interface is among the kept ones.
+        Positions of the interface among the retained unknowns.
     """
 
-    kept: Indices
+    retained: Indices
     order: Indices
     interface: Indices
 
     @cached_property
-    def eliminated(self) -> Submatrix:
-        """What is factorised: all in `order`."""
-        return Submatrix(self.order)
+    def factorised_block(self) -> PrincipalSubmatrix:
+        """The block of the eliminated unknowns and the interface, in elimination order."""
+        return PrincipalSubmatrix(self.order)
 
     @cached_property
-    def kept_block(self) -> Submatrix:
-        """The kept ones among themselves."""
-        return Submatrix(self.kept)
+    def retained_block(self) -> PrincipalSubmatrix:
+        """The block of the retained unknowns."""
+        return PrincipalSubmatrix(self.retained)
 
     @classmethod
-    def of(cls, A: SparseMatrix, kept: Indices) -> Pattern:
+    def of(cls, A: SparseMatrix, retained: Indices) -> EliminationPattern:
         """Pattern for matrices with the sparsity of A (n×n), symmetric positive definite."""
-        others = np.setdiff1d(np.arange(A.shape[0]), kept)
-        interface = np.unique(sp.csr_array(A)[others][:, kept].indices)
-        inside = np.union1d(others, kept[interface])
-        order = elimination_order(sp.csr_array(A)[inside][:, inside], np.searchsorted(inside, kept[interface]))
-        return cls(kept, inside[order], interface)
+        others = np.setdiff1d(np.arange(A.shape[0]), retained)
+        interface = np.unique(sp.csr_array(A)[others][:, retained].indices)
+        inside = np.union1d(others, retained[interface])
+        order = elimination_order(sp.csr_array(A)[inside][:, inside], np.searchsorted(inside, retained[interface]))
+        return cls(retained, inside[order], interface)
 
 
-class Submatrix:
-    """Some rows and columns of square matrices; where one has the sparsity of the last, its entries are only copied.
+class PrincipalSubmatrix:
+    """Extracts the rows and columns of chosen unknowns from many square matrices.
+
+    The positions of the entries are found once per sparsity pattern; after that, extraction copies entries.
 
     Parameters
     ----------
     chosen
-        Which, in the order in which they are wanted.
+        Unknowns, in the order they have in the submatrix.
     """
 
     def __init__(self, chosen: Indices) -> None:
         self._chosen = chosen
-        self._known: tuple[Indices, Indices] | None = None
+        self._sparsity: tuple[Indices, Indices] | None = None
 
     def of(self, A: SparseMatrix) -> SparseMatrix:
-        """Those of A (CSR)."""
-        places = A.indptr, A.indices
-        if self._known is None or not all(map(np.array_equal, self._known, places)):
-            self._known = A.indptr.copy(), A.indices.copy()  # libraries sort in place
-            numbered = sp.csr_array((np.arange(A.nnz), *reversed(places)), shape=A.shape)
-            self._numbers = numbered[self._chosen][:, self._chosen]
-            self._numbers.sort_indices()
-        found = self._numbers
+        """The submatrix of A (CSR)."""
+        sparsity = A.indptr, A.indices
+        if self._sparsity is None or not all(map(np.array_equal, self._sparsity, sparsity)):
+            self._sparsity = A.indptr.copy(), A.indices.copy()  # copies, since libraries sort indices in place
+            numbered = sp.csr_array((np.arange(A.nnz), *reversed(sparsity)), shape=A.shape)
+            self._positions = numbered[self._chosen][:, self._chosen]
+            self._positions.sort_indices()
+        found = self._positions
         return sp.csr_array((A.data[found.data], found.indices.copy(), found.indptr.copy()), shape=found.shape)
 
 
-class Condensed:
-    """One stiffness A, condensed: whatever is wanted of the kept unknowns takes arrays of their number alone.
+class StaticCondensation:
+    """A stiffness matrix A condensed on the retained unknowns of a pattern.
 
     Parameters
     ----------
     A, pattern
-        The matrix (n×n), and what to condense it on.
+        The matrix (n×n) and its elimination pattern.
     reused
-        Whether many solutions will be expanded, so that preparing for it pays.
+        Whether many solutions are recovered from it, so that a dense extension operator pays off.
 
     Attributes
     ----------
     dense
-        Whether most of Ŝ is filled in.
+        Whether most entries of the Schur complement are non-zero.
     """
 
-    def __init__(self, A: SparseMatrix, pattern: Pattern, *, reused: bool = False) -> None:
+    def __init__(self, A: SparseMatrix, pattern: EliminationPattern, *, reused: bool = False) -> None:
         self._pattern, self._size, self._reused = pattern, A.shape[0], reused
         A, count = sp.csr_array(A), len(pattern.interface)
         natural = np.arange(len(pattern.order))
-        self._factor = SparseCholesky(pattern.eliminated.of(A).T, "A", natural, count) if len(natural) else None
+        self._factor = SparseCholesky(pattern.factorised_block.of(A).T, "A", natural, count) if len(natural) else None
         self._eliminated = len(natural) - count
-        upper = self._factor.tail(count) if self._factor is not None else np.zeros((0, 0))
-        self._schur = upper.T @ upper
-        self.dense = 2 * count > len(pattern.kept)
-        self._kept_block = pattern.kept_block.of(A)
-        self._loaded: tuple[Array, tuple[Array, Array]] | None = None
+        upper = self._factor.trailing_factor(count) if self._factor is not None else np.zeros((0, 0))
+        self._interface_schur = upper.T @ upper
+        self.dense = 2 * count > len(pattern.retained)
+        self._retained_block = pattern.retained_block.of(A)
+        self._last_load: tuple[Array, tuple[Array, Array]] | None = None
 
     @property
-    def matrix(self) -> SparseMatrix:
+    def schur(self) -> SparseMatrix:
         """Schur complement Ŝ of the eliminated unknowns (c×c), sparse."""
-        return _with_block(sp.coo_array(self._kept_block), self._pattern.interface, self._schur)
+        return _with_block(sp.coo_array(self._retained_block), self._pattern.interface, self._interface_schur)
 
     @property
-    def array(self) -> Array:
+    def dense_schur(self) -> Array:
         """Ŝ as an array."""
-        found, interface = self._kept_block.toarray(), self._pattern.interface
-        found[np.ix_(interface, interface)] = self._schur
+        found, interface = self._retained_block.toarray(), self._pattern.interface
+        found[np.ix_(interface, interface)] = self._interface_schur
         return np.asarray(found)
 
-    def load(self, f: Array) -> tuple[Array, Array]:
-        """Load (c,) on the kept unknowns that f (n,) amounts to, and what `expand` needs of f."""
-        if self._loaded is not None and np.array_equal(self._loaded[0], f):
-            return self._loaded[1]
+    def condense_load(self, f: Array) -> tuple[Array, Array]:
+        """The condensed load (c,) of f (n,), and the particular solution that `recover` needs."""
+        if self._last_load is not None and np.array_equal(self._last_load[0], f):
+            return self._last_load[1]
         order, interface = self._pattern.order, self._pattern.interface
         right = f[order]
         right[self._eliminated :] = 0.0
-        free = self._factor.solve(right) if self._factor is not None else right
-        condensed = f[self._pattern.kept]
-        condensed[interface] += self._schur @ free[self._eliminated :]
-        self._loaded = f, (condensed, free)
-        return self._loaded[1]
+        particular = self._factor.solve(right) if self._factor is not None else right
+        condensed = f[self._pattern.retained]
+        condensed[interface] += self._interface_schur @ particular[self._eliminated :]
+        self._last_load = f, (condensed, particular)
+        return self._last_load[1]
 
-    def expand(self, u_kept: Array, free: Array) -> Array:
-        """All unknowns (n,) from the kept ones (c,), equilibrium holding in the others."""
+    def recover(self, u_retained: Array, particular: Array) -> Array:
+        """All unknowns (n,) from the retained ones (c,), with equilibrium in the eliminated ones."""
         order, interface = self._pattern.order, self._pattern.interface
         u = np.empty(self._size)
         if self._factor is not None:
-            u[order] = free + self._extended(self._factor, u_kept[interface] - free[self._eliminated :])
-        u[self._pattern.kept] = u_kept
+            on_interface = u_retained[interface] - particular[self._eliminated :]
+            u[order] = particular + self._extension(self._factor, on_interface)
+        u[self._pattern.retained] = u_retained
         return u
 
-    def settle(self, residual: Array) -> Array:
-        """Displacement (n,) of the unknowns not kept that takes a residual (n,) out of their equilibrium."""
-        order, found = self._pattern.order, np.zeros(self._size)
+    def correct_eliminated(self, residual: Array) -> Array:
+        """Correction (n,) of the eliminated unknowns alone that restores their equilibrium, from a residual (n,)."""
+        order, correction = self._pattern.order, np.zeros(self._size)
         if self._factor is not None:
-            inside = residual[order]
-            inside[self._eliminated :] = 0.0
-            free = self._factor.solve(inside)
-            settled = free + self._extended(self._factor, -free[self._eliminated :])
-            found[order[: self._eliminated]] = settled[: self._eliminated]
-        return found
+            right = residual[order]
+            right[self._eliminated :] = 0.0
+            particular = self._factor.solve(right)
+            inside = particular + self._extension(self._factor, -particular[self._eliminated :])
+            correction[order[: self._eliminated]] = inside[: self._eliminated]
+        return correction
 
-    def _extended(self, factor: SparseCholesky, interface: Array) -> Array:
-        """Unknowns in the order of elimination that are given on the interface and in equilibrium elsewhere."""
+    def _extension(self, factor: SparseCholesky, interface: Array) -> Array:
+        """Unknowns in elimination order with given interface values and equilibrium in the eliminated ones."""
         if self._reused:
             return factor.extend(interface)
         right = np.zeros(len(self._pattern.order))
-        right[self._eliminated :] = self._schur @ interface
+        right[self._eliminated :] = self._interface_schur @ interface
         return factor.solve(right)
 
 
@@ -162,13 +165,13 @@ def _with_block(matrix: SparseMatrix, where: Indices, block: Array) -> SparseMat
     inside = np.zeros(matrix.shape[0], dtype=bool)
     inside[where] = True
     rows, columns = matrix.coords
-    stays = ~(inside[rows] & inside[columns])
+    outside = ~(inside[rows] & inside[columns])
     return sp.csc_array(
         (
-            np.concatenate([matrix.data[stays], block.ravel()]),
+            np.concatenate([matrix.data[outside], block.ravel()]),
             (
-                np.concatenate([rows[stays], np.repeat(where, len(where))]),
-                np.concatenate([columns[stays], np.tile(where, len(where))]),
+                np.concatenate([rows[outside], np.repeat(where, len(where))]),
+                np.concatenate([columns[outside], np.tile(where, len(where))]),
             ),
         ),
         shape=matrix.shape,

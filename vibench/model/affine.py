@@ -1,4 +1,4 @@
-"""How the members of a parametrised variational inequality can be evaluated without assembling all of it."""
+"""Affine decomposition of A, f, B, g: declared, or by empirical interpolation of their entries."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from vibench.interfaces.validation import checked_assembly
 from vibench.model.deim import interpolate
 
 CONSTANT_RTOL = 1e-13
-"""A member that varies by less over the training set, relative to its largest entry, is constant."""
+"""A member whose entries vary by less over the training set, relative to the largest one, is constant."""
 
-COMPRESSED = 0.75
-"""Interpolation compresses where it needs no more terms than this share of the training parameters."""
+MAX_TERMS_SHARE = 0.75
+"""Interpolation is used where it needs no more terms than this share of the training parameters."""
 
 
 class Evaluation(StrEnum):
@@ -32,21 +32,21 @@ class Evaluation(StrEnum):
 
 
 @dataclass(frozen=True)
-class Member:
-    """One of A, f, B, g: Σ_q θ_q(mu) · terms_q, or not.
+class AffineMember:
+    """One of A, f, B, g with its affine decomposition Σ_q θ_q(mu) · terms_q, if it has one.
 
     Attributes
     ----------
     way
         How it is evaluated.
     terms
-        Matrices or vectors; one for a constant member, none where there is no such sum.
+        Matrices or vectors; one for a constant member, none where there is no decomposition.
     rows, columns
-        Where the entries are (Q,) whose values at mu are the θ_q; `columns` is zero for vectors.
+        Positions (Q,) of the entries whose values at mu are the θ_q; `columns` is zero for vectors.
     error
         Largest relative error over the training set.
-    why
-        Why it has to be assembled in full; "" where it has not.
+    reason
+        Why it has to be assembled in full; "" otherwise.
     """
 
     way: Evaluation
@@ -54,23 +54,24 @@ class Member:
     rows: Indices
     columns: Indices
     error: float = 0.0
-    why: str = ""
+    reason: str = ""
 
 
 _NONE = np.zeros(0, dtype=np.intp)
 
 
-def affine_decomposition(problem: Problem, training: Array, tolerance: float) -> dict[str, Member]:
-    """The members "A", "f", "B", "g", each in the cheapest way there is.
+def affine_decomposition(problem: Problem, training: Array, tolerance: float) -> dict[str, AffineMember]:
+    """The members "A", "f", "B", "g", each with its cheapest evaluation.
 
-    Declared constants are believed; the others are assembled at all training parameters. Those that turn out not to
-    vary are constants, too; those that a problem evaluates entry by entry are interpolated where that compresses, "by a
-    factor" being one term; B and g are left to `Problem.contact` where there is one.
+    Declared constants are not checked here; the others are assembled at all training parameters. Members that do not
+    vary there are constants, too. Members that the problem evaluates entry by entry are interpolated where that takes
+    few terms; a matrix that is one matrix times a function of mu takes one. Else B and g are left to `Problem.contact`,
+    if the problem has it.
 
     Parameters
     ----------
     problem
-        What is to be evaluated.
+        The high-fidelity problem.
     training
         Parameters (P×d).
     tolerance
@@ -87,18 +88,18 @@ def affine_decomposition(problem: Problem, training: Array, tolerance: float) ->
     return {name: found[name] for name in MEMBERS}
 
 
-def constant(value: Any) -> Member:
+def constant(value: Any) -> AffineMember:
     """A member that does not depend on the parameter."""
-    return Member(Evaluation.CONSTANT, (value,), _NONE, _NONE)
+    return AffineMember(Evaluation.CONSTANT, (value,), _NONE, _NONE)
 
 
 def _assembled(problem: Problem, training: Array, names: Sequence[str]) -> Mapping[str, list[Any]]:
-    """The members of these names at all training parameters; only the constraint where nothing else is wanted."""
+    """The named members at all training parameters; the constraint alone where only B and g are needed."""
     found: dict[str, list[Any]] = {name: [] for name in names}
     for mu in training:
         if set(names) <= {"B", "g"}:
             B, g = problem.constraint(mu)
-            vi = VariationalInequality(A=None, f=g, B=B, g=g)
+            vi = VariationalInequality(A=None, f=g, B=B, g=g)  # A and f are never read
         else:
             vi = checked_assembly(problem, mu)
         for name in names:
@@ -106,25 +107,25 @@ def _assembled(problem: Problem, training: Array, names: Sequence[str]) -> Mappi
     return found
 
 
-def _member(name: str, values: list[Any], problem: Problem, tolerance: float) -> Member:
+def _member(name: str, values: list[Any], problem: Problem, tolerance: float) -> AffineMember:
     entries = _Entries(values, symmetric=name == "A")
     if entries.constant:
         return constant(values[0])
-    why = f"{name} depends on mu and the problem does not evaluate it entry by entry"
+    reason = f"{name} depends on mu and the problem does not evaluate it entry by entry"
     if name in problem.entrywise and len(values) > 1:
         found = interpolate(entries.values, tolerance)
-        if len(found.points) <= max(1.0, COMPRESSED * len(values)):
-            terms = tuple(entries.rebuilt(mode) for mode in found.modes.T)
-            rows, columns = entries.places(found.points)
-            return Member(Evaluation.INTERPOLATED, terms, rows, columns, found.error)
-        why = f"{name} depends on mu, and interpolation needs {len(found.points)} terms for {len(values)} parameters"
+        if len(found.points) <= max(1.0, MAX_TERMS_SHARE * len(values)):
+            terms = tuple(entries.assembled(mode) for mode in found.modes.T)
+            rows, columns = entries.positions(found.points)
+            return AffineMember(Evaluation.INTERPOLATED, terms, rows, columns, found.error)
+        reason = f"{name} depends on mu, and interpolation needs {len(found.points)} terms for {len(values)} parameters"
     if name in ("B", "g") and problem.has_contact:
-        return Member(Evaluation.CONTACT, (), _NONE, _NONE)
-    return Member(Evaluation.FULL, (), _NONE, _NONE, why=why)
+        return AffineMember(Evaluation.CONTACT, (), _NONE, _NONE)
+    return AffineMember(Evaluation.FULL, (), _NONE, _NONE, reason=reason)
 
 
 class _Entries:
-    """The entries of a member at all training parameters, as columns (k×P) on their common pattern."""
+    """The entries of a member at all training parameters, as columns (k×P) on the union of their sparsity patterns."""
 
     def __init__(self, values: list[Any], symmetric: bool) -> None:
         self._shape, self._symmetric = values[0].shape, symmetric
@@ -135,8 +136,8 @@ class _Entries:
         else:
             self.values = self._of_matrices(values)
         spread = float(np.ptp(self.values, axis=1).max(initial=0.0))
-        enough = self.values.shape[1] > 1  # to tell what varies
-        self.constant = enough and spread <= CONSTANT_RTOL * float(np.abs(self.values).max(initial=0.0))
+        several = self.values.shape[1] > 1  # one parameter cannot show what varies
+        self.constant = several and spread <= CONSTANT_RTOL * float(np.abs(self.values).max(initial=0.0))
 
     def _of_matrices(self, matrices: list[SparseMatrix]) -> Array:
         entries = [_canonical(sp.triu(matrix) if self._symmetric else matrix) for matrix in matrices]
@@ -151,11 +152,11 @@ class _Entries:
             np.add.at(found[:, k], np.searchsorted(pattern, key), entry.data)
         return found
 
-    def places(self, points: Indices) -> tuple[Indices, Indices]:
+    def positions(self, points: Indices) -> tuple[Indices, Indices]:
         """Row and column of some entries."""
         return self._rows[points], self._columns[points]
 
-    def rebuilt(self, values: Array) -> Any:
+    def assembled(self, values: Array) -> Any:
         """The vector or matrix with these entries (k,)."""
         if self._vector:
             return values
@@ -164,7 +165,7 @@ class _Entries:
 
 
 def _canonical(matrix: SparseMatrix) -> SparseMatrix:
-    """A copy in coordinates, row by row, in which every entry stands once."""
+    """A copy in coordinate format, row by row, without duplicate entries."""
     rows = sp.csr_array(matrix, copy=True)
     rows.sum_duplicates()
     return sp.coo_array(rows)

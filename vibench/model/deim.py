@@ -13,16 +13,16 @@ from vibench.linalg.dense import svd
 
 @dataclass(frozen=True)
 class Interpolation:
-    """v(mu) ≈ Σ_q v(mu)[points_q] · modes_q: a few entries of a vector tell all of it.
+    """Empirical interpolation v(mu) ≈ Σ_q v(mu)[points_q] · modes_q from a few entries of the vector.
 
     Attributes
     ----------
     points
-        Entries (Q,) to be evaluated, rising.
+        Interpolation points: entries (Q,), rising.
     modes
         Cardinal modes (k×Q): mode q is 1 at its own point and 0 at the others.
     error
-        Largest relative Euclidean error over the vectors it was made from.
+        Largest relative Euclidean error over the snapshots.
     """
 
     points: Indices
@@ -31,7 +31,7 @@ class Interpolation:
 
 
 def interpolate(snapshots: Array, tolerance: float) -> Interpolation:
-    """Discrete empirical interpolation of vectors (k×P), not all zero, with few terms.
+    """Discrete empirical interpolation of vectors (k×P), not all zero, to a tolerance.
 
     The modes are those of a singular value decomposition, the points those of a pivoted QR factorisation of the modes
     (Q-DEIM, Drmač and Gugercin 2016; of matrices, matrix DEIM, Negri, Manzoni and Amsallem 2015).
@@ -41,29 +41,31 @@ def interpolate(snapshots: Array, tolerance: float) -> Interpolation:
     snapshots
         One vector per column.
     tolerance
-        Largest error of any column, relative to the longest. Fewer terms are looked for by bisection, as if errors only
-        fell with them; they do on the whole.
+        Largest error of any column, relative to the longest. The number of terms is found by bisection; errors are not
+        monotone in it, so a smaller number may exist.
     """
     scale = float(np.linalg.norm(snapshots, axis=0).max())
     q, r = np.linalg.qr(snapshots)
     left, sigma, right = svd(r)
-    squares = np.cumsum(((sigma[:, None] * right) ** 2)[::-1], axis=0)[::-1]  # what k modes leave of every column
-    best = np.append(np.sqrt(squares.max(axis=1)), 0.0) / scale
+    squares = np.cumsum(((sigma[:, None] * right) ** 2)[::-1], axis=0)[
+        ::-1
+    ]  # squared error of projecting every column on k modes
+    projection = np.append(np.sqrt(squares.max(axis=1)), 0.0) / scale
     rank = max(1, int(np.count_nonzero(sigma > np.finfo(float).eps * sigma[0])))
-    low = min(rank, max(1, int(np.argmax(best <= tolerance))))  # no interpolation does with fewer
+    low = min(rank, max(1, int(np.argmax(projection <= tolerance))))  # interpolation is never better than projection
 
     def with_terms(count: int) -> Interpolation:
         return _with_terms(snapshots, q @ left[:, :count], scale)
 
-    found, step, high = with_terms(low), 1, low
+    found, step, high = with_terms(low), 1, low  # gallop upwards, since the projection error is a close guess
     while found.error > tolerance and high < rank:
         low, high, step = high + 1, min(high + step, rank), 2 * step
         found = with_terms(high)
     while found.error <= tolerance and low < high:
         middle = (low + high) // 2
-        tried = with_terms(middle)
-        if tried.error <= tolerance:
-            found, high = tried, middle
+        candidate = with_terms(middle)
+        if candidate.error <= tolerance:
+            found, high = candidate, middle
         else:
             low = middle + 1
     return found

@@ -10,9 +10,12 @@ on W⁺. What is left of ŝ lies in the polar cone, so sᵀλ ≤ ⟨π, λ⟩ =
 
     δ_r = ‖r‖_V',    δ_s1 = ‖π‖_W,    δ_s2 = ⟨π, λ_N⟩_W + max(0, −sᵀλ_N)
 
-(the last term vanishes where λ_N and u_N are exactly complementary):  α‖e‖² ≤ δ_r‖e‖ + δ_s1‖ε‖ + δ_s2. The inf-sup
-condition over the span, Bᵀε = r − A e, gives β‖ε‖ ≤ δ_r + γ_a‖e‖. Together, with c₁ = (δ_r + δ_s1 γ_a/β)/(2α) and
-c₂ = (δ_s1 δ_r/β + δ_s2)/α,
+(the last term vanishes where λ_N and u_N are exactly complementary, which an inexact QP solution is not):
+
+    α‖e‖² ≤ δ_r‖e‖ + δ_s1‖ε‖ + δ_s2.
+
+The inf-sup condition over the span and Bᵀε = r − A e give β‖ε‖ ≤ δ_r + γ_a‖e‖. Together, with
+c₁ = (δ_r + δ_s1 γ_a/β)/(2α) and c₂ = (δ_s1 δ_r/β + δ_s2)/α,
 
     ‖e‖_V ≤ Δ_u = c₁ + √(c₁² + c₂),        ‖ε‖_W ≤ Δ_λ = (δ_r + γ_a Δ_u)/β.
 """
@@ -32,7 +35,7 @@ from vibench.reduction import cones
 from vibench.stability.infsup import InfSup
 
 MARGIN = 1e-3
-"""Lanczos approaches eigenvalues from inside, to 1e-4; the constants are moved outwards by this share."""
+"""Lanczos approximates extreme eigenvalues from inside, to 1e-4; constants are moved outwards by this share."""
 
 
 @dataclass(frozen=True)
@@ -68,7 +71,7 @@ def extreme_quotients(A: SparseMatrix, V: InnerProduct) -> tuple[float, float]:
     NumericalError
         If A is not symmetric positive definite.
     """
-    if V.dim < 3:  # too small for Lanczos
+    if V.dim < 3:  # eigsh needs more dimensions than eigenvalues
         whitened = V.whiten_functional(V.whiten_functional(A.toarray()).T)
         values = np.linalg.eigvalsh(whitened)
         return (1.0 - MARGIN) * float(values[0]), (1.0 + MARGIN) * float(values[-1])
@@ -82,16 +85,17 @@ def extreme_quotients(A: SparseMatrix, V: InnerProduct) -> tuple[float, float]:
 
 
 def bounds(
-    problem: Problem, vis: Sequence[VariationalInequality], known: Sequence[Stability], u: Array, lam: Array
+    problem: Problem, vis: Sequence[VariationalInequality], constants: Sequence[Stability], u: Array, lam: Array
 ) -> list[Bounds | None]:
-    """Δ_u and Δ_λ of reduced u (n×P), λ (m×P), column by column at the parameters of `vis`; see the module.
+    """Δ_u and Δ_λ of reduced u (n×P), λ (m×P), column by column at the parameters of `vis`; see above.
 
     Infinite where β_HF over the span is zero; `None` where λ is not in W⁺ and nothing is certified.
     """
-    left = [vi.f - vi.A @ u[:, k] - vi.B.T @ lam[:, k] for k, vi in enumerate(vis)]
-    residuals = np.linalg.norm(problem.V.whiten_functional(np.column_stack(left)), axis=0)
+    residuals = np.column_stack([vi.f - vi.A @ u[:, k] - vi.B.T @ lam[:, k] for k, vi in enumerate(vis)])
+    dual_norms = np.linalg.norm(problem.V.whiten_functional(residuals), axis=0)
     return [
-        _bound(problem.W, vi.B @ u[:, k] - vi.g, lam[:, k], float(residuals[k]), known[k]) for k, vi in enumerate(vis)
+        _bound(problem.W, vi.B @ u[:, k] - vi.g, lam[:, k], float(dual_norms[k]), constants[k])
+        for k, vi in enumerate(vis)
     ]
 
 
@@ -103,8 +107,9 @@ def _bound(W: InnerProduct, excess: Array, lam: Array, residual: float, stabilit
     if beta <= 0.0:
         return Bounds(float("inf"), float("inf"))
     penetration = cones.project_on_orthant(excess, W)
-    size = float(W.norm(penetration))
-    mismatch = float(penetration @ W.apply(lam)) + max(0.0, -float(excess @ lam))
-    half = (residual + size * gamma / beta) / (2.0 * alpha)
-    bound = half + float(np.sqrt(half**2 + (size * residual / beta + mismatch) / alpha))
+    penetration_norm = float(W.norm(penetration))
+    complementarity = float(penetration @ W.apply(lam)) + max(0.0, -float(excess @ lam))
+    c_1 = (residual + penetration_norm * gamma / beta) / (2.0 * alpha)
+    c_2 = (penetration_norm * residual / beta + complementarity) / alpha
+    bound = c_1 + float(np.sqrt(c_1**2 + c_2))
     return Bounds(bound, (residual + gamma * bound) / beta)

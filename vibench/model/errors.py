@@ -24,24 +24,24 @@ class Reference:
     floor_lam: float
 
     def at(self, numbers: Sequence[int]) -> Reference:
-        """Those at some of the parameters."""
+        """The solutions at some of the parameters."""
         return Reference(self.u[:, numbers], self.lam[:, numbers], self.floor_u, self.floor_lam)
 
 
 @dataclass(frozen=True)
 class Errors:
-    """How far a reduced solution is from the high-fidelity one at the same parameter.
+    """Errors of one reduced solution against the high-fidelity one at the same parameter.
 
     Attributes
     ----------
     u, lam, energy
         Relative, in the norms of V, of W and of A(mu).
     absolute_u, absolute_lam
-        The first two before they are divided.
+        The first two without the division.
     violation
         Largest (B u_N − g)₊, each row over the integral of its multiplier function [unit of u].
     complementarity
-        λᵀ(B u_N − g) with the high-fidelity multiplier.
+        λᵀ(B u_N − g) with the high-fidelity multiplier; with λ_N it would only repeat the gap of the QP solver.
     """
 
     u: float
@@ -67,9 +67,9 @@ def errors(
         excess = vi.B @ u[:, k] - vi.g
         found.append(
             Errors(
-                u=_over(float(error_u[k]), float(norm_u[k])),
-                lam=_over(float(error_lam[k]), float(norm_lam[k])),
-                energy=_over(_energy(vi, du[:, k]), _energy(vi, reference.u[:, k])),
+                u=_relative(float(error_u[k]), float(norm_u[k])),
+                lam=_relative(float(error_lam[k]), float(norm_lam[k])),
+                energy=_relative(_energy(vi, du[:, k]), _energy(vi, reference.u[:, k])),
                 absolute_u=float(error_u[k]),
                 absolute_lam=float(error_lam[k]),
                 violation=float(np.max(excess / integrals, initial=0.0)),
@@ -83,5 +83,5 @@ def _energy(vi: VariationalInequality, u: Array) -> float:
     return float(np.sqrt(max(float(u @ (vi.A @ u)), 0.0)))
 
 
-def _over(value: float, scale: float) -> float:
+def _relative(value: float, scale: float) -> float:
     return value / scale if scale > 0.0 else value

@@ -1,4 +1,4 @@
-"""The reduced model: project, solve, reconstruct (paper, §2.2 and §2.3; MATH in the documentation, §4)."""
+"""Reduced models by Galerkin projection of the assembled high-fidelity problem (paper, §2.2 and §2.3)."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class ReducedProblem:
     lift
         From coordinates (N'×k) in the V-orthonormal primal basis Z at this parameter to vectors (n×k): u = Z x.
     factor
-        Cholesky factor (lower, N'×N') of A, where it is known beforehand.
+        Cholesky factor (lower, N'×N') of A, where it was computed offline.
     """
 
     program: VariationalInequality
@@ -42,7 +42,7 @@ class ReducedProblem:
 
 
 class ReducedModel:
-    """V_N + enrichment against a reduced cone.
+    """A reduced primal space, V_N and its enrichment, with a reduced multiplier cone.
 
     Parameters
     ----------
@@ -53,10 +53,10 @@ class ReducedModel:
     enrichment
         What the primal strategy adds.
     generators
-        χ (m×R), unit norm in W, all with nonnegative coefficients: those that are free stand there with either sign
-        (`Cone.rays`), so that their two inequalities make an equality.
+        χ (m×R), unit norm in W, all with nonnegative coefficients: a free generator appears with both signs
+        (`Cone.rays`), and its two inequalities are an equality.
     span
-        W-orthonormal basis of span χ (m×rank), what per-parameter enrichments are computed from.
+        W-orthonormal basis of span χ (m×rank), from which per-parameter enrichments are computed.
 
     Attributes
     ----------
@@ -82,7 +82,7 @@ class ReducedModel:
         if self._has_coordinates:
             return np.hstack([self.fixed_basis, self._contact.vectors(self._added(vi))])
         if enrichment.eta is not None:
-            whitened = V.whiten_functional(np.asarray(vi.B.T @ enrichment.eta))  # those of T(mu)η
+            whitened = V.whiten_functional(np.asarray(vi.B.T @ enrichment.eta))  # coordinates of T(mu)η
         elif enrichment.supply is not None:
             added = enrichment.supply(V, vi, self.span)
             if added.ndim != 2 or added.shape[0] != V.dim:
@@ -95,7 +95,7 @@ class ReducedModel:
         return np.hstack([self.fixed_basis, V.unwhiten(orthonormal_range(whitened, self._whitened_basis))])
 
     def lift(self, mu: Array, vi: VariationalInequality, x: Array) -> Array:  # noqa: ARG002
-        """Vectors u = Z x (n×k) with coordinates x (N'×k) at mu, where `vi` is assembled."""
+        """Vectors u = Z x (n×k) with coordinates x (N'×k) at mu, with `vi` assembled there."""
         if not self._has_coordinates:
             return np.asarray(self.primal_basis(vi) @ x)
         count = self.fixed_basis.shape[1]
@@ -110,7 +110,7 @@ class ReducedModel:
 
     @property
     def _has_coordinates(self) -> bool:
-        """Whether V_N and all supremizers have coordinates in which bases are found without vectors of mesh size."""
+        """Whether supremizers are orthonormalised in coordinates of contact size instead of vectors of mesh size."""
         return self.enrichment.eta is not None and self.problem.contact_dofs is not None
 
     def _added(self, vi: VariationalInequality) -> Array:
@@ -124,9 +124,9 @@ class ReducedModel:
 
     @cached_property
     def _contact(self) -> ContactCoordinates:
-        """Coordinates of V_N and of all supremizers of a problem that says what its constraint touches."""
+        """Coordinates in V_N and all supremizers of a problem that declares its contact unknowns."""
         V, dofs = self.problem.V, self.problem.contact_dofs
-        assert dofs is not None  # asked for in this case alone
+        assert dofs is not None  # `_has_coordinates`
         return ContactCoordinates(V, self.fixed_basis, dofs)
 
     @cached_property
@@ -139,12 +139,12 @@ class ReducedModel:
         Raises
         ------
         NumericalError
-            If what the problem assembles has the wrong shape or values that are not finite.
+            If an assembled member has the wrong shape or values that are not finite.
         """
         return self.reduce(checked_assembly(self.problem, mu))
 
     def reduce(self, vi: VariationalInequality) -> ReducedProblem:
-        """Project what the problem assembled at a parameter."""
+        """Galerkin projection of an assembled variational inequality."""
         Z = self.primal_basis(vi)
         return ReducedProblem(project(vi, Z, self.generators), partial(np.matmul, Z))
 
@@ -155,7 +155,7 @@ def project(vi: VariationalInequality, Z: Array, chi: Array) -> VariationalInequ
     return VariationalInequality(A=0.5 * (A + A.T), f=Z.T @ vi.f, B=chi.T @ np.asarray(vi.B @ Z), g=chi.T @ vi.g)
 
 
-def beginning(program: VariationalInequality, size: int) -> VariationalInequality:
-    """The program on the first `size` vectors of a basis, out of that on all of them."""
+def leading_part(program: VariationalInequality, size: int) -> VariationalInequality:
+    """The program on the first `size` vectors of a nested basis, from the program on all of them."""
     A, B = (np.ascontiguousarray(member) for member in (program.A[:size, :size], program.B[:, :size]))
     return VariationalInequality(A, program.f[:size].copy(), B, program.g)

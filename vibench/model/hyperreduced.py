@@ -1,4 +1,4 @@
-"""Reduced models whose queries touch no array of mesh size (equations (8) and (9) of the paper, assembled online)."""
+"""Hyper-reduced models: equations (8) and (9) of the paper assembled online without arrays of mesh size."""
 
 from __future__ import annotations
 
@@ -14,28 +14,28 @@ from vibench.errors import NumericalError
 from vibench.interfaces.problem import MEMBERS, Contact, Problem, Sampler, VariationalInequality
 from vibench.interfaces.strategies import Kind
 from vibench.linalg.dense import orthonormal_range
-from vibench.model.affine import Evaluation, Member
+from vibench.model.affine import AffineMember, Evaluation
 from vibench.model.galerkin import ReducedModel, ReducedProblem
 from vibench.reduction.supremizers import ContactCoordinates, Coordinates, SpannedCoordinates, supremizers
 
 Samples = Mapping[str, Array]
-"""Values of sampled entries at one parameter, by member."""
+"""Values θ of the sampled entries at one parameter, by member."""
 
 
 @dataclass(frozen=True)
-class Projected:
+class ProjectedMember:
     """A member in reduced coordinates: Σ_q θ_q(mu) · terms_q, or a constant.
 
     Attributes
     ----------
     terms
-        Flattened terms (Q×size), packed where they are symmetric.
+        Flattened terms (Q×size); symmetric ones are stored as upper triangles.
     shape
         Shape of the member.
     constant
         Whether the only term is the member itself.
     unpack
-        Where the entries of a symmetric matrix are in its packed form (d²,); `None` where nothing is packed.
+        Positions of the entries of a symmetric matrix in its packed triangle (d²,); `None` for full storage.
     """
 
     terms: Array
@@ -44,14 +44,14 @@ class Projected:
     unpack: Indices | None = None
 
     @classmethod
-    def of(cls, terms: list[Array], member: Member) -> Projected:
-        """Pack projected terms."""
+    def of(cls, terms: list[Array], member: AffineMember) -> ProjectedMember:
+        """A member from its projected terms."""
         shape = terms[0].shape
         return cls(np.array([term.ravel() for term in terms]), shape, member.way is Evaluation.CONSTANT)
 
     @classmethod
-    def symmetric(cls, terms: list[Array], member: Member) -> Projected:
-        """Pack projected symmetric terms (d×d)."""
+    def symmetric(cls, terms: list[Array], member: AffineMember) -> ProjectedMember:
+        """A symmetric member from its projected terms (d×d)."""
         d = terms[0].shape[0]
         upper = np.triu_indices(d)
         where = np.empty((d, d), dtype=np.intp)
@@ -60,13 +60,13 @@ class Projected:
         return cls(packed, (d, d), member.way is Evaluation.CONSTANT, where.ravel())
 
     def at(self, theta: Array | None) -> Array:
-        """The member where its samples are θ (Q,)."""
+        """The member with coefficients θ (Q,)."""
         if self.constant or theta is None:
-            return self._only
+            return self._constant_value
         return self._unpacked(theta @ self.terms)
 
     @cached_property
-    def _only(self) -> Array:
+    def _constant_value(self) -> Array:
         return self._unpacked(self.terms[0])
 
     def _unpacked(self, flat: Array) -> Array:
@@ -75,99 +75,106 @@ class Projected:
 
 @dataclass(frozen=True)
 class Operators:
-    """What a query without arrays of mesh size needs: a space Φ of dimension d, and the members on it.
+    """Offline data of a hyper-reduced model: a space Φ of dimension d and the members projected on it.
 
     Attributes
     ----------
-    wanted
-        Entries of the members to be sampled at a parameter: rows and columns by member.
+    sampled_entries
+        Entries of the members that are evaluated at a parameter: rows and columns by member.
     A, f
         Stiffness (d×d) and load (d,) on Φ.
     g
-        Bound (R,); `None` where it comes with the contact.
+        Bound (R,); `None` where it is evaluated by `Problem.contact`.
     B
-        Constraint on generators and on Φ (R×d), or on (η, χ) and Φ for enrichments that vary ((k+R)×d); `None` where it
-        comes with the contact.
-    on_contact
-        Φ on the contact unknowns (|E|×d), where a fixed space meets a constraint assembled there.
-    varying
-        Coordinates of Φ where the enrichment varies in it, else `None`.
+        Constraint (R×d) on the generators χ, or ((k+R)×d) on (η, χ) for a per-parameter enrichment; `None` where it is
+        evaluated by `Problem.contact`.
+    contact_basis
+        Rows of Φ at the contact unknowns (|E|×d), for a fixed space and a constraint from `Problem.contact`.
+    supremizer_coordinates
+        Coordinates of Φ = V_N + supremizers for a per-parameter enrichment that varies in it, else `None`.
     basis
-        Φ itself (n×d), for reconstruction, where it is neither `varying` nor the model's fixed basis.
+        Φ itself (n×d), for reconstruction, where it is neither of the above nor the model's fixed basis.
     factor
-        Cholesky factor (lower, d×d) of a stiffness that does not depend on the parameter, on a fixed space of no fewer
-        dimensions than there are generators, which are independent.
+        Cholesky factor (lower, d×d) of a constant stiffness on a fixed space, for queries that solve the dual program.
+        `None` for more than d or linearly dependent generators, with which the dual is singular.
     """
 
-    wanted: Mapping[str, tuple[Indices, Indices]]
-    A: Projected
-    f: Projected
-    g: Projected | None
-    B: Projected | None
-    on_contact: Array | None
-    varying: Coordinates | None
+    sampled_entries: Mapping[str, tuple[Indices, Indices]]
+    A: ProjectedMember
+    f: ProjectedMember
+    g: ProjectedMember | None
+    B: ProjectedMember | None
+    contact_basis: Array | None
+    supremizer_coordinates: Coordinates | None
     basis: Array | None
     factor: Array | None
 
 
-def why_in_full(model: ReducedModel, members: Mapping[str, Member]) -> str:
-    """Why queries of a model have to be assembled in full; "" if they have not."""
+def reason_for_full_assembly(model: ReducedModel, members: Mapping[str, AffineMember]) -> str:
+    """Why the model has to be assembled in full, as the paper does; "" if it can be hyper-reduced."""
     if model.enrichment.supply is not None:
-        return "the enrichment varies with mu in a way of its own"
-    return "; ".join(members[name].why for name in MEMBERS if members[name].way is Evaluation.FULL)
+        return "the enrichment computes its own vectors at every mu"
+    return "; ".join(members[name].reason for name in MEMBERS if members[name].way is Evaluation.FULL)
 
 
-def project_members(model: ReducedModel, members: Mapping[str, Member]) -> Operators:
-    """Project the members of a problem on what its reduced model lives in; see `why_in_full`."""
+def hyper_reduce(model: ReducedModel, members: Mapping[str, AffineMember]) -> Operators:
+    """Project the affine members of a problem on the space of its reduced model; see `reason_for_full_assembly`."""
     problem, chi, eta = model.problem, model.generators, model.enrichment.eta
-    varying = None if eta is None or len(members["B"].terms) == 1 else _supremizer_space(model, members["B"], eta)
+    # where B has one term, all supremizer spaces coincide and the enrichment is a fixed one
+    coordinates = None if eta is None or len(members["B"].terms) == 1 else _supremizer_space(model, members["B"], eta)
     Z = basis = None
-    if varying is not None and eta is not None:
-        Z, chi = varying.vectors(np.eye(varying.plain.shape[0])), np.hstack([eta, chi])
+    if coordinates is not None and eta is not None:
+        Z, chi = coordinates.vectors(np.eye(coordinates.plain.shape[0])), np.hstack([eta, chi])
     elif eta is not None:
         B = members["B"].terms[0]
         basis = Z = model.primal_basis(VariationalInequality(A=None, f=np.zeros(0), B=B, g=np.zeros(0)))
     else:
         Z = model.fixed_basis
-    A = Projected.symmetric([Z.T @ np.asarray(term @ Z) for term in members["A"].terms], members["A"])
+    A = ProjectedMember.symmetric([Z.T @ np.asarray(term @ Z) for term in members["A"].terms], members["A"])
     contact = members["B"].way is Evaluation.CONTACT
     count, rank = model.generators.shape[1], model.span.shape[1]
-    through_dual = A.constant and varying is None and A.shape[0] >= count == rank > 0  # or the dual is singular
+    dual_is_regular = A.constant and coordinates is None and A.shape[0] >= count == rank > 0
     return Operators(
-        wanted={name: (m.rows, m.columns) for name, m in members.items() if m.way is Evaluation.INTERPOLATED},
+        sampled_entries={name: (m.rows, m.columns) for name, m in members.items() if m.way is Evaluation.INTERPOLATED},
         A=A,
-        f=Projected.of([Z.T @ term for term in members["f"].terms], members["f"]),
+        f=ProjectedMember.of([Z.T @ term for term in members["f"].terms], members["f"]),
         g=_bound(members["g"], model.generators),
-        B=None if contact else Projected.of([chi.T @ np.asarray(B @ Z) for B in members["B"].terms], members["B"]),
-        on_contact=np.ascontiguousarray(Z[problem.contact_dofs]) if contact and varying is None else None,
-        varying=varying,
+        B=None
+        if contact
+        else ProjectedMember.of([chi.T @ np.asarray(B @ Z) for B in members["B"].terms], members["B"]),
+        contact_basis=np.ascontiguousarray(Z[problem.contact_dofs]) if contact and coordinates is None else None,
+        supremizer_coordinates=coordinates,
         basis=basis,
-        factor=scipy.linalg.cholesky(A.at(None), lower=True) if through_dual else None,
+        factor=scipy.linalg.cholesky(A.at(None), lower=True) if dual_is_regular else None,
     )
 
 
-def _bound(member: Member, chi: Array) -> Projected | None:
-    return None if member.way is Evaluation.CONTACT else Projected.of([chi.T @ term for term in member.terms], member)
+def _bound(member: AffineMember, chi: Array) -> ProjectedMember | None:
+    return (
+        None
+        if member.way is Evaluation.CONTACT
+        else ProjectedMember.of([chi.T @ term for term in member.terms], member)
+    )
 
 
-def _supremizer_space(model: ReducedModel, B: Member, eta: Array) -> Coordinates:
+def _supremizer_space(model: ReducedModel, B: AffineMember, eta: Array) -> Coordinates:
     """Coordinates of V_N and of the supremizers of η at any parameter."""
     V, basis = model.problem.V, model.fixed_basis
     if B.way is Evaluation.CONTACT:
-        assert model.problem.contact_dofs is not None  # what this way means
+        assert model.problem.contact_dofs is not None  # implied by `Evaluation.CONTACT`
         return ContactCoordinates(V, basis, model.problem.contact_dofs)
     return SpannedCoordinates(V, basis, np.hstack([supremizers(V, term, eta) for term in B.terms]))
 
 
-class OnlineModel:
-    """A reduced model ready for queries that touch no array of mesh size.
+class HyperReducedModel:
+    """A reduced model whose queries use no array of mesh size.
 
     Parameters
     ----------
     model
-        The model it makes queries of.
+        The reduced model.
     operators
-        Its members, projected.
+        Its offline data, from `hyper_reduce`.
     """
 
     def __init__(self, model: ReducedModel, operators: Operators) -> None:
@@ -181,8 +188,8 @@ class OnlineModel:
 
     @cached_property
     def _sampler(self) -> Sampler:
-        wanted = self._operators.wanted
-        return self.problem.sampler(wanted) if wanted else lambda _: {}
+        entries = self._operators.sampled_entries
+        return self.problem.sampler(entries) if entries else lambda _: {}
 
     @property
     def generators(self) -> Array:
@@ -196,8 +203,8 @@ class OnlineModel:
 
     @property
     def kind(self) -> Kind:
-        """How the enrichment depends on the parameter, in the coordinates that queries work in."""
-        return Kind.FIXED if self._operators.varying is None else Kind.PER_PARAMETER
+        """How the enrichment depends on the parameter, in the coordinates of the queries."""
+        return Kind.FIXED if self._operators.supremizer_coordinates is None else Kind.PER_PARAMETER
 
     def assemble(self, mu: Array) -> ReducedProblem:
         """The reduced problem at mu (d,).
@@ -205,17 +212,17 @@ class OnlineModel:
         Raises
         ------
         NumericalError
-            If values that are not finite come out.
+            If the reduced problem has entries that are not finite.
         """
         operators = self._operators
         samples = self._sampler(mu)
         contact = self.problem.contact(mu) if operators.B is None or operators.g is None else None
         A, f = operators.A.at(samples.get("A")), operators.f.at(samples.get("f"))
-        g = operators.g.at(samples.get("g")) if operators.g is not None else _on_generators(self.model, contact)
-        if operators.varying is not None:
-            Y, B = self._enriched(operators.varying, samples, contact)
-            A, f, B = _congruent(A, Y), Y.T @ f, B @ Y
-            lift = partial(_lifted, operators.varying, Y)
+        g = operators.g.at(samples.get("g")) if operators.g is not None else _projected_bound(self.model, contact)
+        if operators.supremizer_coordinates is not None:
+            Y, B = self._enriched(operators.supremizer_coordinates, samples, contact)
+            A, f, B = _symmetric_product(A, Y), Y.T @ f, B @ Y
+            lift = partial(_lift, operators.supremizer_coordinates, Y)
         else:
             B = self._constraint(samples, contact)
             Z = operators.basis if operators.basis is not None else self.model.fixed_basis
@@ -225,20 +232,20 @@ class OnlineModel:
         return ReducedProblem(VariationalInequality(A, f, B, g), lift, operators.factor)
 
     def lift(self, mu: Array, vi: VariationalInequality, x: Array) -> Array:  # noqa: ARG002
-        """Vectors u = Z x (n×k) with coordinates x (N'×k) at mu, which only a reconstruction needs."""
+        """Vectors u = Z x (n×k) with coordinates x (N'×k) at mu, for reconstruction; it assembles again."""
         return self.assemble(mu).lift(x)
 
     def _constraint(self, samples: Samples, contact: Contact | None) -> Array:
         operators = self._operators
         if operators.B is not None:
             return operators.B.at(samples.get("B"))
-        assert contact is not None and operators.on_contact is not None  # noqa: PT018  what `project_members` provides
-        return np.asarray(self.model.generators.T @ (contact.B @ operators.on_contact))
+        assert contact is not None and operators.contact_basis is not None  # noqa: PT018  set by `hyper_reduce`
+        return np.asarray(self.model.generators.T @ (contact.B @ operators.contact_basis))
 
     def _enriched(self, space: Coordinates, samples: Samples, contact: Contact | None) -> tuple[Array, Array]:
         """Orthonormal coordinates Y (d×N') of V_N and the supremizers, and the constraint (R×d) in coordinates."""
         eta = self.model.enrichment.eta
-        assert eta is not None  # only such an enrichment varies in a space of coordinates
+        assert eta is not None  # implied by `supremizer_coordinates`
         if isinstance(space, ContactCoordinates) and contact is not None:
             represented = space.supremizers(np.asarray(contact.B.T @ np.hstack([eta, self.model.generators])))
         else:
@@ -249,16 +256,16 @@ class OnlineModel:
         return np.hstack([space.plain, added]), represented[:, k:].T
 
 
-def _lifted(space: Coordinates, Y: Array, x: Array) -> Array:
+def _lift(space: Coordinates, Y: Array, x: Array) -> Array:
     """Vectors (n×k) from coordinates (N'×k) in an orthonormal basis with coordinates Y (d×N')."""
     return space.vectors(Y @ x)
 
 
-def _on_generators(model: ReducedModel, contact: Contact | None) -> Array:
-    assert contact is not None  # what `OnlineModel.assemble` asked for
+def _projected_bound(model: ReducedModel, contact: Contact | None) -> Array:
+    assert contact is not None  # evaluated by `HyperReducedModel.assemble`
     return np.asarray(model.generators.T @ contact.g)
 
 
-def _congruent(A: Array, Y: Array) -> Array:
+def _symmetric_product(A: Array, Y: Array) -> Array:
     found = Y.T @ (A @ Y)
     return np.asarray(0.5 * (found + found.T))

@@ -1,1 +1,1 @@
-"""Quadratic programs: one call for all QP solvers, their settings, KKT verification, and what an accuracy allows."""
+"""Quadratic programs: solvers and their settings, KKT verification, and a bound on how far two solutions may differ."""

@@ -1,13 +1,13 @@
-"""The disagreement audit: solvers that are both `ok` on the same reduced problem must agree as far as accuracy says.
+"""How far apart two solutions of one quadratic program can be when the KKT residuals of both meet an accuracy.
 
 For two solutions k = 1, 2 of min ½xᵀAx − fᵀx, Bx ≤ g, with α_k ≥ 0, residuals r_k = Ax_k − f + Bᵀα_k, excesses
 p_k = (Bx_k − g)₊ and gaps δ_k = x_kᵀAx_k − fᵀx_k + gᵀα_k, the difference d = x₁ − x₂ satisfies
 
     dᵀAd ≤ dᵀ(r₁ − r₂) + Σ_k (δ_k − x_kᵀr_k) + p₁ᵀα₂ + p₂ᵀα₁.
 
-Where every relative residual is at most ε, each term has a bound that belongs to one of the two solutions; with the
-smallest eigenvalue of A they give ‖d‖² ≤ (l₁ + l₂)‖d‖ + c₁ + c₂. In a V-orthonormal basis ‖d‖ is the distance of the
-two displacements in V.
+Where every relative residual is at most ε, each term is bounded by data of one solution alone. With the smallest
+eigenvalue of A this gives ‖d‖² ≤ (l₁ + l₂)‖d‖ + c₁ + c₂. In a V-orthonormal basis ‖d‖ is the distance of the two
+displacements in V. Solvers that are `ok` on the same reduced problem and farther apart reveal a bug.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from vibench.qp.verification import scales
 
 @dataclass(frozen=True)
 class Slack:
-    """What an accuracy leaves open around one solution: its shares l and c of the bound above."""
+    """The terms l and c of one solution in the bound above."""
 
     linear: float
     constant: float
@@ -42,6 +42,6 @@ def slack(program: VariationalInequality, x: Array, alpha: Array, accuracy: floa
 
 
 def allowed(first: Slack, second: Slack) -> float:
-    """The largest ‖x₁ − x₂‖ that two slacks allow."""
+    """The largest ‖x₁ − x₂‖ compatible with the slacks of both solutions."""
     half = 0.5 * (first.linear + second.linear)
     return float(half + np.sqrt(half**2 + first.constant + second.constant))

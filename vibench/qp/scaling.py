@@ -1,4 +1,4 @@
-"""How quadratic programs are scaled."""
+"""Norms by which quadratic programs and their residuals are scaled."""
 
 from __future__ import annotations
 
@@ -20,5 +20,5 @@ def peak(vector: Array) -> float:
 
 
 def size(vector: Array) -> float:
-    """What a vector is divided by to have a largest entry of 1; 1 for zero."""
+    """Largest entry in absolute value, or 1 for the zero vector: a safe divisor."""
     return peak(vector) or 1.0

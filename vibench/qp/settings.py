@@ -1,7 +1,8 @@
-"""The one table that says, for every QP solver, how to ask for an accuracy and how to read its report.
+"""Settings of the QP solvers: keyword arguments for an accuracy, and where each solver reports its status.
 
-A new solver of qpsolvers is one entry here. Tolerances are relative; `solve_qp` scales the data so that absolute
-tolerances mean the same; the gap has no natural scale, its absolute tolerance is kept far below the relative one.
+A new solver of qpsolvers is one entry here. Accuracies are relative. `solve_qp` scales the data so that absolute
+tolerances are equivalent. The duality gap has no natural scale; its absolute tolerance is far below the relative one.
+Tolerances are tighter than the accuracy, because solvers measure residuals in norms and scalings of their own.
 """
 
 from __future__ import annotations
@@ -17,16 +18,16 @@ from vibench.arrays import Array
 
 @dataclass(frozen=True)
 class SolverSettings:
-    """How to talk to one solver.
+    """Settings of one solver.
 
     Attributes
     ----------
     settings
         Keyword arguments for an accuracy.
     start
-        Further keyword arguments for a solution x (n,), α (m,) of a similar program to start from, if it takes one.
+        Keyword arguments for a warm start from x (n,), α (m,), if the solver has one.
     status, iterations
-        Paths into `solution.extras` ("info.status") where the solver leaves its own words, "" where it leaves none.
+        Paths into `solution.extras`, as "info.status"; "" where the solver reports none.
     """
 
     settings: Callable[[float], Mapping[str, Any]]
@@ -35,7 +36,7 @@ class SolverSettings:
     start: Callable[[Array, Array], Mapping[str, Any]] | None = None
 
     def report(self, solution: Any) -> tuple[str, int | None]:
-        """Status in the solver's words and its number of iterations."""
+        """Status as the solver reports it, and its number of iterations."""
         status = _follow(solution.extras, self.status)
         text = ("found" if solution.found else "not found") if status is None else str(status)
         count = _follow(solution.extras, self.iterations)
@@ -52,8 +53,8 @@ def _follow(extras: Mapping[str, Any], path: str) -> Any:
 
 
 def _proxqp_start(x: Array, alpha: Array) -> dict[str, Any]:
-    """Both parts of the solution; without `initial_guess` it would begin with a solution of its own."""
-    from proxsuite import proxqp  # noqa: PLC0415  the solver may be missing; others run without it
+    """A primal and dual warm start; without `initial_guess` ProxQP would start from a guess of its own."""
+    from proxsuite import proxqp  # noqa: PLC0415  an optional solver
 
     return {"initvals": x, "z": alpha, "initial_guess": proxqp.InitialGuess.WARM_START}
 
@@ -84,7 +85,7 @@ SETTINGS: Mapping[str, SolverSettings] = {
         iterations="info.iter",
         start=_proxqp_start,
     ),
-    "osqp": SolverSettings(  # a first-order method: its iteration limit decides between slow and inaccurate
+    "osqp": SolverSettings(  # a first-order method; the iteration limit trades time for accuracy
         lambda accuracy: {"eps_abs": 0.1 * accuracy, "eps_rel": 0.3 * accuracy, "max_iter": 10_000},
         status="info.status",
         iterations="info.iter",
@@ -118,11 +119,11 @@ SETTINGS: Mapping[str, SolverSettings] = {
 
 
 def settings_for(solver: str, accuracy: float) -> dict[str, Any]:
-    """Keyword arguments that ask `solver` for a relative accuracy."""
+    """Keyword arguments of `solver` for a relative accuracy."""
     return dict(SETTINGS[solver].settings(accuracy))
 
 
 def start_for(solver: str, x: Array, alpha: Array) -> dict[str, Any]:
-    """Keyword arguments that let `solver` start from x (n,), α (m,); none if it cannot."""
+    """Keyword arguments of `solver` for a warm start from x (n,), α (m,); none if it has no warm start."""
     start = SETTINGS[solver].start
     return {} if start is None else dict(start(x, alpha))

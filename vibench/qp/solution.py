@@ -1,4 +1,4 @@
-"""What a QP solver returns."""
+"""The solution of a QP solver, and the interface of solvers from plugins."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from vibench.interfaces.problem import VariationalInequality
 
 @dataclass(frozen=True)
 class QPSolution:
-    """What a solver claims: x (n,), multipliers α (m,) with A x + Bᵀα = f, its own status and iteration count.
+    """Unverified result of a solver: x (n,), multipliers α (m,) with A x + Bᵀα = f, its status and iteration count.
 
-    `solve` sets negative multipliers to zero; `negative` is how negative the worst of them was.
+    `solve_qp` sets negative multipliers to zero; `negative` is the largest absolute value among them.
     """
 
     x: Array | None
@@ -24,7 +24,7 @@ class QPSolution:
 
 
 class QPSolver(Protocol):
-    """What the entry point group `vibench.qp_solvers` registers: a solver qpsolvers does not have."""
+    """A solver registered through the entry point group `vibench.qp_solvers`."""
 
     def __call__(self, program: VariationalInequality, accuracy: float) -> QPSolution:
-        """Solve to the relative accuracy asked for."""
+        """Solve to a relative accuracy."""

@@ -1,4 +1,4 @@
-"""The one door to quadratic programming solvers; nothing that comes back through it is believed unverified.
+"""One call for all QP solvers; its solutions are unverified until `vibench.qp.verification` has classified them.
 
 A quadratic program is a `VariationalInequality`, dense or sparse: min ½ xᵀA x − fᵀx subject to B x ≤ g, with
 multipliers α ≥ 0 such that A x + Bᵀα = f.
@@ -32,10 +32,10 @@ def solve_qp(
     factor: Array | None = None,
     start: QPSolution | None = None,
 ) -> QPSolution:
-    """Solve a quadratic program with a solver known by name.
+    """Solve a quadratic program with a named solver.
 
     The data are scaled first, every constraint row to unit norm and the objective to ‖f‖∞ = 1, so that the absolute
-    tolerances of the solvers mean what the residuals of the benchmark measure; the answer is scaled back.
+    tolerances of the solvers correspond to the relative residuals of the benchmark. The solution is scaled back.
 
     Parameters
     ----------
@@ -44,23 +44,23 @@ def solve_qp(
     solver
         A name that qpsolvers knows, or one of `extra`.
     accuracy
-        Relative accuracy, passed on in the solver's own words (`vibench.qp.settings`).
+        Relative accuracy, translated to the solver's tolerances by `vibench.qp.settings`.
     extra
         Solvers registered through the entry point group `vibench.qp_solvers`.
     factor
-        Cholesky factor (lower) of a dense A, where it is known: what is solved then is the dual.
+        Cholesky factor (lower) of a dense A, if known: the dual program is solved then.
     start
-        Solution of a similar program with as many unknowns and constraints, for solvers that `takes_start`.
+        Warm start of the same dimensions, for solvers with `takes_start`.
 
     Raises
     ------
     NumericalError
-        If what the solver returns is not a `QPSolution`, or has the wrong shape.
+        If the solver does not return a `QPSolution` of the right shapes.
     """
     if not len(program.f):
         return QPSolution(np.zeros(0), np.zeros(len(program.g)), "nothing to solve: no unknowns")
     if factor is not None:
-        return _through_the_dual(program, factor, solver, accuracy, extra, start)
+        return _solve_dual(program, factor, solver, accuracy, extra, start)
     rows, cost = row_norms(program.B), size(program.f)
     scaled = VariationalInequality(program.A / cost, program.f / cost, _divide_rows(program.B, rows), program.g / rows)
     if extra and solver in extra:
@@ -68,10 +68,10 @@ def solve_qp(
         if not isinstance(answer, QPSolution):
             raise NumericalError(f"the solver returned a {type(answer).__name__}, expected a QPSolution")
     else:
-        begin: Mapping[str, Any] = {}
+        warm_start: Mapping[str, Any] = {}
         if start is not None and takes_start(solver) and start.x is not None and start.alpha is not None:
-            begin = start_for(solver, start.x, rows * start.alpha / cost)
-        answer = _through_qpsolvers(scaled, solver, accuracy, begin)
+            warm_start = start_for(solver, start.x, rows * start.alpha / cost)
+        answer = _call_qpsolvers(scaled, solver, accuracy, warm_start)
     for name, value, count in (("x", answer.x, len(program.f)), ("α", answer.alpha, len(program.g))):
         if value is not None and value.shape != (count,):
             raise NumericalError(f"the solver returned {name} of shape {value.shape}, expected ({count},)")
@@ -84,7 +84,7 @@ def solve_qp(
     return replace(answer, alpha=np.maximum(alpha, 0.0), negative=-min(float(np.min(alpha, initial=0.0)), 0.0))
 
 
-def _through_the_dual(
+def _solve_dual(
     program: VariationalInequality,
     factor: Array,
     solver: str,
@@ -92,14 +92,14 @@ def _through_the_dual(
     extra: Mapping[str, QPSolver] | None,
     start: QPSolution | None,
 ) -> QPSolution:
-    """Solution of a dense program with A = L Lᵀ through its dual, in as many unknowns as there are constraints.
+    """Solve a dense program with A = L Lᵀ through its dual, which has one unknown per constraint.
 
     The multipliers minimise ½ αᵀ(B A⁻¹Bᵀ)α − (B A⁻¹f − g)ᵀα over α ≥ 0; then x = A⁻¹(f − Bᵀα).
     """
-    rows = row_norms(program.B)  # the dual would have their squares
+    rows = row_norms(program.B)  # scaled before products: the matrix of the dual has their squares
     right = np.column_stack([(program.B / rows[:, None]).T, program.f])
-    half = scipy.linalg.solve_triangular(factor, right, lower=True, check_finite=False)
-    constraints, load = half[:, :-1], half[:, -1]
+    whitened = scipy.linalg.solve_triangular(factor, right, lower=True, check_finite=False)
+    constraints, load = whitened[:, :-1], whitened[:, -1]
     count = len(program.g)
     dual = VariationalInequality(
         A=constraints.T @ constraints,
@@ -120,28 +120,28 @@ def _through_the_dual(
 
 
 def installed_solvers(extra: Iterable[str] = ()) -> list[str]:
-    """Names of the solvers that can be run here; `extra` are those that plugins register."""
+    """Names of the installed solvers, with those that plugins register as `extra`."""
     return sorted(set(qpsolvers.available_solvers) & set(SETTINGS) | set(extra))
 
 
 def check_solver_name(solver: str, extra: Iterable[str] = ()) -> None:
-    """Refuse a name that neither the settings table nor a plugin knows (installed or not is another question)."""
+    """Refuse a name that is neither in the settings table nor registered by a plugin, installed or not."""
     known = set(SETTINGS) | set(extra)
     if solver not in known:
         raise unknown_name("QP solver", solver, known)
 
 
 def takes_start(solver: str) -> bool:
-    """Whether a solver makes use of a solution to start from."""
+    """Whether a solver can be warm-started."""
     return solver in SETTINGS and SETTINGS[solver].start is not None
 
 
-def _through_qpsolvers(
+def _call_qpsolvers(
     program: VariationalInequality, solver: str, accuracy: float, start: Mapping[str, Any]
 ) -> QPSolution:
-    problem = qpsolvers.Problem(_plain(program.A), -program.f, _plain(program.B), program.g)
+    problem = qpsolvers.Problem(_as_csc(program.A), -program.f, _as_csc(program.B), program.g)
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # statuses come through the answer, and are verified by `judge`
+        warnings.simplefilter("ignore")  # the status is part of the solution, which is verified later
         solution = qpsolvers.solve_problem(problem, solver=solver, **settings_for(solver, accuracy), **start)
     status, iterations = SETTINGS[solver].report(solution)
     if solution.x is None or solution.z is None:
@@ -149,8 +149,8 @@ def _through_qpsolvers(
     return QPSolution(np.asarray(solution.x, float), np.asarray(solution.z, float), status, iterations)
 
 
-def _plain(matrix: Any) -> Any:
-    """Dense arrays as they are, sparse ones as the CSC matrices solvers ask for."""
+def _as_csc(matrix: Any) -> Any:
+    """Dense arrays as they are, sparse ones as the CSC matrices that qpsolvers expects."""
     return matrix if isinstance(matrix, np.ndarray) else sp.csc_matrix(matrix)
 
 

@@ -1,4 +1,4 @@
-"""What becomes of a query."""
+"""The status of a query."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from enum import StrEnum
 
 
 class Status(StrEnum):
-    """What became of a query, from good to bad; the order is the severity a cell inherits."""
+    """Status of a query, by increasing severity; a cell has the most severe one of its queries."""
 
     OK = "ok"
     INACCURATE = "inaccurate"

@@ -1,4 +1,4 @@
-"""What a solver's answer is worth: residuals, and a status that rests on them alone, whatever the solver claims."""
+"""KKT verification: residuals recomputed from the solution, and a status from them alone, not from the solver."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from vibench.qp.solution import QPSolution
 from vibench.qp.status import Status
 
 ENERGY_FLOOR = 1e-4
-"""The gap is relative to no less than this share of the energy that a steepest descent step would gain."""
+"""Share of the energy gained by a step of steepest descent below which the scale of the gap never falls."""
 
 
 @dataclass(frozen=True)
 class Residuals:
-    """Relative residuals as the benchmark computes them, whatever the solver claims.
+    """Relative KKT residuals, recomputed from the solution.
 
     Attributes
     ----------
@@ -29,8 +29,8 @@ class Residuals:
         ‖A x − f + Bᵀα‖∞ over max(‖A x‖∞, ‖f‖∞, ‖Bᵀα‖∞).
     gap
         |xᵀA x − fᵀx + gᵀα| over max(|½ xᵀA x|, |fᵀx|, |gᵀα|, `ENERGY_FLOOR` (fᵀf)² / 2fᵀA f). The last term is a share
-        of what one step of steepest descent from 0 gains: where constraints leave next to nothing of that energy, the
-        others are round-off.
+        of the energy gained by one step of steepest descent from 0: where the constraints admit almost no displacement,
+        the other terms are round-off.
     """
 
     primal: float
@@ -45,7 +45,7 @@ class Residuals:
 
 @dataclass(frozen=True)
 class Scales:
-    """What the residuals of a solution are relative to; the primal one in units of each row's own norm."""
+    """Denominators of the residuals of a solution; the primal one in units of each row's own norm."""
 
     primal: float
     dual: float
@@ -54,7 +54,7 @@ class Scales:
 
 @dataclass(frozen=True)
 class _Products:
-    """What scales and residuals of x (n,), α (m,) are made from: norms of the rows of B (m,), A x and Bᵀα (n,)."""
+    """Products that scales and residuals of x (n,), α (m,) share: row norms of B (m,), A x and Bᵀα (n,)."""
 
     norms: Array
     Ax: Array
@@ -70,19 +70,22 @@ def scales(program: VariationalInequality, x: Array, alpha: Array) -> Scales:
     return _scales(program, x, alpha, _Products.of(program, x, alpha))
 
 
-def _scales(program: VariationalInequality, x: Array, alpha: Array, known: _Products) -> Scales:
+def _scales(program: VariationalInequality, x: Array, alpha: Array, products: _Products) -> Scales:
     A, f, g = program.A, program.f, program.g
     return Scales(
-        primal=max(1.0, peak(g / known.norms)),
-        dual=max(peak(known.Ax), peak(f), peak(known.force)),
+        primal=max(1.0, peak(g / products.norms)),
+        dual=max(peak(products.Ax), peak(f), peak(products.force)),
         gap=max(
-            abs(0.5 * float(x @ known.Ax)), abs(float(f @ x)), abs(float(g @ alpha)), ENERGY_FLOOR * _descent(A, f)
+            abs(0.5 * float(x @ products.Ax)),
+            abs(float(f @ x)),
+            abs(float(g @ alpha)),
+            ENERGY_FLOOR * _steepest_descent_energy(A, f),
         ),
     )
 
 
-def _descent(A: SparseMatrix | Array, f: Array) -> float:
-    """(fᵀf)² / 2fᵀA f: the energy that the best multiple of f gains, a part of what A⁻¹f would."""
+def _steepest_descent_energy(A: SparseMatrix | Array, f: Array) -> float:
+    """(fᵀf)² / 2fᵀA f: the energy gained by the best multiple of f, a lower bound on that gained by A⁻¹f."""
     curvature = float(f @ (A @ f))
     return 0.5 * float(f @ f) ** 2 / curvature if curvature > 0.0 else 0.0
 
@@ -90,21 +93,22 @@ def _descent(A: SparseMatrix | Array, f: Array) -> float:
 def kkt_residuals(program: VariationalInequality, x: Array, alpha: Array) -> Residuals:
     """Relative residuals of x (n,), α (m,) ≥ 0; see `Residuals`."""
     f, B, g = program.f, program.B, program.g
-    known = _Products.of(program, x, alpha)
-    scale = _scales(program, x, alpha, known)
+    products = _Products.of(program, x, alpha)
+    scale = _scales(program, x, alpha, products)
     return Residuals(
-        primal=float(np.max((B @ x - g) / known.norms, initial=0.0)) / scale.primal,
-        dual=_ratio(peak(known.Ax - f + known.force), scale.dual),
-        gap=_ratio(abs(float(x @ known.Ax) - float(f @ x) + float(g @ alpha)), scale.gap),
+        primal=float(np.max((B @ x - g) / products.norms, initial=0.0)) / scale.primal,
+        dual=_ratio(peak(products.Ax - f + products.force), scale.dual),
+        gap=_ratio(abs(float(x @ products.Ax) - float(f @ x) + float(g @ alpha)), scale.gap),
     )
 
 
 def verify(program: VariationalInequality, answer: QPSolution, accuracy: float) -> tuple[Status, str, Residuals | None]:
-    """Classify an answer by what we compute ourselves: status, reason ("" when ok), residuals if they exist."""
+    """Classify a solution by recomputed residuals: status, reason ("" when ok), residuals if they exist."""
     if answer.x is None or answer.alpha is None:
         if infeasibility_certificate(program) is not None:
             return Status.INFEASIBLE, "no point satisfies the constraints (certified)", None
         return Status.FAILED, f"the solver returned nothing: {answer.solver_status}", None
+    # before any residual: max(0, nan) is 0 and would hide it
     if not (np.all(np.isfinite(answer.x)) and np.all(np.isfinite(answer.alpha))):
         return Status.NONFINITE, f"the solution is not finite: {answer.solver_status}", None
     found = kkt_residuals(program, answer.x, answer.alpha)
@@ -132,7 +136,7 @@ def infeasibility_certificate(program: VariationalInequality, tolerance: float =
     target[-1] = -1.0
     try:
         alpha, distance = nnls(system, target, maxiter=30 * system.shape[1])
-    except RuntimeError:  # nnls gave up: no certificate
+    except RuntimeError:  # nnls did not converge, which certifies nothing
         return None
     if distance > tolerance * max(1.0, float(alpha.max(initial=0.0))):
         return None

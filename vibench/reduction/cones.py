@@ -1,8 +1,7 @@
-"""Projection on polyhedral cones and the greedy construction of cones (paper, §4)."""
+"""Projection on polyhedral cones, and the cone-projected greedy algorithms CPG and mCPG (paper, §4)."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,13 +12,10 @@ from vibench.errors import NumericalError
 from vibench.interfaces.strategies import Cone, Stop, no_free, rays
 from vibench.linalg.cholesky import SparseCholesky
 from vibench.linalg.inner_product import InnerProduct
-from vibench.reduction.lazy_greedy import LazyMaximum
+from vibench.reduction.lazy_greedy import TIE, LazyMaximum
 
 REPRODUCED = 1e-12
-"""Relative distances below this are round-off."""
-
-Subtract = Callable[[Array, Array], tuple[Array, str]]
-"""From a snapshot θ (m,) and the generators so far (m×r): the part Υ ∈ K_r of θ to leave out, and a fallback note."""
+"""A snapshot whose relative distance from the cone is below this is reproduced up to round-off."""
 
 
 @dataclass(frozen=True)
@@ -38,21 +34,21 @@ def project_on_cone(generators: Array, theta: Array, W: InnerProduct) -> Project
 def project_on_orthant(functional: Array, W: InnerProduct) -> Array:
     """Projection (m,) on W⁺, nonnegative coefficients, of the Riesz representer of a functional (m,) in the W norm.
 
-    X_W π − s ≥ 0 and π ≥ 0 are complementary: an active set method, which starts where s is positive and keeps what is
-    not negative; should its sets repeat themselves, a nonnegative least squares solver takes over.
+    X_W π − s ≥ 0 and π ≥ 0 are complementary. An active set method starts from the support of the positive part of s;
+    where its sets cycle, nonnegative least squares replaces it.
     """
     free, seen = functional > 0.0, set[bytes]()
     while free.tobytes() not in seen:
         seen.add(free.tobytes())
-        inside = np.flatnonzero(free)
-        found = np.zeros(W.dim)
-        if len(inside):
-            block = W.matrix[inside][:, inside]
-            found[inside] = SparseCholesky(block, "a block of X_W").solve(functional[inside])
-        rest = functional - W.apply(found)
-        following = np.where(free, found > 0.0, rest > 1e-14 * np.max(np.abs(functional), initial=0.0))
+        support = np.flatnonzero(free)
+        projection = np.zeros(W.dim)
+        if len(support):
+            block = W.matrix[support][:, support]
+            projection[support] = SparseCholesky(block, "a block of X_W").solve(functional[support])
+        residual = functional - W.apply(projection)
+        following = np.where(free, projection > 0.0, residual > 1e-14 * np.max(np.abs(functional), initial=0.0))
         if np.array_equal(following, free):
-            return found
+            return projection
         free = following
     return project_on_cone(np.eye(W.dim), W.riesz(functional), W).coefficients
 
@@ -67,17 +63,11 @@ def _project_whitened(generators: Array, theta: Array) -> Projection:
     return Projection(np.asarray(coefficients), float(distance))
 
 
-def nothing(theta: Array, _: Array) -> tuple[Array, str]:
-    """Leave nothing of a snapshot θ (m,) out."""
-    return np.zeros_like(theta), ""
+class GrowingCone:
+    """A cone that grows by one generator at a time, and the snapshot that is farthest from it.
 
-
-def greedy_cone(snapshots: Array, W: InnerProduct, stop: Stop, subtract: Subtract = nothing) -> Cone:
-    """Greedy cone with the relative maximum criterion (paper, Algorithm 2 and Remark 4.3).
-
-    Each step takes the snapshot farthest from the present cone and adds the direction of what `subtract` leaves of
-    it. Cones are nested, so distances only fall and the maximum is taken lazily. It ends before `stop` where all
-    snapshots are reproduced to round-off (Remark 4.2).
+    Greedy algorithms with the relative maximum criterion (paper, equations (13) and (34)) are a loop over `farthest`
+    and `add`. Cones are nested, so distances only fall and the maximum is taken lazily.
 
     Parameters
     ----------
@@ -85,46 +75,84 @@ def greedy_cone(snapshots: Array, W: InnerProduct, stop: Stop, subtract: Subtrac
         θ_q (m×Q), coefficientwise nonnegative.
     W
         Inner product of the multiplier space.
-    stop
-        Relative largest projection error, or number of generators.
-    subtract
-        What to leave out of the chosen snapshot: nothing (Remark 4.3), or what line 9 of Algorithm 2 says.
+
+    Attributes
+    ----------
+    generators
+        Generators so far (m×r), unit norm.
+    farthest
+        Index of the snapshot farthest from the cone.
+    error
+        Its distance, relative to the largest norm of a snapshot.
 
     Raises
     ------
     NumericalError
         If a snapshot has a negative coefficient: it would not be in W⁺.
     """
-    refuse_negative(snapshots)
-    whitened = W.whiten(snapshots)
-    norms = np.linalg.norm(whitened, axis=0)
-    largest = float(norms.max(initial=0.0))
-    if largest == 0.0:
-        return Cone(np.zeros((W.dim, 0)), np.zeros(1), no_free(0))
-    distances = LazyDistances(whitened)
-    generators = np.zeros((W.dim, 0))
-    pick, error = int(np.argmax(norms >= norms.max() * (1.0 - 1e-9))), 1.0
-    errors, fallbacks = [error], []
-    while not stop.reached(generators.shape[1], error) and error > REPRODUCED:
-        part, note = subtract(snapshots[:, pick], generators)
+
+    def __init__(self, snapshots: Array, W: InnerProduct) -> None:
+        refuse_negative(snapshots)
+        whitened = W.whiten(snapshots)
+        self._W, self._norms = W, np.linalg.norm(whitened, axis=0)
+        self.generators = np.zeros((W.dim, 0))
+        largest = float(self._norms.max(initial=0.0))
+        self.error = 1.0 if largest else 0.0
+        self._errors, self._fallbacks = [self.error], list[str]()
+        if largest:
+            # Ties, as of mirrored snapshots, go to the smallest index, as in `LazyMaximum`.
+            self.farthest = int(np.argmax(self._norms >= largest * (1.0 - TIE)))
+            self._distances = LazyDistances(whitened)
+
+    def reached(self, stop: Stop) -> bool:
+        """Whether the cone is large enough, or reproduces all snapshots to round-off."""
+        return stop.reached(self.generators.shape[1], self.error) or self.error <= REPRODUCED
+
+    def add(self, direction: Array, note: str = "") -> bool:
+        """Add the generator of a direction (m,), part of `farthest`; `False` where that is nothing but round-off.
+
+        `note` says what of the algorithm could not be done as it says.
+        """
         if note:
-            fallbacks.append(f"generator {generators.shape[1] + 1}: {note}")
-        direction = snapshots[:, pick] - part
-        length = float(W.norm(direction))
-        if length <= REPRODUCED * norms[pick]:
+            self._fallbacks.append(f"generator {self.generators.shape[1] + 1}: {note}")
+        length = float(self._W.norm(direction))
+        if length <= REPRODUCED * self._norms[self.farthest]:
+            return False  # normalised, it would be an arbitrary generator
+        self.generators = np.column_stack([self.generators, direction / length])
+        self._distances.widen(self._W.whiten(self.generators), self.farthest)  # which is in the cone now (Remark 4.1)
+        if self.generators.shape[1] == len(self._norms):  # every snapshot has been taken
+            self.error = 0.0
+        else:
+            self.farthest, self.error = self._distances.next()
+        self._errors.append(self.error)
+        return True
+
+    def result(self) -> Cone:
+        """The cone, with its error for every number of generators."""
+        count = self.generators.shape[1]
+        return Cone(self.generators, np.array(self._errors), no_free(count), tuple(self._fallbacks))
+
+
+def greedy_cone(snapshots: Array, W: InnerProduct, stop: Stop) -> Cone:
+    """Cone of snapshots (m×Q) chosen greedily: CPG (paper, Remark 4.3, and Benaceur, Ern and Ehrlacher 2020).
+
+    Each step adds the snapshot farthest from the present cone, normalised. It ends before `stop` where all snapshots
+    are reproduced to round-off (Remark 4.2).
+
+    Raises
+    ------
+    NumericalError
+        If a snapshot has a negative coefficient: it would not be in W⁺.
+    """
+    cone = GrowingCone(snapshots, W)
+    while not cone.reached(stop):
+        if not cone.add(snapshots[:, cone.farthest]):
             break
-        generators = np.column_stack([generators, direction / length])
-        distances.widen(W.whiten(generators), pick)
-        if generators.shape[1] == snapshots.shape[1]:
-            errors.append(0.0)
-            break
-        pick, error = distances.next()
-        errors.append(error)
-    return Cone(generators, np.array(errors), no_free(generators.shape[1]), tuple(fallbacks))
+    return cone.result()
 
 
 def refuse_negative(snapshots: Array) -> None:
-    """Refuse snapshots (m×Q) outside W⁺.
+    """Refuse snapshots (m×Q) that are not in W⁺.
 
     Raises
     ------
@@ -151,7 +179,7 @@ def normalised(snapshots: Array, W: InnerProduct) -> Array:
 def projection_errors(generators: Array, snapshots: Array, W: InnerProduct) -> Array:
     """e(r) for r = 0 … R: the largest distance of a snapshot from the cone of the first r generators.
 
-    Relative to the largest norm of a snapshot, as in equations (13) and (34); for cones that no greedy algorithm made.
+    Relative to the largest norm of a snapshot, as in equations (13) and (34), for any cone.
 
     Parameters
     ----------
@@ -175,9 +203,9 @@ def projection_errors(generators: Array, snapshots: Array, W: InnerProduct) -> A
 class LazyDistances:
     """Largest distance of snapshots from a growing cone, relative to the largest norm, with few projections.
 
-    Any point of the cone bounds the distance from above. One is kept for every snapshot; where the cone grows, the
-    nearest combination of it and of the new generator takes its place, and one sweep over the generators, coordinate by
-    coordinate, brings it nearer still. Only where these bounds leave the choice open is a projection computed.
+    Any point of the cone bounds the distance from above. One point is stored for every snapshot. When the cone grows,
+    the point is replaced by its best combination with the new generator and improved by one sweep of coordinate
+    descent. A projection is computed only where these bounds do not decide the maximum.
 
     Parameters
     ----------
@@ -187,7 +215,7 @@ class LazyDistances:
     Attributes
     ----------
     maximum
-        What chooses; it counts the projections.
+        The lazy maximum; it counts the projections.
     """
 
     def __init__(self, whitened: Array) -> None:
@@ -195,52 +223,52 @@ class LazyDistances:
         norms = np.linalg.norm(whitened, axis=0)
         self._largest = float(norms.max())
         self._generators = np.zeros((whitened.shape[0], 0))
-        self._points = np.zeros((0, whitened.shape[1]))  # coefficients of a point of the cone for every snapshot
+        self._coefficients = np.zeros((0, whitened.shape[1]))  # of one point of the cone for every snapshot
         self.maximum = LazyMaximum(norms / self._largest)
 
     def widen(self, generators: Array, taken: int | None = None) -> None:
-        """Take in the last of the generators (m×r, unit norm, whitened); the snapshot `taken` is in the cone by now."""
-        old, new = _two_dimensional(self._generators @ self._points, generators[:, -1], self._snapshots)
-        self._points = np.vstack([self._points * old, new])
+        """Add the last of the generators (m×r, unit norm, whitened); the snapshot `taken` is never chosen again."""
+        old, new = _best_combination(self._generators @ self._coefficients, generators[:, -1], self._snapshots)
+        self._coefficients = np.vstack([self._coefficients * old, new])
         self._generators = generators
-        slope = generators.T @ (self._snapshots - generators @ self._points)
+        slope = generators.T @ (self._snapshots - generators @ self._coefficients)
         for i, row in enumerate(generators.T @ generators):
-            step = np.maximum(slope[i], -self._points[i])
-            self._points[i] += step
+            step = np.maximum(slope[i], -self._coefficients[i])
+            self._coefficients[i] += step
             slope -= row[:, None] * step
-        self.maximum.bound(np.linalg.norm(self._snapshots - generators @ self._points, axis=0) / self._largest)
+        self.maximum.bound(np.linalg.norm(self._snapshots - generators @ self._coefficients, axis=0) / self._largest)
         if taken is not None:
             self.maximum.exclude(taken)
 
     def next(self) -> tuple[int, float]:
-        """Index of the snapshot farthest from the cone, and its distance; of those taken, none."""
+        """Index of the snapshot farthest from the cone, and its distance, those taken excluded."""
         return self.maximum.next(self._distance)
 
     def residual(self, q: int) -> Array:
-        """What the best known point of the cone leaves of a snapshot (m,); that of `next` is its projection."""
-        return np.asarray(self._snapshots[:, q] - self._generators @ self._points[:, q])
+        """Snapshot minus its stored point of the cone (m,): for the index from `next`, minus its projection."""
+        return np.asarray(self._snapshots[:, q] - self._generators @ self._coefficients[:, q])
 
     def _distance(self, q: int) -> float:
         found = _project_whitened(self._generators, self._snapshots[:, q])
-        self._points[:, q] = found.coefficients
+        self._coefficients[:, q] = found.coefficients
         return found.distance / self._largest
 
 
-def _two_dimensional(points: Array, nu: Array, targets: Array) -> tuple[Array, Array]:
-    """Coefficients a, b ≥ 0 (Q,) of points (m×Q) and of the unit vector ν (m,) that come near targets (m×Q).
+def _best_combination(points: Array, nu: Array, targets: Array) -> tuple[Array, Array]:
+    """Coefficients a, b ≥ 0 (Q,) that minimise ‖a·point + b·ν − target‖; points, targets (m×Q), unit vector ν (m,).
 
-    The nearest combination where both are positive, else that of one alone.
+    The unconstrained minimiser where both are nonnegative, else the better one of a = 0 and b = 0.
     """
     square, overlap = np.sum(points**2, axis=0), nu @ points
-    along, across = np.sum(points * targets, axis=0), nu @ targets
+    on_point, on_nu = np.sum(points * targets, axis=0), nu @ targets
     determinant = square - overlap**2
-    clear = determinant > 1e-8 * square
-    scale = np.where(clear, determinant, 1.0)
-    a, b = (along - overlap * across) / scale, (square * across - overlap * along) / scale
-    both = clear & (a >= 0.0) & (b >= 0.0)
-    alone = (np.maximum(across, 0.0) ** 2 > along**2 / np.where(square > 0.0, square, 1.0)) | (square == 0.0)
-    single_a = np.where(alone, 0.0, np.maximum(along, 0.0) / np.where(square > 0.0, square, 1.0))
-    single_b = np.where(alone, np.maximum(across, 0.0), 0.0)
+    independent = determinant > 1e-8 * square
+    scale = np.where(independent, determinant, 1.0)
+    a, b = (on_point - overlap * on_nu) / scale, (square * on_nu - overlap * on_point) / scale
+    both = independent & (a >= 0.0) & (b >= 0.0)
+    nu_alone = (np.maximum(on_nu, 0.0) ** 2 > on_point**2 / np.where(square > 0.0, square, 1.0)) | (square == 0.0)
+    single_a = np.where(nu_alone, 0.0, np.maximum(on_point, 0.0) / np.where(square > 0.0, square, 1.0))
+    single_b = np.where(nu_alone, np.maximum(on_nu, 0.0), 0.0)
     return np.where(both, a, single_a), np.where(both, b, single_b)
 
 

@@ -9,15 +9,15 @@ import numpy as np
 from vibench.arrays import Array
 
 TIE = 1e-9
-"""Values within this fraction of the largest first value count as equal; the smallest index wins."""
+"""Values within this fraction of the largest first value count as equal, and the smallest index wins: duplicated or
+mirrored snapshots must not let round-off choose."""
 
 
 class LazyMaximum:
     """Argmax over indicators that are non-increasing from one greedy step to the next.
 
     A value computed at an earlier step bounds the present one from above, so only indices whose bound reaches the
-    maximum have to be evaluated again (Minoux 1978). The choice, ties included, is the one that evaluating
-    everything would make.
+    maximum are evaluated again (Minoux 1978). The choice, ties included, is that of evaluating all indicators.
 
     Parameters
     ----------
@@ -27,7 +27,7 @@ class LazyMaximum:
     Attributes
     ----------
     evaluations
-        How often an indicator was evaluated again.
+        Number of evaluations of an indicator.
     """
 
     def __init__(self, first: Array) -> None:
@@ -36,7 +36,7 @@ class LazyMaximum:
         self.evaluations = 0
 
     def next(self, evaluate: Callable[[int], float]) -> tuple[int, float]:
-        """Index of the largest indicator now, the smallest within `TIE`, and the largest value.
+        """Index of the largest current indicator, the smallest index within `TIE`, and the largest value.
 
         `evaluate(p)` computes the indicator of index p.
         """
@@ -48,14 +48,14 @@ class LazyMaximum:
             if not len(stale):
                 return int(candidates[0]), largest
             p = int(stale[0])
-            self._bounds[p] = min(self._bounds[p], evaluate(p))
+            self._bounds[p] = min(self._bounds[p], evaluate(p))  # round-off must not make an indicator grow
             fresh[p] = True
             self.evaluations += 1
 
     def bound(self, bounds: Array) -> None:
-        """Take upper bounds (P,) of the indicators now into account, wherever they are below what is known."""
+        """Apply upper bounds (P,) of the current indicators where they are below the stored ones."""
         self._bounds = np.minimum(self._bounds, bounds)
 
     def exclude(self, index: int) -> None:
-        """Never choose this index again."""
+        """Exclude an index from all later choices."""
         self._bounds[index] = -np.inf

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
-from collections.abc import Iterable, Mapping
+from abc import abstractmethod
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -15,67 +15,26 @@ from vibench.interfaces.strategies import Enrichment, Kind, Offline, PrimalStrat
 from vibench.timing import Seconds, Stopwatch
 
 
-class Growth(ABC):
-    """A fixed enrichment that grows."""
-
-    @property
-    @abstractmethod
-    def count(self) -> int:
-        """Number S of vectors so far."""
-
-    @abstractmethod
-    def reached(self, tolerance: float) -> bool:
-        """Whether the vectors so far keep a tolerance."""
-
-    @abstractmethod
-    def grow(self) -> None:
-        """Add a vector.
-
-        Raises
-        ------
-        NumericalError
-            If there is none left, saying what was reached.
-        """
-
-    @abstractmethod
-    def vectors(self, first: int) -> Array:
-        """The vectors (n×k) from number `first` on, V-orthonormal and orthogonal to V_N and to those before."""
-
-    @abstractmethod
-    def history(self) -> Mapping[str, Array]:
-        """Quantity → values over steps so far."""
-
-
 @dataclass(frozen=True)
-class Milestone:
-    """What had been built when a tolerance was reached, and in how many seconds."""
+class Step:
+    """A fixed enrichment that grows, after some of its vectors.
+
+    Attributes
+    ----------
+    count
+        Number S of vectors so far.
+    measure
+        What a tolerance bounds: from above, or from below where the strategy says `larger_is_tighter`.
+    vectors
+        From a number k: the vectors (n×(S−k)) from the k-th on, V-orthonormal, orthogonal to V_N and to those before.
+    history
+        Quantity → values over the steps so far.
+    """
 
     count: int
-    history: Mapping[str, Array]
-    seconds: Seconds
-
-
-@dataclass(frozen=True)
-class Grown:
-    """All vectors (n×S) of a growth, where it passed its tolerances, and why it passed no others."""
-
-    vectors: Array
-    milestones: Mapping[float, Milestone]
-    missed: str
-
-    def at(self, tolerance: float) -> tuple[Enrichment, Seconds]:
-        """The enrichment of a tolerance, and the seconds it alone would have taken.
-
-        Raises
-        ------
-        NumericalError
-            If the tolerance was not reached.
-        """
-        if tolerance not in self.milestones:
-            raise NumericalError(f"the tolerance {tolerance:g} is not reached: {self.missed}")
-        found = self.milestones[tolerance]
-        vectors = np.ascontiguousarray(self.vectors[:, : found.count])
-        return Enrichment(Kind.FIXED, vectors=vectors, history=found.history), found.seconds
+    measure: float
+    vectors: Callable[[int], Array]
+    history: Mapping[str, Sequence[float]]
 
 
 class NestedStrategy(PrimalStrategy):
@@ -84,38 +43,88 @@ class NestedStrategy(PrimalStrategy):
     takes_tolerance: ClassVar[bool] = True
 
     @abstractmethod
-    def begin(self, offline: Offline) -> Growth:
-        """Prepare the construction; nothing is added yet."""
-
-    def build(self, offline: Offline, tolerance: float | None) -> Enrichment:
-        """Grow until the tolerance is kept.
+    def steps(self, offline: Offline) -> Iterator[Step]:
+        """The enrichment with S = 0, 1, 2, … vectors; whoever iterates stops at the tightest tolerance.
 
         Raises
         ------
         NumericalError
-            If it is not kept with every vector there is.
+            If there is no further vector, saying what was reached.
+        """
+
+    def build(self, offline: Offline, tolerance: float | None) -> Enrichment:
+        """Grow until the tolerance is reached.
+
+        Raises
+        ------
+        NumericalError
+            If it is not reached with all vectors.
         """
         if tolerance is None:
             raise ValueError(f"{type(self).__name__} needs a tolerance")
-        return grow_through(self, offline, [tolerance]).at(tolerance)[0]
+        grown = grow_through(self, offline, [tolerance])
+        return grown.at(grown.milestone(tolerance))
+
+
+@dataclass(frozen=True)
+class Milestone:
+    """Where a growth reached a tolerance: number of vectors, history so far, and seconds so far."""
+
+    count: int
+    history: Mapping[str, Array]
+    seconds: Seconds
+
+
+@dataclass(frozen=True)
+class Grown:
+    """All vectors (n×S) of a growth, its milestones by tolerance, and why it reached no further ones."""
+
+    vectors: Array
+    milestones: Mapping[float, Milestone]
+    missed: str
+
+    def milestone(self, tolerance: float) -> Milestone:
+        """Where a tolerance was reached.
+
+        Raises
+        ------
+        NumericalError
+            If it was not reached.
+        """
+        if tolerance not in self.milestones:
+            raise NumericalError(f"the tolerance {tolerance:g} is not reached: {self.missed}")
+        return self.milestones[tolerance]
+
+    def at(self, milestone: Milestone) -> Enrichment:
+        """The enrichment of a milestone."""
+        vectors = np.ascontiguousarray(self.vectors[:, : milestone.count])
+        return Enrichment(Kind.FIXED, vectors=vectors, history=milestone.history)
 
 
 def grow_through(strategy: NestedStrategy, offline: Offline, tolerances: Iterable[float]) -> Grown:
     """Grow one enrichment through all tolerances; the seconds of each are those up to its last vector."""
     watch, ahead = Stopwatch(), list(dict.fromkeys(tolerances))
-    growth = strategy.begin(offline)
     vectors = np.zeros((offline.problem.V.dim, 0))
     milestones: dict[float, Milestone] = {}
-    while True:
-        passed = [tolerance for tolerance in ahead if growth.reached(tolerance)]
-        if passed:
-            vectors = np.hstack([vectors, growth.vectors(vectors.shape[1])])
-            found = Milestone(growth.count, dict(growth.history()), watch.seconds())
-            milestones |= dict.fromkeys(passed, found)
-            ahead = [tolerance for tolerance in ahead if tolerance not in milestones]
-        if not ahead:
-            return Grown(vectors, milestones, "")
+    steps, begun = strategy.steps(offline), False
+    while ahead:
         try:
-            growth.grow()
+            step = next(steps)
+        except StopIteration:
+            return Grown(vectors, milestones, "the strategy has no further vector")
         except NumericalError as error:
+            if not begun:  # the construction failed before there was an enrichment at all
+                raise
             return Grown(vectors, milestones, str(error))
+        begun = True
+        passed = [tolerance for tolerance in ahead if _keeps(strategy, step.measure, tolerance)]
+        if passed:
+            vectors = np.hstack([vectors, step.vectors(vectors.shape[1])])
+            history = {quantity: np.array(values) for quantity, values in step.history.items()}
+            milestones |= dict.fromkeys(passed, Milestone(step.count, history, watch.seconds()))
+            ahead = [tolerance for tolerance in ahead if tolerance not in milestones]
+    return Grown(vectors, milestones, "")
+
+
+def _keeps(strategy: PrimalStrategy, measure: float, tolerance: float) -> bool:
+    return measure >= tolerance if strategy.larger_is_tighter else measure <= tolerance

@@ -32,6 +32,8 @@ class POD:
 def pod(snapshots: Array, V: InnerProduct, stop: Stop) -> POD:
     """POD of snapshots (n×P), by the singular value decomposition of the whitened snapshots.
 
+    The eigenvalues of the correlation matrix UᵀX_V U, the method of snapshots, have a floor of 1e-8 in relative terms.
+
     Parameters
     ----------
     snapshots
@@ -44,7 +46,7 @@ def pod(snapshots: Array, V: InnerProduct, stop: Stop) -> POD:
     Raises
     ------
     NumericalError
-        If more modes are asked for than the snapshots have numerical rank.
+        If more modes are requested than the numerical rank of the snapshots.
     """
     if not snapshots.shape[1]:
         return POD(np.zeros((V.dim, 0)), np.zeros(1))
@@ -57,5 +59,6 @@ def pod(snapshots: Array, V: InnerProduct, stop: Stop) -> POD:
     if size is None or size > rank:
         raise NumericalError(f"POD cannot give {stop}: the {snapshots.shape[1]} snapshots have rank {rank}")
     modes = left[:, :size]
+    # the sign of a singular vector is arbitrary: make the largest entry positive
     signs = np.where(np.take_along_axis(modes, np.abs(modes).argmax(axis=0)[None], axis=0)[0] < 0.0, -1.0, 1.0)
     return POD(V.unwhiten(modes * signs), errors)

@@ -17,18 +17,17 @@ from vibench.linalg.inner_product import InnerProduct
 PROPORTIONAL_RTOL = 1e-12
 """Two constraint matrices count as proportional when they differ by less than this, relative to their norm."""
 
-MARK_ATOL = 1e-10
-"""Marks of matrices that may be proportional differ by no more."""
+FINGERPRINT_ATOL = 1e-10
+"""Fingerprints of proportional matrices differ by no more."""
 
-FEW_SUPREMIZERS = 2
-"""Norms and angles come from whitened supremizers where there are this many times more touched unknowns."""
+UNKNOWNS_PER_SUPREMIZER = 2
+"""From so many constrained unknowns per supremizer on, whitening on the mesh is cheaper than the contact factor."""
 
-SPANNING = 1.0
-"""Greedy algorithms run in the span of the supremizers where a QR factorisation of all of them, n×k, times this is no
-dearer than dense solves with the contact's factor."""
+SPAN_COST = 1.0
+"""Relative cost of a QR factorisation of all supremizers (n×k), against dense solves with the contact factor."""
 
-FACTORS = 3
-"""Factors with different unknowns last that are kept: of the training set, of the validation set, and as declared."""
+CACHED_FACTORS = 3
+"""Cached contact factors: for the unknowns of the training set, of the validation set, and the declared ones."""
 
 
 def supremizers(V: InnerProduct, B: SparseMatrix, eta: Array) -> Array:
@@ -37,7 +36,7 @@ def supremizers(V: InnerProduct, B: SparseMatrix, eta: Array) -> Array:
 
 
 def proportionality(B: SparseMatrix, reference: SparseMatrix) -> float | None:
-    """C with B = c·reference up to round-off, or `None`; c ≠ 0."""
+    """Factor c ≠ 0 with B = c·reference up to round-off, or `None`."""
     norm = sp.linalg.norm(B)
     square = float(reference.multiply(reference).sum())
     if norm == 0.0 or square == 0.0:
@@ -53,7 +52,7 @@ class ConstraintClasses:
     Attributes
     ----------
     representatives
-        One matrix per class, the first met.
+        One matrix per class, the first one.
     members
         Class of every p (P,).
     factors
@@ -66,23 +65,27 @@ class ConstraintClasses:
 
     @property
     def firsts(self) -> Indices:
-        """Of every class the matrix that stands for it."""
+        """Index p of the representative of every class."""
         return np.unique(self.members, return_index=True)[1]
 
     def everywhere(self, constants: Sequence[float]) -> Array:
-        """At every p (P,) an inf-sup constant that is known of every representative."""
+        """An inf-sup constant at every p (P,), from those of the representatives."""
         return np.array(constants)[self.members] * np.abs(self.factors)
 
 
 def constraint_classes(matrices: Sequence[SparseMatrix]) -> ConstraintClasses:
-    """Sort matrices into classes of proportional ones."""
+    """Sort matrices into classes of proportional ones.
+
+    For the obstacle problem, where B(mu) is one matrix times a scalar, one supremizer space replaces 125 equal ones.
+    """
     representatives: list[SparseMatrix] = []
-    marks: list[Array] = []
+    fingerprints: list[Array] = []
     members, factors = [], []
     for matrix in matrices:
-        mark = _mark(matrix)
+        fingerprint = _fingerprint(matrix)
         for k, representative in enumerate(representatives):
-            factor = proportionality(matrix, representative) if _alike(mark, marks[k]) else None
+            similar = _equal_up_to_sign(fingerprint, fingerprints[k])  # a cheap necessary condition
+            factor = proportionality(matrix, representative) if similar else None
             if factor is not None:
                 members.append(k)
                 factors.append(factor)
@@ -91,22 +94,23 @@ def constraint_classes(matrices: Sequence[SparseMatrix]) -> ConstraintClasses:
             members.append(len(representatives))
             factors.append(1.0)
             representatives.append(matrix)
-            marks.append(mark)
+            fingerprints.append(fingerprint)
     return ConstraintClasses(tuple(representatives), np.array(members, dtype=np.intp), np.array(factors))
 
 
-def _mark(matrix: SparseMatrix) -> Array:
-    """A vector (m,) that proportional matrices share up to its sign, and others almost surely do not."""
+def _fingerprint(matrix: SparseMatrix) -> Array:
+    """Normalised product (m,) with a random vector, which proportional matrices share up to its sign."""
     probe = np.random.default_rng(0).standard_normal(matrix.shape[1])
     return np.asarray(matrix @ probe) / ((sp.linalg.norm(matrix) * float(np.linalg.norm(probe))) or 1.0)
 
 
-def _alike(one: Array, other: Array) -> bool:
-    return min(float(np.abs(one - other).max(initial=0.0)), float(np.abs(one + other).max(initial=0.0))) <= MARK_ATOL
+def _equal_up_to_sign(one: Array, other: Array) -> bool:
+    distances = (float(np.abs(one + sign * other).max(initial=0.0)) for sign in (-1.0, 1.0))
+    return min(distances) <= FINGERPRINT_ATOL
 
 
 class SpannedCoordinates:
-    """Euclidean coordinates in V_N + span of some vectors.
+    """Euclidean coordinates in V_N + span of given vectors.
 
     Parameters
     ----------
@@ -115,7 +119,7 @@ class SpannedCoordinates:
     basis
         V-orthonormal basis of V_N (n×N).
     vectors
-        Vectors (n×k) to be represented, of any rank.
+        Vectors (n×k), possibly linearly dependent.
 
     Attributes
     ----------
@@ -138,7 +142,7 @@ class SpannedCoordinates:
 
 
 class ContactCoordinates:
-    """Euclidean coordinates in V_N + X_V⁻¹E, E some degrees of freedom: every supremizer of every B that touches them.
+    """Euclidean coordinates in V_N + X_V⁻¹E: with E the contact unknowns, this contains the supremizers of every B(mu).
 
     X_V = FᵀF is factorised with E last. For every load r on E, F X_V⁻¹ r = F⁻ᵀ r is then F_EE⁻ᵀ r in its last entries
     and zero before: no array larger than E is needed for it.
@@ -160,13 +164,13 @@ class ContactCoordinates:
 
     def __init__(self, V: InnerProduct, basis: Array, dofs: Indices) -> None:
         self._factor, self._tail = contact_factor(V, dofs)
-        whitened = self._factor.up(basis)
+        whitened = self._factor.apply_factor(basis)
         split = V.dim - len(dofs)
         self._others, r = np.linalg.qr(whitened[:split])
         self.plain: Array = np.vstack([r, whitened[split:]])
 
     def supremizers(self, loads: Array) -> Array:
-        """Coordinates (d×k) of X_V⁻¹ r for loads on E (|E|×k), such as the rows of Bᵀη there."""
+        """Coordinates (d×k) of X_V⁻¹ r for loads r on E (|E|×k), such as Bᵀη."""
         on_contact = scipy.linalg.solve_triangular(self._tail, loads, trans="T", check_finite=False)
         return np.vstack([np.zeros((self._others.shape[1], loads.shape[1])), on_contact])
 
@@ -179,60 +183,59 @@ class ContactCoordinates:
     @cached_property
     def _off_contact(self) -> Array:
         """Vectors (n×N) whose coordinates are the first N unit vectors; they are zero on E."""
-        return self._factor.up_inverse(np.vstack([self._others, np.zeros((len(self._tail), self._others.shape[1]))]))
+        return self._factor.solve_factor(np.vstack([self._others, np.zeros((len(self._tail), self._others.shape[1]))]))
 
 
 def contact_factor(V: InnerProduct, dofs: Indices) -> tuple[SparseCholesky, Array]:
-    """X_V factorised with some unknowns E last, and the last block F_EE (|E|×|E|) of the factor.
+    """X_V factorised with some unknowns E last, and the trailing block F_EE (|E|×|E|) of the factor.
 
-    Like the factor of V itself it is made once for all models of a problem.
+    Cached, so that all models of a problem share one factorisation.
     """
     return _contact_factor(V, dofs.astype(np.intp).tobytes())
 
 
-@lru_cache(maxsize=FACTORS)
+@lru_cache(maxsize=CACHED_FACTORS)
 def _contact_factor(V: InnerProduct, dofs: bytes) -> tuple[SparseCholesky, Array]:
     last = np.frombuffer(dofs, np.intp)
     factor = SparseCholesky(V.matrix, "X_V", elimination_order(V.matrix, last), len(last))
-    return factor, factor.tail(len(last))
+    return factor, factor.trailing_factor(len(last))
 
 
 Coordinates = SpannedCoordinates | ContactCoordinates
-
 
 SupremizerImages = Callable[[SparseMatrix, Array], Array]
 """From B (m×n) and η (m×k): an isometric image (d×k) of T(mu)η."""
 
 
 def supremizer_images(V: InnerProduct, matrices: Sequence[SparseMatrix], count: int) -> SupremizerImages:
-    """The cheapest way to norms and angles of T(mu)η for these matrices and `count` multipliers in all for each."""
-    touched = _touched(matrices)
-    if FEW_SUPREMIZERS * count * len(matrices) <= len(touched):
+    """The cheaper isometric image of T(mu)η, for these matrices and `count` multipliers each."""
+    constrained = _constrained_unknowns(matrices)
+    if UNKNOWNS_PER_SUPREMIZER * count * len(matrices) <= len(constrained):
         return lambda B, eta: V.whiten_functional(np.asarray(B.T @ eta))
-    contact = ContactCoordinates(V, np.zeros((V.dim, 0)), touched)
-    return lambda B, eta: contact.supremizers(_loads(B, touched, eta))
+    contact = ContactCoordinates(V, np.zeros((V.dim, 0)), constrained)
+    return lambda B, eta: contact.supremizers(_loads(B, constrained, eta))
 
 
-def _touched(matrices: Sequence[SparseMatrix]) -> Indices:
-    """Unknowns that some of the matrices touch, rising."""
+def _constrained_unknowns(matrices: Sequence[SparseMatrix]) -> Indices:
+    """Unknowns that occur in some of the matrices, rising."""
     return np.unique(np.concatenate([sp.csr_array(B).indices for B in matrices]))
 
 
 def projected_supremizers(Z: Array, B: SparseMatrix, eta: Array) -> Array:
-    """ZᵀBᵀη (N'×k) from the rows of Z (n×N') that B (m×n) touches."""
-    rows = _touched([B])
+    """ZᵀBᵀη (N'×k) from the rows of Z (n×N') at the non-zero columns of B (m×n)."""
+    rows = _constrained_unknowns([B])
     return np.asarray(Z[rows].T @ _loads(B, rows, eta))
 
 
 def _loads(B: SparseMatrix, dofs: Indices, eta: Array) -> Array:
-    """Bᵀη (|E|×k) on some unknowns E."""
+    """Rows of Bᵀη (|E|×k) at some unknowns E."""
     return np.asarray(sp.csr_array(B)[:, dofs].T @ eta)
 
 
 def supremizer_coordinates(
     V: InnerProduct, basis: Array, matrices: Sequence[SparseMatrix], eta: Array
 ) -> tuple[Coordinates, list[Array]]:
-    """Coordinates in which greedy algorithms over supremizers run, and those (d×k) of T(mu)η for every matrix.
+    """Coordinates for greedy algorithms over supremizers, and those (d×k) of T(mu)η for every matrix.
 
     Parameters
     ----------
@@ -243,11 +246,11 @@ def supremizer_coordinates(
     eta
         Multipliers (m×k).
     """
-    touched = _touched(matrices)
+    constrained = _constrained_unknowns(matrices)
     count = eta.shape[1]
-    if SPANNING * V.dim * count * len(matrices) <= len(touched) ** 2:
+    if SPAN_COST * V.dim * count * len(matrices) <= len(constrained) ** 2:
         space = SpannedCoordinates(V, basis, np.hstack([supremizers(V, B, eta) for B in matrices]))
         return space, [space.represented[:, k * count : (k + 1) * count] for k in range(len(matrices))]
-    contact = ContactCoordinates(V, basis, touched)
-    found = contact.supremizers(np.hstack([_loads(B, touched, eta) for B in matrices]))
+    contact = ContactCoordinates(V, basis, constrained)
+    found = contact.supremizers(np.hstack([_loads(B, constrained, eta) for B in matrices]))
     return contact, [found[:, k * count : (k + 1) * count] for k in range(len(matrices))]

@@ -13,7 +13,7 @@ import pandas as pd
 from vibench.qp.status import Status
 from vibench.results import tables
 from vibench.results.break_even import Meaning
-from vibench.results.schema import KEYS, THRESHOLDS
+from vibench.results.columns import KEYS, THRESHOLDS
 from vibench.stability.infsup import VANISHES
 
 ERROR_FLOOR = 1e-10

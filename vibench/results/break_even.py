@@ -8,7 +8,7 @@ from enum import StrEnum
 from typing import Any
 
 from vibench.interfaces.strategies import Kind
-from vibench.results.schema import KEYS, THRESHOLDS
+from vibench.results.columns import KEYS, THRESHOLDS
 
 
 class Meaning(StrEnum):

@@ -14,7 +14,7 @@ import numpy as np
 
 from vibench.errors import RequestError, StorageError
 from vibench.locking import locked
-from vibench.results.schema import HISTORY_KEYS, STORED, VERSION
+from vibench.results.columns import HISTORY_KEYS, STORED, VERSION
 
 FILE = "results.sqlite"
 
@@ -100,12 +100,11 @@ class ResultsDatabase:
     def _create(self, study: Mapping[str, Any]) -> None:
         self._db.execute("CREATE TABLE IF NOT EXISTS meta (key TEXT PRIMARY KEY, value TEXT)")
         for table, columns in STORED.items():
-            declared = ", ".join(f'"{name}" {kind}' for name, kind in columns.items())
+            declared = ", ".join(f'"{name}" {column.kind}' for name, column in columns.items())
             self._db.execute(f"CREATE TABLE IF NOT EXISTS {table} ({declared})")
         for table in ("queries", "solutions"):
             self._db.execute(f"CREATE INDEX IF NOT EXISTS {table}_of_cell ON {table}(cell)")
         self._db.execute(f"CREATE INDEX IF NOT EXISTS histories_named ON histories({', '.join(NAMED)})")
-        self._db.execute("CREATE INDEX IF NOT EXISTS histories_of ON histories(artefact)")
         entries = {"schema": str(VERSION), "study": json.dumps(study, sort_keys=True)}
         self._db.executemany("INSERT OR REPLACE INTO meta VALUES (?, ?)", entries.items())
 
@@ -130,28 +129,26 @@ class ResultsDatabase:
             self._insert("queries", queries)
             self._insert("solutions", solutions)
 
-    def write_histories(self, artefact: str, rows: Sequence[Mapping[str, Any]], *, parts: bool = False) -> None:
-        """Write the histories of one artefact in place of its earlier ones, and of those that other code made.
+    def write_histories(self, histories: Sequence[Sequence[Mapping[str, Any]]], *, partial: bool = False) -> None:
+        """Write histories, each given as its rows, in place of earlier ones of the same name, whatever code made those.
 
-        `parts` says that others have steps of the same histories, which are kept.
+        `partial` says that others hold further steps of the same histories, which are kept.
         """
-        named = {tuple(row.get(name) for name in NAMED) for row in rows}
-        steps = [row["step"] for row in rows]
-        within = f" AND step BETWEEN {min(steps)} AND {max(steps)}" if parts and steps else ""
         same = " AND ".join(f'"{name}" IS ?' for name in NAMED)
         with self._writing():
-            self._db.execute("DELETE FROM histories WHERE artefact = ?", (artefact,))
-            for values in named:
-                self._db.execute(f"DELETE FROM histories WHERE {same}{within}", tuple(map(_plain, values)))
-            self._insert("histories", rows)
+            for rows in filter(None, histories):
+                steps = [row["step"] for row in rows]
+                within = f" AND step BETWEEN {min(steps)} AND {max(steps)}" if partial else ""
+                name = tuple(_plain(rows[0].get(column)) for column in NAMED)
+                self._db.execute(f"DELETE FROM histories WHERE {same}{within}", name)
+                self._insert("histories", rows)
 
-    def write_pictures(self, rows: Sequence[Mapping[str, Any]]) -> None:
-        """Write the pictures of a problem in place of its earlier ones."""
+    def replace_named(self, table: str, keys: Mapping[str, Any], rows: Sequence[Mapping[str, Any]]) -> None:
+        """Write rows of a table in place of all that have the same values in some columns."""
+        same = " AND ".join(f'"{name}" IS ?' for name in keys)
         with self._writing():
-            for row in rows[:1]:
-                keys = (row["problem"], row["problem_options"])
-                self._db.execute("DELETE FROM pictures WHERE problem = ? AND problem_options = ?", keys)
-            self._insert("pictures", rows)
+            self._db.execute(f"DELETE FROM {table} WHERE {same}", tuple(keys.values()))
+            self._insert(table, rows)
 
     def replace(self, table: str, rows: Sequence[Mapping[str, Any]]) -> None:
         """Replace the whole of a table that follows from the others."""

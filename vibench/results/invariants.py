@@ -16,7 +16,7 @@ import numpy as np
 import pandas as pd
 
 from vibench.interfaces.strategies import Kind
-from vibench.results.schema import CONSTANTS
+from vibench.results.columns import CONSTANTS
 from vibench.stability.conic_infsup import ABSOLUTE, RELATIVE
 from vibench.stability.infsup import UNSIGNED
 

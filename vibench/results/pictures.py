@@ -1,10 +1,10 @@
-"""Pictures of high-fidelity solutions: made by a stage of a run, kept in its results file, read back for figures."""
+"""Pictures of high-fidelity solutions, packed into the results file and read back from it."""
 
 from __future__ import annotations
 
 import io
 import json
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -17,23 +17,17 @@ from vibench.results import tables
 ARRAYS = tuple(field.name for field in fields(Picture) if not field.name.endswith("name"))
 
 
-def rows(keys: Mapping[str, Any], drawn: Iterable[tuple[str, Picture]]) -> list[dict[str, Any]]:
-    """Rows of the pictures table: titles and pictures of the problem that `keys` name."""
+def picture_rows(drawn: Iterable[tuple[str, Picture]]) -> list[dict[str, Any]]:
+    """Rows of the pictures table, one for every title and picture; the columns that name the problem come apart."""
     return [
-        {
-            **keys,
-            "number": k,
-            "title": title,
-            "names": json.dumps([one.name, one.multiplier_name]),
-            "data": _packed(one),
-        }
+        {"number": k, "title": title, "names": json.dumps([one.name, one.multiplier_name]), "data": _packed(one)}
         for k, (title, one) in enumerate(drawn)
     ]
 
 
-def missing(keys: Mapping[str, Any], reason: str) -> list[dict[str, Any]]:
-    """The row that says why there is no picture of the problem that `keys` name."""
-    return [{**keys, "number": 0, "reason": reason}]
+def failure_rows(reason: str) -> list[dict[str, Any]]:
+    """The row that says why there is no picture."""
+    return [{"number": 0, "reason": reason}]
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ import pandas as pd
 from vibench.arrays import Array
 from vibench.qp.accuracy_bounds import Slack, allowed
 from vibench.qp.status import Status
-from vibench.results.schema import DISAGREEMENTS, KEYS
+from vibench.results.columns import DISAGREEMENTS, KEYS
 
 
 def solution_row(x: Array, alpha: Array, left_open: Slack) -> dict[str, Any]:

@@ -12,8 +12,8 @@ from urllib.parse import quote
 import pandas as pd
 
 from vibench.errors import RequestError
+from vibench.results.columns import CELLS, INTEGER, KEYS, STORED, TABLES, THRESHOLDS, VERSION, Column, shown_columns
 from vibench.results.database import FILE, read_meta
-from vibench.results.schema import KEYS, STORED, TABLES, VERSION
 
 SUMMARY = "summary"
 
@@ -43,8 +43,8 @@ def read(path: Path, table: str) -> pd.DataFrame:
         frame = pd.read_sql_query(f"SELECT * FROM {table}", db)
     finally:
         db.close()
-    for name, kind in STORED.get(table, {}).items():
-        if kind.startswith(("REAL", "INTEGER")) and frame[name].dtype == object:  # nothing but NULL
+    for name, column in STORED.get(table, {}).items():
+        if column.kind.startswith(("REAL", "INTEGER")) and frame[name].dtype == object:  # nothing but NULL
             frame[name] = frame[name].astype(float)
     return frame
 
@@ -84,60 +84,37 @@ def in_order(frame: pd.DataFrame) -> pd.DataFrame:
 
 def summary(cells: pd.DataFrame) -> pd.DataFrame:
     """The table for reading: one line per cell, the figures people compare."""
-    cells = in_order(cells)
-    ok = [
-        f"{fine}/{count}" + ("" if status == "ok" else f" {status}")
-        for fine, count, status in zip(cells["queries_ok"], cells["queries"], cells["status"], strict=True)
-    ]
-    return pd.DataFrame(
-        {
-            "problem": cells["problem"],
-            "δ_POD": _asked(cells, "pod"),
-            "δ_dual": _asked(cells, "dual"),
-            "dual": cells["dual"],
-            "primal": cells["primal"],
-            "δ": cells["primal_tol"],
-            "solver": cells["solver"],
-            "assembly": cells["assembly"],
-            "ok": ok,
-            "N": cells["N"].astype("Int64"),
-            "R": cells["R"].astype("Int64"),
-            "added": cells["enrichment"].astype("Int64"),
-            "min β span": cells["beta_span_min"],
-            "min β cone": cells["beta_cone_lower_min"],
-            "error u": cells["error_u_mean"],
-            "error λ": cells["error_lambda_mean"],
-            "offline [s]": cells["offline_s"],
-            "online [ms]": 1e3 * cells["online_s"],
-        }
-    )
+    return _for_reading(in_order(cells), CELLS)
 
 
 def benefits(thresholds: pd.DataFrame) -> pd.DataFrame:
-    """The thresholds for reading: from how many queries on b pays against a."""
-    frame = in_order(thresholds)
-    return pd.DataFrame(
-        {
-            "problem": frame["problem"],
-            "δ_POD": _asked(frame, "pod"),
-            "δ_dual": _asked(frame, "dual"),
-            "dual": frame["dual"],
-            "solver": frame["solver"],
-            "a": frame["primal_a"],
-            "assembly a": frame["assembly_a"],
-            "b": frame["primal_b"],
-            "assembly b": frame["assembly_b"],
-            "δ of b": frame["primal_tol_b"],
-            "offline a [s]": frame["offline_a_s"],
-            "online a [ms]": 1e3 * frame["online_a_s"],
-            "offline b [s]": frame["offline_b_s"],
-            "online b [ms]": 1e3 * frame["online_b_s"],
-            "b pays": [
-                meaning if pd.isna(number) else f"{meaning} {number:.0f}"
-                for number, meaning in zip(frame["benefit_threshold"], frame["meaning"], strict=True)
-            ],
-        }
-    )
+    """The break-evens for reading: from how many queries on b is cheaper than a."""
+    return _for_reading(in_order(thresholds), THRESHOLDS)
+
+
+def _for_reading(frame: pd.DataFrame, table: Mapping[str, Column]) -> pd.DataFrame:
+    """The columns of a table that are shown, under their headings."""
+    shown = {column.heading: _shown(frame, name, column) for name, column in shown_columns(table).items()}
+    return pd.DataFrame(shown, index=frame.index)
+
+
+def _shown(frame: pd.DataFrame, name: str, column: Column) -> pd.Series | list[str]:
+    """One column for reading; some are made of several."""
+    if name in ("pod_tol", "dual_tol"):
+        return [asked(row, name.removesuffix("_tol")) for row in frame.to_dict("records")]
+    if name == "queries_ok":
+        return [
+            f"{fine}/{count}" + ("" if status == "ok" else f" {status}")
+            for fine, count, status in zip(frame["queries_ok"], frame["queries"], frame["status"], strict=True)
+        ]
+    if name == "benefit_threshold":
+        return [
+            meaning if pd.isna(number) else f"{meaning} {number:.0f}"
+            for number, meaning in zip(frame["benefit_threshold"], frame["meaning"], strict=True)
+        ]
+    if column.kind == INTEGER:
+        return frame[name].astype("Int64")
+    return 1e3 * frame[name] if column.heading.endswith("[ms]") else frame[name]
 
 
 def to_csv(frame: pd.DataFrame) -> str:
@@ -207,10 +184,6 @@ def asked(row: Mapping[str, Any] | pd.Series, axis: str) -> str:
     """The tolerance of "pod" or "dual", or the size where the study prescribed that."""
     tolerance, count = row[f"{axis}_tol"], row[f"{axis}_size"]
     return f"{'N' if axis == 'pod' else 'R'}={int(count)}" if pd.notna(count) else f"{tolerance:g}"
-
-
-def _asked(frame: pd.DataFrame, axis: str) -> list[str]:
-    return [asked(row, axis) for row in frame[[f"{axis}_tol", f"{axis}_size"]].to_dict("records")]
 
 
 def _replace(path: Path, text: str) -> None:

@@ -4,7 +4,8 @@ With an orthonormal basis Z of the primal space and generators χ of unit norm, 
 
     β_span = min ‖Cα‖ / ‖χα‖_W over all α,    β_cone = the same minimum over α ≥ 0   (paper, (14), (18), (30)).
 
-The second is NP-hard in general; it is bounded from both sides.
+The second is NP-hard in general and is bounded from both sides. β_span is a singular value, never the square root of an
+eigenvalue of M: that has a floor of √eps.
 """
 
 from __future__ import annotations
@@ -21,16 +22,18 @@ from vibench.reduction.supremizers import projected_supremizers
 from vibench.stability.conic_infsup import cone_interval
 
 UNSIGNED = "span"
-"""Name of the lower bound of a cone with free generators, β_span; no other is known to hold for it."""
-
+"""Name of the lower bound β_span in the intervals of cones with free generators; no other bound is valid for them."""
 
 VANISHES = 1e-12
-"""Constants below this are zero in floating point."""
+"""Constants below this are zero up to round-off."""
 
 
 @dataclass(frozen=True)
 class Multipliers:
-    """A reduced cone prepared once for every constant computed on it.
+    """A reduced cone with its span and Gram matrix.
+
+    One instance serves every constant of a cone, so that all share one rank decision: constants of different primal
+    spaces would not be comparable otherwise.
 
     Attributes
     ----------
@@ -57,7 +60,7 @@ class Multipliers:
 
 @dataclass(frozen=True)
 class InfSup:
-    """Inf-sup constants of one pair of spaces at one parameter; `sharp` names the bounds that gave the interval."""
+    """Inf-sup constants of one pair of spaces at one parameter; `sharp` names the bounds of the cone interval."""
 
     span: float
     cone_lower: float
@@ -65,13 +68,13 @@ class InfSup:
     sharp: str
 
     def scaled(self, factor: float) -> InfSup:
-        """The constants of the form multiplied by a number."""
+        """The constants for the bilinear form b multiplied by a number."""
         size = abs(factor)
         return InfSup(size * self.span, size * self.cone_lower, size * self.cone_upper, self.sharp)
 
 
 def multipliers(chi: Array, W: InnerProduct, free: Mask | None = None) -> Multipliers:
-    """Prepare generators (m×R) of unit norm; `free` says which may be used with either sign (R,), none by default."""
+    """`Multipliers` of generators (m×R) of unit norm; `free` (R,) marks those without a sign, none by default."""
     whitened = W.whiten(chi)
     free = no_free(chi.shape[1]) if free is None else free
     return Multipliers(chi, W.orthonormalise(chi), whitened.T @ whitened, free)
@@ -87,25 +90,25 @@ def inf_sup(on_span: Array, on_generators: Array, cone: Multipliers) -> InfSup:
     on_generators
         ZᵀBᵀχ (N'×R), likewise.
     cone
-        The prepared multipliers.
+        The reduced cone.
 
     Returns
     -------
     InfSup
-        All zeros when there is no primal vector, infinite when there is no multiplier.
+        Zero without primal vectors, infinite without multipliers.
     """
     span = beta_span(on_span)
     if np.any(cone.free) and np.all(cone.free):  # the cone is its span
         return InfSup(span, span, span, f"{UNSIGNED}/{UNSIGNED}")
-    lower, upper, sharp = cone_interval(compressed(on_generators), cone.gram, span)
-    if np.any(cone.free):  # nonnegative coefficients are some of those allowed: only upper bounds hold
+    lower, upper, sharp = cone_interval(_compressed(on_generators), cone.gram, span)
+    if np.any(cone.free):  # α ≥ 0 is a subset of the cone: only upper bounds carry over
         return InfSup(span, span, upper, f"{UNSIGNED}/{sharp.split('/')[1]}")
     return InfSup(span, lower, upper, sharp)
 
 
-def compressed(images: Array) -> Array:
+def _compressed(projected: Array) -> Array:
     """An isometric image of the columns (k×R) with no more rows than columns."""
-    return images if images.shape[0] <= images.shape[1] else np.asarray(np.linalg.qr(images, mode="r"))
+    return projected if projected.shape[0] <= projected.shape[1] else np.asarray(np.linalg.qr(projected, mode="r"))
 
 
 def beta_span(on_span: Array) -> float:
@@ -115,23 +118,23 @@ def beta_span(on_span: Array) -> float:
         return float("inf")
     if rows < rank:
         return 0.0
-    return float(singular_values(compressed(on_span))[-1])
+    return float(singular_values(_compressed(on_span))[-1])
 
 
 def inf_sup_on(Z: Array, B: SparseMatrix, cone: Multipliers) -> InfSup:
     """Constants of a primal space with V-orthonormal basis Z (n×N') at the parameter of B (m×n)."""
-    images = projected_supremizers(Z, B, np.hstack([cone.span, cone.chi]))
-    return inf_sup(images[:, : cone.rank], images[:, cone.rank :], cone)
+    projected = projected_supremizers(Z, B, np.hstack([cone.span, cone.chi]))
+    return inf_sup(projected[:, : cone.rank], projected[:, cone.rank :], cone)
 
 
 def inf_sup_full(V: InnerProduct, B: SparseMatrix, cone: Multipliers) -> InfSup:
-    """Constants of the whole of V: what online supremizers reach; the supremum is attained at T(mu)η."""
+    """Constants of the whole of V, where T(mu)η attains the supremum: those of online supremizers."""
     return inf_sup(
         V.whiten_functional(np.asarray(B.T @ cone.span)), V.whiten_functional(np.asarray(B.T @ cone.chi)), cone
     )
 
 
 def nodal_multipliers(W: InnerProduct) -> Multipliers:
-    """The high-fidelity cone W⁺ itself: nodal or cell functions, normalised."""
+    """The high-fidelity cone W⁺, generated by the normalised nodal or cell functions."""
     identity = np.eye(W.dim)
     return multipliers(identity / W.norm(identity), W)

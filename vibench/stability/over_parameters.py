@@ -1,4 +1,4 @@
-"""Assessment of queries: errors and inf-sup constants. Nothing here is timed."""
+"""Inf-sup constants over many parameters, one computation per class of proportional constraint matrices."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from vibench.stability.infsup import InfSup, Multipliers, inf_sup, inf_sup_on
 
 
 def constants_full(V: InnerProduct, classes: ConstraintClasses, cone: Multipliers) -> list[InfSup]:
-    """Constants of the whole of V at every B(mu) (m×n); matrices that are proportional share one computation."""
+    """Constants of the whole of V at every B(mu) (m×n)."""
     image = supremizer_images(V, classes.representatives, cone.span.shape[1] + cone.chi.shape[1])
     return everywhere(
         classes, [inf_sup(image(B, cone.span), image(B, cone.chi), cone) for B in classes.representatives]
@@ -19,10 +19,10 @@ def constants_full(V: InnerProduct, classes: ConstraintClasses, cone: Multiplier
 
 
 def constants_on(Z: Array, classes: ConstraintClasses, cone: Multipliers) -> list[InfSup]:
-    """Constants of one primal space with V-orthonormal basis Z (n×N') at every B(mu), likewise."""
+    """Constants of one primal space with V-orthonormal basis Z (n×N') at every B(mu)."""
     return everywhere(classes, [inf_sup_on(Z, B, cone) for B in classes.representatives])
 
 
 def everywhere(classes: ConstraintClasses, found: Sequence[InfSup]) -> list[InfSup]:
-    """Constants of all matrices from those of the ones that stand for their classes."""
+    """Constants of all matrices from those of the representatives."""
     return [found[k].scaled(c) for k, c in zip(classes.members, classes.factors, strict=True)]

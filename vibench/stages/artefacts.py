@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import platformdirs
+from cachetools import LRUCache
 
 from vibench.errors import RequestError, StorageError
 from vibench.locking import locked
@@ -32,21 +33,24 @@ LOCK = "lock"
 
 @dataclass(frozen=True)
 class History:
-    """One convergence history: what is plotted against the steps of an algorithm.
+    """One convergence history: a quantity over the steps of an algorithm.
 
     Attributes
     ----------
-    key
-        The columns of the histories table that say whose it is.
+    stage
+        The column `stage` of the histories table.
     quantity
         "error", "sigma", …
     values
         One per step.
+    first_step
+        Number of the first of these steps; not 0 where several stages hold parts of one history (`Stage.partial`).
     """
 
-    key: dict[str, Any]
+    stage: str
     quantity: str
     values: tuple[float, ...]
+    first_step: int = 0
 
 
 @dataclass(frozen=True)
@@ -69,7 +73,7 @@ class Store:
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
-        self._recent: dict[str, Artefact] = {}
+        self._recent: LRUCache[str, Artefact] = LRUCache(maxsize=64)
 
     def get(self, key: str) -> Artefact | None:
         """The artefact stored under a key; `None` if there is none that is whole.
@@ -94,8 +98,6 @@ class Store:
             raise StorageError(f"artefacts cannot be read from '{self.folder}': {error.strerror}") from None
         if not isinstance(artefact, Artefact):
             return None
-        if len(self._recent) >= 64:
-            self._recent.pop(next(iter(self._recent)))
         self._recent[key] = artefact
         return artefact
 
@@ -138,12 +140,12 @@ class Store:
             yield
 
     def contents(self) -> list[tuple[str, int, float]]:
-        """What is stored: sort of stage, bytes, seconds since it was made; one entry per artefact."""
+        """What is stored: label of the stage, bytes, seconds since it was made; one entry per artefact."""
         found = []
         for path in sorted(self.folder.glob(f"*{SUFFIX}")):
             with contextlib.suppress(FileNotFoundError):
                 status = path.stat()
-                found.append((path.name.partition("-")[0], status.st_size, time.time() - status.st_mtime))
+                found.append((path.name.rpartition("-")[0], status.st_size, time.time() - status.st_mtime))
         return found
 
     def clear(self, older_than: float = 0.0) -> int:

@@ -5,41 +5,41 @@ from __future__ import annotations
 from functools import lru_cache
 
 import numpy as np
+from cachetools import LRUCache
 
 from vibench.arrays import Array
 from vibench.interfaces.problem import Problem, VariationalInequality
 from vibench.interfaces.validation import checked_assembly
 
+LIMIT = 2**28
+"""Bytes that are kept at most; what was used longest ago is dropped first."""
+
 
 class Assemblies:
-    """What a problem assembles, kept for assessments that look at the same parameters again and again.
+    """The assemblies of one problem, each made once while there is room for it; nothing that is timed uses them."""
 
-    Parameters
-    ----------
-    problem
-        The problem.
-    limit
-        Bytes to keep at most; what was asked for longest ago goes first.
-    """
-
-    def __init__(self, problem: Problem, limit: int = 2**28) -> None:
-        self._problem, self._limit = problem, limit
-        self._kept: dict[bytes, VariationalInequality] = {}
-        self._size = 0
+    def __init__(self, problem: Problem, limit: int = LIMIT) -> None:
+        self._problem = problem
+        self._kept: LRUCache[bytes, VariationalInequality] = LRUCache(limit, getsizeof=_bytes)
 
     def at(self, mu: Array) -> VariationalInequality:
         """`checked_assembly` at mu (d,)."""
         vi = self._kept.get(_key(mu))
-        return self.keep(mu, checked_assembly(self._problem, mu) if vi is None else vi)
-
-    def keep(self, mu: Array, vi: VariationalInequality) -> VariationalInequality:
-        """Take in what was assembled at mu (d,), or asked for once more; gives it back."""
-        before = self._kept.pop(_key(mu), None)
-        self._size += _bytes(vi) - (0 if before is None else _bytes(before))
-        while self._kept and self._size > self._limit:
-            self._size -= _bytes(self._kept.pop(next(iter(self._kept))))
-        self._kept[_key(mu)] = vi
+        if vi is None:
+            vi = checked_assembly(self._problem, mu)
+            self.keep(mu, vi)
         return vi
+
+    def keep(self, mu: Array, vi: VariationalInequality) -> None:
+        """Keep what was assembled at mu (d,) elsewhere, unless it is larger than the limit."""
+        if _bytes(vi) <= self._kept.maxsize:
+            self._kept[_key(mu)] = vi
+
+
+@lru_cache(maxsize=1)
+def assemblies(problem: Problem) -> Assemblies:
+    """The assemblies of the present problem of this process."""
+    return Assemblies(problem)
 
 
 def _key(mu: Array) -> bytes:
@@ -49,9 +49,3 @@ def _key(mu: Array) -> bytes:
 def _bytes(vi: VariationalInequality) -> int:
     """Memory of the matrices, as if none were shared."""
     return int(12 * (vi.A.nnz + vi.B.nnz)) + vi.f.nbytes + vi.g.nbytes
-
-
-@lru_cache(maxsize=1)
-def assemblies(problem: Problem) -> Assemblies:
-    """What the problem in hand assembles, kept in this process; for whatever is not timed."""
-    return Assemblies(problem)

@@ -1,4 +1,4 @@
-"""How queries are assembled, in full or reduced: what that takes offline, and what it takes per query."""
+"""Assembly of reduced programs, in full or hyper-reduced: what it prepares offline, and its seconds per query."""
 
 from __future__ import annotations
 
@@ -12,33 +12,36 @@ from vibench.arrays import Array
 from vibench.interfaces.problem import MEMBERS, VariationalInequality
 from vibench.interfaces.strategies import Kind
 from vibench.interfaces.validation import checked_assembly, training_parameters, validation_parameters
-from vibench.model.affine import Evaluation, Member, affine_decomposition
-from vibench.model.galerkin import ReducedModel, beginning, project
-from vibench.model.hyperreduced import OnlineModel, Operators, project_members, why_in_full
+from vibench.model.affine import AffineMember, Evaluation, affine_decomposition
+from vibench.model.galerkin import ReducedModel, leading_part, project
+from vibench.model.hyperreduced import HyperReducedModel, Operators, hyper_reduce, reason_for_full_assembly
 from vibench.stages.artefacts import Store
 from vibench.stages.assemblies import assemblies
 from vibench.stages.base import Result, Stage, build_problem, value_of
-from vibench.stages.offline import EnrichmentStage, GrowthStage, enrichment_stage, grown_model, reduced_model
+from vibench.stages.enrichment import EnrichmentStage, GrowthStage, enrichment_stage
 from vibench.study.cells import Cell, Plugin
 from vibench.timing import NO_TIME, REPEATS, Seconds, median_of, median_seconds, timed
 
-Model = ReducedModel | OnlineModel
+Model = ReducedModel | HyperReducedModel
 """What gives the reduced problem at a parameter."""
 
 
 @dataclass(frozen=True)
-class Separation(Stage):
-    """How A, f, B, g can be evaluated without assembling all of them; it depends on the problem alone."""
+class AffineDecomposition(Stage):
+    """How A, f, B, g are evaluated without assembling all of them; it depends on the problem alone."""
+
+    label = "affine decomposition"
+    rooms = ("linalg", "interfaces", "model")
 
     problem: Plugin
     tolerance: float
 
     def inputs(self) -> tuple[Stage, ...]:
-        """Nothing comes before: the matrices of the training parameters are not kept."""
+        """None: the matrices of the training parameters are not kept."""
         return ()
 
     def run(self, store: Store) -> Result:  # noqa: ARG002
-        """A `Member` by name."""
+        """An `AffineMember` by name."""
         problem = build_problem(self.problem)
         return Result(*timed(lambda: affine_decomposition(problem, training_parameters(problem), self.tolerance)))
 
@@ -52,37 +55,43 @@ class Reduction:
 
 
 @dataclass(frozen=True)
-class ReductionStage(Stage):
-    """Projection of the separated members on the space of a reduced model."""
+class HyperReduction(Stage):
+    """Projection of the decomposed members on the space of a reduced model."""
+
+    label = "hyper-reduction"
+    rooms = ("linalg", "interfaces", "reduction", "model")
 
     enrichment: EnrichmentStage
-    separation: Separation
+    decomposition: AffineDecomposition
 
     def inputs(self) -> tuple[Stage, ...]:
         """The reduced model and the members."""
-        return (self.enrichment, *self.enrichment.inputs(), self.separation)
+        return (*self.enrichment.model_inputs, self.decomposition)
 
     def run(self, store: Store) -> Result:
         """A `Reduction`."""
-        model, _, _ = reduced_model(store, self.enrichment)
-        members: Mapping[str, Member] = value_of(store, self.separation)
-        why = why_in_full(model, members)
+        model = self.enrichment.model(store)
+        members: Mapping[str, AffineMember] = value_of(store, self.decomposition)
+        why = reason_for_full_assembly(model, members)
         if why:
             return Result(Reduction(None, why), NO_TIME)
-        operators, seconds = timed(lambda: project_members(model, members))
+        operators, seconds = timed(lambda: hyper_reduce(model, members))
         return Result(Reduction(operators, ""), seconds)
 
 
 @dataclass(frozen=True)
-class FormsStage(Stage):
-    """What assembling the high-fidelity matrices takes: median seconds per validation parameter."""
+class FullAssemblyTimes(Stage):
+    """Median seconds of assembling the high-fidelity matrices, per validation parameter."""
+
+    label = "full assembly times"
+    rooms = ("interfaces",)
 
     problem: Plugin
     count: int
     seed: int
 
     def inputs(self) -> tuple[Stage, ...]:
-        """Nothing comes before."""
+        """None."""
         return ()
 
     def run(self, store: Store) -> Result:  # noqa: ARG002
@@ -97,27 +106,30 @@ class FormsStage(Stage):
 
 
 @dataclass(frozen=True)
-class Projections(Stage):
-    """Programs of everything a nested strategy grew, in full; those of its tolerances are their beginnings."""
+class NestedPrograms(Stage):
+    """Reduced programs, in full, with all vectors of a nested strategy; its tolerances take their leading parts."""
+
+    label = "nested programs"
+    rooms = ("linalg", "interfaces", "model")
 
     growth: GrowthStage
     count: int
     seed: int
 
     def inputs(self) -> tuple[Stage, ...]:
-        """The growth and what it was built on."""
-        return (self.growth, *self.growth.inputs())
+        """The growth, and the POD and the cone of its model."""
+        return (self.growth.pod, self.growth.cone, self.growth)
 
     def run(self, store: Store) -> Result:
         """One program per validation parameter; not timed."""
-        model = grown_model(store, self.growth)
+        model = self.growth.model(store)
         mus, kept = validation_parameters(model.problem, self.count, self.seed), assemblies(model.problem)
         return Result(tuple(model.reduce(kept.at(mu)).program for mu in mus))
 
 
 @dataclass(frozen=True)
-class Assembled:
-    """Reduced programs and what assembling them takes, whatever solves them.
+class ReducedPrograms:
+    """Reduced programs and the seconds of their assembly, whatever solves them.
 
     Attributes
     ----------
@@ -140,7 +152,10 @@ class Assembled:
 
 @dataclass(frozen=True)
 class AssemblyStage(Stage):
-    """Assembly of the reduced problems at the validation parameters, timed."""
+    """Assembly of the reduced programs at the validation parameters, timed; the value is a `ReducedPrograms`."""
+
+    label = "assembly"
+    rooms = ("linalg", "interfaces", "reduction", "model")
 
     enrichment: EnrichmentStage
     interpolation: float | None
@@ -148,61 +163,87 @@ class AssemblyStage(Stage):
     seed: int
 
     @property
-    def reduction(self) -> ReductionStage | None:
-        """What reduced assembly needs offline; `None` for assembly in full."""
+    def reduction(self) -> HyperReduction | None:
+        """What reduced assembly prepares offline; `None` for assembly in full."""
         if self.interpolation is None:
             return None
-        return ReductionStage(self.enrichment, Separation(self.enrichment.pod.problem, self.interpolation))
+        return HyperReduction(self.enrichment, AffineDecomposition(self.enrichment.pod.problem, self.interpolation))
 
     @property
-    def forms(self) -> FormsStage:
-        """The stage that knows what high-fidelity matrices take."""
-        return FormsStage(self.enrichment.pod.problem, self.count, self.seed)
+    def full_times(self) -> FullAssemblyTimes:
+        """The stage of the seconds of the high-fidelity matrices."""
+        return FullAssemblyTimes(self.enrichment.pod.problem, self.count, self.seed)
 
     @property
-    def projections(self) -> Projections | None:
-        """What knows the programs in full of an enrichment that others are the beginnings of."""
+    def nested(self) -> NestedPrograms | None:
+        """The programs in full of all vectors of a nested strategy; `None` for any other."""
         growth = self.enrichment.growth
-        return None if growth is None else Projections(growth, self.count, self.seed)
+        return None if growth is None else NestedPrograms(growth, self.count, self.seed)
+
+    @property
+    def model_inputs(self) -> tuple[Stage, ...]:
+        """The stages whose artefacts `model` reads."""
+        reduction = self.reduction
+        return self.enrichment.model_inputs + (() if reduction is None else (reduction,))
 
     def inputs(self) -> tuple[Stage, ...]:
-        """Enrichment, what it was built on, what the matrices take, and what is known of full and reduced assembly."""
-        reduction, projections = self.reduction, self.projections
-        known = () if projections is None else (projections,)
-        extra = () if reduction is None else (reduction, reduction.separation)
-        return (self.enrichment, *self.enrichment.inputs(), self.forms, *known, *extra)
+        """The model, the seconds of the high-fidelity matrices, and the programs in full that are known."""
+        nested = self.nested
+        return (*self.model_inputs, self.full_times, *(() if nested is None else (nested,)))
 
     def run(self, store: Store) -> Result:
         """Time every assembly; compare reduced ones with full ones, untimed."""
-        model, _ = query_model(store, self)
+        model, _ = self.model(store)
         mus = validation_parameters(model.problem, self.count, self.seed)
-        known = None if self.projections is None else value_of(store, self.projections)
-        if isinstance(model, OnlineModel):
+        known = None if self.nested is None else value_of(store, self.nested)
+        if isinstance(model, HyperReducedModel):
             return Result(_reduced(model, mus, known))
-        return Result(_in_full(model, mus, value_of(store, self.forms), known))
+        return Result(_in_full(model, mus, value_of(store, self.full_times), known))
+
+    def model(self, store: Store) -> tuple[Model, str]:
+        """The model that queries use, and why it assembles in full although reduced assembly was asked for."""
+        model = self.enrichment.model(store)
+        if self.reduction is None:
+            return model, ""
+        reduction: Reduction = value_of(store, self.reduction)
+        if reduction.operators is None:
+            return model, f"assembled in full: {reduction.why_full}"
+        return HyperReducedModel(model, reduction.operators), ""
+
+    def columns(self, store: Store) -> dict[str, float | int | None]:
+        """Columns of a cell: tolerance, training error and terms of every member; none for assembly in full."""
+        if self.reduction is None:
+            return {}
+        members: Mapping[str, AffineMember] = value_of(store, self.reduction.decomposition)
+        summed = {name: member for name, member in members.items() if member.terms}
+        return {
+            "interpolation_tol": self.interpolation,
+            "interpolation_error": max((member.error for member in summed.values()), default=0.0),
+            **{f"terms_{name}": len(m.rows) if m.way is Evaluation.INTERPOLATED else 0 for name, m in summed.items()},
+        }
 
 
 InFull = Sequence[VariationalInequality] | None
 """Programs in full of a space that begins with that of a model, one per parameter, if they are known."""
 
 
-def _reduced(model: OnlineModel, mus: Array, known: InFull) -> Assembled:
+def _reduced(model: HyperReducedModel, mus: Array, known: InFull) -> ReducedPrograms:
     """Assemble without arrays of mesh size at every parameter; how far the members are from their projections."""
     matrices = assemblies(model.problem)
     programs, seconds, errors, factor = [], [], [], None
     for k, mu in enumerate(mus):
         found, spent = median_seconds(partial(model.assemble, mu))
         factor = found.factor
-        full = known and beginning(known[k], len(found.program.f))
+        full = known and leading_part(known[k], len(found.program.f))
         errors.append(
             _largest_difference(found.program, full or project(matrices.at(mu), found.basis, model.generators))
         )
         programs.append(found.program)
         seconds.append(spent)
-    return Assembled(tuple(programs), factor, tuple(seconds), tuple(errors))
+    return ReducedPrograms(tuple(programs), factor, tuple(seconds), tuple(errors))
 
 
-def _in_full(model: ReducedModel, mus: Array, forms: Sequence[Seconds], known: InFull) -> Assembled:
+def _in_full(model: ReducedModel, mus: Array, forms: Sequence[Seconds], known: InFull) -> ReducedPrograms:
     """Assemble the high-fidelity matrices, which are timed once for all models, and project them.
 
     After a warm-up the projection is timed once at every parameter. On a space that does not vary it takes as long at
@@ -215,38 +256,14 @@ def _in_full(model: ReducedModel, mus: Array, forms: Sequence[Seconds], known: I
     projecting = [seconds for _, seconds in each]
     if model_of_one:
         projecting = [median_of(projecting)] * len(mus)
-    programs = [beginning(program, size) for program in known] if known else [found.program for found, _ in each]
+    programs = [leading_part(program, size) for program in known] if known else [found.program for found, _ in each]
     total = tuple(form + spent for form, spent in zip(forms, projecting, strict=True))
-    return Assembled(tuple(programs), None, total, (0.0,) * len(mus))
+    return ReducedPrograms(tuple(programs), None, total, (0.0,) * len(mus))
 
 
 def _largest_difference(found: VariationalInequality, exact: VariationalInequality) -> float:
     pairs = [(getattr(found, name), getattr(exact, name)) for name in MEMBERS]
     return max(float(np.linalg.norm(one - other)) / (float(np.linalg.norm(other)) or 1.0) for one, other in pairs)
-
-
-def query_model(store: Store, stage: AssemblyStage) -> tuple[Model, str]:
-    """The model that queries ask, and why it assembles in full although reduced assembly was asked for."""
-    model, _, _ = reduced_model(store, stage.enrichment)
-    if stage.reduction is None:
-        return model, ""
-    reduction: Reduction = value_of(store, stage.reduction)
-    if reduction.operators is None:
-        return model, f"assembled in full: {reduction.why_full}"
-    return OnlineModel(model, reduction.operators), ""
-
-
-def assembly_columns(store: Store, stage: AssemblyStage) -> dict[str, float | int | None]:
-    """Columns of a cell: tolerance, training error and number of terms of every member; none for assembly in full."""
-    if stage.reduction is None:
-        return {}
-    members: Mapping[str, Member] = value_of(store, stage.reduction.separation)
-    summed = {name: member for name, member in members.items() if member.terms}
-    return {
-        "interpolation_tol": stage.interpolation,
-        "interpolation_error": max((member.error for member in summed.values()), default=0.0),
-        **{f"terms_{name}": len(m.rows) if m.way is Evaluation.INTERPOLATED else 0 for name, m in summed.items()},
-    }
 
 
 def assembly_stage(cell: Cell) -> AssemblyStage:

@@ -1,33 +1,37 @@
-"""What a stage is: a pure function of its true inputs, shared by every cell that needs it; what is told of its end."""
+"""What a stage is: a pure function of its inputs, stored as an artefact and shared by every cell that needs it."""
 
 from __future__ import annotations
 
+import sys
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass, fields
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, fields, is_dataclass
 from functools import cached_property, lru_cache
-from typing import Any
+from typing import Any, ClassVar
 
 from vibench.errors import NumericalError
 from vibench.interfaces.problem import Problem
 from vibench.provenance import core_code, libraries
 from vibench.qp.status import Status
 from vibench.stages.artefacts import History, Store
-from vibench.study.cells import Plugin, digest
+from vibench.study.cells import Axes, Plugin, digest
 from vibench.timing import NO_TIME, Seconds
+
+Row = dict[str, Any]
+"""A row of a results table: column → value."""
 
 
 @lru_cache(maxsize=4)
 def build_problem(plugin: Plugin) -> Problem:
     """The problem of a stage; one instance per process."""
     problem = plugin.create()
-    assert isinstance(problem, Problem)  # `plugins.load` refuses anything else
+    assert isinstance(problem, Problem)  # `registry.load` refuses anything else
     return problem
 
 
 @dataclass(frozen=True)
 class Result:
-    """What a stage gives: its value, the seconds that count as its own, and histories."""
+    """What a stage computes: its value, the seconds that count as its own, and histories."""
 
     value: Any
     seconds: Seconds = NO_TIME
@@ -36,7 +40,7 @@ class Result:
 
 @dataclass(frozen=True)
 class Done:
-    """A stage that went through: its histories, its value if nobody else stores it, and how long it took in all."""
+    """A stage that succeeded: its histories, its value where that is not stored, and its wall seconds in all."""
 
     histories: tuple[History, ...]
     value: Any
@@ -45,7 +49,7 @@ class Done:
 
 @dataclass(frozen=True)
 class Failed:
-    """A stage, or a piece of one, that did not: the status its rows get, and why."""
+    """A stage, or a piece of one, that failed: the status of the rows that need it, and the reason."""
 
     status: Status
     reason: str
@@ -53,48 +57,97 @@ class Failed:
 
 @dataclass(frozen=True)
 class Unstored:
-    """A stage whose result could not be stored, and why: nothing else could be, either."""
+    """A stage whose artefact could not be written, and the reason; no other could be written either."""
 
     reason: str
 
 
 class Stage(ABC):
-    """One stage; subclasses are frozen dataclasses."""
+    """One stage of a computation; subclasses are frozen dataclasses of what determines the result.
+
+    The runner, the recorder and the progress display treat all stages alike: a stage says itself how it is called,
+    which axes of the study it belongs to and what of it is recorded.
+    """
+
+    label: ClassVar[str]
+    """What the stage computes, in a word or two, for messages and for the names of artefacts."""
+    rooms: ClassVar[tuple[str, ...]] = ()
+    """Rooms of vibench whose code determines the result; those of the inputs need not be repeated."""
+    stored: ClassVar[bool] = True
+    """Whether the value is kept as an artefact, under `key`."""
+    partial: ClassVar[bool] = False
+    """Whether several stages hold parts of the same histories; progress is then shown part by part."""
 
     @cached_property
     def key(self) -> str:
-        """Name of the stage's artefact: its kind, and a hash of all that determines it, code and libraries included."""
-        name = type(self).__name__.lower()
-        return f"{name}-{digest([name, core_code(), libraries(), asdict(self)])}"  # type: ignore[call-overload]
+        """Name of the artefact: the label, and a hash of everything that determines the value.
+
+        That is the fields of the stage, the keys of its inputs, the code and the libraries. The code of a plugin counts
+        through `Plugin.code`; of vibench, the module that defines the stage and `rooms` count. A figure or a help text
+        does not.
+        """
+        parts = (
+            "arrays.py",
+            "errors.py",
+            "timing.py",
+            *self.rooms,
+            __file__,
+            str(sys.modules[type(self).__module__].__file__),
+        )
+        own = {part.name: _described(getattr(self, part.name)) for part in fields(self)}  # type: ignore[arg-type]
+        content = [type(self).__name__, core_code(*parts), libraries(), own, [stage.key for stage in self.inputs()]]
+        return f"{self.label.lower().replace(' ', '-')}-{digest(content)}"
+
+    @property
+    def sort(self) -> str:
+        """Stages of the same sort take about as long; the remaining time of a run is estimated by it."""
+        return self.label
+
+    @property
+    def axes(self) -> Axes:
+        """The axes of the study that the stage depends on; they name its histories."""
+        return Axes()
 
     def plugins(self) -> Iterator[Plugin]:
-        """The plugins that the stage and those it is described by depend on."""
-        for part in fields(self):  # type: ignore[arg-type]
-            value = getattr(self, part.name)
-            if isinstance(value, Plugin):
-                yield value
-            elif isinstance(value, Stage):
-                yield from value.plugins()
+        """The plugins that the stage and its inputs depend on."""
+        yield from (value for part in fields(self) if isinstance(value := getattr(self, part.name), Plugin))  # type: ignore[arg-type]
+        for stage in self.inputs():
+            yield from stage.plugins()
 
     @abstractmethod
     def inputs(self) -> tuple[Stage, ...]:
-        """Stages whose artefacts `run` reads."""
+        """Stages whose artefacts `run` reads itself; what these read in turn is not repeated."""
 
     @abstractmethod
     def run(self, store: Store) -> Result:
-        """Do the work; inputs are in the store."""
+        """Compute the value; the artefacts of the inputs are in the store."""
+
+    def rows(self, value: Any) -> Mapping[str, Sequence[Row]]:  # noqa: ARG002
+        """Rows of results tables made from the value, by table; the columns that name the axes are added to them."""
+        return {}
+
+    def failure_rows(self, reason: str) -> Mapping[str, Sequence[Row]]:  # noqa: ARG002
+        """Rows recorded in place of `rows` where the stage failed; the rows of the cells that need it say so anyway."""
+        return {}
+
+
+def _described(value: Any) -> Any:
+    """A field of a stage as JSON can hold it; another stage is described by its key."""
+    if isinstance(value, Stage):
+        return value.key
+    return asdict(value) if is_dataclass(value) and not isinstance(value, type) else value
 
 
 class Pieces(ABC):
-    """The work of a piecewise stage, begun: pieces can be done in any order, and by several processes."""
+    """The work of a piecewise stage, begun; pieces can be done in any order and by several processes."""
 
     @abstractmethod
     def piece(self, number: int, watch: Callable[[bool], None]) -> Any:
-        """Do one piece; `watch(True)` is called before whatever has a limit of its own, `watch(False)` after it."""
+        """Do one piece; `watch(True)` is called before what has a limit of its own, `watch(False)` after it."""
 
     @abstractmethod
     def lost(self, number: int, failed: Failed) -> Any:
-        """What stands in the place of a piece that hung or died."""
+        """What replaces a piece that hung or whose process died."""
 
     @abstractmethod
     def finish(self, pieces: Sequence[Any]) -> Any:
@@ -102,16 +155,18 @@ class Pieces(ABC):
 
 
 class PiecewiseStage(Stage):
-    """A stage whose pieces are kept one by one: a process that dies or hangs costs one piece. It is not stored."""
+    """A stage whose pieces are kept one by one: a process that dies or hangs costs one piece."""
+
+    stored = False
 
     @property
     @abstractmethod
     def pieces(self) -> int:
-        """How many pieces there are."""
+        """Number of pieces."""
 
     @abstractmethod
     def begin(self, store: Store) -> Pieces:
-        """Do what the pieces have in common; inputs are in the store."""
+        """Do what the pieces have in common; the artefacts of the inputs are in the store."""
 
     def run(self, store: Store) -> Result:
         """All pieces in this process, in their order."""
@@ -120,7 +175,13 @@ class PiecewiseStage(Stage):
 
 
 def value_of(store: Store, stage: Stage) -> Any:
-    """The stored value of a stage that has been run."""
+    """The stored value of a stage that has been run.
+
+    Raises
+    ------
+    NumericalError
+        If its artefact is not there.
+    """
     artefact = store.get(stage.key)
     if artefact is None:
         raise NumericalError(f"the artefact {stage.key} is missing")

@@ -20,8 +20,9 @@ from vibench.qp.status import Status
 from vibench.results.solver_agreement import vectors
 from vibench.stability.infsup import InfSup
 from vibench.stages.artefacts import Artefact, Store
-from vibench.stages.assembly import Assembled, AssemblyStage, assembly_columns, query_model
-from vibench.stages.base import Failed, Pieces, PiecewiseStage, Stage, value_of
+from vibench.stages.assembly import AssemblyStage, ReducedPrograms, assembly_stage
+from vibench.stages.base import Failed, Pieces, PiecewiseStage, Row, Stage, value_of
+from vibench.stages.cell_summary import summarise
 from vibench.stages.infsup_constants import (
     FullConstants,
     OwnConstants,
@@ -29,31 +30,31 @@ from vibench.stages.infsup_constants import (
     ReferenceConstants,
     ValidationConstraints,
 )
-from vibench.stages.offline import ReducedCone, enrichment_of
-from vibench.stages.query import Asked, Row, Task, assess
-from vibench.stages.snapshots import gather, sweep, training
+from vibench.stages.offline import ReducedCone
+from vibench.stages.query import Query, QuerySolver, error_columns
+from vibench.stages.snapshots import gather, training_stages, validation_stages
+from vibench.study.cells import Cell
 from vibench.timing import calibration
 
-DISTURBED = 1.3
-"""Rows measured where the calibration is this much slower than at its best are marked."""
+QueryRows = tuple[Row, Row | None]
+"""The row of a query, and that of its solution if there is one."""
 
 
 @dataclass(frozen=True)
 class CellRows:
-    """The rows one cell leaves: its own, one per query, and the solutions of the queries that have one."""
+    """The rows of one cell: its own, one per query, and the solutions of the queries that have one."""
 
     cell: Row
     queries: tuple[Row, ...]
     solutions: tuple[Row, ...] = ()
 
 
-Answered = tuple[Row, Row | None]
-"""The row of a query, and of its solution if there is one."""
-
-
 @dataclass(frozen=True)
-class QueriesStage(PiecewiseStage):
+class CellQueries(PiecewiseStage):
     """All queries of one cell, each a piece; the value is a `CellRows`."""
+
+    label = "queries"
+    rooms = ("linalg", "interfaces", "qp", "model")
 
     assembly: AssemblyStage
     solver: str
@@ -62,22 +63,23 @@ class QueriesStage(PiecewiseStage):
     warm_start: bool = False
 
     @property
+    def sort(self) -> str:
+        """Queries of one solver take about as long."""
+        return f"{self.label} with {self.solver}"
+
+    @property
     def pieces(self) -> int:
         """One query per validation parameter."""
         return self.assembly.count
 
     @property
     def reference(self) -> ReferenceConstants:
-        """The stage that knows the constants of the high-fidelity problem."""
+        """The stage of the constants of the high-fidelity problem."""
         return ReferenceConstants(self._constraints)
 
     @property
-    def _constraints(self) -> ValidationConstraints:
-        return ValidationConstraints(self.assembly.enrichment.pod.problem, self.assembly.count, self.assembly.seed)
-
-    @property
     def constants(self) -> tuple[OwnConstants, FullConstants, PlainConstants]:
-        """The stages that know the inf-sup constants of the reduced pair, of V with the cone, and of V_N alone."""
+        """The stages of the inf-sup constants of the reduced pair, of V with the cone, and of V_N alone."""
         enrichment, constraints = self.assembly.enrichment, self._constraints
         return (
             OwnConstants(enrichment, constraints),
@@ -86,72 +88,98 @@ class QueriesStage(PiecewiseStage):
         )
 
     @property
+    def _constraints(self) -> ValidationConstraints:
+        return ValidationConstraints(self.assembly.enrichment.pod.problem, self.assembly.count, self.assembly.seed)
+
+    @property
+    def training(self) -> tuple[Stage, ...]:
+        """The stages of the training snapshots."""
+        return training_stages(self.assembly.enrichment.pod.problem)
+
+    @property
     def validation(self) -> tuple[Stage, ...]:
-        """The high-fidelity sweep over the validation parameters."""
-        return sweep(self.assembly.enrichment.pod.problem, "validation", self.assembly.count, self.assembly.seed)
+        """The stages of the reference solutions."""
+        return validation_stages(self.assembly.enrichment.pod.problem, self.assembly.count, self.assembly.seed)
+
+    @property
+    def offline(self) -> Mapping[str, tuple[Stage, ...]]:
+        """The stages whose seconds are the offline time of the cell, by the columns they count in."""
+        enrichment, reduction = self.assembly.enrichment, self.assembly.reduction
+        return {
+            "snapshots": self.training,
+            "pod": (enrichment.pod,),
+            "cone": (enrichment.cone,),
+            "enrichment": (enrichment,),
+            "assembly": () if reduction is None else (reduction.decomposition, reduction),
+        }
 
     def inputs(self) -> tuple[Stage, ...]:
-        """Everything the cell's rows are made from."""
-        problem = self.assembly.enrichment.pod.problem
-        known = (self._constraints, *self.constants, self.reference, *training(problem), *self.validation)
-        return (self.assembly, *self.assembly.inputs(), *known)
+        """Everything that the rows of the cell are made from."""
+        timed = (stage for stages in self.offline.values() for stage in stages)
+        read = (self.assembly, *self.assembly.model_inputs, self.assembly.full_times, *timed)
+        found = (*read, *self.constants, self.reference, *self.validation)
+        return tuple(dict.fromkeys(found))
 
-    def begin(self, store: Store) -> Queries:
-        """Bring the reduced model and the reference solutions back."""
-        return Queries(self, store)
+    def begin(self, store: Store) -> _Queries:
+        """Load the reduced programs and the reference solutions."""
+        return _Queries(self, store)
 
 
-class Queries(Pieces):
+def cell_queries(cell: Cell, query_seconds: float) -> CellQueries:
+    """The last stage of a cell; its inputs lead to all others."""
+    return CellQueries(assembly_stage(cell), cell.solver, cell.accuracy, query_seconds, cell.warm_start)
+
+
+class _Queries(Pieces):
     """The queries of a cell: solve, verify and assess every one."""
 
-    def __init__(self, stage: QueriesStage, store: Store) -> None:
+    def __init__(self, stage: CellQueries, store: Store) -> None:
         self._slowdown = calibration().slowdown()
         self._stage, self._store = stage, store
         enrichment = stage.assembly.enrichment
-        self._model, self._note = query_model(store, stage.assembly)
+        self._model, self._note = stage.assembly.model(store)
         self._cone: ReducedCone = value_of(store, enrichment.cone)
-        snapshots = gather(store, training(enrichment.pod.problem))
+        snapshots = gather(store, stage.training)
         self._reference = gather(store, stage.validation)
         problem = self._model.problem
         self._floors = tuple(
             1e-12 * float(np.max(space.norm(columns), initial=0.0))
             for space, columns in ((problem.V, snapshots.u), (problem.W, snapshots.lam))
         )
-        self._assembled: Assembled = value_of(store, stage.assembly)
+        self._programs: ReducedPrograms = value_of(store, stage.assembly)
         self._own, self._full, self._plain = (value_of(store, known) for known in stage.constants)
         self._stability: list[Stability] = value_of(store, stage.reference)
-        self._task = Task(stage.solver, stage.accuracy, stage.query_seconds)
+        self._solver = QuerySolver(stage.solver, stage.accuracy, stage.query_seconds)
 
-    def piece(self, number: int, watch: Callable[[bool], None]) -> Answered:
+    def piece(self, number: int, watch: Callable[[bool], None]) -> QueryRows:
         """The rows of one query."""
-        assembled, k = self._assembled, number
-        asked = Asked(assembled.programs[k], assembled.factor, assembled.seconds[k], self._before(k))
-        found, solution = self._task.run(asked, watch)
+        reduced, k = self._programs, number
+        query = Query(reduced.programs[k], reduced.factor, reduced.seconds[k], self._start(k))
+        found, solution = self._solver.run(query, watch)
         return self._known(k) | found, solution and {"query": k} | solution
 
     @cached_property
     def _path(self) -> list[int | None]:
         return path_before(self._reference.mu, self._model.problem.parameters)
 
-    def _before(self, number: int) -> tuple[int, VariationalInequality] | None:
-        """The query before this one on a path through the parameters, where one starts from the solution of the other.
+    def _start(self, number: int) -> tuple[int, VariationalInequality] | None:
+        """The query before this one on a path through the parameters, where a solver starts from its solution.
 
-        It is solved again for that: what a query starts from does not depend on who solved what before. Where the
-        primal basis changes with the parameter there is nothing to start from.
+        It is solved again for that: the start of a query does not depend on which process solved what before. Where
+        the primal basis changes with the parameter there is nothing to start from.
         """
-        programs = self._assembled.programs
         if not self._stage.warm_start or self._model.kind is Kind.PER_PARAMETER:
             return None
         before = self._path[number]
-        return None if before is None else (before, programs[before])
+        return None if before is None else (before, self._programs.programs[before])
 
-    def lost(self, number: int, failed: Failed) -> Answered:
+    def lost(self, number: int, failed: Failed) -> QueryRows:
         """The row of a query whose process hung or died."""
         outcome = {"status": failed.status.value, "reason": failed.reason}
-        return self._known(number) | {"assemble_s": self._assembled.seconds[number].cpu} | outcome, None
+        return self._known(number) | {"assemble_s": self._programs.seconds[number].cpu} | outcome, None
 
-    def finish(self, pieces: Sequence[Answered]) -> CellRows:
-        """All rows; the cell's are means and extremes over the queries."""
+    def finish(self, pieces: Sequence[QueryRows]) -> CellRows:
+        """All rows; that of the cell has means and extremes over the queries."""
         solutions = {k: solution for k, (_, solution) in enumerate(pieces) if solution is not None}
         assessed = dict(zip(solutions, self._assess(solutions), strict=True))
         rows = [row | assessed.get(k, {}) for k, (row, _) in enumerate(pieces)]
@@ -160,28 +188,28 @@ class Queries(Pieces):
         return CellRows(found | self._sizes() | self._offline(), tuple(rows), tuple(solutions.values()))
 
     def _assess(self, solutions: Mapping[int, Row]) -> list[Row]:
-        """What comparing the solutions of some queries with the high-fidelity ones gives, row by row.
+        """Error columns of some queries, all at once.
 
-        Where that fails for all together it is done one by one, and the rows that it fails for say so.
+        Where that fails it is done one by one, and the rows for which it fails say so.
         """
         try:
-            return self._assessed(solutions)
+            return self._errors(solutions)
         except MemoryError:
             raise
-        except Exception:  # noqa: BLE001  whatever it is, it may be of one query alone
-            return [row for k, solution in solutions.items() for row in self._alone(k, solution)]
+        except Exception:  # noqa: BLE001  one query may be the cause; which one is found out below
+            return [row for k, solution in solutions.items() for row in self._assess_one(k, solution)]
 
-    def _alone(self, number: int, solution: Row) -> list[Row]:
+    def _assess_one(self, number: int, solution: Row) -> list[Row]:
         try:
-            return self._assessed({number: solution})
+            return self._errors({number: solution})
         except MemoryError:
             raise
         except Exception as error:  # noqa: BLE001  the row says what
             return [{"status": Status.ERROR.value, "reason": f"in the assessment: {in_a_line(error)}"}]
 
-    def _assessed(self, solutions: Mapping[int, Row]) -> list[Row]:
+    def _errors(self, solutions: Mapping[int, Row]) -> list[Row]:
         numbers, reference = list(solutions), self._reference
-        return assess(
+        return error_columns(
             self._model,
             reference.mu[numbers],
             [vectors(solution) for solution in solutions.values()],
@@ -190,7 +218,7 @@ class Queries(Pieces):
         )
 
     def _known(self, number: int) -> Row:
-        """What is known of a query before it is asked: where, and the inf-sup constants there."""
+        """The columns of a query that are known before it is solved: its parameter and the inf-sup constants there."""
         reference = self._reference
         return (
             {f"mu_{i + 1}": float(value) for i, value in enumerate(reference.mu[number])}
@@ -199,21 +227,21 @@ class Queries(Pieces):
             | _constants("beta_full_", self._full[number])
             | _constants("beta_plain_", self._plain[number])
             | _constants("beta_hf_", self._stability[number].inf_sup)
-            | {"bounds": self._own[number].sharp, "assembly_error": self._assembled.errors[number]}
+            | {"bounds": self._own[number].sharp, "assembly_error": self._programs.errors[number]}
         )
 
     def _sizes(self) -> Row:
         """Dimensions, fallbacks, memory."""
-        enrichment = self._stage.assembly.enrichment
-        built, cone = enrichment_of(self._store, enrichment), self._cone
-        size = value_of(self._store, enrichment.pod).basis.shape[1]
+        assembly, cone = self._stage.assembly, self._cone
+        built = assembly.enrichment.enrichment(self._store)
+        size = value_of(self._store, assembly.enrichment.pod).basis.shape[1]
         fallbacks = [*cone.cone.fallbacks, *built.fallbacks, *([self._note] if self._note else [])]
-        for purpose, chunks in (("training", training(enrichment.pod.problem)), ("validation", self._stage.validation)):
+        for purpose, chunks in (("training", self._stage.training), ("validation", self._stage.validation)):
             notes = [note for note in gather(self._store, chunks).fallbacks if note]
             fallbacks += [f"{len(notes)} of the {purpose} solutions: {notes[0]}"] if notes else []
         added = self._model.fixed_basis.shape[1] - size
         return {
-            "model": self._stage.assembly.key,
+            "model": assembly.key,
             "enrichment_kind": built.kind.value,
             "dim_V": self._model.problem.V.dim,
             "dim_W": self._model.problem.W.dim,
@@ -222,33 +250,22 @@ class Queries(Pieces):
             "rank": cone.prepared.rank,
             "gram_condition": cone.gram_condition,
             "enrichment": cone.prepared.rank if built.kind is Kind.PER_PARAMETER else added,
-            **assembly_columns(self._store, self._stage.assembly),
+            **assembly.columns(self._store),
             "fallbacks": "; ".join(fallbacks),
             "peak_memory_mib": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
         }
 
     def _offline(self) -> Row:
-        """Seconds of the stages the cell would have had to run, and the machines that measured them."""
-        enrichment = self._stage.assembly.enrichment
-        reduction = self._stage.assembly.reduction
-        stages: dict[str, tuple[Stage, ...]] = {
-            "snapshots": training(enrichment.pod.problem),
-            "pod": (enrichment.pod,),
-            "cone": (enrichment.cone,),
-            "enrichment": (enrichment,),
-            "assembly": () if reduction is None else (reduction.separation, reduction),
-        }
-        artefacts = {name: [self._artefact(stage) for stage in parts] for name, parts in stages.items()}
+        """Seconds of the stages the cell alone would have run, and the machines that measured them."""
+        artefacts = {name: [self._artefact(stage) for stage in parts] for name, parts in self._stage.offline.items()}
         spent = {name: [artefact.seconds for artefact in found] for name, found in artefacts.items()}
         row: Row = {f"offline_{name}_s": sum(s.cpu for s in parts) for name, parts in spent.items()}
         row["offline_s"] = sum(row.values())
         row["offline_wall_s"] = sum(s.wall for parts in spent.values() for s in parts)
         row["hf_s"] = float(np.mean([s.cpu for s in self._reference.seconds]))
-        others = [
-            self._artefact(stage)
-            for stage in (self._stage.assembly, self._stage.assembly.forms, *self._stage.validation)
-        ]
-        machines = {artefact.machine for found in (*artefacts.values(), others) for artefact in found} | {machine()}
+        assembly = self._stage.assembly
+        online = [self._artefact(stage) for stage in (assembly, assembly.full_times, *self._stage.validation)]
+        machines = {artefact.machine for found in (*artefacts.values(), online) for artefact in found} | {machine()}
         return row | {"machine": "; ".join(sorted(machines))}
 
     def _artefact(self, stage: Stage) -> Artefact:
@@ -275,52 +292,3 @@ def _constants(prefix: str, constants: InfSup) -> Row:
         f"{prefix}cone_lower": constants.cone_lower,
         f"{prefix}cone_upper": constants.cone_upper,
     }
-
-
-def summarise(rows: Sequence[Row], slowdown: float = 1.0) -> Row:
-    """The columns of a cell that are means, extremes and counts over its queries; means are over the ok ones.
-
-    `slowdown` is that of the calibration, before or after the queries.
-    """
-    fine = [row for row in rows if row["status"] == Status.OK]
-    worst = max((Status(row["status"]) for row in rows), key=lambda status: status.severity)
-    reasons = [f"mu={_mu(row)}: {row['reason']}" for row in rows if row["status"] == worst and row["reason"]]
-
-    def column(name: str) -> Array:
-        return np.array([row[name] for row in fine if row.get(name) is not None], dtype=float)
-
-    def mean(name: str) -> float | None:
-        return float(column(name).mean()) if column(name).size else None
-
-    def most(name: str) -> float | None:
-        return float(column(name).max()) if column(name).size else None
-
-    residuals = [most(name) for name in ("primal_residual", "dual_residual", "gap")]
-    cpu, wall = column("total_s").sum(), column("total_wall_s").sum()
-    return {
-        "status": worst.value,
-        "reason": f"{len(reasons)} of {len(rows)} queries, first {reasons[0]}" if reasons else "",
-        "queries": len(rows),
-        "queries_ok": len(fine),
-        "online_s": mean("total_s"),
-        "online_wall_s": mean("total_wall_s"),
-        "online_assemble_s": mean("assemble_s"),
-        "online_solve_s": mean("solve_s"),
-        "error_u_mean": mean("error_u"),
-        "error_u_max": most("error_u"),
-        "error_lambda_mean": mean("error_lambda"),
-        "error_lambda_max": most("error_lambda"),
-        "assembly_error_max": most("assembly_error"),
-        "violation_max": most("violation"),
-        "residual_max": max((r for r in residuals if r is not None), default=None),
-        "beta_span_min": min(row["beta_span"] for row in rows),
-        "beta_cone_lower_min": min(row["beta_cone_lower"] for row in rows),
-        "beta_cone_upper_min": min(row["beta_cone_upper"] for row in rows),
-        "slowdown": slowdown,
-        "disturbed": int(wall > 1.5 * cpu or slowdown > DISTURBED),
-    }
-
-
-def _mu(row: Row) -> str:
-    values = [row[name] for name in sorted(row) if name.startswith("mu_")]
-    return "(" + ", ".join(f"{value:.4g}" for value in values) + ")"

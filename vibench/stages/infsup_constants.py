@@ -17,20 +17,24 @@ from vibench.stability.over_parameters import constants_full, constants_on, ever
 from vibench.stages.artefacts import Store
 from vibench.stages.assemblies import assemblies
 from vibench.stages.base import Result, Stage, build_problem, value_of
-from vibench.stages.offline import ConeStage, EnrichmentStage, PODStage, reduced_model
+from vibench.stages.enrichment import EnrichmentStage
+from vibench.stages.offline import ConeStage, PODStage
 from vibench.study.cells import Plugin
 
 
 @dataclass(frozen=True)
 class ValidationConstraints(Stage):
-    """The constraint matrices of the validation set, sorted into classes."""
+    """The constraint matrices of the validation set, sorted into classes of proportional ones."""
+
+    label = "validation constraints"
+    rooms = ("linalg", "interfaces", "reduction")
 
     problem: Plugin
     count: int
     seed: int
 
     def inputs(self) -> tuple[Stage, ...]:
-        """Nothing comes before."""
+        """None."""
         return ()
 
     def run(self, store: Store) -> Result:  # noqa: ARG002
@@ -43,6 +47,9 @@ class ValidationConstraints(Stage):
 @dataclass(frozen=True)
 class ReferenceConstants(Stage):
     """Constants of the high-fidelity problem: β_HF, coercivity and continuity; a `Stability` per parameter."""
+
+    label = "high-fidelity constants"
+    rooms = ("linalg", "interfaces", "reduction", "stability", "model")
 
     constraints: ValidationConstraints
 
@@ -65,6 +72,9 @@ class ReferenceConstants(Stage):
 class FullConstants(Stage):
     """Constants of the whole of V with a reduced cone, what online supremizers reach: an `InfSup` per parameter."""
 
+    label = "constants of V"
+    rooms = ("linalg", "interfaces", "reduction", "stability")
+
     cone: ConeStage
     constraints: ValidationConstraints
 
@@ -82,6 +92,9 @@ class FullConstants(Stage):
 class PlainConstants(Stage):
     """Constants of V_N alone with a reduced cone: an `InfSup` per parameter."""
 
+    label = "constants of V_N"
+    rooms = ("linalg", "interfaces", "reduction", "stability")
+
     pod: PODStage
     cone: ConeStage
     constraints: ValidationConstraints
@@ -98,18 +111,22 @@ class PlainConstants(Stage):
 
 @dataclass(frozen=True)
 class OwnConstants(Stage):
-    """Constants of the pair of spaces that a reduced model works with: an `InfSup` per parameter."""
+    """Constants of the pair of spaces of a reduced model: an `InfSup` per parameter."""
+
+    label = "constants of the model"
+    rooms = ("linalg", "interfaces", "reduction", "stability", "model")
 
     enrichment: EnrichmentStage
     constraints: ValidationConstraints
 
     def inputs(self) -> tuple[Stage, ...]:
         """The reduced model and the constraint matrices."""
-        return (self.enrichment, *self.enrichment.inputs(), self.constraints)
+        return (*self.enrichment.model_inputs, self.constraints)
 
     def run(self, store: Store) -> Result:
         """Compute the constants."""
-        model, _, cone = reduced_model(store, self.enrichment)
+        model, reduced = self.enrichment.model(store), value_of(store, self.enrichment.cone)
+        cone: Multipliers = reduced.prepared
         classes: ConstraintClasses = value_of(store, self.constraints)
         if model.kind is not Kind.PER_PARAMETER:
             return Result(constants_on(model.fixed_basis, classes, cone))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,10 +10,11 @@ import numpy as np
 from vibench.arrays import Array
 from vibench.errors import NumericalError
 from vibench.interfaces.problem import ParameterBox, Picture
+from vibench.results.pictures import failure_rows, picture_rows
 from vibench.stages.artefacts import Store
-from vibench.stages.base import Result, Stage, build_problem
-from vibench.stages.snapshots import gather, training
-from vibench.study.cells import Plugin
+from vibench.stages.base import Result, Row, Stage, build_problem
+from vibench.stages.snapshots import gather, training_stages
+from vibench.study.cells import Axes, Plugin
 
 CORNERS = (0.0, 0.5, 1.0)
 """Where in the box of parameters solutions are looked at: its lower corner, its middle and its upper corner."""
@@ -22,11 +24,19 @@ CORNERS = (0.0, 0.5, 1.0)
 class PictureStage(Stage):
     """Pictures of a few training solutions of a problem."""
 
+    label = "pictures"
+    rooms = ("interfaces",)
+
     problem: Plugin
 
+    @property
+    def axes(self) -> Axes:
+        """The problem alone."""
+        return Axes(problem=self.problem)
+
     def inputs(self) -> tuple[Stage, ...]:
-        """The training sweep."""
-        return training(self.problem)
+        """The training snapshots."""
+        return training_stages(self.problem)
 
     def run(self, store: Store) -> Result:
         """Titles and pictures, in the order of `CORNERS`; none of a problem that has no picture."""
@@ -37,6 +47,14 @@ class PictureStage(Stage):
             if picture is not None:
                 drawn.append((_title(problem.parameters, found.mu[k]), _checked(picture)))
         return Result(tuple(drawn))
+
+    def rows(self, value: tuple[tuple[str, Picture], ...]) -> Mapping[str, Sequence[Row]]:
+        """Rows of the pictures table."""
+        return {"pictures": picture_rows(value)}
+
+    def failure_rows(self, reason: str) -> Mapping[str, Sequence[Row]]:
+        """A row with the reason."""
+        return {"pictures": failure_rows(reason)}
 
 
 def _nearest(box: ParameterBox, mus: Array) -> list[int]:

@@ -1,11 +1,10 @@
-"""Queries: a reduced problem solved (timed) and judged, and solutions compared with the high-fidelity ones (not)."""
+"""A query: a reduced program solved (timed) and verified, and its solution compared with the high-fidelity one."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
 
 import numpy as np
 
@@ -15,80 +14,76 @@ from vibench.interfaces.problem import VariationalInequality
 from vibench.interfaces.strategies import Kind
 from vibench.model.error_bounds import Bounds, Stability, bounds
 from vibench.model.errors import Errors, Reference, errors
-from vibench.qp import verification
 from vibench.qp.accuracy_bounds import slack
 from vibench.qp.solution import QPSolution
 from vibench.qp.solve import solve_qp, takes_start
 from vibench.qp.status import Status
+from vibench.qp.verification import verify
 from vibench.results.solver_agreement import solution_row
 from vibench.stages.assemblies import assemblies
 from vibench.stages.assembly import Model
+from vibench.stages.base import Row
 from vibench.study import registry
 from vibench.timing import Seconds, median_seconds
 
-Row = dict[str, Any]
-"""A row of a results table: column → value."""
-
 UNMEASURABLE = 1e-8
-"""Relative errors below this may be those of the high-fidelity solution: no effectivity is made of them."""
+"""Relative errors below this may be those of the high-fidelity solution: no effectivity is computed from them."""
 
 
 @dataclass(frozen=True)
-class Asked:
-    """One query before it is solved.
+class Query:
+    """A reduced program to be solved.
 
     Attributes
     ----------
     program, factor
-        The reduced program, and the Cholesky factor of A where it is known.
+        The program, and the Cholesky factor of A where it is known.
     seconds
-        What assembling the program takes.
-    before
-        Program of the parameter whose solution the solver starts from, and the number of that query; `None` to start
-        from nothing.
+        Seconds of its assembly.
+    start
+        Number and program of the query whose solution the solver starts from; `None` to start from nothing.
     """
 
     program: VariationalInequality
     factor: Array | None
     seconds: Seconds
-    before: tuple[int, VariationalInequality] | None = None
+    start: tuple[int, VariationalInequality] | None = None
 
 
 @dataclass(frozen=True)
-class Task:
-    """How the queries of a cell are solved and judged."""
+class QuerySolver:
+    """A QP solver, the accuracy that its solutions are verified by, and the limit of its seconds."""
 
     solver: str
     accuracy: float
     query_seconds: float
 
-    def run(self, asked: Asked, watch: Callable[[bool], None]) -> tuple[Row, Row | None]:
-        """The columns of one query, and of its solution if there is one.
+    def run(self, query: Query, watch: Callable[[bool], None]) -> tuple[Row, Row | None]:
+        """The columns of a query, and those of its solution if there is one.
 
-        `watch` is told, untimed, when the solver begins and when it is back.
+        `watch(True)` is called, untimed, before the solver begins and `watch(False)` when it has returned.
         """
-        program, assembly, registered = asked.program, asked.seconds, registry.qp_solver(self.solver)
-        answers: list[QPSolution] = []
-
-        row: Row = {"assemble_s": assembly.cpu, "form": "primal" if asked.factor is None else "dual"}
+        program, assembly, extra = query.program, query.seconds, registry.qp_solver(self.solver)
+        row: Row = {"assemble_s": assembly.cpu, "form": "primal" if query.factor is None else "dual"}
+        repeats: list[QPSolution] = []
         start: QPSolution | None = None
 
         def work() -> QPSolution:
-            answers.append(solve_qp(program, self.solver, self.accuracy, registered, asked.factor, start))
-            return answers[-1]
+            repeats.append(solve_qp(program, self.solver, self.accuracy, extra, query.factor, start))
+            return repeats[-1]
 
         try:
-            if asked.before is not None and takes_start(self.solver):
+            if query.start is not None and takes_start(self.solver):
                 watch(True)
-                row["started_from"], similar = asked.before
-                start = solve_qp(similar, self.solver, self.accuracy, registered, asked.factor)
-            answer, solving = median_seconds(work, before=partial(watch, True))
+                row["started_from"], similar = query.start
+                start = solve_qp(similar, self.solver, self.accuracy, extra, query.factor)
+            solution, solving = median_seconds(work, before=partial(watch, True))
             watch(False)
         except MemoryError:
             raise
         except (Exception, SystemExit) as error:  # noqa: BLE001  a solver may raise anything; the row says what
             return row | {"status": Status.ERROR.value, "reason": in_a_line(error)}, None
-        status, reason, residuals = verification.verify(program, answer, self.accuracy)
+        status, reason, residuals = verify(program, solution, self.accuracy)
         if solving.wall > self.query_seconds:
             status, reason = Status.TIMEOUT, f"took {solving.wall:.1f} s, the limit is {self.query_seconds:g} s"
         row |= {
@@ -97,36 +92,37 @@ class Task:
             "total_wall_s": assembly.wall + solving.wall,
             "status": status.value,
             "reason": reason,
-            "solver_status": answer.solver_status,
-            "iterations": answer.iterations,
-            "repeatable": int(all(_same(answer, other) for other in answers)),
+            "solver_status": solution.solver_status,
+            "iterations": solution.iterations,
+            "repeatable": int(all(_identical(solution, other) for other in repeats)),
         }
-        if residuals is None or answer.x is None or answer.alpha is None:
+        if residuals is None or solution.x is None or solution.alpha is None:
             return row, None
         row |= {"primal_residual": residuals.primal, "dual_residual": residuals.dual, "gap": residuals.gap}
-        return row, solution_row(answer.x, answer.alpha, slack(program, answer.x, answer.alpha, self.accuracy))
+        open_by_accuracy = slack(program, solution.x, solution.alpha, self.accuracy)
+        return row, solution_row(solution.x, solution.alpha, open_by_accuracy)
 
 
-def _same(one: QPSolution, other: QPSolution) -> bool:
-    """Whether two answers are the same to the last bit."""
+def _identical(one: QPSolution, other: QPSolution) -> bool:
+    """Whether two solutions are the same to the last bit."""
     pairs = ((one.x, other.x), (one.alpha, other.alpha))
     return all((a is b) if a is None or b is None else a.tobytes() == b.tobytes() for a, b in pairs)
 
 
-def assess(
-    model: Model, mus: Array, answers: Sequence[tuple[Array, Array]], exact: Reference, known: Sequence[Stability]
+def error_columns(
+    model: Model, mus: Array, solutions: Sequence[tuple[Array, Array]], exact: Reference, known: Sequence[Stability]
 ) -> list[Row]:
-    """Errors of solutions (x, α), one per parameter of `mus` (P×d), their certified bounds and effectivities."""
-    if not answers:
+    """Errors of solutions (x, α), one per parameter of `mus` (P×d), their error bounds and effectivities."""
+    if not solutions:
         return []
     problem = model.problem
     vis = [assemblies(problem).at(mu) for mu in mus]
     if model.kind is Kind.PER_PARAMETER:
-        asked = zip(mus, vis, answers, strict=True)
-        u = np.hstack([model.lift(mu, vi, x[:, None]) for mu, vi, (x, _) in asked])
-    else:
-        u = model.lift(mus[0], vis[0], np.column_stack([x for x, _ in answers]))
-    lam = model.generators @ np.column_stack([alpha for _, alpha in answers])
+        queries = zip(mus, vis, solutions, strict=True)
+        u = np.hstack([model.lift(mu, vi, x[:, None]) for mu, vi, (x, _) in queries])
+    else:  # one basis: all solutions are reconstructed at once
+        u = model.lift(mus[0], vis[0], np.column_stack([x for x, _ in solutions]))
+    lam = model.generators @ np.column_stack([alpha for _, alpha in solutions])
     found = zip(errors(problem, vis, exact, u, lam), bounds(problem, vis, known, u, lam), strict=True)
     return [_columns(error, bound) for error, bound in found]
 

@@ -1,4 +1,4 @@
-"""High-fidelity sweeps: solutions over the training and the validation parameters, and their constants."""
+"""High-fidelity solutions over the training and the validation parameters: the snapshots and the references."""
 
 from __future__ import annotations
 
@@ -8,21 +8,33 @@ from typing import Literal
 import numpy as np
 
 from vibench.arrays import Array
-from vibench.highfidelity import active_set
+from vibench.highfidelity.active_set import HighFidelitySolver
 from vibench.interfaces.problem import Problem
 from vibench.interfaces.validation import checked_assembly, training_parameters, validation_parameters
 from vibench.stages.artefacts import History, Store
 from vibench.stages.base import Result, Stage, build_problem, value_of
-from vibench.study.cells import Plugin
+from vibench.study.cells import Axes, Plugin
 from vibench.timing import NO_TIME, Seconds, Stopwatch
 
 CHUNKS = 4
-"""Parts the parameters of a high-fidelity sweep are split into, whatever the number of jobs; each prepares anew."""
+"""Chunks that a set of parameters is split into, whatever the number of workers; each is set up by itself."""
 
 
 @dataclass(frozen=True)
-class Solutions:
-    """High-fidelity solutions at some parameters: columns of u (n×P) and λ (m×P)."""
+class Snapshots:
+    """High-fidelity solutions at some parameters.
+
+    Attributes
+    ----------
+    mu
+        Parameters (P×d).
+    u, lam
+        Columns u(mu) (n×P) and λ(mu) (m×P).
+    seconds
+        Of every solution, assembly included.
+    fallbacks
+        What had to help the active set method, "" for most.
+    """
 
     mu: Array
     u: Array
@@ -32,8 +44,12 @@ class Solutions:
 
 
 @dataclass(frozen=True)
-class HighFidelity(Stage):
-    """High-fidelity solutions of one chunk of the training or the validation parameters; seconds per solution."""
+class SnapshotStage(Stage):
+    """High-fidelity solutions of one chunk of the training or the validation parameters."""
+
+    label = "high-fidelity solutions"
+    rooms = ("linalg", "interfaces", "qp", "highfidelity")
+    partial = True
 
     problem: Plugin
     purpose: Literal["training", "validation"]
@@ -41,17 +57,21 @@ class HighFidelity(Stage):
     seed: int
     chunk: int
 
+    @property
+    def axes(self) -> Axes:
+        """The problem alone."""
+        return Axes(problem=self.problem)
+
     def inputs(self) -> tuple[Stage, ...]:
-        """Nothing comes before."""
+        """None."""
         return ()
 
     def run(self, store: Store) -> Result:  # noqa: ARG002
         """Assemble and solve at every parameter of the chunk."""
         problem = build_problem(self.problem)
-        everything = training_parameters(problem) if self.purpose == "training" else self._validation(problem)
-        first, mus = self._part(everything)
+        first, mus = self._part(self._parameters(problem))
         u, lam = np.zeros((problem.V.dim, len(mus))), np.zeros((problem.W.dim, len(mus)))
-        seconds, fallbacks, solver = [], [], active_set.HighFidelitySolver(problem)
+        seconds, fallbacks, solver = [], [], HighFidelitySolver(problem)
         for k, mu in enumerate(mus):
             watch = Stopwatch()
             vi = checked_assembly(problem, mu)
@@ -61,10 +81,12 @@ class HighFidelity(Stage):
                 solver.check_coercive(mu, vi)
             u[:, k], lam[:, k] = solution.u, solution.lam
             fallbacks.append(solution.fallback)
-        solutions = Solutions(mus, u, lam, tuple(seconds), tuple(fallbacks))
-        return Result(solutions, sum(seconds, NO_TIME), self._diagnostics(problem, mus, first))
+        found = Snapshots(mus, u, lam, tuple(seconds), tuple(fallbacks))
+        return Result(found, sum(seconds, NO_TIME), self._diagnostics(problem, mus, first))
 
-    def _validation(self, problem: Problem) -> Array:
+    def _parameters(self, problem: Problem) -> Array:
+        if self.purpose == "training":
+            return training_parameters(problem)
         return validation_parameters(problem, self.count, self.seed)
 
     def _part(self, everything: Array) -> tuple[int, Array]:
@@ -76,27 +98,26 @@ class HighFidelity(Stage):
         for mu in mus:
             for quantity, value in problem.diagnostics(mu).items():
                 found.setdefault(quantity, []).append(float(value))
-        key = {"stage": self.purpose, "first_step": first}
-        return tuple(History(key, quantity, tuple(values)) for quantity, values in found.items())
+        return tuple(History(self.purpose, quantity, tuple(values), first) for quantity, values in found.items())
 
 
-def sweep(problem: Plugin, purpose: Literal["training", "validation"], count: int, seed: int) -> tuple[Stage, ...]:
-    """The chunks of one high-fidelity sweep."""
-    return tuple(HighFidelity(problem, purpose, count, seed, chunk) for chunk in range(CHUNKS))
+def training_stages(problem: Plugin) -> tuple[Stage, ...]:
+    """The chunks of the training set, which depends on nothing but the problem."""
+    return tuple(SnapshotStage(problem, "training", 0, 0, chunk) for chunk in range(CHUNKS))
 
 
-def training(problem: Plugin) -> tuple[Stage, ...]:
-    """The training sweep; it depends on nothing but the problem."""
-    return sweep(problem, "training", 0, 0)
+def validation_stages(problem: Plugin, count: int, seed: int) -> tuple[Stage, ...]:
+    """The chunks of the validation set."""
+    return tuple(SnapshotStage(problem, "validation", count, seed, chunk) for chunk in range(CHUNKS))
 
 
-def gather(store: Store, chunks: tuple[Stage, ...]) -> Solutions:
-    """The solutions of a whole sweep."""
+def gather(store: Store, chunks: tuple[Stage, ...]) -> Snapshots:
+    """The snapshots of all chunks."""
     parts = [value_of(store, chunk) for chunk in chunks]
-    return Solutions(
+    return Snapshots(
         np.concatenate([part.mu for part in parts]),
         np.hstack([part.u for part in parts]),
         np.hstack([part.lam for part in parts]),
-        tuple(s for part in parts for s in part.seconds),
+        tuple(seconds for part in parts for seconds in part.seconds),
         tuple(note for part in parts for note in part.fallbacks),
     )

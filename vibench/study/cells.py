@@ -12,7 +12,7 @@ from typing import Any
 
 from vibench.errors import RequestError
 from vibench.interfaces.strategies import Stop
-from vibench.provenance import core_code, solver_version
+from vibench.provenance import NUMERICAL, core_code, solver_version
 from vibench.reduction.nested import NestedStrategy
 from vibench.study import registry
 from vibench.study.spec import Entry, Study, ToleranceTable
@@ -59,12 +59,24 @@ class Plugin:
 
 
 @dataclass(frozen=True)
+class Axes:
+    """Values on the axes of a study, those that something depends on."""
+
+    problem: Plugin | None = None
+    dual: Plugin | None = None
+    primal: Plugin | None = None
+    pod: Stop | None = None
+    cone: Stop | None = None
+    primal_tol: float | None = None
+
+
+@dataclass(frozen=True)
 class Cell:
     """One cell: problem × dual strategy × primal strategy × tolerances × QP solver × assembly.
 
     `interpolation` is the tolerance of reduced assembly, `None` for assembly in full. `seed`, `validation` and
-    `accuracy` are the study's. Labels are for reading and no part of the identity; nor is `along`, the tolerances in
-    the study of a nested primal strategy, which are reached on one way.
+    `accuracy` are the study's. Labels are for reading and no part of the identity; nor are `nested_tolerances`, all
+    tolerances of a nested primal strategy in the study, which one growth reaches.
     """
 
     problem: Plugin
@@ -81,13 +93,13 @@ class Cell:
     validation: int
     accuracy: float
     labels: tuple[str, str, str]
-    along: tuple[float, ...] = ()
+    nested_tolerances: tuple[float, ...] = ()
 
     @cached_property
     def key(self) -> str:
         """Hash of everything that determines the cell's numbers, the code aside."""
         content = asdict(self)
-        del content["labels"], content["along"]
+        del content["labels"], content["nested_tolerances"]
         for plugin in ("problem", "dual", "primal"):
             del content[plugin]["code"]
         return digest(content)
@@ -112,15 +124,20 @@ class Cell:
             content[axis] = replace(plugin, code=registry.code(plugin.kind, plugin.name))
         for axis in ("pod", "cone"):
             content[axis] = Stop(**content[axis])
-        return cls(**content | {name: tuple(content[name]) for name in ("labels", "along")})
+        return cls(**content | {name: tuple(content[name]) for name in ("labels", "nested_tolerances")})
+
+    @property
+    def axes(self) -> Axes:
+        """The axes that name the cell, its solver and assembly aside."""
+        return Axes(self.problem, self.dual, self.primal, self.pod, self.cone, self.primal_tol)
 
     @property
     def code(self) -> str:
-        """Hash of the code that computes the cell: the core, its plugins and its solver."""
+        """Hash of the code that computes the cell: the numerical rooms of the core, its plugins and its solver."""
         plugins_used = [plugin.code for plugin in (self.problem, self.dual, self.primal)]
         registered = self.solver in registry.names("QP solver")
         solver = registry.code("QP solver", self.solver) if registered else solver_version(self.solver)
-        return digest([core_code(), *plugins_used, solver])
+        return digest([core_code(*NUMERICAL), *plugins_used, solver])
 
     def __str__(self) -> str:
         problem, dual, primal = self.labels
@@ -144,7 +161,7 @@ def expand(study: Study) -> list[Cell]:
     """
     cells: dict[str, Cell] = {}
     for problem, table in product(study.problem, study.tolerances):
-        along = {entry.title: _along(entry, table) for entry in study.primal}
+        nested = {entry.title: _nested_tolerances(entry, table) for entry in study.primal}
         for dual, pod, cone, primal, tolerance in _combinations(study, table):
             for assembly, solver in product(study.assembly, study.solver_names()):
                 cell = Cell(
@@ -162,7 +179,7 @@ def expand(study: Study) -> list[Cell]:
                     validation=study.validation,
                     accuracy=study.accuracy,
                     labels=(problem.title, dual.title, primal.title),
-                    along=along[primal.title],
+                    nested_tolerances=nested[primal.title],
                 )
                 cells.setdefault(cell.key, cell)
     if not cells:
@@ -170,7 +187,7 @@ def expand(study: Study) -> list[Cell]:
     return list(cells.values())
 
 
-def _along(primal: Entry, table: ToleranceTable) -> tuple[float, ...]:
+def _nested_tolerances(primal: Entry, table: ToleranceTable) -> tuple[float, ...]:
     if not issubclass(registry.load("primal strategy", primal.name), NestedStrategy):
         return ()
     return tuple(sorted({value for value in table.of_primal(primal) if value is not None}, reverse=True))

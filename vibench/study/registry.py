@@ -17,7 +17,7 @@ from pydantic import ConfigDict, TypeAdapter, ValidationError
 from vibench.errors import RequestError, in_a_line, unknown_name
 from vibench.interfaces.problem import Problem
 from vibench.interfaces.strategies import DualStrategy, PrimalStrategy
-from vibench.provenance import source_hash
+from vibench.provenance import distribution_version, source_hash
 from vibench.qp.solution import QPSolver
 
 GROUPS: Mapping[str, str] = {
@@ -106,7 +106,20 @@ def code(kind: str, name: str) -> str:
     source = Path(str(module.__file__))
     while (source.parent / "__init__.py").is_file():
         source = source.parent
-    return f"{version(kind, name)} {source_hash(source)}"
+    needed = "".join(f" {required} {distribution_version(required)}" for required in requirements(kind, name))
+    return f"{version(kind, name)} {source_hash(source)}{needed}"
+
+
+def missing(kind: str, name: str) -> list[str]:
+    """Distributions that a plugin `requires` and that are not installed."""
+    return [distribution for distribution in requirements(kind, name) if not distribution_version(distribution)]
+
+
+def requirements(kind: str, name: str) -> tuple[str, ...]:
+    """Distributions that a plugin declares as `requires`, beside those of its own package."""
+    entry = _registered(kind)[name]
+    plugin = getattr(importlib.import_module(entry.module), entry.attr.partition(".")[0], None)
+    return tuple(getattr(plugin, "requires", ()))
 
 
 def options(kind: str, name: str) -> list[Option]:

@@ -1,4 +1,4 @@
-"""Checks for authors of plugins: what vibench takes for granted of a problem or a strategy, tried one by one.
+"""Conformance checks for authors of plugins: every property that vibench assumes of a problem or a strategy.
 
 In a test of a plugin's own package:
 
@@ -7,10 +7,10 @@ In a test of a plugin's own package:
     def test_the_cable_conforms() -> None:
         check_problem(Cable)
 
-`check_problem`, `check_dual` and `check_primal` raise one `ConformanceError` that lists every failure, with what is
-wrong and where to look; `examine_problem`, `examine_dual` and `examine_primal` give the findings and raise nothing. All
-take a function that makes an instance, such as the class or `partial(Cable, nodes=20)`: two instances have to agree.
-The command `vibench check` prints the same findings.
+`check_problem`, `check_dual` and `check_primal` raise one `ConformanceError` that lists every failure: what is wrong,
+where, and what would be right. `examine_problem`, `examine_dual` and `examine_primal` return the findings instead. The
+first argument is a class, or a function that makes an instance such as `partial(Cable, nodes=20)`, because two
+instances are compared. The command `vibench check` prints the same findings.
 """
 
 from __future__ import annotations
@@ -22,17 +22,6 @@ from vibench.testing.problems import check_problem, examine_problem
 from vibench.testing.sample import MovingSupport, sample_offline, sample_snapshots
 
 __all__ = [
-    "SECONDS",
-    "ConformanceError",
-    "Finding",
-    "MovingSupport",
-    "Verdict",
-    "check_dual",
-    "check_primal",
-    "check_problem",
-    "examine_dual",
-    "examine_primal",
-    "examine_problem",
-    "sample_offline",
-    "sample_snapshots",
+    "SECONDS", "ConformanceError", "Finding", "MovingSupport", "Verdict", "check_dual", "check_primal", "check_problem",
+    "examine_dual", "examine_primal", "examine_problem", "sample_offline", "sample_snapshots",
 ]  # fmt: skip

@@ -1,13 +1,15 @@
-"""What checks find: one line each, and where to look for the cause."""
+"""Checks, their findings, and the error that lists the failures."""
 
 from __future__ import annotations
 
+import inspect
 import sysconfig
 import traceback
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
+from typing import Generic, ParamSpec, TypeVar
 
 import numpy as np
 import scipy
@@ -15,16 +17,18 @@ import scipy
 import vibench
 from vibench.errors import in_a_line
 
-MOST = 5
-"""Faults that one check lists; whoever has mended these looks again."""
+CaseT = TypeVar("CaseT")
+P = ParamSpec("P")
 
+MOST = 5
+"""Largest number of faults that one check lists."""
 
 SECONDS = 60.0
-"""Longest time that anything may take unless the caller says otherwise: above it there is a mistake."""
+"""Default limit on the wall time [s] of the constructor and of every call."""
 
 
 class Verdict(StrEnum):
-    """What became of a check."""
+    """Outcome of a check."""
 
     PASSED = "passed"
     FAILED = "failed"
@@ -33,16 +37,9 @@ class Verdict(StrEnum):
 
 @dataclass(frozen=True)
 class Finding:
-    """One check.
+    """Result of one check: its name, its outcome, and a message.
 
-    Attributes
-    ----------
-    check
-        What was looked at.
-    verdict
-        What became of it.
-    message
-        Of a failure all that is wrong and where; why a check was skipped; figures of a check that passed, or "".
+    The message gives every fault and its place, the reason why a check was skipped, or the figures of a passed one.
     """
 
     check: str
@@ -54,70 +51,84 @@ class Finding:
 
 
 class Note(str):
-    """Something that a check has to say and that is no fault."""
+    """A remark of a check that is not a fault."""
 
     __slots__ = ()
 
 
 class ConformanceError(AssertionError):
-    """A plugin that fails checks; the message lists all of them."""
+    """A plugin violates what vibench assumes of it; raised in a check, it is a fault that ends the check."""
 
 
 @dataclass(frozen=True)
-class Check:
-    """A check: its name, what yields the faults (and a `Note`), and names of checks without which it tells nothing."""
+class Check(Generic[CaseT]):
+    """A check: a name, a function from a case to its faults and notes, and the names of checks that must pass before.
+
+    A function that reports its faults by a `ConformanceError` alone returns `None`.
+    """
 
     name: str
-    faults: Callable[[], Iterable[str]]
+    faults: Callable[[CaseT], Iterable[str] | None]
     needs: tuple[str, ...] = ()
 
 
-def examine(checks: Iterable[Check]) -> list[Finding]:
-    """Do checks in their order; a check that needs one that did not pass is skipped.
-
-    An exception in a check is a fault: it comes from the code that is checked.
-    """
-    findings: list[Finding] = []
-    passed: set[str] = set()
+def examine(checks: Iterable[Check[CaseT]], case: CaseT) -> list[Finding]:
+    """Make checks in their order; skip a check if one that it needs did not pass."""
+    findings: dict[str, Finding] = {}
     for check in checks:
-        missing = [name for name in check.needs if name not in passed]
+        missing = [name for name in check.needs if findings[name].verdict is not Verdict.PASSED]
         if missing:
-            findings.append(Finding(check.name, Verdict.SKIPPED, f"it needs '{missing[0]}'"))
-            continue
-        faults, notes = _collected(check.faults)
-        if faults:
-            findings.append(Finding(check.name, Verdict.FAILED, "; ".join(faults)))
+            verdict, lines = Verdict.SKIPPED, [f"it needs '{missing[0]}'"]
         else:
-            passed.add(check.name)
-            findings.append(Finding(check.name, Verdict.PASSED, "; ".join(notes)))
-    return findings
+            faults, notes = _collected(check, case)
+            verdict, lines = (Verdict.FAILED, faults) if faults else (Verdict.PASSED, notes)
+        findings[check.name] = Finding(check.name, verdict, "; ".join(lines))
+    return list(findings.values())
 
 
-def _collected(source: Callable[[], Iterable[str]]) -> tuple[list[str], list[str]]:
-    faults: list[str] = []
-    notes: list[str] = []
+def _collected(check: Check[CaseT], case: CaseT) -> tuple[list[str], list[str]]:
+    """Faults and notes of a check; an exception is a fault because it comes from the plugin."""
+    lines: list[str] = []
     try:
-        for line in source():
-            if isinstance(line, Note):
-                notes.append(line)
-            elif len(faults) == MOST:
-                faults.append("and more")
-                break
-            else:
-                faults.append(line)
-    except (Exception, SystemExit) as error:  # noqa: BLE001  checks run code of strangers
-        faults.append(raised(error))
-    return faults, notes
+        for line in check.faults(case) or ():
+            lines.append(line)  # noqa: PERF402  what precedes an exception is kept
+    except ConformanceError as error:
+        lines.append(str(error))
+    except (Exception, SystemExit) as error:  # noqa: BLE001  a plugin may raise anything
+        lines.append(raised(error))
+    faults = [line for line in lines if not isinstance(line, Note)]
+    if len(faults) > MOST:
+        faults[MOST:] = ["and more"]
+    return faults, [line for line in lines if isinstance(line, Note)]
+
+
+def raising(examination: Callable[P, list[Finding]]) -> Callable[P, None]:
+    """Turn `examine_…` into `check_…`, which has the same parameters and raises if a check fails."""
+    name, signature = examination.__name__, inspect.signature(examination)
+
+    def check(*args: P.args, **kwargs: P.kwargs) -> None:
+        findings = examination(*args, **kwargs)
+        failures = [f"{each.check}: {each.message}" for each in findings if each.verdict is Verdict.FAILED]
+        if failures:
+            create = signature.bind(*args, **kwargs).arguments["create"]
+            plugin = getattr(getattr(create, "func", create), "__name__", create)
+            raise ConformanceError("\n".join([f"{plugin} fails {len(failures)} of {len(findings)} checks", *failures]))
+
+    check.__name__ = check.__qualname__ = name.replace("examine", "check")
+    check.__module__ = examination.__module__
+    check.__doc__ = f"Make the checks of `{name}`; raise a `ConformanceError` that lists all failures if there are any."
+    check.__signature__ = signature.replace(return_annotation=None)  # type: ignore[attr-defined]
+    return check
 
 
 def raised(error: BaseException) -> str:
-    """An exception in a line, and the last line of code of its own that the plugin had come to."""
+    """An exception in one line, with the last line of the plugin's own code that it passed through."""
     place = plugin_line(error)
     return in_a_line(error) + (f" ({place})" if place else "")
 
 
 def plugin_line(error: BaseException) -> str:
-    """Where an exception left the plugin: "cable.py, line 12: self.V = …"; "" if it never was there."""
+    """Where an exception left the plugin, "cable.py, line 12: self.V = …"; "" if it did not pass through it."""
     frames = [frame for frame in traceback.extract_tb(error.__traceback__) if not _is_library(frame.filename)]
     return f"{Path(frames[-1].filename).name}, line {frames[-1].lineno}: {frames[-1].line}" if frames else ""
 
@@ -126,42 +137,6 @@ def _is_library(file: str) -> bool:
     path = Path(file)
     if any(path.is_relative_to(Path(str(module.__file__)).parent) for module in (vibench, np, scipy)):
         return True
+    # Installed plugins lie below the standard library, in its folder of packages.
     standard = path.is_relative_to(sysconfig.get_path("stdlib"))
     return file.startswith("<") or (standard and not {"site-packages", "dist-packages"} & set(path.parts))
-
-
-def require(name: str, findings: Sequence[Finding]) -> None:
-    """Raise if a check failed.
-
-    Raises
-    ------
-    ConformanceError
-        With a line for every failure.
-    """
-    failures = [finding for finding in findings if finding.verdict is Verdict.FAILED]
-    if failures:
-        lines = [f"{finding.check}: {finding.message}" for finding in failures]
-        raise ConformanceError("\n".join([f"{name} fails {len(failures)} of {len(findings)} checks", *lines]))
-
-
-def name_of(create: Callable[[], object]) -> str:
-    """What to call the plugin that a function makes.
-
-    Raises
-    ------
-    TypeError
-        If it is an instance where a class, or a function that makes instances, is asked for.
-    """
-    if not callable(create):
-        raise TypeError(
-            f"give the class {type(create).__name__}, or a function that makes an instance, instead of an instance: "
-            "two instances have to agree"
-        )
-    return str(getattr(getattr(create, "func", create), "__name__", create))
-
-
-def too_long(what: str, seconds: Sequence[float], limit: float) -> Iterator[str]:
-    """A fault if something took longer than the limit once [s], and how long it takes."""
-    if max(seconds) > limit:
-        yield f"{what} takes {max(seconds):.3g} s, above the limit of {limit:g} s; is something made anew every time?"
-    yield Note(f"{what} takes {np.median(seconds):.2g} s")

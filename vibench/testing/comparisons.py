@@ -1,141 +1,100 @@
-"""Vectors and sparse matrices compared: where they differ, in words."""
+"""Comparison of dense arrays and sparse matrices; the messages name the entry at fault."""
 
 from __future__ import annotations
 
-import pickle
-from typing import Any
+from collections.abc import Callable, Iterator
+from typing import Any, TypeVar
 
 import numpy as np
 import scipy.sparse as sp
 
-from vibench.arrays import Array, SparseMatrix
-from vibench.interfaces.problem import MEMBERS, VariationalInequality
+from vibench.arrays import Array
+from vibench.testing.checks import ConformanceError
 
-Members = dict[str, Any]
-"""Vectors and sparse matrices by name."""
+T = TypeVar("T")
 
-
-def copied(value: Any) -> Any:
-    """A copy of a vector or a sparse matrix in which every entry stands once; the matrix is CSR."""
-    if isinstance(value, np.ndarray):
-        return value.copy()
-    matrix = sp.csr_array(value, copy=True)
-    matrix.sum_duplicates()
-    return matrix
+Arrays = dict[str, Any]
+"""Dense arrays and sparse matrices by name."""
 
 
-def members(vi: VariationalInequality) -> Members:
-    """Copies of A, f, B and g."""
-    return {name: copied(getattr(vi, name)) for name in MEMBERS}
+def copies(arrays: Arrays) -> Arrays:
+    """Copies of dense arrays, and of sparse matrices in CSR format without duplicate entries."""
+    found: Arrays = {
+        name: v.copy() if isinstance(v, np.ndarray) else sp.csr_array(v, copy=True) for name, v in arrays.items()
+    }
+    for value in found.values():
+        if sp.issparse(value):
+            value.sum_duplicates()
+    return found
 
 
 def peak(value: Any) -> float:
-    """Largest modulus of an entry of a vector or a sparse matrix; 0 if there is none."""
-    entries = value if isinstance(value, np.ndarray) else value.data
-    return float(np.max(np.abs(entries), initial=0.0))
+    """Largest modulus of an entry of a dense array or a sparse matrix; 0 without entries."""
+    return float(np.max(np.abs(_entries(value)), initial=0.0))
 
 
 def difference(one: Any, other: Any, limit: float = 0.0) -> str:
-    """Where two vectors or sparse matrices differ most, "entry (3, 4) is 1.0 against 2.0"; "" if by no more than this.
-
-    Parameters
-    ----------
-    one, other
-        Dense arrays of any shape, or sparse matrices.
-    limit
-        Largest difference of entries that is none; by default bits have to agree.
-    """
+    """Entry in which two arrays differ most, "entry (3, 4) is 1.0 against 2.0"; "" if by no more than the limit."""
     if one.shape != other.shape:
         return f"the shape is {one.shape} against {other.shape}"
-    apart = sp.coo_array(one - other) if sp.issparse(one) else one - other
-    data = apart.data if sp.issparse(apart) else np.ravel(apart)
-    if not len(data) or np.max(np.abs(data)) <= limit:
+    gap = one - other
+    sizes = np.abs(_entries(gap))
+    if not len(sizes) or np.max(sizes) <= limit:
         return ""
-    worst = int(np.argmax(np.where(np.isnan(data), np.inf, np.abs(data))))
-    if sp.issparse(apart):
-        place: tuple[Any, ...] = tuple(int(axis[worst]) for axis in apart.coords)
-    else:
-        place = tuple(int(index) for index in np.unravel_index(worst, one.shape))
-    return f"{entry(place)} is {_digits(one, place, other)} against {_digits(other, place, one)}"
+    place = _place(gap, int(np.argmax(np.where(np.isnan(sizes), np.inf, sizes))))
+    values = float(one[place]), float(other[place])
+    short = [f"{value:.6g}" for value in values]
+    first, second = short if short[0] != short[1] else map(repr, values)
+    return f"entry {place} is {first} against {second}"
 
 
-def entry(place: tuple[Any, ...]) -> str:
-    """An entry of a vector or a matrix, in words."""
-    return f"entry {place[0]}" if len(place) == 1 else f"entry ({', '.join(map(str, place))})"
+def differences(one: Arrays, other: Arrays, rtol: float = 0.0) -> Iterator[tuple[str, str]]:
+    """Names of the arrays that differ by more than rtol times the largest entry of the other, and the `difference`."""
+    for name in {**one, **other}:
+        if name not in one or name not in other:
+            yield name, "one of the two has none"
+        elif what := difference(one[name], other[name], rtol * peak(other[name])):
+            yield name, what
 
 
-def _digits(value: Any, place: tuple[Any, ...], other: Any) -> str:
-    """An entry with as many digits as it takes to tell it from the other."""
-    own, against = float(value[place]), float(other[place])
-    short = f"{own:.6g}"
-    return short if short != f"{against:.6g}" else repr(own)
+def unmutated(function: str, arrays: Arrays, call: Callable[[], T]) -> T:
+    """Result of a call; a `ConformanceError` names the arrays that it changed, and an entry of each."""
+    before = copies(arrays)
+    result = call()
+    changed = [f"{name}: {what} before" for name, what in differences(copies(arrays), before)]
+    if changed:
+        raise ConformanceError(f"{function} changes {'; '.join(changed)}; work on copies and return new arrays")
+    return result
 
 
-def asymmetry(matrix: SparseMatrix, rtol: float) -> str:
-    """Where a square matrix is not symmetric, relative to its largest entry; "" if it is."""
-    matrix = sp.csr_array(matrix)
-    apart = sp.coo_array(abs(matrix - matrix.T))
-    if not apart.nnz or apart.data.max() <= rtol * peak(matrix):
-        return ""
-    i, j = (int(axis[np.argmax(apart.data)]) for axis in apart.coords)
-    return f"entry ({i}, {j}) is {matrix[i, j]:.6g} and entry ({j}, {i}) is {matrix[j, i]:.6g}"
-
-
-def pickled(thing: Any) -> Any:
-    """A thing after a journey between processes."""
-    return pickle.loads(pickle.dumps(thing))
-
-
-def why_not_pickled(thing: Any) -> str:
-    """The attributes that keep an object from being pickled, in words; "" if it can be."""
-    try:
-        pickled(thing)
-    except Exception as error:  # noqa: BLE001  pickling runs code of strangers
-        reason = f"{type(error).__name__}: {error}"
-    else:
-        return ""
-    found = [name for name, value in getattr(thing, "__dict__", {}).items() if not _travels(value)]
-    where = f": look at its {'attribute' if len(found) == 1 else 'attributes'} {', '.join(found)}" if found else ""
-    return f"the {type(thing).__name__} cannot be pickled ({reason}){where}"
-
-
-def _travels(value: Any) -> bool:
-    try:
-        pickled(value)
-    except Exception:  # noqa: BLE001  pickling runs code of strangers
-        return False
-    return True
-
-
-def array_fault(name: str, value: Any, shape: tuple[int, ...]) -> str:
-    """What is wrong with a dense array of floats that should have a shape; "" if nothing is."""
-    if not isinstance(value, np.ndarray):
-        return f"{name} is a {type(value).__name__}; expected a NumPy array of shape {shape}"
+def array_fault(name: str, value: Any, shape: tuple[int, ...], *, sparse: bool = False) -> str:
+    """Why a value is not a finite float64 array of a shape, dense or sparse (CSR, CSC); "" if it is."""
+    if not (sp.issparse(value) if sparse else isinstance(value, np.ndarray)):
+        right = f"sparse CSR matrix: scipy.sparse.csr_array({name})" if sparse else f"NumPy array of shape {shape}"
+        return f"{name} is a {type(value).__name__}; expected a {right}"
     if value.shape != shape:
         return f"{name} has shape {value.shape}; expected {shape}"
-    if value.dtype != np.float64:
-        return f"{name} has dtype {value.dtype}; expected float64, which no assignment rounds"
-    wrong = np.argwhere(~np.isfinite(value))
-    return f"{name} is not finite: {entry(tuple(wrong[0]))} is {value[tuple(wrong[0])]}" if len(wrong) else ""
-
-
-def matrix_fault(name: str, value: Any, shape: tuple[int, ...]) -> str:
-    """What is wrong with a sparse matrix of floats that should have a shape; "" if nothing is."""
-    if not sp.issparse(value):
-        return f"{name} is a {type(value).__name__}; expected a sparse CSR matrix: scipy.sparse.csr_array({name})"
-    if value.shape != shape:
-        return f"{name} has shape {value.shape}; the spaces V and W ask for {shape}"
-    if value.format not in ("csr", "csc"):
+    if sparse and value.format not in ("csr", "csc"):
         return f"{name} has the sparse format {value.format}; expected CSR or CSC: scipy.sparse.csr_array({name})"
     if value.dtype != np.float64:
         return f"{name} has dtype {value.dtype}; expected float64"
-    if np.all(np.isfinite(value.data)):
+    wrong = np.flatnonzero(~np.isfinite(_entries(value)))
+    if not len(wrong):
         return ""
-    found = sp.coo_array(value)
-    k = int(np.flatnonzero(~np.isfinite(found.data))[0])
-    return f"{name} is not finite: {entry(tuple(int(axis[k]) for axis in found.coords))} is {found.data[k]}"
+    return f"{name} is not finite: entry {_place(value, wrong[0])} is {_entries(value)[wrong[0]]}"
 
 
 def at(mu: Array) -> str:
-    """A parameter in a sentence."""
+    """A parameter (d,) in words: "at mu = [4.0, 0.1]"."""
     return f"at mu = {[float(f'{value:.12g}') for value in mu]}"
+
+
+def _entries(value: Any) -> Array:
+    """Entries of a dense array, or stored entries of a sparse matrix."""
+    return np.asarray(value.data if sp.issparse(value) else np.ravel(value))
+
+
+def _place(value: Any, k: int) -> tuple[int, ...] | int:
+    """Index of the k-th of these entries, in a vector a number."""
+    axes = [axis[k] for axis in sp.coo_array(value).coords] if sp.issparse(value) else np.unravel_index(k, value.shape)
+    return tuple(int(index) for index in axes) if len(axes) > 1 else int(axes[0])

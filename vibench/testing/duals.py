@@ -1,51 +1,141 @@
-"""Checks of dual strategies."""
+"""The conformance checks of dual strategies: cone, tolerance, size and claimed errors."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from functools import cached_property
+from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
 from vibench.arrays import Array
 from vibench.errors import NumericalError, VibenchError
-from vibench.interfaces.strategies import Cone, DualStrategy, Stop
+from vibench.interfaces.strategies import Cone, DualStrategy, Stop, rays
 from vibench.interfaces.validation import check_cone
 from vibench.linalg.inner_product import InnerProduct
 from vibench.reduction.cones import project_on_cone
-from vibench.testing.checks import SECONDS, Check, Finding, Note, examine, name_of, require, too_long
-from vibench.testing.comparisons import array_fault, copied, difference, pickled, why_not_pickled
+from vibench.testing.case import Case
+from vibench.testing.checks import SECONDS, Check, Finding, Note, examine, raising
+from vibench.testing.comparisons import Arrays, array_fault, unmutated
 from vibench.testing.sample import sample_snapshots
-from vibench.timing import timed
 
 TOLERANCES = (0.3, 0.1, 0.01)
 SIZES = (1, 3)
 
 ERROR_ATOL = 1e-8
-"""How far a claimed projection error may be from ours, which comes from a nonnegative least squares solver."""
+"""Largest absolute difference of a claimed projection error from that of nonnegative least squares."""
 
-KEPT = 1e-6
-"""Share of a tolerance by which it may be missed: round-off of whoever projects."""
+ERROR_RTOL = 1e-6
+"""Relative excess over a tolerance, or over an error, that counts as round-off of the strategy's projection."""
 
 
-def check_dual(
-    create: Callable[[], DualStrategy],
-    snapshots: Array | None = None,
-    W: InnerProduct | None = None,
-    *,
-    tolerances: Sequence[float] = TOLERANCES,
-    sizes: Sequence[int] = SIZES,
-    seconds: float = SECONDS,
-) -> None:
-    """Check all that vibench takes for granted of a dual strategy; see `examine_dual`.
+@dataclass(eq=False)
+class DualCase(Case[DualStrategy, Stop, Cone]):
+    """A dual strategy, tolerances and sizes, and the cones it makes of snapshots (m×P)."""
 
-    Raises
-    ------
-    ConformanceError
-        Listing every failure: what is wrong, and where to look.
-    """
-    findings = examine_dual(create, snapshots, W, tolerances=tolerances, sizes=sizes, seconds=seconds)
-    require(name_of(create), findings)
+    base = DualStrategy
+    snapshots: Array
+    W: InnerProduct
+    stops: dict[str, Stop]
+
+    @property
+    def arguments(self) -> dict[str, Stop]:
+        """Tolerances and sizes."""
+        return self.stops
+
+    def evaluate(self, argument: Stop, plugin: DualStrategy | None = None, snapshots: Array | None = None) -> Cone:
+        """Cone of all snapshots, or of others."""
+        given = (self.snapshots if snapshots is None else snapshots).copy()
+        return self.clocked("a cone", lambda: (plugin or self.plugin).reduce(given, self.W, argument))
+
+    def arrays(self, result: Cone) -> Arrays:
+        """Generators, errors and signs."""
+        return {"generators": result.generators, "errors": result.errors, "free": result.free.astype(float)}
+
+    def cone(self) -> Iterator[str]:
+        """Generators lie in W⁺ and have unit norm; errors have the right shape."""
+        for stop, cone in self.results.items():
+            fault = _cone_fault(cone, self.W)
+            yield f"{stop}: {fault}" if fault else Note(f"{stop}: R = {cone.size}")
+
+    def tolerance(self) -> Iterator[str]:
+        """The projection error of every snapshot is below the tolerance."""
+        for name, stop in self.arguments.items():
+            if stop.tolerance is not None:
+                yield from self._missed(stop.tolerance, self.results[name], self.snapshots)
+
+    def _missed(self, tolerance: float, cone: Cone, snapshots: Array) -> Iterator[str]:
+        errors = _errors(cone, cone.size, snapshots, self.W)
+        if errors.max(initial=0.0) > tolerance * (1.0 + ERROR_RTOL) + ERROR_ATOL:
+            yield (
+                f"tolerance {tolerance:g} is missed: with {cone.size} generators the projection error of snapshot "
+                f"{errors.argmax()} is {errors.max():.3g}, relative to the largest norm of a snapshot; "
+                f"the claimed error is {cone.errors[-1]:.3g}"
+            )
+
+    def size(self) -> Iterator[str]:
+        """The cone has the prescribed number of generators, fewer only if it contains all snapshots."""
+        for name, stop in self.arguments.items():
+            cone = self.results[name]
+            if stop.size is None or cone.size == stop.size:
+                continue
+            error = _errors(cone, cone.size, self.snapshots, self.W).max(initial=0.0)
+            if cone.size > stop.size or error > ERROR_ATOL:
+                yield f"{name} was prescribed; the cone has {cone.size} generators and the projection error {error:.1e}"
+
+    def errors(self) -> Iterator[str]:
+        """Claimed errors are the projection errors of the first r generators."""
+        for stop, cone in self.results.items():
+            first = 0 if len(cone.errors) == cone.size + 1 else cone.size
+            for r, claimed in enumerate(cone.errors, first):
+                error = _errors(cone, r, self.snapshots, self.W).max(initial=0.0)
+                if abs(error - claimed) > ERROR_ATOL + ERROR_RTOL * error:
+                    yield (
+                        f"{stop}: the claimed error e({r}) is {claimed:.6g}; the projection error of the snapshots is "
+                        f"{error:.6g} for r = {r} (a construction that is not nested returns its last error alone)"
+                    )
+                    break
+
+    def no_mutation(self) -> None:
+        """`reduce` changes neither the snapshots nor the space."""
+        for name, stop in self.arguments.items():
+            given = self.snapshots.copy()
+            arrays = {"the snapshots": given, "X_W": self.W.matrix}
+            unmutated(f"{name}: reduce", arrays, partial(self.plugin.reduce, given, self.W, stop))
+
+    def without_contact(self) -> Iterator[str]:
+        """Zero, repeated and single snapshots are reduced; snapshots that all vanish are reduced or refused."""
+        tolerance = next((stop.tolerance for stop in self.stops.values() if stop.tolerance is not None), TOLERANCES[0])
+        some, stop = self.snapshots, Stop(tolerance=tolerance)
+        largest = some[:, [np.linalg.norm(some, axis=0).argmax()]]
+        for name, snapshots in {
+            "with a zero snapshot": np.hstack([np.zeros((len(some), 1)), some]),
+            "with a repeated snapshot": np.hstack([some, largest]),
+            "with one snapshot": largest,
+        }.items():
+            cone = self.evaluate(stop, snapshots=snapshots)
+            if fault := _cone_fault(cone, self.W) or "".join(self._missed(tolerance, cone, snapshots)):
+                yield f"{name}: {fault}"
+        try:
+            cone = self.evaluate(stop, snapshots=np.zeros_like(some))
+        except VibenchError:  # a strategy may refuse them in one line
+            return
+        if fault := _cone_fault(cone, self.W):
+            yield f"with zero snapshots alone: {fault}; expected a cone without generators"
+
+
+CHECKS: tuple[Check[DualCase], ...] = (
+    Check("construction", DualCase.construction),
+    Check("cone", DualCase.cone, ("construction",)),
+    Check("tolerance", DualCase.tolerance, ("cone",)),
+    Check("size", DualCase.size, ("cone",)),
+    Check("errors", DualCase.errors, ("cone",)),
+    Check("determinism", DualCase.determinism, ("cone",)),
+    Check("no mutation", DualCase.no_mutation, ("cone",)),
+    Check("snapshots without contact", DualCase.without_contact, ("cone", "tolerance")),
+    Check("pickling", DualCase.pickling, ("determinism",)),
+    Check("time", DualCase.time, ("cone",)),
+)
 
 
 def examine_dual(
@@ -57,214 +147,66 @@ def examine_dual(
     sizes: Sequence[int] = SIZES,
     seconds: float = SECONDS,
 ) -> list[Finding]:
-    """Findings of all checks of a dual strategy.
+    """Make all checks of a dual strategy.
 
     A cone with R + 1 errors claims that its generators are nested, and every error is computed again; a construction
-    that is not nested gives its last error alone.
+    that is not nested returns its last error alone.
 
     Parameters
     ----------
     create
-        Makes an instance: the class, or a `partial` of it with options.
+        Class, or `partial` of it with options; an instance is refused with a `TypeError`.
     snapshots, W
-        Multiplier snapshots (m×P), coefficientwise nonnegative, and their space; those of a sample problem by default.
+        Multiplier snapshots (m×P), nonnegative coefficients, and their space; both or neither. By default those of a
+        sample problem.
     tolerances, sizes
-        What it is asked for.
+        Stopping rules of the cones that are made.
     seconds
-        Longest time that one construction may take.
+        Largest wall time [s] of the constructor and of one cone.
     """
-    name_of(create)
     if (snapshots is None) != (W is None):
-        raise TypeError("give both snapshots and W, or neither")
+        raise TypeError("pass both snapshots and W, or neither")
     given, space = sample_snapshots() if snapshots is None or W is None else (snapshots, W)
-    stops = [*(Stop(tolerance=value) for value in tolerances), *(Stop(size=value) for value in sizes)]
-    case = _Case(create, given, space, stops, seconds)
-    return examine([
-        Check("construction", case.construction),
-        Check("cone", case.cone, ("construction",)),
-        Check("tolerance", case.tolerance, ("cone",)),
-        Check("size", case.size, ("cone",)),
-        Check("errors", case.errors, ("cone",)),
-        Check("determinism", case.determinism, ("cone",)),
-        Check("no mutation", case.no_mutation, ("cone",)),
-        Check("snapshots without contact", case.without_contact, ("cone", "tolerance")),
-        Check("pickling", case.pickling, ("determinism",)),
-        Check("time", case.time, ("cone",)),
-    ])  # fmt: skip
+    stops = {f"tolerance {value}": Stop(tolerance=value) for value in tolerances}
+    stops |= {f"size {value}": Stop(size=value) for value in sizes}
+    return examine(CHECKS, DualCase(create, seconds, given, space, stops))
 
 
-class _Case:
-    """A dual strategy under examination; it is given copies."""
-
-    def __init__(
-        self, create: Callable[[], DualStrategy], snapshots: Array, W: InnerProduct, stops: list[Stop], limit: float
-    ) -> None:
-        self._create, self._snapshots, self._W, self._stops, self._limit = create, snapshots, W, stops, limit
-        self._times: list[float] = []
-
-    @cached_property
-    def _strategy(self) -> DualStrategy:
-        return self._create()
-
-    @cached_property
-    def _cones(self) -> list[tuple[Stop, Cone]]:
-        return [(stop, self._reduce(stop)) for stop in self._stops]
-
-    def _reduce(self, stop: Stop, snapshots: Array | None = None, strategy: DualStrategy | None = None) -> Cone:
-        given = (self._snapshots if snapshots is None else snapshots).copy()
-        cone, spent = timed(lambda: (strategy or self._strategy).reduce(given, self._W, stop))
-        self._times.append(spent.wall)
-        return cone
-
-    def construction(self) -> Iterator[str]:
-        """It can be made."""
-        strategy: object = self._strategy
-        if not isinstance(strategy, DualStrategy):
-            yield f"a {type(strategy).__name__} was made; expected a subclass of vibench.DualStrategy"
-
-    def cone(self) -> Iterator[str]:
-        """What is handed over is a cone in W⁺, of unit generators."""
-        for stop, cone in self._cones:
-            if fault := _cone_fault(cone, self._W):
-                yield f"{stop}: {fault}"
-        if not [fault for _, cone in self._cones if (fault := _cone_fault(cone, self._W))]:
-            yield Note(", ".join(f"{stop}: R = {cone.size}" for stop, cone in self._cones))
-
-    def tolerance(self) -> Iterator[str]:
-        """Every snapshot is as near to the cone as was asked for."""
-        for stop, cone in self._cones:
-            if stop.tolerance is not None and (fault := self._missed(stop.tolerance, cone, self._snapshots)):
-                yield fault
-
-    def _missed(self, tolerance: float, cone: Cone, snapshots: Array) -> str:
-        distances = _distances(cone, cone.size, snapshots, self._W)
-        if distances.max(initial=0.0) <= tolerance * (1.0 + KEPT) + ERROR_ATOL:
-            return ""
-        worst = int(np.argmax(distances))
-        return (
-            f"tolerance {tolerance:g} is missed: the cone of {cone.size} generators leaves {distances[worst]:.3g} of "
-            f"snapshot {worst}, relative to the largest norm of a snapshot; the error claimed is {cone.errors[-1]:.3g}"
-        )
-
-    def size(self) -> Iterator[str]:
-        """There are as many generators as were asked for, fewer only where all snapshots are reproduced."""
-        for stop, cone in self._cones:
-            if stop.size is None or cone.size == stop.size:
-                continue
-            left = float(_distances(cone, cone.size, self._snapshots, self._W).max(initial=0.0))
-            if cone.size > stop.size or left > ERROR_ATOL:
-                yield f"{stop} was asked for and the cone has {cone.size} generators, which leave {left:.1e}"
-
-    def errors(self) -> Iterator[str]:
-        """The errors claimed are those of the generators."""
-        for stop, cone in self._cones:
-            claimed = cone.errors
-            sizes = range(cone.size + 1) if len(claimed) == cone.size + 1 else [cone.size]
-            for r, claim in zip(sizes, claimed[-len(sizes) :], strict=True):
-                found = float(_distances(cone, r, self._snapshots, self._W).max(initial=0.0))
-                if abs(found - float(claim)) > ERROR_ATOL + KEPT * found:
-                    yield (
-                        f"{stop}: the error of {r} generators is given as {claim:.6g}; the first {r} leave "
-                        f"{found:.6g} of the worst snapshot (a cone that is not nested gives its last error alone)"
-                    )
-                    break
-
-    def determinism(self) -> Iterator[str]:
-        """The same again, to the last bit: of the same instance, and of another."""
-        for how, strategy in (("when asked again", self._strategy), ("of another instance", self._create())):
-            for stop, before in self._cones:
-                if what := _different(self._reduce(stop, strategy=strategy), before):
-                    yield f"{stop}: the {what.replace(': ', f' are not the same {how}: ', 1)}"
-                    return
-
-    def no_mutation(self) -> Iterator[str]:
-        """Snapshots and space are left as they are."""
-        for stop, _ in self._cones:
-            given, gram = self._snapshots.copy(), copied(self._W.matrix)
-            self._strategy.reduce(given, self._W, stop)
-            if what := difference(given, self._snapshots):
-                yield f"{stop}: reduce changes the snapshots it is given: {what} before; work on a copy"
-                return
-            if what := difference(copied(self._W.matrix), gram):
-                yield f"{stop}: reduce changes X_W: {what} before"
-                return
-
-    def without_contact(self) -> Iterator[str]:
-        """A snapshot that is zero, one that comes twice, one alone; all of them zero."""
-        tolerance = next((stop.tolerance for stop in self._stops if stop.tolerance is not None), TOLERANCES[0])
-        some = self._snapshots
-        cases = {
-            "with a zero snapshot": np.column_stack([np.zeros(len(some)), some]),
-            "with a snapshot that comes twice": np.column_stack([some, some[:, np.linalg.norm(some, axis=0).argmax()]]),
-            "with one snapshot": some[:, [np.linalg.norm(some, axis=0).argmax()]],
-        }
-        for name, snapshots in cases.items():
-            cone = self._reduce(Stop(tolerance=tolerance), snapshots)
-            if fault := _cone_fault(cone, self._W) or self._missed(tolerance, cone, snapshots):
-                yield f"{name}: {fault}"
-        try:
-            cone = self._reduce(Stop(tolerance=tolerance), np.zeros_like(some))
-        except VibenchError:  # a refusal in a line is an answer, too
-            return
-        if fault := _cone_fault(cone, self._W):
-            yield f"with nothing but zero snapshots: {fault}; expected a cone without generators"
-
-    def pickling(self) -> Iterator[str]:
-        """Strategy and cone travel between processes."""
-        for thing in (self._strategy, self._cones[0][1]):
-            if what := why_not_pickled(thing):
-                yield what
-                return
-        stop, before = self._cones[0]
-        if what := _different(self._reduce(stop, strategy=pickled(self._strategy)), before):
-            yield f"{stop}: the {what.replace(': ', ' are not the same after pickling: ', 1)}"
-
-    def time(self) -> Iterator[str]:
-        """Nothing takes absurdly long."""
-        yield from too_long("a cone", self._times, self._limit)
+check_dual = raising(examine_dual)
 
 
 def _cone_fault(cone: object, W: InnerProduct) -> str:
-    """What is wrong with a cone, and where."""
+    """What is wrong with a cone, and where; "" if nothing is."""
     try:
         checked = check_cone(cone, W)
     except NumericalError as error:
-        return f"{error}{_where(cone, W)}"
-    errors = checked.errors
+        return f"{error}{_generator(cone, W)}"
+    errors, R = checked.errors, checked.size
     if fault := array_fault("errors", errors, np.shape(errors)):
         return fault
-    R = checked.size
     if errors.ndim != 1 or len(errors) not in (1, R + 1) or errors.min() < 0.0:
         return f"errors has shape {errors.shape}; expected e(0) … e({R}), or e({R}) alone, none negative"
     return ""
 
 
-def _where(cone: object, W: InnerProduct) -> str:
-    """The generator that is to blame."""
+def _generator(cone: object, W: InnerProduct) -> str:
+    """The generator that `check_cone` refuses."""
     if not isinstance(cone, Cone) or np.ndim(cone.generators) != 2 or len(cone.generators) != W.dim:
         return ""
     chi = cone.generators
-    if not np.all(np.isfinite(chi)):
-        return f": look at generator {np.flatnonzero(~np.isfinite(chi).all(axis=0))[0]}"
-    away = np.abs(W.norm(chi) - 1.0)
-    if away.max(initial=0.0) > ERROR_ATOL:
-        return f": that of generator {away.argmax()} is {W.norm(chi)[away.argmax()]:.6g}"
+    with np.errstate(invalid="ignore"):
+        norms = W.norm(chi)
+    away = np.abs(norms - 1.0)
+    if not away.max(initial=0.0) <= ERROR_ATOL:  # true for NaN, too
+        return f": generator {away.argmax()} has norm {norms[away.argmax()]:.6g}"
     i, r = np.unravel_index(int(chi.argmin()), chi.shape)
     return f": look at coefficient {i} of generator {r}"
 
 
-def _distances(cone: Cone, r: int, snapshots: Array, W: InnerProduct) -> Array:
-    """Distances (P,) of the snapshots from the cone of the first r generators, over the largest norm of a snapshot."""
+def _errors(cone: Cone, r: int, snapshots: Array, W: InnerProduct) -> Array:
+    """Projection errors (P,) of snapshots on the cone of the first r generators, relative to the largest norm."""
     largest = float(np.max(W.norm(snapshots), initial=0.0))
     if largest == 0.0:
         return np.zeros(snapshots.shape[1])
-    chi, free = cone.generators[:, :r], cone.free[:r]
-    both = np.hstack([chi, -chi[:, free]])
-    return np.array([project_on_cone(both, theta, W).distance for theta in snapshots.T]) / largest
-
-
-def _different(one: Cone, other: Cone) -> str:
-    for name in ("generators", "errors"):
-        if what := difference(getattr(one, name), getattr(other, name)):
-            return f"{name}: {what}"
-    return "" if np.array_equal(one.free, other.free) else "signs: other generators are free"
+    chi = rays(cone.generators[:, :r], cone.free[:r])
+    return np.array([project_on_cone(chi, theta, W).distance for theta in snapshots.T]) / largest

@@ -1,71 +1,203 @@
-"""Checks of problems."""
+"""The conformance checks of problems: spaces, parameters, what is assembled, high-fidelity solutions, pictures."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from functools import partial
 
-from vibench.interfaces.problem import Problem
-from vibench.testing import assembling, partial_assembly, solving, spaces
-from vibench.testing.checks import SECONDS, Check, Finding, examine, name_of, require, too_long
-from vibench.testing.problem_case import Case
+import numpy as np
 
-CHECKS: tuple[tuple[str, Callable[[Case], Iterator[str]], tuple[str, ...]], ...] = (
-    ("construction", spaces.construction, ()),
-    ("spaces", spaces.spaces, ("construction",)),
-    ("parameters", spaces.parameters, ("construction",)),
-    ("training set", spaces.training_set, ("parameters",)),
-    ("validation set", spaces.validation_set, ("parameters",)),
-    ("assembly", assembling.assembly, ("spaces", "parameters")),
-    ("no mutation", assembling.no_mutation, ("assembly",)),
-    ("symmetry of A", assembling.symmetry, ("assembly",)),
-    ("definiteness of A", assembling.definiteness, ("symmetry of A",)),
-    ("determinism", assembling.determinism, ("assembly",)),
-    ("independence of mu", assembling.independence, ("determinism",)),
-    ("continuity in mu", assembling.continuity, ("independence of mu",)),
-    ("assembly on the contact", partial_assembly.on_contact, ("determinism",)),
-    ("assembly by entries", partial_assembly.by_entries, ("determinism",)),
-    ("pickling", assembling.pickling, ("determinism",)),
-    (
+from vibench.arrays import Array
+from vibench.errors import NumericalError
+from vibench.highfidelity import active_set
+from vibench.interfaces.problem import ParameterBox, Picture, Problem
+from vibench.interfaces.validation import training_parameters, validation_parameters
+from vibench.linalg.inner_product import InnerProduct
+from vibench.testing import assembly
+from vibench.testing.case import ProblemCase
+from vibench.testing.checks import SECONDS, Check, ConformanceError, Finding, Note, examine, raising
+from vibench.testing.comparisons import array_fault, at, difference, unmutated
+
+OUTSIDE_RTOL = 1e-12
+"""Largest distance of a parameter from the box, relative to its bounds."""
+
+COUNT = 5
+"""Number of validation parameters."""
+
+SOLVED = 5
+"""Number of training parameters solved at; up to ten times as many while no constraint is active."""
+
+
+def spaces(case: ProblemCase) -> Iterator[str]:
+    """X_V and X_W are symmetric positive definite; the integrals of the multiplier basis are positive."""
+    for name in ("V", "W"):
+        space = getattr(case.plugin, name, None)
+        if not isinstance(space, InnerProduct):
+            yield f"{name} is a {type(space).__name__}; expected a vibench.InnerProduct"
+        elif space.dim == 0:
+            yield f"{name} has dimension 0; {'no unknown is free' if name == 'V' else 'there is no constraint'}"
+        elif fault := array_fault(f"X_{name}", space.matrix, (space.dim, space.dim), sparse=True):
+            yield fault
+        else:
+            try:
+                InnerProduct(space.matrix, f"X_{name}")
+            except NumericalError as error:
+                yield f"{error}: the matrix was changed after the InnerProduct was made"
+    integrals = case.plugin.multiplier_integrals()
+    if fault := array_fault("multiplier_integrals", integrals, (case.plugin.W.dim,)):
+        yield fault
+    elif np.any(integrals <= 0.0):
+        k = int(np.argmin(integrals))
+        yield (
+            f"multiplier_integrals has the value {integrals[k]:.2g} at entry {k}; expected the positive integrals of "
+            "the multiplier basis: override the method if the basis does not sum to one"
+        )
+
+
+def parameters(case: ProblemCase) -> Iterator[str]:
+    """`parameters` is a box with names, units and ordered bounds."""
+    box = case.plugin.parameters
+    if not isinstance(box, ParameterBox):
+        raise ConformanceError(f"parameters is a {type(box).__name__}; expected a vibench.ParameterBox")
+    if isinstance(box.names, str) or not box.names or not all(isinstance(name, str) and name for name in box.names):
+        raise ConformanceError(f"the parameters' names are {box.names!r}; expected a tuple of strings, one for each")
+    if len(set(box.names)) < box.dim:
+        yield f"two parameters have the same name: {', '.join(box.names)}"
+    if isinstance(box.units, str) or len(box.units) != box.dim:
+        yield f"the parameters' units are {box.units!r}; expected a tuple of {box.dim}, '1' for a number"
+    faults = [array_fault(f"parameters.{name}", getattr(box, name), (box.dim,)) for name in ("lower", "upper")]
+    yield from filter(None, faults)
+    if not any(faults):
+        for name, low, high in zip(box.names, box.lower, box.upper, strict=True):
+            if low > high:
+                yield f"the lower bound {low:g} of the parameter '{name}' is above its upper bound {high:g}"
+
+
+def training_set(case: ProblemCase) -> Iterator[str]:
+    """Training parameters lie in the box, are reproducible, and there are at least two."""
+    mus = training_parameters(case.plugin)
+    yield from _outside("training_set", mus, case.plugin.parameters)
+    if len(np.unique(mus, axis=0)) < 2:
+        yield f"training_set has mu = {mus[0].tolist()} alone; expected at least two different parameters"
+    if what := difference(training_parameters(case.plugin), mus):
+        yield f"training_set differs in a second call: {what} before"
+    yield Note(f"{len(mus)} parameters")
+
+
+def validation_set(case: ProblemCase) -> Iterator[str]:
+    """Validation parameters lie in the box and are reproducible."""
+    mus = validation_parameters(case.plugin, COUNT, case.seed)
+    yield from _outside("validation_set", mus, case.plugin.parameters)
+    if what := difference(validation_parameters(case.plugin, COUNT, case.seed), mus):
+        yield f"validation_set is not the same for the same seed: {what} before; draw from default_rng(seed)"
+
+
+def _outside(name: str, mus: Array, box: ParameterBox) -> Iterator[str]:
+    slack = OUTSIDE_RTOL * np.maximum(np.abs(box.lower), np.abs(box.upper))
+    for k, i in np.argwhere((mus < box.lower - slack) | (mus > box.upper + slack))[:1]:
+        interval = f"[{box.lower[i]:g}, {box.upper[i]:g}]"
+        yield f"{name} leaves the box: parameter {k}, {at(mus[k])}, has '{box.names[i]}' outside {interval}"
+
+
+def solution(case: ProblemCase) -> Iterator[str]:
+    """High-fidelity solutions exist; their multipliers lie in W⁺ and are not all zero."""
+    mus, solver = training_parameters(case.plugin), active_set.HighFidelitySolver(case.plugin)
+    solved: list[active_set.HighFidelitySolution] = []
+    contacts = 0
+    # Evenly spread indices: SOLVED of them first, then those between.
+    spread = [k for count in (SOLVED, 10 * SOLVED) for k in np.linspace(0, len(mus) - 1, count).round().astype(int)]
+    for k in dict.fromkeys(spread):
+        if len(solved) >= SOLVED and contacts:
+            break
+        try:
+            found = solver.solve(mus[k].copy())
+        except NumericalError as error:
+            raise ConformanceError(f"no solution {at(mus[k])}: {error}") from error
+        if np.min(found.lam) < 0.0:
+            yield f"the multiplier is not in W⁺ {at(mus[k])}: entry {np.argmin(found.lam)} is {np.min(found.lam):.1e}"
+            return
+        solved.append(found)
+        contacts += bool(np.any(found.lam > 0.0))
+    if not contacts:
+        yield (
+            f"no constraint is active at any of {len(solved)} training parameters, so that all multipliers are zero; "
+            "check that B u ≤ g is the admissible side"
+        )
+    worst, fallbacks = max(each.residuals.worst for each in solved), sum(bool(each.fallback) for each in solved)
+    initial = f", {fallbacks} started from an interior-point solution" if fallbacks else ""
+    yield Note(f"residuals up to {worst:.0e}, contact at {contacts} of {len(solved)} parameters{initial}")
+
+
+def pictures(case: ProblemCase) -> Iterator[str]:
+    """`diagnostics` are finite numbers; `picture` has the right shapes and does not change the solution."""
+    mu = training_parameters(case.plugin)[0]
+    for name, value in case.plugin.diagnostics(mu.copy()).items():
+        if not isinstance(name, str) or not np.isscalar(value) or not np.isfinite(float(value)):  # type: ignore[arg-type]
+            yield f"diagnostics returns {value!r} for {name!r} {at(mu)}; expected a finite number for a name"
+    found = active_set.HighFidelitySolver(case.plugin).solve(mu.copy())
+    u, lam = found.u.copy(), found.lam.copy()
+    picture = unmutated("picture", {"u": u, "lam": lam}, lambda: case.plugin.picture(mu.copy(), u, lam))
+    if picture is None:
+        yield Note("no picture")
+    elif not isinstance(picture, Picture):
+        yield f"picture returns a {type(picture).__name__}; expected a vibench.Picture or None"
+    else:
+        yield from _picture_faults(picture, len(lam))
+
+
+def _picture_faults(picture: Picture, m: int) -> Iterator[str]:
+    count, line = np.shape(picture.points)[-1], np.shape(picture.points)[:1] == (1,)
+    expected = {"points": (1 if line else 2, count), "values": (count,), "multiplier": (m,),
+                "positions": (1 if np.shape(picture.positions)[:1] == (1,) else 2, m)}  # fmt: skip
+    for name, shape in expected.items():
+        if fault := array_fault(f"picture.{name}", getattr(picture, name), shape):
+            yield fault
+    triangles = np.zeros((3, 0), dtype=int) if line else np.asarray(picture.triangles)
+    if triangles.ndim != 2 or len(triangles) != 3 or not np.issubdtype(triangles.dtype, np.integer):
+        yield f"picture.triangles has dtype {triangles.dtype} and shape {triangles.shape}; expected indices (3, t)"
+    elif triangles.size and (triangles.min() < 0 or triangles.max() >= count):
+        yield f"picture.triangles refers to points {triangles.min()} to {triangles.max()}; there are {count}"
+
+
+CHECKS: tuple[Check[ProblemCase], ...] = (
+    Check("construction", ProblemCase.construction),
+    Check("spaces", spaces, ("construction",)),
+    Check("parameters", parameters, ("construction",)),
+    Check("training set", training_set, ("parameters",)),
+    Check("validation set", validation_set, ("parameters",)),
+    Check("assembly", assembly.assembly, ("spaces", "parameters")),
+    Check("no mutation", assembly.no_mutation, ("assembly",)),
+    Check("symmetry of A", assembly.symmetry, ("assembly",)),
+    Check("definiteness of A", assembly.definiteness, ("symmetry of A",)),
+    Check("determinism", ProblemCase.determinism, ("assembly",)),
+    Check("independence of mu", assembly.independence, ("determinism",)),
+    Check("continuity in mu", assembly.continuity, ("independence of mu",)),
+    Check("assembly on the contact", assembly.on_contact, ("determinism",)),
+    Check("assembly by entries", assembly.by_entries, ("determinism",)),
+    Check("pickling", ProblemCase.pickling, ("determinism",)),
+    Check(
         "high-fidelity solution",
-        solving.solution,
+        solution,
         ("training set", "definiteness of A", "independence of mu", "assembly on the contact"),
     ),
-    ("picture and diagnostics", solving.pictures, ("high-fidelity solution",)),
+    Check("picture and diagnostics", pictures, ("high-fidelity solution",)),
+    Check("time", ProblemCase.time, ("assembly",)),
 )
-"""Every check, in the order in which they are made, and those without which it tells nothing."""
-
-
-def check_problem(create: Callable[[], Problem], *, seed: int = 0, seconds: float = SECONDS) -> None:
-    """Check all that vibench takes for granted of a problem; see `examine_problem`.
-
-    Raises
-    ------
-    ConformanceError
-        Listing every failure: what is wrong, and where to look.
-    """
-    require(name_of(create), examine_problem(create, seed=seed, seconds=seconds))
 
 
 def examine_problem(create: Callable[[], Problem], *, seed: int = 0, seconds: float = SECONDS) -> list[Finding]:
-    """Findings of all checks of a problem.
+    """Make all checks of a problem.
 
     Parameters
     ----------
     create
-        Makes an instance: the class, or a `partial` of it with options. Take a coarse mesh: it is assembled some
-        hundred times.
+        Class, or `partial` of it with options; an instance is refused with a `TypeError`. Choose a coarse mesh: some
+        hundred assemblies are made.
     seed
-        Of the random parameters and entries that are looked at.
+        Of the random parameters and entries.
     seconds
-        Longest time that an assembly, or making the problem, may take.
+        Largest wall time [s] of the constructor and of an assembly.
     """
-    name_of(create)
-    case = Case(create, seed)
-    checks = [Check(name, partial(faults, case), needs) for name, faults, needs in CHECKS]
-    return examine([*checks, Check("time", partial(_time, case, seconds), ("assembly",))])
+    return examine(CHECKS, ProblemCase(create, seconds, seed))
 
 
-def _time(case: Case, limit: float) -> Iterator[str]:
-    yield from too_long("making the problem", [case.construction], limit)
-    yield from too_long("an assembly", case.times, limit)
+check_problem = raising(examine_problem)

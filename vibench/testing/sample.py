@@ -1,8 +1,8 @@
-"""A small problem to try strategies on, its snapshots, and a reduced model of it to enrich."""
+"""The sample problem on which strategies are checked, its snapshots, and a reduced model of it."""
 
 from __future__ import annotations
 
-from typing import Any
+from copy import deepcopy
 
 import numpy as np
 import scipy.sparse as sp
@@ -15,20 +15,17 @@ from vibench.linalg.inner_product import InnerProduct
 from vibench.reduction.cones import greedy_cone
 from vibench.reduction.pod import pod
 from vibench.stability.infsup import multipliers
-from vibench.testing.comparisons import copied
+from vibench.testing.comparisons import Arrays
 
 NODES, CONSTRAINTS = 40, 14
 """Free nodes of the string, and constraints on it."""
-
-MODES, GENERATORS = 4, 6
-"""Dimensions of the reduced model that primal strategies enrich."""
 
 
 class MovingSupport(Problem):
     """A string pressed on a parabolic support that moves and rises with the parameter.
 
-    The gap is controlled in means around points that move with the support, so that B, and with it every supremizer,
-    truly depends on mu.
+    The constraints are on weighted means around points that move with the support, so that B, and with it every
+    supremizer, depends on mu.
     """
 
     parameters = ParameterBox(("position", "height"), np.array([-0.1, 0.0]), np.array([0.1, 0.04]), ("m", "m"))
@@ -50,7 +47,7 @@ class MovingSupport(Problem):
         return self.parameters.grid(5, 5)
 
     def assemble(self, mu: Array) -> VariationalInequality:
-        """Means of −u around 14 points are no larger than those of −ψ, ψ the support."""
+        """Weighted means of −u around 14 points are at most those of −ψ, where ψ is the support."""
         centres = np.linspace(0.25, 0.75, CONSTRAINTS) + mu[0]
         hats = np.maximum(0.0, 1.0 - np.abs(self._x[None, :] - centres[:, None]) / self._width)
         weights = hats / len(self._x)
@@ -59,46 +56,37 @@ class MovingSupport(Problem):
 
 
 def sample_snapshots() -> tuple[Array, InnerProduct]:
-    """Multipliers λ(mu_p) (m×P) of the sample problem at its training parameters, and the space W they live in."""
+    """Multipliers λ(mu_p) (m×P) of the sample problem at its training parameters, and their space W."""
     problem = MovingSupport()
     return _solutions(problem)[1], problem.W
 
 
-def sample_offline(modes: int = MODES, generators: int = GENERATORS) -> Offline:
-    """A reduced model of the sample problem, of a POD and of snapshots chosen greedily, for strategies to enrich.
-
-    Parameters
-    ----------
-    modes, generators
-        N and R.
-    """
+def sample_offline(modes: int = 4, generators: int = 6) -> Offline:
+    """A reduced model of the sample problem to enrich: N POD modes and a greedy cone of R generators."""
     problem = MovingSupport()
     u, lam = _solutions(problem)
-    cone = greedy_cone(lam, problem.W, Stop(size=generators), lambda theta, _: (np.zeros_like(theta), ""))
+    cone = greedy_cone(lam, problem.W, Stop(size=generators))
     return offline_of(problem, pod(u, problem.V, Stop(size=modes)).basis, cone)
 
 
 def offline_of(problem: Problem, basis: Array, cone: Cone) -> Offline:
-    """What a primal strategy gets to work with: a problem, a basis of V_N (n×N) and a cone."""
+    """The reduced model of a basis of V_N (n×N) and a cone."""
     span = multipliers(cone.generators, problem.W).span
     return Offline(problem, basis, cone, span, problem.training_set())
 
 
 def copy_of(offline: Offline) -> Offline:
-    """The same with arrays of its own; the problem is shared."""
-    cone = offline.cone
-    own = Cone(cone.generators.copy(), cone.errors.copy(), cone.free.copy(), cone.fallbacks)
-    return Offline(offline.problem, offline.basis.copy(), own, offline.span.copy(), offline.training.copy())
+    """A copy with arrays of its own; the problem is shared."""
+    return deepcopy(offline, {id(offline.problem): offline.problem})
 
 
-def arrays_of(offline: Offline) -> dict[str, Any]:
-    """All that a strategy could change, by where it is: its arrays, and copies of the matrices of the spaces."""
-    arrays = {
-        "basis": offline.basis, "span": offline.span, "training": offline.training,
-        "cone.generators": offline.cone.generators, "cone.errors": offline.cone.errors,
-    }  # fmt: skip
-    spaces = {f"problem.{name}.matrix": copied(getattr(offline.problem, name).matrix) for name in "VW"}
-    return {**arrays, **spaces}
+def arrays_of(offline: Offline) -> Arrays:
+    """All arrays that a strategy could change, by name."""
+    cone, problem = offline.cone, offline.problem
+    arrays = {"basis": offline.basis, "span": offline.span, "training": offline.training,
+              "cone.generators": cone.generators, "cone.errors": cone.errors,
+              "problem.V.matrix": problem.V.matrix, "problem.W.matrix": problem.W.matrix}  # fmt: skip
+    return {f"offline.{name}": value for name, value in arrays.items()}
 
 
 def _solutions(problem: Problem) -> tuple[Array, Array]:

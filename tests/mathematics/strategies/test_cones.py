@@ -17,13 +17,13 @@ from vibench.interfaces.strategies import Cone, DualStrategy, Stop, rays
 from vibench.interfaces.validation import check_cone
 from vibench.linalg.inner_product import InnerProduct
 from vibench.reduction.cones import project_on_cone
-from vibench.reduction.removal import removable_part
 from vibench.testing import check_dual
 from vibench_strategies import enlarged_cpg
 from vibench_strategies.angle_greedy import AngleGreedy
 from vibench_strategies.cpg import CPG
 from vibench_strategies.dictionary import Dictionary
 from vibench_strategies.enlarged_cpg import EnlargedCPG
+from vibench_strategies.mcpg import part_in_cone
 from vibench_strategies.nmf import NonnegativeFactors
 from vibench_strategies.orthant import Orthant
 from vibench_strategies.pod_dual import PODDual
@@ -179,7 +179,7 @@ def test_the_enlarged_cone_contains_that_of_cpg_and_nothing_moves_any_more(theta
         assert project_on_cone(cone.generators, generator, W).distance <= 1e-8
     if not cone.fallbacks:
         for i in range(cone.size):
-            part, _ = removable_part(cone.generators[:, i], np.delete(cone.generators, i, axis=1), W)
+            part, _ = part_in_cone(cone.generators[:, i], np.delete(cone.generators, i, axis=1), W)
             assert W.norm(part) <= 1e-8
 
 
@@ -198,8 +198,8 @@ def test_a_sweep_that_is_not_enough_is_recorded() -> None:
 
 
 def test_a_step_that_is_only_feasible_is_recorded(monkeypatch: pytest.MonkeyPatch) -> None:
-    whole: Callable[..., tuple[Array, str]] = enlarged_cpg.removable_part
-    monkeypatch.setattr(enlarged_cpg, "removable_part", lambda *data: (whole(*data)[0], "not optimal"))
+    whole: Callable[..., tuple[Array, str]] = enlarged_cpg.part_in_cone
+    monkeypatch.setattr(enlarged_cpg, "part_in_cone", lambda *data: (whole(*data)[0], "not optimal"))
     theta, X = bumps(5)
     notes = EnlargedCPG().reduce(theta, X, Stop(size=3)).fallbacks
     assert notes[0] == "sweep 1, generator 1: not optimal"

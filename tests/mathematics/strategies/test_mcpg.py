@@ -11,11 +11,10 @@ from vibench.interfaces.problem import VariationalInequality
 from vibench.interfaces.strategies import Stop
 from vibench.linalg.inner_product import InnerProduct
 from vibench.qp.solution import QPSolution
-from vibench.reduction import removal
 from vibench.reduction.cones import project_on_cone
-from vibench.reduction.removal import removable_part
+from vibench_strategies import mcpg
 from vibench_strategies.cpg import CPG
-from vibench_strategies.mcpg import ModifiedCPG
+from vibench_strategies.mcpg import ModifiedCPG, part_in_cone
 
 seeds = st.integers(0, 10_000)
 EUCLID = InnerProduct(sp.eye_array(3))
@@ -32,7 +31,7 @@ def bumps(count: int = 12, m: int = 40) -> tuple[np.ndarray, InnerProduct]:
 
 def test_the_second_generator_of_the_example_that_corrects_remark_4_3() -> None:
     theta = np.array([[1.0, 1.0], [1.0, 2.0], [0.0, 1.0]])
-    part, note = removable_part(theta[:, 1], theta[:, :1], EUCLID)
+    part, note = part_in_cone(theta[:, 1], theta[:, :1], EUCLID)
     assert np.allclose(part, [1.0, 1.0, 0.0], atol=1e-10)
     assert note == ""
     cone = ModifiedCPG().reduce(theta[:, ::-1], EUCLID, Stop(size=2))  # the larger snapshot comes first
@@ -42,8 +41,8 @@ def test_the_second_generator_of_the_example_that_corrects_remark_4_3() -> None:
 def test_generators_positive_where_theta_is_zero_take_no_part() -> None:
     theta = np.array([1.0, 1.0, 0.0])
     wide = np.array([[1.0], [1.0], [1.0]])
-    assert np.all(removable_part(theta, wide, EUCLID)[0] == 0.0)
-    part, _ = removable_part(theta, np.hstack([wide, [[1.0], [0.0], [0.0]]]), EUCLID)
+    assert np.all(part_in_cone(theta, wide, EUCLID)[0] == 0.0)
+    part, _ = part_in_cone(theta, np.hstack([wide, [[1.0], [0.0], [0.0]]]), EUCLID)
     assert np.allclose(part, [1.0, 0.0, 0.0], atol=1e-10)
 
 
@@ -52,7 +51,7 @@ def test_the_removed_part_is_feasible_and_optimal(seed: int) -> None:
     rng = np.random.default_rng(seed)
     W = space(6, seed)
     chi, theta = rng.random((6, 3)), rng.random(6) + 0.1
-    part, note = removable_part(theta, chi, W)
+    part, note = part_in_cone(theta, chi, W)
     assert note == ""
     assert np.all(theta - part >= 0.0)
     assert project_on_cone(chi, part, W).distance < 1e-9
@@ -101,8 +100,8 @@ def test_a_solver_that_fails_leaves_a_feasible_generator_and_a_note(monkeypatch,
         return QPSolution(np.full(count, value), np.zeros(rows), "solved")
 
     theta, W = bumps()
-    monkeypatch.setattr(removal, "solve_qp", fails)
-    part, note = removable_part(theta[:, 3], theta[:, 2:3] * (theta[:, 3:4] > 0.0), W)
+    monkeypatch.setattr(mcpg, "solve_qp", fails)
+    part, note = part_in_cone(theta[:, 3], theta[:, 2:3] * (theta[:, 3:4] > 0.0), W)
     assert "line 9" in note
     assert np.all(theta[:, 3] - part >= 0.0)
     cone = ModifiedCPG().reduce(theta, W, Stop(size=12))

@@ -18,8 +18,8 @@ from vibench.cli.main import app
 from vibench.cli.plugin_commands import LISTS
 from vibench.qp.settings import SETTINGS
 from vibench.results import tables
+from vibench.results.columns import TABLES
 from vibench.results.database import FILE
-from vibench.results.schema import TABLES
 from vibench.study import registry
 
 GROUP: Any = typer.main.get_command(app)

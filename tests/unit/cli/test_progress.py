@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from itertools import pairwise
 from pathlib import Path
 
@@ -13,19 +13,19 @@ from hypothesis import strategies as st
 from rich.console import Console
 from samples import STUDY, changed, write_study
 
-from vibench.cli.progress import Report, TimeLeft, duration
-from vibench.execution.run import queries_stage
+from vibench.cli.progress import ProgressDisplay, TimeLeft, duration
+from vibench.execution.run import Agenda
 from vibench.interfaces.strategies import Stop
 from vibench.stages.base import Stage
-from vibench.stages.cell_queries import QueriesStage
+from vibench.stages.cell_queries import CellQueries, cell_queries
 from vibench.stages.offline import PODStage
-from vibench.stages.snapshots import CHUNKS, HighFidelity
+from vibench.stages.snapshots import CHUNKS, SnapshotStage
 from vibench.study.cells import Cell, Plugin, expand
 from vibench.study.reader import load_study
 
 PROBLEM = Plugin("problem", "p", "{}", "")
 PODS: list[Stage] = [PODStage(PROBLEM, Stop(size=k)) for k in range(1, 5)]
-CHUNK: list[Stage] = [HighFidelity(PROBLEM, "training", 0, 0, chunk) for chunk in range(CHUNKS)]
+CHUNK: list[Stage] = [SnapshotStage(PROBLEM, "training", 0, 0, chunk) for chunk in range(CHUNKS)]
 
 
 @pytest.fixture
@@ -36,8 +36,7 @@ def cells(tmp_path: Path) -> list[Cell]:
 
 @pytest.fixture
 def queries(cells: list[Cell]) -> list[Stage]:
-    study = load_study("quick")
-    return [queries_stage(cell, study) for cell in cells]
+    return [cell_queries(cell, 20.0) for cell in cells]
 
 
 def test_nothing_is_known_before_a_stage_is_done() -> None:
@@ -67,8 +66,8 @@ def test_workers_share_what_is_left() -> None:
 
 
 def test_solvers_are_told_apart(queries: list[Stage]) -> None:
-    fast = [stage for stage in queries if isinstance(stage, QueriesStage) and stage.solver == "piqp"]
-    slow = [stage for stage in queries if isinstance(stage, QueriesStage) and stage.solver == "osqp"]
+    fast = [stage for stage in queries if isinstance(stage, CellQueries) and stage.solver == "piqp"]
+    slow = [stage for stage in queries if isinstance(stage, CellQueries) and stage.solver == "osqp"]
     left = TimeLeft([*fast[:3], *slow[:3]], 1)
     left.done(fast[0], 1.0)
     left.done(slow[0], 10.0)
@@ -104,41 +103,46 @@ def test_a_duration_in_words_is_about_the_duration(seconds: float) -> None:
 
 
 @pytest.fixture
-def report() -> Callable[..., tuple[Report, io.StringIO]]:
+def report() -> Callable[..., tuple[ProgressDisplay, io.StringIO]]:
     """Function that gives a report and what it prints."""
 
-    def make(*, terminal: bool = False) -> tuple[Report, io.StringIO]:
+    def make(*, terminal: bool = False) -> tuple[ProgressDisplay, io.StringIO]:
         printed = io.StringIO()
-        return Report(Console(file=printed, force_terminal=terminal, width=120)), printed
+        return ProgressDisplay(Console(file=printed, force_terminal=terminal, width=120)), printed
 
     return make
 
 
-Make = Callable[..., tuple[Report, io.StringIO]]
+def agenda(cells: int, stages: Sequence[Stage], workers: int) -> Agenda:
+    """Every queries' stage is a cell to be run."""
+    return Agenda(cells, sum(isinstance(stage, CellQueries) for stage in stages), 0, stages, workers)
+
+
+Make = Callable[..., tuple[ProgressDisplay, io.StringIO]]
 OK = {"status": "ok", "reason": ""}
 
 
 def test_the_beginning_says_what_is_to_be_done(report: Make, queries: list[Stage]) -> None:
     made, printed = report()
-    made.start(20, [*queries[:3], *PODS], 0, 2)
+    made.start(agenda(20, [*queries[:3], *PODS], 2))
     assert printed.getvalue() == "20 cells, 3 to run, 7 stages on 2 workers\n"
 
 
 def test_one_worker_is_no_workers(report: Make) -> None:
     made, printed = report()
-    made.start(1, PODS, 0, 1)
+    made.start(agenda(1, PODS, 1))
     assert printed.getvalue() == "1 cells, 0 to run, 4 stages on 1 worker\n"
 
 
 def test_where_nothing_is_to_be_done_nobody_works(report: Make) -> None:
     made, printed = report()
-    made.start(1, [], 0, 0)
+    made.start(agenda(1, [], 0))
     assert printed.getvalue() == "1 cells, 0 to run, 0 stages\n"
 
 
-def test_high_fidelity_parts_are_reported_sweep_by_sweep(report: Make) -> None:
+def test_high_fidelity_parts_are_reported_four_by_four(report: Make) -> None:
     made, printed = report()
-    made.start(1, CHUNK, 0, 2)
+    made.start(agenda(1, CHUNK, 2))
     for chunk in CHUNK[:-1]:
         made.stage(chunk, 0.1)
     assert "high-fidelity" not in printed.getvalue()
@@ -148,7 +152,7 @@ def test_high_fidelity_parts_are_reported_sweep_by_sweep(report: Make) -> None:
 
 def test_other_stages_are_not_reported(report: Make) -> None:
     made, printed = report()
-    made.start(1, PODS, 0, 2)
+    made.start(agenda(1, PODS, 2))
     before = printed.getvalue()
     made.stage(PODS[0], 0.1)
     assert printed.getvalue() == before
@@ -156,7 +160,7 @@ def test_other_stages_are_not_reported(report: Make) -> None:
 
 def test_every_cell_has_a_line(report: Make, cells: list[Cell], queries: list[Stage]) -> None:
     made, printed = report()
-    made.start(len(cells), queries, 0, 2)
+    made.start(agenda(len(cells), queries, 2))
     made.cell(cells[0], OK)
     made.cell(cells[1], {"status": "timeout", "reason": "took [bold]long"})
     lines = printed.getvalue().splitlines()
@@ -167,23 +171,23 @@ def test_every_cell_has_a_line(report: Make, cells: list[Cell], queries: list[St
 
 def test_a_long_line_stays_one_line(report: Make, cells: list[Cell], queries: list[Stage]) -> None:
     made, printed = report()
-    made.start(1, queries[:1], 0, 2)
+    made.start(agenda(1, queries[:1], 2))
     made.cell(cells[0], {"status": "error", "reason": "word " * 100})
     assert len(printed.getvalue().splitlines()) == 2
 
 
 def test_the_time_left_is_said_once_known(report: Make, cells: list[Cell], queries: list[Stage]) -> None:
     made, printed = report()
-    made.start(len(cells), queries, 0, 1)
+    made.start(agenda(len(cells), queries, 1))
     made.stage(queries[0], 20.0)
     made.cell(cells[0], OK)
-    same = sum(isinstance(stage, QueriesStage) for stage in queries) - 1
+    same = sum(isinstance(stage, CellQueries) for stage in queries) - 1
     assert f"about {duration(20.0 * same)} left" in printed.getvalue()
 
 
 def test_less_than_a_second_left_is_not_said(report: Make, cells: list[Cell], queries: list[Stage]) -> None:
     made, printed = report()
-    made.start(len(cells), queries[:2], 0, 2)
+    made.start(agenda(len(cells), queries[:2], 2))
     made.stage(queries[0], 0.2)
     made.cell(cells[0], OK)
     assert "left" not in printed.getvalue()
@@ -192,7 +196,7 @@ def test_less_than_a_second_left_is_not_said(report: Make, cells: list[Cell], qu
 def test_plain_lines_where_there_is_no_terminal(report: Make, cells: list[Cell], queries: list[Stage]) -> None:
     made, printed = report()
     with made:
-        made.start(len(cells), [*CHUNK, *queries], 0, 2)
+        made.start(agenda(len(cells), [*CHUNK, *queries], 2))
         for stage in (*CHUNK, *queries):
             made.stage(stage, 3.0)
         for cell in cells:
@@ -206,7 +210,7 @@ def test_plain_lines_where_there_is_no_terminal(report: Make, cells: list[Cell],
 def test_a_terminal_gets_a_bar_and_only_what_fell_short(report: Make, cells: list[Cell], queries: list[Stage]) -> None:
     made, printed = report(terminal=True)
     with made:
-        made.start(len(cells), queries, 0, 2)
+        made.start(agenda(len(cells), queries, 2))
         made.stage(queries[0], 30.0)
         made.cell(cells[0], OK)
         made.cell(cells[1], {"status": "error", "reason": "broke"})
@@ -221,6 +225,6 @@ def test_a_terminal_gets_a_bar_and_only_what_fell_short(report: Make, cells: lis
 def test_a_terminal_gets_no_bar_where_nothing_is_to_be_done(report: Make) -> None:
     made, printed = report(terminal=True)
     with made:
-        made.start(3, [], 0, 0)
+        made.start(agenda(3, [], 0))
     assert "stages" in printed.getvalue()
     assert "0:00:00" not in printed.getvalue()

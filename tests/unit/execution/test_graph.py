@@ -2,29 +2,38 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field
+from functools import cached_property
 
-from hypothesis import given
+import pytest
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from vibench.execution.graph import Plan
+from vibench.execution.graph import Graph
 from vibench.stages.artefacts import Store
 from vibench.stages.base import Result, Stage
+from vibench.stages.cell_queries import cell_queries
+from vibench.stages.pictures import PictureStage
+from vibench.study.cells import expand
+from vibench.study.reader import load_study
 
 
 @dataclass(frozen=True)
 class Node(Stage):
-    """A stage that needs others, and all that these need."""
+    """A stage that needs others."""
+
+    label = "node"
 
     name: str
     direct: tuple[Node, ...] = field(default=())
 
+    @cached_property
+    def key(self) -> str:
+        return self.name
+
     def inputs(self) -> tuple[Stage, ...]:
-        found: dict[str, Stage] = {}
-        for node in self.direct:
-            found[node.name] = node
-            found |= {below.name: below for below in node.inputs() if isinstance(below, Node)}
-        return tuple(found.values())
+        return self.direct
 
     def run(self, store: Store) -> Result:
         return Result(self.name)
@@ -56,7 +65,7 @@ def test_what_fails_takes_its_goals_along_and_nothing_else(
         asked.append(stage.name)
         return stage.name in there
 
-    plan, begun, lost = Plan(), [], []
+    plan, begun, lost = Graph(), [], []
     for goal in goals:
         plan.add_goal(goal, is_there)
     assert len(asked) == len(set(asked))
@@ -75,3 +84,44 @@ def test_what_fails_takes_its_goals_along_and_nothing_else(
     assert len(begun) == len(set(begun))
     assert not there & set(begun)
     assert sorted([*lost, *(name for name in begun if name.startswith("goal"))]) == sorted(goal.name for goal in goals)
+
+
+def closure(stage: Stage) -> Iterator[str]:
+    """The keys of a stage and of all that it needs, directly or not."""
+    yield stage.key
+    for needed in stage.inputs():
+        yield from closure(needed)
+
+
+@pytest.fixture(scope="module")
+def goals_of_quick() -> dict[str, tuple[Stage, frozenset[str]]]:
+    """The goals of the study `quick`, each with the keys of all that it needs."""
+    goals = [cell_queries(cell, 20.0) for cell in expand(load_study("quick"))]
+    goals += [PictureStage(problem) for problem in {goal.assembly.enrichment.pod.problem for goal in goals}]
+    return {goal.key: (goal, frozenset(closure(goal))) for goal in goals}
+
+
+@settings(max_examples=30)
+@given(st.data())
+def test_whatever_fails_in_a_real_study_every_goal_ends_once(
+    goals_of_quick: dict[str, tuple[Stage, frozenset[str]]], data: st.DataObject
+) -> None:
+    """The goals that need a stage that failed are lost, and no other; nothing waits for ever."""
+    stages = sorted(set().union(*(needed for _, needed in goals_of_quick.values())))
+    bad = set(data.draw(st.lists(st.sampled_from(stages), max_size=4)))
+    graph, failed, lost, done = Graph(), set(), [], []
+    for goal, _ in goals_of_quick.values():
+        graph.add_goal(goal, lambda _: False)
+    while graph.waiting:
+        batch = list(graph.begin(data.draw(st.integers(1, 3))))
+        assert batch
+        for stage in batch:
+            if stage.key in bad:
+                failed.add(stage.key)
+                lost += [goal.key for goal in graph.lost(stage)]
+            else:
+                done.append(stage.key)
+                graph.done(stage)
+    assert sorted(lost) == sorted(key for key, (_, needed) in goals_of_quick.items() if needed & failed)
+    assert set(goals_of_quick) == {*lost, *(key for key in done if key in goals_of_quick)}
+    assert len(done) == len(set(done))

@@ -9,14 +9,15 @@ from pathlib import Path
 import pytest
 from samples import STUDY, changed, write_study
 
-from vibench.execution.row_keys import HistoryNames, cell_columns
-from vibench.execution.run import queries_stage
+from vibench.execution.row_keys import axis_columns, cell_columns, labels_of
 from vibench.interfaces.strategies import Stop
-from vibench.results.schema import HISTORY_KEYS, KEYS
+from vibench.results.columns import HISTORY_KEYS, KEYS
 from vibench.stages.base import Stage
+from vibench.stages.cell_queries import cell_queries
+from vibench.stages.enrichment import NestedEnrichment
 from vibench.stages.infsup_constants import ReferenceConstants
-from vibench.stages.offline import ConeStage, EnrichmentStage, PODStage
-from vibench.stages.snapshots import HighFidelity
+from vibench.stages.offline import ConeStage, PODStage
+from vibench.stages.snapshots import SnapshotStage
 from vibench.study.cells import Cell, expand
 from vibench.study.reader import load_study
 from vibench.study.spec import Study
@@ -48,7 +49,7 @@ def first(stages: Sequence[Stage], sort: type) -> Stage:
 
 @pytest.fixture
 def stages(cell: Cell, study: Study) -> list[Stage]:
-    return list(stages_of(queries_stage(cell, study)))
+    return list(stages_of(cell_queries(cell, 20.0)))
 
 
 def test_a_cell_is_named_by_the_key_columns(cell: Cell) -> None:
@@ -74,17 +75,17 @@ CONE = PROBLEM | {"dual", "dual_options", "dual_tol", "dual_size"}
 @pytest.mark.parametrize(
     ("sort", "names"),
     [
-        (HighFidelity, PROBLEM),
+        (SnapshotStage, PROBLEM),
         (PODStage, POD),
         (ConeStage, CONE),
-        (EnrichmentStage, POD | CONE | {"primal", "primal_options", "primal_tol"}),
+        (NestedEnrichment, POD | CONE | {"primal", "primal_options", "primal_tol"}),
         (ReferenceConstants, set()),
     ],
 )
 def test_a_history_is_named_by_what_its_stage_depends_on(
     sort: type, names: set[str], cell: Cell, stages: list[Stage]
 ) -> None:
-    columns = HistoryNames([cell]).columns(first(stages, sort))
+    columns = axis_columns(first(stages, sort).axes, labels_of([cell]))
     assert set(columns) == names
     assert set(columns) <= set(HISTORY_KEYS)
     of_cell = cell_columns(cell)
@@ -93,12 +94,12 @@ def test_a_history_is_named_by_what_its_stage_depends_on(
 
 def test_every_stage_of_every_cell_has_names(study: Study) -> None:
     cells = expand(study)
-    names = HistoryNames(cells)
+    labels = labels_of(cells)
     for cell in cells:
-        for stage in stages_of(queries_stage(cell, study)):
-            assert set(names.columns(stage)) <= set(HISTORY_KEYS)
+        for stage in stages_of(cell_queries(cell, 20.0)):
+            assert set(axis_columns(stage.axes, labels)) <= set(HISTORY_KEYS)
 
 
 def test_the_first_of_two_labels_names_the_history(cell: Cell, stages: list[Stage]) -> None:
     other = replace(cell, labels=("x", "y", "z"), solver="osqp")
-    assert HistoryNames([cell, other]).columns(first(stages, PODStage))["problem"] == "membrane"
+    assert axis_columns(first(stages, PODStage).axes, labels_of([cell, other]))["problem"] == "membrane"

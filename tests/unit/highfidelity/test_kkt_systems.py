@@ -11,8 +11,8 @@ from numerics import spd
 
 from vibench.errors import NumericalError
 from vibench.highfidelity import kkt_systems
-from vibench.highfidelity.kkt_systems import SaddlePoint, Stiffness
-from vibench.linalg.schur_complement import Pattern
+from vibench.highfidelity.kkt_systems import CondensedStiffness, SaddlePointSolver
+from vibench.linalg.schur_complement import EliminationPattern
 
 
 @given(
@@ -26,8 +26,8 @@ def test_solutions_are_those_of_the_whole_system(seed: int, sets: list[set[int]]
     A, f = young * spd(8, rng), young * rng.standard_normal(8)
     B, g = rng.standard_normal((6, 8)), rng.standard_normal(6)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(kkt_systems, "BORDER", border)
-        solve = SaddlePoint(sp.csc_array(A), f, sp.csr_array(B), g)
+        patch.setattr(kkt_systems, "MAX_BORDER", border)
+        solve = SaddlePointSolver(sp.csc_array(A), f, sp.csr_array(B), g)
         for chosen in sets:
             active = np.array(sorted(chosen), dtype=np.intp)
             rows = B[active]
@@ -44,8 +44,9 @@ def test_sets_that_differ_little_are_not_factorised_again(monkeypatch: pytest.Mo
     made = []
     monkeypatch.setattr(kkt_systems, "splu", lambda matrix: made.append(matrix.shape) or sp.linalg.splu(matrix))
     rng = np.random.default_rng(0)
-    solve = SaddlePoint(sp.csc_array(young * spd(40, rng)), young * np.ones(40), sp.eye_array(40).tocsr(), np.zeros(40))
-    for active in (np.arange(20), np.arange(3, 22), np.arange(20), np.arange(20 + kkt_systems.BORDER + 1)):
+    A, B = sp.csc_array(young * spd(40, rng)), sp.eye_array(40).tocsr()
+    solve = SaddlePointSolver(A, young * np.ones(40), B, np.zeros(40))
+    for active in (np.arange(20), np.arange(3, 22), np.arange(20), np.arange(20 + kkt_systems.MAX_BORDER + 1)):
         solve(active)
     assert made == [(60, 60), (77, 77)]
 
@@ -55,7 +56,7 @@ def test_a_border_that_is_dependent_is_left_to_a_factorisation(monkeypatch: pyte
     monkeypatch.setattr(kkt_systems, "splu", lambda matrix: made.append(matrix.shape) or sp.linalg.splu(matrix))
     rng = np.random.default_rng(1)
     rows = rng.standard_normal((2, 5))
-    solve = SaddlePoint(sp.csc_array(spd(5, rng)), np.ones(5), sp.csr_array(rows[[0, 1, 0]]), np.zeros(3))
+    solve = SaddlePointSolver(sp.csc_array(spd(5, rng)), np.ones(5), sp.csr_array(rows[[0, 1, 0]]), np.zeros(3))
     solve(np.array([0, 1]))
     with contextlib.suppress(RuntimeError):  # exactly singular or nearly so
         solve(np.array([0, 1, 2]))
@@ -64,7 +65,7 @@ def test_a_border_that_is_dependent_is_left_to_a_factorisation(monkeypatch: pyte
 
 def test_a_stiffness_that_is_not_definite_is_for_others_to_refuse() -> None:
     A = sp.csc_array(np.array([[1.0, 0.0, 0.0], [0.0, -2.0, 1.0], [0.0, 1.0, 0.0]]))
-    u, lam = SaddlePoint(A, np.ones(3), sp.csr_array(np.eye(3)), np.zeros(3))(np.array([0]))
+    u, lam = SaddlePointSolver(A, np.ones(3), sp.csr_array(np.eye(3)), np.zeros(3))(np.array([0]))
     assert np.allclose((A @ u + lam)[1:], 1.0)
     assert np.isclose(u[0], 0.0)
 
@@ -74,8 +75,8 @@ def test_a_stiffness_that_is_not_definite_is_for_others_to_refuse() -> None:
 def test_what_is_left_after_elimination_shows_whether_a_stiffness_is_definite(coupled: int, kept: int) -> None:
     A = sp.block_diag([4.0 * np.eye(6), np.diag([4.0, 5.0, 6.0])]).toarray()
     A[:coupled, 6 : 6 + coupled] = A[6 : 6 + coupled, :coupled] = np.eye(coupled)
-    pattern = Pattern.of(sp.csr_array(A), np.arange(9 - kept, 9)) if kept else None
-    Stiffness(sp.csr_array(A), pattern).check_definite("A somewhere")
+    pattern = EliminationPattern.of(sp.csr_array(A), np.arange(9 - kept, 9)) if kept else None
+    CondensedStiffness(sp.csr_array(A), pattern).check_definite("A somewhere")
     A[8, 8] = 0.2 if coupled else -1.0  # a quarter is taken from it where it is coupled
     with pytest.raises(NumericalError, match=r"A( somewhere)? is not positive definite"):
-        Stiffness(sp.csr_array(A), pattern).check_definite("A somewhere")
+        CondensedStiffness(sp.csr_array(A), pattern).check_definite("A somewhere")

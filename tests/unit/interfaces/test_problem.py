@@ -38,7 +38,7 @@ def test_an_ordinary_assembly_passes() -> None:
 @pytest.mark.parametrize(
     ("member", "wrong", "message"),
     [
-        ("A", lambda vi: vi.A[:-1], r"A has shape \(29, 30\).*ask for \(30, 30\)"),
+        ("A", lambda vi: vi.A[:-1], r"A has shape \(29, 30\).*require \(30, 30\)"),
         ("g", lambda vi: np.append(vi.g, 1.0), r"g has shape \(9,\)"),
         ("f", lambda vi: vi.f * np.nan, "f has entries that are not finite"),
         ("B", lambda vi: sp.csr_array(vi.B * np.inf), "B has entries that are not finite"),

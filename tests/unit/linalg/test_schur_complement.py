@@ -10,9 +10,9 @@ from numerics import Varying, spd
 from vibench.errors import NumericalError
 from vibench.highfidelity import active_set
 from vibench.highfidelity.active_set import HighFidelitySolver
-from vibench.highfidelity.kkt_systems import Stiffness
+from vibench.highfidelity.kkt_systems import CondensedStiffness
 from vibench.interfaces.problem import VariationalInequality
-from vibench.linalg.schur_complement import Condensed, Pattern, Submatrix
+from vibench.linalg.schur_complement import EliminationPattern, PrincipalSubmatrix, StaticCondensation
 
 
 def sparse_spd(n: int, rng: np.random.Generator) -> sp.csc_array:
@@ -22,33 +22,34 @@ def sparse_spd(n: int, rng: np.random.Generator) -> sp.csc_array:
 
 
 @given(st.integers(0, 10_000), st.integers(0, 12), st.booleans())
-def test_equilibrium_with_the_kept_unknowns_given(seed: int, count: int, reused: bool) -> None:
+def test_equilibrium_with_given_retained_unknowns(seed: int, count: int, reused: bool) -> None:
     rng = np.random.default_rng(seed)
     A, f = sparse_spd(12, rng), rng.standard_normal(12)
-    kept = np.sort(rng.permutation(12)[:count])
-    others = np.setdiff1d(np.arange(12), kept)
-    condensed = Condensed(A, Pattern.of(A, kept), reused=reused)
+    retained = np.sort(rng.permutation(12)[:count])
+    others = np.setdiff1d(np.arange(12), retained)
+    condensed = StaticCondensation(A, EliminationPattern.of(A, retained), reused=reused)
     dense = A.toarray()
     inner = np.linalg.inv(dense[np.ix_(others, others)])
-    taken = dense[np.ix_(kept, others)] @ inner
-    assert np.allclose(condensed.matrix.toarray(), dense[np.ix_(kept, kept)] - taken @ dense[np.ix_(others, kept)])
-    load, free = condensed.load(f)
-    assert np.allclose(load, f[kept] - taken @ f[others])
-    u_kept = rng.standard_normal(count)
-    u = condensed.expand(u_kept, free)
-    assert np.allclose(u[kept], u_kept)
+    taken = dense[np.ix_(retained, others)] @ inner
+    schur = dense[np.ix_(retained, retained)] - taken @ dense[np.ix_(others, retained)]
+    assert np.allclose(condensed.schur.toarray(), schur)
+    load, particular = condensed.condense_load(f)
+    assert np.allclose(load, f[retained] - taken @ f[others])
+    u_retained = rng.standard_normal(count)
+    u = condensed.recover(u_retained, particular)
+    assert np.allclose(u[retained], u_retained)
     assert np.allclose((dense @ u - f)[others], 0.0, atol=1e-10)
     disturbed = u + rng.standard_normal(12) * np.isin(np.arange(12), others)
-    settled = disturbed + condensed.settle(f - dense @ disturbed)
-    assert np.array_equal(settled[kept], disturbed[kept])
-    assert np.allclose((dense @ settled - f)[others], 0.0, atol=1e-10)
+    corrected = disturbed + condensed.correct_eliminated(f - dense @ disturbed)
+    assert np.array_equal(corrected[retained], disturbed[retained])
+    assert np.allclose((dense @ corrected - f)[others], 0.0, atol=1e-10)
 
 
 @given(st.integers(0, 10_000), st.integers(0, 12))
 def test_submatrices_follow_their_matrix_through_changes_of_its_sparsity(seed: int, count: int) -> None:
     rng = np.random.default_rng(seed)
     chosen = rng.permutation(12)[:count]
-    submatrix, A = Submatrix(chosen), sp.csr_array(sparse_spd(12, rng))
+    submatrix, A = PrincipalSubmatrix(chosen), sp.csr_array(sparse_spd(12, rng))
     unsorted = A[::-1][:, rng.permutation(12)]
     for matrix in (A, 2.0 * A, unsorted, A, sp.csr_array(sparse_spd(12, rng))):
         found = submatrix.of(matrix)
@@ -58,29 +59,31 @@ def test_submatrices_follow_their_matrix_through_changes_of_its_sparsity(seed: i
             used.sort_indices()
 
 
-def test_a_load_that_changes_is_not_remembered() -> None:
+def test_a_different_load_is_condensed_anew() -> None:
     A = sparse_spd(12, np.random.default_rng(0))
-    condensed = Condensed(A, Pattern.of(A, np.arange(3)))
+    condensed = StaticCondensation(A, EliminationPattern.of(A, np.arange(3)))
     one, two = np.ones(12), np.arange(12.0)
-    assert not np.allclose(condensed.load(one)[0], condensed.load(two)[0])
-    assert np.allclose(condensed.load(one)[0] + condensed.load(two)[0], condensed.load(one + two)[0])
+    first, second = condensed.condense_load(one)[0], condensed.condense_load(two)[0]
+    assert not np.allclose(first, second)
+    assert np.allclose(first + second, condensed.condense_load(one + two)[0])
 
 
 @given(st.integers(0, 10_000), st.integers(1, 6))
-def test_condensed_systems_have_the_solutions_of_the_whole_ones(seed: int, touched: int) -> None:
+def test_condensed_systems_have_the_solutions_of_the_whole_ones(seed: int, constrained: int) -> None:
     rng = np.random.default_rng(seed)
-    A, kept = sparse_spd(14, rng), np.sort(rng.permutation(14)[:touched])
-    B = np.zeros((touched, 14))
-    B[:, kept] = np.triu(spd(touched, rng))
-    vi = VariationalInequality(A, rng.standard_normal(14), sp.csr_array(B), 0.2 * rng.random(touched))
+    A, retained = sparse_spd(14, rng), np.sort(rng.permutation(14)[:constrained])
+    B = np.zeros((constrained, 14))
+    B[:, retained] = np.triu(spd(constrained, rng))
+    vi = VariationalInequality(A, rng.standard_normal(14), sp.csr_array(B), 0.2 * rng.random(constrained))
     whole = active_set.solve_high_fidelity(vi)
-    condensed = active_set.solve_high_fidelity(vi, Stiffness(A, Pattern.of(A, kept)), start=rng.random(touched) > 0.5)
+    stiffness = CondensedStiffness(A, EliminationPattern.of(A, retained))
+    condensed = active_set.solve_high_fidelity(vi, stiffness, start=rng.random(constrained) > 0.5)
     assert np.allclose(condensed.u, whole.u, atol=1e-9)
     assert np.allclose(condensed.lam, whole.lam, atol=1e-9)
 
 
 @pytest.mark.parametrize("declared", [True, False])
-def test_a_sweep_gives_the_solutions_of_single_solves(declared: bool) -> None:
+def test_successive_solves_give_the_solutions_of_single_ones(declared: bool) -> None:
     class Declaring(Varying):
         contact_dofs = property(lambda self: np.arange(8, 52))
 

@@ -188,7 +188,7 @@ def test_a_constraint_with_contact_is_left_to_it_unless_it_is_constant_or_interp
     members = affine_decomposition(Touching(), Touching().training_set(), 1e-8)
     assert (members["B"].way, members["g"].way) == (Evaluation.CONTACT, Evaluation.CONTACT)
     assert members["B"].terms == members["g"].terms == ()
-    assert members["B"].why == ""
+    assert members["B"].reason == ""
     assert members["A"].way is Evaluation.FULL  # contact says nothing of A
     assert members["f"].way is Evaluation.CONSTANT
     entrywise = declaring(Touching, entrywise=frozenset({"g"}))()
@@ -203,7 +203,7 @@ def test_a_constraint_with_contact_is_left_to_it_unless_it_is_constant_or_interp
 def test_what_cannot_be_evaluated_apart_is_assembled_in_full_and_the_reason_names_it(name: str) -> None:
     member = affine_decomposition(Varying(), Varying().training_set(), 1e-8)[name]
     assert member.way is Evaluation.FULL
-    assert member.why == f"{name} depends on mu and the problem does not evaluate it entry by entry"
+    assert member.reason == f"{name} depends on mu and the problem does not evaluate it entry by entry"
     assert member.terms == ()
 
 
@@ -213,14 +213,14 @@ def test_contact_that_does_not_say_which_unknowns_it_touches_is_not_used() -> No
 
     member = affine_decomposition(Vague(), Vague().training_set(), 1e-8)["B"]
     assert member.way is Evaluation.FULL
-    assert member.why.startswith("B depends on mu")
+    assert member.reason.startswith("B depends on mu")
 
 
 def test_members_that_interpolation_does_not_compress_are_not_interpolated() -> None:
     problem = declaring(Counting, entrywise=frozenset({"B"}))()
     member = affine_decomposition(problem, problem.training_set(), 1e-10)["B"]
     assert member.way is Evaluation.FULL
-    assert member.why == "B depends on mu, and interpolation needs 7 terms for 7 parameters"
+    assert member.reason == "B depends on mu, and interpolation needs 7 terms for 7 parameters"
     touching = declaring(Touching, entrywise=frozenset({"B"}))()
     assert affine_decomposition(touching, touching.training_set(), 1e-10)["B"].way is Evaluation.CONTACT
     assert affine_decomposition(problem, problem.training_set(), 0.3)["B"].way is Evaluation.INTERPOLATED

@@ -25,7 +25,7 @@ from vibench.interfaces.validation import checked_assembly
 from vibench.linalg.dense import singular_values
 from vibench.model.affine import Evaluation, affine_decomposition
 from vibench.model.galerkin import ReducedModel, project
-from vibench.model.hyperreduced import OnlineModel, project_members, why_in_full
+from vibench.model.hyperreduced import HyperReducedModel, hyper_reduce, reason_for_full_assembly
 from vibench.qp import verification
 from vibench.qp.solve import solve_qp
 from vibench.qp.status import Status
@@ -113,13 +113,13 @@ def reduced_model(problem: Problem, kind: str, modes: int, generators: int, mus:
     return ReducedModel(problem, basis, enrichment, cone.chi, cone.span)
 
 
-def online(model: ReducedModel, tolerance: float = 1e-11) -> OnlineModel:
+def online(model: ReducedModel, tolerance: float = 1e-11) -> HyperReducedModel:
     members = affine_decomposition(model.problem, model.problem.training_set(), tolerance)
-    assert why_in_full(model, members) == ""
-    return OnlineModel(model, project_members(model, members))
+    assert reason_for_full_assembly(model, members) == ""
+    return HyperReducedModel(model, hyper_reduce(model, members))
 
 
-def assert_same_program(model: ReducedModel, reduced: OnlineModel, mu: np.ndarray, accuracy: float) -> None:
+def assert_same_program(model: ReducedModel, reduced: HyperReducedModel, mu: np.ndarray, accuracy: float) -> None:
     """The program is that of the full assembly, projected on the same basis; the basis is as good."""
     V, found, vi = model.problem.V, reduced.assemble(mu), checked_assembly(model.problem, mu)
     Z, own = found.basis, model.primal_basis(vi)
@@ -170,7 +170,7 @@ def test_members_on_the_contact_and_interpolated_ones_go_together(entrywise: str
     assert {name for name in MEMBERS if members[name].way is Evaluation.CONTACT} == set(on_contact)
     model = reduced_model(problem, kind, 3, 2, problem.training_set()[:5])
     for mu in NEW:
-        assert_same_program(model, OnlineModel(model, project_members(model, members)), mu, 1e-9)
+        assert_same_program(model, HyperReducedModel(model, hyper_reduce(model, members)), mu, 1e-9)
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -204,7 +204,7 @@ def test_a_loose_tolerance_gives_a_program_that_is_as_inexact() -> None:
     model = reduced_model(problem, "none", 3, 2, problem.training_set()[:5])
     members = affine_decomposition(problem, problem.training_set(), 0.2)
     assert members["B"].error > 1e-3
-    reduced, mu = OnlineModel(model, project_members(model, members)), NEW[0]
+    reduced, mu = HyperReducedModel(model, hyper_reduce(model, members)), NEW[0]
     exact = model.assemble(mu).program.B
     assert 1e-3 < np.linalg.norm(reduced.assemble(mu).program.B - exact) / np.linalg.norm(exact) < 0.5
 
@@ -214,8 +214,8 @@ def test_a_loose_tolerance_gives_a_program_that_is_as_inexact() -> None:
 def test_operators_travel(constraint: str, kind: str) -> None:
     problem = Rope(constraint)
     model = reduced_model(problem, kind, 3, 2, problem.training_set()[:5])
-    operators = project_members(model, affine_decomposition(problem, problem.training_set(), 1e-11))
-    here, there = OnlineModel(model, operators), OnlineModel(model, pickle.loads(pickle.dumps(operators)))
+    operators = hyper_reduce(model, affine_decomposition(problem, problem.training_set(), 1e-11))
+    here, there = HyperReducedModel(model, operators), HyperReducedModel(model, pickle.loads(pickle.dumps(operators)))
     for mu in NEW:
         one, other = here.assemble(mu), there.assemble(mu)
         for name in MEMBERS:
@@ -226,8 +226,8 @@ def test_operators_travel(constraint: str, kind: str) -> None:
 def test_an_unpickled_factor_is_still_that_of_a() -> None:
     problem = Rope("contact", "constant")
     model = reduced_model(problem, "fixed", 3, 2, problem.training_set()[:5])
-    operators = project_members(model, affine_decomposition(problem, problem.training_set(), 1e-11))
-    query = OnlineModel(model, pickle.loads(pickle.dumps(operators))).assemble(NEW[0])
+    operators = hyper_reduce(model, affine_decomposition(problem, problem.training_set(), 1e-11))
+    query = HyperReducedModel(model, pickle.loads(pickle.dumps(operators))).assemble(NEW[0])
     assert np.allclose(query.factor @ query.factor.T, query.program.A, rtol=1e-12)
 
 
@@ -261,11 +261,11 @@ def test_what_stands_in_the_way_of_reduction_is_said() -> None:
     problem = Varying()
     members = affine_decomposition(problem, problem.training_set(), 1e-8)
     model = reduced_model(problem, "none", 3, 2, problem.training_set())
-    assert [reason.split()[0] for reason in why_in_full(model, members).split("; ")] == ["A", "B", "g"]
+    assert [reason.split()[0] for reason in reason_for_full_assembly(model, members).split("; ")] == ["A", "B", "g"]
     own = Enrichment(Kind.PER_PARAMETER, supply=lambda V, vi, span: supremizers(V, vi.B, span))
     roaming = ReducedModel(Rope("one"), model.fixed_basis, own, model.generators, model.span)
     fine = affine_decomposition(Rope("one"), problem.training_set(), 1e-8)
-    assert why_in_full(roaming, fine) == "the enrichment varies with mu in a way of its own"
+    assert reason_for_full_assembly(roaming, fine) == "the enrichment computes its own vectors at every mu"
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -309,7 +309,7 @@ def test_reduced_queries_of_real_problems_are_as_good_as_full_ones(name: str, ki
     assert [members[member].way for member in MEMBERS] == ways
     training = problem.training_set()
     model = reduced_model(problem, kind, 5, 4, training[np.linspace(0, len(training) - 1, 6).astype(int)])
-    reduced, solver = OnlineModel(model, project_members(model, members)), HighFidelitySolver(problem)
+    reduced, solver = HyperReducedModel(model, hyper_reduce(model, members)), HighFidelitySolver(problem)
     for mu in problem.validation_set(4, 5):
         assert_same_program(model, reduced, mu, 1e-5)
         exact, errors = solver.solve(mu), []
@@ -391,7 +391,7 @@ def test_a_query_makes_no_array_of_mesh_size(name: str, kind: str, dim: int, gen
     assert problem.V.dim == dim
     training = problem.training_set()
     model = reduced_model(problem, kind, 4, generators, training[np.linspace(0, len(training) - 1, 5).astype(int)])
-    reduced, mu = OnlineModel(model, project_members(model, members)), problem.validation_set(1, 0)[0]
+    reduced, mu = HyperReducedModel(model, hyper_reduce(model, members)), problem.validation_set(1, 0)[0]
     reduced.assemble(mu)  # what is set up once is set up
     found = largest_step(lambda: reduced.assemble(mu))
     assert 0 < found.size < 8 * dim, found

@@ -1,48 +1,42 @@
 """One growth serves every tolerance it passes: same vectors and histories, seconds of each its own."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator
 
 import numpy as np
 import pytest
 from fake_plugins import Wire
 
-from vibench.arrays import Array
 from vibench.errors import NumericalError
 from vibench.interfaces.strategies import Cone, Offline, no_free
-from vibench.reduction.nested import Growth, NestedStrategy, grow_through
+from vibench.reduction.nested import NestedStrategy, Step, grow_through
 from vibench.study.cells import expand
 from vibench.study.spec import Study
 
 
-class Axes(NestedStrategy):
+class UnitVectors(NestedStrategy):
     """Adds unit vectors; after k of them the error is 1 / (k + 1)."""
 
-    def begin(self, offline: Offline) -> "Counted":
-        return Counted(offline)
+    def steps(self, offline: Offline) -> Iterator[Step]:
+        unit, errors = np.eye(offline.problem.V.dim), []
+        for count in range(5):
+            errors.append(1.0 / (count + 1))
+            yield Step(count, errors[-1], lambda first, count=count: unit[:, first:count], {"error": errors})
+        raise NumericalError("four are all there are")
 
 
-class Counted(Growth):
-    def __init__(self, offline: Offline) -> None:
-        self._V, self._count, self.made = offline.problem.V, 0, []
+class Ends(UnitVectors):
+    """Just ends where it has no further vector."""
 
-    @property
-    def count(self) -> int:
-        return self._count
+    def steps(self, offline: Offline) -> Iterator[Step]:
+        yield next(super().steps(offline))
 
-    def reached(self, tolerance: float) -> bool:
-        return 1.0 / (self._count + 1) <= tolerance
 
-    def grow(self) -> None:
-        if self._count == 4:
-            raise NumericalError("four are all there are")
-        self._count += 1
+class Fails(UnitVectors):
+    """Fails before there is an enrichment at all."""
 
-    def vectors(self, first: int) -> Array:
-        self.made.append(self._count - first)
-        return np.eye(self._V.dim)[:, first : self._count]
-
-    def history(self) -> Mapping[str, Array]:
-        return {"error": 1.0 / np.arange(1, self._count + 2)}
+    def steps(self, offline: Offline) -> Iterator[Step]:
+        raise NumericalError("no space to begin with")
+        yield
 
 
 @pytest.fixture
@@ -53,28 +47,39 @@ def offline() -> Offline:
 
 
 def test_every_tolerance_gets_what_building_for_it_alone_gives(offline: Offline) -> None:
-    grown = grow_through(Axes(), offline, [0.25, 1.0, 0.5])
+    grown = grow_through(UnitVectors(), offline, [0.25, 1.0, 0.5])
     for tolerance, count in ((1.0, 0), (0.5, 1), (0.25, 3)):
-        enrichment, _ = grown.at(tolerance)
-        alone = Axes().build(offline, tolerance)
+        enrichment = grown.at(grown.milestone(tolerance))
+        alone = UnitVectors().build(offline, tolerance)
         assert enrichment.vectors.shape[1] == count
         assert np.array_equal(enrichment.vectors, alone.vectors)
         assert np.array_equal(enrichment.history["error"], alone.history["error"])
-    seconds = [grown.at(tolerance)[1].wall for tolerance in (1.0, 0.5, 0.25)]
+    seconds = [grown.milestone(tolerance).seconds.wall for tolerance in (1.0, 0.5, 0.25)]
     assert seconds == sorted(seconds)
     assert seconds[0] < seconds[-1]
 
 
 def test_a_tolerance_beyond_reach_costs_no_other(offline: Offline) -> None:
-    grown = grow_through(Axes(), offline, [0.5, 0.1])
-    assert grown.at(0.5)[0].vectors.shape[1] == 1
+    grown = grow_through(UnitVectors(), offline, [0.5, 0.1])
+    assert grown.at(grown.milestone(0.5)).vectors.shape[1] == 1
     with pytest.raises(NumericalError, match=r"tolerance 0\.1 is not reached: four are all there are"):
-        grown.at(0.1)
+        grown.milestone(0.1)
+
+
+def test_a_strategy_that_just_ends_has_missed_the_tolerance(offline: Offline) -> None:
+    with pytest.raises(NumericalError, match=r"tolerance 0\.1 is not reached: the strategy has no further vector"):
+        Ends().build(offline, 0.1)
+    assert Ends().build(offline, 1.0).vectors.shape[1] == 0
+
+
+def test_a_construction_that_fails_at_once_is_no_tolerance_missed(offline: Offline) -> None:
+    with pytest.raises(NumericalError, match=r"^no space to begin with$"):
+        grow_through(Fails(), offline, [1.0])
 
 
 def test_a_nested_strategy_needs_a_tolerance(offline: Offline) -> None:
-    with pytest.raises(ValueError, match="Axes needs a tolerance"):
-        Axes().build(offline, None)
+    with pytest.raises(ValueError, match="UnitVectors needs a tolerance"):
+        UnitVectors().build(offline, None)
 
 
 def test_cells_of_a_nested_strategy_know_its_tolerances_and_keep_their_identity() -> None:
@@ -84,7 +89,7 @@ def test_cells_of_a_nested_strategy_know_its_tolerances_and_keep_their_identity(
             "name": "some", "validation": 3, "problem": ["obstacle"], "dual": ["cpg"], "solvers": ["piqp"],
             "primal": ["offline-pga", "decorrelated"], "tolerances": [table],
         })  # fmt: skip
-        return {cell.primal_tol: (cell.key, cell.along) for cell in expand(study)}
+        return {cell.primal_tol: (cell.key, cell.nested_tolerances) for cell in expand(study)}
 
     few, many = cells(0.3), cells(0.3, 0.6)
     assert few[0.3] == (many[0.3][0], (0.3,))

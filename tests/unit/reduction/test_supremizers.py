@@ -30,7 +30,7 @@ def test_a_supremizer_attains_its_own_norm() -> None:
 def test_coordinates_are_an_isometry_that_leads_back_to_the_supremizers(
     monkeypatch: pytest.MonkeyPatch, cost: float
 ) -> None:
-    monkeypatch.setattr(module, "SPANNING", cost)
+    monkeypatch.setattr(module, "SPAN_COST", cost)
     problem = Varying()
     matrices = [problem.assemble(mu).B for mu in problem.training_set()]
     basis = problem.V.orthonormalise(np.random.default_rng(0).standard_normal((30, 4)))

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from samples import cell_row
 
 from vibench.results.break_even import BreakEven, Meaning, break_even, break_even_rows
-from vibench.results.schema import THRESHOLDS
+from vibench.results.columns import THRESHOLDS
 
 PAPER = {
     # (N, R): offline and online seconds of the online and of the offline enrichment, benefit threshold

@@ -15,8 +15,8 @@ from samples import cell_row, query_rows
 
 from vibench.errors import RequestError
 from vibench.results import database as module
+from vibench.results.columns import CELLS, TABLES, VERSION
 from vibench.results.database import FILE, ResultsDatabase, claimed, read_meta
-from vibench.results.schema import CELLS, TABLES, VERSION
 
 STUDY = {"name": "sample", "seed": 1, "validation": 4, "accuracy": 1e-7}
 
@@ -166,18 +166,18 @@ def test_a_run_that_dies_loses_no_written_cell(journal: ResultsDatabase, tmp_pat
 HISTORY = {"artefact": "pod-1", "stage": "pod", "quantity": "error", "step": 0, "value": 1.0}
 
 
-def test_histories_replace_those_of_their_artefact(journal: ResultsDatabase) -> None:
-    journal.write_histories("pod-1", [HISTORY, HISTORY | {"step": 1, "value": 0.5}])
-    journal.write_histories("pod-2", [HISTORY | {"artefact": "pod-2", "pod_tol": 0.75}])
-    journal.write_histories("pod-1", [HISTORY | {"value": 0.25}])
+def test_histories_replace_those_of_the_same_name(journal: ResultsDatabase) -> None:
+    journal.write_histories([[HISTORY, HISTORY | {"step": 1, "value": 0.5}]])
+    journal.write_histories([[HISTORY | {"artefact": "pod-2", "pod_tol": 0.75}]])
+    journal.write_histories([[HISTORY | {"value": 0.25}]])
     found = sorted((row["artefact"], row["step"], row["value"]) for row in journal.rows("histories"))
     assert found == [("pod-1", 0, 0.25), ("pod-2", 0, 1.0)]
 
 
 def test_a_failing_write_of_histories_leaves_the_earlier_ones(journal: ResultsDatabase) -> None:
-    journal.write_histories("pod-1", [HISTORY])
+    journal.write_histories([[HISTORY]])
     with pytest.raises(sqlite3.Error):
-        journal.write_histories("pod-1", [HISTORY | {"step": 1}, HISTORY | {"surprise": 1}])
+        journal.write_histories([[HISTORY | {"step": 1}, HISTORY | {"surprise": 1}]])
     assert [row["step"] for row in journal.rows("histories")] == [0]
 
 
@@ -191,7 +191,7 @@ def test_thresholds_replace_all_earlier_ones(journal: ResultsDatabase) -> None:
 def test_numbers_of_numpy_are_stored_as_numbers(journal: ResultsDatabase) -> None:
     """SQLite would take NumPy's integers for bytes."""
     journal.write_cell(cell_row(N=np.int64(12)), query_rows(count=1, iterations=np.int32(7)))
-    journal.write_histories("pod-1", [HISTORY | {"value": np.int64(2)}])
+    journal.write_histories([[HISTORY | {"value": np.int64(2)}]])
     assert journal.rows("cells")[0]["N"] == 12
     assert journal.rows("queries")[0]["iterations"] == 7
     assert journal.rows("histories")[0]["value"] == 2
@@ -301,10 +301,10 @@ def test_histories_of_other_code_give_way_and_parts_of_a_sweep_stay(tmp_path: Pa
         keys = {"artefact": artefact, "stage": stage, "problem": "wire", "quantity": "error"}
         return [keys | {"step": first + k, "value": 1.0} for k in range(count)]
 
-    journal.write_histories("old", rows("old", "pod", 0, 5))
-    journal.write_histories("new", rows("new", "pod", 0, 3))
+    journal.write_histories([rows("old", "pod", 0, 5)])
+    journal.write_histories([rows("new", "pod", 0, 3)])
     for first, artefact in ((0, "a"), (4, "b"), (0, "c")):
-        journal.write_histories(artefact, rows(artefact, "training", first, 4), parts=True)
+        journal.write_histories([rows(artefact, "training", first, 4)], partial=True)
     found = [(row["stage"], row["artefact"], row["step"]) for row in journal.rows("histories")]
     journal.close()
     assert sorted(found) == sorted(

@@ -18,8 +18,8 @@ from samples import cell_row, query_rows
 from vibench.errors import RequestError
 from vibench.results import tables
 from vibench.results.break_even import break_even_rows
+from vibench.results.columns import CELLS, HISTORIES, KEYS, QUERIES, TABLES, THRESHOLDS, VERSION
 from vibench.results.database import FILE, ResultsDatabase
-from vibench.results.schema import CELLS, HISTORIES, KEYS, QUERIES, TABLES, THRESHOLDS, VERSION
 from vibench.results.tables import (
     benefits,
     cell_text,
@@ -53,7 +53,7 @@ def run(tmp_path: Path) -> Path:
     missing = dict.fromkeys(CELLS) | {"cell": "c2", "status": "error", "reason": "broke", "queries": 4, "queries_ok": 0}
     journal.write_cell(CELL | {"cell": "c1"}, query_rows("c1", 4, gap=1.0 / 3.0))
     journal.write_cell(missing | {name: CELL[name] for name in KEYS} | {"solver": "osqp"}, [])
-    journal.write_histories("pod-1", [{"artefact": "pod-1", "quantity": "error", "step": 0, "value": 1.0}])
+    journal.write_histories([[{"artefact": "pod-1", "quantity": "error", "step": 0, "value": 1.0}]])
     journal.replace("thresholds", break_even_rows(journal.rows("cells")))
     journal.replace("disagreements", [{"solver_a": "osqp", "solver_b": "piqp", "queries": 4, "flagged": 0}])
     journal.close()

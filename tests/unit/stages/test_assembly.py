@@ -13,12 +13,13 @@ from vibench.interfaces.strategies import Stop
 from vibench.interfaces.validation import checked_assembly
 from vibench.model.affine import Evaluation
 from vibench.model.galerkin import ReducedModel, project
-from vibench.model.hyperreduced import OnlineModel
+from vibench.model.hyperreduced import HyperReducedModel
 from vibench.stages.artefacts import Store
-from vibench.stages.assembly import AssemblyStage, Separation, assembly_columns, query_model
+from vibench.stages.assembly import AffineDecomposition, AssemblyStage
 from vibench.stages.base import value_of
-from vibench.stages.cell_queries import QueriesStage
-from vibench.stages.offline import ConeStage, EnrichmentStage, PODStage
+from vibench.stages.cell_queries import CellQueries
+from vibench.stages.enrichment import SingleEnrichment
+from vibench.stages.offline import ConeStage, PODStage
 from vibench.study.cells import Plugin
 
 OBSTACLE = Plugin("problem", "obstacle", '{"resolution": 200}', "test")
@@ -31,14 +32,14 @@ QUERIES = 3
 
 def cell(
     problem: Plugin, primal: str, interpolation: float | None, tolerance: float | None = None, dual: str = "mcpg"
-) -> QueriesStage:
-    enrichment = EnrichmentStage(
+) -> CellQueries:
+    enrichment = SingleEnrichment(
         PODStage(problem, Stop(size=6)),
         ConeStage(problem, Plugin("dual strategy", dual, "{}", "test"), Stop(size=3)),
         Plugin("primal strategy", primal, "{}", "test"),
         tolerance,
     )
-    return QueriesStage(AssemblyStage(enrichment, interpolation, QUERIES, 3), "piqp", 1e-8, 20.0)
+    return CellQueries(AssemblyStage(enrichment, interpolation, QUERIES, 3), "piqp", 1e-8, 20.0)
 
 
 CELLS = {
@@ -75,7 +76,7 @@ def wire_store(register: Register, tmp_path: Path) -> Store:
     return store
 
 
-def wire(interpolation: float | None) -> QueriesStage:
+def wire(interpolation: float | None) -> CellQueries:
     """A cell of few modes and generators."""
     found = cell(WIRE, "decorrelated", interpolation)
     enrichment = replace(
@@ -88,7 +89,7 @@ def wire(interpolation: float | None) -> QueriesStage:
 
 def test_rows_of_an_interpolated_problem(store: Store) -> None:
     rows = value_of(store, CELLS["obstacle"])
-    members = value_of(store, CELLS["obstacle"].assembly.reduction.separation)
+    members = value_of(store, CELLS["obstacle"].assembly.reduction.decomposition)
     assert rows.cell["status"] == "ok"
     assert rows.cell["interpolation_tol"] == TOLERANCE
     assert {name: rows.cell[f"terms_{name}"] for name in "fBg"} == {"f": 7, "B": 1, "g": 1}
@@ -112,9 +113,9 @@ def test_a_looser_tolerance_has_fewer_terms_and_larger_errors(store: Store) -> N
 @pytest.mark.parametrize("name", ["obstacle", "radial", "hertz", "hertz, per-parameter"])
 def test_the_error_of_an_assembly_is_that_of_the_worst_member(store: Store, name: str) -> None:
     stage = CELLS[name].assembly
-    model, note = query_model(store, stage)
+    model, note = stage.model(store)
     assert note == ""
-    assert isinstance(model, OnlineModel)
+    assert isinstance(model, HyperReducedModel)
     mus = model.problem.validation_set(QUERIES, 3)
     for mu, error in zip(mus, value_of(store, stage).errors, strict=True):
         found = model.assemble(mu)
@@ -152,7 +153,7 @@ def test_errors_of_queries_are_those_of_full_assembly(store: Store, one: str, ot
 @pytest.mark.parametrize("name", ["hertz", "hertz, per-parameter"])
 def test_columns_of_a_problem_with_contact(store: Store, name: str) -> None:
     """B and g have no terms: they are assembled on the contact."""
-    assert assembly_columns(store, CELLS[name].assembly) == {
+    assert CELLS[name].assembly.columns(store) == {
         "interpolation_tol": TOLERANCE,
         "interpolation_error": 0.0,
         "terms_A": 0,
@@ -162,7 +163,7 @@ def test_columns_of_a_problem_with_contact(store: Store, name: str) -> None:
 
 
 def test_columns_of_a_problem_whose_bound_alone_varies(store: Store) -> None:
-    columns = assembly_columns(store, CELLS["radial"].assembly)
+    columns = CELLS["radial"].assembly.columns(store)
     assert {name: columns[f"terms_{name}"] for name in MEMBERS} == {"A": 0, "f": 0, "B": 0, "g": 2}
 
 
@@ -170,9 +171,9 @@ def test_columns_of_a_problem_whose_bound_alone_varies(store: Store) -> None:
 def test_assembly_in_full_has_no_offline_part_and_no_error(store: Store, name: str) -> None:
     stage = CELLS[name].assembly
     rows = value_of(store, CELLS[name])
-    assert assembly_columns(store, stage) == {}
+    assert stage.columns(store) == {}
     assert stage.reduction is None
-    assert isinstance(query_model(store, stage)[0], ReducedModel)
+    assert isinstance(stage.model(store)[0], ReducedModel)
     assert rows.cell["offline_assembly_s"] == 0.0
     assert "interpolation_tol" not in rows.cell
     assert [row["assembly_error"] for row in rows.queries] == [0.0] * QUERIES
@@ -181,7 +182,7 @@ def test_assembly_in_full_has_no_offline_part_and_no_error(store: Store, name: s
 @pytest.mark.parametrize("name", ["obstacle", "hertz", "radial"])
 def test_reduced_assembly_costs_its_separation_and_its_projection(store: Store, name: str) -> None:
     reduction = CELLS[name].assembly.reduction
-    spent = [store.get(stage.key).seconds.cpu for stage in (reduction.separation, reduction)]
+    spent = [store.get(stage.key).seconds.cpu for stage in (reduction.decomposition, reduction)]
     assert min(spent) > 0.0
     row = value_of(store, CELLS[name]).cell
     assert row["offline_assembly_s"] == pytest.approx(sum(spent))
@@ -199,18 +200,18 @@ def test_what_an_assembly_took_is_what_its_queries_say(store: Store) -> None:
 def test_the_separation_of_a_problem_serves_every_reduced_model() -> None:
     one, other = (CELLS[name].assembly.reduction for name in ("obstacle", "obstacle, fixed"))
     assert one.key != other.key
-    assert one.separation.key == other.separation.key
-    assert one.separation.key != CELLS["obstacle, loose"].assembly.reduction.separation.key
-    assert one.separation.key != CELLS["hertz"].assembly.reduction.separation.key
-    assert one.separation.inputs() == ()
-    assert one.separation in CELLS["obstacle"].inputs()
+    assert one.decomposition.key == other.decomposition.key
+    assert one.decomposition.key != CELLS["obstacle, loose"].assembly.reduction.decomposition.key
+    assert one.decomposition.key != CELLS["hertz"].assembly.reduction.decomposition.key
+    assert one.decomposition.inputs() == ()
+    assert one.decomposition in CELLS["obstacle"].inputs()
     assert CELLS["obstacle"].assembly.key != CELLS["obstacle, full"].assembly.key
 
 
 def test_a_problem_that_declares_nothing_is_assembled_in_full_and_the_reason_is_told(wire_store: Store) -> None:
     why = "f depends on mu and the problem does not evaluate it entry by entry"
     stage = wire(TOLERANCE)
-    members = value_of(wire_store, Separation(WIRE, TOLERANCE))
+    members = value_of(wire_store, AffineDecomposition(WIRE, TOLERANCE))
     assert [members[name].way for name in MEMBERS] == [
         Evaluation.CONSTANT,
         Evaluation.FULL,
@@ -221,7 +222,7 @@ def test_a_problem_that_declares_nothing_is_assembled_in_full_and_the_reason_is_
     assert rows.cell["status"] == "ok"
     assert rows.cell["fallbacks"] == f"assembled in full: {why}"
     assert full.cell["fallbacks"] == ""
-    assert isinstance(query_model(wire_store, stage.assembly)[0], ReducedModel)
+    assert isinstance(stage.assembly.model(wire_store)[0], ReducedModel)
     assert {name for name in rows.cell if name.startswith("terms_")} == {"terms_A", "terms_B", "terms_g"}
     for one, other in zip(rows.queries, full.queries, strict=True):
         assert one["assembly_error"] == 0.0

@@ -20,9 +20,10 @@ from vibench.stages import cell_queries
 from vibench.stages.artefacts import Store
 from vibench.stages.assembly import AssemblyStage
 from vibench.stages.base import value_of
-from vibench.stages.cell_queries import QueriesStage, path_before
-from vibench.stages.offline import ConeStage, EnrichmentStage, PODStage
-from vibench.stages.query import assess
+from vibench.stages.cell_queries import CellQueries, path_before
+from vibench.stages.enrichment import SingleEnrichment
+from vibench.stages.offline import ConeStage, PODStage
+from vibench.stages.query import error_columns
 from vibench.study.cells import Plugin
 
 BOX = ParameterBox(("a", "b"), np.array([0.0, 0.0]), np.array([1.0, 100.0]), ("1", "1"))
@@ -64,17 +65,17 @@ def test_a_start_changes_the_way_and_not_the_answer(solver: str, dual: bool) -> 
 def test_a_query_whose_assessment_fails_costs_itself(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     cone = ConeStage(PROBLEM, Plugin("dual strategy", "cpg", "{}", "test"), Stop(size=3))
     primal = Plugin("primal strategy", "decorrelated", "{}", "test")
-    enrichment = EnrichmentStage(PODStage(PROBLEM, Stop(size=4)), cone, primal, None)
-    stage, store = QueriesStage(AssemblyStage(enrichment, None, 4, 1), "piqp", 1e-6, 20.0), Store(tmp_path)
+    enrichment = SingleEnrichment(PODStage(PROBLEM, Stop(size=4)), cone, primal, None)
+    stage, store = CellQueries(AssemblyStage(enrichment, None, 4, 1), "piqp", 1e-6, 20.0), Store(tmp_path)
     carry_out(stage, store)
     whole, bad = value_of(store, stage), float(PROBLEM.create().validation_set(4, 1)[2, 0])
 
     def unlucky(model: object, mus: np.ndarray, *others: object) -> list[dict[str, object]]:
         if bad in mus[:, 0]:
             raise ArithmeticError("nothing to compare with")
-        return assess(model, mus, *others)
+        return error_columns(model, mus, *others)
 
-    monkeypatch.setattr(cell_queries, "assess", unlucky)
+    monkeypatch.setattr(cell_queries, "error_columns", unlucky)
     found = stage.run(store).value
     assert [row["status"] for row in found.queries] == ["ok", "ok", "error", "ok"]
     assert "in the assessment: ArithmeticError: nothing to compare with" in found.queries[2]["reason"]
@@ -86,9 +87,9 @@ def test_a_query_whose_assessment_fails_costs_itself(tmp_path: Path, monkeypatch
 def test_rows_say_which_query_they_started_from(tmp_path: Path) -> None:
     cone = ConeStage(PROBLEM, Plugin("dual strategy", "cpg", "{}", "test"), Stop(size=3))
     primal = Plugin("primal strategy", "decorrelated", "{}", "test")
-    enrichment = EnrichmentStage(PODStage(PROBLEM, Stop(size=4)), cone, primal, None)
+    enrichment = SingleEnrichment(PODStage(PROBLEM, Stop(size=4)), cone, primal, None)
     assembly = AssemblyStage(enrichment, None, 4, 1)
-    stage, store, started = QueriesStage(assembly, "osqp", 1e-6, 20.0), Store(tmp_path), {}
+    stage, store, started = CellQueries(assembly, "osqp", 1e-6, 20.0), Store(tmp_path), {}
     for warm, solver in ((False, "osqp"), (True, "osqp"), (True, "piqp")):
         asked = replace(stage, warm_start=warm, solver=solver)
         carry_out(asked, store)

@@ -9,8 +9,9 @@ from vibench.stability.infsup import InfSup, inf_sup_full, inf_sup_on
 from vibench.stages.artefacts import Store
 from vibench.stages.assembly import AssemblyStage
 from vibench.stages.base import value_of
-from vibench.stages.cell_queries import QueriesStage
-from vibench.stages.offline import ConeStage, EnrichmentStage, PODStage, reduced_model
+from vibench.stages.cell_queries import CellQueries
+from vibench.stages.enrichment import SingleEnrichment
+from vibench.stages.offline import ConeStage, PODStage
 from vibench.study.cells import Plugin
 
 PROBLEMS = {
@@ -22,15 +23,15 @@ COUNT = 5
 EVERY = pytest.mark.parametrize("problem", list(PROBLEMS))
 
 
-def cell(problem: str, primal: str) -> QueriesStage:
+def cell(problem: str, primal: str) -> CellQueries:
     plugin = PROBLEMS[problem]
-    enrichment = EnrichmentStage(
+    enrichment = SingleEnrichment(
         PODStage(plugin, Stop(size=4)),
         ConeStage(plugin, Plugin("dual strategy", "mcpg", "{}", "test"), Stop(size=6)),
         Plugin("primal strategy", primal, "{}", "test"),
         PRIMALS[primal],
     )
-    return QueriesStage(AssemblyStage(enrichment, None, COUNT, 3), "piqp", 1e-8, 20.0)
+    return CellQueries(AssemblyStage(enrichment, None, COUNT, 3), "piqp", 1e-8, 20.0)
 
 
 @pytest.fixture(scope="module")
@@ -89,7 +90,8 @@ def test_the_kinds_of_enrichment_reach_what_they_are_for(store: Store, problem: 
 @pytest.mark.parametrize("primal", list(PRIMALS))
 def test_constants_are_those_of_every_parameter_by_itself(store: Store, problem: str, primal: str) -> None:
     stage = cell(problem, primal).assembly.enrichment
-    model, basis, cone = reduced_model(store, stage)
+    model, basis = stage.model(store), value_of(store, stage.pod).basis
+    cone = value_of(store, stage.cone).prepared
     found = constants(store, problem, primal)
     mus = model.problem.validation_set(COUNT, 3)
     assert [len(values) for values in found] == [COUNT] * 3

@@ -10,28 +10,31 @@ from samples import carry_out
 
 from vibench.errors import NumericalError
 from vibench.interfaces.strategies import Kind, Stop
+from vibench.reduction.nested import Milestone
 from vibench.stages import snapshots
 from vibench.stages.artefacts import Store
 from vibench.stages.assembly import AssemblyStage
 from vibench.stages.base import value_of
-from vibench.stages.cell_queries import QueriesStage, summarise
+from vibench.stages.cell_queries import CellQueries
+from vibench.stages.cell_summary import summarise
+from vibench.stages.enrichment import NestedEnrichment, SingleEnrichment
 from vibench.stages.infsup_constants import ReferenceConstants, ValidationConstraints
-from vibench.stages.offline import ConeStage, EnrichmentStage, PODStage, reduced_model
-from vibench.stages.snapshots import CHUNKS, HighFidelity, gather, sweep, training
+from vibench.stages.offline import ConeStage, PODStage
+from vibench.stages.snapshots import CHUNKS, SnapshotStage, gather, training_stages, validation_stages
 from vibench.study.cells import Plugin
 from vibench.timing import NO_TIME
 
 PROBLEM = Plugin("problem", "obstacle", '{"resolution": 200}', "test")
 
 
-def cell(primal: str, tolerance: float | None, solver: str = "piqp") -> QueriesStage:
-    enrichment = EnrichmentStage(
+def cell(primal: str, tolerance: float | None, solver: str = "piqp") -> CellQueries:
+    enrichment = SingleEnrichment(
         PODStage(PROBLEM, Stop(tolerance=1e-2)),
         ConeStage(PROBLEM, Plugin("dual strategy", "mcpg", "{}", "test"), Stop(tolerance=5e-2)),
         Plugin("primal strategy", primal, "{}", "test"),
         tolerance,
     )
-    return QueriesStage(AssemblyStage(enrichment, None, 9, 3), solver, 1e-8, 20.0)
+    return CellQueries(AssemblyStage(enrichment, None, 9, 3), solver, 1e-8, 20.0)
 
 
 @pytest.fixture(scope="module")
@@ -57,25 +60,25 @@ def test_keys_say_what_determines_a_stage_and_nothing_else() -> None:
     keys = {
         PODStage(PROBLEM, Stop(size=3)).key,
         PODStage(PROBLEM, Stop(size=4)).key,
-        *(c.key for c in training(PROBLEM)),
+        *(c.key for c in training_stages(PROBLEM)),
     }
     assert len(keys) == 2 + CHUNKS
 
 
 def test_chunks_make_up_the_whole_sweep_in_order(store: Store) -> None:
-    found = gather(store, training(PROBLEM))
+    found = gather(store, training_stages(PROBLEM))
     problem = PROBLEM.create()
     assert np.array_equal(found.mu, problem.training_set())
     assert found.u.shape == (problem.V.dim, 125)
     assert len(found.seconds) == len(found.fallbacks) == 125
     assert all(s.cpu > 0.0 for s in found.seconds)
-    validation = gather(store, sweep(PROBLEM, "validation", 9, 3))
+    validation = gather(store, validation_stages(PROBLEM, 9, 3))
     assert np.array_equal(validation.mu, problem.validation_set(9, 3))
 
 
 def test_few_parameters_leave_empty_chunks(tmp_path: Path) -> None:
     store = Store(tmp_path)
-    chunks = sweep(PROBLEM, "validation", 3, 1)
+    chunks = validation_stages(PROBLEM, 3, 1)
     for chunk in chunks:
         carry_out(chunk, store)
     assert gather(store, chunks).mu.shape == (3, 3)
@@ -83,10 +86,10 @@ def test_few_parameters_leave_empty_chunks(tmp_path: Path) -> None:
 
 def test_diagnostics_are_kept_beside_the_solutions(store: Store) -> None:
     steps = {}
-    for chunk in training(PROBLEM):
+    for chunk in training_stages(PROBLEM):
         for history in store.get(chunk.key).histories:
             assert history.quantity == "aspect_ratio"
-            steps |= {history.key["first_step"] + k: v for k, v in enumerate(history.values)}
+            steps |= {history.first_step + k: v for k, v in enumerate(history.values)}
     assert sorted(steps) == list(range(125))
     assert min(steps.values()) >= 1.0
 
@@ -107,15 +110,18 @@ def test_histories_of_the_offline_stages(store: Store) -> None:
 
 
 @pytest.mark.parametrize("interpolation", [None, 1e-6])
-def test_a_cell_grown_along_others_is_the_cell_alone(store: Store, tmp_path: Path, interpolation: float | None) -> None:
+def test_a_cell_of_a_nested_strategy_is_the_cell_built_alone(
+    store: Store, tmp_path: Path, interpolation: float | None
+) -> None:
     alone = cell("offline-pga", 0.5)
-    enrichment = replace(alone.assembly.enrichment, along=(0.3, 0.5, 0.9))
+    parts = alone.assembly.enrichment
+    enrichment = NestedEnrichment(parts.pod, parts.cone, parts.primal, parts.tolerance, (0.3, 0.5, 0.9))
     grown = replace(alone, assembly=replace(alone.assembly, enrichment=enrichment, interpolation=interpolation))
     beside = Store(tmp_path)
     carry_out(grown, beside)
     expected, found = value_of(store, alone).cell, value_of(beside, grown).cell
     assert found["enrichment"] == expected["enrichment"] > 0
-    assert beside.get(enrichment.key).value is None  # its vectors are stored with the growth
+    assert isinstance(value_of(beside, enrichment), Milestone)  # the vectors are stored once, with the growth
     for name in ("error_u_mean", "error_lambda_mean", "beta_span_min", "beta_cone_upper_min"):
         assert found[name] == pytest.approx(expected[name], rel=1e-6), name
     assert found["assembly_error_max"] < 1e-5
@@ -134,7 +140,9 @@ def test_a_cell_grown_along_others_is_the_cell_alone(store: Store, tmp_path: Pat
 
 
 def test_the_model_behind_a_cell_is_ready_for_queries(store: Store) -> None:
-    model, basis, prepared = reduced_model(store, cell("online-supremizers", None).assembly.enrichment)
+    enrichment = cell("online-supremizers", None).assembly.enrichment
+    model, basis = enrichment.model(store), value_of(store, enrichment.pod).basis
+    prepared = value_of(store, enrichment.cone).prepared
     assert model.kind is Kind.PER_PARAMETER
     query = model.assemble(np.array([1.05, 0.01, -0.03]))
     assert query.basis.shape[1] == basis.shape[1] + prepared.rank
@@ -152,10 +160,10 @@ def test_rows_of_a_cell(store: Store, primal: str, tolerance: float | None, kind
     assert rows.cell["queries"] == rows.cell["queries_ok"] == len(rows.queries) == 9
     parts = ("snapshots", "pod", "cone", "enrichment", "assembly")
     assert rows.cell["offline_s"] == pytest.approx(sum(rows.cell[f"offline_{part}_s"] for part in parts))
-    snapshots = sum((store.get(chunk.key).seconds for chunk in training(PROBLEM)), NO_TIME)
+    snapshots = sum((store.get(chunk.key).seconds for chunk in training_stages(PROBLEM)), NO_TIME)
     assert rows.cell["offline_snapshots_s"] == pytest.approx(snapshots.cpu)
     assert rows.cell["offline_snapshots_s"] == pytest.approx(
-        sum(s.cpu for s in gather(store, training(PROBLEM)).seconds)
+        sum(s.cpu for s in gather(store, training_stages(PROBLEM)).seconds)
     )
     enrichment = store.get(cell(primal, tolerance).assembly.enrichment.key)
     assert rows.cell["offline_enrichment_s"] == enrichment.seconds.cpu
@@ -204,7 +212,7 @@ def test_a_problem_without_diagnostics_has_no_such_history(monkeypatch: pytest.M
     problem = PROBLEM.create()
     monkeypatch.setattr(problem, "diagnostics", lambda mu: {})
     monkeypatch.setattr(snapshots, "build_problem", lambda plugin: problem)
-    assert HighFidelity(PROBLEM, "validation", 2, 0, 0).run(None).histories == ()
+    assert SnapshotStage(PROBLEM, "validation", 2, 0, 0).run(None).histories == ()
 
 
 def query(status: str, error: float | None = 1.0, **columns) -> dict:

@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from vibench.qp.status import Status
 from vibench.report.figures.data import Data
 from vibench.report.figures.style import Sheet, line, logarithmic, plot
-from vibench.results.schema import KEYS
+from vibench.results.columns import KEYS
 
 RESIDUALS = ["primal_residual", "dual_residual", "gap"]
 

@@ -1,0 +1,73 @@
+"""The folder `results/` is light: it holds pages, their scripts, and the files that pages show or link."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+RESULTS = ROOT / "results"
+FILES = sorted(path for path in RESULTS.rglob("*") if path.is_file() and "__pycache__" not in path.parts)
+PAGES = [path for path in FILES if path.suffix == ".md"]
+LARGEST = 8_000_000
+"""Bytes of the whole folder."""
+
+LINK = re.compile(r"\]\(([^)\s#]+)(?:#[^)]*)?\)")
+
+
+def linked(page: Path) -> set[Path]:
+    """Files of the repository that a page shows or links."""
+    targets = LINK.findall(page.read_text(encoding="utf-8"))
+    return {(page.parent / target).resolve() for target in targets if "://" not in target}
+
+
+def test_the_folder_is_light() -> None:
+    assert sum(path.stat().st_size for path in FILES) <= LARGEST
+
+
+def test_every_file_is_a_page_or_a_script_or_on_a_page() -> None:
+    pages = {*PAGES, ROOT / "README.md", *(ROOT / "docs").rglob("*.md")}
+    shown = set().union(*map(linked, pages))
+    assert [path for path in FILES if path.suffix not in {".md", ".py"} and path not in shown] == []
+
+
+@pytest.mark.parametrize("page", [*PAGES, ROOT / "README.md"], ids=lambda page: str(page.relative_to(ROOT)))
+def test_every_link_of_a_page_resolves(page: Path) -> None:
+    assert [path for path in linked(page) if not path.exists()] == []
+
+
+def test_every_page_is_in_the_overview() -> None:
+    overview = RESULTS / "README.md"
+    assert {page for page in PAGES if page != overview} <= linked(overview)
+
+
+@pytest.mark.parametrize("name", ["benefit", "field", "hertz-quadrature", "paper-hertz", "paper-obstacle"])
+def test_the_page_of_a_study_names_the_command_that_makes_the_tables_of_all_queries(name: str) -> None:
+    text = (RESULTS / name / "README.md").read_text(encoding="utf-8")
+    assert f"`vibench run {name}` leaves the tables of all queries and histories under `runs/{name}/tables`" in text
+
+
+def test_a_page_made_anew_is_as_light(quick_run: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "benefit"
+    make = [sys.executable, str(RESULTS / "make.py"), str(quick_run), str(folder)]
+    done = subprocess.run(make, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    written, page = set(folder.iterdir()), folder / "README.md"
+    assert written == {page, *linked(page)}
+    assert {path.name for path in written if path.suffix == ".csv"} == {
+        "cells.csv",
+        "thresholds.csv",
+        "disagreements.csv",
+    }
+    pictures = [path for path in written if path.suffix == ".png"]
+    kinds = ("total-cost", "work-precision", "mcpg-inf-sup", "cpg-inf-sup")
+    names = {f"{problem}-{kind}" for problem in ("obstacle", "hertz") for kind in kinds}
+    assert {path.stem for path in pictures} == names
+    assert all(path.stat().st_size < 150_000 for path in pictures)
+    text = page.read_text(encoding="utf-8")
+    assert "`vibench run benefit` leaves the tables of all queries and histories under `runs/benefit/tables`" in text
+    assert "## Break-even of fixed enrichments" in text

@@ -1,0 +1,66 @@
+"""The columns of a cell that are means, extremes and counts over its queries."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from vibench.arrays import Array
+from vibench.qp.status import Status
+from vibench.stages.base import Row
+
+DISTURBED = 1.3
+"""A row is marked where the calibration beside it is slower than at its best by more than this factor."""
+
+WAITED = 1.5
+"""A row is marked where its wall seconds are more than this factor of its CPU seconds."""
+
+
+def summarise(rows: Sequence[Row], slowdown: float = 1.0) -> Row:
+    """The columns of a cell from those of its queries; means and maxima are over the ok ones.
+
+    `slowdown` is that of the calibration, before or after the queries.
+    """
+    fine = [row for row in rows if row["status"] == Status.OK]
+    worst = max((Status(row["status"]) for row in rows), key=lambda status: status.severity)
+    reasons = [f"mu={_mu(row)}: {row['reason']}" for row in rows if row["status"] == worst and row["reason"]]
+
+    def column(name: str) -> Array:
+        return np.array([row[name] for row in fine if row.get(name) is not None], dtype=float)
+
+    def mean(name: str) -> float | None:
+        return float(column(name).mean()) if column(name).size else None
+
+    def largest(name: str) -> float | None:
+        return float(column(name).max()) if column(name).size else None
+
+    residuals = [largest(name) for name in ("primal_residual", "dual_residual", "gap")]
+    cpu, wall = column("total_s").sum(), column("total_wall_s").sum()
+    return {
+        "status": worst.value,
+        "reason": f"{len(reasons)} of {len(rows)} queries, first {reasons[0]}" if reasons else "",
+        "queries": len(rows),
+        "queries_ok": len(fine),
+        "online_s": mean("total_s"),
+        "online_wall_s": mean("total_wall_s"),
+        "online_assemble_s": mean("assemble_s"),
+        "online_solve_s": mean("solve_s"),
+        "error_u_mean": mean("error_u"),
+        "error_u_max": largest("error_u"),
+        "error_lambda_mean": mean("error_lambda"),
+        "error_lambda_max": largest("error_lambda"),
+        "assembly_error_max": largest("assembly_error"),
+        "violation_max": largest("violation"),
+        "residual_max": max((r for r in residuals if r is not None), default=None),
+        "beta_span_min": min(row["beta_span"] for row in rows),
+        "beta_cone_lower_min": min(row["beta_cone_lower"] for row in rows),
+        "beta_cone_upper_min": min(row["beta_cone_upper"] for row in rows),
+        "slowdown": slowdown,
+        "disturbed": int(wall > WAITED * cpu or slowdown > DISTURBED),
+    }
+
+
+def _mu(row: Row) -> str:
+    values = [row[name] for name in sorted(row) if name.startswith("mu_")]
+    return "(" + ", ".join(f"{value:.4g}" for value in values) + ")"

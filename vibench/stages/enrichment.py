@@ -1,0 +1,211 @@
+"""The stages of the enrichment, the last that is offline, and the reduced model that they complete."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from vibench.arrays import Array
+from vibench.interfaces.strategies import Enrichment, Kind, Offline
+from vibench.interfaces.validation import check_enrichment, training_parameters
+from vibench.model.galerkin import ReducedModel
+from vibench.reduction.nested import Grown, Milestone, grow_through
+from vibench.reduction.supremizers import (
+    ConstraintClasses,
+    projected_supremizers,
+)
+from vibench.stability.growth import ProjectedSupremizers
+from vibench.stages.artefacts import History, Store
+from vibench.stages.base import Result, Stage, build_problem, value_of
+from vibench.stages.offline import ConeStage, PODStage, ReducedCone, TrainingConstants
+from vibench.study.cells import Axes, Cell, Plugin
+from vibench.timing import timed
+
+
+@dataclass(frozen=True)
+class AssessedGrowth:
+    """A nested enrichment, and what it reaches on the training set.
+
+    Attributes
+    ----------
+    grown
+        The vectors, and how many of them each tolerance takes.
+    steps
+        The smallest β_span over the training set after every vector (S+1,).
+    training
+        β_span at every training parameter (P,), by the tolerance that was reached.
+    """
+
+    grown: Grown
+    steps: Array
+    training: Mapping[float, Array]
+
+
+@dataclass(frozen=True)
+class GrowthStage(Stage):
+    """A nested primal strategy, grown once through all its tolerances; its seconds are those of the tolerances."""
+
+    label = "nested enrichment"
+    rooms = ("linalg", "interfaces", "qp", "reduction", "stability")
+
+    pod: PODStage
+    cone: ConeStage
+    primal: Plugin
+    tolerances: tuple[float, ...]
+
+    def inputs(self) -> tuple[Stage, ...]:
+        """POD, cone and the constraint matrices."""
+        return (self.pod, self.cone, self.cone.constraints)
+
+    def run(self, store: Store) -> Result:
+        """An `AssessedGrowth`."""
+        offline = _offline(store, self.pod, self.cone)
+        grown = grow_through(self.primal.create(), offline, self.tolerances)
+        images, size = _images(offline, grown.vectors, value_of(store, self.cone.constraints)), offline.basis.shape[1]
+        training = {tolerance: images.first(size + m.count).beta_span() for tolerance, m in grown.milestones.items()}
+        return Result(AssessedGrowth(grown, images.over_steps(size), training))
+
+    def model(self, store: Store) -> ReducedModel:
+        """The reduced model with all vectors."""
+        growth: AssessedGrowth = value_of(store, self)
+        return _model(store, self.pod, self.cone, Enrichment(Kind.FIXED, vectors=growth.grown.vectors))
+
+
+@dataclass(frozen=True)
+class EnrichmentStage(Stage):
+    """The primal strategy, offline, at one tolerance; it completes a reduced model."""
+
+    label = "enrichment"
+    rooms = ("linalg", "interfaces", "qp", "reduction", "stability")
+
+    pod: PODStage
+    cone: ConeStage
+    primal: Plugin
+    tolerance: float | None
+
+    @property
+    def axes(self) -> Axes:
+        """The axes of POD and cone, the primal strategy and its tolerance."""
+        return Axes(self.pod.problem, self.cone.dual, self.primal, self.pod.stop, self.cone.stop, self.tolerance)
+
+    @property
+    def growth(self) -> GrowthStage | None:
+        """The stage that holds the vectors of all tolerances of a nested strategy; `None` for any other."""
+        return None
+
+    @property
+    def reachable(self) -> TrainingConstants:
+        """The stage of what the whole of V reaches on the training set."""
+        return TrainingConstants(self.cone)
+
+    @property
+    def model_inputs(self) -> tuple[Stage, ...]:
+        """The stages whose artefacts `model` reads."""
+        return (self.pod, self.cone, self)
+
+    @abstractmethod
+    def enrichment(self, store: Store) -> Enrichment:
+        """The enrichment, once the stage has been run."""
+
+    def model(self, store: Store) -> ReducedModel:
+        """The reduced model, once the stage has been run."""
+        return _model(store, self.pod, self.cone, self.enrichment(store))
+
+
+@dataclass(frozen=True)
+class SingleEnrichment(EnrichmentStage):
+    """An enrichment built for its tolerance alone; the value is an `Enrichment`."""
+
+    def inputs(self) -> tuple[Stage, ...]:
+        """POD, cone, and what it is compared with on the training set."""
+        return (self.pod, self.cone, self.cone.constraints, self.reachable)
+
+    def run(self, store: Store) -> Result:
+        """Build the enrichment; what it reaches on the training set is not timed."""
+        offline, strategy = _offline(store, self.pod, self.cone), self.primal.create()
+        enrichment, seconds = timed(lambda: strategy.build(offline, self.tolerance))
+        check_enrichment(enrichment, offline.problem.V, offline.basis)
+        known = dict(enrichment.history)
+        if enrichment.vectors is not None:
+            images = _images(offline, enrichment.vectors, value_of(store, self.cone.constraints))
+            known |= {"beta_span_min": images.over_steps(offline.basis.shape[1])}
+            known |= {"beta_span_training": images.beta_span()}
+            known |= {"beta_full_span_training": value_of(store, self.reachable)}
+        return Result(enrichment, seconds, _histories(known))
+
+    def enrichment(self, store: Store) -> Enrichment:
+        """The stored value."""
+        found: Enrichment = value_of(store, self)
+        return found
+
+
+@dataclass(frozen=True)
+class NestedEnrichment(EnrichmentStage):
+    """The leading vectors of a `GrowthStage`; the value is the `Milestone` of the tolerance."""
+
+    tolerances: tuple[float, ...]
+
+    @property
+    def growth(self) -> GrowthStage:
+        """The stage that holds the vectors of all `tolerances`."""
+        return GrowthStage(self.pod, self.cone, self.primal, self.tolerances)
+
+    @property
+    def model_inputs(self) -> tuple[Stage, ...]:
+        """POD, cone, the milestone and the vectors."""
+        return (*super().model_inputs, self.growth)
+
+    def inputs(self) -> tuple[Stage, ...]:
+        """POD and cone, all vectors, and what they are compared with on the training set."""
+        return (self.pod, self.cone, self.growth, self.reachable)
+
+    def run(self, store: Store) -> Result:
+        """Look up where the tolerance was reached, and check the vectors up to there."""
+        assert self.tolerance is not None  # a nested strategy takes one
+        offline, growth = _offline(store, self.pod, self.cone), value_of(store, self.growth)
+        milestone: Milestone = growth.grown.milestone(self.tolerance)
+        check_enrichment(growth.grown.at(milestone), offline.problem.V, offline.basis)
+        known = dict(milestone.history) | {
+            "beta_span_min": growth.steps[: milestone.count + 1],
+            "beta_span_training": growth.training[self.tolerance],
+            "beta_full_span_training": value_of(store, self.reachable),
+        }
+        return Result(milestone, milestone.seconds, _histories(known))
+
+    def enrichment(self, store: Store) -> Enrichment:
+        """The vectors up to the milestone."""
+        found: Enrichment = value_of(store, self.growth).grown.at(value_of(store, self))
+        return found
+
+
+def enrichment_stage(cell: Cell) -> EnrichmentStage:
+    """The stage that completes the reduced model of a cell."""
+    pods, cone = PODStage(cell.problem, cell.pod), ConeStage(cell.problem, cell.dual, cell.cone)
+    if cell.nested_tolerances:
+        return NestedEnrichment(pods, cone, cell.primal, cell.primal_tol, cell.nested_tolerances)
+    return SingleEnrichment(pods, cone, cell.primal, cell.primal_tol)
+
+
+def _histories(known: Mapping[str, Array]) -> tuple[History, ...]:
+    return tuple(History("enrichment", quantity, tuple(values)) for quantity, values in known.items())
+
+
+def _offline(store: Store, pod: PODStage, cone: ConeStage) -> Offline:
+    """What a primal strategy builds on."""
+    problem, basis = build_problem(pod.problem), value_of(store, pod).basis
+    reduced: ReducedCone = value_of(store, cone)
+    return Offline(problem, basis, reduced.cone, reduced.prepared.span, training_parameters(problem))
+
+
+def _images(offline: Offline, vectors: Array, classes: ConstraintClasses) -> ProjectedSupremizers:
+    """ZᵀBᵀη of V_N and vectors (n×S) for every class of the training set, η orthonormal in span χ."""
+    Z = np.hstack([offline.basis, vectors])
+    return ProjectedSupremizers([projected_supremizers(Z, B, offline.span) for B in classes.representatives], classes)
+
+
+def _model(store: Store, pod: PODStage, cone: ConeStage, enrichment: Enrichment) -> ReducedModel:
+    basis, reduced = value_of(store, pod).basis, value_of(store, cone)
+    return ReducedModel(build_problem(pod.problem), basis, enrichment, reduced.cone.rays, reduced.prepared.span)

@@ -1,0 +1,221 @@
+"""Checks of what a problem assembles: A, f, B and g, in full, on the contact alone, and entry by entry."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from functools import partial
+
+import numpy as np
+import scipy.linalg
+import scipy.sparse as sp
+
+from vibench.arrays import Array, Indices
+from vibench.errors import NumericalError
+from vibench.interfaces.problem import MEMBERS, Contact, Problem, VariationalInequality
+from vibench.linalg.inner_product import InnerProduct
+from vibench.model.affine import CONSTANT_RTOL
+from vibench.testing.case import ProblemCase
+from vibench.testing.checks import ConformanceError, Note, raised
+from vibench.testing.comparisons import Arrays, array_fault, at, copies, difference, differences, peak, unmutated
+from vibench.testing.continuity import find_jump
+
+SYMMETRY_RTOL = 1e-12
+"""Largest difference of a symmetric matrix and its transpose, relative to its largest entry."""
+
+DENSE = 2000
+"""Largest dimension of a matrix whose smallest eigenvalue is computed for a message."""
+
+PARTIAL_RTOL = 1e-10
+"""Largest difference of partial and full assembly, relative to the largest entry of the member."""
+
+ENTRIES = 40
+"""Number of entries of every member that are sampled."""
+
+
+def assembly(case: ProblemCase) -> Iterator[str]:
+    """Members have the right types and shapes, and finite values."""
+    n, m = case.plugin.V.dim, case.plugin.W.dim
+    shapes = {"A": (n, n), "f": (n,), "B": (m, n), "g": (m,)}
+    for mu in case.mus:
+        try:
+            vi: object = case.plugin.assemble(mu.copy())
+        except Exception as error:  # a plugin may raise anything
+            raise ConformanceError(f"assemble fails {at(mu)}: {raised(error)}") from error
+        if not isinstance(vi, VariationalInequality):
+            yield f"assemble returns a {type(vi).__name__} {at(mu)}; expected a vibench.VariationalInequality"
+            return
+        found = [array_fault(name, getattr(vi, name), shape, sparse=name in "AB") for name, shape in shapes.items()]
+        if vi.lift is not None:
+            found.append(array_fault("lift", vi.lift, np.shape(vi.lift)))
+        yield from (f"{fault} ({at(mu)})" for fault in found if fault)
+        if any(found):
+            return
+    yield Note(f"n = {n}, m = {m}, at {len(case.mus)} parameters")
+
+
+def no_mutation(case: ProblemCase) -> None:
+    """`assemble` changes neither its argument nor earlier results, spaces or bounds."""
+    problem, mus = case.plugin, case.mus.copy()
+    earlier = problem.assemble(case.mus[0].copy())
+    arrays = {f"{name} of an earlier result": getattr(earlier, name) for name in MEMBERS}
+    arrays |= {f"X_{name}": getattr(problem, name).matrix for name in "VW"}
+    arrays |= {f"parameters.{name}": getattr(problem.parameters, name) for name in ("lower", "upper")}
+    unmutated("assemble", {"its argument mu": mus, **arrays}, lambda: [problem.assemble(mu) for mu in mus])
+
+
+def symmetry(case: ProblemCase) -> None:
+    """A is symmetric."""
+    for where, found in case.results.items():
+        if what := difference(found["A"], found["A"].T, SYMMETRY_RTOL * peak(found["A"])):
+            raise ConformanceError(f"A is not symmetric {where}: {what} in the transpose")
+
+
+def definiteness(case: ProblemCase) -> None:
+    """A is positive definite."""
+    for where, found in case.results.items():
+        try:
+            InnerProduct(found["A"], "A")
+        except NumericalError as error:
+            eigenvalue = ""
+            if case.plugin.V.dim <= DENSE:
+                values, vectors = scipy.linalg.eigh(found["A"].toarray(), subset_by_index=(0, 0))
+                unknown = np.abs(vectors[:, 0]).argmax()
+                eigenvalue = f": its smallest eigenvalue is {values[0]:.3g}; the eigenvector peaks at unknown {unknown}"
+            raise ConformanceError(f"{error} {where}{eigenvalue}") from error
+
+
+def independence(case: ProblemCase) -> Iterator[str]:
+    """Members declared `constant` do not depend on the parameter."""
+    yield from _undeclarable("constant", case.plugin.constant)
+    first = at(case.mus[0])
+    for name in (name for name in MEMBERS if name in case.plugin.constant):
+        reference = case.results[first][name]
+        for where, found in case.results.items():
+            if what := difference(found[name], reference, CONSTANT_RTOL * peak(reference)):
+                yield f"{name} is declared `constant` but depends on mu: {what} ({where} and {first})"
+                break
+
+
+def continuity(case: ProblemCase) -> None:
+    """Members do not jump on lines in the box: a diagonal, one between random points, one along every axis."""
+    largest = {name: max(peak(found[name]) for found in case.results.values()) for name in MEMBERS}
+    scales = {name: s for name, s in largest.items() if s > 0.0 and name not in case.plugin.constant}
+    lower, upper, centre, *others = case.mus
+    lines = [(lower, upper), (others[0], others[1])]
+    if len(lower) > 1:
+        along = np.eye(len(lower), dtype=bool)
+        lines += [(np.where(axis, lower, centre), np.where(axis, upper, centre)) for axis in along]
+    for start, end in lines if scales else []:
+        if jump := find_jump(_line(case, start, end), scales):
+            first, _, last = (arrays[jump.name] for arrays in jump.values)
+            step = (jump.right - jump.left) * float(np.linalg.norm(end - start))
+            where = at(start + jump.right * (end - start))
+            raise ConformanceError(f"{jump.name} jumps {where}: {difference(first, last)} over a step of {step:.0e}")
+
+
+def _line(case: ProblemCase, start: Array, end: Array) -> Callable[[float], Arrays]:
+    return lambda t: case.evaluate(start + t * (end - start))
+
+
+def on_contact(case: ProblemCase) -> Iterator[str]:
+    """`contact_dofs`, `contact` and `constraint` agree with B and g."""
+    problem, dofs = case.plugin, case.plugin.contact_dofs
+    defined = type(problem).contact is not Problem.contact
+    if dofs is None:
+        yield Note("not declared")
+        if defined:
+            yield "`contact` is defined but `contact_dofs` is not, so it is never used; name the unknowns B may touch"
+    else:
+        _check_dofs(dofs, problem.V.dim)
+    for where, mu in case.arguments.items():
+        full = case.results[where]
+        if dofs is not None:
+            outside = np.setdiff1d(full["B"].indices[full["B"].data != 0.0], dofs)
+            if len(outside):
+                yield f"B touches {len(outside)} unknowns outside `contact_dofs` {where}; the first is {outside[0]}"
+                return
+            if defined:
+                _check_contact(case, dofs, mu, full)
+        B, g = problem.constraint(mu.copy())
+        _compare("constraint", mu, {"B": B, "g": g}, {"B": full["B"], "g": full["g"]})
+
+
+def _check_dofs(dofs: object, n: int) -> None:
+    if not isinstance(dofs, np.ndarray) or dofs.ndim != 1 or not np.issubdtype(dofs.dtype, np.integer):
+        fault = f"is {getattr(dofs, 'dtype', type(dofs).__name__)}; expected a vector of indices"
+    elif len(dofs) and (dofs.min() < 0 or dofs.max() >= n):
+        fault = f"ranges from {dofs.min()} to {dofs.max()}; the unknowns are 0 to {n - 1}"
+    elif np.any(np.diff(dofs) <= 0):
+        fault = "is not strictly increasing; expected sorted indices without repetition"
+    else:
+        return
+    raise ConformanceError(f"`contact_dofs` {fault}")
+
+
+def _check_contact(case: ProblemCase, dofs: Indices, mu: Array, full: Arrays) -> None:
+    given, m = mu.copy(), case.plugin.W.dim
+    contact = unmutated("contact", {"its argument mu": given}, partial(case.plugin.contact, given))
+    if not isinstance(contact, Contact):
+        raise ConformanceError(f"contact returns a {type(contact).__name__} {at(mu)}; expected a vibench.Contact")
+    fault = array_fault("contact.B", contact.B, (m, len(dofs)), sparse=True)
+    if fault := fault or array_fault("contact.g", contact.g, (m,)):
+        raise ConformanceError(f"{fault} ({at(mu)})")
+    columns = "B[:, contact_dofs]"
+    _compare("contact", mu, {columns: contact.B, "g": contact.g}, {columns: full["B"][:, dofs], "g": full["g"]})
+
+
+def by_entries(case: ProblemCase) -> Iterator[str]:
+    """`sampler` agrees with `assemble` on entries of every member alone, and of all at once."""
+    problem = case.plugin
+    yield from _undeclarable("entrywise", problem.entrywise)
+    names = [name for name in MEMBERS if name in problem.entrywise]
+    if not names:
+        yield Note("not declared")
+        if type(problem).sampler is not Problem.sampler:
+            yield "`sampler` is defined but `entrywise` names no member, so it is never used"
+        return
+    rng, pattern = np.random.default_rng(case.seed), case.results[at(case.mus[0])]
+    wanted = {name: _places(name, pattern[name], rng) for name in names}
+    for chosen in [*([name] for name in names), names]:
+        _check_sampler(case, {name: wanted[name] for name in chosen})
+
+
+def _places(name: str, values: object, rng: np.random.Generator) -> tuple[Indices, Indices]:
+    """Rows and columns of entries in the pattern of a member; of the symmetric A on and above the diagonal."""
+    if isinstance(values, np.ndarray):
+        rows, columns = np.arange(len(values)), np.zeros(len(values), dtype=np.intp)
+    else:
+        pattern = sp.coo_array(sp.triu(values) if name == "A" else values)
+        rows, columns = (np.asarray(axis, dtype=np.intp) for axis in pattern.coords)
+    chosen = np.sort(rng.choice(len(rows), min(ENTRIES, len(rows)), replace=False))
+    return rows[chosen], columns[chosen]
+
+
+def _check_sampler(case: ProblemCase, wanted: dict[str, tuple[Indices, Indices]]) -> None:
+    sample = case.plugin.sampler(wanted)
+    for where, mu in case.arguments.items():
+        full = case.results[where]
+        given = mu.copy()
+        samples = unmutated("the sampler", {"its argument mu": given}, partial(sample, given))
+        for name, (rows, columns) in wanted.items():
+            if name not in samples:
+                raise ConformanceError(f"the sampler returns no {name}, which `entrywise` names")
+            if fault := array_fault(f"{name} of the sampler", samples[name], rows.shape):
+                raise ConformanceError(f"{fault} ({at(mu)})")
+            # A full copy with the sampled entries, so that the message names their place in the member.
+            found = copies({name: full[name]})
+            found[name][(rows, columns) if name in "AB" else rows] = samples[name]
+            _compare("sampler", mu, found, {name: full[name]})
+
+
+def _compare(function: str, mu: Array, found: Arrays, full: Arrays) -> None:
+    for name, what in differences(copies(found), full, PARTIAL_RTOL):
+        raise ConformanceError(f"{name} of `{function}` differs from that of `assemble` {at(mu)}: {what}")
+
+
+def _undeclarable(declaration: str, names: Iterable[str]) -> Iterator[str]:
+    """Faults of `constant` or `entrywise`: names that are not members."""
+    if isinstance(names, str):
+        raise ConformanceError(f"`{declaration}` is the string {names!r}; expected a set: frozenset({{{names!r}}})")
+    for name in sorted(set(names) - set(MEMBERS)):
+        yield f"`{declaration}` names '{name}'; expected {', '.join(MEMBERS)}"

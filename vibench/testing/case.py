@@ -1,0 +1,173 @@
+"""A plugin under examination, and the checks that problems and strategies have in common."""
+
+from __future__ import annotations
+
+import pickle
+from abc import ABC, abstractmethod
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, ClassVar, Generic, TypeVar
+
+import numpy as np
+
+from vibench.arrays import Array
+from vibench.errors import NumericalError, in_a_line
+from vibench.interfaces.problem import MEMBERS, Problem
+from vibench.testing.checks import ConformanceError, Note, plugin_line
+from vibench.testing.comparisons import Arrays, at, copies, differences
+from vibench.timing import timed
+
+PluginT = TypeVar("PluginT")
+ArgumentT = TypeVar("ArgumentT")
+ResultT = TypeVar("ResultT")
+T = TypeVar("T")
+
+RANDOM = 4
+"""Number of random parameters of a problem, beside two corners and the centre of the box."""
+
+
+@dataclass(eq=False)
+class Case(ABC, Generic[PluginT, ArgumentT, ResultT]):
+    """A plugin, the arguments it is called with, and the results; `limit` bounds the wall time [s] of every call.
+
+    Every call receives copies, so that a plugin that writes to its input fails the check "no mutation" alone.
+    """
+
+    base: ClassVar[type]
+    """Class that the plugin derives from."""
+
+    create: Callable[[], PluginT]
+    limit: float
+
+    def __post_init__(self) -> None:
+        self._times: defaultdict[str, list[float]] = defaultdict(list)
+        if not callable(self.create):
+            raise TypeError(
+                f"pass the class {type(self.create).__name__}, or a function that makes an instance, not an instance: "
+                "two instances are compared"
+            )
+
+    @property
+    @abstractmethod
+    def arguments(self) -> Mapping[str, ArgumentT]:
+        """Arguments by their names in messages."""
+
+    @abstractmethod
+    def evaluate(self, argument: ArgumentT, plugin: PluginT | None = None) -> ResultT:
+        """Result of one call of the plugin, or of another instance."""
+
+    @abstractmethod
+    def arrays(self, result: ResultT) -> Arrays:
+        """Arrays of a result that a repeated call has to reproduce to the last bit."""
+
+    @cached_property
+    def plugin(self) -> PluginT:
+        """The instance that most checks use."""
+        return self.clocked("the construction", self.create)
+
+    @cached_property
+    def results(self) -> dict[str, ResultT]:
+        """Results by the names of their arguments."""
+        return {name: self.evaluate(argument) for name, argument in self.arguments.items()}
+
+    def clocked(self, what: str, work: Callable[[], T]) -> T:
+        """Result of some work; the check "time" reports its wall time."""
+        result, seconds = timed(work)
+        self._times[what].append(seconds.wall)
+        return result
+
+    def construction(self) -> Iterator[str]:
+        """An instance of the right class can be made."""
+        plugin: object = self.plugin
+        if not isinstance(plugin, self.base):
+            yield f"a {type(plugin).__name__} was made; expected a subclass of vibench.{self.base.__name__}"
+
+    def determinism(self) -> Iterator[str]:
+        """A second call and another instance give the same results to the last bit."""
+        again = list(self._deviations("a second call", self.plugin))
+        yield from again or self._deviations("another instance", self.create())
+
+    def pickling(self) -> Iterator[str]:
+        """Plugin and result can be sent to another process."""
+        name, before = next(iter(self.results.items()))
+        for thing in (self.plugin, before):
+            if reason := _pickling_error(thing):
+                faulty = [key for key, value in getattr(thing, "__dict__", {}).items() if _pickling_error(value)]
+                where = f": look at attribute {', '.join(faulty)}" if faulty else ""
+                raise ConformanceError(f"the {type(thing).__name__} cannot be pickled ({reason}){where}")
+        for array, what in differences(self.arrays(_pickled(before)), self.arrays(before)):
+            yield f"{name}: pickling changes {array}: {what}"
+        yield from self._deviations("a pickled copy", _pickled(self.plugin))
+
+    def time(self) -> Iterator[str]:
+        """The constructor and every call stay below the limit."""
+        for what, seconds in self._times.items():
+            if max(seconds) > self.limit:
+                excess = f"{what} takes {max(seconds):.3g} s, above the limit of {self.limit:g} s"
+                yield f"{excess}; is something recomputed that could be stored?"
+            yield Note(f"{what} takes {np.median(seconds):.2g} s")
+
+    def _deviations(self, source: str, plugin: PluginT) -> Iterator[str]:
+        """Arrays that differ when all calls are repeated, each named once."""
+        found: set[str] = set()
+        # The reverse order reveals results that depend on the previous call.
+        for name, argument in reversed(list(self.arguments.items())):
+            again = self.arrays(self.evaluate(argument, plugin))
+            for array, what in differences(again, self.arrays(self.results[name])):
+                if array not in found:
+                    found.add(array)
+                    yield f"{name}: {source} gives different values of {array}: {what}"
+
+
+@dataclass(eq=False)
+class ProblemCase(Case[Problem, Array, Arrays]):
+    """A problem, parameters, and the arrays it assembles; `seed` is that of random parameters and entries."""
+
+    base = Problem
+    seed: int
+
+    @cached_property
+    def mus(self) -> Array:
+        """Parameters (K×d): two corners of the box, its centre, and random ones."""
+        box = self.plugin.parameters
+        fixed = np.stack([box.lower, box.upper, 0.5 * (box.lower + box.upper)])
+        return np.concatenate([fixed, box.sample(RANDOM, self.seed)])
+
+    @property
+    def arguments(self) -> dict[str, Array]:
+        """The parameters."""
+        return {at(mu): mu for mu in self.mus}
+
+    def evaluate(self, argument: Array, plugin: Problem | None = None) -> Arrays:
+        """Copies of A, f, B and g at a parameter (d,), and of X_V and X_W."""
+        problem, mu = plugin or self.plugin, argument.copy()
+        vi = self.clocked("an assembly", lambda: problem.assemble(mu))
+        members = {name: getattr(vi, name) for name in MEMBERS}
+        return copies({**members, "X_V": problem.V.matrix, "X_W": problem.W.matrix})
+
+    def arrays(self, result: Arrays) -> Arrays:
+        """All of them."""
+        return result
+
+    def construction(self) -> Iterator[str]:
+        """An instance can be made; a refused Gram matrix is named."""
+        try:
+            yield from super().construction()
+        except NumericalError as error:
+            place = plugin_line(error)
+            names = [f"X_{name}: " for name in "VW" if f"self.{name} =" in place and f"X_{name}" not in str(error)]
+            raise ConformanceError(f"{''.join(names)}{error} ({place})") from error
+
+
+def _pickled(thing: Any) -> Any:
+    return pickle.loads(pickle.dumps(thing))
+
+
+def _pickling_error(thing: Any) -> str:
+    try:
+        _pickled(thing)
+    except Exception as error:  # noqa: BLE001  a plugin may raise anything
+        return in_a_line(error)
+    return ""
