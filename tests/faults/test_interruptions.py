@@ -79,7 +79,7 @@ def test_a_second_interrupt_changes_nothing(command: str, plugins_folder: Path, 
             time.sleep(0.01)
         out, err = process.communicate(timeout=60)
     assert (process.returncode, err) == (130, "")
-    assert "interrupted: 1 cells have no row yet; the same command goes on from here" in out
+    assert "interrupted: 1 cells have no row yet; the same command resumes the run" in out
     assert len(rows(waiting / "runs" / "wire")) == 1
 
 

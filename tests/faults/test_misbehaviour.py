@@ -244,11 +244,11 @@ def test_progress_counts_up_to_the_number_of_cells(run: Run) -> None:
         assert counted == [(k + 1, count) for k in range(count)]
 
 
-def test_the_end_names_what_fell_short(run: Run) -> None:
+def test_the_end_names_what_is_not_ok(run: Run) -> None:
     for folder, printed in zip(run.folders, run.printed, strict=True):
         statuses = [row["status"] for row in rows(folder)]
         fine = statuses.count("ok")
-        assert f"{len(statuses)} cells, {fine} ok, {len(statuses) - fine} fell short" in printed
+        assert f"{len(statuses)} cells, {fine} ok, {len(statuses) - fine} not ok" in printed
         for status in set(statuses) - {"ok"}:
             assert re.search(rf"^{status}: ", printed, re.MULTILINE)
 

@@ -64,7 +64,7 @@ def test_a_second_run_does_nothing_new(vibench: Vibench, again: Path) -> None:
     printed, _ = run_again(vibench, again)
     assert "3 cells, 0 to run, 0 stages" in printed
     assert {table: rows(again / "runs" / "wire", table) for table in before} == before
-    assert "3 cells, 2 ok, 1 fell short" in printed
+    assert "3 cells, 2 ok, 1 not ok" in printed
 
 
 def test_retry_redoes_what_was_not_ok(vibench: Vibench, again: Path) -> None:
@@ -161,7 +161,7 @@ def test_a_run_in_which_nothing_works_comes_to_its_end(vibench: Vibench, tmp_pat
     assert {problem: row["status"] for problem, row in found.items()} == {"wire-raises": "error", "wire": "timeout"}
     assert "the limit is 1e-09 s" in found["wire"]["reason"]
     assert {row["queries_ok"] for row in found.values()} == {0}
-    assert "2 cells, 0 ok, 2 fell short" in done.stdout
+    assert "2 cells, 0 ok, 2 not ok" in done.stdout
 
 
 def test_a_problem_that_fails_first_leaves_the_one_beside_it_alone(vibench: Vibench, tmp_path: Path) -> None:

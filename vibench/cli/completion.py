@@ -1,4 +1,7 @@
-"""What a shell and `--help` are told: values to complete words with, and examples of every command."""
+"""Words that a shell completes, and the examples at the end of every command's help.
+
+A shell waits for completions, so names of plugins are read from entry points and nothing heavy is imported at the top.
+"""
 
 from __future__ import annotations
 
@@ -9,14 +12,7 @@ from pathlib import Path
 import typer
 
 from vibench.errors import VibenchError
-from vibench.qp.settings import SETTINGS
-from vibench.results import tables
 from vibench.results.columns import TABLES
-from vibench.results.database import FILE
-from vibench.study import registry
-
-Complete = Callable[[str], list[str]]
-"""From the beginning of a word to the words it may become."""
 
 EXAMPLES: Mapping[str, tuple[str, ...]] = {
     "run": (
@@ -44,69 +40,75 @@ EXAMPLES: Mapping[str, tuple[str, ...]] = {
 
 
 def examples(command: str) -> str:
-    """The last lines of a command's help, kept as they are."""
+    """The last paragraph of a command's help; the leading backspace makes click keep its line breaks."""
     return "\n".join(["\b", "Examples:", *(f"  {line}" for line in EXAMPLES[command])])
 
 
-def names(kind: str) -> Complete:
-    """Completes names of one kind of plugin."""
+def names(*groups: str) -> Callable[[str], list[str]]:
+    """Completes names of plugins in groups of entry points: "problems" stands for `vibench.problems`."""
 
     def complete(incomplete: str) -> list[str]:
-        return _beginning(incomplete, lambda: registry.names(kind))
+        return _beginning(incomplete, _registered(*groups))
 
     return complete
 
 
-def plugin_names(incomplete: str) -> list[str]:
-    """Completes names of problems and strategies."""
-    return _beginning(incomplete, lambda: {name for kind in registry.WORDS.values() for name in registry.names(kind)})
+plugin_names = names("problems", "primal_strategies", "dual_strategies")
 
 
 def studies(incomplete: str) -> list[str]:
-    """Completes registered studies and the study files here, or in the folder the word names."""
-    return _beginning(incomplete, lambda: [*registry.names("study"), *_study_files(incomplete)])
-
-
-def _study_files(word: str) -> Iterable[str]:
-    folder = word.rpartition("/")[0]
-    for path in Path(folder or ("/" if word.startswith("/") else ".")).glob("*.toml"):
-        yield f"{folder}/{path.name}" if "/" in word else path.name
+    """Completes registered studies, and study files in the current folder or in the folder of the word."""
+    folder, slash, _ = incomplete.rpartition("/")
+    files = (f"{folder}{slash}{path.name}" for path in Path(folder + slash).glob("*.toml"))
+    return sorted([*_beginning(incomplete, _registered("studies")), *_beginning(incomplete, files)])
 
 
 def solvers(incomplete: str) -> list[str]:
     """Completes QP solvers, installed or not."""
-    return _beginning(incomplete, lambda: {*SETTINGS, *registry.names("QP solver")})
+    from vibench.qp.settings import SETTINGS
+
+    return _beginning(incomplete, {*SETTINGS, *_registered("qp_solvers")})
 
 
 def runs(incomplete: str) -> list[str]:
     """Completes names of the runs under `runs/`."""
-    return _beginning(incomplete, lambda: (path.parent.name for path in Path("runs").glob(f"*/{FILE}")))
+    from vibench.results.database import FILE
+
+    return _beginning(incomplete, (path.parent.name for path in Path("runs").glob(f"*/{FILE}")))
 
 
 def lists(incomplete: str) -> list[str]:
-    """Completes what `vibench list` lists."""
-    return _beginning(incomplete, lambda: ("problems", "dual", "primal", "solvers", "studies"))
+    """Completes the arguments of `vibench list`."""
+    return _beginning(incomplete, ("problems", "dual", "primal", "solvers", "studies"))
 
 
 def table_names(incomplete: str) -> list[str]:
     """Completes tables of a run."""
-    return _beginning(incomplete, lambda: ("summary", "benefits", *TABLES))
+    return _beginning(incomplete, ("summary", "benefits", *TABLES))
 
 
 def cells(context: typer.Context, incomplete: str) -> list[tuple[str, str]]:
-    """Completes keys of the cells of the run named before, each with what it is."""
+    """Completes keys of the cells of the run named before, each with a description."""
+    from vibench.results import tables
+
     try:
         found = tables.read(tables.results_file(str(context.params.get("run"))), "cells")
     except (VibenchError, OSError, sqlite3.Error):
         return []
-    columns = (found[name] for name in ("cell", "problem", "dual", "primal", "solver"))
-    rows = [(str(key), " · ".join(map(str, what))) for key, *what in zip(*columns, strict=True)]
-    return sorted(row for row in rows if row[0].startswith(incomplete))
+    rows = found[["cell", "problem", "dual", "primal", "solver"]].astype(str).itertuples(index=False)
+    return sorted((key, " · ".join(axes)) for key, *axes in rows if key.startswith(incomplete))
 
 
-def _beginning(word: str, known: Callable[[], Iterable[str]]) -> list[str]:
-    """The known names that begin like a word; none where they cannot be known, for a shell wants no complaints."""
+def _registered(*groups: str) -> set[str]:
+    """Names in the entry points themselves: `vibench.study.registry` would import SciPy and pydantic."""
+    from importlib.metadata import entry_points
+
+    return {entry.name for group in groups for entry in entry_points(group=f"vibench.{group}")}
+
+
+def _beginning(word: str, known: Iterable[str]) -> list[str]:
+    """The known names that begin with a word; none if they cannot be read, since a prompt is no place for errors."""
     try:
-        return sorted(name for name in known() if name.startswith(word))
-    except (VibenchError, OSError):
+        return sorted(name for name in known if name.startswith(word))
+    except OSError:
         return []

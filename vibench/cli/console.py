@@ -1,4 +1,4 @@
-"""Tables on a terminal, or where there is none."""
+"""Tables on a terminal, or as plain text elsewhere."""
 
 from __future__ import annotations
 
@@ -20,8 +20,9 @@ def new_console() -> Console:
     return console if console.is_terminal else Console(highlight=False, width=WIDTH)
 
 
-def print_frame(console: Console, frame: pd.DataFrame, title: str) -> None:
-    """Print a table; text columns that say the same in every row go into the title, and nothing is cut off."""
+def print_frame(frame: pd.DataFrame, title: str) -> None:
+    """Print a table without truncated cells; text columns with the same value in every row go into the title."""
+    console = new_console()
     shared = [name for name in frame.columns if len(frame) > 1 and _same_text(frame[name])]
     title = ", ".join([title, *(f"{name} {tables.cell_text(frame[name].iloc[0])}" for name in shared)])
     table = Table(title=Text(title), title_justify="left", pad_edge=False, padding=(0, 1, 0, 0), box=box.SIMPLE_HEAD)
@@ -33,9 +34,9 @@ def print_frame(console: Console, frame: pd.DataFrame, title: str) -> None:
         table.add_column(Text(str(name)), justify="right" if numeric else "left", min_width=min(widest, 24))
     for row in rows:
         table.add_row(*map(Text, row))
-    unbounded = console.options.update(width=10 * WIDTH)
-    natural = console.measure(table, options=unbounded).maximum
-    console.width = max(console.width, min(natural, WIDTH))  # better a wrapped line than a cut one
+    # On a narrow terminal, lines wider than the window that wrap are better than cells cut off by rich.
+    natural = console.measure(table, options=console.options.update(width=10 * WIDTH)).maximum
+    console.width = max(console.width, min(natural, WIDTH))
     console.print(table)
 
 

@@ -1,4 +1,4 @@
-"""Whether vibench works here: what is installed, what works, what there is room for, and what timings are worth."""
+"""Findings of `vibench doctor`: versions, QP solvers, plugins, machine, disk, and whether timings can be trusted."""
 
 from __future__ import annotations
 
@@ -9,16 +9,15 @@ import re
 import shutil
 import sqlite3
 import tempfile
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterator
+from contextlib import closing
 from dataclasses import dataclass
 from enum import StrEnum
 from importlib.metadata import requires
 from pathlib import Path
-from typing import Annotated
 
 import numpy as np
 import typer
-from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 from threadpoolctl import threadpool_info, threadpool_limits
@@ -32,94 +31,73 @@ from vibench.qp.settings import SETTINGS
 from vibench.qp.solve import installed_solvers
 from vibench.qp.status import Status
 from vibench.stages.artefacts import CACHE_VARIABLE, LOCK, Store, default_folder
-from vibench.stages.cell_summary import DISTURBED
+from vibench.stages.cell_summary import DISTURBED, WAITED
 from vibench.study import registry
 from vibench.study.reader import load_study
 from vibench.timing import Calibration, Stopwatch
 
-LITTLE = 1.0
-"""GiB of memory or disk below which there is a note."""
+MIN_GIB = 1.0
+"""Less free memory or disk space than this is a note."""
 
-OTHERS = 0.25
-"""Share of the cores that other processes may keep busy before there is a note."""
+MAX_OTHER_LOAD = 0.25
+"""Share of the cores that other processes may use before timings are doubtful."""
 
-WAITS = 1.5
-"""Wall over CPU seconds above which `vibench.stages.cell_queries` marks a row as disturbed."""
-
-LISTENING = 0.5
-"""Seconds for which the machine is listened to."""
+MEASURED_SECONDS = 0.5
+"""Duration of the measurement of load and slowdown."""
 
 
 class Health(StrEnum):
-    """How bad a finding is: `BROKEN` is for what vibench cannot work without, or what is there and does not work."""
+    """Severity of a finding: `BROKEN` if a required part is missing, or an installed one does not work."""
 
     OK = "ok"
     NOTE = "note"
     BROKEN = "broken"
 
 
+STYLES = {Health.OK: "", Health.NOTE: "yellow", Health.BROKEN: "bold red"}
+
+
 @dataclass(frozen=True)
 class Finding:
-    """One thing that was looked at: what, what was found, and how bad that is."""
+    """Result of one check: its subject, what was found, and how severe that is."""
 
     subject: str
     found: str
     health: Health = Health.OK
 
 
-def doctor(
-    out: Annotated[Path, typer.Option(metavar="DIR", help="Folder of the runs.")] = Path("runs"),
-) -> None:
-    """Check versions, QP solvers, plugins, disk and timings.
-
-    Every installed solver solves a small program. Exit code 1 if something is broken: there and not working, or needed
-    and not there.
-    """
+def print_findings(out: Path) -> list[str]:
+    """Print the findings of all checks; returns the subjects of those that are broken."""
     console, broken = new_console(), []
-    for title, examine in _sections(out).items():
-        findings = list(examine())
-        _print(console, title, findings)
-        broken += [finding.subject for finding in findings if finding.health is Health.BROKEN]
-    console.print(f"broken: {', '.join(broken)}" if broken else "nothing is broken", markup=False, soft_wrap=True)
-    if broken:
-        raise typer.Exit(1)
-
-
-def _sections(out: Path) -> Mapping[str, Callable[[], Iterable[Finding]]]:
-    return {
-        "versions": versions,
-        "QP solvers": solvers,
-        "plugins": registered,
-        "machine": machine,
-        "disk": lambda: disk(out),
-        "timings": timings,
-    }
-
-
-def _print(console: Console, title: str, findings: list[Finding]) -> None:
-    table = Table.grid(padding=(0, 2))
-    for options in ({"min_width": 6}, {"min_width": 18, "no_wrap": True}, {"overflow": "fold"}):
-        table.add_column(**options)
-    for finding in findings:
-        style = {Health.OK: "", Health.NOTE: "yellow", Health.BROKEN: "bold red"}[finding.health]
-        table.add_row(Text(finding.health, style), Text(finding.subject), Text(finding.found))
-    console.print(title, style="bold")
-    console.print(table)
+    sections = {
+        "versions": versions(), "QP solvers": solvers(), "plugins": plugins(),
+        "machine": machine(), "disk": disk(out), "timings": timings(),
+    }  # fmt: skip
+    for title, findings in sections.items():
+        table = Table.grid(padding=(0, 2))
+        for options in ({"min_width": 6}, {"min_width": 18, "no_wrap": True}, {"overflow": "fold"}):
+            table.add_column(**options)
+        for finding in findings:
+            table.add_row(Text(finding.health, STYLES[finding.health]), Text(finding.subject), Text(finding.found))
+            broken += [finding.subject] * (finding.health is Health.BROKEN)
+        console.print(title, style="bold")
+        console.print(table)
+    typer.echo(f"broken: {', '.join(broken)}" if broken else "nothing is broken")
+    return broken
 
 
 def versions() -> Iterator[Finding]:
-    """Python, vibench and what it needs; broken where something of that is missing."""
+    """Versions of Python, vibench and the libraries it requires."""
     yield Finding("Python", f"{platform.python_version()}, {platform.python_implementation()}, {platform.platform()}")
     yield Finding("vibench", provenance.core_code())
     found = {name: provenance.distribution_version(name) for name, extras in requirements().items() if not extras}
-    yield Finding("libraries", ", ".join(f"{name} {there}" for name, there in found.items() if there))
-    for name, there in found.items():
-        if not there:
-            yield Finding(name, "is needed and not installed", Health.BROKEN)
+    yield Finding("libraries", ", ".join(f"{name} {version}" for name, version in found.items() if version))
+    for name in (name for name, version in found.items() if not version):
+        yield Finding(name, "is required and not installed", Health.BROKEN)
 
 
 def requirements() -> dict[str, list[str]]:
-    """Distributions that vibench asks for, and the extras they are for; none for what it always needs."""
+    """Distributions that vibench depends on, each with the extras that include it; no extra if it is required."""
     found: dict[str, list[str]] = {}
     for line in requires("vibench") or ():
         name = re.match(r"[\w.-]+", line)
@@ -129,63 +107,58 @@ def requirements() -> dict[str, list[str]]:
 
 
 def solvers() -> Iterator[Finding]:
-    """Every QP solver there could be; those that are there solve a small program each."""
+    """All known QP solvers; the installed ones solve a small program each."""
     extra, _ = _names("QP solver")
-    installed = installed_solvers(extra)
-    trials = solver_check.attempts(installed)
+    trials = solver_check.attempts(installed_solvers(extra))
     for name in sorted({*SETTINGS, *extra}):
         version = provenance.solver_version(name) if name in SETTINGS else registry.version("QP solver", name)
         if name not in trials:
-            yield _absent(name, version)
-            continue
-        trial = trials[name]
-        reached = "" if trial.residual is None else f"largest residual {trial.residual:.0e}"
-        if trial.status is Status.OK:
-            yield Finding(name, f"{version}: {reached}")
+            yield _unavailable(name, version)
+        elif (trial := trials[name]).status is Status.OK:
+            yield Finding(name, f"{version}: largest residual {trial.residual:.0e}")
         else:
             yield Finding(name, f"{version}: {trial.status}, {trial.reason}", Health.BROKEN)
 
 
-def _absent(solver: str, version: str) -> Finding:
-    """What to say of a solver that cannot be run."""
+def _unavailable(solver: str, version: str) -> Finding:
+    """Why a solver cannot be run."""
     distribution = provenance.SOLVER_DISTRIBUTIONS.get(solver, solver)
     if version:
         try:
             importlib.import_module(distribution)
-        except (Exception, SystemExit) as error:  # noqa: BLE001  whatever keeps it from being imported
+        except (Exception, SystemExit) as error:  # noqa: BLE001  a library may raise anything when it is imported
             return Finding(solver, f"{version} is installed and cannot be imported: {in_a_line(error)}", Health.BROKEN)
         return Finding(solver, f"{version} is installed and qpsolvers does not know it", Health.BROKEN)
     extras = requirements().get(distribution)
     if extras == []:
-        return Finding(solver, "is needed and not installed", Health.BROKEN)
-    hint = f"; pip install 'vibench[{extras[0]}]' brings it" if extras else ""
+        return Finding(solver, "is required and not installed", Health.BROKEN)
+    hint = f"; pip install 'vibench[{extras[0]}]' installs it" if extras else ""
     return Finding(solver, f"not installed{hint}", Health.NOTE)
 
 
-def registered() -> Iterator[Finding]:
-    """How many plugins of each kind load, and why the others do not."""
+def plugins() -> Iterator[Finding]:
+    """The plugins of each kind that load, and the errors of those that do not."""
     for kind in registry.GROUPS:
-        names, doubled = _names(kind)
-        if doubled:
-            yield Finding(kind, doubled, Health.BROKEN)
+        names, conflict = _names(kind)
+        if conflict:
+            yield Finding(kind, conflict, Health.BROKEN)
             continue
-        broken = {name: reason for name in names if (reason := _why_not(kind, name))}
-        fine = [name for name in names if name not in broken]
-        yield Finding(kind, ", ".join(fine) or "none")
-        for name, reason in broken.items():
-            yield Finding(f"{kind} '{name}'", f"{reason} (from {registry.version(kind, name)})", Health.BROKEN)
+        errors = {name: error for name in names if (error := _load_error(kind, name))}
+        yield Finding(kind, ", ".join(name for name in names if name not in errors) or "none")
+        for name, error in errors.items():
+            yield Finding(f"{kind} '{name}'", f"{error} (from {registry.version(kind, name)})", Health.BROKEN)
 
 
 def _names(kind: str) -> tuple[list[str], str]:
-    """The names of a kind; none where two packages register one, and what is to be said about that."""
+    """The names of a kind of plugin; none, and an error, if two packages register the same name."""
     try:
         return registry.names(kind), ""
     except RequestError as error:
         return [], str(error)
 
 
-def _why_not(kind: str, name: str) -> str:
-    """Why a plugin is of no use; "" if it loads."""
+def _load_error(kind: str, name: str) -> str:
+    """The error that loading a plugin ends with; "" if it loads."""
     try:
         if kind == "study":
             load_study(name)
@@ -195,16 +168,18 @@ def _why_not(kind: str, name: str) -> str:
                 registry.options(kind, name)
     except RequestError as error:
         return str(error)
-    except Exception as error:  # noqa: BLE001  annotations of strangers are evaluated
+    except Exception as error:  # noqa: BLE001  annotations of plugins are evaluated
         return in_a_line(error)
     return ""
 
 
 def machine() -> Iterator[Finding]:
-    """Processor, memory that is free, and the BLAS of NumPy and SciPy."""
+    """Processor, free memory, and the BLAS libraries of NumPy and SciPy."""
     yield Finding("processor", provenance.machine())
-    free = _free_memory()
-    yield Finding("free memory", f"{free:.1f} GiB", Health.NOTE if free < LITTLE else Health.OK)
+    info = Path("/proc/meminfo")
+    found = re.search(r"MemAvailable:\s*(\d+) kB", info.read_text()) if info.is_file() else None
+    free = int(found[1]) / 2**20 if found else os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30
+    yield Finding("free memory", f"{free:.1f} GiB", _note_if(free < MIN_GIB))
     for pool in threadpool_info():
         name = f"{pool['internal_api']} {pool.get('version') or ''}".strip()
         threads = f"{pool['num_threads']} threads here, 1 in workers"
@@ -212,81 +187,69 @@ def machine() -> Iterator[Finding]:
         yield Finding(subject, f"{name} of {Path(pool['filepath']).parent.name}, {threads}")
 
 
-def _free_memory() -> float:
-    """GiB that processes can still get."""
-    info = Path("/proc/meminfo")
-    found = re.search(r"MemAvailable:\s*(\d+) kB", info.read_text()) if info.is_file() else None
-    return int(found[1]) / 2**20 if found else os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30
-
-
 def disk(out: Path) -> Iterator[Finding]:
-    """Room and rights where runs and artefacts go, and what artefacts take."""
+    """Free space and permissions in the folders of runs and artefacts, and the size of stored artefacts."""
     store = Store(default_folder())
-    yield _place("runs", out.absolute())
-    yield _place("artefacts", store.folder)
+    yield _folder("runs", out.absolute())
+    yield _folder("artefacts", store.folder)
     sizes = [size for _, size, _ in store.contents()]
-    yield Finding("kept", f"{len(sizes)} artefacts, {sum(sizes) / 2**20:.1f} MiB; `vibench clean` frees them")
+    yield Finding("stored", f"{len(sizes)} artefacts, {sum(sizes) / 2**20:.1f} MiB; `vibench clean` deletes them")
     source = f"${CACHE_VARIABLE}" if os.environ.get(CACHE_VARIABLE) else f"the default; ${CACHE_VARIABLE} changes it"
-    yield Finding("place of artefacts", source)
+    yield Finding("artefact folder", source)
 
 
-def _place(subject: str, folder: Path) -> Finding:
-    """Whether a folder, or the one it will be made in, takes locks and databases, and how much else."""
-    there = next(parent for parent in (folder, *folder.parents) if parent.exists())
+def _folder(subject: str, folder: Path) -> Finding:
+    """Free space of a folder, or of the one it will be created in, and whether locks and databases work there."""
+    existing = next(parent for parent in (folder, *folder.parents) if parent.exists())
     try:
-        free = shutil.disk_usage(there).free / 2**30
-        with tempfile.TemporaryDirectory(dir=there, prefix=".vibench-") as scratch:
-            _use(Path(scratch))
-    except (OSError, RequestError, sqlite3.Error) as error:
-        reason = error.strerror if isinstance(error, OSError) else str(error)
-        return Finding(subject, f"{folder}: cannot be used: {reason}", Health.BROKEN)
-    return Finding(subject, f"{folder}: {free:.1f} GiB free", Health.NOTE if free < LITTLE else Health.OK)
-
-
-def _use(folder: Path) -> None:
-    """Do in a folder what runs do: lock a file, and write a database ahead."""
-    with locked(folder / LOCK, busy="a lock of our own is taken"):
-        db = sqlite3.connect(folder / "trial.sqlite")
-        try:
+        free = shutil.disk_usage(existing).free / 2**30
+        with (
+            tempfile.TemporaryDirectory(dir=existing, prefix=".vibench-") as scratch,
+            locked(Path(scratch, LOCK), busy="a new lock is already held"),
+            closing(sqlite3.connect(Path(scratch, "trial.sqlite"))) as db,
+        ):
             mode = db.execute("PRAGMA journal_mode=WAL").fetchone()[0]
             db.execute("CREATE TABLE trial (number)")
             db.commit()
-        finally:
-            db.close()
-    if mode != "wal":
-        raise RequestError("SQLite cannot write ahead here; is it a network drive?")
+        if mode != "wal":
+            raise RequestError("SQLite cannot keep a write-ahead log here; is it a network drive?")
+    except (OSError, RequestError, sqlite3.Error) as error:
+        reason = error.strerror if isinstance(error, OSError) else str(error)
+        return Finding(subject, f"{folder}: cannot be used: {reason}", Health.BROKEN)
+    return Finding(subject, f"{folder}: {free:.1f} GiB free", _note_if(free < MIN_GIB))
 
 
 def timings() -> Iterator[Finding]:
-    """Who else is at work, how steady a fixed calculation is, and what follows for seconds measured now."""
-    before, watch = _busy(), Stopwatch()
+    """Load of other processes, slowdown of a fixed calculation, and whether timings can be trusted."""
+    before, watch = _busy_seconds(), Stopwatch()
     with threadpool_limits(1):
         calibration = Calibration()
         slowdowns = [calibration.slowdown()]
-        while watch.seconds().wall < LISTENING:
+        while watch.seconds().wall < MEASURED_SECONDS:
             slowdowns.append(calibration.slowdown())
-    spent, after = watch.seconds(), _busy()
+    spent, after = watch.seconds(), _busy_seconds()
     cores = os.cpu_count() or 1
-    own = spent.cpu / spent.wall
-    others = max((after - before) / spent.wall - own, 0.0) if after > before else max(os.getloadavg()[0] - own, 0.0)
-    slow, waits = float(np.quantile(slowdowns, 0.9)), spent.wall / spent.cpu
-    heard = [
-        Finding("other load", f"{others:.1f} of {cores} cores", _above(others, OTHERS * cores)),
-        Finding("slowdown", f"{slow:.2f}; rows are marked above {DISTURBED}", _above(slow, DISTURBED)),
-        Finding("wall over CPU", f"{waits:.2f}; rows are marked above {WAITS}", _above(waits, WAITS)),
-    ]
-    yield from heard
-    doubts = [finding.subject for finding in heard if finding.health is not Health.OK]
-    verdict = f"are not to be trusted: {', '.join(doubts)}" if doubts else "can be trusted"
-    yield Finding("verdict", f"seconds measured now {verdict}", Health.NOTE if doubts else Health.OK)
+    load = (after - before) / spent.wall if after > before else os.getloadavg()[0]
+    others = max(load - spent.cpu / spent.wall, 0.0)
+    slowdown, ratio = float(np.quantile(slowdowns, 0.9)), spent.wall / spent.cpu
+    doubts = []
+    for subject, found, doubtful in (
+        ("other load", f"{others:.1f} of {cores} cores", others > MAX_OTHER_LOAD * cores),
+        ("slowdown", f"{slowdown:.2f}; rows are marked above {DISTURBED}", slowdown > DISTURBED),
+        ("wall over CPU", f"{ratio:.2f}; rows are marked above {WAITED}", ratio > WAITED),
+    ):
+        yield Finding(subject, found, _note_if(doubtful))
+        doubts += [subject] * doubtful
+    verdict = f"cannot be trusted: {', '.join(doubts)}" if doubts else "can be trusted"
+    yield Finding("verdict", f"seconds measured now {verdict}", _note_if(bool(doubts)))
 
 
-def _above(value: float, limit: float) -> Health:
-    return Health.NOTE if value > limit else Health.OK
+def _note_if(doubtful: bool) -> Health:
+    return Health.NOTE if doubtful else Health.OK
 
 
-def _busy() -> float:
-    """CPU seconds that the whole machine has worked; 0 where the system does not tell."""
+def _busy_seconds() -> float:
+    """CPU seconds that all processes of the machine have used so far; 0 where the system does not tell."""
     stat = Path("/proc/stat")
     if not stat.is_file():
         return 0.0

@@ -1,4 +1,4 @@
-"""New packages of plugins, made from templates."""
+"""Packages with a new plugin, written from the templates."""
 
 from __future__ import annotations
 
@@ -10,37 +10,29 @@ from string import Template
 
 from vibench.errors import RequestError, StorageError
 from vibench.provenance import distribution_version
-from vibench.study import registry
-from vibench.study.registry import GROUPS, WORDS
+from vibench.study.registry import GROUPS, WORDS, names, version
 
 MODULES = {"problem": "problem", "primal": "strategy", "dual": "strategy"}
-"""Module that holds the plugin."""
+"""Module of the plugin by kind."""
 
 NAME = re.compile(r"[a-z][a-z0-9]*(-[a-z0-9]+)*")
-LONGEST = 40
+MAX_LENGTH = 40
 
-TAKEN = ("problems", "strategies")
-"""Names whose packages would be called as those that come with vibench."""
+RESERVED = ("problems", "strategies")
+"""Names whose packages would have the names of those that come with vibench."""
 
 
 def write_package(kind: str, name: str, parent: Path) -> Path:
-    """Write the folder `vibench-NAME` into a folder, all of it or nothing; gives its path.
+    """Write a package with one plugin, completely or not at all; returns its folder `parent/vibench-NAME`.
 
-    Parameters
-    ----------
-    kind
-        "problem", "primal" or "dual".
-    name
-        What the plugin is registered as.
-    parent
-        Folder for the new folder; made if it is not there.
+    The kind is "problem", "primal" or "dual". The parent folder is created if necessary.
 
     Raises
     ------
     RequestError
-        If the name is no good or taken, or the folder exists.
+        If the name is invalid or taken, or the folder exists.
     StorageError
-        If there is no space, or no permission.
+        If a file cannot be written.
     """
     check_name(kind, name)
     target = parent / f"vibench-{name}"
@@ -66,29 +58,21 @@ def write_package(kind: str, name: str, parent: Path) -> Path:
 
 
 def check_name(kind: str, name: str) -> None:
-    """Refuse a name that cannot be that of a package, or that a plugin has already.
-
-    Raises
-    ------
-    RequestError
-        Saying why, and what would be right.
-    """
-    if not NAME.fullmatch(name) or len(name) > LONGEST:
+    """Raise a `RequestError` for a name that no package can have, or that another plugin of the kind has."""
+    if not NAME.fullmatch(name) or len(name) > MAX_LENGTH:
         raise RequestError(
             f"'{name}' cannot be the name of a plugin: expected lower case letters and digits, in words joined by '-', "
-            f"a letter first, {LONGEST} characters at most, such as 'my-{kind}'"
+            f"a letter first, {MAX_LENGTH} characters at most, such as 'my-{kind}'"
         )
-    if name in TAKEN:
+    if name in RESERVED:
         raise RequestError(f"'{name}' cannot be the name of a plugin: vibench itself has a package of that name")
     title = WORDS[kind]
-    if name in registry.names(title):
-        raise RequestError(
-            f"there is a {title} '{name}' already, in {registry.version(title, name)}; choose another name"
-        )
+    if name in names(title):
+        raise RequestError(f"there is a {title} '{name}' already, in {version(title, name)}; choose another name")
 
 
 def module_file(folder: Path, kind: str, name: str) -> Path:
-    """The module of a package that holds the plugin."""
+    """The module of a package that contains the plugin."""
     return folder / "src" / _package(name) / f"{MODULES[kind]}.py"
 
 
@@ -97,7 +81,7 @@ def _package(name: str) -> str:
 
 
 def _contents(kind: str, name: str) -> dict[str, str]:
-    """The files of a package by their path."""
+    """Texts of the files of a package by path."""
     package, module = _package(name), MODULES[kind]
     words = {
         "name": name,

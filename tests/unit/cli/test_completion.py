@@ -5,22 +5,24 @@ from __future__ import annotations
 import os
 import shlex
 import subprocess
+from importlib.metadata import EntryPoint
 from pathlib import Path
 from typing import Any
 
 import pytest
 import typer
-from running import Main, Register
+from running import Main
 
 from vibench.cli import completion
-from vibench.cli import main as main_module
+from vibench.cli.main import app
+from vibench.cli.plugin_commands import LISTS
 from vibench.qp.settings import SETTINGS
 from vibench.results import tables
 from vibench.results.columns import TABLES
 from vibench.results.database import FILE
 from vibench.study import registry
 
-GROUP: Any = typer.main.get_command(main_module.app)
+GROUP: Any = typer.main.get_command(app)
 
 
 def completed(line: str) -> list[str]:
@@ -43,6 +45,7 @@ def completed(line: str) -> list[str]:
         ("vibench run quick --dual ", registry.names("dual strategy")),
         ("vibench run quick --primal o", ["offline-pga", "online-supremizers"]),
         ("vibench run quick --solver ", sorted(SETTINGS)),
+        ("vibench check o", ["obstacle", "offline-pga", "online-supremizers", "orthant"]),
         ("vibench list s", ["solvers", "studies"]),
         ("vibench show quick --table th", ["thresholds"]),
         ("vibench show quick --table s", ["summary"]),
@@ -53,7 +56,7 @@ def test_values_are_completed_with_what_there_is(line: str, words: list[str]) ->
 
 
 def test_the_lists_and_tables_offered_are_all_there_are() -> None:
-    assert set(completion.lists("")) == {*main_module.LISTS, "solvers"}
+    assert set(completion.lists("")) == {*LISTS, "solvers"}
     assert set(completion.table_names("")) == {"summary", "benefits", *TABLES}
 
 
@@ -92,9 +95,11 @@ class TestFiles:
         assert completed("vibench replay broken ") == []
 
 
-def test_a_name_that_two_packages_register_spoils_no_prompt(register: Register) -> None:
-    register(("vibench.problems", "mine", "one:Problem"), ("vibench.problems", "mine", "other:Problem"))
-    assert completed("vibench run quick --problem ") == []
+def test_a_name_that_two_packages_register_is_completed_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The command then refuses it and names both packages; a prompt is no place for that."""
+    both = [EntryPoint("mine", f"{module}:Problem", "vibench.problems") for module in ("one", "other")]
+    monkeypatch.setattr("importlib.metadata.entry_points", lambda *, group: both if group == both[0].group else [])
+    assert completed("vibench run quick --problem ") == ["mine"]
 
 
 def test_the_installed_command_completes_for_bash(command: str, tmp_path: Path) -> None:

@@ -121,7 +121,7 @@ def test_every_plugin_that_does_not_load_has_a_line_with_the_reason(register: Re
         ("vibench.studies", "wrong", "test_doctor:WRONG"),
     )
     globals()["WRONG"] = tmp_path / "wrong.toml"
-    found = by_subject(list(doctor.registered()))
+    found = by_subject(list(doctor.plugins()))
     assert found["problem"] == Finding("problem", "fine")
     broken = {subject: finding.found for subject, finding in found.items() if finding.health is Health.BROKEN}
     assert set(broken) == {"problem 'gone'", "problem 'no-problem'", "study 'wrong'"}
@@ -132,7 +132,7 @@ def test_every_plugin_that_does_not_load_has_a_line_with_the_reason(register: Re
 
 def test_a_name_that_two_packages_register_is_broken_and_stops_nothing(register: Register) -> None:
     register(("vibench.qp_solvers", "mine", "one:solve"), ("vibench.qp_solvers", "mine", "other:solve"))
-    found = by_subject(list(doctor.registered()))
+    found = by_subject(list(doctor.plugins()))
     assert found["QP solver"].health is Health.BROKEN
     assert "two packages" in found["QP solver"].found
     assert "problem" in found
@@ -167,8 +167,8 @@ class TestDisk:
         monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path / "cache"))
         Store(default_folder()).put("pod-1", "x" * 2**20, NO_TIME, ())
         found = by_subject(list(doctor.disk(tmp_path)))
-        assert found["kept"].found.startswith("1 artefacts, 1.0 MiB")
-        assert CACHE_VARIABLE in found["place of artefacts"].found
+        assert found["stored"].found.startswith("1 artefacts, 1.0 MiB")
+        assert CACHE_VARIABLE in found["artefact folder"].found
         assert str(tmp_path / "cache" / "artefacts") in found["artefacts"].found
 
 
@@ -180,7 +180,7 @@ class TestTimings:
     def test_load_and_an_unsteady_calculation_are_doubts(
         self, others: float, slowdown: float, doubts: list[str], monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        monkeypatch.setattr(doctor, "_busy", iter([100.0, 101.0 + others]).__next__)
+        monkeypatch.setattr(doctor, "_busy_seconds", iter([100.0, 101.0 + others]).__next__)
         monkeypatch.setattr(doctor, "Stopwatch", _SecondOfWork)
         monkeypatch.setattr("os.cpu_count", lambda: 2)
         monkeypatch.setattr(doctor.Calibration, "slowdown", lambda _: slowdown)
@@ -190,13 +190,13 @@ class TestTimings:
         assert ("can be trusted" in found["verdict"].found) is not bool(doubts)
 
     def test_the_machine_that_works_is_seen_to_work(self) -> None:
-        before = doctor._busy()
+        before = doctor._busy_seconds()
         if before == 0.0:
             pytest.skip("the system does not tell")
         watch = Stopwatch()
         while watch.seconds().cpu < 0.1:
             pass
-        assert doctor._busy() - before >= 0.05
+        assert doctor._busy_seconds() - before >= 0.05
 
 
 class _SecondOfWork:

@@ -1,4 +1,4 @@
-"""Solvers on the small program: who solves it, who does not, and who takes the process along."""
+"""QP solvers on the small program: accurate, wrong, failing, hanging, and ending their process."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from vibench.cli.solver_check import ACCURACY, UNKNOWNS, attempt, attempts, program
+from vibench.cli.solver_check import ACCURACY, UNKNOWNS, attempts, program
 from vibench.qp.solve import installed_solvers, solve_qp
 from vibench.qp.status import Status
 from vibench.study import registry
@@ -56,14 +56,15 @@ def test_what_goes_wrong_is_said_and_costs_nobody_else_a_trial() -> None:
 
 @pytest.mark.usefixtures("_fakes")
 def test_a_solver_that_hangs_is_stopped() -> None:
-    trial = attempts(["hangs"], seconds=1.0)["hangs"]
-    assert (trial.status, trial.residual) == (Status.TIMEOUT, None)
-    assert "1 s" in trial.reason
+    found = attempts(["hangs", "piqp"], seconds=1.0)
+    assert (found["hangs"].status, found["hangs"].residual) == (Status.TIMEOUT, None)
+    assert "1 s" in found["hangs"].reason
+    assert found["piqp"].status is Status.OK
 
 
 @pytest.mark.usefixtures("_fakes")
 def test_a_wrong_answer_is_not_believed() -> None:
-    trial = attempt("wrong")
+    trial = attempts(["wrong"])["wrong"]
     assert trial.status is Status.INACCURATE
     assert trial.residual is not None
     assert trial.residual > ACCURACY

@@ -1,0 +1,48 @@
+"""Help imports none of the libraries that take most of the time to start, and completion of names none but pydantic."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+
+import pytest
+
+from vibench.cli.main import COMMANDS
+
+HEAVY = {"numpy", "scipy", "pandas", "matplotlib", "pydantic", "qpsolvers", "rich", "skfem", "vibench_problems"}
+
+
+def imported(command: str, *arguments: str, **environment: str) -> tuple[set[str], str]:
+    """Top-level packages that a process of the installed command imports, and what it prints."""
+    line = [sys.executable, "-X", "importtime", command, *arguments]
+    done = subprocess.run(line, env=os.environ | environment, capture_output=True, text=True, check=True)
+    lines = [line for line in done.stderr.splitlines() if line.startswith("import time:")]
+    return {line.rsplit("|", 1)[1].strip().split(".")[0] for line in lines}, done.stdout
+
+
+@pytest.mark.parametrize("name", ["", *COMMANDS])
+def test_help_imports_no_heavy_library(name: str, command: str) -> None:
+    found, printed = imported(command, *name.split(), "--help")
+    assert printed.startswith(f"Usage: vibench {name}".rstrip())
+    assert "vibench" in found
+    assert found & HEAVY == set()
+
+
+@pytest.mark.parametrize(
+    ("line", "word"),
+    [
+        ("vibench r", "replay"),
+        ("vibench run paper-", "paper-hertz"),
+        ("vibench run --dual ", "mcpg"),
+        ("vibench check ", "obstacle"),
+        ("vibench list ", "solvers"),
+        ("vibench show quick --table ", "histories"),
+    ],
+)
+def test_completion_imports_no_heavy_library(line: str, word: str, command: str) -> None:
+    words = {"COMP_WORDS": line, "COMP_CWORD": str(line.count(" "))}
+    found, printed = imported(command, _VIBENCH_COMPLETE="complete_bash", **words)
+    assert word in printed.split()
+    assert "vibench" in found
+    assert found & (HEAVY - {"pydantic"}) == set()  # typer itself checks the words before with pydantic
