@@ -19,6 +19,7 @@ from pathlib import Path
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from running import assert_same_numbers
+
 from vibench.stages.artefacts import CACHE_VARIABLE
 
 WAYS = {

@@ -1,0 +1,49 @@
+"""The map of the code in CONTRIBUTING is that of the code."""
+
+from __future__ import annotations
+
+import importlib
+import re
+import tomllib
+from pathlib import Path
+
+import vibench
+
+ROOT = Path(__file__).parents[2]
+TEXT = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
+ROOMS = re.findall(r"^    (\w+)/ ", TEXT, re.MULTILINE)
+WALK = re.findall(r"^\d\. `vibench\.([\w.]+)`", TEXT, re.MULTILINE)
+LAYERS = [
+    name.strip()
+    for layer in tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["importlinter"]["contracts"][0]["layers"]
+    for name in layer.split("|")
+]
+
+
+def test_the_map_names_every_room_in_the_order_of_the_layers() -> None:
+    package = Path(str(vibench.__file__)).parent
+    assert set(ROOMS) == {path.parent.name for path in package.glob("*/__init__.py")}
+    assert [layer for layer in LAYERS if layer in ROOMS] == ROOMS
+
+
+def test_the_walk_from_a_study_to_a_row_leads_through_eight_modules_each_once_and_downwards() -> None:
+    modules, places = [], []
+    for name in WALK:
+        parts = name.split(".")
+        depth = next(k for k in (3, 2) if (ROOT / "vibench" / ("/".join(parts[:k]) + ".py")).is_file())
+        found = importlib.import_module("vibench." + ".".join(parts[:depth]))
+        modules.append(found.__name__)
+        for part in parts[depth:]:
+            found = getattr(found, part)
+        assert callable(found), name
+        places.append(LAYERS.index(parts[0]))
+    assert len(modules) == len(set(modules)) == 8
+    assert places == sorted(places)
+
+
+def test_no_room_has_more_than_fourteen_entries_and_each_says_what_it_is_for() -> None:
+    package = Path(str(vibench.__file__)).parent
+    for folder in {path.parent for path in package.glob("*/**/*.py")} - {package}:
+        assert len([path for path in folder.iterdir() if path.name != "__pycache__"]) <= 14, folder
+        text = (folder / "__init__.py").read_text(encoding="utf-8")
+        assert re.match(r'"""[A-Z].+?\.', text, re.DOTALL), folder
