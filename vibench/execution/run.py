@@ -16,7 +16,7 @@ from vibench.errors import ExecutorError, RequestError, StorageError, VibenchErr
 from vibench.execution.dask import Dask
 from vibench.execution.executors import Executor, Local
 from vibench.execution.graph import Graph
-from vibench.execution.recorder import Recorder
+from vibench.execution.result_writer import ResultWriter
 from vibench.execution.row_keys import labels_of
 from vibench.execution.supervisor import Job
 from vibench.qp.solve import installed_solvers
@@ -148,7 +148,7 @@ def run_study(study: Study, folder: Path, observer: Observer, options: Options =
         try:
             finished = database.finished()
             todo = [cell for cell in cells if _to_do(cell, finished, options.retry)]
-            run = _Run(study, folder, store, Recorder(study, database, labels_of(cells)), observer, options)
+            run = _Run(study, folder, store, ResultWriter(study, database, labels_of(cells)), observer, options)
             interrupted = run.execute(todo, len(cells))
             everything = database.rows("cells")
             database.replace("thresholds", break_even_rows(everything))
@@ -189,7 +189,7 @@ class _Run:
     study: Study
     folder: Path
     store: Store
-    recorder: Recorder
+    writer: ResultWriter
     observer: Observer
     options: Options
     graph: Graph = field(default_factory=Graph)
@@ -241,7 +241,7 @@ class _Run:
         artefact = self.store.get(stage.key)
         if artefact is None or artefact.machine not in machines:
             return False
-        self.recorder.stage(stage, artefact.histories, self.store)
+        self.writer.stage(stage, artefact.histories, self.store)
         return True
 
     def _loop(self, workers: Executor) -> None:
@@ -264,21 +264,21 @@ class _Run:
         """Record the end of a stage; one that failed gives a row to every cell that needs it."""
         if isinstance(outcome, Failed):
             reason = outcome.reason if stage.key in self.cells else f"in {stage.label}: {outcome.reason}"
-            self.recorder.failure(stage, outcome.reason)
+            self.writer.failure(stage, outcome.reason)
             for goal in self.graph.lost(stage):
                 for cell in self.cells.get(goal.key, ()):
                     self._fail_cell(cell, Failed(outcome.status, reason))
             return
         self.observer.stage(stage, outcome.wall)
         if stage.stored:
-            self.recorder.stage(stage, outcome.histories, self.store)
+            self.writer.stage(stage, outcome.histories, self.store)
         for cell in self.cells.get(stage.key, ()):
-            self.observer.cell(cell, self.recorder.cell(cell, outcome.value))
+            self.observer.cell(cell, self.writer.cell(cell, outcome.value))
         self.graph.done(stage)
 
     def _fail_cell(self, cell: Cell, failed: Failed) -> None:
         row = {"status": failed.status.value, "reason": failed.reason, "queries": cell.validation, "queries_ok": 0}
-        self.observer.cell(cell, self.recorder.cell(cell, CellRows(row, ())))
+        self.observer.cell(cell, self.writer.cell(cell, CellRows(row, ())))
 
 
 def unavailable(cell: Cell) -> str:

@@ -65,7 +65,7 @@ class Unstored:
 class Stage(ABC):
     """One stage of a computation; subclasses are frozen dataclasses of what determines the result.
 
-    The runner, the recorder and the progress display treat all stages alike: a stage says itself how it is called,
+    The runner, the result writer and the progress display treat all stages alike: a stage says itself how it is called,
     which axes of the study it belongs to and what of it is recorded.
     """
 

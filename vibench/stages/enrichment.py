@@ -64,9 +64,12 @@ class GrowthStage(Stage):
         """An `AssessedGrowth`."""
         offline = _offline(store, self.pod, self.cone)
         grown = grow_through(self.primal.create(), offline, self.tolerances)
-        images, size = _images(offline, grown.vectors, value_of(store, self.cone.constraints)), offline.basis.shape[1]
-        training = {tolerance: images.first(size + m.count).beta_span() for tolerance, m in grown.milestones.items()}
-        return Result(AssessedGrowth(grown, images.over_steps(size), training))
+        projected, size = (
+            _projected(offline, grown.vectors, value_of(store, self.cone.constraints)),
+            offline.basis.shape[1],
+        )
+        training = {tolerance: projected.first(size + m.count).beta_span() for tolerance, m in grown.milestones.items()}
+        return Result(AssessedGrowth(grown, projected.over_steps(size), training))
 
     def model(self, store: Store) -> ReducedModel:
         """The reduced model with all vectors."""
@@ -130,9 +133,9 @@ class SingleEnrichment(EnrichmentStage):
         check_enrichment(enrichment, offline.problem.V, offline.basis)
         known = dict(enrichment.history)
         if enrichment.vectors is not None:
-            images = _images(offline, enrichment.vectors, value_of(store, self.cone.constraints))
-            known |= {"beta_span_min": images.over_steps(offline.basis.shape[1])}
-            known |= {"beta_span_training": images.beta_span()}
+            projected = _projected(offline, enrichment.vectors, value_of(store, self.cone.constraints))
+            known |= {"beta_span_min": projected.over_steps(offline.basis.shape[1])}
+            known |= {"beta_span_training": projected.beta_span()}
             known |= {"beta_full_span_training": value_of(store, self.reachable)}
         return Result(enrichment, seconds, _histories(known))
 
@@ -200,7 +203,7 @@ def _offline(store: Store, pod: PODStage, cone: ConeStage) -> Offline:
     return Offline(problem, basis, reduced.cone, reduced.prepared.span, training_parameters(problem))
 
 
-def _images(offline: Offline, vectors: Array, classes: ConstraintClasses) -> ProjectedSupremizers:
+def _projected(offline: Offline, vectors: Array, classes: ConstraintClasses) -> ProjectedSupremizers:
     """ZᵀBᵀη of V_N and vectors (n×S) for every class of the training set, η orthonormal in span χ."""
     Z = np.hstack([offline.basis, vectors])
     return ProjectedSupremizers([projected_supremizers(Z, B, offline.span) for B in classes.representatives], classes)

@@ -18,7 +18,7 @@ from vibench.study.spec import Study
 
 
 @dataclass(frozen=True)
-class Recorder:
+class ResultWriter:
     """Writes what the stages of a study give; `labels` are what its plugins are called."""
 
     study: Study
