@@ -64,10 +64,8 @@ class GrowthStage(Stage):
         """An `AssessedGrowth`."""
         offline = _offline(store, self.pod, self.cone)
         grown = grow_through(self.primal.create(), offline, self.tolerances)
-        projected, size = (
-            _projected(offline, grown.vectors, value_of(store, self.cone.constraints)),
-            offline.basis.shape[1],
-        )
+        projected = _projected(offline, grown.vectors, value_of(store, self.cone.constraints))
+        size = offline.basis.shape[1]
         training = {tolerance: projected.first(size + m.count).beta_span() for tolerance, m in grown.milestones.items()}
         return Result(AssessedGrowth(grown, projected.over_steps(size), training))
 
