@@ -188,34 +188,22 @@ class _Queries(Pieces):
         return CellRows(found | self._sizes() | self._offline(), tuple(rows), tuple(solutions.values()))
 
     def _assess(self, solutions: Mapping[int, Row]) -> list[Row]:
-        """Error columns of some queries, all at once.
-
-        Where that fails it is done one by one, and the rows for which it fails say so.
-        """
-        try:
-            return self._errors(solutions)
-        except MemoryError:
-            raise
-        except Exception:  # noqa: BLE001  one query may be the cause; which one is found out below
-            return [row for k, solution in solutions.items() for row in self._assess_one(k, solution)]
-
-    def _assess_one(self, number: int, solution: Row) -> list[Row]:
-        try:
-            return self._errors({number: solution})
-        except MemoryError:
-            raise
-        except Exception as error:  # noqa: BLE001  the row says what
-            return [{"status": Status.ERROR.value, "reason": f"in the assessment: {in_a_line(error)}"}]
-
-    def _errors(self, solutions: Mapping[int, Row]) -> list[Row]:
+        """Error columns of some queries, all at once; where that fails, one by one, and a row says why it failed."""
         numbers, reference = list(solutions), self._reference
-        return error_columns(
-            self._model,
-            reference.mu[numbers],
-            [vectors(solution) for solution in solutions.values()],
-            Reference(reference.u, reference.lam, *self._floors).at(numbers),
-            [self._stability[k] for k in numbers],
-        )
+        try:
+            return error_columns(
+                self._model,
+                reference.mu[numbers],
+                [vectors(solution) for solution in solutions.values()],
+                Reference(reference.u, reference.lam, *self._floors).at(numbers),
+                [self._stability[k] for k in numbers],
+            )
+        except MemoryError:
+            raise
+        except Exception as error:  # noqa: BLE001  whatever it is, it may concern one query alone
+            if len(numbers) > 1:
+                return [row for k in numbers for row in self._assess({k: solutions[k]})]
+            return [{"status": Status.ERROR.value, "reason": f"in the assessment: {in_a_line(error)}"}]
 
     def _known(self, number: int) -> Row:
         """The columns of a query that are known before it is solved: its parameter and the inf-sup constants there."""
