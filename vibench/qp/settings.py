@@ -43,7 +43,8 @@ class SolverSettings:
 
     def at(self, accuracy: float) -> dict[str, Any]:
         """Keyword arguments for a relative accuracy."""
-        return {name: max(factor * accuracy, self.smallest) for name, factor in self.tolerances.items()} | self.fixed
+        scaled = {name: max(factor * accuracy, self.smallest) for name, factor in self.tolerances.items()}
+        return {**scaled, **self.fixed}
 
     def report(self, solution: Any) -> tuple[str, int | None]:
         """Status as the solver reports it, and its number of iterations."""

@@ -106,8 +106,7 @@ def infeasibility_certificate(program: VariationalInequality, tolerance: float =
         return None
     rows = row_norms(program.B)
     system = np.vstack([(program.B / rows[:, None]).T, program.g / rows / size(program.g / rows)])
-    target = np.zeros(system.shape[0])
-    target[-1] = -1.0
+    target = np.append(np.zeros(len(system) - 1), -1.0)
     try:
         alpha, distance = nnls(system, target, maxiter=30 * system.shape[1])
     except RuntimeError:  # nnls did not converge, which certifies nothing
