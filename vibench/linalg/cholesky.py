@@ -154,7 +154,7 @@ def _scale_rows(factors: Array, values: Array) -> Array:
 
 
 def elimination_order(matrix: SparseMatrix, last: Indices) -> Indices:
-    """Elimination order (n,) of an SPD matrix (n×n) with little fill-in (minimum degree) that ends with `last`."""
+    """Elimination order (n,) of an SPD matrix (n×n) with little fill-in: minimum degree, then `last` in its order."""
     matrix = sp.csc_array(matrix)
     rest = np.setdiff1d(np.arange(matrix.shape[0]), last)
     if not len(rest):

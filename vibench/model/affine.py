@@ -83,7 +83,8 @@ def _assembled(problem: Problem, training: Array, names: Sequence[str]) -> Mappi
         if set(names) <= {"B", "g"}:
             values = dict(zip(("B", "g"), problem.constraint(mu), strict=True))
         else:
-            values = vars(checked_assembly(problem, mu))
+            vi = checked_assembly(problem, mu)
+            values = {name: getattr(vi, name) for name in names}
         for name in names:
             found[name].append(values[name])
     return found

@@ -72,14 +72,14 @@ def _primal_start(x: Array, _: Array) -> dict[str, Any]:
     return {"initvals": x}
 
 
-_RELATIVE_TOO = {"eps_abs": 0.1, "eps_rel": 0.1}
+_EPS = {"eps_abs": 0.1, "eps_rel": 0.1}
 _DUALITY_GAP = {"eps_duality_gap_abs": 1e-3, "eps_duality_gap_rel": 0.1}
 _CONIC = {"abstol": 0.1, "reltol": 0.1, "feastol": 0.1}
 
 
 SETTINGS: Mapping[str, SolverSettings] = {
     "piqp": SolverSettings(
-        _RELATIVE_TOO | _DUALITY_GAP, {"max_iter": 500, "check_duality_gap": True}, "info.status", "info.iter"
+        _EPS | _DUALITY_GAP, {"max_iter": 500, "check_duality_gap": True}, "info.status", "info.iter"
     ),
     "proxqp": SolverSettings(
         {"eps_abs": 0.1} | _DUALITY_GAP,
@@ -97,7 +97,7 @@ SETTINGS: Mapping[str, SolverSettings] = {
     ),
     "quadprog": SolverSettings({}, iterations="iterations"),
     "highs": SolverSettings({"primal_feasibility_tolerance": 0.1, "dual_feasibility_tolerance": 0.1}, smallest=1e-10),
-    "scs": SolverSettings(_RELATIVE_TOO, {"max_iters": 20_000}),
+    "scs": SolverSettings(_EPS, {"max_iters": 20_000}),
     "cvxopt": SolverSettings(_CONIC, iterations="iterations"),
     "ecos": SolverSettings(_CONIC),
 }

@@ -66,7 +66,8 @@ def _residuals_and_scales(program: VariationalInequality, x: Array, alpha: Array
     A, f, B, g = program.A, program.f, program.B, program.g
     norms, Ax, force = row_norms(B), A @ x, B.T @ alpha
     energy, work, bound, curvature = float(x @ Ax), float(f @ x), float(g @ alpha), float(f @ (A @ f))
-    descent = 0.5 * float(f @ f) ** 2 / curvature if curvature > 0.0 else 0.0  # by the best multiple of f
+    # gained by the best multiple of f, a lower bound on the energy gained by A⁻¹f
+    descent = 0.5 * float(f @ f) ** 2 / curvature if curvature > 0.0 else 0.0
     scale = Scales(
         primal=max(1.0, peak(g / norms)),
         dual=max(peak(Ax), peak(f), peak(force)),
