@@ -97,12 +97,7 @@ class HighFidelitySolver:
     def check_coercive(self, mu: Array, vi: VariationalInequality) -> None:
         """Refuse a stiffness that is not symmetric positive definite.
 
-        Parameters
-        ----------
-        mu
-            Parameter (d,).
-        vi
-            The variational inequality solved last, whose factorisation is reused.
+        The factorisation is reused: `vi` has to be the variational inequality solved last, at mu (d,).
 
         Raises
         ------
@@ -121,15 +116,11 @@ class HighFidelitySolver:
         return self._active[int(np.argmin(distances))]
 
     def _condensed(self, vi: VariationalInequality) -> CondensedStiffness:
-        undeclared = np.zeros(vi.A.shape[0], dtype=bool)
-        undeclared[sp.csr_array(vi.B).indices] = True
-        undeclared[self._constrained] = False
-        outside = np.flatnonzero(undeclared)
-        if len(outside) and self._problem.contact_dofs is not None:
-            raise NumericalError(
-                f"B touches {len(outside)} unknowns outside the declared contact_dofs, the first is {outside[0]}"
-            )
+        outside = np.setdiff1d(sp.csr_array(vi.B).indices, self._constrained)
         if len(outside):
+            if self._problem.contact_dofs is not None:
+                found = f"{len(outside)} unknowns outside the declared contact_dofs, the first is {outside[0]}"
+                raise NumericalError(f"B touches {found}")
             self._constrained, self._pattern = np.union1d(self._constrained, outside), None
         if self._pattern is None:
             self._pattern, self._stiffness = EliminationPattern.of(vi.A, self._constrained), None

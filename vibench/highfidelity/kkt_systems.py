@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 import scipy.linalg
@@ -28,6 +28,10 @@ ROUND_OFF = 1e-12
 """Entries of a bordered system below this, relative to their terms, may consist of round-off alone."""
 
 
+ActiveSolver = Callable[[Indices], tuple[Array, Array]]
+"""From the active constraints to u (c,) and λ (m,): these are equalities, all other multipliers vanish."""
+
+
 class CondensedStiffness:
     """A stiffness matrix A, condensed on the unknowns that constraints involve.
 
@@ -48,14 +52,9 @@ class CondensedStiffness:
         self._condensed = StaticCondensation(A, self._pattern, reused=reused)
 
     def check_definite(self, name: str) -> None:
-        """Refuse an A that is not positive definite.
+        """Raise a `NumericalError` that calls A by `name` if A is not positive definite.
 
         The elimination has factorised one block; A is definite exactly where the Schur complement is, too.
-
-        Raises
-        ------
-        NumericalError
-            Calling A by `name`.
         """
         if self._condensed.dense:
             self._compliance  # noqa: B018  its Cholesky factorisation fails otherwise
@@ -81,30 +80,20 @@ class CondensedStiffness:
             if condensed.dense
             else SaddlePointSolver(condensed.schur, load, B, vi.g)
         )
-        return ActiveSetSystem(
-            B, vi.g, solve_active, lambda u: condensed.recover(u, particular), condensed.correct_eliminated
-        )
+        recover = partial(condensed.recover, particular=particular)
+        return ActiveSetSystem(B, vi.g, solve_active, recover, condensed.correct_eliminated)
 
 
 @dataclass(frozen=True)
 class ActiveSetSystem:
-    """The variational inequality of one parameter in the c retained unknowns.
+    """The variational inequality of one parameter in the c retained unknowns: B sparse (m×c), g (m,).
 
-    Attributes
-    ----------
-    B, g
-        Constraints, B sparse (m×c).
-    solve_active
-        From the active constraints to u (c,) and λ (m,): these are equalities, all other multipliers vanish.
-    recover
-        All unknowns (n,) from the retained ones (c,).
-    correct_eliminated
-        Correction (n,) of the eliminated unknowns that restores their equilibrium, from a residual (n,).
+    `recover` and `correct_eliminated` are those of `StaticCondensation`, the first one at this load.
     """
 
     B: SparseMatrix
     g: Array
-    solve_active: Callable[[Indices], tuple[Array, Array]]
+    solve_active: ActiveSolver
     recover: Callable[[Array], Array]
     correct_eliminated: Callable[[Array], Array]
 
@@ -232,9 +221,7 @@ def _regular(schur: Array, sizes: Array) -> bool:
     return bool(np.linalg.cond(schur / np.outer(scale, scale)) < 1.0 / np.sqrt(ROUND_OFF))
 
 
-def _compliance_solver(
-    compliance: Array, f: Array, B: SparseMatrix, g: Array
-) -> Callable[[Indices], tuple[Array, Array]]:
+def _compliance_solver(compliance: Array, f: Array, B: SparseMatrix, g: Array) -> ActiveSolver:
     """Solutions for active sets through their dense compliance B_a Ŝ⁻¹B_aᵀ; multipliers are refined once."""
     unconstrained = compliance @ f
     excess = B @ unconstrained - g

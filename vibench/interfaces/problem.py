@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
@@ -71,20 +71,12 @@ class VariationalInequality:
     f: Array
     B: SparseMatrix
     g: Array
-    lift: Array | None = field(default=None)
+    lift: Array | None = None
 
 
 @dataclass(frozen=True)
 class Contact:
-    """The constraint B u ≤ g on the contact unknowns.
-
-    Attributes
-    ----------
-    B
-        Sparse (m×k), a column for each of the problem's `contact_dofs`.
-    g
-        Bound (m,).
-    """
+    """The constraint B u ≤ g: B sparse (m×k), a column for each of the problem's `contact_dofs`, and g (m,)."""
 
     B: SparseMatrix
     g: Array
@@ -171,15 +163,8 @@ class Problem(ABC):
     def sampler(self, wanted: Mapping[str, tuple[Indices, Indices]]) -> Sampler:
         """Function that evaluates chosen entries of the members in `entrywise`, at the cost of these entries alone.
 
-        Parameters
-        ----------
-        wanted
-            Rows and columns (k,) by member; columns are zero for the vectors f and g.
-
-        Returns
-        -------
-        callable
-            From mu (d,) to the values (k,) by member.
+        It maps mu (d,) to the values (k,) by member. `wanted` has their rows and columns (k,) by member; columns are
+        zero for the vectors f and g.
         """
         raise NotImplementedError(f"{type(self).__name__} declares {sorted(self.entrywise)} and has no sampler")
 

@@ -40,8 +40,7 @@ class Stop:
 
     def first_reached(self, errors: Array) -> int | None:
         """Smallest k at which `errors[k]`, the error with k vectors, meets the criterion; `None` if there is none."""
-        reached = [k for k, error in enumerate(errors) if self.reached(k, float(error))]
-        return reached[0] if reached else None
+        return next((k for k, error in enumerate(errors) if self.reached(k, float(error))), None)
 
     def __str__(self) -> str:
         return f"tolerance {self.tolerance:g}" if self.tolerance is not None else f"size {self.size}"

@@ -1,4 +1,4 @@
-"""Validation of what plugins return; every message names the fault and the expected value."""
+"""Validation of what plugins return: each fault raises a `NumericalError` that names it and the expected value."""
 
 from __future__ import annotations
 
@@ -64,13 +64,7 @@ def _matrix(name: str, value: object, rows: int) -> Array:
 
 
 def training_parameters(problem: Problem) -> Array:
-    """The training set (P×d); refused if it is empty, has the wrong shape or is not finite.
-
-    Raises
-    ------
-    NumericalError
-        Naming the fault and the expected value.
-    """
+    """The training set (P×d); refused if it is empty, has the wrong shape or is not finite."""
     return _checked(problem, "training_set", np.asarray(problem.training_set(), float), None)
 
 
@@ -100,10 +94,8 @@ def checked_assembly(problem: Problem, mu: Array) -> VariationalInequality:
     n, m = problem.V.dim, problem.W.dim
     for name, value, shape in (("A", vi.A, (n, n)), ("f", vi.f, (n,)), ("B", vi.B, (m, n)), ("g", vi.g, (m,))):
         if value.shape != shape:
-            raise NumericalError(
-                f"{name} has shape {value.shape} at mu = {mu.tolist()}; the spaces V and W require {shape}"
-            )
-        entries = value if isinstance(value, np.ndarray) else value.data
-        if not np.all(np.isfinite(entries)):
+            found = f"shape {value.shape} at mu = {mu.tolist()}"
+            raise NumericalError(f"{name} has {found}; the spaces V and W require {shape}")
+        if not np.all(np.isfinite(value if isinstance(value, np.ndarray) else value.data)):
             raise NumericalError(f"{name} has entries that are not finite at mu = {mu.tolist()}")
     return vi

@@ -87,7 +87,7 @@ class SparseCholesky:
         first = sp.csc_array(self._lower[:, :split])
         corner, coupling = sp.csc_array(first[:split]), sp.csc_array(first[split:])
         corner.sort_indices()
-        return corner.T, coupling.T, np.asfortranarray(self.trailing_factor(len(self._root) - split))
+        return corner.T, coupling.T, np.asfortranarray(self.trailing_factor())
 
     def solve(self, right: Array) -> Array:
         """X⁻¹ r for right-hand sides (n,) or (n, k)."""
@@ -143,14 +143,10 @@ class SparseCholesky:
             return permuted
         return _scale_rows(1.0 / self._root, spsolve_triangular(self._lower, permuted, lower=True, unit_diagonal=True))
 
-    def trailing_factor(self, count: int) -> Array:
-        """The trailing block F_cc (count×count) of F in elimination order.
-
-        F_ccᵀF_cc is the Schur complement of X on the last `count` unknowns c.
-        """
-        first = len(self._root) - count
-        block = sp.csc_array(self._lu.L)[:, first:][first:].toarray()
-        return np.asarray((block * self._root[first:]).T)
+    def trailing_factor(self) -> Array:
+        """The trailing block F_cc of F on the last `dense` unknowns c; F_ccᵀF_cc is the Schur complement of X on c."""
+        block = sp.csc_array(self._lu.L)[:, self._split :][self._split :].toarray()
+        return np.asarray((block * self._root[self._split :]).T)
 
 
 def _scale_rows(factors: Array, values: Array) -> Array:
@@ -158,15 +154,7 @@ def _scale_rows(factors: Array, values: Array) -> Array:
 
 
 def elimination_order(matrix: SparseMatrix, last: Indices) -> Indices:
-    """Elimination order with little fill-in (minimum degree) in which some unknowns come last, in their given order.
-
-    Parameters
-    ----------
-    matrix
-        A symmetric positive definite matrix (n×n) with the sparsity pattern.
-    last
-        Unknowns to eliminate last.
-    """
+    """Elimination order (n,) of an SPD matrix (n×n) with little fill-in: minimum degree, then `last` in its order."""
     matrix = sp.csc_array(matrix)
     rest = np.setdiff1d(np.arange(matrix.shape[0]), last)
     if not len(rest):

@@ -35,12 +35,7 @@ def orthonormal_range(y: Array, against: Array | None = None) -> Array:
     """Euclidean orthonormal basis of the columns of y (n×k), with orthonormal columns `against` (n×l) projected out.
 
     Rank-revealing (pivoted QR). The threshold is relative to the norm of each column before `against` is projected out:
-    a short column is not mistaken for a dependent one.
-
-    Returns
-    -------
-    Array
-        (n×r), r the numerical rank at `RANK_RTOL`.
+    a short column is not mistaken for a dependent one. The basis is (n×r), r the numerical rank at `RANK_RTOL`.
     """
     norms = np.linalg.norm(y, axis=0)
     y = y[:, norms > 0.0] / norms[norms > 0.0]

@@ -80,35 +80,16 @@ class InnerProduct:
         return self._factor.solve_factor_transposed(functional)
 
     def orthonormalise(self, u: Array, against: Array | None = None) -> Array:
-        """Orthonormal basis of span(u), or of its part orthogonal to a given orthonormal basis.
+        """Orthonormal basis (n×r) of span(u), u (n×k), or of its part orthogonal to orthonormal `against` (n×l).
 
-        Columns are scaled to unit norm, `against` is projected out twice, and the rank is revealed by a pivoted QR in
-        whitened coordinates; directions below `linalg.RANK_RTOL` of a unit vector are dropped.
-
-        Parameters
-        ----------
-        u
-            Vectors (n×k), possibly linearly dependent.
-        against
-            Orthonormal vectors (n×l) to be orthogonal to; `None` for none.
-
-        Returns
-        -------
-        Array
-            Orthonormal vectors (n×r), r ≤ k.
+        It is computed by `orthonormal_range` in whitened coordinates; r ≤ k is the numerical rank.
         """
         fixed = np.zeros((self.dim, 0)) if against is None else self.whiten(against)
         return self.unwhiten(orthonormal_range(self.whiten(u), fixed))
 
 
 def check_symmetric(matrix: SparseMatrix, name: str) -> None:
-    """Refuse a matrix that is not square, not finite or not symmetric up to round-off.
-
-    Raises
-    ------
-    NumericalError
-        Naming the matrix and the missing property.
-    """
+    """Raise a `NumericalError` if a matrix is not square, not finite or not symmetric up to round-off."""
     rows, columns = matrix.shape
     if rows != columns:
         raise NumericalError(f"{name} must be square, it is {rows}×{columns}")

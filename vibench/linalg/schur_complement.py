@@ -32,12 +32,12 @@ class EliminationPattern:
 
     @cached_property
     def factorised_block(self) -> PrincipalSubmatrix:
-        """The block of the eliminated unknowns and the interface, in elimination order."""
+        """Extracts the block of the eliminated unknowns and the interface, in elimination order."""
         return PrincipalSubmatrix(self.order)
 
     @cached_property
     def retained_block(self) -> PrincipalSubmatrix:
-        """The block of the retained unknowns."""
+        """Extracts the block of the retained unknowns."""
         return PrincipalSubmatrix(self.retained)
 
     @classmethod
@@ -99,7 +99,7 @@ class StaticCondensation:
         natural = np.arange(len(pattern.order))
         self._factor = SparseCholesky(pattern.factorised_block.of(A).T, "A", natural, count) if len(natural) else None
         self._eliminated = len(natural) - count
-        upper = self._factor.trailing_factor(count) if self._factor is not None else np.zeros((0, 0))
+        upper = self._factor.trailing_factor() if self._factor is not None else np.zeros((0, 0))
         self._interface_schur = upper.T @ upper
         self.dense = 2 * count > len(pattern.retained)
         self._retained_block = pattern.retained_block.of(A)
@@ -108,7 +108,13 @@ class StaticCondensation:
     @property
     def schur(self) -> SparseMatrix:
         """Schur complement Ŝ of the eliminated unknowns (c×c), sparse."""
-        return _with_block(sp.coo_array(self._retained_block), self._pattern.interface, self._interface_schur)
+        retained, interface = sp.coo_array(self._retained_block), self._pattern.interface
+        rows, columns = retained.coords
+        kept = ~(np.isin(rows, interface) & np.isin(columns, interface))
+        data = np.concatenate([retained.data[kept], self._interface_schur.ravel()])
+        rows = np.concatenate([rows[kept], np.repeat(interface, len(interface))])
+        columns = np.concatenate([columns[kept], np.tile(interface, len(interface))])
+        return sp.csc_array((data, (rows, columns)), shape=retained.shape)
 
     @property
     def dense_schur(self) -> Array:
@@ -121,58 +127,33 @@ class StaticCondensation:
         """The condensed load (c,) of f (n,), and the particular solution that `recover` needs."""
         if self._last_load is not None and np.array_equal(self._last_load[0], f):
             return self._last_load[1]
-        order, interface = self._pattern.order, self._pattern.interface
-        right = f[order]
-        right[self._eliminated :] = 0.0
-        particular = self._factor.solve(right) if self._factor is not None else right
+        interface, particular = self._pattern.interface, self._particular(f)
         condensed = f[self._pattern.retained]
         condensed[interface] += self._interface_schur @ particular[self._eliminated :]
         self._last_load = f, (condensed, particular)
         return self._last_load[1]
 
+    def _particular(self, f: Array) -> Array:
+        """A solution in elimination order of the equations of the eliminated unknowns."""
+        right = f[self._pattern.order]
+        right[self._eliminated :] = 0.0
+        return self._factor.solve(right) if self._factor is not None else right
+
     def recover(self, u_retained: Array, particular: Array) -> Array:
         """All unknowns (n,) from the retained ones (c,), with equilibrium in the eliminated ones."""
-        order, interface = self._pattern.order, self._pattern.interface
         u = np.empty(self._size)
         if self._factor is not None:
-            on_interface = u_retained[interface] - particular[self._eliminated :]
-            u[order] = particular + self._extension(self._factor, on_interface)
+            on_interface = u_retained[self._pattern.interface] - particular[self._eliminated :]
+            if self._reused:
+                extension = self._factor.extend(on_interface)
+            else:
+                right = np.zeros(len(particular))
+                right[self._eliminated :] = self._interface_schur @ on_interface
+                extension = self._factor.solve(right)
+            u[self._pattern.order] = particular + extension
         u[self._pattern.retained] = u_retained
         return u
 
     def correct_eliminated(self, residual: Array) -> Array:
         """Correction (n,) of the eliminated unknowns alone that restores their equilibrium, from a residual (n,)."""
-        order, correction = self._pattern.order, np.zeros(self._size)
-        if self._factor is not None:
-            right = residual[order]
-            right[self._eliminated :] = 0.0
-            particular = self._factor.solve(right)
-            inside = particular + self._extension(self._factor, -particular[self._eliminated :])
-            correction[order[: self._eliminated]] = inside[: self._eliminated]
-        return correction
-
-    def _extension(self, factor: SparseCholesky, interface: Array) -> Array:
-        """Unknowns in elimination order with given interface values and equilibrium in the eliminated ones."""
-        if self._reused:
-            return factor.extend(interface)
-        right = np.zeros(len(self._pattern.order))
-        right[self._eliminated :] = self._interface_schur @ interface
-        return factor.solve(right)
-
-
-def _with_block(matrix: SparseMatrix, where: Indices, block: Array) -> SparseMatrix:
-    """A sparse matrix (CSC) with the rows and columns `where` of it replaced by a dense block."""
-    inside = np.zeros(matrix.shape[0], dtype=bool)
-    inside[where] = True
-    rows, columns = matrix.coords
-    outside = ~(inside[rows] & inside[columns])
-    return sp.csc_array(
-        (
-            np.concatenate([matrix.data[outside], block.ravel()]),
-            (
-                np.concatenate([rows[outside], np.repeat(where, len(where))]),
-                np.concatenate([columns[outside], np.tile(where, len(where))]),
-            ),
-        ),
-        shape=matrix.shape,
-    )
+        return self.recover(np.zeros(len(self._pattern.retained)), self._particular(residual))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Any
 
@@ -11,7 +11,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from vibench.arrays import Array, Indices, SparseMatrix
-from vibench.interfaces.problem import MEMBERS, Problem, VariationalInequality
+from vibench.interfaces.problem import MEMBERS, Problem
 from vibench.interfaces.validation import checked_assembly
 from vibench.model.deim import interpolate
 
@@ -51,13 +51,10 @@ class AffineMember:
 
     way: Evaluation
     terms: tuple[Any, ...]
-    rows: Indices
-    columns: Indices
+    rows: Indices = field(default_factory=lambda: np.zeros(0, np.intp))
+    columns: Indices = field(default_factory=lambda: np.zeros(0, np.intp))
     error: float = 0.0
     reason: str = ""
-
-
-_NONE = np.zeros(0, dtype=np.intp)
 
 
 def affine_decomposition(problem: Problem, training: Array, tolerance: float) -> dict[str, AffineMember]:
@@ -66,31 +63,17 @@ def affine_decomposition(problem: Problem, training: Array, tolerance: float) ->
     Declared constants are not checked here; the others are assembled at all training parameters. Members that do not
     vary there are constants, too. Members that the problem evaluates entry by entry are interpolated where that takes
     few terms; a matrix that is one matrix times a function of mu takes one. Else B and g are left to `Problem.contact`,
-    if the problem has it.
-
-    Parameters
-    ----------
-    problem
-        The high-fidelity problem.
-    training
-        Parameters (P×d).
-    tolerance
-        Largest relative interpolation error.
+    if the problem has it. `training` is (P×d), `tolerance` the largest relative interpolation error.
     """
     first = checked_assembly(problem, training[0])
-    found = {name: constant(getattr(first, name)) for name in MEMBERS if name in problem.constant}
-    varying = [name for name in MEMBERS if name not in found]
-    if not varying:
-        return found
-    assembled = _assembled(problem, training, varying)
-    for name in varying:
-        found[name] = _member(name, assembled[name], problem, tolerance)
-    return {name: found[name] for name in MEMBERS}
-
-
-def constant(value: Any) -> AffineMember:
-    """A member that does not depend on the parameter."""
-    return AffineMember(Evaluation.CONSTANT, (value,), _NONE, _NONE)
+    varying = [name for name in MEMBERS if name not in problem.constant]
+    assembled = _assembled(problem, training, varying) if varying else {}
+    return {
+        name: _member(name, assembled[name], problem, tolerance)
+        if name in varying
+        else AffineMember(Evaluation.CONSTANT, (getattr(first, name),))
+        for name in MEMBERS
+    }
 
 
 def _assembled(problem: Problem, training: Array, names: Sequence[str]) -> Mapping[str, list[Any]]:
@@ -98,30 +81,30 @@ def _assembled(problem: Problem, training: Array, names: Sequence[str]) -> Mappi
     found: dict[str, list[Any]] = {name: [] for name in names}
     for mu in training:
         if set(names) <= {"B", "g"}:
-            B, g = problem.constraint(mu)
-            vi = VariationalInequality(A=None, f=g, B=B, g=g)  # A and f are never read
+            values = dict(zip(("B", "g"), problem.constraint(mu), strict=True))
         else:
             vi = checked_assembly(problem, mu)
+            values = {name: getattr(vi, name) for name in names}
         for name in names:
-            found[name].append(getattr(vi, name))
+            found[name].append(values[name])
     return found
 
 
 def _member(name: str, values: list[Any], problem: Problem, tolerance: float) -> AffineMember:
     entries = _Entries(values, symmetric=name == "A")
     if entries.constant:
-        return constant(values[0])
+        return AffineMember(Evaluation.CONSTANT, (values[0],))
     reason = f"{name} depends on mu and the problem does not evaluate it entry by entry"
     if name in problem.entrywise and len(values) > 1:
         found = interpolate(entries.values, tolerance)
         if len(found.points) <= max(1.0, MAX_TERMS_SHARE * len(values)):
             terms = tuple(entries.assembled(mode) for mode in found.modes.T)
-            rows, columns = entries.positions(found.points)
+            rows, columns = entries.rows[found.points], entries.columns[found.points]
             return AffineMember(Evaluation.INTERPOLATED, terms, rows, columns, found.error)
         reason = f"{name} depends on mu, and interpolation needs {len(found.points)} terms for {len(values)} parameters"
     if name in ("B", "g") and problem.has_contact:
-        return AffineMember(Evaluation.CONTACT, (), _NONE, _NONE)
-    return AffineMember(Evaluation.FULL, (), _NONE, _NONE, reason=reason)
+        return AffineMember(Evaluation.CONTACT, ())
+    return AffineMember(Evaluation.FULL, (), reason=reason)
 
 
 class _Entries:
@@ -132,7 +115,7 @@ class _Entries:
         self._vector = isinstance(values[0], np.ndarray)
         if self._vector:
             self.values = np.column_stack(values)
-            self._rows, self._columns = np.arange(len(self.values)), np.zeros(len(self.values), np.intp)
+            self.rows, self.columns = np.arange(len(self.values)), np.zeros(len(self.values), np.intp)
         else:
             self.values = self._of_matrices(values)
         spread = float(np.ptp(self.values, axis=1).max(initial=0.0))
@@ -144,7 +127,7 @@ class _Entries:
         width = self._shape[1]
         keys = [entry.coords[0].astype(np.int64) * width + entry.coords[1] for entry in entries]
         pattern = keys[0] if all(np.array_equal(keys[0], key) for key in keys) else np.unique(np.concatenate(keys))
-        self._rows, self._columns = pattern // width, pattern % width
+        self.rows, self.columns = pattern // width, pattern % width
         if pattern is keys[0]:
             return np.column_stack([entry.data for entry in entries])
         found = np.zeros((len(pattern), len(entries)))
@@ -152,15 +135,11 @@ class _Entries:
             np.add.at(found[:, k], np.searchsorted(pattern, key), entry.data)
         return found
 
-    def positions(self, points: Indices) -> tuple[Indices, Indices]:
-        """Row and column of some entries."""
-        return self._rows[points], self._columns[points]
-
     def assembled(self, values: Array) -> Any:
         """The vector or matrix with these entries (k,)."""
         if self._vector:
             return values
-        matrix = sp.csr_array((values, (self._rows, self._columns)), shape=self._shape)
+        matrix = sp.csr_array((values, (self.rows, self.columns)), shape=self._shape)
         return matrix + sp.triu(matrix, 1).T if self._symmetric else matrix
 
 

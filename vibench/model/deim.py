@@ -34,28 +34,26 @@ def interpolate(snapshots: Array, tolerance: float) -> Interpolation:
     """Discrete empirical interpolation of vectors (k×P), not all zero, to a tolerance.
 
     The modes are those of a singular value decomposition, the points those of a pivoted QR factorisation of the modes
-    (Q-DEIM, Drmač and Gugercin 2016; of matrices, matrix DEIM, Negri, Manzoni and Amsallem 2015).
-
-    Parameters
-    ----------
-    snapshots
-        One vector per column.
-    tolerance
-        Largest error of any column, relative to the longest. The number of terms is found by bisection; errors are not
-        monotone in it, so a smaller number may exist.
+    (Q-DEIM, Drmač and Gugercin 2016; of matrices, matrix DEIM, Negri, Manzoni and Amsallem 2015). The tolerance bounds
+    the error of every column, relative to the longest. The number of terms is found by bisection; errors are not
+    monotone in it, so a smaller number may exist.
     """
     scale = float(np.linalg.norm(snapshots, axis=0).max())
     q, r = np.linalg.qr(snapshots)
     left, sigma, right = svd(r)
-    squares = np.cumsum(((sigma[:, None] * right) ** 2)[::-1], axis=0)[
-        ::-1
-    ]  # squared error of projecting every column on k modes
+    # squared error of projecting every column on k modes
+    squares = np.cumsum(((sigma[:, None] * right) ** 2)[::-1], axis=0)[::-1]
     projection = np.append(np.sqrt(squares.max(axis=1)), 0.0) / scale
     rank = max(1, int(np.count_nonzero(sigma > np.finfo(float).eps * sigma[0])))
     low = min(rank, max(1, int(np.argmax(projection <= tolerance))))  # interpolation is never better than projection
 
     def with_terms(count: int) -> Interpolation:
-        return _with_terms(snapshots, q @ left[:, :count], scale)
+        modes = q @ left[:, :count]
+        _, _, pivots = scipy.linalg.qr(modes.T, mode="economic", pivoting=True)
+        points = np.sort(pivots[:count])
+        cardinal = np.linalg.solve(modes[points].T, modes.T).T
+        errors = np.linalg.norm(snapshots - cardinal @ snapshots[points], axis=0)
+        return Interpolation(points, cardinal, float(errors.max()) / scale)
 
     found, step, high = with_terms(low), 1, low  # gallop upwards, since the projection error is a close guess
     while found.error > tolerance and high < rank:
@@ -69,11 +67,3 @@ def interpolate(snapshots: Array, tolerance: float) -> Interpolation:
         else:
             low = middle + 1
     return found
-
-
-def _with_terms(snapshots: Array, modes: Array, scale: float) -> Interpolation:
-    _, _, pivots = scipy.linalg.qr(modes.T, mode="economic", pivoting=True)
-    points = np.sort(pivots[: modes.shape[1]])
-    cardinal = np.linalg.solve(modes[points].T, modes.T).T
-    errors = np.linalg.norm(snapshots - cardinal @ snapshots[points], axis=0)
-    return Interpolation(points, cardinal, float(errors.max()) / scale)

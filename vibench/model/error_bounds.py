@@ -40,15 +40,7 @@ MARGIN = 1e-3
 
 @dataclass(frozen=True)
 class Stability:
-    """Constants of the high-fidelity problem at one parameter.
-
-    Attributes
-    ----------
-    inf_sup
-        β_HF, of the high-fidelity pair.
-    coercivity, continuity
-        α and γ_a of A in the norm of V.
-    """
+    """Constants of the high-fidelity problem at one parameter: β_HF, and α and γ_a of A in the norm of V."""
 
     inf_sup: InfSup
     coercivity: float
@@ -93,10 +85,8 @@ def bounds(
     """
     residuals = np.column_stack([vi.f - vi.A @ u[:, k] - vi.B.T @ lam[:, k] for k, vi in enumerate(vis)])
     dual_norms = np.linalg.norm(problem.V.whiten_functional(residuals), axis=0)
-    return [
-        _bound(problem.W, vi.B @ u[:, k] - vi.g, lam[:, k], float(dual_norms[k]), constants[k])
-        for k, vi in enumerate(vis)
-    ]
+    excesses = (vi.B @ u[:, k] - vi.g for k, vi in enumerate(vis))
+    return [_bound(problem.W, s, lam[:, k], float(dual_norms[k]), constants[k]) for k, s in enumerate(excesses)]
 
 
 def _bound(W: InnerProduct, excess: Array, lam: Array, residual: float, stability: Stability) -> Bounds | None:

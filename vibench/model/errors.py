@@ -9,6 +9,7 @@ import numpy as np
 
 from vibench.arrays import Array
 from vibench.interfaces.problem import Problem, VariationalInequality
+from vibench.qp.scaling import ratio
 
 
 @dataclass(frozen=True)
@@ -62,26 +63,20 @@ def errors(
     norm_u = np.maximum(V.norm(reference.u), reference.floor_u)
     norm_lam = np.maximum(W.norm(reference.lam), reference.floor_lam)
     error_u, error_lam, integrals = V.norm(du), W.norm(dlam), problem.multiplier_integrals()
-    found = []
-    for k, vi in enumerate(vis):
-        excess = vi.B @ u[:, k] - vi.g
-        found.append(
-            Errors(
-                u=_relative(float(error_u[k]), float(norm_u[k])),
-                lam=_relative(float(error_lam[k]), float(norm_lam[k])),
-                energy=_relative(_energy(vi, du[:, k]), _energy(vi, reference.u[:, k])),
-                absolute_u=float(error_u[k]),
-                absolute_lam=float(error_lam[k]),
-                violation=float(np.max(excess / integrals, initial=0.0)),
-                complementarity=float(reference.lam[:, k] @ excess),
-            )
+    excesses = [vi.B @ u[:, k] - vi.g for k, vi in enumerate(vis)]
+    return [
+        Errors(
+            u=ratio(float(error_u[k]), float(norm_u[k])),
+            lam=ratio(float(error_lam[k]), float(norm_lam[k])),
+            energy=ratio(_energy(vi, du[:, k]), _energy(vi, reference.u[:, k])),
+            absolute_u=float(error_u[k]),
+            absolute_lam=float(error_lam[k]),
+            violation=float(np.max(excesses[k] / integrals, initial=0.0)),
+            complementarity=float(reference.lam[:, k] @ excesses[k]),
         )
-    return found
+        for k, vi in enumerate(vis)
+    ]
 
 
 def _energy(vi: VariationalInequality, u: Array) -> float:
     return float(np.sqrt(max(float(u @ (vi.A @ u)), 0.0)))
-
-
-def _relative(value: float, scale: float) -> float:
-    return value / scale if scale > 0.0 else value

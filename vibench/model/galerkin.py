@@ -11,7 +11,7 @@ import numpy as np
 from vibench.arrays import Array
 from vibench.errors import NumericalError
 from vibench.interfaces.problem import Problem, VariationalInequality
-from vibench.interfaces.strategies import Enrichment, Kind
+from vibench.interfaces.strategies import Enrichment
 from vibench.interfaces.validation import checked_assembly
 from vibench.linalg.dense import orthonormal_range
 from vibench.reduction.supremizers import ContactCoordinates, projected_supremizers
@@ -62,19 +62,14 @@ class ReducedModel:
     ----------
     fixed_basis
         The part of the primal basis that does not depend on the parameter (n×(N+S)).
+    kind
+        How the enrichment depends on the parameter.
     """
 
     def __init__(self, problem: Problem, basis: Array, enrichment: Enrichment, generators: Array, span: Array) -> None:
-        self.problem = problem
-        self.generators = generators
-        self.span = span
-        self.enrichment = enrichment
+        self.problem, self.generators, self.span = problem, generators, span
+        self.enrichment, self.kind = enrichment, enrichment.kind
         self.fixed_basis = basis if enrichment.vectors is None else np.hstack([basis, enrichment.vectors])
-
-    @property
-    def kind(self) -> Kind:
-        """How the enrichment depends on the parameter."""
-        return self.enrichment.kind
 
     def primal_basis(self, vi: VariationalInequality) -> Array:
         """V-orthonormal basis Z (n×N') at the parameter of `vi`; V_N comes first."""
@@ -86,9 +81,8 @@ class ReducedModel:
         elif enrichment.supply is not None:
             added = enrichment.supply(V, vi, self.span)
             if added.ndim != 2 or added.shape[0] != V.dim:
-                raise NumericalError(
-                    f"the enrichment supplied vectors of shape {added.shape}, expected ({V.dim}, count)"
-                )
+                found = f"vectors of shape {added.shape}, expected ({V.dim}, count)"
+                raise NumericalError(f"the enrichment supplied {found}")
             whitened = V.whiten(added)
         else:
             return self.fixed_basis
@@ -134,13 +128,7 @@ class ReducedModel:
         return self.problem.V.whiten(self.fixed_basis)
 
     def assemble(self, mu: Array) -> ReducedProblem:
-        """Assemble at mu (d,) in full, as the paper does: high-fidelity matrices, then their projections.
-
-        Raises
-        ------
-        NumericalError
-            If an assembled member has the wrong shape or values that are not finite.
-        """
+        """Assemble at mu (d,) in full, as the paper does: high-fidelity matrices, checked, then their projections."""
         return self.reduce(checked_assembly(self.problem, mu))
 
     def reduce(self, vi: VariationalInequality) -> ReducedProblem:

@@ -11,7 +11,7 @@ import scipy.linalg
 
 from vibench.arrays import Array, Indices
 from vibench.errors import NumericalError
-from vibench.interfaces.problem import MEMBERS, Contact, Problem, Sampler, VariationalInequality
+from vibench.interfaces.problem import MEMBERS, Contact, Sampler, VariationalInequality
 from vibench.interfaces.strategies import Kind
 from vibench.linalg.dense import orthonormal_range
 from vibench.model.affine import AffineMember, Evaluation
@@ -150,11 +150,8 @@ def hyper_reduce(model: ReducedModel, members: Mapping[str, AffineMember]) -> Op
 
 
 def _bound(member: AffineMember, chi: Array) -> ProjectedMember | None:
-    return (
-        None
-        if member.way is Evaluation.CONTACT
-        else ProjectedMember.of([chi.T @ term for term in member.terms], member)
-    )
+    contact = member.way is Evaluation.CONTACT
+    return None if contact else ProjectedMember.of([chi.T @ term for term in member.terms], member)
 
 
 def _supremizer_space(model: ReducedModel, B: AffineMember, eta: Array) -> Coordinates:
@@ -175,36 +172,24 @@ class HyperReducedModel:
         The reduced model.
     operators
         Its offline data, from `hyper_reduce`.
+
+    Attributes
+    ----------
+    model, problem, generators, fixed_basis
+        The reduced model, and these of its attributes.
+    kind
+        How the enrichment depends on the parameter, in the coordinates of the queries.
     """
 
     def __init__(self, model: ReducedModel, operators: Operators) -> None:
-        self.model = model
-        self._operators = operators
-
-    @property
-    def problem(self) -> Problem:
-        """The high-fidelity problem."""
-        return self.model.problem
+        self.model, self._operators = model, operators
+        self.problem, self.generators, self.fixed_basis = model.problem, model.generators, model.fixed_basis
+        self.kind = Kind.FIXED if operators.supremizer_coordinates is None else Kind.PER_PARAMETER
 
     @cached_property
     def _sampler(self) -> Sampler:
         entries = self._operators.sampled_entries
         return self.problem.sampler(entries) if entries else lambda _: {}
-
-    @property
-    def generators(self) -> Array:
-        """χ (m×R)."""
-        return self.model.generators
-
-    @property
-    def fixed_basis(self) -> Array:
-        """The part of the primal basis that does not depend on the parameter (n×(N+S))."""
-        return self.model.fixed_basis
-
-    @property
-    def kind(self) -> Kind:
-        """How the enrichment depends on the parameter, in the coordinates of the queries."""
-        return Kind.FIXED if self._operators.supremizer_coordinates is None else Kind.PER_PARAMETER
 
     def assemble(self, mu: Array) -> ReducedProblem:
         """The reduced problem at mu (d,).
@@ -225,7 +210,7 @@ class HyperReducedModel:
             lift = partial(_lift, operators.supremizer_coordinates, Y)
         else:
             B = self._constraint(samples, contact)
-            Z = operators.basis if operators.basis is not None else self.model.fixed_basis
+            Z = operators.basis if operators.basis is not None else self.fixed_basis
             lift = partial(np.matmul, Z)
         if not all(np.isfinite(member.sum()) for member in (A, f, B, g)):
             raise NumericalError(f"the reduced problem has entries that are not finite at mu = {mu.tolist()}")

@@ -22,3 +22,8 @@ def peak(vector: Array) -> float:
 def size(vector: Array) -> float:
     """Largest entry in absolute value, or 1 for the zero vector: a safe divisor."""
     return peak(vector) or 1.0
+
+
+def ratio(value: float, scale: float) -> float:
+    """A value relative to a scale, or as it is where the scale is zero."""
+    return value / scale if scale > 0.0 else value

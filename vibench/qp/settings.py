@@ -1,4 +1,4 @@
-"""Settings of the QP solvers: keyword arguments for an accuracy, and where each solver reports its status.
+"""Settings of the QP solvers: tolerances for an accuracy, and where each solver reports its status.
 
 A new solver of qpsolvers is one entry here. Accuracies are relative. `solve_qp` scales the data so that absolute
 tolerances are equivalent. The duality gap has no natural scale; its absolute tolerance is far below the relative one.
@@ -8,7 +8,7 @@ Tolerances are tighter than the accuracy, because solvers measure residuals in n
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -22,18 +22,29 @@ class SolverSettings:
 
     Attributes
     ----------
-    settings
-        Keyword arguments for an accuracy.
-    start
-        Keyword arguments for a warm start from x (n,), α (m,), if the solver has one.
+    tolerances
+        Keyword arguments that are multiples of the accuracy, with their factors.
+    fixed
+        Other keyword arguments.
     status, iterations
         Paths into `solution.extras`, as "info.status"; "" where the solver reports none.
+    start
+        Keyword arguments for a warm start from x (n,), α (m,), if the solver has one.
+    smallest
+        The smallest tolerance that the solver accepts.
     """
 
-    settings: Callable[[float], Mapping[str, Any]]
+    tolerances: Mapping[str, float]
+    fixed: Mapping[str, Any] = field(default_factory=dict)
     status: str = ""
     iterations: str = ""
     start: Callable[[Array, Array], Mapping[str, Any]] | None = None
+    smallest: float = 0.0
+
+    def at(self, accuracy: float) -> dict[str, Any]:
+        """Keyword arguments for a relative accuracy."""
+        scaled = {name: max(factor * accuracy, self.smallest) for name, factor in self.tolerances.items()}
+        return {**scaled, **self.fixed}
 
     def report(self, solution: Any) -> tuple[str, int | None]:
         """Status as the solver reports it, and its number of iterations."""
@@ -45,11 +56,9 @@ class SolverSettings:
 
 def _follow(extras: Mapping[str, Any], path: str) -> Any:
     value: Any = extras
-    for step in path.split(".") if path else []:
+    for step in path.split("."):
         value = value.get(step) if isinstance(value, Mapping) else getattr(value, step, None)
-        if value is None:
-            return None
-    return value if path else None
+    return value
 
 
 def _proxqp_start(x: Array, alpha: Array) -> dict[str, Any]:
@@ -59,71 +68,36 @@ def _proxqp_start(x: Array, alpha: Array) -> dict[str, Any]:
     return {"initvals": x, "z": alpha, "initial_guess": proxqp.InitialGuess.WARM_START}
 
 
+def _primal_start(x: Array, _: Array) -> dict[str, Any]:
+    return {"initvals": x}
+
+
+_EPS = {"eps_abs": 0.1, "eps_rel": 0.1}
+_DUALITY_GAP = {"eps_duality_gap_abs": 1e-3, "eps_duality_gap_rel": 0.1}
+_CONIC = {"abstol": 0.1, "reltol": 0.1, "feastol": 0.1}
+
+
 SETTINGS: Mapping[str, SolverSettings] = {
     "piqp": SolverSettings(
-        lambda accuracy: {
-            "eps_abs": 0.1 * accuracy,
-            "eps_rel": 0.1 * accuracy,
-            "max_iter": 500,
-            "check_duality_gap": True,
-            "eps_duality_gap_abs": 1e-3 * accuracy,
-            "eps_duality_gap_rel": 0.1 * accuracy,
-        },
-        status="info.status",
-        iterations="info.iter",
+        _EPS | _DUALITY_GAP, {"max_iter": 500, "check_duality_gap": True}, "info.status", "info.iter"
     ),
     "proxqp": SolverSettings(
-        lambda accuracy: {
-            "eps_abs": 0.1 * accuracy,
-            "eps_rel": 0.0,
-            "max_iter": 1000,
-            "check_duality_gap": True,
-            "eps_duality_gap_abs": 1e-3 * accuracy,
-            "eps_duality_gap_rel": 0.1 * accuracy,
-        },
-        status="info.status",
-        iterations="info.iter",
+        {"eps_abs": 0.1} | _DUALITY_GAP,
+        {"eps_rel": 0.0, "max_iter": 1000, "check_duality_gap": True},
+        "info.status",
+        "info.iter",
         start=_proxqp_start,
     ),
     "osqp": SolverSettings(  # a first-order method; the iteration limit trades time for accuracy
-        lambda accuracy: {"eps_abs": 0.1 * accuracy, "eps_rel": 0.3 * accuracy, "max_iter": 10_000},
-        status="info.status",
-        iterations="info.iter",
-        start=lambda x, _: {"initvals": x},
+        {"eps_abs": 0.1, "eps_rel": 0.3}, {"max_iter": 10_000}, "info.status", "info.iter", start=_primal_start
     ),
-    "clarabel": SolverSettings(
-        lambda accuracy: {"tol_gap_abs": 0.1 * accuracy, "tol_gap_rel": 0.1 * accuracy, "tol_feas": 0.1 * accuracy},
-        status="status",
-    ),
+    "clarabel": SolverSettings({"tol_gap_abs": 0.1, "tol_gap_rel": 0.1, "tol_feas": 0.1}, status="status"),
     "daqp": SolverSettings(
-        lambda accuracy: {"primal_tol": 0.01 * accuracy, "dual_tol": 0.01 * accuracy, "zero_tol": 1e-14},
-        iterations="iterations",
-        start=lambda x, _: {"initvals": x},
+        {"primal_tol": 0.01, "dual_tol": 0.01}, {"zero_tol": 1e-14}, iterations="iterations", start=_primal_start
     ),
-    "quadprog": SolverSettings(lambda _: {}, iterations="iterations"),
-    "highs": SolverSettings(
-        lambda accuracy: {
-            "primal_feasibility_tolerance": max(0.1 * accuracy, 1e-10),
-            "dual_feasibility_tolerance": max(0.1 * accuracy, 1e-10),
-        },
-    ),
-    "scs": SolverSettings(lambda accuracy: {"eps_abs": 0.1 * accuracy, "eps_rel": 0.1 * accuracy, "max_iters": 20_000}),
-    "cvxopt": SolverSettings(
-        lambda accuracy: {"abstol": 0.1 * accuracy, "reltol": 0.1 * accuracy, "feastol": 0.1 * accuracy},
-        iterations="iterations",
-    ),
-    "ecos": SolverSettings(
-        lambda accuracy: {"abstol": 0.1 * accuracy, "reltol": 0.1 * accuracy, "feastol": 0.1 * accuracy},
-    ),
+    "quadprog": SolverSettings({}, iterations="iterations"),
+    "highs": SolverSettings({"primal_feasibility_tolerance": 0.1, "dual_feasibility_tolerance": 0.1}, smallest=1e-10),
+    "scs": SolverSettings(_EPS, {"max_iters": 20_000}),
+    "cvxopt": SolverSettings(_CONIC, iterations="iterations"),
+    "ecos": SolverSettings(_CONIC),
 }
-
-
-def settings_for(solver: str, accuracy: float) -> dict[str, Any]:
-    """Keyword arguments of `solver` for a relative accuracy."""
-    return dict(SETTINGS[solver].settings(accuracy))
-
-
-def start_for(solver: str, x: Array, alpha: Array) -> dict[str, Any]:
-    """Keyword arguments of `solver` for a warm start from x (n,), α (m,); none if it has no warm start."""
-    start = SETTINGS[solver].start
-    return {} if start is None else dict(start(x, alpha))

@@ -20,7 +20,7 @@ from vibench.arrays import Array, SparseMatrix
 from vibench.errors import NumericalError, unknown_name
 from vibench.interfaces.problem import VariationalInequality
 from vibench.qp.scaling import row_norms, size
-from vibench.qp.settings import SETTINGS, settings_for, start_for
+from vibench.qp.settings import SETTINGS
 from vibench.qp.solution import QPSolution, QPSolver
 
 
@@ -60,7 +60,7 @@ def solve_qp(
     if not len(program.f):
         return QPSolution(np.zeros(0), np.zeros(len(program.g)), "nothing to solve: no unknowns")
     if factor is not None:
-        return _solve_dual(program, factor, solver, accuracy, extra, start)
+        return _solve_dual(program, solver, accuracy, extra, factor, start)
     rows, cost = row_norms(program.B), size(program.f)
     scaled = VariationalInequality(program.A / cost, program.f / cost, _divide_rows(program.B, rows), program.g / rows)
     if extra and solver in extra:
@@ -68,9 +68,9 @@ def solve_qp(
         if not isinstance(answer, QPSolution):
             raise NumericalError(f"the solver returned a {type(answer).__name__}, expected a QPSolution")
     else:
-        warm_start: Mapping[str, Any] = {}
-        if start is not None and takes_start(solver) and start.x is not None and start.alpha is not None:
-            warm_start = start_for(solver, start.x, rows * start.alpha / cost)
+        warm_start, starter = dict[str, Any](), SETTINGS[solver].start
+        if start is not None and starter is not None and start.x is not None and start.alpha is not None:
+            warm_start |= starter(start.x, rows * start.alpha / cost)
         answer = _call_qpsolvers(scaled, solver, accuracy, warm_start)
     for name, value, count in (("x", answer.x, len(program.f)), ("α", answer.alpha, len(program.g))):
         if value is not None and value.shape != (count,):
@@ -81,15 +81,15 @@ def solve_qp(
     if answer.alpha is None:
         return answer
     alpha = cost * answer.alpha / rows
-    return replace(answer, alpha=np.maximum(alpha, 0.0), negative=-min(float(np.min(alpha, initial=0.0)), 0.0))
+    return replace(answer, alpha=np.maximum(alpha, 0.0), negative=-float(np.min(alpha, initial=0.0)))
 
 
 def _solve_dual(
     program: VariationalInequality,
-    factor: Array,
     solver: str,
     accuracy: float,
     extra: Mapping[str, QPSolver] | None,
+    factor: Array,
     start: QPSolution | None,
 ) -> QPSolution:
     """Solve a dense program with A = L Lᵀ through its dual, which has one unknown per constraint.
@@ -100,13 +100,8 @@ def _solve_dual(
     right = np.column_stack([(program.B / rows[:, None]).T, program.f])
     whitened = scipy.linalg.solve_triangular(factor, right, lower=True, check_finite=False)
     constraints, load = whitened[:, :-1], whitened[:, -1]
-    count = len(program.g)
-    dual = VariationalInequality(
-        A=constraints.T @ constraints,
-        f=constraints.T @ load - program.g / rows,
-        B=-np.eye(count),
-        g=np.zeros(count),
-    )
+    A, f, count = constraints.T @ constraints, constraints.T @ load - program.g / rows, len(program.g)
+    dual = VariationalInequality(A, f, B=-np.eye(count), g=np.zeros(count))
     if start is not None and start.alpha is not None and start.x is not None:  # slack g − Bx of the constraints −α ≤ 0
         slack = np.maximum(program.g - program.B @ start.x, 0.0) / rows
         start = replace(start, x=rows * start.alpha, alpha=slack)
@@ -115,8 +110,7 @@ def _solve_dual(
         return answer
     forces = np.maximum(answer.x, 0.0)
     x = scipy.linalg.solve_triangular(factor, load - constraints @ forces, lower=True, trans="T", check_finite=False)
-    negative = -min(float(np.min(answer.x / rows, initial=0.0)), 0.0)
-    return replace(answer, x=x, alpha=forces / rows, negative=negative)
+    return replace(answer, x=x, alpha=forces / rows, negative=-float(np.min(answer.x / rows, initial=0.0)))
 
 
 def installed_solvers(extra: Iterable[str] = ()) -> list[str]:
@@ -142,7 +136,7 @@ def _call_qpsolvers(
     problem = qpsolvers.Problem(_as_csc(program.A), -program.f, _as_csc(program.B), program.g)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # the status is part of the solution, which is verified later
-        solution = qpsolvers.solve_problem(problem, solver=solver, **settings_for(solver, accuracy), **start)
+        solution = qpsolvers.solve_problem(problem, solver=solver, **SETTINGS[solver].at(accuracy), **start)
     status, iterations = SETTINGS[solver].report(solution)
     if solution.x is None or solution.z is None:
         return QPSolution(None, None, status, iterations)

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import nnls
 
-from vibench.arrays import Array, SparseMatrix
+from vibench.arrays import Array
 from vibench.interfaces.problem import VariationalInequality
-from vibench.qp.scaling import peak, row_norms, size
+from vibench.qp.scaling import peak, ratio, row_norms, size
 from vibench.qp.solution import QPSolution
 from vibench.qp.status import Status
 
@@ -52,54 +52,33 @@ class Scales:
     gap: float
 
 
-@dataclass(frozen=True)
-class _Products:
-    """Products that scales and residuals of x (n,), α (m,) share: row norms of B (m,), A x and Bᵀα (n,)."""
-
-    norms: Array
-    Ax: Array
-    force: Array
-
-    @classmethod
-    def of(cls, program: VariationalInequality, x: Array, alpha: Array) -> _Products:
-        return cls(row_norms(program.B), program.A @ x, program.B.T @ alpha)
-
-
 def scales(program: VariationalInequality, x: Array, alpha: Array) -> Scales:
     """Denominators of the residuals of x (n,), α (m,); see `Residuals`."""
-    return _scales(program, x, alpha, _Products.of(program, x, alpha))
-
-
-def _scales(program: VariationalInequality, x: Array, alpha: Array, products: _Products) -> Scales:
-    A, f, g = program.A, program.f, program.g
-    return Scales(
-        primal=max(1.0, peak(g / products.norms)),
-        dual=max(peak(products.Ax), peak(f), peak(products.force)),
-        gap=max(
-            abs(0.5 * float(x @ products.Ax)),
-            abs(float(f @ x)),
-            abs(float(g @ alpha)),
-            ENERGY_FLOOR * _steepest_descent_energy(A, f),
-        ),
-    )
-
-
-def _steepest_descent_energy(A: SparseMatrix | Array, f: Array) -> float:
-    """(fᵀf)² / 2fᵀA f: the energy gained by the best multiple of f, a lower bound on that gained by A⁻¹f."""
-    curvature = float(f @ (A @ f))
-    return 0.5 * float(f @ f) ** 2 / curvature if curvature > 0.0 else 0.0
+    return _residuals_and_scales(program, x, alpha)[1]
 
 
 def kkt_residuals(program: VariationalInequality, x: Array, alpha: Array) -> Residuals:
     """Relative residuals of x (n,), α (m,) ≥ 0; see `Residuals`."""
-    f, B, g = program.f, program.B, program.g
-    products = _Products.of(program, x, alpha)
-    scale = _scales(program, x, alpha, products)
-    return Residuals(
-        primal=float(np.max((B @ x - g) / products.norms, initial=0.0)) / scale.primal,
-        dual=_ratio(peak(products.Ax - f + products.force), scale.dual),
-        gap=_ratio(abs(float(x @ products.Ax) - float(f @ x) + float(g @ alpha)), scale.gap),
+    return _residuals_and_scales(program, x, alpha)[0]
+
+
+def _residuals_and_scales(program: VariationalInequality, x: Array, alpha: Array) -> tuple[Residuals, Scales]:
+    A, f, B, g = program.A, program.f, program.B, program.g
+    norms, Ax, force = row_norms(B), A @ x, B.T @ alpha
+    energy, work, bound, curvature = float(x @ Ax), float(f @ x), float(g @ alpha), float(f @ (A @ f))
+    # gained by the best multiple of f, a lower bound on the energy gained by A⁻¹f
+    descent = 0.5 * float(f @ f) ** 2 / curvature if curvature > 0.0 else 0.0
+    scale = Scales(
+        primal=max(1.0, peak(g / norms)),
+        dual=max(peak(Ax), peak(f), peak(force)),
+        gap=max(abs(0.5 * energy), abs(work), abs(bound), ENERGY_FLOOR * descent),
     )
+    residuals = Residuals(
+        primal=float(np.max((B @ x - g) / norms, initial=0.0)) / scale.primal,
+        dual=ratio(peak(Ax - f + force), scale.dual),
+        gap=ratio(abs(energy - work + bound), scale.gap),
+    )
+    return residuals, scale
 
 
 def verify(program: VariationalInequality, answer: QPSolution, accuracy: float) -> tuple[Status, str, Residuals | None]:
@@ -117,13 +96,9 @@ def verify(program: VariationalInequality, answer: QPSolution, accuracy: float) 
     if found.primal > accuracy and infeasibility_certificate(program) is not None:
         return Status.INFEASIBLE, "no point satisfies the constraints (certified)", found
     name = max(("primal", "dual", "gap"), key=lambda key: getattr(found, key))
-    value = getattr(found, name)
     clipped = f" after setting multipliers down to -{answer.negative:.0e} to zero" if answer.negative else ""
-    return (
-        Status.INACCURATE,
-        f"{name} residual {value:.1e} above {accuracy:.0e}{clipped}: {answer.solver_status}",
-        found,
-    )
+    reason = f"{name} residual {getattr(found, name):.1e} above {accuracy:.0e}{clipped}: {answer.solver_status}"
+    return Status.INACCURATE, reason, found
 
 
 def infeasibility_certificate(program: VariationalInequality, tolerance: float = 1e-10) -> Array | None:
@@ -132,8 +107,7 @@ def infeasibility_certificate(program: VariationalInequality, tolerance: float =
         return None
     rows = row_norms(program.B)
     system = np.vstack([(program.B / rows[:, None]).T, program.g / rows / size(program.g / rows)])
-    target = np.zeros(system.shape[0])
-    target[-1] = -1.0
+    target = np.append(np.zeros(len(system) - 1), -1.0)
     try:
         alpha, distance = nnls(system, target, maxiter=30 * system.shape[1])
     except RuntimeError:  # nnls did not converge, which certifies nothing
@@ -141,7 +115,3 @@ def infeasibility_certificate(program: VariationalInequality, tolerance: float =
     if distance > tolerance * max(1.0, float(alpha.max(initial=0.0))):
         return None
     return np.asarray(alpha / rows)
-
-
-def _ratio(numerator: float, denominator: float) -> float:
-    return numerator / denominator if denominator > 0.0 else numerator

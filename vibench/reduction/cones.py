@@ -109,9 +109,9 @@ class GrowingCone:
         return stop.reached(self.generators.shape[1], self.error) or self.error <= REPRODUCED
 
     def add(self, direction: Array, note: str = "") -> bool:
-        """Add the generator of a direction (m,), part of `farthest`; `False` where that is nothing but round-off.
+        """Add the generator of a direction (m,), part of `farthest`, with a `note` on any deviation from the algorithm.
 
-        `note` says what of the algorithm could not be done as it says.
+        `False` where the direction is nothing but round-off.
         """
         if note:
             self._fallbacks.append(f"generator {self.generators.shape[1] + 1}: {note}")
@@ -129,66 +129,39 @@ class GrowingCone:
 
     def result(self) -> Cone:
         """The cone, with its error for every number of generators."""
-        count = self.generators.shape[1]
-        return Cone(self.generators, np.array(self._errors), no_free(count), tuple(self._fallbacks))
+        free = no_free(self.generators.shape[1])
+        return Cone(self.generators, np.array(self._errors), free, tuple(self._fallbacks))
 
 
 def greedy_cone(snapshots: Array, W: InnerProduct, stop: Stop) -> Cone:
     """Cone of snapshots (m×Q) chosen greedily: CPG (paper, Remark 4.3, and Benaceur, Ern and Ehrlacher 2020).
 
     Each step adds the snapshot farthest from the present cone, normalised. It ends before `stop` where all snapshots
-    are reproduced to round-off (Remark 4.2).
-
-    Raises
-    ------
-    NumericalError
-        If a snapshot has a negative coefficient: it would not be in W⁺.
+    are reproduced to round-off (Remark 4.2). Snapshots that are not in W⁺ are refused as by `GrowingCone`.
     """
     cone = GrowingCone(snapshots, W)
-    while not cone.reached(stop):
-        if not cone.add(snapshots[:, cone.farthest]):
-            break
+    while not cone.reached(stop) and cone.add(snapshots[:, cone.farthest]):
+        pass
     return cone.result()
 
 
 def refuse_negative(snapshots: Array) -> None:
-    """Refuse snapshots (m×Q) that are not in W⁺.
-
-    Raises
-    ------
-    NumericalError
-        If a coefficient is negative.
-    """
+    """Raise a `NumericalError` if snapshots (m×Q) have a negative coefficient: they would not be in W⁺."""
     if np.min(snapshots, initial=0.0) < 0.0:
         raise NumericalError(f"a multiplier snapshot has the negative coefficient {snapshots.min():.1e}")
 
 
 def normalised(snapshots: Array, W: InnerProduct) -> Array:
-    """Snapshots (m×Q) in W⁺ with unit norm in W, without those that are zero.
-
-    Raises
-    ------
-    NumericalError
-        If a coefficient is negative.
-    """
+    """Snapshots (m×Q) with unit norm in W, without those that are zero; `refuse_negative` checks them first."""
     refuse_negative(snapshots)
     norms = W.norm(snapshots)
     return np.asarray(snapshots[:, norms > 0.0] / norms[norms > 0.0])
 
 
 def projection_errors(generators: Array, snapshots: Array, W: InnerProduct) -> Array:
-    """e(r) for r = 0 … R: the largest distance of a snapshot from the cone of the first r generators.
+    """e(r) for r = 0 … R: the largest distance of snapshots (m×Q) from the cone of the first r unit vectors (m×R).
 
-    Relative to the largest norm of a snapshot, as in equations (13) and (34), for any cone.
-
-    Parameters
-    ----------
-    generators
-        Unit vectors (m×R).
-    snapshots
-        θ_q (m×Q); where all are zero, so are the errors.
-    W
-        Inner product of the multiplier space.
+    Relative to the largest norm of a snapshot, as in equations (13) and (34); zero where all snapshots are zero.
     """
     errors = np.zeros(generators.shape[1] + 1)
     if np.any(snapshots):
@@ -265,9 +238,9 @@ def _best_combination(points: Array, nu: Array, targets: Array) -> tuple[Array, 
     independent = determinant > 1e-8 * square
     scale = np.where(independent, determinant, 1.0)
     a, b = (on_point - overlap * on_nu) / scale, (square * on_nu - overlap * on_point) / scale
-    both = independent & (a >= 0.0) & (b >= 0.0)
-    nu_alone = (np.maximum(on_nu, 0.0) ** 2 > on_point**2 / np.where(square > 0.0, square, 1.0)) | (square == 0.0)
-    single_a = np.where(nu_alone, 0.0, np.maximum(on_point, 0.0) / np.where(square > 0.0, square, 1.0))
+    both, safe = independent & (a >= 0.0) & (b >= 0.0), np.where(square > 0.0, square, 1.0)
+    nu_alone = (np.maximum(on_nu, 0.0) ** 2 > on_point**2 / safe) | (square == 0.0)
+    single_a = np.where(nu_alone, 0.0, np.maximum(on_point, 0.0) / safe)
     single_b = np.where(nu_alone, np.maximum(on_nu, 0.0), 0.0)
     return np.where(both, a, single_a), np.where(both, b, single_b)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import operator
 from abc import abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -46,20 +47,11 @@ class NestedStrategy(PrimalStrategy):
     def steps(self, offline: Offline) -> Iterator[Step]:
         """The enrichment with S = 0, 1, 2, … vectors; whoever iterates stops at the tightest tolerance.
 
-        Raises
-        ------
-        NumericalError
-            If there is no further vector, saying what was reached.
+        A `NumericalError` says that there is no further vector and what was reached.
         """
 
     def build(self, offline: Offline, tolerance: float | None) -> Enrichment:
-        """Grow until the tolerance is reached.
-
-        Raises
-        ------
-        NumericalError
-            If it is not reached with all vectors.
-        """
+        """Grow until the tolerance is reached; a `NumericalError` says why it was not."""
         if tolerance is None:
             raise ValueError(f"{type(self).__name__} needs a tolerance")
         grown = grow_through(self, offline, [tolerance])
@@ -84,13 +76,7 @@ class Grown:
     missed: str
 
     def milestone(self, tolerance: float) -> Milestone:
-        """Where a tolerance was reached.
-
-        Raises
-        ------
-        NumericalError
-            If it was not reached.
-        """
+        """Where a tolerance was reached; a `NumericalError` says why it was not."""
         if tolerance not in self.milestones:
             raise NumericalError(f"the tolerance {tolerance:g} is not reached: {self.missed}")
         return self.milestones[tolerance]
@@ -117,14 +103,11 @@ def grow_through(strategy: NestedStrategy, offline: Offline, tolerances: Iterabl
                 raise
             return Grown(vectors, milestones, str(error))
         begun = True
-        passed = [tolerance for tolerance in ahead if _keeps(strategy, step.measure, tolerance)]
+        meets = operator.ge if strategy.larger_is_tighter else operator.le
+        passed = [tolerance for tolerance in ahead if meets(step.measure, tolerance)]
         if passed:
             vectors = np.hstack([vectors, step.vectors(vectors.shape[1])])
             history = {quantity: np.array(values) for quantity, values in step.history.items()}
             milestones |= dict.fromkeys(passed, Milestone(step.count, history, watch.seconds()))
             ahead = [tolerance for tolerance in ahead if tolerance not in milestones]
     return Grown(vectors, milestones, "")
-
-
-def _keeps(strategy: PrimalStrategy, measure: float, tolerance: float) -> bool:
-    return measure >= tolerance if strategy.larger_is_tighter else measure <= tolerance

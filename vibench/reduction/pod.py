@@ -30,18 +30,10 @@ class POD:
 
 
 def pod(snapshots: Array, V: InnerProduct, stop: Stop) -> POD:
-    """POD of snapshots (n×P), by the singular value decomposition of the whitened snapshots.
+    """POD of snapshots u(mu_p) (n×P), by the singular value decomposition of the whitened snapshots.
 
     The eigenvalues of the correlation matrix UᵀX_V U, the method of snapshots, have a floor of 1e-8 in relative terms.
-
-    Parameters
-    ----------
-    snapshots
-        Columns u(mu_p).
-    V
-        Inner product of the space.
-    stop
-        Relative tail, or number of modes.
+    The number of modes is given by `stop`: a relative tail, or a size.
 
     Raises
     ------

@@ -37,8 +37,7 @@ def supremizers(V: InnerProduct, B: SparseMatrix, eta: Array) -> Array:
 
 def proportionality(B: SparseMatrix, reference: SparseMatrix) -> float | None:
     """Factor c ≠ 0 with B = c·reference up to round-off, or `None`."""
-    norm = sp.linalg.norm(B)
-    square = float(reference.multiply(reference).sum())
+    norm, square = sp.linalg.norm(B), float(reference.multiply(reference).sum())
     if norm == 0.0 or square == 0.0:
         return None
     factor = float(B.multiply(reference).sum()) / square
@@ -78,24 +77,21 @@ def constraint_classes(matrices: Sequence[SparseMatrix]) -> ConstraintClasses:
 
     For the obstacle problem, where B(mu) is one matrix times a scalar, one supremizer space replaces 125 equal ones.
     """
-    representatives: list[SparseMatrix] = []
-    fingerprints: list[Array] = []
-    members, factors = [], []
+    classes: list[tuple[SparseMatrix, Array]] = []
+    found: list[tuple[int, float]] = []
     for matrix in matrices:
         fingerprint = _fingerprint(matrix)
-        for k, representative in enumerate(representatives):
-            similar = _equal_up_to_sign(fingerprint, fingerprints[k])  # a cheap necessary condition
+        for k, (representative, other) in enumerate(classes):
+            similar = _equal_up_to_sign(fingerprint, other)  # a cheap necessary condition
             factor = proportionality(matrix, representative) if similar else None
             if factor is not None:
-                members.append(k)
-                factors.append(factor)
+                found.append((k, factor))
                 break
         else:
-            members.append(len(representatives))
-            factors.append(1.0)
-            representatives.append(matrix)
-            fingerprints.append(fingerprint)
-    return ConstraintClasses(tuple(representatives), np.array(members, dtype=np.intp), np.array(factors))
+            found.append((len(classes), 1.0))
+            classes.append((matrix, fingerprint))
+    members, factors = [k for k, _ in found], [factor for _, factor in found]
+    return ConstraintClasses(tuple(B for B, _ in classes), np.array(members, dtype=np.intp), np.array(factors))
 
 
 def _fingerprint(matrix: SparseMatrix) -> Array:
@@ -163,7 +159,7 @@ class ContactCoordinates:
     """
 
     def __init__(self, V: InnerProduct, basis: Array, dofs: Indices) -> None:
-        self._factor, self._tail = contact_factor(V, dofs)
+        self._factor, self._tail = _contact_factor(V, dofs.astype(np.intp).tobytes())
         whitened = self._factor.apply_factor(basis)
         split = V.dim - len(dofs)
         self._others, r = np.linalg.qr(whitened[:split])
@@ -186,19 +182,12 @@ class ContactCoordinates:
         return self._factor.solve_factor(np.vstack([self._others, np.zeros((len(self._tail), self._others.shape[1]))]))
 
 
-def contact_factor(V: InnerProduct, dofs: Indices) -> tuple[SparseCholesky, Array]:
-    """X_V factorised with some unknowns E last, and the trailing block F_EE (|E|×|E|) of the factor.
-
-    Cached, so that all models of a problem share one factorisation.
-    """
-    return _contact_factor(V, dofs.astype(np.intp).tobytes())
-
-
-@lru_cache(maxsize=CACHED_FACTORS)
+@lru_cache(maxsize=CACHED_FACTORS)  # so that all models of a problem share one factorisation
 def _contact_factor(V: InnerProduct, dofs: bytes) -> tuple[SparseCholesky, Array]:
+    """X_V factorised with some unknowns E last, and the trailing block F_EE (|E|×|E|) of the factor."""
     last = np.frombuffer(dofs, np.intp)
     factor = SparseCholesky(V.matrix, "X_V", elimination_order(V.matrix, last), len(last))
-    return factor, factor.trailing_factor(len(last))
+    return factor, factor.trailing_factor()
 
 
 Coordinates = SpannedCoordinates | ContactCoordinates
@@ -237,20 +226,14 @@ def supremizer_coordinates(
 ) -> tuple[Coordinates, list[Array]]:
     """Coordinates for greedy algorithms over supremizers, and those (d×k) of T(mu)η for every matrix.
 
-    Parameters
-    ----------
-    V, basis
-        The primal space and a V-orthonormal basis of V_N (n×N).
-    matrices
-        Constraint matrices B(mu) (m×n).
-    eta
-        Multipliers (m×k).
+    From a V-orthonormal basis of V_N (n×N), constraint matrices B(mu) (m×n) and multipliers η (m×k).
     """
+    space: Coordinates
     constrained = _constrained_unknowns(matrices)
-    count = eta.shape[1]
-    if SPAN_COST * V.dim * count * len(matrices) <= len(constrained) ** 2:
+    if SPAN_COST * V.dim * eta.shape[1] * len(matrices) <= len(constrained) ** 2:
         space = SpannedCoordinates(V, basis, np.hstack([supremizers(V, B, eta) for B in matrices]))
-        return space, [space.represented[:, k * count : (k + 1) * count] for k in range(len(matrices))]
-    contact = ContactCoordinates(V, basis, constrained)
-    found = contact.supremizers(np.hstack([_loads(B, constrained, eta) for B in matrices]))
-    return contact, [found[:, k * count : (k + 1) * count] for k in range(len(matrices))]
+        found = space.represented
+    else:
+        space = ContactCoordinates(V, basis, constrained)
+        found = space.supremizers(np.hstack([_loads(B, constrained, eta) for B in matrices]))
+    return space, np.split(found, len(matrices), axis=1)

@@ -24,9 +24,10 @@ ABSOLUTE = 1e-12
 
 
 def cone_interval(C: Array, G: Array, span: float) -> tuple[float, float, str]:
-    """Certified bounds on min ‖Cα‖/√(αᵀGα) over α ≥ 0.
+    """Certified lower and upper bounds on min ‖Cα‖/√(αᵀGα) over α ≥ 0, and the names of the sharpest ones, "L½/U0".
 
-    The minimum is NP-hard in general, and the interval is reported as it is where it stays wider than `GAP`.
+    The minimum is NP-hard in general, and the interval is reported as it is where it stays wider than `GAP`. The bounds
+    are infinite without generators.
 
     Parameters
     ----------
@@ -36,11 +37,6 @@ def cone_interval(C: Array, G: Array, span: float) -> tuple[float, float, str]:
         Gram matrix (R×R), unit diagonal. Only L0 and L1 are known to hold where it has negative entries.
     span
         The same minimum over all α: β_span.
-
-    Returns
-    -------
-    tuple
-        Lower bound, upper bound, and the names of the sharpest ones, "L½/U0". Infinite without generators.
     """
     if not len(G):
         return float("inf"), float("inf"), ""
@@ -71,7 +67,7 @@ def _cheap_bounds(C: Array, M: Array, G: Array, span: float) -> tuple[dict[str, 
 
 
 def _sharpest(lowers: dict[str, float], uppers: dict[str, float]) -> tuple[str, str]:
-    return max(lowers, key=lambda name: lowers[name]), min(uppers, key=lambda name: uppers[name])
+    return max(lowers, key=lowers.__getitem__), min(uppers, key=uppers.__getitem__)
 
 
 def simplex_minimiser(C: Array) -> Array:
@@ -82,7 +78,5 @@ def simplex_minimiser(C: Array) -> Array:
     """
     scale = float(np.linalg.norm(C, axis=0).max(initial=0.0)) or 1.0
     system = np.vstack([C / scale, np.ones(C.shape[1])])
-    target = np.zeros(system.shape[0])
-    target[-1] = 1.0
-    alpha, _ = nnls(system, target, maxiter=30 * C.shape[1])
+    alpha, _ = nnls(system, np.append(np.zeros(len(C)), 1.0), maxiter=30 * C.shape[1])
     return np.asarray(alpha / alpha.sum())

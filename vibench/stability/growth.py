@@ -16,14 +16,9 @@ from vibench.stability.infsup import beta_span
 
 @dataclass(frozen=True)
 class ProjectedSupremizers:
-    """Supremizers of an orthonormal multiplier basis η, projected on a nested primal basis Z: ZᵀBᵀη (N'×k).
+    """Supremizers of an orthonormal multiplier basis η, projected on a nested primal basis Z.
 
-    Attributes
-    ----------
-    of_classes
-        One matrix (N'×k) per class of constraint matrices.
-    classes
-        The constraint matrices.
+    `of_classes` has one matrix ZᵀBᵀη (N'×k) for each of the classes of constraint matrices.
     """
 
     of_classes: Sequence[Array]

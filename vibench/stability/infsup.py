@@ -83,6 +83,8 @@ def multipliers(chi: Array, W: InnerProduct, free: Mask | None = None) -> Multip
 def inf_sup(on_span: Array, on_generators: Array, cone: Multipliers) -> InfSup:
     """Span constant and cone interval from coordinates of the supremizers projected on the primal space.
 
+    The constants are zero without primal vectors and infinite without multipliers.
+
     Parameters
     ----------
     on_span
@@ -91,11 +93,6 @@ def inf_sup(on_span: Array, on_generators: Array, cone: Multipliers) -> InfSup:
         ZᵀBᵀχ (N'×R), likewise.
     cone
         The reduced cone.
-
-    Returns
-    -------
-    InfSup
-        Zero without primal vectors, infinite without multipliers.
     """
     span = beta_span(on_span)
     if np.any(cone.free) and np.all(cone.free):  # the cone is its span
@@ -129,9 +126,8 @@ def inf_sup_on(Z: Array, B: SparseMatrix, cone: Multipliers) -> InfSup:
 
 def inf_sup_full(V: InnerProduct, B: SparseMatrix, cone: Multipliers) -> InfSup:
     """Constants of the whole of V, where T(mu)η attains the supremum: those of online supremizers."""
-    return inf_sup(
-        V.whiten_functional(np.asarray(B.T @ cone.span)), V.whiten_functional(np.asarray(B.T @ cone.chi)), cone
-    )
+    on_span, on_generators = (V.whiten_functional(np.asarray(B.T @ eta)) for eta in (cone.span, cone.chi))
+    return inf_sup(on_span, on_generators, cone)
 
 
 def nodal_multipliers(W: InnerProduct) -> Multipliers:

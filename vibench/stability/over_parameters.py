@@ -12,10 +12,9 @@ from vibench.stability.infsup import InfSup, Multipliers, inf_sup, inf_sup_on
 
 def constants_full(V: InnerProduct, classes: ConstraintClasses, cone: Multipliers) -> list[InfSup]:
     """Constants of the whole of V at every B(mu) (m×n)."""
-    image = supremizer_images(V, classes.representatives, cone.span.shape[1] + cone.chi.shape[1])
-    return everywhere(
-        classes, [inf_sup(image(B, cone.span), image(B, cone.chi), cone) for B in classes.representatives]
-    )
+    image = supremizer_images(V, classes.representatives, cone.rank + cone.chi.shape[1])
+    found = [inf_sup(image(B, cone.span), image(B, cone.chi), cone) for B in classes.representatives]
+    return everywhere(classes, found)
 
 
 def constants_on(Z: Array, classes: ConstraintClasses, cone: Multipliers) -> list[InfSup]:

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 
 from vibench.interfaces.problem import VariationalInequality
-from vibench.qp.settings import SETTINGS, settings_for
+from vibench.qp.settings import SETTINGS
 from vibench.qp.solve import installed_solvers, solve_qp
 
 
 @pytest.mark.parametrize("solver", sorted(SETTINGS))
 def test_a_tighter_accuracy_never_asks_for_less(solver: str) -> None:
-    loose, tight = settings_for(solver, 1e-4), settings_for(solver, 1e-8)
+    loose, tight = SETTINGS[solver].at(1e-4), SETTINGS[solver].at(1e-8)
     assert loose.keys() == tight.keys()
     for key, value in tight.items():
         if isinstance(value, float) and not isinstance(loose[key], bool):
