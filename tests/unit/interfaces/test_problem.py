@@ -10,7 +10,6 @@ from numerics import Varying
 from vibench.errors import NumericalError
 from vibench.interfaces.problem import ParameterBox, VariationalInequality
 from vibench.interfaces.validation import checked_assembly
-from vibench.stages.assemblies import Assemblies
 
 BOX = ParameterBox(("a", "b"), np.array([0.0, -1.0]), np.array([1.0, 3.0]), ("1", "m"))
 
@@ -52,20 +51,3 @@ def test_a_wrong_assembly_is_named(monkeypatch: pytest.MonkeyPatch, member, wron
     monkeypatch.setattr(problem, "assemble", lambda mu: bad)
     with pytest.raises(NumericalError, match=message):
         checked_assembly(problem, np.array([0.3]))
-
-
-def test_assemblies_are_kept_up_to_a_limit_and_those_of_longest_ago_go_first() -> None:
-    problem = Varying()
-    one, two, three = (np.array([value]) for value in (0.2, 0.5, 0.8))
-    given_before = problem.assemble(one)
-    size = 12 * (given_before.A.nnz + given_before.B.nnz) + given_before.f.nbytes + given_before.g.nbytes
-    kept = Assemblies(problem, limit=int(2.5 * size))
-    assert kept.keep(one, given_before) is given_before
-    assert kept.keep(one, given_before) is given_before  # counted once
-    second = kept.at(two)
-    assert kept.at(one) is given_before
-    assert kept.at(two) is second
-    kept.at(one)
-    kept.at(three)  # for which the second has to go
-    assert kept.at(one) is given_before
-    assert kept.at(two) is not second
