@@ -1,4 +1,4 @@
-"""Locks between processes: a file that somebody holds, and who."""
+"""Lock files between processes, which name the process that holds them."""
 
 from __future__ import annotations
 
@@ -15,21 +15,14 @@ from vibench.errors import RequestError
 
 @contextlib.contextmanager
 def locked(path: Path, *, busy: str, shared: bool = False) -> Iterator[None]:
-    """Hold a lock file; the system releases it when the process ends, however it does.
+    """Hold a lock file; the system releases it when the process ends.
 
-    Parameters
-    ----------
-    path
-        The file; made if it does not exist, in a folder that does, and left behind.
-    busy
-        What it means that somebody else holds it.
-    shared
-        Whether others may hold it at the same time, if they do not mind either.
+    The file is created in an existing folder and never deleted. Several processes may hold a `shared` lock.
 
     Raises
     ------
     RequestError
-        If somebody else holds it, saying who, or if the file cannot be written.
+        With the text `busy` and the holder if another process holds the lock; if the file cannot be written.
     """
     try:
         file = path.open("a+", encoding="utf-8")
@@ -53,7 +46,7 @@ def locked(path: Path, *, busy: str, shared: bool = False) -> Iterator[None]:
 
 
 def _note(file: TextIO, holder: str) -> None:
-    """Write down who holds a lock; on a full disk it holds all the same."""
+    """Write the holder into the lock file; on a full disk the lock is valid without it."""
     with contextlib.suppress(OSError):
         file.truncate(0)
         file.write(holder)

@@ -65,16 +65,10 @@ def timed(work: Callable[[], T]) -> tuple[T, Seconds]:
 def median_seconds(
     work: Callable[[], T], before: Callable[[], None] = lambda: None, enough: float = SLOW
 ) -> tuple[T, Seconds]:
-    """Result of some work and its seconds: one warm-up, then the median of `REPEATS`, fewer if these take long.
+    """Result of some work and its seconds: one warm-up, then the median of at most `REPEATS` repeats.
 
-    Parameters
-    ----------
-    work
-        What is timed.
-    before
-        Called, untimed, before each run.
-    enough
-        Seconds of repeats after which there are no more; if the warm-up takes longer, it is what counts.
+    Repeats end after `enough` wall seconds; the warm-up counts if it takes longer than that. `before` is called,
+    untimed, before each run.
     """
 
     def once() -> tuple[T, Seconds]:
@@ -96,13 +90,10 @@ def median_of(runs: Sequence[Seconds]) -> Seconds:
 
 
 class Calibration:
-    """A fixed piece of numerical work, timed again and again, that tells how much slower the machine is than it was.
+    """Fixed numerical work whose time, relative to its best, measures how much the machine is slowed down at present.
 
-    What takes time from it, another process on its core, a shared cache, a lower clock rate, takes it from everything
-    that is timed beside it.
+    Other processes on the core, a shared cache and a lower clock rate slow down all that is timed beside it.
     """
-
-    TRIES = 3
 
     def __init__(self) -> None:
         self._matrix = np.random.default_rng(0).standard_normal((160, 160))
@@ -110,8 +101,8 @@ class Calibration:
         self.slowdown()
 
     def slowdown(self) -> float:
-        """Wall seconds of the work now, the quickest of three, over the quickest ever in this process."""
-        now = min(timed(self._work)[1].wall for _ in range(self.TRIES))
+        """Wall seconds of the work, the quickest of three runs, over the quickest in this process so far."""
+        now = min(timed(self._work)[1].wall for _ in range(3))
         self._best = min(self._best, now)
         return now / self._best
 

@@ -1,1 +1,1 @@
-"""The results file: its columns, the database, and what is derived from its tables."""
+"""The results file: its columns, its database, and tables and checks derived from them."""

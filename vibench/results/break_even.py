@@ -1,4 +1,4 @@
-"""Benefit thresholds: from how many queries on one way of reducing pays against another (paper, Tables 1 and 2)."""
+"""Break-even: the number of queries at which the total costs of two models are equal (paper, Tables 1 and 2)."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from vibench.results.columns import KEYS, THRESHOLDS
 
 
 class Meaning(StrEnum):
-    """What a threshold says."""
+    """When the second model, b, is cheaper in total than the first, a."""
 
     FROM = "from"
     UNTIL = "until"
@@ -22,7 +22,7 @@ class Meaning(StrEnum):
 
 @dataclass(frozen=True)
 class BreakEven:
-    """Number of queries n* (`None` where there is none) and what it means for way b against way a."""
+    """Number n* of queries, `None` where the total costs are never equal, and on which side of it b is cheaper."""
 
     number: float | None
     meaning: Meaning
@@ -32,11 +32,11 @@ class BreakEven:
 
 
 def break_even(offline_a: float, online_a: float, offline_b: float, online_b: float) -> BreakEven:
-    """When b, with its offline seconds and its seconds per query, is cheaper than a in total.
+    """Break-even of b against a, from their offline seconds and their seconds per query.
 
-    n* = (offline_b − offline_a) / (online_a − online_b). Offline dearer and queries faster: from n* queries on.
-    Offline dearer and queries no faster: never. Offline cheaper and queries no slower: at once. Offline cheaper but
-    queries slower: until n*.
+    n* = (offline_b − offline_a) / (online_a − online_b). If b costs more offline, it is cheaper from n* queries on if
+    its queries are faster, never otherwise. If b costs less offline, it is cheaper until n* queries if its queries are
+    slower, at once otherwise.
     """
     dearer, faster = offline_b - offline_a, online_a - online_b
     if dearer <= 0.0 and faster >= 0.0:
@@ -47,7 +47,7 @@ def break_even(offline_a: float, online_a: float, offline_b: float, online_b: fl
 
 
 HIGH_FIDELITY = "high-fidelity"
-"""What `primal_a` says where a reduced model is compared with the high-fidelity one."""
+"""Value of `primal_a` where a is the high-fidelity model."""
 
 _SHARED = tuple(name for name in THRESHOLDS if name in KEYS)
 
@@ -55,31 +55,25 @@ _SHARED = tuple(name for name in THRESHOLDS if name in KEYS)
 def break_even_rows(cells: Iterable[Mapping[str, Any]]) -> list[dict[str, Any]]:
     """Rows of the thresholds table from rows of the cells table.
 
-    Every per-parameter enrichment (a) against every fixed one (b) with the same problem, cone, tolerances and solver,
-    and the high-fidelity model (a, nothing offline) against every strategy (b). Cells without an ok query are left out.
+    Every per-parameter enrichment (a) is compared with every fixed one (b) of the same problem, cone, tolerances and
+    solver, if one machine measured both; the high-fidelity model (a, no offline phase) with every strategy (b). Cells
+    without an ok query are left out.
     """
     timed = [cell for cell in cells if cell["online_s"] is not None]
     rows = []
     for b in timed:
-        rows.append(_row(None, b))
+        full = {"primal": HIGH_FIDELITY, "primal_tol": None, "assembly": "", "offline_s": 0.0, "online_s": b["hf_s"]}
+        rows.append(_row(full, b))
         if b["enrichment_kind"] == Kind.FIXED:
-            shared = _comparable(b)
-            rows += [
-                _row(a, b) for a in timed if a["enrichment_kind"] == Kind.PER_PARAMETER and _comparable(a) == shared
-            ]
+            others = (a for a in timed if a["enrichment_kind"] == Kind.PER_PARAMETER)
+            rows += [_row(a, b) for a in others if all(a[name] == b[name] for name in (*_SHARED, "machine"))]
     return rows
 
 
-def _comparable(cell: Mapping[str, Any]) -> tuple[Any, ...]:
-    """What two cells must share: all but the enrichment, and the machine that measured their seconds."""
-    return tuple(cell[name] for name in (*_SHARED, "machine"))
-
-
-def _row(a: Mapping[str, Any] | None, b: Mapping[str, Any]) -> dict[str, Any]:
-    first = a or {"primal": HIGH_FIDELITY, "primal_tol": None, "assembly": "", "offline_s": 0.0, "online_s": b["hf_s"]}
-    found = break_even(first["offline_s"], first["online_s"], b["offline_s"], b["online_s"])
+def _row(a: Mapping[str, Any], b: Mapping[str, Any]) -> dict[str, Any]:
+    found = break_even(a["offline_s"], a["online_s"], b["offline_s"], b["online_s"])
     row = {name: b[name] for name in _SHARED}
-    for side, cell in (("a", first), ("b", b)):
+    for side, cell in (("a", a), ("b", b)):
         row |= {f"{name}_{side}": cell[name] for name in ("primal", "primal_tol", "assembly")}
         row |= {f"{phase}_{side}_s": cell[f"{phase}_s"] for phase in ("offline", "online")}
     return row | {"benefit_threshold": found.number, "meaning": found.meaning.value}

@@ -19,20 +19,20 @@ from vibench.results.columns import HISTORY_KEYS, STORED, VERSION
 FILE = "results.sqlite"
 
 NAMED = ("stage", "quantity", *HISTORY_KEYS)
-"""Columns that say whose a history is, and of what."""
+"""Columns that identify a history."""
 
 LOCK = ".lock"
-"""File in a run folder that the run holds."""
+"""Lock file in a run folder, held during a run."""
 
 
 @contextlib.contextmanager
 def claimed(folder: Path) -> Iterator[None]:
-    """Have a run folder for oneself; it is made if it does not exist.
+    """Lock a run folder, which is created if it does not exist.
 
     Raises
     ------
     RequestError
-        If the folder is a file, holds something that is not a results file, or is used by another run.
+        If the folder is a file, holds files but no results file, cannot be written, or is locked by another run.
     """
     try:
         if folder.exists() and not folder.is_dir():
@@ -47,14 +47,10 @@ def claimed(folder: Path) -> Iterator[None]:
 
 
 UNWRITABLE = {
-    sqlite3.SQLITE_FULL,
-    sqlite3.SQLITE_IOERR,
-    sqlite3.SQLITE_READONLY,
-    sqlite3.SQLITE_CANTOPEN,
-    sqlite3.SQLITE_BUSY,
+    sqlite3.SQLITE_FULL, sqlite3.SQLITE_IOERR, sqlite3.SQLITE_READONLY, sqlite3.SQLITE_CANTOPEN, sqlite3.SQLITE_BUSY,
     sqlite3.SQLITE_CORRUPT,
-}
-"""What SQLite says where the disk is full, gone, or not ours, or another program holds or broke the file."""
+}  # fmt: skip
+"""SQLite's error codes of a full, lost or read-only disk, and of a file locked or damaged by another program."""
 
 
 class ResultsDatabase:
@@ -63,16 +59,16 @@ class ResultsDatabase:
     Parameters
     ----------
     folder
-        The run folder; made if it does not exist.
+        Run folder; created if it does not exist.
     study
-        What the numbers of the study depend on: results of another study are refused.
+        Settings that determine the numbers of the study: results of another study are refused.
     anew
-        Drop whatever is there, in the transaction that makes the tables.
+        Drop all existing tables, in the transaction that creates the new ones.
 
     Raises
     ------
     RequestError
-        If the folder holds something that is not a results file of this study and schema.
+        If the folder holds results of another study or schema, or cannot be written.
     """
 
     def __init__(self, folder: Path, study: Mapping[str, Any], *, anew: bool = False) -> None:
@@ -85,19 +81,15 @@ class ResultsDatabase:
             self._db.execute("PRAGMA journal_mode=WAL")
             with self._db:
                 self._db.execute("BEGIN IMMEDIATE")
-                if anew:
-                    self._drop()
-                self._create(study)
+                self._create(study, anew)
             self._db.execute("PRAGMA foreign_keys=ON")
         except (OSError, sqlite3.Error) as error:
             raise RequestError(f"output folder '{folder}' cannot be written: {error}") from None
 
-    def _drop(self) -> None:
-        names = self._db.execute("SELECT name FROM sqlite_master WHERE type = 'table' AND name NOT LIKE 'sqlite_%'")
-        for (name,) in names.fetchall():
+    def _create(self, study: Mapping[str, Any], anew: bool) -> None:
+        old = "SELECT name FROM sqlite_master WHERE type = 'table' AND name NOT LIKE 'sqlite_%'"
+        for (name,) in self._db.execute(old).fetchall() if anew else ():
             self._db.execute(f'DROP TABLE "{name}"')
-
-    def _create(self, study: Mapping[str, Any]) -> None:
         self._db.execute("CREATE TABLE IF NOT EXISTS meta (key TEXT PRIMARY KEY, value TEXT)")
         for table, columns in STORED.items():
             declared = ", ".join(f'"{name}" {column.kind}' for name, column in columns.items())
@@ -109,19 +101,19 @@ class ResultsDatabase:
         self._db.executemany("INSERT OR REPLACE INTO meta VALUES (?, ?)", entries.items())
 
     def close(self) -> None:
-        """Close the file; what was written stays, in the one file."""
-        with contextlib.suppress(sqlite3.OperationalError, sqlite3.ProgrammingError):  # being read, or closed before
+        """Close the database and merge the write-ahead log into the one file."""
+        with contextlib.suppress(sqlite3.OperationalError, sqlite3.ProgrammingError):  # read by others, or closed
             self._db.execute("PRAGMA journal_mode=DELETE")
         self._db.close()
 
     def finished(self) -> dict[str, tuple[str, str]]:
-        """Cells that have a row: key → (status, code)."""
+        """Status and code of the cells that have a row, by their key."""
         return {key: (status, code) for key, status, code in self._db.execute("SELECT cell, status, code FROM cells")}
 
     def write_cell(
         self, cell: Mapping[str, Any], queries: Sequence[Mapping[str, Any]], solutions: Sequence[Mapping[str, Any]] = ()
     ) -> None:
-        """Write a cell, its queries and solutions in one transaction, in place of earlier rows of the same cell."""
+        """Write a cell, its queries and solutions in one transaction; earlier rows of the cell are replaced."""
         with self._writing():
             self._add_columns(queries)
             self._db.execute("DELETE FROM cells WHERE cell = ?", (cell["cell"],))
@@ -130,41 +122,41 @@ class ResultsDatabase:
             self._insert("solutions", solutions)
 
     def write_histories(self, histories: Sequence[Sequence[Mapping[str, Any]]], *, partial: bool = False) -> None:
-        """Write histories, each given as its rows, in place of earlier ones of the same name, whatever code made those.
+        """Write histories, each given as its rows; earlier histories of the same name are replaced.
 
-        `partial` says that others hold further steps of the same histories, which are kept.
+        With `partial`, earlier steps outside the range of the new ones are kept: several writers share a history.
         """
-        same = " AND ".join(f'"{name}" IS ?' for name in NAMED)
         with self._writing():
             for rows in filter(None, histories):
                 steps = [row["step"] for row in rows]
                 within = f" AND step BETWEEN {min(steps)} AND {max(steps)}" if partial else ""
-                name = tuple(_plain(rows[0].get(column)) for column in NAMED)
-                self._db.execute(f"DELETE FROM histories WHERE {same}{within}", name)
-                self._insert("histories", rows)
+                self._replace("histories", {name: rows[0].get(name) for name in NAMED}, rows, within)
 
     def replace_named(self, table: str, keys: Mapping[str, Any], rows: Sequence[Mapping[str, Any]]) -> None:
-        """Write rows of a table in place of all that have the same values in some columns."""
-        same = " AND ".join(f'"{name}" IS ?' for name in keys)
+        """Write rows of a table; earlier rows with these values in the columns `keys` are replaced."""
         with self._writing():
-            self._db.execute(f"DELETE FROM {table} WHERE {same}", tuple(keys.values()))
-            self._insert(table, rows)
+            self._replace(table, keys, rows)
 
     def replace(self, table: str, rows: Sequence[Mapping[str, Any]]) -> None:
-        """Replace the whole of a table that follows from the others."""
-        with self._writing():
-            self._db.execute(f"DELETE FROM {table}")
-            self._insert(table, rows)
+        """Replace all rows of a table."""
+        self.replace_named(table, {}, rows)
+
+    def _replace(
+        self, table: str, keys: Mapping[str, Any], rows: Sequence[Mapping[str, Any]], within: str = ""
+    ) -> None:
+        same = " AND ".join(["TRUE", *(f'"{name}" IS ?' for name in keys)])
+        self._db.execute(f"DELETE FROM {table} WHERE {same}{within}", tuple(map(_plain, keys.values())))
+        self._insert(table, rows)
 
     def rows(self, table: str) -> list[dict[str, Any]]:
         """All rows of a table."""
         cursor = self._db.execute(f"SELECT * FROM {table}")
-        names = [column[0] for column in cursor.description]
-        return [dict(zip(names, row, strict=True)) for row in cursor]
+        cursor.row_factory = sqlite3.Row
+        return [dict(row) for row in cursor]
 
     @contextlib.contextmanager
     def _writing(self) -> Iterator[None]:
-        """One transaction; what cannot be written leaves what was there before."""
+        """One transaction, rolled back if it cannot be written."""
         try:
             with self._db:
                 yield
@@ -175,14 +167,11 @@ class ResultsDatabase:
 
     def _insert(self, table: str, rows: Iterable[Mapping[str, Any]]) -> None:
         for row in rows:
-            names = ", ".join(f'"{name}"' for name in row)
-            marks = ", ".join("?" for _ in row)
-            self._db.execute(
-                f"INSERT INTO {table} ({names}) VALUES ({marks})", tuple(_plain(value) for value in row.values())
-            )
+            names, marks = ", ".join(f'"{name}"' for name in row), ", ".join("?" * len(row))
+            self._db.execute(f"INSERT INTO {table} ({names}) VALUES ({marks})", tuple(map(_plain, row.values())))
 
     def _add_columns(self, queries: Sequence[Mapping[str, Any]]) -> None:
-        """Make room for as many parameters mu_1, mu_2, … as the rows have."""
+        """Add a column for every parameter mu_1, mu_2, … of the rows."""
         known = {row[1] for row in self._db.execute("PRAGMA table_info(queries)")}
         for name in dict.fromkeys(name for row in queries for name in row):
             if name not in known and name.startswith("mu_"):
@@ -190,15 +179,13 @@ class ResultsDatabase:
 
 
 def _plain(value: Any) -> Any:
-    """A value SQLite stores as what it is: NumPy scalars would end as bytes."""
+    """A NumPy scalar as a Python number: SQLite would store its bytes."""
     return value.item() if isinstance(value, np.generic) else value
 
 
 def _refuse_other(path: Path, study: Mapping[str, Any]) -> None:
-    if not path.exists():
-        return
-    found = read_meta(path)
-    if not found:  # made by a run that was killed before it could write anything
+    found = read_meta(path) if path.exists() else {}
+    if not found:  # empty where a run was killed before its first transaction
         return
     if found.get("schema") != str(VERSION):
         raise RequestError(f"'{path}' has schema {found.get('schema')}, this vibench writes {VERSION}; use --out")
@@ -210,26 +197,35 @@ def _refuse_other(path: Path, study: Mapping[str, Any]) -> None:
         raise RequestError(f"'{path.parent}' holds results of another study ({what}); use another --out, or --fresh")
 
 
+def open_read_only(path: Path) -> contextlib.closing[sqlite3.Connection]:
+    """Context with a connection that cannot write to the results file."""
+    return contextlib.closing(sqlite3.connect(f"file:{quote(str(path))}?mode=ro", uri=True))
+
+
 def read_meta(path: Path) -> dict[str, str]:
-    """The meta table of a results file, empty where the file is.
+    """The meta table of a results file; empty if the file has no tables.
 
     Raises
     ------
     RequestError
-        If the file is something else.
+        If the file is not a results file.
     """
-    db = sqlite3.connect(f"file:{quote(str(path))}?mode=ro", uri=True)
-    try:
-        tables = [name for (name,) in db.execute("SELECT name FROM sqlite_master WHERE type = 'table'")]
-        return dict(db.execute("SELECT key, value FROM meta")) if tables else {}
-    except sqlite3.Error as error:
-        raise RequestError(f"'{path}' is not a results file of vibench: {error}") from None
-    finally:
-        db.close()
+    with open_read_only(path) as db:
+        try:
+            tables = db.execute("SELECT name FROM sqlite_master WHERE type = 'table'").fetchall()
+            return dict(db.execute("SELECT key, value FROM meta")) if tables else {}
+        except sqlite3.Error as error:
+            raise RequestError(f"'{path}' is not a results file of vibench: {error}") from None
 
 
 def study_of(path: Path, meta: Mapping[str, str]) -> dict[str, Any]:
-    """The identity of the study a results file belongs to."""
+    """The settings of the study that a results file belongs to, from its meta table.
+
+    Raises
+    ------
+    RequestError
+        If the meta table does not hold them.
+    """
     try:
         found = json.loads(meta.get("study", ""))
     except ValueError:

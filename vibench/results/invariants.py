@@ -1,10 +1,10 @@
-"""What must hold in every row of `queries`, whatever was run; a violation is a bug in our own linear algebra.
+"""Inequalities that hold in every row of `queries`; a violation is a bug in the linear algebra of vibench.
 
-Whole space ≥ own space ≥ V_N alone, whole space ≥ high-fidelity pair, own = whole space for per-parameter enrichments,
-cone ≥ span; certified error bounds ≥ errors. The order is exact for the span; of intervals over the cone, the upper end
-of the larger constant is compared with the lower end of the smaller. A reduced cone with free generators is not in W⁺,
-and its constant is compared with that of the high-fidelity pair over the span alone. Round-off is allowed for, in units
-of the constant of the whole space, which is no larger than the norm of the form.
+Inf-sup constants grow with the primal space: V_N ≤ enriched V_N ≤ V, with equality of the last two for per-parameter
+enrichments; that of V is at least that of the high-fidelity pair, and that over the cone at least that over the span.
+Certified error bounds are at least the errors. Of intervals over the cone, the upper end of the larger constant is
+compared with the lower end of the smaller. A cone with free generators is not in W⁺ and compared with the high-fidelity
+pair over the span alone. The tolerance for round-off is relative to the constant of V, at most the norm of the form.
 """
 
 from __future__ import annotations
@@ -21,15 +21,15 @@ from vibench.stability.conic_infsup import ABSOLUTE, RELATIVE
 from vibench.stability.infsup import UNSIGNED
 
 EFFECTIVITIES = ("effectivity_u", "effectivity_lambda")
-"""Certified bound over error: at least 1 wherever there is one."""
+"""Certified bound over error, at least 1."""
 
 ORDER = (("full_", ""), ("", "plain_"), ("full_", "hf_"))
-"""Pairs of constants: the first is at least the second."""
+"""Pairs of inf-sup constants, the larger one first."""
 
 
 @dataclass(frozen=True)
 class Violation:
-    """An invariant that some rows break."""
+    """An invariant, the number of rows that violate it, and the largest violation."""
 
     invariant: str
     rows: int
@@ -40,21 +40,13 @@ class Violation:
 
 
 def violations(queries: pd.DataFrame, kinds: pd.Series) -> list[Violation]:
-    """Invariants that do not hold.
-
-    Parameters
-    ----------
-    queries
-        Rows of the queries table.
-    kinds
-        How the enrichment of each cell depends on the parameter, by cell.
-    """
-    numbers = queries[[*CONSTANTS, *EFFECTIVITIES]].astype(float)
-    signed = ~queries["bounds"].fillna("").str.startswith(f"{UNSIGNED}/")
-    return list(_found(numbers, queries["cell"].map(kinds), signed))
+    """Violated invariants in rows of the queries table; `kinds` is the kind of enrichment of each cell, by cell."""
+    return list(_violations(queries, kinds))
 
 
-def _found(queries: pd.DataFrame, kind: pd.Series, signed: pd.Series) -> Iterator[Violation]:
+def _violations(rows: pd.DataFrame, kinds: pd.Series) -> Iterator[Violation]:
+    queries, kind = rows[[*CONSTANTS, *EFFECTIVITIES]].astype(float), rows["cell"].map(kinds)
+    signed = ~rows["bounds"].fillna("").str.startswith(f"{UNSIGNED}/")
     scale = queries["beta_full_cone_upper"]
     for larger, smaller in ORDER:
         inside = signed if smaller == "hf_" else signed | True
@@ -74,6 +66,6 @@ def _found(queries: pd.DataFrame, kind: pd.Series, signed: pd.Series) -> Iterato
 
 def _at_least(rows: pd.DataFrame, larger: str, smaller: str, scale: pd.Series) -> Iterator[Violation]:
     missing = rows[smaller] * (1.0 - RELATIVE) - ABSOLUTE * scale - rows[larger]
-    broken = ~(missing <= 0.0) & np.isfinite(rows[smaller])  # a constant that is not a number breaks it too
+    broken = ~(missing <= 0.0) & np.isfinite(rows[smaller])  # NaN violates it too
     if broken.any():
         yield Violation(f"{larger} ≥ {smaller}", int(broken.sum()), float(missing[broken].max()))

@@ -1,4 +1,4 @@
-"""Pictures of high-fidelity solutions, packed into the results file and read back from it."""
+"""Pictures of high-fidelity solutions: their rows in the results file, written and read."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ ARRAYS = tuple(field.name for field in fields(Picture) if not field.name.endswit
 
 
 def picture_rows(drawn: Iterable[tuple[str, Picture]]) -> list[dict[str, Any]]:
-    """Rows of the pictures table, one for every title and picture; the columns that name the problem come apart."""
+    """Rows of the pictures table, one for every title and picture, without the columns that identify the problem."""
     return [
         {"number": k, "title": title, "names": json.dumps([one.name, one.multiplier_name]), "data": _packed(one)}
         for k, (title, one) in enumerate(drawn)
@@ -26,13 +26,13 @@ def picture_rows(drawn: Iterable[tuple[str, Picture]]) -> list[dict[str, Any]]:
 
 
 def failure_rows(reason: str) -> list[dict[str, Any]]:
-    """The row that says why there is no picture."""
+    """The row of the pictures table that holds the reason why a problem has no picture."""
     return [{"number": 0, "reason": reason}]
 
 
 @dataclass(frozen=True)
 class Shown:
-    """A picture read back: whose it is, its title, and why it is not there if it is not."""
+    """A picture with its problem (label and options) and title, or the reason why there is none."""
 
     key: tuple[str, str]
     title: str
@@ -52,9 +52,8 @@ def read(path: Path) -> Iterator[Shown]:
 def _packed(picture: Picture) -> bytes:
     """The arrays, in single precision, compressed."""
     stream = io.BytesIO()
-    small = {name: getattr(picture, name) for name in ARRAYS}
-    kept = {name: value.astype(np.int32 if name == "triangles" else np.float32) for name, value in small.items()}
-    np.savez_compressed(stream, **kept)
+    precision = {name: np.int32 if name == "triangles" else np.float32 for name in ARRAYS}
+    np.savez_compressed(stream, **{name: getattr(picture, name).astype(kind) for name, kind in precision.items()})
     return stream.getvalue()
 
 

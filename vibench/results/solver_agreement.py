@@ -1,4 +1,4 @@
-"""Whether QP solvers that are both ok on the same reduced problem agree within what their accuracy allows."""
+"""Agreement of QP solvers: distances of ok solutions of the same program, and the distance their accuracy allows."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from vibench.results.columns import DISAGREEMENTS, KEYS
 
 
 def solution_row(x: Array, alpha: Array, left_open: Slack) -> dict[str, Any]:
-    """Columns of the solutions table."""
+    """Columns of the solutions table that hold x (N',), α (R,) and the slack of a solution."""
     return {
         "x": np.asarray(x, "<f8").tobytes(),
         "alpha": np.asarray(alpha, "<f8").tobytes(),
@@ -33,7 +33,7 @@ def vectors(row: Mapping[str, Any]) -> tuple[Array, Array]:
 
 @dataclass(frozen=True)
 class Recorded:
-    """An `ok` answer of one solver to one query: x (N',) and its slack."""
+    """An ok solution x (N',) of one query by one solver, with its slack."""
 
     solver: str
     query: int
@@ -58,7 +58,7 @@ def disagreement_rows(
 
 
 def sentence(disagreements: pd.DataFrame) -> str:
-    """The audit in a line."""
+    """The disagreements table in one sentence."""
     if disagreements.empty:
         return "no two solvers were ok on the same reduced problem"
     pairs, flagged = int(disagreements["queries"].sum()), int(disagreements["flagged"].sum())
@@ -70,7 +70,7 @@ def sentence(disagreements: pd.DataFrame) -> str:
 
 
 def compare(answers: Iterable[Recorded]) -> Iterator[dict[str, Any]]:
-    """For every two solvers of one reduced model: how far apart they are, and how often farther than allowed."""
+    """Largest distance of every two solvers of one reduced model, and the number of queries where it is too large."""
     by_solver: dict[str, dict[int, Recorded]] = {}
     for answer in answers:
         by_solver.setdefault(answer.solver, {})[answer.query] = answer

@@ -1,1 +1,1 @@
-"""What a study asks for: plugins and their options, study files, and the matrix of cells."""
+"""Studies: the registry of plugins and their options, study files, and the matrix of cells."""

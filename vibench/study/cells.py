@@ -1,4 +1,4 @@
-"""The matrix of a study: its cells, each with an identity that is the same whenever its numbers are."""
+"""The matrix of a study: its cells, each identified by what determines its numbers."""
 
 from __future__ import annotations
 
@@ -19,24 +19,14 @@ from vibench.study.spec import Entry, Study, ToleranceTable
 
 
 def digest(content: Any) -> str:
-    """Short hash of anything JSON can hold, the same for equal content."""
+    """Short hash of JSON content, independent of the order of keys."""
     text = json.dumps(content, sort_keys=True, separators=(",", ":"), ensure_ascii=True)
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
 @dataclass(frozen=True)
 class Plugin:
-    """A plugin with its options, as an axis of a study names it.
-
-    Attributes
-    ----------
-    kind, name
-        What it is registered as.
-    options
-        Options as canonical JSON.
-    code
-        Distribution, version and a hash of the module it comes from.
-    """
+    """A plugin with its options as canonical JSON, and the version of its code (`registry.code`)."""
 
     kind: str
     name: str
@@ -45,13 +35,9 @@ class Plugin:
 
     @classmethod
     def from_entry(cls, kind: str, entry: Entry) -> Plugin:
-        """Plugin of an axis entry that has been checked."""
-        return cls(
-            kind,
-            entry.name,
-            registry.canonical_options(kind, entry.name, entry.options),
-            registry.code(kind, entry.name),
-        )
+        """Plugin of an entry of an axis."""
+        options = registry.canonical_options(kind, entry.name, entry.options)
+        return cls(kind, entry.name, options, registry.code(kind, entry.name))
 
     def create(self) -> Any:
         """A new instance."""
@@ -60,7 +46,7 @@ class Plugin:
 
 @dataclass(frozen=True)
 class Axes:
-    """Values on the axes of a study, those that something depends on."""
+    """Values on the axes of a study; `None` on an axis that does not matter."""
 
     problem: Plugin | None = None
     dual: Plugin | None = None
@@ -74,9 +60,9 @@ class Axes:
 class Cell:
     """One cell: problem × dual strategy × primal strategy × tolerances × QP solver × assembly.
 
-    `interpolation` is the tolerance of reduced assembly, `None` for assembly in full. `seed`, `validation` and
-    `accuracy` are the study's. Labels are for reading and no part of the identity; nor are `nested_tolerances`, all
-    tolerances of a nested primal strategy in the study, which one growth reaches.
+    `interpolation` is the tolerance of reduced assembly, `None` for full assembly. `labels` of problem, dual and primal
+    strategy are no part of the identity; nor are `nested_tolerances`, all tolerances of a nested primal strategy in the
+    study, whose enrichments are stages of one.
     """
 
     problem: Plugin
@@ -97,7 +83,7 @@ class Cell:
 
     @cached_property
     def key(self) -> str:
-        """Hash of everything that determines the cell's numbers, the code aside."""
+        """Hash of everything but the code that determines the cell's numbers."""
         content = asdict(self)
         del content["labels"], content["nested_tolerances"]
         for plugin in ("problem", "dual", "primal"):
@@ -111,12 +97,12 @@ class Cell:
 
     @classmethod
     def from_definition(cls, text: str) -> Cell:
-        """The cell a definition describes, with its plugins as they are today.
+        """The cell of a definition, with the code of its plugins as installed.
 
         Raises
         ------
         RequestError
-            If one of them is not installed any more.
+            If a plugin is not installed.
         """
         content = json.loads(text)
         for axis in ("problem", "dual", "primal"):
@@ -128,7 +114,7 @@ class Cell:
 
     @property
     def axes(self) -> Axes:
-        """The axes that name the cell, its solver and assembly aside."""
+        """The axes of the cell, without solver and assembly."""
         return Axes(self.problem, self.dual, self.primal, self.pod, self.cone, self.primal_tol)
 
     @property
@@ -142,22 +128,21 @@ class Cell:
     def __str__(self) -> str:
         problem, dual, primal = self.labels
         tolerance = "" if self.primal_tol is None else f" {self.primal_tol:g}"
-        sizes = f"{_stop(self.pod, 'N')}, {_stop(self.cone, 'R')}"
+        pod, cone = (
+            f"{size}={stop.size}" if stop.tolerance is None else f"{stop.tolerance:g}"
+            for size, stop in (("N", self.pod), ("R", self.cone))
+        )
         assembly = "" if self.assembly == "full" else f" · {self.assembly}"
-        return f"{problem} · {dual} · {primal}{tolerance} · {sizes} · {self.solver}{assembly}"
-
-
-def _stop(stop: Stop, size: str) -> str:
-    return f"{stop.tolerance:g}" if stop.tolerance is not None else f"{size}={stop.size}"
+        return f"{problem} · {dual} · {primal}{tolerance} · {pod}, {cone} · {self.solver}{assembly}"
 
 
 def expand(study: Study) -> list[Cell]:
-    """All cells of a study, duplicates merged, in the order of its axes.
+    """All cells of a study without duplicates, in the order of its axes.
 
     Raises
     ------
     RequestError
-        If there is none, or a strategy that takes a tolerance is given none.
+        If the matrix is empty, or a strategy that takes a tolerance has none.
     """
     cells: dict[str, Cell] = {}
     for problem, table in product(study.problem, study.tolerances):

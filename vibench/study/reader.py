@@ -1,9 +1,10 @@
-"""Reading study files: where they are, what the command line replaces, and the line that says what is wrong."""
+"""Reading study files: their location, the axes that the command line replaces, and error messages."""
 
 from __future__ import annotations
 
+import os
 import tomllib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,22 +17,23 @@ from vibench.study.spec import Entry, Limits, Study, ToleranceTable
 
 
 def find_study(request: str) -> Path:
-    """File behind what the user called a study: a path, or the name of a registered one."""
+    """File of a study, from its path or the name under which it is registered.
+
+    Raises
+    ------
+    RequestError
+        If there is no such file or registered study.
+    """
     path = Path(request)
-    if path.suffix != ".toml" and not _exists(path, Path.is_file):
-        if _exists(path, Path.exists) and request not in registry.names("study"):
+    # os.path, since methods of Path raise OSError for names too long for a file.
+    is_file, exists = os.path.isfile(path), os.path.exists(path)  # noqa: PTH110, PTH113
+    if path.suffix != ".toml" and not is_file:
+        if exists and request not in registry.names("study"):
             raise RequestError(f"study '{request}' is not a file")
         return registry.study_path(request)
-    if not path.is_file():
-        raise RequestError(f"study file '{request}' {'is not a file' if path.exists() else 'does not exist'}")
+    if not is_file:
+        raise RequestError(f"study file '{request}' {'is not a file' if exists else 'does not exist'}")
     return path
-
-
-def _exists(path: Path, kind: Callable[[Path], bool]) -> bool:
-    try:
-        return kind(path)
-    except OSError:  # a name that no file can have
-        return False
 
 
 def load_study(request: str, overrides: Mapping[str, Sequence[Any]] | None = None) -> Study:
@@ -42,13 +44,13 @@ def load_study(request: str, overrides: Mapping[str, Sequence[Any]] | None = Non
     request
         Path of a TOML file, or the name of a registered study.
     overrides
-        Axes to replace everywhere, keys "problem", "dual", "primal", "solvers", "pod", "dual_tol",
-        "primal_tol"; empty sequences replace nothing.
+        Values that replace those of the file: of the axes "problem", "dual", "primal" and "solvers", and of the
+        tolerances "pod", "dual_tol" and "primal_tol" in every table. Empty sequences replace nothing.
 
     Raises
     ------
     RequestError
-        With file, key, what was found and what is expected.
+        If the file cannot be read or is not a valid study; the message names the file, the key and the expected value.
     """
     path = find_study(request)
     try:
@@ -62,14 +64,20 @@ def load_study(request: str, overrides: Mapping[str, Sequence[Any]] | None = Non
     given = {key: list(values) for key, values in (overrides or {}).items() if values}
     source = str(path) if path == Path(request) else f"study '{request}'"
     source += " with the options of the command line" if given else ""
-    study = _validate(_replace_axes(content, given), source)
-    _check_names(study, source)
+    content = _replace_axes(content, given)
+    try:
+        study = Study.model_validate(content)
+        _check_names(study)
+    except ValidationError as error:
+        line = f"{source}: {_message(error.errors(include_url=False)[0])}"
+        raise RequestError(" ".join(line.split())) from None
+    except RequestError as error:
+        raise RequestError(f"{source}: {error}") from None
     return study
 
 
 def _replace_axes(content: dict[str, Any], given: Mapping[str, list[Any]]) -> dict[str, Any]:
-    """The content of a study file with whole axes replaced, as the options of the command line ask."""
-    content = dict(content)
+    """The content of a study file, not checked yet, with the axes and tolerances given on the command line."""
     for axis in ("problem", "dual", "primal", "solvers"):
         if axis in given:
             content[axis] = [entry for name in given[axis] for entry in _entries_in(content.get(axis), name)]
@@ -77,18 +85,14 @@ def _replace_axes(content: dict[str, Any], given: Mapping[str, list[Any]]) -> di
     if isinstance(tables, list) and all(isinstance(table, dict) for table in tables):
         primal = content.get("primal")
         names = [_title(entry) for entry in primal if _takes_tolerance(entry)] if isinstance(primal, list) else []
-        content["tolerances"] = [_replace_tolerances(dict(table), given, names) for table in tables]
+        for table in tables:
+            for key, tolerance, size in (("pod", "pod", "N"), ("dual_tol", "dual", "R")):
+                if key in given:
+                    table.pop(size, None)
+                    table[tolerance] = given[key]
+            if "primal_tol" in given:
+                table["primal"] = dict.fromkeys(names, given["primal_tol"])
     return content
-
-
-def _replace_tolerances(table: dict[str, Any], given: Mapping[str, list[Any]], primal: list[str]) -> dict[str, Any]:
-    for key, tolerance, size in (("pod", "pod", "N"), ("dual_tol", "dual", "R")):
-        if key in given:
-            table.pop(size, None)
-            table[tolerance] = given[key]
-    if "primal_tol" in given:
-        table["primal"] = dict.fromkeys(primal, given["primal_tol"])
-    return table
 
 
 def _title(entry: Any) -> str:
@@ -96,88 +100,68 @@ def _title(entry: Any) -> str:
 
 
 def _takes_tolerance(entry: Any) -> bool:
-    """Whether an entry of the primal axis names a strategy with a tolerance; nothing has been checked yet."""
+    """Whether an unchecked entry of the primal axis names a strategy that takes a tolerance."""
     name = str(entry.get("name") if isinstance(entry, dict) else entry)
     known = name in registry.names("primal strategy")
     return known and bool(registry.load("primal strategy", name).takes_tolerance)
 
 
 def _entries_in(axis: Any, name: str) -> list[Any]:
-    """The axis entries with this name or label, their options included; the bare name where the file has none."""
+    """The entries of an unchecked axis that have this name or label; the name itself if there are none."""
     tables = [entry for entry in axis if isinstance(entry, dict)] if isinstance(axis, list) else []
     return [entry for entry in tables if name in (entry.get("name"), entry.get("label"))] or [name]
 
 
-def _validate(content: dict[str, Any], source: str) -> Study:
-    try:
-        return Study.model_validate(content)
-    except ValidationError as error:
-        first = error.errors(include_url=False)[0]
-        line = " ".join(f"{source}: {_complaint(first)}".split())
-        raise RequestError(line) from None
-
-
-def _complaint(error: Any) -> str:
-    """What is wrong at which key of a study file, and what was expected there."""
-    where = [part for part in error["loc"] if not str(part).startswith("<")]
-    if error["type"] == "extra_forbidden":
-        return _unknown_key(where)
-    message = {"model_type": "expected a table", "missing": "required, but not given"}.get(error["type"], error["msg"])
-    if error["type"] == "model_type" and where[0] in ("problem", "dual", "primal"):
-        message = "expected a name, or a table with one"
-    found = f" (found {error['input']!r:.80})" if isinstance(error["input"], str | int | float) else ""
-    place = ".".join(str(part) for part in where)
-    return f"{place + ': ' if place else ''}{message.removeprefix('Value error, ')}{found}"
-
-
 MODELS: Mapping[str, type[BaseModel]] = {"tolerances": ToleranceTable, "limits": Limits}
-"""What stands under a key of a study file; entries of an axis under the others."""
+"""Models of the tables in a study file, by their key; those under other keys are entries of an axis."""
 
 
-def _unknown_key(where: list[Any]) -> str:
-    """The line for a key that is not known where it stands, the nearest of those that are suggested."""
-    *path, key = where
-    model: type[BaseModel] = Study if not path else MODELS.get(path[0], Entry)
-    place = ".".join(str(part) for part in path)
-    return f"{place + ': ' if place else ''}{unknown_name('key', ''.join(str(key).split()), model.model_fields)}"
+def _message(error: Any) -> str:
+    """The key of a study file that is wrong, the expected value and the one found."""
+    where = [part for part in error["loc"] if not str(part).startswith("<")]
+    message, found = error["msg"].removeprefix("Value error, "), ""
+    if isinstance(error["input"], str | int | float):
+        found = f" (found {error['input']!r:.80})"
+    match error["type"]:
+        case "extra_forbidden":
+            *where, key = where
+            model: type[BaseModel] = MODELS.get(where[0], Entry) if where else Study
+            message, found = str(unknown_name("key", "".join(str(key).split()), model.model_fields)), ""
+        case "missing":
+            message = "required, but not given"
+        case "model_type":
+            of_plugin = where[0] in ("problem", "dual", "primal")
+            message = "expected a name, or a table with one" if of_plugin else "expected a table"
+    place = ".".join(str(part) for part in where)
+    return f"{place + ': ' if place else ''}{message}{found}"
 
 
-def _check_names(study: Study, source: str) -> None:
-    """Refuse names no plugin has, options it does not take and tolerances for nobody, or lacking for somebody."""
-    try:
-        for kind, axis in (
-            ("problem", study.problem),
-            ("dual strategy", study.dual),
-            ("primal strategy", study.primal),
-        ):
-            for entry in axis:
-                registry.check_options(kind, entry.name, entry.options)
-        for solver in study.solver_names():
-            check_solver_name(solver, registry.names("QP solver"))
-            registry.qp_solver(solver)
-        for table in study.tolerances:
-            _check_tolerances(study, table)
-    except RequestError as error:
-        raise RequestError(f"{source}: {error}") from None
+def _check_names(study: Study) -> None:
+    """Check names and options of plugins, and that exactly the strategies which take a tolerance have one."""
+    axes = {"problem": study.problem, "dual strategy": study.dual, "primal strategy": study.primal}
+    for kind, axis in axes.items():
+        for entry in axis:
+            registry.check_options(kind, entry.name, entry.options)
+    for solver in study.solver_names():
+        check_solver_name(solver, registry.names("QP solver"))
+        registry.qp_solver(solver)
+    for table in study.tolerances:
+        _check_tolerances(study, table)
 
 
 def _check_tolerances(study: Study, table: ToleranceTable) -> None:
     for kind, axis, tolerances in (
-        ("dual strategy of this study", study.dual, table.dual),
-        ("dual strategy of this study", study.dual, table.R),
-        ("primal strategy of this study", study.primal, table.primal),
+        ("dual strategy", study.dual, table.dual),
+        ("dual strategy", study.dual, table.R),
+        ("primal strategy", study.primal, table.primal),
     ):
+        # A tolerance may name a plugin that an option of the command line removed from the axis.
         known = {name for entry in axis for name in (entry.name, entry.title)}
         for name in tolerances if isinstance(tolerances, dict) else ():
-            if name not in known and not _registered_elsewhere(kind, name):
-                raise unknown_name(kind, name, known)
+            if name not in known and name not in registry.names(kind):
+                raise unknown_name(f"{kind} of this study", name, known)
     for entry in study.dual:
         table.of_dual(entry)
     for entry in study.primal:
         if table.of_primal(entry) == [None] and not table.primal.keys().isdisjoint({entry.name, entry.title}):
             raise RequestError(f"tolerances.primal gives something for '{entry.title}', which takes no tolerance")
-
-
-def _registered_elsewhere(kind: str, name: str) -> bool:
-    """Whether a tolerance names a plugin that exists, though an option of the command line took it off the axis."""
-    return name in registry.names(kind.removesuffix(" of this study"))

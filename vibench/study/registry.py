@@ -1,4 +1,4 @@
-"""Plugins found through entry points, created from options that their annotations check."""
+"""The registry of plugins: entry points, and options checked against the annotations of constructors."""
 
 from __future__ import annotations
 
@@ -28,18 +28,18 @@ GROUPS: Mapping[str, str] = {
     "study": "vibench.studies",
 }
 FINITE = ConfigDict(allow_inf_nan=False)
-"""No option of a plugin may be infinite or not a number."""
+"""Options of plugins are finite."""
 
 BASES: Mapping[str, type] = {"problem": Problem, "dual strategy": DualStrategy, "primal strategy": PrimalStrategy}
-"""The abstract classes of plugins that are classes."""
+"""Abstract base classes of the kinds of plugins that are classes."""
 
 WORDS: Mapping[str, str] = {"problem": "problem", "primal": "primal strategy", "dual": "dual strategy"}
-"""These kinds as the command line calls them."""
+"""Kinds of plugins by their names on the command line."""
 
 
 @dataclass(frozen=True)
 class Option:
-    """One option of a plugin: name, what is expected, default as text ("" when it must be given)."""
+    """One option of a plugin: name, expected values in words, default as text ("" if it is required)."""
 
     name: str
     expected: str
@@ -52,20 +52,18 @@ def names(kind: str) -> list[str]:
 
 
 def load(kind: str, name: str) -> Any:
-    """What a plugin's entry point refers to.
+    """The object that a plugin's entry point refers to.
 
     Raises
     ------
     RequestError
         If no plugin has that name, it cannot be imported, or it is not of its kind.
     """
-    registered = _registered(kind)
-    if name not in registered:
-        raise unknown_name(kind, name, registered)
-    where = f"{kind} '{name}' ({registered[name].value})"
+    entry = _entry(kind, name)
+    where = f"{kind} '{name}' ({entry.value})"
     try:
-        plugin = registered[name].load()
-    except (Exception, SystemExit) as error:  # noqa: BLE001  importing a plugin runs code of strangers
+        plugin = entry.load()
+    except (Exception, SystemExit) as error:  # noqa: BLE001  importing a plugin runs third-party code
         raise RequestError(f"{where} cannot be loaded: {in_a_line(error)}") from None
     base = BASES.get(kind)
     if base is not None and not (isinstance(plugin, type) and issubclass(plugin, base)):
@@ -90,20 +88,14 @@ def version(kind: str, name: str) -> str:
 
 @cache
 def code(kind: str, name: str) -> str:
-    """Version of a plugin with a hash of its package, or of its one module: edited code is not taken for the old.
-
-    Of a package the outermost one that has an `__init__.py` counts, with all that is below it.
+    """Version of a plugin with a hash of its outermost package, or of its module if it is in none.
 
     Raises
     ------
     RequestError
         If no plugin has that name.
     """
-    registered = _registered(kind)
-    if name not in registered:
-        raise unknown_name(kind, name, registered)
-    module = importlib.import_module(registered[name].module)
-    source = Path(str(module.__file__))
+    source = Path(str(importlib.import_module(_entry(kind, name).module).__file__))
     while (source.parent / "__init__.py").is_file():
         source = source.parent
     needed = "".join(f" {required} {distribution_version(required)}" for required in requirements(kind, name))
@@ -116,7 +108,7 @@ def missing(kind: str, name: str) -> list[str]:
 
 
 def requirements(kind: str, name: str) -> tuple[str, ...]:
-    """Distributions that a plugin declares as `requires`, beside those of its own package."""
+    """Distributions that a plugin `requires`, in addition to the requirements of its own distribution."""
     entry = _registered(kind)[name]
     plugin = getattr(importlib.import_module(entry.module), entry.attr.partition(".")[0], None)
     return tuple(getattr(plugin, "requires", ()))
@@ -124,63 +116,53 @@ def requirements(kind: str, name: str) -> tuple[str, ...]:
 
 def options(kind: str, name: str) -> list[Option]:
     """The options of a plugin, read from its constructor."""
-    found = []
-    for parameter, annotation in _parameters(load(kind, name)):
-        default = "" if parameter.default is inspect.Parameter.empty else repr(parameter.default)
-        found.append(Option(parameter.name, _expected(annotation), default))
-    return found
+    return [
+        Option(option, _expected(annotation), "" if default is inspect.Parameter.empty else repr(default))
+        for option, (default, annotation) in _parameters(load(kind, name)).items()
+    ]
 
 
 def check_options(kind: str, name: str, given: Mapping[str, Any]) -> dict[str, Any]:
-    """Options as the annotations of the plugin's constructor ask for them.
-
-    Raises
-    ------
-    RequestError
-        Naming the option, what was given and what is expected.
-    """
+    """Options of a registered plugin, checked as by `checked_arguments`."""
     return checked_arguments(load(kind, name), f"{kind} '{name}'", given)
 
 
 def checked_arguments(plugin: type, what: str, given: Mapping[str, Any]) -> dict[str, Any]:
-    """Options as the annotations of a class ask for them, registered or not; `what` it is called in messages.
+    """Options of a class, converted to the types in its constructor's annotations; `what` is its name in messages.
 
     Raises
     ------
     RequestError
-        Naming the option, what was given and what is expected.
+        If an option is unknown, missing, or not of its type.
     """
-    known = {parameter.name: (parameter, annotation) for parameter, annotation in _parameters(plugin)}
+    known = _parameters(plugin)
     for option in given:
         if option not in known:
             raise unknown_name(f"option of {what}", option, known)
     checked = {}
-    for option, (parameter, annotation) in known.items():
-        if option not in given:
-            if parameter.default is inspect.Parameter.empty:
-                raise RequestError(f"{what} needs the option '{option}' ({_expected(annotation)})")
-            continue
-        try:
+    for option, (default, annotation) in known.items():
+        if option in given:
+            # In strict mode pydantic converts lists to tuples and texts to enumerations only from JSON.
             text = json.dumps(given[option], default=str)
-            checked[option] = TypeAdapter(annotation, config=FINITE).validate_json(text, strict=True)
-        except ValidationError:
-            raise RequestError(
-                f"option '{option}' of {what} is {given[option]!r}; expected {_expected(annotation)}"
-            ) from None
+            try:
+                checked[option] = TypeAdapter(annotation, config=FINITE).validate_json(text, strict=True)
+            except ValidationError:
+                found, expected = given[option], _expected(annotation)
+                raise RequestError(f"option '{option}' of {what} is {found!r}; expected {expected}") from None
+        elif default is inspect.Parameter.empty:
+            raise RequestError(f"{what} needs the option '{option}' ({_expected(annotation)})")
     return checked
 
 
 def canonical_options(kind: str, name: str, given: Mapping[str, Any]) -> str:
-    """Options as JSON, the same for equal ones: those that say what is the default anyway are left out."""
-    defaults = {parameter.name: parameter.default for parameter, _ in _parameters(load(kind, name))}
-    adapter = TypeAdapter(dict[str, Any])
-    checked = check_options(kind, name, given)
-    kept = {option: value for option, value in checked.items() if value != defaults[option]}
-    return json.dumps(adapter.dump_python(kept, mode="json"), sort_keys=True)
+    """Options as canonical JSON, without those that equal their default."""
+    known, checked = _parameters(load(kind, name)), check_options(kind, name, given)
+    kept = {option: value for option, value in checked.items() if value != known[option][0]}
+    return json.dumps(TypeAdapter(dict[str, Any]).dump_python(kept, mode="json"), sort_keys=True)
 
 
 def qp_solver(name: str) -> dict[str, QPSolver]:
-    """The solver registered under this name by a plugin, keyed by it; nothing where qpsolvers has it."""
+    """The solver that a plugin registers under this name, by it; empty for the solvers of qpsolvers."""
     return {name: load("QP solver", name)} if name in names("QP solver") else {}
 
 
@@ -200,14 +182,22 @@ def _registered(kind: str) -> dict[str, EntryPoint]:
     return found
 
 
-def _parameters(plugin: Any) -> list[tuple[inspect.Parameter, Any]]:
+def _entry(kind: str, name: str) -> EntryPoint:
+    registered = _registered(kind)
+    if name not in registered:
+        raise unknown_name(kind, name, registered)
+    return registered[name]
+
+
+def _parameters(plugin: Any) -> dict[str, tuple[Any, Any]]:
+    """Default and annotation of every named parameter of a constructor."""
     constructor = inspect.getattr_static(plugin, "__init__")
     if constructor is object.__init__:
-        return []
+        return {}
     hints = get_type_hints(constructor, include_extras=True)
     parameters = list(inspect.signature(constructor).parameters.values())[1:]  # without self
     named = [p for p in parameters if p.kind not in (p.VAR_POSITIONAL, p.VAR_KEYWORD)]
-    return [(p, hints.get(p.name, Any)) for p in named]
+    return {p.name: (p.default, hints.get(p.name, Any)) for p in named}
 
 
 def _expected(annotation: Any) -> str:
@@ -221,9 +211,8 @@ def _words(schema: Mapping[str, Any]) -> str:
         return ", ".join(repr(value) for value in schema["enum"])
     if "const" in schema:
         return repr(schema["const"])
-    kind = {"integer": "int", "number": "float", "string": "str", "boolean": "bool", "array": "list"}.get(
-        str(schema.get("type", "")), str(schema.get("type", "any value"))
-    )
+    kind = str(schema.get("type", "any value"))
+    python = {"integer": "int", "number": "float", "string": "str", "boolean": "bool", "array": "list"}.get(kind, kind)
     signs = {"exclusiveMinimum": ">", "minimum": "≥", "exclusiveMaximum": "<", "maximum": "≤"}
     bounds = [f"{sign} {schema[key]:g}" for key, sign in signs.items() if key in schema]
-    return " ".join([kind, " and ".join(bounds)]).strip()
+    return " ".join([python, " and ".join(bounds)]).strip()

@@ -1,20 +1,11 @@
-"""What may stand in a study file."""
+"""The schema of study files."""
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal, TypeAlias
+from typing import Annotated, Any, Literal, TypeAlias, TypeVar
 
 from annotated_types import Ge, Gt, Le, Lt, MinLen
-from pydantic import (
-    AllowInfNan,
-    BaseModel,
-    BeforeValidator,
-    ConfigDict,
-    Discriminator,
-    Field,
-    Tag,
-    model_validator,
-)
+from pydantic import AllowInfNan, BaseModel, BeforeValidator, ConfigDict, Discriminator, Field, Tag, model_validator
 
 from vibench.errors import RequestError
 from vibench.interfaces.strategies import Stop
@@ -30,14 +21,6 @@ Name: TypeAlias = Annotated[str, MinLen(1)]
 Names: TypeAlias = Annotated[list[Name], MinLen(1)]
 
 
-def _word_or_list(value: Any) -> str:
-    return "<list>" if isinstance(value, list) else "<word>"
-
-
-def _table_or_list(value: Any) -> str:
-    return "<table>" if isinstance(value, dict) else "<list>"
-
-
 def _only_available(value: Any) -> Any:
     if value != "available":
         raise ValueError("expected 'available' or a list of solver names")
@@ -46,14 +29,12 @@ def _only_available(value: Any) -> Any:
 
 Solvers: TypeAlias = Annotated[
     Annotated[Literal["available"], BeforeValidator(_only_available), Tag("<word>")] | Annotated[Names, Tag("<list>")],
-    Discriminator(_word_or_list),
+    Discriminator(lambda value: "<list>" if isinstance(value, list) else "<word>"),
 ]
-PerStrategyTolerances: TypeAlias = Annotated[
-    Annotated[Tolerances, Tag("<list>")] | Annotated[dict[str, Tolerances], Tag("<table>")],
-    Discriminator(_table_or_list),
-]
-PerStrategySizes: TypeAlias = Annotated[
-    Annotated[Sizes, Tag("<list>")] | Annotated[dict[str, Sizes], Tag("<table>")], Discriminator(_table_or_list)
+Values = TypeVar("Values")
+PerStrategy: TypeAlias = Annotated[
+    Annotated[Values, Tag("<list>")] | Annotated[dict[str, Values], Tag("<table>")],
+    Discriminator(lambda value: "<table>" if isinstance(value, dict) else "<list>"),
 ]
 
 
@@ -65,7 +46,7 @@ class Entry(_Model):
     """One entry of an axis of plugins."""
 
     name: Annotated[Name, Field(description="Name the plugin is registered under.")]
-    label: Annotated[str, Field(description="How tables call it; its name unless given.")] = ""
+    label: Annotated[str, Field(description="Label in tables; its name by default.")] = ""
     options: Annotated[dict[str, Any], Field(description="Keyword arguments of its constructor.")] = {}
 
     @model_validator(mode="before")
@@ -80,19 +61,18 @@ class Entry(_Model):
 
 
 class ToleranceTable(_Model):
-    """A grid of tolerances: the product of what is given."""
+    """A grid of tolerances: the Cartesian product of its lists."""
 
     pod: Annotated[Tolerances | None, Field(description="Tolerances δ_POD of the POD.")] = None
     N: Annotated[Sizes | None, Field(description="Dimensions of V_N, in place of `pod`.")] = None
     dual: Annotated[
-        PerStrategyTolerances | None, Field(description="Tolerances δ_dual of the cones: for all, or by strategy.")
+        PerStrategy[Tolerances] | None, Field(description="Tolerances δ_dual of the cones: for all, or by strategy.")
     ] = None
     R: Annotated[
-        PerStrategySizes | None,
-        Field(description="Numbers of generators, in place of `dual`: for all, or by strategy."),
+        PerStrategy[Sizes] | None, Field(description="Numbers of generators, in place of `dual`: likewise.")
     ] = None
     primal: Annotated[
-        dict[str, Tolerances], Field(description="Tolerances δ of the primal strategies that take one, by strategy.")
+        dict[str, Tolerances], Field(description="Tolerances δ of the primal strategies, by strategy.")
     ] = {}
 
     @model_validator(mode="after")
@@ -104,20 +84,20 @@ class ToleranceTable(_Model):
         return self
 
     def of_dual(self, entry: Entry) -> list[Stop]:
-        """Where the cone of one dual strategy is to stop."""
+        """Tolerances or sizes of the cone of one dual strategy."""
         if self.dual is not None:
             return [Stop(tolerance=value) for value in _meant_for(self.dual, entry, "tolerances.dual")]
         return [Stop(size=value) for value in _meant_for(self.R or [], entry, "tolerances.R")]
 
     def of_primal(self, entry: Entry) -> list[float | None]:
-        """Tolerances of one primal strategy; `None` alone for a strategy that takes none."""
+        """Tolerances of one primal strategy; [`None`] for a strategy that takes none."""
         if not registry.load("primal strategy", entry.name).takes_tolerance:
             return [None]
         return list(_meant_for(self.primal, entry, "tolerances.primal"))
 
 
 def _meant_for(values: Any, entry: Entry, key: str) -> list[Any]:
-    """The values meant for one entry: a plain list is for all, a table says for whom."""
+    """The values for one entry: of a table those under its label or name, of a list all."""
     if not isinstance(values, dict):
         return list(values)
     found = values.get(entry.title, values.get(entry.name))
@@ -127,31 +107,23 @@ def _meant_for(values: Any, entry: Entry, key: str) -> list[Any]:
 
 
 class Limits(_Model):
-    """What a query and a stage may take; a stage is everything of a cell that is computed in one go."""
+    """Limits of a query and of a stage; all queries of a cell are one stage."""
 
     query_seconds: Annotated[Seconds, Field(description="Wall seconds of one solution of a query.")] = 20.0
-    cell_seconds: Annotated[Seconds, Field(description="Wall seconds of a stage; all queries of a cell are one.")] = (
-        600.0
-    )
+    cell_seconds: Annotated[Seconds, Field(description="Wall seconds of a stage.")] = 600.0
     memory_gib: Annotated[
         float, Gt(0.0), Lt(1e6), AllowInfNan(False), Field(description="Address space of a worker process in GiB.")
     ] = 8.0
 
 
 class Study(_Model):
-    """A study file: the axes of the matrix and what all its cells share."""
+    """A study file: the axes of the matrix of cells, and the settings that all cells share."""
 
-    name: Annotated[str, MinLen(1), Field(description="Name of the study; results go to `runs/` and this name.")]
+    name: Annotated[Name, Field(description="Name of the study; its results are in the folder `runs/<name>`.")]
     seed: Annotated[int, Ge(0), Lt(2**63), Field(description="Seed of the validation set.")] = 0
-    validation: Annotated[
-        int, Ge(1), Le(100_000), Field(description="Number of validation parameters, on which every cell is judged.")
-    ]
+    validation: Annotated[Size, Field(description="Number of validation parameters, the queries of every cell.")]
     accuracy: Annotated[
-        float,
-        Ge(1e-14),
-        Le(1e-2),
-        AllowInfNan(False),
-        Field(description="Relative accuracy every solver is asked for and every query is judged by."),
+        float, Ge(1e-14), Le(1e-2), AllowInfNan(False), Field(description="Relative accuracy prescribed to QP solvers.")
     ] = 1e-7
     solvers: Annotated[Solvers, Field(description="QP solvers; `available` for all that are installed.")]
     dual: Annotated[list[Entry], MinLen(1), Field(description="Dual strategies.")]
@@ -160,16 +132,16 @@ class Study(_Model):
         list[Literal["full", "reduced"]], MinLen(1), Field(description="How queries are assembled.")
     ] = ["full"]
     interpolation: Annotated[
-        Tolerance, Field(description="Largest relative interpolation error accepted in reduced assembly.")
+        Tolerance, Field(description="Tolerance of empirical interpolation in reduced assembly.")
     ] = 1e-6
     warm_start: Annotated[
-        bool, Field(description="Whether solvers that can start from the solution of a neighbouring parameter.")
+        bool, Field(description="Whether QP solvers start from the solution at a neighbouring parameter if they can.")
     ] = False
     problem: Annotated[list[Entry], MinLen(1), Field(description="Problems.")]
     tolerances: Annotated[
-        list[ToleranceTable], MinLen(1), Field(description="Grids of tolerances; several of them add up.")
+        list[ToleranceTable], MinLen(1), Field(description="Grids of tolerances; cells are their union.")
     ]
-    limits: Annotated[Limits, Field(description="What a query and a stage may take.")] = Limits()
+    limits: Annotated[Limits, Field(description="Limits of a query and of a stage.")] = Limits()
 
     @model_validator(mode="after")
     def _file_name(self) -> Study:

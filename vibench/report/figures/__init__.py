@@ -30,7 +30,7 @@ OF_PROBLEM: dict[str, Drawing] = {
     "solvers": solvers,
     "total-cost": total_cost,
 }
-"""Figures of every problem, by the end of their file names; `None` where the run has no data for one."""
+"""Figures of every problem, by the end of their file names."""
 
 OF_DUAL: dict[str, Drawing] = {"enrichment": enrichment, "inf-sup": inf_sup}
 """Figures of every problem and dual strategy."""
@@ -45,18 +45,9 @@ def drawings(path: Path) -> Iterator[tuple[str, Drawing, Data]]:
 
 
 def draw_all(path: Path, folder: Path, formats: tuple[str, ...] = FORMATS, jobs: int = 1) -> list[Path]:
-    """Draw every figure that a results file has data for; returns the files written.
+    """Draw every figure that a results file has data for, in every format; returns the files written to the folder.
 
-    Parameters
-    ----------
-    path
-        Results file.
-    folder
-        Folder of the files.
-    formats
-        Formats to write every figure in.
-    jobs
-        Number of processes to draw in, this one included.
+    `jobs` is the number of processes that draw, this one included.
     """
     if jobs == 1:
         return [file for files in _part(path, folder, formats, 0, 1) for file in files]

@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 
 from vibench.interfaces.strategies import Kind
 from vibench.report.figures.data import Data, at_best_tolerance, by_strategy, dimensions, one_solver
-from vibench.report.figures.style import BLACK, Sheet, counted, line, logarithmic, plot, positive, style_of
+from vibench.report.figures.style import BLACK, Sheet, counted, line, plot, positive, style_of
 from vibench.stability.infsup import VANISHES
 
 
@@ -17,14 +17,16 @@ def inf_sup(data: Data) -> Figure:
     """Inf-sup constants β of every primal strategy and of the high-fidelity pair over the validation set.
 
     First row: over the span; second row: over the cone, with the certified interval as a band. Fixed enrichments are
-    shown at their loosest tolerance, and parameters are sorted by the constant of the first of these.
+    shown at the tolerance of the smallest mean, and parameters are sorted by the constant of the first of these.
     """
     pairs = list(data.queries.groupby("pair", sort=False))
     sheet = Sheet(2, len(pairs), f"{data.problem}, {data.duals[0]}: inf-sup constants over the validation set")
     styles: dict[str, int] = {}
     for column, (_, of_pair) in enumerate(pairs):
         group = one_solver(of_pair)
-        loosest = _loosest(group[group["enrichment_kind"] == Kind.FIXED])
+        fixed = group[group["enrichment_kind"] == Kind.FIXED]
+        smallest = -fixed.groupby(["primal", "primal_tol"], dropna=False)["beta_span"].mean()
+        loosest = at_best_tolerance(fixed, smallest)
         sorting = loosest if len(loosest) else group
         first = sorting[sorting["cell"] == sorting["cell"].iloc[0]]
         order = first.sort_values("beta_span", kind="stable")["query"]
@@ -37,15 +39,9 @@ def inf_sup(data: Data) -> Figure:
                 _draw(axes, rows, "beta_hf_", BLACK, "high-fidelity")
         axes[0].set_title(dimensions(of_pair))
         for panel, generated in zip(axes, ("span", "cone"), strict=True):
-            panel.set(ylabel=f"β over {generated}", xlabel="validation parameters, sorted")
-            logarithmic(panel)
+            panel.set(ylabel=f"β over {generated}", xlabel="validation parameters, sorted", yscale="log")
             counted(panel)
     return sheet.finish()
-
-
-def _loosest(fixed: pd.DataFrame) -> pd.DataFrame:
-    """Rows of every fixed enrichment at the tolerance with the smallest mean constant."""
-    return at_best_tolerance(fixed, -fixed.groupby(["primal", "primal_tol"], dropna=False)["beta_span"].mean())
 
 
 def _draw(axes: tuple[Axes, Axes], rows: pd.DataFrame, prefix: str, k: int, name: str) -> None:

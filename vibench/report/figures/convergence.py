@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pandas as pd
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from vibench.interfaces.strategies import Kind
 from vibench.report.figures.data import Data, at_best_tolerance, by_strategy, dimensions, label, longest, one_solver
-from vibench.report.figures.style import POINTS, Sheet, counted, logarithmic, plot, positive, style_of
+from vibench.report.figures.style import POINTS, Sheet, counted, plot, positive, style_of
 
 ROUND_OFF = 1e-12
 """The tail of a POD below this is round-off."""
@@ -46,13 +47,10 @@ def projection_errors(data: Data) -> Figure:
     for _, found in longest(errors[errors["stage"] == "pod"]):
         shown = found[found["value"] > ROUND_OFF]
         plot(left, shown["step"], shown["value"], 0, "POD")
-    left.set(xlabel="number of modes N", ylabel="relative error of the POD", title="primal")
-    for k, (dual, found) in enumerate(longest(errors[errors["stage"] == "cone"]), 1):
-        plot(right, found["step"], positive(found["value"]), k, dual)
-    right.set(xlabel="number of generators R", ylabel="largest relative error of the cone", title="dual")
-    for panel in sheet.panels:
-        logarithmic(panel)
-        counted(panel)
+    left.set(xlabel="number of modes N", ylabel="relative error of the POD", title="primal", yscale="log")
+    counted(left)
+    right.set(title="dual")
+    _cones(right, errors[errors["stage"] == "cone"], "number of generators R", "largest relative error of the cone")
     return sheet.finish()
 
 
@@ -62,13 +60,16 @@ def orthogonality(data: Data) -> Figure | None:
     if found.empty:
         return None
     sheet = Sheet(1, 1, f"{data.problem}: angles between generators")
-    (axes,) = sheet.panels
-    for k, (dual, one) in enumerate(longest(found), 1):
-        plot(axes, one["step"], positive(one["value"]), k, dual)
-    axes.set(xlabel="number of preceding generators r", ylabel="e_orth(r)")
-    logarithmic(axes)
-    counted(axes)
+    _cones(sheet.panels[0], found, "number of preceding generators r", "e_orth(r)")
     return sheet.finish()
+
+
+def _cones(axes: Axes, histories: pd.DataFrame, xlabel: str, ylabel: str) -> None:
+    """A line for the longest cone of every dual strategy."""
+    for k, (dual, found) in enumerate(longest(histories), 1):
+        plot(axes, found["step"], positive(found["value"]), k, dual)
+    axes.set(xlabel=xlabel, ylabel=ylabel, yscale="log")
+    counted(axes)
 
 
 def enrichment(data: Data) -> Figure | None:
@@ -90,15 +91,12 @@ def enrichment(data: Data) -> Figure | None:
             panel = sheet.at(row, column)
             for name, one in by_strategy(steps[steps["quantity"] == quantity]):
                 plot(panel, one["step"], positive(one["value"], SINE_FLOOR), style_of(name, styles), name)
-            panel.set(xlabel="vectors added", ylabel=ylabel, title=dimensions(group))
-            panel.set_xlim(left=0)
+            panel.set(xlabel="vectors added", ylabel=ylabel, title=dimensions(group), xlim=(0, None), yscale="log")
             counted(panel)
-            logarithmic(panel)
         panel = sheet.at(row, 2)
         for name, one in by_strategy(one_solver(group)):
             plot(panel, np.arange(1, len(one) + 1), np.sort(one["beta_span"]), style_of(name, styles), name)
-        panel.set(xlabel="validation parameters, sorted", ylabel="β over span", title=dimensions(group))
-        panel.set_ylim(bottom=0.0)
+        panel.set(xlabel="validation parameters, sorted", ylabel="β over span", title=dimensions(group), ylim=(0, None))
         counted(panel)
     return sheet.finish()
 

@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from vibench.report.figures.data import Data, best_solver, by_dimensions, label
-from vibench.report.figures.style import BLACK, POINTS, Sheet, line, logarithmic, plot, style_of
+from vibench.report.figures.style import BLACK, POINTS, Sheet, line, plot, style_of
 from vibench.results.break_even import HIGH_FIDELITY, Meaning
 
 ERRORS = {"error_u_mean": "mean relative error of u", "error_lambda_mean": "mean relative error of λ"}
@@ -21,10 +21,7 @@ MOST_QUERIES = 1e6
 ABREAST = 6
 """Panels in a row."""
 
-MARKS = {
-    Meaning.FROM: (">", "break-even: cheaper from here"),
-    Meaning.UNTIL: ("<", "break-even: cheaper until here"),
-}
+MARKS = {Meaning.FROM: ">", Meaning.UNTIL: "<"}
 
 
 def dimension(data: Data) -> Figure | None:
@@ -38,12 +35,11 @@ def dimension(data: Data) -> Figure | None:
 def work_precision(data: Data) -> Figure | None:
     """Errors against the time of a query; no cell is both faster and more accurate than those on the line."""
     cells = best_solver(data.cells)
-    x = 1e3 * cells["online_s"]
-    return _scatter(data, cells, x, "mean time of a query [ms]", "work and precision", with_front=True)
+    return _scatter(data, cells, 1e3 * cells["online_s"], "mean time of a query [ms]", "work and precision", front=True)
 
 
 def _scatter(
-    data: Data, cells: pd.DataFrame, x: pd.Series, xlabel: str, title: str, *, with_front: bool = False
+    data: Data, cells: pd.DataFrame, x: pd.Series, xlabel: str, title: str, *, front: bool = False
 ) -> Figure | None:
     """One point per cell: colour and marker for primal strategy and assembly, filling for the dual strategy."""
     known = cells["error_u_mean"].notna() & x.notna()
@@ -57,11 +53,10 @@ def _scatter(
         for (primal, assembly, dual), mine in cells.groupby(["primal", "assembly", "dual"]):
             point = _point(kinds.index((primal, assembly)), duals.index(dual))
             panel.plot(x[mine.index], mine[column], label=f"{label(primal, None, assembly)}, {dual}", **point)
-        if with_front:
-            front = _front(x.to_numpy(float), cells[column].to_numpy(float))
-            panel.plot(*front, color="0.6", linewidth=0.8, drawstyle="steps-post", zorder=0)
-        panel.set(xlabel=xlabel, ylabel=ylabel)
-        logarithmic(panel, "xy")
+        if front:
+            line_of = _front(x.to_numpy(float), cells[column].to_numpy(float))
+            panel.plot(*line_of, color="0.6", linewidth=0.8, drawstyle="steps-post", zorder=0)
+        panel.set(xlabel=xlabel, ylabel=ylabel, xscale="log", yscale="log")
     return sheet.finish()
 
 
@@ -93,22 +88,17 @@ def total_cost(data: Data) -> Figure | None:
         # The most vectors stand for every strategy and assembly: a line per tolerance would hide the crossings.
         added = mine.assign(added=mine["enrichment"].fillna(0)).sort_values("added", ascending=False, kind="stable")
         most = added.drop_duplicates(["primal", "primal_options", "assembly"]).sort_index()
-        _lines(panel, most, styles)
+        queries = np.geomspace(1.0, MOST_QUERIES, 61)
+        plot(panel, queries, queries * most["hf_s"].iloc[0], BLACK, HIGH_FIDELITY)
+        for cell in most.itertuples():
+            name = label(cell.primal, cell.primal_tol, cell.assembly)
+            plot(panel, queries, cell.offline_s + queries * cell.online_s, style_of(name, styles), name)
         _marks(panel, most, data.thresholds)
         panel.set(xlabel="number of queries", ylabel="offline + online [s]", title=title)
-        panel.set_xlim(1.0, MOST_QUERIES)
-        logarithmic(panel, "xy")
+        panel.set(xlim=(1.0, MOST_QUERIES), xscale="log", yscale="log")
     for panel in sheet.panels[len(shown) :]:
         panel.set_axis_off()
     return sheet.finish()
-
-
-def _lines(panel: Axes, cells: pd.DataFrame, styles: dict[str, int]) -> None:
-    queries = np.geomspace(1.0, MOST_QUERIES, 61)
-    plot(panel, queries, queries * cells["hf_s"].iloc[0], BLACK, HIGH_FIDELITY)
-    for cell in cells.itertuples():
-        name = label(cell.primal, cell.primal_tol, cell.assembly)
-        plot(panel, queries, cell.offline_s + queries * cell.online_s, style_of(name, styles), name)
 
 
 def _marks(panel: Axes, cells: pd.DataFrame, thresholds: pd.DataFrame) -> None:
@@ -119,5 +109,5 @@ def _marks(panel: Axes, cells: pd.DataFrame, thresholds: pd.DataFrame) -> None:
         n, b = row.benefit_threshold, (row.offline_b_s, row.online_b_s)
         between = row.primal_a == HIGH_FIDELITY or (row.offline_a_s, row.online_a_s) in drawn
         if b in drawn and between and 1.0 <= n <= MOST_QUERIES:
-            marker, name = MARKS[row.meaning]
-            panel.plot(n, b[0] + n * b[1], marker, c="black", markersize=5, mfc="none", label=name, zorder=5)
+            name = f"break-even: cheaper {row.meaning} here"
+            panel.plot(n, b[0] + n * b[1], MARKS[row.meaning], c="black", ms=5, mfc="none", label=name, zorder=5)

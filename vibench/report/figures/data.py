@@ -24,8 +24,8 @@ PRIMAL = ["primal", "primal_options", "primal_tol"]
 class Data:
     """The tables of one problem of a run.
 
-    Each has a column `pair`, which is the same where the values of `PAIR` are; queries also have the columns
-    `enrichment_kind`, `N` and `R` of their cells.
+    Each has a column `pair`, a text of the values of `PAIR`; queries also have the columns `enrichment_kind`, `N` and
+    `R` of their cells.
     """
 
     problem: str
@@ -68,15 +68,13 @@ def problems(path: Path) -> Iterator[tuple[str, Data]]:
 
 def _tell_apart(axis: str, frames: list[pd.DataFrame]) -> None:
     """Number the labels of a plugin that occurs with different options."""
-    options: dict[str, dict[str, int]] = {}
+    columns = [axis, f"{axis}_options"]
+    found = pd.concat([frame[columns].dropna().drop_duplicates() for frame in frames]).drop_duplicates()
+    found["label"] = found[axis] + " (" + (found.groupby(axis).cumcount() + 1).astype(str) + ")"
+    numbered = found[found.duplicated(axis, keep=False)].set_index(columns)["label"]
     for frame in frames:
-        for name, given in frame[[axis, f"{axis}_options"]].dropna().drop_duplicates().itertuples(index=False):
-            options.setdefault(name, {}).setdefault(given, len(options[name]) + 1)
-    shared = {name for name, known in options.items() if len(known) > 1}
-    for frame in frames:
-        rows = frame[axis].isin(shared)
-        named = zip(frame.loc[rows, axis], frame.loc[rows, f"{axis}_options"], strict=True)
-        frame.loc[rows, axis] = [f"{name} ({options[name][given]})" for name, given in named]
+        rows = frame[axis].isin(numbered.index.get_level_values(0))
+        frame.loc[rows, axis] = numbered.loc[pd.MultiIndex.from_frame(frame.loc[rows, columns])].to_numpy()
 
 
 def dimensions(rows: pd.DataFrame) -> str:

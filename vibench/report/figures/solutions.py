@@ -15,16 +15,14 @@ from vibench.report.figures.style import COLOURS, Layout, Sheet
 MAP = "cividis"
 """A colour map of evenly rising lightness, legible in grey print and to colour-blind readers."""
 
-WIDE = Layout(width=3.3, height=2.9, right=1.0)
-"""Room for a colour bar."""
-
 
 def solutions(data: Data) -> Figure | None:
     """High-fidelity solution above and multiplier below, at some training parameters."""
     shown = [(one.title, one.picture) for one in data.pictures if one.picture is not None]
     if not shown:
         return None
-    sheet = Sheet(2, len(shown), f"{data.problem}: high-fidelity solutions", WIDE)
+    layout = Layout(width=3.3, height=2.9, right=1.0)  # right: room for a colour bar
+    sheet = Sheet(2, len(shown), f"{data.problem}: high-fidelity solutions", layout)
     for column, (title, picture) in enumerate(shown):
         field, multiplier = sheet.at(0, column), sheet.at(1, column)
         field.set_title(title)

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 
 from vibench.qp.status import Status
 from vibench.report.figures.data import Data
-from vibench.report.figures.style import POINTS, Sheet, logarithmic, plot
+from vibench.report.figures.style import POINTS, Sheet, plot
 from vibench.results.columns import KEYS
 
 RESIDUALS = ["primal_residual", "dual_residual", "gap"]
@@ -51,7 +51,7 @@ def _accuracy(panel: Axes, queries: pd.DataFrame, names: list[str]) -> None:
         finite = found[np.isfinite(found["worst"])]  # a query without a solution has no residual
         plot(panel, 1e3 * finite["time"], np.maximum(finite["worst"], EXACT), k, solver, **POINTS)
     panel.set(xlabel="median time of a program [ms]", ylabel="largest residual of a model's queries")
-    logarithmic(panel, "xy")
+    panel.set(xscale="log", yscale="log")
 
 
 def _profile(panel: Axes, queries: pd.DataFrame, names: list[str]) -> None:
@@ -67,5 +67,4 @@ def _profile(panel: Axes, queries: pd.DataFrame, names: list[str]) -> None:
         y = np.concatenate([[0.0], np.arange(1, count + 1), [count]]) / len(mine)
         plot(panel, x, y, k, solver, drawstyle="steps-post")
     panel.set(xlabel="time relative to the fastest solver", ylabel="share of programs solved", ylim=(0.0, 1.03))
-    logarithmic(panel, "x")
-    panel.set_xlim(1.0, max(last, 1.5))
+    panel.set(xscale="log", xlim=(1.0, max(last, 1.5)))

@@ -53,17 +53,11 @@ STYLE: Any = {
     "svg.hashsalt": "vibench",
 }
 
-CHARACTER = 0.068
-"""Average width of a character of a legend, in inches."""
+CHARACTER, TITLE_CHARACTER = 0.068, 0.085
+"""Average widths of a character of a legend and of a title, in inches."""
 
-TITLE_CHARACTER = 0.085
-"""The same for a title."""
-
-DENSE = 2.2
-"""Decades below which a logarithmic axis has ticks at 1, 2 and 5, labelled as plain numbers."""
-
-FEW = 0.6
-"""Decades below which it has the ticks of a linear axis."""
+FEW, DENSE = 0.6, 2.2
+"""Decades below which a logarithmic axis has the ticks of a linear one, and ticks at 1, 2 and 5, as plain numbers."""
 
 SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
@@ -81,18 +75,9 @@ class Layout:
 
 
 class Sheet:
-    """A figure of equal panels with one legend below them all.
+    """A figure of rows × columns equal panels with a title above and one legend below them all.
 
     Sizes follow from the layout and the number of characters of title and legend: no text is rendered to measure it.
-
-    Parameters
-    ----------
-    rows, columns
-        Numbers of panels.
-    title
-        Title of the whole figure.
-    layout
-        Sizes of a panel.
     """
 
     def __init__(self, rows: int, columns: int, title: str = "", layout: Layout = Layout()) -> None:
