@@ -1,4 +1,4 @@
-"""Maps of the square that scale, shift and, on request, bulge the disc in its middle; its outer boundary stays."""
+"""Maps of the square that scale, shift and optionally bulge its central disc and leave the outer boundary fixed."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from skfem.helpers import dot, grad
 from vibench import Array, Indices, SparseMatrix
 
 DECAY = 6.0
-"""Exponent of the weight |x|^−DECAY under which the bulge is continued: stiff by the disc, soft by the boundary."""
+"""Exponent of the weight |x|^−DECAY in the extension of the bulge: stiff near the disc, soft near the boundary."""
 
 
 @BilinearForm
@@ -34,40 +34,41 @@ class DiscMap:
 
         z ↦ mu_1 (z + mu_4 z²/(2r̂)) + mu_2 + i mu_3,
 
-    which turns the disc into an egg that points along x. It is conformal there, so angles stay, and lengths change by
-    mu_1 |1 + mu_4 z/r̂|; it is injective for |mu_4| < 1, for its derivative has a positive real part on a convex set
-    (Noshiro and Warschawski). Outside, the displacement is continued to zero on the boundary: scaling and shifts
-    harmonically, the bulge under the weight |x|^−6, which keeps the triangles by the disc in shape. Where no triangle
-    turns over the whole map is injective, because it is the identity on the boundary.
+    which deforms the disc into an egg shape along x. The map is conformal on ω̂: it preserves angles and scales lengths
+    by mu_1 |1 + mu_4 z/r̂|. It is injective for |mu_4| < 1, because its derivative has a positive real part on a convex
+    set (Noshiro and Warschawski). Outside ω̂ the displacement is extended to zero on the boundary: scaling and shifts
+    harmonically, the bulge with the weight |x|^−6, which preserves the shape of the triangles near the disc. The whole
+    map is injective if no triangle is inverted, because it is the identity on the boundary.
 
     Parameters
     ----------
     mesh
         Triangulation of the square.
     disc_nodes
-        Nodes of the closed disc, rising.
+        Nodes of the closed disc, ascending.
     radius
         r̂ [m].
     bulge
-        Whether there is a mu_4.
+        Whether the map has the fourth parameter mu_4.
     """
 
     def __init__(self, mesh: MeshTri, disc_nodes: Indices, radius: float, bulge: bool) -> None:
         self._disc_nodes, self._bulge = disc_nodes, bulge
         basis = Basis(mesh, ElementTriP1())
         on_disc = mesh.p[:, disc_nodes]
-        continued = partial(self._continued, basis, stiffness.assemble(basis))
-        x, y, one = (continued(values) for values in (*on_disc, np.ones(len(disc_nodes))))
+        extend = partial(self._extend, basis, stiffness.assemble(basis))
+        x, y, one = (extend(values) for values in (*on_disc, np.ones(len(disc_nodes))))
         zero = np.zeros(mesh.p.shape[1])
         modes = [mesh.p, np.stack([x, y]), np.stack([one, zero]), np.stack([zero, one])]
         if bulge:
             square = (on_disc[0] + 1j * on_disc[1]) ** 2 / (2.0 * radius)
-            continued = partial(self._continued, basis, decaying_stiffness.assemble(basis))
-            modes.append(np.stack([continued(square.real), continued(square.imag)]))
+            # The weight keeps the deformation away from the triangles next to the disc.
+            extend = partial(self._extend, basis, decaying_stiffness.assemble(basis))
+            modes.append(np.stack([extend(square.real), extend(square.imag)]))
         self.modes: Array = np.stack(modes)
 
-    def _continued(self, basis: Basis, form: SparseMatrix, values: Array) -> Array:
-        """What is `values` on the disc, zero on the boundary and of least energy in between (nodes,)."""
+    def _extend(self, basis: Basis, form: SparseMatrix, values: Array) -> Array:
+        """Extension (nodes,) of `values` from the disc that vanishes on the boundary and minimises the energy."""
         boundary, on_disc = basis.get_dofs().all(), np.zeros(basis.N)
         on_disc[self._disc_nodes] = values
         fixed = np.union1d(boundary, self._disc_nodes)
@@ -83,9 +84,9 @@ class DiscMap:
         return np.asarray(np.tensordot(self.weights(mu), self.modes, axes=1))
 
     def areas(self, triangles: NDArray[np.integer]) -> Array:
-        """Areas of triangles (3×t) of the disc, over those at mu_1 = 1 and mu_4 = 0, by monomial (1×t or 3×t).
+        """Areas of triangles (3×t) of the disc relative to mu_1 = 1 and mu_4 = 0, one row per monomial (1×t or 3×t).
 
-        As the nodes move linearly in mu_1 and mu_1 mu_4, an area is Σ_k monomials_k · areas_k exactly.
+        The nodes move linearly in mu_1 and mu_1 mu_4, so an area is exactly Σ_k monomials_k · areas_k.
         """
         (e1, e2), (f1, f2) = (
             (mode[:, triangles[1]] - mode[:, triangles[0]], mode[:, triangles[2]] - mode[:, triangles[0]])

@@ -21,14 +21,14 @@ def disc_in_square(nodes: int, radius: float) -> MeshTri:
     Parameters
     ----------
     nodes
-        Wanted number of nodes, boundary included; met to within a few per cent.
+        Target number of nodes, boundary included; met to within a few per cent.
     radius
         Radius of the disc, below ½.
 
     Returns
     -------
     MeshTri
-        With `boundaries` left to the caller and the disc's elements as subdomain "disc".
+        Mesh with the elements of the disc as subdomain "disc" and without named boundaries.
 
     Raises
     ------
@@ -40,6 +40,7 @@ def disc_in_square(nodes: int, radius: float) -> MeshTri:
     wanted = nodes - len(disc_points)
     spacing = np.sqrt((1.0 - np.pi * radius**2) / max(wanted, 1) * 2.0 / np.sqrt(3.0))
     outside = _outside(spacing, radius)
+    # The estimate ignores the clearance between the lattice and the two boundaries: correct it by the actual count.
     for _ in range(8):
         if abs(len(outside) - wanted) <= 0.01 * nodes:
             break
@@ -145,12 +146,14 @@ def _delaunay_annulus(points: Array, used: NDArray[np.int64], radius: float) -> 
     """Delaunay triangles (k×3) of the points `used` that lie outside the disc, counter-clockwise."""
     triangles = used[Delaunay(points[used]).simplices]
     corners = points[triangles]
+    # Delaunay fills the convex hull: triangles with all corners on the circle cover the disc, which has its own mesh.
     inside = np.all(np.linalg.norm(corners, axis=2) < radius * (1.0 + 1e-9), axis=1)
     triangles = triangles[~inside]
     a, b, c = (points[triangles[:, i]].T for i in range(3))
-    turned = _cross(b - a, c - a)
-    triangles = triangles[np.abs(turned) > 1e-12]
-    flip = turned[np.abs(turned) > 1e-12] < 0.0
+    twice_area = _cross(b - a, c - a)
+    proper = np.abs(twice_area) > 1e-12  # collinear nodes on a side of the square give slivers
+    triangles = triangles[proper]
+    flip = twice_area[proper] < 0.0
     triangles[flip] = triangles[flip][:, [0, 2, 1]]
     return np.asarray(triangles, dtype=np.int64)
 

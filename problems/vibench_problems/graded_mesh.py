@@ -12,7 +12,7 @@ from skfem import MeshTri
 from vibench import Array, Indices
 
 COARSEST = 0.2
-"""Largest element size, in radii."""
+"""Largest element size, relative to the radius."""
 
 
 @dataclass(frozen=True)
@@ -38,8 +38,9 @@ class QuarterDisc:
 def quarter_disc(edges: int, angle: float, growth: float) -> QuarterDisc:
     """Mesh with `edges` equal edges on the arc 0 ≤ θ ≤ `angle`, layers around it growing by the factor `growth`.
 
-    Nodes lie on curves at growing distances from the zone, spaced like the curves; the rest of the boundary follows
-    the same sizes. The domain is convex, so Delaunay's triangulation of the nodes is one of the domain.
+    Inner nodes lie on curves at increasing distances from the zone, with a spacing that matches that of the curves. The
+    rest of the boundary is graded by the same size function. The domain is convex, so the Delaunay triangulation of the
+    nodes triangulates the domain.
 
     Parameters
     ----------
@@ -48,7 +49,7 @@ def quarter_disc(edges: int, angle: float, growth: float) -> QuarterDisc:
     angle
         End of the zone [rad], below π/2.
     growth
-        Ratio of the sizes of two layers that follow each other, above 1.
+        Ratio of the sizes of two successive layers, above 1.
     """
     finest = 2.0 * np.sin(0.5 * angle / edges)
 
@@ -76,6 +77,7 @@ def quarter_disc(edges: int, angle: float, growth: float) -> QuarterDisc:
 def _on_arc(theta: Array) -> Array:
     """Points (n×2) of the unit circle at angles from the apex; exact on the axis and on the flat."""
     points = np.column_stack([np.sin(theta), -np.cos(theta)])
+    # sin and cos of π/2 are not exact, and the nodes on axis and flat are found by exact comparison with zero.
     points[theta <= 0.0] = (0.0, -1.0)
     points[theta >= 0.5 * np.pi] = (1.0, 0.0)
     return points
@@ -90,7 +92,7 @@ def _distance_to_zone(points: Array, angle: float) -> Array:
 
 
 def _graded(start: float, end: float, size: Callable[[Array], Array]) -> Array:
-    """Positions from `start` to `end` whose spacing follows `size` (lengths per unit of the position)."""
+    """Positions from `start` to `end` whose spacing follows `size`."""
     fine = np.linspace(start, end, 20_001)
     density = 1.0 / size(fine)
     count = np.concatenate([[0.0], np.cumsum(0.5 * (density[1:] + density[:-1]) * np.diff(fine))])
@@ -123,19 +125,19 @@ def _layers(angle: float, finest: float, growth: float, size: Callable[[Array], 
 
 
 def _triangulate(points: Array) -> Indices:
-    """Delaunay triangles (k×3), counter-clockwise, without the flat ones of nodes that lie on one line."""
+    """Delaunay triangles (k×3), counter-clockwise, without degenerate triangles of collinear nodes."""
     triangles = Delaunay(points).simplices
     a, b, c = (points[triangles[:, k]] for k in range(3))
-    turned = (b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0]
+    twice_area = (b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0]
     longest = np.max([np.sum((q - p) ** 2, axis=1) for p, q in ((a, b), (b, c), (c, a))], axis=0)
-    proper = np.abs(turned) > 1e-8 * longest
-    triangles, turned = triangles[proper], turned[proper]
-    triangles[turned < 0.0] = triangles[turned < 0.0][:, [0, 2, 1]]
+    proper = np.abs(twice_area) > 1e-8 * longest
+    triangles, clockwise = triangles[proper], twice_area[proper] < 0.0
+    triangles[clockwise] = triangles[clockwise][:, [0, 2, 1]]
     return np.asarray(triangles, dtype=np.intp)
 
 
 def _smoothed(points: Array, triangles: Indices, fixed: int) -> Array:
-    """One Laplacian sweep over the nodes after the first `fixed`: half way to the mean of the neighbours."""
+    """One damped Laplacian sweep over the nodes after the first `fixed`: half way to the mean of the neighbours."""
     edges = np.vstack([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]])
     edges = np.vstack([edges, edges[:, ::-1]])
     count = np.maximum(np.bincount(edges[:, 0], minlength=len(points)), 1)

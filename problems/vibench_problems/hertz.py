@@ -26,7 +26,7 @@ EDGES = {"coarse": 90, "medium": 240, "paper": 560, "fine": 1120}
 WITH_APPROACH = ParameterBox(
     names=("radius", "approach"), lower=np.array([0.905, 0.075]), upper=np.array([1.125, 0.15]), units=("m", "m")
 )
-"""The parameters when the approach is one of them."""
+"""The parameter box with the approach as second parameter."""
 
 NODES_PER_EDGE = 6130 / EDGES["paper"]
 
@@ -45,18 +45,18 @@ def norm_form(u, v, w):  # type: ignore[no-untyped-def]
 
 
 class Hertz(Problem):
-    """Two quarter discs pressed together, the radius mu_1 of the lower one the parameter.
+    """Two quarter discs pressed against each other; the parameter mu_1 is the radius of the lower one.
 
     P1 displacements, multipliers constant on macro-edges of two slave edges (local average contact), pairing by the
     vertical projection in the physical configuration. Disc 2 is scaled about its apex, which changes neither its
-    two-dimensional elastic energy nor the gap on the axis; the flats are moved by a rigid lifting, which loads nothing:
-    A and f do not depend on mu, only B and g do.
+    two-dimensional elastic energy nor the gap on the axis. The flats are moved by a rigid-body lifting, which causes no
+    stress. Hence A and f do not depend on mu; B and g do.
 
-    The load d is a second parameter on request, after Benaceur, Ern and Ehrlacher (2020): radii from 0.905 to 1.125 m,
-    and 0.15 + 0.01 i m for what they call d. It is read here as what the flats approach each other by in all, 2d, with
-    0 ≤ i ≤ 15: d runs from 0.075 to 0.15 m, the 0.09 m of the later paper among them, strains stay small, and the
-    contact reaches x = 0.39 m of the 0.5 m that it may. If each flat moved by so much, the contact would leave the
-    potential contact zone from 0.22 m on.
+    With `approach = "parameter"` the approach d is a second parameter, after Benaceur, Ern and Ehrlacher (2020). Their
+    radii run from 0.905 to 1.125 m, and their d takes the values 0.15 + 0.01 i m. These values are interpreted here as
+    the total approach 2d of both flats, 0 ≤ i ≤ 15: d runs from 0.075 to 0.15 m and includes the 0.09 m of the later
+    paper, strains stay small, and the contact extends to x = 0.39 m, inside the potential contact zone (0.5 m). If each
+    flat moved by that value, the contact would leave the potential contact zone from 0.22 m on.
 
     Parameters
     ----------
@@ -64,12 +64,12 @@ class Hertz(Problem):
         "coarse" (about 1000 nodes), "medium", "paper" (6130 nodes, 560 slave edges, 280 multipliers), "fine", or a
         number of nodes.
     quadrature
-        "exact" (segments cut at projected master nodes), or Gauss points per slave edge (the paper's way).
+        "exact" (segments cut at projected master nodes), or a number of Gauss points per slave edge (as in the paper).
     flats
         "free" horizontally, or "clamped".
     ratio
-        Master edges per slave edge of the same length, before disc 2 is scaled. By default both zones have as many
-        edges, and the master's are the longer ones at every radius, as mortar methods want it.
+        Density of master edges relative to that of slave edges, before disc 2 is scaled. By default both zones have the
+        same number of edges, and master edges are longer than slave edges at every radius, as usual in mortar methods.
     growth
         Ratio of the sizes of successive element layers away from the contact zone.
     length
@@ -126,7 +126,7 @@ class Hertz(Problem):
         self._contact_dofs, self._contact_lift = np.searchsorted(self.free, zone), self._unit_lift[zone]
         upper, lower = self.points(np.ones(1))
         self._pairing = Pairing(upper[:, self.slave.zone], quadrature)
-        self._master_zone = lower[:, self.master.zone]  # at radius 1; every other is a multiple
+        self._master_zone = lower[:, self.master.zone]  # at radius 1; any other radius scales it
         self.V = InnerProduct(sp.csr_array(sp.block_diag(norms))[self.free][:, self.free])
         self.W = InnerProduct(sp.diags_array(self.macro_lengths))
 
@@ -146,7 +146,7 @@ class Hertz(Problem):
         return self.parameters.grid(81) if self._approach is not None else self.parameters.grid(12, 16)
 
     def approach(self, mu: Array) -> float:
-        """What each flat moves by at mu, d [m]."""
+        """Displacement d [m] of each flat at mu."""
         return float(mu[1]) if self._approach is None else self._approach
 
     def points(self, mu: Array) -> tuple[Array, Array]:
@@ -158,12 +158,14 @@ class Hertz(Problem):
     def assemble(self, mu: Array) -> VariationalInequality:
         """Form (45) and the non-interpenetration condition ∫ (v₂∘φ − v₁)·e_y η ≤ ∫ (x − φ(x))·e_y η, lifting included.
 
-        The lifting moves disc 1 by −d and disc 2 by +d as rigid bodies: it takes 2d from the gap and loads nothing.
+        The sign follows from the closing direction: the normal printed in the paper would, with the printed boundary
+        displacements, pull the discs apart. Equation (52) prints g independent of mu; with a vertical projection φ(mu)
+        it depends on mu. The lifting moves disc 1 by −d and disc 2 by +d as rigid bodies: it reduces the gap by 2d.
 
         Raises
         ------
         NumericalError
-            If mu is so small that the arc of disc 2 does not face the whole potential contact zone.
+            If mu_1 is so small that the arc of disc 2 does not cover the whole potential contact zone.
         """
         B, g = self.constraint(mu)
         return VariationalInequality(A=self._stiffness, f=np.zeros(len(self.free)), B=B, g=g, lift=self._lift(mu))
@@ -179,7 +181,7 @@ class Hertz(Problem):
         return Contact(integrals.jump, integrals.gap - integrals.jump @ (self.approach(mu) * self._contact_lift))
 
     def refuse(self, mu: Array, u: Array, lam: Array) -> str:  # noqa: ARG002
-        """Contact that reaches the last macro-edge may go on beyond the potential contact zone."""
+        """Refuse contact that reaches the last macro-edge: it may extend beyond the potential contact zone."""
         if lam[-1] <= 0.0:
             return ""
         return "the contact reaches the end of the potential contact zone: a smaller approach d keeps it inside"

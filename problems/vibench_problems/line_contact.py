@@ -1,4 +1,4 @@
-"""Hertz's theory of line contact, and the same figures measured on a solution of the Hertz problem."""
+"""Hertz's theory of line contact, and the same quantities measured on a solution of the Hertz problem."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ class LineContact:
 
 
 def theory(problem: Hertz, mu: Array, u: Array) -> LineContact:
-    """A = √(4PR*/(πE*)), p₀ = 2P/(πa) for the computed load P [N/m] of the whole bodies (Johnson 1985, §4.2).
+    """Half-width a = √(4PR*/(πE*)) and peak p₀ = 2P/(πa) for the computed load P [N/m] (Johnson 1985, §4.2).
 
-    E* = E/(2(1 − ν²)) for two bodies of one material and 1/R* = 1 + 1/mu. The theory holds for a small against R.
+    E* = E/(2(1 − ν²)) for two bodies of the same material and 1/R* = 1 + 1/mu. The theory assumes a ≪ R.
 
     Parameters
     ----------
@@ -36,7 +36,7 @@ def theory(problem: Hertz, mu: Array, u: Array) -> LineContact:
     u
         Displacement (n,), for the load.
     """
-    load = sum(problem.resultants(mu, u))
+    load = sum(problem.resultants(mu, u))  # of each disc only one half is meshed, and the two forces are equal
     modulus = problem.young / (2.0 * (1.0 - problem.poisson**2))
     radius = 1.0 / (1.0 + 1.0 / float(mu[0]))
     half_width = float(np.sqrt(4.0 * load * radius / (np.pi * modulus)))
@@ -44,9 +44,9 @@ def theory(problem: Hertz, mu: Array, u: Array) -> LineContact:
 
 
 def measured(problem: Hertz, mu: Array, lam: Array) -> LineContact:
-    """Half-width and peak of the elliptic pressure that fits λ (m,): a straight line through p² over x².
+    """Half-width and peak of the elliptic pressure fitted to λ (m,) by a linear fit of p² over x².
 
-    The last active macro-edge is left out, because the contact ends inside it.
+    The last active macro-edge is excluded, because the contact ends inside it.
     """
     x = problem.points(mu)[0][0, problem.slave.zone[1::2]]
     active = np.flatnonzero(lam)[:-1]

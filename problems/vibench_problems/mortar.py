@@ -31,14 +31,14 @@ class Pairing:
     """A slave polygon, to be coupled to master polygons by the vertical projection φ.
 
     Values are P1 on both sides, multipliers constant on pairs of slave edges. Along a vertical projection both sides
-    are piecewise linear in the abscissa, with kinks at the nodes of either: "exact" cuts the slave edges at the
-    projected master nodes, a number takes that many Gauss points per slave edge. What is integrated on the slave side
-    alone is exact in both cases and does not depend on the master.
+    are piecewise linear in the abscissa, with kinks at the nodes of either. "exact" cuts the slave edges at the
+    projected master nodes; a number is that of Gauss points per slave edge. Integrals over the slave side alone are
+    exact in both cases and do not depend on the master.
 
     Parameters
     ----------
     slave
-        Nodes (2×s) of the slave polygon, abscissae rising from the axis.
+        Nodes (2×s) of the slave polygon, abscissae increasing from the axis.
     quadrature
         "exact", or Gauss points per slave edge.
     """
@@ -58,12 +58,12 @@ class Pairing:
         self._points = None if quadrature == "exact" else self._gauss(int(quadrature))
 
     def couple(self, master: Array) -> Coupling:
-        """Couple to a master polygon (2×k), abscissae rising from the axis.
+        """Couple to a master polygon (2×k), abscissae increasing from the axis.
 
         Raises
         ------
         NumericalError
-            If the master side does not reach as far as the slave side.
+            If the master side does not cover the slave side.
         """
         slave = self._slave
         if master[0, -1] < slave[0, -1]:
@@ -80,7 +80,7 @@ class Pairing:
         return Coupling(jump, self._height - height)
 
     def _beside_slave(self, rows: Indices, nodes: Indices, values: Array, count: int) -> SparseMatrix:
-        """The entries of the slave side, then those of `count` master nodes, rising by row and node."""
+        """Matrix of the slave entries followed by those of `count` master nodes, sorted by row and node."""
         known = self._on_slave
         before = np.concatenate([[0], np.cumsum(np.bincount(rows, minlength=known.shape[0]))])
         mine = np.arange(known.nnz) + before[self._slave_rows]
@@ -95,11 +95,13 @@ class Pairing:
         """Macro-edge, master edge, abscissa and weight of the midpoints of all segments between projected nodes."""
         nodes = self._slave[0]
         first, last = np.searchsorted(abscissae, nodes[[0, -1]])
-        both = np.concatenate([nodes, abscissae[first:last]])
-        order = np.argsort(both, kind="stable")
-        cuts, begun = both[order], np.cumsum(order < len(nodes))[:-1]  # slave edges that have begun before each segment
-        facing = np.maximum(first + np.arange(len(begun)) - begun, 0)  # of all others the last master node
-        x = 0.5 * (cuts[1:] + cuts[:-1])
+        merged = np.concatenate([nodes, abscissae[first:last]])
+        order = np.argsort(merged, kind="stable")
+        cuts, begun = merged[order], np.cumsum(order < len(nodes))[:-1]  # slave nodes up to each segment
+        # The other cuts are master nodes; the last one before a segment is the number of its master edge. It would be
+        # −1 on the empty segment between two nodes that coincide on the axis.
+        facing = np.maximum(first + np.arange(len(begun)) - begun, 0)
+        x = 0.5 * (cuts[1:] + cuts[:-1])  # exact: the integrands are linear on every segment
         return self._macros[begun - 1], facing, x, np.diff(cuts) * self._stretch[begun - 1]
 
     @staticmethod
@@ -118,9 +120,13 @@ class Pairing:
 
 
 def _by_row(rows: Indices, edges: Indices, left: Array, right: Array) -> tuple[Indices, Indices, Array]:
-    """Rows, nodes and sums of what points give to the two nodes of their edges, both rising from point to point."""
-    further = np.diff(edges)
-    step = np.where((np.diff(rows) > 0) | (further > 1), 2, further)  # what nodes two points share is summed
+    """Sum the contributions of points to the two nodes of their edges; returns rows, nodes and sums.
+
+    Rows and edges ascend from point to point, so equal pairs of row and node are adjacent.
+    """
+    advance = np.diff(edges)
+    # Successive points in one row share both nodes (same edge), one node (next edge) or none.
+    step = np.where((np.diff(rows) > 0) | (advance > 1), 2, advance)
     place = np.concatenate([[0], np.cumsum(step)])
     count = int(place[-1]) + 2
     sums = np.asarray(np.bincount(place, left, count) + np.bincount(place + 1, right, count), float)

@@ -32,7 +32,7 @@ RADIUS = 0.2
 """Radius of the reference disc ω̂ [m]."""
 
 NODES = {"coarse": 400, "medium": 1200, "paper": 3594, "fine": 4 * 3594}
-"""Number of nodes behind each named resolution, Dirichlet nodes counted."""
+"""Number of nodes behind each named resolution, Dirichlet nodes included."""
 
 WITH_BULGE = ParameterBox(
     names=("scale", "centre_x", "centre_y", "bulge"),
@@ -40,7 +40,7 @@ WITH_BULGE = ParameterBox(
     upper=np.array([1.2, 0.05, 0.05, 0.3]),
     units=("1", "m", "m", "1"),
 )
-"""The parameters when the disc may bulge."""
+"""The parameter box with the bulge as fourth parameter."""
 
 
 @BilinearForm
@@ -76,14 +76,14 @@ def weighted_paraboloid(v, w):  # type: ignore[no-untyped-def]
 class Obstacle(Problem):
     """Membrane on a square above a parabolic obstacle on a disc that scales with mu_1 and moves with (mu_2, mu_3).
 
-    P1 displacements, P1 multipliers. The reference mesh fits the disc ω̂; h(mu) scales and shifts ω̂ and continues
+    P1 displacements, P1 multipliers. The reference mesh fits the disc ω̂; h(mu) scales and shifts ω̂ and is extended
     harmonically to the fixed outer boundary, so the physical mesh is the reference mesh with its nodes moved.
-    The paper prints the radius itself as mu_1 ∈ [0.8, 1.2] in a square of side 1 m; its node counts ask for the
-    reading used here, r = 0.2·mu_1 (and ψ̂ independent of mu).
+    The paper states mu_1 ∈ [0.8, 1.2] as the radius itself, in a square of side 1 m, which contradicts its node counts
+    (467 of 3594 nodes in ω̂). They imply the reading used here: r = 0.2·mu_1, with ψ̂ independent of mu.
 
     The paper's map is affine on ω̂: B(mu) is mu_1² times one matrix, and all mu share one space of supremizers. With
-    `bulge` there is a fourth parameter that makes an egg of the disc (see `DiscMap`): B(mu) is a combination of three
-    matrices, in proportions that vary with mu, and the supremizers vary with it.
+    `bulge` there is a fourth parameter that deforms the disc into an egg shape (see `DiscMap`): B(mu) is a combination
+    of three matrices, in proportions that vary with mu, and so do the supremizers.
 
     Parameters
     ----------
@@ -93,9 +93,9 @@ class Obstacle(Problem):
     length
         ℓ̂ [m] of the norm (44), ‖v‖² = ‖v‖²_L² + ℓ̂²‖∇v‖²_L².
     load
-        Vertical load ℓ̂ [1/m].
+        Vertical load [1/m], negative downwards.
     obstacle
-        Coefficient of the obstacle ψ̂ = obstacle·|x̂|² [1/m] on ω̂, which moves along with h(mu): on a disc that is
+        Coefficient of the obstacle ψ̂ = obstacle·|x̂|² [1/m] on ω̂, which h(mu) transports: without a bulge
         ψ = obstacle·|x − c|²/mu_1².
     bulge
         Whether there is a fourth parameter, mu_4 ∈ [−0.3, 0.3]; on ω̂ lengths then vary by factors from 0.7 to 1.3.
@@ -148,17 +148,20 @@ class Obstacle(Problem):
 
     @property
     def nodes(self) -> int:
-        """Nodes of the mesh, those on the Dirichlet boundary included; `V.dim` leaves them out."""
+        """Number of nodes of the mesh, Dirichlet nodes included; `V.dim` excludes them."""
         return int(self.mesh.p.shape[1])
 
     def training_set(self) -> Array:
-        """The 5×5×5 grid; with a bulge the 4×4×4×5 grid, on which A still interpolates to 1e-5 in between."""
+        """The 5×5×5 grid; with a bulge the 4×4×4×5 grid, from which A is interpolated to 1e-5 at other parameters."""
         return self.parameters.grid(4, 4, 4, 5) if self.bulge else self.parameters.grid(5, 5, 5)
 
     def assemble(self, mu: Array) -> VariationalInequality:
-        """Forms (37) to (40) on the mapped mesh; b = −∫ v η and g = −∫ ψ η, so that B u ≤ g says u ≥ ψ."""
+        """Forms (37) to (40) on the mapped mesh; b = −∫ v η and g = −∫ ψ η, so that B u ≤ g states u ≥ ψ.
+
+        The paper prints (40) without the minus signs, which would reverse the constraint.
+        """
         mesh = MeshTri(self.points(mu), self.mesh.t, sort_t=False, validate=False)
-        basis = Basis(mesh, ElementTriP1(), disable_doflocs=True)  # nobody asks where they are
+        basis = Basis(mesh, ElementTriP1(), disable_doflocs=True)  # their locations are not used
         B, g = self.constraint(mu)
         return VariationalInequality(
             A=stiffness.assemble(basis)[self.free][:, self.free],
@@ -173,17 +176,17 @@ class Obstacle(Problem):
         return self._contact_dofs
 
     def contact(self, mu: Array) -> Contact:
-        """B and g on the disc, where only the areas of the triangles depend on the parameter."""
+        """B and g on the disc; they depend on the parameter only through the areas of the triangles."""
         areas = self._map.monomials(self._map.weights(mu))
         return Contact(self._on_disc(-areas @ self._masses), -areas * self.obstacle @ self._paraboloids)
 
     def _on_disc(self, entries: Array) -> SparseMatrix:
-        """A matrix with the pattern of that of W."""
+        """A matrix with the sparsity pattern of the Gram matrix of W."""
         pattern = self.W.matrix
         return sp.csc_array((entries, pattern.indices, pattern.indptr), shape=pattern.shape)
 
     def sampler(self, wanted: Mapping[str, tuple[Indices, Indices]]) -> Sampler:
-        """Entries of A and f from the triangles around them; those of B and g are monomials times constants."""
+        """Entries of A and f from the triangles at their nodes; those of B and g are monomials times constants."""
         evaluated: dict[str, Callable[[Array], Array]] = {}
         if "A" in wanted:
             rows, columns = (self.free[places] for places in wanted["A"])

@@ -1,4 +1,4 @@
-"""Single entries of P1 stiffness matrices and load vectors on triangles whose nodes move linearly in some weights."""
+"""Single entries of P1 stiffness matrices and load vectors on meshes whose node positions are linear in weights."""
 
 from __future__ import annotations
 
@@ -27,19 +27,21 @@ class StiffnessEntries:
         entry, triangle = _shared(triangles, rows, columns)
         nodes = triangles[:, triangle]
         i, j = (np.argmax(nodes == wanted[entry], axis=0) for wanted in (rows, columns))
+        # The third edge is needed for the area: on the diagonal the edges opposite to i and to j are the same.
         edges = np.stack([_opposite(modes, nodes, local) for local in (i, j, (i + 1) % 3)], axis=2)
-        self._edges = edges.reshape(len(modes), -1)  # by weight; then two components of three edges of every share
+        self._edges = edges.reshape(len(modes), -1)  # weight × (component, edge, contribution)
+        # `reduceat` returns a wrong value for an empty range: every entry must have a triangle, as neighbours do.
         self._starts = np.searchsorted(entry, np.arange(len(rows)))
 
     def __call__(self, weights: Array) -> Array:
         """The entries (k,) at some weights."""
         (xi, xj, xk), (yi, yj, yk) = (weights @ self._edges).reshape(2, 3, -1)
-        shares = 0.5 * (xi * xj + yi * yj) / np.abs(xi * yk - yi * xk)
-        return np.asarray(np.add.reduceat(shares, self._starts))
+        contributions = 0.5 * (xi * xj + yi * yj) / np.abs(xi * yk - yi * xk)
+        return np.asarray(np.add.reduceat(contributions, self._starts))
 
 
 class LoadEntries:
-    """Entries of ∫ φ_i: a third of the area of the triangles at the node i.
+    """Entries of ∫ φ_i: one third of the area of the triangles at node i.
 
     Parameters
     ----------
@@ -63,7 +65,7 @@ class LoadEntries:
 
 
 def _shared(triangles: NDArray[np.integer], rows: Indices, columns: Indices) -> tuple[Indices, Indices]:
-    """Every triangle that has both nodes of an entry: number of the entry, rising, and of the triangle."""
+    """Pairs of an entry and a triangle that contains both of its nodes, sorted by entry: two index arrays."""
     pairs = [
         (k, t)
         for k, (i, j) in enumerate(zip(rows, columns, strict=True))
@@ -74,6 +76,6 @@ def _shared(triangles: NDArray[np.integer], rows: Indices, columns: Indices) -> 
 
 
 def _opposite(modes: Array, nodes: NDArray[np.integer], local: Indices) -> Array:
-    """Edges (weights×2×shares) opposite to a local node of every triangle, counter-clockwise as the triangle is."""
+    """Edges (weights×2×contributions) opposite to a local node of each triangle, in the triangle's orientation."""
     at = np.arange(nodes.shape[1])
     return np.asarray(modes[:, :, nodes[(local + 2) % 3, at]] - modes[:, :, nodes[(local + 1) % 3, at]])

@@ -1,4 +1,4 @@
-"""A membrane on a disc above a paraboloid: the obstacle problem whose answer is known in closed form."""
+"""A membrane on a disc above a paraboloid: an obstacle problem with a closed-form solution."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ class RadialSolution:
 
     def u(self, r: Array) -> Array:
         """Deflection [m]."""
-        rho, outside = self.contact_radius, np.maximum(r, 1e-300)
+        rho, outside = self.contact_radius, np.maximum(r, 1e-300)  # ln r is evaluated at r = 0, too, and discarded
         free = 0.25 * r**2 - rho**2 * (0.5 + 2.0 * self.curvature) * np.log(outside) - 0.25
         return np.where(r <= rho, -self.height - self.curvature * r**2, free)
 
@@ -62,16 +62,15 @@ class RadialSolution:
         return np.where(r <= rho, -2.0 * self.curvature * r, free)
 
     def lam(self, r: Array) -> Array:
-        """Multiplier [1/m]: what the obstacle carries."""
+        """Multiplier [1/m]: the contact pressure."""
         return np.where(r <= self.contact_radius, 1.0 + 4.0 * self.curvature, 0.0)
 
 
 class Radial(Problem):
-    """Membrane of load −1 on the unit disc above ψ(x) = −h − c|x|², h and c the parameters; solved by hand.
+    """Membrane of load −1 on the unit disc above ψ(x) = −h − c|x|², h and c the parameters; closed-form solution.
 
     P1 displacements, zero on the circle, P1 multipliers on the inner half of the rings: |x| ≤ ½, or 5/11 at "coarse".
-    Only g depends on mu. For checking whatever claims to solve obstacle problems against an answer that no mesh has
-    touched.
+    Only g depends on mu. The problem verifies solvers of obstacle problems against a solution that involves no mesh.
 
     Parameters
     ----------
@@ -116,7 +115,7 @@ class Radial(Problem):
         return self.parameters.grid(7, 7)
 
     def assemble(self, mu: Array) -> VariationalInequality:
-        """The forms of the obstacle problem; b = −∫ v η and g = −∫ ψ η, so that B u ≤ g says u ≥ ψ."""
+        """The forms of the obstacle problem; b = −∫ v η and g = −∫ ψ η, so that B u ≤ g states u ≥ ψ."""
         return VariationalInequality(
             A=self._stiffness, f=self._load, B=self._coupling, g=mu[0] * self._one + mu[1] * self._square
         )
@@ -154,7 +153,7 @@ class Radial(Problem):
         return relative(whole, deflection, exact.u, exact.slope), relative(disc, multiplier, exact.lam)
 
     def contact_radius(self, lam: Array) -> float:
-        """ρ of a discrete multiplier (m,): of the disc that carries the same load at the pressure of its plateau."""
+        """ρ of a discrete multiplier (m,): the radius of the disc with the same resultant at the median pressure."""
         active = lam > 0.0
         if not active.any():
             return 0.0

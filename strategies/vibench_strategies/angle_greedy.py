@@ -10,8 +10,8 @@ from vibench import Array, Cone, DualStrategy, InnerProduct, Stop, greedy_cone, 
 class AngleGreedy(DualStrategy):
     """Angle greedy algorithm of Haasdonk, Salomon and Wohlmuth (2012) and Burkovska et al. (2015).
 
-    A tolerance bounds the sine of the angle between every snapshot and the cone: its distance relative to its own norm,
-    not to the largest. The errors of the cone are relative to the largest norm, as everywhere.
+    The tolerance bounds the sine of the angle between each snapshot and the cone, which is its distance relative to its
+    own norm. The reported errors are relative to the largest norm, as for every dual strategy.
     """
 
     def reduce(self, snapshots: Array, W: InnerProduct, stop: Stop) -> Cone:

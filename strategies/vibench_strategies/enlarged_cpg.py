@@ -1,4 +1,4 @@
-"""Enlarged cone: the generators of CPG, each widened by what the others have in it."""
+"""Enlarged cone: the generators of CPG, each without its part in the cone of the others."""
 
 from __future__ import annotations
 
@@ -21,37 +21,37 @@ from vibench import (
 from vibench_strategies.mcpg import part_in_cone
 
 ROUND_OFF = 1e-9
-"""A generator that loses less than this share of its norm stays as it is; one no farther from the others is dropped."""
+"""A part of smaller norm is not subtracted from its generator; a generator this close to the others is dropped."""
 
 
 class EnlargedCPG(DualStrategy):
-    """A cone around a given one with no more generators, the idea that Remark 4.4 of Niakh et al. (2022) compares with.
+    """A cone that contains that of CPG and has no more generators, as discussed in Remark 4.4 of Niakh et al. (2022).
 
-    Each generator ν of CPG in turn leaves its best part Υ in the cone of the others, with ν − Υ ≥ 0, behind (line 9 of
-    Algorithm 2). Since ν = (ν − Υ) + Υ the cone only grows. Sweeps go on until nothing moves.
+    Each generator ν of CPG in turn is replaced by ν − Υ ≥ 0, where Υ is its part in the cone of the others (line 9 of
+    Algorithm 2). Since ν = (ν − Υ) + Υ, the cone can only grow. Sweeps are repeated until no generator changes.
     """
 
     def __init__(self, sweeps: Annotated[int, Ge(1)] = 100) -> None:
         self.sweeps = sweeps
 
     def reduce(self, snapshots: Array, W: InnerProduct, stop: Stop) -> Cone:
-        """CPG, then sweeps over its generators; one that the others contain is dropped."""
+        """Sweep over the generators of CPG; a generator in the cone of the others is dropped."""
         chi, notes = greedy_cone(snapshots, W, stop).generators, list[str]()
         for sweep in range(1, self.sweeps + 1):
-            moved, i = False, 0
+            changed, i = False, 0
             while i < chi.shape[1]:
                 others = np.delete(chi, i, axis=1)
                 if project_on_cone(others, chi[:, i], W).distance <= ROUND_OFF:
-                    moved, chi = True, others
+                    changed, chi = True, others  # i stays: it is now the index of the next generator
                     continue
                 part, note = part_in_cone(chi[:, i], others, W)
                 notes += [f"sweep {sweep}, generator {i + 1}: {note}"] if note else []
                 if W.norm(part) > ROUND_OFF:
                     rest = chi[:, i] - part
-                    moved, chi = True, np.insert(others, i, rest / W.norm(rest), axis=1)
+                    changed, chi = True, np.insert(others, i, rest / W.norm(rest), axis=1)
                 i += 1
-            if not moved:
+            if not changed:
                 break
         else:
-            notes.append(f"generators still moved in sweep {self.sweeps}")
+            notes.append(f"generators still changed in sweep {self.sweeps}")
         return Cone(chi, projection_errors(chi, snapshots, W), no_free(chi.shape[1]), tuple(notes))

@@ -1,4 +1,4 @@
-"""Inf-sup greedy: supremizers of the least stable multipliers, until a share of what online ones reach is kept."""
+"""Inf-sup greedy: supremizers of the least stable multipliers, until a given share of β_on is reached."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from vibench_strategies.supremizer_greedy import Shares, SupremizerSpace
 class InfSupGreedy(NestedStrategy):
     """After the double greedy algorithm of Dahmen, Plesken and Welper (2014), with a fixed cone and a fixed V_N.
 
-    The tolerance is ρ: β_S(mu) ≥ ρ·β_on(mu) over the training set, both over span χ (§3.1 of Niakh et al. 2022), β_on
-    what the whole of V gives. The larger it is the more vectors it takes.
+    The tolerance ρ demands β_S(mu) ≥ ρ·β_on(mu) on the training set. Both are inf-sup constants over span χ (§3.1 of
+    Niakh et al. 2022); online supremizers attain β_on, the constant of the whole of V. A larger ρ takes more vectors.
     """
 
     larger_is_tighter = True
@@ -29,4 +29,4 @@ class InfSupGreedy(NestedStrategy):
             p, missing = largest.next(lambda p: shares[p].missing(space.basis))
             history.append(1.0 - missing)
             yield space.step(history[-1], {"beta_share": history})
-            space.add(shares[p].worst_supremizer(space.basis), f"{history[-1]:.3g} of β_on")
+            space.add(shares[p].worst_supremizer(space.basis), f"β_S/β_on = {history[-1]:.3g}")

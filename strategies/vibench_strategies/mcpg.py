@@ -1,4 +1,4 @@
-"""Modified cone projected greedy algorithm: a cone with generators widened by what the cone already contains."""
+"""Modified cone projected greedy algorithm: each generator is a snapshot without its part in the present cone."""
 
 from __future__ import annotations
 
@@ -21,8 +21,10 @@ SOLVERS = ("piqp", "proxqp")
 """QP solvers tried for line 9, in this order."""
 
 ACCURACY = 1e-12
+"""Accuracy requested for line 9."""
+
 ACCEPTED = 1e-9
-"""A solution of line 9 with a larger residual is recorded as a fallback; any feasible one keeps Remark 4.1."""
+"""A solution of line 9 with a larger residual is recorded as a fallback; Remark 4.1 holds for any feasible one."""
 
 ZERO = 1e-12
 """Entries of θ − Υ below this share of max θ are round-off; left there, they would exclude generators later on."""
@@ -62,8 +64,8 @@ def part_in_cone(theta: Array, generators: Array, W: InnerProduct) -> tuple[Arra
         Υ (m,) such that θ − Υ has no negative entry, and exact zeros where round-off would leave less than `ZERO` of
         its maximum; and a note, empty where Υ is optimal to `ACCEPTED`.
     """
-    # A generator that is positive where θ is zero cannot take part. Without it, and on the support of θ alone, the
-    # problem has strictly feasible points; with it there are none, and QP solvers break down.
+    # A generator that is positive where θ is zero must have the coefficient 0. Without such generators, and restricted
+    # to the support of θ, the problem has strictly feasible points; otherwise it has none, and QP solvers break down.
     support = theta > 0.0
     usable = generators[:, ~np.any(generators[~support] > 0.0, axis=0)]
     if not usable.shape[1]:
@@ -71,7 +73,9 @@ def part_in_cone(theta: Array, generators: Array, W: InnerProduct) -> tuple[Arra
     coefficients, residual = _least_squares(theta, usable, support, W)
     part = usable @ coefficients
     over = part > theta
-    if np.any(over):  # round-off of the solver; a shorter multiple is feasible exactly, up to the clamp below
+    # The solver may violate Υ ≤ θ. Scaling Υ down restores feasibility and stays in the cone; a violation of the size
+    # of round-off is left to the clamp below.
+    if np.any(over):
         shrink = float(np.min(theta[over] / part[over]))
         part *= shrink if shrink < 1.0 - ACCEPTED else 1.0
     rest = np.maximum(theta - part, 0.0)

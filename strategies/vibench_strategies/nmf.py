@@ -26,9 +26,9 @@ from vibench import (
 class NonnegativeFactors(DualStrategy):
     """NMF, as Balajewicz, Amsallem and Farhat (2016) compress multipliers; factorised by scikit-learn.
 
-    The factorisation minimises the sum of squares in a lumped norm, the diagonal of X_W, since whitening by a
-    consistent mass matrix would destroy signs; the cone is judged in the norm of W. R is the smallest that meets a
-    tolerance.
+    The factorisation minimises the sum of squares in a lumped norm, the diagonal of X_W, because whitening by a
+    consistent mass matrix does not preserve nonnegativity. The errors of the cone are in the norm of W. R is the
+    smallest number of generators that meets the tolerance.
     """
 
     requires = ("scikit-learn",)
@@ -42,18 +42,21 @@ class NonnegativeFactors(DualStrategy):
         self._factorisation, self._not_converged = NMF, ConvergenceWarning
 
     def reduce(self, snapshots: Array, W: InnerProduct, stop: Stop) -> Cone:
-        """Factorise, with one generator more each time, from where the best linear space could meet the tolerance."""
+        """Factorise with one more generator at a time, from the smallest number at which POD meets the tolerance."""
         refuse_negative(snapshots)
         sigma, norms = singular_values(W.whiten(snapshots)), W.norm(snapshots)
         means = np.sqrt(np.append(np.cumsum(sigma[::-1] ** 2)[::-1], 0.0) / max(1, len(norms)))
-        first = stop.first_reached(means / (np.max(norms, initial=0.0) or 1.0))  # no largest distance is below the mean
+        # A lower bound: the largest distance is at least the root mean square, which POD minimises.
+        first = stop.first_reached(means / (np.max(norms, initial=0.0) or 1.0))
         best, most = np.inf, min(W.dim, int(np.count_nonzero(norms)))
         for size in range(most if first is None else min(first, most), most + 1):
             cone = self._factorised(snapshots, W, size)
             best = min(best, cone.errors[-1])
             if stop.size is not None or cone.errors[-1] <= (stop.tolerance or 0.0):
                 return cone
-        raise NumericalError(f"no factorisation reaches {stop}: the best of up to {most} generators leaves {best:.1e}")
+        raise NumericalError(
+            f"no factorisation reaches {stop}: the best of up to {most} generators has the error {best:.1e}"
+        )
 
     def _factorised(self, snapshots: Array, W: InnerProduct, size: int) -> Cone:
         if not size:
@@ -61,7 +64,7 @@ class NonnegativeFactors(DualStrategy):
         weights, scale = np.sqrt(W.matrix.diagonal())[:, None], float(snapshots.max())
         method = self._factorisation(size, init="nndsvd", max_iter=self.iterations, random_state=self.seed)
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", self._not_converged)  # said below
+            warnings.simplefilter("ignore", self._not_converged)  # recorded in the notes
             generators = normalised(method.fit_transform(weights * (snapshots / scale)) / weights, W)
         stopped = method.n_iter_ >= self.iterations
         notes = (f"the factorisation was stopped after {method.n_iter_} iterations",) if stopped else ()

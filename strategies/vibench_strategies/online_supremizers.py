@@ -9,5 +9,5 @@ class OnlineSupremizers(PrimalStrategy):
     """V_N + S_R(mu), equation (17) of Niakh et al. (2022), after Haasdonk, Salomon and Wohlmuth (2012)."""
 
     def build(self, offline: Offline, tolerance: float | None) -> Enrichment:  # noqa: ARG002
-        """Nothing offline; the supremizers of span χ at every parameter."""
+        """Compute nothing offline; request the supremizers of span χ at every parameter."""
         return Enrichment(Kind.PER_PARAMETER, eta=offline.span)

@@ -19,14 +19,14 @@ from vibench import (
 
 
 class Orthant(DualStrategy):
-    """The multiplier's own degrees of freedom, those where the snapshots have most.
+    """Selected degrees of freedom of the high-fidelity multiplier.
 
-    Restricting the multiplier to some of its degrees of freedom is what Fauque, Ramière and Ryckelynck (2018) do, on a
-    reduced integration domain; here a matching pursuit (Mallat and Zhang 1993) with coefficients α ≥ 0 chooses them.
+    Fauque, Ramière and Ryckelynck (2018) restrict the multiplier to its degrees of freedom on a reduced integration
+    domain; here a matching pursuit (Mallat and Zhang 1993) with coefficients α ≥ 0 selects them.
     """
 
     def reduce(self, snapshots: Array, W: InnerProduct, stop: Stop) -> Cone:
-        """Add the direction that has the largest share in the residual of the snapshot farthest from the cone."""
+        """Add the direction most correlated with the residual of the snapshot farthest from the cone."""
         refuse_negative(snapshots)
         units = np.eye(W.dim) / np.sqrt(W.matrix.diagonal())
         if not np.any(snapshots):
@@ -37,7 +37,7 @@ class Orthant(DualStrategy):
         errors = [error]
         while not stop.reached(len(chosen), errors[-1]) and errors[-1] > REPRODUCED:
             shares = whitened.T @ distances.residual(farthest)
-            shares[chosen] = -np.inf  # round-off apart they have none
+            shares[chosen] = -np.inf  # zero up to round-off: must not be selected again
             chosen.append(int(np.argmax(shares >= shares.max() * (1.0 - TIE))))
             distances.widen(whitened[:, chosen])
             farthest, error = distances.next()

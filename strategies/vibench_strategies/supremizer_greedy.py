@@ -1,4 +1,4 @@
-"""What the enrichments by supremizers of the training set share: their space, and how much of β_on is reached in it."""
+"""Common to the enrichments by training supremizers: the supremizer space and the share of β_on reached in it."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class SupremizerSpace:
     Attributes
     ----------
     supremizers
-        Coordinates (d×k) of T(mu)η, η running through `Offline.span`, for every class of parameters.
+        Coordinates (d×k) of T(mu)η for all η of `Offline.span`, one array per class of parameters.
     shared_by
         Number of training parameters of each class.
     plain, basis
@@ -64,24 +64,24 @@ class SupremizerSpace:
         return self._coordinates.vectors(self.basis[:, self.plain.shape[1] + first :])
 
     def add(self, vector: Array, reached: str) -> None:
-        """Add to S what is left of a vector (d,) outside V_N + S, normalised.
+        """Add to S the normalised component of a vector (d,) orthogonal to V_N + S.
 
         Raises
         ------
         NumericalError
-            If that is nothing but round-off; `reached` says how far the vectors so far have come.
+            If that component is round-off; `reached` describes what the present vectors have reached.
         """
         left = project_out(self.basis, vector)
         length = float(np.linalg.norm(left))
         if self.basis.shape[1] == self.basis.shape[0] or length <= RANK_RTOL * float(np.linalg.norm(vector)):
-            raise NumericalError(f"all supremizers leave {reached}")
-        # Orthogonalised twice: once is not enough where little is left of the vector.
+            raise NumericalError(f"with all supremizers added, {reached}")
+        # Orthogonalised twice: once is not enough if the component is small, because of cancellation.
         left = project_out(self.basis, left / length)
         self.basis = np.column_stack([self.basis, left / np.linalg.norm(left)])
 
 
 class Shares:
-    """How much of β_on(mu), what the whole of V gives span χ, is reached by V_N + S at one parameter.
+    """Share of β_on(mu), the constant of the whole of V over span χ, that V_N + S reaches at one parameter.
 
     Parameters
     ----------
@@ -97,18 +97,19 @@ class Shares:
         self._online = float(values[-1]) if independent and len(values) else 0.0
 
     def missing(self, space: Array) -> float:
-        """1 − β_S(mu)/β_on(mu), which only falls as S grows; 0 where β_on(mu) = 0 and there is nothing to reach."""
+        """1 − β_S(mu)/β_on(mu), which does not increase with S; 0 where β_on(mu) = 0."""
         return max(0.0, 1.0 - beta_span(self._on(space)) / self._online) if self._online else 0.0
 
     def worst_supremizer(self, space: Array) -> Array:
         """T(mu)η* (d,) for the unit η* in span χ at which β_S(mu) is attained; `canonical` if there are several."""
         images = self._on(space)
+        # Zero rows make the decomposition return the null space, too, where β_S is attained if N' < k.
         padding = np.zeros((max(0, images.shape[1] - images.shape[0]), images.shape[1]))
         _, values, right = svd(np.vstack([images, padding]))
         return np.asarray(self._supremizers @ canonical(right[values <= values[-1] + TIE * self._online]))
 
     def _on(self, space: Array) -> Array:
-        """Coordinates (N'×k) of the supremizers projected on V_N + S (d×N', orthonormal); of what is new alone."""
+        """Coordinates (N'×k) of the supremizers projected on V_N + S (d×N', orthonormal); computes new rows only."""
         new = space[:, self._images.shape[0] :]
         self._images = np.vstack([self._images, new.T @ self._supremizers])
         return self._images
@@ -117,7 +118,7 @@ class Shares:
 def canonical(cluster: Array) -> Array:
     """Unit vector (k,) of the span of orthonormal rows (c×k) that does not depend on which rows LAPACK returned.
 
-    The projection on the span of the coordinate vector that is closest to it.
+    It is the normalised projection on the span of the coordinate vector closest to the span.
     """
     weight = np.linalg.norm(cluster, axis=0)
     closest = int(np.argmax(weight >= weight.max() - TIE))

@@ -1,4 +1,4 @@
-"""Stages on the workers of a dask cluster, each in a process that a supervisor watches."""
+"""Stages on the workers of a dask cluster, each in a supervised process."""
 
 from __future__ import annotations
 
@@ -24,21 +24,21 @@ class Dask(Executor):
     """The workers of a dask cluster, one job at a time on each.
 
     They must have the same vibench installed and see the folder of the artefacts under the same path. The job of a
-    worker that dies is done again by another one, for stages are pure.
+    worker that dies is repeated by another one, which is safe because stages are pure functions.
 
     Parameters
     ----------
     scheduler
         Address of the scheduler; `None` for a cluster of processes on this machine, over TCP.
     slots
-        How many workers a cluster on this machine gets.
+        Number of workers of a cluster on this machine.
     store
         Folder of the artefacts.
 
     Raises
     ------
     RequestError
-        If dask.distributed is not installed, the scheduler does not answer, or a worker is of no use.
+        If dask.distributed is not installed, the scheduler does not answer, or a worker cannot run the jobs.
     """
 
     def __init__(self, scheduler: str | None, slots: int, store: Path) -> None:
@@ -51,7 +51,7 @@ class Dask(Executor):
         self._token = secrets.token_hex(8)
         self._cluster: Any = None
         if scheduler is None:
-            resource_tracker.ensure_running()  # whose start lets Ctrl-C through again
+            resource_tracker.ensure_running()  # started first, because its start unblocks SIGINT
             with _interrupts_held():
                 self._cluster = LocalCluster(
                     n_workers=slots,
@@ -69,12 +69,12 @@ class Dask(Executor):
         self.slots, self.machines = self._check_workers(store)
 
     def _check_workers(self, store: Path) -> tuple[int, frozenset[str]]:
-        """How many workers there are, and on which machines; refuses those that cannot do the work."""
+        """Number of workers and their machines; refuses workers with other code or without access to the artefacts."""
         token = store / f"{self._token}.part"
         token.touch()
         try:
             found: dict[str, tuple[bool, str, str]] = self._client.run(_describe, str(token))
-        except Exception as error:  # noqa: BLE001  whatever a worker without vibench answers
+        except Exception as error:  # noqa: BLE001  a worker without vibench may raise anything
             raise RequestError(f"the dask workers cannot run vibench: {in_a_line(error)}") from None
         finally:
             token.unlink()
@@ -95,13 +95,13 @@ class Dask(Executor):
         return result
 
     def check(self) -> None:
-        """The scheduler answers."""
+        """Check that the scheduler is connected."""
         if self._client.status != "running":
-            raise ExecutorError("the dask scheduler is gone; the same command goes on from here")
+            raise ExecutorError("the dask scheduler is not connected any more; run the same command again to continue")
 
     def close(self) -> None:
-        """End the jobs, leave the cluster as it was found, and end it if it is ours."""
-        with contextlib.suppress(Exception):  # a cluster that is gone has nothing to be ended
+        """End the jobs and their processes, and the cluster if this run started it."""
+        with contextlib.suppress(Exception):  # a cluster that was lost has no jobs to end
             if self._client.status == "running":
                 self._client.run(_dismiss, self._token)
         self._client.close()
@@ -111,7 +111,7 @@ class Dask(Executor):
 
 @contextlib.contextmanager
 def _interrupts_held() -> Iterator[None]:
-    """Processes started meanwhile never see Ctrl-C: they inherit what is blocked."""
+    """Block SIGINT: processes started in the block inherit the signal mask and do not receive Ctrl-C."""
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         yield
@@ -120,15 +120,17 @@ def _interrupts_held() -> Iterator[None]:
 
 
 def _hand_over(theirs: Any, ours: Future[Outcome]) -> None:
-    """Give the end of a dask future to one of the standard library's, for which `concurrent.futures.wait` works."""
+    """Pass the result of a dask future to a standard one, because `concurrent.futures.wait` works only on these."""
     try:
         ours.set_result(theirs.result())
-    except BaseException as error:  # noqa: BLE001  in a thread of dask's: whoever waits has to hear of it
+    except BaseException as error:  # noqa: BLE001  in a thread of dask: passed to the waiting thread
         line = in_a_line(error)
         if type(error).__name__ == "KilledWorker":
-            ours.set_result(Failed(Status.CRASHED, f"dask gave up on it: {line}"))
+            ours.set_result(Failed(Status.CRASHED, f"dask does not repeat the job again: {line}"))
         else:
-            ours.set_exception(ExecutorError(f"the dask cluster was lost: {line}; the same command goes on from here"))
+            ours.set_exception(
+                ExecutorError(f"the dask cluster was lost: {line}; run the same command again to continue")
+            )
 
 
 _supervisors: dict[tuple[str, int], Supervisor] = {}
@@ -141,11 +143,11 @@ def _run_for(token: str, job: Job) -> Outcome:
 
 
 def _dismiss(token: str) -> None:
-    """End what a dask worker does for a run."""
+    """End the supervisors of a run on a dask worker."""
     for key in [key for key in _supervisors if key[0] == token]:
         _supervisors.pop(key).close()
 
 
 def _describe(token: str) -> tuple[bool, str, str]:
-    """What a run wants to know of a dask worker: whether it sees a file, its code, its machine."""
+    """Describe a dask worker: whether it sees a file, its code, its machine."""
     return Path(token).exists(), code_here(), machine()

@@ -1,4 +1,4 @@
-"""Where stages run: here the worker processes of this machine; a dask cluster is another executor."""
+"""Executors run stages: here the interface and the worker processes of this machine; `dask` has the other one."""
 
 from __future__ import annotations
 
@@ -27,17 +27,17 @@ class Executor(ABC):
         """Begin a job."""
 
     def check(self) -> None:  # noqa: B027  nothing to check where jobs run in our own threads
-        """Make sure that jobs can still end.
+        """Check that submitted jobs can still finish.
 
         Raises
         ------
         ExecutorError
-            If whoever runs them is gone.
+            If the processes that run them were lost.
         """
 
     @abstractmethod
     def close(self) -> None:
-        """Stop whatever still runs."""
+        """Stop all jobs."""
 
 
 class Local(Executor):
@@ -46,9 +46,9 @@ class Local(Executor):
     Parameters
     ----------
     slots
-        How many.
+        Number of worker processes.
     log
-        File that takes what plugins print.
+        File for the output of plugins.
     """
 
     def __init__(self, slots: int, log: Path) -> None:
@@ -73,7 +73,7 @@ class Local(Executor):
 
     def close(self) -> None:
         """End the worker processes."""
-        for supervisor in self._supervisors:
+        for supervisor in self._supervisors:  # stopped first, because `shutdown` waits for running jobs
             supervisor.stop()
         self._threads.shutdown(cancel_futures=True)
         for supervisor in self._supervisors:

@@ -10,14 +10,14 @@ from vibench.stages.base import Stage
 
 @dataclass
 class Graph:
-    """The stages that a run has to do, by key; goals are what it is for, every other stage is there for a goal.
+    """The stages of a run, by key: the goals, and the stages that they need.
 
     Attributes
     ----------
     stages
         All stages that were planned.
     waiting
-        Of each that has not begun, the inputs that are not done.
+        For each stage that has not begun, its inputs that are not done.
     """
 
     stages: dict[str, Stage] = field(default_factory=dict)
@@ -27,7 +27,7 @@ class Graph:
     _there: set[str] = field(default_factory=set)
 
     def add_goal(self, stage: Stage, is_there: Callable[[Stage], bool]) -> None:
-        """Plan a stage, and what it needs that is not there already; `is_there` is called once for each."""
+        """Plan a stage and the inputs that are not available; `is_there` is called once per stage."""
         self._goals.add(stage.key)
         self._add(stage, is_there)
 
@@ -45,7 +45,7 @@ class Graph:
         return True
 
     def begin(self, count: int) -> Iterator[Stage]:
-        """At most so many stages that wait for nothing; they begin now."""
+        """Take at most `count` stages whose inputs are done; they count as begun."""
         for key in [key for key, needed in self.waiting.items() if not needed][: max(count, 0)]:
             del self.waiting[key]
             yield self.stages[key]
@@ -56,7 +56,7 @@ class Graph:
             needed.discard(stage.key)
 
     def lost(self, stage: Stage) -> list[Stage]:
-        """Drop what cannot be done without a stage that failed, and what leads to no other goal.
+        """Drop the stages that depend on a failed one, and those that no remaining goal needs.
 
         Returns
         -------
@@ -68,6 +68,7 @@ class Graph:
             for needed in inputs:
                 used_by.setdefault(needed, set()).add(key)
         gone = _closure([stage.key], used_by)
+        # Goals that an earlier failure has dropped are not waiting any more, so that each is reported once.
         lost = {key for key in self._goals & gone if key in self.waiting or key == stage.key}
         wanted = _closure((self.waiting.keys() & self._goals) - gone, self._inputs)
         for key in self.waiting.keys() - wanted:

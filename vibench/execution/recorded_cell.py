@@ -1,4 +1,4 @@
-"""A recorded cell and its reduced model, loaded from artefacts, or made again where these are gone."""
+"""A recorded cell and its reduced model, loaded from artefacts, or computed again where these are missing."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ from vibench.stages.base import Done, Stage
 from vibench.study.cells import Cell
 
 UNLIMITED = (1e6, 1e6, 1e6)
-"""Limits of stages that are made again: they went well before."""
+"""Limits (seconds, seconds, GiB) of stages that are run again: they succeeded before."""
 
 
 @dataclass(frozen=True)
 class RecordedCell:
-    """One row of the cells table, and what leads from it to its reduced model.
+    """One row of the cells table, and the reduced model that it was computed with.
 
     Attributes
     ----------
@@ -43,17 +43,17 @@ class RecordedCell:
 
     @cached_property
     def cell(self) -> Cell:
-        """What the study asked for."""
+        """The cell of the study."""
         return Cell.from_definition(self.row["definition"])
 
     @cached_property
     def model(self) -> Model:
-        """The reduced model; stages whose artefacts are gone are run again.
+        """The reduced model; stages whose artefacts are missing are run again.
 
         Raises
         ------
         RequestError
-            If the row was made by other code: the model of today would be another one.
+            If other code computed the row: its model cannot be reproduced.
         """
         if self.cell.code != self.row["code"]:
             raise RequestError(
@@ -84,12 +84,12 @@ class RecordedCell:
 
 
 def _provide(stage: Stage, store: Store) -> None:
-    """Make sure that the artefact of a stage is in the store, made as a run would make it.
+    """Run a stage, and the inputs it needs, if its artefact is missing; in a supervised process, as in a run.
 
     Raises
     ------
     RequestError
-        If it cannot be made.
+        If one of them fails.
     """
     missing: dict[str, Stage] = {}
     _collect(stage, store, missing)
@@ -99,13 +99,13 @@ def _provide(stage: Stage, store: Store) -> None:
             for needed in missing.values():
                 outcome = supervisor.run(Job(str(store.folder), needed, *UNLIMITED))
                 if not isinstance(outcome, Done):
-                    raise RequestError(f"what the cell needs cannot be made again: {outcome.reason}")
+                    raise RequestError(f"{needed.label}, a stage of the cell, failed when run again: {outcome.reason}")
     finally:
         supervisor.close()
 
 
 def _collect(stage: Stage, store: Store, missing: dict[str, Stage]) -> None:
-    """Add a stage and what it needs, if they are not in the store, in the order in which they are to be run."""
+    """Add a stage and its inputs that are not in the store, in the order in which they have to run."""
     if stage.key not in missing and store.get(stage.key) is None:
         for needed in stage.inputs():
             _collect(needed, store, missing)
@@ -126,12 +126,12 @@ def recorded_cells(run: str) -> list[RecordedCell]:
 
 
 def recorded_cell(run: str, cell: str) -> RecordedCell:
-    """One cell of a run, by its key or by as much of its beginning as no other has.
+    """One cell of a run, by its key or a unique prefix of it.
 
     Raises
     ------
     RequestError
-        If no cell, or more than one, begins like that, or the cell failed before it had a reduced model.
+        If the prefix fits no cell or several, or the cell failed before it had a reduced model.
     """
     path = results_file(run)
     rows = tables.read(path, "cells").to_dict("records")

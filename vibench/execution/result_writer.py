@@ -19,7 +19,7 @@ from vibench.study.spec import Study
 
 @dataclass(frozen=True)
 class ResultWriter:
-    """Writes what the stages of a study give; `labels` are what its plugins are called."""
+    """Writes the results of the stages of a study; `labels` are the names of its plugins in the results."""
 
     study: Study
     database: ResultsDatabase
@@ -34,13 +34,13 @@ class ResultWriter:
         return row
 
     def stage(self, stage: Stage, histories: Iterable[History], store: Store) -> None:
-        """Write what is recorded of a stage that is stored."""
+        """Write the histories and rows of a stage whose value is stored."""
         self._histories(stage, histories)
-        if type(stage).rows is not Stage.rows:  # the value is read only where rows are made of it
+        if type(stage).rows is not Stage.rows:  # artefacts are large: read only if rows are made of them
             self._tables(stage, stage.rows(value_of(store, stage)))
 
     def failure(self, stage: Stage, reason: str) -> None:
-        """Write what is recorded of a stage that failed, beside the rows of the cells that need it."""
+        """Write the rows of a stage that failed; those of the cells that need it are written separately."""
         self._tables(stage, stage.failure_rows(reason))
 
     def _tables(self, stage: Stage, tables: Mapping[str, Sequence[Row]]) -> None:

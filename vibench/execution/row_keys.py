@@ -1,4 +1,4 @@
-"""The columns that name the rows of the results: of a cell, and of what a stage leaves."""
+"""The key columns of the results: of cells, and of the rows and histories of a stage."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ def cell_columns(cell: Cell) -> dict[str, Any]:
 
 
 def labels_of(cells: Iterable[Cell]) -> dict[Plugin, str]:
-    """What the plugins of a study are called in its results: their labels in the first cell that has them."""
+    """The names of a study's plugins in its results: their labels in the first cell that has them."""
     found: dict[Plugin, str] = {}
     for cell in cells:
         for plugin, label in zip((cell.problem, cell.dual, cell.primal), cell.labels, strict=True):
@@ -25,7 +25,7 @@ def labels_of(cells: Iterable[Cell]) -> dict[Plugin, str]:
 
 
 def axis_columns(axes: Axes, labels: Mapping[Plugin, str]) -> dict[str, Any]:
-    """The key columns of some axes; those of axes that nothing depends on are left out."""
+    """The key columns of some axes; unset axes have none."""
     columns: dict[str, Any] = {}
     for name, plugin in (("problem", axes.problem), ("dual", axes.dual), ("primal", axes.primal)):
         if plugin is not None:

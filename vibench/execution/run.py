@@ -1,4 +1,4 @@
-"""Running a study: stages in worker processes, shared by the cells that need them, every cell ending in a row."""
+"""Running a study: stages run in worker processes and are shared by cells; every cell gets a row."""
 
 from __future__ import annotations
 
@@ -33,18 +33,18 @@ from vibench.study.cells import Cell, expand
 from vibench.study.spec import Study
 
 CHECK_INTERVAL = 5.0
-"""Seconds after which a run that waits makes sure that the executor still runs."""
+"""Seconds between two checks that the executor still runs."""
 
 REPORT = "report.html"
 """File in the run folder that `vibench report` writes unless told otherwise."""
 
 LOG = "workers.log"
-"""File in the run folder that takes what plugins and solvers print."""
+"""File in the run folder for the output of plugins and solvers."""
 
 
 @dataclass(frozen=True)
 class Agenda:
-    """What a run has to do.
+    """The work of a run.
 
     Attributes
     ----------
@@ -53,9 +53,9 @@ class Agenda:
     to_run
         Those that have no row yet.
     unavailable
-        Those of them that cannot be run here, for want of a solver or of what a plugin needs.
+        Those of `to_run` whose solver or plugins need a distribution that is not installed.
     stages
-        Stages that the others need.
+        Stages that the other cells need.
     workers
         Number of worker processes.
     """
@@ -90,20 +90,20 @@ class Outcome:
 
 
 def identity(study: Study) -> dict[str, Any]:
-    """What all numbers of a study depend on; results of another identity do not go into the same folder."""
+    """The settings that all numbers of a study depend on; a run folder holds results of one identity only."""
     return {"name": study.name, "seed": study.seed, "validation": study.validation, "accuracy": study.accuracy}
 
 
 @dataclass(frozen=True)
 class Options:
-    """How a study is run; none of it changes a number besides times.
+    """How a study is run; only times depend on it.
 
     Attributes
     ----------
     jobs
         Worker processes.
     fresh
-        Begin from nothing: earlier results of this study are removed, artefacts are made anew.
+        Remove earlier results of this study and compute all artefacts again.
     retry
         Also redo cells that did not end ok.
     executor
@@ -120,7 +120,7 @@ class Options:
 
 
 def run_study(study: Study, folder: Path, observer: Observer, options: Options = Options()) -> Outcome:
-    """Run what is missing of a study's matrix and write every result into its folder.
+    """Run the missing cells of a study and write every result into its folder.
 
     Parameters
     ----------
@@ -170,7 +170,7 @@ def _to_do(cell: Cell, finished: Mapping[str, tuple[str, str]], retry: bool) -> 
 
 
 def _clear(folder: Path, study: Study) -> None:
-    """Remove what follows from a study's earlier results, never of those of a study with another name."""
+    """Remove tables, figures, log and report of a study's earlier run; refuse the folder of another study."""
     path = folder / FILE
     meta = read_meta(path) if path.is_file() else {}
     there = study_of(path, meta).get("name") if meta else study.name
@@ -194,7 +194,7 @@ class _Run:
     options: Options
     graph: Graph = field(default_factory=Graph)
     cells: dict[str, list[Cell]] = field(default_factory=dict)
-    """The cells whose rows a goal gives, by its key; cells may share one."""
+    """The cells that get their rows from a goal, by its key; several cells may share a goal."""
 
     def execute(self, todo: Sequence[Cell], count: int) -> bool:
         """Run these cells of a matrix of `count`; returns whether Ctrl-C ended it."""
@@ -234,7 +234,7 @@ class _Run:
     def _is_there(self, machines: Set[str], stage: Stage) -> bool:
         """Whether the artefact of a stage can be reused; its histories are recorded if so.
 
-        Seconds count only where they were measured: an artefact of another machine is made anew.
+        Seconds of different machines are not comparable: an artefact of another machine is computed again.
         """
         if self.options.fresh or not stage.stored:
             return False
@@ -253,7 +253,7 @@ class _Run:
                 running[workers.submit(job)] = stage
             if not running:
                 raise ExecutorError(
-                    f"{len(self.graph.waiting)} stages wait for others that nobody runs: a bug of vibench"
+                    f"{len(self.graph.waiting)} stages wait for inputs that are not running: this is a bug in vibench"
                 )
             done, _ = wait(running, timeout=CHECK_INTERVAL, return_when=FIRST_COMPLETED)
             workers.check()
@@ -261,7 +261,7 @@ class _Run:
                 self._finish(running.pop(future), _outcome(future))
 
     def _finish(self, stage: Stage, outcome: Done | Failed) -> None:
-        """Record the end of a stage; one that failed gives a row to every cell that needs it."""
+        """Record the end of a stage; if it failed, every cell that needs it gets a row with the reason."""
         if isinstance(outcome, Failed):
             reason = outcome.reason if stage.key in self.cells else f"in {stage.label}: {outcome.reason}"
             self.writer.failure(stage, outcome.reason)
@@ -296,7 +296,7 @@ def _outcome(future: Future[Any]) -> Done | Failed:
         result = future.result()
     except VibenchError:
         raise
-    except Exception as error:  # noqa: BLE001  a stage or a result that does not travel between processes
+    except Exception as error:  # noqa: BLE001  a stage or a result that cannot be pickled
         return Failed(Status.ERROR, in_a_line(error))
     if isinstance(result, Unstored):
         raise StorageError(result.reason)

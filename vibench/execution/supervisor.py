@@ -1,7 +1,7 @@
-"""Stages in worker processes with hard limits: whatever becomes of a process, its job has an outcome.
+"""Stages in worker processes with hard limits: every job has an outcome, even if its process dies or hangs.
 
-A supervisor owns one worker process and talks to it through a socket. It follows what the worker reports, stops it when
-a limit is passed, and starts another one. Of a piecewise stage only the present piece is lost.
+A supervisor owns one worker process and talks to it through a socket. It follows what the worker reports, kills it when
+a limit is exceeded, and starts another one. Of a piecewise stage only the current piece is lost.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ POLL = 0.2
 """Seconds between two checks of the limits."""
 
 GRACE = 2.0
-"""Seconds that a process has beyond the limit of a query, for the work around it."""
+"""Seconds allowed beyond the limit of a query, for the work before and after the solver."""
 
 
 def code_here() -> str:
@@ -51,7 +51,7 @@ class Job:
 
 @dataclass(frozen=True)
 class Watch:
-    """A worker is in a piece; `on` while it does something that may hang and has a limit of its own."""
+    """A worker is in a piece; `on` while it is in an operation with a time limit of its own."""
 
     piece: int
     on: bool
@@ -93,9 +93,9 @@ class _WorkerLostError(Exception):
 
 
 class _JobState:
-    """What workers have reported of a job: its pieces, the present one, and when that one has to be stopped.
+    """What workers have reported of a job: finished pieces, the current piece and its deadline.
 
-    Time counts in small steps: of a night in which the run was suspended only one step counts.
+    Time is added up in steps of bounded length, so that a suspended machine does not exhaust the limits.
     """
 
     def __init__(self, job: Job) -> None:
@@ -104,7 +104,7 @@ class _JobState:
         self.begin()
 
     def begin(self) -> Progress:
-        """Another process, or another piece, begins; returns what the process has to know."""
+        """Reset the current piece for a new process or piece; returns the progress that a process continues from."""
         self.piece: int | None = None
         self.piece_limit = float("inf")
         return self.progress
@@ -116,7 +116,7 @@ class _JobState:
         self._last = now
 
     def update(self, message: Any) -> Done | Failed | Unstored | None:
-        """Take in a message of the worker; returns the outcome if it is one."""
+        """Process a message of the worker; returns the outcome if it is one."""
         match message:
             case Watch():
                 self.piece = message.piece
@@ -137,7 +137,7 @@ class Supervisor:
     Parameters
     ----------
     log
-        File that takes what plugins print; `None` to drop it.
+        File for the output of plugins; `None` to discard it.
     """
 
     def __init__(self, log: Path | None = None) -> None:
@@ -147,7 +147,7 @@ class Supervisor:
         self._stop = threading.Event()
 
     def run(self, job: Job) -> Done | Failed | Unstored:
-        """Run a stage to its end, or to the end of its limits.
+        """Run a stage until it ends or exceeds its limits.
 
         Raises
         ------
@@ -161,7 +161,7 @@ class Supervisor:
             raise
 
     def stop(self) -> None:
-        """Let `run`, which may go on in another thread, end soon."""
+        """Make `run`, which may be active in another thread, return soon."""
         self._stop.set()
 
     def close(self) -> None:
@@ -183,16 +183,16 @@ class Supervisor:
                     lost[state.piece] = error.failed
                 if not isinstance(job.stage, PiecewiseStage) or not (found or lost) or limit > job.cell_seconds:
                     return error.failed
-                if state.seconds > job.cell_seconds:  # one more process may finish the stage with the pieces there are
+                if state.seconds > job.cell_seconds:  # another process may finish with these pieces
                     limit += state.seconds
                     for late in set(range(job.stage.pieces)) - found.keys():
                         lost.setdefault(late, _beyond("cell_seconds", job.cell_seconds))
-                elif state.piece is None and retried:  # it dies outside of any piece, again and again
+                elif state.piece is None and retried:  # died outside any piece for the second time
                     return error.failed
                 retried = retried or state.piece is None
 
     def _attempt(self, state: _JobState, limit: float) -> Done | Failed | Unstored:
-        """What one process makes of the rest of a stage."""
+        """Run the rest of a stage in one process."""
         job = state.job
         try:
             connection, process = self._worker()
@@ -205,7 +205,7 @@ class Supervisor:
                     outcome = state.update(connection.recv())
                     if outcome is not None:
                         return outcome
-                elif process.poll() is not None:  # a process that it started may hold the socket open
+                elif process.poll() is not None:  # a child process of it may hold the socket open
                     raise EOFError
                 state.tick()
                 if state.seconds > limit:
@@ -220,7 +220,7 @@ class Supervisor:
     def _worker(self) -> tuple[Connection, subprocess.Popen[bytes]]:
         """The worker process, started where there is none, and the connection to it.
 
-        It leads a process group of its own: Ctrl-C on the terminal does not reach it, and what plugins start ends too.
+        It leads its own process group: Ctrl-C on the terminal does not reach it, and children of plugins die with it.
         """
         if self._connection is None or self._process is None:
             ours, theirs = socket.socketpair()

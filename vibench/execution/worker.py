@@ -1,4 +1,4 @@
-"""What happens inside a worker process: one stage at a time, on one thread, under a memory limit."""
+"""The worker process: it runs one stage at a time, on one thread, under a memory limit."""
 
 from __future__ import annotations
 
@@ -30,13 +30,13 @@ Send = Callable[[Any], None]
 
 
 class _NoMemoryError(Exception):
-    """Some work met the limit of the memory; this process does not go on."""
+    """The memory limit was reached; this process has to be replaced."""
 
 
 def main() -> None:
     """Serve the supervisor at the other end of a socket until it closes the connection."""
     socket, log = int(sys.argv[1]), os.open(sys.argv[2], os.O_WRONLY | os.O_APPEND | os.O_CREAT)
-    os.set_inheritable(socket, False)  # what plugins start does not hold it open
+    os.set_inheritable(socket, False)  # children of plugins must not hold it open
     connection = Connection(socket)
     for stream in (1, 2):  # what plugins print must not look like output of vibench
         os.dup2(log, stream)
@@ -47,7 +47,7 @@ def main() -> None:
     own, first = os.getpid(), True
 
     def send(message: Any) -> None:
-        if os.getpid() != own:  # a plugin forked, and this is the other one
+        if os.getpid() != own:  # a plugin forked: the child must not use the socket
             os._exit(0)
         connection.send(message)
 
@@ -56,6 +56,7 @@ def main() -> None:
             job, progress = connection.recv()
         except EOFError:
             return
+        # The allocator keeps freed memory: a large process is replaced before the next job instead of failing it.
         if not first and _address_space() > 0.5 * job.memory_gib * 2**30:
             send(OutOfMemory(None))
             return
@@ -66,14 +67,14 @@ def main() -> None:
 
 
 def _end_with(parent: int) -> None:
-    """End this process, and what plugins started in it, when its parent has ended and nobody enforces its limits."""
+    """Kill this process and the children of plugins once the parent has died, since its limits are not enforced."""
     while os.getppid() == parent:
         time.sleep(1.0)
     os.killpg(0, signal.SIGKILL)
 
 
 def perform(job: Job, progress: Progress, send: Send) -> Done | Failed | Unstored | OutOfMemory:
-    """Run one stage; what a plugin raises becomes a reason, and the rest of the matrix goes on."""
+    """Run one stage; an exception of a plugin becomes the reason of a failed stage and does not end the run."""
     start = time.perf_counter()
 
     def work() -> Done:
@@ -95,7 +96,7 @@ def perform(job: Job, progress: Progress, send: Send) -> Done | Failed | Unstore
 
 
 def _check_code(job: Job) -> None:
-    """Refuse a job that was planned with other code than there is here: its artefact would have the wrong key."""
+    """Refuse a job that was planned with other code than this process has: its artefact would have the wrong key."""
     used = job.stage.plugins()
     changed = [f"the {p.kind} '{p.name}'" for p in used if registry.code(p.kind, p.name) != p.code]
     if job.code != code_here():
@@ -105,7 +106,7 @@ def _check_code(job: Job) -> None:
 
 
 def _pieces(job: Job, store: Store, progress: Progress, send: Send) -> Any:
-    """Do what is left of a piecewise stage, piece by piece; returns its value."""
+    """Do the remaining pieces of a piecewise stage; returns its value."""
     stage = job.stage
     assert isinstance(stage, PiecewiseStage)
     pieces = stage.begin(store)
@@ -130,7 +131,7 @@ def _out_of_memory(job: Job) -> Failed:
 
 
 def _guarded(memory_gib: float, work: Callable[[], T]) -> T | Failed:
-    """The value of some work, or why it failed."""
+    """The value of `work()`, or the reason of its failure."""
     try:
         with _memory_limit(memory_gib):
             return work()
@@ -146,7 +147,7 @@ def _guarded(memory_gib: float, work: Callable[[], T]) -> T | Failed:
 
 @contextmanager
 def _memory_limit(gib: float) -> Iterator[None]:
-    """Limit the address space for some work; outside of it the worker must be able to reply."""
+    """Limit the address space inside the block; outside it the worker needs memory to reply."""
     soft, hard = resource.getrlimit(resource.RLIMIT_AS)
     limit = int(gib * 2**30)
     if _address_space() > limit:
@@ -159,7 +160,7 @@ def _memory_limit(gib: float) -> Iterator[None]:
 
 
 def _address_space() -> int:
-    """Bytes of address space in use, 0 where the system does not tell."""
+    """Bytes of address space in use, 0 on systems without /proc."""
     statm = Path("/proc/self/statm")
     return int(statm.read_text().split()[0]) * resource.getpagesize() if statm.is_file() else 0
 

@@ -22,13 +22,13 @@ from vibench.provenance import machine
 from vibench.timing import Seconds
 
 CACHE_VARIABLE = "VIBENCH_CACHE"
-"""Environment variable that says where artefacts are kept."""
+"""Environment variable that sets the cache folder, in which artefacts are kept."""
 
 SUFFIX = ".artefact"
-"""How artefacts' files end; a SHA-256 of what follows, then a pickle."""
+"""Suffix of artefact files: each holds a SHA-256 digest and then the pickle that it belongs to."""
 
 LOCK = "lock"
-"""File that runs share and `clear` wants for itself."""
+"""Lock file: shared by runs, exclusive for `clear`."""
 
 
 @dataclass(frozen=True)
@@ -76,7 +76,7 @@ class Store:
         self._recent: LRUCache[str, Artefact] = LRUCache(maxsize=64)
 
     def get(self, key: str) -> Artefact | None:
-        """The artefact stored under a key; `None` if there is none that is whole.
+        """The artefact stored under a key; `None` if it is missing or damaged.
 
         Raises
         ------
@@ -90,10 +90,10 @@ class Store:
             size = hashlib.sha256().digest_size
             digest, content = whole[:size], whole[size:]
             if hashlib.sha256(content).digest() != digest:
-                return None  # cut off, or changed on the disk
+                return None  # truncated or corrupted
             artefact = pickle.loads(content)
         except (FileNotFoundError, pickle.UnpicklingError, EOFError, AttributeError, ImportError):
-            return None  # not there, or of classes that are not there any more
+            return None  # missing, or pickled with classes that no longer exist
         except OSError as error:
             raise StorageError(f"artefacts cannot be read from '{self.folder}': {error.strerror}") from None
         if not isinstance(artefact, Artefact):
@@ -102,7 +102,7 @@ class Store:
         return artefact
 
     def put(self, key: str, value: Any, seconds: Seconds, histories: tuple[History, ...]) -> None:
-        """Store an artefact: written beside its place, synced, then renamed, so that it is whole or not there.
+        """Store an artefact atomically: it is written to a temporary file, synced and renamed.
 
         Raises
         ------
@@ -129,7 +129,7 @@ class Store:
 
     @contextlib.contextmanager
     def used(self) -> Iterator[None]:
-        """Nobody clears the store meanwhile.
+        """Keep the store from being cleared inside the block.
 
         Raises
         ------
@@ -140,7 +140,7 @@ class Store:
             yield
 
     def contents(self) -> list[tuple[str, int, float]]:
-        """What is stored: label of the stage, bytes, seconds since it was made; one entry per artefact."""
+        """The stored artefacts: label of the stage, bytes, and age in seconds."""
         found = []
         for path in sorted(self.folder.glob(f"*{SUFFIX}")):
             with contextlib.suppress(FileNotFoundError):
@@ -149,7 +149,7 @@ class Store:
         return found
 
     def clear(self, older_than: float = 0.0) -> int:
-        """Remove artefacts made more than so many seconds ago, and what killed runs left; returns the bytes freed.
+        """Remove artefacts older than so many seconds, and temporary files of killed runs; returns the bytes freed.
 
         Raises
         ------
@@ -178,7 +178,7 @@ def usable_store() -> Store:
     Raises
     ------
     RequestError
-        If its folder cannot be made.
+        If its folder cannot be created.
     """
     store = Store(default_folder())
     try:

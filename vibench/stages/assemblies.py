@@ -1,4 +1,4 @@
-"""What a problem assembles, kept for assessments that look at the same parameters again and again."""
+"""A cache of assembled matrices for assessments, which use the same parameters repeatedly."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from vibench.interfaces.problem import Problem, VariationalInequality
 from vibench.interfaces.validation import checked_assembly
 
 LIMIT = 2**28
-"""Bytes that are kept at most; what was used longest ago is dropped first."""
+"""Size limit of the cache in bytes; the least recently used assembly is dropped first."""
 
 
 class Assemblies:
-    """The assemblies of one problem, each made once while there is room for it; nothing that is timed uses them."""
+    """Cached assemblies of one problem; timed code must not use them."""
 
     def __init__(self, problem: Problem, limit: int = LIMIT) -> None:
         self._problem = problem
@@ -31,14 +31,14 @@ class Assemblies:
         return vi
 
     def keep(self, mu: Array, vi: VariationalInequality) -> None:
-        """Keep what was assembled at mu (d,) elsewhere, unless it is larger than the limit."""
+        """Add an assembly at mu (d,) to the cache, unless it is larger than the limit."""
         if _bytes(vi) <= self._kept.maxsize:
             self._kept[_key(mu)] = vi
 
 
 @lru_cache(maxsize=1)
 def assemblies(problem: Problem) -> Assemblies:
-    """The assemblies of the present problem of this process."""
+    """The cache of the problem that this process works on; another problem replaces it."""
     return Assemblies(problem)
 
 
@@ -48,4 +48,5 @@ def _key(mu: Array) -> bytes:
 
 def _bytes(vi: VariationalInequality) -> int:
     """Memory of the matrices, as if none were shared."""
+    # A value of 8 bytes and an index of 4 per nonzero.
     return int(12 * (vi.A.nnz + vi.B.nnz)) + vi.f.nbytes + vi.g.nbytes

@@ -1,4 +1,4 @@
-"""Assembly of reduced programs, in full or hyper-reduced: what it prepares offline, and its seconds per query."""
+"""Assembly of reduced programs, in full or hyper-reduced: its offline part and its seconds per query."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ from vibench.study.cells import Cell, Plugin
 from vibench.timing import NO_TIME, REPEATS, Seconds, median_of, median_seconds, timed
 
 Model = ReducedModel | HyperReducedModel
-"""What gives the reduced problem at a parameter."""
+"""A model that assembles the reduced program at a parameter."""
 
 
 @dataclass(frozen=True)
 class AffineDecomposition(Stage):
-    """How A, f, B, g are evaluated without assembling all of them; it depends on the problem alone."""
+    """Affine decomposition of A, f, B and g for their evaluation at reduced cost; it depends only on the problem."""
 
     label = "affine decomposition"
     rooms = ("linalg", "interfaces", "model")
@@ -37,7 +37,7 @@ class AffineDecomposition(Stage):
     tolerance: float
 
     def inputs(self) -> tuple[Stage, ...]:
-        """None: the matrices of the training parameters are not kept."""
+        """None: the training matrices are not stored, they are assembled again."""
         return ()
 
     def run(self, store: Store) -> Result:  # noqa: ARG002
@@ -129,14 +129,14 @@ class NestedPrograms(Stage):
 
 @dataclass(frozen=True)
 class ReducedPrograms:
-    """Reduced programs and the seconds of their assembly, whatever solves them.
+    """Reduced programs and the seconds of their assembly, for any QP solver.
 
     Attributes
     ----------
     programs
         One per validation parameter.
     factor
-        Cholesky factor (lower) of their A, where it is the same in all and they are solved through the dual.
+        Cholesky factor (lower) of A, where A is constant and the programs are solved in dual form.
     seconds
         Seconds of the assembly per validation parameter.
     errors
@@ -164,19 +164,19 @@ class AssemblyStage(Stage):
 
     @property
     def reduction(self) -> HyperReduction | None:
-        """What reduced assembly prepares offline; `None` for assembly in full."""
+        """The offline stage of reduced assembly; `None` for full assembly."""
         if self.interpolation is None:
             return None
         return HyperReduction(self.enrichment, AffineDecomposition(self.enrichment.pod.problem, self.interpolation))
 
     @property
     def full_times(self) -> FullAssemblyTimes:
-        """The stage of the seconds of the high-fidelity matrices."""
+        """The stage that times the assembly of the high-fidelity matrices."""
         return FullAssemblyTimes(self.enrichment.pod.problem, self.count, self.seed)
 
     @property
     def nested(self) -> NestedPrograms | None:
-        """The programs in full of all vectors of a nested strategy; `None` for any other."""
+        """The stage of the fully assembled programs of a nested strategy; `None` for any other."""
         growth = self.enrichment.growth
         return None if growth is None else NestedPrograms(growth, self.count, self.seed)
 
@@ -201,7 +201,7 @@ class AssemblyStage(Stage):
         return Result(_in_full(model, mus, value_of(store, self.full_times), known))
 
     def model(self, store: Store) -> tuple[Model, str]:
-        """The model that queries use, and why it assembles in full although reduced assembly was asked for."""
+        """The model that queries use, and why requested reduced assembly was replaced by full assembly, or ""."""
         model = self.enrichment.model(store)
         if self.reduction is None:
             return model, ""
@@ -224,11 +224,11 @@ class AssemblyStage(Stage):
 
 
 InFull = Sequence[VariationalInequality] | None
-"""Programs in full of a space that begins with that of a model, one per parameter, if they are known."""
+"""Fully assembled programs of a larger nested space, one per parameter, if they are known."""
 
 
 def _reduced(model: HyperReducedModel, mus: Array, known: InFull) -> ReducedPrograms:
-    """Assemble without arrays of mesh size at every parameter; how far the members are from their projections."""
+    """Time the hyper-reduced assembly at every parameter; compare it with the Galerkin projection, untimed."""
     matrices = assemblies(model.problem)
     programs, seconds, errors, factor = [], [], [], None
     for k, mu in enumerate(mus):
@@ -246,11 +246,11 @@ def _reduced(model: HyperReducedModel, mus: Array, known: InFull) -> ReducedProg
 def _in_full(model: ReducedModel, mus: Array, forms: Sequence[Seconds], known: InFull) -> ReducedPrograms:
     """Assemble the high-fidelity matrices, which are timed once for all models, and project them.
 
-    After a warm-up the projection is timed once at every parameter. On a space that does not vary it takes as long at
-    each, and the median over the first parameters counts for all, where the programs are known already.
+    After a warm-up the projection is timed once at every parameter. On a fixed basis it takes the same time at each
+    parameter: where the programs are known already, only the first ones are timed, and their median counts for all.
     """
     matrices, model_of_one = assemblies(model.problem), model.kind is not Kind.PER_PARAMETER
-    size = len(model.reduce(matrices.at(mus[0])).program.f)
+    size = len(model.reduce(matrices.at(mus[0])).program.f)  # the warm-up
     timed_at = mus[:REPEATS] if known and model_of_one else mus
     each = [timed(partial(model.reduce, matrices.at(mu))) for mu in timed_at]
     projecting = [seconds for _, seconds in each]

@@ -65,8 +65,8 @@ class Unstored:
 class Stage(ABC):
     """One stage of a computation; subclasses are frozen dataclasses of what determines the result.
 
-    The runner, the result writer and the progress display treat all stages alike: a stage says itself how it is called,
-    which axes of the study it belongs to and what of it is recorded.
+    The runner, the result writer and the progress display treat all stages alike: a stage declares its label, the axes
+    of the study it depends on and the rows that are recorded of it.
     """
 
     label: ClassVar[str]
@@ -82,9 +82,9 @@ class Stage(ABC):
     def key(self) -> str:
         """Name of the artefact: the label, and a hash of everything that determines the value.
 
-        That is the fields of the stage, the keys of its inputs, the code and the libraries. The code of a plugin counts
-        through `Plugin.code`; of vibench, the module that defines the stage and `rooms` count. A figure or a help text
-        does not.
+        These are the fields of the stage, the keys of its inputs, the code and the libraries. The code of a plugin
+        enters through `Plugin.code`. Of vibench, only the module that defines the stage and `rooms` enter: an edited
+        figure or help text invalidates no artefact.
         """
         parts = (
             "arrays.py",
@@ -127,7 +127,7 @@ class Stage(ABC):
         return {}
 
     def failure_rows(self, reason: str) -> Mapping[str, Sequence[Row]]:  # noqa: ARG002
-        """Rows recorded in place of `rows` where the stage failed; the rows of the cells that need it say so anyway."""
+        """Rows recorded in place of `rows` if the stage failed, in addition to those of the cells that need it."""
         return {}
 
 
@@ -139,15 +139,15 @@ def _described(value: Any) -> Any:
 
 
 class Pieces(ABC):
-    """The work of a piecewise stage, begun; pieces can be done in any order and by several processes."""
+    """A piecewise stage in progress; its pieces can be done in any order and by several processes."""
 
     @abstractmethod
     def piece(self, number: int, watch: Callable[[bool], None]) -> Any:
-        """Do one piece; `watch(True)` is called before what has a limit of its own, `watch(False)` after it."""
+        """Do one piece; `watch(True)` is called before an operation with its own time limit, `watch(False)` after."""
 
     @abstractmethod
     def lost(self, number: int, failed: Failed) -> Any:
-        """What replaces a piece that hung or whose process died."""
+        """The substitute for a piece that exceeded its limit or whose process died."""
 
     @abstractmethod
     def finish(self, pieces: Sequence[Any]) -> Any:
@@ -155,7 +155,7 @@ class Pieces(ABC):
 
 
 class PiecewiseStage(Stage):
-    """A stage whose pieces are kept one by one: a process that dies or hangs costs one piece."""
+    """A stage whose pieces are kept one by one: if its process dies or hangs, only the current piece is lost."""
 
     stored = False
 
@@ -166,7 +166,7 @@ class PiecewiseStage(Stage):
 
     @abstractmethod
     def begin(self, store: Store) -> Pieces:
-        """Do what the pieces have in common; the artefacts of the inputs are in the store."""
+        """Prepare what all pieces need; the artefacts of the inputs are in the store."""
 
     def run(self, store: Store) -> Result:
         """All pieces in this process, in their order."""
@@ -180,7 +180,7 @@ def value_of(store: Store, stage: Stage) -> Any:
     Raises
     ------
     NumericalError
-        If its artefact is not there.
+        If its artefact is missing.
     """
     artefact = store.get(stage.key)
     if artefact is None:

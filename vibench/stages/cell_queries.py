@@ -103,7 +103,7 @@ class CellQueries(PiecewiseStage):
 
     @property
     def offline(self) -> Mapping[str, tuple[Stage, ...]]:
-        """The stages whose seconds are the offline time of the cell, by the columns they count in."""
+        """The stages whose seconds add up to the offline time of the cell, by column."""
         enrichment, reduction = self.assembly.enrichment, self.assembly.reduction
         return {
             "snapshots": self.training,
@@ -114,7 +114,7 @@ class CellQueries(PiecewiseStage):
         }
 
     def inputs(self) -> tuple[Stage, ...]:
-        """Everything that the rows of the cell are made from."""
+        """All stages whose artefacts enter the rows of the cell."""
         timed = (stage for stages in self.offline.values() for stage in stages)
         read = (self.assembly, *self.assembly.model_inputs, self.assembly.full_times, *timed)
         found = (*read, *self.constants, self.reference, *self.validation)
@@ -126,7 +126,7 @@ class CellQueries(PiecewiseStage):
 
 
 def cell_queries(cell: Cell, query_seconds: float) -> CellQueries:
-    """The last stage of a cell; its inputs lead to all others."""
+    """The last stage of a cell; all its other stages are inputs of it, directly or indirectly."""
     return CellQueries(assembly_stage(cell), cell.solver, cell.accuracy, query_seconds, cell.warm_start)
 
 
@@ -142,6 +142,7 @@ class _Queries(Pieces):
         snapshots = gather(store, stage.training)
         self._reference = gather(store, stage.validation)
         problem = self._model.problem
+        # A reference below 1e-12 of the largest snapshot is zero up to round-off: relative errors divide by the floor.
         self._floors = tuple(
             1e-12 * float(np.max(space.norm(columns), initial=0.0))
             for space, columns in ((problem.V, snapshots.u), (problem.W, snapshots.lam))
@@ -163,10 +164,10 @@ class _Queries(Pieces):
         return path_before(self._reference.mu, self._model.problem.parameters)
 
     def _start(self, number: int) -> tuple[int, VariationalInequality] | None:
-        """The query before this one on a path through the parameters, where a solver starts from its solution.
+        """The previous query on a path through the parameters, whose solution the warm-started solver starts from.
 
-        It is solved again for that: the start of a query does not depend on which process solved what before. Where
-        the primal basis changes with the parameter there is nothing to start from.
+        It is solved again for this purpose, so that a start does not depend on what the process solved before. A primal
+        basis that changes with the parameter allows no warm start: coordinates of two queries are not comparable.
         """
         if not self._stage.warm_start or self._model.kind is Kind.PER_PARAMETER:
             return None
@@ -174,12 +175,12 @@ class _Queries(Pieces):
         return None if before is None else (before, self._programs.programs[before])
 
     def lost(self, number: int, failed: Failed) -> QueryRows:
-        """The row of a query whose process hung or died."""
+        """The row of a query that exceeded its limit or whose process died."""
         outcome = {"status": failed.status.value, "reason": failed.reason}
         return self._known(number) | {"assemble_s": self._programs.seconds[number].cpu} | outcome, None
 
     def finish(self, pieces: Sequence[QueryRows]) -> CellRows:
-        """All rows; that of the cell has means and extremes over the queries."""
+        """All rows; the row of the cell has means and extremes over the queries."""
         solutions = {k: solution for k, (_, solution) in enumerate(pieces) if solution is not None}
         assessed = dict(zip(solutions, self._assess(solutions), strict=True))
         rows = [row | assessed.get(k, {}) for k, (row, _) in enumerate(pieces)]
@@ -206,7 +207,7 @@ class _Queries(Pieces):
             return [{"status": Status.ERROR.value, "reason": f"in the assessment: {in_a_line(error)}"}]
 
     def _known(self, number: int) -> Row:
-        """The columns of a query that are known before it is solved: its parameter and the inf-sup constants there."""
+        """The columns of a query that do not depend on its solution: the parameter and the inf-sup constants."""
         reference = self._reference
         return (
             {f"mu_{i + 1}": float(value) for i, value in enumerate(reference.mu[number])}
@@ -244,7 +245,7 @@ class _Queries(Pieces):
         }
 
     def _offline(self) -> Row:
-        """Seconds of the stages the cell alone would have run, and the machines that measured them."""
+        """Offline seconds as if the cell had been run alone, and the machines that measured them."""
         artefacts = {name: [self._artefact(stage) for stage in parts] for name, parts in self._stage.offline.items()}
         spent = {name: [artefact.seconds for artefact in found] for name, found in artefacts.items()}
         row: Row = {f"offline_{name}_s": sum(s.cpu for s in parts) for name, parts in spent.items()}
@@ -263,7 +264,7 @@ class _Queries(Pieces):
 
 
 def path_before(mus: Array, box: ParameterBox) -> list[int | None]:
-    """Of every parameter (P×d) the one before it on a path that goes on to the nearest not yet visited."""
+    """Predecessor of every parameter (P×d) on the nearest-neighbour path from the first; ties go to the lower index."""
     scaled = (mus - box.lower) / np.maximum(box.upper - box.lower, np.finfo(float).tiny)
     before: list[int | None] = [None] * len(mus)
     left, here = set(range(1, len(mus))), 0

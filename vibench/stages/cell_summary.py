@@ -11,16 +11,16 @@ from vibench.qp.status import Status
 from vibench.stages.base import Row
 
 DISTURBED = 1.3
-"""A row is marked where the calibration beside it is slower than at its best by more than this factor."""
+"""A row is marked as disturbed if the calibration is slower than its best by more than this factor."""
 
 WAITED = 1.5
-"""A row is marked where its wall seconds are more than this factor of its CPU seconds."""
+"""A row is marked as disturbed if its wall seconds exceed its CPU seconds by more than this factor."""
 
 
 def summarise(rows: Sequence[Row], slowdown: float = 1.0) -> Row:
-    """The columns of a cell from those of its queries; means and maxima are over the ok ones.
+    """The columns of a cell from those of its queries; means and maxima are over the queries with status ok.
 
-    `slowdown` is that of the calibration, before or after the queries.
+    `slowdown` is the larger one of the calibrations before and after the queries.
     """
     fine = [row for row in rows if row["status"] == Status.OK]
     worst = max((Status(row["status"]) for row in rows), key=lambda status: status.severity)

@@ -1,4 +1,4 @@
-"""The stages of the enrichment, the last that is offline, and the reduced model that they complete."""
+"""The stages of the enrichment, the last part of the offline phase, and the reduced model that they complete."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from vibench.timing import timed
 
 @dataclass(frozen=True)
 class AssessedGrowth:
-    """A nested enrichment, and what it reaches on the training set.
+    """A nested enrichment and its inf-sup constants on the training set.
 
     Attributes
     ----------
@@ -36,7 +36,7 @@ class AssessedGrowth:
     steps
         The smallest β_span over the training set after every vector (S+1,).
     training
-        β_span at every training parameter (P,), by the tolerance that was reached.
+        β_span at every training parameter (P,), by tolerance.
     """
 
     grown: Grown
@@ -46,7 +46,7 @@ class AssessedGrowth:
 
 @dataclass(frozen=True)
 class GrowthStage(Stage):
-    """A nested primal strategy, grown once through all its tolerances; its seconds are those of the tolerances."""
+    """A nested primal strategy, run once through all its tolerances; its seconds are recorded per tolerance."""
 
     label = "nested enrichment"
     rooms = ("linalg", "interfaces", "qp", "reduction", "stability")
@@ -99,7 +99,7 @@ class EnrichmentStage(Stage):
 
     @property
     def reachable(self) -> TrainingConstants:
-        """The stage of what the whole of V reaches on the training set."""
+        """The stage of the constants of the whole of V on the training set."""
         return TrainingConstants(self.cone)
 
     @property
@@ -121,11 +121,11 @@ class SingleEnrichment(EnrichmentStage):
     """An enrichment built for its tolerance alone; the value is an `Enrichment`."""
 
     def inputs(self) -> tuple[Stage, ...]:
-        """POD, cone, and what it is compared with on the training set."""
+        """POD, cone, and the training constants that the enrichment is compared with."""
         return (self.pod, self.cone, self.cone.constraints, self.reachable)
 
     def run(self, store: Store) -> Result:
-        """Build the enrichment; what it reaches on the training set is not timed."""
+        """Build the enrichment, timed; assess it on the training set, untimed."""
         offline, strategy = _offline(store, self.pod, self.cone), self.primal.create()
         enrichment, seconds = timed(lambda: strategy.build(offline, self.tolerance))
         check_enrichment(enrichment, offline.problem.V, offline.basis)
@@ -160,12 +160,12 @@ class NestedEnrichment(EnrichmentStage):
         return (*super().model_inputs, self.growth)
 
     def inputs(self) -> tuple[Stage, ...]:
-        """POD and cone, all vectors, and what they are compared with on the training set."""
+        """POD and cone, all vectors, and the training constants that they are compared with."""
         return (self.pod, self.cone, self.growth, self.reachable)
 
     def run(self, store: Store) -> Result:
         """Look up where the tolerance was reached, and check the vectors up to there."""
-        assert self.tolerance is not None  # a nested strategy takes one
+        assert self.tolerance is not None  # a nested strategy always has one
         offline, growth = _offline(store, self.pod, self.cone), value_of(store, self.growth)
         milestone: Milestone = growth.grown.milestone(self.tolerance)
         check_enrichment(growth.grown.at(milestone), offline.problem.V, offline.basis)
@@ -195,7 +195,7 @@ def _histories(known: Mapping[str, Array]) -> tuple[History, ...]:
 
 
 def _offline(store: Store, pod: PODStage, cone: ConeStage) -> Offline:
-    """What a primal strategy builds on."""
+    """The offline data that a primal strategy is built from."""
     problem, basis = build_problem(pod.problem), value_of(store, pod).basis
     reduced: ReducedCone = value_of(store, cone)
     return Offline(problem, basis, reduced.cone, reduced.prepared.span, training_parameters(problem))

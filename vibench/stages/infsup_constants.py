@@ -1,4 +1,4 @@
-"""The stages that compute inf-sup constants at the validation parameters; each serves many cells."""
+"""The stages that compute inf-sup constants at the validation parameters; many cells share each of them."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ class ReferenceConstants(Stage):
         problem, known = build_problem(self.constraints.problem), self.constraints
         inf_sup = constants_full(problem.V, value_of(store, known), nodal_multipliers(problem.W))
         mus = validation_parameters(problem, known.count, known.seed)
-        different = mus[:1] if "A" in problem.constant else mus
+        different = mus[:1] if "A" in problem.constant else mus  # the eigenvalue problems are the expensive part
         quotients = [extreme_quotients(assemblies(problem).at(mu).A, problem.V) for mu in different]
         quotients *= len(mus) // len(different)
         return Result([Stability(found, *extremes) for found, extremes in zip(inf_sup, quotients, strict=True)])
@@ -70,7 +70,7 @@ class ReferenceConstants(Stage):
 
 @dataclass(frozen=True)
 class FullConstants(Stage):
-    """Constants of the whole of V with a reduced cone, what online supremizers reach: an `InfSup` per parameter."""
+    """Constants of the whole of V with a reduced cone, which online supremizers attain: an `InfSup` per parameter."""
 
     label = "constants of V"
     rooms = ("linalg", "interfaces", "reduction", "stability")
@@ -133,7 +133,7 @@ class OwnConstants(Stage):
         mus = validation_parameters(model.problem, self.constraints.count, self.constraints.seed)
         if model.enrichment.eta is None:
             return Result([_constants_at(model, assemblies(model.problem).at(mu), cone) for mu in mus])
-        at_firsts = (assemblies(model.problem).at(mu) for mu in mus[classes.firsts])  # the others span the same space
+        at_firsts = (assemblies(model.problem).at(mu) for mu in mus[classes.firsts])  # a class shares one space
         return Result(everywhere(classes, [_constants_at(model, vi, cone) for vi in at_firsts]))
 
 

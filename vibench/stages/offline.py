@@ -1,4 +1,4 @@
-"""The offline stages before the enrichment: POD, cone, and what an enrichment is compared with."""
+"""The offline stages before the enrichment: POD, cone, and the constants that enrichments are compared with."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ class PODStage(Stage):
 
 @dataclass(frozen=True)
 class ReducedCone:
-    """A cone, what every constant and enrichment on it shares, and the condition number of its Gram matrix."""
+    """A cone, its multipliers prepared for constants and enrichments, and the condition number of its Gram matrix."""
 
     cone: Cone
     prepared: Multipliers
@@ -75,7 +75,7 @@ class ConeStage(Stage):
 
     @property
     def constraints(self) -> TrainingConstraints:
-        """The stage of the training constraint matrices, for what is assessed on the cone."""
+        """The stage of the training constraint matrices, used to assess the cone."""
         return TrainingConstraints(self.problem)
 
     def inputs(self) -> tuple[Stage, ...]:
@@ -89,7 +89,7 @@ class ConeStage(Stage):
         watch = Stopwatch()
         cone = strategy.reduce(snapshots, W, self.stop)
         spent = watch.seconds()
-        check_cone(cone, W)
+        check_cone(cone, W)  # verification, which is not part of the offline time
         watch = Stopwatch()
         prepared = multipliers(cone.generators, W, cone.free)
         seconds = spent + watch.seconds()
@@ -120,7 +120,7 @@ class TrainingConstraints(Stage):
 
 @dataclass(frozen=True)
 class TrainingConstants(Stage):
-    """What no enrichment of V_N can surpass on the training set; not timed."""
+    """The upper bound of β_span over all enrichments of V_N, on the training set; not timed."""
 
     label = "training constants"
     rooms = ("linalg", "interfaces", "reduction", "stability")

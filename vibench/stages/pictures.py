@@ -17,7 +17,7 @@ from vibench.stages.snapshots import gather, training_stages
 from vibench.study.cells import Axes, Plugin
 
 CORNERS = (0.0, 0.5, 1.0)
-"""Where in the box of parameters solutions are looked at: its lower corner, its middle and its upper corner."""
+"""Positions in the unit box of parameters at which solutions are drawn: lower corner, centre and upper corner."""
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,7 @@ class PictureStage(Stage):
         return training_stages(self.problem)
 
     def run(self, store: Store) -> Result:
-        """Titles and pictures, in the order of `CORNERS`; none of a problem that has no picture."""
+        """Titles and pictures, in the order of `CORNERS`; empty for a problem without pictures."""
         problem, found = build_problem(self.problem), gather(store, self.inputs())
         drawn = []
         for k in _nearest(problem.parameters, found.mu):

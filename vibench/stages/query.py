@@ -27,7 +27,7 @@ from vibench.study import registry
 from vibench.timing import Seconds, median_seconds
 
 UNMEASURABLE = 1e-8
-"""Relative errors below this may be those of the high-fidelity solution: no effectivity is computed from them."""
+"""Relative errors below this may be errors of the high-fidelity solution: no effectivity is computed from them."""
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,7 @@ class Query:
     seconds
         Seconds of its assembly.
     start
-        Number and program of the query whose solution the solver starts from; `None` to start from nothing.
+        Number and program of the query whose solution the solver starts from; `None` for a cold start.
     """
 
     program: VariationalInequality
@@ -52,7 +52,7 @@ class Query:
 
 @dataclass(frozen=True)
 class QuerySolver:
-    """A QP solver, the accuracy that its solutions are verified by, and the limit of its seconds."""
+    """A QP solver, the accuracy to which its solutions are verified, and its time limit in seconds."""
 
     solver: str
     accuracy: float
@@ -73,6 +73,7 @@ class QuerySolver:
             return repeats[-1]
 
         try:
+            # The solution to start from belongs to an earlier query: its seconds are not those of this one.
             if query.start is not None and takes_start(self.solver):
                 watch(True)
                 row["started_from"], similar = query.start
@@ -81,7 +82,7 @@ class QuerySolver:
             watch(False)
         except MemoryError:
             raise
-        except (Exception, SystemExit) as error:  # noqa: BLE001  a solver may raise anything; the row says what
+        except (Exception, SystemExit) as error:  # noqa: BLE001  a solver may raise anything; recorded in the row
             return row | {"status": Status.ERROR.value, "reason": in_a_line(error)}, None
         status, reason, residuals = verify(program, solution, self.accuracy)
         if solving.wall > self.query_seconds:
@@ -120,7 +121,7 @@ def error_columns(
     if model.kind is Kind.PER_PARAMETER:
         queries = zip(mus, vis, solutions, strict=True)
         u = np.hstack([model.lift(mu, vi, x[:, None]) for mu, vi, (x, _) in queries])
-    else:  # one basis: all solutions are reconstructed at once
+    else:  # a fixed basis: all solutions are reconstructed at once
         u = model.lift(mus[0], vis[0], np.column_stack([x for x, _ in solutions]))
     lam = model.generators @ np.column_stack([alpha for _, alpha in solutions])
     found = zip(errors(problem, vis, exact, u, lam), bounds(problem, vis, known, u, lam), strict=True)

@@ -17,7 +17,7 @@ from vibench.study.cells import Axes, Plugin
 from vibench.timing import NO_TIME, Seconds, Stopwatch
 
 CHUNKS = 4
-"""Chunks that a set of parameters is split into, whatever the number of workers; each is set up by itself."""
+"""Number of chunks of a parameter set, each with its own set-up; fixed, so that keys do not depend on the workers."""
 
 
 @dataclass(frozen=True)
@@ -31,9 +31,9 @@ class Snapshots:
     u, lam
         Columns u(mu) (n×P) and λ(mu) (m×P).
     seconds
-        Of every solution, assembly included.
+        Seconds per solution, assembly included.
     fallbacks
-        What had to help the active set method, "" for most.
+        Fallbacks of the active set method per solution, "" where it needed none.
     """
 
     mu: Array
@@ -77,7 +77,7 @@ class SnapshotStage(Stage):
             vi = checked_assembly(problem, mu)
             solution = solver.solve_assembled(mu, vi)
             seconds.append(watch.seconds())
-            if k == 0 or "A" not in problem.constant:
+            if k == 0 or "A" not in problem.constant:  # verification, which is not timed
                 solver.check_coercive(mu, vi)
             u[:, k], lam[:, k] = solution.u, solution.lam
             fallbacks.append(solution.fallback)
@@ -102,7 +102,7 @@ class SnapshotStage(Stage):
 
 
 def training_stages(problem: Plugin) -> tuple[Stage, ...]:
-    """The chunks of the training set, which depends on nothing but the problem."""
+    """The chunks of the training set, which depends only on the problem."""
     return tuple(SnapshotStage(problem, "training", 0, 0, chunk) for chunk in range(CHUNKS))
 
 

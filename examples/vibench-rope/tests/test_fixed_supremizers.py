@@ -1,4 +1,4 @@
-"""What is added once serves every parameter where the constraint does not vary, and the references where it does."""
+"""A fixed enrichment contains the supremizers of every parameter if B is constant, of the references otherwise."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def offline(problem: Problem) -> Offline:
 
 
 def lacking(given: Offline, added: Enrichment, mu: Array) -> float:
-    """The largest part of a supremizer at mu, relative, that the enriched space does not have."""
+    """Largest relative projection error of a supremizer at mu on the enriched space."""
     V, wanted = given.problem.V, supremizers(given.problem.V, given.problem.constraint(mu)[0], given.cone.generators)
     assert added.vectors is not None
     space = np.hstack([given.basis, added.vectors])

@@ -12,7 +12,7 @@ from vibench import MEMBERS, Array, HighFidelitySolver
 from vibench_rope.rope import FIRM, Rope
 
 PARAMETERS = [np.array(mu) for mu in ((0.05, 0.0), (0.1, 0.1), (0.15, 0.3))]
-"""The rope lies on both hills, and on nothing else."""
+"""Parameters at which the contact set is one interval on each hill."""
 
 
 def slope(mu: Array, x: float) -> float:
@@ -21,7 +21,7 @@ def slope(mu: Array, x: float) -> float:
 
 
 class Exact:
-    """The rope without a mesh: u'' = 1/ν where it hangs, u = h and u' = h' where it takes off."""
+    """The solution without a mesh: u'' = 1/ν off contact, u = h and u' = h' at the ends of the contact."""
 
     def __init__(self, mu: Array) -> None:
         self.mu, self.soft = mu, float(mu[0])
@@ -44,7 +44,7 @@ class Exact:
         return np.select(hanging, [left, soft, firm, right], np.vectorize(self.h)(x))
 
     def _gap(self, ends: Array) -> tuple[float, float]:
-        """What force and deflection of the two parabolas between the hills lack to meet at ½."""
+        """Jumps of force and deflection at ½ between the two parabolas between the hills."""
         b, c = ends
         soft, firm = slope(self.mu, b) * (0.5 - b), slope(self.mu, c) * (0.5 - c)
         force = self.soft * slope(self.mu, b) + (0.5 - b) - FIRM * slope(self.mu, c) - (0.5 - c)

@@ -16,16 +16,16 @@ FIRM = 0.15
 
 
 class Rope(Problem):
-    """A rope between (0, 0) and (1, 0) that hangs on hills; its left half has the elasticity mu_1.
+    """A rope between (0, 0) and (1, 0) over an obstacle with two hills; its left half has the elasticity mu_1.
 
     −(ν u')' = −1 + λ with ν = mu_1 on (0, ½) and ν₀ on (½, 1), under u ≥ h = −0.2 (sin πx − sin 3πx) − ½ + mu_2 x,
     λ ≥ 0 and λ (u − h) = 0. P1 displacements; multipliers in the basis dual to the hat functions, so that u ≥ h is
-    asked for at the nodes.
+    imposed at the nodes.
 
     Parameters
     ----------
     half
-        Elements on either half.
+        Number of elements per half.
     """
 
     parameters = ParameterBox(
@@ -40,7 +40,7 @@ class Rope(Problem):
         difference = sp.diags_array([1.0, -1.0], offsets=[0, -1], shape=(nodes + 1, nodes)).tocsr()
         self._left, self._right = (part.T @ part / self.step for part in (difference[:half], difference[half:]))
         lumped = sp.diags_array(np.full(nodes, self.step)).tocsr()
-        self._load, self._coupling = np.full(nodes, -self.step), -lumped
+        self._load, self._coupling = np.full(nodes, -self.step), -lumped  # the minus turns u ≥ h into B u ≤ g
         self.V, self.W = InnerProduct(self._left + self._right), InnerProduct(lumped)
 
     def training_set(self) -> Array:

@@ -194,7 +194,7 @@ def test_enlarged_generators_are_better_conditioned_and_leave_less_of_the_snapsh
 
 def test_a_sweep_that_is_not_enough_is_recorded() -> None:
     theta, X = bumps(25)
-    assert EnlargedCPG(sweeps=1).reduce(theta, X, Stop(size=8)).fallbacks == ("generators still moved in sweep 1",)
+    assert EnlargedCPG(sweeps=1).reduce(theta, X, Stop(size=8)).fallbacks == ("generators still changed in sweep 1",)
 
 
 def test_a_step_that_is_only_feasible_is_recorded(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -188,5 +188,5 @@ def test_pga_without_a_tolerance_is_refused(varying: Offline) -> None:
 
 
 def test_a_tolerance_nobody_can_reach_ends_with_a_reason(varying: Offline) -> None:
-    with pytest.raises(NumericalError, match=r"tolerance 0 is not reached: all supremizers leave σ = "):
+    with pytest.raises(NumericalError, match=r"tolerance 0 is not reached: with all supremizers added, σ = "):
         OfflinePGA().build(varying, 0.0)

@@ -209,9 +209,13 @@ def test_they_conform(create: Callable[[], NestedStrategy]) -> None:
 @pytest.mark.parametrize(
     ("strategy", "tolerance", "reason"),
     [
-        (InfSupGreedy(), 1.5, r"tolerance 1.5 is not reached: all supremizers leave 1 of β_on"),
-        (OfflinePGA(stop="beta"), 1.5, r"tolerance 1.5 is not reached: all supremizers leave σ = "),
-        (PODSupremizers(), -1.0, r"tolerance -1 is not reached: all supremizers leave 0e\+00 of themselves"),
+        (InfSupGreedy(), 1.5, r"tolerance 1.5 is not reached: with all supremizers added, β_S/β_on = 1"),
+        (OfflinePGA(stop="beta"), 1.5, r"tolerance 1.5 is not reached: with all supremizers added, σ = "),
+        (
+            PODSupremizers(),
+            -1.0,
+            r"tolerance -1 is not reached: with all supremizers added, the relative tail is 0e\+00",
+        ),
     ],
 )
 def test_what_nobody_can_reach_ends_with_a_reason(

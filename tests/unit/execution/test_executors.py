@@ -124,7 +124,7 @@ def test_a_cluster_that_is_shut_down_stops_the_run_with_a_line_and_it_goes_on_wi
         _, err = process.communicate(timeout=90)
     assert process.returncode == 1
     assert err.splitlines()[-1].startswith("vibench: the dask ")
-    assert err.splitlines()[-1].endswith("the same command goes on from here")
+    assert err.splitlines()[-1].endswith("run the same command again to continue")
     (tmp_path / "go on").touch()
     done = vibench(tmp_path, "run", path)
     assert (done.returncode, done.stderr) == (0, "")
