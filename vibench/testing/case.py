@@ -94,9 +94,10 @@ class Case(ABC, Generic[PluginT, ArgumentT, ResultT]):
                 faulty = [key for key, value in getattr(thing, "__dict__", {}).items() if _pickling_error(value)]
                 where = f": look at attribute {', '.join(faulty)}" if faulty else ""
                 raise ConformanceError(f"the {type(thing).__name__} cannot be pickled ({reason}){where}")
-        for array, what in differences(self.arrays(_pickled(before)), self.arrays(before)):
+        plugin, after = pickle.loads(pickle.dumps(self.plugin)), pickle.loads(pickle.dumps(before))
+        for array, what in differences(self.arrays(after), self.arrays(before)):
             yield f"{name}: pickling changes {array}: {what}"
-        yield from self._deviations("a pickled copy", _pickled(self.plugin))
+        yield from self._deviations("a pickled copy", plugin)
 
     def time(self) -> Iterator[str]:
         """The constructor and every call stay below the limit."""
@@ -158,13 +159,9 @@ class ProblemCase(Case[Problem, Array, Arrays]):
             raise ConformanceError(f"{''.join(names)}{error} ({place})") from error
 
 
-def _pickled(thing: Any) -> Any:
-    return pickle.loads(pickle.dumps(thing))
-
-
 def _pickling_error(thing: Any) -> str:
     try:
-        _pickled(thing)
+        pickle.loads(pickle.dumps(thing))
     except Exception as error:  # noqa: BLE001  a plugin may raise anything
         return in_a_line(error)
     return ""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property, partial
 from itertools import pairwise
@@ -67,13 +68,11 @@ class PrimalCase(Case[PrimalStrategy, float | None, Enrichment]):
             how = "with a tolerance" if takes else "without a tolerance, although takes_tolerance is False"
             advice = "" if takes else "; set takes_tolerance = True if the strategy needs one"
             raise ConformanceError(f"build fails {how}: {raised(error)}{advice}") from error
-        if takes:
-            try:
+        with suppress(Exception):  # every refusal is right
+            if takes:
                 self.evaluate(None)
-            except Exception:  # noqa: BLE001  every refusal is right
-                return
-            advice = "refuse None, or set takes_tolerance = False"
-            yield f"takes_tolerance is True, but build(offline, None) returns an enrichment; {advice}"
+                advice = "refuse None, or set takes_tolerance = False"
+                yield f"takes_tolerance is True, but build(offline, None) returns an enrichment; {advice}"
 
     def enrichment(self) -> Iterator[str]:
         """Enrichments have the right types and shapes; fixed vectors are orthonormal and orthogonal to V_N."""
