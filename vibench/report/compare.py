@@ -19,10 +19,8 @@ from vibench.stability.infsup import VANISHES
 ERROR_FLOOR = 1e-10
 """Errors below this are round-off, and their ratio is meaningless."""
 
-DIMENSIONS = ("N", "R", "rank", "enrichment")
 CONSTANTS = ("beta_span_min", "beta_cone_lower_min")
 ERRORS = ("error_u_mean", "error_u_max", "error_lambda_mean", "error_lambda_max", "violation_max")
-TIMES = ("offline_s", "online_s")
 
 COLUMNS = ["problem", "dual", "primal", "asked", "solver", "assembly", "what", "before", "after", "ratio", "verdict"]
 
@@ -88,23 +86,25 @@ def _cell(one: pd.Series, two: pd.Series, limit: float) -> Iterator[Change]:
     yield one, "queries ok", before, after, _verdict(before, after, 1.0, more_is_better=True)
     before, after = Status(one["status"]), Status(two["status"])
     yield one, "status", before, after, _verdict(before.severity, after.severity, 1.0)
-    for name in DIMENSIONS:
+    for name in ("N", "R", "rank", "enrichment"):
         before, after = one[name], two[name]
         moved = Verdict.CHANGED if before != after and pd.notna(before) else None
         yield one, name, before, after, _verdict(before, after, limit) or moved
-    times = TIMES if one["machine"] == two["machine"] else ()
+    times = ("offline_s", "online_s") if one["machine"] == two["machine"] else ()
     for names, floor, more in ((CONSTANTS, VANISHES, True), (ERRORS, ERROR_FLOOR, False), (times, 0.0, False)):
         for name in names:
-            before, after = one[name], two[name]
             # Missing values stay NaN: `max` returns its first argument unless the second is larger.
-            verdict = _verdict(max(before, floor), max(after, floor), limit, more_is_better=more)
-            yield one, name, before, after, verdict
+            verdict = _verdict(max(one[name], floor), max(two[name], floor), limit, more_is_better=more)
+            yield one, name, one[name], two[name], verdict
 
 
 def _thresholds(one: pd.DataFrame, two: pd.DataFrame, limit: float) -> Iterator[Change]:
     keys = [name for name in THRESHOLDS if not name.endswith(("_s", "benefit_threshold", "meaning"))]
     for _, row in one.merge(two, on=keys, suffixes=("_one", "_two")).iterrows():
-        before, after = (_break_even(row[f"benefit_threshold_{k}"], row[f"meaning_{k}"]) for k in ("one", "two"))
+        before, after = (
+            BreakEven(None if pd.isna(n := row[f"benefit_threshold_{k}"]) else n, Meaning(row[f"meaning_{k}"]))
+            for k in ("one", "two")
+        )
         verdict: Verdict | None = Verdict.CHANGED
         if before.meaning == after.meaning:
             verdict = _verdict(before.number, after.number, limit, more_is_better=before.meaning == Meaning.UNTIL)
@@ -115,10 +115,6 @@ def _thresholds(one: pd.DataFrame, two: pd.DataFrame, limit: float) -> Iterator[
             verdict = Verdict.WORSE
         cell = row.rename({f"{name}_b": name for name in ("primal", "assembly", "primal_tol")})
         yield cell, f"break-even against {row['primal_a']}", str(before), str(after), verdict
-
-
-def _break_even(number: float, meaning: str) -> BreakEven:
-    return BreakEven(None if pd.isna(number) else number, Meaning(meaning))
 
 
 def _verdict(before: Any, after: Any, limit: float, *, more_is_better: bool = False) -> Verdict | None:
@@ -132,11 +128,11 @@ def _verdict(before: Any, after: Any, limit: float, *, more_is_better: bool = Fa
 
 
 def _row(cell: pd.Series, what: str, before: Any, after: Any, verdict: Verdict) -> dict[str, Any]:
-    sizes = [tables.asked(cell, axis) for axis in ("pod", "dual")]
     tolerance = "" if pd.isna(cell["primal_tol"]) else f", δ {cell['primal_tol']:g}"
     ratio = float("nan")
     if not isinstance(before, str) and not isinstance(after, str) and pd.notna(before) and pd.notna(after) and before:
         ratio = float(after) / float(before)
     names = {name: cell[name] for name in ("problem", "dual", "primal", "solver", "assembly")}
-    changed = {"asked": ", ".join(sizes) + tolerance, "what": what, "ratio": ratio, "verdict": verdict.value}
-    return names | changed | {"before": tables.cell_text(before), "after": tables.cell_text(after)}
+    asked = f"{tables.asked(cell, 'pod')}, {tables.asked(cell, 'dual')}{tolerance}"
+    shown = {"before": tables.cell_text(before), "after": tables.cell_text(after)}
+    return names | shown | {"asked": asked, "what": what, "ratio": ratio, "verdict": verdict.value}

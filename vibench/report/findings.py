@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
+from collections import defaultdict
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -19,23 +19,14 @@ from vibench.results.solver_agreement import sentence
 from vibench.stability.infsup import VANISHES
 
 
-@dataclass(frozen=True)
-class Finding:
-    """A sentence and its subject, "" for the whole run."""
-
-    about: str
-    text: str
-
-
-def findings(path: Path) -> list[Finding]:
-    """Sentences on completeness, stability, errors, costs and solvers, in this order."""
-    found = [Finding("", text) for text in _whole_run(path)]
+def findings(path: Path) -> dict[str, list[str]]:
+    """Sentences on completeness, stability, errors, costs and solvers by subject, "" for the whole run."""
+    found = defaultdict(list, {"": list(_whole_run(path))})
     for name, data in problems(path):
         for title, cells in by_dimensions(best_solver(data.cells)):
-            about = f"{name}, {title}"
-            found += [Finding(about, text) for text in (*_stability(cells), *_costs(cells, data.thresholds))]
-        found += [Finding(f"{name}, solvers", text) for text in _solvers(data)]
-    return found
+            found[f"{name}, {title}"] += [*_stability(cells), *_costs(cells, data.thresholds)]
+        found[f"{name}, solvers"] += _solvers(data)
+    return {subject: sentences for subject, sentences in found.items() if sentences}
 
 
 def _whole_run(path: Path) -> Iterator[str]:
@@ -53,8 +44,7 @@ def _whole_run(path: Path) -> Iterator[str]:
         yield f"The invariants of the inf-sup constants and the error bounds hold in all {len(queries)} queries."
     agreement = sentence(tables.read(path, "disagreements"))
     yield f"{agreement[:1].upper()}{agreement[1:]}."
-    disturbed = int((cells["disturbed"] == 1).sum())
-    if disturbed:
+    if disturbed := int((cells["disturbed"] == 1).sum()):
         yield f"{disturbed} cells were timed while other processes slowed the machine down (column `disturbed`)."
 
 

@@ -23,26 +23,12 @@ from vibench.results import pictures, tables
 from vibench.results.break_even import HIGH_FIDELITY
 from vibench.results.database import read_meta, study_of
 
-LONG = 48
-"""Characters beyond which a text may be wrapped."""
-
 IDENTITY = ["problem", "dual", "primal", "primal_tol", "solver", "assembly", "status"]
 """Columns that cells and queries share in the tables of failures."""
 
-Table = tuple[str, str, str, pd.DataFrame]
-"""Identifier, title, caption and rows."""
-
 
 def write(path: Path, target: Path) -> Path:
-    """Write the page of a results file; an interrupted call leaves no incomplete file under its name.
-
-    Parameters
-    ----------
-    path
-        Results file.
-    target
-        The HTML file.
-    """
+    """Write the page of a results file as `target`; an interrupted call leaves no incomplete file under its name."""
     part = target.with_name(target.name + ".part")
     part.write_text(page(path), encoding="utf-8")
     part.replace(target)
@@ -52,23 +38,26 @@ def write(path: Path, target: Path) -> Path:
 def page(path: Path) -> str:
     """The page of a results file."""
     environment = Environment(loader=PackageLoader("vibench.report"), autoescape=True, undefined=StrictUndefined)
-    grid = environment.get_template("grid.html.j2")
+    template = environment.get_template("grid.html.j2")
     cells, queries = tables.read(path, "cells"), tables.read(path, "queries")
     study = study_of(path, read_meta(path))
-    by_subject: dict[str, list[str]] = {}
-    for finding in findings(path):
-        by_subject.setdefault(finding.about, []).append(finding.text)
+
+    def grid(frame: pd.DataFrame) -> Markup:
+        shown = frame.dropna(axis=1, how="all")
+        rows = [map(_entry, row) for row in shown.itertuples(index=False)]
+        return Markup(template.render(columns=shown.columns, rows=rows))
+
     return environment.get_template("report.html.j2").render(
         study=study.get("name", path.parent.name),
         facts=list(_facts(study, cells)),
-        findings=by_subject,
+        findings=findings(path),
         cells=len(cells),
         failed=cells[cells["status"] != Status.OK][["cell", *IDENTITY, "queries_ok", "queries", "reason"]],
         failed_queries=queries[queries["status"] != Status.OK][["cell", "query", *IDENTITY, "reason"]],
         missing=[f"no picture of {one.key[0]}: {one.reason}" for one in pictures.read(path) if one.reason],
         tables=list(_tables(path, cells)),
         figures=list(_figures(path)),
-        grid=lambda frame: Markup(grid.render(_grid(frame))),
+        grid=grid,
     )
 
 
@@ -83,7 +72,8 @@ def _facts(study: dict[str, Any], cells: pd.DataFrame) -> Iterator[tuple[str, st
     yield "seconds", "CPU seconds of one thread; the offline time of a cell includes every stage it depends on"
 
 
-def _tables(path: Path, cells: pd.DataFrame) -> Iterator[Table]:
+def _tables(path: Path, cells: pd.DataFrame) -> Iterator[tuple[str, str, str, pd.DataFrame]]:
+    """Identifier, title, caption and rows."""
     yield "summary", "All cells", "Errors are relative; they are means over the ok queries.", tables.summary(cells)
     thresholds = tables.read(path, "thresholds")
     model = thresholds["primal_a"] == HIGH_FIDELITY
@@ -100,18 +90,12 @@ def _tables(path: Path, cells: pd.DataFrame) -> Iterator[Table]:
         yield "disagreements", "Agreement of the solvers", caption, disagreements
 
 
-def _grid(frame: pd.DataFrame) -> dict[str, Any]:
-    """Columns and rows of a table, without empty columns."""
-    shown = frame.dropna(axis=1, how="all")
-    return {"columns": shown.columns, "rows": [map(_entry, row) for row in shown.itertuples(index=False)]}
-
-
 def _entry(value: Any) -> tuple[str, str, str]:
-    """A value as JavaScript sorts it, as it is printed, and its class."""
+    """A value as JavaScript sorts it, as it is printed, and its class; "long" text may be wrapped."""
     text = tables.cell_text(value)
     number = isinstance(value, Real) and not isinstance(value, bool)
     plain = "" if not text else repr(float(value)).replace("inf", "Infinity") if number else text
-    return plain, text, "number" if number else "long" if len(text) > LONG else ""
+    return plain, text, "number" if number else "long" if len(text) > 48 else ""
 
 
 def _figures(path: Path) -> Iterator[tuple[str, str, str]]:

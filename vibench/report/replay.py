@@ -28,7 +28,6 @@ from vibench.timing import median_seconds
 CHECKER = "check.py"
 """Script in an exported test set that recomputes its residuals; it needs only NumPy."""
 
-
 KEPT = ("status", "primal_residual", "dual_residual", "gap", "solver_status")
 """Columns of a query that an exported test set repeats."""
 
@@ -60,11 +59,10 @@ def replay(recorded: RecordedCell, query: int, file: Path) -> pd.DataFrame:
         raise RequestError(f"cell {recorded.row['cell']} has no query {query}; it has 0 to {len(rows) - 1}")
     program, accuracy = recorded.program(query), recorded.cell.accuracy
     write_program(program, file)
-    solutions = recorded.rows("solutions")
     known: Array | None = None
     table: list[dict[str, Any]] = []
-    if query in solutions:
-        known, alpha = vectors(solutions[query])
+    if found := recorded.rows("solutions").get(query):
+        known, alpha = vectors(found)
         solution = QPSolution(known, alpha, rows[query]["solver_status"] or "", rows[query]["iterations"])
         line = _line(program, solution, accuracy, None) | {"seconds": rows[query]["solve_s"]}
         table.append({"solver": f"{recorded.cell.solver} (recorded)"} | line)

@@ -2,15 +2,12 @@
 
 In a test of a plugin's own package:
 
-    from vibench.testing import check_problem
-
     def test_the_cable_conforms() -> None:
-        check_problem(Cable)
+        vibench.testing.check_problem(Cable)
 
-`check_problem`, `check_dual` and `check_primal` raise one `ConformanceError` that lists every failure: what is wrong,
-where, and what would be right. `examine_problem`, `examine_dual` and `examine_primal` return the findings instead. The
-first argument is a class, or a function that makes an instance such as `partial(Cable, nodes=20)`, because two
-instances are compared. The command `vibench check` prints the same findings.
+`check_…` raises one `ConformanceError` that lists every failure; `examine_…`, like the command `vibench check`, returns
+the findings. The first argument is a class, or a function that makes an instance such as `partial(Cable, nodes=20)`,
+because two instances are compared.
 """
 
 from __future__ import annotations

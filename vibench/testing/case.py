@@ -5,7 +5,7 @@ from __future__ import annotations
 import pickle
 from abc import ABC, abstractmethod
 from collections import defaultdict
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, ClassVar, Generic, TypeVar
@@ -23,9 +23,6 @@ PluginT = TypeVar("PluginT")
 ArgumentT = TypeVar("ArgumentT")
 ResultT = TypeVar("ResultT")
 T = TypeVar("T")
-
-RANDOM = 4
-"""Number of random parameters of a problem, beside two corners and the centre of the box."""
 
 
 @dataclass(eq=False)
@@ -51,7 +48,7 @@ class Case(ABC, Generic[PluginT, ArgumentT, ResultT]):
 
     @property
     @abstractmethod
-    def arguments(self) -> Mapping[str, ArgumentT]:
+    def arguments(self) -> dict[str, ArgumentT]:
         """Arguments by their names in messages."""
 
     @abstractmethod
@@ -97,9 +94,10 @@ class Case(ABC, Generic[PluginT, ArgumentT, ResultT]):
                 faulty = [key for key, value in getattr(thing, "__dict__", {}).items() if _pickling_error(value)]
                 where = f": look at attribute {', '.join(faulty)}" if faulty else ""
                 raise ConformanceError(f"the {type(thing).__name__} cannot be pickled ({reason}){where}")
-        for array, what in differences(self.arrays(_pickled(before)), self.arrays(before)):
+        plugin, after = pickle.loads(pickle.dumps(self.plugin)), pickle.loads(pickle.dumps(before))
+        for array, what in differences(self.arrays(after), self.arrays(before)):
             yield f"{name}: pickling changes {array}: {what}"
-        yield from self._deviations("a pickled copy", _pickled(self.plugin))
+        yield from self._deviations("a pickled copy", plugin)
 
     def time(self) -> Iterator[str]:
         """The constructor and every call stay below the limit."""
@@ -113,8 +111,8 @@ class Case(ABC, Generic[PluginT, ArgumentT, ResultT]):
         """Arrays that differ when all calls are repeated, each named once."""
         found: set[str] = set()
         # The reverse order reveals results that depend on the previous call.
-        for name, argument in reversed(list(self.arguments.items())):
-            again = self.arrays(self.evaluate(argument, plugin))
+        for name in reversed(self.arguments):
+            again = self.arrays(self.evaluate(self.arguments[name], plugin))
             for array, what in differences(again, self.arrays(self.results[name])):
                 if array not in found:
                     found.add(array)
@@ -130,12 +128,12 @@ class ProblemCase(Case[Problem, Array, Arrays]):
 
     @cached_property
     def mus(self) -> Array:
-        """Parameters (K×d): two corners of the box, its centre, and random ones."""
+        """Parameters (7×d): two corners of the box, its centre, and four random ones."""
         box = self.plugin.parameters
         fixed = np.stack([box.lower, box.upper, 0.5 * (box.lower + box.upper)])
-        return np.concatenate([fixed, box.sample(RANDOM, self.seed)])
+        return np.concatenate([fixed, box.sample(4, self.seed)])
 
-    @property
+    @cached_property
     def arguments(self) -> dict[str, Array]:
         """The parameters."""
         return {at(mu): mu for mu in self.mus}
@@ -161,13 +159,9 @@ class ProblemCase(Case[Problem, Array, Arrays]):
             raise ConformanceError(f"{''.join(names)}{error} ({place})") from error
 
 
-def _pickled(thing: Any) -> Any:
-    return pickle.loads(pickle.dumps(thing))
-
-
 def _pickling_error(thing: Any) -> str:
     try:
-        _pickled(thing)
+        pickle.loads(pickle.dumps(thing))
     except Exception as error:  # noqa: BLE001  a plugin may raise anything
         return in_a_line(error)
     return ""

@@ -78,33 +78,25 @@ def examine(checks: Iterable[Check[CaseT]], case: CaseT) -> list[Finding]:
     for check in checks:
         missing = [name for name in check.needs if findings[name].verdict is not Verdict.PASSED]
         if missing:
-            verdict, lines = Verdict.SKIPPED, [f"it needs '{missing[0]}'"]
-        else:
-            faults, notes = _collected(check, case)
-            verdict, lines = (Verdict.FAILED, faults) if faults else (Verdict.PASSED, notes)
-        findings[check.name] = Finding(check.name, verdict, "; ".join(lines))
+            findings[check.name] = Finding(check.name, Verdict.SKIPPED, f"it needs '{missing[0]}'")
+            continue
+        lines: list[str] = []
+        try:
+            for line in check.faults(case) or ():
+                lines.append(line)  # noqa: PERF402  what precedes an exception is kept
+        except (Exception, SystemExit) as error:  # noqa: BLE001  a plugin may raise anything
+            lines.append(str(error) if isinstance(error, ConformanceError) else raised(error))
+        faults = [line for line in lines if not isinstance(line, Note)]
+        if len(faults) > MOST:
+            faults[MOST:] = ["and more"]
+        verdict = Verdict.FAILED if faults else Verdict.PASSED
+        findings[check.name] = Finding(check.name, verdict, "; ".join(faults or lines))
     return list(findings.values())
-
-
-def _collected(check: Check[CaseT], case: CaseT) -> tuple[list[str], list[str]]:
-    """Faults and notes of a check; an exception is a fault because it comes from the plugin."""
-    lines: list[str] = []
-    try:
-        for line in check.faults(case) or ():
-            lines.append(line)  # noqa: PERF402  what precedes an exception is kept
-    except ConformanceError as error:
-        lines.append(str(error))
-    except (Exception, SystemExit) as error:  # noqa: BLE001  a plugin may raise anything
-        lines.append(raised(error))
-    faults = [line for line in lines if not isinstance(line, Note)]
-    if len(faults) > MOST:
-        faults[MOST:] = ["and more"]
-    return faults, [line for line in lines if isinstance(line, Note)]
 
 
 def raising(examination: Callable[P, list[Finding]]) -> Callable[P, None]:
     """Turn `examine_…` into `check_…`, which has the same parameters and raises if a check fails."""
-    name, signature = examination.__name__, inspect.signature(examination)
+    signature = inspect.signature(examination)
 
     def check(*args: P.args, **kwargs: P.kwargs) -> None:
         findings = examination(*args, **kwargs)
@@ -114,8 +106,8 @@ def raising(examination: Callable[P, list[Finding]]) -> Callable[P, None]:
             plugin = getattr(getattr(create, "func", create), "__name__", create)
             raise ConformanceError("\n".join([f"{plugin} fails {len(failures)} of {len(findings)} checks", *failures]))
 
+    name, check.__module__ = examination.__name__, examination.__module__
     check.__name__ = check.__qualname__ = name.replace("examine", "check")
-    check.__module__ = examination.__module__
     check.__doc__ = f"Make the checks of `{name}`; raise a `ConformanceError` that lists all failures if there are any."
     check.__signature__ = signature.replace(return_annotation=None)  # type: ignore[attr-defined]
     return check
@@ -134,9 +126,8 @@ def plugin_line(error: BaseException) -> str:
 
 
 def _is_library(file: str) -> bool:
-    path = Path(file)
-    if any(path.is_relative_to(Path(str(module.__file__)).parent) for module in (vibench, np, scipy)):
-        return True
+    folders = [Path(str(module.__file__)).parent for module in (vibench, np, scipy)]
     # Installed plugins lie below the standard library, in its folder of packages.
-    standard = path.is_relative_to(sysconfig.get_path("stdlib"))
-    return file.startswith("<") or (standard and not {"site-packages", "dist-packages"} & set(path.parts))
+    if not {"site-packages", "dist-packages"} & set(Path(file).parts):
+        folders.append(Path(sysconfig.get_path("stdlib")))
+    return file.startswith("<") or any(map(Path(file).is_relative_to, folders))

@@ -19,12 +19,11 @@ Arrays = dict[str, Any]
 
 def copies(arrays: Arrays) -> Arrays:
     """Copies of dense arrays, and of sparse matrices in CSR format without duplicate entries."""
-    found: Arrays = {
-        name: v.copy() if isinstance(v, np.ndarray) else sp.csr_array(v, copy=True) for name, v in arrays.items()
-    }
-    for value in found.values():
-        if sp.issparse(value):
-            value.sum_duplicates()
+    found: Arrays = {}
+    for name, value in arrays.items():
+        found[name] = value.copy() if isinstance(value, np.ndarray) else sp.csr_array(value, copy=True)
+        if sp.issparse(found[name]):
+            found[name].sum_duplicates()
     return found
 
 
@@ -61,8 +60,7 @@ def unmutated(function: str, arrays: Arrays, call: Callable[[], T]) -> T:
     """Result of a call; a `ConformanceError` names the arrays that it changed, and an entry of each."""
     before = copies(arrays)
     result = call()
-    changed = [f"{name}: {what} before" for name, what in differences(copies(arrays), before)]
-    if changed:
+    if changed := [f"{name}: {what} before" for name, what in differences(copies(arrays), before)]:
         raise ConformanceError(f"{function} changes {'; '.join(changed)}; work on copies and return new arrays")
     return result
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import cached_property, partial
 
 import numpy as np
 
@@ -36,12 +36,14 @@ class DualCase(Case[DualStrategy, Stop, Cone]):
     base = DualStrategy
     snapshots: Array
     W: InnerProduct
-    stops: dict[str, Stop]
+    tolerances: Sequence[float]
+    sizes: Sequence[int]
 
-    @property
+    @cached_property
     def arguments(self) -> dict[str, Stop]:
         """Tolerances and sizes."""
-        return self.stops
+        stops = {f"tolerance {value}": Stop(tolerance=value) for value in self.tolerances}
+        return stops | {f"size {value}": Stop(size=value) for value in self.sizes}
 
     def evaluate(self, argument: Stop, plugin: DualStrategy | None = None, snapshots: Array | None = None) -> Cone:
         """Cone of all snapshots, or of others."""
@@ -65,7 +67,7 @@ class DualCase(Case[DualStrategy, Stop, Cone]):
                 yield from self._missed(stop.tolerance, self.results[name], self.snapshots)
 
     def _missed(self, tolerance: float, cone: Cone, snapshots: Array) -> Iterator[str]:
-        errors = _errors(cone, cone.size, snapshots, self.W)
+        errors = self._errors(cone, cone.size, snapshots)
         if errors.max(initial=0.0) > tolerance * (1.0 + ERROR_RTOL) + ERROR_ATOL:
             yield (
                 f"tolerance {tolerance:g} is missed: with {cone.size} generators the projection error of snapshot "
@@ -79,7 +81,7 @@ class DualCase(Case[DualStrategy, Stop, Cone]):
             cone = self.results[name]
             if stop.size is None or cone.size == stop.size:
                 continue
-            error = _errors(cone, cone.size, self.snapshots, self.W).max(initial=0.0)
+            error = self._errors(cone, cone.size, self.snapshots).max(initial=0.0)
             if cone.size > stop.size or error > ERROR_ATOL:
                 yield f"{name} was prescribed; the cone has {cone.size} generators and the projection error {error:.1e}"
 
@@ -88,7 +90,7 @@ class DualCase(Case[DualStrategy, Stop, Cone]):
         for stop, cone in self.results.items():
             first = 0 if len(cone.errors) == cone.size + 1 else cone.size
             for r, claimed in enumerate(cone.errors, first):
-                error = _errors(cone, r, self.snapshots, self.W).max(initial=0.0)
+                error = self._errors(cone, r, self.snapshots).max(initial=0.0)
                 if abs(error - claimed) > ERROR_ATOL + ERROR_RTOL * error:
                     yield (
                         f"{stop}: the claimed error e({r}) is {claimed:.6g}; the projection error of the snapshots is "
@@ -105,7 +107,7 @@ class DualCase(Case[DualStrategy, Stop, Cone]):
 
     def without_contact(self) -> Iterator[str]:
         """Zero, repeated and single snapshots are reduced; snapshots that all vanish are reduced or refused."""
-        tolerance = next((stop.tolerance for stop in self.stops.values() if stop.tolerance is not None), TOLERANCES[0])
+        tolerance = next(iter(self.tolerances), TOLERANCES[0])
         some, stop = self.snapshots, Stop(tolerance=tolerance)
         largest = some[:, [np.linalg.norm(some, axis=0).argmax()]]
         for name, snapshots in {
@@ -122,6 +124,12 @@ class DualCase(Case[DualStrategy, Stop, Cone]):
             return
         if fault := _cone_fault(cone, self.W):
             yield f"with zero snapshots alone: {fault}; expected a cone without generators"
+
+    def _errors(self, cone: Cone, r: int, snapshots: Array) -> Array:
+        """Projection errors (P,) on the cone of the first r generators, relative to the largest norm of a snapshot."""
+        largest = float(np.max(self.W.norm(snapshots), initial=0.0)) or 1.0
+        chi = rays(cone.generators[:, :r], cone.free[:r])
+        return np.array([project_on_cone(chi, theta, self.W).distance for theta in snapshots.T]) / largest
 
 
 CHECKS: tuple[Check[DualCase], ...] = (
@@ -167,9 +175,7 @@ def examine_dual(
     if (snapshots is None) != (W is None):
         raise TypeError("pass both snapshots and W, or neither")
     given, space = sample_snapshots() if snapshots is None or W is None else (snapshots, W)
-    stops = {f"tolerance {value}": Stop(tolerance=value) for value in tolerances}
-    stops |= {f"size {value}": Stop(size=value) for value in sizes}
-    return examine(CHECKS, DualCase(create, seconds, given, space, stops))
+    return examine(CHECKS, DualCase(create, seconds, given, space, tolerances, sizes))
 
 
 check_dual = raising(examine_dual)
@@ -182,11 +188,10 @@ def _cone_fault(cone: object, W: InnerProduct) -> str:
     except NumericalError as error:
         return f"{error}{_generator(cone, W)}"
     errors, R = checked.errors, checked.size
-    if fault := array_fault("errors", errors, np.shape(errors)):
-        return fault
-    if errors.ndim != 1 or len(errors) not in (1, R + 1) or errors.min() < 0.0:
+    fault = array_fault("errors", errors, np.shape(errors))
+    if not fault and (errors.ndim != 1 or len(errors) not in (1, R + 1) or errors.min() < 0.0):
         return f"errors has shape {errors.shape}; expected e(0) … e({R}), or e({R}) alone, none negative"
-    return ""
+    return fault
 
 
 def _generator(cone: object, W: InnerProduct) -> str:
@@ -201,12 +206,3 @@ def _generator(cone: object, W: InnerProduct) -> str:
         return f": generator {away.argmax()} has norm {norms[away.argmax()]:.6g}"
     i, r = np.unravel_index(int(chi.argmin()), chi.shape)
     return f": look at coefficient {i} of generator {r}"
-
-
-def _errors(cone: Cone, r: int, snapshots: Array, W: InnerProduct) -> Array:
-    """Projection errors (P,) of snapshots on the cone of the first r generators, relative to the largest norm."""
-    largest = float(np.max(W.norm(snapshots), initial=0.0))
-    if largest == 0.0:
-        return np.zeros(snapshots.shape[1])
-    chi = rays(cone.generators[:, :r], cone.free[:r])
-    return np.array([project_on_cone(chi, theta, W).distance for theta in snapshots.T]) / largest

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property, partial
 from itertools import pairwise
@@ -53,8 +54,7 @@ class PrimalCase(Case[PrimalStrategy, float | None, Enrichment]):
         problem, mu = model.problem, model.training[0]
         named = {"vectors": result.vectors, "eta": result.eta}
         if result.supply is not None:
-            supplied = result.supply(problem.V, problem.assemble(mu.copy()), model.span.copy())
-            named[f"the supply {at(mu)}"] = supplied
+            named[f"the supply {at(mu)}"] = result.supply(problem.V, problem.assemble(mu.copy()), model.span.copy())
         return {name: value for name, value in named.items() if value is not None}
 
     def tolerance(self) -> Iterator[str]:
@@ -68,15 +68,11 @@ class PrimalCase(Case[PrimalStrategy, float | None, Enrichment]):
             how = "with a tolerance" if takes else "without a tolerance, although takes_tolerance is False"
             advice = "" if takes else "; set takes_tolerance = True if the strategy needs one"
             raise ConformanceError(f"build fails {how}: {raised(error)}{advice}") from error
-        if takes:
-            try:
+        with suppress(Exception):  # every refusal is right
+            if takes:
                 self.evaluate(None)
-            except Exception:  # noqa: BLE001  every refusal is right
-                return
-            yield (
-                "takes_tolerance is True, but build(offline, None) returns an enrichment; refuse None, "
-                "or set takes_tolerance = False"
-            )
+                advice = "refuse None, or set takes_tolerance = False"
+                yield f"takes_tolerance is True, but build(offline, None) returns an enrichment; {advice}"
 
     def enrichment(self) -> Iterator[str]:
         """Enrichments have the right types and shapes; fixed vectors are orthonormal and orthogonal to V_N."""
@@ -111,10 +107,9 @@ class PrimalCase(Case[PrimalStrategy, float | None, Enrichment]):
 
     def tighter(self) -> None:
         """A fixed enrichment of a tighter tolerance has at least as many vectors."""
-        counts = [(name, vectors.shape[1]) for name, vectors in self._fixed().items()]
-        for (loose, before), (tight, after) in pairwise(counts):
-            if after < before:
-                raise ConformanceError(f"{tight} gives {after} vectors, fewer than the {before} of {loose}")
+        for (loose, before), (tight, after) in pairwise(self._fixed().items()):
+            if (fewer := after.shape[1]) < (more := before.shape[1]):
+                raise ConformanceError(f"{tight} gives {fewer} vectors, fewer than the {more} of {loose}")
 
     def nested(self) -> Iterator[str]:
         """The vectors of a `NestedStrategy` at a loose tolerance are the first ones at a tight tolerance."""
@@ -144,9 +139,9 @@ class PrimalCase(Case[PrimalStrategy, float | None, Enrichment]):
 
     def without_contact(self) -> Iterator[str]:
         """A cone without generators, as of snapshots without contact, is accepted or refused."""
-        full = self.offline
-        empty = Cone(np.zeros((full.problem.W.dim, 0)), np.zeros(1), no_free(0))
-        offline = offline_of(full.problem, full.basis.copy(), empty)
+        problem = self.offline.problem
+        empty = Cone(np.zeros((problem.W.dim, 0)), np.zeros(1), no_free(0))
+        offline = offline_of(problem, self.offline.basis.copy(), empty)
         try:
             found = self.plugin.build(offline, next(iter(self.arguments.values())))
         except VibenchError:  # a strategy may refuse it in one line

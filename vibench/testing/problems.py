@@ -20,9 +20,6 @@ from vibench.testing.comparisons import array_fault, at, difference, unmutated
 OUTSIDE_RTOL = 1e-12
 """Largest distance of a parameter from the box, relative to its bounds."""
 
-COUNT = 5
-"""Number of validation parameters."""
-
 SOLVED = 5
 """Number of training parameters solved at; up to ten times as many while no constraint is active."""
 
@@ -66,10 +63,9 @@ def parameters(case: ProblemCase) -> Iterator[str]:
         yield f"the parameters' units are {box.units!r}; expected a tuple of {box.dim}, '1' for a number"
     faults = [array_fault(f"parameters.{name}", getattr(box, name), (box.dim,)) for name in ("lower", "upper")]
     yield from filter(None, faults)
-    if not any(faults):
-        for name, low, high in zip(box.names, box.lower, box.upper, strict=True):
-            if low > high:
-                yield f"the lower bound {low:g} of the parameter '{name}' is above its upper bound {high:g}"
+    for name, low, high in () if any(faults) else zip(box.names, box.lower, box.upper, strict=True):
+        if low > high:
+            yield f"the lower bound {low:g} of the parameter '{name}' is above its upper bound {high:g}"
 
 
 def training_set(case: ProblemCase) -> Iterator[str]:
@@ -85,9 +81,9 @@ def training_set(case: ProblemCase) -> Iterator[str]:
 
 def validation_set(case: ProblemCase) -> Iterator[str]:
     """Validation parameters lie in the box and are reproducible."""
-    mus = validation_parameters(case.plugin, COUNT, case.seed)
+    mus = validation_parameters(case.plugin, 5, case.seed)
     yield from _outside("validation_set", mus, case.plugin.parameters)
-    if what := difference(validation_parameters(case.plugin, COUNT, case.seed), mus):
+    if what := difference(validation_parameters(case.plugin, len(mus), case.seed), mus):
         yield f"validation_set is not the same for the same seed: {what} before; draw from default_rng(seed)"
 
 

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from copy import deepcopy
+from operator import attrgetter
 
 import numpy as np
 import scipy.sparse as sp
 
-from vibench.arrays import Array
+from vibench.arrays import Array, SparseMatrix
 from vibench.highfidelity import active_set
 from vibench.interfaces.problem import ParameterBox, Problem, VariationalInequality
 from vibench.interfaces.strategies import Cone, Offline, Stop
@@ -33,14 +34,11 @@ class MovingSupport(Problem):
     def __init__(self) -> None:
         h = 1.0 / (NODES + 1)
         self._x = h * np.arange(1, NODES + 1)
-        off, diagonal = -np.ones(NODES - 1), 2.0 * np.ones(NODES)
-        self._stiffness = sp.csr_array(sp.diags_array([off, diagonal, off], offsets=[-1, 0, 1])) / h
+        self._stiffness = _tridiagonal(-1.0, 2.0, NODES) / h
         self._load = np.full(NODES, -4.0 * h)
         self._width = 0.5 / (CONSTRAINTS - 1)
-        sides = np.full(CONSTRAINTS - 1, self._width / 6.0)
-        middles = np.full(CONSTRAINTS, self._width * 2.0 / 3.0)
         self.V = InnerProduct(self._stiffness + h * sp.eye_array(NODES), "X_V")
-        self.W = InnerProduct(sp.csr_array(sp.diags_array([sides, middles, sides], offsets=[-1, 0, 1])), "X_W")
+        self.W = InnerProduct(_tridiagonal(self._width / 6.0, self._width * 2.0 / 3.0, CONSTRAINTS), "X_W")
 
     def training_set(self) -> Array:
         """The 5×5 grid."""
@@ -50,9 +48,13 @@ class MovingSupport(Problem):
         """Weighted means of −u around 14 points are at most those of −ψ, where ψ is the support."""
         centres = np.linspace(0.25, 0.75, CONSTRAINTS) + mu[0]
         hats = np.maximum(0.0, 1.0 - np.abs(self._x[None, :] - centres[:, None]) / self._width)
-        weights = hats / len(self._x)
+        weights = hats / NODES
         support = -0.2 + mu[1] - 0.8 * (self._x - 0.5 - mu[0]) ** 2
         return VariationalInequality(self._stiffness, self._load, sp.csr_array(-weights), -weights @ support)
+
+
+def _tridiagonal(off: float, diagonal: float, n: int) -> SparseMatrix:
+    return sp.csr_array(sp.diags_array([off, diagonal, off], offsets=[-1, 0, 1], shape=(n, n)))
 
 
 def sample_snapshots() -> tuple[Array, InnerProduct]:
@@ -65,14 +67,13 @@ def sample_offline(modes: int = 4, generators: int = 6) -> Offline:
     """A reduced model of the sample problem to enrich: N POD modes and a greedy cone of R generators."""
     problem = MovingSupport()
     u, lam = _solutions(problem)
-    cone = greedy_cone(lam, problem.W, Stop(size=generators))
-    return offline_of(problem, pod(u, problem.V, Stop(size=modes)).basis, cone)
+    basis = pod(u, problem.V, Stop(size=modes)).basis
+    return offline_of(problem, basis, greedy_cone(lam, problem.W, Stop(size=generators)))
 
 
 def offline_of(problem: Problem, basis: Array, cone: Cone) -> Offline:
     """The reduced model of a basis of V_N (n×N) and a cone."""
-    span = multipliers(cone.generators, problem.W).span
-    return Offline(problem, basis, cone, span, problem.training_set())
+    return Offline(problem, basis, cone, multipliers(cone.generators, problem.W).span, problem.training_set())
 
 
 def copy_of(offline: Offline) -> Offline:
@@ -82,11 +83,8 @@ def copy_of(offline: Offline) -> Offline:
 
 def arrays_of(offline: Offline) -> Arrays:
     """All arrays that a strategy could change, by name."""
-    cone, problem = offline.cone, offline.problem
-    arrays = {"basis": offline.basis, "span": offline.span, "training": offline.training,
-              "cone.generators": cone.generators, "cone.errors": cone.errors,
-              "problem.V.matrix": problem.V.matrix, "problem.W.matrix": problem.W.matrix}  # fmt: skip
-    return {f"offline.{name}": value for name, value in arrays.items()}
+    names = ("basis", "span", "training", "cone.generators", "cone.errors", "problem.V.matrix", "problem.W.matrix")
+    return {f"offline.{name}": attrgetter(name)(offline) for name in names}
 
 
 def _solutions(problem: Problem) -> tuple[Array, Array]:

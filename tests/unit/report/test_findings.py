@@ -18,13 +18,7 @@ from vibench.results.database import FILE
 def said(changed: Changed) -> Callable[..., dict[str, list[str]]]:
     """Function that gives the findings of a changed copy of a real run, by what they are about."""
 
-    def run(*statements: str) -> dict[str, list[str]]:
-        found: dict[str, list[str]] = {}
-        for finding in findings(changed(*statements)):
-            found.setdefault(finding.about, []).append(finding.text)
-        return found
-
-    return run
+    return lambda *statements: findings(changed(*statements))
 
 
 Said = Callable[..., dict[str, list[str]]]

@@ -19,9 +19,9 @@ from running import Main, refused
 from vibench import testing
 from vibench.interfaces.strategies import DualStrategy
 from vibench.study import registry
+from vibench.testing.assembly import JUMP, WIDTH, find_jump
 from vibench.testing.checks import Check, Finding, Note, Verdict, examine
 from vibench.testing.comparisons import difference
-from vibench.testing.continuity import JUMP, WIDTH, find_jump
 
 Case = tuple[str, list[str]]
 """The one check that fails, and parts of its message."""
