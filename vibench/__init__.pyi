@@ -45,9 +45,7 @@ from .reduction.cones import REPRODUCED as REPRODUCED
 from .reduction.cones import GrowingCone as GrowingCone
 from .reduction.cones import LazyDistances as LazyDistances
 from .reduction.cones import greedy_cone as greedy_cone
-from .reduction.cones import normalised as normalised
 from .reduction.cones import project_on_cone as project_on_cone
-from .reduction.cones import projection_errors as projection_errors
 from .reduction.cones import refuse_negative as refuse_negative
 from .reduction.lazy_greedy import TIE as TIE
 from .reduction.lazy_greedy import LazyMaximum as LazyMaximum

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from vibench import Array, Cone, DualStrategy, InnerProduct, Stop, greedy_cone, normalised, projection_errors
+from vibench import Array, Cone, DualStrategy, InnerProduct, Stop, greedy_cone
+from vibench_strategies.snapshot_cones import normalised, projection_errors
 
 
 class AngleGreedy(DualStrategy):

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from vibench import Array, Cone, DualStrategy, InnerProduct, Stop, no_free, normalised, projection_errors
+from vibench import Array, Cone, DualStrategy, InnerProduct, Stop, no_free
+from vibench_strategies.snapshot_cones import normalised, projection_errors
 
 
 class Dictionary(DualStrategy):

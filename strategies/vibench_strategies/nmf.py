@@ -16,11 +16,10 @@ from vibench import (
     NumericalError,
     Stop,
     no_free,
-    normalised,
-    projection_errors,
     refuse_negative,
     singular_values,
 )
+from vibench_strategies.snapshot_cones import normalised, projection_errors
 
 
 class NonnegativeFactors(DualStrategy):
