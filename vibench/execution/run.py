@@ -44,20 +44,9 @@ LOG = "workers.log"
 
 @dataclass(frozen=True)
 class Agenda:
-    """The work of a run.
+    """The work of a run: cells of the matrix, those that have no row yet, and those of them that cannot be run here.
 
-    Attributes
-    ----------
-    cells
-        Cells of the matrix.
-    to_run
-        Those that have no row yet.
-    unavailable
-        Those of `to_run` whose solver or plugins need a distribution that is not installed.
-    stages
-        Stages that the other cells need.
-    workers
-        Number of worker processes.
+    `stages` are what the other cells need, `workers` is the number of worker processes.
     """
 
     cells: int

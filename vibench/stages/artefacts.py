@@ -33,18 +33,10 @@ LOCK = "lock"
 
 @dataclass(frozen=True)
 class History:
-    """One convergence history: a quantity over the steps of an algorithm.
+    """One convergence history: a quantity ("error", "sigma", …) over the steps of an algorithm, one value per step.
 
-    Attributes
-    ----------
-    stage
-        The column `stage` of the histories table.
-    quantity
-        "error", "sigma", …
-    values
-        One per step.
-    first_step
-        Number of the first of these steps; not 0 where several stages hold parts of one history (`Stage.partial`).
+    `stage` is the column of the histories table. `first_step` is not 0 where several stages hold parts of one history
+    (`Stage.partial`).
     """
 
     stage: str
