@@ -240,7 +240,7 @@ FAULTS = (
     Fault(
         "limit-of-a-query-not-enforced",
         "vibench/execution/supervisor.py",
-        "if talk.clock.seconds > talk.own_limit:",
+        "if state.seconds > state.piece_limit:",
         "if False:",
         ("tests/faults/test_supervisor.py",),
     ),

@@ -1,4 +1,4 @@
-"""Projection on polyhedral cones, and the cone-projected greedy algorithms CPG and mCPG (paper, §4)."""
+"""Projection on polyhedral cones, and cones that grow greedily from snapshots (paper, §4)."""
 
 from __future__ import annotations
 
@@ -134,7 +134,7 @@ class GrowingCone:
 
 
 def greedy_cone(snapshots: Array, W: InnerProduct, stop: Stop) -> Cone:
-    """Cone of snapshots (m×Q) chosen greedily: CPG (paper, Remark 4.3, and Benaceur, Ern and Ehrlacher 2020).
+    """Cone of snapshots (m×Q) chosen greedily (paper, Remark 4.3, and Benaceur, Ern and Ehrlacher 2020).
 
     Each step adds the snapshot farthest from the present cone, normalised. It ends before `stop` where all snapshots
     are reproduced to round-off (Remark 4.2). Snapshots that are not in W⁺ are refused as by `GrowingCone`.

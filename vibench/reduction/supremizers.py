@@ -75,7 +75,7 @@ class ConstraintClasses:
 def constraint_classes(matrices: Sequence[SparseMatrix]) -> ConstraintClasses:
     """Sort matrices into classes of proportional ones.
 
-    For the obstacle problem, where B(mu) is one matrix times a scalar, one supremizer space replaces 125 equal ones.
+    Where every B(mu) is one matrix times a scalar, one supremizer space replaces one for each parameter.
     """
     classes: list[tuple[SparseMatrix, Array]] = []
     found: list[tuple[int, float]] = []
