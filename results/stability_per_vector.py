@@ -15,7 +15,7 @@ from vibench.linalg.inner_product import InnerProduct
 from vibench.reduction.cones import project_on_cone
 from vibench.reduction.nested import NestedStrategy, grow_through
 from vibench.reduction.pod import pod
-from vibench.reduction.supremizers import constraint_classes, projected_supremizers, supremizer_images
+from vibench.reduction.supremizers import constraint_classes, isometric_supremizers, projected_supremizers
 from vibench.results import tables
 from vibench.stability.infsup import beta_span, multipliers
 from vibench.study import registry
@@ -44,7 +44,7 @@ W, and the largest distance of a generator of cpg from the cone.
 def counts(data: Offline, vectors: Array) -> dict[str, int | None]:
     """Smallest numbers of vectors that reach the shares; β_on and β_S do not come from the strategies."""
     classes = constraint_classes([data.problem.constraint(mu)[0] for mu in data.training])
-    image = supremizer_images(data.problem.V, classes.representatives, data.span.shape[1])
+    image = isometric_supremizers(data.problem.V, classes.representatives, data.span.shape[1])
     online = np.array([beta_span(image(B, data.span)) for B in classes.representatives])
     images = [projected_supremizers(np.hstack([data.basis, vectors]), B, data.span) for B in classes.representatives]
     first = data.basis.shape[1]

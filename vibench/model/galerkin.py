@@ -95,7 +95,7 @@ class ReducedModel:
         count = self.fixed_basis.shape[1]
         return np.asarray(self.fixed_basis @ x[:count] + self._contact.vectors(self._added(vi) @ x[count:]))
 
-    def images(self, vi: VariationalInequality, eta: Array) -> Array:
+    def project_supremizers(self, vi: VariationalInequality, eta: Array) -> Array:
         """ZᵀBᵀη (N'×k) for multipliers η (m×k) at the parameter of `vi`."""
         if not self._has_coordinates:
             return projected_supremizers(self.primal_basis(vi), vi.B, eta)

@@ -192,11 +192,11 @@ def _contact_factor(V: InnerProduct, dofs: bytes) -> tuple[SparseCholesky, Array
 
 Coordinates = SpannedCoordinates | ContactCoordinates
 
-SupremizerImages = Callable[[SparseMatrix, Array], Array]
+IsometricSupremizers = Callable[[SparseMatrix, Array], Array]
 """From B (m×n) and η (m×k): an isometric image (d×k) of T(mu)η."""
 
 
-def supremizer_images(V: InnerProduct, matrices: Sequence[SparseMatrix], count: int) -> SupremizerImages:
+def isometric_supremizers(V: InnerProduct, matrices: Sequence[SparseMatrix], count: int) -> IsometricSupremizers:
     """The cheaper isometric image of T(mu)η, for these matrices and `count` multipliers each."""
     constrained = _constrained_unknowns(matrices)
     if UNKNOWNS_PER_SUPREMIZER * count * len(matrices) <= len(constrained):

@@ -6,13 +6,13 @@ from collections.abc import Sequence
 
 from vibench.arrays import Array
 from vibench.linalg.inner_product import InnerProduct
-from vibench.reduction.supremizers import ConstraintClasses, supremizer_images
+from vibench.reduction.supremizers import ConstraintClasses, isometric_supremizers
 from vibench.stability.infsup import InfSup, Multipliers, inf_sup, inf_sup_on
 
 
 def constants_full(V: InnerProduct, classes: ConstraintClasses, cone: Multipliers) -> list[InfSup]:
     """Constants of the whole of V at every B(mu) (m×n)."""
-    image = supremizer_images(V, classes.representatives, cone.rank + cone.chi.shape[1])
+    image = isometric_supremizers(V, classes.representatives, cone.rank + cone.chi.shape[1])
     found = [inf_sup(image(B, cone.span), image(B, cone.chi), cone) for B in classes.representatives]
     return everywhere(classes, found)
 

@@ -138,5 +138,5 @@ class OwnConstants(Stage):
 
 
 def _constants_at(model: ReducedModel, vi: VariationalInequality, cone: Multipliers) -> InfSup:
-    images = model.images(vi, np.hstack([cone.span, cone.chi]))
-    return inf_sup(images[:, : cone.rank], images[:, cone.rank :], cone)
+    projected = model.project_supremizers(vi, np.hstack([cone.span, cone.chi]))
+    return inf_sup(projected[:, : cone.rank], projected[:, cone.rank :], cone)

@@ -12,7 +12,7 @@ from vibench.reduction.cones import orthogonality
 from vibench.reduction.pod import pod
 from vibench.reduction.supremizers import (
     constraint_classes,
-    supremizer_images,
+    isometric_supremizers,
 )
 from vibench.stability.infsup import Multipliers, beta_span, multipliers
 from vibench.stages.artefacts import History, Store
@@ -134,5 +134,5 @@ class TrainingConstants(Stage):
     def run(self, store: Store) -> Result:
         """β_span of the whole of V with the cone at every parameter (P,)."""
         span, classes = value_of(store, self.cone).prepared.span, value_of(store, self.cone.constraints)
-        image = supremizer_images(build_problem(self.cone.problem).V, classes.representatives, span.shape[1])
+        image = isometric_supremizers(build_problem(self.cone.problem).V, classes.representatives, span.shape[1])
         return Result(classes.everywhere([beta_span(image(B, span)) for B in classes.representatives]))
