@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Annotated, ClassVar, Literal
@@ -47,7 +48,7 @@ class RadialSolution:
     def contact_radius(self) -> float:
         """ρ [m]."""
         share = (0.25 - self.height) / (0.25 + self.curvature)
-        return float(np.exp(0.5 * (1.0 + lambertw(-share / np.e, -1).real)))
+        return float(np.exp(0.5 * (1.0 + lambertw(-share / math.e, -1).real)))
 
     def u(self, r: Array) -> Array:
         """Deflection [m]."""
