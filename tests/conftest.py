@@ -32,6 +32,8 @@ def artefacts(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     folder = tmp_path_factory.mktemp("cache")
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv(CACHE_VARIABLE, str(folder))
+        # Hundreds of processes are started; each would compile the sources again where bytecode is not kept.
+        patch.delenv("PYTHONDONTWRITEBYTECODE", raising=False)
         yield folder / "artefacts"
 
 
