@@ -240,7 +240,7 @@ FAULTS = (
     Fault(
         "limit-of-a-query-not-enforced",
         "vibench/execution/supervisor.py",
-        "if state.seconds > state.piece_limit:",
+        "if self.seconds > self._piece_limit:",
         "if False:",
         ("tests/faults/test_supervisor.py",),
     ),

@@ -17,7 +17,7 @@ import pytest
 from fake_stages import InPieces, OfAPlugin, Whole
 
 from vibench.execution import supervisor
-from vibench.execution.supervisor import Job, StoppedError, Supervisor
+from vibench.execution.supervisor import Begun, Job, StoppedError, Supervisor
 from vibench.qp.status import Status
 from vibench.stages.artefacts import Store
 from vibench.stages.base import Done, Failed, Stage, Unstored
@@ -84,10 +84,10 @@ def test_what_a_piece_raises_costs_itself(run: Run) -> None:
 
 
 def test_beyond_the_limit_of_the_cell_the_pieces_done_are_kept(run: Run) -> None:
-    found = run(InPieces(("fine", "fine", "sleep", "fine")), query=60.0, cell=10.0)
+    found = run(InPieces(("fine", "fine", "sleep", "fine")), query=60.0, cell=2.0)
     assert isinstance(found, Done)
     assert [isinstance(value, Failed) for _, value in found.value] == [False, False, True, True]
-    assert found.value[3][1] == Failed(Status.TIMEOUT, "stopped after cell_seconds = 10 s")
+    assert found.value[3][1] == Failed(Status.TIMEOUT, "stopped after cell_seconds = 2 s")
 
 
 def test_a_piece_that_dies_before_it_is_watched_costs_itself(run: Run) -> None:
@@ -97,15 +97,15 @@ def test_a_piece_that_dies_before_it_is_watched_costs_itself(run: Run) -> None:
 
 
 def test_many_quick_pieces_have_the_limit_of_the_cell_too(run: Run) -> None:
-    found = run(InPieces(("moment",) * 400), cell=4.0)
+    found = run(InPieces(("moment",) * 400), cell=2.0)
     assert isinstance(found, Done)
     lost = [value for _, value in found.value if isinstance(value, Failed)]
     assert 300 < len(lost) < 400
-    assert set(lost) == {Failed(Status.TIMEOUT, "stopped after cell_seconds = 4 s")}
+    assert set(lost) == {Failed(Status.TIMEOUT, "stopped after cell_seconds = 2 s")}
 
 
 def test_a_death_beyond_the_limit_is_not_the_reason_of_pieces_never_asked(run: Run) -> None:
-    found = run(InPieces(("fine", "sleep", "exit", "fine")), query=600.0, cell=4.0)
+    found = run(InPieces(("fine", "sleep", "exit", "fine")), query=600.0, cell=1.0)
     assert isinstance(found, Done)
     assert {value.status for _, value in found.value[1:]} == {Status.TIMEOUT}
 
@@ -163,10 +163,22 @@ def test_another_vibench_than_planned_with_is_refused(watcher: Supervisor, tmp_p
 
 def test_a_suspended_run_is_not_late(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     state = supervisor._JobState(Job(str(tmp_path), Whole("fine"), 1.0, 30.0, 8.0))
+    state.update(Begun())
     now = time.monotonic()
     monkeypatch.setattr(supervisor.time, "monotonic", lambda: now + 3600.0)
-    state.tick()
+    state.tick(30.0)
     assert 0.0 < state.seconds <= 1.0
+
+
+def test_limits_begin_when_the_work_begins(run: Run) -> None:
+    """A process starts and imports for about a second: none of it counts."""
+    found = run(Whole("fine"), cell=0.3)
+    assert isinstance(found, Done)
+
+
+def test_a_process_that_never_begins_is_given_up(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(supervisor, "START_SECONDS", 0.1)
+    assert run(Whole("fine")) == Failed(Status.CRASHED, "the worker process did not begin within 0.1 s")
 
 
 def test_a_talkative_job_can_be_stopped(watcher: Supervisor, tmp_path: Path) -> None:
@@ -181,7 +193,7 @@ def test_a_talkative_job_can_be_stopped(watcher: Supervisor, tmp_path: Path) -> 
     ("how", "status"), [("sleep", Status.TIMEOUT), ("exit", Status.CRASHED), ("interrupt", Status.ERROR)]
 )
 def test_what_is_not_of_a_piece_costs_the_cell(run: Run, where: str, how: str, status: Status) -> None:
-    found = run(InPieces(("fine",), **{where: how}), cell=1.5 if how == "sleep" else 20.0)
+    found = run(InPieces(("fine",), **{where: how}), cell=0.5 if how == "sleep" else 20.0)
     assert isinstance(found, Failed)
     assert found.status is status
 
@@ -190,7 +202,7 @@ def test_what_is_not_of_a_piece_costs_the_cell(run: Run, where: str, how: str, s
     ("how", "status"), [("sleep", Status.TIMEOUT), ("hang", Status.TIMEOUT), ("segfault", Status.CRASHED)]
 )
 def test_a_whole_stage_that_hangs_or_dies_is_said_so(run: Run, how: str, status: Status) -> None:
-    found = run(Whole(how), cell=1.5 if status is Status.TIMEOUT else 30.0)
+    found = run(Whole(how), cell=0.5 if status is Status.TIMEOUT else 30.0)
     assert isinstance(found, Failed)
     assert found.status is status
     assert isinstance(run(Whole("fine")), Done)  # the next one has a new process

@@ -28,6 +28,9 @@ from vibench.timing import KEPT_MEMORY, ONE_THREAD
 POLL = 0.2
 """Seconds between two checks of the limits."""
 
+START_SECONDS = 300.0
+"""Time limit of the start of a worker process and its imports; the limits of a job begin when its work begins."""
+
 GRACE = 2.0
 """Seconds allowed beyond the limit of a query, for the work before and after the solver."""
 
@@ -47,6 +50,11 @@ class Job:
     cell_seconds: float
     memory_gib: float
     code: str = field(default_factory=code_here)
+
+
+@dataclass(frozen=True)
+class Begun:
+    """A worker has received its job."""
 
 
 @dataclass(frozen=True)
@@ -95,35 +103,59 @@ class _WorkerLostError(Exception):
 class _JobState:
     """What workers have reported of a job: finished pieces, the current piece and its deadline.
 
-    Time is added up in steps of bounded length, so that a suspended machine does not exhaust the limits.
+    Time is added up in steps of bounded length, so that a suspended machine does not exhaust the limits. The start of a
+    process counts separately: on a busy machine it may take longer than a limit.
     """
 
     def __init__(self, job: Job) -> None:
         self.job, self.progress = job, Progress()
-        self.seconds, self._last = 0.0, time.monotonic()
-        self.begin()
+        self.seconds = 0.0
+        self.start()
 
-    def begin(self) -> Progress:
-        """Reset the current piece for a new process or piece; returns the progress that a process continues from."""
-        self.piece: int | None = None
-        self.piece_limit = float("inf")
+    def start(self) -> Progress:
+        """Note that a process is given the job; returns the progress that it continues from."""
+        self._last, self._begun, self._starting = time.monotonic(), False, 0.0
+        self._next_piece()
         return self.progress
 
-    def tick(self) -> None:
-        """Count the seconds since the last call."""
+    def _next_piece(self) -> None:
+        self.piece: int | None = None
+        self._piece_limit = float("inf")
+
+    def tick(self, limit: float) -> None:
+        """Count the seconds since the last call; `limit` is that of the stage.
+
+        Raises
+        ------
+        _WorkerLostError
+            If a limit is exceeded.
+        """
         now = time.monotonic()
-        self.seconds += min(now - self._last, 5.0 * POLL)
+        step = min(now - self._last, 5.0 * POLL)
         self._last = now
+        if not self._begun:
+            self._starting += step
+            if self._starting > START_SECONDS:
+                reason = f"the worker process did not begin within {START_SECONDS:g} s"
+                raise _WorkerLostError(Failed(Status.CRASHED, reason))
+            return
+        self.seconds += step
+        if self.seconds > limit:
+            raise _WorkerLostError(_beyond("cell_seconds", self.job.cell_seconds))
+        if self.seconds > self._piece_limit:
+            raise _WorkerLostError(_beyond("query_seconds", self.job.query_seconds))
 
     def update(self, message: Any) -> Done | Failed | Unstored | None:
         """Process a message of the worker; returns the outcome if it is one."""
         match message:
+            case Begun():
+                self._begun, self._last = True, time.monotonic()
             case Watch():
                 self.piece = message.piece
-                self.piece_limit = self.seconds + self.job.query_seconds + GRACE if message.on else float("inf")
+                self._piece_limit = self.seconds + self.job.query_seconds + GRACE if message.on else float("inf")
             case Finished():
                 self.progress.found[message.piece] = message.value
-                self.begin()
+                self._next_piece()
             case OutOfMemory():
                 raise _WorkerLostError(message.failed)
             case Done() | Failed() | Unstored():
@@ -193,13 +225,12 @@ class Supervisor:
 
     def _attempt(self, state: _JobState, limit: float) -> Done | Failed | Unstored:
         """Run the rest of a stage in one process."""
-        job = state.job
         try:
             connection, process = self._worker()
         except OSError as error:
             return Failed(Status.CRASHED, f"no worker process could be started: {error.strerror}")
         try:
-            connection.send((job, state.begin()))
+            connection.send((state.job, state.start()))
             while not self._stop.is_set():
                 if connection.poll(POLL):
                     outcome = state.update(connection.recv())
@@ -207,11 +238,7 @@ class Supervisor:
                         return outcome
                 elif process.poll() is not None:  # a child process of it may hold the socket open
                     raise EOFError
-                state.tick()
-                if state.seconds > limit:
-                    raise _WorkerLostError(_beyond("cell_seconds", job.cell_seconds))
-                if state.seconds > state.piece_limit:
-                    raise _WorkerLostError(_beyond("query_seconds", job.query_seconds))
+                state.tick(limit)
         except (EOFError, OSError):  # the other end of the socket is closed
             if not self._stop.is_set():
                 raise _WorkerLostError(Failed(Status.CRASHED, _cause_of_death(process))) from None

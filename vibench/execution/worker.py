@@ -19,7 +19,7 @@ from typing import Any, TypeVar
 from threadpoolctl import threadpool_limits
 
 from vibench.errors import NumericalError, StorageError, VibenchError, in_a_line
-from vibench.execution.supervisor import Finished, Job, OutOfMemory, Progress, Watch, code_here
+from vibench.execution.supervisor import Begun, Finished, Job, OutOfMemory, Progress, Watch, code_here
 from vibench.qp.status import Status
 from vibench.stages.artefacts import Store
 from vibench.stages.base import Done, Failed, PiecewiseStage, Unstored
@@ -56,6 +56,7 @@ def main() -> None:
             job, progress = connection.recv()
         except EOFError:
             return
+        send(Begun())
         # The allocator keeps freed memory: a large process is replaced before the next job instead of failing it.
         if not first and _address_space() > 0.5 * job.memory_gib * 2**30:
             send(OutOfMemory(None))

@@ -118,15 +118,16 @@ MODELS: Mapping[str, type[BaseModel]] = {"tolerances": ToleranceTable, "limits":
 
 def _message(error: Any) -> str:
     """The key of a study file that is wrong, the expected value and the one found."""
-    where = [part for part in error["loc"] if not str(part).startswith("<")]
+    # The last part of an unexpected key's path is the key itself, whatever its first character.
+    outer = error["loc"][:-1] if error["type"] == "extra_forbidden" else error["loc"]
+    where = [part for part in outer if not str(part).startswith("<")]
     message, found = error["msg"].removeprefix("Value error, "), ""
     if isinstance(error["input"], str | int | float):
         found = f" (found {error['input']!r:.80})"
     match error["type"]:
         case "extra_forbidden":
-            *where, key = where
             model: type[BaseModel] = MODELS.get(where[0], Entry) if where else Study
-            message, found = str(unknown_name("key", "".join(str(key).split()), model.model_fields)), ""
+            message, found = str(unknown_name("key", "".join(str(error["loc"][-1]).split()), model.model_fields)), ""
         case "missing":
             message = "required, but not given"
         case "model_type":

@@ -140,6 +140,8 @@ WRONG: Mapping[str, tuple[tuple[str | int, ...], Any, tuple[str, ...]]] = {
     "limit beyond every machine": (("limits",), {"memory_gib": 1e300}, ("limits.memory_gib", "less than")),
     "limit unknown": (("limits",), {"query_second": 1.0}, ("'query_second'", "did you mean 'query_seconds'")),
     "key unknown": (("sed",), 7, ("'sed'", "did you mean 'seed'")),
+    "key unknown, in angle brackets": (("<list>",), 7, ("'<list>'", "known: ")),
+    "key unknown in a table, an angle bracket": ((*TABLE, "<"), [], ("'<'", "known: ")),
     "key unknown in a table": ((*TABLE, "pods"), [1e-3], ("'pods'", "did you mean 'pod'")),
 }
 
