@@ -23,7 +23,7 @@ BAD_PROBLEMS: Mapping[str, tuple[set[str], str]] = {
     "wire-indefinite": ({"error"}, "not positive definite"),
     "wire-broken": ({"error"}, "in high-fidelity solutions: OSError: no wire in stock"),
     "wire-hungry": ({"error"}, "out of memory: the limit is memory_gib = 8"),
-    "wire-sleeps": ({"timeout"}, "in high-fidelity solutions: stopped after cell_seconds = 12 s"),
+    "wire-sleeps": ({"timeout"}, "in high-fidelity solutions: stopped after cell_seconds = 6 s"),
     "wire-exits": ({"crashed"}, "in high-fidelity solutions: the worker process died with exit code 3"),
     "wire-segfaults": ({"crashed"}, "in high-fidelity solutions: the worker process died with signal SIGSEGV"),
     "wire-infeasible": (
@@ -34,7 +34,7 @@ BAD_PROBLEMS: Mapping[str, tuple[set[str], str]] = {
 }
 BAD_DUALS: Mapping[str, tuple[set[str], str]] = {
     "cone-raises": ({"error"}, "in cone: LookupError: no generator found"),
-    "cone-waits": ({"timeout"}, "in cone: stopped after cell_seconds = 12 s"),
+    "cone-waits": ({"timeout"}, "in cone: stopped after cell_seconds = 6 s"),
     "cone-nan": ({"error"}, "in cone: the generators have entries that are not finite"),
     "cone-shape": ({"error"}, "in cone: the generators have shape (11, 2), expected (12, count)"),
     "cone-negative": ({"error"}, "in cone: a generator has the negative coefficient -"),
@@ -94,7 +94,7 @@ def run(vibench: Vibench, tmp_path_factory: pytest.TempPathFactory) -> Run:
     waits = {"name": "cone-waits", "options": {"file": str(folder / "never")}}
     duals = [bad(name, "cone-bad") for name in list(BAD_DUALS)[2:]]
     primals = [bad(name, "enrichment-bad") for name in list(BAD_PRIMALS)[1:]]
-    limits = {"cell_seconds": 12.0, "query_seconds": 0.5}
+    limits = {"cell_seconds": 6.0, "query_seconds": 0.5}
     studies = [
         wire_study(
             problem=[*FINE["problem"], *BAD_PROBLEMS],

@@ -34,12 +34,20 @@ def watcher() -> Iterator[Supervisor]:
     made.close()
 
 
+@pytest.fixture(scope="module")
+def shared() -> Iterator[Supervisor]:
+    """One supervisor for most tests: after whatever a test did to its process, the next one is served."""
+    made = Supervisor()
+    yield made
+    made.close()
+
+
 @pytest.fixture
-def run(watcher: Supervisor, tmp_path: Path) -> Run:
+def run(shared: Supervisor, tmp_path: Path) -> Run:
     """Function that runs a stage under limits."""
 
     def go(stage: Stage, query: float = 1.0, cell: float = 30.0) -> Done | Failed | Unstored:
-        return watcher.run(Job(str(tmp_path), stage, query, cell, 8.0))
+        return shared.run(Job(str(tmp_path), stage, query, cell, 8.0))
 
     return go
 
@@ -127,8 +135,8 @@ def test_a_finish_that_dies_is_tried_once_more_with_what_is_there(run: Run) -> N
     assert found.status is Status.CRASHED
 
 
-def test_what_a_plugin_started_ends_with_its_process(run: Run, watcher: Supervisor) -> None:
-    assert isinstance(run(InPieces(("child",))), Done)
+def test_what_a_plugin_started_ends_with_its_process(watcher: Supervisor, tmp_path: Path) -> None:
+    assert isinstance(watcher.run(Job(str(tmp_path), InPieces(("child",)), 1.0, 30.0, 8.0)), Done)
     deadline = time.monotonic() + 10.0
     while not sleepers() and time.monotonic() < deadline:  # a process that has just begun has no name yet
         time.sleep(0.01)
@@ -170,15 +178,18 @@ def test_a_suspended_run_is_not_late(monkeypatch: pytest.MonkeyPatch, tmp_path: 
     assert 0.0 < state.seconds <= 1.0
 
 
-def test_limits_begin_when_the_work_begins(run: Run) -> None:
+def test_limits_begin_when_the_work_begins(watcher: Supervisor, tmp_path: Path) -> None:
     """A process starts and imports for about a second: none of it counts."""
-    found = run(Whole("fine"), cell=0.3)
+    found = watcher.run(Job(str(tmp_path), Whole("fine"), 1.0, 0.3, 8.0))
     assert isinstance(found, Done)
 
 
-def test_a_process_that_never_begins_is_given_up(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_process_that_never_begins_is_given_up(
+    watcher: Supervisor, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(supervisor, "START_SECONDS", 0.1)
-    assert run(Whole("fine")) == Failed(Status.CRASHED, "the worker process did not begin within 0.1 s")
+    found = watcher.run(Job(str(tmp_path), Whole("fine"), 1.0, 30.0, 8.0))
+    assert found == Failed(Status.CRASHED, "the worker process did not begin within 0.1 s")
 
 
 def test_a_talkative_job_can_be_stopped(watcher: Supervisor, tmp_path: Path) -> None:

@@ -63,7 +63,6 @@ def run(
     from vibench.cli.progress import ProgressDisplay
     from vibench.execution.run import Options, run_study
     from vibench.qp.status import Status
-    from vibench.report import figures
     from vibench.results import tables
     from vibench.study.cells import expand
     from vibench.study.reader import load_study
@@ -88,7 +87,11 @@ def run(
     if outcome.interrupted:
         echo(f"interrupted: {outcome.missing} cells have no row yet; the same command resumes the run")
         raise typer.Exit(130)
-    drawn = figures.draw_all(path, folder / "figures", jobs=min(options.jobs, provenance.cores())) if draw else []
+    drawn: list[Path] = []
+    if draw:
+        from vibench.report import figures
+
+        drawn = figures.draw_all(path, folder / "figures", jobs=min(options.jobs, provenance.cores()))
     _summarise(loaded.name, path, outcome.rows)
     echo(f"results: {path}, tables: {folder / 'tables'}, {len(drawn)} figures: {folder / 'figures'}")
     if strict and any(row["status"] not in (Status.OK, Status.UNAVAILABLE) for row in outcome.rows):

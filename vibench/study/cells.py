@@ -8,14 +8,16 @@ from collections.abc import Iterator
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from itertools import product
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from vibench.errors import RequestError
 from vibench.interfaces.strategies import Stop
 from vibench.provenance import NUMERICAL, core_code, solver_version
 from vibench.reduction.nested import NestedStrategy
 from vibench.study import registry
-from vibench.study.spec import Entry, Study, ToleranceTable
+
+if TYPE_CHECKING:  # worker processes have no use for the schema of study files
+    from vibench.study.spec import Entry, Study, ToleranceTable
 
 
 def digest(content: Any) -> str:
