@@ -126,7 +126,7 @@ def test_a_cluster_that_is_shut_down_stops_the_run_with_a_line_and_it_goes_on_wi
     assert err.splitlines()[-1].startswith("vibench: the dask ")
     assert err.splitlines()[-1].endswith("run the same command again to continue")
     (tmp_path / "go on").touch()
-    done = vibench(tmp_path, "run", path)
+    done = vibench(tmp_path, "run", path, "--jobs", "1")
     assert (done.returncode, done.stderr) == (0, "")
     assert "2 cells, 1 to run" in done.stdout
     assert "2 cells, 2 ok" in done.stdout
