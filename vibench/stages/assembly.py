@@ -28,17 +28,16 @@ Model = ReducedModel | HyperReducedModel
 
 @dataclass(frozen=True)
 class AffineDecomposition(Stage):
-    """Affine decomposition of A, f, B and g for their evaluation at reduced cost; it depends only on the problem."""
+    """Affine decomposition of A, f, B and g for their evaluation at reduced cost; it depends only on the problem.
+
+    The training matrices are not stored, they are assembled again.
+    """
 
     label = "affine decomposition"
     rooms = ("linalg", "interfaces", "model")
 
     problem: Plugin
     tolerance: float
-
-    def inputs(self) -> tuple[Stage, ...]:
-        """None: the training matrices are not stored, they are assembled again."""
-        return ()
 
     def run(self, store: Store) -> Result:  # noqa: ARG002
         """An `AffineMember` by name."""
@@ -89,10 +88,6 @@ class FullAssemblyTimes(Stage):
     problem: Plugin
     count: int
     seed: int
-
-    def inputs(self) -> tuple[Stage, ...]:
-        """None."""
-        return ()
 
     def run(self, store: Store) -> Result:  # noqa: ARG002
         """Time every assembly; the same for all reduced models that assemble in full."""

@@ -108,10 +108,6 @@ class TrainingConstraints(Stage):
 
     problem: Plugin
 
-    def inputs(self) -> tuple[Stage, ...]:
-        """None."""
-        return ()
-
     def run(self, store: Store) -> Result:  # noqa: ARG002
         """The `ConstraintClasses`."""
         problem = build_problem(self.problem)
