@@ -206,7 +206,8 @@ class HyperReducedModel:
         g = operators.g.at(samples.get("g")) if operators.g is not None else _projected_bound(self.model, contact)
         if operators.supremizer_coordinates is not None:
             Y, B = self._enriched(operators.supremizer_coordinates, samples, contact)
-            A, f, B = _symmetric_product(A, Y), Y.T @ f, B @ Y
+            A, f, B = Y.T @ (A @ Y), Y.T @ f, B @ Y
+            A = 0.5 * (A + A.T)
             lift = partial(_lift, operators.supremizer_coordinates, Y)
         else:
             B = self._constraint(samples, contact)
@@ -249,8 +250,3 @@ def _lift(space: Coordinates, Y: Array, x: Array) -> Array:
 def _projected_bound(model: ReducedModel, contact: Contact | None) -> Array:
     assert contact is not None  # evaluated by `HyperReducedModel.assemble`
     return np.asarray(model.generators.T @ contact.g)
-
-
-def _symmetric_product(A: Array, Y: Array) -> Array:
-    found = Y.T @ (A @ Y)
-    return np.asarray(0.5 * (found + found.T))
