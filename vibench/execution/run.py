@@ -153,9 +153,7 @@ def run_study(study: Study, folder: Path, observer: Observer, options: Options =
 
 def _to_do(cell: Cell, finished: Mapping[str, tuple[str, str]], retry: bool) -> bool:
     status, code = finished.get(cell.key, (None, None))
-    if status is None or code != cell.code:
-        return True
-    return retry and status != Status.OK
+    return code != cell.code or (retry and status != Status.OK)
 
 
 def _clear(folder: Path, study: Study) -> None:
