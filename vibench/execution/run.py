@@ -16,8 +16,7 @@ from vibench.errors import ExecutorError, RequestError, StorageError, VibenchErr
 from vibench.execution.dask import Dask
 from vibench.execution.executors import Executor, Local
 from vibench.execution.graph import Graph
-from vibench.execution.result_writer import ResultWriter
-from vibench.execution.row_keys import labels_of
+from vibench.execution.result_writer import ResultWriter, labels_of
 from vibench.execution.supervisor import Job
 from vibench.qp.solve import installed_solvers
 from vibench.qp.status import Status
