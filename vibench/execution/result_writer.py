@@ -58,7 +58,7 @@ class ResultWriter:
     def _tables(self, stage: Stage, tables: Mapping[str, Sequence[Row]]) -> None:
         keys = axis_columns(stage.axes, self.labels)
         for table, rows in tables.items():
-            self.database.replace_named(table, keys, [keys | row for row in rows])
+            self.database.replace(table, [keys | row for row in rows], **keys)
 
 
 def cell_columns(cell: Cell) -> dict[str, Any]:
