@@ -138,7 +138,9 @@ def hyper_reduce(model: ReducedModel, members: Mapping[str, AffineMember]) -> Op
         sampled_entries={name: (m.rows, m.columns) for name, m in members.items() if m.way is Evaluation.INTERPOLATED},
         A=A,
         f=ProjectedMember.of([Z.T @ term for term in members["f"].terms], members["f"]),
-        g=_bound(members["g"], model.generators),
+        g=None
+        if members["g"].way is Evaluation.CONTACT
+        else ProjectedMember.of([model.generators.T @ term for term in members["g"].terms], members["g"]),
         B=None
         if contact
         else ProjectedMember.of([chi.T @ np.asarray(B @ Z) for B in members["B"].terms], members["B"]),
@@ -147,11 +149,6 @@ def hyper_reduce(model: ReducedModel, members: Mapping[str, AffineMember]) -> Op
         basis=basis,
         factor=scipy.linalg.cholesky(A.at(None), lower=True) if dual_is_regular else None,
     )
-
-
-def _bound(member: AffineMember, chi: Array) -> ProjectedMember | None:
-    contact = member.way is Evaluation.CONTACT
-    return None if contact else ProjectedMember.of([chi.T @ term for term in member.terms], member)
 
 
 def _supremizer_space(model: ReducedModel, B: AffineMember, eta: Array) -> Coordinates:
