@@ -20,7 +20,7 @@ from matplotlib.figure import Figure
 from palette import use_palette
 
 from vibench.report.figures.data import label
-from vibench.report.figures.style import COLOURS, MARKERS, Sheet, logarithmic, plot, save, styled
+from vibench.report.figures.style import COLOURS, MARKERS, Sheet, plot, save, styled
 from vibench.results import tables
 
 SHARES = (0.3, 0.5, 0.7, 0.9)
@@ -204,7 +204,7 @@ def scatter(field: Field, cost: Callable[[pd.DataFrame], pd.Series], xlabel: str
             best["cost"], best["error_lambda_mean"], color="0.6", linewidth=0.8, drawstyle="steps-post", zorder=0
         )
         panel.set(title=problem, xlabel=xlabel, ylabel="mean relative error of λ")
-        logarithmic(panel, "xy")
+        panel.set(xscale="log", yscale="log")
     return sheet.finish()
 
 

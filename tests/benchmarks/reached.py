@@ -158,7 +158,7 @@ def of_queries(material: Material, model: Model, solve: Solve, accuracy: float) 
 
 def _errors(material: Material, query: Query, u: Array, lam: Array) -> dict[str, float]:
     (found,) = errors(material.problem, [query.vi], query.exact, u[:, None], lam[:, None])
-    return {"error_u": found.u, "error_lambda": found.lam}
+    return {"error_u": found.error_u, "error_lambda": found.error_lambda}
 
 
 def of_answer(program: VariationalInequality, answer: QPSolution, accuracy: float) -> Info:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
+from statistics import fmean
 from typing import Any
 
 from rich.console import Console
@@ -35,12 +36,8 @@ class TimeLeft:
         if not self._done:
             return None
         every = [wall for walls in self._done.values() for wall in walls]
-        overall = sum(every) / len(every)
-        total = 0.0
-        for sort, count in self._left.items():
-            walls = self._done.get(sort)
-            total += max(count, 0) * (sum(walls) / len(walls) if walls else overall)
-        return total / self._jobs
+        left = (max(count, 0) * fmean(self._done.get(sort, every)) for sort, count in self._left.items())
+        return sum(left) / self._jobs
 
 
 def duration(seconds: float) -> str:

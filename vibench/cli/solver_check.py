@@ -14,7 +14,7 @@ from vibench.qp.solve import solve_qp
 from vibench.qp.status import Status
 from vibench.qp.verification import verify
 from vibench.stages.artefacts import Store
-from vibench.stages.base import Done, Failed, Pieces, PiecewiseStage, Stage
+from vibench.stages.base import Done, Failed, Pieces, PiecewiseStage
 from vibench.study import registry
 from vibench.study.spec import Limits
 
@@ -57,10 +57,6 @@ class SolverTrials(PiecewiseStage, Pieces):
     def pieces(self) -> int:
         """Number of solvers."""
         return len(self.solvers)
-
-    def inputs(self) -> tuple[Stage, ...]:
-        """No stage."""
-        return ()
 
     def begin(self, store: Store) -> Pieces:  # noqa: ARG002
         """Nothing to prepare."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sqlite3
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from contextlib import closing
 from dataclasses import dataclass
 from functools import cached_property
@@ -12,6 +12,7 @@ from typing import Any
 
 from vibench.arrays import Array
 from vibench.errors import RequestError
+from vibench.execution.graph import Graph
 from vibench.execution.supervisor import Job, Supervisor
 from vibench.interfaces.problem import VariationalInequality
 from vibench.interfaces.validation import validation_parameters
@@ -61,8 +62,7 @@ class RecordedCell:
                 "run its study again"
             )
         store, assembly = usable_store(), assembly_stage(self.cell)
-        for stage in assembly.model_inputs:
-            _provide(stage, store)
+        _provide(assembly.model_inputs, store)
         return assembly.model(store)[0]
 
     @cached_property
@@ -83,33 +83,22 @@ class RecordedCell:
         return {int(row["query"]): row for row in found}
 
 
-def _provide(stage: Stage, store: Store) -> None:
-    """Run a stage, and the inputs it needs, if its artefact is missing; in a supervised process, as in a run.
+def _provide(stages: Iterable[Stage], store: Store) -> None:
+    """Run the stages whose artefacts are missing, and the inputs they need; in a supervised process, as in a run.
 
     Raises
     ------
     RequestError
         If one of them fails.
     """
-    missing: dict[str, Stage] = {}
-    _collect(stage, store, missing)
-    supervisor = Supervisor()
-    try:
-        with store.used():
-            for needed in missing.values():
-                outcome = supervisor.run(Job(str(store.folder), needed, *UNLIMITED))
-                if not isinstance(outcome, Done):
-                    raise RequestError(f"{needed.label}, a stage of the cell, failed when run again: {outcome.reason}")
-    finally:
-        supervisor.close()
-
-
-def _collect(stage: Stage, store: Store, missing: dict[str, Stage]) -> None:
-    """Add a stage and its inputs that are not in the store, in the order in which they have to run."""
-    if stage.key not in missing and store.get(stage.key) is None:
-        for needed in stage.inputs():
-            _collect(needed, store, missing)
-        missing[stage.key] = stage
+    graph = Graph()
+    for stage in stages:
+        graph.add_goal(stage, lambda needed: store.get(needed.key) is not None)
+    with closing(Supervisor()) as supervisor, store.used():
+        for stage in graph.stages.values():  # inputs come first
+            outcome = supervisor.run(Job(str(store.folder), stage, *UNLIMITED))
+            if not isinstance(outcome, Done):
+                raise RequestError(f"{stage.label}, a stage of the cell, failed when run again: {outcome.reason}")
 
 
 def recorded_cells(run: str) -> list[RecordedCell]:

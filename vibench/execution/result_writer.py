@@ -1,4 +1,4 @@
-"""What a run writes into its results file, and when: rows of cells, histories and pictures, with their provenance."""
+"""What a run writes into its results file: rows of cells, histories and pictures, with keys and provenance."""
 
 from __future__ import annotations
 
@@ -8,12 +8,11 @@ from dataclasses import dataclass
 from typing import Any
 
 from vibench import provenance
-from vibench.execution.row_keys import axis_columns, cell_columns
 from vibench.results.database import ResultsDatabase
 from vibench.stages.artefacts import History, Store
 from vibench.stages.base import Row, Stage, value_of
 from vibench.stages.cell_queries import CellRows
-from vibench.study.cells import Cell, Plugin, digest
+from vibench.study.cells import Axes, Cell, Plugin, digest
 from vibench.study.spec import Study
 
 
@@ -28,14 +27,27 @@ class ResultWriter:
     def cell(self, cell: Cell, found: CellRows) -> Row:
         """Write the rows of a cell; returns its own."""
         keys = cell_columns(cell)
-        row = {"cell": cell.key, **keys, "machine": provenance.machine(), **found.cell, **self._provenance(cell)}
+        row = {"cell": cell.key, **keys, "machine": provenance.machine(), **found.cell}
+        row |= {
+            "seed": cell.seed,
+            "study_hash": digest(self.study.model_dump(mode="json")),
+            "code": cell.code,
+            "threads": 1,
+            "versions": json.dumps(provenance.versions(cell.solver), sort_keys=True),
+            "definition": cell.definition,
+        }
         queries = [{"cell": cell.key, **keys, "query": k, **query} for k, query in enumerate(found.queries)]
         self.database.write_cell(row, queries, [{"cell": cell.key, **solution} for solution in found.solutions])
         return row
 
     def stage(self, stage: Stage, histories: Iterable[History], store: Store) -> None:
         """Write the histories and rows of a stage whose value is stored."""
-        self._histories(stage, histories)
+        keys, found = axis_columns(stage.axes, self.labels), []
+        for history in histories:
+            named = {"artefact": stage.key, "stage": history.stage, **keys, "quantity": history.quantity}
+            found.append([named | {"step": history.first_step + k, "value": v} for k, v in enumerate(history.values)])
+        if found:
+            self.database.write_histories(found, partial=stage.partial)
         if type(stage).rows is not Stage.rows:  # artefacts are large: read only if rows are made of them
             self._tables(stage, stage.rows(value_of(store, stage)))
 
@@ -46,23 +58,31 @@ class ResultWriter:
     def _tables(self, stage: Stage, tables: Mapping[str, Sequence[Row]]) -> None:
         keys = axis_columns(stage.axes, self.labels)
         for table, rows in tables.items():
-            self.database.replace_named(table, keys, [keys | row for row in rows])
+            self.database.replace(table, [keys | row for row in rows], **keys)
 
-    def _provenance(self, cell: Cell) -> dict[str, Any]:
-        return {
-            "seed": cell.seed,
-            "study_hash": digest(self.study.model_dump(mode="json")),
-            "code": cell.code,
-            "threads": 1,
-            "versions": json.dumps(provenance.versions(cell.solver), sort_keys=True),
-            "definition": cell.definition,
-        }
 
-    def _histories(self, stage: Stage, histories: Iterable[History]) -> None:
-        keys = axis_columns(stage.axes, self.labels)
-        found = []
-        for history in histories:
-            named = {"artefact": stage.key, "stage": history.stage, **keys, "quantity": history.quantity}
-            found.append([named | {"step": history.first_step + k, "value": v} for k, v in enumerate(history.values)])
-        if found:
-            self.database.write_histories(found, partial=stage.partial)
+def cell_columns(cell: Cell) -> dict[str, Any]:
+    """The key columns of a cell."""
+    labels = dict(zip((cell.problem, cell.dual, cell.primal), cell.labels, strict=True))
+    return {**axis_columns(cell.axes, labels), "solver": cell.solver, "assembly": cell.assembly}
+
+
+def labels_of(cells: Iterable[Cell]) -> dict[Plugin, str]:
+    """The names of a study's plugins in its results: their labels in the first cell that has them."""
+    found: dict[Plugin, str] = {}
+    for cell in cells:
+        for plugin, label in zip((cell.problem, cell.dual, cell.primal), cell.labels, strict=True):
+            found.setdefault(plugin, label)
+    return found
+
+
+def axis_columns(axes: Axes, labels: Mapping[Plugin, str]) -> dict[str, Any]:
+    """The key columns of some axes; unset axes have none."""
+    columns: dict[str, Any] = {}
+    for name, plugin in (("problem", axes.problem), ("dual", axes.dual), ("primal", axes.primal)):
+        if plugin is not None:
+            columns |= {name: labels[plugin], f"{name}_options": plugin.options}
+    for name, stop in (("pod", axes.pod), ("dual", axes.cone)):
+        if stop is not None:
+            columns |= {f"{name}_tol": stop.tolerance, f"{name}_size": stop.size}
+    return columns if axes.primal is None else columns | {"primal_tol": axes.primal_tol}

@@ -16,8 +16,7 @@ from vibench.errors import ExecutorError, RequestError, StorageError, VibenchErr
 from vibench.execution.dask import Dask
 from vibench.execution.executors import Executor, Local
 from vibench.execution.graph import Graph
-from vibench.execution.result_writer import ResultWriter
-from vibench.execution.row_keys import labels_of
+from vibench.execution.result_writer import ResultWriter, labels_of
 from vibench.execution.supervisor import Job
 from vibench.qp.solve import installed_solvers
 from vibench.qp.status import Status
@@ -153,9 +152,7 @@ def run_study(study: Study, folder: Path, observer: Observer, options: Options =
 
 def _to_do(cell: Cell, finished: Mapping[str, tuple[str, str]], retry: bool) -> bool:
     status, code = finished.get(cell.key, (None, None))
-    if status is None or code != cell.code:
-        return True
-    return retry and status != Status.OK
+    return code != cell.code or (retry and status != Status.OK)
 
 
 def _clear(folder: Path, study: Study) -> None:

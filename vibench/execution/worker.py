@@ -93,7 +93,7 @@ def perform(job: Job, progress: Progress, send: Send) -> Done | Failed | Unstore
     except StorageError as error:
         return Unstored(str(error))
     except _NoMemoryError:
-        return OutOfMemory(_out_of_memory(job))
+        return OutOfMemory(Failed(Status.ERROR, f"out of memory: the limit is memory_gib = {job.memory_gib:g}"))
 
 
 def _check_code(job: Job) -> None:
@@ -125,10 +125,6 @@ def _pieces(job: Job, store: Store, progress: Progress, send: Send) -> Any:
 
 def _announce(send: Send, number: int, on: bool) -> None:
     send(Watch(number, on))
-
-
-def _out_of_memory(job: Job) -> Failed:
-    return Failed(Status.ERROR, f"out of memory: the limit is memory_gib = {job.memory_gib:g}")
 
 
 def _guarded(memory_gib: float, work: Callable[[], T]) -> T | Failed:

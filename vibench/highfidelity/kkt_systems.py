@@ -167,17 +167,8 @@ def _scaled(rows: Array, matrix: SparseMatrix, columns: Array) -> SparseMatrix:
 
 def _saddle_point_matrix(A: SparseMatrix, B: SparseMatrix) -> SparseMatrix:
     """[[A, Bᵀ], [B, 0]] (CSC) of a symmetric A (c×c) and of B (m×c), both CSR."""
-    below = sp.csc_array(B)
-    ends = A.indptr + below.indptr  # each column of A continues with a column of B below it
-    last = int(ends[-1])
-    data, rows = np.empty(last + B.nnz), np.empty(last + B.nnz, dtype=A.indices.dtype)
-    upper = np.arange(A.nnz) + np.repeat(below.indptr[:-1], np.diff(A.indptr))
-    lower = np.arange(B.nnz) + np.repeat(A.indptr[1:], np.diff(below.indptr))
-    data[upper], rows[upper] = A.data, A.indices
-    data[lower], rows[lower] = below.data, A.shape[0] + below.indices
-    data[last:], rows[last:] = B.data, B.indices
-    size = A.shape[0] + B.shape[0]
-    return sp.csc_array((data, rows, np.concatenate([ends, last + B.indptr[1:]])), shape=(size, size))
+    zero = sp.csr_array((B.shape[0], B.shape[0]))  # where all blocks are CSR, SciPy stacks them without triplets
+    return sp.block_array([[A, sp.csr_array(B.T)], [B, zero]], format="csr").T
 
 
 class _BorderedFactorisation:

@@ -25,13 +25,18 @@ def check_cone(cone: object, W: InnerProduct) -> Cone:
     if not isinstance(cone, Cone):
         raise NumericalError(f"the dual strategy returned a {type(cone).__name__}, expected a Cone")
     chi = _matrix("generators", cone.generators, W.dim)
-    if chi.shape[1] and np.max(np.abs(W.norm(chi) - 1.0)) > ROUND_OFF:
-        raise NumericalError("the generators do not all have unit norm in W")
+    norms = W.norm(chi)
+    away = np.abs(norms - 1.0)
+    if away.max(initial=0.0) > ROUND_OFF:
+        found = f"generator {away.argmax()} has norm {norms[away.argmax()]:.6g}"
+        raise NumericalError(f"the generators do not all have unit norm in W: {found}")
     if cone.free.shape != (chi.shape[1],):
         raise NumericalError(f"'free' has shape {cone.free.shape} for {chi.shape[1]} generators")
-    smallest = float(np.min(chi[:, ~cone.free], initial=0.0))
-    if smallest < 0.0:
-        raise NumericalError(f"a generator has the negative coefficient {smallest:.1e} and is not declared free")
+    signed = np.where(cone.free, 0.0, chi)
+    if signed.min(initial=0.0) < 0.0:
+        i, r = np.unravel_index(signed.argmin(), signed.shape)
+        found = f"the negative coefficient {signed[i, r]:.1e} and is not declared free"
+        raise NumericalError(f"a generator has {found}: look at coefficient {i} of generator {r}")
     return cone
 
 
@@ -50,7 +55,12 @@ def check_enrichment(enrichment: object, V: InnerProduct, basis: Array) -> Enric
         off = V.gram(np.hstack([basis, vectors]), vectors)
         off[basis.shape[1] :] -= np.eye(vectors.shape[1])
         if np.max(np.abs(off), initial=0.0) > ROUND_OFF:
-            raise NumericalError("the vectors of the enrichment are not orthonormal in V and orthogonal to V_N")
+            i, j = (int(k) for k in np.unravel_index(np.abs(off).argmax(), off.shape))
+            other = f"mode {i} of V_N" if i < basis.shape[1] else f"vector {i - basis.shape[1]}"
+            raise NumericalError(
+                "the vectors of the enrichment are not orthonormal in V and orthogonal to V_N: "
+                f"the inner product of vector {j} with {other} is off by {off[i, j]:.1e}"
+            )
     return enrichment
 
 
@@ -58,8 +68,9 @@ def _matrix(name: str, value: object, rows: int) -> Array:
     if not isinstance(value, np.ndarray) or value.ndim != 2 or value.shape[0] != rows:
         found = getattr(value, "shape", type(value).__name__)
         raise NumericalError(f"the {name} have shape {found}, expected ({rows}, count)")
-    if not np.all(np.isfinite(value)):
-        raise NumericalError(f"the {name} have entries that are not finite")
+    wrong = np.flatnonzero(~np.isfinite(value).all(axis=0))
+    if len(wrong):
+        raise NumericalError(f"the {name} have entries that are not finite, the first in column {wrong[0]}")
     return value
 
 

@@ -31,13 +31,13 @@ class Reference:
 
 @dataclass(frozen=True)
 class Errors:
-    """Errors of one reduced solution against the high-fidelity one at the same parameter.
+    """Errors of one reduced solution against the high-fidelity one at the same parameter, named as in the results.
 
     Attributes
     ----------
-    u, lam, energy
+    error_u, error_lambda, error_energy
         Relative, in the norms of V, of W and of A(mu).
-    absolute_u, absolute_lam
+    error_u_absolute, error_lambda_absolute
         The first two without the division.
     violation
         Largest (B u_N − g)₊, each row over the integral of its multiplier function [unit of u].
@@ -45,11 +45,11 @@ class Errors:
         λᵀ(B u_N − g) with the high-fidelity multiplier; with λ_N it would only repeat the gap of the QP solver.
     """
 
-    u: float
-    lam: float
-    energy: float
-    absolute_u: float
-    absolute_lam: float
+    error_u: float
+    error_lambda: float
+    error_energy: float
+    error_u_absolute: float
+    error_lambda_absolute: float
     violation: float
     complementarity: float
 
@@ -66,11 +66,11 @@ def errors(
     excesses = [vi.B @ u[:, k] - vi.g for k, vi in enumerate(vis)]
     return [
         Errors(
-            u=ratio(float(error_u[k]), float(norm_u[k])),
-            lam=ratio(float(error_lam[k]), float(norm_lam[k])),
-            energy=ratio(_energy(vi, du[:, k]), _energy(vi, reference.u[:, k])),
-            absolute_u=float(error_u[k]),
-            absolute_lam=float(error_lam[k]),
+            error_u=ratio(float(error_u[k]), float(norm_u[k])),
+            error_lambda=ratio(float(error_lam[k]), float(norm_lam[k])),
+            error_energy=ratio(_energy(vi, du[:, k]), _energy(vi, reference.u[:, k])),
+            error_u_absolute=float(error_u[k]),
+            error_lambda_absolute=float(error_lam[k]),
             violation=float(np.max(excesses[k] / integrals, initial=0.0)),
             complementarity=float(reference.lam[:, k] @ excesses[k]),
         )

@@ -138,7 +138,9 @@ def hyper_reduce(model: ReducedModel, members: Mapping[str, AffineMember]) -> Op
         sampled_entries={name: (m.rows, m.columns) for name, m in members.items() if m.way is Evaluation.INTERPOLATED},
         A=A,
         f=ProjectedMember.of([Z.T @ term for term in members["f"].terms], members["f"]),
-        g=_bound(members["g"], model.generators),
+        g=None
+        if members["g"].way is Evaluation.CONTACT
+        else ProjectedMember.of([model.generators.T @ term for term in members["g"].terms], members["g"]),
         B=None
         if contact
         else ProjectedMember.of([chi.T @ np.asarray(B @ Z) for B in members["B"].terms], members["B"]),
@@ -147,11 +149,6 @@ def hyper_reduce(model: ReducedModel, members: Mapping[str, AffineMember]) -> Op
         basis=basis,
         factor=scipy.linalg.cholesky(A.at(None), lower=True) if dual_is_regular else None,
     )
-
-
-def _bound(member: AffineMember, chi: Array) -> ProjectedMember | None:
-    contact = member.way is Evaluation.CONTACT
-    return None if contact else ProjectedMember.of([chi.T @ term for term in member.terms], member)
 
 
 def _supremizer_space(model: ReducedModel, B: AffineMember, eta: Array) -> Coordinates:
@@ -206,7 +203,8 @@ class HyperReducedModel:
         g = operators.g.at(samples.get("g")) if operators.g is not None else _projected_bound(self.model, contact)
         if operators.supremizer_coordinates is not None:
             Y, B = self._enriched(operators.supremizer_coordinates, samples, contact)
-            A, f, B = _symmetric_product(A, Y), Y.T @ f, B @ Y
+            A, f, B = Y.T @ (A @ Y), Y.T @ f, B @ Y
+            A = 0.5 * (A + A.T)
             lift = partial(_lift, operators.supremizer_coordinates, Y)
         else:
             B = self._constraint(samples, contact)
@@ -249,8 +247,3 @@ def _lift(space: Coordinates, Y: Array, x: Array) -> Array:
 def _projected_bound(model: ReducedModel, contact: Contact | None) -> Array:
     assert contact is not None  # evaluated by `HyperReducedModel.assemble`
     return np.asarray(model.generators.T @ contact.g)
-
-
-def _symmetric_product(A: Array, Y: Array) -> Array:
-    found = Y.T @ (A @ Y)
-    return np.asarray(0.5 * (found + found.T))

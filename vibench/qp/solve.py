@@ -17,7 +17,7 @@ import scipy.linalg
 import scipy.sparse as sp
 
 from vibench.arrays import Array, SparseMatrix
-from vibench.errors import NumericalError, unknown_name
+from vibench.errors import NumericalError
 from vibench.interfaces.problem import VariationalInequality
 from vibench.qp.scaling import row_norms, size
 from vibench.qp.settings import SETTINGS
@@ -116,13 +116,6 @@ def _solve_dual(
 def installed_solvers(extra: Iterable[str] = ()) -> list[str]:
     """Names of the installed solvers, with those that plugins register as `extra`."""
     return sorted(set(qpsolvers.available_solvers) & set(SETTINGS) | set(extra))
-
-
-def check_solver_name(solver: str, extra: Iterable[str] = ()) -> None:
-    """Refuse a name that is neither in the settings table nor registered by a plugin, installed or not."""
-    known = set(SETTINGS) | set(extra)
-    if solver not in known:
-        raise unknown_name("QP solver", solver, known)
 
 
 def takes_start(solver: str) -> bool:

@@ -132,14 +132,10 @@ class ResultsDatabase:
                 within = f" AND step BETWEEN {min(steps)} AND {max(steps)}" if partial else ""
                 self._replace("histories", {name: rows[0].get(name) for name in NAMED}, rows, within)
 
-    def replace_named(self, table: str, keys: Mapping[str, Any], rows: Sequence[Mapping[str, Any]]) -> None:
-        """Write rows of a table; earlier rows with these values in the columns `keys` are replaced."""
+    def replace(self, table: str, rows: Sequence[Mapping[str, Any]], **keys: Any) -> None:
+        """Replace all rows of a table, or those with these values in the columns `keys`."""
         with self._writing():
             self._replace(table, keys, rows)
-
-    def replace(self, table: str, rows: Sequence[Mapping[str, Any]]) -> None:
-        """Replace all rows of a table."""
-        self.replace_named(table, {}, rows)
 
     def _replace(
         self, table: str, keys: Mapping[str, Any], rows: Sequence[Mapping[str, Any]], within: str = ""

@@ -20,7 +20,7 @@ from vibench.stages.assemblies import assemblies
 from vibench.stages.base import Result, Stage, build_problem, value_of
 from vibench.stages.enrichment import EnrichmentStage, GrowthStage, enrichment_stage
 from vibench.study.cells import Cell, Plugin
-from vibench.timing import NO_TIME, REPEATS, Seconds, median_of, median_seconds, timed
+from vibench.timing import REPEATS, Seconds, median_of, median_seconds, timed
 
 Model = ReducedModel | HyperReducedModel
 """A model that assembles the reduced program at a parameter."""
@@ -28,7 +28,10 @@ Model = ReducedModel | HyperReducedModel
 
 @dataclass(frozen=True)
 class AffineDecomposition(Stage):
-    """Affine decomposition of A, f, B and g for their evaluation at reduced cost; it depends only on the problem."""
+    """Affine decomposition of A, f, B and g for their evaluation at reduced cost; it depends only on the problem.
+
+    The training matrices are not stored, they are assembled again.
+    """
 
     label = "affine decomposition"
     rooms = ("linalg", "interfaces", "model")
@@ -36,22 +39,10 @@ class AffineDecomposition(Stage):
     problem: Plugin
     tolerance: float
 
-    def inputs(self) -> tuple[Stage, ...]:
-        """None: the training matrices are not stored, they are assembled again."""
-        return ()
-
     def run(self, store: Store) -> Result:  # noqa: ARG002
         """An `AffineMember` by name."""
         problem = build_problem(self.problem)
         return Result(*timed(lambda: affine_decomposition(problem, training_parameters(problem), self.tolerance)))
-
-
-@dataclass(frozen=True)
-class Reduction:
-    """The projected members of a reduced model, or why there are none and queries are assembled in full."""
-
-    operators: Operators | None
-    why_full: str
 
 
 @dataclass(frozen=True)
@@ -69,14 +60,11 @@ class HyperReduction(Stage):
         return (*self.enrichment.model_inputs, self.decomposition)
 
     def run(self, store: Store) -> Result:
-        """A `Reduction`."""
+        """The `Operators` of a reduced model, or why there are none and queries are assembled in full."""
         model = self.enrichment.model(store)
         members: Mapping[str, AffineMember] = value_of(store, self.decomposition)
         why = reason_for_full_assembly(model, members)
-        if why:
-            return Result(Reduction(None, why), NO_TIME)
-        operators, seconds = timed(lambda: hyper_reduce(model, members))
-        return Result(Reduction(operators, ""), seconds)
+        return Result(why) if why else Result(*timed(lambda: hyper_reduce(model, members)))
 
 
 @dataclass(frozen=True)
@@ -89,10 +77,6 @@ class FullAssemblyTimes(Stage):
     problem: Plugin
     count: int
     seed: int
-
-    def inputs(self) -> tuple[Stage, ...]:
-        """None."""
-        return ()
 
     def run(self, store: Store) -> Result:  # noqa: ARG002
         """Time every assembly; the same for all reduced models that assemble in full."""
@@ -205,10 +189,10 @@ class AssemblyStage(Stage):
         model = self.enrichment.model(store)
         if self.reduction is None:
             return model, ""
-        reduction: Reduction = value_of(store, self.reduction)
-        if reduction.operators is None:
-            return model, f"assembled in full: {reduction.why_full}"
-        return HyperReducedModel(model, reduction.operators), ""
+        reduced: Operators | str = value_of(store, self.reduction)
+        if isinstance(reduced, str):
+            return model, f"assembled in full: {reduced}"
+        return HyperReducedModel(model, reduced), ""
 
     def columns(self, store: Store) -> dict[str, float | int | None]:
         """Columns of a cell: tolerance, training error and terms of every member; none for assembly in full."""

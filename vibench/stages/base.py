@@ -94,7 +94,7 @@ class Stage(ABC):
             __file__,
             str(sys.modules[type(self).__module__].__file__),
         )
-        own = {part.name: _described(getattr(self, part.name)) for part in fields(self)}  # type: ignore[arg-type]
+        own = {name: _described(value) for name, value in self._fields().items()}
         content = [type(self).__name__, core_code(*parts), libraries(), own, [stage.key for stage in self.inputs()]]
         return f"{self.label.lower().replace(' ', '-')}-{digest(content)}"
 
@@ -108,15 +108,18 @@ class Stage(ABC):
         """The axes of the study that the stage depends on; they name its histories."""
         return Axes()
 
+    def _fields(self) -> dict[str, Any]:
+        return {part.name: getattr(self, part.name) for part in fields(self)}  # type: ignore[arg-type]
+
     def plugins(self) -> Iterator[Plugin]:
         """The plugins that the stage and its inputs depend on."""
-        yield from (value for part in fields(self) if isinstance(value := getattr(self, part.name), Plugin))  # type: ignore[arg-type]
+        yield from (value for value in self._fields().values() if isinstance(value, Plugin))
         for stage in self.inputs():
             yield from stage.plugins()
 
-    @abstractmethod
     def inputs(self) -> tuple[Stage, ...]:
-        """Stages whose artefacts `run` reads itself; what these read in turn is not repeated."""
+        """Stages whose artefacts `run` reads itself, by default those among the fields; theirs are not repeated."""
+        return tuple(value for value in self._fields().values() if isinstance(value, Stage))
 
     @abstractmethod
     def run(self, store: Store) -> Result:

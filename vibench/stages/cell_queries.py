@@ -31,7 +31,7 @@ from vibench.stages.infsup_constants import (
     ValidationConstraints,
 )
 from vibench.stages.offline import ReducedCone
-from vibench.stages.query import Query, QuerySolver, error_columns
+from vibench.stages.query import Query, error_columns, run_query
 from vibench.stages.snapshots import gather, training_stages, validation_stages
 from vibench.study.cells import Cell
 from vibench.timing import calibration
@@ -150,13 +150,12 @@ class _Queries(Pieces):
         self._programs: ReducedPrograms = value_of(store, stage.assembly)
         self._own, self._full, self._plain = (value_of(store, known) for known in stage.constants)
         self._stability: list[Stability] = value_of(store, stage.reference)
-        self._solver = QuerySolver(stage.solver, stage.accuracy, stage.query_seconds)
 
     def piece(self, number: int, watch: Callable[[bool], None]) -> QueryRows:
         """The rows of one query."""
-        reduced, k = self._programs, number
+        reduced, stage, k = self._programs, self._stage, number
         query = Query(reduced.programs[k], reduced.factor, reduced.seconds[k], self._start(k))
-        found, solution = self._solver.run(query, watch)
+        found, solution = run_query(query, stage.solver, stage.accuracy, stage.query_seconds, watch)
         return self._known(k) | found, solution and {"query": k} | solution
 
     @cached_property

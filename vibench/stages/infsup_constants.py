@@ -33,10 +33,6 @@ class ValidationConstraints(Stage):
     count: int
     seed: int
 
-    def inputs(self) -> tuple[Stage, ...]:
-        """None."""
-        return ()
-
     def run(self, store: Store) -> Result:  # noqa: ARG002
         """The `ConstraintClasses`."""
         problem = build_problem(self.problem)
@@ -52,10 +48,6 @@ class ReferenceConstants(Stage):
     rooms = ("linalg", "interfaces", "reduction", "stability", "model")
 
     constraints: ValidationConstraints
-
-    def inputs(self) -> tuple[Stage, ...]:
-        """The constraint matrices."""
-        return (self.constraints,)
 
     def run(self, store: Store) -> Result:
         """Compute the constants."""
@@ -78,10 +70,6 @@ class FullConstants(Stage):
     cone: ConeStage
     constraints: ValidationConstraints
 
-    def inputs(self) -> tuple[Stage, ...]:
-        """The cone and the constraint matrices."""
-        return (self.cone, self.constraints)
-
     def run(self, store: Store) -> Result:
         """Compute the constants."""
         classes, cone = value_of(store, self.constraints), value_of(store, self.cone).prepared
@@ -98,10 +86,6 @@ class PlainConstants(Stage):
     pod: PODStage
     cone: ConeStage
     constraints: ValidationConstraints
-
-    def inputs(self) -> tuple[Stage, ...]:
-        """The basis, the cone and the constraint matrices."""
-        return (self.pod, self.cone, self.constraints)
 
     def run(self, store: Store) -> Result:
         """Compute the constants."""

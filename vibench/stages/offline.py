@@ -19,7 +19,7 @@ from vibench.stages.artefacts import History, Store
 from vibench.stages.base import Result, Stage, build_problem, value_of
 from vibench.stages.snapshots import gather, training_stages
 from vibench.study.cells import Axes, Plugin
-from vibench.timing import Stopwatch, timed
+from vibench.timing import timed
 
 
 @dataclass(frozen=True)
@@ -86,17 +86,13 @@ class ConeStage(Stage):
         """Reduce; histories are the projection error and e_orth over the number of generators."""
         snapshots, W = gather(store, self.inputs()).lam, build_problem(self.problem).W
         strategy = self.dual.create()
-        watch = Stopwatch()
-        cone = strategy.reduce(snapshots, W, self.stop)
-        spent = watch.seconds()
+        cone, reducing = timed(lambda: strategy.reduce(snapshots, W, self.stop))
         check_cone(cone, W)  # verification, which is not part of the offline time
-        watch = Stopwatch()
-        prepared = multipliers(cone.generators, W, cone.free)
-        seconds = spent + watch.seconds()
+        prepared, preparing = timed(lambda: multipliers(cone.generators, W, cone.free))
         found = ReducedCone(cone, prepared, float(np.linalg.cond(prepared.gram)) if cone.size else None)
         orthogonal = orthogonality(cone.generators, W, cone.free)
         histories = History("cone", "error", tuple(cone.errors)), History("cone", "e_orth", tuple(orthogonal))
-        return Result(found, seconds, histories)
+        return Result(found, reducing + preparing, histories)
 
 
 @dataclass(frozen=True)
@@ -107,10 +103,6 @@ class TrainingConstraints(Stage):
     rooms = ("linalg", "interfaces", "reduction")
 
     problem: Plugin
-
-    def inputs(self) -> tuple[Stage, ...]:
-        """None."""
-        return ()
 
     def run(self, store: Store) -> Result:  # noqa: ARG002
         """The `ConstraintClasses`."""

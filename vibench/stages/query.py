@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import partial
 
 import numpy as np
@@ -50,58 +50,53 @@ class Query:
     start: tuple[int, VariationalInequality] | None = None
 
 
-@dataclass(frozen=True)
-class QuerySolver:
-    """A QP solver, the accuracy to which its solutions are verified, and its time limit in seconds."""
+def run_query(
+    query: Query, solver: str, accuracy: float, query_seconds: float, watch: Callable[[bool], None]
+) -> tuple[Row, Row | None]:
+    """The columns of a query, and those of its solution if there is one.
 
-    solver: str
-    accuracy: float
-    query_seconds: float
+    Its solution is verified to `accuracy`; a solver that takes more than `query_seconds` has the status timeout.
+    `watch(True)` is called, untimed, before the solver begins and `watch(False)` when it has returned.
+    """
+    program, assembly, extra = query.program, query.seconds, registry.qp_solver(solver)
+    row: Row = {"assemble_s": assembly.cpu, "form": "primal" if query.factor is None else "dual"}
+    repeats: list[QPSolution] = []
+    start: QPSolution | None = None
 
-    def run(self, query: Query, watch: Callable[[bool], None]) -> tuple[Row, Row | None]:
-        """The columns of a query, and those of its solution if there is one.
+    def work() -> QPSolution:
+        repeats.append(solve_qp(program, solver, accuracy, extra, query.factor, start))
+        return repeats[-1]
 
-        `watch(True)` is called, untimed, before the solver begins and `watch(False)` when it has returned.
-        """
-        program, assembly, extra = query.program, query.seconds, registry.qp_solver(self.solver)
-        row: Row = {"assemble_s": assembly.cpu, "form": "primal" if query.factor is None else "dual"}
-        repeats: list[QPSolution] = []
-        start: QPSolution | None = None
-
-        def work() -> QPSolution:
-            repeats.append(solve_qp(program, self.solver, self.accuracy, extra, query.factor, start))
-            return repeats[-1]
-
-        try:
-            # The solution to start from belongs to an earlier query: its seconds are not those of this one.
-            if query.start is not None and takes_start(self.solver):
-                watch(True)
-                row["started_from"], similar = query.start
-                start = solve_qp(similar, self.solver, self.accuracy, extra, query.factor)
-            solution, solving = median_seconds(work, before=partial(watch, True))
-            watch(False)
-        except MemoryError:
-            raise
-        except (Exception, SystemExit) as error:  # noqa: BLE001  a solver may raise anything; recorded in the row
-            return row | {"status": Status.ERROR.value, "reason": in_a_line(error)}, None
-        status, reason, residuals = verify(program, solution, self.accuracy)
-        if solving.wall > self.query_seconds:
-            status, reason = Status.TIMEOUT, f"took {solving.wall:.1f} s, the limit is {self.query_seconds:g} s"
-        row |= {
-            "solve_s": solving.cpu,
-            "total_s": assembly.cpu + solving.cpu,
-            "total_wall_s": assembly.wall + solving.wall,
-            "status": status.value,
-            "reason": reason,
-            "solver_status": solution.solver_status,
-            "iterations": solution.iterations,
-            "repeatable": int(all(_identical(solution, other) for other in repeats)),
-        }
-        if residuals is None or solution.x is None or solution.alpha is None:
-            return row, None
-        row |= {"primal_residual": residuals.primal, "dual_residual": residuals.dual, "gap": residuals.gap}
-        open_by_accuracy = slack(program, solution.x, solution.alpha, self.accuracy)
-        return row, solution_row(solution.x, solution.alpha, open_by_accuracy)
+    try:
+        # The solution to start from belongs to an earlier query: its seconds are not those of this one.
+        if query.start is not None and takes_start(solver):
+            watch(True)
+            row["started_from"], similar = query.start
+            start = solve_qp(similar, solver, accuracy, extra, query.factor)
+        solution, solving = median_seconds(work, before=partial(watch, True))
+        watch(False)
+    except MemoryError:
+        raise
+    except (Exception, SystemExit) as error:  # noqa: BLE001  a solver may raise anything; recorded in the row
+        return row | {"status": Status.ERROR.value, "reason": in_a_line(error)}, None
+    status, reason, residuals = verify(program, solution, accuracy)
+    if solving.wall > query_seconds:
+        status, reason = Status.TIMEOUT, f"took {solving.wall:.1f} s, the limit is {query_seconds:g} s"
+    row |= {
+        "solve_s": solving.cpu,
+        "total_s": assembly.cpu + solving.cpu,
+        "total_wall_s": assembly.wall + solving.wall,
+        "status": status.value,
+        "reason": reason,
+        "solver_status": solution.solver_status,
+        "iterations": solution.iterations,
+        "repeatable": int(all(_identical(solution, other) for other in repeats)),
+    }
+    if residuals is None or solution.x is None or solution.alpha is None:
+        return row, None
+    row |= {"primal_residual": residuals.primal, "dual_residual": residuals.dual, "gap": residuals.gap}
+    open_by_accuracy = slack(program, solution.x, solution.alpha, accuracy)
+    return row, solution_row(solution.x, solution.alpha, open_by_accuracy)
 
 
 def _identical(one: QPSolution, other: QPSolution) -> bool:
@@ -129,19 +124,11 @@ def error_columns(
 
 
 def _columns(error: Errors, bound: Bounds | None) -> Row:
-    row = {
-        "error_u": error.u,
-        "error_lambda": error.lam,
-        "error_energy": error.energy,
-        "error_u_absolute": error.absolute_u,
-        "error_lambda_absolute": error.absolute_lam,
-        "violation": error.violation,
-        "complementarity": error.complementarity,
-    }
+    row = asdict(error)
     if bound is not None:
         row |= {"bound_u": bound.u, "bound_lambda": bound.lam}
-        if error.u > UNMEASURABLE:
-            row["effectivity_u"] = bound.u / error.absolute_u
-        if error.lam > UNMEASURABLE:
-            row["effectivity_lambda"] = bound.lam / error.absolute_lam
+        if error.error_u > UNMEASURABLE:
+            row["effectivity_u"] = bound.u / error.error_u_absolute
+        if error.error_lambda > UNMEASURABLE:
+            row["effectivity_lambda"] = bound.lam / error.error_lambda_absolute
     return row

@@ -62,10 +62,6 @@ class SnapshotStage(Stage):
         """The problem alone."""
         return Axes(problem=self.problem)
 
-    def inputs(self) -> tuple[Stage, ...]:
-        """None."""
-        return ()
-
     def run(self, store: Store) -> Result:  # noqa: ARG002
         """Assemble and solve at every parameter of the chunk."""
         problem = build_problem(self.problem)

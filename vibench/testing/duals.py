@@ -186,23 +186,9 @@ def _cone_fault(cone: object, W: InnerProduct) -> str:
     try:
         checked = check_cone(cone, W)
     except NumericalError as error:
-        return f"{error}{_generator(cone, W)}"
+        return str(error)
     errors, R = checked.errors, checked.size
     fault = array_fault("errors", errors, np.shape(errors))
     if not fault and (errors.ndim != 1 or len(errors) not in (1, R + 1) or errors.min() < 0.0):
         return f"errors has shape {errors.shape}; expected e(0) … e({R}), or e({R}) alone, none negative"
     return fault
-
-
-def _generator(cone: object, W: InnerProduct) -> str:
-    """The generator that `check_cone` refuses."""
-    if not isinstance(cone, Cone) or np.ndim(cone.generators) != 2 or len(cone.generators) != W.dim:
-        return ""
-    chi = cone.generators
-    with np.errstate(invalid="ignore"):
-        norms = W.norm(chi)
-    away = np.abs(norms - 1.0)
-    if not away.max(initial=0.0) <= ERROR_ATOL:  # true for NaN, too
-        return f": generator {away.argmax()} has norm {norms[away.argmax()]:.6g}"
-    i, r = np.unravel_index(int(chi.argmin()), chi.shape)
-    return f": look at coefficient {i} of generator {r}"

@@ -7,11 +7,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numerics import exact, spd
 
-from vibench.errors import RequestError
 from vibench.interfaces.problem import VariationalInequality
 from vibench.qp import verification
 from vibench.qp.solution import QPSolution
-from vibench.qp.solve import check_solver_name, solve_qp
+from vibench.qp.solve import solve_qp
 from vibench.qp.status import Status
 
 seeds = st.integers(0, 10_000)
@@ -211,13 +210,6 @@ def test_a_registered_solver_sees_scaled_data_and_its_answer_is_scaled_back() ->
     assert np.allclose(seen["rows"], 1.0)
     assert np.isclose(seen["f"], 1.0)
     assert verification.kkt_residuals(vi, answer.x, answer.alpha).worst < 1e-9
-
-
-def test_names_are_checked_with_a_suggestion() -> None:
-    check_solver_name("piqp")
-    check_solver_name("mine", ["mine"])
-    with pytest.raises(RequestError, match="no QP solver is called 'proxpq'; did you mean 'proxqp'"):
-        check_solver_name("proxpq")
 
 
 def test_severities_follow_the_order_of_the_statuses() -> None:

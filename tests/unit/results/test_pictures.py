@@ -49,7 +49,7 @@ def test_what_is_shown_are_the_solutions_there(drawn: tuple[tuple[str, Picture],
 def test_pictures_read_back_are_those_written(drawn: tuple[tuple[str, Picture], ...], tmp_path: Path) -> None:
     journal = ResultsDatabase(tmp_path, {"name": "some"})
     for _ in range(2):  # a second run writes in place of the first
-        journal.replace_named("pictures", KEYS, [KEYS | row for row in pictures.picture_rows(drawn)])
+        journal.replace("pictures", [KEYS | row for row in pictures.picture_rows(drawn)], **KEYS)
     journal.close()
     found = list(pictures.read(tmp_path / FILE))
     assert [(one.key, one.title, one.reason) for one in found] == [
@@ -65,7 +65,7 @@ def test_pictures_read_back_are_those_written(drawn: tuple[tuple[str, Picture], 
 
 def test_a_picture_that_could_not_be_made_has_its_reason(tmp_path: Path) -> None:
     journal = ResultsDatabase(tmp_path, {"name": "some"})
-    journal.replace_named("pictures", KEYS, [KEYS | row for row in pictures.failure_rows("the camera broke")])
+    journal.replace("pictures", [KEYS | row for row in pictures.failure_rows("the camera broke")], **KEYS)
     journal.close()
     assert list(pictures.read(tmp_path / FILE)) == [Shown(("membrane", OBSTACLE.options), "", None, "the camera broke")]
 

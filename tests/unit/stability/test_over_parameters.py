@@ -25,14 +25,14 @@ def test_errors_as_defined() -> None:
     du, dlam = 1e-3 * rng.standard_normal(30), 1e-2 * rng.standard_normal(8)
     (found,) = errors(problem, [vi], reference, (exact.u + du)[:, None], (exact.lam + dlam)[:, None])
     X, Y, A = problem.V.matrix, problem.W.matrix, vi.A
-    assert np.isclose(found.u, np.sqrt((du @ (X @ du)) / (exact.u @ (X @ exact.u))))
-    assert np.isclose(found.lam, np.sqrt((dlam @ (Y @ dlam)) / (exact.lam @ (Y @ exact.lam))))
-    assert np.isclose(found.energy, np.sqrt((du @ (A @ du)) / (exact.u @ (A @ exact.u))))
+    assert np.isclose(found.error_u, np.sqrt((du @ (X @ du)) / (exact.u @ (X @ exact.u))))
+    assert np.isclose(found.error_lambda, np.sqrt((dlam @ (Y @ dlam)) / (exact.lam @ (Y @ exact.lam))))
+    assert np.isclose(found.error_energy, np.sqrt((du @ (A @ du)) / (exact.u @ (A @ exact.u))))
     integrals = Y @ np.ones(8)
     assert np.isclose(found.violation, max(0.0, np.max((vi.B @ (exact.u + du) - vi.g) / integrals)))
     assert np.isclose(found.complementarity, exact.lam @ (vi.B @ du), atol=1e-12)
     (nothing,) = errors(problem, [vi], reference, exact.u[:, None], exact.lam[:, None])
-    assert (nothing.u, nothing.lam, nothing.energy) == (0.0, 0.0, 0.0)
+    assert (nothing.error_u, nothing.error_lambda, nothing.error_energy) == (0.0, 0.0, 0.0)
     assert nothing.violation < 1e-10
 
 
@@ -42,7 +42,7 @@ def test_a_solution_below_the_floor_is_measured_against_the_floor() -> None:
     u, lam = np.zeros((30, 1)), np.zeros((8, 1))
     lam[0] = 1e-3
     (found,) = errors(problem, [vi], Reference(u, 0.0 * lam, 1.0, 2.0), u, lam)
-    assert np.isclose(found.lam, float(problem.W.norm(lam)[0]) / 2.0)
+    assert np.isclose(found.error_lambda, float(problem.W.norm(lam)[0]) / 2.0)
 
 
 def test_errors_and_bounds_of_many_queries_are_those_of_each() -> None:

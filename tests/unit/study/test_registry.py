@@ -211,14 +211,22 @@ def test_a_solver_must_be_callable(register: Register) -> None:
     assert "'broken'" in refusal(registry.load, "QP solver", "broken")
 
 
-def test_an_unused_solver_that_cannot_be_loaded_does_not_stop_a_study(register: Register, tmp_path: Path) -> None:
-    built_in = [
+def built_in() -> list[tuple[str, str, str]]:
+    return [
         (entry.group, entry.name, entry.value)
         for entry in importlib.metadata.distribution("vibench").entry_points
         if entry.group.startswith("vibench.")
     ]
-    register(*built_in, ("vibench.qp_solvers", "broken", "no_such_module:solve"))
+
+
+def test_an_unused_solver_that_cannot_be_loaded_does_not_stop_a_study(register: Register) -> None:
+    register(*built_in(), ("vibench.qp_solvers", "broken", "no_such_module:solve"))
     assert load_study("quick").solver_names()
+
+
+def test_a_study_may_name_a_registered_solver(register: Register) -> None:
+    register(*built_in(), ("vibench.qp_solvers", "mine", f"{HERE}:no_strategy"))
+    assert load_study("quick", {"solvers": ["mine"]}).solver_names() == ["mine"]
 
 
 def test_a_study_must_be_a_path(register: Register) -> None:

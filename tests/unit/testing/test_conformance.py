@@ -103,7 +103,7 @@ MORE_STRATEGIES: Mapping[str, Case] = {
     "Oversized": ("size", ["size 1 was prescribed; the cone has 2 generators"]),
     "Draws": ("determinism", ["size 3: a second call gives different values of generators: entry ("]),
     "Normalises": ("no mutation", ["reduce changes the snapshots: entry (", "work on copies"]),
-    "DividesByZero": ("snapshots without contact", ["with a zero snapshot", "not finite", "generator 0 has norm nan"]),
+    "DividesByZero": ("snapshots without contact", ["with a zero snapshot", "not finite, the first in column 0"]),
     "UnpicklableDual": ("pickling", ["cannot be pickled", "attribute weight"]),
     "NotOrthogonal": ("enrichment", ["not orthonormal in V and orthogonal to V_N: the ", " of vector "]),
     "AsksForATolerance": ("tolerance", ["without a tolerance", "TypeError", "set takes_tolerance = True"]),

@@ -146,12 +146,6 @@ def plot(axes: Axes, x: Any, y: Any, k: int, label: str | None = None, **more: A
     axes.plot(x, y, label=label, **line(k, len(x)) | more)
 
 
-def logarithmic(axes: Axes, which: str = "y") -> None:
-    """Make axes logarithmic."""
-    for name in which:
-        getattr(axes, f"set_{name}scale")("log")
-
-
 def _ticks(axes: Axes) -> None:
     """Set the ticks of logarithmic axes, however many decades they span."""
     for name, axis in (("x", axes.xaxis), ("y", axes.yaxis)):
