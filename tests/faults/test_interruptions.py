@@ -10,14 +10,7 @@ from pathlib import Path
 
 import pandas as pd
 import pytest
-from running import (
-    Vibench,
-    read_until,
-    rows,
-    run_again,
-    started,
-    workers,
-)
+from running import Vibench, read_until, rows, run_again, started, workers
 from samples import wire_study, write_study
 
 

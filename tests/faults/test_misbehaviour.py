@@ -10,10 +10,7 @@ from typing import Any
 
 import pandas as pd
 import pytest
-from running import (
-    Vibench,
-    rows,
-)
+from running import Vibench, rows
 from samples import wire_study, write_study
 
 BAD_PROBLEMS: Mapping[str, tuple[set[str], str]] = {

@@ -189,7 +189,7 @@ def test_a_process_that_never_begins_is_given_up(
 ) -> None:
     monkeypatch.setattr(supervisor, "START_SECONDS", 0.1)
     found = watcher.run(Job(str(tmp_path), Whole("fine"), 1.0, 30.0, 8.0))
-    assert found == Failed(Status.CRASHED, "the worker process did not begin within 0.1 s")
+    assert found == Failed(Status.CRASHED, "no worker process began within 0.1 s")
 
 
 def test_a_talkative_job_can_be_stopped(watcher: Supervisor, tmp_path: Path) -> None:

@@ -15,14 +15,7 @@ from pathlib import Path
 
 import pandas as pd
 import pytest
-from running import (
-    Vibench,
-    assert_same_numbers,
-    by_solver,
-    execute,
-    rows,
-    run_again,
-)
+from running import Vibench, assert_same_numbers, by_solver, execute, rows, run_again
 from samples import wire_study, write_study
 
 from vibench.results.columns import TABLES

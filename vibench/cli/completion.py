@@ -44,16 +44,23 @@ def examples(command: str) -> str:
     return "\n".join(["\b", "Examples:", *(f"  {line}" for line in EXAMPLES[command])])
 
 
-def names(*groups: str) -> Callable[[str], list[str]]:
-    """Completes names of plugins in groups of entry points: "problems" stands for `vibench.problems`."""
+def words(known: Callable[[], Iterable[str]]) -> Callable[[str], list[str]]:
+    """Completes the words of a function, which is called when a shell asks."""
 
     def complete(incomplete: str) -> list[str]:
-        return _beginning(incomplete, _registered(*groups))
+        return _beginning(incomplete, known())
 
     return complete
 
 
+def names(*groups: str) -> Callable[[str], list[str]]:
+    """Completes names of plugins in groups of entry points: "problems" stands for `vibench.problems`."""
+    return words(lambda: _registered(*groups))
+
+
 plugin_names = names("problems", "primal_strategies", "dual_strategies")
+lists = words(lambda: ("problems", "dual", "primal", "solvers", "studies"))
+table_names = words(lambda: ("summary", "benefits", *TABLES))
 
 
 def studies(incomplete: str) -> list[str]:
@@ -75,16 +82,6 @@ def runs(incomplete: str) -> list[str]:
     from vibench.results.database import FILE
 
     return _beginning(incomplete, (path.parent.name for path in Path("runs").glob(f"*/{FILE}")))
-
-
-def lists(incomplete: str) -> list[str]:
-    """Completes the arguments of `vibench list`."""
-    return _beginning(incomplete, ("problems", "dual", "primal", "solvers", "studies"))
-
-
-def table_names(incomplete: str) -> list[str]:
-    """Completes tables of a run."""
-    return _beginning(incomplete, ("summary", "benefits", *TABLES))
 
 
 def cells(context: typer.Context, incomplete: str) -> list[tuple[str, str]]:

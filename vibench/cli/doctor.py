@@ -92,8 +92,8 @@ def versions() -> Iterator[Finding]:
     yield Finding("vibench", provenance.core_code())
     found = {name: provenance.distribution_version(name) for name, extras in requirements().items() if not extras}
     yield Finding("libraries", ", ".join(f"{name} {version}" for name, version in found.items() if version))
-    for name in (name for name, version in found.items() if not version):
-        yield Finding(name, "is required and not installed", Health.BROKEN)
+    missing = (name for name, version in found.items() if not version)
+    yield from (Finding(name, "is required and not installed", Health.BROKEN) for name in missing)
 
 
 def requirements() -> dict[str, list[str]]:

@@ -123,21 +123,14 @@ class _JobState:
         self._piece_limit = float("inf")
 
     def tick(self, limit: float) -> None:
-        """Count the seconds since the last call; `limit` is that of the stage.
-
-        Raises
-        ------
-        _WorkerLostError
-            If a limit is exceeded.
-        """
+        """Count the seconds since the last call; a `_WorkerLostError` beyond a limit, `limit` being the stage's."""
         now = time.monotonic()
         step = min(now - self._last, 5.0 * POLL)
         self._last = now
         if not self._begun:
             self._starting += step
             if self._starting > START_SECONDS:
-                reason = f"the worker process did not begin within {START_SECONDS:g} s"
-                raise _WorkerLostError(Failed(Status.CRASHED, reason))
+                raise _WorkerLostError(Failed(Status.CRASHED, f"no worker process began within {START_SECONDS:g} s"))
             return
         self.seconds += step
         if self.seconds > limit:

@@ -13,10 +13,7 @@ from vibench.interfaces.strategies import Enrichment, Kind, Offline
 from vibench.interfaces.validation import check_enrichment, training_parameters
 from vibench.model.galerkin import ReducedModel
 from vibench.reduction.nested import Grown, Milestone, grow_through
-from vibench.reduction.supremizers import (
-    ConstraintClasses,
-    projected_supremizers,
-)
+from vibench.reduction.supremizers import ConstraintClasses, projected_supremizers
 from vibench.stability.growth import ProjectedSupremizers
 from vibench.stages.artefacts import History, Store
 from vibench.stages.base import Result, Stage, build_problem, value_of

@@ -10,10 +10,7 @@ from vibench.interfaces.strategies import Cone, Stop
 from vibench.interfaces.validation import check_cone, training_parameters
 from vibench.reduction.cones import orthogonality
 from vibench.reduction.pod import pod
-from vibench.reduction.supremizers import (
-    constraint_classes,
-    isometric_supremizers,
-)
+from vibench.reduction.supremizers import constraint_classes, isometric_supremizers
 from vibench.stability.infsup import Multipliers, beta_span, multipliers
 from vibench.stages.artefacts import History, Store
 from vibench.stages.base import Result, Stage, build_problem, value_of
