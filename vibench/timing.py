@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import statistics
 import time
 from collections.abc import Callable, Sequence
@@ -39,6 +40,10 @@ class Seconds:
 
     def __add__(self, other: Seconds) -> Seconds:
         return Seconds(self.cpu + other.cpu, self.wall + other.wall)
+
+    def beyond(self, other: Seconds) -> Seconds:
+        """By how much these exceed others, not less than nothing."""
+        return Seconds(max(self.cpu - other.cpu, 0.0), max(self.wall - other.wall, 0.0))
 
 
 NO_TIME = Seconds()
@@ -87,6 +92,20 @@ def median_seconds(
 def median_of(runs: Sequence[Seconds]) -> Seconds:
     """Median CPU and median wall seconds."""
     return Seconds(statistics.median(r.cpu for r in runs), statistics.median(r.wall for r in runs))
+
+
+def median_interval(values: Sequence[float]) -> tuple[float, float]:
+    """Interval that contains the median of the distribution of independent values (n,) with probability 0.95.
+
+    Its ends are order statistics, whatever the distribution is (Conover 1999, section 3.2); fewer than six values give
+    their range, which has a smaller probability.
+    """
+    ordered, n = sorted(values), len(values)
+    outside, below = 0, 0.0  # values left out on each side; probability that the median is among or below them
+    while (below := below + math.comb(n, outside) / 2.0**n) <= 0.025:
+        outside += 1
+    first = max(outside - 1, 0)
+    return ordered[first], ordered[n - 1 - first]
 
 
 class Calibration:

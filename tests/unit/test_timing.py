@@ -10,9 +10,20 @@ import time
 from collections.abc import Callable, Iterator
 
 import pytest
+from scipy.stats import binom
 
 from vibench import timing
-from vibench.timing import NO_TIME, ONE_THREAD, REPEATS, Calibration, Seconds, Stopwatch, median_seconds, timed
+from vibench.timing import (
+    NO_TIME,
+    ONE_THREAD,
+    REPEATS,
+    Calibration,
+    Seconds,
+    Stopwatch,
+    median_interval,
+    median_seconds,
+    timed,
+)
 
 
 @pytest.fixture
@@ -42,6 +53,20 @@ class Work:
 def test_seconds_add_up() -> None:
     assert Seconds(1.0, 2.0) + Seconds(0.5, 0.25) == Seconds(1.5, 2.25)
     assert sum([Seconds(1.0, 2.0)] * 3, NO_TIME) == Seconds(3.0, 6.0)
+
+
+def test_seconds_beyond_others_are_never_negative() -> None:
+    assert Seconds(3.0, 1.0).beyond(Seconds(1.0, 2.0)) == Seconds(2.0, 0.0)
+
+
+@pytest.mark.parametrize(("count", "first"), [(1, 0), (5, 0), (6, 0), (9, 1), (30, 9), (100, 39)])
+def test_the_interval_of_a_median_has_the_tabulated_order_statistics(count: int, first: int) -> None:
+    """As in Conover, Practical Nonparametric Statistics: the largest ones left out with a probability up to 0.025."""
+    values = [float(k) for k in range(count)]
+    assert median_interval(values[::-1]) == (first, count - 1 - first)
+    if count > 5:
+        inside, wider = (1.0 - 2.0 * binom.cdf(k, count, 0.5) for k in (first, first + 1))
+        assert inside >= 0.95 > wider
 
 
 def test_work_is_timed_once(clocks: Callable[..., None]) -> None:

@@ -82,17 +82,22 @@ class HighFidelitySolver:
             If the assembly is invalid, the solution does not reach `ACCURACY`, the problem refuses it, or B touches
             unknowns outside the declared `contact_dofs`.
         """
-        return self.solve_assembled(mu, checked_assembly(self._problem, mu))
+        found = self.solve_assembled(mu, checked_assembly(self._problem, mu))
+        self.remember(mu, found)
+        return found
 
     def solve_assembled(self, mu: Array, vi: VariationalInequality) -> HighFidelitySolution:
-        """Solve the variational inequality `vi` assembled at mu (d,)."""
+        """Solve the variational inequality `vi` assembled at mu (d,); unless remembered, no other starts from it."""
         found = solve_high_fidelity(vi, self._condensed(vi), self._nearest_contact_set(mu))
         reason = self._problem.refuse(mu, found.u, found.lam)
         if reason:
             raise NumericalError(f"at mu = {mu.tolist()}: {reason}")
+        return found
+
+    def remember(self, mu: Array, found: HighFidelitySolution) -> None:
+        """Let later solutions start from the contact set of this one, at mu (d,)."""
         self._solved.append(mu)
         self._active.append(found.lam > 0.0)
-        return found
 
     def check_coercive(self, mu: Array, vi: VariationalInequality) -> None:
         """Refuse a stiffness that is not symmetric positive definite.

@@ -81,7 +81,8 @@ def _costs(cells: pd.DataFrame, thresholds: pd.DataFrame) -> Iterator[str]:
     name = label(row["primal"], row["primal_tol"], row["assembly"])
     yield (
         f"The fastest query is that of {name}: {1e3 * row['online_s']:.3g} ms, of which the QP solver takes "
-        f"{1e3 * row['online_solve_s']:.3g} ms; a high-fidelity solution takes {1e3 * row['hf_s']:.3g} ms."
+        f"{1e3 * row['online_solve_s']:.3g} ms; a high-fidelity solution takes {1e3 * row['hf_s']:.3g} ms "
+        f"after a set-up of {1e3 * row['hf_setup_s']:.3g} ms."
     )
     of_cell = (thresholds["offline_b_s"] == row["offline_s"]) & (thresholds["online_b_s"] == row["online_s"])
     for found in thresholds[of_cell & (thresholds["primal_a"] == HIGH_FIDELITY)].head(1).itertuples():

@@ -34,7 +34,7 @@ from vibench.stages.offline import ReducedCone
 from vibench.stages.query import Query, error_columns, run_query
 from vibench.stages.snapshots import gather, training_stages, validation_stages
 from vibench.study.cells import Cell
-from vibench.timing import calibration
+from vibench.timing import calibration, median_interval, median_of
 
 QueryRows = tuple[Row, Row | None]
 """The row of a query, and that of its solution if there is one."""
@@ -139,13 +139,12 @@ class _Queries(Pieces):
         enrichment = stage.assembly.enrichment
         self._model, self._note = stage.assembly.model(store)
         self._cone: ReducedCone = value_of(store, enrichment.cone)
-        snapshots = gather(store, stage.training)
-        self._reference = gather(store, stage.validation)
+        self._training, self._reference = gather(store, stage.training), gather(store, stage.validation)
         problem = self._model.problem
         # A reference below 1e-12 of the largest snapshot is zero up to round-off: relative errors divide by the floor.
         self._floors = tuple(
             1e-12 * float(np.max(space.norm(columns), initial=0.0))
-            for space, columns in ((problem.V, snapshots.u), (problem.W, snapshots.lam))
+            for space, columns in ((problem.V, self._training.u), (problem.W, self._training.lam))
         )
         self._programs: ReducedPrograms = value_of(store, stage.assembly)
         self._own, self._full, self._plain = (value_of(store, known) for known in stage.constants)
@@ -224,8 +223,8 @@ class _Queries(Pieces):
         built = assembly.enrichment.enrichment(self._store)
         size = value_of(self._store, assembly.enrichment.pod).basis.shape[1]
         fallbacks = [*cone.cone.fallbacks, *built.fallbacks, *([self._note] if self._note else [])]
-        for purpose, chunks in (("training", self._stage.training), ("validation", self._stage.validation)):
-            notes = [note for note in gather(self._store, chunks).fallbacks if note]
+        for purpose, found in (("training", self._training), ("validation", self._reference)):
+            notes = [note for note in found.fallbacks if note]
             fallbacks += [f"{len(notes)} of the {purpose} solutions: {notes[0]}"] if notes else []
         added = self._model.fixed_basis.shape[1] - size
         return {
@@ -247,10 +246,15 @@ class _Queries(Pieces):
         """Offline seconds as if the cell had been run alone, and the machines that measured them."""
         artefacts = {name: [self._artefact(stage) for stage in parts] for name, parts in self._stage.offline.items()}
         spent = {name: [artefact.seconds for artefact in found] for name, found in artefacts.items()}
+        # The chunks of a parameter set have a set-up each, for the sake of parallel runs: one counts.
+        setup = median_of([*self._training.setups, *self._reference.setups])
+        spent["snapshots"].append(setup)
         row: Row = {f"offline_{name}_s": sum(s.cpu for s in parts) for name, parts in spent.items()}
         row["offline_s"] = sum(row.values())
         row["offline_wall_s"] = sum(s.wall for parts in spent.values() for s in parts)
-        row["hf_s"] = float(np.mean([s.cpu for s in self._reference.seconds]))
+        marginal = [seconds.cpu for seconds in self._reference.seconds]
+        row |= {"hf_setup_s": setup.cpu, "hf_s": float(np.median(marginal))}
+        row |= dict(zip(("hf_low_s", "hf_high_s"), median_interval(marginal), strict=True))
         assembly = self._stage.assembly
         online = [self._artefact(stage) for stage in (assembly, assembly.full_times, *self._stage.validation)]
         machines = {artefact.machine for found in (*artefacts.values(), online) for artefact in found} | {machine()}

@@ -3,13 +3,19 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from statistics import median
+from typing import Literal
 
 import numpy as np
 import pytest
 import scipy.linalg
 from samples import carry_out
 
+from vibench import timing
+from vibench.arrays import Array
 from vibench.errors import NumericalError
+from vibench.highfidelity.active_set import HighFidelitySolution, HighFidelitySolver
+from vibench.interfaces.problem import Problem, VariationalInequality
 from vibench.interfaces.strategies import Kind, Stop
 from vibench.reduction.nested import Milestone
 from vibench.stages import base, snapshots
@@ -23,7 +29,7 @@ from vibench.stages.infsup_constants import ReferenceConstants, ValidationConstr
 from vibench.stages.offline import ConeStage, PODStage
 from vibench.stages.snapshots import CHUNKS, SnapshotStage, gather, training_stages, validation_stages
 from vibench.study.cells import Plugin
-from vibench.timing import NO_TIME
+from vibench.timing import NO_TIME, Seconds
 
 PROBLEM = Plugin("problem", "obstacle", '{"resolution": 200}', "test")
 
@@ -194,10 +200,14 @@ def test_rows_of_a_cell(store: Store, primal: str, tolerance: float | None, kind
     parts = ("snapshots", "pod", "cone", "enrichment", "assembly")
     assert rows.cell["offline_s"] == pytest.approx(sum(rows.cell[f"offline_{part}_s"] for part in parts))
     snapshots = sum((store.get(chunk.key).seconds for chunk in training_stages(PROBLEM)), NO_TIME)
-    assert rows.cell["offline_snapshots_s"] == pytest.approx(snapshots.cpu)
-    assert rows.cell["offline_snapshots_s"] == pytest.approx(
-        sum(s.cpu for s in gather(store, training_stages(PROBLEM)).seconds)
-    )
+    training, validation = gather(store, training_stages(PROBLEM)), gather(store, validation_stages(PROBLEM, 9, 3))
+    assert snapshots.cpu == pytest.approx(sum(seconds.cpu for seconds in training.seconds))
+    setup = median(seconds.cpu for seconds in (*training.setups, *validation.setups))
+    assert rows.cell["offline_snapshots_s"] == pytest.approx(snapshots.cpu + setup)
+    assert rows.cell["hf_setup_s"] == pytest.approx(setup)
+    assert rows.cell["hf_s"] == pytest.approx(median(seconds.cpu for seconds in validation.seconds))
+    assert rows.cell["hf_low_s"] <= rows.cell["hf_s"] <= rows.cell["hf_high_s"]
+    assert [row["hf_s"] for row in rows.queries] == [seconds.cpu for seconds in validation.seconds]
     enrichment = store.get(cell(primal, tolerance).assembly.enrichment.key)
     assert rows.cell["offline_enrichment_s"] == enrichment.seconds.cpu
     assert rows.cell["online_s"] == pytest.approx(rows.cell["online_assemble_s"] + rows.cell["online_solve_s"])
@@ -211,6 +221,35 @@ def test_rows_of_a_cell(store: Store, primal: str, tolerance: float | None, kind
         assert row["total_s"] == row["assemble_s"] + row["solve_s"]
         assert row["error_u"] < 0.05
         assert max(row["primal_residual"], row["dual_residual"], row["gap"]) <= 1e-8
+
+
+class Factorising(HighFidelitySolver):
+    """A solver whose first solution takes 10 s longer than the others, which take 1 s each, by a clock of its own."""
+
+    now = 0.0
+
+    def __init__(self, problem: Problem) -> None:
+        super().__init__(problem)
+        self._is_set_up = False
+
+    def solve_assembled(self, mu: Array, vi: VariationalInequality) -> HighFidelitySolution:
+        Factorising.now += 1.0 if self._is_set_up else 11.0
+        self._is_set_up = True
+        return super().solve_assembled(mu, vi)
+
+
+@pytest.mark.parametrize(("purpose", "count"), [("training", 0), ("validation", 9), ("validation", 18)])
+def test_the_set_up_is_no_part_of_the_seconds_of_a_solution(
+    purpose: Literal["training", "validation"], count: int, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """Whatever the number of parameters that share it: break-even would depend on the number of queries otherwise."""
+    monkeypatch.setattr(snapshots, "HighFidelitySolver", Factorising)
+    for clock in ("thread_time", "perf_counter"):
+        monkeypatch.setattr(timing.time, clock, lambda: Factorising.now)
+    found = SnapshotStage(PROBLEM, purpose, count, 3, 1).run(Store(tmp_path))
+    assert found.value.setups == (Seconds(10.0, 10.0),)
+    assert set(found.value.seconds) == {Seconds(1.0, 1.0)}
+    assert found.seconds == Seconds(float(len(found.value.mu)), float(len(found.value.mu)))
 
 
 def test_a_slow_query_is_a_timeout(store: Store) -> None:

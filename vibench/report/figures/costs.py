@@ -89,7 +89,8 @@ def total_cost(data: Data) -> Figure | None:
         added = mine.assign(added=mine["enrichment"].fillna(0)).sort_values("added", ascending=False, kind="stable")
         most = added.drop_duplicates(["primal", "primal_options", "assembly"]).sort_index()
         queries = np.geomspace(1.0, MOST_QUERIES, 61)
-        plot(panel, queries, queries * most["hf_s"].iloc[0], BLACK, HIGH_FIDELITY)
+        model = most.iloc[0]
+        plot(panel, queries, model["hf_setup_s"] + queries * model["hf_s"], BLACK, HIGH_FIDELITY)
         for cell in most.itertuples():
             name = label(cell.primal, cell.primal_tol, cell.assembly)
             plot(panel, queries, cell.offline_s + queries * cell.online_s, style_of(name, styles), name)
