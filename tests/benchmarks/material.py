@@ -106,7 +106,7 @@ class Material:
         def make() -> ReducedCone:
             found = registry.create("dual strategy", spaces.dual, {}).reduce(lam, W, spaces.cone)
             check_cone(found, W)
-            return ReducedCone(found, multipliers(found.generators, W, found.free), None)
+            return ReducedCone(found, multipliers(found.generators, W, found.free))
 
         return self._once(f"cone of {spaces.dual}", make, spaces.cone)
 

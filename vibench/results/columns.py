@@ -84,7 +84,14 @@ CELLS: Mapping[str, Column] = {
     "N": Column(INTEGER, "", "Dimension of V_N.", "N", 10),
     "R": Column(INTEGER, "", "Generators of the cone.", "R", 11),
     "rank": Column(INTEGER, "", "Numerical rank of the generators: dimension of their span."),
-    "gram_condition": Column(REAL, "", "Condition number of the Gram matrix of the generators in W."),
+    "rank_gap": Column(
+        REAL,
+        "1",
+        "Last singular value that counts for the rank over the first that does not; near 1 the rank is in doubt.",
+    ),
+    "gram_condition": Column(
+        REAL, "1", "Condition number of the Gram matrix of the generators in W, from their singular values."
+    ),
     "enrichment": Column(
         INTEGER, "", "Vectors added to V_N; of an enrichment per parameter, the rank of the generators.", "added", 12
     ),

@@ -36,6 +36,9 @@ from vibench.stages.snapshots import gather, training_stages, validation_stages
 from vibench.study.cells import Cell
 from vibench.timing import calibration, median_interval, median_of
 
+CLEAR_GAP = 10.0
+"""A rank is in doubt where the singular values on both sides of the threshold differ by less than this factor."""
+
 QueryRows = tuple[Row, Row | None]
 """The row of a query, and that of its solution if there is one."""
 
@@ -226,6 +229,10 @@ class _Queries(Pieces):
         for purpose, found in (("training", self._training), ("validation", self._reference)):
             notes = [note for note in found.fallbacks if note]
             fallbacks += [f"{len(notes)} of the {purpose} solutions: {notes[0]}"] if notes else []
+        if (gap := cone.prepared.rank_gap) < CLEAR_GAP:
+            fallbacks.append(
+                f"the rank {cone.prepared.rank} has no gap: the next singular value is smaller by {gap:.2g}"
+            )
         added = self._model.fixed_basis.shape[1] - size
         return {
             "model": assembly.key,
@@ -235,7 +242,8 @@ class _Queries(Pieces):
             "N": size,
             "R": cone.cone.size,
             "rank": cone.prepared.rank,
-            "gram_condition": cone.gram_condition,
+            "rank_gap": cone.prepared.rank_gap,
+            "gram_condition": cone.prepared.gram_condition,
             "enrichment": cone.prepared.rank if built.kind is Kind.PER_PARAMETER else added,
             **assembly.columns(self._store),
             "fallbacks": "; ".join(fallbacks),

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
-
 from vibench.interfaces.strategies import Cone, Stop
 from vibench.interfaces.validation import check_cone, training_parameters
 from vibench.reduction.cones import orthogonality
@@ -47,11 +45,10 @@ class PODStage(Stage):
 
 @dataclass(frozen=True)
 class ReducedCone:
-    """A cone, its multipliers prepared for constants and enrichments, and the condition number of its Gram matrix."""
+    """A cone, and its multipliers prepared for constants and enrichments."""
 
     cone: Cone
     prepared: Multipliers
-    gram_condition: float | None
 
 
 @dataclass(frozen=True)
@@ -86,10 +83,9 @@ class ConeStage(Stage):
         cone, reducing = timed(lambda: strategy.reduce(snapshots, W, self.stop))
         check_cone(cone, W)  # verification, which is not part of the offline time
         prepared, preparing = timed(lambda: multipliers(cone.generators, W, cone.free))
-        found = ReducedCone(cone, prepared, float(np.linalg.cond(prepared.gram)) if cone.size else None)
         orthogonal = orthogonality(cone.generators, W, cone.free)
         histories = History("cone", "error", tuple(cone.errors)), History("cone", "e_orth", tuple(orthogonal))
-        return Result(found, reducing + preparing, histories)
+        return Result(ReducedCone(cone, prepared), reducing + preparing, histories)
 
 
 @dataclass(frozen=True)

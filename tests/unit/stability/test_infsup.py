@@ -8,6 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numerics import Varying, space
 
+from vibench.linalg.dense import RANK_RTOL
 from vibench.linalg.inner_product import InnerProduct
 from vibench.reduction.supremizers import supremizers
 from vibench.stability.infsup import beta_span, inf_sup_full, inf_sup_on, multipliers, nodal_multipliers
@@ -37,6 +38,46 @@ def test_the_span_constant_is_zero_exactly_below_the_rank_and_honest_at_it() -> 
     assert beta_span(np.ones((2, 3))) == 0.0
     assert beta_span(np.eye(3)) == 1.0
     assert beta_span(np.zeros((4, 0))) == np.inf
+
+
+def kahan(n: int, c: float) -> np.ndarray:
+    """Kahan's matrix with unit columns: no diagonal entry of its QR factor is small, its last singular value is."""
+    s = np.sqrt(1.0 - c**2)
+    matrix = np.diag(s ** np.arange(n)) @ (np.eye(n) - c * np.triu(np.ones((n, n)), 1))
+    return np.asarray(matrix / np.linalg.norm(matrix, axis=0))
+
+
+def test_the_rank_is_that_of_the_singular_values() -> None:
+    chi = kahan(90, 0.3)
+    assert abs(scipy.linalg.qr(chi, pivoting=True)[1][-1, -1]) > RANK_RTOL  # which hides the deficiency
+    cone = multipliers(chi, InnerProduct(sp.eye_array(90)))
+    assert cone.rank == 89
+    assert np.allclose(cone.span.T @ cone.span, np.eye(89), atol=1e-12)
+    assert cone.rank_gap > 1e8  # the last one alone is small
+
+
+def test_a_rank_without_a_gap_is_seen() -> None:
+    """Singular values that fall evenly through the threshold."""
+    rng = np.random.default_rng(0)
+    left, right = (np.linalg.qr(rng.standard_normal((20, 16)))[0] for _ in range(2))
+    chi = left @ np.diag(10.0 ** -np.arange(16.0)) @ right[:16].T
+    cone = multipliers(chi, InnerProduct(sp.eye_array(20)))
+    assert cone.rank in (12, 13)
+    assert 5.0 < cone.rank_gap < 20.0
+
+
+@pytest.mark.parametrize("distance", [1e-4, 1e-8, 1e-11, 1e-13])
+def test_the_condition_of_nearly_parallel_generators_does_not_saturate(distance: float) -> None:
+    """cond G = (1 + cos φ) / (1 − cos φ) of two unit vectors at the angle φ: 4 / φ² for small angles."""
+    chi = np.array([[1.0, np.cos(distance)], [0.0, np.sin(distance)]])
+    cone = multipliers(chi, InnerProduct(sp.eye_array(2)))
+    assert cone.gram_condition == pytest.approx(4.0 / distance**2, rel=1e-2)
+
+
+def test_without_generators_there_is_neither_rank_nor_condition() -> None:
+    cone = multipliers(np.zeros((6, 0)), space(6))
+    assert (cone.rank, cone.gram_condition, cone.rank_gap) == (0, None, np.inf)
+    assert cone.span.shape == (6, 0)
 
 
 @pytest.mark.parametrize("mu", [0.0, 0.5, 1.0])
