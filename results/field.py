@@ -42,8 +42,7 @@ class Field:
     cells
         One row per cell.
     steps
-        One row per enrichment and number of vectors: the smallest β_S over the training set as a share of the smallest
-        β_on there.
+        One row per enrichment and number of vectors: the smallest share β_S / β_on over the training set.
     """
 
     cells: pd.DataFrame
@@ -54,10 +53,7 @@ class Field:
         """From a results file."""
         cells = tables.in_order(tables.read(path, "cells"))
         histories = tables.read(path, "histories")
-        histories = histories[histories["stage"] == "enrichment"]
-        online = histories[histories["quantity"] == "beta_full_span_training"].groupby("artefact")["value"].min()
-        steps = histories[histories["quantity"] == "beta_span_min"].copy()
-        steps["share"] = steps["value"] / steps["artefact"].map(online)
+        steps = histories[histories["quantity"] == "share_min"].rename(columns={"value": "share"})
         return cls(cells, steps.sort_values(["artefact", "step"]))
 
     def longest(self) -> Iterator[tuple[tuple[Any, ...], pd.DataFrame]]:

@@ -25,6 +25,7 @@ def findings(path: Path) -> dict[str, list[str]]:
     for name, data in problems(path):
         for title, cells in by_dimensions(best_solver(data.cells)):
             found[f"{name}, {title}"] += [*_stability(cells), *_costs(cells, data.thresholds)]
+        found[f"{name}, enrichments"] += _off_training(data)
         found[f"{name}, solvers"] += _solvers(data)
     return {subject: sentences for subject, sentences in found.items() if sentences}
 
@@ -57,18 +58,33 @@ def _stability(cells: pd.DataFrame) -> Iterator[str]:
                 f"Without enrichment, min β over the span is {value} and min β over the cone at least "
                 f"{row.beta_cone_lower_min:.3g}; the mean error of λ is {row.error_lambda_mean:.3g}."
             )
-    online = cells[cells["enrichment_kind"] == Kind.PER_PARAMETER].dropna(subset="beta_span_min").head(1)
-    reference = online[(online["beta_span_min"] > VANISHES) & np.isfinite(online["beta_span_min"])]
     fixed = cells[(cells["enrichment_kind"] == Kind.FIXED) & np.isfinite(cells["beta_span_min"])]
     for row in fixed.drop_duplicates(PRIMAL).itertuples():
-        share = "".join(
-            f", {100.0 * row.beta_span_min / best.beta_span_min:.0f} % of that of {best.primal} with "
-            f"{best.enrichment:.0f}"
-            for best in reference.itertuples()
-        )
         yield (
             f"{label(row.primal, row.primal_tol)} adds {row.enrichment:.0f} vectors, with which min β over the span is "
-            f"{row.beta_span_min:.3g}{share}; the mean error of λ is {row.error_lambda_mean:.3g}."
+            f"{row.beta_span_min:.3g}, at every validation parameter at least {100.0 * row.share_validation:.0f} % of "
+            f"the constant of the whole of V; the mean error of λ is {row.error_lambda_mean:.3g}."
+        )
+
+
+def _off_training(data: Data) -> Iterator[str]:
+    """Whether the share of the inf-sup constant that holds on the training set holds off it."""
+    fixed = data.cells[data.cells["share_training"].notna()].drop_duplicates([*PRIMAL, "dual", "pair"])
+    lost = fixed["share_training"] - fixed["share_validation"]
+    if lost.max() > 0.0:
+        worst = fixed.loc[lost.idxmax()]
+        yield (
+            f"The share of β over the span in that of the whole of V is smaller at validation parameters than at "
+            f"training parameters in {(lost > 0.0).sum()} of {len(fixed)} fixed enrichments, at worst "
+            f"{worst['share_validation']:.3f} against {worst['share_training']:.3f} "
+            f"({label(worst['primal'], worst['primal_tol'])}, {worst['dual']})."
+        )
+    bounded = fixed[fixed["share_guaranteed"].notna()]
+    broken = bounded[bounded["share_validation"] < bounded["share_guaranteed"]]
+    if len(bounded):
+        yield (
+            f"√(1 − σ²), which bounds this share at training parameters, is not reached at a validation parameter in "
+            f"{len(broken)} of {len(bounded)} fixed enrichments that record σ."
         )
 
 

@@ -132,6 +132,13 @@ CELLS: Mapping[str, Column] = {
         REAL, "b/VW", "Smallest certified lower bound of β over their cone.", "min β cone", 14
     ),
     "beta_cone_upper_min": Column(REAL, "b/VW", "Smallest upper bound of β over their cone."),
+    "share_training": Column(
+        REAL, "1", "Smallest share of β over the span in that of the whole of V, over the training parameters."
+    ),
+    "share_validation": Column(REAL, "1", "The same over the validation parameters."),
+    "share_guaranteed": Column(
+        REAL, "1", "√(1 − σ²), which bounds the share at training parameters where the strategy records σ."
+    ),
     "error_u_mean": Column(REAL, "1", "Mean relative error of u in V.", "error u", 15),
     "error_u_max": Column(REAL, "1", "Largest relative error of u in V."),
     "error_lambda_mean": Column(REAL, "1", "Mean relative error of λ in W.", "error λ", 16),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 
@@ -11,7 +11,7 @@ import numpy as np
 from vibench.arrays import Array
 from vibench.reduction.lazy_greedy import LazyMaximum
 from vibench.reduction.supremizers import ConstraintClasses
-from vibench.stability.infsup import beta_span
+from vibench.stability.infsup import beta_span, share
 
 
 @dataclass(frozen=True)
@@ -33,15 +33,24 @@ class ProjectedSupremizers:
         return self.classes.everywhere([beta_span(projected) for projected in self.of_classes])
 
     def over_steps(self, first: int) -> Array:
-        """The smallest β_span over all parameters with the first `first`, `first` + 1, … N' vectors (N' − first + 1,).
+        """The smallest β_span over all parameters with the first `first`, … N' vectors (N' − first + 1,)."""
+        factors = np.abs(self.classes.factors)
+        weights = [float(np.min(factors[self.classes.members == k])) for k in range(len(self.of_classes))]
+        return self._smallest(first, lambda beta, k: weights[k] * beta)
+
+    def shares_over_steps(self, first: int, reachable: Array) -> Array:
+        """The smallest `share` of `reachable` (P,), the β_span of the whole of V, likewise (N' − first + 1,)."""
+        of_representatives = reachable[self.classes.firsts]
+        return self._smallest(first, lambda beta, k: share(beta, of_representatives[k]))
+
+    def _smallest(self, first: int, value: Callable[[float, int], float]) -> Array:
+        """The smallest value over all classes, each from the β_span of its representative.
 
         β_span never decreases as Z grows, so values of earlier steps are lower bounds and the minimum is found lazily.
         """
-        factors = np.abs(self.classes.factors)
-        weights = [float(np.min(factors[self.classes.members == k])) for k in range(len(self.of_classes))]
 
         def negative(count: int, k: int) -> float:
-            return -weights[k] * beta_span(self.of_classes[k][:count])
+            return -value(beta_span(self.of_classes[k][:count]), k)
 
-        lazy, last = LazyMaximum(np.zeros(len(weights))), self.of_classes[0].shape[0]
+        lazy, last = LazyMaximum(np.zeros(len(self.of_classes))), self.of_classes[0].shape[0]
         return np.array([-lazy.next(partial(negative, count))[1] for count in range(first, last + 1)])

@@ -143,6 +143,11 @@ def beta_span(on_span: Array) -> float:
     return float(singular_values(_compressed(on_span))[-1])
 
 
+def share(beta: float, reachable: float) -> float:
+    """β_span as a share of that of the whole of V, which no primal space exceeds; 1 where that is 0 or infinite."""
+    return beta / reachable if VANISHES < reachable < float("inf") else 1.0
+
+
 def inf_sup_on(Z: Array, B: SparseMatrix, cone: Multipliers) -> InfSup:
     """Constants of a primal space with V-orthonormal basis Z (n×N') at the parameter of B (m×n)."""
     projected = projected_supremizers(Z, B, np.hstack([cone.span, cone.chi]))

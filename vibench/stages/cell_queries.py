@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import resource
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -18,7 +19,7 @@ from vibench.model.errors import Reference
 from vibench.provenance import machine
 from vibench.qp.status import Status
 from vibench.results.solver_agreement import vectors
-from vibench.stability.infsup import InfSup
+from vibench.stability.infsup import InfSup, share
 from vibench.stages.artefacts import Artefact, Store
 from vibench.stages.assembly import AssemblyStage, ReducedPrograms, assembly_stage
 from vibench.stages.base import Failed, Pieces, PiecewiseStage, Row, Stage, value_of
@@ -187,7 +188,9 @@ class _Queries(Pieces):
         rows = [row | assessed.get(k, {}) for k, (row, _) in enumerate(pieces)]
         slowdown = max(self._slowdown, calibration().slowdown())
         found = summarise(rows, slowdown)
-        return CellRows(found | self._sizes() | self._offline(), tuple(rows), tuple(solutions.values()))
+        return CellRows(
+            found | self._sizes() | self._shares() | self._offline(), tuple(rows), tuple(solutions.values())
+        )
 
     def _assess(self, solutions: Mapping[int, Row]) -> list[Row]:
         """Error columns of some queries, all at once; where that fails, one by one, and a row says why it failed."""
@@ -249,6 +252,17 @@ class _Queries(Pieces):
             "fallbacks": "; ".join(fallbacks),
             "peak_memory_mib": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
         }
+
+    def _shares(self) -> Row:
+        """The smallest shares of β_span in that of V, and the share that the last σ of the enrichment guarantees."""
+        histories = {h.quantity: h.values for h in self._artefact(self._stage.assembly.enrichment).histories}
+        validation = [share(own.span, full.span) for own, full in zip(self._own, self._full, strict=True)]
+        row: Row = {"share_validation": min(validation)}
+        if "share_min" in histories:
+            row["share_training"] = histories["share_min"][-1]
+        if "sigma" in histories:
+            row["share_guaranteed"] = math.sqrt(max(0.0, 1.0 - histories["sigma"][-1] ** 2))
+        return row
 
     def _offline(self) -> Row:
         """Offline seconds as if the cell had been run alone, and the machines that measured them."""

@@ -30,14 +30,15 @@ class AssessedGrowth:
     ----------
     grown
         The vectors, and how many of them each tolerance takes.
-    steps
-        The smallest β_span over the training set after every vector (S+1,).
+    steps, shares
+        The smallest β_span over the training set after every vector (S+1,), and its smallest share of that of V.
     training
         β_span at every training parameter (P,), by tolerance.
     """
 
     grown: Grown
     steps: Array
+    shares: Array
     training: Mapping[float, Array]
 
 
@@ -54,8 +55,8 @@ class GrowthStage(Stage):
     tolerances: tuple[float, ...]
 
     def inputs(self) -> tuple[Stage, ...]:
-        """POD, cone and the constraint matrices."""
-        return (self.pod, self.cone, self.cone.constraints)
+        """POD, cone, and the training constants that every vector is compared with."""
+        return (self.pod, self.cone, self.cone.constraints, TrainingConstants(self.cone))
 
     def run(self, store: Store) -> Result:
         """An `AssessedGrowth`."""
@@ -64,7 +65,8 @@ class GrowthStage(Stage):
         projected = _projected(offline, grown.vectors, value_of(store, self.cone.constraints))
         size = offline.basis.shape[1]
         training = {tolerance: projected.first(size + m.count).beta_span() for tolerance, m in grown.milestones.items()}
-        return Result(AssessedGrowth(grown, projected.over_steps(size), training))
+        shares = projected.shares_over_steps(size, value_of(store, TrainingConstants(self.cone)))
+        return Result(AssessedGrowth(grown, projected.over_steps(size), shares, training))
 
     def model(self, store: Store) -> ReducedModel:
         """The reduced model with all vectors."""
@@ -129,9 +131,10 @@ class SingleEnrichment(EnrichmentStage):
         known = dict(enrichment.history)
         if enrichment.vectors is not None:
             projected = _projected(offline, enrichment.vectors, value_of(store, self.cone.constraints))
-            known |= {"beta_span_min": projected.over_steps(offline.basis.shape[1])}
-            known |= {"beta_span_training": projected.beta_span()}
-            known |= {"beta_full_span_training": value_of(store, self.reachable)}
+            size, reachable = offline.basis.shape[1], value_of(store, self.reachable)
+            known |= {"beta_span_min": projected.over_steps(size)}
+            known |= {"share_min": projected.shares_over_steps(size, reachable)}
+            known |= {"beta_span_training": projected.beta_span(), "beta_full_span_training": reachable}
         return Result(enrichment, seconds, _histories(known))
 
     def enrichment(self, store: Store) -> Enrichment:
@@ -168,6 +171,7 @@ class NestedEnrichment(EnrichmentStage):
         check_enrichment(growth.grown.at(milestone), offline.problem.V, offline.basis)
         known = dict(milestone.history) | {
             "beta_span_min": growth.steps[: milestone.count + 1],
+            "share_min": growth.shares[: milestone.count + 1],
             "beta_span_training": growth.training[self.tolerance],
             "beta_full_span_training": value_of(store, self.reachable),
         }

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from matplotlib.figure import Figure
 
-from vibench.report.figures.constants import inf_sup
+from vibench.report.figures.constants import inf_sup, shares
 from vibench.report.figures.convergence import diagnostics, enrichment, orthogonality, projection_errors
 from vibench.report.figures.costs import dimension, total_cost, work_precision
 from vibench.report.figures.data import Data, file_names, problems
@@ -27,6 +27,7 @@ OF_PROBLEM: dict[str, Drawing] = {
     "orthogonality": orthogonality,
     "dimension": dimension,
     "work-precision": work_precision,
+    "shares": shares,
     "solvers": solvers,
     "total-cost": total_cost,
 }

@@ -8,8 +8,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from vibench.interfaces.strategies import Kind
-from vibench.report.figures.data import Data, at_best_tolerance, by_strategy, dimensions, one_solver
-from vibench.report.figures.style import BLACK, Sheet, counted, line, plot, positive, style_of
+from vibench.report.figures.data import PRIMAL, Data, at_best_tolerance, by_strategy, dimensions, one_solver
+from vibench.report.figures.style import BLACK, POINTS, Sheet, counted, line, plot, positive, style_of
 from vibench.stability.infsup import VANISHES
 
 
@@ -41,6 +41,27 @@ def inf_sup(data: Data) -> Figure:
         for panel, generated in zip(axes, ("span", "cone"), strict=True):
             panel.set(ylabel=f"β over {generated}", xlabel="validation parameters, sorted", yscale="log")
             counted(panel)
+    return sheet.finish()
+
+
+def shares(data: Data) -> Figure | None:
+    """Smallest shares of β over the span in that of the whole of V: over the validation against the training set.
+
+    One point per fixed enrichment. Below the diagonal, validation parameters are less stable than the training set; the
+    tick on the left of a point is √(1 − σ²), which bounds the share on the training set.
+    """
+    cells = data.cells[data.cells["share_training"].notna()].drop_duplicates([*PRIMAL, "dual", "pair"])
+    if cells.empty:
+        return None
+    sheet = Sheet(1, len(cells["dual"].unique()), f"{data.problem}: shares of the inf-sup constant")
+    styles: dict[str, int] = {}
+    for panel, (dual, group) in zip(sheet.panels, cells.groupby("dual", sort=False), strict=True):
+        panel.plot([0.0, 1.0], [0.0, 1.0], color="0.6", linewidth=0.8, zorder=0)
+        for primal, mine in group.groupby("primal", sort=False):
+            k = style_of(str(primal), styles)
+            plot(panel, mine["share_training"], mine["share_validation"], k, str(primal), **POINTS)
+            panel.plot(mine["share_guaranteed"], mine["share_validation"], "|", color=line(k)["color"])
+        panel.set(title=str(dual), xlabel="smallest share, training set", ylabel="smallest share, validation set")
     return sheet.finish()
 
 
