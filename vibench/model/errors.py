@@ -54,14 +54,19 @@ class Errors:
     complementarity: float
 
 
+def relative_to(problem: Problem, reference: Reference) -> tuple[Array, Array]:
+    """Denominators of the relative errors (P,): the norms of the solutions in V and in W, not below the floors."""
+    norm_u = np.maximum(problem.V.norm(reference.u), reference.floor_u)
+    return norm_u, np.maximum(problem.W.norm(reference.lam), reference.floor_lam)
+
+
 def errors(
     problem: Problem, vis: Sequence[VariationalInequality], reference: Reference, u: Array, lam: Array
 ) -> list[Errors]:
     """Errors of reduced u (n×P) and λ (m×P), column by column at the parameters of `vis`."""
     V, W = problem.V, problem.W
     du, dlam = u - reference.u, lam - reference.lam
-    norm_u = np.maximum(V.norm(reference.u), reference.floor_u)
-    norm_lam = np.maximum(W.norm(reference.lam), reference.floor_lam)
+    norm_u, norm_lam = relative_to(problem, reference)
     error_u, error_lam, integrals = V.norm(du), W.norm(dlam), problem.multiplier_integrals()
     excesses = [vi.B @ u[:, k] - vi.g for k, vi in enumerate(vis)]
     return [

@@ -12,7 +12,16 @@ import pandas as pd
 
 from vibench.interfaces.strategies import Kind
 from vibench.qp.status import Status
-from vibench.report.figures.data import PRIMAL, Data, best_solver, by_dimensions, label, problems
+from vibench.report.figures.data import (
+    PRIMAL,
+    SOLVER_SHARE,
+    Data,
+    best_solver,
+    by_dimensions,
+    label,
+    problems,
+    solved_too_loosely,
+)
 from vibench.results import invariants, tables
 from vibench.results.break_even import HIGH_FIDELITY
 from vibench.results.solver_agreement import sentence
@@ -45,6 +54,11 @@ def _whole_run(path: Path) -> Iterator[str]:
         yield f"The invariants of the inf-sup constants and the error bounds hold in all {len(queries)} queries."
     agreement = sentence(tables.read(path, "disagreements"))
     yield f"{agreement[:1].upper()}{agreement[1:]}."
+    if loose := int(solved_too_loosely(cells).sum()):
+        yield (
+            f"{loose} cells are not compared with others: their QP solver makes {100.0 * SOLVER_SHARE:.0f} % or more "
+            "of an error (column `solver_share_max`). A smaller `accuracy` would help."
+        )
     if disturbed := int((cells["disturbed"] == 1).sum()):
         yield f"{disturbed} cells were timed while other processes slowed the machine down (column `disturbed`)."
 

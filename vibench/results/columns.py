@@ -143,6 +143,11 @@ CELLS: Mapping[str, Column] = {
     "error_u_max": Column(REAL, "1", "Largest relative error of u in V."),
     "error_lambda_mean": Column(REAL, "1", "Mean relative error of λ in W.", "error λ", 16),
     "error_lambda_max": Column(REAL, "1", "Largest relative error of λ in W."),
+    "solver_error_u_max": Column(REAL, "1", "Largest part of the error of u that the QP solver makes."),
+    "solver_error_lambda_max": Column(REAL, "1", "Largest part of the error of λ that it makes."),
+    "solver_share_max": Column(
+        REAL, "1", "Largest of these over the error itself; strategies are compared only where it is below 0.1."
+    ),
     "assembly_error_max": Column(REAL, "1", "Largest difference of a member of a reduced program from its projection."),
     "violation_max": Column(REAL, "u", "Largest constraint violation of a reduced solution."),
     "residual_max": Column(REAL, "1", "Largest of all recomputed residuals."),
@@ -197,6 +202,15 @@ QUERIES: Mapping[str, Column] = {
     "error_energy": Column(REAL, "1", "The error of u in the norm of A(µ), relative."),
     "error_u_absolute": Column(REAL, "V", "‖u − u_N‖ in V."),
     "error_lambda_absolute": Column(REAL, "W", "‖λ − λ_N‖ in W."),
+    "solver_error_u": Column(
+        REAL,
+        "1",
+        "Distance of u from the reduced program solved to round-off, relative as error_u; empty where not solved.",
+    ),
+    "solver_error_lambda": Column(REAL, "1", "The same of λ; empty, too, where the reduced λ is not unique."),
+    "solver_share": Column(
+        REAL, "1", "The larger of these two over the error of u or λ; empty where both errors are at most 1e-8."
+    ),
     "bound_u": Column(REAL, "V", "Certified bound Δ_u of the error of u; infinite where β_HF over the span is 0."),
     "bound_lambda": Column(REAL, "W", "Certified bound Δ_λ of the error of λ."),
     "effectivity_u": Column(REAL, "1", "bound_u / error_u_absolute; empty for relative errors up to 1e-8."),

@@ -15,6 +15,7 @@ from vibench.interfaces.validation import checked_assembly, training_parameters,
 from vibench.model.affine import AffineMember, Evaluation, affine_decomposition
 from vibench.model.galerkin import ReducedModel, leading_part, project
 from vibench.model.hyperreduced import HyperReducedModel, Operators, hyper_reduce, reason_for_full_assembly
+from vibench.qp.exact import exact_solution
 from vibench.stages.artefacts import Store
 from vibench.stages.assemblies import assemblies
 from vibench.stages.base import Result, Stage, build_problem, value_of
@@ -248,6 +249,20 @@ def _in_full(model: ReducedModel, mus: Array, forms: Sequence[Seconds], known: I
 def _largest_difference(found: VariationalInequality, exact: VariationalInequality) -> float:
     pairs = [(getattr(found, name), getattr(exact, name)) for name in MEMBERS]
     return max(float(np.linalg.norm(one - other)) / (float(np.linalg.norm(other)) or 1.0) for one, other in pairs)
+
+
+@dataclass(frozen=True)
+class ExactSolutions(Stage):
+    """The reduced programs solved to round-off, for any QP solver and accuracy; not timed."""
+
+    label = "exact reduced solutions"
+    rooms = ("linalg", "interfaces", "qp")
+
+    assembly: AssemblyStage
+
+    def run(self, store: Store) -> Result:
+        """One `ExactSolution` per validation parameter, or `None`."""
+        return Result(tuple(exact_solution(program) for program in value_of(store, self.assembly).programs))
 
 
 def assembly_stage(cell: Cell) -> AssemblyStage:

@@ -17,11 +17,12 @@ from vibench.interfaces.strategies import Kind
 from vibench.model.error_bounds import Stability
 from vibench.model.errors import Reference
 from vibench.provenance import machine
+from vibench.qp.exact import ExactSolution
 from vibench.qp.status import Status
 from vibench.results.solver_agreement import vectors
 from vibench.stability.infsup import InfSup, share
 from vibench.stages.artefacts import Artefact, Store
-from vibench.stages.assembly import AssemblyStage, ReducedPrograms, assembly_stage
+from vibench.stages.assembly import AssemblyStage, ExactSolutions, ReducedPrograms, assembly_stage
 from vibench.stages.base import Failed, Pieces, PiecewiseStage, Row, Stage, value_of
 from vibench.stages.cell_summary import summarise
 from vibench.stages.infsup_constants import (
@@ -96,6 +97,11 @@ class CellQueries(PiecewiseStage):
         return ValidationConstraints(self.assembly.enrichment.pod.problem, self.assembly.count, self.assembly.seed)
 
     @property
+    def exact(self) -> ExactSolutions:
+        """The stage of the reduced programs solved to round-off."""
+        return ExactSolutions(self.assembly)
+
+    @property
     def training(self) -> tuple[Stage, ...]:
         """The stages of the training snapshots."""
         return training_stages(self.assembly.enrichment.pod.problem)
@@ -120,7 +126,7 @@ class CellQueries(PiecewiseStage):
     def inputs(self) -> tuple[Stage, ...]:
         """All stages whose artefacts enter the rows of the cell."""
         timed = (stage for stages in self.offline.values() for stage in stages)
-        read = (self.assembly, *self.assembly.model_inputs, self.assembly.full_times, *timed)
+        read = (self.assembly, self.exact, *self.assembly.model_inputs, self.assembly.full_times, *timed)
         found = (*read, *self.constants, self.reference, *self.validation)
         return tuple(dict.fromkeys(found))
 
@@ -153,6 +159,7 @@ class _Queries(Pieces):
         self._programs: ReducedPrograms = value_of(store, stage.assembly)
         self._own, self._full, self._plain = (value_of(store, known) for known in stage.constants)
         self._stability: list[Stability] = value_of(store, stage.reference)
+        self._exact: tuple[ExactSolution | None, ...] = value_of(store, stage.exact)
 
     def piece(self, number: int, watch: Callable[[bool], None]) -> QueryRows:
         """The rows of one query."""
@@ -202,6 +209,7 @@ class _Queries(Pieces):
                 [vectors(solution) for solution in solutions.values()],
                 Reference(reference.u, reference.lam, *self._floors).at(numbers),
                 [self._stability[k] for k in numbers],
+                [self._exact[k] for k in numbers],
             )
         except MemoryError:
             raise

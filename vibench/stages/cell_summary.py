@@ -50,6 +50,7 @@ def summarise(rows: Sequence[Row], slowdown: float = 1.0) -> Row:
         "error_u_max": largest("error_u"),
         "error_lambda_mean": mean("error_lambda"),
         "error_lambda_max": largest("error_lambda"),
+        **{f"{name}_max": largest(name) for name in ("solver_error_u", "solver_error_lambda", "solver_share")},
         "assembly_error_max": largest("assembly_error"),
         "violation_max": largest("violation"),
         "residual_max": max((r for r in residuals if r is not None), default=None),

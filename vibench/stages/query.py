@@ -13,8 +13,10 @@ from vibench.errors import in_a_line
 from vibench.interfaces.problem import VariationalInequality
 from vibench.interfaces.strategies import Kind
 from vibench.model.error_bounds import Bounds, Stability, bounds
-from vibench.model.errors import Errors, Reference, errors
+from vibench.model.errors import Errors, Reference, errors, relative_to
 from vibench.qp.accuracy_bounds import slack
+from vibench.qp.exact import ExactSolution
+from vibench.qp.scaling import ratio
 from vibench.qp.solution import QPSolution
 from vibench.qp.solve import solve_qp, takes_start
 from vibench.qp.status import Status
@@ -106,9 +108,17 @@ def _identical(one: QPSolution, other: QPSolution) -> bool:
 
 
 def error_columns(
-    model: Model, mus: Array, solutions: Sequence[tuple[Array, Array]], exact: Reference, known: Sequence[Stability]
+    model: Model,
+    mus: Array,
+    solutions: Sequence[tuple[Array, Array]],
+    reference: Reference,
+    known: Sequence[Stability],
+    exact: Sequence[ExactSolution | None],
 ) -> list[Row]:
-    """Errors of solutions (x, α), one per parameter of `mus` (P×d), their error bounds and effectivities."""
+    """Errors of solutions (x, α), one per parameter of `mus` (P×d), their error bounds and effectivities.
+
+    `exact` are the same programs solved to round-off: what the solver contributes to the errors.
+    """
     if not solutions:
         return []
     problem = model.problem
@@ -119,8 +129,19 @@ def error_columns(
     else:  # a fixed basis: all solutions are reconstructed at once
         u = model.lift(mus[0], vis[0], np.column_stack([x for x, _ in solutions]))
     lam = model.generators @ np.column_stack([alpha for _, alpha in solutions])
-    found = zip(errors(problem, vis, exact, u, lam), bounds(problem, vis, known, u, lam), strict=True)
-    return [_columns(error, bound) for error, bound in found]
+    found = zip(errors(problem, vis, reference, u, lam), bounds(problem, vis, known, u, lam), strict=True)
+    rows = [_columns(error, bound) for error, bound in found]
+    sizes = zip(*relative_to(problem, reference), strict=True)
+    for row, (x, alpha), program, (size_u, size_lam) in zip(rows, solutions, exact, sizes, strict=True):
+        if program is None:
+            continue
+        row["solver_error_u"] = ratio(float(np.linalg.norm(x - program.x)), size_u)  # the basis is orthonormal in V
+        if program.unique:
+            difference = model.generators @ (alpha - program.alpha)
+            row["solver_error_lambda"] = ratio(float(problem.W.norm(difference)), size_lam)
+        names = [name for name in ("u", "lambda") if row[f"error_{name}"] > UNMEASURABLE]
+        row["solver_share"] = max((row.get(f"solver_error_{n}", 0.0) / row[f"error_{n}"] for n in names), default=None)
+    return rows
 
 
 def _columns(error: Errors, bound: Bounds | None) -> Row:

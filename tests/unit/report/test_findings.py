@@ -36,6 +36,14 @@ def test_what_fell_short_is_counted(said: Said) -> None:
     assert said(ruined)[""][0].startswith("36 cells, 24 with every query ok; 504 of 576 queries")
 
 
+def test_cells_whose_solver_makes_the_error_are_counted_and_left_out(said: Said) -> None:
+    texts = said("UPDATE cells SET solver_share_max = 0.2 WHERE solver = 'osqp' OR primal = 'online-supremizers'")
+    assert any(text.startswith("20 cells are not compared with others") for text in texts[""])
+    of_model = [text for subject, found in texts.items() if "(N, R)" in subject for text in found]
+    assert of_model
+    assert not [text for text in of_model if "online-supremizers" in text]
+
+
 def test_a_violated_invariant_is_not_hidden(said: Said) -> None:
     broken = "UPDATE queries SET beta_span = 9 WHERE query = 3 AND problem = 'hertz' AND solver = 'piqp'"
     assert any("invariants of the inf-sup constants" in text and "violated" in text for text in said(broken)[""])

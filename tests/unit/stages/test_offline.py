@@ -223,6 +223,19 @@ def test_rows_of_a_cell(store: Store, primal: str, tolerance: float | None, kind
         assert max(row["primal_residual"], row["dual_residual"], row["gap"]) <= 1e-8
 
 
+def test_a_row_says_how_much_of_its_error_the_solver_makes(store: Store) -> None:
+    """Exactly as much as separates it from the program solved to round-off; a tight accuracy leaves next to nothing."""
+    loose = replace(cell("offline-pga", 0.5, "osqp"), accuracy=1e-3).run(store).value
+    tight = replace(cell("offline-pga", 0.5, "piqp"), accuracy=1e-10).run(store).value
+    assert tight.cell["solver_share_max"] < 1e-3 < loose.cell["solver_share_max"]
+    for one, other in zip(loose.queries, tight.queries, strict=True):
+        for name in ("u", "lambda"):
+            apart = abs(one[f"error_{name}"] - other[f"error_{name}"])
+            assert apart <= one[f"solver_error_{name}"] + 1e-6 * other[f"error_{name}"]
+        share = max(one[f"solver_error_{name}"] / one[f"error_{name}"] for name in ("u", "lambda"))
+        assert one["solver_share"] == pytest.approx(share)
+
+
 class Factorising(HighFidelitySolver):
     """A solver whose first solution takes 10 s longer than the others, which take 1 s each, by a clock of its own."""
 

@@ -1,0 +1,92 @@
+"""Reduced programs solved to round-off: KKT conditions, uniqueness of the multipliers, and what cannot be solved."""
+
+from __future__ import annotations
+
+from itertools import combinations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from vibench.interfaces.problem import VariationalInequality
+from vibench.qp.exact import exact_solution
+from vibench.qp.scaling import size
+from vibench.qp.solve import solve_qp
+from vibench.qp.verification import kkt_residuals
+
+
+def program(seed: int, n: int, m: int, scale: float = 1.0) -> VariationalInequality:
+    """A feasible program with a stiffness of moderate condition, its load of a given size."""
+    rng = np.random.default_rng(seed)
+    M = rng.standard_normal((n, n))
+    B = rng.standard_normal((m, n))
+    g = B @ rng.standard_normal(n) + rng.random(m)
+    return VariationalInequality(M @ M.T + 1e-2 * np.eye(n), scale * rng.standard_normal(n), B, g)
+
+
+@given(st.integers(0, 10_000), st.integers(1, 15), st.integers(0, 20), st.sampled_from([1e-6, 1.0, 1e6]))
+def test_solutions_satisfy_the_kkt_conditions_to_round_off(seed: int, n: int, m: int, scale: float) -> None:
+    vi = program(seed, n, m, scale)
+    found = exact_solution(vi)
+    assert found is not None
+    assert np.all(found.alpha >= 0.0)
+    residuals = kkt_residuals(vi, found.x, found.alpha)
+    assert max(residuals.dual, residuals.gap) <= 1e-12
+    assert np.all(vi.B @ found.x - vi.g <= 1e-12 * (np.abs(vi.B) @ np.abs(found.x) + np.abs(vi.g)))
+    assert np.all((found.alpha == 0.0) | (np.abs(vi.B @ found.x - vi.g) <= 1e-10 * (1.0 + size(found.x))))
+
+
+@given(st.integers(0, 10_000), st.integers(1, 4), st.integers(0, 5))
+def test_it_is_the_best_of_all_active_sets(seed: int, n: int, m: int) -> None:
+    vi = program(seed, n, m)
+    energies = []
+    for count in range(min(n, m) + 1):
+        for chosen in map(list, combinations(range(m), count)):
+            K = np.block([[vi.A, vi.B[chosen].T], [vi.B[chosen], np.zeros((count, count))]])
+            x = np.linalg.solve(K, np.concatenate([vi.f, vi.g[chosen]]))[:n]
+            if np.all(vi.B @ x <= vi.g + 1e-9):
+                energies.append(0.5 * x @ vi.A @ x - vi.f @ x)
+    found = exact_solution(vi)
+    assert found is not None
+    assert 0.5 * found.x @ vi.A @ found.x - vi.f @ found.x == pytest.approx(min(energies), rel=1e-8, abs=1e-10)
+
+
+def test_it_is_nearer_than_any_solver() -> None:
+    """A scale of stiffness like that of a reduced contact problem, 1e11, and loads of 1e6."""
+    vi = program(3, 12, 9)
+    stiff = VariationalInequality(1e11 * vi.A, 1e11 * vi.f, vi.B, vi.g)
+    found, answer = exact_solution(stiff), solve_qp(stiff, "piqp", 1e-7)
+    assert found is not None
+    assert kkt_residuals(stiff, found.x, found.alpha).worst <= 1e-12
+    assert np.linalg.norm(answer.x - found.x) < 1e-3 * np.linalg.norm(found.x)
+
+
+def test_multipliers_of_equal_constraints_are_not_unique() -> None:
+    vi = program(0, 4, 3)
+    vi = VariationalInequality(vi.A, vi.f + 10.0 * vi.B[0], vi.B, vi.g)  # which presses on the first
+    once = exact_solution(vi)
+    twice = exact_solution(VariationalInequality(vi.A, vi.f, np.vstack([vi.B, vi.B[:1]]), np.append(vi.g, vi.g[0])))
+    assert once is not None
+    assert twice is not None
+    assert once.alpha[0] > 0.0
+    assert np.allclose(twice.x, once.x, atol=1e-12)
+    assert np.isclose(twice.alpha[0] + twice.alpha[3], once.alpha[0])
+
+
+@pytest.mark.parametrize(
+    "vi",
+    [
+        VariationalInequality(np.diag([1.0, -1.0]), np.ones(2), np.eye(2), np.ones(2)),
+        VariationalInequality(np.eye(1), np.ones(1), np.array([[1.0], [-1.0]]), np.array([-1.0, -1.0])),
+    ],
+    ids=["indefinite", "infeasible"],
+)
+def test_what_has_no_solution_gets_none(vi: VariationalInequality) -> None:
+    assert exact_solution(vi) is None
+
+
+def test_a_program_without_unknowns_is_solved() -> None:
+    found = exact_solution(VariationalInequality(np.zeros((0, 0)), np.zeros(0), np.zeros((2, 0)), np.ones(2)))
+    assert found is not None
+    assert found.alpha.tolist() == [0.0, 0.0]

@@ -1,0 +1,106 @@
+"""Reduced programs solved to round-off, against which the part of an error that a QP solver makes is measured."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.linalg
+from scipy.optimize import nnls
+
+from vibench.arrays import Array, Mask
+from vibench.interfaces.problem import VariationalInequality
+from vibench.qp.scaling import row_norms, size
+from vibench.qp.verification import kkt_residuals
+
+ROUND_OFF = 1e-12
+"""Residuals below this fraction of their terms are round-off."""
+
+DEPENDENT = 1e-10
+"""Active constraints are dependent where a pivot of their factorisation is below this fraction of the largest."""
+
+MAX_ITERATIONS = 20
+"""Active sets tried after the first."""
+
+
+@dataclass(frozen=True)
+class ExactSolution:
+    """The solution x (n,) of a program, and multipliers α (m,), of which there may be others where not `unique`."""
+
+    x: Array
+    alpha: Array
+    unique: bool
+
+
+def exact_solution(program: VariationalInequality) -> ExactSolution | None:
+    """The solution of a dense program up to round-off; `None` if it has none or is too badly conditioned.
+
+    With A = L Lᵀ and z = L⁻¹(f − Ax) the program is a least distance problem, min ‖z‖ subject to Cᵀz ≥ d, C = L⁻¹Bᵀ.
+    Nonnegative least squares finds its active set (Lawson and Hanson 1974, chapter 23); orthogonal factors of the
+    active columns of C then give z and the multipliers without squaring the condition number. Where round-off has
+    misled the first set, a primal–dual active set method continues from it.
+    """
+    if not len(program.f):
+        return ExactSolution(np.zeros(0), np.zeros(len(program.g)), unique=True)
+    try:
+        L = np.linalg.cholesky(program.A)
+    except np.linalg.LinAlgError:
+        return None
+    whitened = _Whitened(program, L)
+    active, seen = whitened.least_distance_set(), set[bytes]()
+    for _ in range(MAX_ITERATIONS):
+        x, alpha, unique = whitened.solve_active(active)
+        # An excess is compared with the terms that it is the difference of, not with g alone, which may be small.
+        excess, terms = program.B @ x - program.g, np.abs(program.B) @ np.abs(x) + np.abs(program.g)
+        violated, pulling = excess > ROUND_OFF * terms, alpha < -ROUND_OFF * size(alpha)
+        if not np.any(violated) and not np.any(pulling):
+            alpha = np.maximum(alpha, 0.0)
+            balanced = kkt_residuals(program, x, alpha).dual <= ROUND_OFF
+            return ExactSolution(x, alpha, unique) if balanced else None
+        seen.add(active.tobytes())
+        active = violated | (active & ~pulling)
+        if active.tobytes() in seen:
+            return None
+    return None
+
+
+class _Whitened:
+    """A program in the coordinates z = L⁻¹(f − A x), in which its constraints are Cᵀz ≥ d, in units of their norms."""
+
+    def __init__(self, program: VariationalInequality, L: Array) -> None:
+        self._program, self._L, self._rows = program, L, row_norms(program.B)
+        self._C, self._load = self._whiten((program.B / self._rows[:, None]).T), self._whiten(program.f)
+
+    def _whiten(self, right: Array) -> Array:
+        return np.asarray(scipy.linalg.solve_triangular(self._L, right, lower=True, check_finite=False))
+
+    def least_distance_set(self) -> Mask:
+        """Constraints that are active in min ‖z‖ subject to Cᵀz ≥ d; none where nonnegative least squares fails."""
+        d = self._C.T @ self._load - self._program.g / self._rows
+        if not len(d):
+            return np.zeros(0, dtype=bool)
+        system = np.vstack([self._C / size(self._C), d / size(d)])
+        try:
+            weights, _ = nnls(system, np.append(np.zeros(len(self._C)), 1.0), maxiter=30 * max(system.shape))
+        except RuntimeError:
+            return np.zeros(len(d), dtype=bool)
+        return np.asarray(weights > 0.0)
+
+    def solve_active(self, active: Mask) -> tuple[Array, Array, bool]:
+        """Solution x (n,), α (m,) with the active constraints as equalities, and whether these are independent."""
+        kept = chosen = np.flatnonzero(active)
+        q, r = np.zeros((len(self._C), 0)), np.zeros((0, 0))
+        if len(chosen):  # LAPACK does not factorise matrices without columns
+            q, r, order = scipy.linalg.qr(self._C[:, chosen], mode="economic", pivoting=True)
+            pivots = np.abs(np.diag(r))
+            rank = int(np.sum(pivots > DEPENDENT * np.max(pivots, initial=0.0)))
+            kept, q, r = chosen[order[:rank]], q[:, :rank], r[:rank, :rank]
+        program, B = self._program, self._program.B[kept] / self._rows[kept, None]
+        x, alpha = np.zeros(len(program.f)), np.zeros(len(program.g))
+        for _ in range(2):  # the second time for the residual of the first
+            load = self._whiten(program.f - program.A @ x - program.B.T @ alpha)
+            right = r.T @ (q.T @ load) - (program.g[kept] / self._rows[kept] - B @ x)
+            y = scipy.linalg.solve_triangular(r, right, trans="T")
+            x = x + scipy.linalg.solve_triangular(self._L, load - q @ y, lower=True, trans="T")
+            alpha[kept] += scipy.linalg.solve_triangular(r, y) / self._rows[kept]
+        return x, alpha, len(kept) == len(chosen)
