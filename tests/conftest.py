@@ -16,6 +16,7 @@ import pytest
 from hypothesis import settings
 from running import Changed, Main, Register, Vibench, execute, started
 from samples import install_fakes
+from threadpoolctl import threadpool_limits
 
 from vibench.cli import main as main_module
 from vibench.results.database import FILE
@@ -24,6 +25,16 @@ from vibench.study import registry
 
 settings.register_profile("any machine", deadline=None)
 settings.load_profile("any machine")
+
+
+@pytest.fixture(scope="session", autouse=True)
+def one_thread() -> Iterator[None]:
+    """BLAS on one thread, as in workers: on several, products of this size spend twice the CPU seconds on waiting.
+
+    Only in this process, no variable of the environment: processes that tests start see to their threads themselves.
+    """
+    with threadpool_limits(1):
+        yield
 
 
 @pytest.fixture(scope="session", autouse=True)
