@@ -9,10 +9,12 @@ import subprocess
 import sys
 import sysconfig
 from collections.abc import Iterator
+from functools import cache
 from importlib.metadata import EntryPoint
 from pathlib import Path
 
 import pytest
+import typer.main
 from hypothesis import settings
 from running import Changed, Main, Register, Vibench, execute, started
 from samples import install_fakes
@@ -125,9 +127,14 @@ def vibench(command: str, plugins_folder: Path) -> Vibench:
     return run
 
 
+command_line = cache(typer.main.get_command)
+"""The command line that typer makes of an app: it would make the same one at every call, in longer than most take."""
+
+
 @pytest.fixture
 def main(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> Main:
     """Function that calls the command in an empty folder; gives exit code, what was printed, and errors."""
+    monkeypatch.setattr(typer.main, "get_command", command_line)
     (tmp_path / "here").mkdir()
     monkeypatch.chdir(tmp_path / "here")
 
