@@ -158,7 +158,12 @@ def canonical_options(kind: str, name: str, given: Mapping[str, Any]) -> str:
     """Options as canonical JSON, without those that equal their default."""
     known, checked = _parameters(load(kind, name)), check_options(kind, name, given)
     kept = {option: value for option, value in checked.items() if value != known[option][0]}
-    return json.dumps(TypeAdapter(dict[str, Any]).dump_python(kept, mode="json"), sort_keys=True)
+    return json.dumps(_json_values().dump_python(kept, mode="json"), sort_keys=True)
+
+
+@cache  # to make it takes longer than to use it
+def _json_values() -> TypeAdapter[dict[str, Any]]:
+    return TypeAdapter(dict[str, Any])
 
 
 def qp_solver(name: str) -> dict[str, QPSolver]:
@@ -189,7 +194,8 @@ def _entry(kind: str, name: str) -> EntryPoint:
     return registered[name]
 
 
-def _parameters(plugin: Any) -> dict[str, tuple[Any, Any]]:
+@cache
+def _parameters(plugin: Any) -> Mapping[str, tuple[Any, Any]]:
     """Default and annotation of every named parameter of a constructor."""
     constructor = inspect.getattr_static(plugin, "__init__")
     if constructor is object.__init__:
