@@ -79,10 +79,6 @@ class SparseCholesky:
         return lower
 
     @cached_property
-    def _upper(self) -> SparseMatrix:
-        return self._lower.T  # here once; for small matrices, making it costs more than a product
-
-    @cached_property
     def _blocks(self) -> tuple[SparseMatrix, SparseMatrix, Array]:
         """Leading and coupling block of the unit lower factor, transposed, and the dense trailing block of F."""
         split = self._split
@@ -103,7 +99,7 @@ class SparseCholesky:
 
     def apply_factor(self, u: Array) -> Array:
         """F u, for u (n,) or (n, k)."""
-        return _scale_rows(self._root, self._upper @ u[self.order])
+        return _scale_rows(self._root, self._lower.T @ u[self.order])
 
     def solve_factor(self, y: Array) -> Array:
         """F⁻¹ y, for y (n,) or (n, k)."""

@@ -31,12 +31,6 @@ def project_on_cone(generators: Array, theta: Array, W: InnerProduct) -> Project
     return _project_whitened(W.whiten(generators), W.whiten(theta))
 
 
-def distances_from_cone(generators: Array, snapshots: Array, W: InnerProduct) -> Array:
-    """Distances (P,) of snapshots (m×P) from the cone of `generators` (m×R) in the W norm."""
-    whitened = W.whiten(generators)
-    return np.array([_project_whitened(whitened, W.whiten(theta)).distance for theta in snapshots.T])
-
-
 def project_on_orthant(functional: Array, W: InnerProduct) -> Array:
     """Projection (m,) on W⁺, nonnegative coefficients, of the Riesz representer of a functional (m,) in the W norm.
 

@@ -158,12 +158,7 @@ def canonical_options(kind: str, name: str, given: Mapping[str, Any]) -> str:
     """Options as canonical JSON, without those that equal their default."""
     known, checked = _parameters(load(kind, name)), check_options(kind, name, given)
     kept = {option: value for option, value in checked.items() if value != known[option][0]}
-    return json.dumps(_json_values().dump_python(kept, mode="json"), sort_keys=True)
-
-
-@cache  # to make it takes longer than to use it
-def _json_values() -> TypeAdapter[dict[str, Any]]:
-    return TypeAdapter(dict[str, Any])
+    return json.dumps(TypeAdapter(dict[str, Any]).dump_python(kept, mode="json"), sort_keys=True)
 
 
 def qp_solver(name: str) -> dict[str, QPSolver]:

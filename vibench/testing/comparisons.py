@@ -32,19 +32,6 @@ def peak(value: Any) -> float:
     return float(np.max(np.abs(_entries(value)), initial=0.0))
 
 
-def deviation(first: Any, middle: Any, last: Any) -> float:
-    """Largest modulus of an entry of middle − (first + last)/2, of dense arrays or sparse matrices as of `copies`."""
-    if sp.issparse(middle) and all(_same_pattern(middle, other) for other in (first, last)):
-        first, middle, last = (_entries(value) for value in (first, middle, last))  # sparse sums take far longer
-    return peak(middle - 0.5 * (first + last))
-
-
-def _same_pattern(one: Any, other: Any) -> bool:
-    return one.shape == other.shape and all(
-        np.array_equal(getattr(one, part), getattr(other, part)) for part in ("indptr", "indices")
-    )
-
-
 def difference(one: Any, other: Any, limit: float = 0.0) -> str:
     """Entry in which two arrays differ most, "entry (3, 4) is 1.0 against 2.0"; "" if by no more than the limit."""
     if one.shape != other.shape:

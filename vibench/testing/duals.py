@@ -13,7 +13,7 @@ from vibench.errors import NumericalError, VibenchError
 from vibench.interfaces.strategies import Cone, DualStrategy, Stop, rays
 from vibench.interfaces.validation import check_cone
 from vibench.linalg.inner_product import InnerProduct
-from vibench.reduction.cones import distances_from_cone
+from vibench.reduction.cones import project_on_cone
 from vibench.testing.case import Case
 from vibench.testing.checks import SECONDS, Check, Finding, Note, examine, raising
 from vibench.testing.comparisons import Arrays, array_fault, unmutated
@@ -129,7 +129,7 @@ class DualCase(Case[DualStrategy, Stop, Cone]):
         """Projection errors (P,) on the cone of the first r generators, relative to the largest norm of a snapshot."""
         largest = float(np.max(self.W.norm(snapshots), initial=0.0)) or 1.0
         chi = rays(cone.generators[:, :r], cone.free[:r])
-        return distances_from_cone(chi, snapshots, self.W) / largest
+        return np.array([project_on_cone(chi, theta, self.W).distance for theta in snapshots.T]) / largest
 
 
 CHECKS: tuple[Check[DualCase], ...] = (
