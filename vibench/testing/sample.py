@@ -93,7 +93,4 @@ def _solutions() -> tuple[Array, Array]:
     problem = MovingSupport()
     solver = active_set.HighFidelitySolver(problem)
     found = [solver.solve(mu) for mu in problem.training_set()]
-    U, lam = np.column_stack([each.u for each in found]), np.column_stack([each.lam for each in found])
-    for shared in (U, lam):
-        shared.setflags(write=False)
-    return U, lam
+    return np.column_stack([each.u for each in found]), np.column_stack([each.lam for each in found])
