@@ -9,13 +9,16 @@ import subprocess
 import sys
 import sysconfig
 from collections.abc import Iterator
+from functools import cache
 from importlib.metadata import EntryPoint
 from pathlib import Path
 
 import pytest
+import typer.main
 from hypothesis import settings
 from running import Changed, Main, Register, Vibench, execute, started
 from samples import install_fakes
+from threadpoolctl import threadpool_limits
 
 from vibench.cli import main as main_module
 from vibench.results.database import FILE
@@ -24,6 +27,16 @@ from vibench.study import registry
 
 settings.register_profile("any machine", deadline=None)
 settings.load_profile("any machine")
+
+
+@pytest.fixture(scope="session", autouse=True)
+def one_thread() -> Iterator[None]:
+    """BLAS on one thread, as in workers: on several, products of this size spend twice the CPU seconds on waiting.
+
+    Only in this process, no variable of the environment: processes that tests start see to their threads themselves.
+    """
+    with threadpool_limits(1):
+        yield
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -114,9 +127,14 @@ def vibench(command: str, plugins_folder: Path) -> Vibench:
     return run
 
 
+command_line = cache(typer.main.get_command)
+"""The command line that typer makes of an app: it would make the same one at every call, in longer than most take."""
+
+
 @pytest.fixture
 def main(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> Main:
     """Function that calls the command in an empty folder; gives exit code, what was printed, and errors."""
+    monkeypatch.setattr(typer.main, "get_command", command_line)
     (tmp_path / "here").mkdir()
     monkeypatch.chdir(tmp_path / "here")
 

@@ -24,6 +24,9 @@ IMPORTED = ("", "problems", "strategies", "tests", "tests/helpers")
 AT_ONCE = 2
 """Copies that are tested side by side."""
 
+PLACES = "tests/faults/test_mutations.py"
+"""Says whether the faults fit the sources, and so fails on every copy with a fault."""
+
 PATIENCE = 600
 """Seconds after which tests that do not end count as failed."""
 
@@ -305,7 +308,7 @@ FAULTS = (
         "vibench/linalg/cholesky.py",
         "spsolve_triangular(corner, -(coupling @ last), lower=False",
         "spsolve_triangular(corner, coupling @ last, lower=False",
-        ("tests/unit/linalg/test_schur_complement.py",),
+        ("tests/unit/linalg/test_cholesky.py",),
     ),
     Fault(
         "forces-where-contact-has-ended",
@@ -390,7 +393,7 @@ def caught(fault: Fault) -> str | None:
     with tempfile.TemporaryDirectory() as folder:
         root = copy_of_sources(folder)
         (root / fault.file).write_text(changed(root, fault), encoding="utf-8")
-        return first_failure(root, fault.tests) or first_failure(root, ["tests"])
+        return first_failure(root, fault.tests) or first_failure(root, ["tests", f"--ignore={PLACES}"])
 
 
 def main(names: Sequence[str]) -> int:

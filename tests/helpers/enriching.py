@@ -7,16 +7,15 @@ from collections.abc import Callable
 import numpy as np
 
 from vibench import Cone, LazyMaximum, Offline, no_free
-from vibench.highfidelity import active_set
+from vibench.highfidelity.active_set import HighFidelitySolver
 from vibench.stability.infsup import multipliers
 
 
 def offline(problem, count: int, modes: int, generators: int) -> Offline:
     """A reduced setting from some training solutions."""
     training = problem.training_set()
-    solved = [
-        active_set.solve_high_fidelity(problem.assemble(mu)) for mu in training[:: max(1, len(training) // count)]
-    ]
+    solver = HighFidelitySolver(problem)
+    solved = [solver.solve(mu) for mu in training[:: max(1, len(training) // count)]]
     u, lam = np.column_stack([s.u for s in solved]), np.column_stack([s.lam for s in solved])
     basis = problem.V.orthonormalise(u)[:, :modes]
     chi = lam[:, :generators] / problem.W.norm(lam[:, :generators])

@@ -100,11 +100,16 @@ EVERYTHING = [
 ]
 
 
+@pytest.fixture(scope="module")
+def store(tmp_path_factory) -> Store:
+    """Artefacts of all cells: snapshots and POD of a case are those of every strategy."""
+    return Store(tmp_path_factory.mktemp("degenerate"))
+
+
 @pytest.fixture
-def rows(register, tmp_path):
+def rows(register, store):
     """Function that runs one cell of a case and returns its rows."""
     register(*EVERYTHING)
-    store = Store(tmp_path)
 
     def run(case: type[Wire], dual: str, primal: str) -> CellRows:
         problem = Plugin("problem", case.__name__, "{}", registry.code("problem", case.__name__))

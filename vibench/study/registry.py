@@ -189,7 +189,8 @@ def _entry(kind: str, name: str) -> EntryPoint:
     return registered[name]
 
 
-def _parameters(plugin: Any) -> dict[str, tuple[Any, Any]]:
+@cache
+def _parameters(plugin: Any) -> Mapping[str, tuple[Any, Any]]:
     """Default and annotation of every named parameter of a constructor."""
     constructor = inspect.getattr_static(plugin, "__init__")
     if constructor is object.__init__:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from copy import deepcopy
+from functools import cache
 from operator import attrgetter
 
 import numpy as np
@@ -59,14 +60,13 @@ def _tridiagonal(off: float, diagonal: float, n: int) -> SparseMatrix:
 
 def sample_snapshots() -> tuple[Array, InnerProduct]:
     """Multipliers λ(mu_p) (m×P) of the sample problem at its training parameters, and their space W."""
-    problem = MovingSupport()
-    return _solutions(problem)[1], problem.W
+    return _solutions()[1].copy(), MovingSupport().W
 
 
 def sample_offline(modes: int = 4, generators: int = 6) -> Offline:
     """A reduced model of the sample problem to enrich: N POD modes and a greedy cone of R generators."""
     problem = MovingSupport()
-    u, lam = _solutions(problem)
+    u, lam = _solutions()
     basis = pod(u, problem.V, Stop(size=modes)).basis
     return offline_of(problem, basis, greedy_cone(lam, problem.W, Stop(size=generators)))
 
@@ -87,8 +87,10 @@ def arrays_of(offline: Offline) -> Arrays:
     return {f"offline.{name}": attrgetter(name)(offline) for name in names}
 
 
-def _solutions(problem: Problem) -> tuple[Array, Array]:
-    """U (n×P) and λ (m×P) at the training parameters."""
+@cache
+def _solutions() -> tuple[Array, Array]:
+    """U (n×P) and λ (m×P) of the sample problem at its training parameters; for reading only."""
+    problem = MovingSupport()
     solver = active_set.HighFidelitySolver(problem)
     found = [solver.solve(mu) for mu in problem.training_set()]
     return np.column_stack([each.u for each in found]), np.column_stack([each.lam for each in found])

@@ -6,7 +6,7 @@ from itertools import product
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from skfem import Basis, BilinearForm, ElementTriP1, LinearForm, MeshTri, condense, solve
 from skfem.helpers import dot, grad
@@ -53,6 +53,7 @@ def disc_parameters(seed: int, count: int = 1) -> np.ndarray:
 
 
 @given(seeds)
+@settings(max_examples=50)
 def test_forms_are_those_assembled_on_the_moved_mesh(seed: int) -> None:
     """Everything anew on the mesh with its nodes moved; ψ is a function of the reference point, in the same rule."""
     mu = disc_parameters(seed)[0]
@@ -74,6 +75,7 @@ def test_forms_are_those_assembled_on_the_moved_mesh(seed: int) -> None:
 
 
 @given(seeds)
+@settings(max_examples=50)
 def test_what_is_assembled_in_parts_is_the_whole(seed: int) -> None:
     rng, mu = np.random.default_rng(seed), disc_parameters(seed)[0]
     vi, contact, dofs = EGG.assemble(mu), EGG.contact(mu), EGG.contact_dofs

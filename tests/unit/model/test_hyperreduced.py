@@ -95,14 +95,35 @@ class Rope(Varying):
         return lambda mu: {name: self.factors(name, float(mu[0])) @ terms for name, terms in entries.items()}
 
 
+@cache
+def rope(constraint: str, stiffness: str = "several") -> Rope:
+    """A rope that tests share."""
+    return Rope(constraint, stiffness)
+
+
+@cache
+def solutions(problem: Problem, mus: tuple[tuple[float, ...], ...]) -> tuple[np.ndarray, np.ndarray]:
+    """U (n×P) and λ (m×P) at some parameters, the same for all kinds and sizes of reduced models."""
+    solver = HighFidelitySolver(problem)
+    found = [solver.solve(np.array(mu)) for mu in mus]
+    both = np.column_stack([s.u for s in found]), np.column_stack([s.lam for s in found])
+    for shared in both:
+        shared.setflags(write=False)
+    return both
+
+
+@cache
+def separation(problem: Problem) -> Mapping[str, Any]:
+    """Its members, interpolated to round-off."""
+    return affine_decomposition(problem, problem.training_set(), 1e-11)
+
+
 def reduced_model(problem: Problem, kind: str, modes: int, generators: int, mus: np.ndarray) -> ReducedModel:
     """A reduced model from some solutions; the fixed enrichment is the supremizers at the first parameter."""
-    solver = HighFidelitySolver(problem)
-    found = [solver.solve(mu) for mu in mus]
-    lam = np.column_stack([s.lam for s in found])
+    u, lam = solutions(problem, tuple(map(tuple, mus.tolist())))
     lam = lam[:, lam.any(axis=0)][:, :generators]
     cone = multipliers(lam / problem.W.norm(lam), problem.W)
-    basis = problem.V.orthonormalise(np.column_stack([s.u for s in found]))[:, :modes]
+    basis = problem.V.orthonormalise(u)[:, :modes]
     if kind == "none":
         enrichment = Enrichment(Kind.NONE)
     elif kind == "fixed":
@@ -113,8 +134,8 @@ def reduced_model(problem: Problem, kind: str, modes: int, generators: int, mus:
     return ReducedModel(problem, basis, enrichment, cone.chi, cone.span)
 
 
-def online(model: ReducedModel, tolerance: float = 1e-11) -> HyperReducedModel:
-    members = affine_decomposition(model.problem, model.problem.training_set(), tolerance)
+def online(model: ReducedModel) -> HyperReducedModel:
+    members = separation(model.problem)
     assert reason_for_full_assembly(model, members) == ""
     return HyperReducedModel(model, hyper_reduce(model, members))
 
@@ -139,8 +160,8 @@ def assert_same_program(model: ReducedModel, reduced: HyperReducedModel, mu: np.
 @pytest.mark.parametrize("constraint", WAYS)
 @pytest.mark.parametrize("stiffness", ["constant", "several"])
 def test_programs_are_those_of_the_full_assembly(constraint: str, stiffness: str, kind: str) -> None:
-    problem = Rope(constraint, stiffness)
-    members = affine_decomposition(problem, problem.training_set(), 1e-11)
+    problem = rope(constraint, stiffness)
+    members = separation(problem)
     assert [len(members[name].terms) for name in "AB"] == [
         {"constant": 1, "several": 2}[stiffness],
         {"constant": 1, "one": 1, "several": 3, "contact": 0}[constraint],
@@ -166,7 +187,7 @@ class Mixed(Rope):
 def test_members_on_the_contact_and_interpolated_ones_go_together(entrywise: str, on_contact: str, kind: str) -> None:
     problem = Mixed("several")
     problem.entrywise = frozenset(entrywise)
-    members = affine_decomposition(problem, problem.training_set(), 1e-11)
+    members = separation(problem)
     assert {name for name in MEMBERS if members[name].way is Evaluation.CONTACT} == set(on_contact)
     model = reduced_model(problem, kind, 3, 2, problem.training_set()[:5])
     for mu in NEW:
@@ -177,7 +198,7 @@ def test_members_on_the_contact_and_interpolated_ones_go_together(entrywise: str
 @pytest.mark.parametrize("constraint", WAYS)
 @pytest.mark.parametrize(("modes", "generators"), [(3, 0), (0, 2), (0, 0)])
 def test_without_modes_or_without_generators(constraint: str, kind: str, modes: int, generators: int) -> None:
-    problem = Rope(constraint, "constant")
+    problem = rope(constraint, "constant")
     model = reduced_model(problem, kind, modes, generators, problem.training_set()[:5])
     reduced = online(model)
     for mu in NEW[:2]:
@@ -200,7 +221,7 @@ def test_programs_of_spaces_that_depend_on_mu_are_right_in_all_dimensions(
 
 
 def test_a_loose_tolerance_gives_a_program_that_is_as_inexact() -> None:
-    problem = Rope("several")
+    problem = rope("several")
     model = reduced_model(problem, "none", 3, 2, problem.training_set()[:5])
     members = affine_decomposition(problem, problem.training_set(), 0.2)
     assert members["B"].error > 1e-3
@@ -212,9 +233,9 @@ def test_a_loose_tolerance_gives_a_program_that_is_as_inexact() -> None:
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("constraint", WAYS)
 def test_operators_travel(constraint: str, kind: str) -> None:
-    problem = Rope(constraint)
+    problem = rope(constraint)
     model = reduced_model(problem, kind, 3, 2, problem.training_set()[:5])
-    operators = hyper_reduce(model, affine_decomposition(problem, problem.training_set(), 1e-11))
+    operators = hyper_reduce(model, separation(problem))
     here, there = HyperReducedModel(model, operators), HyperReducedModel(model, pickle.loads(pickle.dumps(operators)))
     for mu in NEW:
         one, other = here.assemble(mu), there.assemble(mu)
@@ -224,9 +245,9 @@ def test_operators_travel(constraint: str, kind: str) -> None:
 
 
 def test_an_unpickled_factor_is_still_that_of_a() -> None:
-    problem = Rope("contact", "constant")
+    problem = rope("contact", "constant")
     model = reduced_model(problem, "fixed", 3, 2, problem.training_set()[:5])
-    operators = hyper_reduce(model, affine_decomposition(problem, problem.training_set(), 1e-11))
+    operators = hyper_reduce(model, separation(problem))
     query = HyperReducedModel(model, pickle.loads(pickle.dumps(operators))).assemble(NEW[0])
     assert np.allclose(query.factor @ query.factor.T, query.program.A, rtol=1e-12)
 
@@ -246,7 +267,7 @@ def test_an_unpickled_factor_is_still_that_of_a() -> None:
 def test_a_factor_comes_with_a_constant_stiffness_on_a_fixed_space(
     stiffness: str, constraint: str, kind: str, modes: int, dual: bool
 ) -> None:
-    problem = Rope(constraint, stiffness)
+    problem = rope(constraint, stiffness)
     model = reduced_model(problem, kind, modes, 3, problem.training_set()[:5])
     query = online(model).assemble(NEW[1])
     assert (query.factor is not None) == dual
@@ -277,7 +298,7 @@ def test_what_stands_in_the_way_of_reduction_is_said() -> None:
 def test_values_that_are_not_finite_are_refused(
     monkeypatch: pytest.MonkeyPatch, constraint: str, member: str, kind: str, value: float
 ) -> None:
-    problem = Rope(constraint)
+    problem = rope(constraint)
     reduced = online(reduced_model(problem, kind, 3, 2, problem.training_set()[:5]))
     sampler, contact = problem.sampler, problem.contact
 

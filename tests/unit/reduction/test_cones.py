@@ -4,7 +4,7 @@ from itertools import combinations
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from numerics import space
 
@@ -82,6 +82,7 @@ def test_projection_on_an_empty_cone() -> None:
 
 
 @given(seeds)
+@settings(max_examples=50)
 def test_greedy_errors_fall_and_are_the_largest_distances(seed: int) -> None:
     X, theta = space(8, seed), snapshots(seed)
     largest = float(X.norm(theta).max())
@@ -96,6 +97,7 @@ def test_greedy_errors_fall_and_are_the_largest_distances(seed: int) -> None:
 
 
 @given(seeds)
+@settings(max_examples=50)
 def test_greedy_picks_what_a_plain_greedy_picks(seed: int) -> None:
     X, theta = space(8, seed), snapshots(seed)
     if not np.any(theta):

@@ -149,30 +149,29 @@ def test_histories_of_the_offline_stages(store: Store) -> None:
 
 
 @pytest.mark.parametrize("interpolation", [None, 1e-6])
-def test_a_cell_of_a_nested_strategy_is_the_cell_built_alone(
-    store: Store, tmp_path: Path, interpolation: float | None
-) -> None:
+def test_a_cell_of_a_nested_strategy_is_the_cell_built_alone(store: Store, interpolation: float | None) -> None:
+    """Snapshots, POD and cone are the same stages; everything from the enrichment on has keys of its own."""
     alone = cell("offline-pga", 0.5)
     parts = alone.assembly.enrichment
     enrichment = NestedEnrichment(parts.pod, parts.cone, parts.primal, parts.tolerance, (0.3, 0.5, 0.9))
     grown = replace(alone, assembly=replace(alone.assembly, enrichment=enrichment, interpolation=interpolation))
-    beside = Store(tmp_path)
-    carry_out(grown, beside)
-    expected, found = value_of(store, alone).cell, value_of(beside, grown).cell
+    assert len({stage.key for stage in (enrichment, grown, parts, alone)}) == 4
+    carry_out(grown, store)
+    expected, found = value_of(store, alone).cell, value_of(store, grown).cell
     assert found["enrichment"] == expected["enrichment"] > 0
-    assert isinstance(value_of(beside, enrichment), Milestone)  # the vectors are stored once, with the growth
+    assert isinstance(value_of(store, enrichment), Milestone)  # the vectors are stored once, with the growth
     for name in ("error_u_mean", "error_lambda_mean", "beta_span_min", "beta_cone_upper_min"):
         assert found[name] == pytest.approx(expected[name], rel=1e-6), name
     assert found["assembly_error_max"] < 1e-5
     histories = [
-        {h.quantity: h.values for h in some.get(stage.key).histories}
-        for some, stage in ((store, alone.assembly.enrichment), (beside, enrichment))
+        {h.quantity: h.values for h in store.get(stage.key).histories}
+        for stage in (alone.assembly.enrichment, enrichment)
     ]
     assert histories[0].keys() == histories[1].keys()
     for quantity, values in histories[0].items():
         assert histories[1][quantity] == pytest.approx(values, rel=1e-9), quantity
     if interpolation is None:
-        programs = [value_of(some, c.assembly).programs for some, c in ((store, alone), (beside, grown))]
+        programs = [value_of(store, c.assembly).programs for c in (alone, grown)]
         for one, other in zip(*programs, strict=True):
             assert np.allclose(one.A, other.A, rtol=1e-10, atol=1e-13)
             assert np.allclose(one.B, other.B, rtol=1e-10, atol=1e-13)
