@@ -76,6 +76,7 @@ TABLES = ("cells", "thresholds", "disagreements")
 FIGURES = {
     "benefit": ("total-cost", "work-precision", "inf-sup"),
     "hertz-quadrature": ("solutions", "errors"),
+    "solvers": ("solvers", "precision"),
 }
 """Kinds of figures on the page of a study; all of them on other pages."""
 
@@ -151,7 +152,7 @@ def comparison_with_the_paper(cells: pd.DataFrame, name: str) -> list[str]:
     return [
         f"## {PAPER[name][0]}",
         tables.to_markdown(comparison(cells, name)),
-        f"Columns of vibench: {SOLVER}, full assembly as in the paper; the break-even follows from its seconds by the "
+        f"Columns of vibench: {SOLVER}, full assembly; the break-even follows from its seconds by the "
         "paper's formula.",
     ]
 

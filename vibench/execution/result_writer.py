@@ -64,7 +64,8 @@ class ResultWriter:
 def cell_columns(cell: Cell) -> dict[str, Any]:
     """The key columns of a cell."""
     labels = dict(zip((cell.problem, cell.dual, cell.primal), cell.labels, strict=True))
-    return {**axis_columns(cell.axes, labels), "solver": cell.solver, "assembly": cell.assembly}
+    how = {"solver": cell.solver, "accuracy": cell.accuracy, "assembly": cell.assembly}
+    return axis_columns(cell.axes, labels) | how
 
 
 def labels_of(cells: Iterable[Cell]) -> dict[Plugin, str]:

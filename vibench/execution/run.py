@@ -79,7 +79,7 @@ class Outcome:
 
 def identity(study: Study) -> dict[str, Any]:
     """The settings that all numbers of a study depend on; a run folder holds results of one identity only."""
-    return {"name": study.name, "seed": study.seed, "validation": study.validation, "accuracy": study.accuracy}
+    return {"name": study.name, "seed": study.seed, "validation": study.validation}
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,6 @@
-"""Certified a-posteriori error bounds (Haasdonk, Salomon and Wohlmuth, 2012), derived for inexact reduced solutions.
+"""A-posteriori error bounds (Haasdonk, Salomon and Wohlmuth, 2012), derived for inexact reduced solutions.
+
+They are bounds as far as α and γ_a are: these are estimated by Lanczos iterations and moved by a margin, not certified.
 
 Let (u, λ) solve (7), and let u_N be any vector and λ_N any element of W⁺. With e = u − u_N, ε = λ − λ_N, the residual
 r = f − A u_N − Bᵀλ_N and s = B u_N − g, subtracting the equations gives A e + Bᵀε = r. Tested with e,

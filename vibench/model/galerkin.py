@@ -128,7 +128,7 @@ class ReducedModel:
         return self.problem.V.whiten(self.fixed_basis)
 
     def assemble(self, mu: Array) -> ReducedProblem:
-        """Assemble at mu (d,) in full, as the paper does: high-fidelity matrices, checked, then their projections."""
+        """Assemble at mu (d,) in full: high-fidelity matrices, checked, then their projections."""
         return self.reduce(checked_assembly(self.problem, mu))
 
     def reduce(self, vi: VariationalInequality) -> ReducedProblem:

@@ -65,7 +65,8 @@ KEYS: Mapping[str, Column] = {
     "dual_size": Column(INTEGER, "", "Prescribed R; empty where the study gives a tolerance."),
     "primal_tol": Column(REAL, "1", "Tolerance δ of the primal strategy; empty for strategies that take none.", "δ", 6),
     "solver": Column(TEXT, "", "QP solver.", "solver", 7),
-    "assembly": Column(TEXT, "", "How queries are assembled: full or reduced.", "assembly", 8),
+    "accuracy": Column(REAL, "1", "Relative accuracy prescribed to it.", "accuracy", 8),
+    "assembly": Column(TEXT, "", "How queries are assembled: full or reduced.", "assembly", 9),
 }
 """What names a cell. Where a study prescribes N or R, `pod_size` or `dual_size` is filled instead of the tolerance."""
 
@@ -78,11 +79,11 @@ CELLS: Mapping[str, Column] = {
     "status": Column(f"{TEXT} NOT NULL", "", "The worst status of its queries, or what became of a stage they need."),
     "reason": Column(TEXT, "", "Why it is not ok: the first query with this status and what was wrong there."),
     "queries": Column(INTEGER, "", "Queries asked: one per validation parameter."),
-    "queries_ok": Column(INTEGER, "", "Queries that are ok; means and maxima are over these.", "ok", 9),
+    "queries_ok": Column(INTEGER, "", "Queries that are ok; means and maxima are over these.", "ok", 10),
     "dim_V": Column(INTEGER, "", "Dimension n of V."),
     "dim_W": Column(INTEGER, "", "Dimension m of W."),
-    "N": Column(INTEGER, "", "Dimension of V_N.", "N", 10),
-    "R": Column(INTEGER, "", "Generators of the cone.", "R", 11),
+    "N": Column(INTEGER, "", "Dimension of V_N.", "N", 11),
+    "R": Column(INTEGER, "", "Generators of the cone.", "R", 12),
     "rank": Column(INTEGER, "", "Numerical rank of the generators: dimension of their span."),
     "rank_gap": Column(
         REAL,
@@ -93,7 +94,7 @@ CELLS: Mapping[str, Column] = {
         REAL, "1", "Condition number of the Gram matrix of the generators in W, from their singular values."
     ),
     "enrichment": Column(
-        INTEGER, "", "Vectors added to V_N; of an enrichment per parameter, the rank of the generators.", "added", 12
+        INTEGER, "", "Vectors added to V_N; of an enrichment per parameter, the rank of the generators.", "added", 13
     ),
     "enrichment_kind": Column(TEXT, "", "none, fixed or per-parameter."),
     "interpolation_tol": Column(
@@ -111,10 +112,10 @@ CELLS: Mapping[str, Column] = {
     "offline_cone_s": Column(REAL, "s", "Dual strategy, with the orthonormal basis of the span."),
     "offline_enrichment_s": Column(REAL, "s", "Primal strategy."),
     "offline_assembly_s": Column(REAL, "s", "What reduced assembly prepares; 0 in full."),
-    "offline_s": Column(REAL, "s", "Sum of the five above, what the cell alone would have taken.", "offline [s]", 17),
+    "offline_s": Column(REAL, "s", "Sum of the five above, what the cell alone would have taken.", "offline [s]", 18),
     "offline_wall_s": Column(REAL, "s", "The same sum in wall seconds."),
     "online_s": Column(
-        REAL, "s", "One query, assembly and solution: mean over the ok queries of their medians.", "online [ms]", 18
+        REAL, "s", "One query, assembly and solution: mean over the ok queries of their medians.", "online [ms]", 19
     ),
     "online_wall_s": Column(REAL, "s", "The same in wall seconds."),
     "online_assemble_s": Column(REAL, "s", "Its share of assembly."),
@@ -126,10 +127,10 @@ CELLS: Mapping[str, Column] = {
     "hf_low_s": Column(REAL, "s", "Lower end of the 95 % interval of this median over the validation parameters."),
     "hf_high_s": Column(REAL, "s", "Its upper end."),
     "beta_span_min": Column(
-        REAL, "b/VW", "Smallest β over the span of the generators, over the validation parameters.", "min β span", 13
+        REAL, "b/VW", "Smallest β over the span of the generators, over the validation parameters.", "min β span", 14
     ),
     "beta_cone_lower_min": Column(
-        REAL, "b/VW", "Smallest certified lower bound of β over their cone.", "min β cone", 14
+        REAL, "b/VW", "Smallest certified lower bound of β over their cone.", "min β cone", 15
     ),
     "beta_cone_upper_min": Column(REAL, "b/VW", "Smallest upper bound of β over their cone."),
     "share_training": Column(
@@ -139,9 +140,9 @@ CELLS: Mapping[str, Column] = {
     "share_guaranteed": Column(
         REAL, "1", "√(1 − σ²), which bounds the share at training parameters where the strategy records σ."
     ),
-    "error_u_mean": Column(REAL, "1", "Mean relative error of u in V.", "error u", 15),
+    "error_u_mean": Column(REAL, "1", "Mean relative error of u in V.", "error u", 16),
     "error_u_max": Column(REAL, "1", "Largest relative error of u in V."),
-    "error_lambda_mean": Column(REAL, "1", "Mean relative error of λ in W.", "error λ", 16),
+    "error_lambda_mean": Column(REAL, "1", "Mean relative error of λ in W.", "error λ", 17),
     "error_lambda_max": Column(REAL, "1", "Largest relative error of λ in W."),
     "solver_error_u_max": Column(REAL, "1", "Largest part of the error of u that the QP solver makes."),
     "solver_error_lambda_max": Column(REAL, "1", "Largest part of the error of λ that it makes."),
@@ -211,8 +212,8 @@ QUERIES: Mapping[str, Column] = {
     "solver_share": Column(
         REAL, "1", "The larger of these two over the error of u or λ; empty where both errors are at most 1e-8."
     ),
-    "bound_u": Column(REAL, "V", "Certified bound Δ_u of the error of u; infinite where β_HF over the span is 0."),
-    "bound_lambda": Column(REAL, "W", "Certified bound Δ_λ of the error of λ."),
+    "bound_u": Column(REAL, "V", "Bound Δ_u of the error of u, its α and γ estimated; infinite where β_HF over the span is 0."),
+    "bound_lambda": Column(REAL, "W", "Bound Δ_λ of the error of λ, likewise."),
     "effectivity_u": Column(REAL, "1", "bound_u / error_u_absolute; empty for relative errors up to 1e-8."),
     "effectivity_lambda": Column(REAL, "1", "bound_lambda / error_lambda_absolute, likewise."),
     "violation": Column(REAL, "u", "Largest (B u_N − g)₊, every row over the integral of its multiplier function."),
@@ -239,7 +240,7 @@ def _without(*names: str) -> dict[str, Column]:
     return {name: column for name, column in KEYS.items() if name not in names}
 
 
-HISTORY_KEYS = _without("solver", "assembly")
+HISTORY_KEYS = _without("solver", "accuracy", "assembly")
 
 HISTORIES: Mapping[str, Column] = {
     "artefact": Column(TEXT, "", "Hash of the stage it comes from."),

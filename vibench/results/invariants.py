@@ -2,7 +2,7 @@
 
 Inf-sup constants grow with the primal space: V_N ≤ enriched V_N ≤ V, with equality of the last two for per-parameter
 enrichments; that of V is at least that of the high-fidelity pair, and that over the cone at least that over the span.
-Certified error bounds are at least the errors. Of intervals over the cone, the upper end of the larger constant is
+Error bounds are at least the errors. Of intervals over the cone, the upper end of the larger constant is
 compared with the lower end of the smaller. A cone with free generators is not in W⁺ and compared with the high-fidelity
 pair over the span alone. The tolerance for round-off is relative to the constant of V, at most the norm of the form.
 """
@@ -21,7 +21,7 @@ from vibench.stability.conic_infsup import ABSOLUTE, RELATIVE
 from vibench.stability.infsup import UNSIGNED
 
 EFFECTIVITIES = ("effectivity_u", "effectivity_lambda")
-"""Certified bound over error, at least 1."""
+"""Error bound over error, at least 1."""
 
 ORDER = (("full_", ""), ("", "plain_"), ("full_", "hf_"))
 """Pairs of inf-sup constants, the larger one first."""

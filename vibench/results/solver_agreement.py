@@ -47,14 +47,17 @@ def disagreement_rows(
     """Rows of the disagreements table from rows of the cells, queries and solutions tables."""
     fine = {(row["cell"], row["query"]) for row in queries if row["status"] == Status.OK}
     known = {cell["cell"]: cell for cell in cells if cell["model"]}
-    answers: dict[str, list[Recorded]] = {}
+    answers: dict[tuple[str, float], list[Recorded]] = {}
     for row in solutions:
         if (row["cell"], row["query"]) in fine:
             cell, left_open = known[row["cell"]], Slack(row["slack_linear"], row["slack_constant"])
             answer = Recorded(cell["solver"], row["query"], vectors(row)[0], left_open)
-            answers.setdefault(cell["model"], []).append(answer)
-    keys = {cell["model"]: {name: cell[name] for name in DISAGREEMENTS if name in KEYS} for cell in known.values()}
-    return [keys[model] | row for model, found in answers.items() for row in compare(found)]
+            answers.setdefault((cell["model"], cell["accuracy"]), []).append(answer)
+    keys = {
+        (cell["model"], cell["accuracy"]): {name: cell[name] for name in DISAGREEMENTS if name in KEYS}
+        for cell in known.values()
+    }
+    return [keys[programs] | row for programs, found in answers.items() for row in compare(found)]
 
 
 def sentence(disagreements: pd.DataFrame) -> str:

@@ -79,9 +79,10 @@ def benefits(thresholds: pd.DataFrame) -> pd.DataFrame:
 
 
 def _for_reading(frame: pd.DataFrame, table: Mapping[str, Column]) -> pd.DataFrame:
-    """The columns that have a heading, under it."""
-    shown = {column.heading: _shown(frame, name, column) for name, column in shown_columns(table).items()}
-    return pd.DataFrame(shown, index=frame.index)
+    """The columns that have a heading, under it; the accuracy only where it is an axis of the study."""
+    columns = shown_columns(table).items()
+    kept = [(name, column) for name, column in columns if name != "accuracy" or frame[name].nunique() > 1]
+    return pd.DataFrame({column.heading: _shown(frame, name, column) for name, column in kept}, index=frame.index)
 
 
 def _shown(frame: pd.DataFrame, name: str, column: Column) -> pd.Series | list[str]:

@@ -60,7 +60,7 @@ class Axes:
 
 @dataclass(frozen=True)
 class Cell:
-    """One cell: problem × dual strategy × primal strategy × tolerances × QP solver × assembly.
+    """One cell: problem × dual strategy × primal strategy × tolerances × QP solver × accuracy × assembly.
 
     `interpolation` is the tolerance of reduced assembly, `None` for full assembly. `labels` of problem, dual and primal
     strategy are no part of the identity; nor are `nested_tolerances`, all tolerances of a nested primal strategy in the
@@ -135,7 +135,7 @@ class Cell:
             for size, stop in (("N", self.pod), ("R", self.cone))
         )
         assembly = "" if self.assembly == "full" else f" · {self.assembly}"
-        return f"{problem} · {dual} · {primal}{tolerance} · {pod}, {cone} · {self.solver}{assembly}"
+        return f"{problem} · {dual} · {primal}{tolerance} · {pod}, {cone} · {self.solver} {self.accuracy:g}{assembly}"
 
 
 def expand(study: Study) -> list[Cell]:
@@ -150,7 +150,7 @@ def expand(study: Study) -> list[Cell]:
     for problem, table in product(study.problem, study.tolerances):
         nested = {entry.title: _nested_tolerances(entry, table) for entry in study.primal}
         for dual, pod, cone, primal, tolerance in _combinations(study, table):
-            for assembly, solver in product(study.assembly, study.solver_names()):
+            for assembly, solver, accuracy in product(study.assembly, study.solver_names(), study.accuracy):
                 cell = Cell(
                     problem=Plugin.from_entry("problem", problem),
                     dual=Plugin.from_entry("dual strategy", dual),
@@ -164,7 +164,7 @@ def expand(study: Study) -> list[Cell]:
                     warm_start=study.warm_start,
                     seed=study.seed,
                     validation=study.validation,
-                    accuracy=study.accuracy,
+                    accuracy=accuracy,
                     labels=(problem.title, dual.title, primal.title),
                     nested_tolerances=nested[primal.title],
                 )

@@ -21,6 +21,14 @@ Name: TypeAlias = Annotated[str, MinLen(1)]
 Names: TypeAlias = Annotated[list[Name], MinLen(1)]
 
 
+def _as_list(value: Any) -> Any:
+    return value if isinstance(value, list) else [value]
+
+
+Accuracy: TypeAlias = Annotated[float, Ge(1e-14), Le(1e-2), AllowInfNan(False)]
+Accuracies: TypeAlias = Annotated[list[Accuracy], MinLen(1), BeforeValidator(_as_list)]
+
+
 def _only_available(value: Any) -> Any:
     if value != "available":
         raise ValueError("expected 'available' or a list of solver names")
@@ -123,8 +131,8 @@ class Study(_Model):
     seed: Annotated[int, Ge(0), Lt(2**63), Field(description="Seed of the validation set.")] = 0
     validation: Annotated[Size, Field(description="Number of validation parameters, the queries of every cell.")]
     accuracy: Annotated[
-        float, Ge(1e-14), Le(1e-2), AllowInfNan(False), Field(description="Relative accuracy prescribed to QP solvers.")
-    ] = 1e-7
+        Accuracies, Field(description="Relative accuracy prescribed to QP solvers, or a list of accuracies: an axis.")
+    ] = [1e-7]
     solvers: Annotated[Solvers, Field(description="QP solvers; `available` for all that are installed.")]
     dual: Annotated[list[Entry], MinLen(1), Field(description="Dual strategies.")]
     primal: Annotated[list[Entry], MinLen(1), Field(description="Primal strategies.")]

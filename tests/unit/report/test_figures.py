@@ -417,5 +417,37 @@ def test_a_solver_that_never_answered_is_in_the_profile(change: Callable[..., No
     assert line_called(draw("solvers")["obstacle-solvers"].axes[1], "osqp").get_ydata()[-1] == 0.0
 
 
+def test_shares_on_and_off_the_training_set_are_those_of_the_cells(drawn: Drawn, quick_run: Path) -> None:
+    cells = tables.read(quick_run / FILE, "cells")
+    for problem in problems():
+        mine = cells[(cells["problem"] == problem) & cells["share_training"].notna()].drop_duplicates(["dual", "primal"])
+        for axes, (dual, group) in zip(drawn[f"{problem}-shares"].axes, mine.groupby("dual"), strict=True):
+            assert axes.get_title() == dual
+            points = line_called(axes, "offline-pga").get_xydata()
+            np.testing.assert_array_equal(points, group[["share_training", "share_validation"]].to_numpy())
+
+
+def test_precision_is_over_the_programs_that_every_solver_solved_at_every_accuracy(
+    change: Callable[..., None], draw: Draw, results: Path
+) -> None:
+    assert not draw("precision")  # with one accuracy
+    loose = "accuracy = 1e-4, solve_s = 0.5 * solve_s, solver_error_u = 1e3 * solver_error_u"
+    change(
+        "CREATE TABLE again AS SELECT * FROM queries WHERE problem = 'obstacle'",
+        f"UPDATE again SET {loose}",
+        "INSERT INTO queries SELECT * FROM again",
+        "DROP TABLE again",
+        "UPDATE queries SET status = 'inaccurate' WHERE solver = 'osqp' AND query < 4 AND accuracy = 1e-4",
+    )
+    (figure,) = draw("precision").values()
+    queries = tables.read(results, "queries")
+    kept = queries[(queries["problem"] == "obstacle") & (queries["query"] >= 4)]
+    assert f"{len(kept) // 6} programs" in figure.get_suptitle()
+    for solver, mine in kept.groupby("solver"):
+        expected = mine.groupby("accuracy")[["solve_s", "solver_error_u"]].median()
+        found = line_called(figure.axes[0], solver).get_xydata()
+        np.testing.assert_allclose(found, expected.to_numpy() * [1e3, 1.0])
+
+
 def test_twelve_kinds_have_twelve_looks() -> None:
     assert len({(point["color"], point["marker"]) for point in (costs._point(k, 0) for k in range(12))}) == 12

@@ -64,10 +64,12 @@ def test_two_solvers_far_apart_are_flagged_at_their_query() -> None:
 
 def test_only_ok_answers_of_the_same_reduced_model_are_compared() -> None:
     def cell(key: str, solver: str, model: str | None) -> dict[str, object]:
-        return dict.fromkeys(KEYS) | {"cell": key, "solver": solver, "model": model, "dual": f"of {model}"}
+        names = {"cell": key, "solver": solver, "model": model, "dual": f"of {model}", "accuracy": 1e-7}
+        return dict.fromkeys(KEYS) | names
 
     cells = [cell("1", "a", "m"), cell("2", "b", "m"), cell("3", "b", "other"), cell("4", "c", None)]
-    queries = [{"cell": str(c), "query": q, "status": "ok"} for c in (1, 2, 3) for q in (0, 1)]
+    cells.append(cell("5", "b", "m") | {"accuracy": 1e-3})  # allowed to be farther away
+    queries = [{"cell": str(c), "query": q, "status": "ok"} for c in (1, 2, 3, 5) for q in (0, 1)]
     queries[3]["status"] = "inaccurate"  # cell 2, query 1
     x = np.array([1.0, 2.0])
     solutions = [{"cell": q["cell"], "query": q["query"], **solution_row(x, x, Slack(0.0, 0.0))} for q in queries]

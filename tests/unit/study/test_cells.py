@@ -36,6 +36,15 @@ def test_the_matrix_is_the_product_of_the_axes(cells_of: Expand) -> None:
     assert len({cell.key for cell in cells}) == len(cells)
 
 
+def test_accuracies_are_an_axis(cells_of: Expand) -> None:
+    cells = cells_of(changed(STUDY, "accuracy", to=[1e-4, 1e-7, 1e-10]))
+    alone = cells_of(changed(STUDY, "accuracy", to=1e-4))
+    assert len(cells) == 3 * len(alone)
+    assert {cell.accuracy for cell in cells} == {1e-4, 1e-7, 1e-10}
+    assert {cell.key for cell in alone} < {cell.key for cell in cells}
+    assert len({str(cell) for cell in cells}) == len(cells)
+
+
 def test_a_strategy_without_tolerance_is_not_repeated(cells_of: Expand) -> None:
     few, many = (
         cells_of(changed(STUDY, "tolerances", 0, "primal", to={"offline-pga": values}))

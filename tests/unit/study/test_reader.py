@@ -35,7 +35,7 @@ def refusal(request: str, overrides: Mapping[str, Any] | None = None) -> str:
 
 def test_a_correct_study_is_read_as_written(tmp_path: Path) -> None:
     study = load_study(write_study(tmp_path))
-    assert (study.name, study.seed, study.validation, study.accuracy) == ("sample", 7, 3, 1e-7)
+    assert (study.name, study.seed, study.validation, study.accuracy) == ("sample", 7, 3, [1e-7])
     assert study.solver_names() == ["piqp", "osqp"]
     assert [entry.name for entry in study.dual] == ["cpg", "mcpg"]
     assert study.problem[0].options == {"resolution": "coarse"}
@@ -68,6 +68,8 @@ WRONG: Mapping[str, tuple[tuple[str | int, ...], Any, tuple[str, ...]]] = {
     "accuracy zero": (("accuracy",), 0.0, ("accuracy", "greater than")),
     "accuracy negative": (("accuracy",), -1e-7, ("accuracy", "greater than")),
     "accuracy too loose": (("accuracy",), 0.5, ("accuracy", "less than")),
+    "accuracies none": (("accuracy",), [], ("accuracy", "at least 1")),
+    "accuracies with one too loose": (("accuracy",), [1e-7, 0.5], ("accuracy.1", "less than", "0.5")),
     "solvers missing": (("solvers",), REMOVE, ("solvers", "required")),
     "solvers empty": (("solvers",), [], ("solvers", "at least 1")),
     "solvers one word": (("solvers",), "piqp", ("solvers", "'available'", "list", "'piqp'")),

@@ -15,7 +15,7 @@ from vibench.report.figures.convergence import diagnostics, enrichment, orthogon
 from vibench.report.figures.costs import dimension, total_cost, work_precision
 from vibench.report.figures.data import Data, file_names, problems
 from vibench.report.figures.solutions import solutions
-from vibench.report.figures.solvers import solvers
+from vibench.report.figures.solvers import precision, solvers
 from vibench.report.figures.style import FORMATS, save, styled
 
 Drawing = Callable[[Data], Figure | None]
@@ -29,6 +29,7 @@ OF_PROBLEM: dict[str, Drawing] = {
     "work-precision": work_precision,
     "shares": shares,
     "solvers": solvers,
+    "precision": precision,
     "total-cost": total_cost,
 }
 """Figures of every problem, by the end of their file names."""

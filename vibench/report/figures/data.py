@@ -119,15 +119,16 @@ def solved_too_loosely(cells: pd.DataFrame) -> pd.Series:
 
 
 def best_solver(cells: pd.DataFrame) -> pd.DataFrame:
-    """The timed cells of the solver with the most ok queries, without those `solved_too_loosely`.
+    """The timed cells of the solver and accuracy with the most ok queries, without those `solved_too_loosely`.
 
     Of several such solvers, the fastest.
     """
     timed = cells[cells["online_s"].notna() & ~solved_too_loosely(cells)]
     if timed.empty:
         return timed
-    known = timed.groupby("solver").agg(ok=("queries_ok", "sum"), seconds=("online_s", "mean"))
-    return timed[timed["solver"] == known.sort_values(["ok", "seconds"], ascending=[False, True]).index[0]]
+    known = timed.groupby(["solver", "accuracy"]).agg(ok=("queries_ok", "sum"), seconds=("online_s", "mean"))
+    solver, accuracy = known.sort_values(["ok", "seconds"], ascending=[False, True]).index[0]
+    return timed[(timed["solver"] == solver) & (timed["accuracy"] == accuracy)]
 
 
 def at_best_tolerance(rows: pd.DataFrame, score: pd.Series) -> pd.DataFrame:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-
 import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
@@ -36,9 +34,35 @@ def solvers(data: Data) -> Figure | None:
     left, right = sheet.panels
     names = list(queries["solver"].unique())
     _accuracy(left, queries, names)
-    accuracy = json.loads(data.cells["definition"].iloc[0])["accuracy"]
-    left.axhline(accuracy, color="0.4", linewidth=0.8, linestyle=(0, (1, 2)), label="prescribed accuracy")
+    for accuracy in sorted(queries["accuracy"].unique()):
+        left.axhline(accuracy, color="0.4", linewidth=0.8, linestyle=(0, (1, 2)), label="prescribed accuracy")
     _profile(right, queries, names)
+    return sheet.finish()
+
+
+def precision(data: Data) -> Figure | None:
+    """Median time of a program against the part of the error of u and of λ that the solver makes, over the accuracy.
+
+    Each point is one accuracy of one solver: median over the programs that every solver solved at every accuracy.
+    """
+    fine = data.queries[data.queries["status"] == Status.OK]
+    if fine["accuracy"].nunique() < 2:
+        return None
+    ways = fine.groupby(["solver", "accuracy"]).ngroups
+    programs = [name for name in INSTANCE if name != "accuracy"]
+    shared = fine.groupby(programs, dropna=False)["solver"].transform("size") == ways
+    if not shared.any():
+        return None
+    title = f"{data.problem}: time and precision of the QP solvers, {int(shared.sum()) // ways} programs"
+    sheet = Sheet(1, 2, title)
+    for k, (solver, mine) in enumerate(fine[shared].groupby("solver")):
+        found = mine.groupby("accuracy")[["solve_s", "solver_error_u", "solver_error_lambda"]].median()
+        for panel, name in zip(sheet.panels, ("u", "lambda"), strict=True):
+            error = np.maximum(found[f"solver_error_{name}"], EXACT)
+            plot(panel, 1e3 * found["solve_s"], error, k, str(solver))
+    for panel, name in zip(sheet.panels, ("u", "λ"), strict=True):
+        panel.set(xlabel="median time of a program [ms]", ylabel=f"median error of {name} made by the solver")
+        panel.set(xscale="log", yscale="log")
     return sheet.finish()
 
 
