@@ -15,8 +15,9 @@ from pathlib import Path
 
 import pytest
 import typer.main
+from forking import run_command
 from hypothesis import settings
-from running import Changed, Main, Register, Vibench, execute, started
+from running import Changed, Main, Register, Vibench, execute
 from samples import install_fakes
 from threadpoolctl import threadpool_limits
 
@@ -113,16 +114,14 @@ def plugins_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def vibench(command: str, plugins_folder: Path) -> Vibench:
-    """Function that runs the installed command in a folder; it draws where a test is about figures."""
+def vibench(plugins_folder: Path) -> Vibench:
+    """Function that runs the command in a folder; it draws where a test is about figures."""
 
     def run(
         folder: Path, *arguments: str, plugins: Path = plugins_folder, figures: bool = False, timeout: float = 120.0
     ) -> subprocess.CompletedProcess[str]:
         plain = ["--no-figures"] if arguments[:1] == ("run",) and not figures else []
-        with started([command, *arguments, *plain], folder, plugins) as process:
-            out, err = process.communicate(timeout=timeout)
-        return subprocess.CompletedProcess(arguments, process.returncode, out, err)
+        return run_command([*arguments, *plain], folder, plugins, timeout)
 
     return run
 

@@ -26,7 +26,7 @@ def waiting(tmp_path: Path) -> Path:
 def test_a_run_that_was_stopped_goes_on_later(
     kill: signal.Signals, code: int, command: str, plugins_folder: Path, vibench: Vibench, waiting: Path
 ) -> None:
-    with started([command, "run", "study.toml", "--jobs", "2"], waiting, plugins_folder) as process:
+    with started([command, "run", "study.toml", "--jobs", "2", "--no-figures"], waiting, plugins_folder) as process:
         read_until(process, "[1/2] ok")
         os.killpg(process.pid, kill)  # the workers too, as a terminal does
         out, err = process.communicate(timeout=60)
@@ -51,7 +51,7 @@ def test_workers_do_not_see_ctrl_c(command: str, plugins_folder: Path, waiting: 
     """A terminal tells the group of the command; from the moment on which they come to life, workers are in others."""
     (waiting / "go on").touch()
     groups: set[int] = set()
-    with started([command, "run", "study.toml", "--jobs", "2"], waiting, plugins_folder) as process:
+    with started([command, "run", "study.toml", "--jobs", "2", "--no-figures"], waiting, plugins_folder) as process:
         while process.poll() is None:
             for worker in workers(process.pid):
                 with contextlib.suppress(ProcessLookupError):
@@ -64,7 +64,7 @@ def test_workers_do_not_see_ctrl_c(command: str, plugins_folder: Path, waiting: 
 
 
 def test_a_second_interrupt_changes_nothing(command: str, plugins_folder: Path, waiting: Path) -> None:
-    with started([command, "run", "study.toml", "--jobs", "2"], waiting, plugins_folder) as process:
+    with started([command, "run", "study.toml", "--jobs", "2", "--no-figures"], waiting, plugins_folder) as process:
         read_until(process, "[1/2] ok")
         for _ in range(20):
             with contextlib.suppress(ProcessLookupError):
@@ -78,7 +78,7 @@ def test_a_second_interrupt_changes_nothing(command: str, plugins_folder: Path, 
 
 def test_a_run_that_is_terminated_leaves_no_worker_behind(command: str, plugins_folder: Path, waiting: Path) -> None:
     """As where a terminal is closed, or a scheduler ends a job: only the command itself is told."""
-    with started([command, "run", "study.toml", "--jobs", "2"], waiting, plugins_folder) as process:
+    with started([command, "run", "study.toml", "--jobs", "2", "--no-figures"], waiting, plugins_folder) as process:
         read_until(process, "[1/2] ok")
         left = set(workers(process.pid))
         assert left
@@ -95,7 +95,7 @@ def test_a_run_that_is_terminated_leaves_no_worker_behind(command: str, plugins_
 def test_two_runs_do_not_write_into_one_folder(
     command: str, plugins_folder: Path, vibench: Vibench, waiting: Path
 ) -> None:
-    with started([command, "run", "study.toml", "--jobs", "2"], waiting, plugins_folder) as process:
+    with started([command, "run", "study.toml", "--jobs", "2", "--no-figures"], waiting, plugins_folder) as process:
         read_until(process, "[1/2] ok")
         for options in ((), ("--fresh",)):
             second = vibench(waiting, "run", "study.toml", *options)

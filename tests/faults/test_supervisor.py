@@ -67,7 +67,8 @@ def test_the_process_is_kept_from_one_stage_to_the_next(run: Run) -> None:
 
 
 @pytest.mark.parametrize("how", ["sleep", "hang"])
-def test_a_piece_beyond_its_limit_costs_itself(run: Run, how: str) -> None:
+def test_a_piece_beyond_its_limit_costs_itself(run: Run, how: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(supervisor, "GRACE", 0.1)
     found = run(InPieces(("fine", how, "fine", "fine")), query=1.0)
     assert isinstance(found, Done)
     assert [number for number, _ in found.value] == [0, 1, 2, 3]

@@ -76,7 +76,7 @@ def python(example: Path, artefacts: Path) -> Python:
 @pytest.fixture(scope="module")
 def cells(python: Python, command: str, example: Path) -> tuple[pd.DataFrame, pd.DataFrame, str]:
     """Cells and queries of a small study of the rope, and what the run printed."""
-    done = python(command, "run", write_study(example.parent, STUDY), "--jobs", "1", "--strict")
+    done = python(command, "run", write_study(example.parent, STUDY), "--jobs", "1", "--strict", "--no-figures")
     path = example.parent / "runs" / STUDY["name"] / FILE
     return read(path, "cells"), read(path, "queries"), done.stdout
 

@@ -71,3 +71,9 @@ def test_naming_a_status_loads_no_solver() -> None:
 def test_reading_results_loads_no_stage_and_no_solver() -> None:
     code = "import vibench.results.tables\nassert not any(name.startswith('vibench.stages') for name in sys.modules)"
     assert loaded(code) & {"qpsolvers", "matplotlib", "skfem"} == set()
+
+
+def test_a_worker_process_loads_no_tables_and_no_figures() -> None:
+    """Every run starts some, and every death of one another: pandas would take a quarter of their start."""
+    code = "import vibench.execution.worker, vibench.stages.cell_queries, vibench.stages.pictures"
+    assert loaded(code) & {"matplotlib", "pandas", "rich", "typer"} == set()

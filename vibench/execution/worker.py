@@ -114,17 +114,16 @@ def _pieces(job: Job, store: Store, progress: Progress, send: Send) -> Any:
     found = dict(progress.found)
     for number in range(stage.pieces):
         if number not in found and number not in progress.lost:
-            watch = partial(_announce, send, number)
+
+            def watch(on: bool, number: int = number) -> None:
+                send(Watch(number, on))
+
             watch(False)
             value = _guarded(job.memory_gib, partial(pieces.piece, number, watch))
             found[number] = pieces.lost(number, value) if isinstance(value, Failed) else value
             send(Finished(number, found[number]))
     found |= {number: pieces.lost(number, failed) for number, failed in progress.lost.items()}
     return pieces.finish([found[number] for number in range(stage.pieces)])
-
-
-def _announce(send: Send, number: int, on: bool) -> None:
-    send(Watch(number, on))
 
 
 def _guarded(memory_gib: float, work: Callable[[], T]) -> T | Failed:

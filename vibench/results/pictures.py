@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from vibench.interfaces.problem import Picture
-from vibench.results import tables
+from vibench.results.database import open_read_only
 
 ARRAYS = tuple(field.name for field in fields(Picture) if not field.name.endswith("name"))
 
@@ -42,11 +42,11 @@ class Shown:
 
 def read(path: Path) -> Iterator[Shown]:
     """The pictures of a results file."""
-    for row in tables.read(path, "pictures").to_dict("records"):
-        picture = _unpacked(row["data"], row["names"]) if isinstance(row["data"], bytes) else None
-        key = (str(row["problem"]), str(row["problem_options"]))
-        title, reason = (text if isinstance(text, str) else "" for text in (row["title"], row["reason"]))
-        yield Shown(key, title, picture, reason)
+    with open_read_only(path) as db:
+        rows = db.execute("SELECT problem, problem_options, title, data, names, reason FROM pictures").fetchall()
+    for problem, options, title, data, names, reason in rows:
+        picture = None if data is None else _unpacked(data, names)
+        yield Shown((problem, options), title or "", picture, reason or "")
 
 
 def _packed(picture: Picture) -> bytes:

@@ -5,15 +5,17 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from itertools import combinations
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import pandas as pd
 
 from vibench.arrays import Array
 from vibench.qp.accuracy_bounds import Slack, allowed
 from vibench.qp.status import Status
 from vibench.results.columns import DISAGREEMENTS, KEYS
+
+if TYPE_CHECKING:  # worker processes, which start often, have no use for pandas
+    import pandas as pd
 
 
 def solution_row(x: Array, alpha: Array, left_open: Slack) -> dict[str, Any]:

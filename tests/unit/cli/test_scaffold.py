@@ -70,7 +70,7 @@ def test_new_plugins_pass_their_checks_as_they_are(installed: Run, tmp_path: Pat
 
 def test_new_plugins_give_rows_without_an_edit(installed: Run, tmp_path: Path) -> None:
     axes = ["--problem", "my-rope", "--dual", "cone", "--primal", "tied", "--primal-tol", "0.5", "--solver", "piqp"]
-    done = installed(*COMMAND, "run", "quick", *axes, "--out", "out", "--jobs", "1", folder=tmp_path)
+    done = installed(*COMMAND, "run", "quick", *axes, "--out", "out", "--jobs", "1", "--no-figures", folder=tmp_path)
     assert done.returncode == 0, done.stdout + done.stderr
     (row,) = rows(tmp_path / "out")
     assert (row["status"], row["queries_ok"]) == ("ok", row["queries"])

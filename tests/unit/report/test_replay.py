@@ -42,7 +42,8 @@ primal = { offline-pga = [0.5] }
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("replayed")
     (folder / "study.toml").write_text(STUDY)
-    done = CliRunner().invoke(app, ["run", str(folder / "study.toml"), "--out", str(folder / "run"), "--jobs", "1"])
+    options = ["--out", str(folder / "run"), "--jobs", "1", "--no-figures"]
+    done = CliRunner().invoke(app, ["run", str(folder / "study.toml"), *options])
     assert done.exit_code == 0, done.output
     return folder / "run"
 
