@@ -152,8 +152,7 @@ def comparison_with_the_paper(cells: pd.DataFrame, name: str) -> list[str]:
     return [
         f"## {PAPER[name][0]}",
         tables.to_markdown(comparison(cells, name)),
-        f"Columns of vibench: {SOLVER}, full assembly; the break-even follows from its seconds by the "
-        "paper's formula.",
+        f"Columns of vibench: {SOLVER}, full assembly; the break-even follows from its seconds by the paper's formula.",
     ]
 
 

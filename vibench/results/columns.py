@@ -212,7 +212,9 @@ QUERIES: Mapping[str, Column] = {
     "solver_share": Column(
         REAL, "1", "The larger of these two over the error of u or λ; empty where both errors are at most 1e-8."
     ),
-    "bound_u": Column(REAL, "V", "Bound Δ_u of the error of u, its α and γ estimated; infinite where β_HF over the span is 0."),
+    "bound_u": Column(
+        REAL, "V", "Bound Δ_u of the error of u, its α and γ estimated; infinite where β_HF over the span is 0."
+    ),
     "bound_lambda": Column(REAL, "W", "Bound Δ_λ of the error of λ, likewise."),
     "effectivity_u": Column(REAL, "1", "bound_u / error_u_absolute; empty for relative errors up to 1e-8."),
     "effectivity_lambda": Column(REAL, "1", "bound_lambda / error_lambda_absolute, likewise."),

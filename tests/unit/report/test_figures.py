@@ -420,7 +420,9 @@ def test_a_solver_that_never_answered_is_in_the_profile(change: Callable[..., No
 def test_shares_on_and_off_the_training_set_are_those_of_the_cells(drawn: Drawn, quick_run: Path) -> None:
     cells = tables.read(quick_run / FILE, "cells")
     for problem in problems():
-        mine = cells[(cells["problem"] == problem) & cells["share_training"].notna()].drop_duplicates(["dual", "primal"])
+        mine = cells[(cells["problem"] == problem) & cells["share_training"].notna()].drop_duplicates(
+            ["dual", "primal"]
+        )
         for axes, (dual, group) in zip(drawn[f"{problem}-shares"].axes, mine.groupby("dual"), strict=True):
             assert axes.get_title() == dual
             points = line_called(axes, "offline-pga").get_xydata()
