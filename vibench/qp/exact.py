@@ -8,7 +8,7 @@ import numpy as np
 import scipy.linalg
 from scipy.optimize import nnls
 
-from vibench.arrays import Array, Mask
+from vibench.arrays import Array, Indices, Mask
 from vibench.interfaces.problem import VariationalInequality
 from vibench.qp.scaling import row_norms, size
 from vibench.qp.verification import kkt_residuals
@@ -17,7 +17,10 @@ ROUND_OFF = 1e-12
 """Residuals below this fraction of their terms are round-off."""
 
 DEPENDENT = 1e-10
-"""Active constraints are dependent where a pivot of their factorisation is below this fraction of the largest."""
+"""Constraints are dependent where a pivot of their factorisation is below this fraction of the largest."""
+
+TIGHT = 1e-8
+"""Constraints with a smaller slack than this fraction of its terms may carry a multiplier."""
 
 MAX_ITERATIONS = 20
 """Active sets tried after the first."""
@@ -25,7 +28,7 @@ MAX_ITERATIONS = 20
 
 @dataclass(frozen=True)
 class ExactSolution:
-    """The solution x (n,) of a program, and multipliers α (m,), of which there may be others where not `unique`."""
+    """The solution x (n,) of a program, and multipliers α (m,); there may be others where these are not `unique`."""
 
     x: Array
     alpha: Array
@@ -49,14 +52,15 @@ def exact_solution(program: VariationalInequality) -> ExactSolution | None:
     whitened = _Whitened(program, L)
     active, seen = whitened.least_distance_set(), set[bytes]()
     for _ in range(MAX_ITERATIONS):
-        x, alpha, unique = whitened.solve_active(active)
+        x, alpha = whitened.solve_active(active)
         # An excess is compared with the terms that it is the difference of, not with g alone, which may be small.
         excess, terms = program.B @ x - program.g, np.abs(program.B) @ np.abs(x) + np.abs(program.g)
         violated, pulling = excess > ROUND_OFF * terms, alpha < -ROUND_OFF * size(alpha)
         if not np.any(violated) and not np.any(pulling):
             alpha = np.maximum(alpha, 0.0)
-            balanced = kkt_residuals(program, x, alpha).dual <= ROUND_OFF
-            return ExactSolution(x, alpha, unique) if balanced else None
+            if kkt_residuals(program, x, alpha).dual > ROUND_OFF:
+                return None
+            return ExactSolution(x, alpha, whitened.are_independent(excess > -TIGHT * terms))
         seen.add(active.tobytes())
         active = violated | (active & ~pulling)
         if active.tobytes() in seen:
@@ -86,15 +90,23 @@ class _Whitened:
             return np.zeros(len(d), dtype=bool)
         return np.asarray(weights > 0.0)
 
-    def solve_active(self, active: Mask) -> tuple[Array, Array, bool]:
-        """Solution x (n,), α (m,) with the active constraints as equalities, and whether these are independent."""
-        kept = chosen = np.flatnonzero(active)
-        q, r = np.zeros((len(self._C), 0)), np.zeros((0, 0))
-        if len(chosen):  # LAPACK does not factorise matrices without columns
-            q, r, order = scipy.linalg.qr(self._C[:, chosen], mode="economic", pivoting=True)
-            pivots = np.abs(np.diag(r))
-            rank = int(np.sum(pivots > DEPENDENT * np.max(pivots, initial=0.0)))
-            kept, q, r = chosen[order[:rank]], q[:, :rank], r[:rank, :rank]
+    def are_independent(self, chosen: Mask) -> bool:
+        """Whether constraints (m,) are linearly independent: the multipliers of tight ones are unique then."""
+        return len(self._factorised(chosen)[0]) == int(np.sum(chosen))
+
+    def _factorised(self, chosen: Mask) -> tuple[Indices, Array, Array]:
+        """A largest independent set of constraints, and the QR factors of their columns of C."""
+        columns = np.flatnonzero(chosen)
+        if not len(columns):  # LAPACK does not factorise matrices without columns
+            return columns, np.zeros((len(self._C), 0)), np.zeros((0, 0))
+        q, r, order = scipy.linalg.qr(self._C[:, columns], mode="economic", pivoting=True)
+        pivots = np.abs(np.diag(r))
+        rank = int(np.sum(pivots > DEPENDENT * np.max(pivots, initial=0.0)))
+        return columns[order[:rank]], q[:, :rank], r[:rank, :rank]
+
+    def solve_active(self, active: Mask) -> tuple[Array, Array]:
+        """Solution x (n,), α (m,) with the active constraints as equalities, refined once."""
+        kept, q, r = self._factorised(active)
         program, B = self._program, self._program.B[kept] / self._rows[kept, None]
         x, alpha = np.zeros(len(program.f)), np.zeros(len(program.g))
         for _ in range(2):  # the second time for the residual of the first
@@ -103,4 +115,4 @@ class _Whitened:
             y = scipy.linalg.solve_triangular(r, right, trans="T")
             x = x + scipy.linalg.solve_triangular(self._L, load - q @ y, lower=True, trans="T")
             alpha[kept] += scipy.linalg.solve_triangular(r, y) / self._rows[kept]
-        return x, alpha, len(kept) == len(chosen)
+        return x, alpha

@@ -57,7 +57,7 @@ def _whole_run(path: Path) -> Iterator[str]:
     if loose := int(solved_too_loosely(cells).sum()):
         yield (
             f"{loose} cells are not compared with others: their QP solver makes {100.0 * SOLVER_SHARE:.0f} % or more "
-            "of an error (column `solver_share_max`). A smaller `accuracy` would help."
+            "of an error (column `solver_share_mean`). A smaller `accuracy` would help."
         )
     if disturbed := int((cells["disturbed"] == 1).sum()):
         yield f"{disturbed} cells were timed while other processes slowed the machine down (column `disturbed`)."

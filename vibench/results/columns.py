@@ -146,8 +146,9 @@ CELLS: Mapping[str, Column] = {
     "error_lambda_max": Column(REAL, "1", "Largest relative error of λ in W."),
     "solver_error_u_max": Column(REAL, "1", "Largest part of the error of u that the QP solver makes."),
     "solver_error_lambda_max": Column(REAL, "1", "Largest part of the error of λ that it makes."),
-    "solver_share_max": Column(
-        REAL, "1", "Largest of these over the error itself; strategies are compared only where it is below 0.1."
+    "solver_share_max": Column(REAL, "1", "Largest share of an error that it makes, over the queries."),
+    "solver_share_mean": Column(
+        REAL, "1", "Mean of what it makes over the mean error of u or λ; cells are compared only where it is below 0.1."
     ),
     "assembly_error_max": Column(REAL, "1", "Largest difference of a member of a reduced program from its projection."),
     "violation_max": Column(REAL, "u", "Largest constraint violation of a reduced solution."),
@@ -208,7 +209,9 @@ QUERIES: Mapping[str, Column] = {
         "1",
         "Distance of u from the reduced program solved to round-off, relative as error_u; empty where not solved.",
     ),
-    "solver_error_lambda": Column(REAL, "1", "The same of λ; empty, too, where the reduced λ is not unique."),
+    "solver_error_lambda": Column(
+        REAL, "1", "The same of λ; empty, too, where the tight constraints are dependent and λ is not unique."
+    ),
     "solver_share": Column(
         REAL, "1", "The larger of these two over the error of u or λ; empty where both errors are at most 1e-8."
     ),

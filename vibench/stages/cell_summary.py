@@ -35,6 +35,11 @@ def summarise(rows: Sequence[Row], slowdown: float = 1.0) -> Row:
     def largest(name: str) -> float | None:
         return float(column(name).max()) if column(name).size else None
 
+    def solver_share(name: str) -> float | None:
+        known = [row for row in fine if row.get(f"solver_error_{name}") is not None]
+        whole = sum(row[f"error_{name}"] for row in known)
+        return float(sum(row[f"solver_error_{name}"] for row in known) / whole) if whole > 0.0 else None
+
     residuals = [largest(name) for name in ("primal_residual", "dual_residual", "gap")]
     cpu, wall = column("total_s").sum(), column("total_wall_s").sum()
     return {
@@ -51,6 +56,9 @@ def summarise(rows: Sequence[Row], slowdown: float = 1.0) -> Row:
         "error_lambda_mean": mean("error_lambda"),
         "error_lambda_max": largest("error_lambda"),
         **{f"{name}_max": largest(name) for name in ("solver_error_u", "solver_error_lambda", "solver_share")},
+        "solver_share_mean": max(
+            (share for name in ("u", "lambda") if (share := solver_share(name)) is not None), default=None
+        ),
         "assembly_error_max": largest("assembly_error"),
         "violation_max": largest("violation"),
         "residual_max": max((r for r in residuals if r is not None), default=None),

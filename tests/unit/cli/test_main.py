@@ -252,7 +252,7 @@ def test_options_replace_axes(axis: str, main: Main, monkeypatch: pytest.MonkeyP
 
 def test_options_may_be_repeated(main: Main) -> None:
     _, out, _ = main("run", "quick", "--dry-run", "--solver", "piqp", "--solver", "daqp", "--dual", "cpg")
-    assert {line.split(" · ")[-1] for line in out.splitlines()[:-1]} == {"piqp", "daqp"}
+    assert {line.split(" · ")[-1] for line in out.splitlines()[:-1]} == {"piqp 1e-08", "daqp 1e-08"}
 
 
 def test_list_shows_every_plugin_and_its_options(main: Main) -> None:

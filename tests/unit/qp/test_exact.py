@@ -70,6 +70,8 @@ def test_multipliers_of_equal_constraints_are_not_unique() -> None:
     assert once is not None
     assert twice is not None
     assert once.alpha[0] > 0.0
+    assert once.unique
+    assert not twice.unique
     assert np.allclose(twice.x, once.x, atol=1e-12)
     assert np.isclose(twice.alpha[0] + twice.alpha[3], once.alpha[0])
 

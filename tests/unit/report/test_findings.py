@@ -37,7 +37,7 @@ def test_what_fell_short_is_counted(said: Said) -> None:
 
 
 def test_cells_whose_solver_makes_the_error_are_counted_and_left_out(said: Said) -> None:
-    texts = said("UPDATE cells SET solver_share_max = 0.2 WHERE solver = 'osqp' OR primal = 'online-supremizers'")
+    texts = said("UPDATE cells SET solver_share_mean = 0.2 WHERE solver = 'osqp' OR primal = 'online-supremizers'")
     assert any(text.startswith("20 cells are not compared with others") for text in texts[""])
     of_model = [text for subject, found in texts.items() if "(N, R)" in subject for text in found]
     assert of_model

@@ -234,8 +234,8 @@ def test_defaults_written_out_give_the_same_cells(cells_of: Expand) -> None:
 
 
 def test_a_cell_says_what_it_is() -> None:
-    assert str(SAMPLE) == "P · D · Q 0.5 · 0.001, R=4 · piqp"
-    assert str(replace(SAMPLE, primal_tol=None)) == "P · D · Q · 0.001, R=4 · piqp"
+    assert str(SAMPLE) == "P · D · Q 0.5 · 0.001, R=4 · piqp 1e-07"
+    assert str(replace(SAMPLE, primal_tol=None)) == "P · D · Q · 0.001, R=4 · piqp 1e-07"
 
 
 def test_a_plugin_of_an_entry_is_created_with_its_options(cells_of: Expand) -> None:

@@ -115,7 +115,7 @@ SOLVER_SHARE = 0.1
 
 def solved_too_loosely(cells: pd.DataFrame) -> pd.Series:
     """Which cells are left out where strategies are compared."""
-    return cells["solver_share_max"].astype(float) >= SOLVER_SHARE
+    return cells["solver_share_mean"].astype(float) >= SOLVER_SHARE
 
 
 def best_solver(cells: pd.DataFrame) -> pd.DataFrame:
