@@ -102,7 +102,7 @@ def median_interval(values: Sequence[float]) -> tuple[float, float]:
     """
     ordered, n = sorted(values), len(values)
     outside, below = 0, 0.0  # values left out on each side; probability that the median is among or below them
-    while (below := below + math.comb(n, outside) / 2.0**n) <= 0.025:
+    while (below := below + math.comb(n, outside) / 2**n) <= 0.025:
         outside += 1
     first = max(outside - 1, 0)
     return ordered[first], ordered[n - 1 - first]

@@ -46,8 +46,10 @@ def exact_solution(program: VariationalInequality) -> ExactSolution | None:
     if not len(program.f):
         return ExactSolution(np.zeros(0), np.zeros(len(program.g)), unique=True)
     try:
+        for member in (program.A, program.f, program.B, program.g):
+            np.asarray_chkfinite(member)
         L = np.linalg.cholesky(program.A)
-    except np.linalg.LinAlgError:
+    except (ValueError, np.linalg.LinAlgError):
         return None
     whitened = _Whitened(program, L)
     active, seen = whitened.least_distance_set(), set[bytes]()

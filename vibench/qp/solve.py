@@ -67,7 +67,7 @@ def solve_qp(
     rows, cost = row_norms(program.B), size(program.f)
     scaled = VariationalInequality(program.A / cost, program.f / cost, _divide_rows(program.B, rows), program.g / rows)
     if extra and solver in extra:
-        answer = extra[solver](scaled, accuracy)
+        answer = extra[solver](scaled, MARGIN * accuracy)
         if not isinstance(answer, QPSolution):
             raise NumericalError(f"the solver returned a {type(answer).__name__}, expected a QPSolution")
     else:

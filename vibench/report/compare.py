@@ -22,7 +22,10 @@ ERROR_FLOOR = 1e-10
 CONSTANTS = ("beta_span_min", "beta_cone_lower_min")
 ERRORS = ("error_u_mean", "error_u_max", "error_lambda_mean", "error_lambda_max", "violation_max")
 
-COLUMNS = ["problem", "dual", "primal", "asked", "solver", "assembly", "what", "before", "after", "ratio", "verdict"]
+COLUMNS = [
+    "problem", "dual", "primal", "asked", "solver", "accuracy", "assembly", "what", "before", "after", "ratio",
+    "verdict",
+]  # fmt: skip
 
 
 class Verdict(StrEnum):
@@ -132,7 +135,7 @@ def _row(cell: pd.Series, what: str, before: Any, after: Any, verdict: Verdict) 
     ratio = float("nan")
     if not isinstance(before, str) and not isinstance(after, str) and pd.notna(before) and pd.notna(after) and before:
         ratio = float(after) / float(before)
-    names = {name: cell[name] for name in ("problem", "dual", "primal", "solver", "assembly")}
+    names = {name: cell[name] for name in ("problem", "dual", "primal", "solver", "accuracy", "assembly")}
     asked = f"{tables.asked(cell, 'pod')}, {tables.asked(cell, 'dual')}{tolerance}"
     shown = {"before": tables.cell_text(before), "after": tables.cell_text(after)}
     return names | shown | {"asked": asked, "what": what, "ratio": ratio, "verdict": verdict.value}

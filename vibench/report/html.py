@@ -23,7 +23,7 @@ from vibench.results import pictures, tables
 from vibench.results.break_even import HIGH_FIDELITY
 from vibench.results.database import read_meta, study_of
 
-IDENTITY = ["problem", "dual", "primal", "primal_tol", "solver", "assembly", "status"]
+IDENTITY = ["problem", "dual", "primal", "primal_tol", "solver", "accuracy", "assembly", "status"]
 """Columns that cells and queries share in the tables of failures."""
 
 
@@ -63,7 +63,7 @@ def page(path: Path) -> str:
 
 def _facts(study: dict[str, Any], cells: pd.DataFrame) -> Iterator[tuple[str, str]]:
     yield "study", ", ".join(f"{key} {value}" for key, value in study.items())
-    for axis in ("problem", "dual", "primal", "solver", "assembly"):
+    for axis in ("problem", "dual", "primal", "solver", "accuracy", "assembly"):
         yield axis, ", ".join(str(name) for name in cells[axis].unique())
     yield "cells", f"{len(cells)}, {int(cells['queries'].fillna(0).sum())} queries"
     yield "machine", "; ".join(str(name) for name in cells["machine"].unique())

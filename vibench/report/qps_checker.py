@@ -1,8 +1,9 @@
 """Recompute the residuals of every solution of this test set; needs only NumPy, not the program that exported it.
 
 Programs are min ½ xᵀPx + qᵀx subject to Gx ≤ h, in programs/NAME.npz; solutions x and multipliers z ≥ 0 of
-Px + q + Gᵀz = 0 are x_SOLVER and z_SOLVER in solutions/NAME.npz; rows.csv holds the claimed status and residuals. The
-relative residuals are, with the rows of G and h divided by the norms of the rows of G in the primal one,
+Px + q + Gᵀz = 0 are x_CELL and z_CELL in solutions/NAME.npz, a cell being a solver at an accuracy; rows.csv names the
+cells and holds the claimed status and residuals. The relative residuals are, with the rows of G and h divided by the
+norms of the rows of G in the primal one,
 
     primal  max(Gx − h)₊ / max(1, |h|∞)
     dual    |Px + q + Gᵀz|∞ / max(|Px|∞, |q|∞, |Gᵀz|∞)
@@ -49,7 +50,7 @@ def main(folder: Path) -> int:
             count += 1
             program = np.load(folder / "programs" / f"{row['program']}.npz", allow_pickle=False)
             solution = np.load(folder / "solutions" / f"{row['program']}.npz", allow_pickle=False)
-            x, z = solution[f"x_{row['solver']}"], solution[f"z_{row['solver']}"]
+            x, z = solution[f"x_{row['cell']}"], solution[f"z_{row['cell']}"]
             finite = bool(np.all(np.isfinite(x)) and np.all(np.isfinite(z)))
             found = residuals(program["P"], program["q"], program["G"], program["h"], x, z)
             claimed = [float(row[name] or "nan") for name in ("primal_residual", "dual_residual", "gap")]
@@ -58,7 +59,8 @@ def main(folder: Path) -> int:
             fine += row["status"] == "ok"
             if not honest or (row["status"] == "ok" and not good):
                 wrong += 1
-                print(f"{row['program']} {row['solver']}: {row['status']}, claimed {claimed}, found {found}")
+                about = f"{row['program']} {row['solver']} at {row['accuracy']}: {row['status']}"
+                print(f"{about}, claimed {claimed}, found {found}")
     print(f"{count} solutions, {fine} claimed ok, {wrong} wrong")
     return wrong
 

@@ -95,9 +95,9 @@ def write_program(program: VariationalInequality, file: Path) -> None:
 def export(run: str, folder: Path) -> int:
     """Write every reduced program of a run, with its solutions and their verification; returns their number.
 
-    The folder holds `programs/NAME.npz` (P, q, G, h), `solutions/NAME.npz` (x_SOLVER, z_SOLVER for every cell with a
-    solution), `rows.csv` (a line per solution: status, accuracy, residuals) and `check.py`, which recomputes the
-    residuals of every solution.
+    The folder holds `programs/NAME.npz` (P, q, G, h), `solutions/NAME.npz` (x_CELL, z_CELL for every cell with a
+    solution: a solver at an accuracy), `rows.csv` (a line per solution: status, accuracy, residuals) and `check.py`,
+    which recomputes the residuals of every solution.
 
     Raises
     ------
@@ -127,9 +127,9 @@ def _exported(cells: list[RecordedCell], folder: Path) -> Iterator[list[dict[str
         arrays: dict[str, Any] = {}
         for recorded, queries, solutions in tables:
             if query in solutions:
-                solver, row = recorded.cell.solver, queries[query]
-                arrays[f"x_{solver}"], arrays[f"z_{solver}"] = vectors(solutions[query])
-                about = {"program": name, "solver": solver, "cell": recorded.row["cell"]}
+                cell, row = recorded.row["cell"], queries[query]
+                arrays[f"x_{cell}"], arrays[f"z_{cell}"] = vectors(solutions[query])
+                about = {"program": name, "solver": recorded.cell.solver, "cell": cell}
                 rows.append(about | {"accuracy": recorded.cell.accuracy} | {key: row[key] for key in KEPT})
         (folder / "solutions").mkdir(exist_ok=True)
         np.savez(folder / "solutions" / f"{name}.npz", **arrays)

@@ -88,7 +88,7 @@ CELLS: Mapping[str, Column] = {
     "rank_gap": Column(
         REAL,
         "1",
-        "Last singular value that counts for the rank over the first that does not; near 1 the rank is in doubt.",
+        "Last singular value that counts for the rank over the next, or the threshold; near 1 the rank is in doubt.",
     ),
     "gram_condition": Column(
         REAL, "1", "Condition number of the Gram matrix of the generators in W, from their singular values."

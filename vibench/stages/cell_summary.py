@@ -10,6 +10,9 @@ from vibench.arrays import Array
 from vibench.qp.status import Status
 from vibench.stages.base import Row
 
+UNMEASURABLE = 1e-8
+"""Relative errors below this may be errors of the high-fidelity solution: nothing is measured by them."""
+
 DISTURBED = 1.3
 """A row is marked as disturbed if the calibration is slower than its best by more than this factor."""
 
@@ -38,7 +41,8 @@ def summarise(rows: Sequence[Row], slowdown: float = 1.0) -> Row:
     def solver_share(name: str) -> float | None:
         known = [row for row in fine if row.get(f"solver_error_{name}") is not None]
         whole = sum(row[f"error_{name}"] for row in known)
-        return float(sum(row[f"solver_error_{name}"] for row in known) / whole) if whole > 0.0 else None
+        measurable = whole > UNMEASURABLE * len(known)
+        return float(sum(row[f"solver_error_{name}"] for row in known) / whole) if measurable else None
 
     residuals = [largest(name) for name in ("primal_residual", "dual_residual", "gap")]
     cpu, wall = column("total_s").sum(), column("total_wall_s").sum()

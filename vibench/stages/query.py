@@ -25,11 +25,9 @@ from vibench.results.solver_agreement import solution_row
 from vibench.stages.assemblies import assemblies
 from vibench.stages.assembly import Model
 from vibench.stages.base import Row
+from vibench.stages.cell_summary import UNMEASURABLE
 from vibench.study import registry
 from vibench.timing import Seconds, median_seconds
-
-UNMEASURABLE = 1e-8
-"""Relative errors below this may be errors of the high-fidelity solution: no effectivity is computed from them."""
 
 
 @dataclass(frozen=True)

@@ -53,7 +53,7 @@ def test_the_rank_is_that_of_the_singular_values() -> None:
     cone = multipliers(chi, InnerProduct(sp.eye_array(90)))
     assert cone.rank == 89
     assert np.allclose(cone.span.T @ cone.span, np.eye(89), atol=1e-12)
-    assert cone.rank_gap > 1e8  # the last one alone is small
+    assert cone.rank_gap > 1e8
 
 
 def test_a_rank_without_a_gap_is_seen() -> None:
@@ -64,6 +64,12 @@ def test_a_rank_without_a_gap_is_seen() -> None:
     cone = multipliers(chi, InnerProduct(sp.eye_array(20)))
     assert cone.rank in (12, 13)
     assert 5.0 < cone.rank_gap < 20.0
+
+
+def test_a_full_rank_just_above_the_threshold_is_seen() -> None:
+    cone = multipliers(np.diag([1.0, 0.5, 3.0 * RANK_RTOL]), InnerProduct(sp.eye_array(3)))
+    assert cone.rank == 3
+    assert cone.rank_gap == pytest.approx(3.0)
 
 
 @pytest.mark.parametrize("distance", [1e-4, 1e-8, 1e-11, 1e-13])

@@ -18,7 +18,7 @@ INSTANCE = [*(name for name in KEYS if name not in ("problem", "problem_options"
 """Columns that identify a quadratic program which every solver solves."""
 
 EXACT = 1e-16
-"""Residuals are drawn no lower than this."""
+"""Residuals and errors are drawn no lower than this."""
 
 
 def solvers(data: Data) -> Figure | None:
@@ -34,8 +34,7 @@ def solvers(data: Data) -> Figure | None:
     left, right = sheet.panels
     names = list(queries["solver"].unique())
     _accuracy(left, queries, names)
-    for accuracy in sorted(queries["accuracy"].unique()):
-        left.axhline(accuracy, color="0.4", linewidth=0.8, linestyle=(0, (1, 2)), label="prescribed accuracy")
+    left.axhline(1.0, color="0.4", linewidth=0.8, linestyle=(0, (1, 2)), label="prescribed accuracy")
     _profile(right, queries, names)
     return sheet.finish()
 
@@ -43,7 +42,8 @@ def solvers(data: Data) -> Figure | None:
 def precision(data: Data) -> Figure | None:
     """Median time of a program against the part of the error of u and of λ that the solver makes, over the accuracy.
 
-    Each point is one accuracy of one solver: median over the programs that every solver solved at every accuracy.
+    Each point is one accuracy of one solver: median over the programs that are ok in all of these ways. A solver that
+    has no ok query at an accuracy has no point there.
     """
     fine = data.queries[data.queries["status"] == Status.OK]
     if fine["accuracy"].nunique() < 2:
@@ -67,14 +67,14 @@ def precision(data: Data) -> Figure | None:
 
 
 def _accuracy(panel: Axes, queries: pd.DataFrame, names: list[str]) -> None:
-    """A point per cell: median time and largest residual of its queries."""
+    """A point per cell: median time and largest residual of its queries, relative to its accuracy."""
     for k, solver in enumerate(names):
         mine = queries[(queries["solver"] == solver) & queries["solve_s"].notna()]
-        rows = mine.assign(worst=mine[RESIDUALS].max(axis=1)).groupby("cell")
+        rows = mine.assign(worst=mine[RESIDUALS].max(axis=1) / mine["accuracy"]).groupby("cell")
         found = rows.agg(time=("solve_s", "median"), worst=("worst", "max"))
         finite = found[np.isfinite(found["worst"])]  # a query without a solution has no residual
         plot(panel, 1e3 * finite["time"], np.maximum(finite["worst"], EXACT), k, solver, **POINTS)
-    panel.set(xlabel="median time of a program [ms]", ylabel="largest residual of a model's queries")
+    panel.set(xlabel="median time of a program [ms]", ylabel="largest residual / accuracy")
     panel.set(xscale="log", yscale="log")
 
 
