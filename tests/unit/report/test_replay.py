@@ -120,7 +120,7 @@ def test_the_exported_set_is_rechecked_by_a_script_that_knows_nothing_of_vibench
 def test_wrong_requests_are_one_line(run: Path, tmp_path: Path) -> None:
     with pytest.raises(RequestError, match=r"0 cells of .* begin with 'nothing'"):
         recorded_cell(str(run), "nothing")
-    with pytest.raises(RequestError, match="4 cells"):
+    with pytest.raises(RequestError, match="8 cells"):
         recorded_cell(str(run), "")
     recorded = recorded_cell(str(run), key(run))
     with pytest.raises(RequestError, match="no query 3; it has 0 to 2"):
