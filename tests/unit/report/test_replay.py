@@ -127,7 +127,7 @@ def test_wrong_requests_are_one_line(run: Path, tmp_path: Path) -> None:
         replay.replay(recorded, 3, tmp_path / "p.npz")
     with pytest.raises(RequestError, match=r"must end in \.npz"):
         replay.replay(recorded, 0, tmp_path / "p.txt")
-    assert len(recorded_cells(str(run))) == 4
+    assert len(recorded_cells(str(run))) == 8
     other = RecordedCell(recorded.path, {**recorded.row, "code": "another"})
     with pytest.raises(RequestError, match="computed by other code"):
         _ = other.model
