@@ -241,9 +241,8 @@ class _Queries(Pieces):
             notes = [note for note in found.fallbacks if note]
             fallbacks += [f"{len(notes)} of the {purpose} solutions: {notes[0]}"] if notes else []
         if (gap := cone.prepared.rank_gap) < CLEAR_GAP:
-            fallbacks.append(
-                f"the rank {cone.prepared.rank} has no gap: the next singular value is smaller by {gap:.2g}"
-            )
+            rank = cone.prepared.rank
+            fallbacks.append(f"the rank {rank} is in doubt: its last singular value is {gap:.2g} times what is below")
         added = self._model.fixed_basis.shape[1] - size
         return {
             "model": assembly.key,
