@@ -20,6 +20,12 @@ REPEATS = 5
 SLOW = 1.0
 """Seconds of repeats after which there are no more; what takes longer is timed once."""
 
+DISTURBED = 1.3
+"""A row is marked as disturbed if the calibration is slower than its best by more than this factor."""
+
+WAITED = 1.5
+"""A row is marked as disturbed if its wall seconds exceed its CPU seconds by more than this factor."""
+
 ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMEXPR_NUM_THREADS"), "1")
 """Environment in which numerical libraries start with one thread."""
 

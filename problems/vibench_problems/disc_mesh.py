@@ -8,6 +8,7 @@ from scipy.spatial import Delaunay
 from skfem import MeshTri
 
 from vibench import Array
+from vibench_problems.graded_mesh import DISPLACED, displaced
 
 SMOOTHING_SWEEPS = 20
 
@@ -51,6 +52,16 @@ def disc_in_square(nodes: int, radius: float) -> MeshTri:
     triangles = np.vstack([disc_triangles, outer_triangles])
     mesh = MeshTri(np.ascontiguousarray(points.T), np.ascontiguousarray(triangles.T))
     return mesh.with_subdomains({"disc": np.arange(len(disc_triangles))})
+
+
+def displaced_around_disc(mesh: MeshTri, radius: float) -> MeshTri:
+    """The mesh with its nodes displaced at random, those of the circle along it; the square's boundary stays."""
+    points, distance = mesh.p.T, np.linalg.norm(mesh.p, axis=0)
+    free = np.abs(points).max(axis=1) < 0.5
+    moved = displaced(points, mesh.t.T, free, DISPLACED)
+    circle = np.abs(distance - radius) < 1e-9
+    moved[circle] *= radius / np.linalg.norm(moved[circle], axis=1)[:, None]
+    return MeshTri(np.ascontiguousarray(moved.T), mesh.t).with_subdomains(mesh.subdomains)
 
 
 def rings_for(disc_nodes: float) -> int:

@@ -4,15 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from scipy.spatial import Delaunay
 from skfem import MeshTri
 
-from vibench import Array, Indices
+from vibench import Array, Indices, Mask
 
 COARSEST = 0.2
 """Largest element size, relative to the radius."""
+
+SKEW = 0.05
+"""Displacement along the arc, relative to the depth, that makes the diagonals of aligned layers point one way."""
 
 
 @dataclass(frozen=True)
@@ -35,7 +39,15 @@ class QuarterDisc:
     flat: Indices
 
 
-def quarter_disc(edges: int, angle: float, growth: float) -> QuarterDisc:
+Triangulation = Literal["staggered", "aligned", "irregular"]
+"""How inner nodes and triangles are chosen: every other layer shifted by half a spacing; layers without a shift, cut by
+diagonals that all point one way; or staggered, with nodes displaced at random."""
+
+DISPLACED = 0.2
+"""Largest displacement of a node of an irregular mesh, relative to its shortest edge."""
+
+
+def quarter_disc(edges: int, angle: float, growth: float, triangulation: Triangulation = "staggered") -> QuarterDisc:
     """Mesh with `edges` equal edges on the arc 0 ≤ θ ≤ `angle`, layers around it growing by the factor `growth`.
 
     Inner nodes lie on curves at increasing distances from the zone, with a spacing that matches that of the curves. The
@@ -50,6 +62,8 @@ def quarter_disc(edges: int, angle: float, growth: float) -> QuarterDisc:
         End of the zone [rad], below π/2.
     growth
         Ratio of the sizes of two successive layers, above 1.
+    triangulation
+        The boundary nodes are the same for each.
     """
     finest = 2.0 * np.sin(0.5 * angle / edges)
 
@@ -63,10 +77,14 @@ def quarter_disc(edges: int, angle: float, growth: float) -> QuarterDisc:
     flat_points = np.column_stack([1.0 - flat, np.zeros_like(flat)])[1:]
     axis_points = np.column_stack([np.zeros_like(axis), -axis])[1:-1]
     boundary = np.vstack([zone, rest[1:], flat_points, axis_points])
-    points = np.vstack([boundary, _layers(angle, finest, growth, size)])
-    triangles = _triangulate(points)
+    layers = _layers(angle, finest, growth, size, 0.0 if triangulation == "aligned" else 0.5)
+    points, skew = np.vstack([boundary, layers]), SKEW if triangulation == "aligned" else 0.0
+    triangles = _triangulate(points, skew)
     for _ in range(4):
         points = _smoothed(points, triangles, len(boundary))
+        triangles = _triangulate(points, skew)
+    if triangulation == "irregular":
+        points = displaced(points, triangles, np.arange(len(points)) >= len(boundary), DISPLACED)
         triangles = _triangulate(points)
     mesh = MeshTri(np.ascontiguousarray(points.T), np.ascontiguousarray(triangles.T))
     return QuarterDisc(
@@ -100,8 +118,8 @@ def _graded(start: float, end: float, size: Callable[[Array], Array]) -> Array:
     return np.interp(np.linspace(0.0, count[-1], pieces + 1), count, fine)
 
 
-def _layers(angle: float, finest: float, growth: float, size: Callable[[Array], Array]) -> Array:
-    """Inner nodes (n×2) on curves at growing distances from the zone, every other one shifted by half a spacing.
+def _layers(angle: float, finest: float, growth: float, size: Callable[[Array], Array], shifted: float) -> Array:
+    """Inner nodes (n×2) on curves at growing distances from the zone, every other one shifted by a part of a spacing.
 
     A curve runs from the axis along a smaller arc to the end of the zone and turns around that end to the boundary.
     """
@@ -111,7 +129,7 @@ def _layers(angle: float, finest: float, growth: float, size: Callable[[Array], 
     while distance < 1.1:
         distance += np.sqrt(3.0) / 2.0 * min(finest + (growth - 1.0) * distance, COARSEST)
         spacing = min(finest + (growth - 1.0) * distance, COARSEST)
-        shift = 0.5 - shift
+        shift = shifted - shift
         radius = max(1.0 - distance, 0.0)
         along = np.arange(shift * spacing, radius * angle + np.pi * distance, spacing)
         on_arc = along < radius * angle
@@ -124,9 +142,13 @@ def _layers(angle: float, finest: float, growth: float, size: Callable[[Array], 
     return np.vstack(layers)
 
 
-def _triangulate(points: Array) -> Indices:
-    """Delaunay triangles (k×3), counter-clockwise, without degenerate triangles of collinear nodes."""
-    triangles = Delaunay(points).simplices
+def _triangulate(points: Array, skew: float = 0.0) -> Indices:
+    """Delaunay triangles (k×3), counter-clockwise, without degenerate triangles of collinear nodes.
+
+    A small skew of the nodes decides which diagonal cuts what is nearly a rectangle.
+    """
+    theta, depth = np.arctan2(points[:, 0], -points[:, 1]), 1.0 - np.linalg.norm(points, axis=1)
+    triangles = Delaunay(points + skew * depth[:, None] * np.column_stack([np.cos(theta), np.sin(theta)])).simplices
     a, b, c = (points[triangles[:, k]] for k in range(3))
     twice_area = (b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0]
     longest = np.max([np.sum((q - p) ** 2, axis=1) for p, q in ((a, b), (b, c), (c, a))], axis=0)
@@ -134,6 +156,19 @@ def _triangulate(points: Array) -> Indices:
     triangles, clockwise = triangles[proper], twice_area[proper] < 0.0
     triangles[clockwise] = triangles[clockwise][:, [0, 2, 1]]
     return np.asarray(triangles, dtype=np.intp)
+
+
+def displaced(points: Array, triangles: Indices, free: Mask, share: float) -> Array:
+    """Points (n×2) with the free ones displaced at random by up to `share` of their shortest edge, always the same."""
+    edges = np.vstack([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]])
+    lengths = np.linalg.norm(points[edges[:, 0]] - points[edges[:, 1]], axis=1)
+    shortest = np.full(len(points), np.inf)
+    for end in edges.T:
+        np.minimum.at(shortest, end, lengths)
+    rng = np.random.default_rng(0)
+    angle, radius = 2.0 * np.pi * rng.random(len(points)), np.sqrt(rng.random(len(points)))
+    steps = share * radius[:, None] * np.column_stack([np.cos(angle), np.sin(angle)])
+    return np.asarray(np.where(free[:, None], points + shortest[:, None] * steps, points))
 
 
 def _smoothed(points: Array, triangles: Indices, fixed: int) -> Array:

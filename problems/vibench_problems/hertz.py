@@ -11,7 +11,7 @@ from skfem import Basis, BilinearForm, ElementTriP1, ElementVector
 from skfem.helpers import ddot, dot, eye, grad, sym_grad, trace
 
 from vibench import Array, Contact, Indices, InnerProduct, ParameterBox, Picture, Problem, VariationalInequality
-from vibench_problems.graded_mesh import quarter_disc
+from vibench_problems.graded_mesh import Triangulation, quarter_disc
 from vibench_problems.mortar import Pairing
 
 SLAVE_ANGLE = np.pi / 6.0
@@ -72,6 +72,9 @@ class Hertz(Problem):
         same number of edges, and master edges are longer than slave edges at every radius, as usual in mortar methods.
     growth
         Ratio of the sizes of successive element layers away from the contact zone.
+    triangulation
+        Of both discs, with the same boundary nodes: "staggered" (every other layer of nodes shifted by half a spacing),
+        "aligned" (no shift, all diagonals one way) or "irregular" (staggered, inner nodes displaced at random).
     length
         ℓ̂ [m] of the norm (44).
     young, poisson
@@ -92,6 +95,7 @@ class Hertz(Problem):
         flats: Literal["free", "clamped"] = "free",
         ratio: Annotated[float, Ge(0.25), Le(4.0)] = 0.631,
         growth: Annotated[float, Gt(1.0), Le(2.0)] = 1.265,
+        triangulation: Triangulation = "staggered",
         length: Annotated[float, Gt(0.0)] = 1.0,
         young: Annotated[float, Gt(0.0)] = 15.0,
         poisson: Annotated[float, Ge(0.0), Lt(0.5)] = 0.35,
@@ -103,9 +107,9 @@ class Hertz(Problem):
         self._approach = None if isinstance(approach, str) else approach
         if self._approach is None:
             self.parameters = WITH_APPROACH
-        self.slave = quarter_disc(edges, SLAVE_ANGLE, growth)
+        self.slave = quarter_disc(edges, SLAVE_ANGLE, growth, triangulation)
         masters = round(ratio * edges * MASTER_ANGLE / SLAVE_ANGLE)
-        self.master = quarter_disc(masters, MASTER_ANGLE, growth)
+        self.master = quarter_disc(masters, MASTER_ANGLE, growth, triangulation)
         lame = young * poisson / ((1.0 + poisson) * (1.0 - 2.0 * poisson))
         shear = young / (2.0 * (1.0 + poisson))
         blocks, norms, fixed, offset = [], [], [], 0

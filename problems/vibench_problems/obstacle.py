@@ -25,7 +25,7 @@ from vibench import (
     VariationalInequality,
 )
 from vibench_problems.disc_map import DiscMap, stiffness
-from vibench_problems.disc_mesh import aspect_ratios, disc_in_square
+from vibench_problems.disc_mesh import aspect_ratios, disc_in_square, displaced_around_disc
 from vibench_problems.p1_entries import LoadEntries, StiffnessEntries
 
 RADIUS = 0.2
@@ -97,6 +97,9 @@ class Obstacle(Problem):
     obstacle
         Coefficient of the obstacle ψ̂ = obstacle·|x̂|² [1/m] on ω̂, which h(mu) transports: without a bulge
         ψ = obstacle·|x − c|²/mu_1².
+    asymmetric
+        Whether the nodes are displaced at random. The mesh and the training grid are symmetric otherwise, so that many
+        steps of a greedy algorithm are ties between snapshots.
     bulge
         Whether there is a fourth parameter, mu_4 ∈ [−0.3, 0.3]; on ω̂ lengths then vary by factors from 0.7 to 1.3.
         Aspect ratios stay below 4.7 at "paper" and 8.2 at "fine", against 3.2 and 4.6 without a bulge.
@@ -118,6 +121,7 @@ class Obstacle(Problem):
         load: float = -1.0,
         obstacle: float = -1.25,
         bulge: bool = False,
+        asymmetric: bool = False,
     ) -> None:
         nodes = NODES[resolution] if isinstance(resolution, str) else resolution
         self.load = load
@@ -126,6 +130,8 @@ class Obstacle(Problem):
         if bulge:
             self.parameters = WITH_BULGE
         self.mesh = disc_in_square(nodes, RADIUS)
+        if asymmetric:
+            self.mesh = displaced_around_disc(self.mesh, RADIUS)
         basis = Basis(self.mesh, ElementTriP1())
         self.free = basis.complement_dofs(basis.get_dofs())
         self.disc_nodes = np.flatnonzero(np.linalg.norm(self.mesh.p, axis=0) <= RADIUS * (1.0 + 1e-9))

@@ -7,7 +7,7 @@ import os
 import signal
 import sqlite3
 import subprocess
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -104,7 +104,9 @@ def workers(pid: int) -> list[int]:
     return found
 
 
-MEASURED = ("_s", "peak_memory_mib", "slowdown", "disturbed", "benefit_threshold", "meaning")
+MEASURED = (
+    "_s", "peak_memory_mib", "slowdown", "disturbed", "benefit_threshold", "threshold_low", "threshold_high", "meaning",
+)  # fmt: skip
 """How the columns end that hold seconds, memory, or what follows from them."""
 
 
@@ -114,6 +116,11 @@ def numbers(folder: Path) -> dict[str, pd.DataFrame]:
     return {
         table: frame[[name for name in frame.columns if not name.endswith(MEASURED)]] for table, frame in found.items()
     }
+
+
+def without_seconds(row: Mapping[str, Any]) -> dict[str, Any]:
+    """A row without seconds, memory, and what follows from them."""
+    return {name: value for name, value in row.items() if not name.endswith((*MEASURED, "timing_rounds"))}
 
 
 def assert_same_numbers(one: Path, other: Path) -> None:

@@ -133,6 +133,7 @@ FAKES: Mapping[str, Mapping[str, str]] = {
         "hangs": "hangs",
         "segfaults": "segfaults",
         "dies-sometimes": "dies_sometimes",
+        "dies-once": "dies_once",
         "hungry": "hungry",
         "chatty": "chatty",
     },

@@ -37,7 +37,7 @@ def test_both_sides_come_to_the_same_models(
         as_published.TOTAL_NAME,
         as_published.BARE,
     }
-    assert (times.loc[times["stage"] != "reduction", ["published [s]", "ours [s]"]] > 0.0).all(axis=None)
+    assert (times.loc[times["stage"] != "reduction", ["transcription [s]", "ours [s]"]] > 0.0).all(axis=None)
     assert (tmp_path / f"as-published-{problem}.md").read_text(encoding="utf-8") in capsys.readouterr().out
 
 

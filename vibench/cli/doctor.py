@@ -31,10 +31,9 @@ from vibench.qp.settings import SETTINGS
 from vibench.qp.solve import installed_solvers
 from vibench.qp.status import Status
 from vibench.stages.artefacts import CACHE_VARIABLE, LOCK, Store, default_folder
-from vibench.stages.cell_summary import DISTURBED, WAITED
 from vibench.study import registry
 from vibench.study.reader import load_study
-from vibench.timing import Calibration, Stopwatch
+from vibench.timing import DISTURBED, WAITED, Calibration, Stopwatch
 
 MIN_GIB = 1.0
 """Less free memory or disk space than this is a note."""

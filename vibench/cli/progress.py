@@ -26,6 +26,10 @@ class TimeLeft:
         self._done: dict[str, list[float]] = {}
         self._jobs = jobs
 
+    def add(self, stage: Stage) -> None:
+        """Count a stage that was planned later."""
+        self._left[stage.sort] += 1
+
     def done(self, stage: Stage, wall: float) -> None:
         """Count a finished stage."""
         self._left[stage.sort] -= 1
@@ -93,6 +97,12 @@ class ProgressDisplay:
             done, parts = self._done[stage.label], self._parts[stage.label]
             if done % LINE_EVERY == 0 or done == parts:
                 self._console.print(f"{stage.label}: {done} of {parts} parts{self._left_text(', ')}")
+
+    def plan(self, stage: Stage) -> None:
+        """A stage was added: the timing of cells that have their rows."""
+        self._left.add(stage)
+        if self._bar is not None:
+            self._bar.update(self._task, total=(self._bar.tasks[0].total or 0) + 1)
 
     def cell(self, cell: Cell, row: Mapping[str, Any]) -> None:
         """A cell has its row."""

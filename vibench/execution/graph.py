@@ -32,10 +32,10 @@ class Graph:
         self._add(stage, is_there)
 
     def _add(self, stage: Stage, is_there: Callable[[Stage], bool]) -> bool:
-        if stage.key in self.stages:
-            return True
         if stage.key in self._there:
             return False
+        if stage.key in self.stages:
+            return True
         if is_there(stage):
             self._there.add(stage.key)
             return False
@@ -51,7 +51,8 @@ class Graph:
             yield self.stages[key]
 
     def done(self, stage: Stage) -> None:
-        """Note that a stage succeeded."""
+        """Note that a stage succeeded; what is planned later does not wait for it."""
+        self._there.add(stage.key)
         for needed in self.waiting.values():
             needed.discard(stage.key)
 

@@ -12,6 +12,7 @@ from vibench.results.database import ResultsDatabase
 from vibench.stages.artefacts import History, Store
 from vibench.stages.base import Row, Stage, value_of
 from vibench.stages.cell_queries import CellRows
+from vibench.stages.timing_rounds import TimedCell, cell_seconds, query_seconds, round_rows
 from vibench.study.cells import Axes, Cell, Plugin, digest
 from vibench.study.spec import Study
 
@@ -39,6 +40,16 @@ class ResultWriter:
         queries = [{"cell": cell.key, **keys, "query": k, **query} for k, query in enumerate(found.queries)]
         self.database.write_cell(row, queries, [{"cell": cell.key, **solution} for solution in found.solutions])
         return row
+
+    def seconds(self, cell: Cell, timed: TimedCell, asked: int) -> None:
+        """Write the seconds of a cell that has its rows."""
+        rounds = round_rows(timed.rounds)
+        own = cell_seconds(rounds) | {"timing_rounds": asked, "timing_reason": timed.reason}
+        row = self.database.cell(cell.key)
+        if row is not None and timed.rounds:
+            own["machine"] = "; ".join(sorted({*row["machine"].split("; "), timed.machine}))
+        keys = {"cell": cell.key, **cell_columns(cell)}
+        self.database.write_seconds(cell.key, own, query_seconds(timed.rounds), [keys | row for row in rounds])
 
     def stage(self, stage: Stage, histories: Iterable[History], store: Store) -> None:
         """Write the histories and rows of a stage whose value is stored."""

@@ -8,7 +8,6 @@ import threading
 from collections.abc import Mapping, Sequence, Set
 from concurrent.futures import FIRST_COMPLETED, Future, wait
 from dataclasses import dataclass, field
-from functools import partial
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -18,6 +17,7 @@ from vibench.execution.executors import Executor, Local
 from vibench.execution.graph import Graph
 from vibench.execution.result_writer import ResultWriter, labels_of
 from vibench.execution.supervisor import Job
+from vibench.execution.timing_plan import TimingPlan
 from vibench.qp.solve import installed_solvers
 from vibench.qp.status import Status
 from vibench.results.break_even import break_even_rows
@@ -63,6 +63,9 @@ class Observer(Protocol):
 
     def stage(self, stage: Stage, wall: float) -> None:
         """A stage is done, after so many wall seconds."""
+
+    def plan(self, stage: Stage) -> None:
+        """Another stage was added to the agenda."""
 
     def cell(self, cell: Cell, row: Mapping[str, Any]) -> None:
         """A cell has its row."""
@@ -137,9 +140,9 @@ def run_study(study: Study, folder: Path, observer: Observer, options: Options =
             finished = database.finished()
             todo = [cell for cell in cells if _to_do(cell, finished, options.retry)]
             run = _Run(study, folder, store, ResultWriter(study, database, labels_of(cells)), observer, options)
-            interrupted = run.execute(todo, len(cells))
+            interrupted = run.execute(cells, todo)
             everything = database.rows("cells")
-            database.replace("thresholds", break_even_rows(everything))
+            database.replace("thresholds", break_even_rows(everything, database.rows("timings")))
             database.replace(
                 "disagreements", disagreement_rows(everything, database.rows("queries"), database.rows("solutions"))
             )
@@ -181,26 +184,33 @@ class _Run:
     graph: Graph = field(default_factory=Graph)
     cells: dict[str, list[Cell]] = field(default_factory=dict)
     """The cells that get their rows from a goal, by its key; several cells may share a goal."""
+    timing: TimingPlan = field(init=False)
+    machines: Set[str] = frozenset()
 
-    def execute(self, todo: Sequence[Cell], count: int) -> bool:
-        """Run these cells of a matrix of `count`; returns whether Ctrl-C ended it."""
-        reasons = {cell.key: reason for cell in todo if (reason := unavailable(cell))}
-        runnable = [cell for cell in todo if cell.key not in reasons]
+    def execute(self, cells: Sequence[Cell], todo: Sequence[Cell]) -> bool:
+        """Run some cells of the matrix, and time those that have no seconds; returns whether Ctrl-C ended it."""
+        reasons = {cell.key: reason for cell in cells if (reason := unavailable(cell))}
+        seconds = self.study.limits.query_seconds
+        goals = {cell: cell_queries(cell, seconds) for cell in cells if cell.key not in reasons}
+        runnable = [cell for cell in todo if cell in goals]
+        self.timing = TimingPlan(goals, self.study.timing_rounds, self.writer)
+        untimed = self.timing.start(runnable)
         workers: Executor | None = None
         try:
-            workers = self._workers() if runnable else None
+            workers = self._workers() if runnable or untimed else None
+            self.machines = self.machines if workers is None else workers.machines
             for cell in runnable:
-                assert workers is not None
-                goal = cell_queries(cell, self.study.limits.query_seconds)
-                self.cells.setdefault(goal.key, []).append(cell)
-                for stage in (goal, PictureStage(cell.problem)):
-                    self.graph.add_goal(stage, partial(self._is_there, workers.machines))
+                self.cells.setdefault(goals[cell].key, []).append(cell)
+                for stage in (goals[cell], PictureStage(cell.problem)):
+                    self.graph.add_goal(stage, self._is_there)
+            for group in untimed:
+                self.graph.add_goal(group, self._is_there)
             slots = workers.slots if workers is not None else 0
+            left_out = [cell for cell in todo if cell.key in reasons]
             stages = list(self.graph.stages.values())
-            self.observer.start(Agenda(count, len(todo), len(reasons), stages, slots))
-            for cell in todo:
-                if cell.key in reasons:
-                    self._fail_cell(cell, Failed(Status.UNAVAILABLE, reasons[cell.key]))
+            self.observer.start(Agenda(len(cells), len(todo), len(left_out), stages, slots))
+            for cell in left_out:
+                self._fail_cell(cell, Failed(Status.UNAVAILABLE, reasons[cell.key]))
             if workers is not None:
                 self._loop(workers)
         except KeyboardInterrupt:
@@ -217,7 +227,7 @@ class _Run:
             return Dask(options.scheduler, options.jobs, self.store.folder)
         return Local(options.jobs, self.folder / LOG)
 
-    def _is_there(self, machines: Set[str], stage: Stage) -> bool:
+    def _is_there(self, stage: Stage) -> bool:
         """Whether the artefact of a stage can be reused; its histories are recorded if so.
 
         Seconds of different machines are not comparable: an artefact of another machine is computed again.
@@ -225,7 +235,7 @@ class _Run:
         if self.options.fresh or not stage.stored:
             return False
         artefact = self.store.get(stage.key)
-        if artefact is None or artefact.machine not in machines:
+        if artefact is None or artefact.machine not in self.machines:
             return False
         self.writer.stage(stage, artefact.histories, self.store)
         return True
@@ -235,7 +245,8 @@ class _Run:
         limits = self.study.limits
         while self.graph.waiting or running:
             for stage in self.graph.begin(workers.slots - len(running)):
-                job = Job(str(self.store.folder), stage, limits.query_seconds, limits.cell_seconds, limits.memory_gib)
+                cell_seconds = stage.weight * limits.cell_seconds
+                job = Job(str(self.store.folder), stage, limits.query_seconds, cell_seconds, limits.memory_gib)
                 running[workers.submit(job)] = stage
             if not running:
                 raise ExecutorError(
@@ -251,16 +262,28 @@ class _Run:
         if isinstance(outcome, Failed):
             reason = outcome.reason if stage.key in self.cells else f"in {stage.label}: {outcome.reason}"
             self.writer.failure(stage, outcome.reason)
+            self.timing.record(stage, outcome)
             for goal in self.graph.lost(stage):
                 for cell in self.cells.get(goal.key, ()):
                     self._fail_cell(cell, Failed(outcome.status, reason))
+                    self._ended(cell)
             return
         self.observer.stage(stage, outcome.wall)
+        self.graph.done(stage)
         if stage.stored:
             self.writer.stage(stage, outcome.histories, self.store)
+        else:
+            self.timing.record(stage, outcome.value)
         for cell in self.cells.get(stage.key, ()):
             self.observer.cell(cell, self.writer.cell(cell, outcome.value))
-        self.graph.done(stage)
+            self._ended(cell)
+
+    def _ended(self, cell: Cell) -> None:
+        """Plan the timing of the cell's group if this was its last one."""
+        group = self.timing.ended(cell)
+        if group is not None:
+            self.graph.add_goal(group, self._is_there)
+            self.observer.plan(group)
 
     def _fail_cell(self, cell: Cell, failed: Failed) -> None:
         row = {"status": failed.status.value, "reason": failed.reason, "queries": cell.validation, "queries_ok": 0}

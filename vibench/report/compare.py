@@ -22,6 +22,8 @@ ERROR_FLOOR = 1e-10
 CONSTANTS = ("beta_span_min", "beta_cone_lower_min")
 ERRORS = ("error_u_mean", "error_u_max", "error_lambda_mean", "error_lambda_max", "violation_max")
 
+NUMBERS = ("benefit_threshold", "threshold_low", "threshold_high")
+
 COLUMNS = [
     "problem", "dual", "primal", "asked", "solver", "accuracy", "assembly", "what", "before", "after", "ratio",
     "verdict",
@@ -102,12 +104,11 @@ def _cell(one: pd.Series, two: pd.Series, limit: float) -> Iterator[Change]:
 
 
 def _thresholds(one: pd.DataFrame, two: pd.DataFrame, limit: float) -> Iterator[Change]:
-    keys = [name for name in THRESHOLDS if not name.endswith(("_s", "benefit_threshold", "meaning"))]
+    keys = [name for name in THRESHOLDS if not name.endswith(("_s", *NUMBERS, "meaning"))]
     for _, row in one.merge(two, on=keys, suffixes=("_one", "_two")).iterrows():
-        before, after = (
-            BreakEven(None if pd.isna(n := row[f"benefit_threshold_{k}"]) else n, Meaning(row[f"meaning_{k}"]))
-            for k in ("one", "two")
-        )
+        before, after = (_break_even(row, k) for k in ("one", "two"))
+        if before.overlaps(after):
+            continue
         verdict: Verdict | None = Verdict.CHANGED
         if before.meaning == after.meaning:
             verdict = _verdict(before.number, after.number, limit, more_is_better=before.meaning == Meaning.UNTIL)
@@ -118,6 +119,11 @@ def _thresholds(one: pd.DataFrame, two: pd.DataFrame, limit: float) -> Iterator[
             verdict = Verdict.WORSE
         cell = row.rename({f"{name}_b": name for name in ("primal", "assembly", "primal_tol")})
         yield cell, f"break-even against {row['primal_a']}", str(before), str(after), verdict
+
+
+def _break_even(row: pd.Series, run: str) -> BreakEven:
+    number, low, high = (None if pd.isna(n := row[f"{name}_{run}"]) else float(n) for name in NUMBERS)
+    return BreakEven(number, Meaning(row[f"meaning_{run}"]), low, high)
 
 
 def _verdict(before: Any, after: Any, limit: float, *, more_is_better: bool = False) -> Verdict | None:

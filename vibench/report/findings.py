@@ -117,10 +117,12 @@ def _costs(cells: pd.DataFrame, thresholds: pd.DataFrame) -> Iterator[str]:
         f"{1e3 * row['online_solve_s']:.3g} ms; a high-fidelity solution takes {1e3 * row['hf_s']:.3g} ms "
         f"after a set-up of {1e3 * row['hf_setup_s']:.3g} ms."
     )
-    of_cell = (thresholds["offline_b_s"] == row["offline_s"]) & (thresholds["online_b_s"] == row["online_s"])
-    for found in thresholds[of_cell & (thresholds["primal_a"] == HIGH_FIDELITY)].head(1).itertuples():
+    against = thresholds[(thresholds["cell_b"] == row["cell"]) & (thresholds["primal_a"] == HIGH_FIDELITY)]
+    for found in against.itertuples():
         number = "" if pd.isna(found.benefit_threshold) else f" {math.ceil(found.benefit_threshold)} queries"
-        yield f"Break-even of {name} against high-fidelity solutions: {found.meaning}{number}."
+        interval = tables.interval(found.threshold_low, found.threshold_high)
+        within = f", 95 % interval {interval}" if interval else ""
+        yield f"Break-even of {name} against high-fidelity solutions: {found.meaning}{number}{within}."
 
 
 def _solvers(data: Data) -> Iterator[str]:

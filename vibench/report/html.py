@@ -77,7 +77,10 @@ def _tables(path: Path, cells: pd.DataFrame) -> Iterator[tuple[str, str, str, pd
     yield "summary", "All cells", "Errors are relative; they are means over the ok queries.", tables.summary(cells)
     thresholds = tables.read(path, "thresholds")
     model = thresholds["primal_a"] == HIGH_FIDELITY
-    caption = "When b is cheaper than a, offline and online together, by the number of queries."
+    caption = (
+        "When b is cheaper than a, offline and online together, by the number of queries, with its 95 % interval; "
+        "undecided where the measured rounds do not tell the sign of a difference."
+    )
     for name, title, rows in (
         ("enrichments", "Break-even between enrichments", thresholds[~model]),
         ("model", "Break-even against the high-fidelity model", thresholds[model]),

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import NamedTuple
 
-VERSION = 8
+VERSION = 9
 """Schema version of a results file; a file of another version is refused."""
 
 TEXT, REAL, INTEGER, BLOB = "TEXT", "REAL", "INTEGER", "BLOB"
@@ -115,11 +115,19 @@ CELLS: Mapping[str, Column] = {
     "offline_s": Column(REAL, "s", "Sum of the five above, what the cell alone would have taken.", "offline [s]", 18),
     "offline_wall_s": Column(REAL, "s", "The same sum in wall seconds."),
     "online_s": Column(
-        REAL, "s", "One query, assembly and solution: mean over the ok queries of their medians.", "online [ms]", 19
+        REAL,
+        "s",
+        "One query, assembly and solution: median over the rounds of the mean over ok queries.",
+        "online [ms]",
+        19,
     ),
-    "online_wall_s": Column(REAL, "s", "The same in wall seconds."),
-    "online_assemble_s": Column(REAL, "s", "Its share of assembly."),
-    "online_solve_s": Column(REAL, "s", "Its share of the solver."),
+    "online_q1_s": Column(REAL, "s", "Lower quartile over the rounds."),
+    "online_q3_s": Column(REAL, "s", "Upper quartile over the rounds."),
+    "online_wall_s": Column(REAL, "s", "One query in wall seconds, likewise."),
+    "online_assemble_s": Column(REAL, "s", "Assembly of a query: median over the rounds."),
+    "online_solve_s": Column(REAL, "s", "Solution of a query by the solver: median over the rounds."),
+    "timing_rounds": Column(INTEGER, "", "Rounds of timing asked; empty where the cell was not timed yet."),
+    "timing_reason": Column(TEXT, "", "Why rounds are missing."),
     "hf_setup_s": Column(
         REAL, "s", "Set-up of the high-fidelity solver, once: what the first solution takes beyond its repetition."
     ),
@@ -155,7 +163,7 @@ CELLS: Mapping[str, Column] = {
     "residual_max": Column(REAL, "1", "Largest of all recomputed residuals."),
     "fallbacks": Column(TEXT, "", "Every step that could not be done as its algorithm says."),
     "peak_memory_mib": Column(REAL, "MiB", "Peak of the resident memory of the worker process."),
-    "slowdown": Column(REAL, "1", "Seconds of the calibration beside the queries, over its best in that process."),
+    "slowdown": Column(REAL, "1", "Seconds of the calibration beside the rounds, over its best in that process."),
     "disturbed": Column(
         INTEGER, "", "1 where the slowdown is above 1.3, or wall seconds above 1.5 times the CPU seconds."
     ),
@@ -192,8 +200,8 @@ QUERIES: Mapping[str, Column] = {
     "form": Column(TEXT, "", "Form in which the program was solved: primal or dual."),
     "started_from": Column(INTEGER, "", "Query whose solution the solver started from, if any."),
     "assembly_error": Column(REAL, "1", "Largest relative difference of a member of the program from its projection."),
-    "assemble_s": Column(REAL, "s", "Assembly of the reduced program."),
-    "solve_s": Column(REAL, "s", "The solver: median of the repeats."),
+    "assemble_s": Column(REAL, "s", "Assembly of the reduced program: median over the rounds."),
+    "solve_s": Column(REAL, "s", "The solver: median over the rounds."),
     "total_s": Column(REAL, "s", "Sum of the two."),
     "total_wall_s": Column(REAL, "s", "The same in wall seconds."),
     "hf_s": Column(
@@ -234,7 +242,21 @@ QUERIES: Mapping[str, Column] = {
     "dual_residual": Column(REAL, "1", "Recomputed, relative."),
     "gap": Column(REAL, "1", "Recomputed, relative."),
     "iterations": Column(INTEGER, "", "Iterations the solver reports."),
-    "repeatable": Column(INTEGER, "", "1 where all repeats gave the same answer to the last bit."),
+    "repeatable": Column(
+        INTEGER, "", "1 where a second solution was the same to the last bit; empty if there was none."
+    ),
+}
+
+TIMINGS: Mapping[str, Column] = {
+    "cell": Column(MEMBER, "", "The cell it belongs to."),
+    **KEYS,
+    "round": Column(INTEGER, "", "Number of the round, from 0; rounds of cells that are compared are interleaved."),
+    "queries": Column(INTEGER, "", "Ok queries that were solved in it."),
+    "assemble_s": Column(REAL, "s", "Assembly of a query: mean over these; in full, that of one of them."),
+    "solve_s": Column(REAL, "s", "Solution of a query by the solver: mean over these."),
+    "total_s": Column(REAL, "s", "Sum of the two."),
+    "total_wall_s": Column(REAL, "s", "The same in wall seconds."),
+    "slowdown": Column(REAL, "1", "Seconds of the calibration beside it, over its best in that process."),
 }
 
 PARAMETER = Column(REAL, "µ", "The k-th parameter.")
@@ -260,6 +282,8 @@ HISTORIES: Mapping[str, Column] = {
 
 THRESHOLDS: Mapping[str, Column] = {
     **_without("primal", "primal_options", "primal_tol", "assembly"),
+    "cell_a": Column(TEXT, "", "Cell of way a; empty for the high-fidelity model."),
+    "cell_b": Column(TEXT, "", "Cell of way b."),
     "primal_a": Column(TEXT, "", "Way a: a primal strategy, or high-fidelity.", "a", 11),
     "primal_tol_a": Column(REAL, "1", "Its tolerance."),
     "assembly_a": Column(TEXT, "", "How its queries are assembled.", "assembly a", 12),
@@ -271,9 +295,17 @@ THRESHOLDS: Mapping[str, Column] = {
     "offline_b_s": Column(REAL, "s", "Offline seconds of b.", "offline b [s]", 18),
     "online_b_s": Column(REAL, "s", "Seconds of a query of b.", "online b [ms]", 19),
     "benefit_threshold": Column(
-        REAL, "1", "Number n* of queries; empty where b is cheaper always or never.", "break-even", 20
+        REAL,
+        "1",
+        "Number n* of queries; empty where there is none or it is undecided.",
+        "break-even",
+        20,
     ),
-    "meaning": Column(TEXT, "", "When b is cheaper than a in total: from n* on, until n*, never, or at once."),
+    "threshold_low": Column(REAL, "1", "Lower end of its 95 % interval; of what is undecided, the smallest n*."),
+    "threshold_high": Column(REAL, "1", "Upper end of its 95 % interval.", "interval", 21),
+    "meaning": Column(
+        TEXT, "", "When b is cheaper than a in total: from n* on, until n*, never, or at once; or undecided."
+    ),
 }
 
 DISAGREEMENTS: Mapping[str, Column] = {
@@ -311,6 +343,7 @@ TABLES: Mapping[str, Mapping[str, Column]] = {
     "cells": CELLS,
     "queries": QUERIES,
     "histories": HISTORIES,
+    "timings": TIMINGS,
     "thresholds": THRESHOLDS,
     "disagreements": DISAGREEMENTS,
 }

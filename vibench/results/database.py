@@ -94,7 +94,7 @@ class ResultsDatabase:
         for table, columns in STORED.items():
             declared = ", ".join(f'"{name}" {column.kind}' for name, column in columns.items())
             self._db.execute(f"CREATE TABLE IF NOT EXISTS {table} ({declared})")
-        for table in ("queries", "solutions"):
+        for table in ("queries", "solutions", "timings"):
             self._db.execute(f"CREATE INDEX IF NOT EXISTS {table}_of_cell ON {table}(cell)")
         self._db.execute(f"CREATE INDEX IF NOT EXISTS histories_named ON histories({', '.join(NAMED)})")
         entries = {"schema": str(VERSION), "study": json.dumps(study, sort_keys=True)}
@@ -120,6 +120,47 @@ class ResultsDatabase:
             self._insert("cells", [cell])
             self._insert("queries", queries)
             self._insert("solutions", solutions)
+
+    def write_seconds(
+        self,
+        cell: str,
+        own: Mapping[str, Any],
+        queries: Mapping[int, Mapping[str, Any]],
+        rounds: Sequence[Mapping[str, Any]],
+    ) -> None:
+        """Write the seconds of a cell that has its rows, in one transaction; earlier ones are replaced.
+
+        Parameters
+        ----------
+        cell
+            Key of the cell.
+        own, queries
+            Columns of the cell, and of its queries by their number.
+        rounds
+            Rows of the timings table.
+        """
+        with self._writing():
+            self._update("cells", own, cell=cell)
+            for number, columns in queries.items():
+                self._update("queries", columns, cell=cell, query=number)
+            self._replace("timings", {"cell": cell}, rounds)
+
+    def _update(self, table: str, columns: Mapping[str, Any], **keys: Any) -> None:
+        changes = ", ".join(f'"{name}" = ?' for name in columns)
+        same = " AND ".join(f'"{name}" IS ?' for name in keys)
+        values = tuple(map(_plain, (*columns.values(), *keys.values())))
+        self._db.execute(f"UPDATE {table} SET {changes} WHERE {same}", values)
+
+    def fine_queries(self, cell: str) -> tuple[int, ...]:
+        """Numbers of the queries of a cell that are ok."""
+        found = self._db.execute("SELECT query FROM queries WHERE cell = ? AND status = 'ok' ORDER BY query", (cell,))
+        return tuple(number for (number,) in found)
+
+    def cell(self, key: str) -> dict[str, Any] | None:
+        """The row of a cell, if it has one."""
+        cursor = self._db.execute("SELECT * FROM cells WHERE cell = ?", (key,))
+        cursor.row_factory = sqlite3.Row
+        return next(map(dict, cursor), None)
 
     def write_histories(self, histories: Sequence[Sequence[Mapping[str, Any]]], *, partial: bool = False) -> None:
         """Write histories, each given as its rows; earlier histories of the same name are replaced.

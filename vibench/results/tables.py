@@ -96,6 +96,8 @@ def _shown(frame: pd.DataFrame, name: str, column: Column) -> pd.Series | list[s
         ]
     if name == "benefit_threshold":
         return [m if pd.isna(n) else f"{m} {n:.0f}" for n, m in zip(frame[name], frame["meaning"], strict=True)]
+    if name == "threshold_high":
+        return [interval(*ends) for ends in zip(frame["threshold_low"], frame[name], strict=True)]
     if column.kind == INTEGER:
         return frame[name].astype("Int64")
     return 1e3 * frame[name] if column.heading.endswith("[ms]") else frame[name]
@@ -153,6 +155,13 @@ def asked(row: Mapping[str, Any] | pd.Series, axis: str) -> str:
     """The tolerance of `axis`, "pod" or "dual", or the dimension where the study prescribes one."""
     tolerance, count = row[f"{axis}_tol"], row[f"{axis}_size"]
     return f"{'N' if axis == 'pod' else 'R'}={int(count)}" if pd.notna(count) else f"{tolerance:g}"
+
+
+def interval(low: float | None, high: float | None) -> str:
+    """The interval of a break-even; without an upper end where none is known, "" where neither is."""
+    if pd.isna(low):
+        return ""
+    return f"≥ {low:.0f}" if pd.isna(high) else f"{low:.0f}–{high:.0f}"
 
 
 FORMS = {"markdown": to_markdown, "csv": to_csv, "latex": to_latex, "json": to_json}

@@ -1,17 +1,15 @@
-"""Assembly of reduced programs, in full or hyper-reduced: its offline part and its seconds per query."""
+"""Assembly of reduced programs, in full or hyper-reduced: its offline part, and the programs of the queries."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
 
 import numpy as np
 
 from vibench.arrays import Array
 from vibench.interfaces.problem import MEMBERS, VariationalInequality
-from vibench.interfaces.strategies import Kind
-from vibench.interfaces.validation import checked_assembly, training_parameters, validation_parameters
+from vibench.interfaces.validation import training_parameters, validation_parameters
 from vibench.model.affine import AffineMember, Evaluation, affine_decomposition
 from vibench.model.galerkin import ReducedModel, leading_part, project
 from vibench.model.hyperreduced import HyperReducedModel, Operators, hyper_reduce, reason_for_full_assembly
@@ -21,7 +19,7 @@ from vibench.stages.assemblies import assemblies
 from vibench.stages.base import Result, Stage, build_problem, value_of
 from vibench.stages.enrichment import EnrichmentStage, GrowthStage, enrichment_stage
 from vibench.study.cells import Cell, Plugin
-from vibench.timing import REPEATS, Seconds, median_of, median_seconds, timed
+from vibench.timing import timed
 
 Model = ReducedModel | HyperReducedModel
 """A model that assembles the reduced program at a parameter."""
@@ -69,28 +67,6 @@ class HyperReduction(Stage):
 
 
 @dataclass(frozen=True)
-class FullAssemblyTimes(Stage):
-    """Median seconds of assembling the high-fidelity matrices, per validation parameter."""
-
-    label = "full assembly times"
-    rooms = ("interfaces",)
-
-    problem: Plugin
-    count: int
-    seed: int
-
-    def run(self, store: Store) -> Result:  # noqa: ARG002
-        """Time every assembly; the same for all reduced models that assemble in full."""
-        problem = build_problem(self.problem)
-        seconds = []
-        for mu in validation_parameters(problem, self.count, self.seed):
-            vi, spent = median_seconds(partial(checked_assembly, problem, mu))
-            assemblies(problem).keep(mu, vi)
-            seconds.append(spent)
-        return Result(tuple(seconds))
-
-
-@dataclass(frozen=True)
 class NestedPrograms(Stage):
     """Reduced programs, in full, with all vectors of a nested strategy; its tolerances take their leading parts."""
 
@@ -114,7 +90,7 @@ class NestedPrograms(Stage):
 
 @dataclass(frozen=True)
 class ReducedPrograms:
-    """Reduced programs and the seconds of their assembly, for any QP solver.
+    """Reduced programs, for any QP solver.
 
     Attributes
     ----------
@@ -122,8 +98,6 @@ class ReducedPrograms:
         One per validation parameter.
     factor
         Cholesky factor (lower) of A, where A is constant and the programs are solved in dual form.
-    seconds
-        Seconds of the assembly per validation parameter.
     errors
         Largest relative difference of a member of the reduced program from its Galerkin projection, per parameter; zero
         where it is assembled in full.
@@ -131,13 +105,12 @@ class ReducedPrograms:
 
     programs: tuple[VariationalInequality, ...]
     factor: Array | None
-    seconds: tuple[Seconds, ...]
     errors: tuple[float, ...]
 
 
 @dataclass(frozen=True)
 class AssemblyStage(Stage):
-    """Assembly of the reduced programs at the validation parameters, timed; the value is a `ReducedPrograms`."""
+    """Assembly of the reduced programs at the validation parameters; the value is a `ReducedPrograms`."""
 
     label = "assembly"
     rooms = ("linalg", "interfaces", "reduction", "model")
@@ -155,11 +128,6 @@ class AssemblyStage(Stage):
         return HyperReduction(self.enrichment, AffineDecomposition(self.enrichment.pod.problem, self.interpolation))
 
     @property
-    def full_times(self) -> FullAssemblyTimes:
-        """The stage that times the assembly of the high-fidelity matrices."""
-        return FullAssemblyTimes(self.enrichment.pod.problem, self.count, self.seed)
-
-    @property
     def nested(self) -> NestedPrograms | None:
         """The stage of the fully assembled programs of a nested strategy; `None` for any other."""
         growth = self.enrichment.growth
@@ -172,18 +140,18 @@ class AssemblyStage(Stage):
         return self.enrichment.model_inputs + (() if reduction is None else (reduction,))
 
     def inputs(self) -> tuple[Stage, ...]:
-        """The model, the seconds of the high-fidelity matrices, and the programs in full that are known."""
+        """The model, and the programs in full that are known."""
         nested = self.nested
-        return (*self.model_inputs, self.full_times, *(() if nested is None else (nested,)))
+        return (*self.model_inputs, *(() if nested is None else (nested,)))
 
     def run(self, store: Store) -> Result:
-        """Time every assembly; compare reduced ones with full ones, untimed."""
+        """Assemble at every parameter; compare reduced programs with full ones."""
         model, _ = self.model(store)
         mus = validation_parameters(model.problem, self.count, self.seed)
         known = None if self.nested is None else value_of(store, self.nested)
         if isinstance(model, HyperReducedModel):
             return Result(_reduced(model, mus, known))
-        return Result(_in_full(model, mus, value_of(store, self.full_times), known))
+        return Result(_in_full(model, mus, known))
 
     def model(self, store: Store) -> tuple[Model, str]:
         """The model that queries use, and why requested reduced assembly was replaced by full assembly, or ""."""
@@ -213,37 +181,27 @@ InFull = Sequence[VariationalInequality] | None
 
 
 def _reduced(model: HyperReducedModel, mus: Array, known: InFull) -> ReducedPrograms:
-    """Time the hyper-reduced assembly at every parameter; compare it with the Galerkin projection, untimed."""
+    """The hyper-reduced assembly at every parameter, compared with the Galerkin projection."""
     matrices = assemblies(model.problem)
-    programs, seconds, errors, factor = [], [], [], None
+    programs, errors, factor = [], [], None
     for k, mu in enumerate(mus):
-        found, spent = median_seconds(partial(model.assemble, mu))
+        found = model.assemble(mu)
         factor = found.factor
         full = known and leading_part(known[k], len(found.program.f))
         errors.append(
             _largest_difference(found.program, full or project(matrices.at(mu), found.basis, model.generators))
         )
         programs.append(found.program)
-        seconds.append(spent)
-    return ReducedPrograms(tuple(programs), factor, tuple(seconds), tuple(errors))
+    return ReducedPrograms(tuple(programs), factor, tuple(errors))
 
 
-def _in_full(model: ReducedModel, mus: Array, forms: Sequence[Seconds], known: InFull) -> ReducedPrograms:
-    """Assemble the high-fidelity matrices, which are timed once for all models, and project them.
-
-    After a warm-up the projection is timed once at every parameter. On a fixed basis it takes the same time at each
-    parameter: where the programs are known already, only the first ones are timed, and their median counts for all.
-    """
-    matrices, model_of_one = assemblies(model.problem), model.kind is not Kind.PER_PARAMETER
-    size = len(model.reduce(matrices.at(mus[0])).program.f)  # the warm-up
-    timed_at = mus[:REPEATS] if known and model_of_one else mus
-    each = [timed(partial(model.reduce, matrices.at(mu))) for mu in timed_at]
-    projecting = [seconds for _, seconds in each]
-    if model_of_one:
-        projecting = [median_of(projecting)] * len(mus)
-    programs = [leading_part(program, size) for program in known] if known else [found.program for found, _ in each]
-    total = tuple(form + spent for form, spent in zip(forms, projecting, strict=True))
-    return ReducedPrograms(tuple(programs), None, total, (0.0,) * len(mus))
+def _in_full(model: ReducedModel, mus: Array, known: InFull) -> ReducedPrograms:
+    """The projection of the high-fidelity matrices at every parameter."""
+    matrices, size = assemblies(model.problem), model.fixed_basis.shape[1]
+    programs = (
+        [leading_part(p, size) for p in known] if known else [model.reduce(matrices.at(mu)).program for mu in mus]
+    )
+    return ReducedPrograms(tuple(programs), None, (0.0,) * len(mus))
 
 
 def _largest_difference(found: VariationalInequality, exact: VariationalInequality) -> float:
@@ -266,5 +224,5 @@ class ExactSolutions(Stage):
 
 
 def assembly_stage(cell: Cell) -> AssemblyStage:
-    """The stage that times the assembly of a cell's queries."""
+    """The stage that assembles the reduced programs of a cell."""
     return AssemblyStage(enrichment_stage(cell), cell.interpolation, cell.validation, cell.seed)

@@ -104,6 +104,11 @@ class Stage(ABC):
         return self.label
 
     @property
+    def weight(self) -> int:
+        """Number of cells that the stage works for at once; the limit `cell_seconds` is for each."""
+        return 1
+
+    @property
     def axes(self) -> Axes:
         """The axes of the study that the stage depends on; they name its histories."""
         return Axes()
@@ -138,6 +143,8 @@ def _described(value: Any) -> Any:
     """A field of a stage as JSON can hold it; another stage is described by its key."""
     if isinstance(value, Stage):
         return value.key
+    if isinstance(value, tuple):
+        return [_described(part) for part in value]
     return asdict(value) if is_dataclass(value) and not isinstance(value, type) else value
 
 

@@ -6,13 +6,10 @@ import math
 import resource
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 
-from vibench.arrays import Array
 from vibench.errors import in_a_line
-from vibench.interfaces.problem import ParameterBox, VariationalInequality
 from vibench.interfaces.strategies import Kind
 from vibench.model.error_bounds import Stability
 from vibench.model.errors import Reference
@@ -22,7 +19,7 @@ from vibench.qp.status import Status
 from vibench.results.solver_agreement import vectors
 from vibench.stability.infsup import InfSup, share
 from vibench.stages.artefacts import Artefact, Store
-from vibench.stages.assembly import AssemblyStage, ExactSolutions, ReducedPrograms, assembly_stage
+from vibench.stages.assembly import AssemblyStage, ExactSolutions, assembly_stage
 from vibench.stages.base import Failed, Pieces, PiecewiseStage, Row, Stage, value_of
 from vibench.stages.cell_summary import summarise
 from vibench.stages.infsup_constants import (
@@ -33,10 +30,10 @@ from vibench.stages.infsup_constants import (
     ValidationConstraints,
 )
 from vibench.stages.offline import ReducedCone
-from vibench.stages.query import Query, error_columns, run_query
+from vibench.stages.query import Queries, Query, error_columns, run_query
 from vibench.stages.snapshots import gather, training_stages, validation_stages
 from vibench.study.cells import Cell
-from vibench.timing import calibration, median_interval, median_of
+from vibench.timing import median_interval, median_of
 
 CLEAR_GAP = 10.0
 """A rank is in doubt where the singular values on both sides of the threshold differ by less than this factor."""
@@ -76,6 +73,10 @@ class CellQueries(PiecewiseStage):
     def pieces(self) -> int:
         """One query per validation parameter."""
         return self.assembly.count
+
+    def query(self, queries: Queries, number: int) -> Query:
+        """One query of the cell's reduced model, for its solver."""
+        return queries.query(number, self.solver, self.accuracy, self.warm_start)
 
     @property
     def reference(self) -> ReferenceConstants:
@@ -126,7 +127,7 @@ class CellQueries(PiecewiseStage):
     def inputs(self) -> tuple[Stage, ...]:
         """All stages whose artefacts enter the rows of the cell."""
         timed = (stage for stages in self.offline.values() for stage in stages)
-        read = (self.assembly, self.exact, *self.assembly.model_inputs, self.assembly.full_times, *timed)
+        read = (self.assembly, self.exact, *self.assembly.model_inputs, *timed)
         found = (*read, *self.constants, self.reference, *self.validation)
         return tuple(dict.fromkeys(found))
 
@@ -144,11 +145,9 @@ class _Queries(Pieces):
     """The queries of a cell: solve, verify and assess every one."""
 
     def __init__(self, stage: CellQueries, store: Store) -> None:
-        self._slowdown = calibration().slowdown()
-        self._stage, self._store = stage, store
-        enrichment = stage.assembly.enrichment
-        self._model, self._note = stage.assembly.model(store)
-        self._cone: ReducedCone = value_of(store, enrichment.cone)
+        self._stage, self._store, self._queries = stage, store, Queries(store, stage.assembly)
+        self._model, self._reduced = self._queries.model, self._queries.reduced
+        self._cone: ReducedCone = value_of(store, stage.assembly.enrichment.cone)
         self._training, self._reference = gather(store, stage.training), gather(store, stage.validation)
         problem = self._model.problem
         # A reference below 1e-12 of the largest snapshot is zero up to round-off: relative errors divide by the floor.
@@ -156,48 +155,27 @@ class _Queries(Pieces):
             1e-12 * float(np.max(space.norm(columns), initial=0.0))
             for space, columns in ((problem.V, self._training.u), (problem.W, self._training.lam))
         )
-        self._programs: ReducedPrograms = value_of(store, stage.assembly)
         self._own, self._full, self._plain = (value_of(store, known) for known in stage.constants)
         self._stability: list[Stability] = value_of(store, stage.reference)
         self._exact: tuple[ExactSolution | None, ...] = value_of(store, stage.exact)
 
     def piece(self, number: int, watch: Callable[[bool], None]) -> QueryRows:
         """The rows of one query."""
-        reduced, stage, k = self._programs, self._stage, number
-        query = Query(reduced.programs[k], reduced.factor, reduced.seconds[k], self._start(k))
-        found, solution = run_query(query, stage.solver, stage.accuracy, stage.query_seconds, watch)
-        return self._known(k) | found, solution and {"query": k} | solution
-
-    @cached_property
-    def _path(self) -> list[int | None]:
-        return path_before(self._reference.mu, self._model.problem.parameters)
-
-    def _start(self, number: int) -> tuple[int, VariationalInequality] | None:
-        """The previous query on a path through the parameters, whose solution the warm-started solver starts from.
-
-        It is solved again for this purpose, so that a start does not depend on what the process solved before. A primal
-        basis that changes with the parameter allows no warm start: coordinates of two queries are not comparable.
-        """
-        if not self._stage.warm_start or self._model.kind is Kind.PER_PARAMETER:
-            return None
-        before = self._path[number]
-        return None if before is None else (before, self._programs.programs[before])
+        found, solution = run_query(self._stage.query(self._queries, number), self._stage.query_seconds, watch)
+        return self._known(number) | found, solution and {"query": number} | solution
 
     def lost(self, number: int, failed: Failed) -> QueryRows:
         """The row of a query that exceeded its limit or whose process died."""
         outcome = {"status": failed.status.value, "reason": failed.reason}
-        return self._known(number) | {"assemble_s": self._programs.seconds[number].cpu} | outcome, None
+        return self._known(number) | outcome, None
 
     def finish(self, pieces: Sequence[QueryRows]) -> CellRows:
         """All rows; the row of the cell has means and extremes over the queries."""
         solutions = {k: solution for k, (_, solution) in enumerate(pieces) if solution is not None}
         assessed = dict(zip(solutions, self._assess(solutions), strict=True))
         rows = [row | assessed.get(k, {}) for k, (row, _) in enumerate(pieces)]
-        slowdown = max(self._slowdown, calibration().slowdown())
-        found = summarise(rows, slowdown)
-        return CellRows(
-            found | self._sizes() | self._shares() | self._offline(), tuple(rows), tuple(solutions.values())
-        )
+        own = summarise(rows) | self._sizes() | self._shares() | self._offline()
+        return CellRows(own, tuple(rows), tuple(solutions.values()))
 
     def _assess(self, solutions: Mapping[int, Row]) -> list[Row]:
         """Error columns of some queries, all at once; where that fails, one by one, and a row says why it failed."""
@@ -228,7 +206,7 @@ class _Queries(Pieces):
             | _constants("beta_full_", self._full[number])
             | _constants("beta_plain_", self._plain[number])
             | _constants("beta_hf_", self._stability[number].inf_sup)
-            | {"bounds": self._own[number].sharp, "assembly_error": self._programs.errors[number]}
+            | {"bounds": self._own[number].sharp, "assembly_error": self._reduced.errors[number]}
         )
 
     def _sizes(self) -> Row:
@@ -236,7 +214,7 @@ class _Queries(Pieces):
         assembly, cone = self._stage.assembly, self._cone
         built = assembly.enrichment.enrichment(self._store)
         size = value_of(self._store, assembly.enrichment.pod).basis.shape[1]
-        fallbacks = [*cone.cone.fallbacks, *built.fallbacks, *([self._note] if self._note else [])]
+        fallbacks = [*cone.cone.fallbacks, *built.fallbacks, *([self._queries.note] if self._queries.note else [])]
         for purpose, found in (("training", self._training), ("validation", self._reference)):
             notes = [note for note in found.fallbacks if note]
             fallbacks += [f"{len(notes)} of the {purpose} solutions: {notes[0]}"] if notes else []
@@ -284,27 +262,14 @@ class _Queries(Pieces):
         marginal = [seconds.cpu for seconds in self._reference.seconds]
         row |= {"hf_setup_s": setup.cpu, "hf_s": float(np.median(marginal))}
         row |= dict(zip(("hf_low_s", "hf_high_s"), median_interval(marginal), strict=True))
-        assembly = self._stage.assembly
-        online = [self._artefact(stage) for stage in (assembly, assembly.full_times, *self._stage.validation)]
-        machines = {artefact.machine for found in (*artefacts.values(), online) for artefact in found} | {machine()}
+        solved = [self._artefact(stage) for stage in self._stage.validation]
+        machines = {artefact.machine for found in (*artefacts.values(), solved) for artefact in found} | {machine()}
         return row | {"machine": "; ".join(sorted(machines))}
 
     def _artefact(self, stage: Stage) -> Artefact:
         artefact = self._store.get(stage.key)
         assert artefact is not None  # an input of this stage
         return artefact
-
-
-def path_before(mus: Array, box: ParameterBox) -> list[int | None]:
-    """Predecessor of every parameter (P×d) on the nearest-neighbour path from the first; ties go to the lower index."""
-    scaled = (mus - box.lower) / np.maximum(box.upper - box.lower, np.finfo(float).tiny)
-    before: list[int | None] = [None] * len(mus)
-    left, here = set(range(1, len(mus))), 0
-    while left:
-        following = min(left, key=lambda k: (float(np.linalg.norm(scaled[k] - scaled[here])), k))
-        before[following], here = here, following
-        left.remove(following)
-    return before
 
 
 def _constants(prefix: str, constants: InfSup) -> Row:

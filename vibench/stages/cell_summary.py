@@ -13,18 +13,9 @@ from vibench.stages.base import Row
 UNMEASURABLE = 1e-8
 """Relative errors below this may be errors of the high-fidelity solution: nothing is measured by them."""
 
-DISTURBED = 1.3
-"""A row is marked as disturbed if the calibration is slower than its best by more than this factor."""
 
-WAITED = 1.5
-"""A row is marked as disturbed if its wall seconds exceed its CPU seconds by more than this factor."""
-
-
-def summarise(rows: Sequence[Row], slowdown: float = 1.0) -> Row:
-    """The columns of a cell from those of its queries; means and maxima are over the queries with status ok.
-
-    `slowdown` is the larger one of the calibrations before and after the queries.
-    """
+def summarise(rows: Sequence[Row]) -> Row:
+    """The columns of a cell from those of its queries; means and maxima are over the queries with status ok."""
     fine = [row for row in rows if row["status"] == Status.OK]
     worst = max((Status(row["status"]) for row in rows), key=lambda status: status.severity)
     reasons = [f"mu={_mu(row)}: {row['reason']}" for row in rows if row["status"] == worst and row["reason"]]
@@ -45,16 +36,11 @@ def summarise(rows: Sequence[Row], slowdown: float = 1.0) -> Row:
         return float(sum(row[f"solver_error_{name}"] for row in known) / whole) if measurable else None
 
     residuals = [largest(name) for name in ("primal_residual", "dual_residual", "gap")]
-    cpu, wall = column("total_s").sum(), column("total_wall_s").sum()
     return {
         "status": worst.value,
         "reason": f"{len(reasons)} of {len(rows)} queries, first {reasons[0]}" if reasons else "",
         "queries": len(rows),
         "queries_ok": len(fine),
-        "online_s": mean("total_s"),
-        "online_wall_s": mean("total_wall_s"),
-        "online_assemble_s": mean("assemble_s"),
-        "online_solve_s": mean("solve_s"),
         "error_u_mean": mean("error_u"),
         "error_u_max": largest("error_u"),
         "error_lambda_mean": mean("error_lambda"),
@@ -69,8 +55,6 @@ def summarise(rows: Sequence[Row], slowdown: float = 1.0) -> Row:
         "beta_span_min": min(row["beta_span"] for row in rows),
         "beta_cone_lower_min": min(row["beta_cone_lower"] for row in rows),
         "beta_cone_upper_min": min(row["beta_cone_upper"] for row in rows),
-        "slowdown": slowdown,
-        "disturbed": int(wall > WAITED * cpu or slowdown > DISTURBED),
     }
 
 

@@ -1,17 +1,18 @@
-"""A query: a reduced program solved (timed) and verified, and its solution compared with the high-fidelity one."""
+"""The queries of a cell: a reduced program solved and verified, its solution compared with the high-fidelity one."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
-from functools import partial
+from functools import cached_property, partial
 
 import numpy as np
 
 from vibench.arrays import Array
 from vibench.errors import in_a_line
-from vibench.interfaces.problem import VariationalInequality
+from vibench.interfaces.problem import ParameterBox, VariationalInequality
 from vibench.interfaces.strategies import Kind
+from vibench.interfaces.validation import validation_parameters
 from vibench.model.error_bounds import Bounds, Stability, bounds
 from vibench.model.errors import Errors, Reference, errors, relative_to
 from vibench.qp.accuracy_bounds import slack
@@ -22,80 +23,143 @@ from vibench.qp.solve import solve_qp, takes_start
 from vibench.qp.status import Status
 from vibench.qp.verification import verify
 from vibench.results.solver_agreement import solution_row
+from vibench.stages.artefacts import Store
 from vibench.stages.assemblies import assemblies
-from vibench.stages.assembly import Model
-from vibench.stages.base import Row
+from vibench.stages.assembly import AssemblyStage, Model, ReducedPrograms
+from vibench.stages.base import Row, value_of
 from vibench.stages.cell_summary import UNMEASURABLE
 from vibench.study import registry
-from vibench.timing import Seconds, median_seconds
+from vibench.timing import SLOW, Seconds, timed
+
+Watch = Callable[[bool], None]
+"""Called with True before an operation that has a time limit of its own, and with False after it."""
 
 
 @dataclass(frozen=True)
 class Query:
-    """A reduced program to be solved.
+    """A reduced program, and the QP solver that is to solve it.
 
     Attributes
     ----------
     program, factor
         The program, and the Cholesky factor of A where it is known.
-    seconds
-        Seconds of its assembly.
+    solver, accuracy
+        Name of the solver, and the relative accuracy prescribed to it.
     start
         Number and program of the query whose solution the solver starts from; `None` for a cold start.
     """
 
     program: VariationalInequality
     factor: Array | None
-    seconds: Seconds
+    solver: str
+    accuracy: float
     start: tuple[int, VariationalInequality] | None = None
 
+    def prepare(self, watch: Watch) -> Callable[[], tuple[QPSolution, Seconds]]:
+        """Solve the query to start from, whose seconds are not those of this one; returns the timed solution itself."""
+        extra = registry.qp_solver(self.solver)
+        solve = partial(solve_qp, solver=self.solver, accuracy=self.accuracy, extra=extra, factor=self.factor)
+        start: QPSolution | None = None
+        if self.start is not None:
+            watch(True)
+            start = solve(self.start[1])
+            watch(False)
 
-def run_query(
-    query: Query, solver: str, accuracy: float, query_seconds: float, watch: Callable[[bool], None]
-) -> tuple[Row, Row | None]:
+        def solution() -> tuple[QPSolution, Seconds]:
+            watch(True)
+            found = timed(lambda: solve(self.program, start=start))
+            watch(False)
+            return found
+
+        return solution
+
+
+class Queries:
+    """The queries of a reduced model, one per validation parameter, for any QP solver.
+
+    Parameters
+    ----------
+    store
+        Holds the artefacts of `assembly` and of its inputs.
+    assembly
+        The stage of the reduced programs.
+
+    Attributes
+    ----------
+    model, note
+        The reduced model, and why requested reduced assembly was replaced by full assembly, or "".
+    mus
+        Validation parameters (P×d).
+    reduced
+        The reduced programs.
+    """
+
+    def __init__(self, store: Store, assembly: AssemblyStage) -> None:
+        self.model, self.note = assembly.model(store)
+        self.mus = validation_parameters(self.model.problem, assembly.count, assembly.seed)
+        self.reduced: ReducedPrograms = value_of(store, assembly)
+
+    @cached_property
+    def _before(self) -> list[int | None]:
+        return path_before(self.mus, self.model.problem.parameters)
+
+    def query(self, number: int, solver: str, accuracy: float, warm_start: bool) -> Query:
+        """One query of a solver; for a warm start with the one before it on a path through the parameters.
+
+        That one is solved again for this purpose, so that a start does not depend on what the process solved before. A
+        primal basis that changes with the parameter allows none: coordinates of two queries are not comparable.
+        """
+        programs, start = self.reduced.programs, None
+        if warm_start and takes_start(solver) and self.model.kind is not Kind.PER_PARAMETER:
+            before = self._before[number]
+            start = None if before is None else (before, programs[before])
+        return Query(programs[number], self.reduced.factor, solver, accuracy, start)
+
+
+def path_before(mus: Array, box: ParameterBox) -> list[int | None]:
+    """Predecessor of every parameter (P×d) on the nearest-neighbour path from the first; ties go to the lower index."""
+    scaled = (mus - box.lower) / np.maximum(box.upper - box.lower, np.finfo(float).tiny)
+    before: list[int | None] = [None] * len(mus)
+    left, here = set(range(1, len(mus))), 0
+    while left:
+        following = min(left, key=lambda k: (float(np.linalg.norm(scaled[k] - scaled[here])), k))
+        before[following], here = here, following
+        left.remove(following)
+    return before
+
+
+def run_query(query: Query, query_seconds: float, watch: Watch) -> tuple[Row, Row | None]:
     """The columns of a query, and those of its solution if there is one.
 
-    Its solution is verified to `accuracy`; a solver that takes more than `query_seconds` has the status timeout.
-    `watch(True)` is called, untimed, before the solver begins and `watch(False)` when it has returned.
+    A solver that takes more than `query_seconds` has the status timeout. What takes less than `SLOW` seconds is solved
+    twice, to see whether the solver repeats itself.
     """
-    program, assembly, extra = query.program, query.seconds, registry.qp_solver(solver)
-    row: Row = {"assemble_s": assembly.cpu, "form": "primal" if query.factor is None else "dual"}
-    repeats: list[QPSolution] = []
-    start: QPSolution | None = None
-
-    def work() -> QPSolution:
-        repeats.append(solve_qp(program, solver, accuracy, extra, query.factor, start))
-        return repeats[-1]
-
+    program = query.program
+    row: Row = {"form": "primal" if query.factor is None else "dual"}
+    if query.start is not None:
+        row["started_from"] = query.start[0]
     try:
-        # The solution to start from belongs to an earlier query: its seconds are not those of this one.
-        if query.start is not None and takes_start(solver):
-            watch(True)
-            row["started_from"], similar = query.start
-            start = solve_qp(similar, solver, accuracy, extra, query.factor)
-        solution, solving = median_seconds(work, before=partial(watch, True))
-        watch(False)
+        solve = query.prepare(watch)
+        solution, seconds = solve()
+        again = solve()[0] if seconds.wall <= SLOW else None
     except MemoryError:
         raise
     except (Exception, SystemExit) as error:  # noqa: BLE001  a solver may raise anything; recorded in the row
         return row | {"status": Status.ERROR.value, "reason": in_a_line(error)}, None
-    status, reason, residuals = verify(program, solution, accuracy)
-    if solving.wall > query_seconds:
-        status, reason = Status.TIMEOUT, f"took {solving.wall:.1f} s, the limit is {query_seconds:g} s"
+    status, reason, residuals = verify(program, solution, query.accuracy)
+    if seconds.wall > query_seconds:
+        status, reason = Status.TIMEOUT, f"took {seconds.wall:.1f} s, the limit is {query_seconds:g} s"
     row |= {
-        "solve_s": solving.cpu,
-        "total_s": assembly.cpu + solving.cpu,
-        "total_wall_s": assembly.wall + solving.wall,
         "status": status.value,
         "reason": reason,
         "solver_status": solution.solver_status,
         "iterations": solution.iterations,
-        "repeatable": int(all(_identical(solution, other) for other in repeats)),
+        "repeatable": None if again is None else int(_identical(solution, again)),
     }
     if residuals is None or solution.x is None or solution.alpha is None:
         return row, None
     row |= {"primal_residual": residuals.primal, "dual_residual": residuals.dual, "gap": residuals.gap}
-    open_by_accuracy = slack(program, solution.x, solution.alpha, accuracy)
+    open_by_accuracy = slack(program, solution.x, solution.alpha, query.accuracy)
     return row, solution_row(solution.x, solution.alpha, open_by_accuracy)
 
 

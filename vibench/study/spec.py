@@ -145,6 +145,12 @@ class Study(_Model):
     warm_start: Annotated[
         bool, Field(description="Whether QP solvers start from the solution at a neighbouring parameter if they can.")
     ] = False
+    timing_rounds: Annotated[
+        int,
+        Ge(1),
+        Lt(1000),
+        Field(description="Rounds of timing; break-even is undecided with fewer than six."),
+    ] = 12
     problem: Annotated[list[Entry], MinLen(1), Field(description="Problems.")]
     tolerances: Annotated[
         list[ToleranceTable], MinLen(1), Field(description="Grids of tolerances; cells are their union.")

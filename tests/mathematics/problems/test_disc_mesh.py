@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from vibench_problems.disc_mesh import aspect_ratios, disc_in_square, rings_for
+from vibench_problems.disc_mesh import aspect_ratios, disc_in_square, displaced_around_disc, rings_for
 
 
 def areas(mesh) -> np.ndarray:
@@ -31,6 +31,23 @@ def test_the_mesh_is_always_the_same() -> None:
     one, two = disc_in_square(700, 0.2), disc_in_square(700, 0.2)
     assert np.array_equal(one.p, two.p)
     assert np.array_equal(one.t, two.t)
+
+
+@pytest.mark.parametrize("nodes", [200, 900, 3594])
+def test_displaced_nodes_leave_the_square_and_the_disc_as_they_are(nodes: int) -> None:
+    plain = disc_in_square(nodes, 0.2)
+    mesh = displaced_around_disc(plain, 0.2)
+    assert np.array_equal(mesh.t, plain.t)
+    assert np.array_equal(np.sign(areas(mesh)), np.sign(areas(plain)))
+    assert np.abs(areas(mesh)).sum() == pytest.approx(1.0, abs=1e-12)
+    boundary = np.abs(plain.p).max(axis=0) >= 0.5
+    assert np.array_equal(mesh.p[:, boundary], plain.p[:, boundary])
+    circle = np.abs(np.linalg.norm(plain.p, axis=0) - 0.2) < 1e-9
+    assert np.linalg.norm(mesh.p[:, circle], axis=0) == pytest.approx(0.2)
+    inside = mesh.p[:, mesh.t[:, mesh.subdomains["disc"]]]
+    assert np.all(np.linalg.norm(inside, axis=0) <= 0.2 * (1.0 + 1e-9))
+    assert np.all(mesh.p[:, ~boundary] != plain.p[:, ~boundary])
+    assert aspect_ratios(mesh.p, mesh.t).max() < 2.5
 
 
 def test_aspect_ratios_of_known_triangles() -> None:

@@ -4,12 +4,17 @@ import numpy as np
 import pytest
 
 from vibench_problems.disc_mesh import aspect_ratios
-from vibench_problems.graded_mesh import quarter_disc
+from vibench_problems.graded_mesh import Triangulation, quarter_disc
+
+TRIANGULATIONS: tuple[Triangulation, ...] = ("staggered", "aligned", "irregular")
 
 
+@pytest.mark.parametrize("triangulation", TRIANGULATIONS)
 @pytest.mark.parametrize(("edges", "angle", "growth"), [(40, 0.5, 1.3), (90, np.pi / 6.0, 1.36), (60, 0.83, 1.1)])
-def test_the_mesh_is_a_triangulation_of_the_quarter_disc(edges: int, angle: float, growth: float) -> None:
-    disc = quarter_disc(edges, angle, growth)
+def test_the_mesh_is_a_triangulation_of_the_quarter_disc(
+    edges: int, angle: float, growth: float, triangulation: Triangulation
+) -> None:
+    disc = quarter_disc(edges, angle, growth, triangulation)
     p, t = disc.mesh.p, disc.mesh.t
     a, b, c = (p[:, t[k]] for k in range(3))
     area = 0.5 * np.abs((b - a)[0] * (c - a)[1] - (b - a)[1] * (c - a)[0])
@@ -47,3 +52,34 @@ def test_slower_growth_gives_more_nodes_and_the_same_zone() -> None:
     coarse, fine = quarter_disc(60, 0.5, 1.5), quarter_disc(60, 0.5, 1.1)
     assert fine.mesh.p.shape[1] > 2 * coarse.mesh.p.shape[1]
     assert np.array_equal(coarse.mesh.p[:, coarse.zone], fine.mesh.p[:, fine.zone])
+
+
+def test_triangulations_differ_inside_alone() -> None:
+    meshes = [quarter_disc(90, 0.5, 1.265, triangulation) for triangulation in TRIANGULATIONS]
+    first, *others = meshes
+    for other in others:
+        assert np.array_equal(first.mesh.p[:, first.zone], other.mesh.p[:, other.zone])
+        assert other.mesh.p.shape[1] == pytest.approx(first.mesh.p.shape[1], rel=0.02)
+    assert np.array_equal(first.mesh.p[:, first.axis], others[1].mesh.p[:, others[1].axis])
+    assert not np.array_equal(first.mesh.p, others[1].mesh.p)
+    again = quarter_disc(90, 0.5, 1.265, "irregular")
+    assert np.array_equal(again.mesh.p, others[1].mesh.p)
+
+
+def test_aligned_layers_are_cut_one_way() -> None:
+    """Below the zone: seen from a node of it, the diagonals of the first layer all lead to the same side."""
+
+    def diagonals(triangulation: Triangulation) -> np.ndarray:
+        disc = quarter_disc(90, 0.5, 1.265, triangulation)
+        p, t = disc.mesh.p, disc.mesh.t
+        theta = np.arctan2(p[0], -p[1])
+        edges = np.hstack([t[[0, 1]], t[[1, 2]], t[[2, 0]]])
+        edges = np.hstack([edges, edges[::-1]])
+        down = np.isin(edges[0], disc.zone[5:60]) & ~np.isin(edges[1], disc.zone)
+        sides = (theta[edges[1]] - theta[edges[0]])[down] / (0.5 / 90)
+        return np.sign(np.where(np.abs(sides) > 0.25, sides, 0.0))
+
+    def one_way(sides: np.ndarray) -> float:
+        return abs(sides.sum()) / max(np.abs(sides).sum(), 1.0)
+
+    assert one_way(diagonals("aligned")) > 3.0 * one_way(diagonals("staggered"))

@@ -8,6 +8,7 @@ from skfem import Basis, ElementTriP1, Functional, MeshTri
 from skfem.helpers import dot, grad
 
 from vibench.highfidelity import active_set
+from vibench.highfidelity.active_set import HighFidelitySolver
 from vibench.interfaces.validation import checked_assembly
 from vibench_problems.obstacle import Obstacle
 
@@ -172,3 +173,14 @@ def test_multipliers_converge_with_order_one_half(convergence) -> None:
     widths, _, errors = convergence
     rate = fitted_rate(widths, errors)
     assert 0.35 < rate < 0.75, (rate, errors)
+
+
+@pytest.mark.parametrize(("asymmetric", "ties"), [(False, True), (True, False)])
+def test_snapshots_are_tied_by_symmetry_alone(asymmetric: bool, ties: bool) -> None:
+    """Obstacles at mirrored centres: on a symmetric mesh their multipliers have the same norm, to round-off."""
+    problem = Obstacle("coarse", asymmetric=asymmetric)
+    solver = HighFidelitySolver(problem)
+    mirrored = np.array([[1.0, x, y] for x in (-0.03, 0.03) for y in (-0.02, 0.02)])
+    norms = np.sort([float(problem.W.norm(solver.solve(mu).lam)) for mu in mirrored])
+    assert (np.diff(norms) < 1e-9 * norms[0]).all() == ties
+    assert (np.diff(norms) < 1e-9 * norms[0]).any() == ties

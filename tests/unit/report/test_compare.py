@@ -67,9 +67,19 @@ def test_times_of_another_machine_are_left_out(changed: Changed, quick_run: Path
 
 THRESHOLD = "WHERE solver = 'piqp' AND problem = 'obstacle' AND dual = 'cpg' AND primal_a = 'high-fidelity'"
 
+NUMBERS = ("benefit_threshold", "threshold_low", "threshold_high")
+LATER = ", ".join(f"{name} = 30 * {name}" for name in NUMBERS)
+
+
+def test_a_threshold_within_the_interval_of_the_other_is_no_change(changed: Changed, quick_run: Path) -> None:
+    moved = "benefit_threshold = threshold_high, threshold_high = 3 * threshold_high, offline_b_s = 3 * offline_b_s"
+    decided = "meaning IN ('from', 'until')"
+    after = changed(f"UPDATE thresholds SET {moved} WHERE {decided}")
+    assert compare(quick_run / FILE, after, 1.0 + 1e-9).changes.empty
+
 
 def test_a_threshold_is_worse_where_its_own_side_got_slower(changed: Changed, quick_run: Path) -> None:
-    later = "benefit_threshold = 3 * benefit_threshold, offline_b_s = 3 * offline_b_s"
+    later = f"{LATER}, offline_b_s = 3 * offline_b_s"
     found = compare(
         quick_run / FILE,
         changed(
@@ -85,7 +95,7 @@ def test_a_threshold_is_worse_where_its_own_side_got_slower(changed: Changed, qu
 
 
 def test_a_competitor_that_got_quicker_is_no_regression(changed: Changed, quick_run: Path) -> None:
-    later = "benefit_threshold = 3 * benefit_threshold, online_a_s = online_a_s / 3"
+    later = f"{LATER}, online_a_s = online_a_s / 3"
     found = compare(quick_run / FILE, changed(f"UPDATE thresholds SET {later} {THRESHOLD}"), 1.25)
     assert len(found.changes) == 3
     assert found.regressions == 0

@@ -54,7 +54,10 @@ def run(tmp_path: Path) -> Path:
     journal.write_cell(CELL | {"cell": "c1"}, query_rows("c1", 4, gap=1.0 / 3.0))
     journal.write_cell(missing | {name: CELL[name] for name in KEYS} | {"solver": "osqp"}, [])
     journal.write_histories([[{"artefact": "pod-1", "quantity": "error", "step": 0, "value": 1.0}]])
-    journal.replace("thresholds", break_even_rows(journal.rows("cells")))
+    journal.write_seconds(
+        "c1", {"timing_rounds": 1}, {0: {"solve_s": 0.5}}, [{"cell": "c1", "round": 0, "total_s": 1.0}]
+    )
+    journal.replace("thresholds", break_even_rows(journal.rows("cells"), []))
     journal.replace("disagreements", [{"solver_a": "osqp", "solver_b": "piqp", "queries": 4, "flagged": 0}])
     journal.close()
     return tmp_path / "runs" / "sample"
@@ -173,19 +176,27 @@ def test_the_summary_says_prescribed_sizes() -> None:
     assert (frame["δ_POD"][0], frame["δ_dual"][0]) == ("N=9", "R=4")
 
 
+def rounds(cells: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    same = {"slowdown": 1.0}
+    return [same | {"cell": c["cell"], "round": k, "total_s": c["online_s"]} for c in cells for k in range(6)]
+
+
 def test_the_benefits_say_from_when_on_a_strategy_pays() -> None:
     a = CELL | {"cell": "a", "enrichment_kind": "per-parameter", "primal": "varying", "online_s": 0.004, "hf_s": 0.1}
     b = CELL | {"cell": "b", "enrichment_kind": "fixed", "primal": "fixed", "offline_s": 2.5, "hf_s": 0.1}
-    frame = benefits(pd.DataFrame(break_even_rows([a, b]), columns=list(THRESHOLDS)))
+    frame = benefits(pd.DataFrame(break_even_rows([a, b], rounds([a, b])), columns=list(THRESHOLDS)))
     paired = frame[(frame["a"] == "varying") & (frame["b"] == "fixed")].iloc[0]
     assert paired["break-even"] == f"from {(2.5 - 1.5) / (0.004 - 0.0025):.0f}"
     assert (paired["offline a [s]"], paired["online a [ms]"], paired["online b [ms]"]) == (1.5, 4.0, 2.5)
+    assert paired["interval"] == f"{1 / 0.0015:.0f}–{1 / 0.0015:.0f}"
     assert len(frame) == 3
 
 
 def test_benefits_without_a_number_are_words() -> None:
     slow = CELL | {"hf_s": 0.001, "enrichment_kind": "none"}
-    assert list(benefits(pd.DataFrame(break_even_rows([slow]), columns=list(THRESHOLDS)))["break-even"]) == ["never"]
+    assert list(
+        benefits(pd.DataFrame(break_even_rows([slow], rounds([slow])), columns=list(THRESHOLDS)))["break-even"]
+    ) == ["never"]
 
 
 def test_tables_of_nothing_are_empty() -> None:
@@ -243,10 +254,14 @@ def test_a_real_run_times_what_its_cells_are_made_of(quick_run: Path) -> None:
     frame = read(quick_run / FILE, "cells")
     parts = [f"offline_{part}_s" for part in ("snapshots", "pod", "cone", "enrichment", "assembly")]
     np.testing.assert_allclose(frame[parts].sum(axis=1), frame["offline_s"])
-    np.testing.assert_allclose(frame["online_assemble_s"] + frame["online_solve_s"], frame["online_s"])
     queries = read(quick_run / FILE, "queries")
     fine = queries[queries["status"] == "ok"].groupby("cell")
-    np.testing.assert_allclose(fine["total_s"].mean().loc[frame["cell"]], frame["online_s"])
+    by_cell = read(quick_run / FILE, "timings").set_index("cell")
+    np.testing.assert_allclose(by_cell["assemble_s"] + by_cell["solve_s"], by_cell["total_s"])
+    quartiles = by_cell.groupby("cell")["total_s"].quantile([0.25, 0.5, 0.75]).unstack().loc[frame["cell"]]
+    np.testing.assert_allclose(quartiles, frame[["online_q1_s", "online_s", "online_q3_s"]])
+    assert set(by_cell.groupby("cell").size()) == {12}
+    assert (frame["timing_rounds"] == 12).all()
     np.testing.assert_array_equal(fine.size().loc[frame["cell"]], frame["queries_ok"])
     np.testing.assert_allclose(queries.groupby("cell")["hf_s"].median().loc[frame["cell"]], frame["hf_s"])
     assert (frame[["offline_snapshots_s", "online_s", "hf_s"]] > 0.0).all(axis=None)

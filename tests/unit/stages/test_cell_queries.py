@@ -20,10 +20,10 @@ from vibench.stages import cell_queries
 from vibench.stages.artefacts import Store
 from vibench.stages.assembly import AssemblyStage
 from vibench.stages.base import value_of
-from vibench.stages.cell_queries import CellQueries, path_before
+from vibench.stages.cell_queries import CellQueries
 from vibench.stages.enrichment import SingleEnrichment
 from vibench.stages.offline import ConeStage, PODStage
-from vibench.stages.query import error_columns
+from vibench.stages.query import error_columns, path_before
 from vibench.study.cells import Plugin
 
 BOX = ParameterBox(("a", "b"), np.array([0.0, 0.0]), np.array([1.0, 100.0]), ("1", "1"))

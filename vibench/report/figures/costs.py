@@ -103,12 +103,11 @@ def total_cost(data: Data) -> Figure | None:
 
 
 def _marks(panel: Axes, cells: pd.DataFrame, thresholds: pd.DataFrame) -> None:
-    """Break-even points between the lines of a panel, at their cost."""
-    # Rows of `thresholds` lack the options of the primal strategies; measured seconds identify the cell all the same.
-    drawn = set(zip(cells["offline_s"], cells["online_s"], strict=True))
+    """Break-even points between the lines of a panel, at their cost, with their intervals."""
+    drawn = set(cells["cell"])
     for row in thresholds.itertuples():
-        n, b = row.benefit_threshold, (row.offline_b_s, row.online_b_s)
-        between = row.primal_a == HIGH_FIDELITY or (row.offline_a_s, row.online_a_s) in drawn
-        if b in drawn and between and 1.0 <= n <= MOST_QUERIES:
-            name = f"break-even: cheaper {row.meaning} here"
-            panel.plot(n, b[0] + n * b[1], MARKS[row.meaning], c="black", ms=5, mfc="none", label=name, zorder=5)
+        n, between = row.benefit_threshold, row.primal_a == HIGH_FIDELITY or row.cell_a in drawn
+        if row.cell_b in drawn and between and 1.0 <= n <= MOST_QUERIES:
+            cost, name = row.offline_b_s + n * row.online_b_s, f"break-even: cheaper {row.meaning} here"
+            panel.plot(n, cost, MARKS[row.meaning], c="black", ms=5, mfc="none", label=name, zorder=5)
+            panel.plot([row.threshold_low, row.threshold_high], [cost, cost], c="black", lw=0.8, zorder=5)

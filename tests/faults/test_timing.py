@@ -1,0 +1,69 @@
+"""Runs in which something goes wrong while seconds are measured: answers are kept, and so are the other seconds."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from running import Vibench, by_solver, execute, rows, run_again
+from samples import wire_study, write_study
+
+ANSWERS = 6
+"""Calls of the solver before the timing begins: two for each of three queries."""
+
+
+@pytest.mark.parametrize(("last_call", "lost"), [(ANSWERS + 1, 1), (ANSWERS + 5, 1), (ANSWERS, 0)])
+def test_a_solver_that_dies_in_a_round_costs_that_round(
+    last_call: int, lost: int, vibench: Vibench, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Where it dies at an answer, in the last case, it costs that query and no round of the others."""
+    monkeypatch.setenv("FAKE_CALLS", str(tmp_path / "calls"))
+    monkeypatch.setenv("FAKE_LAST_CALL", str(last_call))
+    write_study(tmp_path, wire_study(solvers=["dies-once", "piqp"]))
+    done = vibench(tmp_path, "run", "study.toml", "--jobs", "1")
+    assert (done.returncode, done.stderr) == (0, "")
+    found = by_solver(tmp_path / "runs" / "wire")
+    unlucky, other = found["dies-once"], found["piqp"]
+    assert (unlucky["status"], unlucky["queries_ok"]) == (("ok", 3) if lost else ("crashed", 2))
+    assert (other["status"], other["timing_reason"]) == ("ok", "")
+    reason = f"{lost} of 12 rounds: the worker process died with signal SIGKILL" if lost else ""
+    assert unlucky["timing_reason"] == reason
+    assert min(unlucky["online_s"], other["online_s"]) > 0.0
+    timed = [row["solver"] for row in rows(tmp_path / "runs" / "wire", "timings")]
+    assert (timed.count("dies-once"), timed.count("piqp")) == (12 - lost, 12)
+
+
+def test_a_cell_that_never_answers_leaves_the_seconds_of_the_others(vibench: Vibench, tmp_path: Path) -> None:
+    write_study(tmp_path, wire_study(solvers=["dies", "raises", "piqp"], dual=["cone-raises", "cpg"]))
+    vibench(tmp_path, "run", "study.toml", "--jobs", "1")
+    found = {(row["dual"], row["solver"]): row for row in rows(tmp_path / "runs" / "wire")}
+    assert len(found) == 6
+    assert [key for key, row in found.items() if row["online_s"] is not None] == [("cpg", "piqp")]
+    assert found["cpg", "piqp"]["timing_rounds"] == 12
+
+
+def test_what_was_answered_but_not_timed_is_timed_by_the_next_run(vibench: Vibench, tmp_path: Path) -> None:
+    """As after an interruption between the last answer and the first round."""
+    write_study(tmp_path, wire_study())
+    folder = tmp_path / "runs" / "wire"
+    vibench(tmp_path, "run", "study.toml", "--jobs", "1")
+    execute(folder, "UPDATE cells SET timing_rounds = NULL, online_s = NULL", "DELETE FROM timings")
+    printed, (row,) = run_again(vibench, tmp_path)
+    assert "1 cells, 0 to run, 1 stages" in printed
+    assert row["online_s"] > 0.0
+    assert len(rows(folder, "timings")) == 12
+    printed, _ = run_again(vibench, tmp_path)
+    assert "1 cells, 0 to run, 0 stages" in printed
+
+
+def test_a_study_may_ask_for_more_rounds(vibench: Vibench, tmp_path: Path) -> None:
+    write_study(tmp_path, wire_study(timing_rounds=2))
+    folder = tmp_path / "runs" / "wire"
+    vibench(tmp_path, "run", "study.toml", "--jobs", "1")
+    assert len(rows(folder, "timings")) == 2
+    assert {row["meaning"] for row in rows(folder, "thresholds")} == {"undecided"}
+    write_study(tmp_path, wire_study(timing_rounds=7))
+    printed, _ = run_again(vibench, tmp_path)
+    assert "0 to run, 1 stages" in printed
+    assert len(rows(folder, "timings")) == 7
+    assert {row["timing_rounds"] for row in rows(folder)} == {7}

@@ -1,0 +1,220 @@
+"""Seconds of the queries of several cells, measured interleaved: a round over all cells, then the next round."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+
+from vibench.interfaces.problem import VariationalInequality
+from vibench.interfaces.validation import checked_assembly
+from vibench.model.hyperreduced import HyperReducedModel
+from vibench.provenance import machine
+from vibench.stages.artefacts import Store
+from vibench.stages.base import Failed, Pieces, PiecewiseStage, Row, Stage
+from vibench.stages.cell_queries import CellQueries
+from vibench.stages.query import Queries, Watch
+from vibench.timing import DISTURBED, WAITED, Seconds, calibration, timed
+
+SHARE = 4
+"""A round takes every fourth query of a cell, another quarter each time: short rounds interleave more closely."""
+
+ROUND_SECONDS = 5.0
+"""Wall seconds of the solver after which a cell's part of a round ends."""
+
+
+CELL_SECONDS = (
+    "online_s", "online_q1_s", "online_q3_s", "online_wall_s", "online_assemble_s", "online_solve_s", "slowdown",
+    "disturbed",
+)  # fmt: skip
+"""Columns of a cell that follow from its rounds."""
+
+
+@dataclass(frozen=True)
+class TimedRound:
+    """One round of one cell: seconds of its queries by their number, and how slow the machine was beside them.
+
+    Attributes
+    ----------
+    assemble
+        Seconds of the assembly; in full, of one query, which counts for all.
+    solve
+        Seconds of the solver.
+    slowdown
+        Of the calibration, before or after, whichever is larger.
+    """
+
+    assemble: Mapping[int, Seconds]
+    solve: Mapping[int, Seconds]
+    slowdown: float
+
+
+@dataclass(frozen=True)
+class TimedCell:
+    """The rounds of one cell, the machine that timed them, and why rounds are missing, or ""."""
+
+    rounds: tuple[TimedRound, ...]
+    machine: str
+    reason: str
+
+
+@dataclass(frozen=True)
+class TimingRounds(PiecewiseStage):
+    """Timing of the queries of cells that are compared; a piece is one round of one cell.
+
+    A disturbance of the machine that lasts longer than a round meets all cells alike. The order of the cells is another
+    one in each round. The value is a `TimedCell` per cell.
+    """
+
+    label = "timing"
+
+    cells: tuple[CellQueries, ...]
+    queries: tuple[tuple[int, ...], ...]
+    """Per cell, the queries that are ok."""
+    rounds: int
+
+    @property
+    def pieces(self) -> int:
+        """One for each round of each cell."""
+        return self.rounds * len(self.cells)
+
+    @property
+    def weight(self) -> int:
+        """It works for all of its cells."""
+        return len(self.cells)
+
+    def inputs(self) -> tuple[Stage, ...]:
+        """The models and the programs of the cells."""
+        read = (stage for cell in self.cells for stage in (*cell.assembly.model_inputs, cell.assembly))
+        return tuple(dict.fromkeys(read))
+
+    def place(self, piece: int) -> tuple[int, int]:
+        """The round and the cell of a piece."""
+        number, within = divmod(piece, len(self.cells))
+        return number, int(np.random.default_rng(number).permutation(len(self.cells))[within])
+
+    def begin(self, store: Store) -> _Rounds:
+        """Load the models; cells that differ in their solver alone share one."""
+        return _Rounds(self, store)
+
+
+class _Rounds(Pieces):
+    """Rounds in progress."""
+
+    def __init__(self, stage: TimingRounds, store: Store) -> None:
+        self._stage = stage
+        self._models = {assembly.key: Queries(store, assembly) for assembly in {c.assembly for c in stage.cells}}
+        self._warm: set[int] = set()
+        self._forms: dict[tuple[int, int], tuple[VariationalInequality, Seconds]] = {}
+
+    def piece(self, number: int, watch: Watch) -> TimedRound:
+        """One round of one cell, after a warm-up if it is the cell's first one in this process."""
+        at, cell = self._stage.place(number)
+        if cell not in self._warm:
+            self._round(at, cell, watch, most=1)  # the warm-up
+            self._warm.add(cell)
+        before = calibration().slowdown()
+        assemble, solve = self._round(at, cell, watch)
+        return TimedRound(assemble, solve, max(before, calibration().slowdown()))
+
+    def _round(
+        self, at: int, cell: int, watch: Watch, most: int | None = None
+    ) -> tuple[dict[int, Seconds], dict[int, Seconds]]:
+        """Seconds of assembly and solution of the cell's queries, or of at most so many."""
+        stage = self._stage.cells[cell]
+        queries, fine = self._models[stage.assembly.key], self._stage.queries[cell]
+        share = min(SHARE, len(fine))
+        order = fine[at % share :: share][:most]
+        assemble = self._assemblies(queries, order, at)
+        solve: dict[int, Seconds] = {}
+        for k in order:
+            solve[k] = stage.query(queries, k).prepare(watch)()[1]
+            if sum(seconds.wall for seconds in solve.values()) > ROUND_SECONDS:
+                break
+        return assemble, solve
+
+    def _assemblies(self, queries: Queries, order: Sequence[int], at: int) -> dict[int, Seconds]:
+        """Seconds of the assembly of every query; in full, which costs the same at each parameter, of the first one.
+
+        High-fidelity matrices are the same for all models: they are assembled once in a round.
+        """
+        model, mus = queries.model, queries.mus
+        if isinstance(model, HyperReducedModel):
+            return {k: timed(partial(model.assemble, mus[k]))[1] for k in order}
+        k = order[0]
+        if (at, k) not in self._forms:
+            assemble = partial(checked_assembly, model.problem, mus[k])
+            if not self._forms:
+                assemble()  # the warm-up
+            self._forms = {(at, k): timed(assemble)}
+        vi, forms = self._forms[at, k]
+        return {k: forms + timed(partial(model.reduce, vi))[1]}
+
+    def lost(self, number: int, failed: Failed) -> Failed:  # noqa: ARG002
+        """A round without a result."""
+        return failed
+
+    def finish(self, pieces: Sequence[TimedRound | Failed]) -> tuple[TimedCell, ...]:
+        """The rounds of every cell, in their order."""
+        found: list[list[TimedRound]] = [[] for _ in self._stage.cells]
+        lost: list[list[Failed]] = [[] for _ in self._stage.cells]
+        for number, outcome in enumerate(pieces):
+            cell = self._stage.place(number)[1]
+            if isinstance(outcome, Failed):
+                lost[cell].append(outcome)
+            else:
+                found[cell].append(outcome)
+        reasons = [f"{len(gone)} of {self._stage.rounds} rounds: {gone[0].reason}" if gone else "" for gone in lost]
+        return tuple(TimedCell(tuple(f), machine(), reason) for f, reason in zip(found, reasons, strict=True))
+
+
+def round_rows(rounds: Sequence[TimedRound]) -> list[Row]:
+    """Rows of the timings table: seconds of a query, mean over the queries of the round."""
+    rows: list[Row] = []
+    for number, one in enumerate(rounds):
+        assemble, solve = (
+            np.mean([(s.cpu, s.wall) for s in part.values()], axis=0) for part in (one.assemble, one.solve)
+        )
+        seconds = {"assemble_s": assemble[0], "solve_s": solve[0], "total_s": assemble[0] + solve[0]}
+        wall = {"total_wall_s": assemble[1] + solve[1]}
+        rows.append({"round": number, "queries": len(one.solve), **seconds, **wall, "slowdown": one.slowdown})
+    return rows
+
+
+def cell_seconds(rows: Sequence[Row]) -> Row:
+    """The columns of a cell from its rounds: medians, and the quartiles of the seconds of a query; empty without any."""
+    if not rows:
+        return dict.fromkeys(CELL_SECONDS)
+    total, wall, slowdown = (np.array([row[name] for row in rows]) for name in ("total_s", "total_wall_s", "slowdown"))
+    low, middle, high = np.quantile(total, (0.25, 0.5, 0.75))
+    return {
+        "online_s": middle,
+        "online_q1_s": low,
+        "online_q3_s": high,
+        "online_wall_s": np.median(wall),
+        "online_assemble_s": np.median([row["assemble_s"] for row in rows]),
+        "online_solve_s": np.median([row["solve_s"] for row in rows]),
+        "slowdown": np.median(slowdown),
+        "disturbed": int(np.median(wall / total) > WAITED or np.median(slowdown) > DISTURBED),
+    }
+
+
+def query_seconds(rounds: Sequence[TimedRound]) -> dict[int, Row]:
+    """The columns of the queries that were timed: medians over the rounds."""
+    rows = {}
+    for k in sorted({k for one in rounds for k in one.solve}):
+        # In full, a query is not assembled in every round: the other queries' seconds stand for its own.
+        assembled = [one.assemble[k] if k in one.assemble else next(iter(one.assemble.values())) for one in rounds]
+        assemble, solve = (
+            np.median([(s.cpu, s.wall) for s in part], axis=0)
+            for part in (assembled, [one.solve[k] for one in rounds if k in one.solve])
+        )
+        rows[k] = {
+            "assemble_s": assemble[0],
+            "solve_s": solve[0],
+            "total_s": assemble[0] + solve[0],
+            "total_wall_s": assemble[1] + solve[1],
+        }
+    return rows
