@@ -120,7 +120,9 @@ def numbers(folder: Path) -> dict[str, pd.DataFrame]:
 
 def without_seconds(row: Mapping[str, Any]) -> dict[str, Any]:
     """A row without seconds, memory, and what follows from them."""
-    return {name: value for name, value in row.items() if not name.endswith((*MEASURED, "timing_rounds"))}
+    return {
+        name: value for name, value in row.items() if not name.endswith((*MEASURED, "timing_rounds", "timing_reason"))
+    }
 
 
 def assert_same_numbers(one: Path, other: Path) -> None:

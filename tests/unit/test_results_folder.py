@@ -16,6 +16,8 @@ PAGES = [path for path in FILES if path.suffix == ".md"]
 LARGEST = 8_000_000
 """Bytes of the whole folder."""
 
+NAMES = ("benefit", "field", "hertz-quadrature", "meshes", "paper-hertz", "paper-obstacle", "solvers")
+
 LINK = re.compile(r"\]\(([^)\s#]+)(?:#[^)]*)?\)")
 
 
@@ -45,7 +47,7 @@ def test_every_page_is_in_the_overview() -> None:
     assert {page for page in PAGES if page != overview} <= linked(overview)
 
 
-@pytest.mark.parametrize("name", ["benefit", "field", "hertz-quadrature", "paper-hertz", "paper-obstacle"])
+@pytest.mark.parametrize("name", NAMES)
 def test_the_page_of_a_study_names_the_command_that_makes_the_tables_of_all_queries(name: str) -> None:
     text = (RESULTS / name / "README.md").read_text(encoding="utf-8")
     assert f"`vibench run {name}` leaves the tables of all queries and histories under `runs/{name}/tables`" in text

@@ -72,7 +72,7 @@ class SnapshotStage(Stage):
     def run(self, store: Store) -> Result:  # noqa: ARG002
         """Assemble and solve at every parameter of the chunk."""
         problem = build_problem(self.problem)
-        first, mus = self._part(self._parameters(problem))
+        first, mus = self.part(self.parameters(problem))
         u, lam = np.zeros((problem.V.dim, len(mus))), np.zeros((problem.W.dim, len(mus)))
         seconds, setups, fallbacks, solver = [], [], [], HighFidelitySolver(problem)
 
@@ -99,12 +99,14 @@ class SnapshotStage(Stage):
         """A training solution is an offline cost, timed once; a validation solution is timed as a query is."""
         return timed(work) if self.purpose == "training" else median_seconds(work)
 
-    def _parameters(self, problem: Problem) -> Array:
+    def parameters(self, problem: Problem) -> Array:
+        """Training or validation parameters (P×d), of which the stage solves a part."""
         if self.purpose == "training":
             return training_parameters(problem)
         return validation_parameters(problem, self.count, self.seed)
 
-    def _part(self, everything: Array) -> tuple[int, Array]:
+    def part(self, everything: Array) -> tuple[int, Array]:
+        """Number of the first parameter of the chunk, and its parameters."""
         edges = np.linspace(0, len(everything), CHUNKS + 1).round().astype(int)
         return int(edges[self.chunk]), everything[edges[self.chunk] : edges[self.chunk + 1]]
 

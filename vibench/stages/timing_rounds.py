@@ -184,7 +184,7 @@ def round_rows(rounds: Sequence[TimedRound]) -> list[Row]:
 
 
 def cell_seconds(rows: Sequence[Row]) -> Row:
-    """The columns of a cell from its rounds: medians, and the quartiles of the seconds of a query; empty without any."""
+    """The columns of a cell from its rounds: medians, and quartiles of the seconds of a query; empty without any."""
     if not rows:
         return dict.fromkeys(CELL_SECONDS)
     total, wall, slowdown = (np.array([row[name] for row in rows]) for name in ("total_s", "total_wall_s", "slowdown"))
