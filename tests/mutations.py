@@ -44,6 +44,34 @@ class Fault:
 
 FAULTS = (
     Fault(
+        "decided-whatever-the-rounds-say",
+        "vibench/results/break_even.py",
+        "if np.mean(found[measured.meaning]) < 1.0 - TAIL:",
+        "if np.mean(found[measured.meaning]) < 0.0:",
+        ("tests/unit/results/test_break_even.py",),
+    ),
+    Fault(
+        "rounds-drawn-apart",
+        "vibench/results/break_even.py",
+        "costs = [self._costs(cell, common, which, shared, rng) for cell in (a, b)]",
+        "costs = [self._costs(cell, common, rng.permuted(which), shared, rng) for cell in (a, b)]",
+        ("tests/unit/results/test_break_even.py",),
+    ),
+    Fault(
+        "cell-after-cell",
+        "vibench/stages/timing_rounds.py",
+        "number, within = divmod(piece, len(self.cells))\n",
+        "within, number = divmod(piece, self.rounds)\n",
+        ("tests/unit/stages/test_timing_rounds.py",),
+    ),
+    Fault(
+        "timed-alone",
+        "vibench/execution/timing_plan.py",
+        "return None if left else self._stage(_group(cell))",
+        "return self._stage(_group(cell))",
+        ("tests/unit/execution/test_timing_plan.py",),
+    ),
+    Fault(
         "wrong-sign-of-b",
         "problems/vibench_problems/obstacle.py",
         "self._on_disc(-areas @ self._masses)",
