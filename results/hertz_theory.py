@@ -42,7 +42,7 @@ def main() -> None:
                 {
                     "d [m]": approach,
                     "multipliers": problem.W.dim,
-                    "growth": growth,
+                    "growth": f"{growth:g}",
                     "nodes": problem.nodes,
                     "µ [m]": mu,
                     "active": int(np.count_nonzero(found.lam)),

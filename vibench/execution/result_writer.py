@@ -43,10 +43,10 @@ class ResultWriter:
 
     def seconds(self, cell: Cell, timed: TimedCell, asked: int) -> None:
         """Write the seconds of a cell that has its rows."""
-        rounds = round_rows(timed.rounds)
-        own = cell_seconds(rounds) | {"timing_rounds": asked, "timing_reason": timed.reason}
-        row = self.database.cell(cell.key)
-        if row is not None and timed.rounds:
+        row, rounds = self.database.cell(cell.key), round_rows(timed.rounds)
+        assert row is not None  # cells are timed when they have their rows
+        own = cell_seconds(rounds, row["offline_s"]) | {"timing_rounds": asked, "timing_reason": timed.reason}
+        if rounds:
             own["machine"] = "; ".join(sorted({*row["machine"].split("; "), timed.machine}))
         keys = {"cell": cell.key, **cell_columns(cell)}
         self.database.write_seconds(cell.key, own, query_seconds(timed.rounds), [keys | row for row in rounds])

@@ -25,9 +25,12 @@ ROUND_SECONDS = 5.0
 """Wall seconds of the solver after which a cell's part of a round ends."""
 
 
+SPREAD = (0.025, 0.975)
+"""Quantiles of the slowdowns of a cell's rounds: what is timed once may have met any of them."""
+
 CELL_SECONDS = (
     "online_s", "online_q1_s", "online_q3_s", "online_wall_s", "online_assemble_s", "online_solve_s", "slowdown",
-    "disturbed",
+    "disturbed", "offline_low_s", "offline_high_s",
 )  # fmt: skip
 """Columns of a cell that follow from its rounds."""
 
@@ -183,12 +186,16 @@ def round_rows(rounds: Sequence[TimedRound]) -> list[Row]:
     return rows
 
 
-def cell_seconds(rows: Sequence[Row]) -> Row:
-    """The columns of a cell from its rounds: medians, and quartiles of the seconds of a query; empty without any."""
+def cell_seconds(rows: Sequence[Row], offline: float) -> Row:
+    """The columns of a cell from its rounds: medians, and quartiles of the seconds of a query; empty without any.
+
+    `offline` are its offline seconds, measured once: they are as uncertain as the machine was unsteady in the rounds.
+    """
     if not rows:
         return dict.fromkeys(CELL_SECONDS)
     total, wall, slowdown = (np.array([row[name] for row in rows]) for name in ("total_s", "total_wall_s", "slowdown"))
     low, middle, high = np.quantile(total, (0.25, 0.5, 0.75))
+    quickest, slowest = np.quantile(slowdown / np.median(slowdown), SPREAD)
     return {
         "online_s": middle,
         "online_q1_s": low,
@@ -196,6 +203,8 @@ def cell_seconds(rows: Sequence[Row]) -> Row:
         "online_wall_s": np.median(wall),
         "online_assemble_s": np.median([row["assemble_s"] for row in rows]),
         "online_solve_s": np.median([row["solve_s"] for row in rows]),
+        "offline_low_s": offline * quickest,
+        "offline_high_s": offline * slowest,
         "slowdown": np.median(slowdown),
         "disturbed": int(np.median(wall / total) > WAITED or np.median(slowdown) > DISTURBED),
     }
