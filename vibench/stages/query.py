@@ -131,8 +131,8 @@ def path_before(mus: Array, box: ParameterBox) -> list[int | None]:
 def run_query(query: Query, query_seconds: float, watch: Watch) -> tuple[Row, Row | None]:
     """The columns of a query, and those of its solution if there is one.
 
-    A solver that takes more than `query_seconds` has the status timeout. What takes less than `SLOW` seconds is solved
-    twice, to see whether the solver repeats itself.
+    A solver that takes more than `query_seconds` has the status timeout. What is ok and took less than `SLOW` is
+    solved a second time, to see whether the solver repeats itself.
     """
     program = query.program
     row: Row = {"form": "primal" if query.factor is None else "dual"}
@@ -141,12 +141,12 @@ def run_query(query: Query, query_seconds: float, watch: Watch) -> tuple[Row, Ro
     try:
         solve = query.prepare(watch)
         solution, seconds = solve()
-        again = solve()[0] if seconds.wall <= SLOW else None
+        status, reason, residuals = verify(program, solution, query.accuracy)
+        again = solve()[0] if status is Status.OK and seconds.wall <= SLOW else None
     except MemoryError:
         raise
     except (Exception, SystemExit) as error:  # noqa: BLE001  a solver may raise anything; recorded in the row
         return row | {"status": Status.ERROR.value, "reason": in_a_line(error)}, None
-    status, reason, residuals = verify(program, solution, query.accuracy)
     if seconds.wall > query_seconds:
         status, reason = Status.TIMEOUT, f"took {seconds.wall:.1f} s, the limit is {query_seconds:g} s"
     row |= {
