@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -47,6 +46,11 @@ class Pair:
     def ours(self) -> str:
         """(N, R) here."""
         return f"({self.plain['N']:.0f}, {self.plain['R']:.0f})"
+
+    def dimension(self, cell: str) -> int:
+        """Primal dimension of one of the cells, enrichment included."""
+        chosen = getattr(self, cell)
+        return int(chosen["N"] + chosen["enrichment"])
 
     @property
     def saving(self) -> float:
@@ -132,6 +136,11 @@ class Run:
         """The machines that measured the seconds."""
         return ", ".join(sorted(set(self.cells["machine"])))
 
+    @property
+    def disturbed(self) -> int:
+        """Cells of the columns whose seconds were measured beside other programs."""
+        return sum(cell["disturbed"] == 1 for pair in self.pairs() for cell in (pair.online, pair.offline))
+
 
 def _by_step(rows: pd.DataFrame) -> dict[int, float]:
     ordered = rows.sort_values("step")
@@ -141,6 +150,3 @@ def _by_step(rows: pd.DataFrame) -> dict[int, float]:
 def reached(curve: dict[int, float], tolerance: float) -> int:
     """First step at which a history is at most a tolerance."""
     return next(step for step, value in curve.items() if value <= tolerance)
-
-
-__all__ = ["DUAL", "PAPER", "SOLVER", "Pair", "Published", "Run", "reached"]

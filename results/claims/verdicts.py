@@ -16,11 +16,17 @@ from vibench.results.tables import cell_text, interval
 DIMENSION = 0.15
 """Dimensions agree within this relative difference."""
 
+MESH = 0.02
+"""Sizes of meshes agree within this relative difference."""
+
 RATIO = 0.25
 """Ratios of seconds agree within this relative difference."""
 
 ORDER = math.sqrt(10.0)
 """Orders of magnitude agree within this factor."""
+
+WIDEST = 3.0
+"""Largest ratio of the ends of an interval that can confirm a number; a wider one contains almost any."""
 
 ROUND_OFF = 1e-9
 """Relative violation of an inequality that counts as round-off."""
@@ -98,12 +104,15 @@ def below(smaller: Array, larger: Array) -> bool:
 
 
 def break_even_verdict(paper: float, meaning: str, low: float | None, high: float | None) -> Verdict:
-    """Whether a published break-even lies in a measured interval; "from" is the only meaning that the paper knows."""
+    """Whether a published break-even lies in a measured interval; "from" is the only meaning that the paper knows.
+
+    Open where the break-even is undecided, or where the interval contains the number and is too wide to confirm it.
+    """
     if meaning == Meaning.UNDECIDED:
         return Verdict.OPEN
-    if meaning != Meaning.FROM or low is None or high is None:
+    if meaning != Meaning.FROM or low is None or high is None or not low <= paper <= high:
         return Verdict.DIFFERS
-    return judged(low <= paper <= high)
+    return Verdict.AGREES if high <= WIDEST * low else Verdict.OPEN
 
 
 def break_even_text(number: float | None, meaning: str, low: float | None, high: float | None) -> str:
@@ -113,21 +122,49 @@ def break_even_text(number: float | None, meaning: str, low: float | None, high:
     return f"{found} ({ends})" if ends else found
 
 
-def _reason(verdict: Verdict, why: str, cause: str) -> str:
-    """The remark, and the cause where the verdict is not that they agree."""
+def cheaper_from(meanings: Iterable[str]) -> Verdict:
+    """Whether several break-evens all read "from"; open where none contradicts it but some are undecided."""
+    found = set(meanings)
+    if found - {Meaning.FROM, Meaning.UNDECIDED}:
+        return Verdict.DIFFERS
+    return Verdict.OPEN if Meaning.UNDECIDED in found else Verdict.AGREES
+
+
+def ranges(steps: Sequence[int]) -> str:
+    """Rising steps, consecutive ones as a range."""
+    groups: list[list[int]] = []
+    for step in steps:
+        if groups and step == groups[-1][-1] + 1:
+            groups[-1].append(step)
+        else:
+            groups.append([step])
+    return ", ".join(str(group[0]) if len(group) == 1 else f"{group[0]}–{group[-1]}" for group in groups)
+
+
+def reason(verdict: Verdict, why: str, cause: str) -> str:
+    """The remark, and the cause where they do not agree."""
     return why if verdict is Verdict.AGREES else " ".join(part for part in (why, cause) if part)
 
 
-def number(claim: str, paper: object, ours: object, *, within: float = 0.0, why: str = "", cause: str = "") -> Claim:
-    """A claim about numbers: one or several, which agree within a relative difference."""
-    verdict = judged(close(paper, ours, within))  # type: ignore[arg-type]
-    return Claim(claim, text(paper), text(ours), verdict, _reason(verdict, why, cause))
+def number(
+    claim: str,
+    paper: float | Sequence[float],
+    ours: float | Sequence[float],
+    *,
+    within: float = 0.0,
+    why: str = "",
+    cause: str = "",
+) -> Claim:
+    """A claim about numbers: one or several, which agree within a relative difference; open where one is missing."""
+    measured = np.all(np.isfinite(np.asarray(ours, float)))
+    verdict = judged(close(paper, ours, within)) if measured else Verdict.OPEN
+    return Claim(claim, text(paper), text(ours), verdict, reason(verdict, why, cause))
 
 
 def holds(claim: str, paper: str, ours: str, condition: object, *, why: str = "", cause: str = "") -> Claim:
     """A claim that a predicate of our numbers decides."""
     verdict = judged(bool(condition))
-    return Claim(claim, paper, ours, verdict, _reason(verdict, why, cause))
+    return Claim(claim, paper, ours, verdict, reason(verdict, why, cause))
 
 
 def unknown(claim: str, paper: object, ours: object, why: str) -> Claim:

@@ -1,0 +1,165 @@
+"""The page that compares the paper claim by claim: its predicates, and that it lists every row and every figure."""
+
+from __future__ import annotations
+
+import importlib
+import math
+import re
+import sys
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+PAGE = ROOT / "docs" / "reproduction.md"
+ROW = re.compile(r"^\| (?P<claim>.+?) \| (?P<paper>.*?) \| (?P<ours>.*?) \| (?P<verdict>[a-z ]+?) \| ", re.MULTILINE)
+
+TABLES = {"Table 1": ("(19, 50)", "(51, 70)", "(89, 50)"), "Table 2": ("(3, 12)", "(46, 70)", "(46, 12)")}
+LINES = (
+    "N",
+    "R",
+    "offline time, on [s]",
+    "offline time, off [s]",
+    "offline time, off / on",
+    "online time, on [s]",
+    "online time, off [s]",
+    "online time, on / off",
+    "benefit threshold",
+)
+
+
+@pytest.fixture(scope="module")
+def results() -> object:
+    """The scripts of the folder `results`, importable."""
+    sys.path.insert(0, str(ROOT / "results"))
+    yield
+    sys.path.remove(str(ROOT / "results"))
+
+
+@pytest.fixture(scope="module")
+def verdicts(results: object) -> ModuleType:
+    return importlib.import_module("claims.verdicts")
+
+
+@pytest.fixture(scope="module")
+def reproduction(results: object) -> ModuleType:
+    return importlib.import_module("reproduction")
+
+
+@pytest.mark.parametrize(
+    ("paper", "ours", "within", "expected"),
+    [
+        (50, 43, 0.15, True),
+        (19, 14, 0.15, False),
+        ((3, 46), (3, 44), 0.15, True),
+        ((3, 46), (3, 10), 0.15, False),
+        (0.09, 0.09 * (1.0 + 1e-14), 0.0, True),
+        (1, 2, 0.0, False),
+        ((1, 2), (1,), 1.0, False),
+        (-1.25, -1.25, 0.0, True),
+        (1.0, math.nan, 1.0, False),
+    ],
+)
+def test_numbers_agree_within_a_relative_difference(
+    verdicts: ModuleType, paper: float, ours: float, within: float, expected: bool
+) -> None:
+    assert verdicts.close(paper, ours, within) is expected
+
+
+@pytest.mark.parametrize(
+    ("meaning", "low", "high", "expected"),
+    [
+        ("from", 90.0, 110.0, "agrees"),
+        ("from", 40.0, 110.0, "agrees"),
+        ("from", 30.0, 110.0, "cannot be compared"),
+        ("from", 20.0, 90.0, "differs"),
+        ("from", 103.0, 110.0, "differs"),
+        ("from", 90.0, 101.0, "differs"),
+        ("from", math.nan, math.nan, "differs"),
+        ("never", None, None, "differs"),
+        ("until", 90.0, 110.0, "differs"),
+        ("at once", None, None, "differs"),
+        ("undecided", 90.0, None, "cannot be compared"),
+    ],
+)
+def test_a_break_even_agrees_where_the_interval_contains_it(
+    verdicts: ModuleType, meaning: str, low: float | None, high: float | None, expected: str
+) -> None:
+    assert verdicts.break_even_verdict(102.0, meaning, low, high).value == expected
+
+
+def test_a_break_even_is_written_with_its_interval(verdicts: ModuleType) -> None:
+    assert verdicts.break_even_text(28.3, "from", 18.8, 63.1) == "from 28 (19–63)"
+    assert verdicts.break_even_text(math.nan, "never", math.nan, math.nan) == "never"
+    assert verdicts.break_even_text(None, "undecided", 179.3, None) == "undecided (≥ 179)"
+
+
+@pytest.mark.parametrize(
+    ("meanings", "expected"),
+    [
+        (["from", "from", "from"], "agrees"),
+        (["from", "undecided", "from"], "cannot be compared"),
+        (["undecided", "never"], "differs"),
+        (["until"], "differs"),
+    ],
+)
+def test_queries_are_cheaper_only_where_every_break_even_says_so(
+    verdicts: ModuleType, meanings: list[str], expected: str
+) -> None:
+    assert verdicts.cheaper_from(meanings).value == expected
+
+
+def test_an_order_of_magnitude_is_a_factor_of_the_root_of_ten(verdicts: ModuleType) -> None:
+    assert verdicts.same_order(8.0, [9.1, 12.6])
+    assert not verdicts.same_order(8.0, [9.1, 26.0])
+    assert not verdicts.same_order(1e-7, [2e-14])
+
+
+def test_exceptions_of_an_inequality_are_the_steps_of_both_beyond_round_off(verdicts: ModuleType) -> None:
+    smaller = {0: 1.0, 1: 0.5, 2: 0.4, 3: 0.3, 5: 9.0}
+    larger = {0: 1.0, 1: 0.5 * (1.0 - 1e-12), 2: 0.3, 3: 0.2, 4: 0.1}
+    assert verdicts.exceptions(smaller, larger) == [2, 3]
+    assert verdicts.ranges([9, 10, 11, 19, 22, 27, 28]) == "9–11, 19, 22, 27–28"
+
+
+def test_the_cause_is_given_where_the_numbers_do_not_agree(verdicts: ModuleType) -> None:
+    agreed = verdicts.number("N", 50, 47, within=0.15, why="Counted.", cause="Another mesh.")
+    differing = verdicts.number("N", 50, 30, within=0.15, why="Counted.", cause="Another mesh.")
+    missing = verdicts.number("ratio", 2.0, math.nan, within=0.15)
+    assert (agreed.verdict.value, agreed.why) == ("agrees", "Counted.")
+    assert (differing.verdict.value, differing.why) == ("differs", "Counted. Another mesh.")
+    assert missing.verdict.value == "cannot be compared"
+
+
+def test_cells_of_the_page_are_one_line_without_markup(reproduction: ModuleType) -> None:
+    table = reproduction.markdown(("claim",), [["n* of a|b\nis -1e-06, 2e+07 in 1e-7, 3–4"]])
+    assert table.splitlines()[-1] == r"| n\* of a\|b is −1e-6, 2e7 in 1e-7, 3–4 |"
+
+
+@pytest.fixture(scope="module")
+def page() -> str:
+    return PAGE.read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize(("table", "column"), [(table, column) for table in TABLES for column in TABLES[table]])
+def test_the_page_has_every_row_of_both_tables(page: str, table: str, column: str) -> None:
+    claims = [row["claim"] for row in ROW.finditer(page)]
+    assert [line for line in LINES if claims.count(f"{table}, {column}: {line}") != 1] == []
+
+
+def test_the_page_has_every_figure(page: str) -> None:
+    found = {int(number) for row in ROW.finditer(page) for number in re.findall(r"Fig\. (\d+)", row["claim"])}
+    assert found == set(range(1, 16))
+
+
+def test_the_counts_of_the_page_are_those_of_its_rows(page: str, verdicts: ModuleType) -> None:
+    found = [row["verdict"] for row in ROW.finditer(page)]
+    counts = [found.count(verdict.value) for verdict in verdicts.Verdict]
+    assert f"| all | {' | '.join(map(str, counts))} |" in page
+    assert sum(counts) > 150
+
+
+def test_what_differs_or_cannot_be_compared_has_a_reason(page: str) -> None:
+    rows = [line for line in page.splitlines() if re.search(r"\| (differs|cannot be compared) \| ", line)]
+    assert [row for row in rows if row.endswith(" |  |")] == []
