@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TextIO
 
 from vibench.errors import RequestError
+from vibench.files import open_unlinked
 
 
 @contextlib.contextmanager
@@ -25,8 +26,10 @@ def locked(path: Path, *, busy: str, shared: bool = False) -> Iterator[None]:
         With the text `busy` and the holder if another process holds the lock; if the file cannot be written.
     """
     try:
-        file = path.open("a+", encoding="utf-8")
+        file = os.fdopen(open_unlinked(path), "r+", encoding="utf-8")
     except OSError as error:
+        if path.is_symlink():
+            raise RequestError(f"'{path}' is a symbolic link, expected a lock file of vibench") from None
         raise RequestError(f"'{path}' cannot be written: {error.strerror}") from None
     with file:
         try:
@@ -48,6 +51,7 @@ def locked(path: Path, *, busy: str, shared: bool = False) -> Iterator[None]:
 def _note(file: TextIO, holder: str) -> None:
     """Write the holder into the lock file; on a full disk the lock is valid without it."""
     with contextlib.suppress(OSError):
-        file.truncate(0)
+        file.seek(0)
+        file.truncate()
         file.write(holder)
         file.flush()

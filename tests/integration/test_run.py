@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import importlib.util
 import os
 import pickle
@@ -70,12 +69,15 @@ def test_retry_redoes_what_was_not_ok(vibench: Vibench, again: Path) -> None:
 
 def test_fresh_starts_over_and_leaves_the_notes_somebody_made(vibench: Vibench, again: Path) -> None:
     execute(again / "runs" / "wire", "UPDATE cells SET reason = 'old'")
-    (again / "runs" / "wire" / "notes.txt").write_text("precious")
+    notes = [again / "runs" / "wire" / name for name in ("notes.txt", "tables/notes.txt", "figures/my-own.svg")]
+    for note in notes:
+        note.parent.mkdir(exist_ok=True)
+        note.write_text("precious")
     printed, after = run_again(vibench, again, "--fresh")
     assert "3 cells, 3 to run" in printed
     assert len(after) == 3
     assert "old" not in {row["reason"] for row in after}
-    assert (again / "runs" / "wire" / "notes.txt").read_text() == "precious"
+    assert [note.read_text() for note in notes] == ["precious"] * 3
 
 
 def test_a_cell_without_row_is_done_again(vibench: Vibench, again: Path, artefacts: Path) -> None:
@@ -249,7 +251,7 @@ def of_another_machine(artefacts: Path) -> None:
         found = store.get(path.name.removesuffix(SUFFIX))
         assert found is not None
         content = pickle.dumps(replace(found, machine="elsewhere"))
-        path.write_bytes(hashlib.sha256(content).digest() + content)
+        path.write_bytes(store._digest(path.name.removesuffix(SUFFIX), content) + content)
 
 
 def test_artefacts_are_shared_by_studies_and_seconds_only_on_their_machine(

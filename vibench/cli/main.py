@@ -88,9 +88,11 @@ def run(
         echo(f"interrupted: {outcome.missing} cells have no row yet; the same command resumes the run")
         raise typer.Exit(130)
     drawn: list[Path] = []
-    if draw:
+    if draw or fresh:
         from vibench.report import figures
 
+        figures.remove(folder / "figures")
+    if draw:
         drawn = figures.draw_all(path, folder / "figures", jobs=min(options.jobs, provenance.cores()))
     _summarise(loaded.name, path, outcome.rows)
     echo(f"results: {path}, tables: {folder / 'tables'}, {len(drawn)} figures: {folder / 'figures'}")

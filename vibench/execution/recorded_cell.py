@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import sqlite3
 from collections.abc import Iterable, Mapping
 from contextlib import closing
@@ -101,6 +102,20 @@ def _provide(stages: Iterable[Stage], store: Store) -> None:
                 raise RequestError(f"{stage.label}, a stage of the cell, failed when run again: {outcome.reason}")
 
 
+KEY = re.compile(r"[0-9a-f]{16}")
+"""A key of a cell, which names files."""
+
+
+def _rows(run: str) -> tuple[Path, list[dict[str, Any]]]:
+    """Results file of a run, and its cells; refuses keys that could name a file elsewhere."""
+    path = results_file(run)
+    rows = [{str(name): value for name, value in row.items()} for row in tables.read(path, "cells").to_dict("records")]
+    for row in rows:
+        if not KEY.fullmatch(str(row["cell"])):
+            raise RequestError(f"'{path}' has a cell named {str(row['cell'])[:60]!a}, expected 16 hexadecimal digits")
+    return path, rows
+
+
 def recorded_cells(run: str) -> list[RecordedCell]:
     """All cells of a run that have a reduced model.
 
@@ -109,8 +124,7 @@ def recorded_cells(run: str) -> list[RecordedCell]:
     RequestError
         If there is no such run.
     """
-    path = results_file(run)
-    rows = tables.read(path, "cells").to_dict("records")
+    path, rows = _rows(run)
     return [RecordedCell(path, row) for row in rows if row["model"]]
 
 
@@ -122,8 +136,7 @@ def recorded_cell(run: str, cell: str) -> RecordedCell:
     RequestError
         If the prefix fits no cell or several, or the cell failed before it had a reduced model.
     """
-    path = results_file(run)
-    rows = tables.read(path, "cells").to_dict("records")
+    path, rows = _rows(run)
     matching = [row for row in rows if str(row["cell"]).startswith(cell)]
     if len(matching) != 1:
         known = "the column 'cell' of `vibench show RUN --table cells` lists them"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 import signal
 import threading
 from collections.abc import Mapping, Sequence, Set
@@ -23,6 +22,7 @@ from vibench.qp.status import Status
 from vibench.results.break_even import break_even_rows
 from vibench.results.database import FILE, ResultsDatabase, claimed, read_meta, study_of
 from vibench.results.solver_agreement import disagreement_rows
+from vibench.results.tables import EXPORTED
 from vibench.stages.artefacts import Store, usable_store
 from vibench.stages.base import Done, Failed, Stage, Unstored
 from vibench.stages.cell_queries import CellRows, cell_queries
@@ -159,15 +159,16 @@ def _to_do(cell: Cell, finished: Mapping[str, tuple[str, str]], retry: bool) -> 
 
 
 def _clear(folder: Path, study: Study) -> None:
-    """Remove tables, figures, log and report of a study's earlier run; refuse the folder of another study."""
+    """Remove the tables, log and report of a study's earlier run; refuse the folder of another study.
+
+    Nothing else: a user may keep notes beside them. Figures are removed when they are drawn anew.
+    """
     path = folder / FILE
     meta = read_meta(path) if path.is_file() else {}
     there = study_of(path, meta).get("name") if meta else study.name
     if there != study.name:
         raise RequestError(f"'{folder}' holds results of the study '{there}'; --fresh removes only '{study.name}'")
-    for name in ("tables", "figures"):
-        shutil.rmtree(folder / name, ignore_errors=True)
-    for name in (LOG, REPORT):
+    for name in (LOG, REPORT, *(f"tables/{file}" for file in EXPORTED)):
         (folder / name).unlink(missing_ok=True)
 
 

@@ -15,6 +15,8 @@ import pandas as pd
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
+from vibench.errors import RequestError
+from vibench.files import write_atomically
 from vibench.qp.status import Status
 from vibench.report.figures import drawings
 from vibench.report.figures.style import WRITTEN, styled
@@ -28,10 +30,19 @@ IDENTITY = ["problem", "dual", "primal", "primal_tol", "solver", "accuracy", "as
 
 
 def write(path: Path, target: Path) -> Path:
-    """Write the page of a results file as `target`; an interrupted call leaves no incomplete file under its name."""
-    part = target.with_name(target.name + ".part")
-    part.write_text(page(path), encoding="utf-8")
-    part.replace(target)
+    """Write the page of a results file as `target`; an interrupted call leaves no incomplete file under its name.
+
+    Raises
+    ------
+    RequestError
+        If `target` is the results file, or cannot be written.
+    """
+    if target.resolve() == path.resolve():
+        raise RequestError(f"'{target}' is the results file itself; choose another file for the report")
+    try:
+        write_atomically(target, page(path).encode("utf-8"))
+    except OSError as error:
+        raise RequestError(f"'{target}' cannot be written: {error.strerror}") from None
     return target
 
 

@@ -8,7 +8,6 @@ import sqlite3
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
-from urllib.parse import quote
 
 import numpy as np
 
@@ -235,8 +234,10 @@ def _refuse_other(path: Path, study: Mapping[str, Any]) -> None:
 
 
 def open_read_only(path: Path) -> contextlib.closing[sqlite3.Connection]:
-    """Context with a connection that cannot write to the results file."""
-    return contextlib.closing(sqlite3.connect(f"file:{quote(str(path))}?mode=ro", uri=True))
+    """Context with a connection that cannot write to the results file, and runs no code that its schema names."""
+    connection = sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro", uri=True)
+    connection.execute("PRAGMA trusted_schema=OFF")
+    return contextlib.closing(connection)
 
 
 def read_meta(path: Path) -> dict[str, str]:
@@ -247,12 +248,17 @@ def read_meta(path: Path) -> dict[str, str]:
     RequestError
         If the file is not a results file.
     """
-    with open_read_only(path) as db:
-        try:
-            tables = db.execute("SELECT name FROM sqlite_master WHERE type = 'table'").fetchall()
-            return dict(db.execute("SELECT key, value FROM meta")) if tables else {}
-        except sqlite3.Error as error:
-            raise RequestError(f"'{path}' is not a results file of vibench: {error}") from None
+    try:
+        with open_read_only(path) as db:
+            kinds = {kind for (kind,) in db.execute("SELECT type FROM sqlite_master")}
+            if strange := kinds - {"table", "index"}:
+                raise RequestError(f"'{path}' is not a results file of vibench: it has a {min(strange)}")
+            damage = "; ".join(line for (line,) in db.execute("PRAGMA quick_check(1)") if line != "ok")
+            if damage:
+                raise RequestError(f"'{path}' is damaged: {' '.join(damage.split())}")
+            return dict(db.execute("SELECT key, value FROM meta")) if kinds else {}
+    except (sqlite3.Error, UnicodeDecodeError) as error:
+        raise RequestError(f"'{path}' is not a results file of vibench: {error}") from None
 
 
 def study_of(path: Path, meta: Mapping[str, str]) -> dict[str, Any]:

@@ -11,6 +11,7 @@ from typing import Any
 import pandas as pd
 
 from vibench.errors import RequestError
+from vibench.files import write_atomically
 from vibench.results.columns import CELLS, INTEGER, KEYS, STORED, TABLES, THRESHOLDS, VERSION, Column, shown_columns
 from vibench.results.database import FILE, open_read_only, read_meta
 
@@ -49,15 +50,18 @@ def read(path: Path, table: str) -> pd.DataFrame:
     return frame
 
 
+SUMMARY = "summary.md"
+EXPORTED = (*(f"{table}.csv" for table in TABLES), SUMMARY)
+"""Names of the files that `export` writes."""
+
+
 def export(path: Path, folder: Path) -> list[Path]:
     """Write every table as CSV and the summary as Markdown into a folder; returns the files."""
     folder.mkdir(parents=True, exist_ok=True)
     texts = {f"{table}.csv": to_csv(in_order(read(path, table))) for table in TABLES}
-    texts["summary.md"] = to_markdown(summary(read(path, "cells")))
+    texts[SUMMARY] = to_markdown(summary(read(path, "cells")))
     for name, text in texts.items():
-        part = folder / f"{name}.part"
-        part.write_text(text, encoding="utf-8")
-        part.replace(folder / name)
+        write_atomically(folder / name, text.encode("utf-8"))
     return [folder / name for name in texts]
 
 

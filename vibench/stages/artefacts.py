@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
+import hmac
 import os
 import pickle
+import secrets
 import tempfile
 import time
 from collections.abc import Iterator
@@ -17,6 +19,7 @@ import platformdirs
 from cachetools import LRUCache
 
 from vibench.errors import RequestError, StorageError
+from vibench.files import PART, TEMPORARY, write_atomically
 from vibench.locking import locked
 from vibench.provenance import machine
 from vibench.timing import Seconds
@@ -25,7 +28,15 @@ CACHE_VARIABLE = "VIBENCH_CACHE"
 """Environment variable that sets the cache folder, in which artefacts are kept."""
 
 SUFFIX = ".artefact"
-"""Suffix of artefact files: each holds a SHA-256 digest and then the pickle that it belongs to."""
+"""Suffix of artefact files: each holds a keyed digest (HMAC-SHA-256) of its name and of the pickle that follows."""
+
+SECRET = "secret"
+"""File with the key of the digests, which its owner alone can read: others cannot write artefacts that are loaded."""
+
+OTHERS, ANYBODY = 0o022, 0o002
+"""Permission bits of all but the owner to write; of those outside the group alone."""
+
+DIGEST = hashlib.sha256().digest_size
 
 LOCK = "lock"
 """Lock file: shared by runs, exclusive for `clear`."""
@@ -65,6 +76,7 @@ class Store:
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
+        self._secret = b""
         self._recent: LRUCache[str, Artefact] = LRUCache(maxsize=64)
 
     def get(self, key: str) -> Artefact | None:
@@ -79,10 +91,9 @@ class Store:
             return self._recent[key]
         try:
             whole = memoryview(self._path(key).read_bytes())
-            size = hashlib.sha256().digest_size
-            digest, content = whole[:size], whole[size:]
-            if hashlib.sha256(content).digest() != digest:
-                return None  # truncated or corrupted
+            digest, content = whole[:DIGEST], whole[DIGEST:]
+            if not hmac.compare_digest(self._digest(key, content), digest):
+                return None  # truncated, corrupted, renamed, or not written with the key
             artefact = pickle.loads(content)
         except (FileNotFoundError, pickle.UnpicklingError, EOFError, AttributeError, ImportError):
             return None  # missing, or pickled with classes that no longer exist
@@ -103,21 +114,11 @@ class Store:
         """
         content = pickle.dumps(Artefact(value, seconds, histories, machine()), protocol=pickle.HIGHEST_PROTOCOL)
         self._recent.pop(key, None)
-        part = None
         try:
-            self.folder.mkdir(parents=True, exist_ok=True)
-            handle, part = tempfile.mkstemp(dir=self.folder, suffix=".part")
-            with os.fdopen(handle, "wb") as file:
-                file.write(hashlib.sha256(content).digest())
-                file.write(content)
-                file.flush()
-                os.fsync(file.fileno())
-            Path(part).replace(self._path(key))
+            self.folder.mkdir(0o700, parents=True, exist_ok=True)
+            write_atomically(self._path(key), self._digest(key, content) + content, durable=True)
         except OSError as error:
             raise StorageError(f"artefacts cannot be written to '{self.folder}': {error.strerror}") from None
-        finally:
-            if part is not None:
-                Path(part).unlink(missing_ok=True)
 
     @contextlib.contextmanager
     def used(self) -> Iterator[None]:
@@ -152,16 +153,55 @@ class Store:
         if not self.folder.is_dir():
             return freed
         with locked(self.folder / LOCK, busy=f"a run uses the artefacts in '{self.folder}'"):
-            for path in [*self.folder.glob(f"*{SUFFIX}"), *self.folder.glob("*.part")]:
+            for path in [*self.folder.glob(f"*{SUFFIX}"), *self.folder.glob(f"{TEMPORARY}*{PART}")]:
                 with contextlib.suppress(FileNotFoundError):
-                    status = path.stat()
-                    if path.suffix == ".part" or time.time() - status.st_mtime >= older_than:
+                    status = path.lstat()
+                    if path.suffix == PART or time.time() - status.st_mtime >= older_than:
                         path.unlink()
                         freed += status.st_size
         return freed
 
+    def key(self) -> bytes:
+        """The key of the digests, read once."""
+        self._secret = self._secret or secret(self.folder)
+        return self._secret
+
+    def _digest(self, key: str, content: bytes | memoryview) -> bytes:
+        """Keyed digest of the name and the content of an artefact."""
+        code = hmac.new(self.key(), key.encode() + b"\0", hashlib.sha256)
+        code.update(content)
+        return code.digest()
+
     def _path(self, key: str) -> Path:
         return self.folder / f"{key}{SUFFIX}"
+
+
+def secret(folder: Path) -> bytes:
+    """The key of the digests of a folder; made at random where there is none.
+
+    Raises
+    ------
+    StorageError
+        If it cannot be read or made, or others may write it.
+    """
+    path = folder / SECRET
+    try:
+        if not path.exists():
+            folder.mkdir(0o700, parents=True, exist_ok=True)
+            handle, name = tempfile.mkstemp(dir=folder, prefix=TEMPORARY, suffix=PART)  # readable by its owner alone
+            with os.fdopen(handle, "wb") as file:
+                file.write(secrets.token_bytes(DIGEST))
+            with contextlib.suppress(FileExistsError):  # another process was quicker: its key counts
+                os.link(name, path)
+            Path(name).unlink()
+        if path.stat().st_mode & OTHERS:
+            raise StorageError(f"'{path}' may be written by others: anybody could plant artefacts; remove it")
+        found = path.read_bytes()
+    except OSError as error:
+        raise StorageError(f"the key of the artefacts, '{path}', cannot be used: {error.strerror}") from None
+    if len(found) != DIGEST:
+        raise StorageError(f"'{path}' has {len(found)} bytes, expected {DIGEST}; remove it")
+    return found
 
 
 def usable_store() -> Store:
@@ -170,11 +210,20 @@ def usable_store() -> Store:
     Raises
     ------
     RequestError
-        If its folder cannot be created.
+        If its folder cannot be created, or others may write into it.
     """
     store = Store(default_folder())
     try:
-        store.folder.mkdir(parents=True, exist_ok=True)
+        store.folder.mkdir(0o700, parents=True, exist_ok=True)
+        # Whoever can replace the key could plant artefacts. A folder that is named on purpose may be shared by a group.
+        if store.folder.stat().st_mode & (ANYBODY if os.environ.get(CACHE_VARIABLE) else OTHERS):
+            raise RequestError(
+                f"others may write into the folder for artefacts, '{store.folder}': run `chmod go-w` on it, "
+                f"or set {CACHE_VARIABLE} to another one"
+            )
+        store.key()
+    except StorageError as error:
+        raise RequestError(str(error)) from None
     except OSError as error:
         raise RequestError(
             f"the folder for artefacts, '{store.folder}', cannot be made: {error.strerror}; "

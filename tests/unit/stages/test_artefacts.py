@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import pickle
 from collections.abc import Callable
 from pathlib import Path
@@ -12,7 +11,7 @@ import pytest
 
 from vibench.errors import RequestError, StorageError
 from vibench.stages import artefacts as module
-from vibench.stages.artefacts import SUFFIX, Artefact, History, Store
+from vibench.stages.artefacts import SECRET, SUFFIX, Artefact, History, Store
 from vibench.timing import Seconds
 
 TIME = Seconds(1.5, 2.5)
@@ -20,7 +19,8 @@ HISTORY = History({"stage": "pod"}, "error", (1.0, 0.5))
 
 
 def files(folder: Path) -> list[str]:
-    return sorted(path.name for path in folder.iterdir())
+    """All but the key of the digests."""
+    return sorted(path.name for path in folder.iterdir() if path.name != SECRET)
 
 
 def test_what_is_put_is_got_by_another_process(tmp_path: Path) -> None:
@@ -86,8 +86,9 @@ def test_an_artefact_is_not_seen_before_it_is_whole(tmp_path: Path, monkeypatch:
     assert files(tmp_path) == []
 
 
-def with_checksum(content: bytes) -> bytes:
-    return hashlib.sha256(content).digest() + content
+def signed(path: Path, content: bytes) -> bytes:
+    """As an artefact of that name would be."""
+    return Store(path.parent)._digest(path.name.removesuffix(SUFFIX), content) + content
 
 
 def flip_a_bit(path: Path) -> None:
@@ -103,7 +104,7 @@ def flip_a_bit(path: Path) -> None:
         lambda path: path.write_bytes(b""),
         lambda path: path.write_bytes(path.read_bytes()[:-20]),
         lambda path: path.write_bytes(b"nonsense"),
-        lambda path: path.write_bytes(with_checksum(pickle.dumps({"value": 1}))),
+        lambda path: path.write_bytes(signed(path, pickle.dumps({"value": 1}))),
         flip_a_bit,
     ],
     ids=["empty", "cut off", "nonsense", "another object", "one bit"],
@@ -147,7 +148,7 @@ def test_what_is_stored_is_counted_and_cleared(tmp_path: Path) -> None:
     store = Store(tmp_path)
     store.put("podstage-1", 1, TIME, ())
     store.put("conestage-1", list(range(1000)), TIME, ())
-    (tmp_path / "left by a killed run.part").write_bytes(b"12345")
+    (tmp_path / "vibench-left by a killed run.part").write_bytes(b"12345")
     counted = {sort: size for sort, size, _ in store.contents()}
     assert counted == {path.name.split("-")[0]: path.stat().st_size for path in tmp_path.glob(f"*{SUFFIX}")}
     assert store.clear(older_than=3600.0) == 5

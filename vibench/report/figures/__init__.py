@@ -46,6 +46,14 @@ def drawings(path: Path) -> Iterator[tuple[str, Drawing, Data]]:
             yield from ((f"{name}-{file}-{kind}", draw, data.of_dual(dual)) for kind, draw in OF_DUAL.items())
 
 
+def remove(folder: Path) -> None:
+    """Remove the figures that an earlier call of `draw_all` may have left in a folder; other files stay."""
+    for kind in (*OF_PROBLEM, *OF_DUAL):
+        for form in FORMATS:
+            for file in folder.glob(f"*-{kind}.{form}"):
+                file.unlink()
+
+
 def draw_all(path: Path, folder: Path, formats: tuple[str, ...] = FORMATS, jobs: int = 1) -> list[Path]:
     """Draw every figure that a results file has data for, in every format; returns the files written to the folder.
 

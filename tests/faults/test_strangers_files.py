@@ -1,0 +1,220 @@
+"""Files of strangers: artefacts, results and links that somebody else has put in place do no harm."""
+
+from __future__ import annotations
+
+import hashlib
+import pickle
+import shutil
+import sqlite3
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from vibench.cli.result_commands import export_qps, replay_query, show, write_report
+from vibench.errors import RequestError, StorageError
+from vibench.execution.run import REPORT
+from vibench.files import write_atomically
+from vibench.locking import locked
+from vibench.report import figures
+from vibench.results import tables
+from vibench.results.database import FILE, LOCK, claimed
+from vibench.stages import artefacts
+from vibench.stages.artefacts import CACHE_VARIABLE, SECRET, SUFFIX, Store, usable_store
+from vibench.timing import NO_TIME
+
+
+class Payload:
+    """Unpickled, it makes a file."""
+
+    def __init__(self, file: Path) -> None:
+        self.file = file
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return Path.touch, (self.file,)
+
+
+@pytest.fixture
+def run(quick_run: Path, tmp_path: Path) -> Path:
+    """A copy of a run, to be tampered with."""
+    folder = tmp_path / "run"
+    folder.mkdir()
+    shutil.copy(quick_run / FILE, folder)
+    return folder
+
+
+def change(folder: Path, *statements: str) -> None:
+    db = sqlite3.connect(folder / FILE)
+    for statement in statements:
+        db.execute(statement)
+    db.commit()
+    db.close()
+
+
+def test_a_planted_artefact_runs_no_code(tmp_path: Path) -> None:
+    """Whoever does not know the key cannot sign one; nor may a signed one take another's place."""
+    store, proof = Store(tmp_path / "store"), tmp_path / "proof"
+    store.put("pod-1", 1, NO_TIME, ())
+    content = pickle.dumps(Payload(proof))
+    digests = [hashlib.sha256(content).digest(), bytes(32), (tmp_path / "store" / f"pod-1{SUFFIX}").read_bytes()[:32]]
+    for digest in digests:
+        (tmp_path / "store" / f"pod-1{SUFFIX}").write_bytes(digest + content)
+        assert Store(tmp_path / "store").get("pod-1") is None
+    assert not proof.exists()
+    Store(tmp_path / "store").put("pod-2", Payload(proof), NO_TIME, ())
+    (tmp_path / "store" / f"pod-2{SUFFIX}").rename(tmp_path / "store" / f"pod-1{SUFFIX}")
+    assert Store(tmp_path / "store").get("pod-1") is None
+    assert not proof.exists()
+
+
+def test_the_payload_would_have_run(tmp_path: Path) -> None:
+    pickle.loads(pickle.dumps(Payload(tmp_path / "proof")))
+    assert (tmp_path / "proof").exists()
+
+
+def test_only_its_owner_reads_the_key_and_the_artefacts(tmp_path: Path) -> None:
+    Store(tmp_path / "store").put("pod-1", 1, NO_TIME, ())
+    assert (tmp_path / "store").stat().st_mode & 0o077 == 0
+    assert (tmp_path / "store" / SECRET).stat().st_mode & 0o077 == 0
+    assert Store(tmp_path / "store").key() == Store(tmp_path / "store").key() != b""
+
+
+def test_a_key_that_others_may_write_is_refused(tmp_path: Path) -> None:
+    Store(tmp_path).put("pod-1", 1, NO_TIME, ())
+    (tmp_path / SECRET).chmod(0o622)
+    with pytest.raises(StorageError, match="may be written by others"):
+        Store(tmp_path).get("pod-1")
+    (tmp_path / SECRET).chmod(0o600)
+    (tmp_path / SECRET).write_bytes(b"short")
+    with pytest.raises(StorageError, match="has 5 bytes, expected 32"):
+        Store(tmp_path).get("pod-1")
+
+
+@pytest.mark.parametrize(("named", "mode", "refused"), [
+    (False, 0o700, False), (False, 0o755, False), (False, 0o775, True), (False, 0o777, True),
+    (True, 0o770, False), (True, 0o777, True),
+])  # fmt: skip
+def test_a_folder_that_others_may_write_is_refused(
+    named: bool, mode: int, refused: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A folder that the user names may be shared with a group on purpose, and never with everybody."""
+    monkeypatch.delenv(CACHE_VARIABLE, raising=False)
+    monkeypatch.setattr(artefacts.platformdirs, "user_cache_dir", lambda name: str(tmp_path))
+    if named:
+        monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path))
+    usable_store()
+    (tmp_path / "artefacts").chmod(mode)
+    if refused:
+        with pytest.raises(RequestError, match="others may write into the folder for artefacts"):
+            usable_store()
+    else:
+        usable_store()
+
+
+@pytest.mark.parametrize("name", ["../../outside", "/tmp/outside", "", "0123456789ABCDEF", "0123456789abcde\n"])
+def test_a_cell_that_would_name_a_file_elsewhere_is_refused(name: str, run: Path, tmp_path: Path) -> None:
+    (cell,) = sqlite3.connect(run / FILE).execute("SELECT cell FROM cells LIMIT 1").fetchone()
+    quoted = name.replace("'", "''")
+    change(run, "PRAGMA foreign_keys=OFF", f"UPDATE cells SET cell = '{quoted}' WHERE cell = '{cell}'")
+    before = sorted(tmp_path.rglob("*"))
+    with pytest.raises(RequestError, match="expected 16 hexadecimal digits"):
+        export_qps(str(run), tmp_path / "set")
+    with pytest.raises(RequestError, match="expected 16 hexadecimal digits"):
+        replay_query(str(run), name[:4])
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+@pytest.mark.parametrize(
+    "planted",
+    [
+        "CREATE TRIGGER t AFTER INSERT ON cells BEGIN DELETE FROM queries; END",
+        "CREATE VIEW v AS SELECT load_extension('x')",
+    ],
+)
+def test_a_results_file_with_code_of_its_own_is_refused(planted: str, run: Path, tmp_path: Path) -> None:
+    change(run, planted)
+    export = partial(export_qps, folder=tmp_path / "set")
+    for command in (show, write_report, export):
+        with pytest.raises(RequestError, match=r"is not a results file of vibench: it has a (trigger|view)"):
+            command(str(run))
+
+
+def test_a_damaged_page_is_found(run: Path) -> None:
+    """Most of the file is content; a page whose structure is broken makes every command say so in a line."""
+    content = bytearray((run / FILE).read_bytes())
+    for start in range(4096 * 3, 4096 * 40, 4096):
+        content[start : start + 8] = b"\xff" * 8
+    (run / FILE).write_bytes(bytes(content))
+    with pytest.raises(RequestError, match=r"is damaged|is not a results file"):
+        show(str(run))
+
+
+def test_a_link_in_place_of_a_lock_is_not_followed(tmp_path: Path) -> None:
+    """It would be truncated, whatever it points to."""
+    valuable = tmp_path / "valuable"
+    valuable.write_text("kept")
+    folder = tmp_path / "runs"
+    folder.mkdir()
+    (folder / LOCK).symlink_to(valuable)
+    with pytest.raises(RequestError, match="is a symbolic link"), locked(folder / LOCK, busy="busy"):
+        pass
+    with pytest.raises(RequestError, match="is a symbolic link"), claimed(folder):
+        pass
+    assert valuable.read_text() == "kept"
+
+
+def test_links_in_place_of_tables_are_replaced_and_not_followed(run: Path, tmp_path: Path) -> None:
+    valuable = tmp_path / "valuable"
+    valuable.write_text("kept")
+    folder = run / "tables"
+    folder.mkdir()
+    for name in ("cells.csv", "cells.csv.part", "summary.md"):
+        (folder / name).symlink_to(valuable)
+    tables.export(run / FILE, folder)
+    (run / REPORT).symlink_to(valuable)
+    write_report(str(run))
+    assert valuable.read_text() == "kept"
+    assert not (folder / "cells.csv").is_symlink()
+
+
+def test_a_report_does_not_replace_the_results(run: Path) -> None:
+    before = (run / FILE).read_bytes()
+    for out in (run / FILE, run / ".." / run.name / FILE):
+        with pytest.raises(RequestError, match="is the results file itself"):
+            write_report(str(run), out)
+    with pytest.raises(RequestError, match="cannot be written"):
+        write_report(str(run), run / "nowhere" / "report.html")
+    assert (run / FILE).read_bytes() == before
+
+
+@pytest.mark.parametrize("name", ["a b?mode=rwc", "100%", "#1", "ü//x"])
+def test_paths_are_names_and_nothing_else(name: str, run: Path, tmp_path: Path) -> None:
+    folder = tmp_path / name
+    folder.mkdir(parents=True)
+    shutil.copy(run / FILE, folder)
+    assert len(tables.read(tables.results_file(str(folder)), "cells")) == 36
+
+
+def test_an_address_of_a_host_is_no_run() -> None:
+    with pytest.raises(RequestError, match="no results in"):
+        show("//nowhere/run")
+
+
+def test_only_figures_of_vibench_are_removed(tmp_path: Path) -> None:
+    ours, theirs = ["obstacle-errors.png", "hertz-mcpg-inf-sup.svg"], ["my-own.svg", "errors.txt", "errors.png"]
+    for name in (*ours, *theirs):
+        (tmp_path / name).touch()
+    figures.remove(tmp_path)
+    assert sorted(path.name for path in tmp_path.iterdir()) == sorted(theirs)
+    figures.remove(tmp_path / "nowhere")
+
+
+def test_what_cannot_be_written_whole_leaves_what_was_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    target = tmp_path / "table.csv"
+    target.write_text("before")
+    monkeypatch.setattr(Path, "replace", lambda self, other: (_ for _ in ()).throw(OSError(28, "No space left")))
+    with pytest.raises(OSError, match="No space left"):
+        write_atomically(target, b"after")
+    assert [path.name for path in tmp_path.iterdir()] == ["table.csv"]
+    assert target.read_text() == "before"
