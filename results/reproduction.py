@@ -82,8 +82,8 @@ def page(claims: Mapping[str, Sequence[Claim]], runs: Sequence[Run]) -> str:
     disturbed = sum(run.disturbed for run in runs)
     introduction = INTRODUCTION.format(
         machine=" and ".join(sorted({run.machine for run in runs})),
-        disturbed=f" Other programs disturbed the timing of {disturbed} of the 12 cells of the tables."
-        * bool(disturbed),
+        disturbed=f" {disturbed} of the 12 cells of the tables are marked as disturbed: the machine was slower than "
+        "at its best by more than a factor of 1.3." * bool(disturbed),
         dimension=100 * DIMENSION,
         mesh=100 * MESH,
         ratio=100 * RATIO,

@@ -59,7 +59,7 @@ def precision(data: Data) -> Figure | None:
         found = mine.groupby("accuracy")[["solve_s", "solver_error_u", "solver_error_lambda"]].median()
         for panel, name in zip(sheet.panels, ("u", "lambda"), strict=True):
             error = np.maximum(found[f"solver_error_{name}"], EXACT)
-            plot(panel, 1e3 * found["solve_s"], error, k, str(solver))
+            plot(panel, 1e3 * found["solve_s"], error, k, str(solver), markevery=1)  # a marker per accuracy
     for panel, name in zip(sheet.panels, ("u", "λ"), strict=True):
         panel.set(xlabel="median time of a program [ms]", ylabel=f"median error of {name} made by the solver")
         panel.set(xscale="log", yscale="log")
