@@ -104,6 +104,15 @@ def workers(pid: int) -> list[int]:
     return found
 
 
+DECIDED = (
+    "UPDATE cells SET hf_setup_s = 0.001, hf_s = 0.1",
+    "UPDATE thresholds SET offline_a_s = 0.001, online_a_s = 0.1, meaning = 'from', "
+    "benefit_threshold = (offline_b_s - 0.001) / (0.1 - online_b_s) WHERE primal_a = 'high-fidelity'",
+    "UPDATE thresholds SET threshold_low = 0.9 * benefit_threshold, threshold_high = 1.1 * benefit_threshold "
+    "WHERE primal_a = 'high-fidelity'",
+)
+"""Statements with which every break-even against the high-fidelity model is decided, however busy the machine was."""
+
 MEASURED = (
     "_s", "peak_memory_mib", "slowdown", "disturbed", "benefit_threshold", "threshold_low", "threshold_high", "meaning",
 )  # fmt: skip

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from running import Changed
+from running import DECIDED, Changed
 
 from vibench.cli.result_commands import compare_runs
 from vibench.errors import RequestError
@@ -71,21 +71,27 @@ NUMBERS = ("benefit_threshold", "threshold_low", "threshold_high")
 LATER = ", ".join(f"{name} = 30 * {name}" for name in NUMBERS)
 
 
-def test_a_threshold_within_the_interval_of_the_other_is_no_change(changed: Changed, quick_run: Path) -> None:
+@pytest.fixture
+def decided(changed: Changed, tmp_path: Path) -> Path:
+    """A run whose break-evens against the high-fidelity model are decided."""
+    return changed(*DECIDED).rename(tmp_path / "decided.sqlite")
+
+
+def test_a_threshold_within_the_interval_of_the_other_is_no_change(changed: Changed, decided: Path) -> None:
     moved = "benefit_threshold = threshold_high, threshold_high = 3 * threshold_high, offline_b_s = 3 * offline_b_s"
-    decided = "meaning IN ('from', 'until')"
-    after = changed(f"UPDATE thresholds SET {moved} WHERE {decided}")
-    assert compare(quick_run / FILE, after, 1.0 + 1e-9).changes.empty
+    after = changed(*DECIDED, f"UPDATE thresholds SET {moved} WHERE primal_a = 'high-fidelity'")
+    assert compare(decided, after, 1.0 + 1e-9).changes.empty
 
 
-def test_a_threshold_is_worse_where_its_own_side_got_slower(changed: Changed, quick_run: Path) -> None:
+def test_a_threshold_is_worse_where_its_own_side_got_slower(changed: Changed, decided: Path) -> None:
     later = f"{LATER}, offline_b_s = 3 * offline_b_s"
+    never = "benefit_threshold = NULL, threshold_low = NULL, threshold_high = NULL, meaning = 'never'"
     found = compare(
-        quick_run / FILE,
+        decided,
         changed(
+            *DECIDED,
             f"UPDATE thresholds SET {later} {THRESHOLD} AND primal_b = 'decorrelated'",
-            "UPDATE thresholds SET benefit_threshold = NULL, meaning = 'never', online_b_s = 9 * online_b_s "
-            f"{THRESHOLD} AND primal_b = 'offline-pga'",
+            f"UPDATE thresholds SET {never}, online_b_s = 9 * online_b_s {THRESHOLD} AND primal_b = 'offline-pga'",
         ),
         1.25,
     )
@@ -94,9 +100,9 @@ def test_a_threshold_is_worse_where_its_own_side_got_slower(changed: Changed, qu
     assert found.regressions == 2
 
 
-def test_a_competitor_that_got_quicker_is_no_regression(changed: Changed, quick_run: Path) -> None:
+def test_a_competitor_that_got_quicker_is_no_regression(changed: Changed, decided: Path) -> None:
     later = f"{LATER}, online_a_s = online_a_s / 3"
-    found = compare(quick_run / FILE, changed(f"UPDATE thresholds SET {later} {THRESHOLD}"), 1.25)
+    found = compare(decided, changed(*DECIDED, f"UPDATE thresholds SET {later} {THRESHOLD}"), 1.25)
     assert len(found.changes) == 3
     assert found.regressions == 0
 

@@ -16,7 +16,7 @@ from matplotlib.backends.backend_agg import RendererAgg
 from matplotlib.figure import Figure
 from matplotlib.image import imread
 from matplotlib.lines import Line2D
-from running import Changed, execute
+from running import DECIDED, Changed, execute
 
 from vibench.report import figures
 from vibench.report.figures import FORMATS, OF_PROBLEM, constants, convergence, costs, draw_all
@@ -341,13 +341,16 @@ def test_there_is_a_style_for_every_strategy(count: int, results: Path) -> None:
     assert len(constants.inf_sup(fixed).axes[0].get_lines()) == count + 1
 
 
-def test_thresholds_are_marked_where_the_lines_cross(results: Path) -> None:
+def test_thresholds_are_marked_where_the_lines_cross(results: Path, change: Callable[..., None]) -> None:
+    change(*DECIDED)
     data = dict(of_file(results))["obstacle"]
     figure = costs.total_cost(data)
     marks = [line for axes in figure.axes for line in axes.get_lines() if line.get_marker() in "<>"]
     assert marks
     for axes in figure.axes:
-        lines = [np.asarray(line.get_xydata()) for line in axes.get_lines() if line.get_marker() not in "<>"]
+        intervals = [line for line in axes.get_lines() if len(line.get_xydata()) == 2]
+        assert len(intervals) == sum(line.get_marker() in "<>" for line in axes.get_lines())
+        lines = [np.asarray(line.get_xydata()) for line in axes.get_lines() if len(line.get_xydata()) > 2]
         for mark in (line for line in axes.get_lines() if line.get_marker() in "<>"):
             ((n, cost),) = mark.get_xydata()
             if 1.0 <= n <= costs.MOST_QUERIES:

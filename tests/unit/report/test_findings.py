@@ -7,7 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from running import Changed
+from running import DECIDED, Changed
 
 from vibench.report.findings import findings
 from vibench.results import tables
@@ -53,19 +53,27 @@ def test_stability_and_cost_are_those_of_the_tables(said: Said, quick_run: Path)
     cells = tables.read(quick_run / FILE, "cells")
     mine = cells[(cells["problem"] == "obstacle") & (cells["dual"] == "mcpg")]
     size = mine.iloc[0]
-    texts = said()[f"obstacle, mcpg, (N, R) = ({size['N']:.0f}, {size['R']:.0f})"]
+    texts = said(*DECIDED)[f"obstacle, mcpg, (N, R) = ({size['N']:.0f}, {size['R']:.0f})"]
     assert texts[0].startswith("Without enrichment, min β over the span is zero")
     quickest = mine.groupby("solver")["online_s"].mean().idxmin()
     of_solver = mine[mine["solver"] == quickest].set_index("primal")
     pga = of_solver.loc["offline-pga"]
     share = f"at least {100.0 * pga['share_validation']:.0f} % of the constant"
     assert any(f"adds {pga['enrichment']:.0f} vectors" in text and share in text for text in texts)
-    best = of_solver["online_s"].min()
-    assert any(f"{1e3 * best:.3g} ms" in text and text.startswith("The fastest query") for text in texts)
-    thresholds = tables.read(quick_run / FILE, "thresholds")
-    numbers = thresholds[(thresholds["problem"] == "obstacle") & (thresholds["dual"] == "mcpg")]["benefit_threshold"]
+    best = of_solver.loc[of_solver["online_s"].idxmin()]
+    assert any(f"{1e3 * best['online_s']:.3g} ms" in text and text.startswith("The fastest query") for text in texts)
+    number = (best["offline_s"] - 0.001) / (0.1 - best["online_s"])
     (against,) = [text for text in texts if text.startswith("Break-even")]
-    assert any(f"from {math.ceil(number)} queries" in against for number in numbers.dropna())
+    assert f"from {math.ceil(number)} queries, 95 % interval {0.9 * number:.0f}–{1.1 * number:.0f}." in against
+
+
+def test_a_break_even_that_the_rounds_do_not_decide_is_called_undecided(said: Said) -> None:
+    found = said(
+        "UPDATE thresholds SET benefit_threshold = NULL, threshold_high = NULL, meaning = 'undecided', threshold_low = 7"
+    )
+    against = [text for texts in found.values() for text in texts if text.startswith("Break-even")]
+    assert against
+    assert all(text.endswith("undecided, 95 % interval ≥ 7.") for text in against)
 
 
 def test_a_share_that_does_not_hold_off_the_training_set_is_said(said: Said) -> None:
