@@ -211,13 +211,13 @@ SECTIONS: dict[str, tuple[str, Callable[[Field], pd.DataFrame]]] = {
         cones,
     ),
     "Enrichments": (
-        f"Cone of {REFERENCE}, tighter tolerances. The share is min β_S / min β_on, both over the span and on the "
+        f"Cone of {REFERENCE}, tighter tolerances. The share is the smallest of β_S(µ) / β_on(µ), both over the span, on the "
         "training set; it is 1 where supremizers are added at every parameter.",
         primals,
     ),
     "Vectors for a share of β_on": (
-        "Smallest numbers of vectors with which min β_S over the training set reaches the shares "
-        f"{', '.join(map(str, SHARES))} of min β_on; a dash where no tolerance of the study reaches the share.",
+        "Smallest numbers of vectors with which β_S(µ) at every training parameter reaches the shares "
+        f"{', '.join(map(str, SHARES))} of β_on(µ); a dash where no tolerance of the study reaches the share.",
         vectors,
     ),
     "Pareto fronts of the error of λ": (

@@ -68,9 +68,8 @@ def test_stability_and_cost_are_those_of_the_tables(said: Said, quick_run: Path)
 
 
 def test_a_break_even_that_the_rounds_do_not_decide_is_called_undecided(said: Said) -> None:
-    found = said(
-        "UPDATE thresholds SET benefit_threshold = NULL, threshold_high = NULL, meaning = 'undecided', threshold_low = 7"
-    )
+    nothing = "benefit_threshold = NULL, threshold_high = NULL"
+    found = said(f"UPDATE thresholds SET {nothing}, meaning = 'undecided', threshold_low = 7")
     against = [text for texts in found.values() for text in texts if text.startswith("Break-even")]
     assert against
     assert all(text.endswith("undecided, 95 % interval ≥ 7.") for text in against)
