@@ -8,7 +8,7 @@ import os
 import pickle
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,6 +19,7 @@ from cachetools import LRUCache
 from vibench.errors import RequestError, StorageError
 from vibench.locking import locked
 from vibench.provenance import machine
+from vibench.text import one_line
 from vibench.timing import Seconds
 
 CACHE_VARIABLE = "VIBENCH_CACHE"
@@ -43,6 +44,17 @@ class History:
     quantity: str
     values: tuple[float, ...]
     first_step: int = 0
+
+    @classmethod
+    def of(cls, stage: str, quantity: object, values: Iterable[Any], first_step: int = 0) -> History:
+        """The history of a quantity that a plugin may have named and evaluated: its name is one printable line.
+
+        Raises
+        ------
+        TypeError, ValueError, OverflowError
+            If a value is no number, or too large for one.
+        """
+        return cls(stage, one_line(str(quantity)), tuple(map(float, values)), first_step)
 
 
 @dataclass(frozen=True)
