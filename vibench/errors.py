@@ -5,6 +5,8 @@ from __future__ import annotations
 import difflib
 from collections.abc import Iterable
 
+from vibench.text import one_line
+
 
 class VibenchError(Exception):
     """Base of every error vibench raises on purpose; its message is one line."""
@@ -27,8 +29,20 @@ class NumericalError(VibenchError):
 
 
 def in_a_line(error: BaseException) -> str:
-    """The sort of an exception and its message, in one line."""
-    return " ".join(f"{type(error).__name__}: {error}".split())
+    """The sort of an exception and its message, in one line of bounded length."""
+    return one_line(f"{type(error).__name__}: {_message(error)}")
+
+
+def message_of(error: BaseException) -> str:
+    """The message of an exception, in one line of bounded length."""
+    return one_line(_message(error))
+
+
+def _message(error: BaseException) -> str:
+    try:
+        return str(error)
+    except Exception:  # noqa: BLE001  `__str__` of a plugin's exception may raise anything
+        return "its message cannot be read"
 
 
 def unknown_name(kind: str, name: str, known: Iterable[str]) -> RequestError:

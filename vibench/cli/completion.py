@@ -104,8 +104,8 @@ def _registered(*groups: str) -> set[str]:
 
 
 def _beginning(word: str, known: Iterable[str]) -> list[str]:
-    """The known names that begin with a word; none if they cannot be read, since a prompt is no place for errors."""
+    """The known names that begin with a word, if a prompt can show them; none, and no error, if they cannot be read."""
     try:
-        return sorted(name for name in known if name.startswith(word))
+        return sorted(name for name in known if name.startswith(word) and name.isprintable())
     except OSError:
         return []

@@ -17,14 +17,14 @@ from importlib.metadata import requires
 from pathlib import Path
 
 import numpy as np
-import typer
 from rich.table import Table
 from rich.text import Text
 from threadpoolctl import threadpool_info, threadpool_limits
 
 from vibench import provenance
 from vibench.cli import solver_check
-from vibench.cli.console import new_console
+from vibench.cli.console import new_console, shown
+from vibench.cli.output import echo
 from vibench.errors import RequestError, in_a_line
 from vibench.locking import locked
 from vibench.qp.settings import SETTINGS
@@ -77,11 +77,11 @@ def print_findings(out: Path) -> list[str]:
         for options in ({"min_width": 6}, {"min_width": 18, "no_wrap": True}, {"overflow": "fold"}):
             table.add_column(**options)
         for finding in findings:
-            table.add_row(Text(finding.health, STYLES[finding.health]), Text(finding.subject), Text(finding.found))
+            table.add_row(Text(finding.health, STYLES[finding.health]), shown(finding.subject), shown(finding.found))
             broken += [finding.subject] * (finding.health is Health.BROKEN)
         console.print(title, style="bold")
         console.print(table)
-    typer.echo(f"broken: {', '.join(broken)}" if broken else "nothing is broken")
+    echo(f"broken: {', '.join(broken)}" if broken else "nothing is broken")
     return broken
 
 

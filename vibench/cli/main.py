@@ -12,12 +12,14 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import typer
-from typer import Argument, Option, echo
+from typer import Argument, Option
 
 from vibench.cli.completion import examples, names, solvers, studies
+from vibench.cli.output import echo
 from vibench.cli.plugin_commands import check_plugin, list_plugins, new_plugin
 from vibench.cli.result_commands import compare_runs, export_qps, replay_query, show, write_report
 from vibench.errors import RequestError, VibenchError
+from vibench.text import printable
 
 Names = list[str] | None
 Tolerances = list[float] | None
@@ -74,7 +76,7 @@ def run(
     loaded = load_study(study, {axis: values for axis, values in overrides.items() if values})
     if dry_run:
         cells = expand(loaded)
-        echo("\n".join([*(f"{cell.key}  {cell}" for cell in cells), f"{len(cells)} cells"]))
+        echo(*(f"{cell.key}  {cell}" for cell in cells), f"{len(cells)} cells")
         return
     if scheduler is not None and executor != "dask":
         raise RequestError(f"--scheduler {scheduler} is for --executor dask")
@@ -186,5 +188,5 @@ def main() -> None:
 
 
 def _print_error(error: object, code: int) -> int:
-    sys.stderr.write("vibench: " + " ".join(str(error).split()) + "\n")
+    sys.stderr.write(f"vibench: {printable(' '.join(str(error).split()))}\n")
     return code

@@ -7,9 +7,10 @@ from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from typer import Argument, Exit, Option, echo
+from typer import Argument, Exit, Option
 
 from vibench.cli.completion import lists, plugin_names
+from vibench.cli.output import echo
 from vibench.errors import RequestError, in_a_line, unknown_name
 
 LISTS = {"problems": "problem", "primal": "primal strategy", "dual": "dual strategy", "studies": "study"}
@@ -92,10 +93,10 @@ def new_plugin(
 
     folder = scaffold.write_package(kind, name, out)
     echo(
-        f"{folder}: a {WORDS[kind]} called '{name}' that works as it is\n"
-        f"  pip install -e {folder}\n"
-        f"  vibench check {kind}:{name}\n"
-        f"the code to edit: {scaffold.module_file(folder, kind, name)}; what to do next: {folder / 'README.md'}"
+        f"{folder}: a {WORDS[kind]} called '{name}' that works as it is",
+        f"  pip install -e {folder}",
+        f"  vibench check {kind}:{name}",
+        f"the code to edit: {scaffold.module_file(folder, kind, name)}; what to do next: {folder / 'README.md'}",
     )
 
 

@@ -10,6 +10,7 @@ from typing import Any
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
+from vibench.cli.console import print_line
 from vibench.execution.run import Agenda
 from vibench.stages.base import Stage
 from vibench.study.cells import Cell
@@ -76,9 +77,8 @@ class ProgressDisplay:
         self._parts = Counter(stage.label for stage in agenda.stages if stage.partial)
         self._total = agenda.to_run
         workers = f" on {agenda.workers} worker{'s' * (agenda.workers != 1)}" * (agenda.workers > 0)
-        self._console.print(
-            f"{agenda.cells} cells, {agenda.to_run - agenda.unavailable} to run, {len(agenda.stages)} stages{workers}"
-        )
+        to_run = agenda.to_run - agenda.unavailable
+        print_line(self._console, f"{agenda.cells} cells, {to_run} to run, {len(agenda.stages)} stages{workers}")
         if self._console.is_terminal and agenda.stages:
             columns = ("[progress.description]{task.description}", BarColumn(), MofNCompleteColumn())
             self._bar = Progress(
@@ -96,7 +96,7 @@ class ProgressDisplay:
             self._done[stage.label] += 1
             done, parts = self._done[stage.label], self._parts[stage.label]
             if done % LINE_EVERY == 0 or done == parts:
-                self._console.print(f"{stage.label}: {done} of {parts} parts{self._left_text(', ')}")
+                print_line(self._console, f"{stage.label}: {done} of {parts} parts{self._left_text(', ')}")
 
     def plan(self, stage: Stage) -> None:
         """A stage was added: the timing of cells that have their rows."""
@@ -109,12 +109,8 @@ class ProgressDisplay:
         self._cells += 1
         reason = f" ({row['reason']})" if row["reason"] else ""
         if self._bar is None or row["reason"]:
-            self._console.print(
-                f"[{self._cells}/{self._total}] {row['status']}: {cell}{reason}{self._left_text(', ')}",
-                markup=False,
-                highlight=False,
-                soft_wrap=True,
-            )
+            line = f"[{self._cells}/{self._total}] {row['status']}: {cell}{reason}"
+            print_line(self._console, line + self._left_text(", "))
 
     def _left_text(self, before: str = "") -> str:
         seconds = self._left.seconds()

@@ -6,9 +6,10 @@ import sys
 from pathlib import Path
 from typing import Annotated, Literal
 
-from typer import Argument, Exit, Option, echo
+from typer import Argument, Exit, Option
 
 from vibench.cli.completion import cells, runs, table_names
+from vibench.cli.output import echo
 from vibench.errors import unknown_name
 from vibench.results.columns import TABLES
 
@@ -72,7 +73,7 @@ def compare_runs(
         if len(found.changes):
             print_frame(found.changes, f"{a} → {b}")
         last = f"{len(found.changes)} changes beyond a factor of {limit:g}, {found.regressions} for the worse"
-        echo("\n".join([*found.notes, last]))
+        echo(*found.notes, last)
     if found.regressions:
         raise Exit(1)
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import sqlite3
 from collections.abc import Iterable, Mapping
 from contextlib import closing
 from dataclasses import dataclass
@@ -18,6 +17,7 @@ from vibench.execution.supervisor import Job, Supervisor
 from vibench.interfaces.problem import VariationalInequality
 from vibench.interfaces.validation import validation_parameters
 from vibench.results import tables
+from vibench.results.database import open_read_only
 from vibench.results.tables import results_file
 from vibench.stages.artefacts import Store, usable_store
 from vibench.stages.assembly import Model, assembly_stage
@@ -77,7 +77,7 @@ class RecordedCell:
 
     def rows(self, table: str) -> dict[int, dict[str, Any]]:
         """The cell's rows of the queries or the solutions table, by query."""
-        with closing(sqlite3.connect(self.path)) as db:
+        with open_read_only(self.path) as db:
             cursor = db.execute(f"SELECT * FROM {table} WHERE cell = ?", (self.row["cell"],))
             names = [column[0] for column in cursor.description]
             found = [dict(zip(names, row, strict=True)) for row in cursor]

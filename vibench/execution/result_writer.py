@@ -26,7 +26,7 @@ class ResultWriter:
     labels: Mapping[Plugin, str]
 
     def cell(self, cell: Cell, found: CellRows) -> Row:
-        """Write the rows of a cell; returns its own."""
+        """Write the rows of a cell; returns its own as it is stored."""
         keys = cell_columns(cell)
         row = {"cell": cell.key, **keys, "machine": provenance.machine(), **found.cell}
         row |= {
@@ -38,8 +38,7 @@ class ResultWriter:
             "definition": cell.definition,
         }
         queries = [{"cell": cell.key, **keys, "query": k, **query} for k, query in enumerate(found.queries)]
-        self.database.write_cell(row, queries, [{"cell": cell.key, **solution} for solution in found.solutions])
-        return row
+        return self.database.write_cell(row, queries, [{"cell": cell.key, **solution} for solution in found.solutions])
 
     def seconds(self, cell: Cell, timed: TimedCell, asked: int) -> None:
         """Write the seconds of a cell that has its rows."""

@@ -18,7 +18,7 @@ from typing import Any, TypeVar
 
 from threadpoolctl import threadpool_limits
 
-from vibench.errors import NumericalError, StorageError, VibenchError, in_a_line
+from vibench.errors import NumericalError, StorageError, VibenchError, in_a_line, message_of
 from vibench.execution.supervisor import Begun, Finished, Job, OutOfMemory, Progress, Watch, code_here
 from vibench.qp.status import Status
 from vibench.stages.artefacts import Store
@@ -136,7 +136,7 @@ def _guarded(memory_gib: float, work: Callable[[], T]) -> T | Failed:
     except (StorageError, _NoMemoryError):
         raise
     except VibenchError as error:
-        return Failed(Status.ERROR, " ".join(str(error).split()))
+        return Failed(Status.ERROR, message_of(error))
     except (Exception, SystemExit, KeyboardInterrupt) as error:  # noqa: BLE001  plugins may raise anything
         return Failed(Status.ERROR, in_a_line(error))
 

@@ -13,7 +13,8 @@ from vibench.interfaces.problem import VariationalInequality
 class QPSolution:
     """Unverified result of a solver: x (n,), multipliers α (m,) with A x + Bᵀα = f, its status and iteration count.
 
-    `solve_qp` sets negative multipliers to zero; `negative` is the largest absolute value among them.
+    `solve_qp` sets negative multipliers to zero; `negative` is the largest absolute value among them. It makes the
+    status one printable line, and leaves out iterations that are no number of them.
     """
 
     x: Array | None

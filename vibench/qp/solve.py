@@ -22,6 +22,7 @@ from vibench.interfaces.problem import VariationalInequality
 from vibench.qp.scaling import row_norms, size
 from vibench.qp.settings import SETTINGS
 from vibench.qp.solution import QPSolution, QPSolver
+from vibench.text import one_line
 
 MARGIN = 0.5
 """Share of the accuracy that qpsolvers is asked for: residuals of its solvers come out up to 1.4 times below ours."""
@@ -58,7 +59,7 @@ def solve_qp(
     Raises
     ------
     NumericalError
-        If the solver does not return a `QPSolution` of the right shapes.
+        If the solver does not return a `QPSolution` of the right shapes, with a text as its status.
     """
     if not len(program.f):
         return QPSolution(np.zeros(0), np.zeros(len(program.g)), "nothing to solve: no unknowns")
@@ -75,16 +76,24 @@ def solve_qp(
         if start is not None and starter is not None and start.x is not None and start.alpha is not None:
             warm_start |= starter(start.x, rows * start.alpha / cost)
         answer = _call_qpsolvers(scaled, solver, accuracy, warm_start)
-    for name, value, count in (("x", answer.x, len(program.f)), ("α", answer.alpha, len(program.g))):
-        if value is not None and value.shape != (count,):
-            raise NumericalError(f"the solver returned {name} of shape {value.shape}, expected ({count},)")
-    if not isinstance(answer.solver_status, str) or not isinstance(answer.iterations, int | np.integer | None):
-        found = f"{answer.solver_status!r:.40}, {answer.iterations!r:.40}"
-        raise NumericalError(f"the solver reports the status and iterations {found}; expected a text, a number or None")
+    answer = _checked(answer, program)
     if answer.alpha is None:
         return answer
     alpha = cost * answer.alpha / rows
     return replace(answer, alpha=np.maximum(alpha, 0.0), negative=-float(np.min(alpha, initial=0.0)))
+
+
+def _checked(answer: QPSolution, program: VariationalInequality) -> QPSolution:
+    """An answer with vectors of the right shapes, a status of one line, and iterations if they are a number of them."""
+    for name, value, count in (("x", answer.x, len(program.f)), ("α", answer.alpha, len(program.g))):
+        if value is not None and value.shape != (count,):
+            raise NumericalError(f"the solver returned {name} of shape {value.shape}, expected ({count},)")
+    status, steps = answer.solver_status, answer.iterations
+    if not isinstance(status, str):
+        raise NumericalError(f"the solver reports the status {status!r:.40}; expected a text")
+    # A results file holds whole numbers of 64 bits.
+    iterations = int(steps) if isinstance(steps, int | np.integer) and 0 <= steps < 2**63 else None
+    return replace(answer, solver_status=one_line(status), iterations=iterations)
 
 
 def _solve_dual(

@@ -22,6 +22,7 @@ from vibench.qp.solution import QPSolution
 from vibench.qp.solve import installed_solvers, solve_qp
 from vibench.qp.status import Status
 from vibench.results.solver_agreement import vectors
+from vibench.results.tables import to_csv
 from vibench.study import registry
 from vibench.timing import median_seconds
 
@@ -112,7 +113,8 @@ def export(run: str, folder: Path) -> int:
     programs = [rows for cells in models.values() for rows in _exported(cells, folder)]
     if not programs:
         raise RequestError(f"no cell of '{run}' has a reduced program")
-    pd.DataFrame(chain.from_iterable(programs)).to_csv(folder / "rows.csv", index=False)
+    table = to_csv(pd.DataFrame(chain.from_iterable(programs)))
+    (folder / "rows.csv").write_text(table, encoding="utf-8")
     (folder / CHECKER).write_bytes((files("vibench.report") / "qps_checker.py").read_bytes())
     return len(programs)
 

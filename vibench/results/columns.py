@@ -27,6 +27,8 @@ class Column(NamedTuple):
         For the documentation; units stand in `UNITS`.
     heading, place
         Heading and place in the table for reading that is made of this one; "" where the column is not shown there.
+    whole
+        Whether a text is JSON, which is never cut.
     """
 
     kind: str
@@ -34,6 +36,7 @@ class Column(NamedTuple):
     meaning: str
     heading: str = ""
     place: int = 0
+    whole: bool = False
 
 
 UNITS: Mapping[str, str] = {
@@ -54,11 +57,11 @@ UNITS: Mapping[str, str] = {
 
 KEYS: Mapping[str, Column] = {
     "problem": Column(TEXT, "", "Problem: its label in the study, or its name.", "problem", 1),
-    "problem_options": Column(TEXT, "", "Options of the problem that are not at their default, as JSON."),
+    "problem_options": Column(TEXT, "", "Options of the problem that are not at their default, as JSON.", whole=True),
     "dual": Column(TEXT, "", "Dual strategy, likewise.", "dual", 4),
-    "dual_options": Column(TEXT, "", "Its options, likewise."),
+    "dual_options": Column(TEXT, "", "Its options, likewise.", whole=True),
     "primal": Column(TEXT, "", "Primal strategy, likewise.", "primal", 5),
-    "primal_options": Column(TEXT, "", "Its options, likewise."),
+    "primal_options": Column(TEXT, "", "Its options, likewise.", whole=True),
     "pod_tol": Column(REAL, "1", "Tolerance δ_POD of the POD; empty where the study prescribes N.", "δ_POD", 2),
     "pod_size": Column(INTEGER, "", "Prescribed N; empty where the study gives a tolerance."),
     "dual_tol": Column(REAL, "1", "Tolerance δ_dual of the cone; empty where the study prescribes R.", "δ_dual", 3),
@@ -176,8 +179,8 @@ CELLS: Mapping[str, Column] = {
     "code": Column(TEXT, "", "Hash of the code: core, plugins, solver."),
     "machine": Column(TEXT, "", "Machines that measured the seconds."),
     "threads": Column(INTEGER, "", "Threads of every timed process."),
-    "versions": Column(TEXT, "", "Versions of Python, libraries and solver, as JSON."),
-    "definition": Column(TEXT, "", "The whole cell as JSON."),
+    "versions": Column(TEXT, "", "Versions of Python, libraries and solver, as JSON.", whole=True),
+    "definition": Column(TEXT, "", "The whole cell as JSON.", whole=True),
 }
 
 
@@ -335,10 +338,10 @@ SOLUTIONS: Mapping[str, Column] = {
 
 PICTURES: Mapping[str, Column] = {
     "problem": Column(TEXT, "", "Problem: its label in the study, or its name."),
-    "problem_options": Column(TEXT, "", "Options of the problem that are not at their default, as JSON."),
+    "problem_options": Column(TEXT, "", "Options of the problem that are not at their default, as JSON.", whole=True),
     "number": Column(INTEGER, "", "Number of the picture."),
     "title": Column(TEXT, "", "Its parameter."),
-    "names": Column(TEXT, "", "What the field and the multiplier are, with their units, as JSON."),
+    "names": Column(TEXT, "", "What the field and the multiplier are, with their units, as JSON.", whole=True),
     "data": Column(BLOB, "", "Mesh, field and multiplier in single precision, a compressed archive of NumPy."),
     "reason": Column(TEXT, "", "Why there is none, where there should be."),
 }

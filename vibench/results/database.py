@@ -9,11 +9,11 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from vibench.errors import RequestError, StorageError
 from vibench.locking import locked
 from vibench.results.columns import HISTORY_KEYS, STORED, VERSION
+from vibench.results.values import UnstorableError, error_row, storable
+from vibench.text import printable
 
 FILE = "results.sqlite"
 
@@ -76,7 +76,8 @@ class ResultsDatabase:
             if not anew:
                 _refuse_other(path, study)
             folder.mkdir(parents=True, exist_ok=True)
-            self._db = sqlite3.connect(path)
+            self._db = sqlite3.connect(path.absolute())  # SQLite may take a name that begins with "file:" for a URI
+            self._db.text_factory = _read_text
             self._db.execute("PRAGMA journal_mode=WAL")
             with self._db:
                 self._db.execute("BEGIN IMMEDIATE")
@@ -111,14 +112,36 @@ class ResultsDatabase:
 
     def write_cell(
         self, cell: Mapping[str, Any], queries: Sequence[Mapping[str, Any]], solutions: Sequence[Mapping[str, Any]] = ()
-    ) -> None:
-        """Write a cell, its queries and solutions in one transaction; earlier rows of the cell are replaced."""
+    ) -> dict[str, Any]:
+        """Write a cell, its queries and solutions in one transaction; earlier rows of the cell are replaced.
+
+        Rows that cannot be stored because of their values cost the cell, not the run: it gets an `error` row instead.
+
+        Returns
+        -------
+        dict
+            The row of the cell as it is stored.
+
+        Raises
+        ------
+        StorageError
+            If the file cannot be written.
+        """
+        try:
+            return self._write_cell(cell, queries, solutions)
+        except (UnstorableError, sqlite3.Error) as error:
+            return self._write_cell(error_row(cell, str(error)), (), ())
+
+    def _write_cell(
+        self, cell: Mapping[str, Any], queries: Sequence[Mapping[str, Any]], solutions: Sequence[Mapping[str, Any]]
+    ) -> dict[str, Any]:
         with self._writing():
             self._add_columns(queries)
             self._db.execute("DELETE FROM cells WHERE cell = ?", (cell["cell"],))
             self._insert("cells", [cell])
             self._insert("queries", queries)
             self._insert("solutions", solutions)
+        return storable("cells", cell)
 
     def write_seconds(
         self,
@@ -147,7 +170,7 @@ class ResultsDatabase:
     def _update(self, table: str, columns: Mapping[str, Any], **keys: Any) -> None:
         changes = ", ".join(f'"{name}" = ?' for name in columns)
         same = " AND ".join(f'"{name}" IS ?' for name in keys)
-        values = tuple(map(_plain, (*columns.values(), *keys.values())))
+        values = (*storable(table, columns).values(), *storable(table, keys).values())
         self._db.execute(f"UPDATE {table} SET {changes} WHERE {same}", values)
 
     def fine_queries(self, cell: str) -> tuple[int, ...]:
@@ -181,7 +204,7 @@ class ResultsDatabase:
         self, table: str, keys: Mapping[str, Any], rows: Sequence[Mapping[str, Any]], within: str = ""
     ) -> None:
         same = " AND ".join(["TRUE", *(f'"{name}" IS ?' for name in keys)])
-        self._db.execute(f"DELETE FROM {table} WHERE {same}{within}", tuple(map(_plain, keys.values())))
+        self._db.execute(f"DELETE FROM {table} WHERE {same}{within}", tuple(storable(table, keys).values()))
         self._insert(table, rows)
 
     def rows(self, table: str) -> list[dict[str, Any]]:
@@ -204,7 +227,8 @@ class ResultsDatabase:
     def _insert(self, table: str, rows: Iterable[Mapping[str, Any]]) -> None:
         for row in rows:
             names, marks = ", ".join(f'"{name}"' for name in row), ", ".join("?" * len(row))
-            self._db.execute(f"INSERT INTO {table} ({names}) VALUES ({marks})", tuple(map(_plain, row.values())))
+            values = tuple(storable(table, row).values())
+            self._db.execute(f"INSERT INTO {table} ({names}) VALUES ({marks})", values)
 
     def _add_columns(self, queries: Sequence[Mapping[str, Any]]) -> None:
         """Add a column for every parameter mu_1, mu_2, … of the rows."""
@@ -214,9 +238,9 @@ class ResultsDatabase:
                 self._db.execute(f'ALTER TABLE queries ADD COLUMN "{name}" REAL')
 
 
-def _plain(value: Any) -> Any:
-    """A NumPy scalar as a Python number: SQLite would store its bytes."""
-    return value.item() if isinstance(value, np.generic) else value
+def _read_text(stored: bytes) -> str:
+    """A text of a results file, which others may have written: printable, whatever its bytes are."""
+    return printable(stored.decode("utf-8", errors="replace"))
 
 
 def _refuse_other(path: Path, study: Mapping[str, Any]) -> None:
@@ -234,9 +258,13 @@ def _refuse_other(path: Path, study: Mapping[str, Any]) -> None:
 
 
 def open_read_only(path: Path) -> contextlib.closing[sqlite3.Connection]:
-    """Context with a connection that cannot write to the results file, and runs no code that its schema names."""
+    """Context with a connection that cannot write to the results file, and runs no code that its schema names.
+
+    What it reads is `printable`.
+    """
     connection = sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro", uri=True)
     connection.execute("PRAGMA trusted_schema=OFF")
+    connection.text_factory = _read_text
     return contextlib.closing(connection)
 
 

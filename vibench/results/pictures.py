@@ -13,6 +13,7 @@ import numpy as np
 
 from vibench.interfaces.problem import Picture
 from vibench.results.database import open_read_only
+from vibench.text import printable
 
 ARRAYS = tuple(field.name for field in fields(Picture) if not field.name.endswith("name"))
 
@@ -60,5 +61,5 @@ def _packed(picture: Picture) -> bytes:
 def _unpacked(data: bytes, names: str) -> Picture:
     with np.load(io.BytesIO(data), allow_pickle=False) as found:
         arrays = {name: found[name].astype(np.intp if name == "triangles" else float) for name in ARRAYS}
-    name, multiplier_name = json.loads(names)
+    name, multiplier_name = (printable(str(text)) for text in json.loads(names))
     return Picture(**arrays, name=name, multiplier_name=multiplier_name)

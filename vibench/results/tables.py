@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping
+import re
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ from vibench.errors import RequestError
 from vibench.files import write_atomically
 from vibench.results.columns import CELLS, INTEGER, KEYS, STORED, TABLES, THRESHOLDS, VERSION, Column, shown_columns
 from vibench.results.database import FILE, open_read_only, read_meta
+from vibench.text import printable, printable_lines
 
 ORDER = (
     *KEYS, "primal_a", "primal_b", "primal_tol_a", "primal_tol_b", "assembly_a", "assembly_b", "stage", "quantity",
@@ -43,7 +45,7 @@ def results_file(run: str) -> Path:
 def read(path: Path, table: str) -> pd.DataFrame:
     """One table of a results file, in the order in which its rows were written."""
     with open_read_only(path) as db:
-        frame = pd.read_sql_query(f"SELECT * FROM {table}", db)
+        frame = pd.read_sql_query(f"SELECT * FROM {table}", db).rename(columns=printable)
     for name, column in STORED.get(table, {}).items():
         if column.kind.startswith(("REAL", "INTEGER")) and frame[name].dtype == object:  # every value is NULL
             frame[name] = frame[name].astype(float)
@@ -108,34 +110,70 @@ def _shown(frame: pd.DataFrame, name: str, column: Column) -> pd.Series | list[s
 
 
 def to_csv(frame: pd.DataFrame) -> str:
-    """CSV with full precision."""
-    return str(frame.to_csv(index=False))
+    """CSV with full precision; a text that a spreadsheet would take for a formula has an apostrophe before it."""
+    shown = frame.rename(columns=lambda name: _no_formula(str(name)))
+    for k, kind in enumerate(frame.dtypes):
+        if not pd.api.types.is_numeric_dtype(kind):
+            shown.isetitem(k, pd.Series(map(_no_formula, frame.iloc[:, k]), index=frame.index, dtype=object))
+    return str(shown.to_csv(index=False))
+
+
+FORMULA = tuple("=+-@＝＋－＠\n")
+"""First characters of a text that spreadsheets may take for a formula (OWASP, CSV injection)."""
+
+NUMBER = re.compile(r"[+-]([0-9]+(\.[0-9]+)?(e[+-]?[0-9]+)?|inf)")
+
+
+def _no_formula(value: Any) -> Any:
+    if not isinstance(value, str):
+        return value
+    text = printable_lines(value)
+    return f"'{text}" if text.startswith(FORMULA) and not NUMBER.fullmatch(text) else text
 
 
 def to_markdown(frame: pd.DataFrame) -> str:
     """A Markdown table, numbers with three significant digits."""
-    return f"{_as_text(frame, MARKDOWN).to_markdown(index=False, disable_numparse=True)}\n"
+    return f"{_as_text(frame, _markdown).to_markdown(index=False, disable_numparse=True)}\n"
 
 
 def to_latex(frame: pd.DataFrame) -> str:
     """A LaTeX tabular (package booktabs), numbers with three significant digits."""
     columns = "".join("r" if pd.api.types.is_numeric_dtype(kind) else "l" for kind in frame.dtypes)
-    text = _as_text(frame, LATEX).rename(columns=lambda name: str(name).translate(LATEX))
-    return str(text.to_latex(index=False, column_format=columns))
+    return str(_as_text(frame, _latex).to_latex(index=False, column_format=columns))
 
 
-MARKDOWN = {ord("|"): "\\|"}
+MARKUP = re.compile(r"[\\`*|]|\](?=[(\[])|(?<![^\W_])_|_(?![^\W_])")
+"""What Markdown acts on and a backslash makes text; an underscore inside a word, or a unit in brackets, is text."""
+
+ENTITIES = {
+    ord(sign): f"&{name};" for sign, name in {"&": "amp", "<": "lt", ">": "gt", "$": "#36", "~": "#126"}.items()
+}
+"""What HTML, or Markdown of some dialects, acts on and a backslash would not make text in all of them."""
 
 LATEX = str.maketrans({
     **{sign: f"\\{sign}" for sign in "&%$#_{}"}, "\\": r"\textbackslash{}", "~": r"\textasciitilde{}",
-    "^": r"\textasciicircum{}", "µ": r"$\mu$", "β": r"$\beta$", "δ": r"$\delta$", "λ": r"$\lambda$", "σ": r"$\sigma$",
+    "^": r"\textasciicircum{}", "<": r"\textless{}", ">": r"\textgreater{}", "|": r"\textbar{}",
+    "[": "{[}", "*": "{*}",  # arguments of the line break before them, at the beginning of a row
+    "µ": r"$\mu$", "β": r"$\beta$", "δ": r"$\delta$", "λ": r"$\lambda$", "σ": r"$\sigma$",
 })  # fmt: skip
 
 
-def _as_text(frame: pd.DataFrame, escapes: dict[int, str]) -> pd.DataFrame:
+def _markdown(text: str) -> str:
+    return MARKUP.sub(r"\\\g<0>", text).translate(ENTITIES)
+
+
+def _latex(text: str) -> str:
+    return text.translate(LATEX)
+
+
+def _as_text(frame: pd.DataFrame, escape: Callable[[str], str]) -> pd.DataFrame:
     """The table as it is printed, special characters escaped and line breaks removed."""
-    rows = [[" ".join(cell_text(v).split()).translate(escapes) for v in row] for row in frame.itertuples(index=False)]
-    return pd.DataFrame(rows, columns=frame.columns)
+    rows = [[escape(_in_a_line(cell_text(value))) for value in row] for row in frame.itertuples(index=False)]
+    return pd.DataFrame(rows, columns=[escape(_in_a_line(str(name))) for name in frame.columns])
+
+
+def _in_a_line(text: str) -> str:
+    return printable(" ".join(text.split()))
 
 
 def to_json(frame: pd.DataFrame) -> str:
@@ -143,7 +181,7 @@ def to_json(frame: pd.DataFrame) -> str:
     # DataFrame.to_json keeps 15 digits at most and writes infinite values as null.
     known = frame.astype(object).where(frame.notna(), None).to_dict("records")
     rows = [{name: str(v) if v in (math.inf, -math.inf) else v for name, v in row.items()} for row in known]
-    return json.dumps(rows, ensure_ascii=False, indent=1) + "\n"
+    return printable_lines(json.dumps(rows, ensure_ascii=False, indent=1)) + "\n"
 
 
 def cell_text(value: Any) -> str:

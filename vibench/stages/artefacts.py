@@ -10,7 +10,7 @@ import pickle
 import secrets
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -22,6 +22,7 @@ from vibench.errors import RequestError, StorageError
 from vibench.files import PART, TEMPORARY, write_atomically
 from vibench.locking import locked
 from vibench.provenance import machine
+from vibench.text import one_line
 from vibench.timing import Seconds
 
 CACHE_VARIABLE = "VIBENCH_CACHE"
@@ -54,6 +55,17 @@ class History:
     quantity: str
     values: tuple[float, ...]
     first_step: int = 0
+
+    @classmethod
+    def of(cls, stage: str, quantity: object, values: Iterable[Any], first_step: int = 0) -> History:
+        """The history of a quantity that a plugin may have named and evaluated: its name is one printable line.
+
+        Raises
+        ------
+        TypeError, ValueError, OverflowError
+            If a value is no number, or too large for one.
+        """
+        return cls(stage, one_line(str(quantity)), tuple(map(float, values)), first_step)
 
 
 @dataclass(frozen=True)

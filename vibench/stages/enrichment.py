@@ -192,7 +192,7 @@ def enrichment_stage(cell: Cell) -> EnrichmentStage:
 
 
 def _histories(known: Mapping[str, Array]) -> tuple[History, ...]:
-    return tuple(History("enrichment", quantity, tuple(values)) for quantity, values in known.items())
+    return tuple(History.of("enrichment", quantity, values) for quantity, values in known.items())
 
 
 def _offline(store: Store, pod: PODStage, cone: ConeStage) -> Offline:

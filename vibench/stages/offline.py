@@ -40,7 +40,7 @@ class PODStage(Stage):
         """Compute the modes; the history is the relative tail over the number of modes."""
         snapshots = gather(store, self.inputs()).u
         found, seconds = timed(lambda: pod(snapshots, build_problem(self.problem).V, self.stop))
-        return Result(found, seconds, (History("pod", "error", tuple(found.errors)),))
+        return Result(found, seconds, (History.of("pod", "error", found.errors),))
 
 
 @dataclass(frozen=True)
@@ -84,7 +84,7 @@ class ConeStage(Stage):
         check_cone(cone, W)  # verification, which is not part of the offline time
         prepared, preparing = timed(lambda: multipliers(cone.generators, W, cone.free))
         orthogonal = orthogonality(cone.generators, W, cone.free)
-        histories = History("cone", "error", tuple(cone.errors)), History("cone", "e_orth", tuple(orthogonal))
+        histories = History.of("cone", "error", cone.errors), History.of("cone", "e_orth", orthogonal)
         return Result(ReducedCone(cone, prepared), reducing + preparing, histories)
 
 

@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from vibench.arrays import Array
 from vibench.errors import NumericalError
 from vibench.interfaces.problem import ParameterBox, Picture
-from vibench.results.pictures import failure_rows, picture_rows
+from vibench.results.pictures import ARRAYS, failure_rows, picture_rows
 from vibench.stages.artefacts import Store
 from vibench.stages.base import Result, Row, Stage, build_problem
 from vibench.stages.snapshots import gather, training_stages
 from vibench.study.cells import Axes, Plugin
+from vibench.text import one_line
 
 CORNERS = (0.0, 0.5, 1.0)
 """Positions in the unit box of parameters at which solutions are drawn: lower corner, centre and upper corner."""
@@ -70,13 +71,17 @@ def _title(box: ParameterBox, mu: Array) -> str:
 
 
 def _checked(picture: Picture) -> Picture:
-    """A picture whose arrays fit together.
+    """A picture whose arrays hold real numbers and fit together, and whose names are texts.
 
     Raises
     ------
     NumericalError
         Naming the member that does not.
     """
+    mistyped = [name for name in ARRAYS if getattr(picture, name).dtype.kind not in "fiu"]
+    mistyped += [name for name in ("name", "multiplier_name") if not isinstance(getattr(picture, name), str)]
+    if mistyped:
+        raise NumericalError(f"the problem's picture has {' and '.join(mistyped)} of the wrong type")
     count, places = picture.points.shape[-1], picture.positions.shape[-1]
     corners = picture.triangles
     mesh = corners.shape[0] == 3 and bool(np.all((corners >= 0) & (corners < count)))
@@ -90,4 +95,4 @@ def _checked(picture: Picture) -> Picture:
     wrong = [name for name, right in fits.items() if not right]
     if wrong:
         raise NumericalError(f"the problem's picture has {' and '.join(wrong)} of the wrong shape")
-    return picture
+    return replace(picture, name=one_line(picture.name), multiplier_name=one_line(picture.multiplier_name))

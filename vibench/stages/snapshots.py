@@ -115,7 +115,7 @@ class SnapshotStage(Stage):
         for mu in mus:
             for quantity, value in problem.diagnostics(mu).items():
                 found.setdefault(quantity, []).append(float(value))
-        return tuple(History(self.purpose, quantity, tuple(values), first) for quantity, values in found.items())
+        return tuple(History.of(self.purpose, quantity, values, first) for quantity, values in found.items())
 
 
 def training_stages(problem: Plugin) -> tuple[Stage, ...]:

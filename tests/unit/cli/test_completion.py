@@ -79,6 +79,9 @@ class TestFiles:
             Path("runs", name).mkdir(parents=True)
         for name in ("mine", "other"):
             Path("runs", name, FILE).touch()
+        for name in ("m\x1b[2J", "m\nrm"):  # a prompt would obey them
+            Path("runs", name).mkdir()
+            Path("runs", name, FILE).touch()
         assert completed("vibench show ") == ["mine", "other"]
         assert completed("vibench replay m") == completed("vibench report m") == ["mine"]
         assert completed("vibench diff mine o") == ["other"]

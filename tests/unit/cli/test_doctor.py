@@ -130,6 +130,20 @@ def test_every_plugin_that_does_not_load_has_a_line_with_the_reason(register: Re
     assert "name" in broken["study 'wrong'"]
 
 
+@pytest.mark.usefixtures("trials")
+def test_the_error_of_a_plugin_is_no_markup_and_no_escape_sequence(
+    main: Main, register: Register, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "odd_module.py").write_text("raise ImportError('[/b] [red]:warning: \\x1b[2J\\ud800')\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    register(("vibench.problems", "[/i]\x1b[31m", "odd_module:Problem"))
+    code, out, err = main("doctor")
+    assert (code, err) == (1, "")
+    assert all(line.isprintable() for line in out.splitlines())
+    assert r"problem '[/i]\u001b[31m'" in out
+    assert r"ImportError: [/b] [red]:warning: \u001b[2J\ud800" in " ".join(out.split())
+
+
 def test_a_name_that_two_packages_register_is_broken_and_stops_nothing(register: Register) -> None:
     register(("vibench.qp_solvers", "mine", "one:solve"), ("vibench.qp_solvers", "mine", "other:solve"))
     found = by_subject(list(doctor.plugins()))

@@ -22,6 +22,7 @@ from vibench.results.tables import read
 from vibench.study import registry
 from vibench.study.cells import expand
 from vibench.study.reader import load_study
+from vibench.text import printable
 
 
 @pytest.fixture
@@ -339,6 +340,37 @@ def test_show_finds_a_run_by_its_name(main: Main, quick_run: Path) -> None:
     code, out, _ = main("show", "quick", "--format", "csv")
     assert code == 0
     assert len(out.splitlines()) == 1 + len(read(quick_run / FILE, "cells"))
+
+
+@pytest.mark.parametrize("run", ["[/b]", "//x", "//x/y", "file:x", "a\x1b[2J\nb", "\udcff", "x?mode=rwc", ""])
+def test_a_run_of_an_odd_name_that_is_not_there_is_refused(run: str, main: Main) -> None:
+    line = refused(main("show", run), "no results in")
+    assert line.rstrip("\n").isprintable()
+    refused(main("report", run))
+    refused(main("diff", run, run))
+    assert list(Path.cwd().iterdir()) == []
+
+
+@pytest.mark.parametrize("name", ["[red]a[bold] :warning:", "a\x1b[2J", "file:x?mode=memory#y", "a%20b", "\udcff"])
+def test_a_run_of_an_odd_name_is_shown(name: str, main: Main, quick_run: Path) -> None:
+    Path(name).symlink_to(quick_run)
+    for run in (name, f"./{name}", str(Path(name).absolute()), f"/{Path(name).absolute()}"):
+        code, out, err = main("show", run)
+        assert (code, err) == (0, "")
+        assert out.startswith(f"{printable(name)}: summary")
+        assert all(line.isprintable() for line in out.splitlines())
+
+
+@pytest.mark.usefixtures("_nothing_starts")
+def test_a_label_of_several_lines_makes_no_lines_of_its_own(main: Main, tmp_path: Path) -> None:
+    path = write_study(tmp_path, changed(STUDY, "problem", 0, "label", to="a\n0 cells\x1b[2J"))
+    code, out, _ = main("run", path, "--dry-run")
+    cells = expand(load_study(path))
+    assert code == 0
+    *lines, last = out.splitlines()
+    assert [line.split()[0] for line in lines] == [cell.key for cell in cells]
+    assert all(r"a\n0 cells\u001b[2J · " in line for line in lines)
+    assert last == f"{len(cells)} cells"
 
 
 def test_an_error_that_nobody_foresaw_is_not_hidden(main: Main, monkeypatch: pytest.MonkeyPatch) -> None:

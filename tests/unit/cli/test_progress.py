@@ -169,6 +169,21 @@ def test_every_cell_has_a_line(report: Make, cells: list[Cell], queries: list[St
     assert "[red]membrane" in lines[1]
 
 
+@pytest.mark.parametrize("terminal", [False, True])
+def test_a_label_is_no_markup_no_emoji_and_no_escape_sequence(
+    terminal: bool, report: Make, queries: list[Stage], tmp_path: Path
+) -> None:
+    odd = changed(STUDY, "problem", 0, "label", to="[/b] [red]a :warning:\x1b[2J\n[1/1] ok: b")
+    cell = expand(load_study(write_study(tmp_path, odd)))[0]
+    made, printed = report(terminal=terminal)
+    with made:
+        made.start(agenda(1, queries[:1], 1))
+        made.cell(cell, {"status": "error", "reason": "[/i] \x1b[31m:smile:\ud800"})
+    (line,) = [line for line in printed.getvalue().splitlines() if "error: " in line]
+    assert r"error: [/b] [red]a :warning:\u001b[2J\n[1/1] ok: b · " in line
+    assert line.endswith(r"([/i] \u001b[31m:smile:\ud800)")
+
+
 def test_a_long_line_stays_one_line(report: Make, cells: list[Cell], queries: list[Stage]) -> None:
     made, printed = report()
     made.start(agenda(1, queries[:1], 2))

@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 import scipy.sparse as sp
@@ -7,11 +9,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numerics import exact, spd
 
+from vibench.errors import NumericalError
 from vibench.interfaces.problem import VariationalInequality
 from vibench.qp import verification
 from vibench.qp.solution import QPSolution
 from vibench.qp.solve import solve_qp
 from vibench.qp.status import Status
+from vibench.text import LONGEST
 
 seeds = st.integers(0, 10_000)
 
@@ -210,6 +214,40 @@ def test_a_registered_solver_sees_scaled_data_and_its_answer_is_scaled_back() ->
     assert np.allclose(seen["rows"], 1.0)
     assert np.isclose(seen["f"], 1.0)
     assert verification.kkt_residuals(vi, answer.x, answer.alpha).worst < 1e-9
+
+
+def answered(status: Any, iterations: Any) -> QPSolution:
+    """What a solver answers that says this of itself."""
+    vi = program(4)
+    return solve_qp(vi, "odd", 1e-7, {"odd": lambda scaled, _: QPSolution(*exact(scaled), status, iterations)})
+
+
+@given(st.text(st.characters()))
+def test_the_status_of_a_solver_is_one_short_printable_line(status: str) -> None:
+    for said in (status, 4000 * status):
+        found = answered(said, 3).solver_status
+        assert found.isprintable()
+        assert len(found) <= LONGEST
+
+
+def test_a_status_that_is_no_text_is_an_error() -> None:
+    with pytest.raises(NumericalError, match="reports the status None; expected a text"):
+        answered(None, 3)
+
+
+@pytest.mark.parametrize("number", [0, 7, np.int64(7), np.uint8(7), 2**63 - 1])
+def test_a_number_of_iterations_is_kept_as_a_whole_number(number: Any) -> None:
+    found = answered("solved", number).iterations
+    assert type(found) is int
+    assert found == number
+
+
+@pytest.mark.parametrize("number", [2**80, 2**63, -1, -(2**70), np.uint64(2**63), 2.5, np.nan, np.inf, "7", [7], None])
+def test_what_is_no_number_of_iterations_is_left_out(number: Any) -> None:
+    """The solution is judged all the same."""
+    found = answered("solved", number)
+    assert found.iterations is None
+    assert found.x is not None
 
 
 def test_severities_follow_the_order_of_the_statuses() -> None:

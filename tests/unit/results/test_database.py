@@ -2,21 +2,28 @@
 
 from __future__ import annotations
 
+import contextlib
+import json
 import os
 import shutil
 import sqlite3
+import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from running import execute
 from samples import cell_row, query_rows
 
-from vibench.errors import RequestError
+from vibench.errors import RequestError, StorageError
 from vibench.results import database as module
 from vibench.results.columns import CELLS, TABLES, VERSION
-from vibench.results.database import FILE, ResultsDatabase, claimed, read_meta
+from vibench.results.database import FILE, ResultsDatabase, claimed, open_read_only, read_meta
+from vibench.results.values import LONGEST_TEXT
 
 STUDY = {"name": "sample", "seed": 1, "validation": 4, "accuracy": 1e-7}
 
@@ -96,32 +103,109 @@ def test_columns_of_parameters_are_found_again(journal: ResultsDatabase, tmp_pat
     again.close()
 
 
-def test_any_other_new_column_is_an_error(journal: ResultsDatabase) -> None:
-    with pytest.raises(sqlite3.Error):
-        journal.write_cell(cell_row(), query_rows(surprise=1.0))
-    assert journal.rows("cells") == []
-
-
-@pytest.mark.parametrize("fault", [{"status": None}, {"gap": object()}], ids=["forbidden null", "no number"])
+@pytest.mark.parametrize(
+    ("fault", "words"),
+    [
+        ({"status": None}, ["'status'", "'queries'", "missing"]), ({"gap": object()}, ["'gap'", "object is no REAL"]),
+        ({"gap": "wide"}, ["'gap'", "str is no REAL"]), ({"gap": 10**400}, ["'gap'", "too large"]),
+        ({"iterations": 2**80}, ["'iterations'", "81 bits"]), ({"iterations": 2.5}, ["'iterations'", "float"]),
+        ({"mu_1": [1.0]}, ["'mu_1'", "list is no REAL"]), ({"surprise": 1.0}, ["no column named surprise"]),
+        ({"cell": "of nobody"}, ["FOREIGN KEY"]),
+    ],
+    ids=lambda value: str(value) if isinstance(value, dict) else "",
+)  # fmt: skip
 @pytest.mark.parametrize("position", [0, 2])
-def test_a_failing_write_leaves_neither_cell_nor_queries(
-    fault: dict[str, Any], position: int, journal: ResultsDatabase, tmp_path: Path
+def test_a_row_that_cannot_be_stored_costs_its_cell_and_no_other(
+    fault: dict[str, Any], words: list[str], position: int, journal: ResultsDatabase, tmp_path: Path
 ) -> None:
     queries = query_rows(count=3)
     queries[position] |= fault
-    with pytest.raises(sqlite3.Error):
-        journal.write_cell(cell_row(), queries)
-    for table in ("cells", "queries"):
-        assert journal.rows(table) == []
-        assert seen(tmp_path / "run", table) == []
+    stored = journal.write_cell(cell_row(error_u_mean=0.5, definition="{}"), queries)
+    journal.write_cell(cell_row("c2"), query_rows("c2"))
+    failed, fine = journal.rows("cells")
+    assert {name: value for name, value in failed.items() if value is not None} == stored
+    assert (failed["cell"], failed["status"], failed["queries_ok"], failed["queries"]) == ("c1", "error", 0, 3)
+    assert failed["reason"].startswith("the results cannot be stored: ")
+    assert [word for word in words if word not in failed["reason"]] == []
+    assert (failed["code"], failed["definition"], failed["solver"]) == ("text", "{}", "text")
+    assert failed["error_u_mean"] is None
+    assert fine["status"] == "ok"
+    assert {row["cell"] for row in journal.rows("queries")} == {"c2"}
+    assert journal.finished() == {"c1": ("error", "text"), "c2": ("ok", "text")}  # a later run resumes behind both
 
 
-def test_a_failing_rewrite_leaves_the_earlier_rows(journal: ResultsDatabase) -> None:
+def test_a_column_of_the_cell_itself_that_cannot_be_stored_is_named(journal: ResultsDatabase) -> None:
+    assert "'rank_gap'" in journal.write_cell(cell_row(rank_gap=1j), query_rows())["reason"]
+    assert journal.rows("queries") == []
+
+
+def test_solutions_that_cannot_be_stored_are_named(journal: ResultsDatabase) -> None:
+    stored = journal.write_cell(cell_row(), query_rows(), [{"cell": "c1", "query": 0, "x": "not bytes"}])
+    assert "'x' of the table 'solutions'" in stored["reason"]
+
+
+def test_a_rewrite_that_cannot_be_stored_leaves_nothing_of_the_earlier_rows(journal: ResultsDatabase) -> None:
+    journal.write_cell(cell_row(), query_rows())
+    journal.write_cell(cell_row(), [*query_rows(count=1), *query_rows(status=None)])
+    assert [row["status"] for row in journal.rows("cells")] == ["error"]
+    assert journal.rows("queries") == []
+
+
+def test_a_disk_that_fails_is_no_fault_of_the_values(journal: ResultsDatabase) -> None:
     journal.write_cell(cell_row(), query_rows())
     before = journal.rows("cells"), journal.rows("queries")
-    with pytest.raises(sqlite3.Error):
-        journal.write_cell(cell_row(status="error"), [*query_rows(count=1), *query_rows(status=None)])
+    journal._db.execute("PRAGMA query_only=ON")
+    with pytest.raises(StorageError, match="cannot be written"):
+        journal.write_cell(cell_row(status="error"), query_rows(count=1))
     assert (journal.rows("cells"), journal.rows("queries")) == before
+
+
+@given(st.text(st.characters()), st.integers(-(10**300), 10**300) | st.floats() | st.none())
+def test_any_text_and_any_number_can_be_written_and_read(text: str, number: Any) -> None:
+    with tempfile.TemporaryDirectory() as folder, contextlib.closing(ResultsDatabase(Path(folder), STUDY)) as journal:
+        columns = {"problem": text, "dual": text, "primal": text, "reason": text, "solver": text}
+        content = {text.encode("utf-8", "replace").decode(): number}
+        options = json.dumps(content, ensure_ascii=False)
+        journal.write_cell(cell_row(fallbacks=text, definition=options, **columns), query_rows(**columns, gap=number))
+        history = {"artefact": "a", "stage": "pod", "problem": text, "step": 0, "quantity": text, "value": 1.0}
+        for value in (1.0, 2.0):
+            journal.write_histories([[history | {"value": value}]])
+        for table, count in (("cells", 1), ("queries", 2), ("histories", 1)):
+            found = journal.rows(table)
+            assert len(found) == count, table
+            assert all(value.isprintable() for row in found for value in row.values() if isinstance(value, str))
+        assert str(json.loads(journal.rows("cells")[0]["definition"])) == str(content)
+
+
+def test_a_long_text_is_cut_and_json_is_not(journal: ResultsDatabase) -> None:
+    whole = json.dumps({"points": list(range(5000))})
+    journal.write_cell(cell_row(reason="x" * 50_000_000, problem_options=whole, definition=whole), [])
+    (row,) = journal.rows("cells")
+    assert (row["problem_options"], row["definition"]) == (whole, whole)
+    assert row["reason"].endswith("x… (50000000 characters)")
+    assert len(row["reason"]) == LONGEST_TEXT
+
+
+def test_what_others_have_written_is_printable_when_it_is_read(journal: ResultsDatabase, tmp_path: Path) -> None:
+    journal.write_cell(cell_row(), [])
+    execute(tmp_path / "run", "UPDATE cells SET reason = CAST(x'411b5b324aff' AS TEXT), problem = 'a' || char(10)")
+    with open_read_only(tmp_path / "run" / FILE) as db:
+        assert db.execute("SELECT problem, reason FROM cells").fetchall() == [("a\\n", "A\\u001b[2J\ufffd")]
+
+
+def test_a_name_that_looks_like_a_uri_is_a_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    for name in ("file:run", "file:run?mode=memory", "a%20b#c", ":memory:", "\udcff"):
+        made = ResultsDatabase(Path(name), STUDY)
+        made.write_cell(cell_row(), [])
+        made.close()
+        assert read_meta(Path(name) / FILE)["schema"] == str(VERSION)
+        assert (tmp_path / name / FILE).is_file()
+    assert len(list(tmp_path.iterdir())) == 5
+
+
+def test_two_slashes_are_no_authority(journal: ResultsDatabase, tmp_path: Path) -> None:
+    assert read_meta(Path(f"/{tmp_path}") / "run" / FILE)["schema"] == str(VERSION)
 
 
 def test_a_rewritten_cell_has_only_its_new_queries(journal: ResultsDatabase) -> None:
@@ -131,11 +215,6 @@ def test_a_rewritten_cell_has_only_its_new_queries(journal: ResultsDatabase) -> 
     assert {row["cell"]: row["status"] for row in journal.rows("cells")} == {"c1": "ok", "c2": "ok"}
     assert sorted((row["cell"], row["query"]) for row in journal.rows("queries")) == [("c1", 0), ("c2", 0), ("c2", 1)]
     assert [row["gap"] for row in journal.rows("queries") if row["cell"] == "c1"] == [0.25]
-
-
-def test_queries_need_their_cell(journal: ResultsDatabase) -> None:
-    with pytest.raises(sqlite3.IntegrityError):
-        journal.write_cell(cell_row("c1"), query_rows("of nobody"))
 
 
 def test_finished_tells_status_and_code(journal: ResultsDatabase) -> None:

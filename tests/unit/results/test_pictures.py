@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -74,22 +75,55 @@ class Drawing(Wire):
     """A wire that draws itself on a line, one array of the wrong shape."""
 
     wrong = ""
+    kind: type = float
+    name: object = "u [m]"
 
     def picture(self, mu: Array, u: Array, lam: Array) -> Picture:
         x = np.linspace(0.0, 1.0, self.V.dim)[None]
         arrays = {"points": x, "values": u, "positions": x, "multiplier": lam, "triangles": np.zeros((3, 0), int)}
         if self.wrong:
             arrays[self.wrong] = np.zeros((3, 4))
-        return Picture(**arrays, name="u [m]", multiplier_name="λ [N]")
+        arrays["values"] = arrays["values"].astype(self.kind)
+        return Picture(**arrays, name=self.name, multiplier_name="λ [N]")  # type: ignore[arg-type]
 
 
-@pytest.mark.parametrize("wrong", ["points", "values", "positions", "multiplier"])
-def test_an_array_of_the_wrong_shape_is_named(wrong: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+Draws = Callable[..., tuple[tuple[str, Picture], ...]]
+
+
+@pytest.fixture
+def draws(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Draws:
+    """Function that gives the pictures of a wire which draws itself as asked for."""
     wire = Plugin("problem", "wire", "{}", "test")
     for module in ("vibench.stages.pictures", "vibench.stages.snapshots"):
         monkeypatch.setattr(f"{module}.build_problem", lambda _: Drawing())
     store = Store(tmp_path)
     carry_out(PictureStage(wire), store)
-    monkeypatch.setattr(Drawing, "wrong", wrong)
+
+    def draw(**how: object) -> tuple[tuple[str, Picture], ...]:
+        for name, value in how.items():
+            monkeypatch.setattr(Drawing, name, value)
+        return tuple(PictureStage(wire).run(store).value)
+
+    return draw
+
+
+@pytest.mark.parametrize("wrong", ["points", "values", "positions", "multiplier"])
+def test_an_array_of_the_wrong_shape_is_named(wrong: str, draws: Draws) -> None:
     with pytest.raises(NumericalError, match=f"picture has .*{wrong}.* of the wrong shape"):
-        PictureStage(wire).run(store)
+        draws(wrong=wrong)
+
+
+@pytest.mark.parametrize("kind", [str, complex, object])
+def test_an_array_that_holds_no_real_numbers_is_named(kind: type, draws: Draws) -> None:
+    with pytest.raises(NumericalError, match="picture has values of the wrong type"):
+        draws(kind=kind)
+
+
+@pytest.mark.parametrize("name", [None, 3, b"u"])
+def test_a_name_that_is_no_text_is_named(name: object, draws: Draws) -> None:
+    with pytest.raises(NumericalError, match="picture has name of the wrong type"):
+        draws(name=name)
+
+
+def test_the_name_of_a_field_is_one_printable_line(draws: Draws) -> None:
+    assert {picture.name for _, picture in draws(name="u\n\x1b[2J\ud800")} == {r"u \u001b[2J\ud800"}

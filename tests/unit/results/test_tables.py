@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import csv
 import io
+import json
+import re
 import sqlite3
 from pathlib import Path
 from typing import Any
@@ -29,10 +31,13 @@ from vibench.results.tables import (
     results_file,
     summary,
     to_csv,
+    to_json,
+    to_latex,
     to_markdown,
 )
 from vibench.study.cells import expand
 from vibench.study.reader import load_study
+from vibench.text import printable_lines
 
 STUDY = {"name": "sample", "seed": 1, "validation": 4, "accuracy": 1e-7}
 
@@ -234,11 +239,76 @@ def test_markdown_has_a_line_per_row() -> None:
     ]  # fmt: skip
 
 
-@pytest.mark.parametrize("text", ["a|b", "a\nb"])
+@pytest.mark.parametrize("text", ["a|b", "a\nb", "a\\|b", "|", "\\"])
 def test_markdown_survives_what_would_end_a_cell(text: str) -> None:
     lines = to_markdown(pd.DataFrame({"name": [text, "c"], "value": [1, 2]})).splitlines()
     assert len(lines) == 4
-    assert {line.replace("\\|", "").count("|") for line in lines} == {3}
+    assert {len(re.findall(r"(?<!\\)(?:\\\\)*\|", line)) for line in lines} == {3}
+
+
+@pytest.mark.parametrize(
+    ("text", "escaped"),
+    [
+        ("<img src=x onerror=alert(1)>", "&lt;img src=x onerror=alert(1)&gt;"), ("`rm`", r"\`rm\`"),
+        ("[a](javascript:b) [c][d] ![e](f)", r"[a\](javascript:b) [c\][d] ![e\](f)"),
+        ("*a* _b_ __c__", r"\*a\* \_b\_ \_\_c\_\_"),
+        ("&lt;", "&amp;lt;"), ("$x$ ~~y~~", "&#36;x&#36; &#126;&#126;y&#126;&#126;"), (r"\*", r"\\\*"),
+        ("dual_residual of offline-pga, δ = 0.1 [ms] (95 %)", "dual_residual of offline-pga, δ = 0.1 [ms] (95 %)"),
+    ],
+)  # fmt: skip
+def test_markdown_shows_text_as_it_is(text: str, escaped: str) -> None:
+    lines = to_markdown(pd.DataFrame({"name": [text], text: ["a"]})).splitlines()
+    assert lines[2].strip("| ").split("|")[0].strip() == escaped
+    assert lines[0].strip("| ").rpartition("|")[2].strip() == escaped
+
+
+@given(st.text(st.characters()))
+def test_markdown_has_no_markup_of_others(text: str) -> None:
+    page = to_markdown(pd.DataFrame({"name": [text, "c"]}))
+    assert len(page.splitlines()) == 4
+    assert not re.search(r"[<>~$]", page)
+    assert not re.search(r"(?<!\\)(?:\\\\)*([`*]|\][(\[])", page)
+
+
+@pytest.mark.parametrize("text", ["=1+1", "+1+1", "-1+1", "@SUM(1)", "\n=1", "＝1+1", "=HYPERLINK(1)", "-2+cmd|a!A0"])
+def test_csv_has_no_formulas(text: str) -> None:
+    """As OWASP advises: spreadsheets take what begins with these characters for a formula, an apostrophe for text."""
+    frame = pd.read_csv(io.StringIO(to_csv(pd.DataFrame({"name": [text], text: [f"a {text}"]}))))
+    assert list(frame.columns) == ["name", f"'{text}"]
+    assert frame.iloc[0].tolist() == [f"'{text}", f"a {text}"]
+
+
+def test_csv_leaves_numbers_alone() -> None:
+    values = {"number": [-1.5, float("inf"), -float("inf"), None], "text": ["-1.5", "+2", "-1e-7", "-inf"]}
+    _, *rows = csv.reader(io.StringIO(to_csv(pd.DataFrame(values))))
+    assert [row for row, _ in rows] == ["-1.5", "inf", "-inf", ""]
+    assert [row for _, row in rows] == ["-1.5", "+2", "-1e-7", "-inf"]
+
+
+@given(st.lists(st.text(st.characters()), max_size=5))
+def test_csv_read_again_has_the_same_texts(texts: list[str]) -> None:
+    _, *rows = csv.reader(io.StringIO(to_csv(pd.DataFrame({"name": texts, "k": 1})), newline=""))
+    shown = list(map(printable_lines, texts))
+    assert [name if name in shown else name.removeprefix("'") for name, _ in rows] == shown
+    assert not any(name.startswith(("=", "@", "\t", "\r", "\n")) for name, _ in rows)
+
+
+@given(st.text(st.characters()))
+def test_json_is_printable_and_has_the_same_texts(text: str) -> None:
+    page = to_json(pd.DataFrame({"name": [text]}))
+    assert all(line.isprintable() for line in page.split("\n"))
+    whole = text.encode("utf-16", "surrogatepass").decode("utf-16", "surrogatepass")  # JSON joins two halves
+    assert json.loads(page) == [{"name": whole}]
+
+
+def test_latex_shows_text_as_it_is() -> None:
+    r"""A row that begins with [ or * would be an argument of \\ or \midrule before it."""
+    page = to_latex(pd.DataFrame({"name": ["[2cm] a", "*b", r"\input{x}% <c> | 5 $ #_~^&"]}))
+    assert page.splitlines()[4:7] == [
+        r"{[}2cm] a \\", r"{*}b \\",
+        r"\textbackslash{}input\{x\}\% \textless{}c\textgreater{} \textbar{} 5 \$ \#\_\textasciitilde{}"
+        r"\textasciicircum{}\& \\",
+    ]  # fmt: skip
 
 
 def test_a_real_run_exports_its_whole_matrix(quick_run: Path) -> None:

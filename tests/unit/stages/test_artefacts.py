@@ -5,9 +5,12 @@ from __future__ import annotations
 import pickle
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from vibench.errors import RequestError, StorageError
 from vibench.stages import artefacts as module
@@ -21,6 +24,25 @@ HISTORY = History({"stage": "pod"}, "error", (1.0, 0.5))
 def files(folder: Path) -> list[str]:
     """All but the key of the digests."""
     return sorted(path.name for path in folder.iterdir() if path.name != SECRET)
+
+
+@given(st.one_of(st.text(st.characters()), st.integers(), st.none()), st.lists(st.integers() | st.floats()))
+def test_a_history_holds_numbers_under_a_printable_name(quantity: object, values: list[float]) -> None:
+    try:
+        found = History.of("enrichment", quantity, np.array(values, dtype=object), 2)
+    except OverflowError:
+        assert max(map(abs, values)) > 1e308
+        return
+    assert found.quantity.isprintable()
+    assert all(type(value) is float for value in found.values)
+    np.testing.assert_array_equal(found.values, [float(value) for value in values])
+    assert (found.stage, found.first_step) == ("enrichment", 2)
+
+
+@pytest.mark.parametrize("values", [["many"], [None], [1.0, 1j], [[1.0, 2.0]]])
+def test_a_history_of_anything_else_is_refused(values: list[Any]) -> None:
+    with pytest.raises((TypeError, ValueError)):
+        History.of("enrichment", "steps", values)
 
 
 def test_what_is_put_is_got_by_another_process(tmp_path: Path) -> None:

@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from vibench.report.figures.data import Data, best_solver, by_dimensions, label
-from vibench.report.figures.style import BLACK, POINTS, Sheet, line, plot, style_of
+from vibench.report.figures.style import BLACK, POINTS, Sheet, legend_label, line, plot, style_of
 from vibench.results.break_even import HIGH_FIDELITY, Meaning
 
 ERRORS = {"error_u_mean": "mean relative error of u", "error_lambda_mean": "mean relative error of λ"}
@@ -52,7 +52,8 @@ def _scatter(
     for panel, (column, ylabel) in zip(sheet.panels, ERRORS.items(), strict=True):
         for (primal, assembly, dual), mine in cells.groupby(["primal", "assembly", "dual"]):
             point = _point(kinds.index((primal, assembly)), duals.index(dual))
-            panel.plot(x[mine.index], mine[column], label=f"{label(primal, None, assembly)}, {dual}", **point)
+            name = f"{label(primal, None, assembly)}, {dual}"
+            panel.plot(x[mine.index], mine[column], label=legend_label(name), **point)
         if front:
             line_of = _front(x.to_numpy(float), cells[column].to_numpy(float))
             panel.plot(*line_of, color="0.6", linewidth=0.8, drawstyle="steps-post", zorder=0)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -152,5 +153,16 @@ def longest(histories: pd.DataFrame) -> Iterator[tuple[Any, pd.DataFrame]]:
 
 def file_names(labels: list[str]) -> list[str]:
     """File names for labels, in their order, all different."""
-    plain = [re.sub(r"[^\w.=-]+", "-", label).strip("-.")[:60] or "unnamed" for label in labels]
-    return [name if plain.count(name) == 1 else f"{name}-{plain[:k].count(name) + 1}" for k, name in enumerate(plain)]
+    plain = [_file_name(label) for label in labels]
+    found: list[str] = []
+    for name in plain:
+        numbered = (f"{name}-{k}" for k in count(1))
+        taken = {*plain, *found}
+        found.append(name if plain.count(name) == 1 else next(one for one in numbered if one not in taken))
+    return found
+
+
+def _file_name(label: str) -> str:
+    """The letters and digits of a label; a file system counts bytes, and two labels are part of one name."""
+    plain = re.sub(r"[^\w.=-]+", "-", label).strip("-.")[:60]
+    return plain.encode()[:90].decode(errors="ignore") or "unnamed"

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import math
 import textwrap
+import warnings
 from collections.abc import Iterable
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import matplotlib as mpl
 import numpy as np
@@ -51,6 +52,10 @@ STYLE: Any = {
     "legend.frameon": False,
     "savefig.dpi": 150,
     "svg.hashsalt": "vibench",
+    # Labels are text of others: a dollar sign in them is no formula, whatever the user's own settings are.
+    "text.parse_math": False,
+    "text.usetex": False,
+    "axes.formatter.use_mathtext": False,
 }
 
 CHARACTER, TITLE_CHARACTER = 0.068, 0.085
@@ -143,7 +148,12 @@ def style_of(name: str, known: dict[str, int]) -> int:
 
 def plot(axes: Axes, x: Any, y: Any, k: int, label: str | None = None, **more: Any) -> None:
     """Draw a line in style k."""
-    axes.plot(x, y, label=label, **line(k, len(x)) | more)
+    axes.plot(x, y, label=legend_label(label), **line(k, len(x)) | more)
+
+
+def legend_label(text: str | None) -> str | None:
+    """A label for the legend; Matplotlib would leave out one that begins with an underscore."""
+    return f" {text}" if text is not None and text.startswith("_") else text
 
 
 def _ticks(axes: Axes) -> None:
@@ -188,5 +198,12 @@ def save(figure: Figure, folder: Path, name: str, formats: Iterable[str] = FORMA
     """Write a figure in every format; returns the files."""
     files = {form: folder / f"{name}.{form}" for form in formats}
     for form, file in files.items():
-        figure.savefig(file, **WRITTEN[form])
+        write_figure(figure, file, form)
     return list(files.values())
+
+
+def write_figure(figure: Figure, target: Path | BinaryIO, form: str) -> None:
+    """Write a figure in a format; a character that the font does not have is a box, and no warning."""
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", r"Glyph \d+|Matplotlib currently does not support", UserWarning)
+        figure.savefig(target, format=form, **WRITTEN[form])

@@ -1,0 +1,41 @@
+"""Text from others as data: nothing that a plugin, a solver, a study or a results file says acts where it is shown."""
+
+from __future__ import annotations
+
+import json
+
+LONGEST = 2000
+"""Characters that are kept of a message or a status."""
+
+
+def printable(text: str) -> str:
+    r"""A text with its characters that are not printable as JSON escapes: ``\u001b``, ``\n``, ``\ud800``.
+
+    These are control and format characters, lone surrogates and all white space but the blank. JSON keeps its content.
+    """
+    if text.isprintable():
+        return text
+    return "".join(c if c.isprintable() else json.dumps(c)[1:-1] for c in text)
+
+
+def printable_lines(text: str) -> str:
+    """A text of several lines, each of them `printable`."""
+    return "\n".join(map(printable, text.split("\n")))
+
+
+def brief(text: str, longest: int = LONGEST) -> str:
+    """A text as `printable` shows it, of at most `longest` characters; what is cut says how long it was."""
+    return _cut(printable(text[:longest]), len(text), longest)
+
+
+def one_line(text: str) -> str:
+    """A `brief` text with blanks in place of line breaks and tabs."""
+    return _cut(printable(" ".join(text[:LONGEST].split())), len(text), LONGEST)
+
+
+def _cut(shown: str, length: int, longest: int) -> str:
+    """What is shown of a text of that length, of which no more than the `longest` first characters were looked at."""
+    if max(length, len(shown)) <= longest:
+        return shown
+    note = f"… ({length} characters)"
+    return shown[: longest - len(note)] + note
