@@ -162,9 +162,7 @@ def draw_shares(field: Field) -> Figure:
     """Share of β_on over vectors, one line per primal strategy, with the cone of mcpg."""
     chosen = [(key, steps) for key, steps in field.longest() if key[3] == REFERENCE]
     pairs = list(dict.fromkeys(key[:3] for key, _ in chosen))
-    sheet = Sheet(
-        2, -(-len(pairs) // 2), "Smallest β_S over the training set as a share of the smallest β_on, cone of mcpg"
-    )
+    sheet = Sheet(2, -(-len(pairs) // 2), "Smallest share of β_S(µ) in β_on(µ) over the training set, cone of mcpg")
     for panel, pair in zip(sheet.panels, pairs, strict=True):
         for k, (key, steps) in enumerate((key, steps) for key, steps in chosen if key[:3] == pair):
             plot(panel, steps["step"], steps["share"], k, key[4])
@@ -211,8 +209,8 @@ SECTIONS: dict[str, tuple[str, Callable[[Field], pd.DataFrame]]] = {
         cones,
     ),
     "Enrichments": (
-        f"Cone of {REFERENCE}, tighter tolerances. The share is the smallest of β_S(µ) / β_on(µ), both over the span, on the "
-        "training set; it is 1 where supremizers are added at every parameter.",
+        f"Cone of {REFERENCE}, tighter tolerances. The share is the smallest of β_S(µ) / β_on(µ), both over the span, "
+        "on the training set; it is 1 where supremizers are added at every parameter.",
         primals,
     ),
     "Vectors for a share of β_on": (
