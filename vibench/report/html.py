@@ -19,11 +19,12 @@ from vibench.errors import RequestError
 from vibench.files import write_atomically
 from vibench.qp.status import Status
 from vibench.report.figures import drawings
-from vibench.report.figures.style import WRITTEN, styled
+from vibench.report.figures.style import styled, write_figure
 from vibench.report.findings import findings
 from vibench.results import pictures, tables
 from vibench.results.break_even import HIGH_FIDELITY
 from vibench.results.database import read_meta, study_of
+from vibench.text import printable
 
 IDENTITY = ["problem", "dual", "primal", "primal_tol", "solver", "accuracy", "assembly", "status"]
 """Columns that cells and queries share in the tables of failures."""
@@ -48,7 +49,9 @@ def write(path: Path, target: Path) -> Path:
 
 def page(path: Path) -> str:
     """The page of a results file."""
-    environment = Environment(loader=PackageLoader("vibench.report"), autoescape=True, undefined=StrictUndefined)
+    environment = Environment(
+        loader=PackageLoader("vibench.report"), autoescape=True, undefined=StrictUndefined, finalize=_printable
+    )
     template = environment.get_template("grid.html.j2")
     cells, queries = tables.read(path, "cells"), tables.read(path, "queries")
     study = study_of(path, read_meta(path))
@@ -70,6 +73,11 @@ def page(path: Path) -> str:
         figures=list(_figures(path)),
         grid=grid,
     )
+
+
+def _printable(value: Any) -> Any:
+    """A text that a template shows; what it has rendered itself stays as it is."""
+    return printable(value) if isinstance(value, str) and not isinstance(value, Markup) else value
 
 
 def _facts(study: dict[str, Any], cells: pd.DataFrame) -> Iterator[tuple[str, str]]:
@@ -120,6 +128,6 @@ def _figures(path: Path) -> Iterator[tuple[str, str, str]]:
             if figure is None:
                 continue
             stream = io.BytesIO()
-            figure.savefig(stream, format="svg", **WRITTEN["svg"])
+            write_figure(figure, stream, "svg")
         source = "data:image/svg+xml;base64," + base64.b64encode(stream.getvalue()).decode("ascii")
         yield name, " ".join((inspect.getdoc(draw) or "").split()), source

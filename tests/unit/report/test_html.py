@@ -11,13 +11,17 @@ from html.parser import HTMLParser
 from pathlib import Path
 
 import pytest
+from markupsafe import escape
+from outputs import clean, elements
 from running import Changed
 
 from vibench.report import html
 from vibench.report.figures import drawings
 from vibench.report.findings import findings
 from vibench.results import tables
+from vibench.results.columns import TABLES
 from vibench.results.database import FILE
+from vibench.text import brief
 
 REQUIRED = "VIBENCH_NEEDS_BROWSER"
 """Where this is set, a missing browser is a failure."""
@@ -155,6 +159,33 @@ def test_every_failure_has_its_reason_and_nothing_is_markup(changed: Changed, mo
     assert page.count("one of many") >= failed
     assert page.count("no picture of ") == 1
     assert "no picture of wire: no &lt;mesh&gt;" in page
+
+
+@pytest.mark.parametrize(
+    "label", ["</script><script>alert(1)</script>", "<img src=x onerror=alert(1)>", '" onclick="x']
+)
+def test_a_label_is_no_markup_wherever_it_stands(label: str, changed: Changed, monkeypatch: pytest.MonkeyPatch) -> None:
+    """In tables, attributes, findings and facts, those that come from JSON included."""
+    monkeypatch.setattr(html, "drawings", lambda _: iter(()))
+    plain = elements(html.page(changed()))
+    label += "\x1b[31m\n\ud800"
+    known = json.dumps({"name": label, "seed": label})
+    axes = [
+        f"UPDATE {table} SET {axis} = '{brief(label)}'"
+        for table in ("cells", "queries", "histories", "thresholds", "disagreements")
+        for axis in ("problem", "dual", "primal", "solver")
+        if axis in TABLES[table]
+    ]
+    results = changed(
+        *axes,
+        f"UPDATE meta SET value = '{known}' WHERE key = 'study'",
+        f"UPDATE cells SET versions = '{known}', reason = 'a' || char(27) || char(7), status = 'failed'",
+    )
+    page = html.page(results)
+    assert elements(page) <= plain | {"td.class", "p.class", "h3"}
+    assert page.count("<script") == page.count("</script") == 1
+    assert clean(page)
+    assert escape(brief(label)) in page
 
 
 def test_a_run_without_any_query_has_a_report(changed: Changed) -> None:
