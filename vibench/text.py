@@ -23,14 +23,19 @@ def printable_lines(text: str) -> str:
     return "\n".join(map(printable, text.split("\n")))
 
 
+def unbroken(text: str) -> str:
+    """A `printable` text with blanks in place of line breaks and tabs."""
+    return printable(" ".join(text.split()))
+
+
 def brief(text: str, longest: int = LONGEST) -> str:
     """A text as `printable` shows it, of at most `longest` characters; what is cut says how long it was."""
     return _cut(printable(text[:longest]), len(text), longest)
 
 
 def one_line(text: str) -> str:
-    """A `brief` text with blanks in place of line breaks and tabs."""
-    return _cut(printable(" ".join(text[:LONGEST].split())), len(text), LONGEST)
+    """An `unbroken` text of at most `LONGEST` characters, cut as a `brief` one."""
+    return _cut(unbroken(text[:LONGEST]), len(text), LONGEST)
 
 
 def _cut(shown: str, length: int, longest: int) -> str:

@@ -7,6 +7,7 @@ import json
 import shutil
 from collections.abc import Mapping
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import fake_plugins
@@ -143,14 +144,20 @@ FAKES: Mapping[str, Mapping[str, str]] = {
 
 def install_fakes(folder: Path) -> Path:
     """Lay the third-party package out in a folder as an installer would; returns the folder."""
+    return install(folder, fake_plugins, FAKES)
+
+
+def install(folder: Path, module: ModuleType, members: Mapping[str, Mapping[str, str]]) -> Path:
+    """Lay a package of one module out in a new folder; `members` is what it registers, as `FAKES`."""
     folder.mkdir(parents=True)
-    shutil.copy(str(fake_plugins.__file__), folder)
-    information = folder / "fake_plugins-1.0.dist-info"
+    shutil.copy(str(module.__file__), folder)
+    name = module.__name__
+    information = folder / f"{name}-1.0.dist-info"
     information.mkdir()
-    (information / "METADATA").write_text("Metadata-Version: 2.1\nName: fake-plugins\nVersion: 1.0\n")
+    (information / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name.replace('_', '-')}\nVersion: 1.0\n")
     lines: list[str] = []
-    for group, members in FAKES.items():
-        lines += [f"[{group}]", *(f"{name} = fake_plugins:{member}" for name, member in members.items())]
+    for group, registered in members.items():
+        lines += [f"[{group}]", *(f"{plugin} = {name}:{member}" for plugin, member in registered.items())]
     (information / "entry_points.txt").write_text("\n".join(lines) + "\n")
     return folder
 

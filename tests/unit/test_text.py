@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from vibench.errors import in_a_line
-from vibench.text import LONGEST, brief, one_line, printable, printable_lines
+from vibench.text import LONGEST, brief, one_line, printable, printable_lines, unbroken
 
 ANYTHING = st.text(st.characters())
 """All of Unicode: `st.text()` alone draws no surrogates."""
@@ -17,7 +17,7 @@ ANYTHING = st.text(st.characters())
 
 @given(ANYTHING)
 def test_what_comes_out_is_printable_and_stays_as_it_is(text: str) -> None:
-    for clean in (printable, brief, one_line):
+    for clean in (printable, unbroken, brief, one_line):
         shown = clean(text)
         assert shown.isprintable()
         assert clean(shown) == shown
@@ -26,7 +26,7 @@ def test_what_comes_out_is_printable_and_stays_as_it_is(text: str) -> None:
 
 @given(st.text(st.characters(exclude_categories=("C", "Z")), max_size=LONGEST))
 def test_what_is_printable_is_not_touched(text: str) -> None:
-    assert printable(text) == brief(text) == one_line(text) == text
+    assert printable(text) == unbroken(text) == brief(text) == one_line(text) == text
 
 
 @pytest.mark.parametrize(

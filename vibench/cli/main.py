@@ -19,7 +19,7 @@ from vibench.cli.output import echo
 from vibench.cli.plugin_commands import check_plugin, list_plugins, new_plugin
 from vibench.cli.result_commands import compare_runs, export_qps, replay_query, show, write_report
 from vibench.errors import RequestError, VibenchError
-from vibench.text import printable
+from vibench.text import unbroken
 
 Names = list[str] | None
 Tolerances = list[float] | None
@@ -188,5 +188,5 @@ def main() -> None:
 
 
 def _print_error(error: object, code: int) -> int:
-    sys.stderr.write(f"vibench: {printable(' '.join(str(error).split()))}\n")
+    sys.stderr.write(f"vibench: {unbroken(str(error))}\n")
     return code

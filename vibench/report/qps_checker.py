@@ -60,7 +60,7 @@ def main(folder: Path) -> int:
             if not honest or (row["status"] == "ok" and not good):
                 wrong += 1
                 about = f"{row['program']} {row['solver']} at {row['accuracy']}: {row['status']}"
-                print(f"{about}, claimed {claimed}, found {found}")
+                print(f"{about!r}, claimed {claimed}, found {found}")  # the rows may be those of others
     print(f"{count} solutions, {fine} claimed ok, {wrong} wrong")
     return wrong
 

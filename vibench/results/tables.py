@@ -15,7 +15,7 @@ from vibench.errors import RequestError
 from vibench.files import write_atomically
 from vibench.results.columns import CELLS, INTEGER, KEYS, STORED, TABLES, THRESHOLDS, VERSION, Column, shown_columns
 from vibench.results.database import FILE, open_read_only, read_meta
-from vibench.text import printable, printable_lines
+from vibench.text import printable, printable_lines, unbroken
 
 ORDER = (
     *KEYS, "primal_a", "primal_b", "primal_tol_a", "primal_tol_b", "assembly_a", "assembly_b", "stage", "quantity",
@@ -168,12 +168,8 @@ def _latex(text: str) -> str:
 
 def _as_text(frame: pd.DataFrame, escape: Callable[[str], str]) -> pd.DataFrame:
     """The table as it is printed, special characters escaped and line breaks removed."""
-    rows = [[escape(_in_a_line(cell_text(value))) for value in row] for row in frame.itertuples(index=False)]
-    return pd.DataFrame(rows, columns=[escape(_in_a_line(str(name))) for name in frame.columns])
-
-
-def _in_a_line(text: str) -> str:
-    return printable(" ".join(text.split()))
+    rows = [[escape(unbroken(cell_text(value))) for value in row] for row in frame.itertuples(index=False)]
+    return pd.DataFrame(rows, columns=[escape(unbroken(str(name))) for name in frame.columns])
 
 
 def to_json(frame: pd.DataFrame) -> str:

@@ -1,0 +1,136 @@
+"""Any text and any count go from a solver through the results file to every output, and act in none of them."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import json
+import tempfile
+from pathlib import Path
+from typing import Any
+from unittest import mock
+from xml.etree import ElementTree
+
+import numpy as np
+import pandas as pd
+import pytest
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+from odd_plugins import LABEL, ODD
+from outputs import clean, elements
+from samples import cell_row, query_rows
+
+from vibench.cli.console import print_frame
+from vibench.interfaces.problem import VariationalInequality
+from vibench.qp.solution import QPSolution
+from vibench.report import html
+from vibench.report.figures import dimension, problems
+from vibench.report.figures.style import styled, write_figure
+from vibench.results import pictures, tables
+from vibench.results.columns import STORED, TABLES
+from vibench.results.database import FILE, ResultsDatabase
+from vibench.stages.query import Query, run_query
+from vibench.study import registry
+
+ANYTHING = st.text(st.characters(), max_size=50) | st.sampled_from([LABEL, ODD, "$$", "_", "[/b]", "=1", "|", "\\", ""])
+"""All of Unicode, lone surrogates included."""
+
+COUNTS = st.integers() | st.floats() | st.none() | st.text() | st.booleans()
+
+SAMPLES = {"TEXT": "text", "REAL": 0.5, "INTEGER": 3, "BLOB": b""}
+
+
+def sample(table: str, **columns: Any) -> dict[str, Any]:
+    """A row of a table in which every column is filled; columns that it does not have are left out."""
+    row = {name: SAMPLES[column.kind.split()[0]] for name, column in STORED[table].items()}
+    return row | {name: value for name, value in columns.items() if name in row}
+
+
+def answered(text: str, count: Any) -> dict[str, Any]:
+    """The row of a query whose solver is right, and says this of itself."""
+
+    def solver(program: VariationalInequality, accuracy: float) -> QPSolution:
+        return QPSolution(np.ones(1), np.zeros(1), text, count)
+
+    with mock.patch.object(registry, "qp_solver", lambda name: {name: solver}):
+        row, _ = run_query(Query(PROGRAM, None, "odd", 1e-7), 60.0, lambda _: None)
+    assert row["status"] == "ok", row["reason"]
+    return row
+
+
+PROGRAM = VariationalInequality(np.eye(1), np.ones(1), np.eye(1), np.full(1, 2.0))
+"""Solved by x = 1, α = 0."""
+
+
+def recorded(folder: Path, text: str, count: Any) -> Path:
+    """A results file in which a text stands wherever one of others may."""
+    names = dict.fromkeys(("problem", "dual", "primal", "solver", "solver_a", "solver_b", "primal_a", "primal_b"), text)
+    options = {f"{axis}_options": json.dumps({"of": text}) for axis in ("problem", "dual", "primal")}
+    said = names | options | {"fallbacks": text, "quantity": text, "versions": json.dumps({"numpy": text})}
+    said |= {
+        "stage": "cone",
+        "meaning": "never",
+        "assembly": "full",
+        "solver_share_mean": 0.01,
+        "definition": json.dumps(names),
+    }
+    of_cells, of_queries = ({k: v for k, v in said.items() if k in TABLES[table]} for table in ("cells", "queries"))
+    with contextlib.closing(ResultsDatabase(folder, {"name": text, "seed": 1, "validation": 2})) as database:
+        database.write_cell(cell_row(**of_cells), query_rows(**of_queries | answered(text, count)))
+        lost = {"status": "error", "reason": text}
+        database.write_cell(cell_row("c2", **of_cells | lost), query_rows("c2", **of_queries | lost))
+        database.write_histories([[sample("histories", **said)]])
+        for table in ("thresholds", "disagreements"):
+            database.replace(table, [sample(table, **said)])
+        database.replace("pictures", [sample("pictures", **said) | pictures.failure_rows(text)[0] | {"data": None}])
+    return folder / FILE
+
+
+def outputs(path: Path) -> list[str]:
+    """Every table of a results file in every format, and the summary as it is shown."""
+    read = {table: tables.in_order(tables.read(path, table)) for table in TABLES}
+    found = [form(frame) for frame in read.values() for form in tables.FORMS.values()]
+    summary = tables.summary(read["cells"])
+    with contextlib.redirect_stdout(io.StringIO()) as out:
+        print_frame(summary, "summary")
+        print_frame(read["disagreements"], "disagreements")
+    return [*found, tables.to_markdown(summary), out.getvalue()]
+
+
+def page(path: Path) -> str:
+    with mock.patch.object(html, "drawings", return_value=()):
+        return html.page(path)
+
+
+def drawn(path: Path) -> str:
+    """One of the figures, which has labels everywhere."""
+    stream = io.BytesIO()
+    (data,) = [data for _, data in problems(path)]
+    with styled():
+        figure = dimension(data)
+        assert figure is not None
+        write_figure(figure, stream, "svg")
+    return stream.getvalue().decode("utf-8")
+
+
+@pytest.fixture(scope="module")
+def own(tmp_path_factory: pytest.TempPathFactory) -> set[str]:
+    """The elements of a report on plain text."""
+    return elements(page(recorded(tmp_path_factory.mktemp("plain"), "plain", 3)))
+
+
+@settings(max_examples=10)
+@given(text=ANYTHING, count=COUNTS)
+@example(text=ODD, count=2**80)
+@example(text=LABEL, count=float("nan"))
+@example(text="$x^{ $", count=-(2**63) - 1)
+def test_any_text_and_any_count_go_through(own: set[str], text: str, count: Any) -> None:
+    with tempfile.TemporaryDirectory() as folder:
+        path = recorded(Path(folder), text, count)
+        assert [row["status"] for row in tables.read(path, "cells").to_dict("records")] == ["ok", "error"]
+        iterations = tables.read(path, "queries")["iterations"].iloc[0]
+        assert iterations == count if isinstance(count, int) and 0 <= count < 2**63 else pd.isna(iterations)
+        report, picture = page(path), drawn(path)
+        assert [found for found in [*outputs(path), report, picture] if not clean(found)] == []
+        assert elements(report) <= own | {"td.class"}
+        ElementTree.fromstring(picture)

@@ -1,0 +1,146 @@
+"""Text from others is data: whatever plugins, solvers, studies and results files say, a run ends and nothing acts."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+from typing import Any
+
+import fake_plugins
+import odd_plugins
+import pytest
+from odd_plugins import LABEL, ODD
+from outputs import clean, elements
+from running import Vibench, rows
+from samples import install, wire_study, write_study
+
+from vibench.results import pictures, tables
+from vibench.results.columns import TABLES
+from vibench.results.database import FILE
+from vibench.results.values import LONGEST_TEXT
+from vibench.text import printable
+
+PLUGINS = {
+    "vibench.problems": {"odd-wire": "OddWire"},
+    "vibench.dual_strategies": {"odd-cone": "OddCone"},
+    "vibench.primal_strategies": {"odd-enrichment": "OddEnrichment", "wordy-enrichment": "WordyEnrichment"},
+    "vibench.qp_solvers": {
+        "odd-raises": "raises", "odd-unreadable": "raises_unreadably", "odd-gives-up": "gives_up",
+        "odd-counts": "counts_far",
+    },
+}  # fmt: skip
+
+STUDY = wire_study(
+    problem=[{"name": "odd-wire", "label": LABEL}],
+    dual=["odd-cone", {"name": "cpg", "label": f"@{LABEL}"}],
+    primal=["wordy-enrichment", {"name": "odd-enrichment", "label": f"_{LABEL}"}, "decorrelated"],
+    solvers=[*PLUGINS["vibench.qp_solvers"], "piqp"],
+    timing_rounds=2,
+)
+"""What goes wrong comes first."""
+
+
+@pytest.fixture(scope="module")
+def plugins_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Where the third-party package is installed; the plugins it is derived from are not registered."""
+    folder = install(tmp_path_factory.mktemp("third-party") / "site", odd_plugins, PLUGINS)
+    shutil.copy(str(fake_plugins.__file__), folder)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def ended(vibench: Vibench, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
+    """The folder of a run that ended, and what it printed."""
+    folder = tmp_path_factory.mktemp("odd")
+    done = vibench(
+        folder, "run", write_study(folder, STUDY), "--jobs", "2", "--out", "run", figures=True, timeout=300.0
+    )
+    assert (done.returncode, done.stderr) == (0, "")
+    return folder, done.stdout
+
+
+def by_strategies(run: Path, table: str) -> dict[tuple[str, str, str], list[dict[str, Any]]]:
+    """The rows of a table by dual strategy, primal strategy and solver."""
+    found: dict[tuple[str, str, str], list[dict[str, Any]]] = {}
+    for row in rows(run, table):
+        found.setdefault((row["dual"], row["primal"], row["solver"]), []).append(row)
+    return found
+
+
+def test_the_run_ends_with_a_row_for_every_cell(ended: tuple[Path, str]) -> None:
+    cells = {key: found for key, (found,) in by_strategies(ended[0] / "run", "cells").items()}
+    cpg, own = printable(f"@{LABEL}"), printable(f"_{LABEL}")
+    assert len(cells) == 30
+    assert {row["problem"] for row in cells.values()} == {printable(LABEL)}
+    for (dual, primal, solver), row in cells.items():
+        if dual != cpg:
+            expected = ("error", f"in cone: OddError: {printable(' '.join(ODD.split()))}xxx")
+        elif primal == "wordy-enrichment":
+            expected = ("error", "in enrichment: ValueError: could not convert string to float")
+        else:
+            expected = {
+                "odd-raises": ("error", "3 of 3 queries, first mu="),
+                "odd-unreadable": ("error", "3 of 3 queries, first mu="),
+                "odd-gives-up": ("failed", "3 of 3 queries, first mu="),
+            }.get(solver, ("ok", ""))
+        assert (row["status"], row["reason"][: len(expected[1])]) == expected, (dual, primal, solver)
+        assert len(row["reason"]) <= LONGEST_TEXT
+        if row["status"] == "ok" and primal == own:
+            assert row["fallbacks"].startswith(printable(ODD))
+            assert len(row["fallbacks"]) == LONGEST_TEXT
+    unreadable = cells[cpg, "decorrelated", "odd-unreadable"]
+    assert unreadable["reason"].endswith("UnreadableError: its message cannot be read")
+
+
+def test_iterations_that_are_no_number_of_them_are_missing_and_nothing_else_is(ended: tuple[Path, str]) -> None:
+    queries = by_strategies(ended[0] / "run", "queries")
+    cpg = printable(f"@{LABEL}")
+    pairs = zip(queries[cpg, "decorrelated", "odd-counts"], queries[cpg, "decorrelated", "piqp"], strict=True)
+    for odd, plain in pairs:
+        assert (odd["status"], odd["iterations"]) == ("ok", None)
+        assert odd["solver_status"] == printable(" ".join(ODD.split()))
+        assert plain["iterations"] > 0
+        assert odd["error_u"] == pytest.approx(plain["error_u"], rel=1e-3)
+
+
+def test_histories_and_pictures_have_printable_names(ended: tuple[Path, str]) -> None:
+    run = ended[0] / "run"
+    known = {row["quantity"]: row["value"] for row in rows(run, "histories") if row["step"] == 0}
+    quantity = printable(" ".join(ODD.split()))
+    assert known[quantity] in (float(2**70), float(2**80))
+    assert known["-"] is None
+    shown = list(pictures.read(run / FILE))
+    assert {one.reason for one in shown} == {""}
+    assert {one.picture.name for one in shown if one.picture is not None} == {quantity}
+    assert len(shown) == 3
+
+
+def test_a_later_run_resumes_behind_all_of_it(ended: tuple[Path, str], vibench: Vibench) -> None:
+    folder, _ = ended
+    before = rows(folder / "run")
+    done = vibench(folder, "run", "study.toml", "--jobs", "1", "--out", "run")
+    assert (done.returncode, done.stderr) == (0, "")
+    assert done.stdout.startswith("30 cells, 0 to run, 0 stages\n")
+    assert rows(folder / "run") == before
+
+
+def test_whatever_is_printed_and_written_is_printable(ended: tuple[Path, str], vibench: Vibench) -> None:
+    folder, printed = ended
+    run = folder / "run"
+    written = [*(run / "tables").iterdir(), *(run / "figures").glob("*.svg")]
+    assert len(list((run / "figures").glob("*.png"))) == len(written) - len(TABLES) - 1 >= 8
+    texts = [printed, *(path.read_text(encoding="utf-8") for path in written)]
+    assert (run / FILE).stat().st_size < 5_000_000
+    cell = next(row["cell"] for row in rows(run) if (row["solver"], row["status"]) == ("odd-counts", "ok"))
+    commands = [["report", "run"], ["diff", "run", "run"], ["replay", "run", cell], ["run", "study.toml", "--dry-run"]]
+    commands += [["show", "run", "--table", table] for table in ("benefits", "queries")]
+    commands += [["show", "run", "--format", form] for form in tables.FORMS]
+    for command in commands:
+        done = vibench(folder, *command)
+        assert (done.returncode, done.stderr) == (0, ""), command
+        texts.append(done.stdout)
+    assert [text for text in texts if not clean(text)] == []
+    page = (run / "report.html").read_text(encoding="utf-8")
+    assert clean(page)
+    assert {"img.onerror", "b"} & elements(page) == set()
+    assert page.count("<script") == page.count("</script") == 1
