@@ -88,8 +88,7 @@ def main() -> None:
         data = Offline(problem, basis, cone, multipliers(cone.generators, problem.W).span, training)
         for primal, tolerance in ENRICHMENTS.items():
             strategy: NestedStrategy = registry.create("primal strategy", primal, {})
-            vectors = grow_through(strategy, data, [tolerance]).at(tolerance)[0].vectors
-            assert vectors is not None
+            vectors = grow_through(strategy, data, [tolerance]).vectors
             shares.append({"problem": name, "N": modes, "R": size, "primal": primal} | counts(data, vectors))
         cones += conditions(name, size, lam, problem.W)
     print(INTRODUCTION)
