@@ -112,7 +112,7 @@ def test_columns_of_parameters_are_found_again(journal: ResultsDatabase, tmp_pat
         ({"mu_1": [1.0]}, ["'mu_1'", "list is no REAL"]), ({"surprise": 1.0}, ["no column named surprise"]),
         ({"cell": "of nobody"}, ["FOREIGN KEY"]),
     ],
-    ids=lambda value: ", ".join(f"{key} {type(one).__name__}" for key, one in value.items()) if isinstance(value, dict) else "",
+    ids=lambda value: "-".join(value) if isinstance(value, dict) else "",
 )  # fmt: skip
 @pytest.mark.parametrize("position", [0, 2])
 def test_a_row_that_cannot_be_stored_costs_its_cell_and_no_other(
