@@ -179,9 +179,9 @@ FAULTS = (
     ),
     Fault(
         "multipliers-not-scaled-back",
-        "vibench/qp/solve.py",
-        "alpha = cost * answer.alpha / rows",
-        "alpha = cost * answer.alpha",
+        "vibench/qp/scaling.py",
+        "return self.length * x, self.force * alpha / self.rows",
+        "return self.length * x, self.force * alpha",
         ("tests/unit/qp/test_solve.py",),
     ),
     Fault(

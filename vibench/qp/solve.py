@@ -16,10 +16,10 @@ import qpsolvers
 import scipy.linalg
 import scipy.sparse as sp
 
-from vibench.arrays import Array, SparseMatrix
+from vibench.arrays import Array
 from vibench.errors import NumericalError
 from vibench.interfaces.problem import VariationalInequality
-from vibench.qp.scaling import row_norms, size
+from vibench.qp.scaling import Units, prescribed, row_norms, units_of, units_of_dual
 from vibench.qp.settings import SETTINGS
 from vibench.qp.solution import QPSolution, QPSolver
 from vibench.text import one_line
@@ -38,8 +38,9 @@ def solve_qp(
 ) -> QPSolution:
     """Solve a quadratic program with a named solver.
 
-    The data are scaled first, every constraint row to unit norm and the objective to ‖f‖∞ = 1, so that the absolute
-    tolerances of the solvers correspond to the relative residuals of the benchmark. The solution is scaled back.
+    The data are scaled first (`Units`), every constraint row to unit norm and the objective to ‖f‖∞ = 1, so that the
+    absolute tolerances of the solvers correspond to the relative residuals of the benchmark. Without a load the length
+    and the force that the constraints prescribe are the units. The solution is scaled back.
 
     Parameters
     ----------
@@ -61,12 +62,23 @@ def solve_qp(
     NumericalError
         If the solver does not return a `QPSolution` of the right shapes, with a text as its status.
     """
+    if factor is None or not len(program.f):
+        return _solve_in(units_of(program), program, solver, accuracy, extra, start)
+    return _solve_dual(program, solver, accuracy, extra, factor, start)
+
+
+def _solve_in(
+    units: Units,
+    program: VariationalInequality,
+    solver: str,
+    accuracy: float,
+    extra: Mapping[str, QPSolver] | None,
+    start: QPSolution | None,
+) -> QPSolution:
+    """Solve a program in these units; an answer without x or without multipliers is none."""
     if not len(program.f):
         return QPSolution(np.zeros(0), np.zeros(len(program.g)), "nothing to solve: no unknowns")
-    if factor is not None:
-        return _solve_dual(program, solver, accuracy, extra, factor, start)
-    rows, cost = row_norms(program.B), size(program.f)
-    scaled = VariationalInequality(program.A / cost, program.f / cost, _divide_rows(program.B, rows), program.g / rows)
+    scaled = units.scaled(program)
     if extra and solver in extra:
         answer = extra[solver](scaled, accuracy)
         if not isinstance(answer, QPSolution):
@@ -74,13 +86,13 @@ def solve_qp(
     else:
         warm_start, starter = dict[str, Any](), SETTINGS[solver].start
         if start is not None and starter is not None and start.x is not None and start.alpha is not None:
-            warm_start |= starter(start.x, rows * start.alpha / cost)
+            warm_start |= starter(*units.to(start.x, start.alpha))
         answer = _call_qpsolvers(scaled, solver, accuracy, warm_start)
     answer = _checked(answer, program)
-    if answer.alpha is None:
-        return answer
-    alpha = cost * answer.alpha / rows
-    return replace(answer, alpha=np.maximum(alpha, 0.0), negative=-float(np.min(alpha, initial=0.0)))
+    if answer.x is None or answer.alpha is None:
+        return replace(answer, x=None, alpha=None)
+    x, alpha = units.back(answer.x, answer.alpha)
+    return replace(answer, x=x, alpha=np.maximum(alpha, 0.0), negative=-float(np.min(alpha, initial=0.0)))
 
 
 def _checked(answer: QPSolution, program: VariationalInequality) -> QPSolution:
@@ -117,7 +129,8 @@ def _solve_dual(
     if start is not None and start.alpha is not None and start.x is not None:  # slack g − Bx of the constraints −α ≤ 0
         slack = np.maximum(program.g - program.B @ start.x, 0.0) / rows
         start = replace(start, x=rows * start.alpha, alpha=slack)
-    answer = solve_qp(dual, solver, accuracy, extra, start=start)
+    units = units_of(dual) if prescribed(program, rows) is None else units_of_dual(dual)
+    answer = _solve_in(units, dual, solver, accuracy, extra, start)
     if answer.x is None:
         return answer
     forces = np.maximum(answer.x, 0.0)
@@ -152,7 +165,3 @@ def _call_qpsolvers(
 def _as_csc(matrix: Any) -> Any:
     """Dense arrays as they are, sparse ones as the CSC matrices that qpsolvers expects."""
     return matrix if isinstance(matrix, np.ndarray) else sp.csc_matrix(matrix)
-
-
-def _divide_rows(B: SparseMatrix | Array, rows: Array) -> SparseMatrix | Array:
-    return B / rows[:, None] if isinstance(B, np.ndarray) else sp.diags_array(1.0 / rows) @ B

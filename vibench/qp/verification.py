@@ -9,12 +9,15 @@ from scipy.optimize import nnls
 
 from vibench.arrays import Array
 from vibench.interfaces.problem import VariationalInequality
-from vibench.qp.scaling import peak, ratio, row_norms, size
+from vibench.qp.scaling import peak, prescribed, ratio, row_norms, size
 from vibench.qp.solution import QPSolution
 from vibench.qp.status import Status
 
 ENERGY_FLOOR = 1e-4
-"""Share of the energy gained by a step of steepest descent below which the scale of the gap never falls."""
+"""Share of the energy of load or constraints below which the scale of the gap never falls."""
+
+FORCE_FLOOR = 1e-4
+"""The same of the prescribed force and the dual residual; small, since nodal forces decrease with the mesh width."""
 
 
 @dataclass(frozen=True)
@@ -31,6 +34,10 @@ class Residuals:
         |xᵀA x − fᵀx + gᵀα| over max(|½ xᵀA x|, |fᵀx|, |gᵀα|, `ENERGY_FLOOR` (fᵀf)² / 2fᵀA f). The last term is a share
         of the energy gained by one step of steepest descent from 0: where the constraints admit almost no displacement,
         the other terms are round-off.
+
+    A program without load has no length but the one that its constraints prescribe: the primal residual is over that.
+    Where they barely act, or not at all, x and α are round-off: the scales of dual residual and gap are at least the
+    shares `FORCE_FLOOR` of the prescribed force and `ENERGY_FLOOR` of its product with that length; see `prescribed`.
     """
 
     primal: float
@@ -65,13 +72,12 @@ def kkt_residuals(program: VariationalInequality, x: Array, alpha: Array) -> Res
 def _residuals_and_scales(program: VariationalInequality, x: Array, alpha: Array) -> tuple[Residuals, Scales]:
     A, f, B, g = program.A, program.f, program.B, program.g
     norms, Ax, force = row_norms(B), A @ x, B.T @ alpha
-    energy, work, bound, curvature = float(x @ Ax), float(f @ x), float(g @ alpha), float(f @ (A @ f))
-    # gained by the best multiple of f, a lower bound on the energy gained by A⁻¹f
-    descent = 0.5 * float(f @ f) ** 2 / curvature if curvature > 0.0 else 0.0
+    energy, work, bound = float(x @ Ax), float(f @ x), float(g @ alpha)
+    least = _smallest_scales(program, norms)
     scale = Scales(
-        primal=max(1.0, peak(g / norms)),
-        dual=max(peak(Ax), peak(f), peak(force)),
-        gap=max(abs(0.5 * energy), abs(work), abs(bound), ENERGY_FLOOR * descent),
+        primal=least.primal,
+        dual=max(peak(Ax), peak(f), peak(force), least.dual),
+        gap=max(abs(0.5 * energy), abs(work), abs(bound), least.gap),
     )
     residuals = Residuals(
         primal=float(np.max((B @ x - g) / norms, initial=0.0)) / scale.primal,
@@ -79,6 +85,18 @@ def _residuals_and_scales(program: VariationalInequality, x: Array, alpha: Array
         gap=ratio(abs(energy - work + bound), scale.gap),
     )
     return residuals, scale
+
+
+def _smallest_scales(program: VariationalInequality, norms: Array) -> Scales:
+    """What the denominators never fall below, `norms` (m,) being those of B's rows."""
+    driven = prescribed(program, norms)
+    if driven is not None:
+        return Scales(driven.length, FORCE_FLOOR * driven.force, ENERGY_FLOOR * driven.force * driven.length)
+    f = program.f
+    curvature = float(f @ (program.A @ f))
+    # gained by the best multiple of f, a lower bound on the energy gained by A⁻¹f
+    descent = 0.5 * float(f @ f) ** 2 / curvature if curvature > 0.0 else 0.0
+    return Scales(max(1.0, peak(program.g / norms)), 0.0, ENERGY_FLOOR * descent)
 
 
 def verify(program: VariationalInequality, answer: QPSolution, accuracy: float) -> tuple[Status, str, Residuals | None]:

@@ -10,7 +10,12 @@ norms of the rows of G in the primal one,
     gap     |xᵀPx + qᵀx + hᵀz| / max(½|xᵀPx|, |qᵀx|, |hᵀz|, 1e-4 (qᵀq)² / 2qᵀPq)
 
 The last term is a share of the energy that a step of steepest descent gains; it serves solutions that vanish up to
-round-off.
+round-off. A program whose load vanishes, |q|∞ ≤ 1e-10 k max(−h)₊ with k the mean of the diagonal of P, has nothing but
+the length L = |h|∞ that its constraints prescribe (1 if that is zero), and the force kL:
+
+    primal  max(Gx − h)₊ / L
+    dual    |Px + q + Gᵀz|∞ / max(|Px|∞, |q|∞, |Gᵀz|∞, 1e-4 kL)
+    gap     |xᵀPx + qᵀx + hᵀz| / max(½|xᵀPx|, |qᵀx|, |hᵀz|, 1e-4 kL²)
 
 Usage: python check.py [FOLDER]. Exit code 1 if a row claims "ok" and is not, or a claimed residual is not reproduced.
 """
@@ -31,15 +36,27 @@ def residuals(P: np.ndarray, q: np.ndarray, G: np.ndarray, h: np.ndarray, x: np.
     """Primal and dual residual and gap, as defined above."""
     norms = np.sqrt(np.sum(G**2, axis=1))
     norms[norms == 0.0] = 1.0
-    primal = max(0.0, ((G @ x - h) / norms).max(initial=0.0)) / max(1.0, abs(h / norms).max(initial=0.0))
+    bound = h / norms
+    length, force, energy = smallest_scales(P, q, bound)
+    primal = max(0.0, ((G @ x - h) / norms).max(initial=0.0)) / length
     parts = [P @ x, q, G.T @ z]
-    largest = max(abs(part).max(initial=0.0) for part in parts)
+    largest = max(force, *(abs(part).max(initial=0.0) for part in parts))
     dual = abs(sum(parts)).max(initial=0.0) / (largest or 1.0)
     terms = [float(x @ P @ x), float(q @ x), float(h @ z)]
-    curvature = float(q @ P @ q)
-    floor = 1e-4 * float(q @ q) ** 2 / (2.0 * curvature) if curvature > 0.0 else 0.0
-    size = max(0.5 * abs(terms[0]), abs(terms[1]), abs(terms[2]), floor)
+    size = max(0.5 * abs(terms[0]), abs(terms[1]), abs(terms[2]), energy)
     return [primal, dual, abs(sum(terms)) / (size or 1.0)]
+
+
+def smallest_scales(P: np.ndarray, q: np.ndarray, bound: np.ndarray) -> tuple[float, float, float]:
+    """The denominator of the primal residual, and what the two others never fall below."""
+    longest, mean = float(abs(bound).max(initial=0.0)), float(P.trace()) / max(len(q), 1)
+    stiffness = mean if mean > 0.0 else 1.0
+    if abs(q).max(initial=0.0) > 1e-10 * stiffness * (-bound).max(initial=0.0):
+        curvature = float(q @ P @ q)
+        descent = float(q @ q) ** 2 / (2.0 * curvature) if curvature > 0.0 else 0.0
+        return max(1.0, longest), 0.0, 1e-4 * descent
+    length = longest or 1.0
+    return length, 1e-4 * stiffness * length, 1e-4 * stiffness * length**2
 
 
 def main(folder: Path) -> int:

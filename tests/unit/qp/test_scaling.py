@@ -1,0 +1,187 @@
+"""Units of quadratic programs: scaling loses nothing, and without load a program is solved in any units of its data."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import scipy.sparse as sp
+from hypothesis import given
+from hypothesis import strategies as st
+from numerics import exact, spd
+
+from vibench.highfidelity.active_set import solve_high_fidelity
+from vibench.interfaces.problem import MEMBERS, VariationalInequality
+from vibench.qp import verification
+from vibench.qp.scaling import prescribed, row_norms, stiffness, units_of, units_of_dual
+from vibench.qp.solution import QPSolution
+from vibench.qp.solve import installed_solvers, solve_qp
+from vibench.qp.status import Status
+
+seeds = st.integers(0, 10_000)
+exponents = st.integers(-12, 12)
+LOADS = {"load": 1.0, "no load": 0.0, "round-off": 1e-15}
+
+
+def indentation(
+    seed: int, length: int = 0, modulus: int = 0, load: float = 0.0, closed: float = 0.3
+) -> VariationalInequality:
+    """A program driven by its constraints, the largest of which x = 0 violates by the share `closed` of max |g_i|."""
+    rng = np.random.default_rng(seed)
+    B = rng.standard_normal((4, 6)) * 10.0 ** rng.integers(-3, 3, (4, 1))
+    gaps = np.array([-closed, 1.0, 0.5 * rng.random() - closed, rng.random()])
+    A, f = 10.0**modulus * spd(6, rng), load * 10.0 ** (modulus + length) * rng.standard_normal(6)
+    return VariationalInequality(A, f, B, 10.0**length * gaps * np.linalg.norm(B, axis=1))
+
+
+@given(seeds, exponents, exponents, st.sampled_from(sorted(LOADS)))
+def test_scaling_back_is_exact(seed: int, length: int, modulus: int, load: str) -> None:
+    """Members, objective and constraints are those of the program; a solution there and back is what it was."""
+    vi = indentation(seed, length, modulus, LOADS[load])
+    units, rng = units_of(vi), np.random.default_rng(seed)
+    scaled = units.scaled(vi)
+    y, beta = rng.standard_normal(6), rng.random(4)
+    x, alpha = units.back(y, beta)
+    assert np.allclose(scaled.B @ y - scaled.g, (vi.B @ x - vi.g) / (units.rows * units.length), rtol=1e-12, atol=1e-12)
+    forces = scaled.A @ y - scaled.f + scaled.B.T @ beta
+    assert np.allclose(forces, (vi.A @ x - vi.f + vi.B.T @ alpha) / units.force, rtol=1e-12, atol=1e-9)
+    assert np.allclose(np.concatenate(units.to(x, alpha)), np.concatenate([y, beta]), rtol=1e-14)
+    assert np.allclose(np.linalg.norm(scaled.B, axis=1), 1.0)
+
+
+@given(seeds)
+def test_a_load_is_the_unit_and_lengths_are_as_they_are(seed: int) -> None:
+    """As they were before programs without load had units of their own: published numbers depend on it."""
+    vi = indentation(seed, load=1.0)
+    rows, cost = np.linalg.norm(vi.B, axis=1), np.abs(vi.f).max()
+    scaled = units_of(vi).scaled(vi)
+    for found, expected in ((scaled.A, vi.A / cost), (scaled.f, vi.f / cost), (scaled.g, vi.g / row_norms(vi.B))):
+        assert found.tobytes() == expected.tobytes()
+    assert np.allclose(scaled.B, vi.B / rows[:, None], rtol=1e-15)
+
+
+@pytest.mark.parametrize("load", ["no load", "round-off"])
+@given(seed=seeds, length=exponents, modulus=exponents)
+def test_without_load_the_scaled_program_knows_no_units(load: str, seed: int, length: int, modulus: int) -> None:
+    one, other = indentation(seed, load=LOADS[load]), indentation(seed, length, modulus, LOADS[load])
+    here, there = units_of(one).scaled(one), units_of(other).scaled(other)
+    for name in MEMBERS:
+        assert np.allclose(getattr(there, name), getattr(here, name), rtol=1e-9, atol=1e-12), name
+    found = prescribed(other, row_norms(other.B))
+    assert found is not None
+    assert found.length == pytest.approx(10.0**length)
+    assert found.force == pytest.approx(10.0 ** (length + modulus) * stiffness(one.A))
+
+
+def test_sparse_members_have_the_units_of_dense_ones() -> None:
+    vi = indentation(5, 2, 3)
+    sparse = VariationalInequality(sp.csc_array(vi.A), vi.f, sp.csr_array(vi.B), vi.g)
+    one, other = units_of(vi), units_of(sparse)
+    assert (one.length, one.force) == (pytest.approx(other.length), pytest.approx(other.force))
+    assert np.allclose(other.scaled(sparse).B.toarray(), one.scaled(vi).B)
+    assert np.allclose(other.scaled(sparse).A.toarray(), one.scaled(vi).A)
+
+
+def test_data_that_are_zero_have_units_too() -> None:
+    nothing = VariationalInequality(np.zeros((2, 2)), np.zeros(2), np.zeros((1, 2)), np.zeros(1))
+    unconstrained = VariationalInequality(np.eye(2), np.zeros(2), np.zeros((0, 2)), np.zeros(0))
+    for vi in (nothing, unconstrained):
+        units = units_of(vi)
+        assert (units.length, units.force > 0.0) == (1.0, True)
+        assert np.all(np.isfinite(units.scaled(vi).A))
+        assert verification.kkt_residuals(vi, np.zeros(2), np.zeros(len(vi.g))).worst == 0.0
+    assert units_of_dual(VariationalInequality(np.eye(1), np.zeros(1), -np.eye(1), np.zeros(1))).length > 0.0
+
+
+@pytest.mark.parametrize("solver", sorted({"piqp", "proxqp", "osqp", "cvxopt"} & set(installed_solvers())))
+@pytest.mark.parametrize(("length", "modulus"), [(0, 0), (-2, 0), (-6, 11), (4, -6)])
+@pytest.mark.parametrize("form", ["primal", "dual"])
+def test_a_program_without_load_is_solved_to_the_accuracy_asked_for(
+    solver: str, length: int, modulus: int, form: str
+) -> None:
+    """An indentation by micrometres into steel as well as by kilometres into foam."""
+    for seed in range(10):
+        vi = indentation(seed, length, modulus)
+        answer = solve_qp(vi, solver, 1e-8, factor=np.linalg.cholesky(vi.A) if form == "dual" else None)
+        status, reason, _ = verification.verify(vi, answer, 1e-8)
+        assert status is Status.OK, (seed, reason)
+        x, alpha = exact(indentation(seed))  # where brute force knows what is zero
+        assert np.allclose(answer.x, 10.0**length * x, rtol=0.0, atol=1e-5 * 10.0**length)
+        force = 10.0 ** (length + modulus)
+        assert np.allclose(vi.B.T @ answer.alpha, force * (vi.B.T @ alpha), rtol=0.0, atol=1e-4 * force)
+
+
+@pytest.mark.parametrize("solver", ["piqp", "proxqp", "osqp"])
+@pytest.mark.parametrize("form", ["primal", "dual"])
+@pytest.mark.parametrize("closed", [0.0, 1e-9, 1e-6, 1e-3])
+def test_without_load_and_contact_or_nearly_so_a_solution_is_ok(solver: str, form: str, closed: float) -> None:
+    """x and α are zero, or small beside what g prescribes: residuals over themselves would be those of round-off."""
+    for seed in range(10):
+        vi = indentation(seed, closed=closed)
+        if closed == 0.0:
+            vi = VariationalInequality(vi.A, vi.f, vi.B, np.abs(vi.g))
+        answer = solve_qp(vi, solver, 1e-8, factor=np.linalg.cholesky(vi.A) if form == "dual" else None)
+        status, reason, _ = verification.verify(vi, answer, 1e-8)
+        assert status is Status.OK, (seed, reason)
+
+
+@given(seeds, exponents, exponents)
+def test_residuals_without_load_are_relative_to_what_the_constraints_prescribe(
+    seed: int, length: int, modulus: int
+) -> None:
+    """In any units: `max(1, ‖g‖∞)` took x = 0 for a solution of an indentation by nanometres."""
+    one, other = indentation(seed), indentation(seed, length, modulus)
+    rng = np.random.default_rng(seed)
+    x, alpha = rng.standard_normal(6), rng.random(4)
+    here = verification.kkt_residuals(one, x, alpha)
+    there = verification.kkt_residuals(other, 10.0**length * x, 10.0 ** (length + modulus) * alpha)
+    for name in ("primal", "dual", "gap"):
+        assert getattr(there, name) == pytest.approx(getattr(here, name), rel=1e-6, abs=1e-12)
+    nothing = verification.kkt_residuals(other, np.zeros(6), np.zeros(4))
+    assert nothing.primal == pytest.approx(0.3)
+
+
+def test_scales_without_load_as_defined_by_hand() -> None:
+    vi = VariationalInequality(np.diag([1.0, 3.0]), np.zeros(2), np.array([[0.0, 2.0]]), np.array([-0.02]))
+    x, alpha = np.array([0.0, -0.009]), np.array([0.0])  # k = 2, L = 0.01
+    found = verification.kkt_residuals(vi, x, alpha)
+    assert found.primal == pytest.approx(0.001 / 0.01)
+    assert found.dual == pytest.approx(1.0)  # A x alone, 0.027, beside which 1e-4 k L is small
+    small = verification.kkt_residuals(vi, 1e-6 * x, alpha)
+    assert small.dual == pytest.approx(0.027e-6 / (1e-4 * 2.0 * 0.01))
+    assert small.gap == pytest.approx(3.0 * (0.009e-6) ** 2 / (1e-4 * 2.0 * 0.01**2))
+
+
+def test_no_scale_of_an_indentation_on_a_fine_mesh_is_the_smallest_there_is() -> None:
+    """Nodal forces decrease with the mesh width; those of a string of 2000 nodes are weighed by themselves."""
+    n, ones = 2000, np.ones(1999)
+    A = sp.csc_array(sp.diags_array([2.0 * np.ones(n), -ones, -ones], offsets=[0, 1, -1])) * (n + 1.0)
+    B = sp.csr_array(([1.0], ([0], [n // 2])), shape=(1, n))
+    vi = VariationalInequality(A, np.zeros(n), B, np.array([-1e-3]))
+    found = solve_high_fidelity(vi)
+    force = np.abs(B.T @ found.lam).max()
+    assert verification.scales(vi, found.u, found.lam).dual == pytest.approx(force)
+
+
+def test_a_bound_that_is_far_away_does_not_turn_a_load_into_none() -> None:
+    vi = VariationalInequality(np.eye(1), np.ones(1), np.ones((1, 1)), np.full(1, 1e15))
+    assert prescribed(vi, np.ones(1)) is None
+    assert verification.kkt_residuals(vi, np.zeros(1), np.zeros(1)).dual == 1.0
+
+
+def test_half_an_answer_is_none() -> None:
+    vi = indentation(0)
+    for x, alpha in ((None, np.zeros(4)), (np.zeros(6), None)):
+        answer = solve_qp(vi, "half", 1e-8, {"half": lambda *_, x=x, alpha=alpha: QPSolution(x, alpha, "solved")})
+        assert (answer.x, answer.alpha) == (None, None)
+        assert verification.verify(vi, answer, 1e-8)[0] is Status.FAILED
+
+
+@pytest.mark.parametrize("solver", ["proxqp", "osqp"])
+@pytest.mark.parametrize("form", ["primal", "dual"])
+def test_a_start_without_load_is_in_the_same_units(solver: str, form: str) -> None:
+    vi = indentation(2, -3, 6)
+    factor = np.linalg.cholesky(vi.A) if form == "dual" else None
+    cold = solve_qp(vi, solver, 1e-8, factor=factor)
+    warm = solve_qp(vi, solver, 1e-8, factor=factor, start=cold)
+    assert verification.verify(vi, warm, 1e-8)[0] is Status.OK
+    assert warm.iterations <= cold.iterations
