@@ -150,11 +150,11 @@ class Material:
     @property
     def queries(self) -> list[Query]:
         problem, (u, lam) = self.problem, self.snapshots
-        floors = 1e-12 * float(problem.V.norm(u).max()), 1e-12 * float(problem.W.norm(lam).max())
+        scales = float(problem.V.norm(u).max()), float(problem.W.norm(lam).max())
 
         def make() -> list[Query]:
             mus = validation_parameters(problem, QUERIES, SEED)
-            exact = [Reference(s.u[:, None], s.lam[:, None], *floors) for s in solve_all(problem, mus)]
+            exact = [Reference(s.u[:, None], s.lam[:, None], *scales) for s in solve_all(problem, mus)]
             return [Query(mu, checked_assembly(problem, mu), known) for mu, known in zip(mus, exact, strict=True)]
 
         return self._once("validation", make)

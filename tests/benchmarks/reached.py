@@ -158,7 +158,10 @@ def of_queries(material: Material, model: Model, solve: Solve, accuracy: float) 
 
 def _errors(material: Material, query: Query, u: Array, lam: Array) -> dict[str, float]:
     (found,) = errors(material.problem, [query.vi], query.exact, u[:, None], lam[:, None])
-    return {"error_u": found.error_u, "error_lambda": found.error_lambda}
+    known = {"error_u": found.error_u, "error_lambda": found.error_lambda}
+    scaled = {"error_u_scaled": found.error_u_scaled, "error_lambda_scaled": found.error_lambda_scaled}
+    measured = {name: value for name, value in known.items() if value is not None}
+    return measured | {name: value for name, value in scaled.items() if name.removesuffix("_scaled") not in measured}
 
 
 def of_answer(program: VariationalInequality, answer: QPSolution, accuracy: float) -> Info:

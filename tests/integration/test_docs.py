@@ -146,7 +146,8 @@ def test_seconds_are_in_seconds(name: str) -> None:
 
 @pytest.mark.parametrize("table", ["cells", "thresholds"])
 def test_the_tables_for_reading_have_the_columns_that_are_described(table: str, reference: ModuleType) -> None:
-    several = pd.DataFrame({"accuracy": [1e-7, 1e-10]})  # with one for all, it has no column
+    zero = {name: [0, 1] for name in ("queries_zero_u", "queries_zero_lambda") if table == "cells"}
+    several = pd.DataFrame({"accuracy": [1e-7, 1e-10], **zero})  # with one for all, or none, they have no columns
     empty = several.reindex(columns=list(columns.STORED[table])).astype({"accuracy": float})
     name, view = {"cells": ("summary", tables.summary), "thresholds": ("benefits", tables.benefits)}[table]
     headings = re.findall(r"^\| (?!column|---)([^|]+?) \|", reference.GENERATED[name](), re.MULTILINE)

@@ -145,10 +145,19 @@ def test_it_ends_in_ok_rows(rows, case: type[Wire], dual: str, primal: str) -> N
     assert (found["status"], found["queries_ok"]) == ("ok", 3)
     assert (found["N"], found["R"]) == SIZES[case]
     assert found["enrichment"] == (0 if primal == "decorrelated" else min(found["enrichment"], found["rank"]))
-    assert 0.0 <= found["error_u_mean"] < 0.1
+    if case is NoLoad:
+        assert (found["queries_zero_u"], found["error_u_mean"], found["error_u_zero_max"]) == (3, None, 0.0)
+    else:
+        assert found["queries_zero_u"] == 0
+        assert 0.0 <= found["error_u_mean"] < (1e-9 if case is NoContact else 0.1)
     if case in (NoContact, NoLoad):
-        assert found["error_u_mean"] < 1e-9
-        assert found["error_lambda_mean"] == 0.0
+        assert (found["queries_zero_lambda"], found["error_lambda_mean"], found["error_lambda_zero_max"]) == (
+            3,
+            None,
+            0,
+        )
+    else:
+        assert found["queries_zero_lambda"] == 0
     if case is AllInContact and primal != "decorrelated":
         assert found["error_lambda_mean"] < 1e-6
 
@@ -166,7 +175,7 @@ def test_other_strategies_end_in_ok_rows(rows, case: type[Wire], dual: str, prim
     assert (found["status"], found["queries_ok"]) == ("ok", 3)
     assert 0.0 <= found["error_u_mean"] < 0.1
     if case is NoContact:
-        assert (found["R"], found["error_lambda_mean"]) == (0, 0.0)
+        assert (found["R"], found["error_lambda_mean"], found["error_lambda_zero_max"]) == (0, None, 0.0)
 
 
 @pytest.mark.parametrize("primal", ["decorrelated", "online-supremizers", "offline-pga"])

@@ -7,26 +7,27 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from vibench.arrays import Array
+from vibench.arrays import Array, Mask
 from vibench.interfaces.problem import Problem, VariationalInequality
 from vibench.qp.scaling import ratio
+
+UNMEASURABLE = 1e-8
+"""Nothing is measured below this: not by an error relative to its solution, nor by a solution relative to the largest
+training solution. High-fidelity solutions have residuals up to 1e-10, so that either may be an error of theirs."""
 
 
 @dataclass(frozen=True)
 class Reference:
-    """High-fidelity solutions, columns of u (n×P) and λ (m×P), and the floors of the relative errors.
-
-    The floors are 1e-12 of the largest training norms: below them a solution counts as zero.
-    """
+    """High-fidelity solutions, columns of u (n×P) and λ (m×P), and the largest training norms of both in V and W."""
 
     u: Array
     lam: Array
-    floor_u: float
-    floor_lam: float
+    scale_u: float
+    scale_lam: float
 
     def at(self, numbers: Sequence[int]) -> Reference:
         """The solutions at some of the parameters."""
-        return Reference(self.u[:, numbers], self.lam[:, numbers], self.floor_u, self.floor_lam)
+        return Reference(self.u[:, numbers], self.lam[:, numbers], self.scale_u, self.scale_lam)
 
 
 @dataclass(frozen=True)
@@ -36,28 +37,35 @@ class Errors:
     Attributes
     ----------
     error_u, error_lambda, error_energy
-        Relative, in the norms of V, of W and of A(mu).
+        Relative, in the norms of V, of W and of A(mu); `None` where u, λ and u, respectively, is zero: see `zeros`.
     error_u_absolute, error_lambda_absolute
         The first two without the division.
+    error_u_scaled, error_lambda_scaled
+        These over the largest training norms, or as they are where those are zero.
     violation
         Largest (B u_N − g)₊, each row over the integral of its multiplier function [unit of u].
     complementarity
         λᵀ(B u_N − g) with the high-fidelity multiplier; with λ_N it would only repeat the gap of the QP solver.
     """
 
-    error_u: float
-    error_lambda: float
-    error_energy: float
+    error_u: float | None
+    error_lambda: float | None
+    error_energy: float | None
     error_u_absolute: float
     error_lambda_absolute: float
+    error_u_scaled: float
+    error_lambda_scaled: float
     violation: float
     complementarity: float
 
 
-def relative_to(problem: Problem, reference: Reference) -> tuple[Array, Array]:
-    """Denominators of the relative errors (P,): the norms of the solutions in V and in W, not below the floors."""
-    norm_u = np.maximum(problem.V.norm(reference.u), reference.floor_u)
-    return norm_u, np.maximum(problem.W.norm(reference.lam), reference.floor_lam)
+def zeros(problem: Problem, reference: Reference) -> tuple[Mask, Mask]:
+    """Which u (P,) and λ (P,) are zero on the scale of the training set: at most `UNMEASURABLE` of its largest norm.
+
+    Without contact λ is zero, and u too where there is no load; a relative error would divide round-off by round-off.
+    """
+    norm_u, norm_lam = problem.V.norm(reference.u), problem.W.norm(reference.lam)
+    return norm_u <= UNMEASURABLE * reference.scale_u, norm_lam <= UNMEASURABLE * reference.scale_lam
 
 
 def errors(
@@ -66,16 +74,18 @@ def errors(
     """Errors of reduced u (n×P) and λ (m×P), column by column at the parameters of `vis`."""
     V, W = problem.V, problem.W
     du, dlam = u - reference.u, lam - reference.lam
-    norm_u, norm_lam = relative_to(problem, reference)
+    norm_u, norm_lam, (zero_u, zero_lam) = V.norm(reference.u), W.norm(reference.lam), zeros(problem, reference)
     error_u, error_lam, integrals = V.norm(du), W.norm(dlam), problem.multiplier_integrals()
     excesses = [vi.B @ u[:, k] - vi.g for k, vi in enumerate(vis)]
     return [
         Errors(
-            error_u=ratio(float(error_u[k]), float(norm_u[k])),
-            error_lambda=ratio(float(error_lam[k]), float(norm_lam[k])),
-            error_energy=ratio(_energy(vi, du[:, k]), _energy(vi, reference.u[:, k])),
+            error_u=None if zero_u[k] else ratio(float(error_u[k]), float(norm_u[k])),
+            error_lambda=None if zero_lam[k] else ratio(float(error_lam[k]), float(norm_lam[k])),
+            error_energy=None if zero_u[k] else ratio(_energy(vi, du[:, k]), _energy(vi, reference.u[:, k])),
             error_u_absolute=float(error_u[k]),
             error_lambda_absolute=float(error_lam[k]),
+            error_u_scaled=ratio(float(error_u[k]), reference.scale_u),
+            error_lambda_scaled=ratio(float(error_lam[k]), reference.scale_lam),
             violation=float(np.max(excesses[k] / integrals, initial=0.0)),
             complementarity=float(reference.lam[:, k] @ excesses[k]),
         )

@@ -115,7 +115,7 @@ CELLS: Mapping[str, Column] = {
     "offline_cone_s": Column(REAL, "s", "Dual strategy, with the orthonormal basis of the span."),
     "offline_enrichment_s": Column(REAL, "s", "Primal strategy."),
     "offline_assembly_s": Column(REAL, "s", "What reduced assembly prepares; 0 in full."),
-    "offline_s": Column(REAL, "s", "Sum of the five above, what the cell alone would have taken.", "offline [s]", 18),
+    "offline_s": Column(REAL, "s", "Sum of the five above, what the cell alone would have taken.", "offline [s]", 22),
     "offline_low_s": Column(
         REAL, "s", "The same at the quickest of the rounds of timing: it is measured once, at whatever speed."
     ),
@@ -126,7 +126,7 @@ CELLS: Mapping[str, Column] = {
         "s",
         "One query, assembly and solution: median over the rounds of the mean over ok queries.",
         "online [ms]",
-        19,
+        23,
     ),
     "online_q1_s": Column(REAL, "s", "Lower quartile over the rounds."),
     "online_q3_s": Column(REAL, "s", "Upper quartile over the rounds."),
@@ -155,10 +155,18 @@ CELLS: Mapping[str, Column] = {
     "share_guaranteed": Column(
         REAL, "1", "√(1 − σ²), which bounds the share at training parameters where the strategy records σ."
     ),
-    "error_u_mean": Column(REAL, "1", "Mean relative error of u in V.", "error u", 16),
-    "error_u_max": Column(REAL, "1", "Largest relative error of u in V."),
-    "error_lambda_mean": Column(REAL, "1", "Mean relative error of λ in W.", "error λ", 17),
-    "error_lambda_max": Column(REAL, "1", "Largest relative error of λ in W."),
+    "error_u_mean": Column(REAL, "1", "Mean relative error of u in V, where it is not zero.", "error u", 16),
+    "error_u_max": Column(REAL, "1", "Largest relative error of u in V, likewise."),
+    "queries_zero_u": Column(
+        INTEGER, "", "Ok queries where zero_u is 1: no mean or maximum of u counts them.", "u = 0", 17
+    ),
+    "error_u_zero_max": Column(REAL, "1", "Largest error_u_scaled of these.", "error, u = 0", 18),
+    "error_lambda_mean": Column(REAL, "1", "Mean relative error of λ in W, where it is not zero.", "error λ", 19),
+    "error_lambda_max": Column(REAL, "1", "Largest relative error of λ in W, likewise."),
+    "queries_zero_lambda": Column(
+        INTEGER, "", "Ok queries where zero_lambda is 1: no mean or maximum of λ counts them.", "λ = 0", 20
+    ),
+    "error_lambda_zero_max": Column(REAL, "1", "Largest error_lambda_scaled of these.", "error, λ = 0", 21),
     "solver_error_u_max": Column(REAL, "1", "Largest part of the error of u that the QP solver makes."),
     "solver_error_lambda_max": Column(REAL, "1", "Largest part of the error of λ that it makes."),
     "solver_share_max": Column(REAL, "1", "Largest share of an error that it makes, over the queries."),
@@ -214,15 +222,21 @@ QUERIES: Mapping[str, Column] = {
     "hf_s": Column(
         REAL, "s", "The high-fidelity solution at this parameter, assembly included, set-up not: median of the repeats."
     ),
-    "error_u": Column(REAL, "1", "‖u − u_N‖ / ‖u‖ in V."),
-    "error_lambda": Column(REAL, "1", "‖λ − λ_N‖ / ‖λ‖ in W."),
-    "error_energy": Column(REAL, "1", "The error of u in the norm of A(µ), relative."),
+    "zero_u": Column(
+        INTEGER, "", "1 where the high-fidelity ‖u‖ is at most 1e-8 of the largest of the training set, else 0."
+    ),
+    "zero_lambda": Column(INTEGER, "", "The same of ‖λ‖: 1 where there is no contact."),
+    "error_u": Column(REAL, "1", "‖u − u_N‖ / ‖u‖ in V; empty where zero_u is 1."),
+    "error_lambda": Column(REAL, "1", "‖λ − λ_N‖ / ‖λ‖ in W; empty where zero_lambda is 1."),
+    "error_energy": Column(REAL, "1", "The error of u in the norm of A(µ), relative; empty where zero_u is 1."),
     "error_u_absolute": Column(REAL, "V", "‖u − u_N‖ in V."),
     "error_lambda_absolute": Column(REAL, "W", "‖λ − λ_N‖ in W."),
+    "error_u_scaled": Column(REAL, "1", "‖u − u_N‖ over the largest ‖u‖ of the training set."),
+    "error_lambda_scaled": Column(REAL, "1", "‖λ − λ_N‖ over the largest ‖λ‖ of the training set."),
     "solver_error_u": Column(
         REAL,
         "1",
-        "Distance of u from the reduced program solved to round-off, relative as error_u; empty where not solved.",
+        "Distance of u from the reduced program solved to round-off, over ‖u‖; empty where error_u is, or not solved.",
     ),
     "solver_error_lambda": Column(
         REAL, "1", "The same of λ; empty, too, where the tight constraints are dependent and λ is not unique."
@@ -234,7 +248,9 @@ QUERIES: Mapping[str, Column] = {
         REAL, "V", "Bound Δ_u of the error of u, its α and γ estimated; infinite where β_HF over the span is 0."
     ),
     "bound_lambda": Column(REAL, "W", "Bound Δ_λ of the error of λ, likewise."),
-    "effectivity_u": Column(REAL, "1", "bound_u / error_u_absolute; empty for relative errors up to 1e-8."),
+    "effectivity_u": Column(
+        REAL, "1", "bound_u / error_u_absolute; empty up to 1e-8 of error_u, or of error_u_scaled where zero_u is 1."
+    ),
     "effectivity_lambda": Column(REAL, "1", "bound_lambda / error_lambda_absolute, likewise."),
     "violation": Column(REAL, "u", "Largest (B u_N − g)₊, every row over the integral of its multiplier function."),
     "complementarity": Column(REAL, "b", "λᵀ(B u_N − g), λ the high-fidelity multiplier."),

@@ -85,10 +85,17 @@ def benefits(thresholds: pd.DataFrame) -> pd.DataFrame:
 
 
 def _for_reading(frame: pd.DataFrame, table: Mapping[str, Column]) -> pd.DataFrame:
-    """The columns that have a heading, under it; the accuracy only where it is an axis of the study."""
-    columns = shown_columns(table).items()
-    kept = [(name, column) for name, column in columns if name != "accuracy" or frame[name].nunique() > 1]
+    """The columns that have a heading, under it; some only where they say something."""
+    kept = [(name, column) for name, column in shown_columns(table).items() if _says_something(frame, name)]
     return pd.DataFrame({column.heading: _shown(frame, name, column) for name, column in kept}, index=frame.index)
+
+
+def _says_something(frame: pd.DataFrame, name: str) -> bool:
+    """Whether to show a column: the accuracy where it is an axis, zero solutions where a query has one."""
+    if name == "accuracy":
+        return bool(frame[name].nunique() > 1)
+    zero = re.fullmatch(r"queries_zero_(u|lambda)|error_(u|lambda)_zero_max", name)
+    return zero is None or bool((frame[f"queries_zero_{zero[1] or zero[2]}"] > 0).any())
 
 
 def _shown(frame: pd.DataFrame, name: str, column: Column) -> pd.Series | list[str]:

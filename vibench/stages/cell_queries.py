@@ -12,7 +12,7 @@ import numpy as np
 from vibench.errors import in_a_line
 from vibench.interfaces.strategies import Kind
 from vibench.model.error_bounds import Stability
-from vibench.model.errors import Reference
+from vibench.model.errors import Reference, zeros
 from vibench.provenance import machine
 from vibench.qp.exact import ExactSolution
 from vibench.qp.status import Status
@@ -150,11 +150,12 @@ class _Queries(Pieces):
         self._cone: ReducedCone = value_of(store, stage.assembly.enrichment.cone)
         self._training, self._reference = gather(store, stage.training), gather(store, stage.validation)
         problem = self._model.problem
-        # A reference below 1e-12 of the largest snapshot is zero up to round-off: relative errors divide by the floor.
-        self._floors = tuple(
-            1e-12 * float(np.max(space.norm(columns), initial=0.0))
+        scales = (
+            float(np.max(space.norm(columns), initial=0.0))
             for space, columns in ((problem.V, self._training.u), (problem.W, self._training.lam))
         )
+        self._compared = Reference(self._reference.u, self._reference.lam, *scales)
+        self._zeros = zeros(problem, self._compared)
         self._own, self._full, self._plain = (value_of(store, known) for known in stage.constants)
         self._stability: list[Stability] = value_of(store, stage.reference)
         self._exact: tuple[ExactSolution | None, ...] = value_of(store, stage.exact)
@@ -179,13 +180,13 @@ class _Queries(Pieces):
 
     def _assess(self, solutions: Mapping[int, Row]) -> list[Row]:
         """Error columns of some queries, all at once; where that fails, one by one, and a row says why it failed."""
-        numbers, reference = list(solutions), self._reference
+        numbers = list(solutions)
         try:
             return error_columns(
                 self._model,
-                reference.mu[numbers],
+                self._reference.mu[numbers],
                 [vectors(solution) for solution in solutions.values()],
-                Reference(reference.u, reference.lam, *self._floors).at(numbers),
+                self._compared.at(numbers),
                 [self._stability[k] for k in numbers],
                 [self._exact[k] for k in numbers],
             )
@@ -197,11 +198,12 @@ class _Queries(Pieces):
             return [{"status": Status.ERROR.value, "reason": f"in the assessment: {in_a_line(error)}"}]
 
     def _known(self, number: int) -> Row:
-        """The columns of a query that do not depend on its solution: the parameter and the inf-sup constants."""
-        reference = self._reference
+        """The columns of a query that do not depend on its solution: parameter, zeros of the reference, constants."""
+        reference, (zero_u, zero_lam) = self._reference, self._zeros
         return (
             {f"mu_{i + 1}": float(value) for i, value in enumerate(reference.mu[number])}
             | {"hf_s": reference.seconds[number].cpu}
+            | {"zero_u": int(zero_u[number]), "zero_lambda": int(zero_lam[number])}
             | _constants("beta_", self._own[number])
             | _constants("beta_full_", self._full[number])
             | _constants("beta_plain_", self._plain[number])

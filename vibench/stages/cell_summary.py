@@ -7,27 +7,30 @@ from collections.abc import Sequence
 import numpy as np
 
 from vibench.arrays import Array
+from vibench.model.errors import UNMEASURABLE
 from vibench.qp.status import Status
 from vibench.stages.base import Row
 
-UNMEASURABLE = 1e-8
-"""Relative errors below this may be errors of the high-fidelity solution: nothing is measured by them."""
-
 
 def summarise(rows: Sequence[Row]) -> Row:
-    """The columns of a cell from those of its queries; means and maxima are over the queries with status ok."""
+    """The columns of a cell from those of its queries; means and maxima are over the queries with status ok.
+
+    A query whose high-fidelity u or λ is zero has no relative error of it, and enters neither: such queries are
+    counted, and their largest error on the scale of the training set has a column of its own.
+    """
     fine = [row for row in rows if row["status"] == Status.OK]
     worst = max((Status(row["status"]) for row in rows), key=lambda status: status.severity)
     reasons = [f"mu={_mu(row)}: {row['reason']}" for row in rows if row["status"] == worst and row["reason"]]
 
-    def column(name: str) -> Array:
-        return np.array([row[name] for row in fine if row.get(name) is not None], dtype=float)
+    def column(name: str, among: Sequence[Row] = fine) -> Array:
+        return np.array([row[name] for row in among if row.get(name) is not None], dtype=float)
 
     def mean(name: str) -> float | None:
         return float(column(name).mean()) if column(name).size else None
 
-    def largest(name: str) -> float | None:
-        return float(column(name).max()) if column(name).size else None
+    def largest(name: str, among: Sequence[Row] = fine) -> float | None:
+        found = column(name, among)
+        return float(found.max()) if found.size else None
 
     def solver_share(name: str) -> float | None:
         known = [row for row in fine if row.get(f"solver_error_{name}") is not None]
@@ -35,16 +38,23 @@ def summarise(rows: Sequence[Row]) -> Row:
         measurable = whole > UNMEASURABLE * len(known)
         return float(sum(row[f"solver_error_{name}"] for row in known) / whole) if measurable else None
 
+    def errors(name: str) -> Row:
+        zero = [row for row in fine if row.get(f"zero_{name}")]
+        return {
+            f"error_{name}_mean": mean(f"error_{name}"),
+            f"error_{name}_max": largest(f"error_{name}"),
+            f"queries_zero_{name}": len(zero),
+            f"error_{name}_zero_max": largest(f"error_{name}_scaled", zero),
+        }
+
     residuals = [largest(name) for name in ("primal_residual", "dual_residual", "gap")]
     return {
         "status": worst.value,
         "reason": f"{len(reasons)} of {len(rows)} queries, first {reasons[0]}" if reasons else "",
         "queries": len(rows),
         "queries_ok": len(fine),
-        "error_u_mean": mean("error_u"),
-        "error_u_max": largest("error_u"),
-        "error_lambda_mean": mean("error_lambda"),
-        "error_lambda_max": largest("error_lambda"),
+        **errors("u"),
+        **errors("lambda"),
         **{f"{name}_max": largest(name) for name in ("solver_error_u", "solver_error_lambda", "solver_share")},
         "solver_share_mean": max(
             (share for name in ("u", "lambda") if (share := solver_share(name)) is not None), default=None

@@ -14,7 +14,7 @@ from vibench.interfaces.problem import ParameterBox, VariationalInequality
 from vibench.interfaces.strategies import Kind
 from vibench.interfaces.validation import validation_parameters
 from vibench.model.error_bounds import Bounds, Stability, bounds
-from vibench.model.errors import Errors, Reference, errors, relative_to
+from vibench.model.errors import UNMEASURABLE, Errors, Reference, errors
 from vibench.qp.accuracy_bounds import slack
 from vibench.qp.exact import ExactSolution
 from vibench.qp.scaling import ratio
@@ -27,7 +27,6 @@ from vibench.stages.artefacts import Store
 from vibench.stages.assemblies import assemblies
 from vibench.stages.assembly import AssemblyStage, Model, ReducedPrograms
 from vibench.stages.base import Row, value_of
-from vibench.stages.cell_summary import UNMEASURABLE
 from vibench.study import registry
 from vibench.timing import SLOW, Seconds, timed
 
@@ -193,15 +192,16 @@ def error_columns(
     lam = model.generators @ np.column_stack([alpha for _, alpha in solutions])
     found = zip(errors(problem, vis, reference, u, lam), bounds(problem, vis, known, u, lam), strict=True)
     rows = [_columns(error, bound) for error, bound in found]
-    sizes = zip(*relative_to(problem, reference), strict=True)
-    for row, (x, alpha), program, (size_u, size_lam) in zip(rows, solutions, exact, sizes, strict=True):
+    norms = zip(problem.V.norm(reference.u), problem.W.norm(reference.lam), strict=True)
+    for row, (x, alpha), program, (norm_u, norm_lam) in zip(rows, solutions, exact, norms, strict=True):
         if program is None:
             continue
-        row["solver_error_u"] = ratio(float(np.linalg.norm(x - program.x)), size_u)  # the basis is orthonormal in V
-        if program.unique:
+        if row["error_u"] is not None:
+            row["solver_error_u"] = ratio(float(np.linalg.norm(x - program.x)), norm_u)  # the basis is orthonormal in V
+        if row["error_lambda"] is not None and program.unique:
             difference = model.generators @ (alpha - program.alpha)
-            row["solver_error_lambda"] = ratio(float(problem.W.norm(difference)), size_lam)
-        names = [name for name in ("u", "lambda") if row[f"error_{name}"] > UNMEASURABLE]
+            row["solver_error_lambda"] = ratio(float(problem.W.norm(difference)), norm_lam)
+        names = [name for name in ("u", "lambda") if (row[f"error_{name}"] or 0.0) > UNMEASURABLE]
         row["solver_share"] = max((row.get(f"solver_error_{n}", 0.0) / row[f"error_{n}"] for n in names), default=None)
     return rows
 
@@ -210,8 +210,13 @@ def _columns(error: Errors, bound: Bounds | None) -> Row:
     row = asdict(error)
     if bound is not None:
         row |= {"bound_u": bound.u, "bound_lambda": bound.lam}
-        if error.error_u > UNMEASURABLE:
+        if _measured(error.error_u, error.error_u_scaled) > UNMEASURABLE:
             row["effectivity_u"] = bound.u / error.error_u_absolute
-        if error.error_lambda > UNMEASURABLE:
+        if _measured(error.error_lambda, error.error_lambda_scaled) > UNMEASURABLE:
             row["effectivity_lambda"] = bound.lam / error.error_lambda_absolute
     return row
+
+
+def _measured(relative: float | None, scaled: float) -> float:
+    """An error relative to its solution, or where that is zero to the largest training solution."""
+    return scaled if relative is None else relative

@@ -181,6 +181,17 @@ def test_the_summary_says_prescribed_sizes() -> None:
     assert (frame["δ_POD"][0], frame["δ_dual"][0]) == ("N=9", "R=4")
 
 
+def test_the_summary_counts_zero_solutions_where_there_are_any() -> None:
+    none = {"queries_zero_u": 0, "error_u_zero_max": None, "queries_zero_lambda": 0, "error_lambda_zero_max": None}
+    some = none | {"queries_zero_lambda": 3, "error_lambda_zero_max": 1e-10}
+    columns = {"u = 0", "error, u = 0", "λ = 0", "error, λ = 0"}
+    assert not columns & set(summary(cells(none)).columns)
+    shown = summary(cells(none, some | {"solver": "z"}))
+    assert columns & set(shown.columns) == {"λ = 0", "error, λ = 0"}
+    assert list(shown["λ = 0"]) == [0, 3]
+    assert shown["error, λ = 0"][1] == 1e-10
+
+
 def rounds(cells: list[dict[str, Any]]) -> list[dict[str, Any]]:
     same = {"slowdown": 1.0}
     return [same | {"cell": c["cell"], "round": k, "total_s": c["online_s"]} for c in cells for k in range(6)]

@@ -5,11 +5,13 @@ from dataclasses import astuple
 import numpy as np
 import pytest
 import scipy.sparse as sp
+from hypothesis import given
+from hypothesis import strategies as st
 from numerics import Varying
 
 from vibench.highfidelity import active_set
 from vibench.model.error_bounds import Stability, bounds, extreme_quotients
-from vibench.model.errors import Reference, errors
+from vibench.model.errors import UNMEASURABLE, Reference, errors
 from vibench.reduction.supremizers import constraint_classes
 from vibench.stability.infsup import inf_sup_full, inf_sup_on, multipliers, nodal_multipliers
 from vibench.stability.over_parameters import constants_full, constants_on
@@ -36,13 +38,35 @@ def test_errors_as_defined() -> None:
     assert nothing.violation < 1e-10
 
 
-def test_a_solution_below_the_floor_is_measured_against_the_floor() -> None:
+@given(st.floats(-12.0, 3.0), st.floats(-12.0, 3.0), st.floats(-20.0, 20.0), st.integers(0, 1000))
+def test_what_is_zero_beside_the_training_set_has_no_relative_error(
+    share_u: float, share_lam: float, unit: float, seed: int
+) -> None:
+    """Whatever the unit: its error on the scale of the training set is known, as that of any other."""
+    problem, rng = Varying(), np.random.default_rng(seed)
+    vi = problem.assemble(np.array([0.5]))
+    u, lam, du, dlam = (10.0**unit * rng.random((size, 1)) for size in (30, 8, 30, 8))
+    scale_u, scale_lam = float(problem.V.norm(u)[0]), float(problem.W.norm(lam)[0])
+    reference = Reference(10.0**share_u * u, 10.0**share_lam * lam, scale_u, scale_lam)
+    (found,) = errors(problem, [vi], reference, reference.u + du, reference.lam + dlam)
+    for name, share, error, scale in (
+        ("u", share_u, float(problem.V.norm(du)[0]), scale_u),
+        ("lambda", share_lam, float(problem.W.norm(dlam)[0]), scale_lam),
+    ):
+        relative = getattr(found, f"error_{name}")
+        assert (relative is None) == (10.0**share <= UNMEASURABLE)
+        assert relative is None or relative == pytest.approx(error / (10.0**share * scale))
+        assert getattr(found, f"error_{name}_scaled") == pytest.approx(error / scale)
+        assert getattr(found, f"error_{name}_absolute") == pytest.approx(error)
+    assert (found.error_energy is None) == (found.error_u is None)
+
+
+def test_without_a_training_solution_only_zero_is_zero() -> None:
     problem = Varying()
     vi = problem.assemble(np.array([0.5]))
-    u, lam = np.zeros((30, 1)), np.zeros((8, 1))
-    lam[0] = 1e-3
-    (found,) = errors(problem, [vi], Reference(u, 0.0 * lam, 1.0, 2.0), u, lam)
-    assert np.isclose(found.error_lambda, float(problem.W.norm(lam)[0]) / 2.0)
+    lam = np.column_stack([np.zeros(8), 1e-30 * np.ones(8)])
+    found = errors(problem, [vi, vi], Reference(np.zeros((30, 2)), lam, 0.0, 0.0), np.zeros((30, 2)), np.zeros((8, 2)))
+    assert [(one.error_u, one.error_lambda) for one in found] == [(None, None), (None, 1.0)]
 
 
 def test_errors_and_bounds_of_many_queries_are_those_of_each() -> None:

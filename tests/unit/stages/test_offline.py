@@ -9,6 +9,8 @@ from typing import Literal
 import numpy as np
 import pytest
 import scipy.linalg
+from hypothesis import given
+from hypothesis import strategies as st
 from samples import carry_out
 
 from vibench import timing
@@ -308,6 +310,33 @@ def test_means_are_over_the_ok_queries_and_the_worst_status_names_the_cell() -> 
     assert found["reason"] == "1 of 4 queries, first mu=(0.5): it was failed"
     assert (found["queries"], found["queries_ok"]) == (4, 2)
     assert (found["error_u_mean"], found["error_u_max"]) == (2.0, 3.0)
+
+
+@given(
+    st.lists(st.tuples(st.booleans(), st.booleans(), st.booleans(), st.floats(1e-6, 1e6), st.floats(0, 1)), min_size=1)
+)
+def test_what_is_zero_is_counted_apart_and_enters_no_mean(drawn: list[tuple[bool, bool, bool, float, float]]) -> None:
+    rows = [
+        query(
+            "ok" if ok else "inaccurate",
+            None if zero_u else error,
+            error_u_scaled=scaled,
+            error_lambda=None if zero_lam else error,
+            error_lambda_scaled=scaled,
+            zero_u=int(zero_u),
+            zero_lambda=int(zero_lam),
+        )
+        for ok, zero_u, zero_lam, error, scaled in drawn
+    ]
+    found = summarise(rows)
+    for name, kind in (("u", 1), ("lambda", 2)):
+        errors = [one[3] for one in drawn if one[0] and not one[kind]]
+        scaled = [one[4] for one in drawn if one[0] and one[kind]]
+        assert found[f"queries_zero_{name}"] == len(scaled)
+        assert found[f"error_{name}_zero_max"] == (max(scaled) if scaled else None)
+        assert found[f"error_{name}_max"] == (max(errors) if errors else None)
+        mean = found[f"error_{name}_mean"]
+        assert mean == pytest.approx(sum(errors) / len(errors)) if errors else mean is None
 
 
 def test_without_an_ok_query_there_are_no_means() -> None:
