@@ -20,7 +20,13 @@ ERROR_FLOOR = 1e-10
 """Errors below this are round-off, and their ratio is meaningless."""
 
 CONSTANTS = ("beta_span_min", "beta_cone_lower_min")
-ERRORS = ("error_u_mean", "error_u_max", "error_lambda_mean", "error_lambda_max", "violation_max")
+ERRORS = {
+    **{f"error_{name}_{how}": (f"error_{name}", how) for name in ("u", "lambda") for how in ("mean", "max")},
+    "violation_max": ("violation", "max"),
+}
+"""Columns of a cell that are means or maxima over its ok queries: of which column, and which of the two."""
+
+ZERO_ERRORS = ("error_u_zero_max", "error_lambda_zero_max")
 
 NUMBERS = ("benefit_threshold", "threshold_low", "threshold_high")
 
@@ -72,18 +78,36 @@ def compare(a: Path, b: Path, limit: float) -> Comparison:
     """
     one, two = (tables.in_order(tables.read(path, "cells")).set_index("cell", drop=False) for path in (a, b))
     shared = [key for key in one.index if key in two.index]
+    moved = _on_common_queries(one, two, *(_ok_queries(path) for path in (a, b)))
     changes: list[Change] = [
         *((one.loc[key], "cell", "present", "gone", Verdict.WORSE) for key in one.index if key not in two.index),
         *((two.loc[key], "cell", "", "new", Verdict.CHANGED) for key in two.index if key not in one.index),
         *(change for key in shared for change in _cell(one.loc[key], two.loc[key], limit)),
     ]
     notes = [f"{len(shared)} cells are in both runs"]
+    notes += [f"errors of {moved} of them are compared on the queries that are ok in both"] if moved else []
     if all(one.loc[key, "machine"] == two.loc[key, "machine"] for key in shared):
         changes += _thresholds(tables.read(a, "thresholds"), tables.read(b, "thresholds"), limit)
     else:
         notes.append("times and break-even of different machines are not compared")
     rows = [_row(cell, what, old, new, verdict) for cell, what, old, new, verdict in changes if verdict is not None]
     return Comparison(pd.DataFrame(rows, columns=COLUMNS), tuple(notes))
+
+
+def _ok_queries(path: Path) -> pd.DataFrame:
+    queries = tables.read(path, "queries")
+    return queries[queries["status"] == Status.OK].set_index(["cell", "query"])
+
+
+def _on_common_queries(one: pd.DataFrame, two: pd.DataFrame, ok_one: pd.DataFrame, ok_two: pd.DataFrame) -> int:
+    """Put means and maxima over the queries that are ok in both runs into cells where those differ; their number."""
+    different = set(ok_one.index.symmetric_difference(ok_two.index).get_level_values("cell"))
+    keys = [key for key in one.index if key in two.index and key in different]
+    for cells, ok in ((one, ok_one), (two, ok_two)):
+        common = ok[ok.index.isin(ok_one.index.intersection(ok_two.index))].groupby("cell")
+        for column, (name, how) in ERRORS.items():
+            cells.loc[keys, column] = common[name].agg(how).reindex(keys)
+    return len(keys)
 
 
 def _cell(one: pd.Series, two: pd.Series, limit: float) -> Iterator[Change]:
@@ -96,7 +120,8 @@ def _cell(one: pd.Series, two: pd.Series, limit: float) -> Iterator[Change]:
         moved = Verdict.CHANGED if before != after and pd.notna(before) else None
         yield one, name, before, after, _verdict(before, after, limit) or moved
     times = ("offline_s", "online_s") if one["machine"] == two["machine"] else ()
-    for names, floor, more in ((CONSTANTS, VANISHES, True), (ERRORS, ERROR_FLOOR, False), (times, 0.0, False)):
+    errors = (*ERRORS, *ZERO_ERRORS)
+    for names, floor, more in ((CONSTANTS, VANISHES, True), (errors, ERROR_FLOOR, False), (times, 0.0, False)):
         for name in names:
             # Missing values stay NaN: `max` returns its first argument unless the second is larger.
             verdict = _verdict(max(one[name], floor), max(two[name], floor), limit, more_is_better=more)

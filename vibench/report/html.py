@@ -26,6 +26,12 @@ from vibench.results.break_even import HIGH_FIDELITY
 from vibench.results.database import read_meta, study_of
 from vibench.text import printable
 
+ERRORS = (
+    "Errors are relative; they are means over the ok queries whose high-fidelity solution is not zero. Where a run has "
+    "others, columns u = 0 and λ = 0 have their number and their largest error over the largest training norm. Means "
+    "over other queries are not comparable: findings and figures take those over queries that all solved."
+)
+
 IDENTITY = ["problem", "dual", "primal", "primal_tol", "solver", "accuracy", "assembly", "status"]
 """Columns that cells and queries share in the tables of failures."""
 
@@ -93,7 +99,7 @@ def _facts(study: dict[str, Any], cells: pd.DataFrame) -> Iterator[tuple[str, st
 
 def _tables(path: Path, cells: pd.DataFrame) -> Iterator[tuple[str, str, str, pd.DataFrame]]:
     """Identifier, title, caption and rows."""
-    yield "summary", "All cells", "Errors are relative; they are means over the ok queries.", tables.summary(cells)
+    yield "summary", "All cells", ERRORS, tables.summary(cells)
     thresholds = tables.read(path, "thresholds")
     model = thresholds["primal_a"] == HIGH_FIDELITY
     caption = (

@@ -47,6 +47,24 @@ def test_a_change_of_one_cell_is_told_with_its_meaning(
     assert (row["problem"], row["dual"], row["primal"], row["solver"]) == ("hertz", "mcpg", "offline-pga", "piqp")
 
 
+def test_errors_are_compared_on_the_queries_that_are_ok_in_both_runs(changed: Changed, quick_run: Path) -> None:
+    """A run that fails in the hard queries is not better for it."""
+    after = changed(
+        f"UPDATE queries SET status = 'inaccurate' WHERE {ONE} AND query > 3",
+        f"UPDATE cells SET queries_ok = 4, error_u_mean = 1e-3 * error_u_mean, error_u_max = 1e-3 * error_u_max,"
+        f" error_lambda_mean = 1e-3 * error_lambda_mean WHERE {ONE}",
+    )
+    found = compare(quick_run / FILE, after, 1.25)
+    assert list(found.changes["what"]) == ["queries ok"]
+    assert "errors of 1 of them are compared on the queries that are ok in both" in found.notes
+    worse = changed(
+        f"UPDATE queries SET status = 'inaccurate' WHERE {ONE} AND query > 3",
+        f"UPDATE queries SET error_u = 2 * error_u WHERE {ONE} AND query < 4",
+        f"UPDATE cells SET queries_ok = 4 WHERE {ONE}",
+    )
+    assert set(compare(quick_run / FILE, worse, 1.25).changes["what"]) == {"queries ok", "error_u_mean", "error_u_max"}
+
+
 def test_changes_within_the_limit_are_not_told(changed: Changed, quick_run: Path) -> None:
     after = changed("UPDATE cells SET online_s = 1.2 * online_s, error_u_mean = 1.2 * error_u_mean")
     assert compare(quick_run / FILE, after, 1.25).changes.empty

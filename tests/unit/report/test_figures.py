@@ -368,6 +368,37 @@ def test_no_strategy_beats_those_on_the_front(results: Path) -> None:
         assert on != beaten
 
 
+def test_errors_in_a_figure_are_those_on_common_queries(change: Callable[..., None], draw: Draw, results: Path) -> None:
+    """A strategy that solved the easy half of the queries has no smaller error for it; one that solved less, none."""
+    few = "problem = 'obstacle' AND dual = 'mcpg' AND primal"
+    change(
+        f"UPDATE queries SET status = 'inaccurate' WHERE {few} = 'decorrelated' AND query < 6",
+        f"UPDATE queries SET status = 'inaccurate' WHERE {few} = 'offline-pga' AND query < 9",
+    )
+    figures = draw("work-precision", "dimension")
+    queries = tables.read(results, "queries")
+    fine = queries[(queries["problem"] == "obstacle") & (queries["query"] >= 6)]
+    means = fine.groupby("cell")[["error_u", "error_lambda"]].mean()
+    for kind in ("work-precision", "dimension"):
+        figure = figures[f"obstacle-{kind}"]
+        assert figure.get_suptitle().endswith("over the 10 of 16 queries that all solved")
+        labels = figure.axes[0].get_legend_handles_labels()[1]
+        assert "decorrelated, mcpg" in labels
+        assert "offline-pga, mcpg" not in labels
+        for axes, name in zip(figure.axes, means, strict=True):
+            for line in axes.get_lines():
+                assert np.isin(np.round(line.get_ydata(), 12), np.round(means[name], 12)).all()
+    assert figures["hertz-dimension"].get_suptitle().endswith("errors against dimension")
+
+
+def test_without_contact_errors_of_u_are_drawn_alone(change: Callable[..., None], draw: Draw) -> None:
+    change("UPDATE queries SET zero_lambda = 1, error_lambda = NULL", "UPDATE cells SET error_lambda_mean = NULL")
+    for figure in draw("work-precision", "dimension").values():
+        left, right = figure.axes
+        assert data_of(left)
+        assert not data_of(right)
+
+
 def test_a_profile_ends_at_the_share_that_was_solved(change: Callable[..., None], draw: Draw) -> None:
     change("UPDATE queries SET status = 'failed' WHERE solver = 'osqp' AND problem = 'obstacle' AND query < 4")
     profile = draw("solvers")["obstacle-solvers"].axes[1]

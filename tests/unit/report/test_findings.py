@@ -44,6 +44,68 @@ def test_cells_whose_solver_makes_the_error_are_counted_and_left_out(said: Said)
     assert not [text for text in of_model if "online-supremizers" in text]
 
 
+def test_zero_solutions_are_counted_and_measured_by_the_training_set(said: Said) -> None:
+    mine = "problem = 'hertz' AND query IN (2, 5)"
+    texts = said(
+        f"UPDATE queries SET zero_lambda = 1, error_lambda = NULL, error_lambda_scaled = 1e-11 WHERE {mine}",
+        f"UPDATE queries SET error_lambda_scaled = 0.25 WHERE {mine} AND query = 5 AND solver = 'piqp'"
+        " AND dual = 'mcpg' AND primal = 'decorrelated'",
+    )
+    zero, worst = texts["hertz, zero solutions"]
+    assert zero.startswith("λ is zero, at most 1e-08 of the largest of the training set, at 2 of 16 validation")
+    assert (
+        "at most 0.25 of the largest of the training set there (decorrelated, mcpg, piqp), in the median 1e-11" in worst
+    )
+    assert "obstacle, zero solutions" not in texts
+
+
+def test_without_a_relative_error_none_is_told(said: Said) -> None:
+    texts = said("UPDATE queries SET zero_lambda = 1, error_lambda = NULL", "UPDATE cells SET error_lambda_mean = NULL")
+    assert not [text for found in texts.values() for text in found if "nan" in text]
+
+
+def test_errors_of_strategies_are_those_on_common_queries(said: Said, quick_run: Path) -> None:
+    """The easy queries alone would flatter a strategy that failed in the others."""
+    failed = "problem = 'obstacle' AND dual = 'mcpg' AND primal = 'decorrelated'"
+    texts = said(
+        f"UPDATE queries SET status = 'inaccurate' WHERE {failed} AND query < 6",
+        f"UPDATE cells SET queries_ok = 10 WHERE {failed}",
+    )
+    queries = tables.read(quick_run / FILE, "queries")
+    mine = queries[(queries["problem"] == "obstacle") & (queries["dual"] == "mcpg") & (queries["query"] >= 6)]
+    (about,) = [found for subject, found in texts.items() if subject.startswith("obstacle, mcpg, (N, R)")]
+    for primal, beginning in (("decorrelated", "Without enrichment"), ("offline-pga", "offline-pga")):
+        of_primal = mine[mine["primal"] == primal].groupby("solver")["error_lambda"].mean()
+        means = {f"is {mean:.3g} over the 10 of 16 queries that all solved." for mean in of_primal}
+        (text,) = [text for text in about if text.startswith(beginning)]
+        assert any(text.endswith(mean) for mean in means), text
+
+
+def test_cells_with_few_ok_queries_are_counted_and_their_errors_left_out(said: Said) -> None:
+    few = "problem = 'obstacle' AND dual = 'mcpg' AND primal = 'decorrelated'"
+    texts = said(
+        f"UPDATE queries SET status = 'inaccurate' WHERE {few} AND query < 9",
+        f"UPDATE cells SET queries_ok = 7 WHERE {few}",
+    )
+    assert any(text.startswith("3 cells have fewer than half of their queries ok") for text in texts[""])
+    (about,) = [found for subject, found in texts.items() if subject.startswith("obstacle, mcpg, (N, R)")]
+    assert ["error of λ" in text for text in about[:2]] == [False, True]
+    assert not [text for text in about if "that all solved" in text]
+
+
+def test_solvers_are_compared_on_common_programs(said: Said, quick_run: Path) -> None:
+    texts = said("UPDATE queries SET status = 'inaccurate' WHERE solver = 'osqp' AND problem = 'hertz' AND query < 4")
+    queries = tables.read(quick_run / FILE, "queries")
+    mine = queries[(queries["problem"] == "hertz") & (queries["query"] >= 4)]
+    for solver, found in mine.groupby("solver"):
+        median = f"with a median of {1e3 * found['solve_s'].median():.3g} ms over the 72 programs that all solved."
+        count = 72 if solver == "osqp" else 96
+        assert f"{solver} solved {count} of 96 programs, {median}" in texts["hertz, solvers"]
+        errors = f"{solver} {found['error_u'].mean():.3g} and {found['error_lambda'].mean():.3g}"
+        assert errors in texts["hertz, solvers"][-1]
+    assert not [text for text in texts["obstacle, solvers"] if "over the" in text]
+
+
 def test_a_violated_invariant_is_not_hidden(said: Said) -> None:
     broken = "UPDATE queries SET beta_span = 9 WHERE query = 3 AND problem = 'hertz' AND solver = 'piqp'"
     assert any("invariants of the inf-sup constants" in text and "violated" in text for text in said(broken)[""])

@@ -9,6 +9,7 @@ import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from vibench.report.common_queries import on_common_queries
 from vibench.report.figures.data import Data, best_solver, by_dimensions, label
 from vibench.report.figures.style import BLACK, POINTS, Sheet, legend_label, line, plot, style_of
 from vibench.results.break_even import HIGH_FIDELITY, Meaning
@@ -25,7 +26,7 @@ MARKS = {Meaning.FROM: ">", Meaning.UNTIL: "<"}
 
 
 def dimension(data: Data) -> Figure | None:
-    """Errors against the dimension of the reduced problem, N + S + R."""
+    """Errors against the dimension of the reduced problem, N + S + R; means over the queries that all cells solved."""
     cells = best_solver(data.cells)
     cells = cells[(cells["assembly"] == "full") | ~(cells["assembly"] == "full").any()]
     size = cells["N"] + cells["enrichment"].fillna(0) + cells["R"]
@@ -33,7 +34,10 @@ def dimension(data: Data) -> Figure | None:
 
 
 def work_precision(data: Data) -> Figure | None:
-    """Errors against the time of a query; no cell is both faster and more accurate than those on the line."""
+    """Errors against the time of a query; no cell is both faster and more accurate than those on the line.
+
+    Errors are means over the queries that all of these cells solved; a cell that solved fewer than half has no point.
+    """
     cells = best_solver(data.cells)
     return _scatter(data, cells, 1e3 * cells["online_s"], "mean time of a query [ms]", "work and precision", front=True)
 
@@ -42,11 +46,11 @@ def _scatter(
     data: Data, cells: pd.DataFrame, x: pd.Series, xlabel: str, title: str, *, front: bool = False
 ) -> Figure | None:
     """One point per cell: colour and marker for primal strategy and assembly, filling for the dual strategy."""
-    known = cells["error_u_mean"].notna() & x.notna()
-    cells, x = cells[known], x[known]
+    compared = on_common_queries(cells[x.notna()], data.queries)
+    cells = compared.cells[compared.cells[list(ERRORS)].notna().any(axis=1)]
     if cells.empty:
         return None
-    sheet = Sheet(1, 2, f"{data.problem}, {cells['solver'].iloc[0]}: {title}")
+    sheet = Sheet(1, 2, f"{data.problem}, {cells['solver'].iloc[0]}: {title}{compared.over}")
     kinds = list(dict.fromkeys(zip(cells["primal"], cells["assembly"], strict=True)))
     duals = list(cells["dual"].unique())
     for panel, (column, ylabel) in zip(sheet.panels, ERRORS.items(), strict=True):
@@ -55,7 +59,8 @@ def _scatter(
             name = f"{label(primal, None, assembly)}, {dual}"
             panel.plot(x[mine.index], mine[column], label=legend_label(name), **point)
         if front:
-            line_of = _front(x.to_numpy(float), cells[column].to_numpy(float))
+            drawn = cells[cells[column].notna()]
+            line_of = _front(x[drawn.index].to_numpy(float), drawn[column].to_numpy(float))
             panel.plot(*line_of, color="0.6", linewidth=0.8, drawstyle="steps-post", zorder=0)
         panel.set(xlabel=xlabel, ylabel=ylabel, xscale="log", yscale="log")
     return sheet.finish()
@@ -72,7 +77,7 @@ def _front(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The Pareto front of points to be small in x and y, from left to right."""
     order = np.lexsort((y, x))
     best = np.minimum.accumulate(y[order])
-    kept = np.concatenate([[True], best[1:] < best[:-1]])
+    kept = np.concatenate([np.ones(min(len(best), 1), dtype=bool), best[1:] < best[:-1]])
     return x[order][kept], y[order][kept]
 
 

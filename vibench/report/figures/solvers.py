@@ -8,14 +8,11 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from vibench.qp.status import Status
+from vibench.report.common_queries import PROGRAM, WAY, common_programs
 from vibench.report.figures.data import Data
 from vibench.report.figures.style import POINTS, Sheet, plot
-from vibench.results.columns import KEYS
 
 RESIDUALS = ["primal_residual", "dual_residual", "gap"]
-
-INSTANCE = [*(name for name in KEYS if name not in ("problem", "problem_options", "solver")), "query"]
-"""Columns that identify a quadratic program which every solver solves."""
 
 EXACT = 1e-16
 """Residuals and errors are drawn no lower than this."""
@@ -43,19 +40,14 @@ def precision(data: Data) -> Figure | None:
     """Median time of a program against the part of the error of u and of λ that the solver makes, over the accuracy.
 
     Each point is one accuracy of one solver: median over the programs that are ok in all of these ways. A solver that
-    has no ok query at an accuracy has no point there.
+    has fewer than half of its queries ok at an accuracy has no point there.
     """
-    fine = data.queries[data.queries["status"] == Status.OK]
-    if fine["accuracy"].nunique() < 2:
+    shared = common_programs(data.queries)
+    if shared["accuracy"].nunique() < 2:
         return None
-    ways = fine.groupby(["solver", "accuracy"]).ngroups
-    programs = [name for name in INSTANCE if name != "accuracy"]
-    shared = fine.groupby(programs, dropna=False)["solver"].transform("size") == ways
-    if not shared.any():
-        return None
-    title = f"{data.problem}: time and precision of the QP solvers, {int(shared.sum()) // ways} programs"
-    sheet = Sheet(1, 2, title)
-    for k, (solver, mine) in enumerate(fine[shared].groupby("solver")):
+    count = len(shared) // shared.groupby(WAY).ngroups
+    sheet = Sheet(1, 2, f"{data.problem}: time and precision of the QP solvers, {count} programs")
+    for k, (solver, mine) in enumerate(shared.groupby("solver")):
         found = mine.groupby("accuracy")[["solve_s", "solver_error_u", "solver_error_lambda"]].median()
         for panel, name in zip(sheet.panels, ("u", "lambda"), strict=True):
             error = np.maximum(found[f"solver_error_{name}"], EXACT)
@@ -80,7 +72,9 @@ def _accuracy(panel: Axes, queries: pd.DataFrame, names: list[str]) -> None:
 
 def _profile(panel: Axes, queries: pd.DataFrame, names: list[str]) -> None:
     solved = queries["solve_s"].where(queries["status"] == Status.OK, np.inf).fillna(np.inf)
-    instances = queries.assign(time=solved).groupby([*INSTANCE, "solver"], dropna=False)["time"].min().unstack()
+    instances = (
+        queries.assign(time=solved).groupby([*PROGRAM, "accuracy", "solver"], dropna=False)["time"].min().unstack()
+    )
     fastest = instances.min(axis=1).replace(np.inf, 1.0)  # where nobody solved a program all ratios are infinite
     ratios = instances.div(fastest, axis=0).fillna(np.inf)
     last = 1.1 * ratios.replace(np.inf, 1.0).to_numpy().max()

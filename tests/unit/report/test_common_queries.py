@@ -1,0 +1,71 @@
+"""Errors compared on common queries: as by hand, and the same for cells that solved everything."""
+
+from __future__ import annotations
+
+import numpy as np
+import pandas as pd
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from samples import query_rows
+
+from vibench.report.common_queries import FEWEST, common_programs, on_common_queries
+
+QUERIES = 6
+solved_by_cell = st.lists(st.sets(st.integers(0, QUERIES - 1)), min_size=1, max_size=5)
+
+
+def tables(solved: list[set[int]], zero: set[int] | None = None) -> tuple[pd.DataFrame, pd.DataFrame]:
+    """Cells named by numbers, the k-th of which solved these queries; the error of query q is q + 1 + 10 k."""
+    cells = pd.DataFrame({"cell": [str(k) for k in range(len(solved))], "queries": QUERIES, "error_u_mean": -1.0})
+    rows = [
+        row
+        | {"status": "ok" if q in mine else "inaccurate", "error_u": q + 1.0 + 10.0 * k}
+        | {"error_lambda": None if q in (zero or ()) else 2.0 * q}
+        | {"solver": f"s{k}", "accuracy": 1e-7}
+        for k, mine in enumerate(solved)
+        for q, row in enumerate(query_rows(str(k), QUERIES))
+    ]
+    return cells.assign(error_lambda_mean=-1.0), pd.DataFrame(rows).astype({"error_lambda": float})
+
+
+@given(solved_by_cell, st.sets(st.integers(0, QUERIES - 1)))
+def test_means_are_over_the_queries_that_all_compared_cells_solved(solved: list[set[int]], zero: set[int]) -> None:
+    found = on_common_queries(*tables(solved, zero))
+    kept = [k for k, mine in enumerate(solved) if len(mine) >= FEWEST * QUERIES]
+    common = set.intersection(*(solved[k] for k in kept)) if kept else set()
+    assert list(found.cells["cell"]) == [str(k) for k in kept]
+    assert (found.common, found.asked) == (len(common), QUERIES if kept else 0)
+    for k, row in zip(kept, found.cells.itertuples(), strict=True):
+        for mean, errors in (
+            (row.error_u_mean, [q + 1.0 + 10.0 * k for q in common]),
+            (row.error_lambda_mean, [2.0 * q for q in common - zero]),
+        ):
+            assert mean == pytest.approx(np.mean(errors)) if errors else np.isnan(mean)
+    assert (found.over == "") == (found.common == found.asked)
+
+
+def test_the_worse_solver_is_not_flattered_by_what_it_did_not_solve() -> None:
+    """As in a run where one was ok in half of the queries, the easy ones, and the other in all."""
+    found = on_common_queries(*tables([{0, 1, 2}, set(range(QUERIES))]))
+    assert list(found.cells["error_u_mean"] - [0.0, 10.0]) == [2.0, 2.0]
+    assert found.over == " over the 3 of 6 queries that all solved"
+
+
+@given(solved_by_cell)
+def test_common_programs_are_those_of_all_compared_solvers(solved: list[set[int]]) -> None:
+    _, queries = tables(solved)
+    found = common_programs(queries)
+    kept = [mine for mine in solved if len(mine) >= FEWEST * QUERIES]
+    common = set.intersection(*kept) if kept else set()
+    assert len(found) == len(kept) * len(common)
+    assert set(found["query"]) == common
+    assert set(found["status"]) <= {"ok"}
+
+
+def test_one_program_at_two_accuracies_is_solved_in_two_ways() -> None:
+    _, queries = tables([{0, 1, 2, 3}, {0, 1, 2, 4}])
+    tight = queries.assign(accuracy=1e-9, status=np.where(queries["query"] < 3, "ok", "inaccurate"))
+    found = common_programs(pd.concat([queries, tight]))
+    assert len(found) == 4 * 3
+    assert set(found["query"]) == {0, 1, 2}
