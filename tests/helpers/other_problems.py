@@ -1,0 +1,183 @@
+"""Problems of another nature than the built-in ones: plastic torsion, a perpetual put, a block on a rigid obstacle."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Annotated, Any, ClassVar
+
+import numpy as np
+import scipy.sparse as sp
+from annotated_types import Ge, Le
+from skfem import (
+    Basis,
+    BilinearForm,
+    ElementHex1,
+    ElementQuad1,
+    ElementTriP1,
+    ElementVector,
+    MeshHex,
+    MeshQuad,
+    MeshTri,
+)
+from skfem.helpers import ddot, dot, eye, grad, sym_grad, trace
+
+from vibench import Array, Indices, InnerProduct, ParameterBox, Problem, Sampler, VariationalInequality
+
+
+@BilinearForm
+def stiffness(u: Any, v: Any, _: Any) -> Any:
+    return dot(grad(u), grad(v))
+
+
+@BilinearForm
+def mass(u: Any, v: Any, _: Any) -> Any:
+    return u * v
+
+
+def lumped(basis: Basis) -> Array:
+    """Row sums of the mass matrix of a scalar basis: the integrals of its functions."""
+    return np.asarray(mass.assemble(basis).sum(axis=1)).ravel()
+
+
+def nodal(entries: Array) -> sp.csr_array:
+    return sp.csr_array(sp.diags_array(entries))
+
+
+class Torsion(Problem):
+    """Elastic–plastic torsion of a square bar: −Δu = twist where |∇u| < 1, as the obstacle problem u ≤ dist(x, ∂Ω).
+
+    The obstacle problem is equivalent (Brezis and Sibony 1971). The bar yields first in the middle of its sides, at a
+    twist of about 3; below it no constraint is active and λ = 0. P1 on a square mesh, lumped multipliers at its nodes.
+    """
+
+    parameters = ParameterBox(("twist",), np.array([1.0]), np.array([8.0]), ("1/m",))
+    constant: ClassVar[frozenset[str]] = frozenset({"A", "B", "g"})
+
+    def __init__(self, cells: Annotated[int, Ge(4), Le(64)] = 12) -> None:
+        mesh = MeshTri.init_tensor(np.linspace(0.0, 1.0, cells + 1), np.linspace(0.0, 1.0, cells + 1))
+        basis = Basis(mesh, ElementTriP1())
+        free = basis.complement_dofs(basis.get_dofs())
+        x, y = mesh.p[:, free]
+        self._stiffness = sp.csr_array(stiffness.assemble(basis)[free][:, free])
+        self._weights = lumped(basis)[free]
+        self._distance = np.minimum.reduce([x, 1.0 - x, y, 1.0 - y])
+        self.V = InnerProduct(self._stiffness + sp.csr_array(mass.assemble(basis)[free][:, free]))
+        self.W = InnerProduct(nodal(self._weights))
+
+    def training_set(self) -> Array:
+        return self.parameters.grid(15)
+
+    def assemble(self, mu: Array) -> VariationalInequality:
+        weights = self._weights
+        return VariationalInequality(self._stiffness, mu[0] * weights, nodal(weights), weights * self._distance)
+
+
+class Put(Problem):
+    """The perpetual American put with strike 1, as an obstacle problem in x = ln S.
+
+    The Black–Scholes operator with volatility σ and rate r becomes symmetric for w = e^{κx} V, κ = r/σ² − ½:
+
+        −½σ² w″ + (r + ½σ²κ²) w ≥ 0,    w ≥ e^{κx} (1 − eˣ)₊,    one of them an equality.
+
+    P1 elements on [−1, 5] with the payoff as Dirichlet data, lumped multipliers at all free nodes.
+    """
+
+    parameters = ParameterBox(
+        ("volatility", "rate"), np.array([0.25, 0.05]), np.array([0.35, 0.08]), ("a^(-1/2)", "1/a")
+    )
+    left, right = -1.0, 5.0
+
+    def __init__(self, cells: Annotated[int, Ge(20), Le(2000)] = 120) -> None:
+        self.x = np.linspace(self.left, self.right, cells + 1)
+        step, ones = self.x[1] - self.x[0], np.ones(cells)
+        diagonal = np.concatenate([[1.0], 2.0 * ones[1:], [1.0]])
+        self._K = sp.csr_array(sp.diags_array([diagonal, -ones, -ones], offsets=[0, 1, -1])) / step
+        self._M = sp.csr_array(sp.diags_array([2.0 * diagonal, ones, ones], offsets=[0, 1, -1])) * (step / 6.0)
+        self._weights = np.full(cells - 1, step)
+        self.V = InnerProduct((self._K + self._M)[1:-1, 1:-1])
+        self.W = InnerProduct(nodal(self._weights))
+
+    def training_set(self) -> Array:
+        return self.parameters.grid(5, 4)
+
+    def symmetrised(self, mu: Array, value: Array) -> Array:
+        """w from the value V at all nodes."""
+        return np.exp((mu[1] / mu[0] ** 2 - 0.5) * self.x) * value
+
+    def assemble(self, mu: Array) -> VariationalInequality:
+        half, kappa = 0.5 * mu[0] ** 2, mu[1] / mu[0] ** 2 - 0.5
+        A = half * self._K + (mu[1] + half * kappa**2) * self._M
+        payoff = self.symmetrised(mu, np.maximum(1.0 - np.exp(self.x), 0.0))
+        lift = np.where(np.arange(len(self.x)) == 0, payoff, 0.0)
+        f, inner = -(A @ lift)[1:-1], slice(1, -1)
+        return VariationalInequality(A[inner, inner], f, -nodal(self._weights), -self._weights * payoff[inner], lift)
+
+    def exact(self, mu: Array) -> Array:
+        """w at the nodes, from the value (1 − S*) (S/S*)^(−γ) above S* = γ/(1 + γ), γ = 2r/σ²; no truncation."""
+        gamma, price = 2.0 * mu[1] / mu[0] ** 2, np.exp(self.x)
+        exercise = gamma / (1.0 + gamma)
+        value = np.where(price < exercise, 1.0 - price, (1.0 - exercise) * (price / exercise) ** -gamma)
+        return self.symmetrised(mu, value)
+
+
+class Block(Problem):
+    """A linearly elastic cube, clamped below, into which a rigid paraboloid is pressed: no load, g drives it alone.
+
+    The parameters are the depth of the indentation, contact being lost below 0, and the place of the apex. Trilinear
+    hexahedra, lumped multipliers at the nodes of the top: the force per area that keeps u_z ≤ gap − depth.
+    """
+
+    constant: ClassVar[frozenset[str]] = frozenset({"A", "f", "B"})
+    entrywise: ClassVar[frozenset[str]] = frozenset({"g"})
+
+    def __init__(
+        self,
+        cells: Annotated[int, Ge(2), Le(12)] = 4,
+        modulus: Annotated[float, Ge(1e-12)] = 1.0,
+        size: Annotated[float, Ge(1e-9)] = 1.0,
+        lowest: float = 0.01,
+    ) -> None:
+        self.parameters = ParameterBox(
+            ("depth", "place"), np.array([lowest * size, 0.4 * size]), np.array([0.06 * size, 0.6 * size]), ("m", "m")
+        )
+        ticks = np.linspace(0.0, size, cells + 1)
+        basis = Basis(MeshHex.init_tensor(ticks, ticks, ticks), ElementVector(ElementHex1()))
+        shear, compression = modulus / 2.6, modulus * 0.3 / (1.3 * 0.4)  # ν = 0.3
+
+        @BilinearForm
+        def elasticity(u: Any, v: Any, _: Any) -> Any:
+            strain = sym_grad(u)
+            return ddot(2.0 * shear * strain + compression * eye(trace(strain), 3), sym_grad(v))
+
+        @BilinearForm
+        def norm(u: Any, v: Any, _: Any) -> Any:
+            return dot(u, v) + size**2 * ddot(grad(u), grad(v))
+
+        free = basis.complement_dofs(basis.get_dofs(lambda x: x[2] < 1e-6 * size))
+        nodes = np.flatnonzero(basis.mesh.p[2] > (1.0 - 1e-6) * size)
+        self._xy, self._size = basis.mesh.p[:2, nodes], size
+        top = Basis(MeshQuad.init_tensor(ticks, ticks), ElementQuad1())
+        order = [int(np.argmin(np.sum((top.mesh.p - point[:, None]) ** 2, axis=0))) for point in self._xy.T]
+        self._weights = lumped(top)[order]
+        columns = np.searchsorted(free, basis.nodal_dofs[2, nodes])
+        rows = np.arange(len(nodes))
+        self._stiffness = sp.csr_array(elasticity.assemble(basis)[free][:, free])
+        self._coupling = sp.csr_array((self._weights, (rows, columns)), shape=(len(nodes), len(free)))
+        self.V = InnerProduct(sp.csr_array(norm.assemble(basis)[free][:, free]))
+        self.W = InnerProduct(nodal(self._weights))
+
+    def training_set(self) -> Array:
+        return self.parameters.grid(6, 3)
+
+    def bound(self, mu: Array) -> Array:
+        """g: the gap below the paraboloid, weighted."""
+        x, y = self._xy
+        gap = ((x - mu[1]) ** 2 + (y - 0.5 * self._size) ** 2) / (2.0 * self._size)
+        return np.asarray(self._weights * (gap - mu[0]))
+
+    def assemble(self, mu: Array) -> VariationalInequality:
+        return VariationalInequality(self._stiffness, np.zeros(self.V.dim), self._coupling, self.bound(mu))
+
+    def sampler(self, wanted: Mapping[str, tuple[Indices, Indices]]) -> Sampler:
+        rows = wanted["g"][0]
+        return lambda mu: {"g": self.bound(mu)[rows]}
