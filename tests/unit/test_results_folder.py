@@ -73,3 +73,17 @@ def test_a_page_made_anew_is_as_light(quick_run: Path, tmp_path: Path) -> None:
     text = page.read_text(encoding="utf-8")
     assert "`vibench run benefit` leaves the tables of all queries and histories under `runs/benefit/tables`" in text
     assert "## Break-even of fixed enrichments" in text
+
+
+def test_the_readme_says_what_a_query_is_compared_with() -> None:
+    """The gain over the next high-fidelity solution, not over a mean that pays its set-up again and again."""
+    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    models, gains = (part for part in text.split("\n\n") if part.startswith("| "))
+    rows = [[word.strip() for word in line.strip("|").split("|")] for line in models.splitlines()]
+    assert rows[0][0] == "model"
+    assert [row[0] for row in rows].count("high-fidelity") == 1
+    assert {"high-fidelity solution [ms]", "gain", "set-up of the high-fidelity solver [s]"} <= {
+        word.strip() for word in gains.splitlines()[0].split("|")
+    }
+    sizes = {row[1] for row in rows if row[1].isdigit()}
+    assert len(sizes) == 2  # the pair that enrichment serves best is not shown alone
