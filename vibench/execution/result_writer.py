@@ -12,7 +12,7 @@ from vibench.results.database import ResultsDatabase
 from vibench.stages.artefacts import History, Store
 from vibench.stages.base import Row, Stage, value_of
 from vibench.stages.cell_queries import CellRows
-from vibench.stages.timing_rounds import TimedCell, cell_seconds, query_seconds, round_rows
+from vibench.stages.timing_rounds import TimedCell, round_rows, seconds_of_cell, seconds_of_queries
 from vibench.study.cells import Axes, Cell, Plugin, digest
 from vibench.study.spec import Study
 
@@ -44,11 +44,11 @@ class ResultWriter:
         """Write the seconds of a cell that has its rows."""
         row, rounds = self.database.cell(cell.key), round_rows(timed.rounds)
         assert row is not None  # cells are timed when they have their rows
-        own = cell_seconds(rounds, row["offline_s"]) | {"timing_rounds": asked, "timing_reason": timed.reason}
+        own = seconds_of_cell(rounds, row["offline_s"]) | {"timing_rounds": asked, "timing_reason": timed.reason}
         if rounds:
             own["machine"] = "; ".join(sorted({*row["machine"].split("; "), timed.machine}))
         keys = {"cell": cell.key, **cell_columns(cell)}
-        self.database.write_seconds(cell.key, own, query_seconds(timed.rounds), [keys | row for row in rounds])
+        self.database.write_seconds(cell.key, own, seconds_of_queries(timed.rounds), [keys | row for row in rounds])
 
     def stage(self, stage: Stage, histories: Iterable[History], store: Store) -> None:
         """Write the histories and rows of a stage whose value is stored."""

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
 
+from vibench.arrays import Array
 from vibench.interfaces.problem import VariationalInequality
 from vibench.interfaces.validation import checked_assembly
 from vibench.model.hyperreduced import HyperReducedModel
@@ -175,18 +176,25 @@ class _Rounds(Pieces):
 
 def round_rows(rounds: Sequence[TimedRound]) -> list[Row]:
     """Rows of the timings table: seconds of a query, mean over the queries of the round."""
-    rows: list[Row] = []
-    for number, one in enumerate(rounds):
-        assemble, solve = (
-            np.mean([(s.cpu, s.wall) for s in part.values()], axis=0) for part in (one.assemble, one.solve)
-        )
-        seconds = {"assemble_s": assemble[0], "solve_s": solve[0], "total_s": assemble[0] + solve[0]}
-        wall = {"total_wall_s": assemble[1] + solve[1]}
-        rows.append({"round": number, "queries": len(one.solve), **seconds, **wall, "slowdown": one.slowdown})
-    return rows
+    return [
+        {"round": number, "queries": len(one.solve), "slowdown": one.slowdown}
+        | _columns(np.mean(_array(one.assemble.values()), axis=0), np.mean(_array(one.solve.values()), axis=0))
+        for number, one in enumerate(rounds)
+    ]
 
 
-def cell_seconds(rows: Sequence[Row], offline: float) -> Row:
+def _array(parts: Iterable[Seconds]) -> Array:
+    """CPU and wall seconds (k×2)."""
+    return np.array([(seconds.cpu, seconds.wall) for seconds in parts])
+
+
+def _columns(assemble: Array, solve: Array) -> Row:
+    """The columns that rounds and queries share, from CPU and wall seconds of assembly and solution (2,)."""
+    total, wall = assemble + solve
+    return {"assemble_s": assemble[0], "solve_s": solve[0], "total_s": total, "total_wall_s": wall}
+
+
+def seconds_of_cell(rows: Sequence[Row], offline: float) -> Row:
     """The columns of a cell from its rounds: medians, and quartiles of the seconds of a query; empty without any.
 
     `offline` are its offline seconds, measured once: they are as uncertain as the machine was unsteady in the rounds.
@@ -210,20 +218,12 @@ def cell_seconds(rows: Sequence[Row], offline: float) -> Row:
     }
 
 
-def query_seconds(rounds: Sequence[TimedRound]) -> dict[int, Row]:
+def seconds_of_queries(rounds: Sequence[TimedRound]) -> dict[int, Row]:
     """The columns of the queries that were timed: medians over the rounds."""
     rows = {}
     for k in sorted({k for one in rounds for k in one.solve}):
         # In full, a query is not assembled in every round: the other queries' seconds stand for its own.
         assembled = [one.assemble[k] if k in one.assemble else next(iter(one.assemble.values())) for one in rounds]
-        assemble, solve = (
-            np.median([(s.cpu, s.wall) for s in part], axis=0)
-            for part in (assembled, [one.solve[k] for one in rounds if k in one.solve])
-        )
-        rows[k] = {
-            "assemble_s": assemble[0],
-            "solve_s": solve[0],
-            "total_s": assemble[0] + solve[0],
-            "total_wall_s": assemble[1] + solve[1],
-        }
+        solved = [one.solve[k] for one in rounds if k in one.solve]
+        rows[k] = _columns(np.median(_array(assembled), axis=0), np.median(_array(solved), axis=0))
     return rows

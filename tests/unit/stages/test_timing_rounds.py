@@ -20,7 +20,7 @@ from vibench.stages.base import Failed
 from vibench.stages.cell_queries import CellQueries
 from vibench.stages.enrichment import SingleEnrichment
 from vibench.stages.offline import ConeStage, PODStage
-from vibench.stages.timing_rounds import TimedRound, TimingRounds, cell_seconds, query_seconds, round_rows
+from vibench.stages.timing_rounds import TimedRound, TimingRounds, round_rows, seconds_of_cell, seconds_of_queries
 from vibench.study.cells import Plugin
 from vibench.timing import Seconds
 
@@ -72,7 +72,7 @@ def test_a_machine_that_slows_down_halfway_meets_all_cells_alike() -> None:
     stage = TimingRounds((CELLS[0],) * 2, (EVERY,) * 2, 12)
     pieces = [steady(1.0 if piece < stage.pieces / 2 else 3.0) for piece in range(stage.pieces)]
     timed = timing_rounds._Rounds.finish(_in(stage), pieces)
-    one, other = (cell_seconds(round_rows(each.rounds), 1.0) for each in timed)
+    one, other = (seconds_of_cell(round_rows(each.rounds), 1.0) for each in timed)
     assert one == other
     assert one["online_q1_s"] < one["online_s"] < one["online_q3_s"]
 
@@ -92,7 +92,7 @@ def test_every_ok_query_is_timed_and_no_other(store: Store) -> None:
         assert {k for each in one.rounds for k in each.solve} == set(numbers)
         assert all(s.cpu > 0.0 for each in one.rounds for part in (each.assemble, each.solve) for s in part.values())
         assert one.reason == ""
-        rows = query_seconds(one.rounds)
+        rows = seconds_of_queries(one.rounds)
         assert set(rows) == set(numbers)
         assert all(row["total_s"] == row["assemble_s"] + row["solve_s"] for row in rows.values())
 
@@ -141,7 +141,7 @@ def test_columns_are_medians_and_quartiles_over_the_rounds() -> None:
     rows = round_rows(rounds)
     assert [row["total_s"] for row in rows] == [1.5, 3.5, 2.5, 8.5]
     assert [(row["round"], row["queries"]) for row in rows] == [(k, 2) for k in range(4)]
-    own = cell_seconds(rows, 10.0)
+    own = seconds_of_cell(rows, 10.0)
     assert (own["online_s"], own["online_solve_s"], own["online_assemble_s"]) == (3.0, 2.5, 0.5)
     assert (own["online_q1_s"], own["online_q3_s"]) == tuple(np.quantile([1.5, 3.5, 2.5, 8.5], (0.25, 0.75)))
     assert own["online_wall_s"] == 3.5
@@ -149,16 +149,16 @@ def test_columns_are_medians_and_quartiles_over_the_rounds() -> None:
     slowdowns = np.array([1.0, 1.2, 1.4, 3.0]) / 1.3
     ends = 10.0 * np.quantile(slowdowns, (0.025, 0.975))
     assert (own["offline_low_s"], own["offline_high_s"]) == pytest.approx(tuple(ends))
-    queries = query_seconds([replace(one, assemble={k: one.assemble[k]}) for k, one in enumerate(rounds)])
+    queries = seconds_of_queries([replace(one, assemble={k: one.assemble[k]}) for k, one in enumerate(rounds)])
     assert queries[2] == {"assemble_s": 0.5, "solve_s": 2.0, "total_s": 2.5, "total_wall_s": 3.0}
-    assert set(cell_seconds([], 10.0)) == set(own)
-    assert set(cell_seconds([], 10.0).values()) == {None}
+    assert set(seconds_of_cell([], 10.0)) == set(own)
+    assert set(seconds_of_cell([], 10.0).values()) == {None}
 
 
 @pytest.mark.parametrize(("wall", "slow", "disturbed"), [(1.0, 1.0, 0), (1.6, 1.0, 1), (1.0, 1.4, 1)])
 def test_a_machine_that_waits_or_is_slow_marks_the_row(wall: float, slow: float, disturbed: int) -> None:
     once = TimedRound({0: Seconds(1.0, wall)}, {0: Seconds(1.0, wall)}, slow)
-    assert cell_seconds(round_rows([once] * 3), 1.0)["disturbed"] == disturbed
+    assert seconds_of_cell(round_rows([once] * 3), 1.0)["disturbed"] == disturbed
 
 
 def test_the_limit_of_the_stage_is_that_of_all_its_cells(tmp_path: Path) -> None:
