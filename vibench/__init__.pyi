@@ -7,7 +7,6 @@ from .arrays import SparseMatrix as SparseMatrix
 from .errors import NumericalError as NumericalError
 from .errors import RequestError as RequestError
 from .errors import VibenchError as VibenchError
-from .execution.recorded_cell import load as load
 from .highfidelity.active_set import HighFidelitySolution as HighFidelitySolution
 from .highfidelity.active_set import HighFidelitySolver as HighFidelitySolver
 from .highfidelity.active_set import solve_high_fidelity as solve_high_fidelity
@@ -29,6 +28,11 @@ from .interfaces.strategies import no_free as no_free
 from .interfaces.validation import check_cone as check_cone
 from .interfaces.validation import check_enrichment as check_enrichment
 from .interfaces.validation import checked_assembly as checked_assembly
+from .library.models import Model as Model
+from .library.models import Solution as Solution
+from .library.runs import Run as Run
+from .library.runs import open_run as open_run
+from .library.runs import run as run
 from .linalg.dense import RANK_RTOL as RANK_RTOL
 from .linalg.dense import orthonormal_range as orthonormal_range
 from .linalg.dense import project_out as project_out
@@ -57,4 +61,12 @@ from .reduction.supremizers import constraint_classes as constraint_classes
 from .reduction.supremizers import projected_supremizers as projected_supremizers
 from .reduction.supremizers import supremizer_coordinates as supremizer_coordinates
 from .reduction.supremizers import supremizers as supremizers
+from .results.break_even import BreakEven as BreakEven
+from .results.break_even import break_even as break_even
 from .stability.infsup import beta_span as beta_span
+from .stability.infsup import inf_sup_full as inf_sup_full
+from .stability.infsup import inf_sup_on as inf_sup_on
+from .stability.infsup import multipliers as multipliers
+from .study.reader import read_study as read_study
+from .study.registry import create as create
+from .study.spec import Study as Study

@@ -20,7 +20,6 @@ from odd_plugins import LABEL, ODD
 from outputs import clean, elements
 from samples import cell_row, query_rows
 
-from vibench.cli.console import print_frame
 from vibench.interfaces.problem import VariationalInequality
 from vibench.qp.solution import QPSolution
 from vibench.report import html
@@ -31,6 +30,7 @@ from vibench.results.columns import STORED, TABLES
 from vibench.results.database import FILE, ResultsDatabase
 from vibench.stages.query import Query, run_query
 from vibench.study import registry
+from vibench.terminal.console import print_frame
 
 ANYTHING = st.text(st.characters(), max_size=50) | st.sampled_from([LABEL, ODD, "$$", "_", "[/b]", "=1", "|", "\\", ""])
 """All of Unicode, lone surrogates included."""

@@ -23,7 +23,7 @@ from samples import toml
 from vibench.cli.main import app
 from vibench.errors import RequestError
 from vibench.results import columns, tables
-from vibench.study.reader import load_study
+from vibench.study.reader import read_study
 from vibench.study.registry import GROUPS
 from vibench.study.spec import Entry, Limits, Study, ToleranceTable
 
@@ -190,7 +190,7 @@ RULES = [
 def test_the_example_of_the_reference_is_a_study(tmp_path: Path) -> None:
     path = tmp_path / "my-study.toml"
     path.write_text(EXAMPLE, encoding="utf-8")
-    load_study(str(path))
+    read_study(str(path))
     assert set(tomllib.loads(EXAMPLE)) == set(Study.model_fields)
 
 
@@ -200,7 +200,7 @@ def test_a_rule_of_the_reference_is_a_rule(change: str, refused: str, tmp_path: 
     path = tmp_path / "my-study.toml"
     path.write_text(toml(content), encoding="utf-8")
     with pytest.raises(RequestError) as caught:
-        load_study(str(path))
+        read_study(str(path))
     assert str(caught.value) == f"{path}: {refused.strip()}"
 
 

@@ -23,7 +23,6 @@ from threadpoolctl import threadpool_info, threadpool_limits
 
 from vibench import provenance
 from vibench.cli import solver_check
-from vibench.cli.console import new_console, shown
 from vibench.cli.output import echo
 from vibench.errors import RequestError, in_a_line
 from vibench.locking import locked
@@ -32,7 +31,8 @@ from vibench.qp.solve import installed_solvers
 from vibench.qp.status import Status
 from vibench.stages.artefacts import CACHE_VARIABLE, LOCK, Store, default_folder
 from vibench.study import registry
-from vibench.study.reader import load_study
+from vibench.study.reader import read_study
+from vibench.terminal.console import new_console, shown
 from vibench.timing import DISTURBED, WAITED, Calibration, Stopwatch
 
 MIN_GIB = 1.0
@@ -160,7 +160,7 @@ def _load_error(kind: str, name: str) -> str:
     """The error that loading a plugin ends with; "" if it loads."""
     try:
         if kind == "study":
-            load_study(name)
+            read_study(name)
         else:
             registry.load(kind, name)
             if kind != "QP solver":

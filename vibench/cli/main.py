@@ -61,19 +61,19 @@ def run(
 ) -> None:
     """Run a study. An interrupted run resumes where it stopped."""
     from vibench import provenance
-    from vibench.cli.console import new_console
-    from vibench.cli.progress import ProgressDisplay
     from vibench.execution.run import Options, run_study
     from vibench.qp.status import Status
     from vibench.results import tables
     from vibench.study.cells import expand
-    from vibench.study.reader import load_study
+    from vibench.study.reader import read_study
+    from vibench.terminal.console import new_console
+    from vibench.terminal.progress import ProgressDisplay
 
     overrides = {
         "problem": problem, "dual": dual, "primal": primal, "solvers": solver,
         "pod": pod_tol, "dual_tol": dual_tol, "primal_tol": primal_tol,
     }  # fmt: skip
-    loaded = load_study(study, {axis: values for axis, values in overrides.items() if values})
+    loaded = read_study(study, {axis: values for axis, values in overrides.items() if values})
     if dry_run:
         cells = expand(loaded)
         echo(*(f"{cell.key}  {cell}" for cell in cells), f"{len(cells)} cells")
@@ -104,10 +104,10 @@ def run(
 
 def _summarise(study: str, path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
     """Print the summary of a run, its rows that are not ok, and violated invariants."""
-    from vibench.cli.console import print_frame
     from vibench.qp.status import Status
     from vibench.results import invariants, tables
     from vibench.results.solver_agreement import sentence
+    from vibench.terminal.console import print_frame
 
     cells, queries = tables.read(path, "cells"), tables.read(path, "queries")
     print_frame(tables.summary(cells), study)
@@ -134,8 +134,8 @@ def clean(
     """Show the disk usage of stored artefacts, and delete them. Results are kept."""
     import pandas as pd
 
-    from vibench.cli.console import print_frame
     from vibench.stages.artefacts import usable_store
+    from vibench.terminal.console import print_frame
 
     store = usable_store()
     found = pd.DataFrame(store.contents(), columns=["stage", "MiB", "days"])

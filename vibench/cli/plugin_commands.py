@@ -29,7 +29,7 @@ def list_plugins(
     """List problems, strategies, studies and QP solvers. Plugins are listed with their options."""
     import pandas as pd
 
-    from vibench.cli.console import print_frame
+    from vibench.terminal.console import print_frame
 
     if what is not None and what not in (*LISTS, "solvers"):
         raise unknown_name("list", what, (*LISTS, "solvers"))
@@ -104,14 +104,14 @@ def _plugin_rows(kind: str) -> list[tuple[str, str, str, str]]:
     """Name, origin, description and options of every plugin of a kind; of one that does not load, the error."""
     from vibench.study import registry
     from vibench.study.cells import expand
-    from vibench.study.reader import load_study
+    from vibench.study.reader import read_study
 
     rows = []
     for name in registry.names(kind):
         options = []
         try:
             if kind == "study":
-                description = f"{len(expand(load_study(name)))} cells"
+                description = f"{len(expand(read_study(name)))} cells"
             else:
                 description = (registry.load(kind, name).__doc__ or "").strip().split("\n")[0]
                 options = registry.options(kind, name)

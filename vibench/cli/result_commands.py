@@ -26,8 +26,8 @@ def show(
     form: FormOption = "terminal",
 ) -> None:
     """Print a table of a run."""
-    from vibench.cli.console import print_frame
     from vibench.results import tables
+    from vibench.terminal.console import print_frame
 
     path = tables.results_file(run)
     derived = {"summary": ("cells", tables.summary), "benefits": ("thresholds", tables.benefits)}
@@ -62,9 +62,9 @@ def compare_runs(
     form: FormOption = "terminal",
 ) -> None:
     """Compare two runs; exit code 1 if a number got worse."""
-    from vibench.cli.console import print_frame
     from vibench.report import compare
     from vibench.results import tables
+    from vibench.terminal.console import print_frame
 
     found = compare.compare(tables.results_file(a), tables.results_file(b), limit)
     if form != "terminal":
@@ -85,9 +85,9 @@ def replay_query(
     out: Annotated[Path | None, Option(help="File for the program; in RUN/replay by default.")] = None,
 ) -> None:
     """Solve the program of one query again with every solver."""
-    from vibench.cli.console import print_frame
     from vibench.execution.recorded_cell import recorded_cell
     from vibench.report import replay
+    from vibench.terminal.console import print_frame
 
     recorded = recorded_cell(run, cell)
     number = replay.worst_query(recorded) if query is None else query

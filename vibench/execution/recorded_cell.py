@@ -144,21 +144,3 @@ def recorded_cell(run: str, cell: str) -> RecordedCell:
     if not matching[0]["model"]:
         raise RequestError(f"cell {matching[0]['cell']} has no reduced model: {matching[0]['reason']}")
     return RecordedCell(path, matching[0])
-
-
-def load(run: str, cell: str) -> Model:
-    """The reduced model of a row of a run, ready for queries.
-
-    Parameters
-    ----------
-    run
-        Run folder, or name of a study run before.
-    cell
-        Key of the cell, or its beginning.
-
-    Raises
-    ------
-    RequestError
-        If there is no such run or cell, or other code computed it.
-    """
-    return recorded_cell(run, cell).model

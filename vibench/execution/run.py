@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence, Set
 from concurrent.futures import FIRST_COMPLETED, Future, wait
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 from vibench.errors import ExecutorError, RequestError, StorageError, VibenchError, in_a_line
 from vibench.execution.dask import Dask
@@ -55,8 +55,8 @@ class Agenda:
     workers: int
 
 
-class Observer(Protocol):
-    """Shows the progress of a run."""
+class Observer:
+    """Follows a run; this one shows nothing."""
 
     def start(self, agenda: Agenda) -> None:
         """The run begins."""

@@ -8,12 +8,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from pydantic import BaseModel, ValidationError
-
-from vibench.errors import RequestError, unknown_name
-from vibench.qp.settings import SETTINGS
+from vibench.errors import RequestError
 from vibench.study import registry
-from vibench.study.spec import Entry, Limits, Study, ToleranceTable
+from vibench.study.spec import Study
 
 
 def find_study(request: str) -> Path:
@@ -36,7 +33,7 @@ def find_study(request: str) -> Path:
     return path
 
 
-def load_study(request: str, overrides: Mapping[str, Sequence[Any]] | None = None) -> Study:
+def read_study(request: str, overrides: Mapping[str, Sequence[Any]] | None = None) -> Study:
     """Read and check a study.
 
     Parameters
@@ -66,14 +63,9 @@ def load_study(request: str, overrides: Mapping[str, Sequence[Any]] | None = Non
     source += " with the options of the command line" if given else ""
     content = _replace_axes(content, given)
     try:
-        study = Study.model_validate(content)
-        _check_names(study)
-    except ValidationError as error:
-        line = f"{source}: {_message(error.errors(include_url=False)[0])}"
-        raise RequestError(" ".join(line.split())) from None
+        return Study.model_validate(content)
     except RequestError as error:
         raise RequestError(f"{source}: {error}") from None
-    return study
 
 
 def _replace_axes(content: dict[str, Any], given: Mapping[str, list[Any]]) -> dict[str, Any]:
@@ -110,61 +102,3 @@ def _entries_in(axis: Any, name: str) -> list[Any]:
     """The entries of an unchecked axis that have this name or label; the name itself if there are none."""
     tables = [entry for entry in axis if isinstance(entry, dict)] if isinstance(axis, list) else []
     return [entry for entry in tables if name in (entry.get("name"), entry.get("label"))] or [name]
-
-
-MODELS: Mapping[str, type[BaseModel]] = {"tolerances": ToleranceTable, "limits": Limits}
-"""Models of the tables in a study file, by their key; those under other keys are entries of an axis."""
-
-
-def _message(error: Any) -> str:
-    """The key of a study file that is wrong, the expected value and the one found."""
-    # The last part of an unexpected key's path is the key itself, whatever its first character.
-    outer = error["loc"][:-1] if error["type"] == "extra_forbidden" else error["loc"]
-    where = [part for part in outer if not str(part).startswith("<")]
-    message, found = error["msg"].removeprefix("Value error, "), ""
-    if isinstance(error["input"], str | int | float):
-        found = f" (found {error['input']!r:.80})"
-    match error["type"]:
-        case "extra_forbidden":
-            model: type[BaseModel] = MODELS.get(where[0], Entry) if where else Study
-            message, found = str(unknown_name("key", "".join(str(error["loc"][-1]).split()), model.model_fields)), ""
-        case "missing":
-            message = "required, but not given"
-        case "model_type":
-            of_plugin = where[0] in ("problem", "dual", "primal")
-            message = "expected a name, or a table with one" if of_plugin else "expected a table"
-    place = ".".join(str(part) for part in where)
-    return f"{place + ': ' if place else ''}{message}{found}"
-
-
-def _check_names(study: Study) -> None:
-    """Check names and options of plugins, and that exactly the strategies which take a tolerance have one."""
-    axes = {"problem": study.problem, "dual strategy": study.dual, "primal strategy": study.primal}
-    for kind, axis in axes.items():
-        for entry in axis:
-            registry.check_options(kind, entry.name, entry.options)
-    known = {*SETTINGS, *registry.names("QP solver")}
-    for solver in study.solver_names():
-        if solver not in known:  # installed or not
-            raise unknown_name("QP solver", solver, known)
-        registry.qp_solver(solver)
-    for table in study.tolerances:
-        _check_tolerances(study, table)
-
-
-def _check_tolerances(study: Study, table: ToleranceTable) -> None:
-    for kind, axis, tolerances in (
-        ("dual strategy", study.dual, table.dual),
-        ("dual strategy", study.dual, table.R),
-        ("primal strategy", study.primal, table.primal),
-    ):
-        # A tolerance may name a plugin that an option of the command line removed from the axis.
-        known = {name for entry in axis for name in (entry.name, entry.title)}
-        for name in tolerances if isinstance(tolerances, dict) else ():
-            if name not in known and name not in registry.names(kind):
-                raise unknown_name(f"{kind} of this study", name, known)
-    for entry in study.dual:
-        table.of_dual(entry)
-    for entry in study.primal:
-        if table.of_primal(entry) == [None] and not table.primal.keys().isdisjoint({entry.name, entry.title}):
-            raise RequestError(f"tolerances.primal gives something for '{entry.title}', which takes no tolerance")

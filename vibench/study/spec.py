@@ -2,13 +2,27 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Annotated, Any, Literal, TypeAlias, TypeVar
 
 from annotated_types import Ge, Gt, Le, Lt, MinLen
-from pydantic import AllowInfNan, BaseModel, BeforeValidator, ConfigDict, Discriminator, Field, Tag, model_validator
+from pydantic import (
+    AfterValidator,
+    AllowInfNan,
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Discriminator,
+    Field,
+    ModelWrapValidatorHandler,
+    Tag,
+    ValidationError,
+    model_validator,
+)
 
-from vibench.errors import RequestError
+from vibench.errors import RequestError, unknown_name
 from vibench.interfaces.strategies import Stop
+from vibench.qp.settings import SETTINGS
 from vibench.qp.solve import installed_solvers
 from vibench.study import registry
 
@@ -44,6 +58,15 @@ PerStrategy: TypeAlias = Annotated[
     Annotated[Values, Tag("<list>")] | Annotated[dict[str, Values], Tag("<table>")],
     Discriminator(lambda value: "<table>" if isinstance(value, dict) else "<list>"),
 ]
+
+
+def _file_name(value: str) -> str:
+    if not all(c.isalnum() or c in "-_." for c in value) or value.startswith("."):
+        raise ValueError("letters, digits, '-', '_' and '.' only, since results are stored under it")
+    return value
+
+
+FileName: TypeAlias = Annotated[Name, AfterValidator(_file_name)]
 
 
 class _Model(BaseModel):
@@ -125,9 +148,15 @@ class Limits(_Model):
 
 
 class Study(_Model):
-    """A study file: the axes of the matrix of cells, and the settings that all cells share."""
+    """A study: the axes of the matrix of cells, and the settings that all cells share; the keys of a study file.
 
-    name: Annotated[Name, Field(description="Name of the study; its results are in the folder `runs/<name>`.")]
+    Raises
+    ------
+    RequestError
+        If a setting is wrong, or names a plugin, or an option of one, that there is not; it says what would be right.
+    """
+
+    name: Annotated[FileName, Field(description="Name of the study; its results are in the folder `runs/<name>`.")]
     seed: Annotated[int, Ge(0), Lt(2**63), Field(description="Seed of the validation set.")] = 0
     validation: Annotated[Size, Field(description="Number of validation parameters, the queries of every cell.")]
     accuracy: Annotated[
@@ -157,12 +186,74 @@ class Study(_Model):
     ]
     limits: Annotated[Limits, Field(description="Limits of a query and of a stage.")] = Limits()
 
-    @model_validator(mode="after")
-    def _file_name(self) -> Study:
-        if not all(c.isalnum() or c in "-_." for c in self.name) or self.name.startswith("."):
-            raise ValueError("name: letters, digits, '-', '_' and '.' only, since results are stored under it")
-        return self
+    @model_validator(mode="wrap")
+    @classmethod
+    def _checked(cls, given: Any, build: ModelWrapValidatorHandler[Study]) -> Study:
+        try:
+            study = build(given)
+        except ValidationError as error:
+            raise RequestError(" ".join(_message(error.errors(include_url=False)[0]).split())) from None
+        _check_names(study)
+        return study
 
     def solver_names(self) -> list[str]:
         """Solvers to run: those named, or all that are installed."""
         return installed_solvers(registry.names("QP solver")) if self.solvers == "available" else list(self.solvers)
+
+
+MODELS: Mapping[str, type[BaseModel]] = {"tolerances": ToleranceTable, "limits": Limits}
+"""Models of the tables in a study file, by their key; those under other keys are entries of an axis."""
+
+
+def _message(error: Any) -> str:
+    """The key of a study file that is wrong, the expected value and the one found."""
+    # The last part of an unexpected key's path is the key itself, whatever its first character.
+    outer = error["loc"][:-1] if error["type"] == "extra_forbidden" else error["loc"]
+    where = [part for part in outer if not str(part).startswith("<")]
+    message, found = error["msg"].removeprefix("Value error, "), ""
+    if isinstance(error["input"], str | int | float):
+        found = f" (found {error['input']!r:.80})"
+    match error["type"]:
+        case "extra_forbidden":
+            model: type[BaseModel] = MODELS.get(where[0], Entry) if where else Study
+            message, found = str(unknown_name("key", "".join(str(error["loc"][-1]).split()), model.model_fields)), ""
+        case "missing":
+            message = "required, but not given"
+        case "model_type":
+            of_plugin = where[0] in ("problem", "dual", "primal")
+            message = "expected a name, or a table with one" if of_plugin else "expected a table"
+    place = ".".join(str(part) for part in where)
+    return f"{place + ': ' if place else ''}{message}{found}"
+
+
+def _check_names(study: Study) -> None:
+    """Check names and options of plugins, and that exactly the strategies which take a tolerance have one."""
+    axes = {"problem": study.problem, "dual strategy": study.dual, "primal strategy": study.primal}
+    for kind, axis in axes.items():
+        for entry in axis:
+            registry.check_options(kind, entry.name, entry.options)
+    known = {*SETTINGS, *registry.names("QP solver")}
+    for solver in study.solver_names():
+        if solver not in known:  # installed or not
+            raise unknown_name("QP solver", solver, known)
+        registry.qp_solver(solver)
+    for table in study.tolerances:
+        _check_tolerances(study, table)
+
+
+def _check_tolerances(study: Study, table: ToleranceTable) -> None:
+    for kind, axis, tolerances in (
+        ("dual strategy", study.dual, table.dual),
+        ("dual strategy", study.dual, table.R),
+        ("primal strategy", study.primal, table.primal),
+    ):
+        # A tolerance may name a plugin that an option of the command line removed from the axis.
+        known = {name for entry in axis for name in (entry.name, entry.title)}
+        for name in tolerances if isinstance(tolerances, dict) else ():
+            if name not in known and name not in registry.names(kind):
+                raise unknown_name(f"{kind} of this study", name, known)
+    for entry in study.dual:
+        table.of_dual(entry)
+    for entry in study.primal:
+        if table.of_primal(entry) == [None] and not table.primal.keys().isdisjoint({entry.name, entry.title}):
+            raise RequestError(f"tolerances.primal gives something for '{entry.title}', which takes no tolerance")

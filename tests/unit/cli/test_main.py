@@ -21,7 +21,7 @@ from vibench.results.database import FILE
 from vibench.results.tables import read
 from vibench.study import registry
 from vibench.study.cells import expand
-from vibench.study.reader import load_study
+from vibench.study.reader import read_study
 from vibench.text import printable
 
 
@@ -138,7 +138,7 @@ class TestOutputFolder:
     ) -> None:
         shutil.copytree(quick_run, "other")
         refused(main("run", write_study(tmp_path), "--out", "other", *fresh), "other", "study", "quick", "sample")
-        assert len(read(Path("other", FILE), "cells")) == len(expand(load_study("quick")))
+        assert len(read(Path("other", FILE), "cells")) == len(expand(read_study("quick")))
 
     def test_another_seed_is_another_study(self, main: Main, quick_run: Path, tmp_path: Path) -> None:
         shutil.copytree(quick_run, "other")
@@ -212,7 +212,7 @@ def test_help_names_every_option_of_run(main: Main) -> None:
 def test_a_dry_run_lists_the_matrix_and_does_nothing_else(main: Main) -> None:
     code, out, err = main("run", "quick", "--dry-run")
     assert (code, err) == (0, "")
-    cells = expand(load_study("quick"))
+    cells = expand(read_study("quick"))
     *lines, last = out.splitlines()
     assert lines == [f"{cell.key}  {cell}" for cell in cells]
     assert last == f"{len(cells)} cells"
@@ -286,7 +286,7 @@ def test_the_list_of_solvers_says_which_are_installed(main: Main) -> None:
 
 def test_the_list_of_studies_counts_their_cells(main: Main) -> None:
     _, out, _ = main("list", "studies")
-    assert f"{len(expand(load_study('quick')))} cells" in out
+    assert f"{len(expand(read_study('quick')))} cells" in out
 
 
 def test_show_prints_the_summary(main: Main, quick_run: Path) -> None:
@@ -365,7 +365,7 @@ def test_a_run_of_an_odd_name_is_shown(name: str, main: Main, quick_run: Path) -
 def test_a_label_of_several_lines_makes_no_lines_of_its_own(main: Main, tmp_path: Path) -> None:
     path = write_study(tmp_path, changed(STUDY, "problem", 0, "label", to="a\n0 cells\x1b[2J"))
     code, out, _ = main("run", path, "--dry-run")
-    cells = expand(load_study(path))
+    cells = expand(read_study(path))
     assert code == 0
     *lines, last = out.splitlines()
     assert [line.split()[0] for line in lines] == [cell.key for cell in cells]
@@ -377,6 +377,6 @@ def test_an_error_that_nobody_foresaw_is_not_hidden(main: Main, monkeypatch: pyt
     def broken(*_: object) -> None:
         raise ZeroDivisionError
 
-    monkeypatch.setattr("vibench.study.reader.load_study", broken)
+    monkeypatch.setattr("vibench.study.reader.read_study", broken)
     with pytest.raises(ZeroDivisionError):
         main("run")

@@ -12,8 +12,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from rich.console import Console
 
-from vibench.cli.console import new_console, print_frame, print_line
 from vibench.cli.output import echo
+from vibench.terminal.console import new_console, print_frame, print_line
 
 ANYTHING = st.text(st.characters())
 

@@ -16,7 +16,7 @@ from vibench.stages.base import Result, Stage
 from vibench.stages.cell_queries import cell_queries
 from vibench.stages.pictures import PictureStage
 from vibench.study.cells import expand
-from vibench.study.reader import load_study
+from vibench.study.reader import read_study
 
 
 @dataclass(frozen=True)
@@ -96,7 +96,7 @@ def closure(stage: Stage) -> Iterator[str]:
 @pytest.fixture(scope="module")
 def goals_of_quick() -> dict[str, tuple[Stage, frozenset[str]]]:
     """The goals of the study `quick`, each with the keys of all that it needs."""
-    goals = [cell_queries(cell, 20.0) for cell in expand(load_study("quick"))]
+    goals = [cell_queries(cell, 20.0) for cell in expand(read_study("quick"))]
     goals += [PictureStage(problem) for problem in {goal.assembly.enrichment.pod.problem for goal in goals}]
     return {goal.key: (goal, frozenset(closure(goal))) for goal in goals}
 

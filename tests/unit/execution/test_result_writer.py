@@ -19,7 +19,7 @@ from vibench.stages.infsup_constants import ReferenceConstants
 from vibench.stages.offline import ConeStage, PODStage
 from vibench.stages.snapshots import SnapshotStage
 from vibench.study.cells import Cell, expand
-from vibench.study.reader import load_study
+from vibench.study.reader import read_study
 from vibench.study.spec import Study
 
 
@@ -29,7 +29,7 @@ def study(tmp_path: Path) -> Study:
     content = changed(STUDY, "problem", 0, "label", to="membrane")
     content = changed(content, "dual", to=[{"name": "mcpg", "label": "widened"}])
     content = changed(content, "primal", to=[{"name": "offline-pga", "label": "greedy"}])
-    return load_study(write_study(tmp_path, content))
+    return read_study(write_study(tmp_path, content))
 
 
 @pytest.fixture

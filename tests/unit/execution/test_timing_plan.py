@@ -15,10 +15,10 @@ from vibench.stages.base import Failed
 from vibench.stages.cell_queries import cell_queries
 from vibench.stages.timing_rounds import TimedCell, TimedRound, TimingRounds
 from vibench.study.cells import Cell, expand
-from vibench.study.reader import load_study
+from vibench.study.reader import read_study
 from vibench.timing import Seconds
 
-STUDY = load_study("quick")
+STUDY = read_study("quick")
 CELLS = expand(STUDY)
 GROUP = [cell for cell in CELLS if cell.problem.name == "hertz" and cell.dual.name == "mcpg"]
 

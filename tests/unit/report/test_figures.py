@@ -24,7 +24,7 @@ from vibench.report.figures import problems as of_file
 from vibench.report.figures.style import save, styled
 from vibench.results import tables
 from vibench.results.database import FILE
-from vibench.study.reader import load_study
+from vibench.study.reader import read_study
 
 Drawn = dict[str, Figure]
 
@@ -91,14 +91,14 @@ SOMETIMES = ("diagnostics", "precision")
 
 
 def problems() -> list[str]:
-    return [entry.title for entry in load_study("quick").problem]
+    return [entry.title for entry in read_study("quick").problem]
 
 
 def test_a_run_draws_its_figures(quick_run: Path) -> None:
     names = {path.stem for path in (quick_run / "figures").glob("*.png")}
     for problem in problems():
         assert {f"{problem}-{kind}" for kind in OF_PROBLEM if kind not in SOMETIMES} <= names
-        for dual in load_study("quick").dual:
+        for dual in read_study("quick").dual:
             assert {f"{problem}-{dual.title}-enrichment", f"{problem}-{dual.title}-inf-sup"} <= names
     assert "obstacle-diagnostics" in names
     assert {path.stem for path in (quick_run / "figures").glob("*.svg")} == names
@@ -168,7 +168,7 @@ def test_projection_errors_are_those_of_the_histories(drawn: Drawn, results: Pat
         np.testing.assert_array_equal(line.get_ydata(), expected.loc[np.asarray(line.get_xdata())])
         assert np.all(np.diff(line.get_ydata()) <= 0.0)
         assert line.get_ydata()[0] == pytest.approx(1.0)
-        for dual in load_study("quick").dual:
+        for dual in read_study("quick").dual:
             line = line_called(cones, dual.title)
             cone = mine[(mine["stage"] == "cone") & (mine["dual"] == dual.title)].sort_values("step")
             np.testing.assert_array_equal(line.get_ydata(), cone["value"])
@@ -179,7 +179,7 @@ def test_projection_errors_are_those_of_the_histories(drawn: Drawn, results: Pat
 def test_orthogonality_has_a_line_per_dual_strategy(drawn: Drawn) -> None:
     for problem in problems():
         (axes,) = drawn[f"{problem}-orthogonality"].axes
-        assert [line.get_label() for line in axes.get_lines()] == sorted(e.title for e in load_study("quick").dual)
+        assert [line.get_label() for line in axes.get_lines()] == sorted(e.title for e in read_study("quick").dual)
         for values in data_of(axes):
             assert values[0] == pytest.approx(1.0)
             assert np.all((values > 0.0) & (values <= 1.0 + 1e-12))
@@ -188,7 +188,7 @@ def test_orthogonality_has_a_line_per_dual_strategy(drawn: Drawn) -> None:
 def test_the_enrichment_shows_sigma_and_beta(drawn: Drawn, results: Path) -> None:
     queries = tables.read(results, "queries")
     for problem in problems():
-        for dual in load_study("quick").dual:
+        for dual in read_study("quick").dual:
             sigma, beta, validation = drawn[f"{problem}-{dual.title}-enrichment"].axes
             assert np.all(np.diff(data_of(sigma)[0]) <= 1e-12)
             assert data_of(sigma)[0][-1] <= 0.5
@@ -201,10 +201,10 @@ def test_the_enrichment_shows_sigma_and_beta(drawn: Drawn, results: Path) -> Non
 def test_the_inf_sup_figure_shows_every_strategy_and_the_high_fidelity_pair(drawn: Drawn, results: Path) -> None:
     queries = tables.read(results, "queries")
     for problem in problems():
-        for dual in load_study("quick").dual:
+        for dual in read_study("quick").dual:
             span, cone = drawn[f"{problem}-{dual.title}-inf-sup"].axes
             _, labels = span.get_legend_handles_labels()
-            for primal in load_study("quick").primal:
+            for primal in read_study("quick").primal:
                 assert any(label.startswith(primal.title) for label in labels)
             exact = queries[(queries["problem"] == problem) & (queries["solver"] == "piqp")]
             found = np.sort(np.asarray(line_called(span, "high-fidelity").get_ydata(), float))

@@ -36,7 +36,7 @@ from vibench.results.tables import (
     to_markdown,
 )
 from vibench.study.cells import expand
-from vibench.study.reader import load_study
+from vibench.study.reader import read_study
 from vibench.text import printable_lines
 
 STUDY = {"name": "sample", "seed": 1, "validation": 4, "accuracy": 1e-7}
@@ -323,7 +323,7 @@ def test_latex_shows_text_as_it_is() -> None:
 
 
 def test_a_real_run_exports_its_whole_matrix(quick_run: Path) -> None:
-    expected = expand(load_study("quick"))
+    expected = expand(read_study("quick"))
     frame = pd.read_csv(quick_run / "tables" / "cells.csv")
     assert set(frame["cell"]) == {cell.key for cell in expected}
     assert len(pd.read_csv(quick_run / "tables" / "queries.csv")) == frame["queries"].sum()

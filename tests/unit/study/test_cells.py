@@ -17,7 +17,7 @@ from vibench.errors import RequestError
 from vibench.interfaces.strategies import Stop
 from vibench.study import cells as module
 from vibench.study.cells import Cell, Plugin, digest, expand
-from vibench.study.reader import load_study
+from vibench.study.reader import read_study
 
 Expand = Callable[[Mapping[str, Any]], list[Cell]]
 
@@ -25,7 +25,7 @@ Expand = Callable[[Mapping[str, Any]], list[Cell]]
 @pytest.fixture
 def cells_of(tmp_path: Path) -> Expand:
     """Function that gives the cells of a study's content."""
-    return lambda content: expand(load_study(write_study(tmp_path, content)))
+    return lambda content: expand(read_study(write_study(tmp_path, content)))
 
 
 def test_the_matrix_is_the_product_of_the_axes(cells_of: Expand) -> None:
@@ -122,7 +122,7 @@ def test_a_strategy_that_takes_a_tolerance_must_be_given_one(primal: Any, cells_
 def test_the_refusal_of_a_missing_tolerance_names_the_file(tmp_path: Path) -> None:
     path = write_study(tmp_path, changed(STUDY, "tolerances", 0, "primal", to=REMOVE))
     with pytest.raises(RequestError) as caught:
-        expand(load_study(path))
+        expand(read_study(path))
     assert path in str(caught.value)
 
 

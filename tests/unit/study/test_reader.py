@@ -16,7 +16,7 @@ from samples import REMOVE, STUDY, changed, toml, write_study
 
 from vibench.errors import RequestError
 from vibench.study.cells import expand
-from vibench.study.reader import find_study, load_study
+from vibench.study.reader import find_study, read_study
 from vibench.study.spec import Study
 
 JARGON = ("list[", "dict[", "literal[", "constrained", "instance of")
@@ -26,7 +26,7 @@ JARGON = ("list[", "dict[", "literal[", "constrained", "instance of")
 def refusal(request: str, overrides: Mapping[str, Any] | None = None) -> str:
     """The line a study is refused with."""
     with pytest.raises(RequestError) as caught:
-        load_study(request, overrides)
+        read_study(request, overrides)
     line = str(caught.value)
     assert line.strip()
     assert "\n" not in line
@@ -34,7 +34,7 @@ def refusal(request: str, overrides: Mapping[str, Any] | None = None) -> str:
 
 
 def test_a_correct_study_is_read_as_written(tmp_path: Path) -> None:
-    study = load_study(write_study(tmp_path))
+    study = read_study(write_study(tmp_path))
     assert (study.name, study.seed, study.validation, study.accuracy) == ("sample", 7, 3, [1e-7])
     assert study.solver_names() == ["piqp", "osqp"]
     assert [entry.name for entry in study.dual] == ["cpg", "mcpg"]
@@ -241,7 +241,7 @@ def test_invalid_toml_says_where(tmp_path: Path) -> None:
 
 
 def test_available_stands_for_every_installed_solver(tmp_path: Path) -> None:
-    study = load_study(write_study(tmp_path, changed(STUDY, "solvers", to="available")))
+    study = read_study(write_study(tmp_path, changed(STUDY, "solvers", to="available")))
     assert {"piqp", "proxqp", "osqp"} <= set(study.solver_names())
 
 
@@ -254,19 +254,19 @@ def test_find_study_knows_paths_and_names(tmp_path: Path) -> None:
 def test_a_folder_does_not_hide_a_registered_study(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     (tmp_path / "quick").mkdir()  # what `vibench run --out quick` leaves
-    assert load_study("quick").name == "quick"
+    assert read_study("quick").name == "quick"
 
 
 def test_overrides_replace_whole_axes(tmp_path: Path) -> None:
     given = {"dual": ["mcpg"], "primal": ["online-supremizers"], "solvers": ["proxqp"], "problem": ["obstacle"]}
-    study = load_study(write_study(tmp_path), given)
+    study = read_study(write_study(tmp_path), given)
     assert [entry.name for entry in study.dual] == ["mcpg"]
     assert [entry.name for entry in study.primal] == ["online-supremizers"]
     assert study.solver_names() == ["proxqp"]
 
 
 def test_overrides_keep_the_options_of_the_entry(tmp_path: Path) -> None:
-    study = load_study(write_study(tmp_path), {"problem": ["obstacle"]})
+    study = read_study(write_study(tmp_path), {"problem": ["obstacle"]})
     assert study.problem[0].options == {"resolution": "coarse"}
 
 
@@ -276,13 +276,13 @@ def test_overrides_find_entries_by_label(tmp_path: Path) -> None:
         {"name": "obstacle", "label": "large", "options": {"resolution": "paper"}},
     ]
     path = write_study(tmp_path, changed(STUDY, "problem", to=entries))
-    study = load_study(path, {"problem": ["large"]})
+    study = read_study(path, {"problem": ["large"]})
     assert [(entry.title, entry.options["resolution"]) for entry in study.problem] == [("large", "paper")]
 
 
 def test_an_override_keeps_every_entry_with_its_name(tmp_path: Path) -> None:
     entries = [{"name": "obstacle", "label": size, "options": {"resolution": size}} for size in ("coarse", "medium")]
-    study = load_study(
+    study = read_study(
         write_study(tmp_path, changed(STUDY, "problem", to=[*entries, "hertz"])), {"problem": ["obstacle"]}
     )
     assert [entry.title for entry in study.problem] == ["coarse", "medium"]
@@ -291,7 +291,7 @@ def test_an_override_keeps_every_entry_with_its_name(tmp_path: Path) -> None:
 def test_overrides_replace_tolerances_in_every_table(tmp_path: Path) -> None:
     second = {"N": [4], "R": {"cpg": [2], "mcpg": [3]}, "primal": {"offline-pga": [0.9]}}
     path = write_study(tmp_path, changed(STUDY, "tolerances", 1, to=second))
-    study = load_study(path, {"pod": [0.5], "dual_tol": [0.25, 0.125], "primal_tol": [0.75]})
+    study = read_study(path, {"pod": [0.5], "dual_tol": [0.25, 0.125], "primal_tol": [0.75]})
     assert len(study.tolerances) == 2
     for table in study.tolerances:
         assert (table.pod, table.N) == ([0.5], None)
@@ -301,7 +301,7 @@ def test_overrides_replace_tolerances_in_every_table(tmp_path: Path) -> None:
 
 def test_overrides_leave_the_other_axes_alone(tmp_path: Path) -> None:
     path = write_study(tmp_path)
-    plain, replaced = load_study(path), load_study(path, {"pod": [0.5], "dual": []})
+    plain, replaced = read_study(path), read_study(path, {"pod": [0.5], "dual": []})
     assert replaced.tolerances[0].pod == [0.5]
     assert replaced.model_dump(exclude={"tolerances"}) == plain.model_dump(exclude={"tolerances"})
     assert replaced.tolerances[0].dual == plain.tolerances[0].dual
@@ -311,13 +311,13 @@ def test_overrides_leave_the_other_axes_alone(tmp_path: Path) -> None:
 def test_a_strategy_and_its_tolerance_can_both_be_given_by_overrides(there: dict[str, Any], tmp_path: Path) -> None:
     content = changed(STUDY, "tolerances", to=[{"pod": [1e-3], "dual": [1e-1]} | there])
     path = write_study(tmp_path, changed(content, "primal", to=["decorrelated"]))
-    cells = expand(load_study(path, {"primal": ["offline-pga"], "primal_tol": [0.5]}))
+    cells = expand(read_study(path, {"primal": ["offline-pga"], "primal_tol": [0.5]}))
     assert {cell.primal_tol for cell in cells} == {0.5}
 
 
 def test_an_override_replaces_the_tolerance_of_a_strategy_the_table_leaves_out(tmp_path: Path) -> None:
     content = changed(STUDY, *TABLE, "dual", to={"cpg": [0.1]})
-    cells = expand(load_study(write_study(tmp_path, content), {"dual": ["mcpg"], "dual_tol": [0.2]}))
+    cells = expand(read_study(write_study(tmp_path, content), {"dual": ["mcpg"], "dual_tol": [0.2]}))
     assert {(cell.dual.name, cell.cone.tolerance) for cell in cells} == {("mcpg", 0.2)}
 
 
@@ -342,7 +342,7 @@ def test_wrong_overrides_are_refused_and_said_to_be_overrides(
 
 @pytest.mark.parametrize("name", ["quick", "paper-obstacle"])
 def test_the_registered_studies_load(name: str) -> None:
-    study = load_study(name)
+    study = read_study(name)
     assert study.name == name
     assert expand(study)
 
@@ -380,7 +380,7 @@ def test_no_mutation_of_a_study_raises_anything_but_a_refusal(data: st.DataObjec
         path = (*where[:-1], data.draw(KEYS)) if added else where
         content = changed(content, *path, to=data.draw(VALUES if added else SCALARS | VALUES))
     with contextlib.suppress(RequestError):
-        study = load_study(write_study(tmp_path, content))
+        study = read_study(write_study(tmp_path, content))
         assert isinstance(study, Study)
         assert expand(study)
 

@@ -21,7 +21,7 @@ from vibench.interfaces.problem import Problem
 from vibench.interfaces.strategies import DualStrategy, PrimalStrategy
 from vibench.study import registry
 from vibench.study.cells import Plugin
-from vibench.study.reader import load_study
+from vibench.study.reader import read_study
 
 HERE = __name__
 
@@ -127,7 +127,7 @@ def test_registered_studies_are_files_that_load() -> None:
     assert "quick" in registry.names("study")
     for name in registry.names("study"):
         assert registry.study_path(name).is_file()
-        assert load_study(name).name == name
+        assert read_study(name).name == name
 
 
 @pytest.mark.parametrize("kind", BASES)
@@ -221,12 +221,12 @@ def built_in() -> list[tuple[str, str, str]]:
 
 def test_an_unused_solver_that_cannot_be_loaded_does_not_stop_a_study(register: Register) -> None:
     register(*built_in(), ("vibench.qp_solvers", "broken", "no_such_module:solve"))
-    assert load_study("quick").solver_names()
+    assert read_study("quick").solver_names()
 
 
 def test_a_study_may_name_a_registered_solver(register: Register) -> None:
     register(*built_in(), ("vibench.qp_solvers", "mine", f"{HERE}:no_strategy"))
-    assert load_study("quick", {"solvers": ["mine"]}).solver_names() == ["mine"]
+    assert read_study("quick", {"solvers": ["mine"]}).solver_names() == ["mine"]
 
 
 def test_a_study_must_be_a_path(register: Register) -> None:
@@ -237,7 +237,7 @@ def test_a_study_must_be_a_path(register: Register) -> None:
 def test_a_registered_study_without_file_is_refused(register: Register, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "lost_study", types.SimpleNamespace(path=Path("/nowhere/lost.toml")))
     register(("vibench.studies", "lost", "lost_study:path"))
-    assert "/nowhere/lost.toml" in refusal(load_study, "lost")
+    assert "/nowhere/lost.toml" in refusal(read_study, "lost")
 
 
 def test_a_registered_solver_comes_as_a_callable(register: Register) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ProcessPoolExecutor
 from itertools import islice, zip_longest
 from multiprocessing import get_context
@@ -10,6 +10,7 @@ from pathlib import Path
 
 from matplotlib.figure import Figure
 
+from vibench.errors import RequestError, unknown_name
 from vibench.report.figures.constants import inf_sup, shares
 from vibench.report.figures.convergence import diagnostics, enrichment, orthogonality, projection_errors
 from vibench.report.figures.costs import dimension, total_cost, work_precision
@@ -44,6 +45,46 @@ def drawings(path: Path) -> Iterator[tuple[str, Drawing, Data]]:
         yield from ((f"{name}-{kind}", draw, data) for kind, draw in OF_PROBLEM.items())
         for dual, file in zip(data.duals, file_names(data.duals), strict=True):
             yield from ((f"{name}-{file}-{kind}", draw, data.of_dual(dual)) for kind, draw in OF_DUAL.items())
+
+
+def draw(path: Path, kind: str, problem: str | None = None, dual: str | None = None) -> Figure:
+    """One figure of a results file.
+
+    Parameters
+    ----------
+    kind
+        A key of `OF_PROBLEM` or `OF_DUAL`.
+    problem, dual
+        Label of the problem, and of the dual strategy for a kind of `OF_DUAL`; `None` where there is only one.
+
+    Raises
+    ------
+    RequestError
+        If there is no such figure, or nothing to draw in it.
+    """
+    if kind not in OF_PROBLEM and kind not in OF_DUAL:
+        raise unknown_name("figure", kind, (*OF_PROBLEM, *OF_DUAL))
+    data = _only("problem", {one.problem: one for _, one in problems(path)}, problem)
+    if kind in OF_DUAL:
+        data = _only("dual strategy", {name: data.of_dual(name) for name in data.duals}, dual)
+    with styled():
+        figure = (OF_PROBLEM | OF_DUAL)[kind](data)
+    if figure is None:
+        raise RequestError(f"the run has no data for the figure '{kind}' of {data.problem}")
+    return figure
+
+
+def _only(what: str, found: Mapping[str, Data], label: str | None) -> Data:
+    """The data under a label, or the only ones."""
+    if label is None:
+        if len(found) != 1:
+            raise RequestError(
+                f"the figure is of one {what}: name one of {', '.join(found) or 'none that has queries'}"
+            )
+        return next(iter(found.values()))
+    if label not in found:
+        raise unknown_name(what, label, found)
+    return found[label]
 
 
 def remove(folder: Path) -> None:

@@ -13,7 +13,6 @@ from hypothesis import strategies as st
 from rich.console import Console
 from samples import STUDY, changed, write_study
 
-from vibench.cli.progress import ProgressDisplay, TimeLeft, duration
 from vibench.execution.run import Agenda
 from vibench.interfaces.strategies import Stop
 from vibench.stages.base import Stage
@@ -21,7 +20,8 @@ from vibench.stages.cell_queries import CellQueries, cell_queries
 from vibench.stages.offline import PODStage
 from vibench.stages.snapshots import CHUNKS, SnapshotStage
 from vibench.study.cells import Cell, Plugin, expand
-from vibench.study.reader import load_study
+from vibench.study.reader import read_study
+from vibench.terminal.progress import ProgressDisplay, TimeLeft, duration
 
 PROBLEM = Plugin("problem", "p", "{}", "")
 PODS: list[Stage] = [PODStage(PROBLEM, Stop(size=k)) for k in range(1, 5)]
@@ -31,7 +31,7 @@ CHUNK: list[Stage] = [SnapshotStage(PROBLEM, "training", 0, 0, chunk) for chunk 
 @pytest.fixture
 def cells(tmp_path: Path) -> list[Cell]:
     content = changed(changed(STUDY, "primal", to=["decorrelated"]), "problem", 0, "label", to="[red]membrane")
-    return expand(load_study(write_study(tmp_path, content)))
+    return expand(read_study(write_study(tmp_path, content)))
 
 
 @pytest.fixture
@@ -174,7 +174,7 @@ def test_a_label_is_no_markup_no_emoji_and_no_escape_sequence(
     terminal: bool, report: Make, queries: list[Stage], tmp_path: Path
 ) -> None:
     odd = changed(STUDY, "problem", 0, "label", to="[/b] [red]a :warning:\x1b[2J\n[1/1] ok: b")
-    cell = expand(load_study(write_study(tmp_path, odd)))[0]
+    cell = expand(read_study(write_study(tmp_path, odd)))[0]
     made, printed = report(terminal=terminal)
     with made:
         made.start(agenda(1, queries[:1], 1))

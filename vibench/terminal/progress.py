@@ -10,10 +10,10 @@ from typing import Any
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
-from vibench.cli.console import print_line
-from vibench.execution.run import Agenda
+from vibench.execution.run import Agenda, Observer
 from vibench.stages.base import Stage
 from vibench.study.cells import Cell
+from vibench.terminal.console import print_line
 
 LINE_EVERY = 4
 """Parts of a stage that share one line of progress."""
@@ -53,7 +53,7 @@ def duration(seconds: float) -> str:
     return f"{minutes} min" if minutes < 90 else f"{minutes // 60} h {minutes % 60} min"
 
 
-class ProgressDisplay:
+class ProgressDisplay(Observer):
     """Shows the progress of a run: a bar on a terminal, lines elsewhere; the observer of `run_study`."""
 
     def __init__(self, console: Console) -> None:

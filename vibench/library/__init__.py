@@ -1,0 +1,1 @@
+"""Studies, runs and reduced models from Python: what the command line does, as functions."""

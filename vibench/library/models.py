@@ -1,0 +1,176 @@
+"""A reduced model of a run, for queries at any parameter."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property, partial
+
+import numpy as np
+
+from vibench.arrays import Array
+from vibench.errors import RequestError, unknown_name
+from vibench.execution.recorded_cell import RecordedCell
+from vibench.highfidelity.active_set import HighFidelitySolution, HighFidelitySolver
+from vibench.interfaces.problem import ParameterBox, Problem
+from vibench.interfaces.validation import checked_assembly
+from vibench.model.error_bounds import Bounds, Stability, bounds, extreme_quotients
+from vibench.model.galerkin import ReducedProblem
+from vibench.qp.settings import SETTINGS
+from vibench.qp.solve import installed_solvers, solve_qp
+from vibench.qp.status import Status
+from vibench.qp.verification import Residuals, verify
+from vibench.stability.infsup import inf_sup_full, nodal_multipliers
+from vibench.stages.assembly import Model as Queried
+from vibench.study import registry
+from vibench.timing import Seconds, timed
+
+Parameters = Sequence[float] | Array | Mapping[str, float]
+"""A parameter mu: its components in the order of `ParameterBox.names`, or by these names."""
+
+
+@dataclass(frozen=True)
+class Solution:
+    """The answer of a reduced model at one parameter; the fields are those of a row of the queries table.
+
+    Attributes
+    ----------
+    mu
+        The parameter (d,).
+    status, reason
+        What verification says of the quadratic program's solution, and why it is not ok.
+    x, alpha
+        Coordinates of u in the primal basis (N',) and of λ on the generators (R,); `None` if the solver gave none.
+    residuals
+        Its relative KKT residuals, recomputed; `None` without x and α.
+    assembly, solution
+        Seconds of the assembly of the program, and of its solution.
+    """
+
+    mu: Array
+    status: Status
+    reason: str
+    x: Array | None
+    alpha: Array | None
+    residuals: Residuals | None
+    assembly: Seconds
+    solution: Seconds
+    _model: Model = field(repr=False)
+    _reduced: ReducedProblem = field(repr=False)
+
+    @cached_property
+    def u(self) -> Array:
+        """The primal solution u (n,)."""
+        return np.asarray(self._reduced.lift(self._given(self.x)[:, None])[:, 0])
+
+    @cached_property
+    def lam(self) -> Array:
+        """The multiplier λ (m,)."""
+        return np.asarray(self._model.reduced.generators @ self._given(self.alpha))
+
+    @cached_property
+    def bound(self) -> Bounds | None:
+        """Bounds on the errors of u and λ, at the cost of high-fidelity constants at mu; `None` if λ is not in W⁺."""
+        problem = self._model.problem
+        vi = checked_assembly(problem, self.mu)
+        inf_sup = inf_sup_full(problem.V, vi.B, nodal_multipliers(problem.W))
+        stability = Stability(inf_sup, *extreme_quotients(vi.A, problem.V))
+        return bounds(problem, [vi], [stability], self.u[:, None], self.lam[:, None])[0]
+
+    def _given(self, vector: Array | None) -> Array:
+        if vector is None:
+            raise RequestError(f"there is no solution at mu = {self.mu.tolist()}: {self.status.value}: {self.reason}")
+        return vector
+
+
+class Model:
+    """A reduced model of a run, which answers queries at any parameter.
+
+    Parameters
+    ----------
+    recorded
+        The cell of the run.
+
+    Attributes
+    ----------
+    row
+        Its row of the cells table.
+    problem
+        The high-fidelity problem.
+    reduced
+        What assembles the reduced programs: `reduced.assemble(mu)` has `program` and `lift`.
+    """
+
+    def __init__(self, recorded: RecordedCell) -> None:
+        self.row = recorded.row
+        self.reduced: Queried = recorded.model
+        self.problem: Problem = self.reduced.problem
+        self._solver, self._accuracy = recorded.cell.solver, recorded.cell.accuracy
+
+    @property
+    def parameters(self) -> ParameterBox:
+        """The parameter domain."""
+        return self.problem.parameters
+
+    def solve(self, mu: Parameters, solver: str | None = None, accuracy: float | None = None) -> Solution:
+        """Assemble and solve the reduced program at a parameter, and verify the solution.
+
+        The solver runs in this process, without the limits of a study.
+
+        Parameters
+        ----------
+        mu
+            The parameter; outside the domain there is a warning, since the model was not trained there.
+        solver, accuracy
+            QP solver and the relative accuracy that it has to reach; those of the cell by default.
+
+        Raises
+        ------
+        RequestError
+            If mu is not a parameter of the problem, or the solver is not installed.
+        """
+        at, name = self._parameter(mu), solver or self._solver
+        accuracy = self._accuracy if accuracy is None else accuracy
+        own = registry.names("QP solver")
+        if name not in installed_solvers(own):
+            if name in SETTINGS:
+                raise RequestError(f"the QP solver '{name}' is not installed")
+            raise unknown_name("QP solver", name, {*SETTINGS, *own})
+        reduced, assembly = timed(lambda: self.reduced.assemble(at))
+        solve = partial(solve_qp, reduced.program, name, accuracy, registry.qp_solver(name), reduced.factor)
+        found, solution = timed(solve)
+        status, reason, residuals = verify(reduced.program, found, accuracy)
+        return Solution(at, status, reason, found.x, found.alpha, residuals, assembly, solution, self, reduced)
+
+    def reconstruct(self, mu: Parameters, x: Array, alpha: Array) -> tuple[Array, Array]:
+        """The solution u (n,), λ (m,) with coordinates x (N',) in the primal basis at mu and α (R,) on generators."""
+        u = self.reduced.assemble(self._parameter(mu)).lift(np.asarray(x)[:, None])[:, 0]
+        return np.asarray(u), np.asarray(self.reduced.generators @ alpha)
+
+    def high_fidelity(self, mu: Parameters) -> HighFidelitySolution:
+        """The high-fidelity solution at a parameter, to compare with."""
+        return self._high_fidelity.solve(self._parameter(mu))
+
+    @cached_property
+    def _high_fidelity(self) -> HighFidelitySolver:
+        return HighFidelitySolver(self.problem)
+
+    def _parameter(self, mu: Parameters) -> Array:
+        """A parameter as an array (d,)."""
+        box = self.parameters
+        if isinstance(mu, Mapping):
+            if set(mu) != set(box.names):
+                raise RequestError(f"mu has the components {sorted(mu)}, expected {sorted(box.names)}")
+            mu = [mu[name] for name in box.names]
+        at = np.asarray(mu, dtype=float)
+        if at.shape != (box.dim,) or not np.all(np.isfinite(at)):
+            raise RequestError(f"mu is {np.asarray(mu).tolist()}, expected finite numbers ({', '.join(box.names)})")
+        outside = [
+            name for name, inside in zip(box.names, (box.lower <= at) & (at <= box.upper), strict=True) if not inside
+        ]
+        if outside:
+            warnings.warn(
+                f"{', '.join(outside)} outside the parameter domain: the model was not trained there", stacklevel=3
+            )
+        return at

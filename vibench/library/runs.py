@@ -1,0 +1,213 @@
+"""Runs from Python: a study is run, a finished run is opened."""
+
+from __future__ import annotations
+
+from contextlib import AbstractContextManager, nullcontext
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import pandas as pd
+
+from vibench import provenance
+from vibench.errors import RequestError, unknown_name
+from vibench.execution.recorded_cell import recorded_cell
+from vibench.execution.run import REPORT, Observer, Options, run_study
+from vibench.library.models import Model
+from vibench.results import tables
+from vibench.results.columns import TABLES
+from vibench.results.database import read_meta, study_of
+from vibench.study.spec import Study
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+
+class Run:
+    """A run: its tables, figures and reduced models.
+
+    Parameters
+    ----------
+    path
+        The results file.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def __repr__(self) -> str:
+        return f"Run('{self.path}')"
+
+    @cached_property
+    def study(self) -> dict[str, Any]:
+        """What all rows have in common: name and seed of the study, and the number of validation parameters."""
+        return study_of(self.path, read_meta(self.path))
+
+    def table(self, name: str) -> pd.DataFrame:
+        """A table of the results file, its rows in the order of the axes; the documentation lists the columns.
+
+        Raises
+        ------
+        RequestError
+            If there is no such table.
+        """
+        if name not in TABLES:
+            raise unknown_name("table", name, TABLES)
+        return tables.in_order(tables.read(self.path, name))
+
+    @property
+    def cells(self) -> pd.DataFrame:
+        """A row per cell: dimensions, means of errors and constants, seconds."""
+        return self.table("cells")
+
+    @property
+    def queries(self) -> pd.DataFrame:
+        """A row per query of a cell: status, residuals, errors, constants, bounds, seconds."""
+        return self.table("queries")
+
+    @property
+    def histories(self) -> pd.DataFrame:
+        """A row per step of POD, cones and enrichments: errors, σ and β."""
+        return self.table("histories")
+
+    @property
+    def thresholds(self) -> pd.DataFrame:
+        """A row per pair of cells, or of the high-fidelity model and a cell: the break-even and its interval."""
+        return self.table("thresholds")
+
+    @property
+    def summary(self) -> pd.DataFrame:
+        """The table that `vibench show` prints."""
+        return tables.summary(tables.read(self.path, "cells"))
+
+    @property
+    def findings(self) -> dict[str, list[str]]:
+        """Sentences computed from the tables, by problem; "" for the whole run."""
+        from vibench.report.findings import findings  # noqa: PLC0415  loads the figures
+
+        return findings(self.path)
+
+    def figure(self, kind: str, problem: str | None = None, dual: str | None = None) -> Figure:
+        """One figure of the run, to be shown or saved.
+
+        Parameters
+        ----------
+        kind
+            What it shows: "inf-sup", "errors", "total-cost", …; the documentation shows them all.
+        problem, dual
+            Label of a problem and, for figures of a cone, of a dual strategy; not needed where the run has one.
+
+        Raises
+        ------
+        RequestError
+            If there is no such figure, or the run has no data for it.
+        """
+        from vibench.report.figures import draw  # noqa: PLC0415  loads matplotlib
+
+        return draw(self.path, kind, problem, dual)
+
+    def write_tables(self, folder: Path | str | None = None) -> list[Path]:
+        """Write every table as CSV, and the summary as Markdown; into `tables` beside the results file by default."""
+        return tables.export(self.path, self.path.parent / "tables" if folder is None else Path(folder))
+
+    def write_figures(self, folder: Path | str | None = None) -> list[Path]:
+        """Write every figure as PNG and SVG; into `figures` beside the results file by default."""
+        from vibench.report.figures import draw_all  # noqa: PLC0415  loads matplotlib
+
+        return draw_all(self.path, self.path.parent / "figures" if folder is None else Path(folder))
+
+    def report(self, path: Path | str | None = None) -> Path:
+        """Write the report, one HTML page; into the folder of the run by default. Returns its path."""
+        from vibench.report import html  # noqa: PLC0415  loads matplotlib
+
+        return html.write(self.path, self.path.parent / REPORT if path is None else Path(path))
+
+    def model(self, cell: str) -> Model:
+        """The reduced model of a cell, ready for queries; stages whose artefacts are missing are run again.
+
+        Parameters
+        ----------
+        cell
+            Key of the cell, or its beginning.
+
+        Raises
+        ------
+        RequestError
+            If there is no such cell, it failed before it had a model, or other code computed it.
+        """
+        return Model(recorded_cell(str(self.path), cell))
+
+
+def _following(observer: Observer | None, progress: bool) -> AbstractContextManager[Observer]:
+    """Who follows a run."""
+    if observer is not None or not progress:
+        return nullcontext(observer or Observer())
+    from vibench.terminal.console import new_console  # noqa: PLC0415  loads rich
+    from vibench.terminal.progress import ProgressDisplay  # noqa: PLC0415  loads rich
+
+    return ProgressDisplay(new_console())
+
+
+def open_run(path: Path | str) -> Run:
+    """A finished run: its folder, its results file, or the name of a study that was run in this folder.
+
+    Raises
+    ------
+    RequestError
+        If there is no results file, or it has another schema.
+    """
+    return Run(tables.results_file(str(path)))
+
+
+def run(
+    study: Study,
+    out: Path | str | None = None,
+    *,
+    jobs: int = 0,
+    fresh: bool = False,
+    retry: bool = False,
+    executor: Literal["local", "dask"] = "local",
+    scheduler: str | None = None,
+    observer: Observer | None = None,
+    progress: bool = True,
+) -> Run:
+    """Run the cells of a study that have no row yet; an interrupted run is continued.
+
+    Parameters
+    ----------
+    study
+        The study, from `Study` or `read_study`.
+    out
+        Run folder; `runs/NAME` by default.
+    jobs
+        Worker processes; 0 for one per core. Numbers do not depend on it.
+    fresh
+        Remove earlier results of the study and compute everything again.
+    retry
+        Also redo cells that did not end ok.
+    executor, scheduler
+        Where the work is done: processes of this machine, or a dask cluster and the address of its scheduler; without
+        an address a cluster is started, for which a script needs the guard `if __name__ == "__main__"`.
+    observer
+        Follows the run, in place of the progress display.
+    progress
+        Whether to show the progress, in a terminal or a notebook.
+
+    Raises
+    ------
+    RequestError
+        If the folder or the cache cannot be used.
+    StorageError
+        If something cannot be written; what was written before is kept.
+    KeyboardInterrupt
+        On Ctrl-C: what is finished is written, and the same call continues the run.
+    """
+    folder = Path("runs") / study.name if out is None else Path(out)
+    if jobs < 0:
+        raise RequestError(f"jobs is {jobs}, expected a number of processes, or 0 for one per core")
+    options = Options(jobs or provenance.cores(), fresh, retry, executor, scheduler)
+    with _following(observer, progress) as following:
+        outcome = run_study(study, folder, following, options)
+    if outcome.interrupted:
+        raise KeyboardInterrupt(f"{outcome.missing} cells have no row yet; the same call continues the run")
+    return open_run(folder)
