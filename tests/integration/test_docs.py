@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import copy
 import importlib.util
+import io
+import json
 import pkgutil
 import re
 import sys
@@ -206,6 +209,44 @@ def test_a_rule_of_the_reference_is_a_rule(change: str, refused: str, tmp_path: 
 
 def test_there_are_rules() -> None:
     assert len(RULES) >= 5
+
+
+def test_the_page_on_python_prints_what_it_says(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its examples build on each other; what one prints is in the block that follows it."""
+    monkeypatch.chdir(tmp_path)
+    page, names = blocks(DOCS / "library.md"), dict[str, Any]()
+    compared = 0
+    for (language, _, code), (following, _, text) in pairwise([*page, ("", "", "")]):
+        if language != "python":
+            continue
+        with contextlib.redirect_stdout(io.StringIO()) as printed:
+            exec(compile(code, "<documentation>", "exec"), names)
+        if following == "text":
+            assert printed.getvalue().endswith(text), code
+            compared += 1
+    assert compared > 7
+    assert {file.name for file in tmp_path.iterdir()} == {"runs", "tables", "decision.html", "inf-sup.svg"}
+
+
+def test_the_script_of_the_readme_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    (script,) = (code for language, _, code in blocks(ROOT / "README.md") if language == "python")
+    names: dict[str, Any] = {}
+    exec(compile(script, "<README>", "exec"), names)
+    assert names["solution"].status == "ok"
+    assert (tmp_path / "total-cost.png").stat().st_size
+    assert len([line for line in script.splitlines() if line]) <= 15
+
+
+def test_the_notebook_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    notebook = json.loads((ROOT / "examples" / "decision.ipynb").read_text(encoding="utf-8"))
+    codes = ["".join(cell["source"]) for cell in notebook["cells"] if cell["cell_type"] == "code"]
+    names: dict[str, Any] = {}
+    for code in codes:
+        exec(compile(code, "<notebook>", "exec"), names)
+    assert names["solution"].status == "ok"
+    assert names["chosen"]["primal"] in set(names["run"].cells["primal"])
 
 
 MODULE = re.compile(r"\b(?:problems/|strategies/)?vibench(?:_problems|_strategies)?/[\w/]+\.py\b")

@@ -166,11 +166,9 @@ class Model:
         at = np.asarray(mu, dtype=float)
         if at.shape != (box.dim,) or not np.all(np.isfinite(at)):
             raise RequestError(f"mu is {np.asarray(mu).tolist()}, expected finite numbers ({', '.join(box.names)})")
-        outside = [
-            name for name, inside in zip(box.names, (box.lower <= at) & (at <= box.upper), strict=True) if not inside
-        ]
+        outside = [name for k, name in enumerate(box.names) if not box.lower[k] <= at[k] <= box.upper[k]]
         if outside:
             warnings.warn(
-                f"{', '.join(outside)} outside the parameter domain: the model was not trained there", stacklevel=3
+                f"{', '.join(outside)}: outside the parameter domain, where the model was not trained", stacklevel=3
             )
         return at

@@ -75,9 +75,24 @@ def load(kind: str, name: str) -> Any:
     return plugin
 
 
-def create(kind: str, name: str, options: Mapping[str, Any]) -> Any:
-    """Instance of a plugin, its options checked."""
-    return load(kind, name)(**check_options(kind, name, options))
+def create(kind: str, name: str, options: Mapping[str, Any] | None = None) -> Any:
+    """Instance of a plugin, its options checked.
+
+    Parameters
+    ----------
+    kind
+        "problem", "dual strategy" or "primal strategy".
+    name
+        Name under which the plugin is registered.
+    options
+        Keyword arguments of its constructor.
+
+    Raises
+    ------
+    RequestError
+        If there is no such plugin, or it does not take these options.
+    """
+    return load(kind, name)(**check_options(kind, name, options or {}))
 
 
 def version(kind: str, name: str) -> str:

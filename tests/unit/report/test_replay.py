@@ -61,7 +61,7 @@ def test_a_recorded_cell_solves_as_it_did(run: Path) -> None:
         again = solve_qp(recorded.program(query), "piqp", 1e-7)
         x = np.frombuffer(solutions[query]["x"])
         assert np.array_equal(again.x, x)
-    model = vibench.load(str(run), key(run)[:8])
+    model = vibench.open_run(run).model(key(run)[:8]).reduced
     assert model.fixed_basis.shape[1] == recorded.row["N"] + recorded.row["enrichment"]
 
 

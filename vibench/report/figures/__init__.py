@@ -78,9 +78,8 @@ def _only(what: str, found: Mapping[str, Data], label: str | None) -> Data:
     """The data under a label, or the only ones."""
     if label is None:
         if len(found) != 1:
-            raise RequestError(
-                f"the figure is of one {what}: name one of {', '.join(found) or 'none that has queries'}"
-            )
+            known = f"name one of {', '.join(found)}" if found else "the run has none with queries"
+            raise RequestError(f"the figure is of one {what}: {known}")
         return next(iter(found.values()))
     if label not in found:
         raise unknown_name(what, label, found)

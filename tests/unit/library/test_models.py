@@ -1,0 +1,121 @@
+"""Reduced models of a run: queries at any parameter."""
+
+from __future__ import annotations
+
+import warnings
+
+import numpy as np
+import pytest
+
+import vibench
+from vibench.interfaces.validation import validation_parameters
+
+STUDY = vibench.Study(
+    name="small",
+    problem=[{"name": "radial-obstacle", "options": {"resolution": 200}}],
+    dual=["mcpg"],
+    primal=["online-supremizers", "offline-pga"],
+    assembly=["full", "reduced"],
+    tolerances=[{"pod": [1e-2], "dual": [1e-1], "primal": {"offline-pga": [0.5]}}],
+    solvers=["piqp"],
+    accuracy=1e-10,
+    validation=3,
+    timing_rounds=1,
+)
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> vibench.Run:
+    return vibench.run(STUDY, tmp_path_factory.mktemp("models") / "run", progress=False)
+
+
+@pytest.fixture(scope="module", params=range(4))
+def model(run: vibench.Run, request: pytest.FixtureRequest) -> vibench.Model:
+    return run.model(run.cells["cell"].iloc[request.param])
+
+
+@pytest.fixture(scope="module")
+def mus(model: vibench.Model) -> np.ndarray:
+    return validation_parameters(model.problem, STUDY.validation, STUDY.seed)
+
+
+def test_a_model_answers_as_the_run_did(run: vibench.Run, model: vibench.Model, mus: np.ndarray) -> None:
+    rows = run.queries[run.queries["cell"] == model.row["cell"]].set_index("query")
+    for query, mu in enumerate(mus):
+        solution, exact = model.solve(mu), model.high_fidelity(mu)
+        assert solution.status == "ok"
+        error_u = model.problem.V.norm(solution.u - exact.u) / model.problem.V.norm(exact.u)
+        error_lambda = model.problem.W.norm(solution.lam - exact.lam) / model.problem.W.norm(exact.lam)
+        assert error_u == pytest.approx(rows.loc[query, "error_u"], rel=1e-6)
+        assert error_lambda == pytest.approx(rows.loc[query, "error_lambda"], rel=1e-6)
+        assert solution.residuals is not None
+        assert solution.residuals.worst <= 1e-10
+        assert solution.bound is not None
+        assert solution.bound.u == pytest.approx(rows.loc[query, "bound_u"], rel=1e-2)
+        assert solution.bound.u >= model.problem.V.norm(solution.u - exact.u)
+        assert solution.bound.lam >= model.problem.W.norm(solution.lam - exact.lam)
+
+
+def test_parameters_by_name_and_reconstruction(model: vibench.Model, mus: np.ndarray) -> None:
+    solution = model.solve(dict(zip(model.parameters.names, mus[0].tolist(), strict=True)))
+    assert np.array_equal(solution.mu, mus[0])
+    u, lam = model.reconstruct(mus[0], solution.x, solution.alpha)
+    assert np.allclose(u, solution.u, rtol=0.0, atol=1e-14 * np.abs(u).max())
+    assert np.array_equal(lam, solution.lam)
+
+
+def test_another_solver_and_accuracy(model: vibench.Model, mus: np.ndarray) -> None:
+    loose = model.solve(mus[0], solver="proxqp", accuracy=1e-4)
+    assert loose.status == "ok"
+    assert loose.residuals is not None
+    assert loose.residuals.worst <= 1e-4
+    assert np.allclose(loose.u, model.solve(mus[0]).u, rtol=0.0, atol=1e-2 * np.abs(loose.u).max())
+
+
+def test_a_parameter_outside_the_domain_is_warned_of(model: vibench.Model) -> None:
+    box = model.parameters
+    with pytest.warns(UserWarning, match="^height, curvature: outside the parameter domain"):
+        model.solve(box.upper + 0.1 * (box.upper - box.lower))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        model.solve(box.upper)
+
+
+@pytest.mark.parametrize(
+    ("mu", "line"),
+    [
+        ([1.0, 2.0, 3.0, 4.0], "expected finite numbers"),
+        ([float("nan")] * 2, "expected finite numbers"),
+        ({"height": 1.0}, "mu has the components \\['height'\\], expected"),
+    ],
+)
+def test_what_is_no_parameter(model: vibench.Model, mu: object, line: str) -> None:
+    with pytest.raises(vibench.RequestError, match=line):
+        model.solve(mu)  # type: ignore[arg-type]
+
+
+def test_solvers_that_are_not_there(model: vibench.Model, mus: np.ndarray, monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(vibench.RequestError, match="no QP solver is called 'piqpp'; did you mean 'piqp'"):
+        model.solve(mus[0], solver="piqpp")
+    monkeypatch.setattr("vibench.library.models.installed_solvers", lambda _: ["piqp"])
+    with pytest.raises(vibench.RequestError, match="the QP solver 'proxqp' is not installed"):
+        model.solve(mus[0], solver="proxqp")
+
+
+def test_a_solver_without_an_answer_has_no_solution(
+    model: vibench.Model, mus: np.ndarray, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    nothing = vibench.QPSolution(None, None, "gave up")
+    monkeypatch.setattr("vibench.library.models.solve_qp", lambda *_: nothing)
+    solution = model.solve(mus[0])
+    assert solution.status != "ok"
+    for vector in ("u", "lam"):
+        with pytest.raises(vibench.RequestError, match="there is no solution at mu"):
+            getattr(solution, vector)
+
+
+def test_a_cell_is_named_by_its_beginning(run: vibench.Run) -> None:
+    key = str(run.cells["cell"].iloc[0])
+    assert run.model(key[:12]).row["cell"] == key
+    with pytest.raises(vibench.RequestError, match="0 cells of"):
+        run.model("zzz")

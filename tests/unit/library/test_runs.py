@@ -1,0 +1,140 @@
+"""Studies and runs from Python."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import matplotlib.figure
+import pandas as pd
+import pytest
+
+import vibench
+from vibench.execution.run import Agenda, Observer
+from vibench.results import tables
+
+SETTINGS: dict[str, Any] = {
+    "name": "small",
+    "problem": [{"name": "radial-obstacle", "options": {"resolution": 200}}],
+    "dual": ["cpg", "mcpg"],
+    "primal": ["decorrelated", "offline-pga"],
+    "tolerances": [{"pod": [1e-2], "dual": [1e-1], "primal": {"offline-pga": [0.5]}}],
+    "solvers": ["piqp"],
+    "validation": 4,
+    "timing_rounds": 2,
+}
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> vibench.Run:
+    return vibench.run(vibench.Study(**SETTINGS), tmp_path_factory.mktemp("library") / "run", progress=False)
+
+
+class Following(Observer):
+    """Counts what it is told."""
+
+    def __init__(self) -> None:
+        self.agenda: Agenda | None = None
+        self.cells = 0
+
+    def start(self, agenda: Agenda) -> None:
+        self.agenda = agenda
+
+    def cell(self, cell: object, row: object) -> None:
+        self.cells += 1
+
+
+def test_a_run_has_its_tables(run: vibench.Run) -> None:
+    assert len(run.cells) == 4
+    assert set(run.cells["status"]) == {"ok"}
+    assert len(run.queries) == 16
+    assert set(run.histories["dual"].dropna()) == {"cpg", "mcpg"}
+    assert len(run.thresholds)
+    pd.testing.assert_frame_equal(run.summary, tables.summary(run.cells))
+    assert run.study == {"name": "small", "seed": 0, "validation": 4}
+
+
+def test_a_run_is_opened_where_it_is(run: vibench.Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "runs").mkdir()
+    (tmp_path / "runs" / "small").symlink_to(run.path.parent)
+    for place in (run.path, str(run.path.parent), "small"):
+        pd.testing.assert_frame_equal(vibench.open_run(place).cells, run.cells)
+    with pytest.raises(vibench.RequestError, match="no results in 'large'"):
+        vibench.open_run("large")
+
+
+def test_a_run_is_continued_and_followed(run: vibench.Run, capsys: pytest.CaptureFixture[str]) -> None:
+    following = Following()
+    vibench.run(vibench.Study(**SETTINGS), run.path.parent, observer=following)
+    assert following.agenda is not None
+    assert (following.agenda.to_run, following.cells) == (0, 0)
+    assert not capsys.readouterr().out
+    vibench.run(vibench.Study(**SETTINGS), run.path.parent)
+    assert "4 cells, 0 to run" in capsys.readouterr().out
+
+
+def test_figures_and_findings(run: vibench.Run) -> None:
+    figure = run.figure("inf-sup", dual="cpg")
+    assert isinstance(figure, matplotlib.figure.Figure)
+    assert figure.axes
+    assert any(title.startswith("radial-obstacle, cpg") for title in run.findings)
+
+
+@pytest.mark.parametrize(
+    ("kind", "options", "line"),
+    [
+        ("infsup", {}, "no figure is called 'infsup'; did you mean 'inf-sup'"),
+        ("inf-sup", {}, "the figure is of one dual strategy: name one of cpg, mcpg"),
+        ("inf-sup", {"dual": "gpc"}, "no dual strategy is called 'gpc'"),
+        ("errors", {"problem": "hertz"}, "no problem is called 'hertz'"),
+        ("precision", {}, "no data for the figure 'precision' of radial-obstacle"),
+    ],
+)
+def test_a_figure_that_there_is_not(run: vibench.Run, kind: str, options: dict[str, str], line: str) -> None:
+    with pytest.raises(vibench.RequestError, match=line):
+        run.figure(kind, **options)
+
+
+def test_what_a_run_writes(run: vibench.Run, tmp_path: Path) -> None:
+    assert {file.name for file in run.write_tables(tmp_path / "tables")} == set(tables.EXPORTED)
+    drawn = run.write_figures(tmp_path / "figures")
+    assert {file.suffix for file in drawn} == {".png", ".svg"}
+    assert all(file.stat().st_size for file in drawn)
+    assert "radial-obstacle" in run.report(tmp_path / "page.html").read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize(
+    ("changes", "line"),
+    [
+        ({"problem": ["radial-obstacel"]}, "did you mean 'radial-obstacle'"),
+        ({"validatoin": 3}, "no key is called 'validatoin'; did you mean 'validation'"),
+        ({"validation": 0}, "validation: .*(found 0)"),
+        ({"name": "../up"}, "name: letters, digits"),
+        ({"tolerances": [{"pod": [1e-2], "dual": [1e-1]}]}, "gives nothing for 'offline-pga'"),
+    ],
+)
+def test_a_wrong_study_says_so_in_one_line(changes: dict[str, Any], line: str) -> None:
+    with pytest.raises(vibench.RequestError, match=line) as caught:
+        vibench.Study(**SETTINGS | changes)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_wrong_request_for_a_run(run: vibench.Run) -> None:
+    with pytest.raises(vibench.RequestError, match="no table is called 'cell'; did you mean 'cells'"):
+        run.table("cell")
+    with pytest.raises(vibench.RequestError, match="jobs is -1"):
+        vibench.run(vibench.Study(**SETTINGS), jobs=-1)
+
+
+def test_ctrl_c_raises_and_the_next_call_continues(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    class Interrupting(Following):
+        def cell(self, cell: object, row: object) -> None:
+            super().cell(cell, row)
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt, match="3 cells have no row yet"):
+        vibench.run(vibench.Study(**SETTINGS), tmp_path, observer=Interrupting(), jobs=1)
+    again = Following()
+    assert len(vibench.run(vibench.Study(**SETTINGS), tmp_path, observer=again).cells) == 4
+    assert again.cells == 3
