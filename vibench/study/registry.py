@@ -12,7 +12,7 @@ from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from typing import Any, get_type_hints
 
-from pydantic import ConfigDict, TypeAdapter, ValidationError
+from pydantic import ConfigDict, PydanticUserError, TypeAdapter, ValidationError
 
 from vibench.errors import RequestError, in_a_line, unknown_name
 from vibench.interfaces.problem import Problem
@@ -152,6 +152,25 @@ def checked_arguments(plugin: type, what: str, given: Mapping[str, Any]) -> dict
         elif default is inspect.Parameter.empty:
             raise RequestError(f"{what} needs the option '{option}' ({_expected(annotation)})")
     return checked
+
+
+def doubtful_options(plugin: type) -> dict[str, str]:
+    """What is doubtful of the options of a class, by name: no annotation, or a default that does not conform to it."""
+    doubts = {}
+    for option, (default, annotation) in _parameters(plugin).items():
+        if annotation is Any:
+            doubts[option] = "has no annotation that says what study files may set it to"
+            continue
+        try:
+            expected = _expected(annotation)
+            if default is not inspect.Parameter.empty:
+                text = json.dumps(default, default=str)
+                TypeAdapter(annotation, config=FINITE).validate_json(text, strict=True)
+        except PydanticUserError as error:
+            doubts[option] = f"has an annotation that no value of a study file conforms to: {in_a_line(error)}"
+        except ValidationError:
+            doubts[option] = f"has the default {default!r}; its annotation expects {expected}"
+    return doubts
 
 
 def canonical_options(kind: str, name: str, given: Mapping[str, Any]) -> str:
