@@ -33,7 +33,9 @@ FINITE = ConfigDict(allow_inf_nan=False)
 BASES: Mapping[str, type] = {"problem": Problem, "dual strategy": DualStrategy, "primal strategy": PrimalStrategy}
 """Abstract base classes of the kinds of plugins that are classes."""
 
-WORDS: Mapping[str, str] = {"problem": "problem", "primal": "primal strategy", "dual": "dual strategy"}
+WORDS: Mapping[str, str] = {
+    "problem": "problem", "primal": "primal strategy", "dual": "dual strategy", "solver": "QP solver",
+}  # fmt: skip
 """Kinds of plugins by their names on the command line."""
 
 
@@ -78,6 +80,12 @@ def load(kind: str, name: str) -> Any:
 def create(kind: str, name: str, options: Mapping[str, Any]) -> Any:
     """Instance of a plugin, its options checked."""
     return load(kind, name)(**check_options(kind, name, options))
+
+
+def reference(kind: str, name: str) -> str:
+    """Where a plugin is, "module:attribute"."""
+    entry = _entry(kind, name)
+    return f"{entry.module}:{entry.attr}"
 
 
 def version(kind: str, name: str) -> str:

@@ -18,7 +18,7 @@ from vibench.interfaces.problem import MEMBERS, Contact, Problem, VariationalIne
 from vibench.linalg.inner_product import InnerProduct
 from vibench.model.affine import CONSTANT_RTOL
 from vibench.testing.case import MOST_POINTS, ProblemCase, assembled
-from vibench.testing.checks import ConformanceError, Note, raised
+from vibench.testing.checks import ConformanceError, Doubt, Note, raised
 from vibench.testing.comparisons import Arrays, array_fault, at, copies, difference, differences, peak, unmutated
 from vibench.testing.elsewhere import NotImportableError, call_elsewhere
 
@@ -102,7 +102,7 @@ def definiteness(case: ProblemCase) -> None:
 
 
 def independence(case: ProblemCase) -> Iterator[str]:
-    """Members declared `constant` do not depend on the parameter."""
+    """Members declared `constant` do not depend on the parameter; every parameter has an effect."""
     yield from _undeclarable("constant", case.plugin.constant)
     first = at(case.mus[0])
     for name in (name for name in MEMBERS if name in case.plugin.constant):
@@ -111,6 +111,19 @@ def independence(case: ProblemCase) -> Iterator[str]:
             if what := difference(found[name], reference, CONSTANT_RTOL * peak(reference)):
                 yield f"{name} is declared `constant` but depends on mu: {what} ({where} and {first})"
                 break
+    yield from _without_effect(case) if case.points == MOST_POINTS else ()
+
+
+def _without_effect(case: ProblemCase) -> Iterator[str]:
+    """Parameters that can be moved from the centre of the box to a side of it, and nothing changes."""
+    box = case.plugin.parameters
+    centre = 0.5 * (box.lower + box.upper)
+    for number, name in enumerate(box.names):
+        moved = np.where(np.arange(box.dim) == number, box.upper, centre)
+        if box.upper[number] > box.lower[number] and not any(
+            differences(case.evaluate(moved), case.evaluate(centre), PARTIAL_RTOL)
+        ):
+            yield Doubt(f"nothing depends on the parameter '{name}'")
 
 
 def elsewhere(case: ProblemCase) -> Iterator[str]:

@@ -15,7 +15,6 @@ from vibench.linalg.dense import singular_values
 from vibench.linalg.inner_product import InnerProduct
 from vibench.testing.case import ProblemCase
 from vibench.testing.checks import Doubt, Note
-from vibench.testing.comparisons import at
 
 DENSE = 400
 """Up to so many unknowns eigenvalues are those of dense matrices."""

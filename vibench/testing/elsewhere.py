@@ -130,7 +130,7 @@ class Call(PiecewiseStage, Pieces):
     """One call of a pickled function with its arguments, where these folders are searched for modules."""
 
     label = "call"
-    pieces = 1  # type: ignore[assignment]
+    pieces = 1
 
     pickled: bytes
     path: tuple[str, ...]

@@ -14,7 +14,7 @@ from vibench.interfaces.validation import training_parameters, validation_parame
 from vibench.linalg.inner_product import InnerProduct
 from vibench.testing import assembly
 from vibench.testing.case import ProblemCase
-from vibench.testing.checks import SECONDS, Check, ConformanceError, Finding, Note, examine, raising
+from vibench.testing.checks import SECONDS, Check, ConformanceError, Doubt, Finding, Note, examine, raising
 from vibench.testing.comparisons import array_fault, at, difference, unmutated
 from vibench.testing.constants import constants
 
@@ -119,6 +119,10 @@ def solution(case: ProblemCase) -> Iterator[str]:
         yield (
             f"no constraint is active at any of {len(solved)} training parameters, so that all multipliers are zero; "
             "check that B u ≤ g is the admissible side"
+        )
+    elif all(np.all(each.lam > 0.0) for each in solved):
+        yield Doubt(
+            f"every constraint is active at each of {len(solved)} training parameters; check the signs of B and g"
         )
     worst, fallbacks = max(each.residuals.worst for each in solved), sum(bool(each.fallback) for each in solved)
     initial = f", {fallbacks} started from an interior-point solution" if fallbacks else ""
