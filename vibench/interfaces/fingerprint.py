@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,6 +10,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from vibench.arrays import Array
+from vibench.errors import NumericalError
 from vibench.interfaces.problem import MEMBERS, Problem, VariationalInequality
 
 AGREEMENT_RTOL = 1e-9
@@ -38,9 +39,9 @@ class Fingerprint:
                 yield f"row {int(np.argmax(np.where(np.isnan(gap), np.inf, gap)))} of {name} differs"
 
 
-def fingerprint(problem: Problem, vi: VariationalInequality, names: Iterable[str] = MEMBERS) -> Fingerprint:
-    """The fingerprint of `vi`, an assembly of the problem, and of its inner products; of the named members alone."""
-    arrays = {name: getattr(vi, name) for name in names}
+def fingerprint(problem: Problem, vi: VariationalInequality) -> Fingerprint:
+    """The fingerprint of `vi`, an assembly of the problem, and of its inner products."""
+    arrays = {name: getattr(vi, name) for name in MEMBERS}
     return _of(arrays | {"X_V": problem.V.matrix, "X_W": problem.W.matrix})
 
 
@@ -70,12 +71,15 @@ class ReferenceAssembly:
         self._problem, self._vi = problem, vi
         self.fingerprint = fingerprint(problem, vi)
 
-    def falsely_constant(self, vi: VariationalInequality) -> Iterator[str]:
-        """Members declared `constant` that an assembly at another parameter has otherwise."""
-        # The same object needs no product; `changed` tells if its entries were replaced.
+    def refuse_false_constants(self, mu: Array, vi: VariationalInequality) -> None:
+        """Raise a `NumericalError` if a member declared `constant` is another one in the assembly at mu (d,)."""
+        # The same object needs no product; `refuse_overwritten` tells if its entries were replaced.
         names = [name for name in self._problem.constant if getattr(vi, name) is not getattr(self._vi, name)]
-        return _of({name: getattr(vi, name) for name in names}).deviations(self.fingerprint)
+        for deviation in _of({name: getattr(vi, name) for name in names}).deviations(self.fingerprint):
+            where = f"at mu = {mu.tolist()} from that at the first training parameter"
+            raise NumericalError(f"a member declared `constant` depends on mu: {deviation} {where}")
 
-    def changed(self) -> Iterator[str]:
-        """Arrays of the reference that later assemblies have overwritten."""
-        return self.fingerprint.deviations(fingerprint(self._problem, self._vi))
+    def refuse_overwritten(self) -> None:
+        """Raise a `NumericalError` if later assemblies have overwritten the reference."""
+        for deviation in self.fingerprint.deviations(fingerprint(self._problem, self._vi)):
+            raise NumericalError(f"assemble overwrites earlier results, return new arrays: {deviation}")

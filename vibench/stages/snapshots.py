@@ -91,17 +91,9 @@ class SnapshotStage(Stage):
                 return vi, solver.solve_assembled(mu, vi)
             except NumericalError:
                 check_stiffness(mu, vi)  # the cause rather than what came of it
-                refuse_wrong(mu, vi)
+                reference.refuse_false_constants(mu, vi)
+                reference.refuse_overwritten()
                 raise
-
-        def refuse_wrong(mu: Array, vi: VariationalInequality) -> None:
-            for deviation in reference.falsely_constant(vi):
-                where = f"at mu = {mu.tolist()} from that at the first training parameter"
-                raise NumericalError(f"a member declared `constant` depends on mu: {deviation} {where}")
-            for deviation in reference.changed():
-                raise NumericalError(f"assemble overwrites earlier results, return new arrays: {deviation}")
-            if not np.array_equal(mus, given):
-                raise NumericalError("assemble changes its argument mu: work on a copy")
 
         for k, mu in enumerate(mus):
             solve_here = partial(solve, mu)
@@ -112,10 +104,13 @@ class SnapshotStage(Stage):
                 setups.append(beginning.beyond(marginal))
             if k == 0 or "A" not in problem.constant:  # verification, as is what follows, which is not timed
                 solver.check_coercive(mu, vi)
-            refuse_wrong(mu, vi)
+            reference.refuse_false_constants(mu, vi)
             solver.remember(mu, solution)
             u[:, k], lam[:, k] = solution.u, solution.lam
             fallbacks.append(solution.fallback)
+        reference.refuse_overwritten()
+        if not np.array_equal(mus, given):
+            raise NumericalError("assemble changes its argument mu: work on a copy")
         found = Snapshots(mus, u, lam, tuple(seconds), tuple(setups), tuple(fallbacks), reference.fingerprint)
         return Result(found, sum(seconds, NO_TIME), self._diagnostics(problem, mus, first))
 

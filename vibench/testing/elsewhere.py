@@ -92,19 +92,20 @@ class _Checking(Pieces):
         return failed
 
     def finish(self, pieces: Sequence[Finding | Failed]) -> list[Finding]:
-        """All findings; of the checks for which no time was left only the first one failed."""
-        findings, late = [], False
+        """All findings; one for all checks that were not begun when the time limit was reached."""
+        findings, late = list[Finding](), list[str]()
         for check, found in zip(self._checks, pieces, strict=True):
             if isinstance(found, Finding):
                 findings.append(found)
-            elif found.status is not Status.TIMEOUT:
-                findings.append(Finding(check.name, Verdict.FAILED, found.reason))
-            elif late:
-                findings.append(Finding(check.name, Verdict.SKIPPED, "no time is left"))
+            elif found.status is Status.TIMEOUT:
+                late.append(check.name)
             else:
-                late = True
-                reason = f"stopped: the checks take longer than {self._stage.seconds:g} s"
-                findings.append(Finding(check.name, Verdict.FAILED, reason))
+                findings.append(Finding(check.name, Verdict.FAILED, found.reason))
+        if late:
+            reason = f"stopped: the checks take longer than {self._stage.seconds:g} s"
+            findings.append(Finding(late[0], Verdict.FAILED, reason))
+        if late[1:]:
+            findings.append(Finding(", ".join(late[1:]), Verdict.SKIPPED, "no time is left"))
         return findings
 
 

@@ -168,7 +168,7 @@ CHECKS: tuple[Check[ProblemCase], ...] = (
     Check("training set", training_set, ("parameters",)),
     Check("validation set", validation_set, ("parameters",)),
     Check("one assembly", assembly.one_assembly, ("spaces", "parameters")),
-    Check("assembly", assembly.assembly, ("spaces", "parameters")),
+    Check("assembly", assembly.assembly, ("one assembly",)),
     Check("no mutation", assembly.no_mutation, ("assembly",)),
     Check("symmetry of A", assembly.symmetry, ("assembly",)),
     Check("definiteness of A", assembly.definiteness, ("symmetry of A",)),
