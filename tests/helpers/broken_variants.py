@@ -5,6 +5,7 @@ Where the docstring of a class says nothing else, `vibench check` names the mist
 
 from __future__ import annotations
 
+import os
 import time
 from collections.abc import Mapping
 from dataclasses import replace
@@ -280,6 +281,18 @@ class Hangs(Bar):
         if self.calls > 1:
             time.sleep(3600.0)
         return super().assemble(mu)
+
+
+class PaintsTheEnd(Bar):
+    """Ends the process where a picture is asked for."""
+
+    def picture(self, mu: Array, u: Array, lam: Array) -> None:
+        os._exit(5)
+
+
+class UnknownAnnotation(Bar):
+    def __init__(self, depth: Depth = 1.0) -> None:  # type: ignore[name-defined]  # noqa: F821
+        super().__init__()
 
 
 class Unannotated(Bar):

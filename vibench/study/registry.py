@@ -222,7 +222,10 @@ def _parameters(plugin: Any) -> Mapping[str, tuple[Any, Any]]:
     constructor = inspect.getattr_static(plugin, "__init__")
     if constructor is object.__init__:
         return {}
-    hints = get_type_hints(constructor, include_extras=True)
+    try:
+        hints = get_type_hints(constructor, include_extras=True)
+    except Exception as error:  # noqa: BLE001  evaluating annotations runs third-party code
+        raise RequestError(f"the options of {plugin.__name__} have annotations that fail: {in_a_line(error)}") from None
     parameters = list(inspect.signature(constructor).parameters.values())[1:]  # without self
     named = [p for p in parameters if p.kind not in (p.VAR_POSITIONAL, p.VAR_KEYWORD)]
     return {p.name: (p.default, hints.get(p.name, Any)) for p in named}

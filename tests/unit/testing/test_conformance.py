@@ -326,6 +326,7 @@ class TestRequests:
             (["broken_problems:Jmups"], ["no plugin of the module broken_problems", "did you mean 'Jumps'"]),
             (["running:Path"], ["'running:Path'", "no subclass of Problem, PrimalStrategy or DualStrategy"]),
             (["some thing:Rope"], ["neither KIND:NAME", "solver", "MODULE:NAME"]),
+            (["broken_variants:UnknownAnnotation"], ["annotations that fail: NameError", "'Depth'"]),
             (["solver:piqq"], ["no QP solver is called 'piqq'", "did you mean 'piqp'"]),
             (["solver:piqp", "--option", "eps=1"], ["QP solver 'piqp' has no options"]),
             (["obstacle", "--option", "resolution"], ["'resolution'", "KEY=VALUE"]),

@@ -52,6 +52,15 @@ def test_a_check_that_ends_its_process_costs_those_that_need_it(plugin: str, cau
     assert len(findings) == len(CHECKS)
 
 
+def test_what_passed_in_a_process_that_died_later_is_remembered() -> None:
+    findings = {each.check: each for each in found("broken_variants:PaintsTheEnd")}
+    assert findings["picture and diagnostics"].message == "the worker process died with exit code 5"
+    assert [name for name, each in findings.items() if each.verdict is not Verdict.PASSED] == [
+        "picture and diagnostics"
+    ]
+    assert findings["time"].verdict is Verdict.PASSED
+
+
 def test_a_plugin_that_is_not_there_is_one_finding() -> None:
     (failed,) = found("fake_plugins:Wier")
     assert failed.verdict is Verdict.FAILED
