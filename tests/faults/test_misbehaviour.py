@@ -204,6 +204,17 @@ def test_a_solver_that_is_not_installed_is_unavailable_everywhere(cells: pd.Data
     assert set(cells.xs("ecos", level="solver")["status"]) == {"unavailable"}
 
 
+def test_reasons_name_the_command_that_checks_the_plugin(cells: pd.DataFrame) -> None:
+    for problem, dual, primal, check in (
+        ("wire-nan", "cpg", "decorrelated", "problem:wire-nan"),
+        ("wire-indefinite", "cpg", "decorrelated", "problem:wire-indefinite"),
+        ("wire-crooked", "cpg", "decorrelated", "problem:wire-crooked"),
+        ("wire", "cone-negative", "decorrelated", "dual:cone-bad --option=how=negative"),
+        ("wire", "cpg", "enrichment-long", "primal:enrichment-bad --option=how=long"),
+    ):
+        assert cells.loc[(problem, dual, primal, "piqp"), "reason"].endswith(f"; run `vibench check {check}`")
+
+
 def test_every_reason_is_one_line(cells: pd.DataFrame, run: Run) -> None:
     reasons = [*cells["reason"], *(row["reason"] for row in run.rows("queries"))]
     assert [reason for reason in reasons if "\n" in reason] == []

@@ -31,8 +31,9 @@ EXAMPLES: Mapping[str, tuple[str, ...]] = {
         "vibench check my-problem --option resolution=medium",
         "vibench check primal:mine",
         "vibench check my_package.cable:Cable",
+        "vibench check solver:piqp",
     ),
-    "new": ("vibench new problem cable", "vibench new dual my-cone --out packages"),
+    "new": ("vibench new problem cable", "vibench new solver my-qp", "vibench new dual my-cone --out packages"),
     "clean": ("vibench clean --dry-run", "vibench clean --older-than 30"),
     "doctor": ("vibench doctor", "vibench doctor --out /scratch/runs"),
 }
@@ -58,7 +59,9 @@ def names(*groups: str) -> Callable[[str], list[str]]:
     return words(lambda: _registered(*groups))
 
 
-plugin_names = names("problems", "primal_strategies", "dual_strategies")
+KINDS = {"problem": "problems", "primal": "primal_strategies", "dual": "dual_strategies", "solver": "qp_solvers"}
+"""Groups of entry points by the word that `vibench check` knows them by."""
+
 lists = words(lambda: ("problems", "dual", "primal", "solvers", "studies"))
 table_names = words(lambda: ("summary", "benefits", *TABLES))
 
@@ -75,6 +78,15 @@ def solvers(incomplete: str) -> list[str]:
     from vibench.qp.settings import SETTINGS
 
     return _beginning(incomplete, {*SETTINGS, *_registered("qp_solvers")})
+
+
+def checkable(incomplete: str) -> list[str]:
+    """Completes names of plugins, after the kind of plugin where that is given: "solver:" stands for QP solvers."""
+    kind, colon, name = incomplete.partition(":")
+    if not colon:
+        return [*_beginning(incomplete, _registered(*KINDS.values())), *_beginning(incomplete, ("solver:",))]
+    known = solvers(name) if kind == "solver" else _beginning(name, _registered(KINDS[kind]) if kind in KINDS else ())
+    return [f"{kind}:{found}" for found in known]
 
 
 def runs(incomplete: str) -> list[str]:

@@ -112,12 +112,8 @@ def _summarise(study: str, path: Path, rows: Sequence[Mapping[str, Any]]) -> Non
     cells, queries = tables.read(path, "cells"), tables.read(path, "queries")
     print_frame(tables.summary(cells), study)
     not_ok = [row for row in rows if row["status"] != Status.OK]
-    for row in not_ok:
-        tolerance = "" if row["primal_tol"] is None else f" {row['primal_tol']:g}"
-        echo(
-            f"{row['status']}: {row['problem']} · {row['dual']} · {row['primal']}{tolerance} · {row['solver']}: "
-            f"{row['queries_ok']} of {row['queries']} queries ok; {row['reason']}"
-        )
+    for line in outcomes(not_ok):
+        echo(line)
     echo(f"{len(rows)} cells, {len(rows) - len(not_ok)} ok, {len(not_ok)} not ok")
     violations = invariants.violations(queries, cells.set_index("cell")["enrichment_kind"])
     for violation in violations:
@@ -125,6 +121,20 @@ def _summarise(study: str, path: Path, rows: Sequence[Mapping[str, Any]]) -> Non
     if not violations:
         echo(f"invariants of the constants and the error bounds hold in all {len(queries)} queries")
     echo(sentence(tables.read(path, "disagreements")))
+
+
+def outcomes(rows: Sequence[Mapping[str, Any]]) -> list[str]:
+    """A line for every status and reason of cells that are not ok: the first of these cells, and how many others."""
+    groups: dict[tuple[str, str], list[Mapping[str, Any]]] = {}
+    for row in rows:
+        groups.setdefault((row["status"], row["reason"]), []).append(row)
+    lines = []
+    for (status, reason), (first, *others) in groups.items():
+        tolerance = "" if first["primal_tol"] is None else f" {first['primal_tol']:g}"
+        cell = f"{first['problem']} · {first['dual']} · {first['primal']}{tolerance} · {first['solver']}"
+        more = f" and {len(others)} more" if others else ""
+        lines.append(f"{status}: {cell}{more}: {first['queries_ok']} of {first['queries']} queries ok; {reason}")
+    return lines
 
 
 def clean(

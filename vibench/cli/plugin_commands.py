@@ -3,21 +3,32 @@
 from __future__ import annotations
 
 import sys
-from functools import partial
+from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from typer import Argument, Exit, Option
 
-from vibench.cli.completion import lists, plugin_names
+from vibench.cli.completion import checkable, lists
 from vibench.cli.output import echo
 from vibench.errors import RequestError, in_a_line, unknown_name
 
 LISTS = {"problems": "problem", "primal": "primal strategy", "dual": "dual strategy", "studies": "study"}
 """Kind of plugin that each list shows; QP solvers are listed whether they are plugins or not."""
 
-SECONDS = 60.0
+SECONDS = 120.0
 """Default of `--seconds`: that of `vibench.testing`, which is too slow to import for a help text."""
+
+
+@dataclass(frozen=True)
+class Found:
+    """A plugin: its kind (a key of `registry.WORDS`), its name, itself, and where it is, "module:attribute"."""
+
+    kind: str
+    name: str
+    plugin: Any
+    reference: str
 
 
 def list_plugins(
@@ -43,43 +54,62 @@ def check_plugin(
     plugin: Annotated[
         str,
         Argument(
-            metavar="PLUGIN", help="A name, problem|primal|dual:NAME, or MODULE:CLASS.", autocompletion=plugin_names
+            metavar="PLUGIN",
+            help="A name, problem|primal|dual|solver:NAME, or MODULE:NAME.",
+            autocompletion=checkable,
         ),
     ],
     option: Annotated[list[str] | None, Option(metavar="KEY=VALUE", help="Option of the plugin (repeatable).")] = None,
-    seconds: Annotated[float, Option(min=0.0, help="Longest time that one call of the plugin may take.")] = SECONDS,
+    seconds: Annotated[float, Option(min=0.0, help="Time limit of all checks; a slow plugin gets fewer.")] = SECONDS,
 ) -> None:
     """Check a plugin: shapes, signs, tolerances, determinism, time.
 
-    One line per requirement of the interface; exit code 1 if one is violated.
+    One line per requirement of the interface, as soon as it is checked; exit code 1 if one is violated.
     """
-    from vibench.study import registry
-    from vibench.testing import Verdict, examine_dual, examine_primal, examine_problem
+    from vibench.testing import Verdict
+    from vibench.testing.elsewhere import Examination, examine_elsewhere
 
-    kind, name, cls = _find(plugin)
-    given = dict(map(_option, option or []))
-    title = f"{registry.WORDS[kind]} '{name}'"
-    options = registry.checked_arguments(cls, title, given)
-    if kind == "problem" and "resolution" not in given:
-        try:
-            options = registry.checked_arguments(cls, title, {"resolution": "coarse", **given})
-            title += ", at resolution coarse (--option resolution=… for another)"
-        except RequestError:  # the problem has no resolution of that name
-            pass
-    echo(title)
-    examine: Any = {"problem": examine_problem, "dual": examine_dual, "primal": examine_primal}[kind]
-    findings = examine(partial(cls, **options), seconds=seconds)
-    for finding in findings:
-        echo(str(finding))
+    found = _find(plugin)
+    options, remark = _options(found, dict(map(_option, option or [])))
+    echo(f"{_title(found)}{remark}")
+    module = {"problem": "problems", "dual": "duals", "primal": "primals", "solver": "solvers"}[found.kind]
+    examination = Examination(module, found.reference, options, seconds)
+    findings = examine_elsewhere(examination, lambda finding: echo(str(finding)))
     counts = {verdict: sum(finding.verdict is verdict for finding in findings) for verdict in Verdict}
-    echo(", ".join(f"{count} {verdict}" for verdict, count in counts.items()))
+    told = (f"{count} {verdict}" for verdict, count in counts.items() if count or verdict is not Verdict.WARNING)
+    echo(", ".join(told))
     if counts[Verdict.FAILED]:
         raise Exit(1)
 
 
+def _title(found: Found) -> str:
+    from vibench.study.registry import WORDS
+
+    return f"{WORDS[found.kind]} '{found.name}'"
+
+
+def _options(found: Found, given: dict[str, Any]) -> tuple[dict[str, Any] | None, str]:
+    """Options of a plugin, and what its title says of them; a problem is as coarse as it can be, if not told."""
+    from vibench.study import registry
+    from vibench.testing.solvers import of_qpsolvers
+
+    title = _title(found)
+    if found.kind == "solver":
+        if given:
+            raise RequestError(f"{title} has no options")
+        return ({"solver": found.name} if found.plugin is of_qpsolvers else None), ""
+    options = registry.checked_arguments(found.plugin, title, given)
+    if found.kind == "problem" and "resolution" not in given:
+        with suppress(RequestError):  # the problem has no resolution of that name
+            options = registry.checked_arguments(found.plugin, title, {"resolution": "coarse", **given})
+            return options, ", at resolution coarse (--option resolution=… for another)"
+    return options, ""
+
+
 def new_plugin(
     kind: Annotated[
-        Literal["problem", "primal", "dual"], Argument(metavar="problem|primal|dual", help="Kind of plugin.")
+        Literal["problem", "primal", "dual", "solver"],
+        Argument(metavar="problem|primal|dual|solver", help="Kind of plugin."),
     ],
     name: Annotated[str, Argument(metavar="NAME", help="Name of the plugin: a-z, 0-9 and hyphens.")],
     out: Annotated[Path, Option(metavar="DIR", help="Folder in which the package is created.")] = Path(),
@@ -136,51 +166,77 @@ def _solver_rows() -> list[tuple[str, str, str, str]]:
     ]
 
 
-def _find(text: str) -> tuple[str, str, type]:
-    """Kind (a key of `registry.WORDS`), name and class of the plugin that NAME, KIND:NAME or MODULE:CLASS refers to.
+def _find(text: str) -> Found:
+    """The plugin that NAME, KIND:NAME or MODULE:NAME refers to.
 
     Raises
     ------
     RequestError
         If there is no such plugin, or several.
     """
-    from vibench.study.registry import WORDS, load, names
+    from vibench.study.registry import WORDS, load, reference
 
     prefix, colon, rest = text.partition(":")
     if colon and prefix not in WORDS:
-        return _find_class(prefix, rest)
+        return _find_object(prefix, rest)
     name = rest if colon else text
-    kinds = [prefix] if colon else [word for word, kind in WORDS.items() if text in names(kind)]
+    kinds = [prefix] if colon else [word for word in WORDS if text in _names(word)]
     if not kinds:
-        raise unknown_name("plugin", text, (known for kind in WORDS.values() for known in names(kind)))
+        raise unknown_name("plugin", text, (known for word in WORDS for known in _names(word)))
     if len(kinds) > 1:
         raise RequestError(f"several plugins are called '{text}': say {' or '.join(f'{k}:{text}' for k in kinds)}")
-    return kinds[0], name, load(WORDS[kinds[0]], name)
+    kind = WORDS[kinds[0]]
+    if name not in _names(kinds[0]):
+        raise unknown_name(kind, name, _names(kinds[0]))
+    if kinds[0] == "solver" and name in _of_qpsolvers():
+        from vibench.testing.solvers import of_qpsolvers
+
+        return Found("solver", name, of_qpsolvers, f"{of_qpsolvers.__module__}:{of_qpsolvers.__name__}")
+    return Found(kinds[0], name, load(kind, name), reference(kind, name))
 
 
-def _find_class(module: str, name: str) -> tuple[str, str, type]:
-    """Kind, MODULE:CLASS and class of an importable plugin; modules in the current folder count."""
+def _names(word: str) -> list[str]:
+    """Names of the plugins of a kind, a key of `registry.WORDS`; of solvers those that are installed."""
+    from vibench.study.registry import WORDS, names
+
+    return names(WORDS[word]) + (_of_qpsolvers() if word == "solver" else [])
+
+
+def _of_qpsolvers() -> list[str]:
+    """The installed solvers that no plugin registers."""
+    from vibench.qp.solve import installed_solvers
+    from vibench.study.registry import names
+
+    return [solver for solver in installed_solvers() if solver not in names("QP solver")]
+
+
+def _find_object(module: str, name: str) -> Found:
+    """A plugin in an importable module; modules in the current folder count. A function is a QP solver."""
     import importlib
 
     from vibench.study.registry import BASES, WORDS
 
-    title = f"'{module}:{name}'"
+    where = f"{module}:{name}"
+    title = f"'{where}'"
     if not module or not all(part.isidentifier() for part in [*module.split("."), name]):
-        raise RequestError(f"{title} is neither KIND:NAME (problem, primal or dual) nor MODULE:CLASS")
+        raise RequestError(f"{title} is neither KIND:NAME ({', '.join(WORDS)}) nor MODULE:NAME")
     if str(Path.cwd()) not in sys.path:
         sys.path.insert(0, str(Path.cwd()))
     try:
-        found = importlib.import_module(module)
+        contents = vars(importlib.import_module(module))
     except (Exception, SystemExit) as error:  # noqa: BLE001  the module may raise anything
         raise RequestError(f"{title}: the module cannot be imported: {in_a_line(error)}") from None
-    classes = {key: value for key, value in vars(found).items() if isinstance(value, type)}
-    if name not in classes:
-        plugins = [c for c in classes.values() if issubclass(c, tuple(BASES.values())) and c.__module__ == module]
-        raise unknown_name(f"class of the module {module}", name, (plugin.__name__ for plugin in plugins))
-    for word, kind in WORDS.items():
-        if issubclass(classes[name], BASES[kind]):
-            return word, f"{module}:{name}", classes[name]
-    raise RequestError(f"{title} is no subclass of Problem, PrimalStrategy or DualStrategy")
+    found, bases = contents.get(name), tuple(BASES.values())
+    if isinstance(found, type):
+        for word, kind in WORDS.items():
+            if kind in BASES and issubclass(found, BASES[kind]):
+                return Found(word, where, found, where)
+        raise RequestError(f"{title} is no subclass of Problem, PrimalStrategy or DualStrategy, and no QP solver")
+    if callable(found):
+        return Found("solver", where, found, where)
+    classes = [value for value in contents.values() if isinstance(value, type)]
+    own = [value.__name__ for value in classes if issubclass(value, bases) and value.__module__ == module]
+    raise unknown_name(f"plugin of the module {module}", name, own)
 
 
 def _option(text: str) -> tuple[str, Any]:

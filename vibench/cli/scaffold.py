@@ -10,9 +10,10 @@ from string import Template
 
 from vibench.errors import RequestError, StorageError
 from vibench.provenance import distribution_version
+from vibench.qp.settings import SETTINGS
 from vibench.study.registry import GROUPS, WORDS, names, version
 
-MODULES = {"problem": "problem", "primal": "strategy", "dual": "strategy"}
+MODULES = {"problem": "problem", "primal": "strategy", "dual": "strategy", "solver": "solver"}
 """Module of the plugin by kind."""
 
 NAME = re.compile(r"[a-z][a-z0-9]*(-[a-z0-9]+)*")
@@ -25,7 +26,7 @@ RESERVED = ("problems", "strategies")
 def write_package(kind: str, name: str, parent: Path) -> Path:
     """Write a package with one plugin, completely or not at all; returns its folder `parent/vibench-NAME`.
 
-    The kind is "problem", "primal" or "dual". The parent folder is created if necessary.
+    The kind is "problem", "primal", "dual" or "solver". The parent folder is created if necessary.
 
     Raises
     ------
@@ -67,6 +68,8 @@ def check_name(kind: str, name: str) -> None:
     if name in RESERVED:
         raise RequestError(f"'{name}' cannot be the name of a plugin: vibench itself has a package of that name")
     title = WORDS[kind]
+    if kind == "solver" and name in SETTINGS:
+        raise RequestError(f"there is a {title} '{name}' already, in qpsolvers; choose another name")
     if name in names(title):
         raise RequestError(f"there is a {title} '{name}' already, in {version(title, name)}; choose another name")
 
@@ -83,15 +86,16 @@ def _package(name: str) -> str:
 def _contents(kind: str, name: str) -> dict[str, str]:
     """Texts of the files of a package by path."""
     package, module = _package(name), MODULES[kind]
+    camel, snake = "".join(word.capitalize() for word in name.split("-")), name.replace("-", "_")
     words = {
         "name": name,
         "package": package,
         "module": module,
-        "cls": "".join(word.capitalize() for word in name.split("-")) + kind.capitalize(),
+        "cls": f"solve_{snake}" if kind == "solver" else camel + kind.capitalize(),
         "kind": kind,
         "title": WORDS[kind],
         "group": GROUPS[WORDS[kind]],
-        "test": name.replace("-", "_"),
+        "test": snake,
         "version": distribution_version("vibench"),
     }
     sources = {

@@ -14,7 +14,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from multiprocessing.connection import Connection
 from pathlib import Path
@@ -107,8 +107,8 @@ class _JobState:
     process counts separately: on a busy machine it may take longer than a limit.
     """
 
-    def __init__(self, job: Job) -> None:
-        self.job, self.progress = job, Progress()
+    def __init__(self, job: Job, observe: Callable[[Any], None]) -> None:
+        self.job, self.progress, self._observe = job, Progress(), observe
         self.seconds = 0.0
         self.start()
 
@@ -148,6 +148,7 @@ class _JobState:
                 self._piece_limit = self.seconds + self.job.query_seconds + GRACE if message.on else float("inf")
             case Finished():
                 self.progress.found[message.piece] = message.value
+                self._observe(message.value)
                 self._next_piece()
             case OutOfMemory():
                 raise _WorkerLostError(message.failed)
@@ -163,16 +164,18 @@ class Supervisor:
     ----------
     log
         File for the output of plugins; `None` to discard it.
+    environment
+        Environment variables of the worker process, beside those of this one.
     """
 
-    def __init__(self, log: Path | None = None) -> None:
-        self._log = log
+    def __init__(self, log: Path | None = None, environment: Mapping[str, str] | None = None) -> None:
+        self._log, self._environment = log, dict(environment or {})
         self._process: subprocess.Popen[bytes] | None = None
         self._connection: Connection | None = None
         self._stop = threading.Event()
 
-    def run(self, job: Job) -> Done | Failed | Unstored:
-        """Run a stage until it ends or exceeds its limits.
+    def run(self, job: Job, observe: Callable[[Any], None] = lambda _: None) -> Done | Failed | Unstored:
+        """Run a stage until it ends or exceeds its limits; `observe` gets the value of every piece that is done.
 
         Raises
         ------
@@ -180,7 +183,7 @@ class Supervisor:
             If `stop` is called meanwhile.
         """
         try:
-            return self._run(job)
+            return self._run(job, observe)
         except BaseException:
             self._kill()
             raise
@@ -194,8 +197,8 @@ class Supervisor:
         self.stop()
         self._kill()
 
-    def _run(self, job: Job) -> Done | Failed | Unstored:
-        state, limit, retried = _JobState(job), job.cell_seconds, False
+    def _run(self, job: Job, observe: Callable[[Any], None]) -> Done | Failed | Unstored:
+        state, limit, retried = _JobState(job, observe), job.cell_seconds, False
         found, lost = state.progress.found, state.progress.lost
         while True:
             try:
@@ -248,7 +251,7 @@ class Supervisor:
             with theirs:
                 self._process = subprocess.Popen(
                     [sys.executable, *command],
-                    env=_environment(os.environ),
+                    env=_environment({**os.environ, **self._environment}),
                     pass_fds=[theirs.fileno()],
                     stdin=subprocess.DEVNULL,
                     process_group=0,

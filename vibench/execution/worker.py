@@ -111,9 +111,11 @@ def _pieces(job: Job, store: Store, progress: Progress, send: Send) -> Any:
     stage = job.stage
     assert isinstance(stage, PiecewiseStage)
     pieces = stage.begin(store)
-    found = dict(progress.found)
+    lost = {number: pieces.lost(number, failed) for number, failed in progress.lost.items()}
+    found = progress.found | lost
+    pieces.resume(found)
     for number in range(stage.pieces):
-        if number not in found and number not in progress.lost:
+        if number not in found:
 
             def watch(on: bool, number: int = number) -> None:
                 send(Watch(number, on))
@@ -122,7 +124,6 @@ def _pieces(job: Job, store: Store, progress: Progress, send: Send) -> Any:
             value = _guarded(job.memory_gib, partial(pieces.piece, number, watch))
             found[number] = pieces.lost(number, value) if isinstance(value, Failed) else value
             send(Finished(number, found[number]))
-    found |= {number: pieces.lost(number, failed) for number, failed in progress.lost.items()}
     return pieces.finish([found[number] for number in range(stage.pieces)])
 
 

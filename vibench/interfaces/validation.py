@@ -94,7 +94,7 @@ def _checked(problem: Problem, name: str, mus: Array, count: int | None) -> Arra
 
 
 def checked_assembly(problem: Problem, mu: Array) -> VariationalInequality:
-    """`problem.assemble(mu)`, refused if shapes are wrong or values not finite.
+    """`problem.assemble(mu)`, refused if shapes are wrong or values not real and finite.
 
     Raises
     ------
@@ -107,6 +107,8 @@ def checked_assembly(problem: Problem, mu: Array) -> VariationalInequality:
         if value.shape != shape:
             found = f"shape {value.shape} at mu = {mu.tolist()}"
             raise NumericalError(f"{name} has {found}; the spaces V and W require {shape}")
+        if np.iscomplexobj(value):
+            raise NumericalError(f"{name} is complex at mu = {mu.tolist()}; vibench is for real problems")
         if not np.all(np.isfinite(value if isinstance(value, np.ndarray) else value.data)):
             raise NumericalError(f"{name} has entries that are not finite at mu = {mu.tolist()}")
     return vi

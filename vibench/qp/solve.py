@@ -17,7 +17,7 @@ import scipy.linalg
 import scipy.sparse as sp
 
 from vibench.arrays import Array
-from vibench.errors import NumericalError
+from vibench.errors import NumericalError, message_of
 from vibench.interfaces.problem import VariationalInequality
 from vibench.qp.scaling import Units, prescribed, row_norms, units_of, units_of_dual
 from vibench.qp.settings import SETTINGS
@@ -155,7 +155,10 @@ def _call_qpsolvers(
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # the status is part of the solution, which is verified later
         settings = SETTINGS[solver].at(MARGIN * accuracy)
-        solution = qpsolvers.solve_problem(problem, solver=solver, **settings, **start)
+        try:
+            solution = qpsolvers.solve_problem(problem, solver=solver, **settings, **start)
+        except qpsolvers.SolverError as error:  # cvxopt raises where no point is feasible
+            return QPSolution(None, None, message_of(error))
     status, iterations = SETTINGS[solver].report(solution)
     if solution.x is None or solution.z is None:
         return QPSolution(None, None, status, iterations)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, fields, is_dataclass
 from functools import cached_property, lru_cache
 from typing import Any, ClassVar
@@ -27,6 +28,15 @@ def build_problem(plugin: Plugin) -> Problem:
     problem = plugin.create()
     assert isinstance(problem, Problem)  # `registry.load` refuses anything else
     return problem
+
+
+@contextmanager
+def faults_of(plugin: Plugin) -> Iterator[None]:
+    """Name the command that checks the plugin in the reason of a `NumericalError`, which is the plugin's fault."""
+    try:
+        yield
+    except NumericalError as error:
+        raise NumericalError(f"{error}; run `{plugin.check}`") from error
 
 
 @dataclass(frozen=True)
@@ -150,6 +160,9 @@ def _described(value: Any) -> Any:
 
 class Pieces(ABC):
     """A piecewise stage in progress; its pieces can be done in any order and by several processes."""
+
+    def resume(self, done: Mapping[int, Any]) -> None:  # noqa: B027
+        """Take note of the values of pieces that another process did, or lost; by default nothing."""
 
     @abstractmethod
     def piece(self, number: int, watch: Callable[[bool], None]) -> Any:

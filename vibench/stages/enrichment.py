@@ -16,7 +16,7 @@ from vibench.reduction.nested import Grown, Milestone, grow_through
 from vibench.reduction.supremizers import ConstraintClasses, projected_supremizers
 from vibench.stability.growth import ProjectedSupremizers
 from vibench.stages.artefacts import History, Store
-from vibench.stages.base import Result, Stage, build_problem, value_of
+from vibench.stages.base import Result, Stage, build_problem, faults_of, value_of
 from vibench.stages.offline import ConeStage, PODStage, ReducedCone, TrainingConstants
 from vibench.study.cells import Axes, Cell, Plugin
 from vibench.timing import timed
@@ -127,7 +127,8 @@ class SingleEnrichment(EnrichmentStage):
         """Build the enrichment, timed; assess it on the training set, untimed."""
         offline, strategy = _offline(store, self.pod, self.cone), self.primal.create()
         enrichment, seconds = timed(lambda: strategy.build(offline, self.tolerance))
-        check_enrichment(enrichment, offline.problem.V, offline.basis)
+        with faults_of(self.primal):
+            check_enrichment(enrichment, offline.problem.V, offline.basis)
         known = dict(enrichment.history)
         if enrichment.vectors is not None:
             projected = _projected(offline, enrichment.vectors, value_of(store, self.cone.constraints))
@@ -168,7 +169,8 @@ class NestedEnrichment(EnrichmentStage):
         assert self.tolerance is not None  # a nested strategy always has one
         offline, growth = _offline(store, self.pod, self.cone), value_of(store, self.growth)
         milestone: Milestone = growth.grown.milestone(self.tolerance)
-        check_enrichment(growth.grown.at(milestone), offline.problem.V, offline.basis)
+        with faults_of(self.primal):
+            check_enrichment(growth.grown.at(milestone), offline.problem.V, offline.basis)
         known = dict(milestone.history) | {
             "beta_span_min": growth.steps[: milestone.count + 1],
             "share_min": growth.shares[: milestone.count + 1],

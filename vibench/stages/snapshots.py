@@ -4,17 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
+from functools import lru_cache, partial
 from typing import Literal, TypeVar
 
 import numpy as np
 
 from vibench.arrays import Array
-from vibench.highfidelity.active_set import HighFidelitySolution, HighFidelitySolver
+from vibench.errors import NumericalError
+from vibench.highfidelity.active_set import HighFidelitySolution, HighFidelitySolver, check_stiffness
+from vibench.interfaces.fingerprint import Fingerprint, ReferenceAssembly
 from vibench.interfaces.problem import Problem, VariationalInequality
 from vibench.interfaces.validation import checked_assembly, training_parameters, validation_parameters
 from vibench.stages.artefacts import History, Store
-from vibench.stages.base import Result, Stage, build_problem, value_of
+from vibench.stages.base import Result, Stage, build_problem, faults_of, value_of
 from vibench.study.cells import Axes, Plugin
 from vibench.timing import NO_TIME, Seconds, median_seconds, timed
 
@@ -40,6 +42,8 @@ class Snapshots:
         Seconds of the set-up, once per chunk: what the first solution took beyond its repetition from the same start.
     fallbacks
         Fallbacks of the active set method per solution, "" where it needed none.
+    fingerprint
+        Of the problem at the first training parameter, as the process of the chunk assembled it.
     """
 
     mu: Array
@@ -48,6 +52,7 @@ class Snapshots:
     seconds: tuple[Seconds, ...]
     setups: tuple[Seconds, ...]
     fallbacks: tuple[str, ...]
+    fingerprint: Fingerprint
 
 
 @dataclass(frozen=True)
@@ -71,14 +76,24 @@ class SnapshotStage(Stage):
 
     def run(self, store: Store) -> Result:  # noqa: ARG002
         """Assemble and solve at every parameter of the chunk."""
-        problem = build_problem(self.problem)
+        with faults_of(self.problem):
+            return self._sweep(build_problem(self.problem))
+
+    def _sweep(self, problem: Problem) -> Result:
         first, mus = self.part(self.parameters(problem))
+        given, reference = mus.copy(), reference_assembly(problem)
         u, lam = np.zeros((problem.V.dim, len(mus))), np.zeros((problem.W.dim, len(mus)))
         seconds, setups, fallbacks, solver = [], [], [], HighFidelitySolver(problem)
 
         def solve(mu: Array) -> tuple[VariationalInequality, HighFidelitySolution]:
             vi = checked_assembly(problem, mu)
-            return vi, solver.solve_assembled(mu, vi)
+            try:
+                return vi, solver.solve_assembled(mu, vi)
+            except NumericalError:
+                check_stiffness(mu, vi)  # the cause rather than what came of it
+                reference.refuse_false_constants(mu, vi)
+                reference.refuse_overwritten()
+                raise
 
         for k, mu in enumerate(mus):
             solve_here = partial(solve, mu)
@@ -87,12 +102,16 @@ class SnapshotStage(Stage):
             seconds.append(marginal)
             if k == 0:
                 setups.append(beginning.beyond(marginal))
-            if k == 0 or "A" not in problem.constant:  # verification, which is not timed
+            if k == 0 or "A" not in problem.constant:  # verification, as is what follows, which is not timed
                 solver.check_coercive(mu, vi)
+            reference.refuse_false_constants(mu, vi)
             solver.remember(mu, solution)
             u[:, k], lam[:, k] = solution.u, solution.lam
             fallbacks.append(solution.fallback)
-        found = Snapshots(mus, u, lam, tuple(seconds), tuple(setups), tuple(fallbacks))
+        reference.refuse_overwritten()
+        if not np.array_equal(mus, given):
+            raise NumericalError("assemble changes its argument mu: work on a copy")
+        found = Snapshots(mus, u, lam, tuple(seconds), tuple(setups), tuple(fallbacks), reference.fingerprint)
         return Result(found, sum(seconds, NO_TIME), self._diagnostics(problem, mus, first))
 
     def _measure(self, work: Callable[[], T]) -> tuple[T, Seconds]:
@@ -128,9 +147,34 @@ def validation_stages(problem: Plugin, count: int, seed: int) -> tuple[Stage, ..
     return tuple(SnapshotStage(problem, "validation", count, seed, chunk) for chunk in range(CHUNKS))
 
 
+def reference_assembly(problem: Problem) -> ReferenceAssembly:
+    """The assembly at the first training parameter, which those of all chunks and processes are compared with."""
+    return ReferenceAssembly(problem, checked_assembly(problem, training_parameters(problem)[0]))
+
+
+@lru_cache(maxsize=4)
+def fingerprint_here(problem: Plugin) -> Fingerprint:
+    """The fingerprint of a problem in this process."""
+    return reference_assembly(build_problem(problem)).fingerprint
+
+
 def gather(store: Store, chunks: tuple[Stage, ...]) -> Snapshots:
-    """The snapshots of all chunks."""
+    """The snapshots of all chunks.
+
+    Raises
+    ------
+    NumericalError
+        If the problem was assembled otherwise for a chunk than it is in this process.
+    """
     parts = [value_of(store, chunk) for chunk in chunks]
+    (problem,) = {plugin for chunk in chunks for plugin in chunk.plugins()}
+    with faults_of(problem):
+        here = fingerprint_here(problem)
+        for deviation in (text for part in parts for text in part.fingerprint.deviations(here)):
+            raise NumericalError(
+                f"two assemblies at one parameter are not the same, as in another process: {deviation}; look for "
+                "unseeded random numbers, the order of sets, and what is kept between calls"
+            )
     return Snapshots(
         np.concatenate([part.mu for part in parts]),
         np.hstack([part.u for part in parts]),
@@ -138,4 +182,5 @@ def gather(store: Store, chunks: tuple[Stage, ...]) -> Snapshots:
         tuple(seconds for part in parts for seconds in part.seconds),
         tuple(seconds for part in parts for seconds in part.setups),
         tuple(note for part in parts for note in part.fallbacks),
+        here,
     )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import shlex
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
@@ -44,6 +45,13 @@ class Plugin:
     def create(self) -> Any:
         """A new instance."""
         return registry.create(self.kind, self.name, json.loads(self.options))
+
+    @property
+    def check(self) -> str:
+        """The command that checks the plugin with these options."""
+        word = next(word for word, kind in registry.WORDS.items() if kind == self.kind)
+        options = (f"{k}={v if isinstance(v, str) else json.dumps(v)}" for k, v in json.loads(self.options).items())
+        return shlex.join(["vibench", "check", f"{word}:{self.name}", *(f"--option={text}" for text in options)])
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from typing import Any, get_type_hints
 
-from pydantic import ConfigDict, TypeAdapter, ValidationError
+from pydantic import ConfigDict, PydanticUserError, TypeAdapter, ValidationError
 
 from vibench.errors import RequestError, in_a_line, unknown_name
 from vibench.interfaces.problem import Problem
@@ -33,7 +33,9 @@ FINITE = ConfigDict(allow_inf_nan=False)
 BASES: Mapping[str, type] = {"problem": Problem, "dual strategy": DualStrategy, "primal strategy": PrimalStrategy}
 """Abstract base classes of the kinds of plugins that are classes."""
 
-WORDS: Mapping[str, str] = {"problem": "problem", "primal": "primal strategy", "dual": "dual strategy"}
+WORDS: Mapping[str, str] = {
+    "problem": "problem", "primal": "primal strategy", "dual": "dual strategy", "solver": "QP solver",
+}  # fmt: skip
 """Kinds of plugins by their names on the command line."""
 
 
@@ -93,6 +95,12 @@ def create(kind: str, name: str, options: Mapping[str, Any] | None = None) -> An
         If there is no such plugin, or it does not take these options.
     """
     return load(kind, name)(**check_options(kind, name, options or {}))
+
+
+def reference(kind: str, name: str) -> str:
+    """Where a plugin is, "module:attribute"."""
+    entry = _entry(kind, name)
+    return f"{entry.module}:{entry.attr}"
 
 
 def version(kind: str, name: str) -> str:
@@ -169,6 +177,25 @@ def checked_arguments(plugin: type, what: str, given: Mapping[str, Any]) -> dict
     return checked
 
 
+def doubtful_options(plugin: type) -> dict[str, str]:
+    """What is doubtful of the options of a class, by name: no annotation, or a default that does not conform to it."""
+    doubts = {}
+    for option, (default, annotation) in _parameters(plugin).items():
+        if annotation is Any:
+            doubts[option] = "has no annotation that says what study files may set it to"
+            continue
+        try:
+            expected = _expected(annotation)
+            if default is not inspect.Parameter.empty:
+                text = json.dumps(default, default=str)
+                TypeAdapter(annotation, config=FINITE).validate_json(text, strict=True)
+        except PydanticUserError as error:
+            doubts[option] = f"has an annotation that no value of a study file conforms to: {in_a_line(error)}"
+        except ValidationError:
+            doubts[option] = f"has the default {default!r}; its annotation expects {expected}"
+    return doubts
+
+
 def canonical_options(kind: str, name: str, given: Mapping[str, Any]) -> str:
     """Options as canonical JSON, without those that equal their default."""
     known, checked = _parameters(load(kind, name)), check_options(kind, name, given)
@@ -210,7 +237,10 @@ def _parameters(plugin: Any) -> Mapping[str, tuple[Any, Any]]:
     constructor = inspect.getattr_static(plugin, "__init__")
     if constructor is object.__init__:
         return {}
-    hints = get_type_hints(constructor, include_extras=True)
+    try:
+        hints = get_type_hints(constructor, include_extras=True)
+    except Exception as error:  # noqa: BLE001  evaluating annotations runs third-party code
+        raise RequestError(f"the options of {plugin.__name__} have annotations that fail: {in_a_line(error)}") from None
     parameters = list(inspect.signature(constructor).parameters.values())[1:]  # without self
     named = [p for p in parameters if p.kind not in (p.VAR_POSITIONAL, p.VAR_KEYWORD)]
     return {p.name: (p.default, hints.get(p.name, Any)) for p in named}

@@ -1,4 +1,4 @@
-"""Conformance checks for authors of plugins: every property that vibench assumes of a problem or a strategy.
+"""Conformance checks for authors of plugins: what vibench assumes of problems, strategies and QP solvers.
 
 In a test of a plugin's own package:
 
@@ -7,7 +7,7 @@ In a test of a plugin's own package:
 
 `check_…` raises one `ConformanceError` that lists every failure; `examine_…`, like the command `vibench check`, returns
 the findings. The first argument is a class, or a function that makes an instance such as `partial(Cable, nodes=20)`,
-because two instances are compared.
+because two instances are compared. A QP solver is the function itself.
 """
 
 from __future__ import annotations
@@ -17,8 +17,10 @@ from vibench.testing.duals import check_dual, examine_dual
 from vibench.testing.primals import check_primal, examine_primal
 from vibench.testing.problems import check_problem, examine_problem
 from vibench.testing.sample import MovingSupport, sample_offline, sample_snapshots
+from vibench.testing.solvers import check_solver, examine_solver
 
 __all__ = [
     "SECONDS", "ConformanceError", "Finding", "MovingSupport", "Verdict", "check_dual", "check_primal", "check_problem",
-    "examine_dual", "examine_primal", "examine_problem", "sample_offline", "sample_snapshots",
+    "check_solver", "examine_dual", "examine_primal", "examine_problem", "examine_solver", "sample_offline",
+    "sample_snapshots",
 ]  # fmt: skip

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from itertools import pairwise
@@ -16,9 +17,10 @@ from vibench.errors import NumericalError
 from vibench.interfaces.problem import MEMBERS, Contact, Problem, VariationalInequality
 from vibench.linalg.inner_product import InnerProduct
 from vibench.model.affine import CONSTANT_RTOL
-from vibench.testing.case import ProblemCase
-from vibench.testing.checks import ConformanceError, Note, raised
+from vibench.testing.case import MOST_POINTS, ProblemCase, assembled
+from vibench.testing.checks import ConformanceError, Doubt, Note, raised
 from vibench.testing.comparisons import Arrays, array_fault, at, copies, difference, differences, peak, unmutated
+from vibench.testing.elsewhere import NotImportableError, call_elsewhere
 
 SYMMETRY_RTOL = 1e-12
 """Largest difference of a symmetric matrix and its transpose, relative to its largest entry."""
@@ -37,6 +39,15 @@ WIDTH = 2.0**-30
 
 BISECTIONS = 60
 """Largest number of bisections on one line; a kink is bisected, too, until its deviation is below `JUMP`."""
+
+
+def one_assembly(case: ProblemCase) -> Iterator[str]:
+    """The first assembly is timed; at how many parameters the others can be made follows."""
+    points = case.points
+    with suppress(Exception):  # the next check says what a plugin raises
+        yield Note(f"takes {case.one_assembly:.2g} s")
+    if points < MOST_POINTS:
+        yield Note(f"checks at {points} parameters instead of {MOST_POINTS}, and none for jumps, for lack of time")
 
 
 def assembly(case: ProblemCase) -> Iterator[str]:
@@ -91,7 +102,7 @@ def definiteness(case: ProblemCase) -> None:
 
 
 def independence(case: ProblemCase) -> Iterator[str]:
-    """Members declared `constant` do not depend on the parameter."""
+    """Members declared `constant` do not depend on the parameter; every parameter has an effect."""
     yield from _undeclarable("constant", case.plugin.constant)
     first = at(case.mus[0])
     for name in (name for name in MEMBERS if name in case.plugin.constant):
@@ -100,10 +111,43 @@ def independence(case: ProblemCase) -> Iterator[str]:
             if what := difference(found[name], reference, CONSTANT_RTOL * peak(reference)):
                 yield f"{name} is declared `constant` but depends on mu: {what} ({where} and {first})"
                 break
+    yield from _without_effect(case) if case.points == MOST_POINTS else ()
 
 
-def continuity(case: ProblemCase) -> None:
+def _without_effect(case: ProblemCase) -> Iterator[str]:
+    """Parameters that can be moved from the centre of the box to a side of it, and nothing changes."""
+    box = case.plugin.parameters
+    centre = 0.5 * (box.lower + box.upper)
+    for number, name in enumerate(box.names):
+        moved = np.where(np.arange(box.dim) == number, box.upper, centre)
+        if box.upper[number] > box.lower[number] and not any(
+            differences(case.evaluate(moved), case.evaluate(centre), PARTIAL_RTOL)
+        ):
+            yield Doubt(f"nothing depends on the parameter '{name}'")
+
+
+def elsewhere(case: ProblemCase) -> Iterator[str]:
+    """Another process, whose sets have another order, assembles the same up to round-off."""
+    mus = case.mus[-2:]
+    try:
+        found = call_elsewhere(assembled, case.create, mus, seconds=case.limit)
+    except NotImportableError as error:
+        yield Note(f"not compared: {error}")
+        return
+    for mu, arrays in zip(mus, found, strict=True):
+        for name, what in differences(arrays, case.results[at(mu)], PARTIAL_RTOL):
+            yield (
+                f"{name} is another one in another process {at(mu)}: {what}; look for the order of sets, unseeded "
+                "random numbers, and what depends on time, folder or environment"
+            )
+            return
+
+
+def continuity(case: ProblemCase) -> Iterator[str]:
     """Members do not jump on lines in the box: a diagonal, one between random points, one along every axis."""
+    if case.points < MOST_POINTS:
+        yield Note("not looked for, for lack of time")
+        return
     largest = {name: max(peak(found[name]) for found in case.results.values()) for name in MEMBERS}
     scales = {name: s for name, s in largest.items() if s > 0.0 and name not in case.plugin.constant}
 
@@ -115,8 +159,11 @@ def continuity(case: ProblemCase) -> None:
     if len(lower) > 1:
         along = np.eye(len(lower), dtype=bool)
         lines += [(np.where(axis, lower, centre), np.where(axis, upper, centre)) for axis in along]
-    for start, end in lines if scales else []:
-        if jump := find_jump(partial(point, start, end), scales):
+    for number, (start, end) in enumerate(lines if scales else []):
+        if case.late:
+            yield Note(f"looked for on {number} of {len(lines)} lines, for lack of time")
+            return
+        if jump := find_jump(partial(point, start, end), scales, lambda: case.late):
             first, _, last = (arrays[jump.name] for arrays in jump.values)
             step = (jump.right - jump.left) * float(np.linalg.norm(end - start))
             where = at(start + jump.right * (end - start))
@@ -137,8 +184,10 @@ class Piece:
     deviation: float
 
 
-def find_jump(evaluate: Callable[[float], Arrays], scales: dict[str, float]) -> Piece | None:
-    """A piece of length `WIDTH` at most on which an array jumps, `None` if no jump is found.
+def find_jump(
+    evaluate: Callable[[float], Arrays], scales: dict[str, float], late: Callable[[], bool] = lambda: False
+) -> Piece | None:
+    """A piece of length `WIDTH` at most on which an array jumps, `None` if no jump is found before it is `late`.
 
     The piece with the largest deviation is halved again and again. The deviation of a smooth array falls by 4 each
     time, that at a kink by 2; at a jump it stays half the jump. `evaluate` returns the arrays at t ∈ [0, 1]; `scales`
@@ -155,7 +204,7 @@ def find_jump(evaluate: Callable[[float], Arrays], scales: dict[str, float]) -> 
     pieces = [piece(left, right, first, last) for (left, first), (right, last) in pairwise(knots)]
     for _ in range(BISECTIONS):
         worst = max(pieces, key=lambda each: each.deviation)
-        if worst.deviation < 0.5 * JUMP:
+        if worst.deviation < 0.5 * JUMP or late():
             return None
         if worst.right - worst.left <= WIDTH:
             return worst

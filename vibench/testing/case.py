@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pickle
+import time
 from abc import ABC, abstractmethod
 from collections import defaultdict
 from collections.abc import Callable, Iterator
@@ -15,9 +16,19 @@ import numpy as np
 from vibench.arrays import Array
 from vibench.errors import NumericalError, in_a_line
 from vibench.interfaces.problem import MEMBERS, Problem
-from vibench.testing.checks import ConformanceError, Note, plugin_line
+from vibench.study import registry
+from vibench.testing.checks import ConformanceError, Doubt, Note, plugin_line
 from vibench.testing.comparisons import Arrays, at, copies, differences
 from vibench.timing import timed
+
+MOST_POINTS, LEAST_POINTS = 7, 2
+"""Numbers of parameters at which a problem is assembled: where there is time, and where there is not."""
+
+CALLS_PER_POINT = 10
+"""Assemblies that all checks but the search for jumps make at each of them, about."""
+
+LATE = 0.7
+"""Share of the time limit after which no search for faults goes on."""
 
 PluginT = TypeVar("PluginT")
 ArgumentT = TypeVar("ArgumentT")
@@ -27,7 +38,7 @@ T = TypeVar("T")
 
 @dataclass(eq=False)
 class Case(ABC, Generic[PluginT, ArgumentT, ResultT]):
-    """A plugin, the arguments it is called with, and the results; `limit` bounds the wall time [s] of every call.
+    """A plugin, the arguments it is called with, and the results; `limit` bounds the wall time [s] of the checks.
 
     Every call receives copies, so that a plugin that writes to its input fails the check "no mutation" alone.
     """
@@ -40,6 +51,7 @@ class Case(ABC, Generic[PluginT, ArgumentT, ResultT]):
 
     def __post_init__(self) -> None:
         self._times: defaultdict[str, list[float]] = defaultdict(list)
+        self._began = time.monotonic()
         if not callable(self.create):
             raise TypeError(
                 f"pass the class {type(self.create).__name__}, or a function that makes an instance, not an instance: "
@@ -75,6 +87,16 @@ class Case(ABC, Generic[PluginT, ArgumentT, ResultT]):
         self._times[what].append(seconds.wall)
         return result
 
+    @property
+    def late(self) -> bool:
+        """Whether most of the time has passed, so that a search for faults has to end."""
+        return time.monotonic() - self._began > LATE * self.limit
+
+    def options(self) -> Iterator[str]:
+        """Every option has an annotation that its default conforms to."""
+        constructor = getattr(self.create, "func", self.create)
+        yield from option_doubts(constructor) if isinstance(constructor, type) else ()
+
     def construction(self) -> Iterator[str]:
         """An instance of the right class can be made."""
         plugin: object = self.plugin
@@ -99,7 +121,7 @@ class Case(ABC, Generic[PluginT, ArgumentT, ResultT]):
             yield f"{name}: pickling changes {array}: {what}"
         yield from self._deviations("a pickled copy", plugin)
 
-    def time(self) -> Iterator[str]:
+    def duration(self) -> Iterator[str]:
         """The constructor and every call stay below the limit."""
         for what, seconds in self._times.items():
             if max(seconds) > self.limit:
@@ -127,11 +149,27 @@ class ProblemCase(Case[Problem, Array, Arrays]):
     seed: int
 
     @cached_property
+    def one_assembly(self) -> float:
+        """Wall seconds of the first assembly."""
+        box, problem = self.plugin.parameters, self.plugin
+        return timed(lambda: problem.assemble(0.5 * (box.lower + box.upper)))[1].wall
+
+    @cached_property
+    def points(self) -> int:
+        """Number of parameters, such that all checks take about half of the time limit: 7, or 2 at least."""
+        try:
+            seconds = self.one_assembly
+        except Exception:  # noqa: BLE001  the check "assembly" says what a plugin raises
+            return MOST_POINTS
+        calls = 0.5 * self.limit / max(seconds, 1e-9)
+        return int(min(max(calls / CALLS_PER_POINT, LEAST_POINTS), MOST_POINTS))
+
+    @cached_property
     def mus(self) -> Array:
-        """Parameters (7×d): two corners of the box, its centre, and four random ones."""
+        """Parameters (7×d): two corners of the box, its centre, and four random ones; only the first if it is slow."""
         box = self.plugin.parameters
         fixed = np.stack([box.lower, box.upper, 0.5 * (box.lower + box.upper)])
-        return np.concatenate([fixed, box.sample(4, self.seed)])
+        return np.concatenate([fixed, box.sample(MOST_POINTS - 3, self.seed)])[: self.points]
 
     @cached_property
     def arguments(self) -> dict[str, Array]:
@@ -157,6 +195,18 @@ class ProblemCase(Case[Problem, Array, Arrays]):
             place = plugin_line(error)
             names = [f"X_{name}: " for name in "VW" if f"self.{name} =" in place and f"X_{name}" not in str(error)]
             raise ConformanceError(f"{''.join(names)}{error} ({place})") from error
+
+
+def assembled(create: Callable[[], Problem], mus: Array) -> list[Arrays]:
+    """What another instance assembles, and its Gram matrices, at parameters (k×d)."""
+    case = ProblemCase(create, np.inf, 0)
+    return [case.evaluate(mu) for mu in mus]
+
+
+def option_doubts(constructor: type) -> Iterator[str]:
+    """Options that a study file may set to anything, and defaults that it could not set."""
+    for option, problem in registry.doubtful_options(constructor).items():
+        yield Doubt(f"the option '{option}' {problem}")
 
 
 def _pickling_error(thing: Any) -> str:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import inspect
 import sysconfig
 import traceback
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
@@ -23,14 +23,15 @@ P = ParamSpec("P")
 MOST = 5
 """Largest number of faults that one check lists."""
 
-SECONDS = 60.0
-"""Default limit on the wall time [s] of the constructor and of every call."""
+SECONDS = 120.0
+"""Default wall time [s] that the checks of a plugin may take; no call of it may take longer."""
 
 
 class Verdict(StrEnum):
     """Outcome of a check."""
 
     PASSED = "passed"
+    WARNING = "warning"
     FAILED = "failed"
     SKIPPED = "skipped"
 
@@ -39,7 +40,8 @@ class Verdict(StrEnum):
 class Finding:
     """Result of one check: its name, its outcome, and a message.
 
-    The message gives every fault and its place, the reason why a check was skipped, or the figures of a passed one.
+    The message gives every fault and its place, the reason why a check was skipped, or the figures of a passed one and
+    what is doubtful.
     """
 
     check: str
@@ -52,6 +54,12 @@ class Finding:
 
 class Note(str):
     """A remark of a check that is not a fault."""
+
+    __slots__ = ()
+
+
+class Doubt(str):
+    """A remark on what is probably not intended, although it is allowed; it turns a passed check into a warning."""
 
     __slots__ = ()
 
@@ -76,22 +84,28 @@ def examine(checks: Iterable[Check[CaseT]], case: CaseT) -> list[Finding]:
     """Make checks in their order; skip a check if one that it needs did not pass."""
     findings: dict[str, Finding] = {}
     for check in checks:
-        missing = [name for name in check.needs if findings[name].verdict is not Verdict.PASSED]
-        if missing:
-            findings[check.name] = Finding(check.name, Verdict.SKIPPED, f"it needs '{missing[0]}'")
-            continue
-        lines: list[str] = []
-        try:
-            for line in check.faults(case) or ():
-                lines.append(line)  # noqa: PERF402  what precedes an exception is kept
-        except (Exception, SystemExit) as error:  # noqa: BLE001  a plugin may raise anything
-            lines.append(str(error) if isinstance(error, ConformanceError) else raised(error))
-        faults = [line for line in lines if not isinstance(line, Note)]
-        if len(faults) > MOST:
-            faults[MOST:] = ["and more"]
-        verdict = Verdict.FAILED if faults else Verdict.PASSED
-        findings[check.name] = Finding(check.name, verdict, "; ".join(faults or lines))
+        findings[check.name] = examine_one(check, case, findings)
     return list(findings.values())
+
+
+def examine_one(check: Check[CaseT], case: CaseT, findings: Mapping[str, Finding]) -> Finding:
+    """Make one check, unless one that it needs is not among the findings or did not pass."""
+    passed = {name for name, found in findings.items() if found.verdict in (Verdict.PASSED, Verdict.WARNING)}
+    missing = [name for name in check.needs if name not in passed]
+    if missing:
+        return Finding(check.name, Verdict.SKIPPED, f"it needs '{missing[0]}'")
+    lines: list[str] = []
+    try:
+        for line in check.faults(case) or ():
+            lines.append(line)  # noqa: PERF402  what precedes an exception is kept
+    except (Exception, SystemExit) as error:  # noqa: BLE001  a plugin may raise anything
+        lines.append(str(error) if isinstance(error, ConformanceError) else raised(error))
+    faults = [line for line in lines if not isinstance(line, Note | Doubt)]
+    if len(faults) > MOST:
+        faults[MOST:] = ["and more"]
+    doubtful = any(isinstance(line, Doubt) for line in lines)
+    verdict = Verdict.FAILED if faults else Verdict.WARNING if doubtful else Verdict.PASSED
+    return Finding(check.name, verdict, "; ".join(faults or lines))
 
 
 def raising(examination: Callable[P, list[Finding]]) -> Callable[P, None]:

@@ -134,6 +134,7 @@ class DualCase(Case[DualStrategy, Stop, Cone]):
 
 CHECKS: tuple[Check[DualCase], ...] = (
     Check("construction", DualCase.construction),
+    Check("options", DualCase.options, ("construction",)),
     Check("cone", DualCase.cone, ("construction",)),
     Check("tolerance", DualCase.tolerance, ("cone",)),
     Check("size", DualCase.size, ("cone",)),
@@ -142,8 +143,19 @@ CHECKS: tuple[Check[DualCase], ...] = (
     Check("no mutation", DualCase.no_mutation, ("cone",)),
     Check("snapshots without contact", DualCase.without_contact, ("cone", "tolerance")),
     Check("pickling", DualCase.pickling, ("determinism",)),
-    Check("time", DualCase.time, ("cone",)),
+    Check("time", DualCase.duration, ("cone",)),
 )
+
+
+def case_of(
+    create: Callable[[], DualStrategy],
+    seconds: float = SECONDS,
+    given: tuple[Array, InnerProduct] | None = None,
+    tolerances: Sequence[float] = TOLERANCES,
+    sizes: Sequence[int] = SIZES,
+) -> DualCase:
+    """The case of a dual strategy and snapshots `given` with their space; see `examine_dual`."""
+    return DualCase(create, seconds, *(given or sample_snapshots()), tolerances, sizes)
 
 
 def examine_dual(
@@ -170,12 +182,12 @@ def examine_dual(
     tolerances, sizes
         Stopping rules of the cones that are made.
     seconds
-        Largest wall time [s] of the constructor and of one cone.
+        Longest wall time [s] of one call.
     """
     if (snapshots is None) != (W is None):
         raise TypeError("pass both snapshots and W, or neither")
-    given, space = sample_snapshots() if snapshots is None or W is None else (snapshots, W)
-    return examine(CHECKS, DualCase(create, seconds, given, space, tolerances, sizes))
+    given = None if snapshots is None or W is None else (snapshots, W)
+    return examine(CHECKS, case_of(create, seconds, given, tolerances, sizes))
 
 
 check_dual = raising(examine_dual)

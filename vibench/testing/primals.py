@@ -151,6 +151,7 @@ class PrimalCase(Case[PrimalStrategy, float | None, Enrichment]):
 
 CHECKS: tuple[Check[PrimalCase], ...] = (
     Check("construction", PrimalCase.construction),
+    Check("options", PrimalCase.options, ("construction",)),
     Check("tolerance", PrimalCase.tolerance, ("construction",)),
     Check("enrichment", PrimalCase.enrichment, ("tolerance",)),
     Check("kind", PrimalCase.kind, ("enrichment",)),
@@ -160,8 +161,18 @@ CHECKS: tuple[Check[PrimalCase], ...] = (
     Check("no mutation", PrimalCase.no_mutation, ("enrichment",)),
     Check("model without contact", PrimalCase.without_contact, ("enrichment",)),
     Check("pickling", PrimalCase.pickling, ("determinism",)),
-    Check("time", PrimalCase.time, ("enrichment",)),
+    Check("time", PrimalCase.duration, ("enrichment",)),
 )
+
+
+def case_of(
+    create: Callable[[], PrimalStrategy],
+    seconds: float = SECONDS,
+    offline: Offline | None = None,
+    tolerances: Sequence[float] = TOLERANCES,
+) -> PrimalCase:
+    """The case of a primal strategy; see `examine_primal`."""
+    return PrimalCase(create, seconds, offline or sample_offline(), tolerances)
 
 
 def examine_primal(
@@ -182,9 +193,9 @@ def examine_primal(
     tolerances
         Tolerances for a strategy that takes one, in any order.
     seconds
-        Largest wall time [s] of the constructor and of one enrichment.
+        Longest wall time [s] of one call.
     """
-    return examine(CHECKS, PrimalCase(create, seconds, offline or sample_offline(), tolerances))
+    return examine(CHECKS, case_of(create, seconds, offline, tolerances))
 
 
 check_primal = raising(examine_primal)

@@ -14,8 +14,9 @@ from vibench.interfaces.validation import training_parameters, validation_parame
 from vibench.linalg.inner_product import InnerProduct
 from vibench.testing import assembly
 from vibench.testing.case import ProblemCase
-from vibench.testing.checks import SECONDS, Check, ConformanceError, Finding, Note, examine, raising
+from vibench.testing.checks import SECONDS, Check, ConformanceError, Doubt, Finding, Note, examine, raising
 from vibench.testing.comparisons import array_fault, at, difference, unmutated
+from vibench.testing.constants import constants
 
 OUTSIDE_RTOL = 1e-12
 """Largest distance of a parameter from the box, relative to its bounds."""
@@ -101,8 +102,9 @@ def solution(case: ProblemCase) -> Iterator[str]:
     contacts = 0
     # Evenly spread indices: SOLVED of them first, then those between.
     spread = [k for count in (SOLVED, 10 * SOLVED) for k in np.linspace(0, len(mus) - 1, count).round().astype(int)]
+    least = min(SOLVED, case.points)
     for k in dict.fromkeys(spread):
-        if len(solved) >= SOLVED and contacts:
+        if len(solved) >= least and (contacts or case.late):
             break
         try:
             found = solver.solve(mus[k].copy())
@@ -117,6 +119,10 @@ def solution(case: ProblemCase) -> Iterator[str]:
         yield (
             f"no constraint is active at any of {len(solved)} training parameters, so that all multipliers are zero; "
             "check that B u ≤ g is the admissible side"
+        )
+    elif all(np.all(each.lam > 0.0) for each in solved):
+        yield Doubt(
+            f"every constraint is active at each of {len(solved)} training parameters; check the signs of B and g"
         )
     worst, fallbacks = max(each.residuals.worst for each in solved), sum(bool(each.fallback) for each in solved)
     initial = f", {fallbacks} started from an interior-point solution" if fallbacks else ""
@@ -156,15 +162,19 @@ def _picture_faults(picture: Picture, m: int) -> Iterator[str]:
 
 CHECKS: tuple[Check[ProblemCase], ...] = (
     Check("construction", ProblemCase.construction),
+    Check("options", ProblemCase.options, ("construction",)),
     Check("spaces", spaces, ("construction",)),
     Check("parameters", parameters, ("construction",)),
     Check("training set", training_set, ("parameters",)),
     Check("validation set", validation_set, ("parameters",)),
-    Check("assembly", assembly.assembly, ("spaces", "parameters")),
+    Check("one assembly", assembly.one_assembly, ("spaces", "parameters")),
+    Check("assembly", assembly.assembly, ("one assembly",)),
     Check("no mutation", assembly.no_mutation, ("assembly",)),
     Check("symmetry of A", assembly.symmetry, ("assembly",)),
     Check("definiteness of A", assembly.definiteness, ("symmetry of A",)),
     Check("determinism", ProblemCase.determinism, ("assembly",)),
+    Check("another process", assembly.elsewhere, ("determinism",)),
+    Check("coercivity and inf-sup", constants, ("definiteness of A", "determinism")),
     Check("independence of mu", assembly.independence, ("determinism",)),
     Check("continuity in mu", assembly.continuity, ("independence of mu",)),
     Check("assembly on the contact", assembly.on_contact, ("determinism",)),
@@ -176,8 +186,13 @@ CHECKS: tuple[Check[ProblemCase], ...] = (
         ("training set", "definiteness of A", "independence of mu", "assembly on the contact"),
     ),
     Check("picture and diagnostics", pictures, ("high-fidelity solution",)),
-    Check("time", ProblemCase.time, ("assembly",)),
+    Check("time", ProblemCase.duration, ("assembly",)),
 )
+
+
+def case_of(create: Callable[[], Problem], seconds: float = SECONDS, seed: int = 0) -> ProblemCase:
+    """The case of a problem; see `examine_problem`."""
+    return ProblemCase(create, seconds, seed)
 
 
 def examine_problem(create: Callable[[], Problem], *, seed: int = 0, seconds: float = SECONDS) -> list[Finding]:
@@ -191,9 +206,9 @@ def examine_problem(create: Callable[[], Problem], *, seed: int = 0, seconds: fl
     seed
         Of the random parameters and entries.
     seconds
-        Largest wall time [s] of the constructor and of an assembly.
+        Wall time [s] that all checks may take, about: where an assembly is slow, they are made at fewer parameters.
     """
-    return examine(CHECKS, ProblemCase(create, seconds, seed))
+    return examine(CHECKS, case_of(create, seconds, seed))
 
 
 check_problem = raising(examine_problem)

@@ -12,8 +12,9 @@ from typing import Any
 
 import pytest
 from running import Main, Register, refused
-from samples import STUDY, changed, write_study
+from samples import STUDY, cell_row, changed, write_study
 
+from vibench.cli.main import outcomes
 from vibench.cli.plugin_commands import LISTS
 from vibench.qp.settings import SETTINGS
 from vibench.results.columns import TABLES
@@ -380,3 +381,13 @@ def test_an_error_that_nobody_foresaw_is_not_hidden(main: Main, monkeypatch: pyt
     monkeypatch.setattr("vibench.study.reader.read_study", broken)
     with pytest.raises(ZeroDivisionError):
         main("run")
+
+
+def test_cells_that_are_not_ok_for_one_reason_are_one_line() -> None:
+    cells = [cell_row(f"c{k}", solver=f"s{k}", status="error", reason="A is not symmetric") for k in range(48)]
+    other = cell_row("c48", solver="piqp", status="timeout", reason="stopped", primal_tol=None)
+    lines = outcomes([*cells, other])
+    assert lines == [
+        "error: text · text · text 0.5 · s0 and 47 more: 3 of 3 queries ok; A is not symmetric",
+        "timeout: text · text · text · piqp: 3 of 3 queries ok; stopped",
+    ]

@@ -18,7 +18,7 @@ from vibench.cli import scaffold
 from vibench.errors import RequestError
 from vibench.study import registry
 
-NAMES = {"problem": "my-rope", "primal": "tied", "dual": "cone"}
+NAMES = {"problem": "my-rope", "primal": "tied", "dual": "cone", "solver": "for-rope"}
 
 
 @pytest.fixture(scope="module")
@@ -54,7 +54,7 @@ def test_the_tests_of_new_packages_are_green(written: dict[str, Path], installed
     tests = [str(folder / "tests") for folder in written.values()]
     done = installed("-m", "pytest", "-q", "-p", "no:cacheprovider", "-W", "error", *tests, folder=tmp_path)
     assert done.returncode == 0, done.stdout
-    assert "6 passed" in done.stdout
+    assert "8 passed" in done.stdout
 
 
 def test_new_plugins_pass_their_checks_as_they_are(installed: Run, tmp_path: Path) -> None:
@@ -69,7 +69,8 @@ def test_new_plugins_pass_their_checks_as_they_are(installed: Run, tmp_path: Pat
 
 
 def test_new_plugins_give_rows_without_an_edit(installed: Run, tmp_path: Path) -> None:
-    axes = ["--problem", "my-rope", "--dual", "cone", "--primal", "tied", "--primal-tol", "0.5", "--solver", "piqp"]
+    axes = ["--problem", "my-rope", "--dual", "cone", "--primal", "tied", "--primal-tol", "0.5"]
+    axes += ["--solver", "for-rope"]
     done = installed(*COMMAND, "run", "quick", *axes, "--out", "out", "--jobs", "1", "--no-figures", folder=tmp_path)
     assert done.returncode == 0, done.stdout + done.stderr
     (row,) = rows(tmp_path / "out")
@@ -89,7 +90,7 @@ def test_a_new_package_registers_its_plugin_under_its_name(written: dict[str, Pa
         module, cls = value.split(":")
         source = scaffold.module_file(folder, kind, name)
         assert source == folder / "src" / f"{module.replace('.', '/')}.py"
-        assert f"class {cls}(" in source.read_text()
+        assert f"{'def' if kind == 'solver' else 'class'} {cls}(" in source.read_text()
 
 
 def test_new_packages_keep_to_the_rules_of_ruff(written: dict[str, Path]) -> None:
@@ -133,6 +134,7 @@ def test_a_name_that_is_accepted_is_good_everywhere(name: str) -> None:
 def test_names_that_are_taken_are_refused(main: Main) -> None:
     taken = registry.names("problem")[0]
     refused(main("new", "problem", taken), f"there is a problem '{taken}' already", "choose another name")
+    refused(main("new", "solver", "piqp"), "there is a QP solver 'piqp' already", "choose another name")
     refused(main("new", "primal", "strategies"), "vibench itself has a package of that name")
     assert list(Path.cwd().iterdir()) == []
     assert main("new", "dual", taken)[0] == 0
@@ -153,7 +155,7 @@ def test_a_file_is_no_folder_to_write_in(main: Main) -> None:
 
 
 def test_a_kind_that_is_none_is_refused(main: Main) -> None:
-    refused(main("new", "solver", "rope"), "solver", "problem")
+    refused(main("new", "study", "rope"), "study", "problem")
 
 
 def test_nothing_is_left_of_a_package_that_could_not_be_written(main: Main, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.metadata
 import inspect
 from collections.abc import Iterator, Mapping
+from functools import partial
 
 import broken_problems
 import broken_strategies
@@ -130,6 +131,14 @@ def assert_found(found: Mapping[str, str], case: Case) -> None:
 
 
 @pytest.mark.parametrize("plugin", THE_TWELVE)
+def test_a_fault_is_found_by_its_check_alone(plugin: str) -> None:
+    module, _, name = plugin.partition(":")
+    cls = getattr({"broken_problems": broken_problems, "broken_strategies": broken_strategies}[module], name)
+    examine = testing.examine_dual if issubclass(cls, DualStrategy) else testing.examine_problem
+    assert_found(failures(examine(cls)), THE_TWELVE[plugin])
+
+
+@pytest.mark.parametrize("plugin", ["broken_problems:Jumps", "broken_strategies:Misses"])
 def test_the_command_catches_a_fault_and_names_it(plugin: str, main: Main) -> None:
     code, out, err = main("check", plugin)
     assert (code, err) == (1, "")
@@ -161,12 +170,39 @@ BUILT_IN = [
 
 
 @pytest.mark.parametrize(("word", "name"), BUILT_IN)
-def test_a_built_in_plugin_passes_every_check(word: str, name: str, main: Main) -> None:
-    code, out, err = main("check", f"{word}:{name}")
+def test_a_built_in_plugin_passes_every_check(word: str, name: str) -> None:
+    examine = {
+        "problem": testing.examine_problem,
+        "dual": testing.examine_dual,
+        "primal": testing.examine_primal,
+    }[word]
+    options = registry.check_options(registry.WORDS[word], name, {"resolution": "coarse"} if word == "problem" else {})
+    findings = examine(partial(registry.load(registry.WORDS[word], name), **options))
+    assert [str(finding) for finding in findings if finding.verdict is not Verdict.PASSED] == []
+
+
+def test_the_command_takes_a_coarse_mesh_and_says_so(main: Main) -> None:
+    code, out, err = main("check", "problem:obstacle")
     assert (code, err) == (0, ""), out
-    assert out.startswith(f"{registry.WORDS[word]} '{name}'")
-    assert ("at resolution coarse" in out.splitlines()[0]) == (word == "problem")
+    assert out.startswith("problem 'obstacle', at resolution coarse (--option resolution=… for another)\n")
     assert out.splitlines()[-1].endswith("passed, 0 failed, 0 skipped")
+
+
+def test_the_command_checks_solvers(main: Main) -> None:
+    code, out, err = main("check", "solver:osqp")
+    assert (code, err) == (0, ""), out
+    assert out.startswith("QP solver 'osqp'\n")
+    code, out, err = main("check", "broken_variants:other_sign")
+    assert (code, err) == (1, "")
+    assert "failed   signs of multipliers: multipliers have the other sign" in out
+
+
+def test_a_warning_does_not_fail_the_command(main: Main) -> None:
+    code, out, err = main("check", "broken_variants:Unannotated")
+    assert (code, err) == (0, "")
+    assert "warning  options: the option 'depth' has no annotation" in out
+    assert "the option 'cells' has the default 6.5; its annotation expects int" in out
+    assert out.splitlines()[-1].endswith("passed, 1 warning, 0 failed, 0 skipped")
 
 
 def test_the_plugins_that_are_broken_elsewhere_are_correct() -> None:
@@ -181,11 +217,11 @@ def test_one_error_lists_all_failures() -> None:
     with pytest.raises(testing.ConformanceError) as caught:
         testing.check_problem(broken_problems.Worse)
     lines = str(caught.value).splitlines()
-    assert lines[0] == "Worse fails 2 of 18 checks"
+    assert lines[0] == "Worse fails 2 of 22 checks"
     assert [line.split(":")[0] for line in lines[1:]] == ["training set", "pickling"]
 
 
-@pytest.mark.parametrize("kind", ["problem", "dual", "primal"])
+@pytest.mark.parametrize("kind", ["problem", "dual", "primal", "solver"])
 def test_check_and_examine_have_the_same_parameters(kind: str) -> None:
     check, examination = getattr(testing, f"check_{kind}"), getattr(testing, f"examine_{kind}")
     assert inspect.signature(check).parameters == inspect.signature(examination).parameters
@@ -287,9 +323,12 @@ class TestRequests:
             (["obstcale"], ["no plugin is called 'obstcale'", "did you mean 'obstacle'"]),
             (["dual:obstacle"], ["no dual strategy is called 'obstacle'", "known:", "mcpg"]),
             (["no_module:Rope"], ["'no_module:Rope'", "cannot be imported", "no_module"]),
-            (["broken_problems:Jmups"], ["no class of the module broken_problems", "did you mean 'Jumps'"]),
+            (["broken_problems:Jmups"], ["no plugin of the module broken_problems", "did you mean 'Jumps'"]),
             (["running:Path"], ["'running:Path'", "no subclass of Problem, PrimalStrategy or DualStrategy"]),
-            (["some thing:Rope"], ["neither KIND:NAME", "MODULE:CLASS"]),
+            (["some thing:Rope"], ["neither KIND:NAME", "solver", "MODULE:NAME"]),
+            (["broken_variants:UnknownAnnotation"], ["annotations that fail: NameError", "'Depth'"]),
+            (["solver:piqq"], ["no QP solver is called 'piqq'", "did you mean 'piqp'"]),
+            (["solver:piqp", "--option", "eps=1"], ["QP solver 'piqp' has no options"]),
             (["obstacle", "--option", "resolution"], ["'resolution'", "KEY=VALUE"]),
             (["obstacle", "--option", "resolution=3"], ["option 'resolution' of problem 'obstacle' is 3", "int ≥ 150"]),
             (["obstacle", "--option", "resoltion=coarse"], ["did you mean 'resolution'"]),

@@ -1,0 +1,382 @@
+"""Strangers' problems, each wrong in one way that an author might well get wrong, and QP solvers that are.
+
+Where the docstring of a class says nothing else, `vibench check` names the mistake.
+"""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Mapping
+from dataclasses import replace
+from functools import cache
+from typing import Any, ClassVar
+
+import numpy as np
+import scipy.sparse as sp
+from other_problems import Block, Put, Torsion, mass, nodal
+from skfem import Basis, ElementTriP1, MeshTri
+
+from vibench import (
+    Array,
+    Contact,
+    Indices,
+    InnerProduct,
+    ParameterBox,
+    QPSolution,
+    Sampler,
+    VariationalInequality,
+    solve_qp,
+)
+
+
+class Bar(Torsion):
+    """A small bar."""
+
+    def __init__(self) -> None:
+        super().__init__(cells=6)
+
+
+class Option(Put):
+    """A coarse put."""
+
+    def __init__(self) -> None:
+        super().__init__(cells=24)
+
+
+class Cube(Block):
+    """A coarse block."""
+
+    def __init__(self) -> None:
+        super().__init__(cells=2)
+
+
+class SkewStiffness(Option):
+    """The Black–Scholes operator with its first derivative, not symmetrised."""
+
+    def assemble(self, mu: Array) -> VariationalInequality:
+        vi = super().assemble(mu)
+        ones = np.ones(self.V.dim - 1)
+        drift = sp.csr_array(sp.diags_array([ones, -ones], offsets=[1, -1])) * (0.5 * (mu[1] - 0.5 * mu[0] ** 2))
+        return replace(vi, A=sp.csr_array(vi.A + drift))
+
+
+class IndefiniteSomewhere(Option):
+    """The reaction has the wrong sign, which matters where the rate is large and the volatility small."""
+
+    def assemble(self, mu: Array) -> VariationalInequality:
+        vi = super().assemble(mu)
+        return replace(vi, A=sp.csr_array(vi.A - 1.6 * mu[1] * self._M[1:-1, 1:-1]))
+
+
+class WrongSide(Bar):
+    """u ≥ −ψ in place of u ≤ ψ: no constraint is ever active."""
+
+    def assemble(self, mu: Array) -> VariationalInequality:
+        vi = super().assemble(mu)
+        return replace(vi, B=-vi.B)
+
+
+class NegativeGap(Bar):
+    """g has the wrong sign: u ≤ −ψ, which sticks everywhere."""
+
+    def assemble(self, mu: Array) -> VariationalInequality:
+        vi = super().assemble(mu)
+        return replace(vi, g=-vi.g)
+
+
+class PermutedNorm(Option):
+    def __init__(self) -> None:
+        super().__init__()
+        order = np.random.default_rng(0).permutation(self.V.dim)
+        self.V = InnerProduct(self.V.matrix[order][:, order])
+
+
+class MassNorm(Bar):
+    def __init__(self) -> None:
+        super().__init__()
+        cells = np.linspace(0.0, 1.0, 7)
+        basis = Basis(MeshTri.init_tensor(cells, cells), ElementTriP1())
+        free = basis.complement_dofs(basis.get_dofs())
+        self.V = InnerProduct(sp.csr_array(mass.assemble(basis))[free][:, free])
+
+
+class EuclideanNorm(Cube):
+    def __init__(self) -> None:
+        super().__init__()
+        self.V = InnerProduct(sp.eye_array(self.V.dim, format="csc"))
+
+
+class SingularDualNorm(Bar):
+    """The corners of X_W have no weight."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.W = InnerProduct(nodal(np.where(np.arange(self.W.dim) == 0, 0.0, self._weights)))
+
+
+class RepeatedConstraint(Cube):
+    """The last constraint is the first one again."""
+
+    def assemble(self, mu: Array) -> VariationalInequality:
+        vi = super().assemble(mu)
+        rows = np.arange(self.W.dim)
+        rows[-1] = 0
+        return replace(vi, B=vi.B[rows], g=vi.g[rows])
+
+
+class ConstantStiffness(Option):
+    constant: ClassVar[frozenset[str]] = frozenset({"A"})
+
+
+class ConstantConstraint(Cube):
+    """B, declared constant, turns with the place of the apex."""
+
+    def assemble(self, mu: Array) -> VariationalInequality:
+        vi = super().assemble(mu)
+        return replace(vi, B=sp.csr_array(vi.B * (1.0 + 0.1 * mu[1])))
+
+
+class RandomMesh(Bar):
+    """The mesh of every instance has other nodes."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        stretch = 1.0 + 0.01 * np.random.default_rng().random(self.V.dim)
+        self._stiffness = sp.csr_array(sp.diags_array(stretch) @ self._stiffness @ sp.diags_array(stretch))
+
+
+class NamesOfNodes(Bar):
+    """The unknowns are numbered in the order of a set of texts, which differs between processes."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        names = {f"node {k}" for k in range(self.V.dim)}
+        order = [int(name.split()[1]) for name in names]
+        self._stiffness = self._stiffness[order][:, order]
+        self._distance = self._distance[order]
+        self.V = InnerProduct(self.V.matrix[order][:, order])
+
+
+class NoisyLoad(Bar):
+    def assemble(self, mu: Array) -> VariationalInequality:
+        vi = super().assemble(mu)
+        return replace(vi, f=vi.f * (1.0 + 1e-6 * np.random.default_rng().random(len(vi.f))))
+
+
+class OneVector(Bar):
+    """Every load is written into the same vector."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._load = np.zeros(self.V.dim)
+
+    def assemble(self, mu: Array) -> VariationalInequality:
+        self._load[:] = mu[0] * self._weights
+        return replace(super().assemble(mu), f=self._load)
+
+
+class NotANumberInACorner(Option):
+    """The root of a negative number where the rate is largest."""
+
+    def assemble(self, mu: Array) -> VariationalInequality:
+        with np.errstate(invalid="ignore"):
+            factor = np.sqrt(0.07999 - mu[1]) / np.sqrt(abs(0.07999 - mu[1]))
+        vi = super().assemble(mu)
+        return replace(vi, g=vi.g * factor)
+
+
+class LoadOnAllNodes(Bar):
+    """The load has an entry for the nodes on the boundary, too."""
+
+    def assemble(self, mu: Array) -> VariationalInequality:
+        return replace(super().assemble(mu), f=np.full(49, mu[0] / 36.0))
+
+
+class DualNormOfAllNodes(Cube):
+    """X_W is that of all nodes, and not of those of the top."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.W = InnerProduct(sp.eye_array(27, format="csc"))
+
+
+class IgnoresTheParameter(Bar):
+    """The twist is not used."""
+
+    def assemble(self, mu: Array) -> VariationalInequality:
+        return super().assemble(np.array([6.0]))
+
+
+class UpsideDownBox(Bar):
+    parameters = ParameterBox(("twist",), np.array([8.0]), np.array([1.0]), ("1/m",))
+
+
+class ComplexStiffness(Option):
+    """κ is the root of a complex number."""
+
+    def assemble(self, mu: Array) -> VariationalInequality:
+        vi = super().assemble(mu)
+        return replace(vi, A=sp.csr_array(vi.A.astype(complex)))
+
+
+class IntegerBound(Cube):
+    def assemble(self, mu: Array) -> VariationalInequality:
+        return replace(super().assemble(mu), f=np.zeros(self.V.dim, dtype=int))
+
+
+class OtherSamples(Cube):
+    """Entry by entry the apex is elsewhere."""
+
+    def sampler(self, wanted: Mapping[str, tuple[Indices, Indices]]) -> Sampler:
+        sample = super().sampler(wanted)
+        return lambda mu: sample(mu + np.array([0.0, 0.01]))
+
+
+class OtherContact(Cube):
+    """The constraint on the contact alone has its rows in another order."""
+
+    @property
+    def contact_dofs(self) -> Indices:
+        return np.unique(self._coupling.indices)
+
+    def contact(self, mu: Array) -> Contact:
+        return Contact(sp.csr_array(self._coupling[:, self.contact_dofs])[::-1], self.bound(mu))
+
+
+class DependsOnTheCallBefore(Option):
+    """The lift is that of the parameter before."""
+
+    last: Array | None = None
+
+    def assemble(self, mu: Array) -> VariationalInequality:
+        vi = super().assemble(mu)
+        before, self.last = (vi if self.last is None else super().assemble(self.last)), mu.copy()
+        return replace(vi, f=before.f)
+
+
+class ShiftsTheParameter(Bar):
+    """Works with the twist beyond 1, in place."""
+
+    def assemble(self, mu: Array) -> VariationalInequality:
+        mu -= 1.0
+        return super().assemble(mu + 1.0)
+
+
+class Slow(Bar):
+    """3 s for an assembly."""
+
+    def assemble(self, mu: Array) -> VariationalInequality:
+        time.sleep(3.0)
+        return super().assemble(mu)
+
+
+class Hangs(Bar):
+    """Does not come back from its second assembly."""
+
+    calls = 0
+
+    def assemble(self, mu: Array) -> VariationalInequality:
+        self.calls += 1
+        if self.calls > 1:
+            time.sleep(3600.0)
+        return super().assemble(mu)
+
+
+class PaintsTheEnd(Bar):
+    """Ends the process where a picture is asked for."""
+
+    def picture(self, mu: Array, u: Array, lam: Array) -> None:
+        os._exit(5)
+
+
+class UnknownAnnotation(Bar):
+    def __init__(self, depth: Depth = 1.0) -> None:  # type: ignore[name-defined]  # noqa: F821
+        super().__init__()
+
+
+class Unannotated(Bar):
+    """Options that nothing checks, and one whose default is none of its values."""
+
+    def __init__(self, depth=1.0, cells: int = 6.5) -> None:  # type: ignore[no-untyped-def, assignment]
+        super().__init__()
+
+
+def exact(program: VariationalInequality, accuracy: float) -> QPSolution:
+    return solve_qp(program, "piqp", accuracy)
+
+
+def other_sign(program: VariationalInequality, accuracy: float) -> QPSolution:
+    found = exact(program, accuracy)
+    return replace(found, alpha=None if found.alpha is None else -found.alpha)
+
+
+def ignores_the_accuracy(program: VariationalInequality, accuracy: float) -> QPSolution:
+    return exact(program, 1e-3)
+
+
+def ignores_the_bounds(program: VariationalInequality, accuracy: float) -> QPSolution:
+    """The solution of A x = f."""
+    return QPSolution(np.linalg.solve(program.A, program.f), np.zeros(len(program.g)), "solved")
+
+
+def overwrites(program: VariationalInequality, accuracy: float) -> QPSolution:
+    found = exact(program, accuracy)
+    program.g[:] += 1.0
+    return found
+
+
+def draws(program: VariationalInequality, accuracy: float) -> QPSolution:
+    found = exact(program, accuracy)
+    assert found.x is not None
+    return replace(found, x=found.x + 1e-5 * np.random.default_rng().random(len(found.x)))
+
+
+def raises_where_infeasible(program: VariationalInequality, accuracy: float) -> QPSolution:
+    found = exact(program, accuracy)
+    if "INFEASIBLE" in found.solver_status:
+        raise ArithmeticError("no point is admissible")
+    return found
+
+
+BUFFER = np.zeros(1000)
+
+
+def one_buffer(program: VariationalInequality, accuracy: float) -> QPSolution:
+    found = exact(program, accuracy)
+    if found.x is None:
+        return found
+    BUFFER[: len(found.x)] = found.x
+    return replace(found, x=BUFFER[: len(found.x)])
+
+
+@cache
+def _kept(contents: tuple[Any, ...], accuracy: float) -> QPSolution:
+    A, f, B, g = (np.frombuffer(data).reshape(shape) for data, shape in contents)
+    for _ in range(20):  # slow enough that a look-up is much quicker
+        found = exact(VariationalInequality(A, f, B, g), accuracy)
+    return found
+
+
+def memoises(program: VariationalInequality, accuracy: float) -> QPSolution:
+    arrays = (program.A, program.f, program.B, program.g)
+    return _kept(tuple((np.ascontiguousarray(a).tobytes(), a.shape) for a in arrays), accuracy)
+
+
+KEPT: dict[int, QPSolution] = {}
+
+
+def knows_by_address(program: VariationalInequality, accuracy: float) -> QPSolution:
+    key = program.f.ctypes.data
+    if key not in KEPT:
+        KEPT[key] = exact(program, accuracy)
+        ADDRESSES.append(program.f)  # so that no other vector gets the address
+    return KEPT[key]
+
+
+ADDRESSES: list[Array] = []
+
+
+def no_solution(program: VariationalInequality, accuracy: float) -> Any:
+    found = exact(program, accuracy)
+    return found.x, found.alpha

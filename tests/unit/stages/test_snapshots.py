@@ -1,0 +1,116 @@
+"""Wrong models are named by the high-fidelity sweep of a run, and by all that reads what another process computed."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import broken_variants
+import numpy as np
+import pytest
+import scipy.sparse as sp
+from fake_plugins import Wire
+from hypothesis import given
+from hypothesis import strategies as st
+from numerics import Varying
+from running import Register
+
+from vibench import NumericalError, Problem, VariationalInequality
+from vibench.interfaces.fingerprint import AGREEMENT_RTOL, Fingerprint, ReferenceAssembly, fingerprint
+from vibench.stages.artefacts import Store
+from vibench.stages.base import build_problem
+from vibench.stages.snapshots import fingerprint_here, gather, training_stages
+from vibench.study.cells import Plugin
+from vibench.testing.elsewhere import call_elsewhere
+
+REASONS: Mapping[str, str] = {
+    "SkewStiffness": "A at mu = [0.25, 0.05] is not symmetric",
+    "IndefiniteSomewhere": "is not positive definite",
+    "ConstantStiffness": "a member declared `constant` depends on mu: row",
+    "ConstantConstraint": "a member declared `constant` depends on mu: row",
+    "SingularDualNorm": "the Gram matrix",
+    "NoisyLoad": "two assemblies at one parameter are not the same, as in another process: row",
+    "OneVector": "assemble overwrites earlier results, return new arrays: row",
+    "NotANumberInACorner": "g has entries that are not finite at mu = [",
+    "LoadOnAllNodes": "f has shape (49,) at mu = [1.0]; the spaces V and W require (25,)",
+    "DualNormOfAllNodes": "B has shape (9, 54) at mu = ",
+    "ComplexStiffness": "A is complex at mu = [0.25, 0.05]",
+    "DependsOnTheCallBefore": "two assemblies at one parameter are not the same",
+    "ShiftsTheParameter": "assemble changes its argument mu",
+}
+
+
+def swept(name: str, folder: Path) -> None:
+    """The training set solved and gathered."""
+    build_problem.cache_clear()
+    fingerprint_here.cache_clear()
+    store = Store(folder / "artefacts")
+    chunks = training_stages(Plugin("problem", name, "{}", ""))
+    for chunk in chunks:
+        found = chunk.run(store)
+        store.put(chunk.key, found.value, found.seconds, found.histories)
+    gather(store, chunks)
+
+
+@pytest.mark.parametrize("name", REASONS)
+def test_a_run_names_the_mistake_and_the_command_that_says_more(name: str, register: Register, tmp_path: Path) -> None:
+    register(("vibench.problems", "it", f"broken_variants:{name}"))
+    with pytest.raises(NumericalError) as caught:
+        swept("it", tmp_path)
+    assert REASONS[name] in str(caught.value)
+    assert str(caught.value).endswith("; run `vibench check problem:it`")
+
+
+@pytest.mark.parametrize("value", ["broken_variants:Bar", "broken_variants:Option", "broken_variants:Cube"])
+def test_what_is_right_is_swept(value: str, register: Register, tmp_path: Path) -> None:
+    register(("vibench.problems", "it", value))
+    swept("it", tmp_path)
+
+
+def fingerprint_of(create: type[Problem]) -> Fingerprint:
+    problem = create()
+    return fingerprint(problem, problem.assemble(problem.training_set()[0]))
+
+
+def test_a_numbering_that_differs_between_processes_shows_in_the_fingerprint() -> None:
+    for create, same in ((broken_variants.Bar, True), (broken_variants.NamesOfNodes, False)):
+        there = call_elsewhere(fingerprint_of, create, seconds=60.0)
+        assert (not list(there.deviations(fingerprint_of(create)))) == same
+
+
+@given(st.sampled_from(["A", "f", "B", "g"]), st.integers(0, 2**16), st.sampled_from([1e-13, 1e-6]))
+def test_a_changed_entry_shows_unless_it_is_round_off(name: str, place: int, size: float) -> None:
+    wire = Wire()
+    vi = wire.assemble(np.array([5.0]))
+    before = fingerprint(wire, vi)
+    entries = getattr(vi, name).data if sp.issparse(getattr(vi, name)) else getattr(vi, name)
+    entries[place % len(entries)] += size * np.max(np.abs(entries))
+    found = list(fingerprint(wire, vi).deviations(before))
+    assert [text.split(" of ")[1] for text in found] == ([f"{name} differs"] if size > AGREEMENT_RTOL else [])
+
+
+def test_a_permutation_of_equal_unknowns_shows_where_the_matrix_shows_it() -> None:
+    wire = Varying()
+    vi = wire.assemble(wire.training_set()[0])
+    swap = np.arange(wire.V.dim)
+    swap[[3, 7]] = swap[[7, 3]]
+    other = VariationalInequality(sp.csr_array(vi.A[swap][:, swap]), vi.f, vi.B, vi.g)
+    (text,) = fingerprint(wire, other).deviations(fingerprint(wire, vi))
+    assert text.endswith("of A differs")
+
+
+def test_shapes_and_values_that_are_not_finite_are_deviations() -> None:
+    small, large, nan = (Fingerprint({"g": g}, {"g": 1.0}) for g in (np.ones(2), np.ones(3), np.array([1.0, np.nan])))
+    assert list(small.deviations(large)) == ["g has 2 rows against 3"]
+    assert list(nan.deviations(small)) == ["row 1 of g differs"]
+
+
+def test_a_constant_member_that_is_the_same_object_costs_no_product(monkeypatch: pytest.MonkeyPatch) -> None:
+    bar = broken_variants.Bar()
+    reference = ReferenceAssembly(bar, bar.assemble(np.array([2.0])))
+    products: list[object] = []
+    monkeypatch.setattr("vibench.interfaces.fingerprint._product", products.append)
+    vi = bar.assemble(np.array([3.0]))
+    again = VariationalInequality(vi.A, vi.f, reference._vi.B, reference._vi.g)
+    reference.refuse_false_constants(np.array([3.0]), again)
+    assert products == []

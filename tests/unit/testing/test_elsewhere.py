@@ -1,0 +1,117 @@
+"""Checks in processes of their own: those that hang or die are told; another process has other hashes."""
+
+from __future__ import annotations
+
+import os
+from functools import partial
+from typing import Any
+
+import pytest
+from broken_variants import Bar
+from fake_plugins import Wire
+from running import Main
+
+from vibench import testing
+from vibench.testing.case import LEAST_POINTS, MOST_POINTS, ProblemCase
+from vibench.testing.checks import ConformanceError, Finding, Verdict
+from vibench.testing.elsewhere import Examination, NotImportableError, call_elsewhere, examine_elsewhere
+from vibench.testing.problems import CHECKS
+
+
+def found(plugin: str, seconds: float = 60.0) -> list[Finding]:
+    """Findings of a problem; every one is told, once."""
+    told: list[Finding] = []
+    findings = examine_elsewhere(Examination("problems", plugin, {}, seconds), told.append)
+    assert sorted(told, key=findings.index) == findings
+    return findings
+
+
+def test_findings_are_those_of_this_process() -> None:
+    elsewhere = [(each.check, each.verdict) for each in found("fake_plugins:Wire")]
+    assert elsewhere == [(each.check, each.verdict) for each in testing.examine_problem(Wire)]
+
+
+def test_a_call_that_hangs_ends_the_checks_with_one_line(main: Main) -> None:
+    code, out, err = main("check", "fake_plugins:Sleeps", "--seconds", "2")
+    assert (code, err) == (1, "")
+    failed = [line for line in out.splitlines() if line.startswith("failed")]
+    assert len(failed) == 1
+    assert failed[0].endswith(": stopped: the checks take longer than 2 s")
+    assert out.splitlines()[-2].startswith("skipped  ")
+    assert out.splitlines()[-2].endswith(", time: no time is left")
+
+
+@pytest.mark.parametrize(("plugin", "cause"), [("Segfaults", "SIGSEGV"), ("Exits", "exit code 3")])
+def test_a_check_that_ends_its_process_costs_those_that_need_it(plugin: str, cause: str) -> None:
+    findings = {each.check: each for each in found(f"fake_plugins:{plugin}")}
+    (failed,) = (each for each in findings.values() if each.verdict is Verdict.FAILED)
+    assert failed.check == "one assembly"
+    assert cause in failed.message
+    assert findings["training set"].verdict is Verdict.PASSED
+    assert findings["assembly"] == Finding("assembly", Verdict.SKIPPED, "it needs 'one assembly'")
+    assert len(findings) == len(CHECKS)
+
+
+def test_what_passed_in_a_process_that_died_later_is_remembered() -> None:
+    findings = {each.check: each for each in found("broken_variants:PaintsTheEnd")}
+    assert findings["picture and diagnostics"].message == "the worker process died with exit code 5"
+    assert [name for name, each in findings.items() if each.verdict is not Verdict.PASSED] == [
+        "picture and diagnostics"
+    ]
+    assert findings["time"].verdict is Verdict.PASSED
+
+
+def test_a_plugin_that_is_not_there_is_one_finding() -> None:
+    (failed,) = found("fake_plugins:Wier")
+    assert failed.verdict is Verdict.FAILED
+    assert "has no attribute 'Wier'" in failed.message
+
+
+@pytest.mark.parametrize(
+    ("seconds", "points"), [(1e-3, MOST_POINTS), (0.8, MOST_POINTS), (1.5, 4), (3.0, LEAST_POINTS)]
+)
+def test_a_slow_assembly_is_made_at_fewer_parameters(seconds: float, points: int) -> None:
+    case = ProblemCase(Bar, 120.0, 0)
+    case.__dict__["one_assembly"] = seconds
+    assert len(case.mus) == points
+    findings = {check.name: list(check.faults(case) or ()) for check in CHECKS if check.name != "another process"}
+    assert findings["one assembly"][0] == f"takes {seconds:.2g} s"
+    fewer = f"checks at {points} parameters instead of 7, and none for jumps, for lack of time"
+    assert findings["one assembly"][1:] == ([fewer] if points < MOST_POINTS else [])
+    assert findings["continuity in mu"] == (["not looked for, for lack of time"] if points < MOST_POINTS else [])
+
+
+def process() -> tuple[int, int]:
+    return os.getpid(), hash("a text")
+
+
+def fails() -> None:
+    raise ArithmeticError("the wire snapped")
+
+
+def test_another_process_has_other_hashes() -> None:
+    there = call_elsewhere(process, seconds=60.0)
+    assert there[0] != os.getpid()
+    assert there[1] != hash("a text")
+    assert call_elsewhere(process, seconds=60.0) == there
+
+
+def test_what_fails_there_is_told_from_what_cannot_be_sent() -> None:
+    with pytest.raises(ConformanceError, match="in another process it fails: ArithmeticError: the wire snapped"):
+        call_elsewhere(fails, seconds=60.0)
+    with pytest.raises(NotImportableError):
+        call_elsewhere(lambda: None, seconds=60.0)
+
+    class Local(Wire):
+        pass
+
+    findings = {each.check: each for each in testing.examine_problem(partial(Local, nodes=6))}
+    assert findings["another process"].verdict is Verdict.PASSED
+    assert findings["another process"].message.startswith("not compared: ")
+
+
+def test_a_plugin_in_a_module_that_only_this_process_has_is_not_compared() -> None:
+    code: dict[str, Any] = {"__name__": "made_up", "Wire": Wire}
+    exec("class Mine(Wire):\n    pass", code)
+    with pytest.raises(NotImportableError):
+        call_elsewhere(code["Mine"], seconds=60.0)

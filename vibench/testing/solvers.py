@@ -1,0 +1,290 @@
+"""The conformance checks of QP solvers: programs with known solutions, signs, accuracy, and independence of calls."""
+
+from __future__ import annotations
+
+import copy
+import statistics
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from functools import cached_property, partial
+
+import numpy as np
+
+from vibench.arrays import Array
+from vibench.errors import NumericalError
+from vibench.interfaces.problem import MEMBERS, VariationalInequality
+from vibench.qp.scaling import units_of
+from vibench.qp.solution import QPSolution, QPSolver
+from vibench.qp.solve import solve_qp
+from vibench.qp.status import Status
+from vibench.qp.verification import kkt_residuals, verify
+from vibench.testing.checks import SECONDS, Check, ConformanceError, Doubt, Finding, Note, examine, raised, raising
+from vibench.testing.comparisons import copies, differences, unmutated
+from vibench.timing import timed
+
+ACCURACY = 1e-7
+"""Relative accuracy of the solutions: the default of studies."""
+
+ACCURACIES = (1e-3, 1e-5, ACCURACY)
+"""Accuracies that the residuals are compared with."""
+
+SOLUTION_RTOL = 1e-3
+"""Largest error of a solution whose residuals are below `ACCURACY`; the conditions of the programs are below 1e3."""
+
+REPEATS = 9
+"""Number of calls with the same program, and of calls with one that is new."""
+
+KEPT_RATIO = 5.0
+"""A program solved before that takes so many times less than a new one was not solved again."""
+
+
+@dataclass(frozen=True, eq=False)
+class KnownProgram:
+    """A dense program with its solution x (n,) and multipliers α (m,); `None` where these are not unique."""
+
+    program: VariationalInequality
+    x: Array
+    alpha: Array | None
+
+
+def known_program(
+    x: Array, alpha: Array, slack: Array, B: Array, seed: int = 0, *, unique: bool = True
+) -> KnownProgram:
+    """The program with this solution (n,), multipliers (m,), slacks g − B x (m,) and constraints (m×n)."""
+    root = np.random.default_rng(seed).standard_normal((len(x), len(x)))
+    A = root.T @ root / len(x) + np.eye(len(x))
+    return KnownProgram(VariationalInequality(A, A @ x + B.T @ alpha, B, B @ x + slack), x, alpha if unique else None)
+
+
+def known_programs() -> dict[str, KnownProgram]:
+    """Programs by what is special about them."""
+    rng = np.random.default_rng(1)
+    n, m = 6, 9
+    x, B, size = rng.standard_normal(n), rng.standard_normal((m, n)), 0.5 + rng.random(m)
+    active, none = np.arange(m) < 3, np.zeros(m)
+    some, away = np.where(active, size, 0.0), np.where(active, 0.0, size)
+    few, most = (np.arange(60) < 4).astype(float), (np.arange(60) >= 4).astype(float)
+    units = 10.0 ** np.linspace(-5, 5, m)
+    one = VariationalInequality(np.eye(1), np.ones(1), np.ones((1, 1)), np.array([0.5]))
+    rigid = known_program(np.zeros(n), none, size, B)
+    driven = known_program(x, some, away, B)
+    # Without load: moving the constraints by A⁻¹f leaves the multipliers as they are.
+    offset = np.linalg.solve(driven.program.A, driven.program.f)
+    return {
+        "some constraints are active": driven,
+        "none is active": known_program(x, none, size, B),
+        "all are active": known_program(x, size[:4], np.zeros(4), B[:4]),
+        "bounds x ≥ 0": known_program(np.maximum(x, 0.0), np.where(x > 0.0, 0.0, 1.0), np.zeros(n), -np.eye(n)),
+        "an active constraint has no multiplier": known_program(x, np.where(np.arange(m) < 2, some, 0.0), away, B),
+        "active constraints are repeated": known_program(
+            x, np.tile(some, 2), np.tile(away, 2), np.tile(B, (2, 1)), unique=False
+        ),
+        "rows of very different size": known_program(x, some / units, away * units, B * units[:, None]),
+        "there is no load": KnownProgram(
+            replace(driven.program, f=np.zeros(n), g=driven.program.g - driven.program.B @ offset), x - offset, some
+        ),
+        "there is neither load nor contact": KnownProgram(replace(rigid.program, f=np.zeros(n)), np.zeros(n), none),
+        "one unknown": KnownProgram(one, np.array([0.5]), np.array([0.5])),
+        "many constraints": known_program(x, few, most, rng.standard_normal((60, n))),
+    }  # fmt: skip
+
+
+IMPOSSIBLE = VariationalInequality(np.eye(1), np.ones(1), np.array([[1.0], [-1.0]]), np.array([-1.0, -1.0]))
+"""x ≤ −1 and x ≥ 1."""
+
+
+@dataclass(eq=False)
+class SolverCase:
+    """A QP solver, and the programs it solves; `limit` bounds the wall time [s] of the checks."""
+
+    create: QPSolver
+    limit: float
+
+    @cached_property
+    def programs(self) -> dict[str, KnownProgram]:
+        """The programs with known solutions."""
+        return known_programs()
+
+    @cached_property
+    def typical(self) -> VariationalInequality:
+        """The program with some active constraints, scaled as it is when a solver gets it."""
+        return _scaled(next(iter(self.programs.values())).program)
+
+    def solve(self, program: VariationalInequality, accuracy: float = ACCURACY) -> QPSolution:
+        """The answer as a run gets it: the data scaled, the answer scaled back."""
+        return solve_qp(program, "it", accuracy, {"it": self.create})
+
+    def answer(self) -> Iterator[str]:
+        """A `QPSolution` with vectors of the right shapes and a text as its status."""
+        if not callable(self.create):
+            raise ConformanceError(f"a {type(self.create).__name__} is no function of a program and an accuracy")
+        try:
+            found = self.solve(self.typical)
+        except NumericalError as error:
+            raise ConformanceError(str(error)) from error
+        if found.x is None or found.alpha is None:
+            yield f"a program with a solution gets none: {found.solver_status}"
+        yield Note(found.solver_status)
+
+    def signs(self) -> Iterator[str]:
+        """Multipliers α ≥ 0 are those of A x + Bᵀα = f."""
+        program, found = self.typical, self.create(self.typical, ACCURACY)
+        assert found.x is not None and found.alpha is not None  # noqa: PT018  the check "answer" passed
+        off = [
+            float(np.max(np.abs(program.A @ found.x - program.f + sign * program.B.T @ found.alpha)))
+            for sign in (1, -1)
+        ]
+        if off[0] > 1e-3 > off[1]:
+            yield f"multipliers have the other sign: ‖A x + Bᵀα − f‖ is {off[0]:.1g}, with −α {off[1]:.1g}"
+        elif np.min(found.alpha) < -SOLUTION_RTOL * np.max(np.abs(found.alpha)):
+            yield f"a multiplier is negative: entry {np.argmin(found.alpha)} is {np.min(found.alpha):.2g}"
+
+    def solutions(self) -> Iterator[str]:
+        """Programs with known solutions are solved to `ACCURACY`."""
+        worst = 0.0
+        for name, known in self.programs.items():
+            found = self.solve(known.program)
+            status, reason, residuals = verify(known.program, found, ACCURACY)
+            if status is not Status.OK or residuals is None:
+                yield f"{name}: {status}, {reason}"
+                continue
+            worst = max(worst, residuals.worst)
+            for symbol, value, right in (("x", found.x, known.x), ("α", found.alpha, known.alpha)):
+                if right is not None and value is not None and len(right):
+                    gap, scale = np.abs(value - right), max(1e-3, float(np.max(np.abs(right))))
+                    if np.max(gap) > SOLUTION_RTOL * scale:
+                        k = int(np.argmax(gap))
+                        yield f"{name}: {symbol}[{k}] is {value[k]:.6g} against {right[k]:.6g}"
+        yield Note(f"{len(self.programs)} programs, residuals up to {worst:.0e}")
+
+    def accuracies(self) -> Iterator[str]:
+        """Residuals are below the accuracy that is asked for."""
+        known = next(iter(self.programs.values())).program
+        for accuracy in ACCURACIES:
+            found = self.solve(known, accuracy)
+            status, reason, residuals = verify(known, found, accuracy)
+            if status is not Status.OK or residuals is None:
+                yield f"accuracy {accuracy:.0e}: {status}, {reason}"
+            else:
+                yield Note(f"asked for {accuracy:.0e}, residual {residuals.worst:.0e}")
+
+    def infeasible(self) -> Iterator[str]:
+        """A program without admissible points is answered, with whatever status, and not by an exception."""
+        try:
+            found = self.solve(IMPOSSIBLE)
+        except Exception as error:  # a plugin may raise anything
+            advice = "return QPSolution(None, None, status) where there is no solution"
+            raise ConformanceError(f"it raises {raised(error)}; {advice}") from error
+        status, _, _ = verify(IMPOSSIBLE, found, ACCURACY)
+        if status is Status.NONFINITE:
+            yield "x or α is not finite; return QPSolution(None, None, status) where there is no solution"
+        yield Note(found.solver_status)
+
+    def no_mutation(self) -> None:
+        """The solver does not write to the program."""
+        program = _own(self.typical)
+        arrays = {name: getattr(program, name) for name in MEMBERS}
+        unmutated("the solver", arrays, lambda: self.create(program, ACCURACY))
+
+    def determinism(self) -> Iterator[str]:
+        """A second call gives the same solution, to the accuracy; to the last bit is noted."""
+        first, second = (_vectors(self.create(_own(self.typical), ACCURACY)) for _ in range(2))
+        for name, what in differences(second, first, 10.0 * ACCURACY):
+            yield f"a second call gives another {name}: {what}"
+        if list(differences(second, first)):
+            yield Note("repeated calls differ by round-off")
+
+    def independence(self) -> Iterator[str]:
+        """An answer depends on nothing but the program: not on where it is stored, nor on other calls."""
+        program = _own(self.typical)
+        earlier = self.create(program, ACCURACY)
+        kept = copies(_vectors(earlier))
+        program.f[:] *= -0.5  # the same arrays with other values
+        later = self.create(program, ACCURACY)
+        if later.x is None or later.alpha is None or earlier.x is None:
+            yield "a program with a solution gets none at a second call"
+            return
+        if kkt_residuals(program, later.x, np.maximum(later.alpha, 0.0)).worst > SOLUTION_RTOL:
+            yield "where the entries of a program were changed, the solution is that of the program before"
+        for name, what in differences(copies(_vectors(earlier)), kept):
+            yield f"a later call overwrites {name} of an earlier solution: {what} before"
+
+    def repetition(self) -> Iterator[str]:
+        """A program that was solved before is solved again: it takes as long as a new one."""
+        known, again = self.programs["many constraints"].program, list[float]()
+        program, new = _scaled(known), list[float]()
+        self.create(program, ACCURACY)
+        for k in range(REPEATS):
+            other = replace(program, f=program.f * (1.0 + 1e-6 * (k + 1)))
+            new.append(timed(partial(self.create, other, ACCURACY))[1].cpu)
+            again.append(timed(partial(self.create, _own(program), ACCURACY))[1].cpu)
+        fast, slow = statistics.median(again), statistics.median(new)
+        if slow > KEPT_RATIO * fast:
+            yield (
+                f"a program solved before takes {fast:.1g} s of CPU, a new one {slow:.1g} s: solutions are kept, and "
+                "their times say nothing"
+            )
+
+    def duration(self) -> Iterator[str]:
+        """A solution is much quicker than the time limit."""
+        begin = time.perf_counter()
+        self.create(self.typical, ACCURACY)
+        seconds = time.perf_counter() - begin
+        if seconds > self.limit:
+            yield f"a solution takes {seconds:.3g} s, above the limit of {self.limit:g} s"
+        elif seconds > 1.0:
+            yield Doubt(f"a solution of a program of 6 unknowns takes {seconds:.3g} s")
+        yield Note(f"a solution takes {seconds:.2g} s")
+
+
+def _scaled(program: VariationalInequality) -> VariationalInequality:
+    return units_of(program).scaled(program)
+
+
+def _own(program: VariationalInequality) -> VariationalInequality:
+    return copy.deepcopy(program)
+
+
+def _vectors(found: QPSolution) -> dict[str, Array]:
+    return {name: value for name, value in (("x", found.x), ("α", found.alpha)) if value is not None}
+
+
+def of_qpsolvers(program: VariationalInequality, accuracy: float, *, solver: str) -> QPSolution:
+    """A solver that qpsolvers has, in the form of one that a plugin registers."""
+    return solve_qp(program, solver, accuracy)
+
+
+CHECKS: tuple[Check[SolverCase], ...] = (
+    Check("answer", SolverCase.answer),
+    Check("signs of multipliers", SolverCase.signs, ("answer",)),
+    Check("known solutions", SolverCase.solutions, ("signs of multipliers",)),
+    Check("accuracy", SolverCase.accuracies, ("signs of multipliers",)),
+    Check("infeasible program", SolverCase.infeasible, ("answer",)),
+    Check("no mutation", SolverCase.no_mutation, ("answer",)),
+    Check("determinism", SolverCase.determinism, ("answer",)),
+    Check("independent calls", SolverCase.independence, ("known solutions", "no mutation")),
+    Check("repeated programs", SolverCase.repetition, ("answer",)),
+    Check("time", SolverCase.duration, ("answer",)),
+)
+
+
+def case_of(create: QPSolver, seconds: float = SECONDS) -> SolverCase:
+    """The case of a solver; see `examine_solver`."""
+    return SolverCase(create, seconds)
+
+
+def examine_solver(create: QPSolver, *, seconds: float = SECONDS) -> list[Finding]:
+    """Make all checks of a QP solver.
+
+    Parameters
+    ----------
+    create
+        The function that is registered under `vibench.qp_solvers`.
+    seconds
+        Longest wall time [s] of one solution.
+    """
+    return examine(CHECKS, case_of(create, seconds))
+
+
+check_solver = raising(examine_solver)
