@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import shutil
 import signal
 import time
 from pathlib import Path
@@ -109,3 +110,31 @@ def test_two_runs_do_not_write_into_one_folder(
         out, err = process.communicate(timeout=60)
     assert (process.returncode, err) == (0, "")
     assert "2 cells, 2 ok" in out
+
+
+@pytest.mark.parametrize("swapped", [False, True], ids=["removed", "swapped"])
+def test_a_run_folder_that_is_gone_ends_the_run_with_a_line(
+    swapped: bool, command: str, plugins_folder: Path, vibench: Vibench, waiting: Path
+) -> None:
+    """At the next commit; what was computed is in the store of artefacts, from which the next run takes it."""
+    folder = waiting / "runs" / "wire"
+    with started([command, "run", "study.toml", "--jobs", "2", "--no-figures"], waiting, plugins_folder) as process:
+        read_until(process, "[1/2] ok")
+        folder.rename(waiting / "elsewhere")
+        if swapped:
+            shutil.copytree(waiting / "elsewhere", folder)
+        (waiting / "go on").touch()
+        out, err = process.communicate(timeout=60)
+    assert process.returncode == 1
+    assert err.endswith(
+        "removed or replaced during the run; the same command runs its cells again, with the artefacts that are "
+        "stored\n"
+    )
+    assert err.count("\n") == 1
+    assert "results:" not in out
+    assert [row["dual"] for row in rows(waiting / "elsewhere")] == ["cpg"]
+    shutil.rmtree(folder, ignore_errors=True)
+    printed, after = run_again(vibench, waiting)
+    assert "2 cells, 2 to run" in printed
+    assert "high-fidelity solutions" not in printed
+    assert [row["status"] for row in after] == ["ok", "ok"]

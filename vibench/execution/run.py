@@ -20,8 +20,9 @@ from vibench.execution.timing_plan import TimingPlan
 from vibench.qp.solve import installed_solvers
 from vibench.qp.status import Status
 from vibench.results.break_even import break_even_rows
-from vibench.results.database import FILE, ResultsDatabase, claimed, read_meta, study_of
+from vibench.results.database import FILE, DamagedError, ResultsDatabase, claimed, read_meta, study_of
 from vibench.results.solver_agreement import disagreement_rows
+from vibench.results.sqlite_files import DAMAGED, set_aside
 from vibench.results.tables import EXPORTED
 from vibench.stages.artefacts import Store, usable_store
 from vibench.stages.base import Done, Failed, Stage, Unstored
@@ -57,6 +58,9 @@ class Agenda:
 
 class Observer(Protocol):
     """Shows the progress of a run."""
+
+    def note(self, line: str) -> None:
+        """Something the user should know."""
 
     def start(self, agenda: Agenda) -> None:
         """The run begins."""
@@ -134,7 +138,7 @@ def run_study(study: Study, folder: Path, observer: Observer, options: Options =
     cells, store = expand(study), usable_store()
     with claimed(folder), store.used():
         if options.fresh:
-            _clear(folder, study)
+            _clear(folder, study, observer)
         database = ResultsDatabase(folder, identity(study), anew=options.fresh)
         try:
             finished = database.finished()
@@ -158,13 +162,19 @@ def _to_do(cell: Cell, finished: Mapping[str, tuple[str, str]], retry: bool) -> 
     return code != cell.code or (retry and status != Status.OK)
 
 
-def _clear(folder: Path, study: Study) -> None:
+def _clear(folder: Path, study: Study, observer: Observer) -> None:
     """Remove the tables, log and report of a study's earlier run; refuse the folder of another study.
 
-    Nothing else: a user may keep notes beside them. Figures are removed when they are drawn anew.
+    Nothing else: a user may keep notes beside them. Figures are removed when they are drawn anew. A results file that
+    cannot be read is kept under another name.
     """
     path = folder / FILE
-    meta = read_meta(path) if path.is_file() else {}
+    try:
+        meta = read_meta(path) if path.is_file() else {}
+    except DamagedError as error:
+        set_aside(path)
+        observer.note(f"{error}; it is kept as '{path}{DAMAGED}'")
+        meta = {}
     there = study_of(path, meta).get("name") if meta else study.name
     if there != study.name:
         raise RequestError(f"'{folder}' holds results of the study '{there}'; --fresh removes only '{study.name}'")
