@@ -11,8 +11,10 @@ from pathlib import Path
 
 import pandas as pd
 import pytest
-from running import Vibench, read_until, rows, run_again, started, without_seconds, workers
+from running import Main, Vibench, read_until, rows, run_again, started, without_seconds, workers
 from samples import wire_study, write_study
+
+from vibench.results import tables
 
 
 @pytest.fixture
@@ -138,3 +140,31 @@ def test_a_run_folder_that_is_gone_ends_the_run_with_a_line(
     assert "2 cells, 2 to run" in printed
     assert "high-fidelity solutions" not in printed
     assert [row["status"] for row in after] == ["ok", "ok"]
+
+
+@pytest.mark.parametrize(
+    "module", ["typer", "numpy", "scipy.sparse", "pandas", "vibench.execution.run", "vibench.study.reader"]
+)
+def test_an_interrupt_among_the_imports_ends_the_command_with_a_line(
+    module: str, command: str, plugins_folder: Path, waiting: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Python tells of every import as soon as it is done; the signal comes during a later one."""
+    monkeypatch.setenv("PYTHONPROFILEIMPORTTIME", "1")
+    (waiting / "go on").touch()  # a run that misses the signal comes to its end
+    with started([command, "run", "study.toml", "--no-figures"], waiting, plugins_folder) as process:
+        assert process.stderr is not None
+        while (line := process.stderr.readline()).rpartition("|")[2].strip() != module:
+            assert line, f"{module} was not imported"
+        process.send_signal(signal.SIGINT)
+        out, err = process.communicate(timeout=60)
+    said = [line for line in err.splitlines() if not line.startswith("import time:")]
+    assert (process.returncode, out, said) == (130, "", ["vibench: interrupted"])
+    assert not (waiting / "runs").exists()
+
+
+def test_an_interrupt_ends_any_command_with_a_line(main: Main, monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupted(_: str) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(tables, "results_file", interrupted)
+    assert main("show", "quick") == (130, "", "vibench: interrupted\n")

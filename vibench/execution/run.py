@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
 
+from vibench import provenance
 from vibench.errors import ExecutorError, RequestError, StorageError, VibenchError, in_a_line
 from vibench.execution.dask import Dask
 from vibench.execution.executors import Executor, Local
@@ -34,6 +35,9 @@ from vibench.study.spec import Study
 
 CHECK_INTERVAL = 5.0
 """Seconds between two checks that the executor still runs."""
+
+JOBS_PER_CORE = 16
+"""Most worker processes per core: more than one makes a run slower, and thousands stop the machine."""
 
 REPORT = "report.html"
 """File in the run folder that `vibench report` writes unless told otherwise."""
@@ -131,10 +135,11 @@ def run_study(study: Study, folder: Path, observer: Observer, options: Options =
     Raises
     ------
     RequestError
-        If the folder, the store of artefacts or the executor cannot be used.
+        If the folder, the store of artefacts or the executor cannot be used, or there are too many jobs.
     StorageError
         If something cannot be written; what was written before is kept.
     """
+    _check_jobs(options.jobs)
     cells, store = expand(study), usable_store()
     with claimed(folder), store.used():
         if options.fresh:
@@ -155,6 +160,12 @@ def run_study(study: Study, folder: Path, observer: Observer, options: Options =
     keys = {cell.key for cell in cells}
     rows = tuple(row for row in everything if row["cell"] in keys)
     return Outcome(rows, len(cells) - len(rows), interrupted)
+
+
+def _check_jobs(jobs: int) -> None:
+    most = JOBS_PER_CORE * provenance.cores()
+    if not 1 <= jobs <= most:
+        raise RequestError(f"--jobs {jobs}: expected 1 to {most} worker processes, {JOBS_PER_CORE} per core")
 
 
 def _to_do(cell: Cell, finished: Mapping[str, tuple[str, str]], retry: bool) -> bool:
