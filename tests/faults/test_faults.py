@@ -108,7 +108,7 @@ def test_a_full_disk_stops_a_run_with_one_line_and_a_later_one_completes_it(
     kib: int, undisturbed: Undisturbed, command: str, plugins_folder: Path, vibench: Vibench, place: Path
 ) -> None:
     """No file may be longer than so many KiB, which is how a disk of that size looks to every process of the run."""
-    limited = ["bash", "-c", f'ulimit -f {kib}; exec "$0" "$@"', command, *OPTIONS]
+    limited = ["bash", "-c", f'ulimit -f {kib}; PYTHONDONTWRITEBYTECODE=1 exec "$0" "$@"', command, *OPTIONS]
     with started(limited, place, plugins_folder) as process:
         _, errors = process.communicate(timeout=120)
     assert process.returncode in (1, 2)

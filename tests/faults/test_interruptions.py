@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import contextlib
 import os
+import shutil
 import signal
 import time
 from pathlib import Path
 
 import pandas as pd
 import pytest
-from running import Vibench, read_until, rows, run_again, started, without_seconds, workers
+from running import Main, Vibench, read_until, rows, run_again, started, without_seconds, workers
 from samples import wire_study, write_study
+
+from vibench.results import tables
 
 
 @pytest.fixture
@@ -109,3 +112,59 @@ def test_two_runs_do_not_write_into_one_folder(
         out, err = process.communicate(timeout=60)
     assert (process.returncode, err) == (0, "")
     assert "2 cells, 2 ok" in out
+
+
+@pytest.mark.parametrize("swapped", [False, True], ids=["removed", "swapped"])
+def test_a_run_folder_that_is_gone_ends_the_run_with_a_line(
+    swapped: bool, command: str, plugins_folder: Path, vibench: Vibench, waiting: Path
+) -> None:
+    """At the next commit; what was computed is in the store of artefacts, from which the next run takes it."""
+    folder = waiting / "runs" / "wire"
+    with started([command, "run", "study.toml", "--jobs", "2", "--no-figures"], waiting, plugins_folder) as process:
+        read_until(process, "[1/2] ok")
+        folder.rename(waiting / "elsewhere")
+        if swapped:
+            shutil.copytree(waiting / "elsewhere", folder)
+        (waiting / "go on").touch()
+        out, err = process.communicate(timeout=60)
+    assert process.returncode == 1
+    assert err.endswith(
+        "removed or replaced during the run; the same command runs its cells again, with the artefacts that are "
+        "stored\n"
+    )
+    assert err.count("\n") == 1
+    assert "results:" not in out
+    assert [row["dual"] for row in rows(waiting / "elsewhere")] == ["cpg"]
+    shutil.rmtree(folder, ignore_errors=True)
+    printed, after = run_again(vibench, waiting)
+    assert "2 cells, 2 to run" in printed
+    assert "high-fidelity solutions" not in printed
+    assert [row["status"] for row in after] == ["ok", "ok"]
+
+
+@pytest.mark.parametrize(
+    "module", ["typer", "numpy", "scipy.sparse", "pandas", "vibench.execution.run", "vibench.study.reader"]
+)
+def test_an_interrupt_among_the_imports_ends_the_command_with_a_line(
+    module: str, command: str, plugins_folder: Path, waiting: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Python tells of every import as soon as it is done; the signal comes during a later one."""
+    monkeypatch.setenv("PYTHONPROFILEIMPORTTIME", "1")
+    (waiting / "go on").touch()  # a run that misses the signal comes to its end
+    with started([command, "run", "study.toml", "--no-figures"], waiting, plugins_folder) as process:
+        assert process.stderr is not None
+        while (line := process.stderr.readline()).rpartition("|")[2].strip() != module:
+            assert line, f"{module} was not imported"
+        process.send_signal(signal.SIGINT)
+        out, err = process.communicate(timeout=60)
+    said = [line for line in err.splitlines() if not line.startswith("import time:")]
+    assert (process.returncode, out, said) == (130, "", ["vibench: interrupted"])
+    assert not (waiting / "runs").exists()
+
+
+def test_an_interrupt_ends_any_command_with_a_line(main: Main, monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupted(_: str) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(tables, "results_file", interrupted)
+    assert main("show", "quick") == (130, "", "vibench: interrupted\n")

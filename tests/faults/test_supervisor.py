@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import random
 import signal
 import subprocess
 import sys
@@ -136,21 +137,38 @@ def test_a_finish_that_dies_is_tried_once_more_with_what_is_there(run: Run) -> N
     assert found.status is Status.CRASHED
 
 
-def test_what_a_plugin_started_ends_with_its_process(watcher: Supervisor, tmp_path: Path) -> None:
-    assert isinstance(watcher.run(Job(str(tmp_path), InPieces(("child",)), 1.0, 30.0, 8.0)), Done)
-    deadline = time.monotonic() + 10.0
-    while not sleepers() and time.monotonic() < deadline:  # a process that has just begun has no name yet
-        time.sleep(0.01)
-    assert sleepers()
+@pytest.mark.parametrize("kind", ["child", "daemon"])
+def test_what_a_plugin_started_ends_with_its_process(kind: str, watcher: Supervisor, tmp_path: Path) -> None:
+    seconds = unique()
+    assert isinstance(watcher.run(Job(str(tmp_path), InPieces((f"{kind} {seconds}",)), 1.0, 30.0, 8.0)), Done)
+    await_sleeper(seconds)
     watcher.close()
-    assert not sleepers()
+    assert not sleepers(seconds)
 
 
-def sleepers() -> list[str]:
+def test_a_daemon_does_not_outlive_a_process_that_dies(run: Run) -> None:
+    seconds = unique()
+    found = run(InPieces((f"daemon {seconds}", "exit", "fine")))
+    assert isinstance(found, Done)
+    assert [isinstance(value, Failed) for _, value in found.value] == [False, True, False]
+    assert not sleepers(seconds)
+
+
+def unique() -> int:
+    """A number of seconds by which a test knows its own `sleep`."""
+    return 10**6 + random.randrange(10**9)
+
+
+def await_sleeper(seconds: int) -> None:
+    while not sleepers(seconds):  # a process that has just begun has no name yet
+        time.sleep(0.01)
+
+
+def sleepers(seconds: int) -> list[str]:
     found = []
     for path in Path("/proc").glob("[0-9]*/cmdline"):
         with contextlib.suppress(OSError):
-            found += [str(path)] if path.read_bytes() == b"sleep\x00601\x00" else []
+            found += [str(path)] if path.read_bytes() == f"sleep\0{seconds}\0".encode() else []
     return found
 
 
@@ -257,11 +275,12 @@ def test_a_keeper_that_is_closed_stops_at_once_and_leaves_nobody(watcher: Superv
 
 
 def test_a_worker_does_not_outlive_its_supervisor(tmp_path: Path) -> None:
-    """Not even one that sleeps in a plugin, when the supervisor's process is killed."""
-    diary = tmp_path / "diary"
+    """Not even one that sleeps in a plugin, nor what that started, when the supervisor's process is killed."""
+    diary, seconds = tmp_path / "diary", unique()
     code = (
-        "from vibench.execution.supervisor import *; from fake_stages import Whole\n"
-        f"Supervisor().run(Job({str(tmp_path)!r}, Whole('sleep', {str(diary)!r}), 1.0, 600.0, 8.0))"
+        "from vibench.execution.supervisor import *; from fake_stages import InPieces, Whole\n"
+        f"one = Supervisor(); one.run(Job({str(tmp_path)!r}, InPieces(('daemon {seconds}',)), 1.0, 600.0, 8.0))\n"
+        f"one.run(Job({str(tmp_path)!r}, Whole('sleep', {str(diary)!r}), 1.0, 600.0, 8.0))"
     )
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
     process = subprocess.Popen([sys.executable, "-c", code], env=environment)
@@ -275,6 +294,8 @@ def test_a_worker_does_not_outlive_its_supervisor(tmp_path: Path) -> None:
         try:
             os.kill(worker, 0)
         except ProcessLookupError:
-            return
+            break
         time.sleep(0.1)
-    pytest.fail("the worker goes on")
+    else:
+        pytest.fail("the worker goes on")
+    assert not sleepers(seconds)

@@ -37,10 +37,18 @@ def misbehave(how: str) -> None:
         os.fork()
     elif how == "hunger":
         np.ones(2**36)
-    elif how == "child":  # which would outlive its parent
-        subprocess.Popen(["sleep", "601"])
     elif how == "moment":
         time.sleep(0.05)
+    else:
+        start(*how.split())
+
+
+def start(kind: str = "", *seconds: str) -> None:
+    """Start a process that would outlive its parent; a daemon is in a session of its own, and soon nobody's child."""
+    if kind == "child":
+        subprocess.Popen(["sleep", *seconds])
+    elif kind == "daemon":
+        subprocess.run(["sh", "-c", f"setsid sleep {seconds[0]} >/dev/null 2>&1 &"], check=True)
 
 
 @dataclass(frozen=True)

@@ -297,3 +297,18 @@ def test_clean_shows_and_frees_what_artefacts_take(
         assert len(list(artefacts.glob(f"*{SUFFIX}"))) == left
     assert "MiB freed" in done.stdout
     assert (tmp_path / "runs" / "wire" / FILE).exists()
+
+
+def test_fresh_begins_anew_where_the_results_file_is_damaged(vibench: Vibench, again: Path) -> None:
+    """It is kept; without --fresh it is refused in a line that says so."""
+    path = again / "runs" / "wire" / FILE
+    path.write_bytes(b"\xff" * 5000)
+    refused = vibench(again, "run", "study.toml")
+    assert refused.returncode == 2
+    assert refused.stderr.count("\n") == 1
+    assert "or --fresh, which keeps it as results.sqlite.damaged" in refused.stderr
+    printed, after = run_again(vibench, again, "--fresh")
+    assert f"is kept as 'runs/wire/{FILE}.damaged'" in printed.splitlines()[0]
+    assert "3 cells, 3 to run" in printed
+    assert len(after) == 3
+    assert path.with_name(f"{FILE}.damaged").read_bytes() == b"\xff" * 5000

@@ -110,7 +110,7 @@ def cells(context: typer.Context, incomplete: str) -> list[tuple[str, str]]:
 
 def _registered(*groups: str) -> set[str]:
     """Names in the entry points themselves: `vibench.study.registry` would import SciPy and pydantic."""
-    from importlib.metadata import entry_points
+    from vibench.study.entry_points import entry_points
 
     return {entry.name for group in groups for entry in entry_points(group=f"vibench.{group}")}
 

@@ -31,6 +31,7 @@ from vibench.qp.solve import installed_solvers
 from vibench.qp.status import Status
 from vibench.stages.artefacts import CACHE_VARIABLE, LOCK, Store, default_folder
 from vibench.study import registry
+from vibench.study.entry_points import unreadable
 from vibench.study.reader import read_study
 from vibench.terminal.console import new_console, shown
 from vibench.timing import DISTURBED, WAITED, Calibration, Stopwatch
@@ -146,6 +147,7 @@ def plugins() -> Iterator[Finding]:
         yield Finding(kind, ", ".join(name for name in names if name not in errors) or "none")
         for name, error in errors.items():
             yield Finding(f"{kind} '{name}'", f"{error} (from {registry.version(kind, name)})", Health.BROKEN)
+    yield from (Finding(name, reason, Health.BROKEN) for name, reason in unreadable().items())
 
 
 def _names(kind: str) -> tuple[list[str], str]:

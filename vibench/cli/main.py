@@ -6,20 +6,24 @@ pandas, rich or pydantic): every command imports what it needs when it runs.
 
 from __future__ import annotations
 
+import os
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-import typer
-from typer import Argument, Option
+from vibench.cli.interrupts import INTERRUPTED, Interrupted, interrupted_at_once, interruptible
 
-from vibench.cli.completion import examples, names, solvers, studies
-from vibench.cli.output import echo
-from vibench.cli.plugin_commands import check_plugin, list_plugins, new_plugin
-from vibench.cli.result_commands import compare_runs, export_qps, replay_query, show, write_report
-from vibench.errors import RequestError, VibenchError
-from vibench.text import unbroken
+with interrupted_at_once():
+    import typer
+    from typer import Argument, Option
+
+    from vibench.cli.completion import examples, names, solvers, studies
+    from vibench.cli.output import echo
+    from vibench.cli.plugin_commands import check_plugin, list_plugins, new_plugin
+    from vibench.cli.result_commands import compare_runs, export_qps, replay_query, show, write_report
+    from vibench.errors import RequestError, VibenchError
+    from vibench.text import unbroken
 
 Names = list[str] | None
 Tolerances = list[float] | None
@@ -60,20 +64,21 @@ def run(
     ] = None,
 ) -> None:
     """Run a study. An interrupted run resumes where it stopped."""
-    from vibench import provenance
-    from vibench.execution.run import Options, run_study
-    from vibench.qp.status import Status
-    from vibench.results import tables
-    from vibench.study.cells import expand
-    from vibench.study.reader import read_study
-    from vibench.terminal.console import new_console
-    from vibench.terminal.progress import ProgressDisplay
+    with interrupted_at_once():  # the libraries and plugins of a study take a second to import
+        from vibench import provenance
+        from vibench.execution.run import Options, run_study
+        from vibench.qp.status import Status
+        from vibench.results import tables
+        from vibench.study.cells import expand
+        from vibench.study.reader import read_study
+        from vibench.terminal.console import new_console
+        from vibench.terminal.progress import ProgressDisplay
 
-    overrides = {
-        "problem": problem, "dual": dual, "primal": primal, "solvers": solver,
-        "pod": pod_tol, "dual_tol": dual_tol, "primal_tol": primal_tol,
-    }  # fmt: skip
-    loaded = read_study(study, {axis: values for axis, values in overrides.items() if values})
+        overrides = {
+            "problem": problem, "dual": dual, "primal": primal, "solvers": solver,
+            "pod": pod_tol, "dual_tol": dual_tol, "primal_tol": primal_tol,
+        }  # fmt: skip
+        loaded = read_study(study, {axis: values for axis, values in overrides.items() if values})
     if dry_run:
         cells = expand(loaded)
         echo(*(f"{cell.key}  {cell}" for cell in cells), f"{len(cells)} cells")
@@ -88,7 +93,7 @@ def run(
     tables.export(path, folder / "tables")
     if outcome.interrupted:
         echo(f"interrupted: {outcome.missing} cells have no row yet; the same command resumes the run")
-        raise typer.Exit(130)
+        raise typer.Exit(INTERRUPTED)
     drawn: list[Path] = []
     if draw or fresh:
         from vibench.report import figures
@@ -175,26 +180,38 @@ COMMANDS: dict[str, Callable[..., None]] = {
     "check": check_plugin, "new": new_plugin,
 }  # fmt: skip
 for _name, _command in COMMANDS.items():
-    app.command(_name, epilog=examples(_name))(_command)
+    app.command(_name, epilog=examples(_name))(interruptible(_command))
 
 
 def main() -> None:
     """Entry point: an expected error is one line; exit code 2 for a wrong request, 1 for anything else."""
     usage_error = typer.BadParameter.__mro__[2]  # click's ClickException, whichever copy of click typer brings
     try:
+        _search_working_directory_last()
         code = app(args=sys.argv[1:] or ["--help"], standalone_mode=False)
     except VibenchError as error:
         code = _print_error(error, 2 if isinstance(error, RequestError) else 1)
     except OSError as error:
         where = f"'{error.filename}' cannot be written or read: " if error.filename else ""
         code = _print_error(f"{where}{error.strerror or error}", 1)
-    except typer.Abort:
-        code = 130
+    except (Interrupted, typer.Abort):
+        code = _print_error("interrupted", INTERRUPTED)
     except Exception as error:
         if not isinstance(error, usage_error):
             raise
         code = _print_error(error.format_message(), 2)  # type: ignore[attr-defined]
     sys.exit(code if isinstance(code, int) else 0)
+
+
+def _search_working_directory_last() -> None:
+    """Let nothing in the working directory take the place of an installed package.
+
+    An empty entry of PYTHONPATH, which `PYTHONPATH=FOLDER:$PYTHONPATH` leaves, puts it first. Workers search as we do.
+    """
+    first, *more = os.environ.get("PYTHONPATH", "").split(os.pathsep)
+    if more and "" in (first, *more):
+        here = os.path.realpath(os.curdir)
+        sys.path[:] = [*(folder for folder in sys.path if folder != here), here]
 
 
 def _print_error(error: object, code: int) -> int:

@@ -40,6 +40,7 @@ def list_plugins(
     """List problems, strategies, studies and QP solvers. Plugins are listed with their options."""
     import pandas as pd
 
+    from vibench.study.entry_points import unreadable
     from vibench.terminal.console import print_frame
 
     if what is not None and what not in (*LISTS, "solvers"):
@@ -48,6 +49,8 @@ def list_plugins(
         rows = _solver_rows() if title == "solvers" else _plugin_rows(LISTS[title])
         columns = ("name", "version" if title == "solvers" else "from", "what", "options")
         print_frame(pd.DataFrame(rows, columns=columns), title)
+    for distribution, reason in unreadable().items():
+        echo(f"{distribution}: {reason}")
 
 
 def check_plugin(
@@ -147,6 +150,8 @@ def _plugin_rows(kind: str) -> list[tuple[str, str, str, str]]:
                 options = registry.options(kind, name)
         except RequestError as error:
             description = str(error)
+        except Exception as error:  # noqa: BLE001  annotations of plugins are evaluated
+            description = f"{kind} '{name}' cannot be read: {in_a_line(error)}"
         lines = [f"{o.name}: {o.expected}" + f" = {o.default}" * bool(o.default) for o in options]
         rows.append((name, registry.version(kind, name), description, "\n".join(lines)))
     return rows

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import resource
 import secrets
 import signal
 import threading
@@ -18,6 +19,9 @@ from vibench.execution.supervisor import Job, Supervisor, code_here
 from vibench.provenance import machine
 from vibench.qp.status import Status
 from vibench.stages.base import Failed
+
+OPEN_FILES, OPEN_FILES_OF_A_WORKER = 64, 16
+"""Files and sockets that a cluster keeps open, and for each worker; about 30 and 11 were counted in /proc."""
 
 
 class Dask(Executor):
@@ -38,7 +42,8 @@ class Dask(Executor):
     Raises
     ------
     RequestError
-        If dask.distributed is not installed, the scheduler does not answer, or a worker cannot run the jobs.
+        If dask.distributed is not installed, this process may not open enough files, the scheduler does not answer, or
+        a worker cannot run the jobs.
     """
 
     def __init__(self, scheduler: str | None, slots: int, store: Path) -> None:
@@ -48,6 +53,7 @@ class Dask(Executor):
             raise RequestError(
                 "the executor 'dask' needs dask.distributed: install vibench with its extra 'cluster'"
             ) from None
+        _allow_open_files(slots if scheduler is None else 0)
         self._token = secrets.token_hex(8)
         self._cluster: Any = None
         if scheduler is None:
@@ -107,6 +113,20 @@ class Dask(Executor):
         self._client.close()
         if self._cluster is not None:
             self._cluster.close()
+
+
+def _allow_open_files(workers: int) -> None:
+    """Raise the soft limit of open files as far as a cluster needs it: below that, dask does not stop trying."""
+    needed = OPEN_FILES + workers * OPEN_FILES_OF_A_WORKER
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    if soft == resource.RLIM_INFINITY or soft >= needed:
+        return
+    if hard != resource.RLIM_INFINITY and hard < needed:
+        raise RequestError(
+            f"the executor 'dask' needs {needed} open files, the limit is {hard}: raise it (`ulimit -n {needed}`), "
+            "ask for fewer --jobs, or use the executor 'local'"
+        )
+    resource.setrlimit(resource.RLIMIT_NOFILE, (needed, hard))
 
 
 @contextlib.contextmanager

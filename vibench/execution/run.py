@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from vibench import provenance
 from vibench.errors import ExecutorError, RequestError, StorageError, VibenchError, in_a_line
 from vibench.execution.dask import Dask
 from vibench.execution.executors import Executor, Local
@@ -20,8 +21,9 @@ from vibench.execution.timing_plan import TimingPlan
 from vibench.qp.solve import installed_solvers
 from vibench.qp.status import Status
 from vibench.results.break_even import break_even_rows
-from vibench.results.database import FILE, ResultsDatabase, claimed, read_meta, study_of
+from vibench.results.database import FILE, DamagedError, ResultsDatabase, claimed, read_meta, study_of
 from vibench.results.solver_agreement import disagreement_rows
+from vibench.results.sqlite_files import DAMAGED, set_aside
 from vibench.results.tables import EXPORTED
 from vibench.stages.artefacts import Store, usable_store
 from vibench.stages.base import Done, Failed, Stage, Unstored
@@ -33,6 +35,9 @@ from vibench.study.spec import Study
 
 CHECK_INTERVAL = 5.0
 """Seconds between two checks that the executor still runs."""
+
+JOBS_PER_CORE = 16
+"""Most worker processes per core: more than one makes a run slower, and thousands stop the machine."""
 
 REPORT = "report.html"
 """File in the run folder that `vibench report` writes unless told otherwise."""
@@ -57,6 +62,9 @@ class Agenda:
 
 class Observer:
     """Follows a run; this one shows nothing."""
+
+    def note(self, line: str) -> None:
+        """Something the user should know."""
 
     def start(self, agenda: Agenda) -> None:
         """The run begins."""
@@ -127,14 +135,15 @@ def run_study(study: Study, folder: Path, observer: Observer, options: Options =
     Raises
     ------
     RequestError
-        If the folder, the store of artefacts or the executor cannot be used.
+        If the folder, the store of artefacts or the executor cannot be used, or there are too many jobs.
     StorageError
         If something cannot be written; what was written before is kept.
     """
+    _check_jobs(options.jobs)
     cells, store = expand(study), usable_store()
     with claimed(folder), store.used():
         if options.fresh:
-            _clear(folder, study)
+            _clear(folder, study, observer)
         database = ResultsDatabase(folder, identity(study), anew=options.fresh)
         try:
             finished = database.finished()
@@ -153,18 +162,30 @@ def run_study(study: Study, folder: Path, observer: Observer, options: Options =
     return Outcome(rows, len(cells) - len(rows), interrupted)
 
 
+def _check_jobs(jobs: int) -> None:
+    most = JOBS_PER_CORE * provenance.cores()
+    if not 1 <= jobs <= most:
+        raise RequestError(f"--jobs {jobs}: expected 1 to {most} worker processes, {JOBS_PER_CORE} per core")
+
+
 def _to_do(cell: Cell, finished: Mapping[str, tuple[str, str]], retry: bool) -> bool:
     status, code = finished.get(cell.key, (None, None))
     return code != cell.code or (retry and status != Status.OK)
 
 
-def _clear(folder: Path, study: Study) -> None:
+def _clear(folder: Path, study: Study, observer: Observer) -> None:
     """Remove the tables, log and report of a study's earlier run; refuse the folder of another study.
 
-    Nothing else: a user may keep notes beside them. Figures are removed when they are drawn anew.
+    Nothing else: a user may keep notes beside them. Figures are removed when they are drawn anew. A results file that
+    cannot be read is kept under another name.
     """
     path = folder / FILE
-    meta = read_meta(path) if path.is_file() else {}
+    try:
+        meta = read_meta(path) if path.is_file() else {}
+    except DamagedError as error:
+        set_aside(path)
+        observer.note(f"{error}; it is kept as '{path}{DAMAGED}'")
+        meta = {}
     there = study_of(path, meta).get("name") if meta else study.name
     if there != study.name:
         raise RequestError(f"'{folder}' holds results of the study '{there}'; --fresh removes only '{study.name}'")

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import secrets
 import signal
 import socket
 import subprocess
@@ -20,6 +21,7 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
+from vibench.execution.descendants import MARK, kill_marked
 from vibench.provenance import NUMERICAL, core_code, libraries
 from vibench.qp.status import Status
 from vibench.stages.base import Done, Failed, PiecewiseStage, Stage, Unstored
@@ -172,6 +174,7 @@ class Supervisor:
         self._log, self._environment = log, dict(environment or {})
         self._process: subprocess.Popen[bytes] | None = None
         self._connection: Connection | None = None
+        self._mark = secrets.token_hex(8)
         self._stop = threading.Event()
 
     def run(self, job: Job, observe: Callable[[Any], None] = lambda _: None) -> Done | Failed | Unstored:
@@ -243,7 +246,8 @@ class Supervisor:
     def _worker(self) -> tuple[Connection, subprocess.Popen[bytes]]:
         """The worker process, started where there is none, and the connection to it.
 
-        It leads its own process group: Ctrl-C on the terminal does not reach it, and children of plugins die with it.
+        It leads its own process group: Ctrl-C on the terminal does not reach it, and children of plugins die with it,
+        as do those in other groups, by their mark.
         """
         if self._connection is None or self._process is None:
             ours, theirs = socket.socketpair()
@@ -251,7 +255,7 @@ class Supervisor:
             with theirs:
                 self._process = subprocess.Popen(
                     [sys.executable, *command],
-                    env=_environment({**os.environ, **self._environment}),
+                    env=_environment({**os.environ, **self._environment}) | {MARK: self._mark},
                     pass_fds=[theirs.fileno()],
                     stdin=subprocess.DEVNULL,
                     process_group=0,
@@ -266,6 +270,7 @@ class Supervisor:
             with contextlib.suppress(ProcessLookupError):
                 os.killpg(process.pid, signal.SIGKILL)
             process.wait()
+            kill_marked(self._mark)
         if connection is not None:
             connection.close()
 

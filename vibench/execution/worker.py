@@ -19,6 +19,7 @@ from typing import Any, TypeVar
 from threadpoolctl import threadpool_limits
 
 from vibench.errors import NumericalError, StorageError, VibenchError, in_a_line, message_of
+from vibench.execution.descendants import MARK, kill_marked
 from vibench.execution.supervisor import Begun, Finished, Job, OutOfMemory, Progress, Watch, code_here
 from vibench.qp.status import Status
 from vibench.stages.artefacts import Store
@@ -71,6 +72,7 @@ def _end_with(parent: int) -> None:
     """Kill this process and the children of plugins once the parent has died, since its limits are not enforced."""
     while os.getppid() == parent:
         time.sleep(1.0)
+    kill_marked(os.environ[MARK])
     os.killpg(0, signal.SIGKILL)
 
 

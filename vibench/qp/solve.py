@@ -19,6 +19,7 @@ import scipy.sparse as sp
 from vibench.arrays import Array
 from vibench.errors import NumericalError, message_of
 from vibench.interfaces.problem import VariationalInequality
+from vibench.provenance import solver_version
 from vibench.qp.scaling import Units, prescribed, row_norms, units_of, units_of_dual
 from vibench.qp.settings import SETTINGS
 from vibench.qp.solution import QPSolution, QPSolver
@@ -139,8 +140,12 @@ def _solve_dual(
 
 
 def installed_solvers(extra: Iterable[str] = ()) -> list[str]:
-    """Names of the installed solvers, with those that plugins register as `extra`."""
-    return sorted(set(qpsolvers.available_solvers) & set(SETTINGS) | set(extra))
+    """Names of the installed solvers, with those that plugins register as `extra`.
+
+    Only those of an installed distribution: any folder called like a solver can be imported from the working directory.
+    """
+    known = {name for name in qpsolvers.available_solvers if name in SETTINGS and solver_version(name)}
+    return sorted(known | set(extra))
 
 
 def takes_start(solver: str) -> bool:

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import contextlib
+import io
+import tempfile
+from collections.abc import Iterator, Sequence
 from functools import partial
 from importlib.resources import files
 from itertools import chain
@@ -16,6 +19,7 @@ import qpsolvers
 from vibench.arrays import Array
 from vibench.errors import RequestError, in_a_line
 from vibench.execution.recorded_cell import RecordedCell, recorded_cells
+from vibench.files import PART, TEMPORARY, write_atomically
 from vibench.interfaces.problem import VariationalInequality
 from vibench.qp import verification
 from vibench.qp.solution import QPSolution
@@ -51,7 +55,7 @@ def replay(recorded: RecordedCell, query: int, file: Path) -> pd.DataFrame:
     Raises
     ------
     RequestError
-        If the cell has no such query, or the file is no npz file.
+        If the cell has no such query, or the file is no npz file or cannot be written.
     """
     if file.suffix != ".npz":
         raise RequestError(f"'{file}': the program is written as an npz file, whose name must end in .npz")
@@ -59,7 +63,8 @@ def replay(recorded: RecordedCell, query: int, file: Path) -> pd.DataFrame:
     if query not in rows:
         raise RequestError(f"cell {recorded.row['cell']} has no query {query}; it has 0 to {len(rows) - 1}")
     program, accuracy = recorded.program(query), recorded.cell.accuracy
-    write_program(program, file)
+    with _writing(file):
+        write_program(program, file)
     known: Array | None = None
     table: list[dict[str, Any]] = []
     if found := recorded.rows("solutions").get(query):
@@ -88,9 +93,26 @@ def _line(program: VariationalInequality, solution: QPSolution, accuracy: float,
 
 
 def write_program(program: VariationalInequality, file: Path) -> None:
-    """Write min ½xᵀPx + qᵀx, Gx ≤ h in the format of qpsolvers: an npz file with P, q, G, h."""
+    """Write min ½xᵀPx + qᵀx, Gx ≤ h in the format of qpsolvers: an npz file with P, q, G, h.
+
+    Raises
+    ------
+    OSError
+        If it cannot be written; nothing is left behind.
+    """
+    content = io.BytesIO()  # zipfile itself leaves half a file on a full disk, and a traceback when that is closed
+    qpsolvers.Problem(program.A, -program.f, program.B, program.g).save(content)  # type: ignore[arg-type]  # a file will do
     file.parent.mkdir(parents=True, exist_ok=True)
-    qpsolvers.Problem(program.A, -program.f, program.B, program.g).save(str(file))
+    write_atomically(file, content.getvalue())
+
+
+@contextlib.contextmanager
+def _writing(target: Path) -> Iterator[None]:
+    """Block in which a file that cannot be written makes the request for `target` a wrong one."""
+    try:
+        yield
+    except OSError as error:
+        raise RequestError(f"'{target}' cannot be written: {error.strerror or error}") from None
 
 
 def export(run: str, folder: Path) -> int:
@@ -98,21 +120,33 @@ def export(run: str, folder: Path) -> int:
 
     The folder holds `programs/NAME.npz` (P, q, G, h), `solutions/NAME.npz` (x_CELL, z_CELL for every cell with a
     solution: a solver at an accuracy), `rows.csv` (a line per solution: status, accuracy, residuals) and `check.py`,
-    which recomputes the residuals of every solution.
+    which recomputes the residuals of every solution. It gets its name when it is complete.
 
     Raises
     ------
     RequestError
-        If there is no such run, the folder is not empty, or other code computed the run.
+        If there is no such run, the folder is not empty or cannot be written, or other code computed the run.
     """
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise RequestError(f"'{folder}' exists and is not an empty folder; choose another")
     models: dict[str, list[RecordedCell]] = {}
     for recorded in recorded_cells(run):
         models.setdefault(recorded.row["model"], []).append(recorded)
-    programs = [rows for cells in models.values() for rows in _exported(cells, folder)]
-    if not programs:
+    if not models:
         raise RequestError(f"no cell of '{run}' has a reduced program")
+    with _writing(folder):
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(dir=folder.parent, prefix=TEMPORARY, suffix=PART) as scratch:
+            new = Path(scratch) / folder.name
+            new.mkdir()
+            count = _write_set(list(models.values()), new)
+            new.replace(folder)
+    return count
+
+
+def _write_set(models: Sequence[list[RecordedCell]], folder: Path) -> int:
+    """Write the programs of some reduced models, each given by its cells; returns their number."""
+    programs = [rows for cells in models for rows in _exported(cells, folder)]
     table = to_csv(pd.DataFrame(chain.from_iterable(programs)))
     (folder / "rows.csv").write_text(table, encoding="utf-8")
     (folder / CHECKER).write_bytes((files("vibench.report") / "qps_checker.py").read_bytes())
@@ -133,6 +167,8 @@ def _exported(cells: list[RecordedCell], folder: Path) -> Iterator[list[dict[str
                 arrays[f"x_{cell}"], arrays[f"z_{cell}"] = vectors(solutions[query])
                 about = {"program": name, "solver": recorded.cell.solver, "cell": cell}
                 rows.append(about | {"accuracy": recorded.cell.accuracy} | {key: row[key] for key in KEPT})
+        content = io.BytesIO()
+        np.savez(content, **arrays)
         (folder / "solutions").mkdir(exist_ok=True)
-        np.savez(folder / "solutions" / f"{name}.npz", **arrays)
+        (folder / "solutions" / f"{name}.npz").write_bytes(content.getvalue())
         yield rows

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import os
 import sqlite3
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -12,6 +13,7 @@ from typing import Any
 from vibench.errors import RequestError, StorageError
 from vibench.locking import locked
 from vibench.results.columns import HISTORY_KEYS, STORED, VERSION
+from vibench.results.sqlite_files import BUSY_SECONDS, DAMAGE, DAMAGED, LOG, code_of, connected_read_only
 from vibench.results.values import UnstorableError, error_row, storable
 from vibench.text import printable
 
@@ -22,6 +24,10 @@ NAMED = ("stage", "quantity", *HISTORY_KEYS)
 
 LOCK = ".lock"
 """Lock file in a run folder, held during a run."""
+
+
+class DamagedError(RequestError):
+    """A results file that cannot be read: cut off, overwritten, or from a disk that failed."""
 
 
 @contextlib.contextmanager
@@ -36,7 +42,8 @@ def claimed(folder: Path) -> Iterator[None]:
     try:
         if folder.exists() and not folder.is_dir():
             raise RequestError(f"output folder '{folder}' is a file")
-        if folder.is_dir() and not (folder / FILE).exists() and any(path.name != LOCK for path in folder.iterdir()):
+        known = {LOCK, FILE + DAMAGED, FILE + DAMAGED + LOG}
+        if folder.is_dir() and not (folder / FILE).exists() and {path.name for path in folder.iterdir()} - known:
             raise RequestError(f"output folder '{folder}' is not empty and holds no {FILE}; choose another with --out")
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -76,13 +83,15 @@ class ResultsDatabase:
             if not anew:
                 _refuse_other(path, study)
             folder.mkdir(parents=True, exist_ok=True)
-            self._db = sqlite3.connect(path.absolute())  # SQLite may take a name that begins with "file:" for a URI
+            self._path = path.absolute()  # SQLite may take a name that begins with "file:" for a URI
+            self._db = sqlite3.connect(self._path, timeout=BUSY_SECONDS)
             self._db.text_factory = _read_text
             self._db.execute("PRAGMA journal_mode=WAL")
             with self._db:
                 self._db.execute("BEGIN IMMEDIATE")
                 self._create(study, anew)
             self._db.execute("PRAGMA foreign_keys=ON")
+            self._opened = self._path.stat()
         except (OSError, sqlite3.Error) as error:
             raise RequestError(f"output folder '{folder}' cannot be written: {error}") from None
 
@@ -215,14 +224,30 @@ class ResultsDatabase:
 
     @contextlib.contextmanager
     def _writing(self) -> Iterator[None]:
-        """One transaction, rolled back if it cannot be written."""
+        """One transaction, rolled back if it cannot be written, or is written into a file that nobody will find."""
         try:
             with self._db:
+                self._db.execute("BEGIN IMMEDIATE")
                 yield
+                self._check_place()
         except sqlite3.DatabaseError as error:
-            if getattr(error, "sqlite_errorcode", 0) & 0xFF not in UNWRITABLE:
+            code = code_of(error)
+            if code not in UNWRITABLE:
                 raise
-            raise StorageError(f"results cannot be written: {error}") from None
+            waited = f" by another program for {BUSY_SECONDS:g} s" if code == sqlite3.SQLITE_BUSY else ""
+            raise StorageError(f"results cannot be written: {error}{waited}") from None
+
+    def _check_place(self) -> None:
+        """Refuse to go on where the results file was removed, or another one has its name, since it was opened."""
+        try:
+            there = os.path.samestat(self._path.stat(), self._opened)
+        except OSError:
+            there = False
+        if not there:
+            raise StorageError(
+                f"'{self._path}' was removed or replaced during the run; the same command runs its cells again, "
+                "with the artefacts that are stored"
+            )
 
     def _insert(self, table: str, rows: Iterable[Mapping[str, Any]]) -> None:
         for row in rows:
@@ -244,7 +269,10 @@ def _read_text(stored: bytes) -> str:
 
 
 def _refuse_other(path: Path, study: Mapping[str, Any]) -> None:
-    found = read_meta(path) if path.exists() else {}
+    try:
+        found = read_meta(path) if path.exists() else {}
+    except DamagedError as error:
+        raise RequestError(f"{error}; use another --out, or --fresh, which keeps it as {FILE}{DAMAGED}") from None
     if not found:  # empty where a run was killed before its first transaction
         return
     if found.get("schema") != str(VERSION):
@@ -257,15 +285,16 @@ def _refuse_other(path: Path, study: Mapping[str, Any]) -> None:
         raise RequestError(f"'{path.parent}' holds results of another study ({what}); use another --out, or --fresh")
 
 
-def open_read_only(path: Path) -> contextlib.closing[sqlite3.Connection]:
+@contextlib.contextmanager
+def open_read_only(path: Path) -> Iterator[sqlite3.Connection]:
     """Context with a connection that cannot write to the results file, and runs no code that its schema names.
 
     What it reads is `printable`.
     """
-    connection = sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro", uri=True)
-    connection.execute("PRAGMA trusted_schema=OFF")
-    connection.text_factory = _read_text
-    return contextlib.closing(connection)
+    with connected_read_only(path) as connection:
+        connection.execute("PRAGMA trusted_schema=OFF")
+        connection.text_factory = _read_text
+        yield connection
 
 
 def read_meta(path: Path) -> dict[str, str]:
@@ -273,8 +302,10 @@ def read_meta(path: Path) -> dict[str, str]:
 
     Raises
     ------
+    DamagedError
+        If the file cannot be read.
     RequestError
-        If the file is not a results file.
+        If it is a database, but no results file.
     """
     try:
         with open_read_only(path) as db:
@@ -283,10 +314,11 @@ def read_meta(path: Path) -> dict[str, str]:
                 raise RequestError(f"'{path}' is not a results file of vibench: it has a {min(strange)}")
             damage = "; ".join(line for (line,) in db.execute("PRAGMA quick_check(1)") if line != "ok")
             if damage:
-                raise RequestError(f"'{path}' is damaged: {' '.join(damage.split())}")
+                raise DamagedError(f"'{path}' is damaged: {' '.join(damage.split())}")
             return dict(db.execute("SELECT key, value FROM meta")) if kinds else {}
     except (sqlite3.Error, UnicodeDecodeError) as error:
-        raise RequestError(f"'{path}' is not a results file of vibench: {error}") from None
+        sort = DamagedError if isinstance(error, sqlite3.Error) and code_of(error) in DAMAGE else RequestError
+        raise sort(f"'{path}' is not a results file of vibench: {error}") from None
 
 
 def study_of(path: Path, meta: Mapping[str, str]) -> dict[str, Any]:

@@ -8,7 +8,7 @@ import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
-from importlib.metadata import EntryPoint, entry_points
+from importlib.metadata import EntryPoint
 from pathlib import Path
 from typing import Any, get_type_hints
 
@@ -19,6 +19,7 @@ from vibench.interfaces.problem import Problem
 from vibench.interfaces.strategies import DualStrategy, PrimalStrategy
 from vibench.provenance import distribution_version, source_hash
 from vibench.qp.solution import QPSolver
+from vibench.study.entry_points import entry_points
 
 GROUPS: Mapping[str, str] = {
     "problem": "vibench.problems",

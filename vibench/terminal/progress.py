@@ -71,6 +71,10 @@ class ProgressDisplay(Observer):
         if self._bar is not None:
             self._bar.stop()
 
+    def note(self, line: str) -> None:
+        """Say something the user should know."""
+        print_line(self._console, line)
+
     def start(self, agenda: Agenda) -> None:
         """Say what is to be done; cells that are unavailable here get their row without it."""
         self._left = TimeLeft(agenda.stages, max(agenda.workers, 1))

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cache, cached_property
 
 import pytest
 from hypothesis import given, settings
@@ -15,6 +14,7 @@ from vibench.stages.artefacts import Store
 from vibench.stages.base import Result, Stage
 from vibench.stages.cell_queries import cell_queries
 from vibench.stages.pictures import PictureStage
+from vibench.study import registry
 from vibench.study.cells import expand
 from vibench.study.reader import read_study
 
@@ -86,32 +86,45 @@ def test_what_fails_takes_its_goals_along_and_nothing_else(
     assert sorted([*lost, *(name for name in begun if name.startswith("goal"))]) == sorted(goal.name for goal in goals)
 
 
-def closure(stage: Stage) -> Iterator[str]:
-    """The keys of a stage and of all that it needs, directly or not."""
-    yield stage.key
-    for needed in stage.inputs():
-        yield from closure(needed)
+Goals = dict[str, tuple[Stage, frozenset[str]]]
+"""The goals of a study, each with the keys of all that it needs."""
 
 
-@pytest.fixture(scope="module")
-def goals_of_quick() -> dict[str, tuple[Stage, frozenset[str]]]:
-    """The goals of the study `quick`, each with the keys of all that it needs."""
-    goals = [cell_queries(cell, 20.0) for cell in expand(read_study("quick"))]
-    goals += [PictureStage(problem) for problem in {goal.assembly.enrichment.pod.problem for goal in goals}]
-    return {goal.key: (goal, frozenset(closure(goal))) for goal in goals}
+@cache
+def goals_of(study: str) -> Goals:
+    known: dict[str, frozenset[str]] = {}
+
+    def closure(stage: Stage) -> frozenset[str]:
+        if stage.key not in known:
+            known[stage.key] = frozenset([stage.key]).union(*map(closure, stage.inputs()))
+        return known[stage.key]
+
+    goals: list[Stage] = [cell_queries(cell, 20.0) for cell in expand(read_study(study))]
+    goals += [PictureStage(problem) for problem in {goal.axes.problem for goal in goals} if problem is not None]
+    return {goal.key: (goal, closure(goal)) for goal in goals}
 
 
-@settings(max_examples=30)
+@pytest.mark.parametrize("study", registry.names("study"))
+@settings(max_examples=5)
 @given(st.data())
-def test_whatever_fails_in_a_real_study_every_goal_ends_once(
-    goals_of_quick: dict[str, tuple[Stage, frozenset[str]]], data: st.DataObject
-) -> None:
+def test_whatever_fails_in_a_real_study_every_goal_ends_once(study: str, data: st.DataObject) -> None:
     """The goals that need a stage that failed are lost, and no other; nothing waits for ever."""
-    stages = sorted(set().union(*(needed for _, needed in goals_of_quick.values())))
+    goals = dict(
+        data.draw(
+            st.lists(
+                st.sampled_from(sorted(goals_of(study).items())),
+                min_size=1,
+                max_size=12,
+                unique_by=lambda goal: goal[0],
+            )
+        )
+    )
+    stages = sorted(frozenset().union(*(needed for _, needed in goals.values())))
     bad = set(data.draw(st.lists(st.sampled_from(stages), max_size=4)))
     graph, failed, lost, done = Graph(), set(), [], []
-    for goal, _ in goals_of_quick.values():
+    for goal, _ in goals.values():
         graph.add_goal(goal, lambda _: False)
+    assert set(graph.stages) == set(stages)
     while graph.waiting:
         batch = list(graph.begin(data.draw(st.integers(1, 3))))
         assert batch
@@ -122,6 +135,6 @@ def test_whatever_fails_in_a_real_study_every_goal_ends_once(
             else:
                 done.append(stage.key)
                 graph.done(stage)
-    assert sorted(lost) == sorted(key for key, (_, needed) in goals_of_quick.items() if needed & failed)
-    assert set(goals_of_quick) == {*lost, *(key for key in done if key in goals_of_quick)}
+    assert sorted(lost) == sorted(key for key, (_, needed) in goals.items() if needed & failed)
+    assert set(goals) == {*lost, *(key for key in done if key in goals)}
     assert len(done) == len(set(done))

@@ -117,6 +117,29 @@ def test_the_exported_set_is_rechecked_by_a_script_that_knows_nothing_of_vibench
     assert CliRunner().invoke(app, ["export-qps", str(run), str(tmp_path / "set")]).exit_code != 0
 
 
+@pytest.mark.parametrize(
+    ("kib", "arguments"), [(0, ["export-qps"]), (4, ["export-qps"]), (1, ["replay"]), (8, ["report"])]
+)
+def test_on_a_full_disk_nothing_half_written_is_left(
+    kib: int, arguments: list[str], run: Path, command: str, tmp_path: Path
+) -> None:
+    """No file may be longer than so many KiB, which is how a full disk looks. Python would cut off bytecode, too."""
+    target = {"export-qps": ["set"], "replay": [key(run), "--out", "one.npz"], "report": ["--out", "one.html"]}
+    limited = [
+        "bash",
+        "-c",
+        f'ulimit -f {kib}; PYTHONDONTWRITEBYTECODE=1 exec "$0" "$@"',
+        command,
+        *arguments,
+        str(run),
+        *target[arguments[0]],
+    ]
+    done = subprocess.run(limited, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr == f"vibench: '{target[arguments[0]][-1]}' cannot be written: File too large\n"
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_wrong_requests_are_one_line(run: Path, tmp_path: Path) -> None:
     with pytest.raises(RequestError, match=r"0 cells of .* begin with 'nothing'"):
         recorded_cell(str(run), "nothing")

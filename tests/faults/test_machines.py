@@ -1,0 +1,94 @@
+"""Machines with odd limits, and odd things beside a study."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+from running import Main, Register, Vibench, by_solver, refused, started
+from samples import wire_study, write_study
+
+from vibench import Enrichment, Kind, Offline, PrimalStrategy
+from vibench.cli import doctor
+from vibench.provenance import cores, solver_version
+
+
+def test_more_jobs_than_a_machine_can_bear_are_refused(main: Main, tmp_path: Path) -> None:
+    study = write_study(tmp_path, wire_study(problem=["obstacle"]))
+    line = refused(main("run", study, "--jobs", "1000000000"), "--jobs 1000000000")
+    assert f"expected 1 to {16 * cores()} worker processes" in line
+    assert list(Path.cwd().iterdir()) == []
+
+
+def test_dask_without_open_files_ends_with_a_line(command: str, tmp_path: Path) -> None:
+    study = write_study(tmp_path, wire_study(problem=["obstacle"]))
+    limited = ["bash", "-c", 'ulimit -n 32; exec "$0" "$@"', command, "run", study, "--executor", "dask", "--jobs", "2"]
+    done = subprocess.run(limited, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.returncode == 2
+    assert done.stderr == (
+        "vibench: the executor 'dask' needs 96 open files, the limit is 32: raise it (`ulimit -n 96`), "
+        "ask for fewer --jobs, or use the executor 'local'\n"
+    )
+
+
+@pytest.mark.skipif(solver_version("daqp") != "", reason="daqp is installed")
+def test_folders_called_like_a_library_are_not_taken_for_it(
+    command: str, plugins_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """`PYTHONPATH=FOLDER:$PYTHONPATH` has an empty entry, the working directory, where the variable was not set."""
+    (tmp_path / "daqp").mkdir()  # can be imported
+    (tmp_path / "piqp").mkdir()
+    (tmp_path / "piqp" / "__init__.py").write_text("raise OSError('not the solver')")
+    write_study(tmp_path, wire_study(solvers=["piqp", "daqp", "careful"]))
+    with started(
+        [command, "run", "study.toml", "--jobs", "1", "--no-figures"], tmp_path, Path(f"{plugins_folder}:")
+    ) as process:
+        _, errors = process.communicate(timeout=120)
+    assert (process.returncode, errors) == (0, "")
+    found = {solver: row["status"] for solver, row in by_solver(tmp_path / "runs" / "wire").items()}
+    assert found == {"piqp": "ok", "careful": "ok", "daqp": "unavailable"}
+
+
+def test_a_distribution_with_unreadable_entry_points_costs_its_own(
+    vibench: Vibench, plugins_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    site = tmp_path / "site"
+    shutil.copytree(plugins_folder, site)
+    for name, content in (("bytes", b"\xff\xfe[vibench.problems]\n"), ("words", b"[vibench.problems]\nno entry\n")):
+        information = site / f"{name}-1.0.dist-info"
+        information.mkdir()
+        (information / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: 1.0\n")
+        (information / "entry_points.txt").write_bytes(content)
+    listed = vibench(tmp_path, "list", "problems", plugins=site)
+    assert (listed.returncode, listed.stderr) == (0, "")
+    assert " wire " in listed.stdout
+    reasons = {line.partition(":")[0]: line for line in listed.stdout.splitlines() if "cannot be read" in line}
+    assert "UnicodeDecodeError" in reasons["bytes"]
+    assert "TypeError" in reasons["words"]
+    done = vibench(tmp_path, "run", write_study(tmp_path, wire_study()), "--dry-run", plugins=site)
+    assert (done.returncode, done.stderr) == (0, "")
+    monkeypatch.setattr(doctor, "unreadable", lambda: {"words": "unreadable"})
+    assert doctor.Finding("words", "unreadable", doctor.Health.BROKEN) in list(doctor.plugins())
+
+
+def test_a_plugin_whose_annotations_name_nothing_is_listed_with_the_reason(main: Main, register: Register) -> None:
+    register(
+        ("vibench.primal_strategies", "nameless", f"{__name__}:Nameless"),
+        ("vibench.primal_strategies", "fine", "vibench_strategies.decorrelated:Decorrelated"),
+    )
+    code, out, err = main("list", "primal")
+    assert (code, err) == (0, "")
+    assert "primal strategy 'nameless' cannot be read: NameError: name 'Nothing' is not defined" in " ".join(
+        out.split()
+    )
+    assert " fine " in out
+
+
+class Nameless(PrimalStrategy):
+    def __init__(self, option: Nothing = 1) -> None:  # type: ignore[name-defined] # noqa: F821
+        pass
+
+    def build(self, offline: Offline, tolerance: float | None) -> Enrichment:
+        return Enrichment(Kind.NONE)
