@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from running import seal
 
 from vibench.cli.result_commands import export_qps, replay_query, show, write_report
 from vibench.errors import NumericalError, RequestError
@@ -48,6 +49,7 @@ def change(folder: Path, *statements: str) -> None:
     db = sqlite3.connect(folder / FILE)
     for statement in statements:
         db.execute(statement)
+    seal(db)
     db.commit()
     db.close()
 

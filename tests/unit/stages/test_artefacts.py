@@ -76,14 +76,14 @@ def test_an_artefact_says_which_machine_measured_it(tmp_path: Path, monkeypatch:
 
 
 def test_what_cannot_be_written_leaves_nothing_behind(tmp_path: Path) -> None:
-    with pytest.raises(NumericalError, match="a value of the type builtins.function cannot be stored"):
+    with pytest.raises(NumericalError, match=r"type builtins\.function cannot be stored"):
         Store(tmp_path).put("key", lambda: 0, TIME, ())
     assert files(tmp_path) == []
 
 
 def test_what_cannot_be_written_leaves_the_earlier_artefact(tmp_path: Path) -> None:
     Store(tmp_path).put("key", 1, TIME, ())
-    with pytest.raises(NumericalError, match="a value of the type builtins.function cannot be stored"):
+    with pytest.raises(NumericalError, match=r"type builtins\.function cannot be stored"):
         Store(tmp_path).put("key", lambda: 0, TIME, ())
     found = Store(tmp_path).get("key")
     assert found is not None
