@@ -86,6 +86,8 @@ def run(
         outcome = run_study(loaded, folder, progress, options)
     path = tables.results_file(str(folder))
     tables.export(path, folder / "tables")
+    if outcome.damaged:
+        echo(f"computed again, as their rows were damaged: {', '.join(outcome.damaged)}")
     if outcome.interrupted:
         echo(f"interrupted: {outcome.missing} cells have no row yet; the same command resumes the run")
         raise typer.Exit(130)

@@ -92,12 +92,15 @@ class ResultsDatabase:
             self._db = sqlite3.connect(path.absolute())  # SQLite may take a name that begins with "file:" for a URI
             self._db.text_factory = read_text
             self._digests = Digests(self._db)
-            self._db.execute("PRAGMA journal_mode=WAL")
-            with self._db:
-                self._db.execute("BEGIN IMMEDIATE")
-                self._create(study, anew)
-                self.damaged = self._remove_damaged(path)
-            self._db.execute("PRAGMA foreign_keys=ON")
+            with contextlib.ExitStack() as opened:
+                opened.callback(self.close)
+                self._db.execute("PRAGMA journal_mode=WAL")
+                with self._db:
+                    self._db.execute("BEGIN IMMEDIATE")
+                    self._create(study, anew)
+                    self.damaged = self._remove_damaged(path)
+                self._db.execute("PRAGMA foreign_keys=ON")
+                opened.pop_all()
         except DigestError as error:
             raise RequestError(f"'{path}' is damaged: {error}; use another --out") from None
         except (OSError, sqlite3.Error) as error:
