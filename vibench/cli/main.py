@@ -63,6 +63,7 @@ def run(
     from vibench import provenance
     from vibench.cli.console import new_console
     from vibench.cli.progress import ProgressDisplay
+    from vibench.execution.dask import is_authenticated
     from vibench.execution.run import Options, run_study
     from vibench.qp.status import Status
     from vibench.results import tables
@@ -80,6 +81,9 @@ def run(
         return
     if scheduler is not None and executor != "dask":
         raise RequestError(f"--scheduler {scheduler} is for --executor dask")
+    if scheduler is not None and not is_authenticated(scheduler):
+        warning = "the connection is not authenticated: others who reach the scheduler can run code on its workers"
+        sys.stderr.write(f"vibench: {unbroken(scheduler)}: {warning}\n")
     folder = out or Path("runs") / loaded.name
     options = Options(jobs or provenance.cores(), fresh, retry, executor, scheduler)
     with ProgressDisplay(new_console()) as progress:
