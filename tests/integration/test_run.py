@@ -16,7 +16,7 @@ import pytest
 from running import Vibench, assert_same_numbers, by_solver, execute, rows, run_again, without_seconds
 from samples import wire_study, write_study
 
-from vibench.execution import run  # noqa: F401  lists the classes of all stages
+import vibench.execution.run  # noqa: F401  lists the classes of all stages
 from vibench.results.columns import TABLES
 from vibench.results.database import FILE
 from vibench.stages.artefacts import CACHE_VARIABLE, SUFFIX, Store, encoded
