@@ -257,9 +257,16 @@ FAULTS = (
     Fault(
         "checksum-not-verified",
         "vibench/stages/artefacts.py",
-        "if not hmac.compare_digest(self._digest(key, content), digest):",
+        "if digest != _digest(key, content):",
         "if False:",
         ("tests/unit/stages/test_artefacts.py",),
+    ),
+    Fault(
+        "rows-not-compared-with-their-digests",
+        "vibench/results/digests.py",
+        "if known.get(key, NONE) != found.get(key, NONE)",
+        "if False",
+        ("tests/faults/test_damaged_files.py",),
     ),
     Fault(
         "folder-not-locked",
@@ -285,7 +292,7 @@ FAULTS = (
     Fault(
         "rows-doubled-at-the-second-write",
         "vibench/results/database.py",
-        'self._db.execute("DELETE FROM cells WHERE cell = ?", (cell["cell"],))',
+        'self._remove(cell["cell"])',
         "pass",
         ("tests/unit/results/test_database.py",),
     ),

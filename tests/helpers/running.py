@@ -13,8 +13,9 @@ from typing import Any
 
 import pandas as pd
 
-from vibench.results.columns import KEYS, TABLES
-from vibench.results.database import FILE
+from vibench.results.columns import KEYS, STORED, TABLES
+from vibench.results.database import FILE, read_text
+from vibench.results.digests import Digests
 
 Vibench = Callable[..., "subprocess.CompletedProcess[str]"]
 """Runs the installed command in a folder."""
@@ -60,13 +61,22 @@ def rows(folder: Path, table: str = "cells") -> list[dict[str, Any]]:
 
 
 def execute(folder: Path, *statements: str) -> None:
-    """Change the results in a folder by SQL."""
+    """Change the results in a folder by SQL, with their digests: as somebody would who wrote the file."""
     db = sqlite3.connect(folder / FILE)
     db.execute("PRAGMA foreign_keys=ON")
     for statement in statements:
         db.execute(statement)
+    seal(db)
     db.commit()
     db.close()
+
+
+def seal(db: sqlite3.Connection) -> None:
+    """Write the digests of all rows that there are."""
+    db.text_factory = read_text
+    db.execute("DELETE FROM digests")
+    for table in ("meta", *STORED):
+        Digests(db).count(table)
 
 
 def by_solver(folder: Path) -> dict[str, dict[str, Any]]:

@@ -13,7 +13,7 @@ from typing import Any
 import fake_plugins
 
 from vibench.results.columns import CELLS, QUERIES
-from vibench.stages.artefacts import Store
+from vibench.stages.artefacts import Artefact, Store
 from vibench.stages.base import Stage
 
 STUDY: Mapping[str, Any] = {
@@ -177,10 +177,24 @@ def wire_study(**axes: Any) -> dict[str, Any]:
     return content | axes
 
 
-def carry_out(stage: Stage, store: Store) -> None:
+class SampleStore(Store):
+    """A store that has the values of all stages: those that are not stored are kept in memory."""
+
+    def __init__(self, folder: Path) -> None:
+        super().__init__(folder)
+        self.kept: dict[str, Artefact] = {}
+
+    def get(self, key: str) -> Artefact | None:
+        return self.kept.get(key) or super().get(key)
+
+
+def carry_out(stage: Stage, store: SampleStore) -> None:
     """Run a stage after all it needs, as the runner does."""
     for needed in stage.inputs():
         if store.get(needed.key) is None:
             carry_out(needed, store)
     result = stage.run(store)
-    store.put(stage.key, result.value, result.seconds, result.histories)
+    if stage.stored:
+        store.put(stage.key, result.value, result.seconds, result.histories)
+    else:
+        store.kept[stage.key] = Artefact(result.value, result.seconds, result.histories, "here")

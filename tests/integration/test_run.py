@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import importlib.util
 import os
-import pickle
 import re
 import shutil
 import subprocess
@@ -17,9 +16,10 @@ import pytest
 from running import Vibench, assert_same_numbers, by_solver, execute, rows, run_again, without_seconds
 from samples import wire_study, write_study
 
+import vibench.execution.run  # noqa: F401  lists the classes of all stages
 from vibench.results.columns import TABLES
 from vibench.results.database import FILE
-from vibench.stages.artefacts import CACHE_VARIABLE, SUFFIX, Store
+from vibench.stages.artefacts import CACHE_VARIABLE, SUFFIX, Store, encoded
 from vibench.stages.snapshots import CHUNKS
 
 SOLVERS = ["piqp", "careful", "gives-up"]
@@ -248,10 +248,10 @@ def of_another_machine(artefacts: Path) -> None:
     """Make all artefacts look as if they had been made elsewhere."""
     store = Store(artefacts)
     for path in artefacts.glob(f"*{SUFFIX}"):
-        found = store.get(path.name.removesuffix(SUFFIX))
+        key = path.name.removesuffix(SUFFIX)
+        found = store.get(key)
         assert found is not None
-        content = pickle.dumps(replace(found, machine="elsewhere"))
-        path.write_bytes(store._digest(path.name.removesuffix(SUFFIX), content) + content)
+        path.write_bytes(encoded(key, replace(found, machine="elsewhere")))
 
 
 def test_artefacts_are_shared_by_studies_and_seconds_only_on_their_machine(

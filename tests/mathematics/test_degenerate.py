@@ -5,13 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from fake_plugins import Wire
-from samples import carry_out
+from samples import SampleStore, carry_out
 
 from vibench.arrays import Array
 from vibench.errors import NumericalError
 from vibench.interfaces.problem import VariationalInequality
 from vibench.interfaces.strategies import Stop
-from vibench.stages.artefacts import Store
 from vibench.stages.assembly import AssemblyStage
 from vibench.stages.base import value_of
 from vibench.stages.cell_queries import CellQueries, CellRows
@@ -101,9 +100,9 @@ EVERYTHING = [
 
 
 @pytest.fixture(scope="module")
-def store(tmp_path_factory) -> Store:
+def store(tmp_path_factory) -> SampleStore:
     """Artefacts of all cells: snapshots and POD of a case are those of every strategy."""
-    return Store(tmp_path_factory.mktemp("degenerate"))
+    return SampleStore(tmp_path_factory.mktemp("degenerate"))
 
 
 @pytest.fixture

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numerics import Varying, space
-from samples import carry_out
+from samples import SampleStore, carry_out
 
 from vibench.arrays import Array
 from vibench.highfidelity import active_set
@@ -21,7 +21,6 @@ from vibench.qp.verification import kkt_residuals, verify
 from vibench.reduction.cones import orthogonality, project_on_cone
 from vibench.results.invariants import violations
 from vibench.stability.infsup import inf_sup, multipliers
-from vibench.stages.artefacts import Store
 from vibench.stages.assembly import AssemblyStage
 from vibench.stages.base import value_of
 from vibench.stages.cell_queries import CellQueries, CellRows
@@ -118,12 +117,14 @@ def test_orthogonality_is_the_distance_from_a_cone_that_has_free_generators() ->
 
 
 @pytest.fixture(scope="module")
-def store(tmp_path_factory: pytest.TempPathFactory) -> Store:
-    return Store(tmp_path_factory.mktemp("free"))
+def store(tmp_path_factory: pytest.TempPathFactory) -> SampleStore:
+    return SampleStore(tmp_path_factory.mktemp("free"))
 
 
 @pytest.mark.parametrize("interpolation", [None, 1e-8], ids=["full", "reduced"])
-def test_rows_of_a_negative_control_are_ok_and_keep_the_invariants(store: Store, interpolation: float | None) -> None:
+def test_rows_of_a_negative_control_are_ok_and_keep_the_invariants(
+    store: SampleStore, interpolation: float | None
+) -> None:
     def plugin(kind: str, name: str, options: str = "{}") -> Plugin:
         return Plugin(kind, name, options, registry.code(kind, name))
 

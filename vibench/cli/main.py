@@ -66,6 +66,7 @@ def run(
     """Run a study. An interrupted run resumes where it stopped."""
     with interrupted_at_once():  # the libraries and plugins of a study take a second to import
         from vibench import provenance
+        from vibench.execution.dask import is_authenticated
         from vibench.execution.run import Options, run_study
         from vibench.qp.status import Status
         from vibench.results import tables
@@ -85,12 +86,17 @@ def run(
         return
     if scheduler is not None and executor != "dask":
         raise RequestError(f"--scheduler {scheduler} is for --executor dask")
+    if scheduler is not None and not is_authenticated(scheduler):
+        warning = "the connection is not authenticated: others who reach the scheduler can run code on its workers"
+        sys.stderr.write(f"vibench: {unbroken(scheduler)}: {warning}\n")
     folder = out or Path("runs") / loaded.name
     options = Options(jobs or provenance.cores(), fresh, retry, executor, scheduler)
     with ProgressDisplay(new_console()) as progress:
         outcome = run_study(loaded, folder, progress, options)
     path = tables.results_file(str(folder))
     tables.export(path, folder / "tables")
+    if outcome.damaged:
+        echo(f"computed again, as their rows were damaged: {', '.join(outcome.damaged)}")
     if outcome.interrupted:
         echo(f"interrupted: {outcome.missing} cells have no row yet; the same command resumes the run")
         raise typer.Exit(INTERRUPTED)

@@ -33,7 +33,8 @@ class Dask(Executor):
     Parameters
     ----------
     scheduler
-        Address of the scheduler; `None` for a cluster of processes on this machine, over TCP.
+        Address of the scheduler; `None` for a cluster of processes on this machine, which speak TLS with credentials
+        made for it. Those of a scheduler tls://… come from dask's configuration.
     slots
         Number of workers of a cluster on this machine.
     store
@@ -49,10 +50,16 @@ class Dask(Executor):
     def __init__(self, scheduler: str | None, slots: int, store: Path) -> None:
         try:
             from distributed import Client, LocalCluster  # noqa: PLC0415  an optional dependency
+            from distributed.security import Security  # noqa: PLC0415
+
+            # Whoever reaches a scheduler can run code on its workers: others on this machine are kept out, too.
+            own = Security.temporary() if scheduler is None else None
         except ImportError:
             raise RequestError(
-                "the executor 'dask' needs dask.distributed: install vibench with its extra 'cluster'"
+                "the executor 'dask' needs dask.distributed and cryptography: install vibench with its extra 'cluster'"
             ) from None
+        if scheduler is not None and is_authenticated(scheduler) and not _has_credentials():
+            raise RequestError(f"the scheduler '{scheduler}' asks for credentials: set distributed.comm.tls of dask")
         _allow_open_files(slots if scheduler is None else 0)
         self._token = secrets.token_hex(8)
         self._cluster: Any = None
@@ -63,7 +70,9 @@ class Dask(Executor):
                     n_workers=slots,
                     threads_per_worker=1,
                     processes=True,
-                    protocol="tcp",
+                    host="127.0.0.1",
+                    protocol="tls",
+                    security=own,
                     dashboard_address="127.0.0.1:0",
                     memory_limit=0,
                     silence_logs="CRITICAL",
@@ -127,6 +136,18 @@ def _allow_open_files(workers: int) -> None:
             "ask for fewer --jobs, or use the executor 'local'"
         )
     resource.setrlimit(resource.RLIMIT_NOFILE, (needed, hard))
+
+
+def is_authenticated(scheduler: str) -> bool:
+    """Whether both sides of a connection to the address of a scheduler prove who they are."""
+    return scheduler.startswith(("tls://", "wss://"))
+
+
+def _has_credentials() -> bool:
+    """Whether dask's configuration has credentials of a client."""
+    from distributed.security import Security  # noqa: PLC0415
+
+    return Security().get_connection_args("client")["ssl_context"] is not None
 
 
 @contextlib.contextmanager

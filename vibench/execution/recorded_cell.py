@@ -17,7 +17,7 @@ from vibench.execution.supervisor import Job, Supervisor
 from vibench.interfaces.problem import VariationalInequality
 from vibench.interfaces.validation import validation_parameters
 from vibench.results import tables
-from vibench.results.database import open_read_only
+from vibench.results.database import read_rows
 from vibench.results.tables import results_file
 from vibench.stages.artefacts import Store, usable_store
 from vibench.stages.assembly import Model, assembly_stage
@@ -77,10 +77,8 @@ class RecordedCell:
 
     def rows(self, table: str) -> dict[int, dict[str, Any]]:
         """The cell's rows of the queries or the solutions table, by query."""
-        with open_read_only(self.path) as db:
-            cursor = db.execute(f"SELECT * FROM {table} WHERE cell = ?", (self.row["cell"],))
-            names = [column[0] for column in cursor.description]
-            found = [dict(zip(names, row, strict=True)) for row in cursor]
+        names, rows = read_rows(self.path, table, self.row["cell"])
+        found = [dict(zip(names, row, strict=True)) for row in rows]
         return {int(row["query"]): row for row in found}
 
 

@@ -81,11 +81,12 @@ class Observer:
 
 @dataclass(frozen=True)
 class Outcome:
-    """How a run ended: rows of all cells of the matrix, and whether it was interrupted."""
+    """How a run ended: rows of all cells, whether it was interrupted, and cells whose earlier rows were damaged."""
 
     rows: tuple[dict[str, Any], ...]
     missing: int
     interrupted: bool
+    damaged: tuple[str, ...] = ()
 
 
 def identity(study: Study) -> dict[str, Any]:
@@ -159,7 +160,7 @@ def run_study(study: Study, folder: Path, observer: Observer, options: Options =
             database.close()
     keys = {cell.key for cell in cells}
     rows = tuple(row for row in everything if row["cell"] in keys)
-    return Outcome(rows, len(cells) - len(rows), interrupted)
+    return Outcome(rows, len(cells) - len(rows), interrupted, database.damaged)
 
 
 def _check_jobs(jobs: int) -> None:

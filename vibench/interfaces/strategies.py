@@ -124,7 +124,7 @@ class Offline:
 
 
 Supply = Callable[[InnerProduct, VariationalInequality, Array], Array]
-"""Vectors (n×k) of an enrichment at one parameter, from V, the assembled forms and `Offline.span`; picklable."""
+"""Vectors (n×k) at one parameter, from V, the assembled forms and `Offline.span`; in the strategy's module."""
 
 
 @dataclass(frozen=True)

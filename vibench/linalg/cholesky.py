@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 import scipy.linalg
@@ -68,9 +69,13 @@ class SparseCholesky:
         self._requested_order, self._split = order, matrix.shape[0] - dense
         self.order: Indices = eliminated if order is None else order
 
-    def __reduce__(self) -> tuple[type[SparseCholesky], tuple[SparseMatrix, str, Indices | None, int]]:
-        """Factorise again when unpickled: SuperLU objects cannot be pickled."""
-        return SparseCholesky, self._arguments
+    def __getstate__(self) -> dict[str, object]:
+        """What it was made of: SuperLU objects cannot be stored."""
+        return dict(zip(("matrix", "name", "order", "dense"), self._arguments, strict=True))
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Factorise again."""
+        SparseCholesky.__init__(self, **state)
 
     @cached_property
     def _lower(self) -> SparseMatrix:

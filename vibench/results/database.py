@@ -12,15 +12,23 @@ from typing import Any
 
 from vibench.errors import RequestError, StorageError
 from vibench.locking import locked
+from vibench.qp.status import Status
 from vibench.results.columns import HISTORY_KEYS, STORED, VERSION
+from vibench.results.digests import CREATE, DigestError, Digests
 from vibench.results.sqlite_files import BUSY_SECONDS, DAMAGE, DAMAGED, LOG, code_of, connected_read_only
 from vibench.results.values import UnstorableError, error_row, storable
-from vibench.text import printable
+from vibench.text import one_line, printable
 
 FILE = "results.sqlite"
 
 NAMED = ("stage", "quantity", *HISTORY_KEYS)
 """Columns that identify a history."""
+
+OF_CELLS = tuple(table for table, columns in STORED.items() if "cell" in columns)
+"""Tables whose rows belong to a cell."""
+
+DERIVED = ("thresholds", "disagreements")
+"""Tables that every run makes anew from the others."""
 
 LOCK = ".lock"
 """Lock file in a run folder, held during a run."""
@@ -74,7 +82,12 @@ class ResultsDatabase:
     Raises
     ------
     RequestError
-        If the folder holds results of another study or schema, or cannot be written.
+        If the folder holds results of another study or schema, or damage that no cell explains, or cannot be written.
+
+    Attributes
+    ----------
+    damaged
+        Cells whose rows were damaged and are removed: they have to be computed again.
     """
 
     def __init__(self, folder: Path, study: Mapping[str, Any], *, anew: bool = False) -> None:
@@ -85,13 +98,20 @@ class ResultsDatabase:
             folder.mkdir(parents=True, exist_ok=True)
             self._path = path.absolute()  # SQLite may take a name that begins with "file:" for a URI
             self._db = sqlite3.connect(self._path, timeout=BUSY_SECONDS)
-            self._db.text_factory = _read_text
-            self._db.execute("PRAGMA journal_mode=WAL")
-            with self._db:
-                self._db.execute("BEGIN IMMEDIATE")
-                self._create(study, anew)
-            self._db.execute("PRAGMA foreign_keys=ON")
-            self._opened = self._path.stat()
+            self._db.text_factory = read_text
+            self._digests = Digests(self._db)
+            with contextlib.ExitStack() as opened:
+                opened.callback(self.close)
+                self._db.execute("PRAGMA journal_mode=WAL")
+                with self._db:
+                    self._db.execute("BEGIN IMMEDIATE")
+                    self._create(study, anew)
+                    self.damaged = self._remove_damaged(path)
+                self._db.execute("PRAGMA foreign_keys=ON")
+                self._opened = self._path.stat()
+                opened.pop_all()
+        except DigestError as error:
+            raise DamagedError(f"'{path}' is damaged: {error}; use another --out, or --fresh") from None
         except (OSError, sqlite3.Error) as error:
             raise RequestError(f"output folder '{folder}' cannot be written: {error}") from None
 
@@ -107,7 +127,45 @@ class ResultsDatabase:
             self._db.execute(f"CREATE INDEX IF NOT EXISTS {table}_of_cell ON {table}(cell)")
         self._db.execute(f"CREATE INDEX IF NOT EXISTS histories_named ON histories({', '.join(NAMED)})")
         entries = {"schema": str(VERSION), "study": json.dumps(study, sort_keys=True)}
+        self._db.execute(CREATE)
         self._db.executemany("INSERT OR REPLACE INTO meta VALUES (?, ?)", entries.items())
+        self._digests.forget(name="meta")
+        self._digests.count("meta")
+
+    def _remove_damaged(self, path: Path) -> tuple[str, ...]:
+        """Remove cells whose rows are not those that were written, and tables derived from them; returns their keys.
+
+        Raises
+        ------
+        RequestError
+            If other tables are damaged, or the file itself is.
+        """
+        sound = self._is_sound()
+        if not sound:
+            self._db.execute("REINDEX")  # an index holds nothing that its table does not
+        changed = {table: self._digests.changed(table) for table in STORED}
+        for table in DERIVED:
+            if changed.pop(table):
+                self._replace(table, {}, ())
+        for table, cells in changed.items():
+            if "" in cells:
+                raise RequestError(f"'{path}' is damaged: rows of the table '{table}' have changed; use another --out")
+        damaged = tuple(sorted({cell for cells in changed.values() for cell in cells}))
+        for cell in damaged:
+            self._remove(cell)
+        if not sound and not self._is_sound():
+            raise RequestError(f"'{path}' is damaged; use another --out")
+        return damaged
+
+    def _is_sound(self) -> bool:
+        """Whether the structure of the file, its indices included, has no damage."""
+        return self._db.execute("PRAGMA integrity_check(1)").fetchall() == [("ok",)]
+
+    def _remove(self, cell: str) -> None:
+        """Remove all rows of a cell."""
+        for table in OF_CELLS:
+            self._db.execute(f"DELETE FROM {table} WHERE cell = ?", (cell,))
+        self._digests.forget(cell=cell)
 
     def close(self) -> None:
         """Close the database and merge the write-ahead log into the one file."""
@@ -146,10 +204,10 @@ class ResultsDatabase:
     ) -> dict[str, Any]:
         with self._writing():
             self._add_columns(queries)
-            self._db.execute("DELETE FROM cells WHERE cell = ?", (cell["cell"],))
-            self._insert("cells", [cell])
-            self._insert("queries", queries)
-            self._insert("solutions", solutions)
+            self._remove(cell["cell"])
+            for table, rows in (("cells", [cell]), ("queries", queries), ("solutions", solutions)):
+                self._insert(table, rows)
+                self._digests.count(table, "cell = ?", (cell["cell"],))
         return storable("cells", cell)
 
     def write_seconds(
@@ -170,10 +228,15 @@ class ResultsDatabase:
         rounds
             Rows of the timings table.
         """
+        changed = ("cells", "queries") if queries else ("cells",)
         with self._writing():
+            for table in changed:
+                self._digests.count(table, "cell = ?", (cell,), sign=-1)
             self._update("cells", own, cell=cell)
             for number, columns in queries.items():
                 self._update("queries", columns, cell=cell, query=number)
+            for table in changed:
+                self._digests.count(table, "cell = ?", (cell,))
             self._replace("timings", {"cell": cell}, rounds)
 
     def _update(self, table: str, columns: Mapping[str, Any], **keys: Any) -> None:
@@ -212,9 +275,15 @@ class ResultsDatabase:
     def _replace(
         self, table: str, keys: Mapping[str, Any], rows: Sequence[Mapping[str, Any]], within: str = ""
     ) -> None:
-        same = " AND ".join(["TRUE", *(f'"{name}" IS ?' for name in keys)])
-        self._db.execute(f"DELETE FROM {table} WHERE {same}{within}", tuple(storable(table, keys).values()))
+        same = " AND ".join(["TRUE", *(f'"{name}" IS ?' for name in keys)]) + within
+        values = tuple(storable(table, keys).values())
+        if keys:
+            self._digests.count(table, same, values, sign=-1)
+        else:
+            self._digests.forget(name=table)
+        self._db.execute(f"DELETE FROM {table} WHERE {same}", values)
         self._insert(table, rows)
+        self._digests.count(table, same, values)
 
     def rows(self, table: str) -> list[dict[str, Any]]:
         """All rows of a table."""
@@ -263,7 +332,7 @@ class ResultsDatabase:
                 self._db.execute(f'ALTER TABLE queries ADD COLUMN "{name}" REAL')
 
 
-def _read_text(stored: bytes) -> str:
+def read_text(stored: bytes) -> str:
     """A text of a results file, which others may have written: printable, whatever its bytes are."""
     return printable(stored.decode("utf-8", errors="replace"))
 
@@ -293,7 +362,7 @@ def open_read_only(path: Path) -> Iterator[sqlite3.Connection]:
     """
     with connected_read_only(path) as connection:
         connection.execute("PRAGMA trusted_schema=OFF")
-        connection.text_factory = _read_text
+        connection.text_factory = read_text
         yield connection
 
 
@@ -315,10 +384,43 @@ def read_meta(path: Path) -> dict[str, str]:
             damage = "; ".join(line for (line,) in db.execute("PRAGMA quick_check(1)") if line != "ok")
             if damage:
                 raise DamagedError(f"'{path}' is damaged: {' '.join(damage.split())}")
-            return dict(db.execute("SELECT key, value FROM meta")) if kinds else {}
-    except (sqlite3.Error, UnicodeDecodeError) as error:
-        sort = DamagedError if isinstance(error, sqlite3.Error) and code_of(error) in DAMAGE else RequestError
+            found = dict(db.execute("SELECT key, value FROM meta")) if kinds else {}
+            if found.get("schema") == str(VERSION):  # other versions are refused, or have no digests
+                Digests(db).verified("meta")
+            return found
+    except DigestError as error:
+        raise DamagedError(f"'{path}' is damaged: {error}") from None
+    except sqlite3.Error as error:
+        sort = DamagedError if code_of(error) in DAMAGE else RequestError
         raise sort(f"'{path}' is not a results file of vibench: {error}") from None
+
+
+STATUSES = tuple(status.value for status in Status)
+
+
+def read_rows(path: Path, table: str, cell: str = "") -> tuple[list[str], list[tuple[Any, ...]]]:
+    """Columns and rows of a table of a results file, or those of one cell, in the order in which they were written.
+
+    Raises
+    ------
+    RequestError
+        If they are damaged, or have a status that does not exist.
+    """
+    try:
+        with open_read_only(path) as db, db:
+            db.execute("BEGIN")  # a run that writes in between changes neither rows nor digests
+            names, rows = Digests(db).verified(table, cell)
+    except DigestError as error:
+        what = "run its study again, which computes damaged cells anew"
+        raise RequestError(f"'{path}' is damaged: {error}; {what}") from None
+    except (sqlite3.Error, OverflowError, MemoryError) as error:
+        raise RequestError(f"'{path}' cannot be read: {one_line(str(error))}") from None
+    if "status" in names:
+        strange = {row[names.index("status")] for row in rows}.difference(STATUSES)
+        if strange:
+            known = f"expected one of {', '.join(STATUSES)}"
+            raise RequestError(f"'{path}' has the status {str(min(strange, key=str))[:60]!a} in '{table}', {known}")
+    return names, rows
 
 
 def study_of(path: Path, meta: Mapping[str, str]) -> dict[str, Any]:

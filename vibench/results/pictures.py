@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from vibench.interfaces.problem import Picture
-from vibench.results.database import open_read_only
+from vibench.results.database import read_rows
 from vibench.text import printable
 
 ARRAYS = tuple(field.name for field in fields(Picture) if not field.name.endswith("name"))
@@ -43,11 +43,10 @@ class Shown:
 
 def read(path: Path) -> Iterator[Shown]:
     """The pictures of a results file."""
-    with open_read_only(path) as db:
-        rows = db.execute("SELECT problem, problem_options, title, data, names, reason FROM pictures").fetchall()
-    for problem, options, title, data, names, reason in rows:
-        picture = None if data is None else _unpacked(data, names)
-        yield Shown((problem, options), title or "", picture, reason or "")
+    names, rows = read_rows(path, "pictures")
+    for row in (dict(zip(names, values, strict=True)) for values in rows):
+        picture = None if row["data"] is None else _unpacked(row["data"], row["names"])
+        yield Shown((row["problem"], row["problem_options"]), row["title"] or "", picture, row["reason"] or "")
 
 
 def _packed(picture: Picture) -> bytes:

@@ -14,8 +14,8 @@ import pandas as pd
 from vibench.errors import RequestError
 from vibench.files import write_atomically
 from vibench.results.columns import CELLS, INTEGER, KEYS, STORED, TABLES, THRESHOLDS, VERSION, Column, shown_columns
-from vibench.results.database import FILE, open_read_only, read_meta
-from vibench.text import printable, printable_lines, unbroken
+from vibench.results.database import FILE, read_meta, read_rows
+from vibench.text import printable_lines, unbroken
 
 ORDER = (
     *KEYS, "primal_a", "primal_b", "primal_tol_a", "primal_tol_b", "assembly_a", "assembly_b", "stage", "quantity",
@@ -43,9 +43,15 @@ def results_file(run: str) -> Path:
 
 
 def read(path: Path, table: str) -> pd.DataFrame:
-    """One table of a results file, in the order in which its rows were written."""
-    with open_read_only(path) as db:
-        frame = pd.read_sql_query(f"SELECT * FROM {table}", db).rename(columns=printable)
+    """One table of a results file, in the order in which its rows were written.
+
+    Raises
+    ------
+    RequestError
+        If they are damaged.
+    """
+    names, rows = read_rows(path, table)
+    frame = pd.DataFrame.from_records(rows, columns=names, coerce_float=True)
     for name, column in STORED.get(table, {}).items():
         if column.kind.startswith(("REAL", "INTEGER")) and frame[name].dtype == object:  # every value is NULL
             frame[name] = frame[name].astype(float)

@@ -4,11 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
-import hmac
 import os
-import pickle
-import secrets
-import tempfile
 import time
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
@@ -22,6 +18,7 @@ from vibench.errors import RequestError, StorageError
 from vibench.files import PART, TEMPORARY, write_atomically
 from vibench.locking import locked
 from vibench.provenance import machine
+from vibench.stages.serialisation import DamagedError, dumps, loads, storable
 from vibench.text import one_line
 from vibench.timing import Seconds
 
@@ -29,10 +26,7 @@ CACHE_VARIABLE = "VIBENCH_CACHE"
 """Environment variable that sets the cache folder, in which artefacts are kept."""
 
 SUFFIX = ".artefact"
-"""Suffix of artefact files: each holds a keyed digest (HMAC-SHA-256) of its name and of the pickle that follows."""
-
-SECRET = "secret"
-"""File with the key of the digests, which its owner alone can read: others cannot write artefacts that are loaded."""
+"""Suffix of artefact files: each holds a digest (SHA-256) of its name and of the content that follows."""
 
 OTHERS, ANYBODY = 0o022, 0o002
 """Permission bits of all but the owner to write; of those outside the group alone."""
@@ -43,6 +37,7 @@ LOCK = "lock"
 """Lock file: shared by runs, exclusive for `clear`."""
 
 
+@storable
 @dataclass(frozen=True)
 class History:
     """One convergence history: a quantity ("error", "sigma", …) over the steps of an algorithm, one value per step.
@@ -68,6 +63,10 @@ class History:
         return cls(stage, one_line(str(quantity)), tuple(map(float, values)), first_step)
 
 
+storable(Seconds)
+
+
+@storable
 @dataclass(frozen=True)
 class Artefact:
     """Result of a stage, the seconds it took on the machine where it was measured, and its histories."""
@@ -76,6 +75,24 @@ class Artefact:
     seconds: Seconds
     histories: tuple[History, ...]
     machine: str
+
+    @classmethod
+    def read(cls, content: bytes) -> Artefact:
+        """The artefact that `dumps` wrote.
+
+        Raises
+        ------
+        DamagedError
+            If the content is anything else.
+        """
+        found = loads(content)
+        if not isinstance(found, cls):
+            raise DamagedError("no artefact")
+        seconds, histories = found.seconds, found.histories
+        right = isinstance(seconds, Seconds) and isinstance(histories, tuple) and isinstance(found.machine, str)
+        if not right or not all(isinstance(history, History) for history in histories):
+            raise DamagedError("an artefact with members of other types")
+        return found
 
 
 def default_folder() -> Path:
@@ -88,7 +105,6 @@ class Store:
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
-        self._secret = b""
         self._recent: LRUCache[str, Artefact] = LRUCache(maxsize=64)
 
     def get(self, key: str) -> Artefact | None:
@@ -102,17 +118,15 @@ class Store:
         if key in self._recent:
             return self._recent[key]
         try:
-            whole = memoryview(self._path(key).read_bytes())
-            digest, content = whole[:DIGEST], whole[DIGEST:]
-            if not hmac.compare_digest(self._digest(key, content), digest):
-                return None  # truncated, corrupted, renamed, or not written with the key
-            artefact = pickle.loads(content)
-        except (FileNotFoundError, pickle.UnpicklingError, EOFError, AttributeError, ImportError):
-            return None  # missing, or pickled with classes that no longer exist
+            with self._path(key).open("rb") as file:
+                digest, content = file.read(DIGEST), file.read()
+            if digest != _digest(key, content):
+                return None  # truncated, corrupted or renamed
+            artefact = Artefact.read(content)
+        except (FileNotFoundError, DamagedError):
+            return None
         except OSError as error:
             raise StorageError(f"artefacts cannot be read from '{self.folder}': {error.strerror}") from None
-        if not isinstance(artefact, Artefact):
-            return None
         self._recent[key] = artefact
         return artefact
 
@@ -121,14 +135,16 @@ class Store:
 
         Raises
         ------
+        NumericalError
+            If the value holds anything but arrays and data.
         StorageError
             If it cannot be written.
         """
-        content = pickle.dumps(Artefact(value, seconds, histories, machine()), protocol=pickle.HIGHEST_PROTOCOL)
+        content = encoded(key, Artefact(value, seconds, histories, machine()))
         self._recent.pop(key, None)
         try:
             self.folder.mkdir(0o700, parents=True, exist_ok=True)
-            write_atomically(self._path(key), self._digest(key, content) + content, durable=True)
+            write_atomically(self._path(key), content, durable=True)
         except OSError as error:
             raise StorageError(f"artefacts cannot be written to '{self.folder}': {error.strerror}") from None
 
@@ -173,47 +189,21 @@ class Store:
                         freed += status.st_size
         return freed
 
-    def key(self) -> bytes:
-        """The key of the digests, read once."""
-        self._secret = self._secret or secret(self.folder)
-        return self._secret
-
-    def _digest(self, key: str, content: bytes | memoryview) -> bytes:
-        """Keyed digest of the name and the content of an artefact."""
-        code = hmac.new(self.key(), key.encode() + b"\0", hashlib.sha256)
-        code.update(content)
-        return code.digest()
-
     def _path(self, key: str) -> Path:
         return self.folder / f"{key}{SUFFIX}"
 
 
-def secret(folder: Path) -> bytes:
-    """The key of the digests of a folder; made at random where there is none.
+def encoded(key: str, artefact: Artefact) -> bytes:
+    """An artefact as it is stored under a key."""
+    content = dumps(artefact)
+    return _digest(key, content) + content
 
-    Raises
-    ------
-    StorageError
-        If it cannot be read or made, or others may write it.
-    """
-    path = folder / SECRET
-    try:
-        if not path.exists():
-            folder.mkdir(0o700, parents=True, exist_ok=True)
-            handle, name = tempfile.mkstemp(dir=folder, prefix=TEMPORARY, suffix=PART)  # readable by its owner alone
-            with os.fdopen(handle, "wb") as file:
-                file.write(secrets.token_bytes(DIGEST))
-            with contextlib.suppress(FileExistsError):  # another process was quicker: its key counts
-                os.link(name, path)
-            Path(name).unlink()
-        if path.stat().st_mode & OTHERS:
-            raise StorageError(f"'{path}' may be written by others: anybody could plant artefacts; remove it")
-        found = path.read_bytes()
-    except OSError as error:
-        raise StorageError(f"the key of the artefacts, '{path}', cannot be used: {error.strerror}") from None
-    if len(found) != DIGEST:
-        raise StorageError(f"'{path}' has {len(found)} bytes, expected {DIGEST}; remove it")
-    return found
+
+def _digest(key: str, content: bytes) -> bytes:
+    """Digest of the name and the content of an artefact."""
+    code = hashlib.sha256(key.encode() + b"\0")
+    code.update(content)
+    return code.digest()
 
 
 def usable_store() -> Store:
@@ -227,15 +217,12 @@ def usable_store() -> Store:
     store = Store(default_folder())
     try:
         store.folder.mkdir(0o700, parents=True, exist_ok=True)
-        # Whoever can replace the key could plant artefacts. A folder that is named on purpose may be shared by a group.
+        # Whoever may write could plant false numbers. A folder that is named on purpose may be shared by a group.
         if store.folder.stat().st_mode & (ANYBODY if os.environ.get(CACHE_VARIABLE) else OTHERS):
             raise RequestError(
                 f"others may write into the folder for artefacts, '{store.folder}': run `chmod go-w` on it, "
                 f"or set {CACHE_VARIABLE} to another one"
             )
-        store.key()
-    except StorageError as error:
-        raise RequestError(str(error)) from None
     except OSError as error:
         raise RequestError(
             f"the folder for artefacts, '{store.folder}', cannot be made: {error.strerror}; "

@@ -10,16 +10,32 @@ import numpy as np
 from vibench.arrays import Array
 from vibench.interfaces.problem import MEMBERS, VariationalInequality
 from vibench.interfaces.validation import training_parameters, validation_parameters
+from vibench.linalg.cholesky import SparseCholesky
+from vibench.linalg.inner_product import InnerProduct
 from vibench.model.affine import AffineMember, Evaluation, affine_decomposition
 from vibench.model.galerkin import ReducedModel, leading_part, project
-from vibench.model.hyperreduced import HyperReducedModel, Operators, hyper_reduce, reason_for_full_assembly
-from vibench.qp.exact import exact_solution
+from vibench.model.hyperreduced import (
+    HyperReducedModel,
+    Operators,
+    ProjectedMember,
+    hyper_reduce,
+    reason_for_full_assembly,
+)
+from vibench.qp.exact import ExactSolution, exact_solution
+from vibench.reduction.supremizers import ContactCoordinates, SpannedCoordinates
 from vibench.stages.artefacts import Store
 from vibench.stages.assemblies import assemblies
 from vibench.stages.base import Result, Stage, build_problem, value_of
 from vibench.stages.enrichment import EnrichmentStage, GrowthStage, enrichment_stage
+from vibench.stages.serialisation import storable
 from vibench.study.cells import Cell, Plugin
 from vibench.timing import timed
+
+for _kind in (
+    AffineMember, Evaluation, Operators, ProjectedMember, ContactCoordinates, SpannedCoordinates, InnerProduct,
+    SparseCholesky, VariationalInequality, ExactSolution,
+):  # fmt: skip
+    storable(_kind)
 
 Model = ReducedModel | HyperReducedModel
 """A model that assembles the reduced program at a parameter."""
@@ -88,6 +104,7 @@ class NestedPrograms(Stage):
         return Result(tuple(model.reduce(kept.at(mu)).program for mu in mus))
 
 
+@storable
 @dataclass(frozen=True)
 class ReducedPrograms:
     """Reduced programs, for any QP solver.

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import sys
 from abc import abstractmethod
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from types import FunctionType
 
 import numpy as np
 
 from vibench.arrays import Array
-from vibench.interfaces.strategies import Enrichment, Kind, Offline
+from vibench.errors import NumericalError
+from vibench.interfaces.strategies import Enrichment, Kind, Offline, PrimalStrategy
 from vibench.interfaces.validation import check_enrichment, training_parameters
 from vibench.model.galerkin import ReducedModel
 from vibench.reduction.nested import Grown, Milestone, grow_through
@@ -18,10 +21,53 @@ from vibench.stability.growth import ProjectedSupremizers
 from vibench.stages.artefacts import History, Store
 from vibench.stages.base import Result, Stage, build_problem, faults_of, value_of
 from vibench.stages.offline import ConeStage, PODStage, ReducedCone, TrainingConstants
+from vibench.stages.serialisation import storable
 from vibench.study.cells import Axes, Cell, Plugin
 from vibench.timing import timed
 
+for _kind in (Kind, Grown, Milestone):
+    storable(_kind)
 
+
+@storable
+@dataclass(frozen=True)
+class BuiltEnrichment:
+    """An `Enrichment` as it is stored: `supply` is the name of a function in the module of its strategy, or ""."""
+
+    kind: Kind
+    vectors: Array | None
+    eta: Array | None
+    supply: str
+    history: Mapping[str, Array]
+    fallbacks: tuple[str, ...]
+
+    @classmethod
+    def of(cls, found: Enrichment, strategy: PrimalStrategy) -> BuiltEnrichment:
+        """The enrichment that a strategy has built.
+
+        Raises
+        ------
+        NumericalError
+            If it has a supply that is not a function in the module of the strategy.
+        """
+        name = "" if found.supply is None else getattr(found.supply, "__name__", "")
+        if found.supply is not None and _functions(strategy).get(name) is not found.supply:
+            raise NumericalError(f"the supply of the enrichment is not a function in {type(strategy).__module__}")
+        return cls(found.kind, found.vectors, found.eta, name, found.history, found.fallbacks)
+
+    def restored(self, strategy: Callable[[], PrimalStrategy]) -> Enrichment:
+        """The enrichment of a strategy; its supply is looked up where `of` found it."""
+        supply = _functions(strategy())[self.supply] if self.supply else None
+        return Enrichment(self.kind, self.vectors, self.eta, supply, self.history, self.fallbacks)
+
+
+def _functions(strategy: PrimalStrategy) -> dict[str, FunctionType]:
+    """The functions in the module of a strategy, by name."""
+    found = vars(sys.modules[type(strategy).__module__])
+    return {name: value for name, value in found.items() if isinstance(value, FunctionType)}
+
+
+@storable
 @dataclass(frozen=True)
 class AssessedGrowth:
     """A nested enrichment and its inf-sup constants on the training set.
@@ -117,7 +163,7 @@ class EnrichmentStage(Stage):
 
 @dataclass(frozen=True)
 class SingleEnrichment(EnrichmentStage):
-    """An enrichment built for its tolerance alone; the value is an `Enrichment`."""
+    """An enrichment built for its tolerance alone; the value is a `BuiltEnrichment`."""
 
     def inputs(self) -> tuple[Stage, ...]:
         """POD, cone, and the training constants that the enrichment is compared with."""
@@ -136,12 +182,12 @@ class SingleEnrichment(EnrichmentStage):
             known |= {"beta_span_min": projected.over_steps(size)}
             known |= {"share_min": projected.shares_over_steps(size, reachable)}
             known |= {"beta_span_training": projected.beta_span(), "beta_full_span_training": reachable}
-        return Result(enrichment, seconds, _histories(known))
+        return Result(BuiltEnrichment.of(enrichment, strategy), seconds, _histories(known))
 
     def enrichment(self, store: Store) -> Enrichment:
         """The stored value."""
-        found: Enrichment = value_of(store, self)
-        return found
+        found: BuiltEnrichment = value_of(store, self)
+        return found.restored(self.primal.create)
 
 
 @dataclass(frozen=True)

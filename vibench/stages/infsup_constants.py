@@ -19,7 +19,11 @@ from vibench.stages.assemblies import assemblies
 from vibench.stages.base import Result, Stage, build_problem, value_of
 from vibench.stages.enrichment import EnrichmentStage
 from vibench.stages.offline import ConeStage, PODStage
+from vibench.stages.serialisation import storable
 from vibench.study.cells import Plugin
+
+for _kind in (ConstraintClasses, Stability, InfSup):
+    storable(_kind)
 
 
 @dataclass(frozen=True)

@@ -7,14 +7,18 @@ from dataclasses import dataclass
 from vibench.interfaces.strategies import Cone, Stop
 from vibench.interfaces.validation import check_cone, training_parameters
 from vibench.reduction.cones import orthogonality
-from vibench.reduction.pod import pod
-from vibench.reduction.supremizers import constraint_classes, isometric_supremizers
+from vibench.reduction.pod import POD, pod
+from vibench.reduction.supremizers import ConstraintClasses, constraint_classes, isometric_supremizers
 from vibench.stability.infsup import Multipliers, beta_span, multipliers
 from vibench.stages.artefacts import History, Store
 from vibench.stages.base import Result, Stage, build_problem, faults_of, value_of
+from vibench.stages.serialisation import storable
 from vibench.stages.snapshots import gather, training_stages
 from vibench.study.cells import Axes, Plugin
 from vibench.timing import timed
+
+for _kind in (POD, Cone, Multipliers, ConstraintClasses):
+    storable(_kind)
 
 
 @dataclass(frozen=True)
@@ -43,6 +47,7 @@ class PODStage(Stage):
         return Result(found, seconds, (History.of("pod", "error", found.errors),))
 
 
+@storable
 @dataclass(frozen=True)
 class ReducedCone:
     """A cone, and its multipliers prepared for constants and enrichments."""

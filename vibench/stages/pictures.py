@@ -13,9 +13,12 @@ from vibench.interfaces.problem import ParameterBox, Picture
 from vibench.results.pictures import ARRAYS, failure_rows, picture_rows
 from vibench.stages.artefacts import Store
 from vibench.stages.base import Result, Row, Stage, build_problem
+from vibench.stages.serialisation import storable
 from vibench.stages.snapshots import gather, training_stages
 from vibench.study.cells import Axes, Plugin
 from vibench.text import one_line
+
+storable(Picture)
 
 CORNERS = (0.0, 0.5, 1.0)
 """Positions in the unit box of parameters at which solutions are drawn: lower corner, centre and upper corner."""

@@ -17,6 +17,7 @@ from vibench.interfaces.problem import Problem, VariationalInequality
 from vibench.interfaces.validation import checked_assembly, training_parameters, validation_parameters
 from vibench.stages.artefacts import History, Store
 from vibench.stages.base import Result, Stage, build_problem, faults_of, value_of
+from vibench.stages.serialisation import storable
 from vibench.study.cells import Axes, Plugin
 from vibench.timing import NO_TIME, Seconds, median_seconds, timed
 
@@ -26,6 +27,7 @@ CHUNKS = 4
 """Number of chunks of a parameter set, each with its own set-up; fixed, so that keys do not depend on the workers."""
 
 
+@storable
 @dataclass(frozen=True)
 class Snapshots:
     """High-fidelity solutions at some parameters.

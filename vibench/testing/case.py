@@ -16,6 +16,7 @@ import numpy as np
 from vibench.arrays import Array
 from vibench.errors import NumericalError, in_a_line
 from vibench.interfaces.problem import MEMBERS, Problem
+from vibench.stages.serialisation import dumps, loads
 from vibench.study import registry
 from vibench.testing.checks import ConformanceError, Doubt, Note, plugin_line
 from vibench.testing.comparisons import Arrays, at, copies, differences
@@ -109,17 +110,24 @@ class Case(ABC, Generic[PluginT, ArgumentT, ResultT]):
         yield from again or self._deviations("another instance", self.create())
 
     def pickling(self) -> Iterator[str]:
-        """Plugin and result can be sent to another process."""
+        """The plugin can be sent to another process, and its result be stored."""
+        if reason := _pickling_error(self.plugin):
+            faulty = [key for key, value in getattr(self.plugin, "__dict__", {}).items() if _pickling_error(value)]
+            where = f": look at attribute {', '.join(faulty)}" if faulty else ""
+            raise ConformanceError(f"the {type(self.plugin).__name__} cannot be pickled ({reason}){where}")
         name, before = next(iter(self.results.items()))
-        for thing in (self.plugin, before):
-            if reason := _pickling_error(thing):
-                faulty = [key for key, value in getattr(thing, "__dict__", {}).items() if _pickling_error(value)]
-                where = f": look at attribute {', '.join(faulty)}" if faulty else ""
-                raise ConformanceError(f"the {type(thing).__name__} cannot be pickled ({reason}){where}")
-        plugin, after = pickle.loads(pickle.dumps(self.plugin)), pickle.loads(pickle.dumps(before))
+        try:
+            after = self.stored(before)
+        except NumericalError as error:
+            raise ConformanceError(f"the {type(before).__name__} cannot be stored: {error}") from None
         for array, what in differences(self.arrays(after), self.arrays(before)):
-            yield f"{name}: pickling changes {array}: {what}"
-        yield from self._deviations("a pickled copy", plugin)
+            yield f"{name}: storing changes {array}: {what}"
+        yield from self._deviations("a pickled copy", pickle.loads(pickle.dumps(self.plugin)))
+
+    def stored(self, result: ResultT) -> ResultT:
+        """A result as a stage finds it in its artefact."""
+        found: ResultT = loads(dumps(result))
+        return found
 
     def duration(self) -> Iterator[str]:
         """The constructor and every call stay below the limit."""

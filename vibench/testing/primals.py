@@ -15,6 +15,8 @@ from vibench.errors import NumericalError, VibenchError
 from vibench.interfaces.strategies import Cone, Enrichment, Kind, Offline, PrimalStrategy, no_free
 from vibench.interfaces.validation import check_enrichment
 from vibench.reduction.nested import NestedStrategy, grow_through
+from vibench.stages.enrichment import BuiltEnrichment
+from vibench.stages.serialisation import dumps, loads
 from vibench.testing.case import Case
 from vibench.testing.checks import SECONDS, Check, ConformanceError, Finding, Note, examine, raised, raising
 from vibench.testing.comparisons import Arrays, array_fault, at, difference, unmutated
@@ -55,6 +57,11 @@ class PrimalCase(Case[PrimalStrategy, float | None, Enrichment]):
         if result.supply is not None:
             named[f"the supply {at(mu)}"] = result.supply(problem.V, problem.assemble(mu.copy()), model.span.copy())
         return {name: value for name, value in named.items() if value is not None}
+
+    def stored(self, result: Enrichment) -> Enrichment:
+        """An enrichment as a stage finds it in its artefact."""
+        built: BuiltEnrichment = loads(dumps(BuiltEnrichment.of(result, self.plugin)))
+        return built.restored(lambda: self.plugin)
 
     def tolerance(self) -> Iterator[str]:
         """`build` accepts a tolerance exactly if `takes_tolerance` says so."""

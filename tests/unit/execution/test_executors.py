@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import os
-import re
+import socket
+import ssl
 import subprocess
 import time
 from collections.abc import Iterator
 from concurrent.futures import wait
 from pathlib import Path
+from urllib.parse import urlsplit
 
 import pytest
 from distributed import LocalCluster
+from distributed.security import Security
 from fake_stages import KillsItsParent, Whole
 from running import Vibench, assert_same_numbers, read_until, started
 from samples import wire_study, write_study
@@ -136,7 +139,55 @@ def test_a_scheduler_that_does_not_answer_is_named(vibench: Vibench, tmp_path: P
     path = write_study(tmp_path, wire_study())
     done = vibench(tmp_path, "run", path, "--executor", "dask", "--scheduler", "tcp://127.0.0.1:9")
     assert done.returncode == 2
-    assert re.fullmatch(r"vibench: no dask scheduler answers at 'tcp://127.0.0.1:9'.*\n", done.stderr)
+    warning, line = done.stderr.splitlines()
+    assert warning.startswith("vibench: tcp://127.0.0.1:9: the connection is not authenticated")
+    assert line.startswith("vibench: no dask scheduler answers at 'tcp://127.0.0.1:9'")
+
+
+def test_an_authenticated_scheduler_needs_credentials(vibench: Vibench, tmp_path: Path) -> None:
+    done = vibench(
+        tmp_path, "run", write_study(tmp_path, wire_study()), "--executor", "dask", "--scheduler", "tls://a:9"
+    )
+    assert (done.returncode, done.stderr) == (
+        2, "vibench: the scheduler 'tls://a:9' asks for credentials: set distributed.comm.tls of dask\n",
+    )  # fmt: skip
+
+
+def test_a_cluster_of_this_machine_answers_nobody_else(tmp_path: Path) -> None:
+    workers = Dask(None, 1, tmp_path)
+    try:
+        address = urlsplit(workers._cluster.scheduler_address)
+        assert (address.scheme, address.hostname) == ("tls", "127.0.0.1")
+        with socket.create_connection((address.hostname, address.port), timeout=60) as plain:
+            plain.sendall(bytes(64))
+            assert answer(plain) == b""
+        other = Security.temporary().get_connection_args("client")["ssl_context"]
+        nobody = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
+        for context in (nobody, other):
+            context.check_hostname, context.verify_mode = False, ssl.CERT_NONE
+            with socket.create_connection((address.hostname, address.port), timeout=60) as plain:
+                assert refusal(context, plain)
+        stage = Whole("fine")
+        assert isinstance(workers.submit(job(stage, tmp_path)).result(timeout=60), Done)
+    finally:
+        workers.close()
+
+
+def answer(connection: socket.socket) -> bytes:
+    """What the scheduler says, "" if it hangs up."""
+    try:
+        return connection.recv(1)
+    except ConnectionError:
+        return b""
+
+
+def refusal(context: ssl.SSLContext, plain: socket.socket) -> bool:
+    """Whether the scheduler refuses the credentials of a client: with TLS 1.3 it says so after the handshake."""
+    try:
+        with context.wrap_socket(plain) as connection:
+            return answer(connection) == b""
+    except (ssl.SSLError, ConnectionError):
+        return True
 
 
 def test_a_scheduler_without_dask_is_refused(vibench: Vibench, tmp_path: Path) -> None:

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from fake_plugins import Wire
-from samples import carry_out
+from samples import SampleStore, carry_out
 
 from vibench.arrays import Array
 from vibench.errors import NumericalError
@@ -17,7 +17,6 @@ from vibench.results import pictures
 from vibench.results.database import FILE, ResultsDatabase
 from vibench.results.pictures import Shown
 from vibench.stages import base
-from vibench.stages.artefacts import Store
 from vibench.stages.pictures import PictureStage
 from vibench.study.cells import Plugin
 
@@ -27,7 +26,7 @@ KEYS = {"problem": "membrane", "problem_options": OBSTACLE.options}
 
 @pytest.fixture(scope="module")
 def drawn(tmp_path_factory: pytest.TempPathFactory) -> tuple[tuple[str, Picture], ...]:
-    store, made = Store(tmp_path_factory.mktemp("pictures")), PictureStage(OBSTACLE)
+    store, made = SampleStore(tmp_path_factory.mktemp("pictures")), PictureStage(OBSTACLE)
     carry_out(made, store)
     return tuple(base.value_of(store, made))
 
@@ -96,7 +95,7 @@ def draws(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Draws:
     wire = Plugin("problem", "wire", "{}", "test")
     for module in ("vibench.stages.pictures", "vibench.stages.snapshots"):
         monkeypatch.setattr(f"{module}.build_problem", lambda _: Drawing())
-    store = Store(tmp_path)
+    store = SampleStore(tmp_path)
     carry_out(PictureStage(wire), store)
 
     def draw(**how: object) -> tuple[tuple[str, Picture], ...]:

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from running import Register
-from samples import carry_out
+from samples import SampleStore, carry_out
 
 from vibench.interfaces.problem import MEMBERS
 from vibench.interfaces.strategies import Stop
@@ -14,7 +14,6 @@ from vibench.interfaces.validation import checked_assembly
 from vibench.model.affine import Evaluation
 from vibench.model.galerkin import ReducedModel, project
 from vibench.model.hyperreduced import HyperReducedModel
-from vibench.stages.artefacts import Store
 from vibench.stages.assembly import AffineDecomposition, AssemblyStage
 from vibench.stages.base import value_of
 from vibench.stages.cell_queries import CellQueries
@@ -55,22 +54,22 @@ CELLS = {
 
 
 @pytest.fixture(scope="module")
-def store(tmp_path_factory: pytest.TempPathFactory) -> Store:
-    store = Store(tmp_path_factory.mktemp("assembly"))
+def store(tmp_path_factory: pytest.TempPathFactory) -> SampleStore:
+    store = SampleStore(tmp_path_factory.mktemp("assembly"))
     for stage in CELLS.values():
         carry_out(stage, store)
     return store
 
 
 @pytest.fixture
-def wire_store(register: Register, tmp_path: Path) -> Store:
+def wire_store(register: Register, tmp_path: Path) -> SampleStore:
     """A store with a cell of a problem that declares nothing, asked for in reduced assembly."""
     register(
         ("vibench.problems", "wire", "fake_plugins:Wire"),
         ("vibench.dual_strategies", "mcpg", "vibench_strategies.mcpg:ModifiedCPG"),
         ("vibench.primal_strategies", "decorrelated", "vibench_strategies.decorrelated:Decorrelated"),
     )
-    store = Store(tmp_path)
+    store = SampleStore(tmp_path)
     carry_out(wire(TOLERANCE), store)
     carry_out(wire(None), store)
     return store
@@ -87,7 +86,7 @@ def wire(interpolation: float | None) -> CellQueries:
     return replace(found, assembly=replace(found.assembly, enrichment=enrichment))
 
 
-def test_rows_of_an_interpolated_problem(store: Store) -> None:
+def test_rows_of_an_interpolated_problem(store: SampleStore) -> None:
     rows = value_of(store, CELLS["obstacle"])
     members = value_of(store, CELLS["obstacle"].assembly.reduction.decomposition)
     assert rows.cell["status"] == "ok"
@@ -103,7 +102,7 @@ def test_rows_of_an_interpolated_problem(store: Store) -> None:
     assert rows.cell["fallbacks"] == ""
 
 
-def test_a_looser_tolerance_has_fewer_terms_and_larger_errors(store: Store) -> None:
+def test_a_looser_tolerance_has_fewer_terms_and_larger_errors(store: SampleStore) -> None:
     tight, loose = (value_of(store, CELLS[name]).cell for name in ("obstacle", "obstacle, loose"))
     assert loose["terms_A"] < tight["terms_A"]
     assert TOLERANCE < loose["interpolation_error"] <= 1e-2
@@ -111,7 +110,7 @@ def test_a_looser_tolerance_has_fewer_terms_and_larger_errors(store: Store) -> N
 
 
 @pytest.mark.parametrize("name", ["obstacle", "radial", "hertz", "hertz, per-parameter"])
-def test_the_error_of_an_assembly_is_that_of_the_worst_member(store: Store, name: str) -> None:
+def test_the_error_of_an_assembly_is_that_of_the_worst_member(store: SampleStore, name: str) -> None:
     stage = CELLS[name].assembly
     model, note = stage.model(store)
     assert note == ""
@@ -136,14 +135,16 @@ def test_the_error_of_an_assembly_is_that_of_the_worst_member(store: Store, name
         ("hertz, per-parameter", "primal"),  # the space depends on mu
     ],
 )
-def test_a_constant_stiffness_on_a_fixed_space_is_solved_through_the_dual(store: Store, name: str, form: str) -> None:
+def test_a_constant_stiffness_on_a_fixed_space_is_solved_through_the_dual(
+    store: SampleStore, name: str, form: str
+) -> None:
     rows = value_of(store, CELLS[name])
     assert rows.cell["status"] == "ok"
     assert {row["form"] for row in rows.queries} == {form}
 
 
 @pytest.mark.parametrize(("one", "other"), [("obstacle", "obstacle, full"), ("hertz", "hertz, full")])
-def test_errors_of_queries_are_those_of_full_assembly(store: Store, one: str, other: str) -> None:
+def test_errors_of_queries_are_those_of_full_assembly(store: SampleStore, one: str, other: str) -> None:
     reduced, full = value_of(store, CELLS[one]), value_of(store, CELLS[other])
     for a, b in zip(reduced.queries, full.queries, strict=True):
         for column in ("error_u", "error_lambda", "beta_span"):
@@ -151,7 +152,7 @@ def test_errors_of_queries_are_those_of_full_assembly(store: Store, one: str, ot
 
 
 @pytest.mark.parametrize("name", ["hertz", "hertz, per-parameter"])
-def test_columns_of_a_problem_with_contact(store: Store, name: str) -> None:
+def test_columns_of_a_problem_with_contact(store: SampleStore, name: str) -> None:
     """B and g have no terms: they are assembled on the contact."""
     assert CELLS[name].assembly.columns(store) == {
         "interpolation_tol": TOLERANCE,
@@ -162,13 +163,13 @@ def test_columns_of_a_problem_with_contact(store: Store, name: str) -> None:
     assert all(row["assembly_error"] < 1e-11 for row in value_of(store, CELLS[name]).queries)
 
 
-def test_columns_of_a_problem_whose_bound_alone_varies(store: Store) -> None:
+def test_columns_of_a_problem_whose_bound_alone_varies(store: SampleStore) -> None:
     columns = CELLS["radial"].assembly.columns(store)
     assert {name: columns[f"terms_{name}"] for name in MEMBERS} == {"A": 0, "f": 0, "B": 0, "g": 2}
 
 
 @pytest.mark.parametrize("name", ["obstacle, full", "hertz, full"])
-def test_assembly_in_full_has_no_offline_part_and_no_error(store: Store, name: str) -> None:
+def test_assembly_in_full_has_no_offline_part_and_no_error(store: SampleStore, name: str) -> None:
     stage = CELLS[name].assembly
     rows = value_of(store, CELLS[name])
     assert stage.columns(store) == {}
@@ -180,7 +181,7 @@ def test_assembly_in_full_has_no_offline_part_and_no_error(store: Store, name: s
 
 
 @pytest.mark.parametrize("name", ["obstacle", "hertz", "radial"])
-def test_reduced_assembly_costs_its_separation_and_its_projection(store: Store, name: str) -> None:
+def test_reduced_assembly_costs_its_separation_and_its_projection(store: SampleStore, name: str) -> None:
     reduction = CELLS[name].assembly.reduction
     spent = [store.get(stage.key).seconds.cpu for stage in (reduction.decomposition, reduction)]
     assert min(spent) > 0.0
@@ -201,7 +202,7 @@ def test_the_separation_of_a_problem_serves_every_reduced_model() -> None:
     assert CELLS["obstacle"].assembly.key != CELLS["obstacle, full"].assembly.key
 
 
-def test_a_problem_that_declares_nothing_is_assembled_in_full_and_the_reason_is_told(wire_store: Store) -> None:
+def test_a_problem_that_declares_nothing_is_assembled_in_full_and_the_reason_is_told(wire_store: SampleStore) -> None:
     why = "f depends on mu and the problem does not evaluate it entry by entry"
     stage = wire(TOLERANCE)
     members = value_of(wire_store, AffineDecomposition(WIRE, TOLERANCE))

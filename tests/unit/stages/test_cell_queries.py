@@ -10,14 +10,13 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from samples import carry_out
+from samples import SampleStore, carry_out
 
 from vibench.interfaces.problem import ParameterBox, VariationalInequality
 from vibench.interfaces.strategies import Stop
 from vibench.qp import verification
 from vibench.qp.solve import solve_qp, takes_start
 from vibench.stages import cell_queries
-from vibench.stages.artefacts import Store
 from vibench.stages.assembly import AssemblyStage
 from vibench.stages.base import value_of
 from vibench.stages.cell_queries import CellQueries
@@ -66,7 +65,7 @@ def test_a_query_whose_assessment_fails_costs_itself(tmp_path: Path, monkeypatch
     cone = ConeStage(PROBLEM, Plugin("dual strategy", "cpg", "{}", "test"), Stop(size=3))
     primal = Plugin("primal strategy", "decorrelated", "{}", "test")
     enrichment = SingleEnrichment(PODStage(PROBLEM, Stop(size=4)), cone, primal, None)
-    stage, store = CellQueries(AssemblyStage(enrichment, None, 4, 1), "piqp", 1e-6, 20.0), Store(tmp_path)
+    stage, store = CellQueries(AssemblyStage(enrichment, None, 4, 1), "piqp", 1e-6, 20.0), SampleStore(tmp_path)
     carry_out(stage, store)
     whole, bad = value_of(store, stage), float(PROBLEM.create().validation_set(4, 1)[2, 0])
 
@@ -89,7 +88,7 @@ def test_rows_say_which_query_they_started_from(tmp_path: Path) -> None:
     primal = Plugin("primal strategy", "decorrelated", "{}", "test")
     enrichment = SingleEnrichment(PODStage(PROBLEM, Stop(size=4)), cone, primal, None)
     assembly = AssemblyStage(enrichment, None, 4, 1)
-    stage, store, started = CellQueries(assembly, "osqp", 1e-6, 20.0), Store(tmp_path), {}
+    stage, store, started = CellQueries(assembly, "osqp", 1e-6, 20.0), SampleStore(tmp_path), {}
     for warm, solver in ((False, "osqp"), (True, "osqp"), (True, "piqp")):
         asked = replace(stage, warm_start=warm, solver=solver)
         carry_out(asked, store)

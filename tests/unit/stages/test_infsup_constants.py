@@ -2,11 +2,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from samples import carry_out
+from samples import SampleStore, carry_out
 
 from vibench.interfaces.strategies import Stop
 from vibench.stability.infsup import InfSup, inf_sup_full, inf_sup_on
-from vibench.stages.artefacts import Store
 from vibench.stages.assembly import AssemblyStage
 from vibench.stages.base import value_of
 from vibench.stages.cell_queries import CellQueries
@@ -35,9 +34,9 @@ def cell(problem: str, primal: str) -> CellQueries:
 
 
 @pytest.fixture(scope="module")
-def store(tmp_path_factory: pytest.TempPathFactory) -> Store:
+def store(tmp_path_factory: pytest.TempPathFactory) -> SampleStore:
     """A store with the constants of every pair of a problem and a primal strategy."""
-    store = Store(tmp_path_factory.mktemp("constants"))
+    store = SampleStore(tmp_path_factory.mktemp("constants"))
     for problem in PROBLEMS:
         for primal in PRIMALS:
             for stage in cell(problem, primal).constants:
@@ -46,7 +45,7 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> Store:
     return store
 
 
-def constants(store: Store, problem: str, primal: str) -> list[list[InfSup]]:
+def constants(store: SampleStore, problem: str, primal: str) -> list[list[InfSup]]:
     """Own, full and plain constants at every parameter."""
     return [value_of(store, stage) for stage in cell(problem, primal).constants]
 
@@ -62,7 +61,7 @@ def agrees(one: InfSup, other: InfSup) -> bool:
 
 @EVERY
 @pytest.mark.parametrize("primal", list(PRIMALS))
-def test_a_larger_primal_space_has_larger_constants(store: Store, problem: str, primal: str) -> None:
+def test_a_larger_primal_space_has_larger_constants(store: SampleStore, problem: str, primal: str) -> None:
     for own, full, plain in zip(*constants(store, problem, primal), strict=True):
         for larger, smaller in ((full, own), (own, plain)):
             assert larger.span >= smaller.span * (1.0 - 1e-8) - 1e-12
@@ -75,7 +74,7 @@ def test_a_larger_primal_space_has_larger_constants(store: Store, problem: str, 
 
 
 @EVERY
-def test_the_kinds_of_enrichment_reach_what_they_are_for(store: Store, problem: str) -> None:
+def test_the_kinds_of_enrichment_reach_what_they_are_for(store: SampleStore, problem: str) -> None:
     own, full, plain = constants(store, problem, "decorrelated")
     assert all(agrees(a, b) for a, b in zip(own, plain, strict=True))
     own, full, _ = constants(store, problem, "online-supremizers")
@@ -88,7 +87,7 @@ def test_the_kinds_of_enrichment_reach_what_they_are_for(store: Store, problem: 
 
 @EVERY
 @pytest.mark.parametrize("primal", list(PRIMALS))
-def test_constants_are_those_of_every_parameter_by_itself(store: Store, problem: str, primal: str) -> None:
+def test_constants_are_those_of_every_parameter_by_itself(store: SampleStore, problem: str, primal: str) -> None:
     stage = cell(problem, primal).assembly.enrichment
     model, basis = stage.model(store), value_of(store, stage.pod).basis
     cone = value_of(store, stage.cone).prepared

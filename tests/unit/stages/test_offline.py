@@ -11,7 +11,7 @@ import pytest
 import scipy.linalg
 from hypothesis import given
 from hypothesis import strategies as st
-from samples import carry_out
+from samples import SampleStore, carry_out
 
 from vibench import timing
 from vibench.arrays import Array
@@ -21,7 +21,6 @@ from vibench.interfaces.problem import Problem, VariationalInequality
 from vibench.interfaces.strategies import Kind, Stop
 from vibench.reduction.nested import Milestone
 from vibench.stages import base, snapshots
-from vibench.stages.artefacts import Store
 from vibench.stages.assembly import AssemblyStage
 from vibench.stages.base import Stage, value_of
 from vibench.stages.cell_queries import CellQueries
@@ -47,8 +46,8 @@ def cell(primal: str, tolerance: float | None, solver: str = "piqp") -> CellQuer
 
 
 @pytest.fixture(scope="module")
-def store(tmp_path_factory: pytest.TempPathFactory) -> Store:
-    store = Store(tmp_path_factory.mktemp("stages"))
+def store(tmp_path_factory: pytest.TempPathFactory) -> SampleStore:
+    store = SampleStore(tmp_path_factory.mktemp("stages"))
     for primal, tolerance in (("decorrelated", None), ("online-supremizers", None), ("offline-pga", 0.5)):
         carry_out(cell(primal, tolerance), store)
     return store
@@ -106,7 +105,7 @@ def test_a_key_changes_with_the_rooms_that_compute_the_value_and_what_it_is_made
     assert not kept & different
 
 
-def test_chunks_make_up_the_whole_sweep_in_order(store: Store) -> None:
+def test_chunks_make_up_the_whole_sweep_in_order(store: SampleStore) -> None:
     found = gather(store, training_stages(PROBLEM))
     problem = PROBLEM.create()
     assert np.array_equal(found.mu, problem.training_set())
@@ -118,14 +117,14 @@ def test_chunks_make_up_the_whole_sweep_in_order(store: Store) -> None:
 
 
 def test_few_parameters_leave_empty_chunks(tmp_path: Path) -> None:
-    store = Store(tmp_path)
+    store = SampleStore(tmp_path)
     chunks = validation_stages(PROBLEM, 3, 1)
     for chunk in chunks:
         carry_out(chunk, store)
     assert gather(store, chunks).mu.shape == (3, 3)
 
 
-def test_diagnostics_are_kept_beside_the_solutions(store: Store) -> None:
+def test_diagnostics_are_kept_beside_the_solutions(store: SampleStore) -> None:
     steps = {}
     for chunk in training_stages(PROBLEM):
         for history in store.get(chunk.key).histories:
@@ -135,7 +134,7 @@ def test_diagnostics_are_kept_beside_the_solutions(store: Store) -> None:
     assert min(steps.values()) >= 1.0
 
 
-def test_histories_of_the_offline_stages(store: Store) -> None:
+def test_histories_of_the_offline_stages(store: SampleStore) -> None:
     stage = cell("offline-pga", 0.5).assembly.enrichment
     pod = {h.quantity: h.values for h in store.get(stage.pod.key).histories}
     cone = {h.quantity: h.values for h in store.get(stage.cone.key).histories}
@@ -151,7 +150,7 @@ def test_histories_of_the_offline_stages(store: Store) -> None:
 
 
 @pytest.mark.parametrize("interpolation", [None, 1e-6])
-def test_a_cell_of_a_nested_strategy_is_the_cell_built_alone(store: Store, interpolation: float | None) -> None:
+def test_a_cell_of_a_nested_strategy_is_the_cell_built_alone(store: SampleStore, interpolation: float | None) -> None:
     """Snapshots, POD and cone are the same stages; everything from the enrichment on has keys of its own."""
     alone = cell("offline-pga", 0.5)
     parts = alone.assembly.enrichment
@@ -179,7 +178,7 @@ def test_a_cell_of_a_nested_strategy_is_the_cell_built_alone(store: Store, inter
             assert np.allclose(one.B, other.B, rtol=1e-10, atol=1e-13)
 
 
-def test_the_model_behind_a_cell_is_ready_for_queries(store: Store) -> None:
+def test_the_model_behind_a_cell_is_ready_for_queries(store: SampleStore) -> None:
     enrichment = cell("online-supremizers", None).assembly.enrichment
     model, basis = enrichment.model(store), value_of(store, enrichment.pod).basis
     prepared = value_of(store, enrichment.cone).prepared
@@ -193,7 +192,7 @@ def test_the_model_behind_a_cell_is_ready_for_queries(store: Store) -> None:
     ("primal", "tolerance", "kind"),
     [("decorrelated", None, "none"), ("online-supremizers", None, "per-parameter"), ("offline-pga", 0.5, "fixed")],
 )
-def test_rows_of_a_cell(store: Store, primal: str, tolerance: float | None, kind: str) -> None:
+def test_rows_of_a_cell(store: SampleStore, primal: str, tolerance: float | None, kind: str) -> None:
     rows = value_of(store, cell(primal, tolerance))
     assert rows.cell["enrichment_kind"] == kind
     assert rows.cell["status"] == "ok"
@@ -222,7 +221,7 @@ def test_rows_of_a_cell(store: Store, primal: str, tolerance: float | None, kind
         assert max(row["primal_residual"], row["dual_residual"], row["gap"]) <= 1e-8
 
 
-def test_a_row_says_how_much_of_its_error_the_solver_makes(store: Store) -> None:
+def test_a_row_says_how_much_of_its_error_the_solver_makes(store: SampleStore) -> None:
     """Exactly as much as separates it from the program solved to round-off; a tight accuracy leaves next to nothing."""
     loose = replace(cell("offline-pga", 0.5, "osqp"), accuracy=1e-3).run(store).value
     tight = replace(cell("offline-pga", 0.5, "piqp"), accuracy=1e-10).run(store).value
@@ -258,13 +257,13 @@ def test_the_set_up_is_no_part_of_the_seconds_of_a_solution(
     monkeypatch.setattr(snapshots, "HighFidelitySolver", Factorising)
     for clock in ("thread_time", "perf_counter"):
         monkeypatch.setattr(timing.time, clock, lambda: Factorising.now)
-    found = SnapshotStage(PROBLEM, purpose, count, 3, 1).run(Store(tmp_path))
+    found = SnapshotStage(PROBLEM, purpose, count, 3, 1).run(SampleStore(tmp_path))
     assert found.value.setups == (Seconds(10.0, 10.0),)
     assert set(found.value.seconds) == {Seconds(1.0, 1.0)}
     assert found.seconds == Seconds(float(len(found.value.mu)), float(len(found.value.mu)))
 
 
-def test_a_slow_query_is_a_timeout(store: Store) -> None:
+def test_a_slow_query_is_a_timeout(store: SampleStore) -> None:
     impatient = replace(cell("decorrelated", None), query_seconds=1e-9)
     rows = impatient.run(store).value
     assert rows.cell["status"] == "timeout"
@@ -272,7 +271,7 @@ def test_a_slow_query_is_a_timeout(store: Store) -> None:
     assert "the limit is 1e-09 s" in rows.queries[0]["reason"]
 
 
-def test_the_reference_constants_are_those_of_every_parameter(store: Store) -> None:
+def test_the_reference_constants_are_those_of_every_parameter(store: SampleStore) -> None:
     constants = value_of(store, ReferenceConstants(ValidationConstraints(PROBLEM, 9, 3)))
     mus = PROBLEM.create().validation_set(9, 3)
     scaled = [c.inf_sup.span / mu[0] ** 2 for c, mu in zip(constants, mus, strict=True)]  # B = mu_1² times one matrix
@@ -288,7 +287,7 @@ def test_the_reference_constants_are_those_of_every_parameter(store: Store) -> N
 def test_a_missing_artefact_is_named(tmp_path: Path) -> None:
     stage = PODStage(PROBLEM, Stop(size=2))
     with pytest.raises(NumericalError, match=stage.key):
-        value_of(Store(tmp_path), stage)
+        value_of(SampleStore(tmp_path), stage)
 
 
 def test_a_problem_without_diagnostics_has_no_such_history(monkeypatch: pytest.MonkeyPatch) -> None:

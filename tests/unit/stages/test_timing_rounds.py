@@ -9,12 +9,11 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from samples import carry_out
+from samples import SampleStore, carry_out
 
 from vibench.interfaces.strategies import Stop
 from vibench.qp.status import Status
 from vibench.stages import timing_rounds
-from vibench.stages.artefacts import Store
 from vibench.stages.assembly import AssemblyStage
 from vibench.stages.base import Failed
 from vibench.stages.cell_queries import CellQueries
@@ -40,8 +39,8 @@ EVERY = tuple(range(VALIDATION))
 
 
 @pytest.fixture(scope="module")
-def store(tmp_path_factory: pytest.TempPathFactory) -> Store:
-    store = Store(tmp_path_factory.mktemp("artefacts"))
+def store(tmp_path_factory: pytest.TempPathFactory) -> SampleStore:
+    store = SampleStore(tmp_path_factory.mktemp("artefacts"))
     for stage in TimingRounds(CELLS, (EVERY,) * len(CELLS), 1).inputs():
         if store.get(stage.key) is None:
             carry_out(stage, store)
@@ -84,7 +83,7 @@ def _in(stage: TimingRounds) -> timing_rounds._Rounds:
     return rounds
 
 
-def test_every_ok_query_is_timed_and_no_other(store: Store) -> None:
+def test_every_ok_query_is_timed_and_no_other(store: SampleStore) -> None:
     fine = (EVERY, (0, 2, 5), EVERY, (3,))
     timed = TimingRounds(CELLS, fine, 8).run(store).value
     for one, numbers in zip(timed, fine, strict=True):
@@ -97,14 +96,14 @@ def test_every_ok_query_is_timed_and_no_other(store: Store) -> None:
         assert all(row["total_s"] == row["assemble_s"] + row["solve_s"] for row in rows.values())
 
 
-def test_reduced_assembly_is_timed_at_every_query_and_full_assembly_once_a_round(store: Store) -> None:
+def test_reduced_assembly_is_timed_at_every_query_and_full_assembly_once_a_round(store: SampleStore) -> None:
     timed = TimingRounds(CELLS, (EVERY,) * len(CELLS), 2).run(store).value
     assert [[len(each.assemble) for each in one.rounds] for one in timed[:3]] == [[1, 1]] * 3
     assert all(each.assemble.keys() == each.solve.keys() for each in timed[3].rounds)
 
 
 def test_matrices_in_full_are_assembled_once_in_a_round_for_all_cells(
-    store: Store, monkeypatch: pytest.MonkeyPatch
+    store: SampleStore, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     calls: list[float] = []
     plain = timing_rounds.checked_assembly
@@ -116,7 +115,7 @@ def test_matrices_in_full_are_assembled_once_in_a_round_for_all_cells(
     assert len(set(calls)) == 4
 
 
-def test_a_round_that_takes_long_ends_early(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_round_that_takes_long_ends_early(store: SampleStore, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(timing_rounds, "ROUND_SECONDS", 0.0)
     (timed,) = TimingRounds(CELLS[:1], (EVERY,), 4).run(store).value
     assert [len(each.solve) for each in timed.rounds] == [1] * 4

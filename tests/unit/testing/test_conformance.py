@@ -114,7 +114,7 @@ MORE_STRATEGIES: Mapping[str, Case] = {
     "DrawsVectors": ("determinism", ["a second call gives different values of vectors: entry ("]),
     "ChangesTheBasis": ("no mutation", ["build changes offline.basis: entry (", "work on copies"]),
     "NoMultiplier": ("model without contact", ["AssertionError: no multiplier", "broken_strategies.py, line"]),
-    "SuppliesFunction": ("pickling", ["the Enrichment cannot be pickled", "attribute supply"]),
+    "SuppliesFunction": ("pickling", ["the Enrichment cannot be stored", "is not a function in broken_strategies"]),
     "SuppliesAVector": ("enrichment", ["the supply at mu = [-0.1, 0.0] has shape (40,); expected (40, 40)"]),
     "Restarts": ("nested growth", ["the vectors of tolerance 0.5 are not the first ones of tolerance 0.1"]),
 }  # fmt: skip

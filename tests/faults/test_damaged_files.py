@@ -1,0 +1,247 @@
+"""Damaged results files and artefacts: any bit, any length; it is found, or without effect on any number."""
+
+from __future__ import annotations
+
+import random
+import shutil
+import sqlite3
+from collections.abc import Callable, Iterator
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import pytest
+from running import Main, execute, rows
+from samples import write_study
+
+from vibench.errors import RequestError
+from vibench.execution import run  # noqa: F401  lists the classes of all stages
+from vibench.report import compare
+from vibench.results import tables
+from vibench.results.columns import STORED
+from vibench.results.database import FILE, ResultsDatabase, read_meta, read_rows, study_of
+from vibench.stages.artefacts import CACHE_VARIABLE, SUFFIX, Store
+from vibench.stages.serialisation import dumps
+
+STUDY = {
+    "name": "small",
+    "seed": 3,
+    "validation": 2,
+    "solvers": ["piqp", "osqp"],
+    "dual": ["mcpg"],
+    "primal": ["decorrelated", "offline-pga"],
+    "assembly": ["full", "reduced"],
+    "problem": [{"name": "obstacle", "options": {"resolution": "coarse"}}],
+    "tolerances": [{"pod": [1e-1], "dual": [1e-1], "primal": {"offline-pga": [0.5]}}],
+    "timing_rounds": 2,
+}
+HEAD = 8192
+"""Bytes at the beginning of a results file that say what the others are: header and schema."""
+
+Damage = Callable[[bytes], bytes]
+
+
+@pytest.fixture(scope="module")
+def made(vibench: Callable[..., Any], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a run of a small study, and its artefacts."""
+    folder = tmp_path_factory.mktemp("made")
+    write_study(folder, STUDY)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv(CACHE_VARIABLE, str(folder / "cache"))
+        done = vibench(folder, "run", "study.toml", "--jobs", "2", "--out", "out")
+    assert done.returncode == 0, done.stderr
+    return folder
+
+
+@pytest.fixture
+def results(made: Path, tmp_path: Path) -> Path:
+    """A copy of the results, to be damaged."""
+    (tmp_path / "run").mkdir()
+    shutil.copy(made / "out" / FILE, tmp_path / "run" / FILE)
+    return tmp_path / "run" / FILE
+
+
+def flips(seed: int, count: int, first: int = 0) -> Iterator[Damage]:
+    """Damages of one bit each, every third among the first bytes."""
+    rng = random.Random(seed)
+
+    def flip(content: bytes, at: float, bit: int, end: int) -> bytes:
+        changed = bytearray(content)
+        changed[int(at * (end or len(content)))] ^= 1 << bit
+        return bytes(changed)
+
+    for k in range(count):
+        at, bit, end = rng.random(), rng.randrange(8), first if k % 3 == 0 else 0
+        yield lambda content, at=at, bit=bit, end=end: flip(content, at, bit, end)
+
+
+def truncations(seed: int, count: int) -> Iterator[Damage]:
+    """Damages that leave the beginning of a file, every second one whole pages of it."""
+    rng = random.Random(seed)
+    for k in range(count):
+        share, page = rng.random(), 4096 if k % 2 else 1
+        yield lambda content, share=share, page=page: content[: int(share * len(content)) // page * page]
+
+
+def everything(path: Path) -> list[Any]:
+    """All that commands read of a results file."""
+    found = tables.results_file(str(path))
+    read = [[names, *rows] for names, rows in (read_rows(found, table) for table in STORED)]
+    return [study_of(found, read_meta(found)), *read]
+
+
+def refusal(path: Path) -> str:
+    """The line in which a damaged file is refused."""
+    with pytest.raises(RequestError) as caught:
+        everything(path)
+    return str(caught.value)
+
+
+@pytest.mark.parametrize("damages", [flips(1, 210, HEAD), truncations(2, 60)], ids=["flips", "truncations"])
+def test_damage_of_a_results_file_is_found_or_has_no_effect(
+    damages: Iterator[Damage], made: Path, results: Path
+) -> None:
+    """As the file itself says it is: its digests are those that were written with it."""
+    content, original = results.read_bytes(), everything(results)
+    harmless, lines = 0, list[str]()
+    for damage in damages:
+        results.write_bytes(damage(content))
+        try:
+            found = everything(results)
+        except RequestError as error:
+            lines.append(str(error))
+            continue
+        assert found == original
+        harmless += 1
+        if harmless < 4:
+            changes = compare.compare(made / "out" / FILE, results, 1.0).changes
+            assert not len(changes)
+    assert len(lines) > 50
+    assert all(line.isprintable() and str(results.parent) in line for line in lines)
+
+
+def test_every_number_of_a_results_file_is_watched(results: Path) -> None:
+    """One value of every column that has one, changed in its last bit or letter."""
+    with closing(sqlite3.connect(results)) as db:
+        db.execute("PRAGMA synchronous=OFF")
+        for table, columns in {"meta": ("value",), **STORED}.items():
+            for column in columns:
+                keys = db.execute(f"SELECT rowid, {column} FROM {table} WHERE {column} IS NOT NULL").fetchone()
+                if keys is None:
+                    continue
+                row, value = keys
+                other = value + "x" if isinstance(value, str) else value + b"x" if isinstance(value, bytes) else -value
+                if other == value:
+                    other = value + 1
+                db.execute(f"UPDATE {table} SET {column} = ? WHERE rowid = ?", (other, row))
+                db.commit()
+                assert "is damaged" in refusal(results) or (table, column) == ("meta", "value")
+                db.execute(f"UPDATE {table} SET {column} = ? WHERE rowid = ?", (value, row))
+                db.commit()
+        for table in STORED:
+            db.execute(f"CREATE TABLE kept AS SELECT * FROM {table} LIMIT 1")
+            if db.execute(f"DELETE FROM {table} WHERE rowid = (SELECT min(rowid) FROM {table})").rowcount:
+                db.commit()
+                assert f"in the table '{table}' are not those that were written" in refusal(results)
+                db.execute(f"INSERT INTO {table} SELECT * FROM kept")
+            db.execute("DROP TABLE kept")
+            db.commit()
+        everything(results)
+
+
+def test_commands_refuse_a_damaged_cell_by_its_name(results: Path, main: Main) -> None:
+    with closing(sqlite3.connect(results)) as db:
+        (cell,) = db.execute("SELECT cell FROM cells LIMIT 1").fetchone()
+        db.execute("UPDATE cells SET online_s = online_s * (1 + 1e-15) WHERE cell = ?", (cell,))
+        db.execute("UPDATE queries SET error_u = error_u * (1 + 1e-15) WHERE cell = ?", (cell,))
+        db.commit()
+    folder = str(results.parent)
+    line = f"vibench: '{results}' is damaged: rows of the cell {cell} in the table"
+    for command in (
+        ("show", folder),
+        ("show", folder, "--table", "queries", "--format", "json"),
+        ("report", folder),
+        ("diff", folder, folder),
+        ("replay", folder, cell),
+        ("export-qps", folder, "set"),
+    ):
+        code, _, errors = main(*command)
+        assert (code, errors.startswith(line), errors.count("\n")) == (2, True, 1), errors
+    assert main("show", folder, "--table", "thresholds")[0] == 0  # which has no part in it
+    assert not (results.parent / "report.html").exists()
+
+
+def study(path: Path) -> dict[str, Any]:
+    return study_of(path, read_meta(path))
+
+
+def test_a_resumed_run_computes_damaged_cells_again(made: Path, results: Path, vibench: Callable[..., Any]) -> None:
+    shutil.copy(made / "study.toml", results.parent.parent)
+    with closing(sqlite3.connect(results)) as db:
+        first, second = (cell for (cell,) in db.execute("SELECT cell FROM cells ORDER BY cell LIMIT 2"))
+        db.execute("UPDATE queries SET error_u = 0.0 WHERE cell = ?", (first,))
+        db.execute("UPDATE solutions SET x = NULL WHERE cell = ?", (second,))
+        db.execute("UPDATE thresholds SET benefit_threshold = 1.0")  # made anew by every run
+        db.commit()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv(CACHE_VARIABLE, str(made / "cache"))
+        done = vibench(results.parent.parent, "run", "study.toml", "--jobs", "1", "--out", "run")
+    assert done.returncode == 0, done.stderr
+    assert f"computed again, as their rows were damaged: {first}, {second}" in done.stdout
+    changes = compare.compare(made / "out" / FILE, results, 1.0 + 1e-9).changes
+    assert not len(changes[~changes["what"].str.contains(r"_s$|benefit|threshold")])
+    everything(results)
+
+
+def test_a_damaged_index_is_made_again(made: Path, results: Path) -> None:
+    """Rows are read without it; where they are changed it is checked."""
+    with closing(sqlite3.connect(results)) as db:
+        (root,) = db.execute("SELECT rootpage FROM sqlite_master WHERE name = 'queries_of_cell'").fetchone()
+        (size,) = db.execute("PRAGMA page_size").fetchone()
+        (cell,) = db.execute("SELECT cell FROM queries LIMIT 1").fetchone()
+    content, page = results.read_bytes(), slice((root - 1) * size, root * size)
+    damaged = content[page].replace(cell.encode(), b"0" * 16)
+    assert damaged != content[page]
+    results.write_bytes(content[: page.start] + damaged + content[page.stop :])
+    assert everything(results) == everything(made / "out" / FILE)
+    database = ResultsDatabase(results.parent, study(results))
+    assert database.damaged == ()
+    assert len(database.fine_queries(cell)) == STUDY["validation"]
+    database.close()
+
+
+@pytest.mark.parametrize("table", ["histories", "pictures"])
+def test_a_run_is_not_resumed_where_no_cell_explains_the_damage(table: str, results: Path) -> None:
+    with closing(sqlite3.connect(results)) as db:
+        db.execute(f"DELETE FROM {table} WHERE rowid = 1")
+        db.commit()
+    before = rows(results.parent, table)
+    with pytest.raises(RequestError, match=f"is damaged: rows of the table '{table}' have changed; use another --out"):
+        ResultsDatabase(results.parent, study(results))
+    assert rows(results.parent, table) == before
+    assert [path.name for path in results.parent.iterdir()] == [FILE]
+
+
+@pytest.mark.parametrize("table", ["cells", "queries"])
+def test_a_status_that_does_not_exist_is_refused(table: str, results: Path, main: Main) -> None:
+    """Written by a stranger, with the right digest."""
+    execute(results.parent, f"UPDATE {table} SET status = 'fine'")
+    folder = str(results.parent)
+    code, _, errors = main("diff", folder, folder)
+    assert code == 2
+    assert f"has the status 'fine' in '{table}', expected one of ok, inaccurate" in errors
+
+
+@pytest.mark.parametrize("damages", [flips(3, 90), truncations(4, 40)], ids=["flips", "truncations"])
+def test_damage_of_an_artefact_is_found(damages: Iterator[Damage], made: Path, tmp_path: Path) -> None:
+    """Every kind of artefact; the digest covers all of it."""
+    paths = sorted((made / "cache" / "artefacts").glob(f"*{SUFFIX}"))
+    assert len({path.name.rpartition("-")[0] for path in paths}) >= 15
+    for path, damage in zip(paths * 10, damages, strict=False):
+        content, key = path.read_bytes(), path.name.removesuffix(SUFFIX)
+        (tmp_path / path.name).write_bytes(damage(content))
+        assert Store(tmp_path).get(key) is None
+        (tmp_path / path.name).write_bytes(content)
+        found = Store(tmp_path).get(key)
+        assert found is not None
+        assert dumps(found) == content[32:]  # read and written again, it is the same to the last bit

@@ -1,0 +1,105 @@
+"""Digests of the rows of a results file: SQLite finds pages whose structure is broken, but no changed numbers."""
+
+from __future__ import annotations
+
+import hashlib
+import marshal
+import sqlite3
+from collections.abc import Sequence
+from itertools import groupby
+from typing import Any
+
+from vibench.results.columns import STORED
+
+META = ("key", "value")
+"""Columns of the meta table."""
+
+NONE = "0"
+"""Digest of no rows."""
+
+CREATE = "CREATE TABLE IF NOT EXISTS digests (name TEXT, cell TEXT, total TEXT, PRIMARY KEY (name, cell))"
+"""The table of the digests: one for each cell in each table, or for a whole table that has no cells."""
+
+FORMAT = 2
+"""Format of marshal for the rows: its later ones depend on how often an object is used."""
+
+
+class DigestError(Exception):
+    """Rows that are not those that were written; the message names the table, and a cell if it has some."""
+
+
+class Digests:
+    """The digests in a results file: sums over rows, which follow a change of few rows without reading the others.
+
+    A row counts 2¹²⁸ and its digest of 128 bits (BLAKE2b). The order of the rows does not matter, nor do columns that
+    were added after them.
+    """
+
+    def __init__(self, db: sqlite3.Connection) -> None:
+        self._db = db
+
+    def count(self, table: str, same: str = "TRUE", values: Sequence[Any] = (), *, sign: int = 1) -> None:
+        """Add the rows of a table under a condition, before they are changed with `sign` −1."""
+        cursor = self._db.execute(f'SELECT * FROM "{table}" WHERE {same}', values)
+        for cell, total in _totals([column[0] for column in cursor.description], cursor.fetchall()).items():
+            known = self._db.execute("SELECT total FROM digests WHERE name = ? AND cell = ?", (table, cell)).fetchone()
+            now = int(known[0] if known else NONE, 16) + sign * total
+            self._db.execute("INSERT OR REPLACE INTO digests VALUES (?, ?, ?)", (table, cell, f"{now:x}"))
+
+    def forget(self, **keys: str) -> None:
+        """Remove the digests of a table or of a cell, whose rows are all replaced."""
+        same = " AND ".join(f"{name} = ?" for name in keys)
+        self._db.execute(f"DELETE FROM digests WHERE {same}", tuple(keys.values()))
+
+    def changed(self, table: str) -> tuple[str, ...]:
+        """Cells whose rows are not those that were written; "" for a table without cells."""
+        return self._compared(table, *self._read(table))
+
+    def verified(self, table: str, cell: str = "") -> tuple[list[str], list[tuple[Any, ...]]]:
+        """Columns and rows of a table, or those of one cell.
+
+        Raises
+        ------
+        DigestError
+            If they are not those that were written.
+        """
+        names, rows = self._read(table, cell)
+        if changed := self._compared(table, names, rows, cell):
+            whose = f" of the cell {changed[0]}" if changed[0] else ""
+            raise DigestError(f"rows{whose} in the table '{table}' are not those that were written")
+        return names, rows
+
+    def _read(self, table: str, cell: str = "") -> tuple[list[str], list[tuple[Any, ...]]]:
+        # An index may be damaged, too: the table itself is read.
+        same, values = ("WHERE cell = ?", (cell,)) if cell else ("", ())
+        cursor = self._db.execute(f'SELECT * FROM "{table}" NOT INDEXED {same}', values)
+        names = [column[0] for column in cursor.description]
+        declared, rows = META if table == "meta" else tuple(STORED[table]), cursor.fetchall()
+        if names != [*declared, *(f"mu_{k + 1}" for k in range(len(names) - len(declared)))]:
+            raise DigestError(f"the columns of the table '{table}' are not those that were written")
+        return names, rows
+
+    def _compared(
+        self, table: str, names: Sequence[str], rows: Sequence[tuple[Any, ...]], cell: str = ""
+    ) -> tuple[str, ...]:
+        same, values = ("AND cell = ?", (table, cell)) if cell else ("", (table,))
+        known = dict(self._db.execute(f"SELECT cell, total FROM digests NOT INDEXED WHERE name = ? {same}", values))
+        found = {str(key): f"{total:x}" for key, total in _totals(names, rows).items()}
+        either = sorted(map(str, known.keys() | found.keys()))
+        return tuple(key for key in either if known.get(key, NONE) != found.get(key, NONE))
+
+
+def _totals(names: Sequence[str], rows: Sequence[tuple[Any, ...]]) -> dict[Any, int]:
+    """Sum over the rows of each cell."""
+    at, found = (names.index("cell") if "cell" in names else None), dict[Any, int]()
+    for cell, group in groupby(rows, key=(lambda row: row[at]) if at is not None else lambda _: ""):
+        found[cell] = found.get(cell, 0) + sum(map(_digest, group))
+    return found
+
+
+def _digest(row: tuple[Any, ...]) -> int:
+    count = len(row)
+    while count and row[count - 1] is None:
+        count -= 1
+    code = hashlib.blake2b(marshal.dumps(row[:count], FORMAT), digest_size=16)
+    return (1 << 128) + int.from_bytes(code.digest())

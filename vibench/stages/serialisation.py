@@ -1,0 +1,235 @@
+"""Values of stages as bytes: arrays and JSON in the safetensors format, from which nothing but data can be read."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import fields, is_dataclass
+from enum import Enum
+from functools import cached_property
+from typing import Any, TypeVar
+
+import numpy as np
+import safetensors
+import safetensors.numpy
+import scipy.sparse as sp
+
+from vibench.arrays import SparseMatrix
+from vibench.errors import NumericalError, VibenchError
+from vibench.text import one_line
+
+STRUCTURE = "structure"
+"""Name of the tensor that holds the JSON text; the others are the arrays it refers to, by their numbers."""
+
+DTYPES = frozenset({
+    "bool", "int8", "int16", "int32", "int64", "uint8", "uint16", "uint32", "uint64", "float16", "float32", "float64",
+})  # fmt: skip
+"""Types of entries that an array may have."""
+
+SPARSE = {
+    "csr": ("data", "indices", "indptr"),
+    "csc": ("data", "indices", "indptr"),
+    "bsr": ("data", "indices", "indptr"),
+    "coo": ("row", "col", "data"),
+    "dia": ("data", "offsets"),
+}
+"""The arrays of a sparse matrix, by its format; matrices of other formats are stored as `coo`."""
+
+_classes: dict[str, type] = {}
+
+ClassT = TypeVar("ClassT", bound=type)
+
+
+class DamagedError(VibenchError):
+    """Bytes that `dumps` did not write."""
+
+
+def storable(kind: ClassT) -> ClassT:
+    """Add a class to the closed list of those whose objects may be stored; may be used as a decorator.
+
+    Of a dataclass the fields are stored, of an enumeration the name of the member, of any other class what
+    `__getstate__` returns. Cached properties are not stored. A module that defines a stage lists the classes of its
+    value; two classes of the same name cannot be on the list.
+    """
+    assert _classes.setdefault(kind.__name__, kind) is kind, f"two storable classes are called {kind.__name__}"
+    return kind
+
+
+def dumps(value: Any) -> bytes:
+    """A value as bytes: `None`, truth values, numbers, texts, tuples, lists, dictionaries, arrays, `storable` objects.
+
+    Raises
+    ------
+    NumericalError
+        Naming the first part that is none of these.
+    """
+    writer = _Writer()
+    text = json.dumps(writer.described(value), allow_nan=False, separators=(",", ":"))
+    return safetensors.numpy.save(writer.arrays | {STRUCTURE: np.frombuffer(text.encode("ascii"), np.uint8)})
+
+
+def loads(content: bytes) -> Any:
+    """The value that `dumps` wrote; arrays have the same entries, shape and order in memory, and may be written to.
+
+    Raises
+    ------
+    DamagedError
+        If the content is anything else. It imports and runs nothing that the content names.
+    """
+    try:
+        arrays = safetensors.numpy.load(content)
+        text = arrays.pop(STRUCTURE).tobytes().decode("ascii")
+        structure = json.loads(text, object_pairs_hook=_no_duplicates, parse_constant=_refuse)
+        return _Reader(arrays).value(structure)
+    except (
+        safetensors.SafetensorError,
+        LookupError,
+        TypeError,
+        ValueError,
+        AttributeError,
+        RecursionError,
+        MemoryError,
+        VibenchError,  # a factorisation that is computed again
+    ) as error:
+        raise DamagedError(one_line(str(error))) from None
+
+
+class _Writer:
+    """Describes a value in JSON; arrays are set aside, and one that occurs twice is stored once."""
+
+    def __init__(self) -> None:
+        self.arrays: dict[str, np.ndarray[Any, Any]] = {}
+        self._numbers: dict[int, str] = {}
+        self._kept: list[Any] = []  # as long as they live, no other object has their identity
+
+    def described(self, value: Any) -> Any:
+        """JSON of a value: itself, or an object with the sort of the value as its only name."""
+        if value is None or type(value) in (bool, int, str):
+            return value
+        if type(value) is float:
+            return value if math.isfinite(value) else {"float": repr(value)}
+        if type(value) in (tuple, list) or (isinstance(value, Mapping) and not sp.issparse(value)):
+            return self._container(value)
+        return self._array(value) if type(value) is np.ndarray or isinstance(value, np.generic) else self._object(value)
+
+    def _container(self, value: Any) -> Any:
+        if isinstance(value, Mapping):
+            return {"dict": [[self.described(key), self.described(part)] for key, part in value.items()]}
+        return {"tuple" if isinstance(value, tuple) else "list": [self.described(part) for part in value]}
+
+    def _array(self, value: Any) -> Any:
+        """An array, or a number of NumPy."""
+        if value.dtype.name not in DTYPES:
+            raise NumericalError(f"an array of the type {value.dtype} cannot be stored")
+        if isinstance(value, np.generic):
+            return {"scalar": self._number(np.asarray(value))}
+        turned = value.flags.f_contiguous and not value.flags.c_contiguous
+        return {"columnwise" if turned else "array": self._number(value)}
+
+    def _number(self, value: np.ndarray[Any, Any]) -> str:
+        if id(value) not in self._numbers:
+            number = self._numbers[id(value)] = str(len(self.arrays))
+            turned = value.flags.f_contiguous and not value.flags.c_contiguous
+            self._kept.append(value)
+            self.arrays[number] = value.T if turned else np.asarray(value, order="C")
+        return self._numbers[id(value)]
+
+    def _sparse(self, value: SparseMatrix) -> Any:
+        kind = value.format if value.format in SPARSE else "coo"
+        stored = value.asformat(kind)
+        self._kept.append(stored)
+        parts = [self.described(np.asarray(getattr(stored, name))) for name in SPARSE[kind]]
+        return {"sparse": [value.format, kind, isinstance(value, sp.sparray), list(value.shape), parts]}
+
+    def _object(self, value: Any) -> Any:
+        if sp.issparse(value):
+            return self._sparse(value)
+        kind, name = type(value), type(value).__name__
+        if _classes.get(name) is not kind:
+            raise NumericalError(f"a value of the type {kind.__module__}.{kind.__qualname__} cannot be stored")
+        if isinstance(value, Enum):
+            return {"member": [name, value.name]}
+        if is_dataclass(value):
+            state = {field.name: getattr(value, field.name) for field in fields(value)}
+        else:
+            state = {k: v for k, v in value.__getstate__().items() if not _is_cached(kind, k)}
+        return {"object": [name, {key: self.described(part) for key, part in state.items()}]}
+
+
+class _Reader:
+    """Makes a value from its description and its arrays."""
+
+    def __init__(self, arrays: dict[str, np.ndarray[Any, Any]]) -> None:
+        self._arrays = arrays
+        self._sorts: dict[str, Callable[[Any], Any]] = {
+            "float": lambda text: {"inf": math.inf, "-inf": -math.inf, "nan": math.nan}[text],
+            "tuple": lambda parts: tuple(map(self.value, parts)),
+            "list": lambda parts: list(map(self.value, parts)),
+            "dict": lambda parts: {self.value(key): self.value(part) for key, part in parts},
+            "array": lambda number: self._arrays[number],
+            "columnwise": lambda number: self._arrays[number].T,
+            "scalar": lambda number: self._arrays[number][()],
+            "sparse": lambda parts: self._sparse(*parts),
+            "member": lambda parts: _class(parts[0], Enum)[parts[1]],
+            "object": lambda parts: self._object(*parts),
+        }
+
+    def value(self, described: Any) -> Any:
+        """The value of a description."""
+        if not isinstance(described, dict):
+            if isinstance(described, list):
+                raise TypeError("a list without its sort")
+            return described
+        ((sort, content),) = described.items()
+        return self._sorts[sort](content)
+
+    def _sparse(self, wanted: str, kind: str, array: bool, shape: list[int], parts: list[Any]) -> SparseMatrix:
+        arrays = [self.value(part) for part in parts]
+        if kind not in SPARSE or wanted not in {*SPARSE, "lil", "dok"} or len(arrays) != len(SPARSE[kind]):
+            raise ValueError("no format of a sparse matrix")
+        make = getattr(sp, f"{kind}_{'array' if array else 'matrix'}")
+        given = (arrays[2], (arrays[0], arrays[1])) if kind == "coo" else tuple(arrays)
+        found = make(given, shape=tuple(shape))
+        if kind in ("csr", "csc", "bsr"):
+            if not arrays[1].dtype.kind == arrays[2].dtype.kind == "i":
+                raise ValueError("indices that are no integers")
+            found.check_format(full_check=True)  # compiled loops trust the indices
+            found.indices, found.indptr = arrays[1], arrays[2]  # as they were: the constructor may have copied them
+        return found if wanted == kind else found.asformat(wanted)
+
+    def _object(self, name: str, described: dict[str, Any]) -> Any:
+        kind = make = _class(name, object)
+        state = {key: self.value(part) for key, part in described.items()}
+        if is_dataclass(kind):
+            if state.keys() != {field.name for field in fields(kind)}:
+                raise TypeError(f"other fields than those of {name}")
+            return make(**state)
+        found = object.__new__(kind)
+        set_state = getattr(found, "__setstate__", found.__dict__.update)
+        set_state(state)
+        return found
+
+
+def _class(name: str, base: type) -> Any:
+    """The class of a name, from the closed list."""
+    found = _classes[name]
+    if issubclass(found, Enum) is not (base is Enum):
+        raise TypeError(f"{name} is another sort of class")
+    return found
+
+
+def _is_cached(kind: type, name: str) -> bool:
+    return isinstance(getattr(kind, name, None), cached_property)
+
+
+def _no_duplicates(pairs: Iterable[tuple[str, Any]]) -> dict[str, Any]:
+    pairs = list(pairs)
+    found = dict(pairs)
+    if len(found) != len(pairs):
+        raise ValueError("a name that occurs twice")
+    return found
+
+
+def _refuse(constant: str) -> None:
+    raise ValueError(f"{constant} is not JSON")
