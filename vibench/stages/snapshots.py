@@ -27,6 +27,9 @@ CHUNKS = 4
 """Number of chunks of a parameter set, each with its own set-up; fixed, so that keys do not depend on the workers."""
 
 
+storable(Fingerprint)
+
+
 @storable
 @dataclass(frozen=True)
 class Snapshots:
