@@ -14,12 +14,14 @@ import subprocess
 import sys
 import threading
 import time
+from collections import OrderedDict
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
+from vibench.execution.parts import Part, PartDone, parts
 from vibench.provenance import NUMERICAL, core_code, libraries
 from vibench.qp.status import Status
 from vibench.stages.base import Done, Failed, PiecewiseStage, Stage, Unstored
@@ -30,6 +32,9 @@ POLL = 0.2
 
 START_SECONDS = 300.0
 """Time limit of the start of a worker process and its imports; the limits of a job begin when its work begins."""
+
+KEPT = 4
+"""Worker processes that a supervisor keeps between two stages, each of other packages."""
 
 GRACE = 2.0
 """Seconds allowed beyond the limit of a query, for the work before and after the solver."""
@@ -110,13 +115,14 @@ class _JobState:
     def __init__(self, job: Job) -> None:
         self.job, self.progress = job, Progress()
         self.seconds = 0.0
-        self.start()
+        self.start(Part(frozenset(), (), ends=False))
 
-    def start(self) -> Progress:
-        """Note that a process is given the job; returns the progress that it continues from."""
+    def start(self, part: Part) -> Progress:
+        """Note that a process is given a part of the job; returns what it needs to know of the others."""
+        self.part = part
         self._last, self._begun, self._starting = time.monotonic(), False, 0.0
         self._next_piece()
-        return self.progress
+        return self.progress if part.ends else Progress()
 
     def _next_piece(self) -> None:
         self.piece: int | None = None
@@ -138,7 +144,7 @@ class _JobState:
         if self.seconds > self._piece_limit:
             raise _WorkerLostError(_beyond("query_seconds", self.job.query_seconds))
 
-    def update(self, message: Any) -> Done | Failed | Unstored | None:
+    def update(self, message: Any) -> Done | Failed | Unstored | PartDone | None:
         """Process a message of the worker; returns the outcome if it is one."""
         match message:
             case Begun():
@@ -151,13 +157,20 @@ class _JobState:
                 self._next_piece()
             case OutOfMemory():
                 raise _WorkerLostError(message.failed)
-            case Done() | Failed() | Unstored():
+            case Done() | Failed() | Unstored() | PartDone():
                 return message
         return None
 
 
+_Worker = tuple[Connection, "subprocess.Popen[bytes]"]
+"""The connection to a worker process, and the process."""
+
+
 class Supervisor:
-    """Runs stages, one at a time, in a worker process that it starts, watches and replaces.
+    """Runs stages, one at a time, in worker processes that it starts, watches and replaces.
+
+    Every set of packages of third parties has a process of its own: whatever they do to it concerns no others. Pieces
+    of one stage that need several are done by these in turn.
 
     Parameters
     ----------
@@ -167,8 +180,7 @@ class Supervisor:
 
     def __init__(self, log: Path | None = None) -> None:
         self._log = log
-        self._process: subprocess.Popen[bytes] | None = None
-        self._connection: Connection | None = None
+        self._workers: OrderedDict[frozenset[str], _Worker] = OrderedDict()  # the one used last comes last
         self._stop = threading.Event()
 
     def run(self, job: Job) -> Done | Failed | Unstored:
@@ -197,11 +209,13 @@ class Supervisor:
     def _run(self, job: Job) -> Done | Failed | Unstored:
         state, limit, retried = _JobState(job), job.cell_seconds, False
         found, lost = state.progress.found, state.progress.lost
+        while len(self._workers) > KEPT:
+            self._kill(next(iter(self._workers)))
         while True:
             try:
                 return self._attempt(state, limit)
             except _WorkerLostError as error:
-                self._kill()
+                self._kill(state.part.packages)
                 if error.failed is None:
                     continue
                 if state.piece is not None:
@@ -217,13 +231,21 @@ class Supervisor:
                 retried = retried or state.piece is None
 
     def _attempt(self, state: _JobState, limit: float) -> Done | Failed | Unstored:
-        """Run the rest of a stage in one process."""
+        """Run the rest of a stage, part by part."""
+        for part in parts(state.job.stage, state.progress.found.keys() | state.progress.lost.keys()):
+            outcome = self._attempt_part(state, limit, part)
+            if not isinstance(outcome, PartDone):
+                return outcome
+        raise AssertionError("the last part ends the stage")
+
+    def _attempt_part(self, state: _JobState, limit: float, part: Part) -> Done | Failed | Unstored | PartDone:
+        """Run a part of a stage in one process."""
         try:
-            connection, process = self._worker()
+            connection, process = self._worker(part.packages)
         except OSError as error:
             return Failed(Status.CRASHED, f"no worker process could be started: {error.strerror}")
         try:
-            connection.send((state.job, state.start()))
+            connection.send((state.job, state.start(part), part))
             while not self._stop.is_set():
                 if connection.poll(POLL):
                     outcome = state.update(connection.recv())
@@ -237,33 +259,35 @@ class Supervisor:
                 raise _WorkerLostError(Failed(Status.CRASHED, _cause_of_death(process))) from None
         raise StoppedError
 
-    def _worker(self) -> tuple[Connection, subprocess.Popen[bytes]]:
-        """The worker process, started where there is none, and the connection to it.
+    def _worker(self, packages: frozenset[str]) -> _Worker:
+        """The connection to the worker process of some packages, and the process, started where there is none.
 
         It leads its own process group: Ctrl-C on the terminal does not reach it, and children of plugins die with it.
         """
-        if self._connection is None or self._process is None:
+        if packages not in self._workers:
             ours, theirs = socket.socketpair()
             command = ["-P", "-m", "vibench.execution.worker", str(theirs.fileno()), str(self._log or os.devnull)]
             with theirs:
-                self._process = subprocess.Popen(
+                process = subprocess.Popen(
                     [sys.executable, *command],
                     env=_environment(os.environ),
                     pass_fds=[theirs.fileno()],
                     stdin=subprocess.DEVNULL,
                     process_group=0,
                 )
-            self._connection = Connection(ours.detach())
-        return self._connection, self._process
+            self._workers[packages] = Connection(ours.detach()), process
+        self._workers.move_to_end(packages)
+        return self._workers[packages]
 
-    def _kill(self) -> None:
-        process, connection = self._process, self._connection
-        self._process = self._connection = None
-        if process is not None:
+    def _kill(self, *those: frozenset[str]) -> None:
+        """End the worker processes of some packages, or all."""
+        for packages in those or tuple(self._workers):
+            if (worker := self._workers.pop(packages, None)) is None:
+                continue
+            connection, process = worker
             with contextlib.suppress(ProcessLookupError):
                 os.killpg(process.pid, signal.SIGKILL)
             process.wait()
-        if connection is not None:
             connection.close()
 
 

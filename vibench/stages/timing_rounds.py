@@ -14,6 +14,7 @@ from vibench.interfaces.validation import checked_assembly
 from vibench.model.hyperreduced import HyperReducedModel
 from vibench.provenance import machine
 from vibench.stages.artefacts import Store
+from vibench.stages.assembly import AssemblyStage
 from vibench.stages.base import Failed, Pieces, PiecewiseStage, Row, Stage
 from vibench.stages.cell_queries import CellQueries
 from vibench.stages.query import Queries, Watch
@@ -100,8 +101,12 @@ class TimingRounds(PiecewiseStage):
         number, within = divmod(piece, len(self.cells))
         return number, int(np.random.default_rng(number).permutation(len(self.cells))[within])
 
+    def stage_of(self, number: int) -> CellQueries:
+        """The cell of a piece: processes take turns where its plugins are of other packages than the next one's."""
+        return self.cells[self.place(number)[1]]
+
     def begin(self, store: Store) -> _Rounds:
-        """Load the models; cells that differ in their solver alone share one."""
+        """Models are loaded when they are first needed; cells that differ in their solver alone share one."""
         return _Rounds(self, store)
 
 
@@ -109,8 +114,8 @@ class _Rounds(Pieces):
     """Rounds in progress."""
 
     def __init__(self, stage: TimingRounds, store: Store) -> None:
-        self._stage = stage
-        self._models = {assembly.key: Queries(store, assembly) for assembly in {c.assembly for c in stage.cells}}
+        self._stage, self._store = stage, store
+        self._models: dict[str, Queries] = {}
         self._warm: set[int] = set()
         self._forms: dict[tuple[int, int], tuple[VariationalInequality, Seconds]] = {}
 
@@ -132,7 +137,7 @@ class _Rounds(Pieces):
         What is timed is equivalent to the queries and nowhere the same: nothing is gained by remembering it.
         """
         stage = self._stage.cells[cell]
-        queries, fine = self._models[stage.assembly.key], self._stage.queries[cell]
+        queries, fine = self._queries(stage.assembly), self._stage.queries[cell]
         share = min(SHARE, len(fine))
         order = fine[at % share :: share][: 1 if warm_up else None]
         assemble = self._assemblies(queries, order, at, cell, warm_up=warm_up)
@@ -144,6 +149,11 @@ class _Rounds(Pieces):
             if sum(seconds.wall for seconds in solve.values()) > ROUND_SECONDS:
                 break
         return assemble, solve
+
+    def _queries(self, assembly: AssemblyStage) -> Queries:
+        if assembly.key not in self._models:
+            self._models[assembly.key] = Queries(self._store, assembly)
+        return self._models[assembly.key]
 
     def _assemblies(
         self, queries: Queries, order: Sequence[int], at: int, cell: int, *, warm_up: bool

@@ -102,7 +102,7 @@ def _title(entry: Any) -> str:
 def _takes_tolerance(entry: Any) -> bool:
     """Whether an unchecked entry of the primal axis names a strategy that takes a tolerance."""
     name = str(entry.get("name") if isinstance(entry, dict) else entry)
-    known = name in registry.names("primal strategy")
+    known = name in registry.names("primal strategy") and not registry.conflict("primal strategy", name)
     return known and bool(registry.load("primal strategy", name).takes_tolerance)
 
 
@@ -147,7 +147,8 @@ def _check_names(study: Study) -> None:
     for solver in study.solver_names():
         if solver not in known:  # installed or not
             raise unknown_name("QP solver", solver, known)
-        registry.qp_solver(solver)
+        if not registry.conflict("QP solver", solver):
+            registry.qp_solver(solver)
     for table in study.tolerances:
         _check_tolerances(study, table)
 

@@ -18,6 +18,7 @@ from vibench.errors import RequestError, in_a_line, unknown_name
 from vibench.interfaces.problem import Problem
 from vibench.interfaces.strategies import DualStrategy, PrimalStrategy
 from vibench.provenance import distribution_version, source_hash
+from vibench.qp.settings import SETTINGS
 from vibench.qp.solution import QPSolver
 
 GROUPS: Mapping[str, str] = {
@@ -57,7 +58,7 @@ def load(kind: str, name: str) -> Any:
     Raises
     ------
     RequestError
-        If no plugin has that name, it cannot be imported, or it is not of its kind.
+        If no plugin or several have that name, it cannot be imported, or it is not of its kind.
     """
     entry = _entry(kind, name)
     where = f"{kind} '{name}' ({entry.value})"
@@ -81,20 +82,49 @@ def create(kind: str, name: str, options: Mapping[str, Any]) -> Any:
 
 
 def version(kind: str, name: str) -> str:
-    """Distribution and version a plugin comes from, "vibench 0.1.0"."""
-    found = _registered(kind)[name].dist
-    return f"{found.name} {found.version}" if found is not None else "unknown"
+    """Distribution and version a plugin comes from, "vibench 0.1.0"; of a name that several use, all of them."""
+    return ", ".join(map(_origin, _registered(kind)[name]))
+
+
+def _origin(entry: EntryPoint) -> str:
+    return f"{entry.dist.name} {entry.dist.version}" if entry.dist is not None else "unknown"
+
+
+def conflict(kind: str, name: str) -> str:
+    """Why a name says too little: who else provides a plugin or a solver of qpsolvers with this name; "" if it is one.
+
+    Nothing of that name is loaded: whichever was meant, results would be recorded under the name of the other.
+    """
+    owners = [f"{_origin(entry)} ({entry.value})" for entry in _registered(kind).get(name, ())]
+    if owners and kind == "QP solver" and name in SETTINGS:
+        owners.insert(0, "qpsolvers")
+    if len(owners) < 2:
+        return ""
+    count = "two" if len(owners) == 2 else "several"
+    return f"{count} packages provide the {kind} '{name}', so that none is used: {', '.join(owners)}"
+
+
+def package(kind: str, name: str) -> str:
+    """Distribution of a third party that a plugin comes from; "" for those of vibench, and for what is no plugin."""
+    for entry in _registered(kind).get(name, ()):
+        owner = entry.module.partition(".")[0] if entry.dist is None else entry.dist.name
+        return "" if owner == "vibench" else owner
+    return ""
 
 
 @cache
 def code(kind: str, name: str) -> str:
     """Version of a plugin with a hash of its outermost package, or of its module if it is in none.
 
+    Of a name that several packages use it is their versions: nothing is computed with it.
+
     Raises
     ------
     RequestError
         If no plugin has that name.
     """
+    if conflict(kind, name):
+        return version(kind, name)
     source = Path(str(importlib.import_module(_entry(kind, name).module).__file__))
     while (source.parent / "__init__.py").is_file():
         source = source.parent
@@ -109,7 +139,7 @@ def missing(kind: str, name: str) -> list[str]:
 
 def requirements(kind: str, name: str) -> tuple[str, ...]:
     """Distributions that a plugin `requires`, in addition to the requirements of its own distribution."""
-    entry = _registered(kind)[name]
+    entry = _entry(kind, name)
     plugin = getattr(importlib.import_module(entry.module), entry.attr.partition(".")[0], None)
     return tuple(getattr(plugin, "requires", ()))
 
@@ -123,7 +153,9 @@ def options(kind: str, name: str) -> list[Option]:
 
 
 def check_options(kind: str, name: str, given: Mapping[str, Any]) -> dict[str, Any]:
-    """Options of a registered plugin, checked as by `checked_arguments`."""
+    """Options of a registered plugin, checked as by `checked_arguments`; as they are if several have its name."""
+    if conflict(kind, name):
+        return dict(given)
     return checked_arguments(load(kind, name), f"{kind} '{name}'", given)
 
 
@@ -155,7 +187,9 @@ def checked_arguments(plugin: type, what: str, given: Mapping[str, Any]) -> dict
 
 
 def canonical_options(kind: str, name: str, given: Mapping[str, Any]) -> str:
-    """Options as canonical JSON, without those that equal their default."""
+    """Options as canonical JSON, without those that equal their default; as they are if several have the name."""
+    if conflict(kind, name):
+        return json.dumps(given, sort_keys=True, default=str)
     known, checked = _parameters(load(kind, name)), check_options(kind, name, given)
     kept = {option: value for option, value in checked.items() if value != known[option][0]}
     return json.dumps(TypeAdapter(dict[str, Any]).dump_python(kept, mode="json"), sort_keys=True)
@@ -172,13 +206,13 @@ def study_path(name: str) -> Path:
 
 
 @cache
-def _registered(kind: str) -> dict[str, EntryPoint]:
-    found: dict[str, EntryPoint] = {}
+def _registered(kind: str) -> dict[str, tuple[EntryPoint, ...]]:
+    """Entry points by name; several where packages register different objects under it."""
+    found: dict[str, tuple[EntryPoint, ...]] = {}
     for entry in entry_points(group=GROUPS[kind]):
-        other = found.get(entry.name)
-        if other is not None and other.value != entry.value:
-            raise RequestError(f"two packages register the {kind} '{entry.name}': {other.value} and {entry.value}")
-        found[entry.name] = entry
+        others = found.get(entry.name, ())
+        if all(other.value != entry.value for other in others):
+            found[entry.name] = (*others, entry)
     return found
 
 
@@ -186,7 +220,9 @@ def _entry(kind: str, name: str) -> EntryPoint:
     registered = _registered(kind)
     if name not in registered:
         raise unknown_name(kind, name, registered)
-    return registered[name]
+    if reason := conflict(kind, name):
+        raise RequestError(reason)
+    return registered[name][0]
 
 
 @cache

@@ -99,6 +99,8 @@ class ToleranceTable(_Model):
 
     def of_primal(self, entry: Entry) -> list[float | None]:
         """Tolerances of one primal strategy; [`None`] for a strategy that takes none."""
+        if registry.conflict("primal strategy", entry.name):  # whether it takes one or not, its cells cannot be run
+            return list(self.primal.get(entry.title, self.primal.get(entry.name, [None])))
         if not registry.load("primal strategy", entry.name).takes_tolerance:
             return [None]
         return list(_meant_for(self.primal, entry, "tolerances.primal"))

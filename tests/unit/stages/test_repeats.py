@@ -88,7 +88,7 @@ def test_a_solver_that_remembers_programs_never_meets_one_again(store: Store, mo
 def test_an_answer_to_a_similar_program_is_not_timed(which: int, store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
     solver = Remembers(digits=1)
     monkeypatch.setattr(registry, "qp_solver", lambda name: {name: solver})
-    with pytest.raises(NumericalError, match="residual .* above 3e-07.*does the solver remember answers"):
+    with pytest.raises(NumericalError, match=r"residual .* above 3e-07.*does the solver remember answers"):
         TimingRounds(CELLS[which : which + 1], (EVERY,), 12).run(store)
     assert solver.remembered == 1
 
