@@ -7,7 +7,7 @@ import inspect
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, cached_property
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from typing import Any, get_type_hints
@@ -83,7 +83,7 @@ def create(kind: str, name: str, options: Mapping[str, Any]) -> Any:
 
 def version(kind: str, name: str) -> str:
     """Distribution and version a plugin comes from, "vibench 0.1.0"; of a name that several use, all of them."""
-    return ", ".join(map(_origin, _registered(kind)[name]))
+    return ", ".join(map(_origin, _registered(kind)[name].entries))
 
 
 def _origin(entry: EntryPoint) -> str:
@@ -95,21 +95,14 @@ def conflict(kind: str, name: str) -> str:
 
     Nothing of that name is loaded: whichever was meant, results would be recorded under the name of the other.
     """
-    owners = [f"{_origin(entry)} ({entry.value})" for entry in _registered(kind).get(name, ())]
-    if owners and kind == "QP solver" and name in SETTINGS:
-        owners.insert(0, "qpsolvers")
-    if len(owners) < 2:
-        return ""
-    count = "two" if len(owners) == 2 else "several"
-    return f"{count} packages provide the {kind} '{name}', so that none is used: {', '.join(owners)}"
+    found = _registered(kind).get(name)
+    return "" if found is None else found.conflict
 
 
 def package(kind: str, name: str) -> str:
     """Distribution of a third party that a plugin comes from; "" for those of vibench, and for what is no plugin."""
-    for entry in _registered(kind).get(name, ()):
-        owner = entry.module.partition(".")[0] if entry.dist is None else entry.dist.name
-        return "" if owner == "vibench" else owner
-    return ""
+    found = _registered(kind).get(name)
+    return "" if found is None else found.package
 
 
 @cache
@@ -205,15 +198,36 @@ def study_path(name: str) -> Path:
     return Path(load("study", name))
 
 
+@dataclass(frozen=True)
+class _Registered:
+    """The entry points of one name; several where packages register different objects under it."""
+
+    kind: str
+    entries: tuple[EntryPoint, ...]
+
+    @cached_property
+    def conflict(self) -> str:
+        name, owners = self.entries[0].name, len(self.entries)
+        others = ["qpsolvers"] if self.kind == "QP solver" and name in SETTINGS else []
+        if owners + len(others) < 2:
+            return ""
+        count = "two" if owners + len(others) == 2 else "several"
+        packages = ", ".join([*others, *(f"{_origin(entry)} ({entry.value})" for entry in self.entries)])
+        return f"{count} packages provide the {self.kind} '{name}', so that none is used: {packages}"
+
+    @cached_property
+    def package(self) -> str:
+        entry = self.entries[0]  # the metadata of a distribution are read again at each access
+        owner = entry.module.partition(".")[0] if entry.dist is None else entry.dist.name
+        return "" if owner == "vibench" else owner
+
+
 @cache
-def _registered(kind: str) -> dict[str, tuple[EntryPoint, ...]]:
-    """Entry points by name; several where packages register different objects under it."""
-    found: dict[str, tuple[EntryPoint, ...]] = {}
+def _registered(kind: str) -> dict[str, _Registered]:
+    found: dict[str, dict[str, EntryPoint]] = {}
     for entry in entry_points(group=GROUPS[kind]):
-        others = found.get(entry.name, ())
-        if all(other.value != entry.value for other in others):
-            found[entry.name] = (*others, entry)
-    return found
+        found.setdefault(entry.name, {}).setdefault(entry.value, entry)
+    return {name: _Registered(kind, tuple(entries.values())) for name, entries in found.items()}
 
 
 def _entry(kind: str, name: str) -> EntryPoint:
@@ -222,7 +236,7 @@ def _entry(kind: str, name: str) -> EntryPoint:
         raise unknown_name(kind, name, registered)
     if reason := conflict(kind, name):
         raise RequestError(reason)
-    return registered[name][0]
+    return registered[name].entries[0]
 
 
 @cache
