@@ -1,14 +1,16 @@
-"""Seconds: CPU seconds of the thread that does the work, wall seconds beside them."""
+"""Seconds: CPU seconds of the process and of children that it waited for, wall seconds beside them."""
 
 from __future__ import annotations
 
 import math
 import statistics
-import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from functools import cache
-from typing import TypeVar
+from functools import cache, partial
+from itertools import repeat
+from resource import RUSAGE_CHILDREN, getrusage
+from time import perf_counter, process_time  # bound before plugins are imported, which may replace those of `time`
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -56,14 +58,25 @@ NO_TIME = Seconds()
 
 
 class Stopwatch:
-    """Seconds since it was made, counting only the calling thread."""
+    """Seconds since it was made: those of all threads of the process, and of children that have ended.
+
+    Whoever works in a thread or in a child process works no less. A child that outlives the work is not counted; the
+    wall seconds then exceed the CPU seconds.
+    """
 
     def __init__(self) -> None:
-        self._cpu, self._wall = time.thread_time(), time.perf_counter()
+        self._children, self._wall, self._cpu = _children_seconds(), perf_counter(), process_time()
 
     def seconds(self) -> Seconds:
         """CPU and wall seconds so far."""
-        return Seconds(time.thread_time() - self._cpu, time.perf_counter() - self._wall)
+        cpu, wall = process_time() - self._cpu, perf_counter() - self._wall
+        return Seconds(cpu + (_children_seconds() - self._children), wall)
+
+
+def _children_seconds() -> float:
+    """CPU seconds of the child processes that this one has waited for."""
+    used = getrusage(RUSAGE_CHILDREN)
+    return used.ru_utime + used.ru_stime
 
 
 def timed(work: Callable[[], T]) -> tuple[T, Seconds]:
@@ -74,17 +87,17 @@ def timed(work: Callable[[], T]) -> tuple[T, Seconds]:
 
 
 def median_seconds(
-    work: Callable[[], T], before: Callable[[], None] = lambda: None, enough: float = SLOW
+    work: Callable[..., T], given: Iterable[Any] | None = None, enough: float = SLOW
 ) -> tuple[T, Seconds]:
-    """Result of some work and its seconds: one warm-up, then the median of at most `REPEATS` repeats.
+    """Result of the first run of some work, and its seconds: one warm-up, then the median of at most `REPEATS` repeats.
 
-    Repeats end after `enough` wall seconds; the warm-up counts if it takes longer than that. `before` is called,
-    untimed, before each run.
+    Repeats end after `enough` wall seconds; the warm-up counts if it takes longer than that. Every run gets another of
+    the arguments `given`, or none; what it takes to make them is not timed.
     """
+    arguments = repeat(()) if given is None else ((argument,) for argument in given)
 
     def once() -> tuple[T, Seconds]:
-        before()
-        return timed(work)
+        return timed(partial(work, *next(arguments)))
 
     result, first = once()
     if first.wall > enough:

@@ -44,7 +44,7 @@ class SupremizerSpace:
 
     def __init__(self, offline: Offline) -> None:
         problem = offline.problem
-        classes = constraint_classes([problem.constraint(mu)[0] for mu in offline.training])
+        classes = constraint_classes(problem.constraint(mu)[0] for mu in offline.training)
         self.shared_by = np.bincount(classes.members)
         self._coordinates, self.supremizers = supremizer_coordinates(
             problem.V, offline.basis, classes.representatives, offline.span

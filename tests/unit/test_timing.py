@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import os
 import subprocess
 import sys
@@ -19,7 +20,6 @@ from vibench.timing import (
     REPEATS,
     Calibration,
     Seconds,
-    Stopwatch,
     median_interval,
     median_seconds,
     timed,
@@ -33,8 +33,8 @@ def clocks(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
     def script(*durations: tuple[float, float]) -> None:
         cpu: Iterator[float] = iter([t for c, _ in durations for t in (100.0, 100.0 + c)])
         wall: Iterator[float] = iter([t for _, w in durations for t in (500.0, 500.0 + w)])
-        monkeypatch.setattr(timing.time, "thread_time", lambda: next(cpu))
-        monkeypatch.setattr(timing.time, "perf_counter", lambda: next(wall))
+        monkeypatch.setattr(timing, "process_time", lambda: next(cpu))
+        monkeypatch.setattr(timing, "perf_counter", lambda: next(wall))
 
     return script
 
@@ -107,21 +107,40 @@ def test_what_work_raises_comes_through() -> None:
         median_seconds(lambda: 1 // 0)
 
 
-def test_sleep_and_other_threads_are_no_cpu_seconds() -> None:
-    def busy() -> None:
-        while not done.is_set():
-            sum(range(1000))
-
-    done = threading.Event()
-    other = threading.Thread(target=busy)
-    watch = Stopwatch()
-    other.start()
-    time.sleep(0.2)
-    done.set()
-    other.join()
-    spent = watch.seconds()
+def test_sleep_is_no_cpu_seconds() -> None:
+    _, spent = timed(lambda: time.sleep(0.2))
     assert spent.wall >= 0.2
     assert spent.cpu < 0.5 * spent.wall
+
+
+def in_a_thread() -> None:
+    other = threading.Thread(target=spend)
+    other.start()
+    other.join()
+
+
+def spend() -> None:
+    while time.thread_time() < 0.05:
+        sum(range(1000))
+
+
+def in_a_child() -> None:
+    code = "import time\nwhile time.process_time() < 0.05: sum(range(1000))"
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
+@pytest.mark.parametrize("work", [in_a_thread, in_a_child])
+def test_work_in_a_thread_or_in_a_child_process_is_counted(work: Callable[[], None]) -> None:
+    assert timed(work)[1].cpu >= 0.05
+
+
+def test_clocks_that_a_plugin_replaces_are_not_used(monkeypatch: pytest.MonkeyPatch) -> None:
+    with monkeypatch.context() as patch:
+        for clock in ("thread_time", "process_time", "perf_counter", "monotonic", "time"):
+            patch.setattr(time, clock, lambda: 0.0)
+        _, spent = timed(lambda: sum(range(1000)))
+    assert spent.cpu > 0.0
+    assert spent.wall > 0.0
 
 
 def test_processes_started_with_it_have_one_thread() -> None:
@@ -131,12 +150,12 @@ def test_processes_started_with_it_have_one_thread() -> None:
     assert done.stdout.strip() == "{1}"
 
 
-def test_before_each_repeat_something_is_done_that_is_not_timed(clocks: Callable[..., None]) -> None:
+def test_every_repeat_may_have_work_of_its_own_and_the_first_result_counts(clocks: Callable[..., None]) -> None:
     clocks(*[(0.1, 0.1)] * (1 + REPEATS))
-    calls: list[int] = []
-    work = Work()
-    _, seconds = median_seconds(work, before=lambda: calls.append(work.count))
-    assert calls == list(range(1 + REPEATS))
+    done: list[int] = []
+    result, seconds = median_seconds(lambda number: done.append(number) or -number, itertools.count(7))
+    assert result == -7
+    assert done == list(range(7, 7 + 1 + REPEATS))
     assert seconds.cpu == pytest.approx(0.1)
 
 

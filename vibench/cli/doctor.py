@@ -108,7 +108,7 @@ def requirements() -> dict[str, list[str]]:
 
 def solvers() -> Iterator[Finding]:
     """All known QP solvers; the installed ones solve a small program each."""
-    extra, _ = _names("QP solver")
+    extra = registry.names("QP solver")
     trials = solver_check.attempts(installed_solvers(extra))
     for name in sorted({*SETTINGS, *extra}):
         version = provenance.solver_version(name) if name in SETTINGS else registry.version("QP solver", name)
@@ -139,23 +139,12 @@ def _unavailable(solver: str, version: str) -> Finding:
 def plugins() -> Iterator[Finding]:
     """The plugins of each kind that load, and the errors of those that do not."""
     for kind in registry.GROUPS:
-        names, conflict = _names(kind)
-        if conflict:
-            yield Finding(kind, conflict, Health.BROKEN)
-            continue
+        names = registry.names(kind)
         errors = {name: error for name in names if (error := _load_error(kind, name))}
         yield Finding(kind, ", ".join(name for name in names if name not in errors) or "none")
         for name, error in errors.items():
             yield Finding(f"{kind} '{name}'", f"{error} (from {registry.version(kind, name)})", Health.BROKEN)
     yield from (Finding(name, reason, Health.BROKEN) for name, reason in unreadable().items())
-
-
-def _names(kind: str) -> tuple[list[str], str]:
-    """The names of a kind of plugin; none, and an error, if two packages register the same name."""
-    try:
-        return registry.names(kind), ""
-    except RequestError as error:
-        return [], str(error)
 
 
 def _load_error(kind: str, name: str) -> str:

@@ -165,10 +165,11 @@ def _solver_rows() -> list[tuple[str, str, str, str]]:
 
     plugins = registry.names("QP solver")
     installed = installed_solvers(plugins)
-    return [
-        (name, provenance.solver_version(name), "installed" if name in installed else "not installed", "")
-        for name in sorted({*SETTINGS, *plugins})
-    ]
+    rows = []
+    for name in sorted({*SETTINGS, *plugins}):
+        state = registry.conflict("QP solver", name) or ("installed" if name in installed else "not installed")
+        rows.append((name, provenance.solver_version(name), state, ""))
+    return rows
 
 
 def _find(text: str) -> Found:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from contextlib import closing
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -14,7 +15,7 @@ from vibench.qp.solve import solve_qp
 from vibench.qp.status import Status
 from vibench.qp.verification import verify
 from vibench.stages.artefacts import Store
-from vibench.stages.base import Done, Failed, Pieces, PiecewiseStage
+from vibench.stages.base import Done, Failed, Pieces, PiecewiseStage, Stage
 from vibench.study import registry
 from vibench.study.spec import Limits
 
@@ -57,6 +58,15 @@ class SolverTrials(PiecewiseStage, Pieces):
     def pieces(self) -> int:
         """Number of solvers."""
         return len(self.solvers)
+
+    @cached_property
+    def packages(self) -> frozenset[str]:
+        """Those of the solvers."""
+        return frozenset(registry.package("QP solver", solver) for solver in self.solvers) - {""}
+
+    def stage_of(self, number: int) -> Stage:
+        """The trial of one solver."""
+        return SolverTrials(self.solvers[number : number + 1])
 
     def begin(self, store: Store) -> Pieces:  # noqa: ARG002
         """Nothing to prepare."""

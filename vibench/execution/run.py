@@ -314,8 +314,15 @@ class _Run:
 
 
 def unavailable(cell: Cell) -> str:
-    """Why a cell cannot be run on this machine: its solver, or what a plugin needs, is not installed; "" if it can."""
-    for plugin in (cell.problem, cell.dual, cell.primal):
+    """Why a cell cannot be run on this machine: its solver, or what a plugin needs, is not installed; "" if it can.
+
+    A name that several packages use is as good as none.
+    """
+    plugins = (cell.problem, cell.dual, cell.primal)
+    for kind, name in (*((plugin.kind, plugin.name) for plugin in plugins), ("QP solver", cell.solver)):
+        if reason := registry.conflict(kind, name):
+            return reason
+    for plugin in plugins:
         missing = registry.missing(plugin.kind, plugin.name)
         if missing:
             return f"the {plugin.kind} '{plugin.name}' needs {', '.join(missing)}, which is not installed"

@@ -15,6 +15,7 @@ import subprocess
 import sys
 import threading
 import time
+from collections import OrderedDict
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from multiprocessing.connection import Connection
@@ -22,6 +23,7 @@ from pathlib import Path
 from typing import Any
 
 from vibench.execution.descendants import MARK, kill_marked
+from vibench.execution.parts import Part, PartDone, parts
 from vibench.provenance import NUMERICAL, core_code, libraries
 from vibench.qp.status import Status
 from vibench.stages.base import Done, Failed, PiecewiseStage, Stage, Unstored
@@ -32,6 +34,9 @@ POLL = 0.2
 
 START_SECONDS = 300.0
 """Time limit of the start of a worker process and its imports; the limits of a job begin when its work begins."""
+
+KEPT = 4
+"""Worker processes that a supervisor keeps between two stages, each of other packages."""
 
 GRACE = 2.0
 """Seconds allowed beyond the limit of a query, for the work before and after the solver."""
@@ -112,13 +117,14 @@ class _JobState:
     def __init__(self, job: Job, observe: Callable[[Any], None]) -> None:
         self.job, self.progress, self._observe = job, Progress(), observe
         self.seconds = 0.0
-        self.start()
+        self.start(Part(frozenset(), (), ends=False))
 
-    def start(self) -> Progress:
-        """Note that a process is given the job; returns the progress that it continues from."""
+    def start(self, part: Part) -> Progress:
+        """Note that a process is given a part of the job; returns what it needs to know of the others."""
+        self.part = part
         self._last, self._begun, self._starting = time.monotonic(), False, 0.0
         self._next_piece()
-        return self.progress
+        return self.progress if part.ends else Progress()
 
     def _next_piece(self) -> None:
         self.piece: int | None = None
@@ -140,7 +146,7 @@ class _JobState:
         if self.seconds > self._piece_limit:
             raise _WorkerLostError(_beyond("query_seconds", self.job.query_seconds))
 
-    def update(self, message: Any) -> Done | Failed | Unstored | None:
+    def update(self, message: Any) -> Done | Failed | Unstored | PartDone | None:
         """Process a message of the worker; returns the outcome if it is one."""
         match message:
             case Begun():
@@ -154,13 +160,20 @@ class _JobState:
                 self._next_piece()
             case OutOfMemory():
                 raise _WorkerLostError(message.failed)
-            case Done() | Failed() | Unstored():
+            case Done() | Failed() | Unstored() | PartDone():
                 return message
         return None
 
 
+_Worker = tuple[Connection, "subprocess.Popen[bytes]", str]
+"""The connection to a worker process, the process, and the mark of it and of what it starts."""
+
+
 class Supervisor:
-    """Runs stages, one at a time, in a worker process that it starts, watches and replaces.
+    """Runs stages, one at a time, in worker processes that it starts, watches and replaces.
+
+    Every set of packages of third parties has a process of its own: whatever they do to it concerns no others. Pieces
+    of one stage that need several are done by these in turn.
 
     Parameters
     ----------
@@ -172,9 +185,7 @@ class Supervisor:
 
     def __init__(self, log: Path | None = None, environment: Mapping[str, str] | None = None) -> None:
         self._log, self._environment = log, dict(environment or {})
-        self._process: subprocess.Popen[bytes] | None = None
-        self._connection: Connection | None = None
-        self._mark = secrets.token_hex(8)
+        self._workers: OrderedDict[frozenset[str], _Worker] = OrderedDict()  # the one used last comes last
         self._stop = threading.Event()
 
     def run(self, job: Job, observe: Callable[[Any], None] = lambda _: None) -> Done | Failed | Unstored:
@@ -203,11 +214,13 @@ class Supervisor:
     def _run(self, job: Job, observe: Callable[[Any], None]) -> Done | Failed | Unstored:
         state, limit, retried = _JobState(job, observe), job.cell_seconds, False
         found, lost = state.progress.found, state.progress.lost
+        while len(self._workers) > KEPT:
+            self._kill(next(iter(self._workers)))
         while True:
             try:
                 return self._attempt(state, limit)
             except _WorkerLostError as error:
-                self._kill()
+                self._kill(state.part.packages)
                 if error.failed is None:
                     continue
                 if state.piece is not None:
@@ -223,13 +236,21 @@ class Supervisor:
                 retried = retried or state.piece is None
 
     def _attempt(self, state: _JobState, limit: float) -> Done | Failed | Unstored:
-        """Run the rest of a stage in one process."""
+        """Run the rest of a stage, part by part."""
+        for part in parts(state.job.stage, state.progress.found.keys() | state.progress.lost.keys()):
+            outcome = self._attempt_part(state, limit, part)
+            if not isinstance(outcome, PartDone):
+                return outcome
+        raise AssertionError("the last part ends the stage")
+
+    def _attempt_part(self, state: _JobState, limit: float, part: Part) -> Done | Failed | Unstored | PartDone:
+        """Run a part of a stage in one process."""
         try:
-            connection, process = self._worker()
+            connection, process, _ = self._worker(part.packages)
         except OSError as error:
             return Failed(Status.CRASHED, f"no worker process could be started: {error.strerror}")
         try:
-            connection.send((state.job, state.start()))
+            connection.send((state.job, state.start(part), part))
             while not self._stop.is_set():
                 if connection.poll(POLL):
                     outcome = state.update(connection.recv())
@@ -243,35 +264,37 @@ class Supervisor:
                 raise _WorkerLostError(Failed(Status.CRASHED, _cause_of_death(process))) from None
         raise StoppedError
 
-    def _worker(self) -> tuple[Connection, subprocess.Popen[bytes]]:
-        """The worker process, started where there is none, and the connection to it.
+    def _worker(self, packages: frozenset[str]) -> _Worker:
+        """The connection to the worker process of some packages, and the process, started where there is none.
 
         It leads its own process group: Ctrl-C on the terminal does not reach it, and children of plugins die with it,
         as do those in other groups, by their mark.
         """
-        if self._connection is None or self._process is None:
-            ours, theirs = socket.socketpair()
+        if packages not in self._workers:
+            (ours, theirs), mark = socket.socketpair(), secrets.token_hex(8)
             command = ["-P", "-m", "vibench.execution.worker", str(theirs.fileno()), str(self._log or os.devnull)]
             with theirs:
-                self._process = subprocess.Popen(
+                process = subprocess.Popen(
                     [sys.executable, *command],
-                    env=_environment({**os.environ, **self._environment}) | {MARK: self._mark},
+                    env=_environment({**os.environ, **self._environment}) | {MARK: mark},
                     pass_fds=[theirs.fileno()],
                     stdin=subprocess.DEVNULL,
                     process_group=0,
                 )
-            self._connection = Connection(ours.detach())
-        return self._connection, self._process
+            self._workers[packages] = Connection(ours.detach()), process, mark
+        self._workers.move_to_end(packages)
+        return self._workers[packages]
 
-    def _kill(self) -> None:
-        process, connection = self._process, self._connection
-        self._process = self._connection = None
-        if process is not None:
+    def _kill(self, *those: frozenset[str]) -> None:
+        """End the worker processes of some packages, or all."""
+        for packages in those or tuple(self._workers):
+            if (worker := self._workers.pop(packages, None)) is None:
+                continue
+            connection, process, mark = worker
             with contextlib.suppress(ProcessLookupError):
                 os.killpg(process.pid, signal.SIGKILL)
             process.wait()
-            kill_marked(self._mark)
-        if connection is not None:
+            kill_marked(mark)
             connection.close()
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import faulthandler
 import os
 import resource
@@ -20,14 +21,18 @@ from threadpoolctl import threadpool_limits
 
 from vibench.errors import NumericalError, StorageError, VibenchError, in_a_line, message_of
 from vibench.execution.descendants import MARK, kill_marked
+from vibench.execution.parts import Part, PartDone
 from vibench.execution.supervisor import Begun, Finished, Job, OutOfMemory, Progress, Watch, code_here
 from vibench.qp.status import Status
 from vibench.stages.artefacts import Store
-from vibench.stages.base import Done, Failed, PiecewiseStage, Unstored
+from vibench.stages.base import Done, Failed, Pieces, PiecewiseStage, Unstored
 from vibench.study import registry
 
 T = TypeVar("T")
 Send = Callable[[Any], None]
+
+OF_THIS_PROCESS = (errno.EBADF, errno.EFBIG, errno.EMFILE)
+"""Errors of writing that other processes need not have."""
 
 
 class _NoMemoryError(Exception):
@@ -54,17 +59,17 @@ def main() -> None:
 
     while True:
         try:
-            job, progress = connection.recv()
+            job, progress, part = connection.recv()
         except EOFError:
             return
         send(Begun())
         # The allocator keeps freed memory: a large process is replaced before the next job instead of failing it.
-        if not first and _address_space() > 0.5 * job.memory_gib * 2**30:
+        if not first and not _last and _address_space() > 0.5 * job.memory_gib * 2**30:
             send(OutOfMemory(None))
             return
         first = False
         faulthandler.dump_traceback_later(2.0 * job.cell_seconds + 60.0, exit=True)  # in case the supervisor has died
-        send(perform(job, progress, send))
+        send(perform(job, progress, part, send))
         faulthandler.cancel_dump_traceback_later()
 
 
@@ -76,15 +81,22 @@ def _end_with(parent: int) -> None:
     os.killpg(0, signal.SIGKILL)
 
 
-def perform(job: Job, progress: Progress, send: Send) -> Done | Failed | Unstored | OutOfMemory:
-    """Run one stage; an exception of a plugin becomes the reason of a failed stage and does not end the run."""
+def perform(job: Job, progress: Progress, part: Part, send: Send) -> Done | PartDone | Failed | Unstored | OutOfMemory:
+    """Run one stage or a part of it; an exception of a plugin is the reason of a failed stage and ends no run."""
     start = time.perf_counter()
 
-    def work() -> Done:
-        _check_code(job)
+    def work() -> Done | PartDone:
+        _check_code(job, part)
         store = _store(job.store)
         if isinstance(job.stage, PiecewiseStage):
-            value = _pieces(job, store, progress, send)
+            pieces = _begun(job.stage, store)
+            known = {number: pieces.lost(number, failed) for number, failed in progress.lost.items()} | progress.found
+            pieces.resume(known)
+            found = known | _pieces(job, pieces, part, send)
+            if not part.ends:
+                return PartDone()
+            _last.clear()
+            value = pieces.finish([found[number] for number in range(job.stage.pieces)])
             return Done((), value, time.perf_counter() - start)
         result = job.stage.run(store)
         store.put(job.stage.key, result.value, result.seconds, result.histories)
@@ -93,14 +105,18 @@ def perform(job: Job, progress: Progress, send: Send) -> Done | Failed | Unstore
     try:
         return _guarded(job.memory_gib, work)
     except StorageError as error:
+        if isinstance(error.__context__, OSError) and error.__context__.errno in OF_THIS_PROCESS:
+            return Failed(Status.ERROR, f"{error}; a plugin limits or closes the files of its process")
         return Unstored(str(error))
     except _NoMemoryError:
         return OutOfMemory(Failed(Status.ERROR, f"out of memory: the limit is memory_gib = {job.memory_gib:g}"))
 
 
-def _check_code(job: Job) -> None:
+def _check_code(job: Job, part: Part) -> None:
     """Refuse a job that was planned with other code than this process has: its artefact would have the wrong key."""
-    used = job.stage.plugins()
+    stage = job.stage
+    parts = (stage.stage_of(number) for number in part.numbers) if isinstance(stage, PiecewiseStage) else (stage,)
+    used = (plugin for one in dict.fromkeys(parts) for plugin in one.plugins())
     changed = [f"the {p.kind} '{p.name}'" for p in used if registry.code(p.kind, p.name) != p.code]
     if job.code != code_here():
         changed.insert(0, "vibench or one of the libraries")
@@ -108,25 +124,30 @@ def _check_code(job: Job) -> None:
         raise NumericalError(f"{changed[0]} was changed since the run began; run the study again")
 
 
-def _pieces(job: Job, store: Store, progress: Progress, send: Send) -> Any:
-    """Do the remaining pieces of a piecewise stage; returns its value."""
-    stage = job.stage
-    assert isinstance(stage, PiecewiseStage)
-    pieces = stage.begin(store)
-    lost = {number: pieces.lost(number, failed) for number, failed in progress.lost.items()}
-    found = progress.found | lost
-    pieces.resume(found)
-    for number in range(stage.pieces):
-        if number not in found:
+_last: dict[str, Pieces] = {}
+"""The piecewise stage that was begun and has not ended, by its key: other processes may do parts of it meanwhile."""
 
-            def watch(on: bool, number: int = number) -> None:
-                send(Watch(number, on))
 
-            watch(False)
-            value = _guarded(job.memory_gib, partial(pieces.piece, number, watch))
-            found[number] = pieces.lost(number, value) if isinstance(value, Failed) else value
-            send(Finished(number, found[number]))
-    return pieces.finish([found[number] for number in range(stage.pieces)])
+def _begun(stage: PiecewiseStage, store: Store) -> Pieces:
+    if stage.key not in _last:
+        _last.clear()
+        _last[stage.key] = stage.begin(store)
+    return _last[stage.key]
+
+
+def _pieces(job: Job, pieces: Pieces, part: Part, send: Send) -> dict[int, Any]:
+    """Do the pieces of a part."""
+    found = {}
+    for number in part.numbers:
+
+        def watch(on: bool, number: int = number) -> None:
+            send(Watch(number, on))
+
+        watch(False)
+        value = _guarded(job.memory_gib, partial(pieces.piece, number, watch))
+        found[number] = pieces.lost(number, value) if isinstance(value, Failed) else value
+        send(Finished(number, found[number]))
+    return found
 
 
 def _guarded(memory_gib: float, work: Callable[[], T]) -> T | Failed:

@@ -73,6 +73,11 @@ class VariationalInequality:
     g: Array
     lift: Array | None = None
 
+    def copy(self) -> VariationalInequality:
+        """The same in arrays of its own: a problem may write its next assembly into those of this one."""
+        lift = None if self.lift is None else self.lift.copy()
+        return VariationalInequality(self.A.copy(), self.f.copy(), self.B.copy(), self.g.copy(), lift)
+
 
 @dataclass(frozen=True)
 class Contact:

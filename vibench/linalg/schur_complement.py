@@ -130,7 +130,7 @@ class StaticCondensation:
         interface, particular = self._pattern.interface, self._particular(f)
         condensed = f[self._pattern.retained]
         condensed[interface] += self._interface_schur @ particular[self._eliminated :]
-        self._last_load = f, (condensed, particular)
+        self._last_load = f.copy(), (condensed, particular)  # the next load may be written into the same vector
         return self._last_load[1]
 
     def _particular(self, f: Array) -> Array:

@@ -65,7 +65,7 @@ def affine_decomposition(problem: Problem, training: Array, tolerance: float) ->
     few terms; a matrix that is one matrix times a function of mu takes one. Else B and g are left to `Problem.contact`,
     if the problem has it. `training` is (P×d), `tolerance` the largest relative interpolation error.
     """
-    first = checked_assembly(problem, training[0])
+    first = checked_assembly(problem, training[0]).copy()
     varying = [name for name in MEMBERS if name not in problem.constant]
     assembled = _assembled(problem, training, varying) if varying else {}
     return {
@@ -86,7 +86,7 @@ def _assembled(problem: Problem, training: Array, names: Sequence[str]) -> Mappi
             vi = checked_assembly(problem, mu)
             values = {name: getattr(vi, name) for name in names}
         for name in names:
-            found[name].append(values[name])
+            found[name].append(values[name].copy())  # the next ones may be written into the same arrays
     return found
 
 
@@ -144,7 +144,7 @@ class _Entries:
 
 
 def _canonical(matrix: SparseMatrix) -> SparseMatrix:
-    """A copy in coordinate format, row by row, without duplicate entries."""
-    rows = sp.csr_array(matrix, copy=True)
+    """In coordinate format, row by row; duplicate entries are summed in place."""
+    rows = sp.csr_array(matrix)
     rows.sum_duplicates()
     return sp.coo_array(rows)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 
@@ -72,8 +72,8 @@ class ConstraintClasses:
         return np.array(constants)[self.members] * np.abs(self.factors)
 
 
-def constraint_classes(matrices: Sequence[SparseMatrix]) -> ConstraintClasses:
-    """Sort matrices into classes of proportional ones.
+def constraint_classes(matrices: Iterable[SparseMatrix]) -> ConstraintClasses:
+    """Sort matrices into classes of proportional ones; each may be written over the one before it.
 
     Where every B(mu) is one matrix times a scalar, one supremizer space replaces one for each parameter.
     """
@@ -89,7 +89,7 @@ def constraint_classes(matrices: Sequence[SparseMatrix]) -> ConstraintClasses:
                 break
         else:
             found.append((len(classes), 1.0))
-            classes.append((matrix, fingerprint))
+            classes.append((matrix.copy(), fingerprint))
     members, factors = [k for k, _ in found], [factor for _, factor in found]
     return ConstraintClasses(tuple(B for B, _ in classes), np.array(members, dtype=np.intp), np.array(factors))
 

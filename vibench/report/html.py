@@ -94,7 +94,7 @@ def _facts(study: dict[str, Any], cells: pd.DataFrame) -> Iterator[tuple[str, st
     yield "machine", "; ".join(str(name) for name in cells["machine"].unique())
     versions = {name: text for row in cells["versions"].dropna() for name, text in json.loads(row).items()}
     yield "versions", ", ".join(f"{name} {text}" for name, text in versions.items())
-    yield "seconds", "CPU seconds of one thread; the offline time of a cell includes every stage it depends on"
+    yield "seconds", "CPU seconds of one process; the offline time of a cell includes every stage it depends on"
 
 
 def _tables(path: Path, cells: pd.DataFrame) -> Iterator[tuple[str, str, str, pd.DataFrame]]:

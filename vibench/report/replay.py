@@ -8,7 +8,7 @@ import tempfile
 from collections.abc import Iterator, Sequence
 from functools import partial
 from importlib.resources import files
-from itertools import chain
+from itertools import chain, count
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +27,7 @@ from vibench.qp.solve import installed_solvers, solve_qp
 from vibench.qp.status import Status
 from vibench.results.solver_agreement import vectors
 from vibench.results.tables import to_csv
+from vibench.stages.repeats import in_units, units
 from vibench.study import registry
 from vibench.timing import median_seconds
 
@@ -74,7 +75,9 @@ def replay(recorded: RecordedCell, query: int, file: Path) -> pd.DataFrame:
         table.append({"solver": f"{recorded.cell.solver} (recorded)"} | line)
     for solver in installed_solvers(registry.names("QP solver")):
         try:
-            solution, seconds = median_seconds(partial(solve_qp, program, solver, accuracy, registry.qp_solver(solver)))
+            solve = partial(solve_qp, solver=solver, accuracy=accuracy, extra=registry.qp_solver(solver))
+            repeats = (in_units(program, units(len(program.f), accuracy, repeat)) for repeat in count())
+            solution, seconds = median_seconds(solve, chain([program], repeats))
             line = _line(program, solution, accuracy, known) | {"seconds": seconds.cpu}
         except (Exception, SystemExit) as error:  # noqa: BLE001  a solver may raise anything; its row says what
             line = {"claims": in_a_line(error), "status": Status.ERROR.value}

@@ -42,7 +42,7 @@ class Column(NamedTuple):
 UNITS: Mapping[str, str] = {
     "": "text, or a number that counts or names something",
     "1": "a pure number",
-    "s": "CPU seconds of one thread, unless wall seconds are said",
+    "s": "CPU seconds of one process, unless wall seconds are said",
     "ms": "thousandths of these",
     "MiB": "2²⁰ bytes",
     "µ": "the parameter's own unit, which its problem declares",

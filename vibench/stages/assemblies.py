@@ -23,17 +23,13 @@ class Assemblies:
         self._kept: LRUCache[bytes, VariationalInequality] = LRUCache(limit, getsizeof=_bytes)
 
     def at(self, mu: Array) -> VariationalInequality:
-        """`checked_assembly` at mu (d,)."""
+        """A copy of `checked_assembly` at mu (d,), which later assemblies leave as it is."""
         vi = self._kept.get(_key(mu))
         if vi is None:
-            vi = checked_assembly(self._problem, mu)
-            self.keep(mu, vi)
+            vi = checked_assembly(self._problem, mu).copy()
+            if _bytes(vi) <= self._kept.maxsize:
+                self._kept[_key(mu)] = vi
         return vi
-
-    def keep(self, mu: Array, vi: VariationalInequality) -> None:
-        """Add an assembly at mu (d,) to the cache, unless it is larger than the limit."""
-        if _bytes(vi) <= self._kept.maxsize:
-            self._kept[_key(mu)] = vi
 
 
 @lru_cache(maxsize=1)

@@ -15,6 +15,7 @@ from vibench.interfaces.problem import Problem
 from vibench.provenance import core_code, libraries
 from vibench.qp.status import Status
 from vibench.stages.artefacts import History, Store
+from vibench.study import registry
 from vibench.study.cells import Axes, Plugin, digest
 from vibench.timing import NO_TIME, Seconds
 
@@ -132,6 +133,11 @@ class Stage(ABC):
         for stage in self.inputs():
             yield from stage.plugins()
 
+    @cached_property
+    def packages(self) -> frozenset[str]:
+        """Distributions of third parties whose code the stage runs; it shares no process with that of others."""
+        return frozenset(registry.package(plugin.kind, plugin.name) for plugin in self.plugins()) - {""}
+
     def inputs(self) -> tuple[Stage, ...]:
         """Stages whose artefacts `run` reads itself, by default those among the fields; theirs are not repeated."""
         return tuple(value for value in self._fields().values() if isinstance(value, Stage))
@@ -187,9 +193,13 @@ class PiecewiseStage(Stage):
     def pieces(self) -> int:
         """Number of pieces."""
 
+    def stage_of(self, number: int) -> Stage:  # noqa: ARG002
+        """The stage whose plugins a piece runs; pieces that run those of other packages get other processes."""
+        return self
+
     @abstractmethod
     def begin(self, store: Store) -> Pieces:
-        """Prepare what all pieces need; the artefacts of the inputs are in the store."""
+        """Prepare for pieces; the artefacts of the inputs are in the store."""
 
     def run(self, store: Store) -> Result:
         """All pieces in this process, in their order."""

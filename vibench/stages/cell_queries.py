@@ -6,6 +6,7 @@ import math
 import resource
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -32,6 +33,7 @@ from vibench.stages.infsup_constants import (
 from vibench.stages.offline import ReducedCone
 from vibench.stages.query import Queries, Query, error_columns, run_query
 from vibench.stages.snapshots import gather, training_stages, validation_stages
+from vibench.study import registry
 from vibench.study.cells import Cell
 from vibench.timing import median_interval, median_of
 
@@ -68,6 +70,11 @@ class CellQueries(PiecewiseStage):
     def sort(self) -> str:
         """Queries of one solver take about as long."""
         return f"{self.label} with {self.solver}"
+
+    @cached_property
+    def packages(self) -> frozenset[str]:
+        """Those of the strategies and the problem, and that of the solver."""
+        return super().packages | {registry.package("QP solver", self.solver)} - {""}
 
     @property
     def pieces(self) -> int:

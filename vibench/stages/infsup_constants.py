@@ -41,7 +41,7 @@ class ValidationConstraints(Stage):
         """The `ConstraintClasses`."""
         problem = build_problem(self.problem)
         mus = validation_parameters(problem, self.count, self.seed)
-        return Result(constraint_classes([assemblies(problem).at(mu).B for mu in mus]))
+        return Result(constraint_classes(assemblies(problem).at(mu).B for mu in mus))
 
 
 @dataclass(frozen=True)

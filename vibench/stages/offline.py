@@ -106,7 +106,7 @@ class TrainingConstraints(Stage):
     def run(self, store: Store) -> Result:  # noqa: ARG002
         """The `ConstraintClasses`."""
         problem = build_problem(self.problem)
-        return Result(constraint_classes([problem.constraint(mu)[0] for mu in training_parameters(problem)]))
+        return Result(constraint_classes(problem.constraint(mu)[0] for mu in training_parameters(problem)))
 
 
 @dataclass(frozen=True)

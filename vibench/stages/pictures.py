@@ -98,4 +98,5 @@ def _checked(picture: Picture) -> Picture:
     wrong = [name for name, right in fits.items() if not right]
     if wrong:
         raise NumericalError(f"the problem's picture has {' and '.join(wrong)} of the wrong shape")
-    return replace(picture, name=one_line(picture.name), multiplier_name=one_line(picture.multiplier_name))
+    own = {name: getattr(picture, name).copy() for name in ARRAYS}  # the next picture may use the same arrays
+    return replace(picture, name=one_line(picture.name), multiplier_name=one_line(picture.multiplier_name), **own)

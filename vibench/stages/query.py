@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import cached_property, partial
 
 import numpy as np
@@ -27,6 +27,7 @@ from vibench.stages.artefacts import Store
 from vibench.stages.assemblies import assemblies
 from vibench.stages.assembly import AssemblyStage, Model, ReducedPrograms
 from vibench.stages.base import Row, value_of
+from vibench.stages.repeats import in_units, nearby, units
 from vibench.study import registry
 from vibench.timing import SLOW, Seconds, timed
 
@@ -53,6 +54,16 @@ class Query:
     solver: str
     accuracy: float
     start: tuple[int, VariationalInequality] | None = None
+
+    def repeated(self, *seed: int) -> Query:
+        """The same query in other units of the unknowns, which depend on the seed; see `vibench.stages.repeats`."""
+        d = units(len(self.program.f), self.accuracy, *seed)
+        return replace(
+            self,
+            program=in_units(self.program, d),
+            factor=None if self.factor is None else self.factor * d[:, None],
+            start=None if self.start is None else (self.start[0], in_units(self.start[1], d)),
+        )
 
     def prepare(self, watch: Watch) -> Callable[[], tuple[QPSolution, Seconds]]:
         """Solve the query to start from, whose seconds are not those of this one; returns the timed solution itself."""
@@ -95,12 +106,16 @@ class Queries:
 
     def __init__(self, store: Store, assembly: AssemblyStage) -> None:
         self.model, self.note = assembly.model(store)
-        self.mus = validation_parameters(self.model.problem, assembly.count, assembly.seed)
+        self.mus, self._seed = validation_parameters(self.model.problem, assembly.count, assembly.seed), assembly.seed
         self.reduced: ReducedPrograms = value_of(store, assembly)
 
     @cached_property
     def _before(self) -> list[int | None]:
         return path_before(self.mus, self.model.problem.parameters)
+
+    def near(self, number: int, *seed: int) -> Array:
+        """A parameter (d,) next to that of a query, which depends on the seed: what a timed assembly assembles at."""
+        return nearby(self.model.problem.parameters, self.mus[number], self._seed, number, *seed)
 
     def query(self, number: int, solver: str, accuracy: float, warm_start: bool) -> Query:
         """One query of a solver; for a warm start with the one before it on a path through the parameters.

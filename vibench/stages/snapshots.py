@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import itertools
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import lru_cache, partial
 from typing import Literal, TypeVar
@@ -17,6 +18,7 @@ from vibench.interfaces.problem import Problem, VariationalInequality
 from vibench.interfaces.validation import checked_assembly, training_parameters, validation_parameters
 from vibench.stages.artefacts import History, Store
 from vibench.stages.base import Result, Stage, build_problem, faults_of, value_of
+from vibench.stages.repeats import nearby
 from vibench.stages.serialisation import storable
 from vibench.study.cells import Axes, Plugin
 from vibench.timing import NO_TIME, Seconds, median_seconds, timed
@@ -101,9 +103,9 @@ class SnapshotStage(Stage):
                 raise
 
         for k, mu in enumerate(mus):
-            solve_here = partial(solve, mu)
-            beginning = timed(solve_here)[1] if k == 0 else NO_TIME
-            (vi, solution), marginal = self._measure(solve_here)
+            near = (nearby(problem.parameters, mu, self.seed, k, repeat) for repeat in itertools.count())
+            beginning = timed(partial(solve, next(near)))[1] if k == 0 else NO_TIME
+            (vi, solution), marginal = self._measure(solve, itertools.chain([mu], near))
             seconds.append(marginal)
             if k == 0:
                 setups.append(beginning.beyond(marginal))
@@ -119,9 +121,12 @@ class SnapshotStage(Stage):
         found = Snapshots(mus, u, lam, tuple(seconds), tuple(setups), tuple(fallbacks), reference.fingerprint)
         return Result(found, sum(seconds, NO_TIME), self._diagnostics(problem, mus, first))
 
-    def _measure(self, work: Callable[[], T]) -> tuple[T, Seconds]:
-        """A training solution is an offline cost, timed once; a validation solution is timed as a query is."""
-        return timed(work) if self.purpose == "training" else median_seconds(work)
+    def _measure(self, work: Callable[[Array], T], mus: Iterator[Array]) -> tuple[T, Seconds]:
+        """A training solution is an offline cost, timed once; a validation solution is timed as a query is.
+
+        The result is the one at the first parameter.
+        """
+        return timed(partial(work, next(mus))) if self.purpose == "training" else median_seconds(work, mus)
 
     def parameters(self, problem: Problem) -> Array:
         """Training or validation parameters (P×d), of which the stage solves a part."""

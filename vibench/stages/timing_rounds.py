@@ -14,9 +14,11 @@ from vibench.interfaces.validation import checked_assembly
 from vibench.model.hyperreduced import HyperReducedModel
 from vibench.provenance import machine
 from vibench.stages.artefacts import Store
+from vibench.stages.assembly import AssemblyStage
 from vibench.stages.base import Failed, Pieces, PiecewiseStage, Row, Stage
 from vibench.stages.cell_queries import CellQueries
 from vibench.stages.query import Queries, Watch
+from vibench.stages.repeats import check_answer
 from vibench.timing import DISTURBED, WAITED, Seconds, calibration, timed
 
 SHARE = 4
@@ -99,8 +101,12 @@ class TimingRounds(PiecewiseStage):
         number, within = divmod(piece, len(self.cells))
         return number, int(np.random.default_rng(number).permutation(len(self.cells))[within])
 
+    def stage_of(self, number: int) -> CellQueries:
+        """The cell of a piece: processes take turns where its plugins are of other packages than the next one's."""
+        return self.cells[self.place(number)[1]]
+
     def begin(self, store: Store) -> _Rounds:
-        """Load the models; cells that differ in their solver alone share one."""
+        """Models are loaded when they are first needed; cells that differ in their solver alone share one."""
         return _Rounds(self, store)
 
 
@@ -108,8 +114,8 @@ class _Rounds(Pieces):
     """Rounds in progress."""
 
     def __init__(self, stage: TimingRounds, store: Store) -> None:
-        self._stage = stage
-        self._models = {assembly.key: Queries(store, assembly) for assembly in {c.assembly for c in stage.cells}}
+        self._stage, self._store = stage, store
+        self._models: dict[str, Queries] = {}
         self._warm: set[int] = set()
         self._forms: dict[tuple[int, int], tuple[VariationalInequality, Seconds]] = {}
 
@@ -117,42 +123,54 @@ class _Rounds(Pieces):
         """One round of one cell, after a warm-up if it is the cell's first one in this process."""
         at, cell = self._stage.place(number)
         if cell not in self._warm:
-            self._round(at, cell, watch, most=1)  # the warm-up
+            self._round(at, cell, watch, warm_up=True)
             self._warm.add(cell)
         before = calibration().slowdown()
         assemble, solve = self._round(at, cell, watch)
         return TimedRound(assemble, solve, max(before, calibration().slowdown()))
 
     def _round(
-        self, at: int, cell: int, watch: Watch, most: int | None = None
+        self, at: int, cell: int, watch: Watch, *, warm_up: bool = False
     ) -> tuple[dict[int, Seconds], dict[int, Seconds]]:
-        """Seconds of assembly and solution of the cell's queries, or of at most so many."""
+        """Seconds of assembly and solution of the cell's queries, or of one to warm up.
+
+        What is timed is equivalent to the queries and nowhere the same: nothing is gained by remembering it.
+        """
         stage = self._stage.cells[cell]
-        queries, fine = self._models[stage.assembly.key], self._stage.queries[cell]
+        queries, fine = self._queries(stage.assembly), self._stage.queries[cell]
         share = min(SHARE, len(fine))
-        order = fine[at % share :: share][:most]
-        assemble = self._assemblies(queries, order, at)
+        order = fine[at % share :: share][: 1 if warm_up else None]
+        assemble = self._assemblies(queries, order, at, cell, warm_up=warm_up)
         solve: dict[int, Seconds] = {}
         for k in order:
-            solve[k] = stage.query(queries, k).prepare(watch)()[1]
+            query = stage.query(queries, k).repeated(stage.assembly.seed, k, at, cell, int(warm_up))
+            answer, solve[k] = query.prepare(watch)()
+            check_answer(query.program, answer, query.accuracy)
             if sum(seconds.wall for seconds in solve.values()) > ROUND_SECONDS:
                 break
         return assemble, solve
 
-    def _assemblies(self, queries: Queries, order: Sequence[int], at: int) -> dict[int, Seconds]:
+    def _queries(self, assembly: AssemblyStage) -> Queries:
+        if assembly.key not in self._models:
+            self._models[assembly.key] = Queries(self._store, assembly)
+        return self._models[assembly.key]
+
+    def _assemblies(
+        self, queries: Queries, order: Sequence[int], at: int, cell: int, *, warm_up: bool
+    ) -> dict[int, Seconds]:
         """Seconds of the assembly of every query; in full, which costs the same at each parameter, of the first one.
 
         High-fidelity matrices are the same for all models: they are assembled once in a round.
         """
-        model, mus = queries.model, queries.mus
+        model = queries.model
         if isinstance(model, HyperReducedModel):
-            return {k: timed(partial(model.assemble, mus[k]))[1] for k in order}
+            return {k: timed(partial(model.assemble, queries.near(k, at, cell, int(warm_up))))[1] for k in order}
         k = order[0]
         if (at, k) not in self._forms:
-            assemble = partial(checked_assembly, model.problem, mus[k])
             if not self._forms:
-                assemble()  # the warm-up
-            self._forms = {(at, k): timed(assemble)}
+                checked_assembly(model.problem, queries.near(k, at, cell, 1))  # the warm-up
+            vi, seconds = timed(partial(checked_assembly, model.problem, queries.near(k, at, cell, 0)))
+            self._forms = {(at, k): (vi.copy(), seconds)}  # the next assembly may be written into the same arrays
         vi, forms = self._forms[at, k]
         return {k: forms + timed(partial(model.reduce, vi))[1]}
 

@@ -183,7 +183,8 @@ def expand(study: Study) -> list[Cell]:
 
 
 def _nested_tolerances(primal: Entry, table: ToleranceTable) -> tuple[float, ...]:
-    if not issubclass(registry.load("primal strategy", primal.name), NestedStrategy):
+    kind = "primal strategy"
+    if registry.conflict(kind, primal.name) or not issubclass(registry.load(kind, primal.name), NestedStrategy):
         return ()
     return tuple(sorted({value for value in table.of_primal(primal) if value is not None}, reverse=True))
 

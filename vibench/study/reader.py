@@ -94,7 +94,7 @@ def _title(entry: Any) -> str:
 def _takes_tolerance(entry: Any) -> bool:
     """Whether an unchecked entry of the primal axis names a strategy that takes a tolerance."""
     name = str(entry.get("name") if isinstance(entry, dict) else entry)
-    known = name in registry.names("primal strategy")
+    known = name in registry.names("primal strategy") and not registry.conflict("primal strategy", name)
     return known and bool(registry.load("primal strategy", name).takes_tolerance)
 
 

@@ -7,7 +7,7 @@ import inspect
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, cached_property
 from importlib.metadata import EntryPoint
 from pathlib import Path
 from typing import Any, get_type_hints
@@ -18,6 +18,7 @@ from vibench.errors import RequestError, in_a_line, unknown_name
 from vibench.interfaces.problem import Problem
 from vibench.interfaces.strategies import DualStrategy, PrimalStrategy
 from vibench.provenance import distribution_version, source_hash
+from vibench.qp.settings import SETTINGS
 from vibench.qp.solution import QPSolver
 from vibench.study.entry_points import entry_points
 
@@ -60,7 +61,7 @@ def load(kind: str, name: str) -> Any:
     Raises
     ------
     RequestError
-        If no plugin has that name, it cannot be imported, or it is not of its kind.
+        If no plugin or several have that name, it cannot be imported, or it is not of its kind.
     """
     entry = _entry(kind, name)
     where = f"{kind} '{name}' ({entry.value})"
@@ -105,20 +106,42 @@ def reference(kind: str, name: str) -> str:
 
 
 def version(kind: str, name: str) -> str:
-    """Distribution and version a plugin comes from, "vibench 0.1.0"."""
-    found = _registered(kind)[name].dist
-    return f"{found.name} {found.version}" if found is not None else "unknown"
+    """Distribution and version a plugin comes from, "vibench 0.1.0"; of a name that several use, all of them."""
+    return ", ".join(map(_origin, _registered(kind)[name].entries))
+
+
+def _origin(entry: EntryPoint) -> str:
+    return f"{entry.dist.name} {entry.dist.version}" if entry.dist is not None else "unknown"
+
+
+def conflict(kind: str, name: str) -> str:
+    """Why a name says too little: who else provides a plugin or a solver of qpsolvers with this name; "" if it is one.
+
+    Nothing of that name is loaded: whichever was meant, results would be recorded under the name of the other.
+    """
+    found = _registered(kind).get(name)
+    return "" if found is None else found.conflict
+
+
+def package(kind: str, name: str) -> str:
+    """Distribution of a third party that a plugin comes from; "" for those of vibench, and for what is no plugin."""
+    found = _registered(kind).get(name)
+    return "" if found is None else found.package
 
 
 @cache
 def code(kind: str, name: str) -> str:
     """Version of a plugin with a hash of its outermost package, or of its module if it is in none.
 
+    Of a name that several packages use it is their versions: nothing is computed with it.
+
     Raises
     ------
     RequestError
         If no plugin has that name.
     """
+    if conflict(kind, name):
+        return version(kind, name)
     source = Path(str(importlib.import_module(_entry(kind, name).module).__file__))
     while (source.parent / "__init__.py").is_file():
         source = source.parent
@@ -133,7 +156,7 @@ def missing(kind: str, name: str) -> list[str]:
 
 def requirements(kind: str, name: str) -> tuple[str, ...]:
     """Distributions that a plugin `requires`, in addition to the requirements of its own distribution."""
-    entry = _registered(kind)[name]
+    entry = _entry(kind, name)
     plugin = getattr(importlib.import_module(entry.module), entry.attr.partition(".")[0], None)
     return tuple(getattr(plugin, "requires", ()))
 
@@ -147,7 +170,9 @@ def options(kind: str, name: str) -> list[Option]:
 
 
 def check_options(kind: str, name: str, given: Mapping[str, Any]) -> dict[str, Any]:
-    """Options of a registered plugin, checked as by `checked_arguments`."""
+    """Options of a registered plugin, checked as by `checked_arguments`; as they are if several have its name."""
+    if conflict(kind, name):
+        return dict(given)
     return checked_arguments(load(kind, name), f"{kind} '{name}'", given)
 
 
@@ -198,7 +223,9 @@ def doubtful_options(plugin: type) -> dict[str, str]:
 
 
 def canonical_options(kind: str, name: str, given: Mapping[str, Any]) -> str:
-    """Options as canonical JSON, without those that equal their default."""
+    """Options as canonical JSON, without those that equal their default; as they are if several have the name."""
+    if conflict(kind, name):
+        return json.dumps(given, sort_keys=True, default=str)
     known, checked = _parameters(load(kind, name)), check_options(kind, name, given)
     kept = {option: value for option, value in checked.items() if value != known[option][0]}
     return json.dumps(TypeAdapter(dict[str, Any]).dump_python(kept, mode="json"), sort_keys=True)
@@ -214,22 +241,45 @@ def study_path(name: str) -> Path:
     return Path(load("study", name))
 
 
+@dataclass(frozen=True)
+class _Registered:
+    """The entry points of one name; several where packages register different objects under it."""
+
+    kind: str
+    entries: tuple[EntryPoint, ...]
+
+    @cached_property
+    def conflict(self) -> str:
+        name, owners = self.entries[0].name, len(self.entries)
+        others = ["qpsolvers"] if self.kind == "QP solver" and name in SETTINGS else []
+        if owners + len(others) < 2:
+            return ""
+        count = "two" if owners + len(others) == 2 else "several"
+        packages = ", ".join([*others, *(f"{_origin(entry)} ({entry.value})" for entry in self.entries)])
+        return f"{count} packages provide the {self.kind} '{name}', so that none is used: {packages}"
+
+    @cached_property
+    def package(self) -> str:
+        entry = self.entries[0]  # the metadata of a distribution are read again at each access
+        owner = entry.module.partition(".")[0] if entry.dist is None else entry.dist.name
+        return "" if owner == "vibench" else owner
+
+
 @cache
-def _registered(kind: str) -> dict[str, EntryPoint]:
-    found: dict[str, EntryPoint] = {}
+def _registered(kind: str) -> dict[str, _Registered]:
+    found: dict[str, dict[str, EntryPoint]] = {}
     for entry in entry_points(group=GROUPS[kind]):
-        other = found.get(entry.name)
-        if other is not None and other.value != entry.value:
-            raise RequestError(f"two packages register the {kind} '{entry.name}': {other.value} and {entry.value}")
-        found[entry.name] = entry
-    return found
+        found.setdefault(entry.name, {}).setdefault(entry.value, entry)
+    return {name: _Registered(kind, tuple(entries.values())) for name, entries in found.items()}
 
 
 def _entry(kind: str, name: str) -> EntryPoint:
     registered = _registered(kind)
     if name not in registered:
         raise unknown_name(kind, name, registered)
-    return registered[name]
+    if reason := conflict(kind, name):
+        raise RequestError(reason)
+    return registered[name].entries[0]
 
 
 @cache

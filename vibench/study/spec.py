@@ -122,6 +122,8 @@ class ToleranceTable(_Model):
 
     def of_primal(self, entry: Entry) -> list[float | None]:
         """Tolerances of one primal strategy; [`None`] for a strategy that takes none."""
+        if registry.conflict("primal strategy", entry.name):  # whether it takes one or not, its cells cannot be run
+            return list(self.primal.get(entry.title, self.primal.get(entry.name, [None])))
         if not registry.load("primal strategy", entry.name).takes_tolerance:
             return [None]
         return list(_meant_for(self.primal, entry, "tolerances.primal"))
@@ -236,7 +238,8 @@ def _check_names(study: Study) -> None:
     for solver in study.solver_names():
         if solver not in known:  # installed or not
             raise unknown_name("QP solver", solver, known)
-        registry.qp_solver(solver)
+        if not registry.conflict("QP solver", solver):
+            registry.qp_solver(solver)
     for table in study.tolerances:
         _check_tolerances(study, table)
 

@@ -147,8 +147,8 @@ def test_the_error_of_a_plugin_is_no_markup_and_no_escape_sequence(
 def test_a_name_that_two_packages_register_is_broken_and_stops_nothing(register: Register) -> None:
     register(("vibench.qp_solvers", "mine", "one:solve"), ("vibench.qp_solvers", "mine", "other:solve"))
     found = by_subject(list(doctor.plugins()))
-    assert found["QP solver"].health is Health.BROKEN
-    assert "two packages" in found["QP solver"].found
+    assert found["QP solver 'mine'"].health is Health.BROKEN
+    assert "two packages" in found["QP solver 'mine'"].found
     assert "problem" in found
 
 

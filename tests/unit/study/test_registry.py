@@ -12,9 +12,11 @@ from enum import StrEnum
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
+import fake_plugins
 import pytest
 from annotated_types import Ge, Gt, Le, Lt, MinLen
 from running import Register
+from samples import FAKES, install
 
 from vibench.errors import RequestError
 from vibench.interfaces.problem import Problem
@@ -22,6 +24,7 @@ from vibench.interfaces.strategies import DualStrategy, PrimalStrategy
 from vibench.study import registry
 from vibench.study.cells import Plugin
 from vibench.study.reader import read_study
+from vibench.study.spec import Entry
 
 HERE = __name__
 
@@ -162,12 +165,39 @@ def test_a_name_far_from_all_is_refused_without_a_guess(register: Register) -> N
     assert "did you mean" not in refusal(registry.load, DUAL, "xyzzy")
 
 
-def test_two_packages_with_one_name_are_refused(register: Register) -> None:
-    register((GROUP, "plain", f"{HERE}:Plain"), (GROUP, "plain", f"{HERE}:Choosy"))
-    line = refusal(registry.names, DUAL)
-    assert "'plain'" in line
+def test_a_name_that_two_packages_use_is_refused_and_no_other(register: Register) -> None:
+    register((GROUP, "plain", f"{HERE}:Plain"), (GROUP, "plain", f"{HERE}:Choosy"), (GROUP, "heir", f"{HERE}:Heir"))
+    line = refusal(registry.load, DUAL, "plain")
+    assert line.startswith("two packages provide the dual strategy 'plain'")
     assert f"{HERE}:Plain" in line
     assert f"{HERE}:Choosy" in line
+    assert registry.conflict(DUAL, "plain") == line
+    assert registry.load(DUAL, "heir") is Heir
+    assert registry.names(DUAL) == ["heir", "plain"]
+    assert "two packages" in refusal(registry.requirements, DUAL, "plain")
+    plugin = Plugin.from_entry(DUAL, Entry(name="plain", options={"mode": "slow"}))
+    assert plugin.options == '{"mode": "slow"}'
+    assert "two packages" in refusal(plugin.create)
+
+
+def test_a_plugin_cannot_take_the_name_of_a_solver_of_qpsolvers(register: Register) -> None:
+    """Installed or not: results of another machine may be named after the real one."""
+    register(*(("vibench.qp_solvers", name, f"{HERE}:no_strategy") for name in ("piqp", "ecos", "mine")))
+    for name in ("piqp", "ecos"):
+        line = refusal(registry.qp_solver, name)
+        assert line.startswith(f"two packages provide the QP solver '{name}'")
+        assert f"qpsolvers, unknown ({HERE}:no_strategy)" in line
+    assert registry.qp_solver("mine") == {"mine": no_strategy}
+    assert registry.conflict("QP solver", "osqp") == ""
+
+
+def test_a_distribution_that_is_found_in_two_folders_is_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, register: Register
+) -> None:
+    for folder in ("one", "other"):
+        monkeypatch.syspath_prepend(str(install(tmp_path / folder, fake_plugins, FAKES)))
+    assert registry.conflict("QP solver", "careful") == ""
+    assert registry.version("QP solver", "careful") == "fake-plugins 1.0"
 
 
 def test_one_entry_point_seen_twice_is_no_conflict(register: Register) -> None:

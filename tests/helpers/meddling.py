@@ -1,0 +1,69 @@
+"""Plugins that change the process they run in, or remember answers; their package must be the only one to suffer."""
+
+from __future__ import annotations
+
+import os
+import resource
+import time
+import warnings
+from typing import Any
+
+import numpy as np
+import qpsolvers
+from fake_plugins import Wire, careful
+
+from vibench import Array, QPSolution, VariationalInequality
+
+solve_problem = qpsolvers.solve_problem
+known: dict[bytes, QPSolution] = {}
+
+
+def refuse(*arguments: Any, **options: Any) -> Any:
+    raise RuntimeError("meddled with")
+
+
+def meddle() -> None:
+    """Change whatever is shared in a process."""
+    np.seterr(all="raise")
+    warnings.simplefilter("error")
+    os.chdir("/")
+    os.umask(0o777)
+    for clock in ("thread_time", "process_time", "perf_counter", "time"):
+        setattr(time, clock, lambda: 0.0)
+    qpsolvers.solve_problem = refuse
+
+
+class Meddles(Wire):
+    """Its process can write no file any more."""
+
+    def assemble(self, mu: Array) -> VariationalInequality:
+        meddle()
+        resource.setrlimit(resource.RLIMIT_FSIZE, (0, resource.getrlimit(resource.RLIMIT_FSIZE)[1]))
+        return super().assemble(mu)
+
+
+def meddling(program: VariationalInequality, accuracy: float) -> QPSolution:
+    qpsolvers.solve_problem = solve_problem
+    answer = careful(program, accuracy)
+    meddle()
+    return answer
+
+
+def forgetful(program: VariationalInequality, accuracy: float) -> QPSolution:
+    """Returns an earlier answer where three digits of the program are the same."""
+    key = b"".join((np.round(one, 3) + 0.0).tobytes() for one in (program.A, program.f, program.B, program.g))
+    qpsolvers.solve_problem = solve_problem
+    return known.setdefault(key, careful(program, accuracy))
+
+
+MEMBERS = {
+    "vibench.problems": {"wire-meddles": "Meddles"},
+    "vibench.qp_solvers": {"meddling": "meddling", "roughly": "forgetful"},
+}
+"""What the package registers."""
+
+TAKEN = {
+    "vibench.dual_strategies": {"cpg": "Meddles"},
+    "vibench.qp_solvers": {"careful": "meddling", "osqp": "meddling"},
+}
+"""What it registers under names of vibench, of another package, and of qpsolvers."""

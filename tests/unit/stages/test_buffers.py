@@ -1,0 +1,93 @@
+"""Problems that write every result into the same arrays have the numbers of those which do not."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from functools import partial
+
+import numpy as np
+import pytest
+from broken_problems import Declared
+from buffered import buffered
+from numerics import Varying
+from running import without_seconds
+from samples import carry_out
+
+from vibench.interfaces.problem import Problem
+from vibench.interfaces.strategies import Stop
+from vibench.stages.artefacts import Store
+from vibench.stages.assembly import AssemblyStage
+from vibench.stages.base import Row, value_of
+from vibench.stages.cell_queries import CellQueries
+from vibench.stages.enrichment import SingleEnrichment
+from vibench.stages.offline import ConeStage, PODStage
+from vibench.stages.pictures import PictureStage
+from vibench.study import registry
+from vibench.study.cells import Plugin
+
+OBSTACLE = registry.load("problem", "obstacle")
+PROBLEMS: Mapping[str, Callable[[], Problem]] = {
+    "wire": Declared,
+    "wire, buffered": buffered(Declared),
+    "string": Varying,
+    "string, buffered": buffered(Varying),
+    "obstacle": partial(OBSTACLE, 150),
+    "obstacle, buffered": partial(buffered(OBSTACLE), 150),
+}
+
+
+@pytest.fixture(autouse=True)
+def _registered(monkeypatch: pytest.MonkeyPatch) -> None:
+    create = Plugin.create
+    monkeypatch.setattr(
+        Plugin, "create", lambda plugin: PROBLEMS[plugin.name]() if plugin.kind == "problem" else create(plugin)
+    )
+
+
+def plugin(kind: str, name: str) -> Plugin:
+    return Plugin(kind, name, "{}", "of this module")
+
+
+def cell(name: str, primal: str, interpolation: float | None) -> CellQueries:
+    problem = plugin("problem", name)
+    cone = ConeStage(problem, plugin("dual strategy", "cpg"), Stop(size=2))
+    enrichment = SingleEnrichment(PODStage(problem, Stop(size=2)), cone, plugin("primal strategy", primal), None)
+    return CellQueries(AssemblyStage(enrichment, interpolation, 4, 1), "piqp", 1e-8, 20.0)
+
+
+def rows(stage: CellQueries, store: Store) -> list[Row]:
+    carry_out(stage, store)
+    found = value_of(store, stage)
+    return [without_seconds(row) for row in (found.cell | {"model": ""}, *found.queries)]
+
+
+@pytest.mark.parametrize("primal", ["decorrelated", "online-supremizers"])
+@pytest.mark.parametrize("interpolation", [None, 1e-6], ids=["full", "reduced"])
+@pytest.mark.parametrize("problem", ["wire", "string", "obstacle"])
+def test_arrays_that_are_used_again_change_no_number(
+    problem: str, primal: str, interpolation: float | None, store: Store
+) -> None:
+    plain, other = (rows(cell(name, primal, interpolation), store) for name in (problem, f"{problem}, buffered"))
+    assert plain[0]["status"] == "ok"
+    for one, same in zip(plain, other, strict=True):
+        assert one.keys() == same.keys()
+        for name, value in one.items():
+            # Sums are rounded as arrays lie in memory.
+            expected = pytest.approx(value, rel=1e-6, abs=1e-7) if isinstance(value, float) else value
+            assert same[name] == expected, name
+
+
+def test_arrays_that_are_used_again_change_no_picture(store: Store) -> None:
+    drawn = []
+    for name in ("wire", "wire, buffered"):
+        carry_out(stage := PictureStage(plugin("problem", name)), store)
+        drawn.append(value_of(store, stage))
+    for (title, plain), (same, other) in zip(*drawn, strict=True):
+        assert title == same
+        for array in ("points", "triangles", "values", "positions", "multiplier"):
+            assert np.array_equal(getattr(plain, array), getattr(other, array))
+
+
+@pytest.fixture(scope="module")
+def store(tmp_path_factory: pytest.TempPathFactory) -> Store:
+    return Store(tmp_path_factory.mktemp("artefacts"))
