@@ -33,6 +33,12 @@ EXAMPLES: Mapping[str, tuple[str, ...]] = {
         "vibench check my_package.cable:Cable",
     ),
     "new": ("vibench new problem cable", "vibench new dual my-cone --out packages"),
+    "import": ("vibench import my-model",),
+    "pack": (
+        "vibench pack obstacle obstacle-pack --option resolution=coarse --validation 16",
+        "vibench pack hertz hertz-pack --seed 2022 --solutions",
+    ),
+    "cones": ("vibench cones my-model", "vibench cones my-model --dual cpg --dual mcpg --dual-tol 1e-3"),
     "clean": ("vibench clean --dry-run", "vibench clean --older-than 30"),
     "doctor": ("vibench doctor", "vibench doctor --out /scratch/runs"),
 }

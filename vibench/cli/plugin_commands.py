@@ -57,7 +57,7 @@ def check_plugin(
     from vibench.testing import Verdict, examine_dual, examine_primal, examine_problem
 
     kind, name, cls = _find(plugin)
-    given = dict(map(_option, option or []))
+    given = dict(map(key_value, option or []))
     title = f"{registry.WORDS[kind]} '{name}'"
     options = registry.checked_arguments(cls, title, given)
     if kind == "problem" and "resolution" not in given:
@@ -183,7 +183,7 @@ def _find_class(module: str, name: str) -> tuple[str, str, type]:
     raise RequestError(f"{title} is no subclass of Problem, PrimalStrategy or DualStrategy")
 
 
-def _option(text: str) -> tuple[str, Any]:
+def key_value(text: str) -> tuple[str, Any]:
     """Key and value of "key=value"; the value is read as JSON if it is valid JSON, as text otherwise."""
     import json
 

@@ -23,7 +23,6 @@ from vibench.execution.supervisor import Begun, Finished, Job, OutOfMemory, Prog
 from vibench.qp.status import Status
 from vibench.stages.artefacts import Store
 from vibench.stages.base import Done, Failed, PiecewiseStage, Unstored
-from vibench.study import registry
 
 T = TypeVar("T")
 Send = Callable[[Any], None]
@@ -99,7 +98,7 @@ def perform(job: Job, progress: Progress, send: Send) -> Done | Failed | Unstore
 def _check_code(job: Job) -> None:
     """Refuse a job that was planned with other code than this process has: its artefact would have the wrong key."""
     used = job.stage.plugins()
-    changed = [f"the {p.kind} '{p.name}'" for p in used if registry.code(p.kind, p.name) != p.code]
+    changed = [f"the {p.kind} '{p.name}'" for p in used if p.as_installed() != p]
     if job.code != code_here():
         changed.insert(0, "vibench or one of the libraries")
     if changed:
