@@ -35,10 +35,10 @@ EXAMPLES: Mapping[str, tuple[str, ...]] = {
     "new": ("vibench new problem cable", "vibench new dual my-cone --out packages"),
     "import": ("vibench import my-model",),
     "pack": (
-        "vibench pack obstacle obstacle-pack --option resolution=coarse --validation 16",
-        "vibench pack hertz hertz-pack --seed 2022 --solutions",
+        "vibench pack obstacle my-model --option resolution=coarse",
+        "vibench pack hertz my-model --seed 2022 --validation 16 --solutions",
     ),
-    "cones": ("vibench cones my-model", "vibench cones my-model --dual cpg --dual mcpg --dual-tol 1e-3"),
+    "cones": ("vibench cones my-model", "vibench cones my-model --dual cpg --dual-tol 1e-3"),
     "clean": ("vibench clean --dry-run", "vibench clean --older-than 30"),
     "doctor": ("vibench doctor", "vibench doctor --out /scratch/runs"),
 }

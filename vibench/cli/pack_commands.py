@@ -67,10 +67,10 @@ def reduce_cones(
     dual_tol: Annotated[float, Option(min=1e-12, max=1.0, help="Tolerance of the cones.")] = 1e-2,
     out: Annotated[Path, Option(metavar="DIR", help="Folder of the table and the figure.")] = Path("cones"),
 ) -> None:
-    """Build cones from the multipliers of a model pack: the dual half of a reduced model, without operators.
+    """Build cones from the multipliers of a model pack.
 
-    Errors are the largest distances from the cone relative to the largest norm, over the multipliers at training
-    parameters, and over the others.
+    This is the dual half of a reduced model, which needs no operators. Errors are the largest distances from the cone
+    relative to the largest norm, over the multipliers at training parameters, and over the others.
     """
     import pandas as pd
 

@@ -37,8 +37,8 @@ UNREADABLE = (
 """What NumPy, SciPy, zipfile and h5py raise for damaged files."""
 
 
-def safe_path(folder: Path, name: str) -> Path:
-    """Path of a file in a folder.
+def safe_path(folder: Path, name: str, *, is_folder: bool = False) -> Path:
+    """Path of a file in a folder, or of a folder in it.
 
     Raises
     ------
@@ -46,9 +46,10 @@ def safe_path(folder: Path, name: str) -> Path:
         If the name leads elsewhere, there is no such file, or it is a link or no regular file.
     """
     parts = PurePosixPath(name).parts
-    if not parts or name.startswith("/") or ".." in parts or "\\" in name or "\0" in name:
+    if not (parts or is_folder) or name.startswith("/") or ".." in parts or "\\" in name or "\0" in name:
         raise RequestError(f"'{name}' is not the name of a file inside the pack's folder")
     path = folder
+    mode = folder.stat().st_mode
     try:
         for part in parts:
             path /= part
@@ -58,8 +59,8 @@ def safe_path(folder: Path, name: str) -> Path:
     except OSError as error:
         where = "does not exist" if isinstance(error, FileNotFoundError) else f"cannot be read: {error.strerror}"
         raise RequestError(f"the file '{name}' {where}") from None
-    if not stat.S_ISREG(mode):
-        raise RequestError(f"'{name}' is not a regular file")
+    if not (stat.S_ISDIR(mode) if is_folder else stat.S_ISREG(mode)):
+        raise RequestError(f"'{name}' is not a {'folder' if is_folder else 'regular file'}")
     return path
 
 
@@ -142,6 +143,8 @@ class ArrayFiles:
         """A dense array, or the arrays of a sparse matrix by name, or a matrix."""
         name, _, inner = reference.partition(":")
         suffix = next((known for known in FORMATS if name.endswith(known)), "")
+        if not suffix:
+            raise RequestError(f"'{name}' has a format that is not read; expected one of {', '.join(FORMATS)}")
         path = safe_path(self._folder, name)
         match suffix:
             case ".npz":
@@ -151,9 +154,7 @@ class ArrayFiles:
                     return self._array(file, path.stat().st_size)
             case ".mtx" | ".mtx.gz":
                 return self._matrix_market(path)
-            case ".h5" | ".hdf5":
-                return self._hdf5(path, inner)
-        raise RequestError(f"'{name}' has a format that is not read; expected one of {', '.join(FORMATS)}")
+        return self._hdf5(path, inner)
 
     def _npz(self, path: Path, inner: str) -> Any:
         with zipfile.ZipFile(path) as archive:

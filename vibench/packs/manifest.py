@@ -165,8 +165,8 @@ class Manifest(_Model):
     solutions: Solutions | None = None
     mesh: Mesh | None = None
 
-    def references(self) -> Iterator[str]:
-        """The arrays that the manifest names, "FILE" or "FILE:NAME", and the mesh."""
+    def references(self) -> Iterator[tuple[str, str]]:
+        """The arrays that the manifest names, "FILE" or "FILE:NAME", and the mesh, each after its place."""
         yield from _references(self)
 
 
@@ -177,15 +177,15 @@ REFERENCES = frozenset(
 """Keys whose texts refer to files."""
 
 
-def _references(value: Any, key: str = "") -> Iterator[str]:
+def _references(value: Any, place: tuple[str, ...] = ()) -> Iterator[tuple[str, str]]:
     if isinstance(value, BaseModel):
         for name, part in value:
-            yield from _references(part, name)
+            yield from _references(part, (*place, name))
     elif isinstance(value, list):
-        for part in value:
-            yield from _references(part)
-    elif isinstance(value, str) and key in REFERENCES:
-        yield value
+        for k, part in enumerate(value):
+            yield from _references(part, (*place, str(k)))
+    elif isinstance(value, str) and place[-1] in REFERENCES:
+        yield ".".join(name for name in place if name not in ("constant", "array")), value
 
 
 def read_manifest(folder: Path) -> Manifest:

@@ -7,7 +7,7 @@ import hashlib
 import os
 from collections.abc import Iterator, Mapping
 from functools import lru_cache
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 import numpy as np
@@ -56,22 +56,25 @@ def pack_digest(path: str | Path) -> str:
     """
     content = hashlib.sha256(core_code("packs").encode())
     with naming(path) as folder:
-        for name in (FILE, *sorted({reference.partition(":")[0] for reference in read_manifest(folder).references()})):
-            for file in _files(folder, name):
+        for place, reference in (("manifest", FILE), *read_manifest(folder).references()):
+            for file in _files(folder, place, reference.partition(":")[0]):
                 state = file.stat()
                 content.update(_file_digest(file, state.st_size, state.st_mtime_ns, state.st_ino))
     return content.hexdigest()[:16]
 
 
-def _files(folder: Path, name: str) -> list[Path]:
-    """The files of a name; those of one that numbers files, in order."""
-    if "{}" not in name:
-        return [safe_path(folder, name)]
-    safe_path(folder, FILE)
-    before, _, after = name.partition("{}")
-    parent = (folder / before) if before.endswith("/") else (folder / before).parent
-    found = (file.relative_to(folder).as_posix() for file in parent.glob("*") if ".." not in name)
-    return [safe_path(folder, each) for each in sorted(found) if each.startswith(before) and each.endswith(after)]
+def _files(folder: Path, place: str, name: str) -> list[Path]:
+    """The files of a name; all of those that a {} in it numbers."""
+    try:
+        if "{}" not in name:
+            return [safe_path(folder, name)]
+        before, _, after = name.partition("{}")
+        parent = PurePosixPath(before + "x").parent.as_posix()
+        found = safe_path(folder, parent, is_folder=True).iterdir()
+        names = (each.relative_to(folder).as_posix() for each in found)
+        return [safe_path(folder, each) for each in sorted(names) if each.startswith(before) and each.endswith(after)]
+    except RequestError as error:
+        raise RequestError(f"{place}: {error}") from None
 
 
 @lru_cache(maxsize=10_000)
