@@ -256,10 +256,13 @@ class ArrayFiles:
         column_wise = "csc" in str(np.ravel(found.get("format", "csr"))[0])
         kind, long, short = (sp.csc_array, columns, rows) if column_wise else (sp.csr_array, rows, columns)
         indices, pointers = np.ravel(found["indices"]), np.ravel(found["indptr"])
-        if len(pointers) != long + 1 or pointers[0] != 0 or pointers[-1] != len(data) or np.any(np.diff(pointers) < 0):
-            raise RequestError(f"indptr does not fit the shape {_size((rows, columns))} and the {len(data)} values")
-        if len(indices) != len(data) or (len(indices) and not 0 <= indices.min() <= indices.max() < short):
-            raise RequestError(f"indices do not fit the shape {_size((rows, columns))} and the {len(data)} values")
+        fits = f"the shape {_size((rows, columns))} and the {len(data)} values"
+        if len(pointers) != long + 1 or pointers[0] != 0 or pointers[-1] > len(data) or np.any(np.diff(pointers) < 0):
+            raise RequestError(f"indptr does not fit {fits}")
+        used = int(pointers[-1])  # SciPy may have allocated more
+        indices, data = indices[:used], data[:used]
+        if len(indices) != used or (used and not 0 <= indices.min() <= indices.max() < short):
+            raise RequestError(f"indices do not fit {fits}")
         return kind((data, indices, pointers), shape=(rows, columns))
 
     def _from_triplets(self, found: Any, data: Array, rows: int, columns: int) -> SparseMatrix:

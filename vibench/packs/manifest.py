@@ -114,10 +114,10 @@ class Spaces(_Model):
 class Operators(_Model):
     """The members of the variational inequality."""
 
-    A: Member
-    f: Member
-    B: Member
-    g: Member
+    A: Annotated[Member, Field(description="Stiffness (n×n), symmetric positive definite.")]
+    f: Annotated[Member, Field(description="Load (n,).")]
+    B: Annotated[Member, Field(description="Constraint (m×n).")]
+    g: Annotated[Member, Field(description="Bound (m,).")]
     entrywise: Annotated[
         list[Literal["A", "f", "B", "g"]] | None,
         Field(description="Members interpolated in reduced assembly; by default all that depend on the parameter."),
@@ -159,11 +159,11 @@ class Manifest(_Model):
     index_base: Annotated[
         Literal[0, 1], Field(description="The first index of index arrays and triplets; 1 in Matrix Market always.")
     ] = 0
-    parameters: Parameters
-    spaces: Spaces
+    parameters: Annotated[Parameters, Field(description="The parameters, their box, and sets of them.")]
+    spaces: Annotated[Spaces, Field(description="The inner products.")]
     operators: Annotated[Operators | None, Field(description="Without them the pack has its dual half only.")] = None
-    solutions: Solutions | None = None
-    mesh: Mesh | None = None
+    solutions: Annotated[Solutions | None, Field(description="Reference solutions, which show signs.")] = None
+    mesh: Annotated[Mesh | None, Field(description="A mesh, for pictures.")] = None
 
     def references(self) -> Iterator[tuple[str, str]]:
         """The arrays that the manifest names, "FILE" or "FILE:NAME", and the mesh, each after its place."""

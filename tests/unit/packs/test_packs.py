@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import scipy.io
 import scipy.sparse as sp
-from packs import SIZE, Cable, group, manifest, write_arrays, write_cable, write_manifest
+from packs import DEPTH, SIZE, Cable, group, manifest, write_arrays, write_cable, write_manifest
 from running import Main
 
 from vibench.errors import NumericalError, RequestError
@@ -159,7 +159,8 @@ def test_multipliers_alone_are_enough_for_cones(tmp_path: Path, main: Main) -> N
     code, out, _ = main("cones", str(tmp_path / "pack"), "--dual", "cpg", "--dual", "mcpg", "--out", "here")
     assert code == 0
     assert {path.name for path in Path("here").iterdir()} == {"errors.csv", "errors.png", "errors.svg"}
-    assert main("cones", str(write_cable(tmp_path / "whole")))[0] == 0
+    whole = str(write_cable(tmp_path / "whole"))
+    assert main("cones", whole, "--dual", "cpg")[0] == 0
 
 
 def test_import_says_what_a_pack_can_do(tmp_path: Path, main: Main) -> None:
@@ -191,3 +192,57 @@ def test_a_pack_is_written_whole_or_not_at_all(tmp_path: Path, main: Main, monke
     assert code == 0
     assert_cable(read_model_pack("new"))
     assert [path.name for path in Path().iterdir()] == ["new"]
+
+
+def test_the_python_example_of_the_page_exports_a_pack(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    page = (Path(__file__).parents[3] / "docs" / "model-packs.md").read_text(encoding="utf-8")
+    code = page.partition('```python title="export.py"\n')[2].partition("```")[0]
+    cable, listed = Cable(), np.array([[4.0, 0.2], [8.0, 0.3], [5.0, 0.2]])
+    monkeypatch.chdir(tmp_path)
+    given = {
+        "training": listed[:2],
+        "validation": listed[2:],
+        "f": -cable.mass,
+        "g": np.outer(cable.mass, listed[:, 1]),
+    }
+    exec(code, {"A": cable.A, "B": cable.B, "X_V": cable.X_V, "X_W": cable.X_W, **given})
+    assert_cable(read_model_pack("my-model"))
+
+
+def test_what_the_example_for_matlab_writes_is_read(tmp_path: Path) -> None:
+    """The lines that its `fprintf` gives; an Octave to run it is not at hand everywhere."""
+    page = (Path(__file__).parents[3] / "docs" / "model-packs.md").read_text(encoding="utf-8")
+    code, cable = page.partition("```matlab\n")[2].partition("```")[0], Cable()
+    assert "'%d %d %.17g\\n', [i(:) j(:) v(:)]'" in code
+    columns = {"f": -cable.mass[:, None], "g": DEPTH * cable.mass[:, None]}
+    for name, matrix in {"A": cable.A, "B": cable.B, "X_V": cable.X_V, "X_W": cable.X_W, **columns}.items():
+        coo = sp.coo_array(matrix if isinstance(matrix, np.ndarray) else matrix.toarray())
+        head = "%%MatrixMarket matrix coordinate real general\n{} {} {}\n".format(*coo.shape, coo.nnz)
+        lines = "".join(f"{i + 1} {j + 1} {v:.17g}\n" for i, j, v in zip(*coo.coords, coo.data, strict=True))
+        (tmp_path / f"{name}.mtx").write_text(head + lines)
+    manifest_lines = code.partition("pack.toml', 'w');")[2]
+    texts = [part.partition("');")[0] for part in manifest_lines.split("fprintf(file, '")[1:]]
+    (tmp_path / "pack.toml").write_text("".join(texts).replace("\\n", "\n"), encoding="utf-8")
+    assert_cable(read_model_pack(tmp_path))
+
+
+def test_a_mesh_gives_pictures(tmp_path: Path) -> None:
+    meshio = pytest.importorskip("meshio")
+    folder, content = write_cable(tmp_path / "pack"), manifest()
+    x = np.linspace(0.0, 1.0, SIZE + 2)
+    points = np.concatenate([np.column_stack([x, y + 0.0 * x, 0.0 * x]) for y in (0.0, 1.0)])
+    cells = [[k, k + 1, k + SIZE + 2] for k in range(SIZE + 1)]
+    meshio.Mesh(points, {"triangle": cells}).write(folder / "mesh.vtu")
+    np.savez(folder / "more.npz", points=np.arange(1, SIZE + 1), positions=x[1:-1])
+    content["mesh"] = {"file": "mesh.vtu", "points": "more.npz:points", "positions": "more.npz:positions"}
+    write_manifest(folder, content)
+    problem = registry.create("problem", "pack", {"path": str(folder)})
+    cable = Cable()
+    picture = problem.picture(MU, cable.u[:, 0], cable.lam[:, 0])
+    assert picture.points.shape == (2, 2 * SIZE + 4)
+    assert picture.triangles.shape == (3, SIZE + 1)
+    assert np.array_equal(picture.values[1 : SIZE + 1], cable.u[:, 0])
+    assert not picture.values[SIZE + 1 :].any()
+    (folder / "mesh.vtu").write_text("<VTKFile>")
+    with pytest.raises(RequestError, match=r"mesh.file: 'mesh.vtu' cannot be read"):
+        read_model_pack(folder)
