@@ -5,8 +5,10 @@ from __future__ import annotations
 import ast
 import math
 import operator
+import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 from vibench.errors import NumericalError, RequestError, unknown_name
 
@@ -30,6 +32,9 @@ UNARY: Mapping[type[ast.unaryop], Callable[[float], float]] = {ast.UAdd: operato
 
 LONGEST = 2000
 """Characters of an expression."""
+
+DEEPEST = 200
+"""Levels of an expression; a sum has as many as terms."""
 
 
 @dataclass(frozen=True)
@@ -78,14 +83,22 @@ class Expression:
         return float(found)
 
 
+@lru_cache(maxsize=1000)
 def _tree(text: str) -> ast.expr:
     if len(text) > LONGEST:
         raise RequestError(f"the expression '{text[:40]}…' has {len(text)} characters, at most {LONGEST} are read")
     try:
-        return ast.parse(text.strip(), mode="eval").body
+        with warnings.catch_warnings(action="ignore"):  # of texts that are refused below
+            tree = ast.parse(text.strip(), mode="eval").body
     except (SyntaxError, ValueError, RecursionError, MemoryError) as error:
         reason = error.msg if isinstance(error, SyntaxError) else "nested too deeply, or not text"
         raise RequestError(f"'{text}' is not an expression: {reason}") from None
+    level: list[ast.AST] = [tree]
+    for _ in range(DEEPEST):
+        level = [child for node in level for child in ast.iter_child_nodes(node)]
+    if level:
+        raise RequestError(f"the expression '{text[:40]}…' is nested more than {DEEPEST} deep")
+    return tree
 
 
 def _check(node: ast.expr, text: str, names: Sequence[str]) -> None:
