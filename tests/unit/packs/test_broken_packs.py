@@ -17,7 +17,7 @@ import scipy.io
 import scipy.sparse as sp
 from packs import SIZE, Cable, manifest, write_arrays, write_cable, write_manifest
 from running import Main
-from samples import toml
+from samples import write_study
 
 from vibench.errors import RequestError
 from vibench.packs import reader
@@ -446,10 +446,13 @@ def broken(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[str], P
 
 @pytest.mark.parametrize("name", MISTAKES)
 def test_a_mistake_has_its_line(name: str, broken: Callable[[str], Path]) -> None:
+    folder = broken(name)
     with pytest.raises(RequestError, match=MISTAKES[name][0]) as caught:
-        read_model_pack(broken(name))
+        read_model_pack(folder)
     assert "\n" not in str(caught.value)
     assert str(caught.value).startswith("pack '")
+    with pytest.raises(RequestError, match="pack '"):  # and no study on it is started
+        load_study(write_study(folder.parent, study_on(folder, 2)))
 
 
 def test_there_are_many_mistakes_and_as_many_lines() -> None:
@@ -457,28 +460,26 @@ def test_there_are_many_mistakes_and_as_many_lines() -> None:
     assert len(set(lines)) == len(lines) > 40
 
 
+def study_on(folder: Path, validation: int) -> Content:
+    """A study on a pack."""
+    return {
+        "name": "broken", "validation": validation, "solvers": ["piqp"], "dual": ["cpg"], "primal": ["decorrelated"],
+        "problem": [{"name": "pack", "options": {"path": str(folder)}}], "tolerances": [{"N": [1], "R": [1]}],
+    }  # fmt: skip
+
+
 @pytest.mark.parametrize("name", ["unknown key", "missing file", "other_multiplier", "zip_bomb", "no_manifest"])
 def test_a_broken_pack_neither_imports_nor_runs(name: str, broken: Callable[[str], Path], main: Main) -> None:
     folder = broken(name)
     code, out, line = main("import", str(folder))
     assert (code, out) == (2, "")
-    study = {
-        "name": "broken", "validation": 2, "solvers": ["piqp"], "dual": ["cpg"], "primal": ["decorrelated"],
-        "problem": [{"name": "pack", "options": {"path": str(folder)}}], "tolerances": [{"N": [1], "R": [1]}],
-    }  # fmt: skip
-    Path("study.toml").write_text(toml(study), encoding="utf-8")
-    code, out, again = main("run", "study.toml")
+    code, out, again = main("run", write_study(Path(), study_on(folder, 2)))
     assert (code, out) == (2, "")
     assert line.removeprefix("vibench: ") in again
     assert not Path("runs").exists()
 
 
 def test_more_validation_parameters_than_are_listed_are_refused_before_a_run(tmp_path: Path) -> None:
-    folder, study = write_cable(tmp_path / "pack"), tmp_path / "study.toml"
-    content = {
-        "name": "many", "validation": 3, "solvers": ["piqp"], "dual": ["cpg"], "primal": ["decorrelated"],
-        "problem": [{"name": "pack", "options": {"path": str(folder)}}], "tolerances": [{"N": [1], "R": [1]}],
-    }  # fmt: skip
-    study.write_text(toml(content), encoding="utf-8")
+    study = write_study(tmp_path, study_on(write_cable(tmp_path / "pack"), 3))
     with pytest.raises(RequestError, match="lists 2 validation parameters, the study asks for 3: set validation = 2"):
-        load_study(str(study))
+        load_study(study)
