@@ -6,6 +6,7 @@ import json
 from collections.abc import Iterable, Mapping
 from typing import Any
 
+from vibench.packs.manifest import Manifest
 from vibench.results.columns import CELLS, PARAMETER, STORED, THRESHOLDS, UNITS, Column, shown_columns
 from vibench.study.spec import Study
 
@@ -15,16 +16,26 @@ SIGNS = {"exclusiveMinimum": ">", "minimum": "≥", "exclusiveMaximum": "<", "ma
 
 def study_fields() -> str:
     """A table of fields for a study file, and one for every table that stands in it."""
-    schema = Study.model_json_schema()
+    return _models(Study.model_json_schema())
+
+
+def pack_fields() -> str:
+    """The same for the manifest of a model pack."""
+    return _models(Manifest.model_json_schema())
+
+
+def _models(schema: Mapping[str, Any]) -> str:
     parts = [_fields(schema)]
     for name, part in schema["$defs"].items():
-        parts.append(f"## {_title(name)} {{ #{name.lower()} }}\n\n{part['description']}\n\n{_fields(part)}")
+        title = _title(name, [schema, *schema["$defs"].values()])
+        parts.append(f"## {title} {{ #{name.lower()} }}\n\n{part['description']}\n\n{_fields(part)}")
     return "\n\n".join(parts)
 
 
-def _title(model: str) -> str:
-    keys = [key for key, field in Study.model_json_schema()["properties"].items() if model in json.dumps(field)]
-    return ", ".join(f"`{key}`" for key in keys)
+def _title(model: str, places: Iterable[Mapping[str, Any]]) -> str:
+    reference = json.dumps(f"#/$defs/{model}")
+    keys = [key for place in places for key, field in place["properties"].items() if reference in json.dumps(field)]
+    return ", ".join(f"`{key}`" for key in dict.fromkeys(keys))
 
 
 def _fields(model: Mapping[str, Any]) -> str:
@@ -109,7 +120,7 @@ def markdown(head: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
     return "\n".join("| " + " | ".join(text.replace("|", "\\|") for text in row) + " |" for row in cells)
 
 
-GENERATED = {"study": study_fields, "units": units, "summary": summary, "benefits": benefits} | {
+GENERATED = {"study": study_fields, "pack": pack_fields, "units": units, "summary": summary, "benefits": benefits} | {
     table: lambda table=table: columns(table) for table in STORED
 }
 """What may stand in a page as `<!-- generated: NAME -->`."""

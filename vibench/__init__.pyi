@@ -39,6 +39,9 @@ from .linalg.dense import project_out as project_out
 from .linalg.dense import singular_values as singular_values
 from .linalg.dense import svd as svd
 from .linalg.inner_product import InnerProduct as InnerProduct
+from .packs.checks import read_model_pack as read_model_pack
+from .packs.pack import ModelPack as ModelPack
+from .packs.reader import pack_digest as pack_digest
 from .qp.solution import QPSolution as QPSolution
 from .qp.solution import QPSolver as QPSolver
 from .qp.solve import solve_qp as solve_qp

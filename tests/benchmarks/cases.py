@@ -104,6 +104,14 @@ def knows(problem: str, resolution: Resolution) -> bool:
     return True
 
 
+def takes_no_option(problem: str) -> bool:
+    """Whether a problem needs no option, as a folder; one that cannot be loaded counts, its case then fails."""
+    try:
+        return all(option.default for option in registry.options("problem", problem))
+    except RequestError:
+        return True
+
+
 def primal_cases() -> list[Primal]:
     """Every registered primal strategy, at all `TOLERANCES` if it takes one."""
     return [Primal(name, tolerance) for name in registry.names("primal strategy") for tolerance in _tolerances(name)]

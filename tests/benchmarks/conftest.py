@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 from threadpoolctl import threadpool_limits
 
-from benchmarks.cases import SIZES, Case, Resolution, knows, primal_cases, problem_cases
+from benchmarks.cases import SIZES, Case, Resolution, knows, primal_cases, problem_cases, takes_no_option
 from benchmarks.material import Material
 from vibench import provenance
 from vibench.errors import RequestError, unknown_name
@@ -62,7 +62,7 @@ def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
 
 
 def _problems(config: pytest.Config) -> list[str]:
-    return _chosen(config, "problems", "problem", registry.names("problem"))
+    return _chosen(config, "problems", "problem", list(filter(takes_no_option, registry.names("problem"))))
 
 
 def _solvers(config: pytest.Config) -> list[str]:

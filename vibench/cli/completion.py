@@ -34,6 +34,12 @@ EXAMPLES: Mapping[str, tuple[str, ...]] = {
         "vibench check solver:piqp",
     ),
     "new": ("vibench new problem cable", "vibench new solver my-qp", "vibench new dual my-cone --out packages"),
+    "import": ("vibench import my-model",),
+    "pack": (
+        "vibench pack obstacle my-model --option resolution=coarse",
+        "vibench pack hertz my-model --seed 2022 --validation 16 --solutions",
+    ),
+    "cones": ("vibench cones my-model", "vibench cones my-model --dual cpg --dual-tol 1e-3"),
     "clean": ("vibench clean --dry-run", "vibench clean --older-than 30"),
     "doctor": ("vibench doctor", "vibench doctor --out /scratch/runs"),
 }

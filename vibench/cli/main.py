@@ -20,6 +20,7 @@ with interrupted_at_once():
 
     from vibench.cli.completion import examples, names, solvers, studies
     from vibench.cli.output import echo
+    from vibench.cli.pack_commands import import_pack, reduce_cones, write_pack
     from vibench.cli.plugin_commands import check_plugin, list_plugins, new_plugin
     from vibench.cli.result_commands import compare_runs, export_qps, replay_query, show, write_report
     from vibench.errors import RequestError, VibenchError
@@ -184,6 +185,7 @@ COMMANDS: dict[str, Callable[..., None]] = {
     "run": run, "list": list_plugins, "show": show, "report": write_report, "diff": compare_runs,
     "replay": replay_query, "export-qps": export_qps, "clean": clean, "doctor": doctor,
     "check": check_plugin, "new": new_plugin,
+    "import": import_pack, "pack": write_pack, "cones": reduce_cones,
 }  # fmt: skip
 for _name, _command in COMMANDS.items():
     app.command(_name, epilog=examples(_name))(interruptible(_command))

@@ -73,7 +73,7 @@ def check_plugin(
     from vibench.testing.elsewhere import Examination, examine_elsewhere
 
     found = _find(plugin)
-    options, remark = _options(found, dict(map(_option, option or [])))
+    options, remark = _options(found, dict(map(key_value, option or [])))
     echo(f"{_title(found)}{remark}")
     module = {"problem": "problems", "dual": "duals", "primal": "primals", "solver": "solvers"}[found.kind]
     examination = Examination(module, found.reference, options, seconds)
@@ -245,7 +245,7 @@ def _find_object(module: str, name: str) -> Found:
     raise unknown_name(f"plugin of the module {module}", name, own)
 
 
-def _option(text: str) -> tuple[str, Any]:
+def key_value(text: str) -> tuple[str, Any]:
     """Key and value of "key=value"; the value is read as JSON if it is valid JSON, as text otherwise."""
     import json
 

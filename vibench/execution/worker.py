@@ -26,7 +26,6 @@ from vibench.execution.supervisor import Begun, Finished, Job, OutOfMemory, Prog
 from vibench.qp.status import Status
 from vibench.stages.artefacts import Store
 from vibench.stages.base import Done, Failed, Pieces, PiecewiseStage, Unstored
-from vibench.study import registry
 
 T = TypeVar("T")
 Send = Callable[[Any], None]
@@ -117,7 +116,7 @@ def _check_code(job: Job, part: Part) -> None:
     stage = job.stage
     parts = (stage.stage_of(number) for number in part.numbers) if isinstance(stage, PiecewiseStage) else (stage,)
     used = (plugin for one in dict.fromkeys(parts) for plugin in one.plugins())
-    changed = [f"the {p.kind} '{p.name}'" for p in used if registry.code(p.kind, p.name) != p.code]
+    changed = [f"the {p.kind} '{p.name}'" for p in used if p.as_installed() != p]
     if job.code != code_here():
         changed.insert(0, "vibench or one of the libraries")
     if changed:

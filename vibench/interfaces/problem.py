@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 import scipy.sparse as sp
@@ -138,6 +138,15 @@ class Problem(ABC):
     """Members that `sampler` evaluates entry by entry."""
     requires: ClassVar[tuple[str, ...]] = ()
     """Optional distributions it cannot do without; where one is not installed its cells are unavailable."""
+
+    @classmethod
+    def data_digest(cls, **options: Any) -> str:  # noqa: ARG003
+        """Digest of the files that the options name, "" if they name none; it is part of the keys of all results.
+
+        A problem with such files is also built once when a study is read, so that a `RequestError` of its constructor
+        refuses the study before anything is written.
+        """
+        return ""
 
     @abstractmethod
     def training_set(self) -> Array:

@@ -29,7 +29,7 @@ def digest(content: Any) -> str:
 
 @dataclass(frozen=True)
 class Plugin:
-    """A plugin with its options as canonical JSON, and the version of its code (`registry.code`)."""
+    """A plugin with its options as canonical JSON, and the version of its code and data (`registry.code_and_data`)."""
 
     kind: str
     name: str
@@ -40,7 +40,17 @@ class Plugin:
     def from_entry(cls, kind: str, entry: Entry) -> Plugin:
         """Plugin of an entry of an axis."""
         options = registry.canonical_options(kind, entry.name, entry.options)
-        return cls(kind, entry.name, options, registry.code(kind, entry.name))
+        return cls(kind, entry.name, options, "").as_installed()
+
+    def as_installed(self) -> Plugin:
+        """The same with the version of the code that is installed, and of the files its options name, now.
+
+        Raises
+        ------
+        RequestError
+            If it is not installed, or one of its files cannot be read.
+        """
+        return replace(self, code=registry.code_and_data(self.kind, self.name, json.loads(self.options)))
 
     def create(self) -> Any:
         """A new instance."""
@@ -112,12 +122,11 @@ class Cell:
         Raises
         ------
         RequestError
-            If a plugin is not installed.
+            If a plugin is not installed, or a file that its options name cannot be read.
         """
         content = json.loads(text)
         for axis in ("problem", "dual", "primal"):
-            plugin = Plugin(**content[axis])
-            content[axis] = replace(plugin, code=registry.code(plugin.kind, plugin.name))
+            content[axis] = Plugin(**content[axis]).as_installed()
         for axis in ("pod", "cone"):
             content[axis] = Stop(**content[axis])
         return cls(**content | {name: tuple(content[name]) for name in ("labels", "nested_tolerances")})

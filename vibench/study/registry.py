@@ -149,6 +149,28 @@ def code(kind: str, name: str) -> str:
     return f"{version(kind, name)} {source_hash(source)}{needed}"
 
 
+def code_and_data(kind: str, name: str, options: Mapping[str, Any]) -> str:
+    """`code`, and the digest of the files that a problem reads with these options (`Problem.data_digest`).
+
+    Raises
+    ------
+    RequestError
+        If no plugin has that name, or one of the files cannot be read.
+    """
+    digest = data_digest(kind, name, options)
+    return f"{code(kind, name)} data {digest}" if digest else code(kind, name)
+
+
+def data_digest(kind: str, name: str, options: Mapping[str, Any]) -> str:
+    """Digest of the files that a problem reads with these options, "" for other plugins and problems without files.
+
+    It is "" for a name that several packages use, too: nothing is computed with it.
+    """
+    if kind != "problem" or conflict(kind, name) or missing(kind, name):
+        return ""
+    return str(load(kind, name).data_digest(**check_options(kind, name, options)))
+
+
 def missing(kind: str, name: str) -> list[str]:
     """Distributions that a plugin `requires` and that are not installed."""
     return [distribution for distribution in requirements(kind, name) if not distribution_version(distribution)]

@@ -20,8 +20,9 @@ from pydantic import (
     model_validator,
 )
 
-from vibench.errors import RequestError, unknown_name
+from vibench.errors import NumericalError, RequestError, unknown_name
 from vibench.interfaces.strategies import Stop
+from vibench.interfaces.validation import validation_parameters
 from vibench.qp.settings import SETTINGS
 from vibench.qp.solve import installed_solvers
 from vibench.study import registry
@@ -234,6 +235,8 @@ def _check_names(study: Study) -> None:
     for kind, axis in axes.items():
         for entry in axis:
             registry.check_options(kind, entry.name, entry.options)
+    for entry in study.problem:
+        _check_data(study, entry)
     known = {*SETTINGS, *registry.names("QP solver")}
     for solver in study.solver_names():
         if solver not in known:  # installed or not
@@ -242,6 +245,17 @@ def _check_names(study: Study) -> None:
             registry.qp_solver(solver)
     for table in study.tolerances:
         _check_tolerances(study, table)
+
+
+def _check_data(study: Study, entry: Entry) -> None:
+    """Build a problem that reads files: what is wrong with them is found before a run, and not in all of its cells."""
+    if not registry.data_digest("problem", entry.name, entry.options):
+        return
+    problem = registry.create("problem", entry.name, entry.options)
+    try:
+        validation_parameters(problem, study.validation, study.seed)
+    except NumericalError as error:
+        raise RequestError(f"problem '{entry.title}': {error}") from None
 
 
 def _check_tolerances(study: Study, table: ToleranceTable) -> None:

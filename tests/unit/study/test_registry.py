@@ -137,8 +137,10 @@ def test_registered_studies_are_files_that_load() -> None:
 def test_every_built_in_plugin_has_a_summary_and_options_with_defaults(kind: str) -> None:
     for name in registry.names(kind):
         assert (registry.load(kind, name).__doc__ or "").strip()
-        assert all(option.expected and option.default for option in registry.options(kind, name))
-        assert registry.check_options(kind, name, {}) == {}
+        assert all(option.expected for option in registry.options(kind, name))
+        required = [option.name for option in registry.options(kind, name) if not option.default]
+        assert required == (["path"] if name == "pack" else [])
+        assert registry.check_options(kind, name, dict.fromkeys(required, "text")) == dict.fromkeys(required, "text")
 
 
 def test_names_are_sorted(register: Register) -> None:

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from vibench.arrays import Array
 from vibench.interfaces.strategies import Kind
 from vibench.report.figures.data import Data, at_best_tolerance, by_strategy, dimensions, label, longest, one_solver
 from vibench.report.figures.style import POINTS, Sheet, counted, plot, positive, style_of
@@ -61,6 +64,16 @@ def orthogonality(data: Data) -> Figure | None:
         return None
     sheet = Sheet(1, 1, f"{data.problem}: angles between generators")
     _cones(sheet.panels[0], found, "number of preceding generators r", "e_orth(r)")
+    return sheet.finish()
+
+
+def cone_errors(title: str, errors: Mapping[str, Array]) -> Figure:
+    """Relative errors of cones, by dual strategy, against their numbers of generators 0 … R."""
+    sheet = Sheet(1, 1, f"{title}: projection errors of the multipliers")
+    for k, (dual, values) in enumerate(errors.items(), 1):
+        plot(sheet.panels[0], np.arange(len(values)), positive(values), k, dual)
+    sheet.panels[0].set(xlabel="number of generators R", ylabel="largest relative error of the cone", yscale="log")
+    counted(sheet.panels[0])
     return sheet.finish()
 
 

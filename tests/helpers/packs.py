@@ -1,0 +1,91 @@
+"""A small model pack, and packs with one thing changed."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import scipy.sparse as sp
+from samples import toml
+
+from vibench.highfidelity.active_set import solve_high_fidelity
+from vibench.interfaces.problem import VariationalInequality
+
+SIZE = 12
+LOADS, DEPTH = [4.0, 6.0, 8.0], 0.2
+
+MANIFEST: Mapping[str, Any] = {
+    "format": 1,
+    "name": "cable",
+    "parameters": {
+        "names": ["load", "depth"],
+        "units": ["N/m", "m"],
+        "lower": [4.0, 0.1],
+        "upper": [8.0, 0.4],
+        "training": [[load, DEPTH] for load in LOADS],
+        "validation": [[5.0, 0.2], [7.0, 0.3]],
+    },
+    "spaces": {"X_V": "spaces.npz:X_V", "X_W": "spaces.npz:X_W"},
+    "operators": {
+        "A": "A.npz",
+        "f": {"affine": [{"theta": "-load", "array": "vectors.npz:mass"}]},
+        "B": "B.npz",
+        "g": {"affine": [{"theta": "depth", "array": "vectors.npz:mass"}]},
+    },
+    "solutions": {"u": "solutions.npz:u", "lam": "solutions.npz:lam"},
+}
+"""A cable pressed onto a floor: load and depth of the floor are the parameters."""
+
+
+class Cable:
+    """The arrays of the pack."""
+
+    def __init__(self) -> None:
+        width = 1.0 / (SIZE + 1)
+        off = np.ones(SIZE - 1)
+        self.A = sp.csr_array(sp.diags_array([2.0 * np.ones(SIZE), -off, -off], offsets=[0, 1, -1]) / width)
+        self.mass = np.full(SIZE, width)
+        self.X_W = sp.csr_array(sp.diags_array(self.mass))
+        self.X_V = sp.csr_array(self.X_W + self.A)
+        self.B = -self.X_W
+        found = [solve_high_fidelity(self.at(load, DEPTH)) for load in LOADS]
+        self.u, self.lam = np.column_stack([s.u for s in found]), np.column_stack([s.lam for s in found])
+
+    def at(self, load: float, depth: float) -> VariationalInequality:
+        return VariationalInequality(self.A, -load * self.mass, self.B, depth * self.mass)
+
+
+def group(name: str, matrix: Any) -> dict[str, Any]:
+    """The arrays of a sparse matrix in a .npz file."""
+    matrix = sp.csr_array(matrix)
+    parts = {"data": matrix.data, "indices": matrix.indices, "indptr": matrix.indptr, "shape": np.array(matrix.shape)}
+    return {f"{name}/{part}": value for part, value in parts.items()}
+
+
+def write_arrays(folder: Path, cable: Cable) -> None:
+    """The arrays of a cable, which may have been changed."""
+    np.savez(folder / "spaces.npz", **group("X_V", cable.X_V), **group("X_W", cable.X_W))
+    np.savez(folder / "vectors.npz", mass=cable.mass)
+    np.savez(folder / "solutions.npz", u=cable.u, lam=cable.lam)
+    sp.save_npz(folder / "A.npz", cable.A)
+    sp.save_npz(folder / "B.npz", cable.B)
+
+
+def write_manifest(folder: Path, content: Mapping[str, Any]) -> None:
+    (folder / "pack.toml").write_text(toml(content), encoding="utf-8")
+
+
+def manifest() -> dict[str, Any]:
+    """The manifest, to be changed."""
+    return copy.deepcopy(dict(MANIFEST))
+
+
+def write_cable(folder: Path) -> Path:
+    """The pack as it should be."""
+    folder.mkdir(parents=True)
+    write_arrays(folder, Cable())
+    write_manifest(folder, MANIFEST)
+    return folder

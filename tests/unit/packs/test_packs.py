@@ -1,0 +1,248 @@
+"""Model packs: what is read is what was written, in every format, and results of an edited one are not used again."""
+
+from __future__ import annotations
+
+import gzip
+import json
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import scipy.io
+import scipy.sparse as sp
+from packs import DEPTH, SIZE, Cable, group, manifest, write_arrays, write_cable, write_manifest
+from running import Main
+
+from vibench.errors import NumericalError, RequestError
+from vibench.highfidelity.active_set import HighFidelitySolver
+from vibench.interfaces.problem import MEMBERS
+from vibench.packs.checks import read_model_pack
+from vibench.packs.dual_half import reduce_multipliers
+from vibench.packs.pack import ModelPack
+from vibench.study import registry
+from vibench.study.cells import Plugin
+from vibench.testing import check_problem
+
+MU = np.array([5.0, 0.2])
+
+
+def pack_with(folder: Path, content: dict[str, Any], **arrays: Any) -> ModelPack:
+    """The pack of a changed manifest and further arrays."""
+    folder.mkdir()
+    write_arrays(folder, Cable())
+    write_manifest(folder, content)
+    if arrays:
+        np.savez(folder / "more.npz", **arrays)
+    return read_model_pack(folder)
+
+
+def assert_cable(pack: ModelPack) -> None:
+    """The members at a parameter are those of the cable, whether its depth is a parameter or not."""
+    found, expected = pack.at(MU[: pack.box.dim]), Cable().at(*MU)
+    for name in MEMBERS:
+        one, other = getattr(found, name), getattr(expected, name)
+        assert abs(one - other).max() <= 1e-15 * abs(other).max(), name
+
+
+def test_an_affine_pack_is_the_problem_anywhere_in_the_box(tmp_path: Path) -> None:
+    pack = read_model_pack(write_cable(tmp_path / "pack"))
+    assert_cable(pack)
+    assert pack.everywhere
+    assert (pack.constant, pack.entrywise) == ({"A", "B"}, {"f", "g"})
+    assert np.array_equal(pack.at(np.array([7.7, 0.11])).f, -7.7 * Cable().mass)
+    assert np.array_equal(pack.contact, np.arange(SIZE))
+
+
+def test_the_problem_of_a_pack_conforms(tmp_path: Path) -> None:
+    folder, content = write_cable(tmp_path / "pack"), manifest()
+    del content["parameters"]["validation"]
+    write_manifest(folder, content)
+    check_problem(partial(registry.load("problem", "pack"), str(folder)))
+
+
+def test_triplets_count_from_the_index_base_and_matrix_market_from_one(tmp_path: Path) -> None:
+    content, cable, folder = manifest(), Cable(), write_cable(tmp_path / "pack")
+    A = sp.coo_array(cable.A)
+    np.savez(folder / "more.npz", row=A.coords[0] + 1, col=A.coords[1] + 1, data=A.data, shape=np.array(A.shape))
+    with gzip.open(folder / "B.mtx.gz", "wb") as file:
+        scipy.io.mmwrite(file, sp.coo_array(cable.B))
+    content |= {"index_base": 1}
+    content["operators"] |= {"A": "more.npz", "B": "B.mtx.gz"}
+    write_manifest(folder, content)
+    assert_cable(read_model_pack(folder))
+
+
+def test_hdf5_datasets_groups_and_links(tmp_path: Path) -> None:
+    h5py = pytest.importorskip("h5py")
+    content, folder = manifest(), write_cable(tmp_path / "pack")
+    content["operators"]["A"] = "arrays.h5:A"
+    content["operators"]["f"] = {"affine": [{"theta": "-load", "array": "arrays.h5:/vectors/mass"}]}
+    with h5py.File(folder / "arrays.h5", "w") as file:
+        for name, value in (group("A", Cable().A) | {"vectors/mass": Cable().mass}).items():
+            file[name] = value
+        file["soft"] = h5py.SoftLink("/vectors/mass")
+        file["elsewhere"] = h5py.ExternalLink("/etc/passwd", "/")
+    write_manifest(folder, content)
+    assert_cable(read_model_pack(folder))
+    for name, line in (
+        ("soft", "is a link"),
+        ("elsewhere", "is a link"),
+        ("nothing", "no dataset"),
+        ("vectors", "is a group"),
+    ):
+        content["operators"]["f"]["affine"][0]["array"] = f"arrays.h5:{name}"
+        write_manifest(folder, content)
+        with pytest.raises(RequestError, match=line):
+            read_model_pack(folder)
+
+
+def test_tables_and_arrays_by_parameter_hold_at_listed_parameters_only(tmp_path: Path) -> None:
+    content, cable = manifest(), Cable()
+    listed = content["parameters"]["training"] + content["parameters"]["validation"]
+    content["operators"] |= {
+        "A": {"each": "more.npz:A{}"},
+        "f": {"each": "more.npz:f"},
+        "g": {"affine": [{"table": "more.npz:depths", "array": "vectors.npz:mass"}]},
+    }
+    arrays = {key: value for k in range(5) for key, value in group(f"A{k}", cable.A).items()}
+    arrays |= {"f": np.column_stack([-load * cable.mass for load, _ in listed]), "depths": np.array(listed)[:, 1]}
+    pack = pack_with(tmp_path / "pack", content, **arrays)
+    assert_cable(pack)
+    assert not pack.everywhere
+    with pytest.raises(NumericalError, match=r"mu = \[5.5, 0.2\] is not listed"):
+        pack.at(np.array([5.5, 0.2]))
+
+
+def test_rows_of_dirichlet_unknowns_are_removed_where_free_ones_are_named(tmp_path: Path) -> None:
+    content, cable = manifest(), Cable()
+
+    def wide(matrix: Any) -> Any:
+        return sp.csr_array(sp.block_diag([[[1.0]], matrix, [[1.0]]]))
+
+    arrays = group("A", wide(cable.A)) | group("X_V", wide(cable.X_V)) | {"free": np.arange(1, SIZE + 1)}
+    arrays |= {"mass": np.pad(cable.mass, 1), "u": np.pad(cable.u, ((1, 1), (0, 0)))}
+    arrays |= group("B", sp.hstack([np.zeros((SIZE, 1)), cable.B, np.zeros((SIZE, 1))]))
+    content["spaces"] |= {"X_V": "more.npz:X_V", "free": "more.npz:free"}
+    content["operators"] |= {"A": "more.npz:A", "B": "more.npz:B"}
+    content["operators"]["f"]["affine"][0]["array"] = "more.npz:mass"
+    content["solutions"]["u"] = "more.npz:u"
+    assert_cable(pack_with(tmp_path / "pack", content, **arrays))
+
+
+def test_what_is_computed_from_a_pack_is_not_used_again_after_an_edit(tmp_path: Path) -> None:
+    folder = write_cable(tmp_path / "pack")
+    plugin = Plugin("problem", "pack", json.dumps({"path": str(folder)}), "").as_installed()
+    (folder / "notes.txt").write_text("not part of the pack")
+    assert plugin.as_installed() == plugin
+    cable = Cable()
+    cable.mass = 1.5 * cable.mass
+    np.savez(folder / "vectors.npz", mass=cable.mass)
+    edited = plugin.as_installed()
+    assert edited.code != plugin.code
+    write_manifest(folder, manifest() | {"description": "another"})
+    assert plugin.as_installed().code not in (edited.code, plugin.code)
+    (folder / "vectors.npz").unlink()
+    with pytest.raises(RequestError, match=r"operators.f.affine.0: the file 'vectors.npz' does not exist"):
+        plugin.as_installed()
+
+
+def test_multipliers_alone_are_enough_for_cones(tmp_path: Path, main: Main) -> None:
+    content = manifest()
+    del content["operators"], content["solutions"]["u"], content["spaces"]["X_V"]
+    pack = pack_with(tmp_path / "pack", content)
+    found = reduce_multipliers(pack, registry.create("dual strategy", "mcpg", {}), 1e-3)
+    assert found.cone.errors[-1] <= 1e-3
+    code, out, _ = main("import", str(tmp_path / "pack"))
+    assert (code, "it has no operators" in out) == (0, True)
+    code, out, _ = main("cones", str(tmp_path / "pack"), "--dual", "cpg", "--dual", "mcpg", "--out", "here")
+    assert code == 0
+    assert {path.name for path in Path("here").iterdir()} == {"errors.csv", "errors.png", "errors.svg"}
+    whole = str(write_cable(tmp_path / "whole"))
+    assert main("cones", whole, "--dual", "cpg")[0] == 0
+
+
+def test_import_says_what_a_pack_can_do(tmp_path: Path, main: Main) -> None:
+    code, out, _ = main("import", str(write_cable(tmp_path / "pack")))
+    assert code == 0
+    for words in (
+        "12 unknowns",
+        "affine, 1 term",
+        "KKT residuals up to",
+        "anywhere in the box",
+        "validation = 2 at most",
+    ):
+        assert words in out
+
+
+def test_a_pack_is_written_whole_or_not_at_all(tmp_path: Path, main: Main, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = write_cable(tmp_path / "pack")
+    code, _, line = main("pack", "pack", str(folder), "--option", f"path={folder}", "--validation", "2")
+    assert (code, "a pack is written into a new folder" in line) == (2, True)
+
+    def fail(self: HighFidelitySolver, mu: Any) -> Any:
+        raise NumericalError("no solution")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(HighFidelitySolver, "solve", fail)
+        assert main("pack", "pack", "new", "--option", f"path={folder}", "--validation", "2", "--solutions")[0] == 1
+    assert list(Path().iterdir()) == []
+    code, _, _ = main("pack", "pack", "new", "--option", f"path={folder}", "--validation", "2", "--solutions")
+    assert code == 0
+    assert_cable(read_model_pack("new"))
+    assert [path.name for path in Path().iterdir()] == ["new"]
+
+
+def test_the_python_example_of_the_page_exports_a_pack(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    page = (Path(__file__).parents[3] / "docs" / "model-packs.md").read_text(encoding="utf-8")
+    code = page.partition('```python title="export.py"\n')[2].partition("```")[0]
+    cable, listed = Cable(), np.array([[4.0, 0.2], [8.0, 0.3], [5.0, 0.2]])
+    monkeypatch.chdir(tmp_path)
+    given = {
+        "training": listed[:2],
+        "validation": listed[2:],
+        "f": -cable.mass,
+        "g": np.outer(cable.mass, listed[:, 1]),
+    }
+    exec(code, {"A": cable.A, "B": cable.B, "X_V": cable.X_V, "X_W": cable.X_W, **given})
+    assert_cable(read_model_pack("my-model"))
+
+
+def test_what_the_example_for_matlab_writes_is_read(tmp_path: Path) -> None:
+    """The lines that its `fprintf` gives; an Octave to run it is not at hand everywhere."""
+    page = (Path(__file__).parents[3] / "docs" / "model-packs.md").read_text(encoding="utf-8")
+    code, cable = page.partition("```matlab\n")[2].partition("```")[0], Cable()
+    assert "'%d %d %.17g\\n', [i(:) j(:) v(:)]'" in code
+    columns = {"f": -cable.mass[:, None], "g": DEPTH * cable.mass[:, None]}
+    for name, matrix in {"A": cable.A, "B": cable.B, "X_V": cable.X_V, "X_W": cable.X_W, **columns}.items():
+        coo = sp.coo_array(matrix)
+        head = "%%MatrixMarket matrix coordinate real general\n{} {} {}\n".format(*coo.shape, coo.nnz)
+        lines = "".join(f"{i + 1} {j + 1} {v:.17g}\n" for i, j, v in zip(*coo.coords, coo.data, strict=True))
+        (tmp_path / f"{name}.mtx").write_text(head + lines)
+    manifest_lines = code.partition("pack.toml', 'w');")[2]
+    texts = [part.partition("');")[0] for part in manifest_lines.split("fprintf(file, '")[1:]]
+    (tmp_path / "pack.toml").write_text("".join(texts).replace("\\n", "\n"), encoding="utf-8")
+    assert_cable(read_model_pack(tmp_path))
+
+
+def test_a_mesh_gives_pictures(tmp_path: Path) -> None:
+    meshio = pytest.importorskip("meshio")
+    folder, content = write_cable(tmp_path / "pack"), manifest()
+    x = np.linspace(0.0, 1.0, SIZE + 2)
+    points = np.concatenate([np.column_stack([x, y + 0.0 * x, 0.0 * x]) for y in (0.0, 1.0)])
+    cells = [[k, k + 1, k + SIZE + 2] for k in range(SIZE + 1)]
+    meshio.Mesh(points, {"triangle": cells}).write(folder / "mesh.vtu")
+    np.savez(folder / "more.npz", points=np.arange(1, SIZE + 1), positions=x[1:-1])
+    content["mesh"] = {"file": "mesh.vtu", "points": "more.npz:points", "positions": "more.npz:positions"}
+    write_manifest(folder, content)
+    problem = registry.create("problem", "pack", {"path": str(folder)})
+    cable = Cable()
+    picture = problem.picture(MU, cable.u[:, 0], cable.lam[:, 0])
+    assert picture.points.shape == (2, 2 * SIZE + 4)
+    assert picture.triangles.shape == (3, SIZE + 1)
+    assert np.array_equal(picture.values[1 : SIZE + 1], cable.u[:, 0])
+    assert not picture.values[SIZE + 1 :].any()
+    (folder / "mesh.vtu").write_text("<VTKFile>")
+    with pytest.raises(RequestError, match=r"mesh.file: 'mesh.vtu' cannot be read"):
+        read_model_pack(folder)

@@ -1,0 +1,145 @@
+"""Commands on model packs: `vibench import`, `vibench pack`, and `vibench cones` for their multipliers."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+from typer import Argument, Option
+
+from vibench.cli.completion import names
+from vibench.cli.output import echo
+from vibench.cli.plugin_commands import key_value
+from vibench.errors import NumericalError
+from vibench.files import write_atomically
+
+if TYPE_CHECKING:
+    from vibench.packs.pack import ModelPack
+
+Folder = Annotated[Path, Argument(metavar="FOLDER", help="Folder of the pack, with its manifest pack.toml.")]
+
+
+def import_pack(folder: Folder) -> None:
+    """Check a model pack, and say what can be done with it.
+
+    One line names the first thing that is wrong, and what was probably meant.
+    """
+    from vibench.packs.checks import check_pack
+    from vibench.packs.reader import naming, read_pack
+
+    pack = read_pack(folder)
+    with naming(folder):
+        residual = check_pack(pack)
+    echo(*_description(pack, residual), *_uses(pack, folder))
+
+
+def write_pack(
+    problem: Annotated[str, Argument(help="A registered problem.", autocompletion=names("problems"))],
+    folder: Annotated[Path, Argument(metavar="FOLDER", help="Folder to be made.")],
+    option: Annotated[list[str] | None, Option(metavar="KEY=VALUE", help="Option of the problem (repeatable).")] = None,
+    validation: Annotated[int, Option(min=1, help="Number of validation parameters.")] = 64,
+    seed: Annotated[int, Option(min=0, help="Seed of the validation parameters, as in a study.")] = 0,
+    solutions: Annotated[bool, Option("--solutions", help="Add the high-fidelity solutions, as references.")] = False,
+) -> None:
+    """Write a model pack of any problem.
+
+    Members that the problem declares constant are written once, the others at every training and validation parameter.
+    """
+    from vibench.packs import writer
+    from vibench.study import registry
+
+    created = registry.create("problem", problem, dict(map(key_value, option or [])))
+    origin = f"problem '{problem}' of {registry.version('problem', problem)}"
+    writer.write_pack(
+        created, folder, name=problem, source=origin, validation=validation, seed=seed, solutions=solutions
+    )
+    echo(f"{folder}: the problem '{problem}' at {len(created.training_set())} training and {validation} validation "
+         f"parameters (seed {seed})", f"  vibench import {folder}")  # fmt: skip
+
+
+def reduce_cones(
+    folder: Folder,
+    dual: Annotated[
+        list[str] | None, Option(help="Dual strategies; all by default.", autocompletion=names("dual_strategies"))
+    ] = None,
+    dual_tol: Annotated[float, Option(min=1e-12, max=1.0, help="Tolerance of the cones.")] = 1e-2,
+    out: Annotated[Path, Option(metavar="DIR", help="Folder of the table and the figure.")] = Path("cones"),
+) -> None:
+    """Build cones from the multipliers of a model pack.
+
+    This is the dual half of a reduced model, which needs no operators. Errors are the largest distances from the cone
+    relative to the largest norm, over the multipliers at training parameters, and over the others.
+    """
+    import pandas as pd
+
+    from vibench.packs.checks import read_model_pack
+    from vibench.packs.dual_half import multipliers, reduce_multipliers
+    from vibench.packs.reader import naming
+    from vibench.report.figures.convergence import cone_errors
+    from vibench.report.figures.style import save, styled
+    from vibench.results.tables import to_csv
+    from vibench.study import registry
+    from vibench.terminal.console import print_frame
+
+    pack = read_model_pack(folder)
+    with naming(folder):
+        multipliers(pack)
+    wanted = dual or [name for name in registry.names("dual strategy") if not registry.missing("dual strategy", name)]
+    rows, errors = [], {}
+    for name in wanted:
+        try:
+            found = reduce_multipliers(pack, registry.create("dual strategy", name, {}), dual_tol)
+        except NumericalError as error:
+            echo(f"failed: {name}: {error}")
+            continue
+        errors[name] = found.cone.errors
+        rows.append((name, found.cone.size, found.cone.errors[-1], found.validation_error, len(found.cone.fallbacks)))
+    columns = ("dual", "R", "error, training", "error, other parameters", "fallbacks")
+    print_frame(pd.DataFrame(rows, columns=columns), f"cones of tolerance {dual_tol:g}")
+    out.mkdir(parents=True, exist_ok=True)
+    steps = [(name, r, error) for name, history in errors.items() for r, error in enumerate(history)]
+    table = out / "errors.csv"
+    write_atomically(table, to_csv(pd.DataFrame(steps, columns=("dual", "step", "value"))).encode())
+    with styled():
+        drawn = save(cone_errors(pack.manifest.name or folder.name, errors), out, "errors")
+    echo(f"table: {table}, figures: {', '.join(map(str, drawn))}")
+
+
+def _description(pack: ModelPack, residual: float | None) -> Iterator[str]:
+    """What a pack holds."""
+    manifest, d = pack.manifest, pack.box.dim
+    yield f"{manifest.name or 'model pack'}{': ' * bool(manifest.description)}{manifest.description}"
+    sizes = f"{pack.W.dim} multipliers" if pack.V is None else f"{pack.V.dim} unknowns, {pack.W.dim} multipliers"
+    yield f"  {sizes}, {d} parameter{'s' * (d > 1)}: {', '.join(pack.box.names)}"
+    yield from (f"  {name}: {member}" for name, member in pack.members.items())
+    count = "drawn at random in the box" if pack.validation is None else f"{len(pack.validation)} listed"
+    yield f"  training parameters: {len(pack.training)}, validation parameters: {count}"
+    if pack.reference is not None:
+        checked = (
+            "not checked, for want of u or operators" if residual is None else f"KKT residuals up to {residual:.0e}"
+        )
+        yield f"  reference solutions: {pack.reference.lam.shape[1]}, {checked}"
+
+
+def _uses(pack: ModelPack, folder: Path) -> Iterator[str]:
+    """What can be done with a pack."""
+    if pack.members:
+        path = json.dumps(str(folder), ensure_ascii=False)
+        most = "" if pack.validation is None else f", with validation = {len(pack.validation)} at most"
+        yield f"it can be run as a problem of a study{most}:"
+        yield "  [[problem]]"
+        yield '  name = "pack"'
+        yield f"  options = {{ path = {path} }}"
+        yield _assembly(pack)
+    if pack.reference is not None:
+        yield f"its multipliers give cones: vibench cones {folder}"
+    if not pack.members:
+        yield "it has no operators: a study, whose primal half needs them, cannot run it"
+
+
+def _assembly(pack: ModelPack) -> str:
+    reduced = "reduced assembly interpolates " + ", ".join(sorted(pack.entrywise)) if pack.entrywise else ""
+    where = "anywhere in the box" if pack.everywhere else "at its listed parameters only"
+    return f"it is evaluated {where}{'; ' * bool(reduced)}{reduced}"

@@ -1,0 +1,313 @@
+"""Arrays in files of others, read as data: .npz, .npy, Matrix Market and HDF5, inside one folder and within memory."""
+
+from __future__ import annotations
+
+import contextlib
+import gzip
+import io
+import os
+import resource
+import stat
+import struct
+import zipfile
+import zlib
+from collections.abc import Iterator, Mapping
+from pathlib import Path, PurePosixPath
+from typing import IO, Any
+
+import numpy as np
+import scipy.io
+import scipy.sparse as sp
+
+from vibench.arrays import Array, Indices, SparseMatrix
+from vibench.errors import RequestError, message_of, unknown_name
+
+FORMATS = (".npz", ".npy", ".mtx", ".mtx.gz", ".h5", ".hdf5")
+
+LINE = 128
+"""Most bytes that an entry of a Matrix Market file takes; what is longer holds more than it declares."""
+
+COMMENTS = 2**16
+"""Most bytes of the comments of a Matrix Market file."""
+
+UNREADABLE = (
+    OSError, EOFError, ValueError, KeyError, TypeError, OverflowError, NotImplementedError, RuntimeError, SyntaxError,
+    struct.error, zipfile.BadZipFile, zlib.error, MemoryError,
+)  # fmt: skip
+"""What NumPy, SciPy, zipfile and h5py raise for damaged files."""
+
+
+def safe_path(folder: Path, name: str, *, is_folder: bool = False) -> Path:
+    """Path of a file in a folder, or of a folder in it.
+
+    Raises
+    ------
+    RequestError
+        If the name leads elsewhere, there is no such file, or it is a link or no regular file.
+    """
+    parts = PurePosixPath(name).parts
+    if not (parts or is_folder) or name.startswith("/") or ".." in parts or "\\" in name or "\0" in name:
+        raise RequestError(f"'{name}' is not the name of a file inside the pack's folder")
+    path = folder
+    mode = folder.stat().st_mode
+    try:
+        for part in parts:
+            path /= part
+            mode = path.lstat().st_mode
+            if stat.S_ISLNK(mode):
+                raise RequestError(f"'{name}' is a symbolic link; a pack holds its files itself")
+    except OSError as error:
+        where = "does not exist" if isinstance(error, FileNotFoundError) else f"cannot be read: {error.strerror}"
+        raise RequestError(f"the file '{name}' {where}") from None
+    if not (stat.S_ISDIR(mode) if is_folder else stat.S_ISREG(mode)):
+        raise RequestError(f"'{name}' is not a {'folder' if is_folder else 'regular file'}")
+    return path
+
+
+def memory_limit() -> int:
+    """Bytes that the arrays of a pack may take: half of the memory of the machine, or of the limit of the process."""
+    physical = int(os.sysconf("SC_PAGE_SIZE")) * int(os.sysconf("SC_PHYS_PAGES"))
+    limit = resource.getrlimit(resource.RLIMIT_AS)[0]
+    return (physical if limit == resource.RLIM_INFINITY else min(physical, limit)) // 2
+
+
+class ArrayFiles:
+    """The arrays in the files of a folder. "FILE" refers to the only array of a file, "FILE:NAME" to one of several.
+
+    A sparse matrix is a Matrix Market file, or several arrays: those of `scipy.sparse.save_npz`, or a group NAME of
+    `data`, `indices`, `indptr`, `shape` and `format` ("csr" or "csc"), or of `row`, `col`, `data` and `shape`. The
+    sizes that files declare are added up before anything is read.
+
+    Parameters
+    ----------
+    folder
+        The folder.
+    index_base
+        0 or 1, the first index of index arrays, of `row` and of `col`.
+    limit
+        Bytes that all arrays together may take.
+    """
+
+    def __init__(self, folder: Path, index_base: int, limit: int) -> None:
+        self._folder, self._base, self._limit, self._left = folder, index_base, limit, limit
+
+    def dense(self, reference: str, what: str) -> Array:
+        """A dense array; a sparse matrix of one column or row is a vector."""
+        with self._reading(reference, what):
+            found = self._read(reference)
+            if isinstance(found, Mapping) or sp.issparse(found):
+                matrix = self._matrix(found)
+                if 1 not in matrix.shape:
+                    raise RequestError(f"a sparse matrix {_size(matrix.shape)}; expected a dense array")
+                self._take(8 * max(matrix.shape))
+                found = matrix.toarray()
+            return self._real(found)
+
+    def vector(self, reference: str, what: str) -> Array:
+        """A vector (k,); one row or column counts as one."""
+        found = self.dense(reference, what)
+        if found.ndim == 2 and 1 in found.shape:
+            return found.ravel()
+        if found.ndim != 1:
+            raise RequestError(f"{what}: an array {size_of(found)}; expected a vector")
+        return found
+
+    def sparse(self, reference: str, what: str) -> SparseMatrix:
+        """A sparse matrix in the format of its rows or columns, its entries in the order of the file."""
+        with self._reading(reference, what):
+            found = self._read(reference)
+            if not isinstance(found, Mapping) and not sp.issparse(found):
+                if found.ndim != 2:
+                    raise RequestError(f"an array {_size(found.shape)}; expected a matrix")
+                found = sp.csr_array(self._real(found))
+            matrix = self._matrix(found)
+            matrix.data = self._real(matrix.data)
+            return matrix
+
+    def indices(self, reference: str, what: str, count: int) -> Indices:
+        """Indices (k,) below `count`, from 0 whatever the index base of the pack."""
+        found = self.vector(reference, what)
+        with self._reading(reference, what):
+            return self._based(found, count)
+
+    @contextlib.contextmanager
+    def _reading(self, reference: str, what: str) -> Iterator[None]:
+        try:
+            yield
+        except RequestError as error:
+            raise RequestError(f"{what}: {error}") from None
+        except UNREADABLE as error:
+            raise RequestError(f"{what}: '{reference}' is damaged: {message_of(error)}") from None
+
+    def _read(self, reference: str) -> Any:
+        """A dense array, or the arrays of a sparse matrix by name, or a matrix."""
+        name, _, inner = reference.partition(":")
+        suffix = next((known for known in FORMATS if name.endswith(known)), "")
+        if not suffix:
+            raise RequestError(f"'{name}' has a format that is not read; expected one of {', '.join(FORMATS)}")
+        path = safe_path(self._folder, name)
+        match suffix:
+            case ".npz":
+                return self._npz(path, inner)
+            case ".npy":
+                with path.open("rb") as file:
+                    return self._array(file, path.stat().st_size)
+            case ".mtx" | ".mtx.gz":
+                return self._matrix_market(path)
+        return self._hdf5(path, inner)
+
+    def _npz(self, path: Path, inner: str) -> Any:
+        with zipfile.ZipFile(path) as archive:
+            members = {info.filename.removesuffix(".npy"): info for info in archive.infolist()}
+            parts = [name for name in members if name.startswith(f"{inner}/")] if inner else list(members)
+            if inner and inner not in members and not parts:
+                raise unknown_name(f"array in '{path.name}'", inner, sorted(members)[:20])
+            if not inner and len(members) > 1 and "data" not in members:
+                raise RequestError(f"'{path.name}' has several arrays: name one, as in '{path.name}:{parts[0]}'")
+            single = inner if inner in members else parts[0] if len(parts) == 1 else None
+            names = [single] if single is not None else parts
+
+            def read(name: str) -> Any:
+                with archive.open(members[name]) as file:
+                    return self._array(file, members[name].file_size)
+
+            found = {name.removeprefix(f"{inner}/" if inner else ""): read(name) for name in names}
+        return found if single is None else next(iter(found.values()))
+
+    def _array(self, file: IO[bytes], size: int) -> Array:
+        """A .npy file of so many bytes; sizes are checked before it is read, and Python objects are refused."""
+        version = np.lib.format.read_magic(file)
+        if version == (1, 0):
+            shape, fortran, dtype = np.lib.format.read_array_header_1_0(file)
+        else:
+            shape, fortran, dtype = np.lib.format.read_array_header_2_0(file)
+        if dtype.hasobject:
+            raise RequestError("it holds Python objects (a pickle), which are not loaded; save numbers")
+        if dtype.kind not in "biufcS":
+            raise RequestError(f"it holds values of type {dtype}; expected numbers")
+        count = int(np.prod([int(length) for length in shape], dtype=object)) if shape else 1
+        if count * dtype.itemsize > size:
+            raise RequestError(f"the array {_size(shape)} is larger than its file: it is damaged or cut off")
+        self._take(count * dtype.itemsize)
+        flat = np.frombuffer(file.read(count * dtype.itemsize), dtype, count)
+        return flat.reshape(shape, order="F" if fortran else "C")
+
+    def _matrix_market(self, path: Path) -> Any:
+        with gzip.open(path) if path.suffix == ".gz" else path.open("rb") as file:
+            head = file.read(COMMENTS)
+            rows, columns, entries, layout, field, _ = scipy.io.mminfo(io.BytesIO(head))
+            if field == "pattern":
+                raise RequestError("the Matrix Market file has the field 'pattern', it holds no values")
+            if field == "complex":
+                raise RequestError("it holds complex numbers; expected real ones")
+            # the text, the indices and values that it becomes, and the pointers
+            self._take(entries * (LINE // 4 + 24) + 8 * min(rows, columns) + 16 * max(rows, columns))
+            text = head + file.read(entries * LINE + 1)
+            if len(text) > entries * LINE + COMMENTS:
+                raise RequestError(f"the Matrix Market file is longer than the {entries} entries that it declares")
+        found = scipy.io.mmread(io.BytesIO(text))
+        return np.asarray(found) if layout == "array" else sp.csr_array(found)
+
+    def _hdf5(self, path: Path, inner: str) -> Any:
+        try:
+            import h5py  # noqa: PLC0415  optional
+        except ImportError:
+            raise RequestError("HDF5 files need h5py: pip install 'vibench[hdf5]'") from None
+        with h5py.File(path, "r") as file:
+            node: Any = file
+            for part in [part for part in inner.split("/") if part]:
+                link = node.get(part, getlink=True) if isinstance(node, h5py.Group) else None
+                if link is None:
+                    raise RequestError(f"'{path.name}' has no dataset '{inner}'")
+                if not isinstance(link, h5py.HardLink):
+                    raise RequestError(f"'{inner}' in '{path.name}' is a link; a pack holds its arrays itself")
+                node = node[part]
+            if isinstance(node, h5py.Dataset):
+                return self._dataset(node)
+            if any(not isinstance(node.get(name, getlink=True), h5py.HardLink) for name in node):
+                raise RequestError(f"'{inner}' in '{path.name}' contains a link; a pack holds its arrays itself")
+            datasets = {name: each for name, each in node.items() if isinstance(each, h5py.Dataset)}
+            if "data" not in datasets:
+                raise RequestError(f"'{path.name}:{inner}' is a group; name a dataset or a group with 'data'")
+            return {name: self._dataset(each) for name, each in datasets.items()}
+
+    def _dataset(self, dataset: Any) -> Array:
+        if dataset.is_virtual or dataset.external:
+            raise RequestError("the dataset refers to other files; a pack holds its arrays itself")
+        if dataset.dtype.kind not in "biufcS" or dataset.shape is None:
+            raise RequestError(f"it holds values of type {dataset.dtype}; expected numbers")
+        self._take(dataset.size * dataset.dtype.itemsize)
+        return np.asarray(dataset[()])
+
+    def _matrix(self, found: Any) -> SparseMatrix:
+        if sp.issparse(found):
+            return found
+        missing = {"data", "shape"} - found.keys()
+        compressed = found.keys() >= {"indices", "indptr"}
+        if missing or not (compressed or found.keys() >= {"row", "col"}):
+            raise RequestError(
+                f"it has the arrays {', '.join(sorted(found)) or 'none'}; a sparse matrix has data and shape, and "
+                "either row and col, or indices and indptr"
+            )
+        rows, columns = (int(length) for length in np.ravel(found["shape"]))
+        data = self._real(np.ravel(found["data"]))
+        if not compressed:
+            return self._from_triplets(found, data, rows, columns)
+        column_wise = "csc" in str(np.ravel(found.get("format", "csr"))[0])
+        kind, long, short = (sp.csc_array, columns, rows) if column_wise else (sp.csr_array, rows, columns)
+        indices, pointers = np.ravel(found["indices"]), np.ravel(found["indptr"])
+        fits = f"the shape {_size((rows, columns))} and the {len(data)} values"
+        if len(pointers) != long + 1 or pointers[0] != 0 or pointers[-1] > len(data) or np.any(np.diff(pointers) < 0):
+            raise RequestError(f"indptr does not fit {fits}")
+        used = int(pointers[-1])  # SciPy may have allocated more
+        indices, data = indices[:used], data[:used]
+        if len(indices) != used or (used and not 0 <= indices.min() <= indices.max() < short):
+            raise RequestError(f"indices do not fit {fits}")
+        return kind((data, indices, pointers), shape=(rows, columns))
+
+    def _from_triplets(self, found: Any, data: Array, rows: int, columns: int) -> SparseMatrix:
+        i, j = np.ravel(found["row"]), np.ravel(found["col"])
+        if not len(i) == len(j) == len(data):
+            raise RequestError(f"row, col and data have {len(i)}, {len(j)} and {len(data)} entries")
+        self._take(16 * len(data) + 8 * rows)
+        places = (self._based(i, rows), self._based(j, columns))
+        return sp.csr_array(sp.coo_array((data, places), shape=(rows, columns)))
+
+    def _based(self, values: Array, count: int) -> Indices:
+        low, high = self._base, self._base + count - 1
+        if np.any(values != np.round(values)):
+            raise RequestError("it has values that are no whole numbers; expected indices")
+        if len(values) and (values.min() < low or values.max() > high):
+            found = f"it has indices from {values.min():.0f} to {values.max():.0f}; expected {low} to {high}"
+            other = 1 - self._base
+            if other <= values.min() and values.max() <= other + count - 1:
+                found += f": they count from {other}, so the manifest needs index_base = {other}"
+            raise RequestError(found)
+        return np.asarray(values - self._base, dtype=np.intp)
+
+    def _real(self, values: Array) -> Array:
+        if values.dtype.kind == "c":
+            raise RequestError("it holds complex numbers; expected real ones")
+        if values.dtype.kind == "S":
+            raise RequestError("it holds text; expected numbers")
+        wrong = np.count_nonzero(~np.isfinite(values))
+        if wrong:
+            raise RequestError(f"{wrong} of its entries are not finite (nan or inf)")
+        return np.asarray(values, dtype=float)
+
+    def _take(self, count: int) -> None:
+        self._left -= count
+        if self._left < 0:
+            needed, limit = (self._limit - self._left) / 2**30, self._limit / 2**30
+            raise RequestError(
+                f"too big for memory: the arrays of the pack take {needed:.3g} GiB, {limit:.3g} GiB are allowed"
+            )
+
+
+def size_of(array: Any) -> str:
+    """The shape of an array in words, "3×4"."""
+    return _size(array.shape)
+
+
+def _size(shape: Any) -> str:
+    return "×".join(map(str, shape)) or "of no dimension"

@@ -1,0 +1,274 @@
+"""The manifest of a model pack, `pack.toml`: its schema, and one line for what is wrong with it."""
+
+from __future__ import annotations
+
+import tomllib
+import typing
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Annotated, Any, Literal, TypeAlias
+
+from annotated_types import Ge, Gt, MinLen
+from pydantic import AllowInfNan, BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from vibench.errors import RequestError, unknown_name
+from vibench.packs.array_files import safe_path
+
+FILE = "pack.toml"
+"""Name of the manifest in its folder."""
+
+VERSION = 1
+"""Version of the format that is read and written."""
+
+Finite: TypeAlias = Annotated[float, AllowInfNan(False)]
+Text: TypeAlias = Annotated[str, MinLen(1)]
+Points: TypeAlias = Annotated[list[Annotated[list[Finite], MinLen(1)]], MinLen(1)]
+
+
+class _Model(BaseModel):
+    model_config = ConfigDict(extra="forbid", strict=True, frozen=True)
+
+
+class ParameterSet(_Model):
+    """Parameters: an array (P×d), a list of points, or the counts of a regular grid in the box; exactly one."""
+
+    array: Annotated[str | None, Field(description="An array (P×d).")] = None
+    points: Annotated[Points | None, Field(description="A list of points.")] = None
+    grid: Annotated[
+        list[Annotated[int, Ge(1)]] | None, Field(description="Points of a regular grid per parameter.")
+    ] = None
+
+    @model_validator(mode="before")
+    @classmethod
+    def _short(cls, value: Any) -> Any:
+        if isinstance(value, list):
+            return {"points": [point if isinstance(point, list) else [point] for point in value]}
+        return {"array": value} if isinstance(value, str) else value
+
+    @model_validator(mode="after")
+    def _one(self) -> ParameterSet:
+        _exactly_one(self, "array", "points", "grid")
+        return self
+
+
+class Parameters(_Model):
+    """The parameter domain, and the training and validation sets."""
+
+    names: Annotated[list[Text], MinLen(1), Field(description="One name per parameter, an identifier.")]
+    units: Annotated[list[Text] | None, Field(description='Units; "1", the default, for numbers.')] = None
+    lower: Annotated[list[Finite] | None, Field(description="Lower bounds; by default those of the sets.")] = None
+    upper: Annotated[list[Finite] | None, Field(description="Upper bounds.")] = None
+    training: Annotated[ParameterSet, Field(description="Training set.")]
+    validation: Annotated[ParameterSet | None, Field(description="Validation set; by default random in the box.")] = (
+        None
+    )
+
+
+class Term(_Model):
+    """One term θ_q(µ)·term_q of an affine sum; θ_q is an expression, or tabulated at the listed parameters."""
+
+    theta: Annotated[str | Finite | None, Field(description="Expression in the names of the parameters.")] = None
+    table: Annotated[str | None, Field(description="Or an array of values at the listed parameters.")] = None
+    array: Annotated[str, Field(description="The matrix or vector.")]
+
+    @model_validator(mode="after")
+    def _one(self) -> Term:
+        _exactly_one(self, "theta", "table")
+        return self
+
+
+class Member(_Model):
+    """One of A, f, B, g: an array, an affine sum, or one array per listed parameter; exactly one."""
+
+    constant: Annotated[str | None, Field(description="An array that does not depend on the parameter.")] = None
+    affine: Annotated[list[Term] | None, MinLen(1), Field(description="Terms of an affine sum.")] = None
+    each: Annotated[
+        str | None, Field(description="Arrays by listed parameter; {} stands for its number. Vectors: or columns.")
+    ] = None
+
+    @model_validator(mode="before")
+    @classmethod
+    def _short(cls, value: Any) -> Any:
+        return {"constant": value} if isinstance(value, str) else value
+
+    @model_validator(mode="after")
+    def _one(self) -> Member:
+        _exactly_one(self, "constant", "affine", "each")
+        return self
+
+
+class Spaces(_Model):
+    """The inner products, and what belongs to the unknowns and the multipliers."""
+
+    X_V: Annotated[str | None, Field(description="Gram matrix of the primal space (n×n).")] = None
+    X_W: Annotated[str, Field(description="Gram matrix of the multiplier space (m×m).")]
+    free: Annotated[
+        str | None, Field(description="Indices of the free unknowns, if the arrays have those of Dirichlet, too.")
+    ] = None
+    contact: Annotated[str | None, Field(description="Indices of the unknowns B touches; by default found.")] = None
+    integrals: Annotated[
+        str | None, Field(description="Integrals (m,) of the multiplier functions; by default X_W applied to ones.")
+    ] = None
+
+
+class Operators(_Model):
+    """The members of the variational inequality."""
+
+    A: Annotated[Member, Field(description="Stiffness (n×n), symmetric positive definite.")]
+    f: Annotated[Member, Field(description="Load (n,).")]
+    B: Annotated[Member, Field(description="Constraint (m×n).")]
+    g: Annotated[Member, Field(description="Bound (m,).")]
+    entrywise: Annotated[
+        list[Literal["A", "f", "B", "g"]] | None,
+        Field(description="Members interpolated in reduced assembly; by default all that depend on the parameter."),
+    ] = None
+
+
+class Solutions(_Model):
+    """Reference solutions, one column per parameter."""
+
+    u: Annotated[str | None, Field(description="Solutions (n×P).")] = None
+    lam: Annotated[str, Field(description="Multipliers (m×P).")]
+    parameters: Annotated[
+        ParameterSet | None, Field(description="Their parameters; by default the listed ones, or the training set.")
+    ] = None
+    tolerance: Annotated[float, Gt(0.0), AllowInfNan(False), Field(description="Largest relative KKT residual.")] = 1e-6
+
+
+class Mesh(_Model):
+    """A mesh for pictures."""
+
+    file: Annotated[str, Field(description="A file that meshio reads, such as .vtu or .msh.")]
+    points: Annotated[str, Field(description="Indices (k,) of mesh points.")]
+    unknowns: Annotated[
+        str | None, Field(description="Indices (k,) of the unknowns drawn at these points; by default all in order.")
+    ] = None
+    positions: Annotated[str, Field(description="Points of the multipliers (m×1 or m×2).")]
+    value: Annotated[str, Field(description="Name of the solution, with its unit.")] = "u"
+    multiplier: Annotated[str, Field(description="Name of the multiplier, with its unit.")] = "λ"
+
+
+class Manifest(_Model):
+    """`pack.toml`."""
+
+    format: Annotated[int, Field(description="Version of the format: 1.")]
+    name: Annotated[str, Field(description="Name of the model.")] = ""
+    description: Annotated[str, Field(description="What it is a model of.")] = ""
+    source: Annotated[str, Field(description="The code and the script it comes from.")] = ""
+    license: Annotated[str, Field(description="Licence of the data.")] = ""
+    index_base: Annotated[
+        Literal[0, 1], Field(description="The first index of index arrays and triplets; 1 in Matrix Market always.")
+    ] = 0
+    parameters: Annotated[Parameters, Field(description="The parameters, their box, and sets of them.")]
+    spaces: Annotated[Spaces, Field(description="The inner products.")]
+    operators: Annotated[Operators | None, Field(description="Without them the pack has its dual half only.")] = None
+    solutions: Annotated[Solutions | None, Field(description="Reference solutions, which show signs.")] = None
+    mesh: Annotated[Mesh | None, Field(description="A mesh, for pictures.")] = None
+
+    def references(self) -> Iterator[tuple[str, str]]:
+        """The arrays that the manifest names, "FILE" or "FILE:NAME", and the mesh, each after its place."""
+        yield from _references(self)
+
+
+REFERENCES = frozenset(
+    {"X_V", "X_W", "free", "contact", "integrals", "constant", "each", "table", "array", "u", "lam"}
+    | {"file", "points", "unknowns", "positions"}
+)
+"""Keys whose texts refer to files."""
+
+
+def _references(value: Any, place: tuple[str, ...] = ()) -> Iterator[tuple[str, str]]:
+    if isinstance(value, BaseModel):
+        for name, part in value:
+            yield from _references(part, (*place, name))
+    elif isinstance(value, list):
+        for k, part in enumerate(value):
+            yield from _references(part, (*place, str(k)))
+    elif isinstance(value, str) and place[-1] in REFERENCES:
+        yield ".".join(name for name in place if name not in ("constant", "array")), value
+
+
+def read_manifest(folder: Path) -> Manifest:
+    """Read and check the manifest of a pack.
+
+    Raises
+    ------
+    RequestError
+        Naming the key, what is wrong with it, and what is expected.
+    """
+    path = safe_path(folder, FILE)
+    try:
+        content = tomllib.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise RequestError(f"{FILE} cannot be read: {error.strerror}") from None
+    except (ValueError, RecursionError) as error:
+        raise RequestError(f"{FILE}: not valid TOML: {error}") from None
+    version = content.get("format", VERSION)
+    if isinstance(version, int) and version != VERSION:
+        raise RequestError(f"{FILE}: format is {version}; this version of vibench reads format {VERSION}")
+    try:
+        manifest = Manifest.model_validate(content)
+        _check_parameters(manifest.parameters)
+    except ValidationError as error:
+        raise RequestError(f"{FILE}: {_line(error.errors(include_url=False)[0])}") from None
+    except RequestError as error:
+        raise RequestError(f"{FILE}: {error}") from None
+    return manifest
+
+
+def _check_parameters(given: Parameters) -> None:
+    for name in given.names:
+        if not name.isidentifier():
+            raise RequestError(f"parameters.names: '{name}' cannot stand in expressions; use letters, digits and _")
+    if len(set(given.names)) < len(given.names):
+        raise RequestError(f"parameters.names: two parameters have the same name: {', '.join(given.names)}")
+    for key in ("units", "lower", "upper"):
+        values = getattr(given, key)
+        if values is not None and len(values) != len(given.names):
+            raise RequestError(f"parameters.{key} has {len(values)} entries for {len(given.names)} parameters")
+    if (given.lower is None) != (given.upper is None):
+        raise RequestError("parameters: give both 'lower' and 'upper', or neither")
+    for name, low, high in zip(given.names, given.lower or (), given.upper or (), strict=False):
+        if low > high:
+            raise RequestError(f"parameters: the lower bound {low:g} of '{name}' is above its upper bound {high:g}")
+    if given.lower is None and (given.training.grid is not None or given.validation is None):
+        raise RequestError("parameters: a grid, or a random validation set, needs the box: give 'lower' and 'upper'")
+
+
+def _exactly_one(table: BaseModel, *keys: str) -> None:
+    given = [key for key in keys if getattr(table, key) is not None]
+    if len(given) != 1:
+        found = " and ".join(given) or "none"
+        raise ValueError(f"give exactly one of {', '.join(keys)} (found {found})")
+
+
+def _line(error: Any) -> str:
+    """The key that is wrong, what is wrong, and what was found."""
+    where = [part for part in error["loc"] if isinstance(part, int) or part.isidentifier()]
+    message, found = error["msg"].removeprefix("Value error, "), ""
+    if isinstance(error["input"], str | int | float):
+        found = f" (found {error['input']!r:.80})"
+    if error["type"] == "extra_forbidden":
+        *outer, key = error["loc"]
+        message, found = str(unknown_name("key", str(key), _model_at(outer).model_fields)), ""
+        where = [part for part in outer if part != key]
+    elif error["type"] == "missing":
+        message, found = "required, but not given", ""
+    elif error["type"] == "model_type":
+        message = "expected a table"
+    place = ".".join(map(str, where))
+    return " ".join(f"{place + ': ' if place else ''}{message}{found}".split())
+
+
+def _model_at(place: list[str | int]) -> type[BaseModel]:
+    """The model of the table at a place in the manifest."""
+    model: type[BaseModel] = Manifest
+    for key in place:
+        if isinstance(key, str) and key in model.model_fields:
+            parts: list[Any] = [model.model_fields[key].annotation]
+            while parts:
+                part = parts.pop()
+                parts += typing.get_args(part)
+                if isinstance(part, type) and issubclass(part, BaseModel):
+                    model = part
+    return model

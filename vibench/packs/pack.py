@@ -1,0 +1,140 @@
+"""A model pack in memory: a variational inequality, its spaces, parameters, reference solutions and mesh."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import scipy.sparse as sp
+
+from vibench.arrays import Array, Indices
+from vibench.errors import NumericalError
+from vibench.interfaces.problem import MEMBERS, ParameterBox, VariationalInequality
+from vibench.linalg.inner_product import InnerProduct
+from vibench.packs.manifest import Manifest
+from vibench.packs.members import Affine, Constant, Listed, PackMember
+
+
+@dataclass(frozen=True)
+class Reference:
+    """Reference solutions: parameters (P×d), u (n×P) or `None`, λ (m×P), largest accepted relative KKT residual."""
+
+    parameters: Array
+    u: Array | None
+    lam: Array
+    tolerance: float
+
+
+@dataclass(frozen=True)
+class PackMesh:
+    """Data of pictures: points (2×p) and triangles (3×t) of the mesh, points and unknowns (k,) drawn, positions."""
+
+    points: Array
+    triangles: Indices
+    drawn: Indices
+    unknowns: Indices
+    positions: Array
+    value: str
+    multiplier: str
+
+
+@dataclass(frozen=True)
+class ModelPack:
+    """A model pack, read into memory; sizes are checked, what its numbers mean is checked by `check_pack`.
+
+    Attributes
+    ----------
+    manifest
+        The manifest.
+    box
+        Parameters, bounds and units.
+    training, validation
+        Training parameters (P×d); validation parameters (Q×d), or `None` for random ones in the box.
+    V, W
+        Inner products X_V (n×n) and X_W (m×m); without operators V is `None`.
+    members
+        "A", "f", "B", "g"; none without operators.
+    contact
+        Unknowns (k,) that B touches at some parameter.
+    integrals
+        Integrals (m,) of the multiplier functions, `None` for X_W applied to ones.
+    reference
+        Reference solutions, or `None`.
+    mesh
+        Data of pictures, or `None`.
+    """
+
+    manifest: Manifest
+    box: ParameterBox
+    training: Array
+    validation: Array | None
+    V: InnerProduct | None
+    W: InnerProduct
+    members: Mapping[str, PackMember]
+    contact: Indices
+    integrals: Array | None
+    reference: Reference | None
+    mesh: PackMesh | None
+
+    @property
+    def constant(self) -> frozenset[str]:
+        """Members that do not depend on the parameter."""
+        return frozenset(name for name, member in self.members.items() if isinstance(member, Constant))
+
+    @property
+    def entrywise(self) -> frozenset[str]:
+        """Members that reduced assembly interpolates."""
+        operators = self.manifest.operators
+        given = None if operators is None else operators.entrywise
+        return frozenset(self.members if given is None else map(str, given)) - self.constant
+
+    @property
+    def everywhere(self) -> bool:
+        """Whether the members can be evaluated at every parameter of the box."""
+        return all(member.everywhere for member in self.members.values())
+
+    @cached_property
+    def contact_members(self) -> Mapping[str, PackMember]:
+        """B on the columns `contact` and g."""
+        return {"B": _mapped(self.members["B"], lambda B: sp.csr_array(B)[:, self.contact]), "g": self.members["g"]}
+
+    def at(self, mu: Array) -> VariationalInequality:
+        """The variational inequality at mu (d,).
+
+        Raises
+        ------
+        NumericalError
+            If a member has arrays for listed parameters only and mu is not one of them, or θ(µ) is not finite.
+        """
+        return VariationalInequality(**{name: self.members[name].at(mu) for name in MEMBERS})
+
+    def validation_set(self, count: int, seed: int) -> Array:
+        """The first `count` listed validation parameters, or as many random ones in the box if none are listed.
+
+        Raises
+        ------
+        NumericalError
+            If fewer are listed.
+        """
+        if self.validation is None:
+            return self.box.sample(count, seed)
+        if count > len(self.validation):
+            raise NumericalError(
+                f"the pack lists {len(self.validation)} validation parameters, the study asks for {count}: "
+                f"set validation = {len(self.validation)}"
+            )
+        return self.validation[:count]
+
+
+def _mapped(member: PackMember, change: Callable[[Any], Any]) -> PackMember:
+    """A member with all its arrays changed."""
+    match member:
+        case Constant(array):
+            return Constant(change(array))
+        case Affine(thetas, terms):
+            return Affine(thetas, tuple(map(change, terms)))
+        case Listed(listing, values):
+            return Listed(listing, tuple(map(change, values)))
+    raise NotImplementedError(type(member).__name__)

@@ -1,0 +1,334 @@
+"""Reading a model pack: its manifest, its arrays, and the digest of both."""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import os
+from collections.abc import Iterator, Mapping
+from functools import lru_cache
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import numpy as np
+import scipy.sparse as sp
+
+from vibench.arrays import Array, Indices
+from vibench.errors import NumericalError, RequestError
+from vibench.interfaces.problem import MEMBERS, ParameterBox
+from vibench.linalg.inner_product import InnerProduct
+from vibench.packs import manifest as schema
+from vibench.packs.array_files import ArrayFiles, memory_limit, safe_path, size_of
+from vibench.packs.expressions import Expression
+from vibench.packs.manifest import FILE, Manifest, read_manifest
+from vibench.packs.members import Affine, Constant, Listed, Listing, PackMember, Table, Theta
+from vibench.packs.pack import ModelPack, PackMesh, Reference
+from vibench.provenance import core_code
+
+OUTSIDE_RTOL = 1e-12
+"""Largest distance of a listed parameter from the box, relative to its bounds."""
+
+
+def read_pack(path: str | Path) -> ModelPack:
+    """Read a model pack.
+
+    Parameters
+    ----------
+    path
+        Its folder.
+
+    Raises
+    ------
+    RequestError
+        Naming what is wrong in the manifest or with an array, and what would be right.
+    """
+    with naming(path) as folder:
+        return _Reader(folder, read_manifest(folder)).pack()
+
+
+def pack_digest(path: str | Path) -> str:
+    """Digest of the manifest and of the files it names, and of the code that reads them.
+
+    Raises
+    ------
+    RequestError
+        If the manifest is invalid or a file is missing.
+    """
+    content = hashlib.sha256(core_code("packs").encode())
+    with naming(path) as folder:
+        for place, reference in (("manifest", FILE), *read_manifest(folder).references()):
+            for file in _files(folder, place, reference.partition(":")[0]):
+                state = file.stat()
+                content.update(_file_digest(file, state.st_size, state.st_mtime_ns, state.st_ino))
+    return content.hexdigest()[:16]
+
+
+def _files(folder: Path, place: str, name: str) -> list[Path]:
+    """The files of a name; all of those that a {} in it numbers."""
+    try:
+        if "{}" not in name:
+            return [safe_path(folder, name)]
+        before, _, after = name.partition("{}")
+        parent = PurePosixPath(before + "x").parent.as_posix()
+        found = safe_path(folder, parent, is_folder=True).iterdir()
+        names = (each.relative_to(folder).as_posix() for each in found)
+        return [safe_path(folder, each) for each in sorted(names) if each.startswith(before) and each.endswith(after)]
+    except RequestError as error:
+        raise RequestError(f"{place}: {error}") from None
+
+
+@lru_cache(maxsize=10_000)
+def _file_digest(path: Path, size: int, changed: int, inode: int) -> bytes:  # noqa: ARG001  the state is part of the key
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").digest()
+
+
+@contextlib.contextmanager
+def naming(path: str | Path) -> Iterator[Path]:
+    """The folder of a pack; errors raised in the block name it.
+
+    Raises
+    ------
+    RequestError
+        If it is no folder.
+    """
+    if not os.path.isdir(path):  # noqa: PTH112  methods of Path raise OSError for names too long for a file
+        raise RequestError(f"pack '{path}': there is no such folder")
+    try:
+        yield Path(path)
+    except RequestError as error:
+        raise RequestError(f"pack '{path}': {error}") from None
+
+
+class _Reader:
+    """Reads the arrays of a manifest; every array is checked against the dimensions known so far."""
+
+    def __init__(self, folder: Path, manifest: Manifest) -> None:
+        self._folder, self._manifest = folder, manifest
+        self._files = ArrayFiles(folder, manifest.index_base, memory_limit())
+        self._names = tuple(manifest.parameters.names)
+        self._bounds: tuple[Array, Array] | None = None
+        self._free: Indices | None = None
+
+    def pack(self) -> ModelPack:
+        given, spaces, operators = self._manifest.parameters, self._manifest.spaces, self._manifest.operators
+        solutions, mesh = self._manifest.solutions, self._manifest.mesh
+        if operators is None and (solutions is None or spaces.free or mesh):
+            raise RequestError("without the table [operators] a pack consists of [spaces] X_W and [solutions] lam")
+        if operators is not None and spaces.X_V is None:
+            raise RequestError("spaces.X_V: required with [operators], but not given")
+        training, validation, box = self._domain(given)
+        W = self._space(spaces.X_W, "X_W")
+        V = None if operators is None or spaces.X_V is None else self._primal_space(spaces.X_V)
+        n, m = 0 if V is None else V.dim, W.dim
+        members = {} if operators is None else self._members(operators, n, m)
+        if members and validation is None and not all(member.everywhere for member in members.values()):
+            raise RequestError(
+                "parameters.validation: required, since arrays or tables are given at listed parameters only"
+            )
+        integrals = None
+        if spaces.integrals is not None:
+            integrals = self._files.vector(spaces.integrals, "spaces.integrals")
+            self._expect("spaces.integrals", integrals, (m,))
+        return ModelPack(
+            self._manifest, box, training, validation, V, W, members, self._contact(members, n), integrals,
+            None if solutions is None else self._reference(solutions, n, m),
+            None if mesh is None else self._mesh(mesh, n, m),
+        )  # fmt: skip
+
+    def _domain(self, given: schema.Parameters) -> tuple[Array, Array | None, ParameterBox]:
+        """The training and the validation set, and the box."""
+        if given.lower is not None:
+            self._bounds = (np.array(given.lower), np.array(given.upper))
+        training, validation = self._parameters(given.training, "parameters.training"), None
+        self._listed = training
+        if given.validation is not None:
+            validation = self._parameters(given.validation, "parameters.validation")
+            self._listed = np.vstack([training, validation])
+        lower, upper = self._bounds or (self._listed.min(axis=0), self._listed.max(axis=0))
+        widths = np.where(upper > lower, upper - lower, np.maximum(np.abs(lower), 1.0))
+        self._listing, self._training = Listing(self._listed, widths), len(training)
+        return training, validation, ParameterBox(self._names, lower, upper, tuple(given.units or ["1"] * len(lower)))
+
+    def _parameters(self, given: schema.ParameterSet, what: str) -> Array:
+        bounds = self._bounds
+        d = len(self._names)
+        if given.grid is not None and bounds is not None:
+            if len(given.grid) != d:
+                raise RequestError(f"{what}.grid has {len(given.grid)} counts for {d} parameters")
+            return ParameterBox(self._names, *bounds, units=()).grid(*given.grid)
+        if given.array is not None:
+            found = self._files.dense(given.array, what)
+            found = found[:, None] if found.ndim == 1 and d == 1 else found
+        elif any(len(point) != d for point in given.points or ()):
+            raise RequestError(f"{what}: every point needs {d} values, one for each of {', '.join(self._names)}")
+        else:
+            found = np.array(given.points, dtype=float)
+        if found.ndim != 2 or found.shape[1] != d:
+            transposed = "; it is transposed" if found.ndim == 2 and found.shape[0] == d else ""
+            raise RequestError(f"{what}: an array {size_of(found)}; expected P×{d}, a row per parameter{transposed}")
+        if bounds is not None:
+            slack = OUTSIDE_RTOL * np.maximum(np.abs(bounds[0]), np.abs(bounds[1]))
+            for k, i in np.argwhere((found < bounds[0] - slack) | (found > bounds[1] + slack))[:1]:
+                box = f"[{bounds[0][i]:g}, {bounds[1][i]:g}]"
+                raise RequestError(f"{what}: point {k} has '{self._names[i]}' = {found[k, i]:g}, outside the box {box}")
+        return found
+
+    def _space(self, reference: str, name: str) -> InnerProduct:
+        return self._inner_product(self._files.sparse(reference, f"spaces.{name}"), name)
+
+    def _primal_space(self, reference: str) -> InnerProduct:
+        X = self._files.sparse(reference, "spaces.X_V")
+        self._all = int(X.shape[0])
+        if self._manifest.spaces.free is not None:
+            self._free = self._files.indices(self._manifest.spaces.free, "spaces.free", self._all)
+            if len(np.unique(self._free)) < len(self._free):
+                raise RequestError("spaces.free names an unknown twice")
+            X = sp.csr_array(X)[self._free][:, self._free] if X.shape[0] == X.shape[1] else X
+        return self._inner_product(X, "X_V")
+
+    @staticmethod
+    def _inner_product(X: Any, name: str) -> InnerProduct:
+        rows, columns = X.shape
+        if rows != columns:
+            raise RequestError(f"spaces.{name}: a matrix {rows}×{columns}; expected a square one")
+        one_triangle(X, f"spaces.{name}")
+        try:
+            return InnerProduct(X, f"spaces.{name}")
+        except NumericalError as error:
+            constants = np.abs(X @ np.ones(rows)).max(initial=0.0) <= 1e-10 * np.abs(X.data).max(initial=0.0)
+            hint = "; it is the product of a seminorm, without the L² part" if constants and X.nnz else ""
+            raise RequestError(f"{error}{hint}") from None
+
+    def _members(self, operators: schema.Operators, n: int, m: int) -> dict[str, PackMember]:
+        full = self._all if self._free is not None else n
+        shapes: dict[str, tuple[tuple[int, ...], tuple[int, ...]]] = {
+            "A": ((full, full), (n, n)), "f": ((full,), (n,)), "B": ((m, full), (m, n)), "g": ((m,), (m,)),
+        }  # fmt: skip
+        return {name: self._member(name, getattr(operators, name), *shapes[name]) for name in MEMBERS}
+
+    def _member(self, name: str, given: schema.Member, stored: tuple[int, ...], kept: tuple[int, ...]) -> PackMember:
+        what = f"operators.{name}"
+
+        def read(reference: str, where: str) -> Any:
+            found = (self._files.sparse if len(stored) == 2 else self._files.vector)(reference, where)
+            self._expect(where, found, stored)
+            return found if stored == kept else self._restricted(name, found)
+
+        if given.constant is not None:
+            return Constant(read(given.constant, what))
+        if given.affine is not None:
+            terms = tuple(read(term.array, f"{what}.affine.{q}") for q, term in enumerate(given.affine))
+            return Affine(tuple(self._theta(term, f"{what}.affine.{q}") for q, term in enumerate(given.affine)), terms)
+        assert given.each is not None  # the manifest has exactly one of the three
+        if "{}" in given.each:
+            base = self._manifest.index_base
+            references = [given.each.replace("{}", str(k + base)) for k in range(len(self._listed))]
+            values = [read(reference, f"{what}, parameter {k}") for k, reference in enumerate(references)]
+        elif len(stored) == 2:
+            raise RequestError(f"{what}.each: '{given.each}' has no {{}} that stands for the number of the parameter")
+        else:
+            columns = self._columns(given.each, f"{what}.each", stored[0], len(self._listed))
+            values = [column if stored == kept else self._restricted(name, column) for column in columns.T]
+        return Listed(self._listing, tuple(values))
+
+    def _restricted(self, name: str, found: Any) -> Any:
+        """A member of all unknowns on the free ones."""
+        if name == "B":
+            return sp.csr_array(found)[:, self._free]
+        return found[self._free] if name == "f" else sp.csr_array(found)[self._free][:, self._free]
+
+    def _theta(self, term: schema.Term, what: str) -> Theta:
+        if term.table is None:
+            try:
+                return Expression.parse(str(term.theta), self._names)
+            except RequestError as error:
+                raise RequestError(f"{what}.theta: {error}") from None
+        values = self._files.vector(term.table, f"{what}.table")
+        self._expect(f"{what}.table", values, (len(self._listed),))
+        return Table(self._listing, values)
+
+    def _columns(self, reference: str, what: str, rows: int, count: int | None) -> Array:
+        found = self._files.dense(reference, what)
+        if found.ndim != 2 or found.shape[0] != rows or count not in (None, found.shape[1]):
+            transposed = "; it is transposed" if found.ndim == 2 and found.shape[1] == rows else ""
+            expected = f"{rows}×{'P' if count is None else count}, a column per parameter"
+            raise RequestError(f"{what}: an array {size_of(found)}; expected {expected}{transposed}")
+        return found
+
+    def _contact(self, members: Mapping[str, PackMember], n: int) -> Indices:
+        if self._manifest.spaces.contact is not None and members:
+            found = np.unique(self._files.indices(self._manifest.spaces.contact, "spaces.contact", self._all))
+            return found if self._free is None else np.flatnonzero(np.isin(self._free, found))
+        touched = np.zeros(n, dtype=bool)
+        for matrix in members["B"].arrays if members else ():
+            touched[sp.csr_array(matrix).indices] = True
+        return np.flatnonzero(touched)
+
+    def _reference(self, given: schema.Solutions, n: int, m: int) -> Reference:
+        lam = self._columns(given.lam, "solutions.lam", m, None)
+        count = lam.shape[1]
+        if given.parameters is not None:
+            mus = self._parameters(given.parameters, "solutions.parameters")
+        else:
+            mus = self._listed[: self._training] if count == self._training else self._listed
+        if len(mus) != count:
+            raise RequestError(f"solutions.lam has {count} columns for {len(mus)} parameters")
+        u = None
+        if given.u is not None and n:
+            full = n if self._free is None else self._all
+            u = self._columns(given.u, "solutions.u", full, count)
+            u = u if self._free is None else u[self._free]
+        return Reference(mus, u, lam, given.tolerance)
+
+    def _mesh(self, given: schema.Mesh, n: int, m: int) -> PackMesh:
+        path = safe_path(self._folder, given.file)
+        try:
+            import meshio  # noqa: PLC0415  optional
+        except ImportError:
+            raise RequestError("mesh.file needs meshio: pip install 'vibench[mesh]'") from None
+        try:
+            mesh = meshio.read(path)
+            points = np.asarray(mesh.points, float)[:, :2].T
+            triangles = np.asarray(mesh.get_cells_type("triangle"), np.intp).reshape(-1, 3).T
+        except (Exception, SystemExit) as error:  # noqa: BLE001  meshio raises anything, and exits, for damaged files
+            raise RequestError(f"mesh.file: '{given.file}' cannot be read: {type(error).__name__}") from None
+        drawn = self._files.indices(given.points, "mesh.points", points.shape[1])
+        unknowns = np.arange(n) if given.unknowns is None else self._unknowns(given.unknowns)
+        self._expect("mesh.points", drawn, (len(unknowns),))
+        positions = self._files.dense(given.positions, "mesh.positions")
+        positions = positions[:, None] if positions.ndim == 1 else positions
+        if positions.shape not in ((m, 1), (m, 2)):
+            raise RequestError(f"mesh.positions: an array {size_of(positions)}; expected {m}×1 or {m}×2")
+        return PackMesh(points, triangles, drawn, unknowns, positions.T, given.value, given.multiplier)
+
+    def _unknowns(self, reference: str) -> Indices:
+        """Unknowns of the pack that are named by their numbers in the files."""
+        found = self._files.indices(reference, "mesh.unknowns", self._all)
+        if self._free is None:
+            return found
+        number = np.full(self._all, -1)
+        number[self._free] = np.arange(len(self._free))
+        if np.any(number[found] < 0):
+            raise RequestError("mesh.unknowns names an unknown that is not free")
+        return number[found]
+
+    def _expect(self, what: str, found: Any, shape: tuple[int, ...]) -> None:
+        if found.shape == shape:
+            return
+        hint = ""
+        if len(shape) == 2 and found.shape == shape[::-1]:
+            hint = "; it is transposed"
+        elif self._free is None and self._manifest.operators is not None and max(found.shape) > max(shape):
+            hint = "; if it has the Dirichlet unknowns, too, leave them out, or name the free ones in spaces.free"
+        raise RequestError(f"{what}: {size_of(found)}; expected {'×'.join(map(str, shape))}{hint}")
+
+
+def one_triangle(matrix: Any, what: str) -> None:
+    """Refuse a matrix of which one triangle is stored and the other is empty."""
+    below, above = sp.tril(matrix, -1).nnz, sp.triu(matrix, 1).nnz
+    if bool(below) != bool(above):
+        side = "lower" if below else "upper"
+        raise RequestError(
+            f"{what} has its {side} triangle only; store both, or in Matrix Market the lower one as 'symmetric'"
+        )

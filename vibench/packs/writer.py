@@ -1,0 +1,147 @@
+"""Writing a model pack of any problem: constants where the problem declares them, else one array per parameter."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import tempfile
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import scipy.sparse as sp
+
+from vibench.arrays import Array
+from vibench.errors import RequestError
+from vibench.highfidelity.active_set import HighFidelitySolver
+from vibench.interfaces.problem import MEMBERS, Problem
+from vibench.interfaces.validation import checked_assembly, training_parameters, validation_parameters
+from vibench.packs.manifest import FILE, VERSION
+
+EXPLANATION = """\
+# u = argmin ½ uᵀA u − fᵀu subject to B u ≤ g, with A u + Bᵀλ = f and λ ≥ 0, on the free unknowns.
+# Listed parameters are numbered from 0: those of the training set, then those of the validation set.
+"""
+
+
+def write_pack(
+    problem: Problem, folder: Path, *, name: str, source: str, validation: int, seed: int, solutions: bool = False
+) -> None:
+    """Write a pack of a problem at its training set and its validation set.
+
+    Parameters
+    ----------
+    problem
+        The problem.
+    folder
+        The folder to be made; it is made whole or not at all.
+    name, source
+        What the manifest says about the origin.
+    validation, seed
+        Number of validation parameters, and the seed they are drawn with.
+    solutions
+        Whether to solve at every parameter and add the solutions.
+
+    Raises
+    ------
+    RequestError
+        If the folder exists.
+    NumericalError
+        If an assembly is invalid, or a parameter has no solution.
+    """
+    training = training_parameters(problem)
+    listed = np.vstack([training, validation_parameters(problem, validation, seed)])
+    with _new_folder(folder) as part:
+        lines = [f"format = {VERSION}", f"name = {_text(name)}", f"source = {_text(source)}", ""]
+        lines += _parameters(problem, len(training), listed, part) + _spaces(problem, part)
+        lines += _operators(problem, listed, part)
+        lines += _solutions(problem, listed, part) if solutions else []
+        (part / FILE).write_text(EXPLANATION + "\n".join(lines) + "\n", encoding="utf-8")
+
+
+@contextlib.contextmanager
+def _new_folder(folder: Path) -> Iterator[Path]:
+    """A folder beside the one that is wanted, which takes its name at the end of the block."""
+    if folder.is_symlink() or folder.exists():
+        raise RequestError(f"'{folder}' exists; a pack is written into a new folder")
+    if not folder.absolute().parent.is_dir():
+        raise RequestError(f"'{folder.absolute().parent}' is not a folder")
+    with tempfile.TemporaryDirectory(dir=folder.absolute().parent, prefix="vibench-") as temporary:
+        part = Path(temporary) / "pack"
+        part.mkdir()
+        yield part
+        part.rename(folder)
+
+
+def _parameters(problem: Problem, training: int, listed: Array, part: Path) -> list[str]:
+    box = problem.parameters
+    _save(part / "parameters.npz", {"training": listed[:training], "validation": listed[training:]})
+    return [
+        "[parameters]",
+        f"names = [{', '.join(map(_text, box.names))}]",
+        f"units = [{', '.join(map(_text, box.units))}]",
+        f"lower = {box.lower.tolist()}",
+        f"upper = {box.upper.tolist()}",
+        'training = "parameters.npz:training"',
+        'validation = "parameters.npz:validation"',
+        "",
+    ]
+
+
+def _spaces(problem: Problem, part: Path) -> list[str]:
+    arrays = _sparse("X_V", problem.V.matrix) | _sparse("X_W", problem.W.matrix)
+    lines = ["[spaces]", 'X_V = "spaces.npz:X_V"', 'X_W = "spaces.npz:X_W"']
+    if problem.contact_dofs is not None:
+        arrays["contact"] = problem.contact_dofs
+        lines.append('contact = "spaces.npz:contact"')
+    if type(problem).multiplier_integrals is not Problem.multiplier_integrals:
+        arrays["integrals"] = problem.multiplier_integrals()
+        lines.append('integrals = "spaces.npz:integrals"')
+    _save(part / "spaces.npz", arrays)
+    return [*lines, ""]
+
+
+def _operators(problem: Problem, listed: Array, part: Path) -> list[str]:
+    """The table of the members, whose arrays are written."""
+    found: dict[str, dict[str, Any]] = {name: {} for name in MEMBERS}
+    for k, mu in enumerate(listed):
+        vi = checked_assembly(problem, mu)
+        for name in MEMBERS:
+            if k == 0 or name not in problem.constant:
+                found[name] |= _stored(str(k), getattr(vi, name))
+    lines = ["[operators]", f"entrywise = [{', '.join(map(_text, sorted(problem.entrywise - problem.constant)))}]"]
+    for name in MEMBERS:
+        _save(part / f"{name}.npz", found[name])
+        lines.append(f'{name} = "{name}.npz:0"' if name in problem.constant else f'{name}.each = "{name}.npz:{{}}"')
+    return [*lines, ""]
+
+
+def _solutions(problem: Problem, listed: Array, part: Path) -> list[str]:
+    solver = HighFidelitySolver(problem)
+    found = [solver.solve(mu) for mu in listed]
+    u, lam = (np.column_stack([getattr(one, name) for one in found]) for name in ("u", "lam"))
+    _save(part / "solutions.npz", {"u": u, "lam": lam})
+    return ["[solutions]", 'u = "solutions.npz:u"', 'lam = "solutions.npz:lam"', ""]
+
+
+def _stored(name: str, value: Any) -> dict[str, Any]:
+    return {name: value} if isinstance(value, np.ndarray) else _sparse(name, value)
+
+
+def _sparse(name: str, matrix: Any) -> dict[str, Any]:
+    """The arrays of a sparse matrix, its entries in their order."""
+    kept = matrix if matrix.format in ("csr", "csc") else sp.csr_array(matrix)
+    return {
+        f"{name}/data": kept.data, f"{name}/indices": kept.indices, f"{name}/indptr": kept.indptr,
+        f"{name}/shape": np.array(kept.shape), f"{name}/format": np.array(kept.format, dtype="S3"),
+    }  # fmt: skip
+
+
+def _save(path: Path, arrays: Mapping[str, Any]) -> None:
+    np.savez_compressed(path, allow_pickle=False, **arrays)
+
+
+def _text(value: str) -> str:
+    """A text as a TOML string, which is one of JSON but for the character DEL."""
+    return json.dumps(value).replace("\x7f", "\\u007f")
