@@ -280,9 +280,15 @@ def test_the_reference_constants_are_those_of_every_parameter(store: Store) -> N
     assert scaled[0] > 0.0
     problem = PROBLEM.create()
     for c, mu in zip(constants, mus, strict=True):
-        values = scipy.linalg.eigh(problem.assemble(mu).A.toarray(), problem.V.matrix.toarray(), eigvals_only=True)
-        assert 0.998 * values[0] <= c.coercivity <= values[0]
-        assert values[-1] <= c.continuity <= 1.002 * values[-1]
+        vi = problem.assemble(mu)
+        values = scipy.linalg.eigh(vi.A.toarray(), problem.V.matrix.toarray(), eigvals_only=True)
+        assert c.coercivity.proved
+        assert 0.998 * values[0] <= c.coercivity.value <= values[0]
+        assert c.continuity.proved
+        assert values[-1] <= c.continuity.value <= 1.002 * values[-1]
+        compliance = vi.B @ np.linalg.solve(vi.A.toarray(), vi.B.toarray().T)
+        smallest = scipy.linalg.eigvalsh(compliance, problem.W.matrix.toarray())[0]
+        assert 0.998 * np.sqrt(smallest) <= c.energy_inf_sup.value <= np.sqrt(smallest)
 
 
 def test_a_missing_artefact_is_named(tmp_path: Path) -> None:
