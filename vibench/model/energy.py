@@ -31,8 +31,8 @@ class Energy:
 
     @property
     def nbytes(self) -> int:
-        """Memory of the factors, if that of the condensed matrix is as large as the other."""
-        return 2 * self.factor.nbytes
+        """Memory, about: that of the condensed matrix is as large, and SuperLU allocates twice what it fills."""
+        return 4 * self.factor.nbytes
 
     def norm(self, v: Array) -> float:
         """‖v‖_A of v (n,)."""

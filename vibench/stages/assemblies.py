@@ -15,7 +15,10 @@ from vibench.linalg.cholesky import SparseCholesky
 from vibench.model.energy import Energy
 
 LIMIT = 2**28
-"""Size limit in bytes of the matrices, and of the factors; those least recently used are dropped first."""
+"""Size limit of the assemblies in bytes; the least recently used one is dropped first."""
+
+FACTORS = 2**29
+"""The same of the factors of A. Cells use the same parameters in the same order: too small a cache is none."""
 
 
 class Assemblies:
@@ -24,7 +27,7 @@ class Assemblies:
     def __init__(self, problem: Problem, limit: int = LIMIT) -> None:
         self._problem = problem
         self._kept: LRUCache[bytes, VariationalInequality] = LRUCache(limit, getsizeof=_bytes)
-        self._energies: LRUCache[bytes, Energy] = LRUCache(limit, getsizeof=lambda energy: energy.nbytes)
+        self._energies: LRUCache[bytes, Energy] = LRUCache(FACTORS, getsizeof=lambda energy: energy.nbytes)
         self._solver = HighFidelitySolver(problem)
         self._constant: SparseCholesky | None = None
 

@@ -130,14 +130,14 @@ def test_the_terms_are_those_of_a_lifting_that_is_feasible_in_exact_arithmetic(
     assert found.lambda_natural == pytest.approx(
         min(np.sqrt(max(gap, 0.0)), found.omega + found.u_energy), abs=ROUND_OFF * found.u_energy
     )
-    assert found.omega**2 + 2.0 * found.kappa <= 1.001 * _least(vi, u_N, lam_N) + (ROUND_OFF * scale) ** 2
+    assert found.omega**2 + 2.0 * found.kappa <= 1.001 * _least(vi, u_N, lam_N) + (10.0 * ROUND_OFF * scale) ** 2
 
 
 def _least(vi: VariationalInequality, u: np.ndarray, lam: np.ndarray) -> float:
-    """The smallest ω² + 2κ, from every active set."""
+    """The smallest ω² + 2κ, from every active set; not negative but for round-off."""
     excess = vi.B @ u - vi.g
     w, _ = exact(VariationalInequality(vi.A.toarray(), -vi.B.T @ lam, -vi.B.toarray(), -excess))
-    return float(w @ (vi.A @ w) + 2.0 * lam @ (vi.B @ w - excess))
+    return max(0.0, float(w @ (vi.A @ w) + 2.0 * lam @ (vi.B @ w - excess)))
 
 
 def scalar(lam: float, u: float) -> tuple[VariationalInequality, np.ndarray, np.ndarray]:
