@@ -27,7 +27,8 @@ excess B v − g = s − B w ≤ 0, for which λᵀ(B v − g) ≤ 0. Constants 
 Δ_A is smallest for w = argmin ½‖w‖²_A + λ_NᵀB w subject to B w ≥ s, which has the structure of (7): stiffness A, load
 −Bᵀλ_N, constraints −B w ≤ −s. The active set method starts from supp λ_N, where B w = s makes κ = 0. Any w with B w ≥ s
 is valid, however it was found: optimality is not verified, feasibility is. s is raised by a margin above the round-off
-of B u_N − g and of B w, and the w that is used satisfies the constraints by more than the bound of that round-off.
+of B u_N − g and of B w, and the w that is used satisfies the constraints by more than the bound of that round-off. The
+norms ρ and ω and the product κ are evaluated in floating-point arithmetic without such a bound.
 """
 
 from __future__ import annotations

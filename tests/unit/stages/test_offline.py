@@ -291,6 +291,23 @@ def test_the_reference_constants_are_those_of_every_parameter(store: Store) -> N
         assert 0.998 * np.sqrt(smallest) <= c.energy_inf_sup.value <= np.sqrt(smallest)
 
 
+def test_every_query_has_proved_bounds_of_the_errors_in_the_same_norms(store: Store) -> None:
+    rows = value_of(store, cell("offline-pga", 0.5))
+    for row in rows.queries:
+        assert (row["bound_note"], row["coercivity_proved"], row["continuity_proved"]) == ("", 1, 1)
+        terms = row["bound_rho"] ** 2 + row["bound_omega"] ** 2 + 2.0 * row["bound_kappa"]
+        assert row["bound_u_energy"] == pytest.approx(np.sqrt(terms))
+        assert row["bound_u"] == pytest.approx(row["bound_u_energy"] / np.sqrt(row["coercivity"]))
+        assert row["bound_lambda"] == pytest.approx(row["bound_lambda_natural"] / row["beta_energy"])
+        for name in ("u_energy", "u", "lambda_natural", "lambda"):
+            assert row[f"effectivity_{name}"] == row[f"bound_{name}"] / row[f"error_{name}_absolute"] >= 1.0
+        assert row["effectivity_hsw_u"] == row["bound_hsw_u"] / row["error_u_absolute"] >= 1.0
+        assert row["effectivity_hsw_lambda"] == row["bound_hsw_lambda"] / row["error_lambda_absolute"] >= 1.0
+    for name in ("u_energy", "hsw_lambda"):
+        median = np.median([row[f"effectivity_{name}"] for row in rows.queries])
+        assert rows.cell[f"effectivity_{name}_median"] == median
+
+
 def test_a_missing_artefact_is_named(tmp_path: Path) -> None:
     stage = PODStage(PROBLEM, Stop(size=2))
     with pytest.raises(NumericalError, match=stage.key):
