@@ -40,8 +40,10 @@ def test_definiteness_is_proved_in_any_order_and_scale(n: int) -> None:
     assert proved_positive([sp.csc_array(-matrix)], scale) == 0
 
 
-def test_what_round_off_hides_is_not_proved() -> None:
-    """Singular to within 1e-18, where every factorisation may end with positive pivots."""
+@pytest.mark.parametrize("shift", [inertia.FIRST_SHIFT, 0.0])
+def test_what_round_off_hides_is_not_proved(monkeypatch: pytest.MonkeyPatch, shift: float) -> None:
+    """Singular to within 1e-18, where a factorisation may end with positive pivots; without a shift many do."""
+    monkeypatch.setattr(inertia, "FIRST_SHIFT", shift)
     for seed in range(50):
         rng = np.random.default_rng(seed)
         matrix = with_eigenvalues(np.array([1.0, 0.5, 1e-18, 0.3]), rng)
