@@ -23,6 +23,7 @@ from vibench.qp.solution import QPSolution
 from vibench.reduction import cones
 from vibench.reduction.pod import POD
 from vibench.reduction.supremizers import supremizers
+from vibench.stages.assemblies import assemblies
 from vibench.stages.assembly import Model
 
 SOME = 9
@@ -157,7 +158,8 @@ def of_queries(material: Material, model: Model, solve: Solve, accuracy: float) 
 
 
 def _errors(material: Material, query: Query, u: Array, lam: Array) -> dict[str, float]:
-    (found,) = errors(material.problem, [query.vi], query.exact, u[:, None], lam[:, None])
+    energy = assemblies(material.problem).energy_at(query.mu)
+    (found,) = errors(material.problem, [query.vi], [energy], query.exact, u[:, None], lam[:, None])
     known = {"error_u": found.error_u, "error_lambda": found.error_lambda}
     scaled = {"error_u_scaled": found.error_u_scaled, "error_lambda_scaled": found.error_lambda_scaled}
     measured = {name: value for name, value in known.items() if value is not None}

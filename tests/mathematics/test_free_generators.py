@@ -19,7 +19,7 @@ from vibench.qp.solve import solve_qp
 from vibench.qp.status import Status
 from vibench.qp.verification import kkt_residuals, verify
 from vibench.reduction.cones import orthogonality, project_on_cone
-from vibench.results.invariants import violations
+from vibench.results.invariants import EFFECTIVITIES, violations
 from vibench.stability.infsup import inf_sup, multipliers
 from vibench.stages.assembly import AssemblyStage
 from vibench.stages.base import value_of
@@ -147,4 +147,4 @@ def test_rows_of_a_negative_control_are_ok_and_keep_the_invariants(
 
 def _complete(queries: pd.DataFrame) -> pd.DataFrame:
     """With the columns of certified bounds, which no row has where λ is not in W⁺."""
-    return queries.reindex(columns=queries.columns.union(["effectivity_u", "effectivity_lambda"]))
+    return queries.reindex(columns=queries.columns.union(EFFECTIVITIES))

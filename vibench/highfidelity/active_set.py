@@ -89,7 +89,7 @@ class HighFidelitySolver:
 
     def solve_assembled(self, mu: Array, vi: VariationalInequality) -> HighFidelitySolution:
         """Solve the variational inequality `vi` assembled at mu (d,); unless remembered, no other starts from it."""
-        found = solve_high_fidelity(vi, self._condensed(vi), self._nearest_contact_set(mu))
+        found = solve_high_fidelity(vi, self.condensed(vi), self._nearest_contact_set(mu))
         reason = self._problem.refuse(mu, found.u, found.lam)
         if reason:
             raise NumericalError(f"at mu = {mu.tolist()}: {reason}")
@@ -112,7 +112,7 @@ class HighFidelitySolver:
         """
         name = f"A at mu = {mu.tolist()}"
         check_symmetric(vi.A, name)
-        (self._stiffness or self._condensed(vi)).check_definite(name)
+        (self._stiffness or self.condensed(vi)).check_definite(name)
 
     def _nearest_contact_set(self, mu: Array) -> Mask | None:
         """Contact set of the nearest parameter solved so far; distances are relative to the widths of the box."""
@@ -121,7 +121,8 @@ class HighFidelitySolver:
         distances = np.linalg.norm((np.array(self._solved) - mu) / self._width, axis=1)
         return self._active[int(np.argmin(distances))]
 
-    def _condensed(self, vi: VariationalInequality) -> CondensedStiffness:
+    def condensed(self, vi: VariationalInequality) -> CondensedStiffness:
+        """The stiffness of `vi` condensed on the constrained unknowns; one object where A is constant."""
         outside = np.setdiff1d(sp.csr_array(vi.B).indices, self._constrained)
         if len(outside):
             if self._problem.contact_dofs is not None:
@@ -169,14 +170,14 @@ def solve_high_fidelity(
     """
     system = (stiffness or CondensedStiffness(vi.A)).active_set_system(vi)
     empty = np.zeros(vi.B.shape[0], dtype=bool)
-    found = None if start is None else _active_set_iterations(system, start)
-    found = found or _active_set_iterations(system, empty)
+    found = None if start is None else active_set_iterations(system, start)
+    found = found or active_set_iterations(system, empty)
     fallback = ""
     if found is None:
         answer = solve_qp(vi, FALLBACK_SOLVER, ACCURACY)
         if answer.alpha is None or not np.all(np.isfinite(answer.alpha)):
             raise NumericalError(f"the high-fidelity problem was not solved: {answer.solver_status}")
-        found = _active_set_iterations(system, answer.alpha > 1e-8 * np.max(answer.alpha, initial=0.0))
+        found = active_set_iterations(system, answer.alpha > 1e-8 * np.max(answer.alpha, initial=0.0))
         fallback = f"the active set cycled; first guess by {FALLBACK_SOLVER}"
     if found is None:
         raise NumericalError("no active set solves the high-fidelity problem; is it feasible?")
@@ -191,7 +192,7 @@ def solve_high_fidelity(
     return HighFidelitySolution(u, lam, fallback, iterations, residuals)
 
 
-def _active_set_iterations(system: ActiveSetSystem, active: Mask) -> tuple[Array, Array, int] | None:
+def active_set_iterations(system: ActiveSetSystem, active: Mask) -> tuple[Array, Array, int] | None:
     """Run the primal–dual active set method from an initial active set (m,): u (c,), λ (m,) and iterations.
 
     `None` if the sets cycle or one of them has linearly dependent constraints.

@@ -14,14 +14,14 @@ from vibench.errors import RequestError, unknown_name
 from vibench.execution.recorded_cell import RecordedCell
 from vibench.highfidelity.active_set import HighFidelitySolution, HighFidelitySolver
 from vibench.interfaces.problem import ParameterBox, Problem
-from vibench.interfaces.validation import checked_assembly
-from vibench.model.error_bounds import Bounds, Stability, bounds, extreme_quotients
+from vibench.model.error_bounds import Certificate, certificate
 from vibench.model.galerkin import ReducedProblem
 from vibench.qp.settings import SETTINGS
 from vibench.qp.solve import installed_solvers, solve_qp
 from vibench.qp.status import Status
 from vibench.qp.verification import Residuals, verify
-from vibench.stability.infsup import inf_sup_full, nodal_multipliers
+from vibench.stability.coercivity import coercivity_and_continuity, energy_inf_sup
+from vibench.stages.assemblies import assemblies
 from vibench.stages.assembly import Model as Queried
 from vibench.study import registry
 from vibench.timing import Seconds, timed
@@ -70,13 +70,13 @@ class Solution:
         return np.asarray(self._model.reduced.generators @ self._given(self.alpha))
 
     @cached_property
-    def bound(self) -> Bounds | None:
-        """Bounds on the errors of u and λ, at the cost of high-fidelity constants at mu; `None` if λ is not in W⁺."""
-        problem = self._model.problem
-        vi = checked_assembly(problem, self.mu)
-        inf_sup = inf_sup_full(problem.V, vi.B, nodal_multipliers(problem.W))
-        stability = Stability(inf_sup, *extreme_quotients(vi.A, problem.V))
-        return bounds(problem, [vi], [stability], self.u[:, None], self.lam[:, None])[0]
+    def certificate(self) -> Certificate:
+        """Proved bounds on the errors of u and λ in four norms, at the cost of high-fidelity factorisations at mu."""
+        problem, kept = self._model.problem, assemblies(self._model.problem)
+        vi = kept.at(self.mu)
+        alpha, _ = coercivity_and_continuity(vi.A, problem.V)
+        beta = energy_inf_sup(vi.A, vi.B, problem.W)
+        return certificate(vi, kept.energy_at(self.mu), alpha, beta, self.u, self.lam)
 
     def _given(self, vector: Array | None) -> Array:
         if vector is None:

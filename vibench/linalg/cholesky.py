@@ -13,7 +13,7 @@ from scipy.sparse.linalg import SuperLU, splu, spsolve_triangular
 from vibench.arrays import Array, Indices, SparseMatrix
 from vibench.errors import NumericalError
 
-_SYMMETRIC = {"diag_pivot_thresh": 0.0, "panel_size": 1, "options": {"SymmetricMode": True}}
+SYMMETRIC = {"diag_pivot_thresh": 0.0, "panel_size": 1, "options": {"SymmetricMode": True}}
 """SuperLU without off-diagonal pivoting is a Cholesky factorisation; SciPy has no sparse one of its own. Panels of one
 column are the fastest for matrices of plane meshes."""
 
@@ -55,7 +55,7 @@ class SparseCholesky:
         if order is not None and not np.array_equal(order, np.arange(len(order))):
             matrix = sp.csc_array(matrix[order][:, order])
         try:
-            lu = splu(matrix, permc_spec="MMD_AT_PLUS_A" if order is None else "NATURAL", **_SYMMETRIC)
+            lu = splu(matrix, permc_spec="MMD_AT_PLUS_A" if order is None else "NATURAL", **SYMMETRIC)
         except RuntimeError as error:
             raise NumericalError(f"{name} cannot be factorised: {error}") from None
         pivots = lu.U.diagonal()
@@ -76,6 +76,11 @@ class SparseCholesky:
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Factorise again."""
         SparseCholesky.__init__(self, **state)
+
+    @property
+    def nbytes(self) -> int:
+        """Memory of the factors: a value of 8 bytes and an index of 4 per entry."""
+        return 12 * int(self._lu.nnz)
 
     @cached_property
     def _lower(self) -> SparseMatrix:
@@ -164,5 +169,5 @@ def elimination_order(matrix: SparseMatrix, last: Indices) -> Indices:
     rest = np.setdiff1d(np.arange(matrix.shape[0]), last)
     if not len(rest):
         return np.asarray(last)
-    lu = splu(sp.csc_array(matrix[rest][:, rest]), permc_spec="MMD_AT_PLUS_A", **_SYMMETRIC)
+    lu = splu(sp.csc_array(matrix[rest][:, rest]), permc_spec="MMD_AT_PLUS_A", **SYMMETRIC)
     return np.concatenate([rest[np.argsort(lu.perm_c)], last])

@@ -1,107 +1,182 @@
-"""A-posteriori error bounds (Haasdonk, Salomon and Wohlmuth, 2012), derived for inexact reduced solutions.
+"""A-posteriori error bounds from an exact identity, without inf-sup, coercivity or continuity constants.
 
-They are bounds as far as α and γ_a are: these are estimated by Lanczos iterations and moved by a margin, not certified.
+At one parameter let (u, λ) solve (7), let u_N be any vector and λ_N ≥ 0 any multiplier. With e = u − u_N, ε = λ − λ_N,
+the residual r = f − A u_N − Bᵀλ_N and s = B u_N − g, subtracting the equations gives A e + Bᵀε = r. Hence
 
-Let (u, λ) solve (7), and let u_N be any vector and λ_N any element of W⁺. With e = u − u_N, ε = λ − λ_N, the residual
-r = f − A u_N − Bᵀλ_N and s = B u_N − g, subtracting the equations gives A e + Bᵀε = r. Tested with e,
+    ρ² := ‖r‖²_{A⁻¹} = ‖e‖²_A + ‖Bᵀε‖²_{A⁻¹} + 2 (B e)ᵀε,
 
-    α‖e‖_V² ≤ eᵀA e = rᵀe − (B e)ᵀε.
+and B e = (B u − g) − s with λᵀ(B u − g) = 0 makes (B e)ᵀε = λ_Nᵀ(g − B u) − λᵀs + λ_Nᵀs. This is the identity
 
-Since (Bu − g)ᵀλ = 0 and (Bu − g)ᵀλ_N ≤ 0, the last term is at most sᵀλ − sᵀλ_N. Let ŝ = X_W⁻¹s and π its W-projection
-on W⁺. What is left of ŝ lies in the polar cone, so sᵀλ ≤ ⟨π, λ⟩ = ⟨π, ε⟩ + ⟨π, λ_N⟩. With
+    ‖e‖²_A + ‖Bᵀε‖²_{A⁻¹} + 2 λ_Nᵀ(g − B u) = ρ² + 2 λᵀs − 2 λ_Nᵀs,                                        (i)
 
-    δ_r = ‖r‖_V',    δ_s1 = ‖π‖_W,    δ_s2 = ⟨π, λ_N⟩_W + max(0, −sᵀλ_N)
+all of whose terms on the left are nonnegative. Only λᵀs on the right is unknown. Let B w ≥ s, and let
 
-(the last term vanishes where λ_N and u_N are exactly complementary, which an inexact QP solution is not):
+    ω = ‖w‖_A,    κ = λ_Nᵀ(B w − s) ≥ 0.
 
-    α‖e‖² ≤ δ_r‖e‖ + δ_s1‖ε‖ + δ_s2.
+As λ ≥ 0, λᵀs ≤ λᵀB w = λ_NᵀB w + (Bᵀε)ᵀw, and (i) becomes ‖e‖²_A + ‖Bᵀε‖²_{A⁻¹} ≤ ρ² + 2κ + 2 (Bᵀε)ᵀw, where
+2 (Bᵀε)ᵀw ≤ ‖Bᵀε‖²_{A⁻¹} + ω² gives the first of the bounds
 
-The inf-sup condition over the span and Bᵀε = r − A e give β‖ε‖ ≤ δ_r + γ_a‖e‖. Together, with
-c₁ = (δ_r + δ_s1 γ_a/β)/(2α) and c₂ = (δ_s1 δ_r/β + δ_s2)/α,
+    ‖e‖_A ≤ Δ_A = √(ρ² + ω² + 2κ),        ‖Bᵀε‖_{A⁻¹} ≤ min(√(Δ_A² + 2 rᵀw), ω + Δ_A).                   (ii)
 
-    ‖e‖_V ≤ Δ_u = c₁ + √(c₁² + c₂),        ‖ε‖_W ≤ Δ_λ = (δ_r + γ_a Δ_u)/β.
+Completing the square instead, ‖e‖²_A + (‖Bᵀε‖_{A⁻¹} − ω)² ≤ Δ_A², the last one. The second is twice the duality gap
+of λ_N and the feasible v = u_N − w, which bounds ‖u − v‖²_A + ‖Bᵀε‖²_{A⁻¹}: (i) at v has the residual r + A w and the
+excess B v − g = s − B w ≤ 0, for which λᵀ(B v − g) ≤ 0. Constants enter in the norms of V and W alone:
+
+    ‖e‖_V ≤ Δ_A / √α,        ‖ε‖_W ≤ ‖Bᵀε‖_{A⁻¹} / β_A.
+
+Δ_A is smallest for w = argmin ½‖w‖²_A + λ_NᵀB w subject to B w ≥ s, which has the structure of (7): stiffness A, load
+−Bᵀλ_N, constraints −B w ≤ −s. The active set method starts from supp λ_N, where B w = s makes κ = 0. Any w with B w ≥ s
+is valid, however it was found: optimality is not verified, feasibility is. s is raised by a margin above the round-off
+of B u_N − g and of B w, and the w that is used satisfies the constraints by more than the bound of that round-off. The
+norms ρ and ω and the product κ are evaluated in floating-point arithmetic without such a bound.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.sparse.linalg import LinearOperator, eigsh
+import scipy.sparse as sp
 
-from vibench.arrays import Array, SparseMatrix
-from vibench.interfaces.problem import Problem, VariationalInequality
-from vibench.linalg.inner_product import InnerProduct
-from vibench.reduction import cones
-from vibench.stability.infsup import InfSup
+from vibench.arrays import Array, Mask
+from vibench.highfidelity.active_set import FALLBACK_SOLVER, active_set_iterations
+from vibench.interfaces.problem import VariationalInequality
+from vibench.linalg.inertia import UNIT
+from vibench.model.energy import Energy
+from vibench.qp.solve import solve_qp
+from vibench.stability.coercivity import Constant, Stability
 
-MARGIN = 1e-3
-"""Lanczos approximates extreme eigenvalues from inside, to 1e-4; constants are moved outwards by this share."""
+ACCURACY = 1e-10
+"""Relative accuracy asked of the solver that replaces the active set method."""
 
+MARGIN = 4.0
+"""The first margin of s, as a multiple of the round-off in s."""
 
-@dataclass(frozen=True)
-class Stability:
-    """Constants of the high-fidelity problem at one parameter: β_HF, and α and γ_a of A in the norm of V."""
-
-    inf_sup: InfSup
-    coercivity: float
-    continuity: float
+ATTEMPTS = 4
+"""Margins that are tried, each at least ten times the one before."""
 
 
 @dataclass(frozen=True)
 class Bounds:
-    """Δ_u and Δ_λ: absolute bounds on ‖u − u_N‖_V and ‖λ − λ_N‖_W."""
+    """Absolute error bounds of one reduced solution.
 
+    Attributes
+    ----------
+    u_energy, u
+        Of ‖u − u_N‖ in the norms of A and of V.
+    lambda_natural, lam
+        Of ‖Bᵀ(λ − λ_N)‖ in the norm of A⁻¹ and of ‖λ − λ_N‖ in the norm of W.
+    rho, omega, kappa
+        ρ and ω, in the unit of `u_energy`, and κ in that of its square.
+    """
+
+    u_energy: float
     u: float
+    lambda_natural: float
     lam: float
+    rho: float
+    omega: float
+    kappa: float
 
 
-def extreme_quotients(A: SparseMatrix, V: InnerProduct) -> tuple[float, float]:
-    """Coercivity and continuity constants of A (n×n): extremes of vᵀAv / ‖v‖_V², moved outwards by `MARGIN`.
+NOT_IN_CONE = "λ_N has negative coefficients"
+NO_LIFTING = "no w with B w ≥ s was found"
+ESTIMATED = "α is estimated"
 
-    Raises
-    ------
-    NumericalError
-        If A is not symmetric positive definite.
+
+@dataclass(frozen=True)
+class Certificate:
+    """The bounds of one solution.
+
+    Attributes
+    ----------
+    bounds
+        `None` where there are none.
+    note
+        Why there are none, or which constant in them is estimated; "" where they are proved.
     """
-    if V.dim < 3:  # eigsh needs more dimensions than eigenvalues
-        whitened = V.whiten_functional(V.whiten_functional(A.toarray()).T)
-        values = np.linalg.eigvalsh(whitened)
-        return (1.0 - MARGIN) * float(values[0]), (1.0 + MARGIN) * float(values[-1])
-    shape, start = (V.dim, V.dim), np.random.default_rng(0).standard_normal(V.dim)
-    inverse = LinearOperator(shape, matvec=InnerProduct(A, "A").riesz)
-    riesz = LinearOperator(shape, matvec=V.riesz)
-    settings = {"k": 1, "M": V.matrix, "v0": start, "tol": 1e-4, "return_eigenvectors": False}
-    smallest = eigsh(A, sigma=0.0, OPinv=inverse, which="LM", **settings)[0]
-    largest = eigsh(A, Minv=riesz, which="LA", **settings)[0]
-    return (1.0 - MARGIN) * float(smallest), (1.0 + MARGIN) * float(largest)
+
+    bounds: Bounds | None
+    note: str
 
 
-def bounds(
-    problem: Problem, vis: Sequence[VariationalInequality], constants: Sequence[Stability], u: Array, lam: Array
-) -> list[Bounds | None]:
-    """Δ_u and Δ_λ of reduced u (n×P), λ (m×P), column by column at the parameters of `vis`; see above.
+def certify(
+    vis: Sequence[VariationalInequality],
+    energies: Sequence[Energy],
+    constants: Sequence[Stability],
+    u: Array,
+    lam: Array,
+) -> list[Certificate]:
+    """Bounds (ii) of reduced u (n×P) and λ (m×P), column by column at the parameters of `vis`."""
+    given = zip(vis, energies, constants, u.T, lam.T, strict=True)
+    return [certificate(vi, energy, c.coercivity, c.energy_inf_sup, *one) for vi, energy, c, *one in given]
 
-    Infinite where β_HF over the span is zero; `None` where λ is not in W⁺ and nothing is certified.
-    """
-    residuals = np.column_stack([vi.f - vi.A @ u[:, k] - vi.B.T @ lam[:, k] for k, vi in enumerate(vis)])
-    dual_norms = np.linalg.norm(problem.V.whiten_functional(residuals), axis=0)
-    excesses = (vi.B @ u[:, k] - vi.g for k, vi in enumerate(vis))
-    return [_bound(problem.W, s, lam[:, k], float(dual_norms[k]), constants[k]) for k, s in enumerate(excesses)]
 
-
-def _bound(W: InnerProduct, excess: Array, lam: Array, residual: float, stability: Stability) -> Bounds | None:
-    """The bounds from s (m,), λ_N (m,) and δ_r."""
+def certificate(
+    vi: VariationalInequality, energy: Energy, alpha: Constant, beta: Constant, u: Array, lam: Array
+) -> Certificate:
+    """Bounds (ii) of one reduced u (n,) and λ (m,), from lower bounds of α and of β_A."""
     if np.min(lam, initial=0.0) < 0.0:
-        return None
-    alpha, gamma, beta = stability.coercivity, stability.continuity, stability.inf_sup.span
-    if beta <= 0.0:
-        return Bounds(float("inf"), float("inf"))
-    penetration = cones.project_on_orthant(excess, W)
-    penetration_norm = float(W.norm(penetration))
-    complementarity = float(penetration @ W.apply(lam)) + max(0.0, -float(excess @ lam))
-    c_1 = (residual + penetration_norm * gamma / beta) / (2.0 * alpha)
-    c_2 = (penetration_norm * residual / beta + complementarity) / alpha
-    bound = c_1 + float(np.sqrt(c_1**2 + c_2))
-    return Bounds(bound, (residual + gamma * bound) / beta)
+        return Certificate(None, NOT_IN_CONE)
+    w = lifting(vi, energy, u, lam)
+    if w is None:
+        return Certificate(None, NO_LIFTING)
+    residual = vi.f - vi.A @ u - vi.B.T @ lam
+    rho, omega = energy.dual_norm(residual), energy.norm(w)
+    kappa = max(0.0, float(lam @ _slack(vi, u, w)))
+    square = rho**2 + omega**2 + 2.0 * kappa
+    bound = float(np.sqrt(square))
+    gap = max(0.0, square + 2.0 * float(residual @ w))  # twice the duality gap
+    natural = min(float(np.sqrt(gap)), omega + bound)
+    in_V = bound / float(np.sqrt(alpha.value))
+    in_W = natural / beta.value if beta.value > 0.0 else float("inf")
+    found = Bounds(bound, in_V, natural, in_W, rho, omega, kappa)
+    return Certificate(found, "" if alpha.proved else ESTIMATED)
+
+
+def lifting(vi: VariationalInequality, energy: Energy, u: Array, lam: Array) -> Array | None:
+    """A w (n,) with B w ≥ B u − g also in exact arithmetic, close to the best one; `None` if none was found.
+
+    Parameters
+    ----------
+    vi, energy
+        A, f, B and g at one parameter, and the factorisations of A.
+    u, lam
+        u_N (n,) and λ_N ≥ 0 (m,).
+    """
+    excess, margin = vi.B @ u - vi.g, MARGIN * _round_off(vi, u, np.zeros_like(u))
+    for _ in range(ATTEMPTS):
+        raised = VariationalInequality(vi.A, -(vi.B.T @ lam), -vi.B, -(excess + margin))
+        for w in _minimisers(raised, energy, lam > 0.0):
+            lacking = _round_off(vi, u, w) - _slack(vi, u, w)
+            if np.all(lacking <= 0.0):  # NaN is not
+                return w
+            margin = np.maximum(margin, 2.0 * np.nan_to_num(lacking, nan=0.0, posinf=0.0))
+        margin = 10.0 * margin
+    return None
+
+
+def _minimisers(program: VariationalInequality, energy: Energy, start: Mask) -> Iterator[Array]:
+    """Approximate solutions of the program: by the active set method, then by an interior-point method."""
+    system = energy.stiffness.active_set_system(program)
+    for active in (start, np.zeros_like(start)):
+        found = active_set_iterations(system, active)
+        if found is not None:
+            yield system.recover(found[0])
+            return
+    answer = solve_qp(program, FALLBACK_SOLVER, ACCURACY)
+    if answer.x is not None:
+        yield answer.x
+
+
+def _slack(vi: VariationalInequality, u: Array, w: Array) -> Array:
+    """B w − s (m,)."""
+    return np.asarray(vi.B @ w - (vi.B @ u - vi.g))
+
+
+def _round_off(vi: VariationalInequality, u: Array, w: Array) -> Array:
+    """Bound (m,) of the round-off in `_slack` (Higham 2002, §3.1)."""
+    B = sp.csr_array(vi.B)
+    terms = np.diff(B.indptr) + 4.0
+    return np.asarray(1.01 * terms * UNIT * (abs(B) @ (np.abs(w) + np.abs(u)) + np.abs(vi.g)))

@@ -9,6 +9,7 @@ import numpy as np
 
 from vibench.arrays import Array, Mask
 from vibench.interfaces.problem import Problem, VariationalInequality
+from vibench.model.energy import Energy
 from vibench.qp.scaling import ratio
 
 UNMEASURABLE = 1e-8
@@ -36,12 +37,14 @@ class Errors:
 
     Attributes
     ----------
-    error_u, error_lambda, error_energy
-        Relative, in the norms of V, of W and of A(mu); `None` where u, λ and u, respectively, is zero: see `zeros`.
-    error_u_absolute, error_lambda_absolute
-        The first two without the division.
+    error_u, error_lambda
+        Relative, in the norms of V and of W; `None` where u or λ, respectively, is zero: see `zeros`.
+    error_u_energy, error_lambda_natural
+        Likewise ‖u − u_N‖ in the norm of A(mu), and ‖Bᵀ(λ − λ_N)‖ in that of A(mu)⁻¹ over ‖Bᵀλ‖.
+    error_u_absolute, error_lambda_absolute, error_u_energy_absolute, error_lambda_natural_absolute
+        These without the division.
     error_u_scaled, error_lambda_scaled
-        These over the largest training norms, or as they are where those are zero.
+        The first two over the largest training norms, or as they are where those are zero.
     violation
         Largest (B u_N − g)₊, each row over the integral of its multiplier function [unit of u].
     complementarity
@@ -50,9 +53,12 @@ class Errors:
 
     error_u: float | None
     error_lambda: float | None
-    error_energy: float | None
+    error_u_energy: float | None
+    error_lambda_natural: float | None
     error_u_absolute: float
     error_lambda_absolute: float
+    error_u_energy_absolute: float
+    error_lambda_natural_absolute: float
     error_u_scaled: float
     error_lambda_scaled: float
     violation: float
@@ -69,7 +75,12 @@ def zeros(problem: Problem, reference: Reference) -> tuple[Mask, Mask]:
 
 
 def errors(
-    problem: Problem, vis: Sequence[VariationalInequality], reference: Reference, u: Array, lam: Array
+    problem: Problem,
+    vis: Sequence[VariationalInequality],
+    energies: Sequence[Energy],
+    reference: Reference,
+    u: Array,
+    lam: Array,
 ) -> list[Errors]:
     """Errors of reduced u (n×P) and λ (m×P), column by column at the parameters of `vis`."""
     V, W = problem.V, problem.W
@@ -77,21 +88,24 @@ def errors(
     norm_u, norm_lam, (zero_u, zero_lam) = V.norm(reference.u), W.norm(reference.lam), zeros(problem, reference)
     error_u, error_lam, integrals = V.norm(du), W.norm(dlam), problem.multiplier_integrals()
     excesses = [vi.B @ u[:, k] - vi.g for k, vi in enumerate(vis)]
-    return [
-        Errors(
-            error_u=None if zero_u[k] else ratio(float(error_u[k]), float(norm_u[k])),
-            error_lambda=None if zero_lam[k] else ratio(float(error_lam[k]), float(norm_lam[k])),
-            error_energy=None if zero_u[k] else ratio(_energy(vi, du[:, k]), _energy(vi, reference.u[:, k])),
-            error_u_absolute=float(error_u[k]),
-            error_lambda_absolute=float(error_lam[k]),
-            error_u_scaled=ratio(float(error_u[k]), reference.scale_u),
-            error_lambda_scaled=ratio(float(error_lam[k]), reference.scale_lam),
-            violation=float(np.max(excesses[k] / integrals, initial=0.0)),
-            complementarity=float(reference.lam[:, k] @ excesses[k]),
+    found = []
+    for k, (vi, energy) in enumerate(zip(vis, energies, strict=True)):
+        in_energy, energy_u = energy.norm(du[:, k]), energy.norm(reference.u[:, k])
+        natural, natural_lam = (energy.dual_norm(vi.B.T @ eta) for eta in (dlam[:, k], reference.lam[:, k]))
+        found.append(
+            Errors(
+                error_u=None if zero_u[k] else ratio(float(error_u[k]), float(norm_u[k])),
+                error_lambda=None if zero_lam[k] else ratio(float(error_lam[k]), float(norm_lam[k])),
+                error_u_energy=None if zero_u[k] else ratio(in_energy, energy_u),
+                error_lambda_natural=None if zero_lam[k] else ratio(natural, natural_lam),
+                error_u_absolute=float(error_u[k]),
+                error_lambda_absolute=float(error_lam[k]),
+                error_u_energy_absolute=in_energy,
+                error_lambda_natural_absolute=natural,
+                error_u_scaled=ratio(float(error_u[k]), reference.scale_u),
+                error_lambda_scaled=ratio(float(error_lam[k]), reference.scale_lam),
+                violation=float(np.max(excesses[k] / integrals, initial=0.0)),
+                complementarity=float(reference.lam[:, k] @ excesses[k]),
+            )
         )
-        for k, vi in enumerate(vis)
-    ]
-
-
-def _energy(vi: VariationalInequality, u: Array) -> float:
-    return float(np.sqrt(max(float(u @ (vi.A @ u)), 0.0)))
+    return found

@@ -73,6 +73,14 @@ KEYS: Mapping[str, Column] = {
 }
 """What names a cell. Where a study prescribes N or R, `pod_size` or `dual_size` is filled instead of the tolerance."""
 
+
+def _medians(*names: str) -> dict[str, Column]:
+    return {
+        f"effectivity_{name}_median": Column(REAL, "1", f"Median effectivity of bound_{name} over the ok queries.")
+        for name in names
+    }
+
+
 CELLS: Mapping[str, Column] = {
     "cell": Column(
         KEY, "", "Hash of everything that determines the cell's numbers, the code aside; what `replay` takes."
@@ -167,6 +175,7 @@ CELLS: Mapping[str, Column] = {
         INTEGER, "", "Ok queries where zero_lambda is 1: no mean or maximum of λ counts them.", "λ = 0", 20
     ),
     "error_lambda_zero_max": Column(REAL, "1", "Largest error_lambda_scaled of these.", "error, λ = 0", 21),
+    **_medians("u_energy", "u", "lambda_natural", "lambda", "hsw_u", "hsw_lambda"),
     "solver_error_u_max": Column(REAL, "1", "Largest part of the error of u that the QP solver makes."),
     "solver_error_lambda_max": Column(REAL, "1", "Largest part of the error of λ that it makes."),
     "solver_share_max": Column(REAL, "1", "Largest share of an error that it makes, over the queries."),
@@ -208,6 +217,19 @@ CONSTANTS: Mapping[str, Column] = {
 }
 """Inf-sup columns of a query."""
 
+
+def _effectivities(*names: str) -> dict[str, Column]:
+    return {
+        f"effectivity_{name}": Column(
+            REAL,
+            "1",
+            f"bound_{name} over the absolute error; empty up to 1e-8 of the relative error in V or W, or of the scaled "
+            "one where that is empty.",
+        )
+        for name in names
+    }
+
+
 QUERIES: Mapping[str, Column] = {
     "cell": Column(MEMBER, "", "The cell it belongs to."),
     **KEYS,
@@ -228,9 +250,14 @@ QUERIES: Mapping[str, Column] = {
     "zero_lambda": Column(INTEGER, "", "The same of ‖λ‖: 1 where there is no contact."),
     "error_u": Column(REAL, "1", "‖u − u_N‖ / ‖u‖ in V; empty where zero_u is 1."),
     "error_lambda": Column(REAL, "1", "‖λ − λ_N‖ / ‖λ‖ in W; empty where zero_lambda is 1."),
-    "error_energy": Column(REAL, "1", "The error of u in the norm of A(µ), relative; empty where zero_u is 1."),
+    "error_u_energy": Column(REAL, "1", "The error of u in the norm of A(µ), relative; empty where zero_u is 1."),
+    "error_lambda_natural": Column(
+        REAL, "1", "‖Bᵀ(λ − λ_N)‖ / ‖Bᵀλ‖ in the norm of A(µ)⁻¹; empty where zero_lambda is 1."
+    ),
     "error_u_absolute": Column(REAL, "V", "‖u − u_N‖ in V."),
     "error_lambda_absolute": Column(REAL, "W", "‖λ − λ_N‖ in W."),
+    "error_u_energy_absolute": Column(REAL, "A", "‖u − u_N‖ in the norm of A(µ)."),
+    "error_lambda_natural_absolute": Column(REAL, "A", "‖Bᵀ(λ − λ_N)‖ in the norm of A(µ)⁻¹, an energy norm, too."),
     "error_u_scaled": Column(REAL, "1", "‖u − u_N‖ over the largest ‖u‖ of the training set."),
     "error_lambda_scaled": Column(REAL, "1", "‖λ − λ_N‖ over the largest ‖λ‖ of the training set."),
     "solver_error_u": Column(
@@ -244,14 +271,33 @@ QUERIES: Mapping[str, Column] = {
     "solver_share": Column(
         REAL, "1", "The larger of these two over the error of u or λ; empty where both errors are at most 1e-8."
     ),
-    "bound_u": Column(
-        REAL, "V", "Bound Δ_u of the error of u, its α and γ estimated; infinite where β_HF over the span is 0."
+    "bound_u_energy": Column(REAL, "A", "Bound √(ρ² + ω² + 2κ) of error_u_energy_absolute."),
+    "bound_u": Column(REAL, "V", "Bound of error_u_absolute: the one before over √α; see bound_note."),
+    "bound_lambda_natural": Column(REAL, "A", "Bound of error_lambda_natural_absolute."),
+    "bound_lambda": Column(
+        REAL, "W", "Bound of error_lambda_absolute: the one before over β_A; infinite where no β_A > 0 is proved."
     ),
-    "bound_lambda": Column(REAL, "W", "Bound Δ_λ of the error of λ, likewise."),
-    "effectivity_u": Column(
-        REAL, "1", "bound_u / error_u_absolute; empty up to 1e-8 of error_u, or of error_u_scaled where zero_u is 1."
+    **_effectivities("u_energy", "u", "lambda_natural", "lambda"),
+    "bound_rho": Column(REAL, "A", "ρ, the residual in the norm of A(µ)⁻¹."),
+    "bound_omega": Column(REAL, "A", "ω, the norm of the lifting w of the constraint violation."),
+    "bound_kappa": Column(REAL, "A²", "κ = λ_Nᵀ(B w − s), its complementarity."),
+    "bound_note": Column(
+        TEXT, "", "Why there are no bounds, or which constant in them is estimated; empty where they are proved."
     ),
-    "effectivity_lambda": Column(REAL, "1", "bound_lambda / error_lambda_absolute, likewise."),
+    "bound_hsw_u": Column(
+        REAL,
+        "V",
+        "Bound Δ_u of Haasdonk, Salomon and Wohlmuth, β_HF in it estimated; infinite where β_HF over the span is 0.",
+    ),
+    "bound_hsw_lambda": Column(REAL, "W", "Their bound Δ_λ of the error of λ, likewise."),
+    **_effectivities("hsw_u", "hsw_lambda"),
+    "coercivity": Column(REAL, "A/V²", "α, a lower bound of the smallest vᵀA(µ)v / ‖v‖²."),
+    "coercivity_proved": Column(INTEGER, "", "1 where a factorisation proves it, 0 where it is a Lanczos estimate."),
+    "continuity": Column(REAL, "A/V²", "γ_a, an upper bound of the largest one."),
+    "continuity_proved": Column(INTEGER, "", "1 where a factorisation proves it, 0 where it is a Lanczos estimate."),
+    "beta_energy": Column(
+        REAL, "b/AW", "β_A, proved lower bound of the inf-sup constant of V in the norm of A(µ) and W over the span."
+    ),
     "violation": Column(REAL, "u", "Largest (B u_N − g)₊, every row over the integral of its multiplier function."),
     "complementarity": Column(REAL, "b", "λᵀ(B u_N − g), λ the high-fidelity multiplier."),
     **CONSTANTS,

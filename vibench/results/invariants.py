@@ -20,7 +20,10 @@ from vibench.results.columns import CONSTANTS
 from vibench.stability.conic_infsup import ABSOLUTE, RELATIVE
 from vibench.stability.infsup import UNSIGNED
 
-EFFECTIVITIES = ("effectivity_u", "effectivity_lambda")
+EFFECTIVITIES = (
+    "effectivity_u_energy", "effectivity_u", "effectivity_lambda_natural", "effectivity_lambda",
+    "effectivity_hsw_u", "effectivity_hsw_lambda",
+)  # fmt: skip
 """Error bound over error, at least 1."""
 
 ORDER = (("full_", ""), ("", "plain_"), ("full_", "hf_"))

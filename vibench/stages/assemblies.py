@@ -1,4 +1,4 @@
-"""A cache of assembled matrices for assessments, which use the same parameters repeatedly."""
+"""A cache of assembled matrices and their factors for assessments, which use the same parameters repeatedly."""
 
 from __future__ import annotations
 
@@ -8,11 +8,17 @@ import numpy as np
 from cachetools import LRUCache
 
 from vibench.arrays import Array
+from vibench.highfidelity.active_set import HighFidelitySolver
 from vibench.interfaces.problem import Problem, VariationalInequality
 from vibench.interfaces.validation import checked_assembly
+from vibench.linalg.cholesky import SparseCholesky
+from vibench.model.energy import Energy
 
 LIMIT = 2**28
-"""Size limit of the cache in bytes; the least recently used assembly is dropped first."""
+"""Size limit of the assemblies in bytes; the least recently used one is dropped first."""
+
+FACTORS = 2**29
+"""The same of the factors of A. Cells use the same parameters in the same order: too small a cache is none."""
 
 
 class Assemblies:
@@ -21,6 +27,9 @@ class Assemblies:
     def __init__(self, problem: Problem, limit: int = LIMIT) -> None:
         self._problem = problem
         self._kept: LRUCache[bytes, VariationalInequality] = LRUCache(limit, getsizeof=_bytes)
+        self._energies: LRUCache[bytes, Energy] = LRUCache(FACTORS, getsizeof=lambda energy: energy.nbytes)
+        self._solver = HighFidelitySolver(problem)
+        self._constant: SparseCholesky | None = None
 
     def at(self, mu: Array) -> VariationalInequality:
         """A copy of `checked_assembly` at mu (d,), which later assemblies leave as it is."""
@@ -30,6 +39,19 @@ class Assemblies:
             if _bytes(vi) <= self._kept.maxsize:
                 self._kept[_key(mu)] = vi
         return vi
+
+    def energy_at(self, mu: Array) -> Energy:
+        """Factorisations of A at mu (d,); a constant A is factorised once."""
+        vi = self.at(mu)
+        if "A" in self._problem.constant:
+            self._constant = self._constant or SparseCholesky(vi.A, "A")
+            return Energy(vi.A, self._constant, self._solver.condensed(vi))
+        found = self._energies.get(_key(mu))
+        if found is None:
+            found = Energy(vi.A, SparseCholesky(vi.A, "A"), self._solver.condensed(vi))
+            if found.nbytes <= self._energies.maxsize:
+                self._energies[_key(mu)] = found
+        return found
 
 
 @lru_cache(maxsize=1)

@@ -12,12 +12,12 @@ import numpy as np
 
 from vibench.errors import in_a_line
 from vibench.interfaces.strategies import Kind
-from vibench.model.error_bounds import Stability
 from vibench.model.errors import Reference, zeros
 from vibench.provenance import machine
 from vibench.qp.exact import ExactSolution
 from vibench.qp.status import Status
 from vibench.results.solver_agreement import vectors
+from vibench.stability.coercivity import Stability
 from vibench.stability.infsup import InfSup, share
 from vibench.stages.artefacts import Artefact, Store
 from vibench.stages.assembly import AssemblyStage, ExactSolutions, assembly_stage
@@ -58,7 +58,7 @@ class CellQueries(PiecewiseStage):
     """All queries of one cell, each a piece; the value is a `CellRows`."""
 
     label = "queries"
-    rooms = ("linalg", "interfaces", "qp", "model")
+    rooms = ("linalg", "interfaces", "qp", "highfidelity", "model")
 
     assembly: AssemblyStage
     solver: str
@@ -215,6 +215,7 @@ class _Queries(Pieces):
             | _constants("beta_full_", self._full[number])
             | _constants("beta_plain_", self._plain[number])
             | _constants("beta_hf_", self._stability[number].inf_sup)
+            | _energy_constants(self._stability[number])
             | {"bounds": self._own[number].sharp, "assembly_error": self._reduced.errors[number]}
         )
 
@@ -286,4 +287,14 @@ def _constants(prefix: str, constants: InfSup) -> Row:
         f"{prefix}span": constants.span,
         f"{prefix}cone_lower": constants.cone_lower,
         f"{prefix}cone_upper": constants.cone_upper,
+    }
+
+
+def _energy_constants(known: Stability) -> Row:
+    return {
+        "coercivity": known.coercivity.value,
+        "coercivity_proved": int(known.coercivity.proved),
+        "continuity": known.continuity.value,
+        "continuity_proved": int(known.continuity.proved),
+        "beta_energy": known.energy_inf_sup.value,
     }

@@ -11,6 +11,9 @@ from vibench.model.errors import UNMEASURABLE
 from vibench.qp.status import Status
 from vibench.stages.base import Row
 
+BOUNDS = ("u_energy", "u", "lambda_natural", "lambda", "hsw_u", "hsw_lambda")
+"""Error bounds, as in the names of their columns."""
+
 
 def summarise(rows: Sequence[Row]) -> Row:
     """The columns of a cell from those of its queries; means and maxima are over the queries with status ok.
@@ -27,6 +30,9 @@ def summarise(rows: Sequence[Row]) -> Row:
 
     def mean(name: str) -> float | None:
         return float(column(name).mean()) if column(name).size else None
+
+    def median(name: str) -> float | None:
+        return float(np.median(column(name))) if column(name).size else None
 
     def largest(name: str, among: Sequence[Row] = fine) -> float | None:
         found = column(name, among)
@@ -55,6 +61,7 @@ def summarise(rows: Sequence[Row]) -> Row:
         "queries_ok": len(fine),
         **errors("u"),
         **errors("lambda"),
+        **{f"effectivity_{name}_median": median(f"effectivity_{name}") for name in BOUNDS},
         **{f"{name}_max": largest(name) for name in ("solver_error_u", "solver_error_lambda", "solver_share")},
         "solver_share_mean": max(
             (share for name in ("u", "lambda") if (share := solver_share(name)) is not None), default=None

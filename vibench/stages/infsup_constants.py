@@ -9,9 +9,9 @@ import numpy as np
 from vibench.interfaces.problem import VariationalInequality
 from vibench.interfaces.strategies import Kind
 from vibench.interfaces.validation import validation_parameters
-from vibench.model.error_bounds import Stability, extreme_quotients
 from vibench.model.galerkin import ReducedModel
 from vibench.reduction.supremizers import ConstraintClasses, constraint_classes
+from vibench.stability.coercivity import Constant, Stability, coercivity_and_continuity, energy_inf_sup
 from vibench.stability.infsup import InfSup, Multipliers, inf_sup, nodal_multipliers
 from vibench.stability.over_parameters import constants_full, constants_on, everywhere
 from vibench.stages.artefacts import Store
@@ -22,7 +22,7 @@ from vibench.stages.offline import ConeStage, PODStage
 from vibench.stages.serialisation import storable
 from vibench.study.cells import Plugin
 
-for _kind in (ConstraintClasses, Stability, InfSup):
+for _kind in (ConstraintClasses, Stability, Constant, InfSup):
     storable(_kind)
 
 
@@ -46,10 +46,10 @@ class ValidationConstraints(Stage):
 
 @dataclass(frozen=True)
 class ReferenceConstants(Stage):
-    """Constants of the high-fidelity problem: β_HF, coercivity and continuity; a `Stability` per parameter."""
+    """Constants of the high-fidelity problem: β_HF, α, γ_a and β_A; a `Stability` per parameter."""
 
     label = "high-fidelity constants"
-    rooms = ("linalg", "interfaces", "reduction", "stability", "model")
+    rooms = ("linalg", "interfaces", "reduction", "stability")
 
     constraints: ValidationConstraints
 
@@ -59,9 +59,13 @@ class ReferenceConstants(Stage):
         inf_sup = constants_full(problem.V, value_of(store, known), nodal_multipliers(problem.W))
         mus = validation_parameters(problem, known.count, known.seed)
         different = mus[:1] if "A" in problem.constant else mus  # the eigenvalue problems are the expensive part
-        quotients = [extreme_quotients(assemblies(problem).at(mu).A, problem.V) for mu in different]
+        quotients = [coercivity_and_continuity(assemblies(problem).at(mu).A, problem.V) for mu in different]
         quotients *= len(mus) // len(different)
-        return Result([Stability(found, *extremes) for found, extremes in zip(inf_sup, quotients, strict=True)])
+        different = mus[:1] if {"A", "B"} <= problem.constant else mus
+        energies = [energy_inf_sup(vi.A, vi.B, problem.W) for vi in map(assemblies(problem).at, different)]
+        energies *= len(mus) // len(different)
+        found = zip(inf_sup, quotients, energies, strict=True)
+        return Result([Stability(hf, *extremes, energy) for hf, extremes, energy in found])
 
 
 @dataclass(frozen=True)

@@ -13,8 +13,9 @@ from vibench.errors import in_a_line
 from vibench.interfaces.problem import ParameterBox, VariationalInequality
 from vibench.interfaces.strategies import Kind
 from vibench.interfaces.validation import validation_parameters
-from vibench.model.error_bounds import Bounds, Stability, bounds
+from vibench.model.error_bounds import Certificate, certify
 from vibench.model.errors import UNMEASURABLE, Errors, Reference, errors
+from vibench.model.hsw_bounds import HSWBounds, hsw_bounds
 from vibench.qp.accuracy_bounds import slack
 from vibench.qp.exact import ExactSolution
 from vibench.qp.scaling import ratio
@@ -23,6 +24,7 @@ from vibench.qp.solve import solve_qp, takes_start
 from vibench.qp.status import Status
 from vibench.qp.verification import verify
 from vibench.results.solver_agreement import solution_row
+from vibench.stability.coercivity import Stability
 from vibench.stages.artefacts import Store
 from vibench.stages.assemblies import assemblies
 from vibench.stages.assembly import AssemblyStage, Model, ReducedPrograms
@@ -205,8 +207,14 @@ def error_columns(
     else:  # a fixed basis: all solutions are reconstructed at once
         u = model.lift(mus[0], vis[0], np.column_stack([x for x, _ in solutions]))
     lam = model.generators @ np.column_stack([alpha for _, alpha in solutions])
-    found = zip(errors(problem, vis, reference, u, lam), bounds(problem, vis, known, u, lam), strict=True)
-    rows = [_columns(error, bound) for error, bound in found]
+    energies = [assemblies(problem).energy_at(mu) for mu in mus]
+    found = zip(
+        errors(problem, vis, energies, reference, u, lam),
+        certify(vis, energies, known, u, lam),
+        hsw_bounds(problem, vis, known, u, lam),
+        strict=True,
+    )
+    rows = [_columns(*one) for one in found]
     norms = zip(problem.V.norm(reference.u), problem.W.norm(reference.lam), strict=True)
     for row, (x, alpha), program, (norm_u, norm_lam) in zip(rows, solutions, exact, norms, strict=True):
         if program is None:
@@ -221,14 +229,26 @@ def error_columns(
     return rows
 
 
-def _columns(error: Errors, bound: Bounds | None) -> Row:
-    row = asdict(error)
-    if bound is not None:
-        row |= {"bound_u": bound.u, "bound_lambda": bound.lam}
-        if _measured(error.error_u, error.error_u_scaled) > UNMEASURABLE:
-            row["effectivity_u"] = bound.u / error.error_u_absolute
-        if _measured(error.error_lambda, error.error_lambda_scaled) > UNMEASURABLE:
-            row["effectivity_lambda"] = bound.lam / error.error_lambda_absolute
+def _columns(error: Errors, certificate: Certificate, hsw: HSWBounds | None) -> Row:
+    row: Row = asdict(error) | {"bound_note": certificate.note}
+    of_u = _measured(error.error_u, error.error_u_scaled) > UNMEASURABLE
+    of_lam = _measured(error.error_lambda, error.error_lambda_scaled) > UNMEASURABLE
+    found: dict[str, tuple[float, bool, float]] = {}  # a bound, the error, and whether that is measurable
+    if (bounds := certificate.bounds) is not None:
+        row |= {"bound_rho": bounds.rho, "bound_omega": bounds.omega, "bound_kappa": bounds.kappa}
+        found |= {
+            "u_energy": (bounds.u_energy, of_u, error.error_u_energy_absolute),
+            "u": (bounds.u, of_u, error.error_u_absolute),
+            "lambda_natural": (bounds.lambda_natural, of_lam, error.error_lambda_natural_absolute),
+            "lambda": (bounds.lam, of_lam, error.error_lambda_absolute),
+        }
+    if hsw is not None:
+        found["hsw_u"] = hsw.u, of_u, error.error_u_absolute
+        found["hsw_lambda"] = hsw.lam, of_lam, error.error_lambda_absolute
+    for name, (bound, measurable, absolute) in found.items():
+        row[f"bound_{name}"] = bound
+        if measurable:
+            row[f"effectivity_{name}"] = ratio(bound, absolute)
     return row
 
 

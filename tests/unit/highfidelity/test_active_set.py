@@ -64,13 +64,13 @@ def test_a_cycling_active_set_is_helped_and_the_help_is_recorded(monkeypatch: py
     vi = string(50, 0.02, 1.0)
     alone = active_set.solve_high_fidelity(vi)
     assert alone.fallback == ""
-    iterate, calls = active_set._active_set_iterations, []
+    iterate, calls = active_set.active_set_iterations, []
 
     def cycles_at_first(system, active):
         calls.append(active)
         return None if len(calls) == 1 else iterate(system, active)
 
-    monkeypatch.setattr(active_set, "_active_set_iterations", cycles_at_first)
+    monkeypatch.setattr(active_set, "active_set_iterations", cycles_at_first)
     helped = active_set.solve_high_fidelity(vi)
     assert "cycled" in helped.fallback
     assert np.allclose(helped.u, alone.u, atol=1e-12)

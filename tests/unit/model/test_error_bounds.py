@@ -1,115 +1,192 @@
 from __future__ import annotations
 
+from fractions import Fraction
+
 import numpy as np
 import pytest
-import scipy.linalg
 import scipy.sparse as sp
 from hypothesis import given
 from hypothesis import strategies as st
-from numerics import Varying, space, spd
+from numerics import exact, space, spd
 
-from vibench.errors import NumericalError
-from vibench.highfidelity import active_set
-from vibench.interfaces.problem import Problem, VariationalInequality
-from vibench.model.error_bounds import MARGIN, Bounds, Stability, bounds, extreme_quotients
-from vibench.stability.infsup import InfSup, inf_sup_full, nodal_multipliers
+from vibench.highfidelity.kkt_systems import CondensedStiffness
+from vibench.interfaces.problem import VariationalInequality
+from vibench.linalg.cholesky import SparseCholesky
+from vibench.model import error_bounds
+from vibench.model.energy import Energy
+from vibench.model.error_bounds import ESTIMATED, NO_LIFTING, NOT_IN_CONE, Bounds, Certificate, certify, lifting
+from vibench.stability.coercivity import Constant, Stability, coercivity_and_continuity, energy_inf_sup
+from vibench.stability.infsup import InfSup
 
-PROBLEM = Varying()
+V, W = space(6, 1), space(4, 2)
+ROUND_OFF = 1e-7
+"""Square root of the round-off in squares, relative."""
 
 
-def bound(
-    problem: Problem, vi: VariationalInequality, known: Stability, u: np.ndarray, lam: np.ndarray
-) -> Bounds | None:
-    """The bounds of one solution."""
-    (found,) = bounds(problem, [vi], [known], u[:, None], lam[:, None])
+def energy(vi: VariationalInequality) -> Energy:
+    return Energy(vi.A, SparseCholesky(vi.A), CondensedStiffness(vi.A))
+
+
+def stability(vi: VariationalInequality) -> Stability:
+    """Without β_HF, which the bounds do not use."""
+    return Stability(
+        InfSup(0.0, 0.0, 0.0, ""), *coercivity_and_continuity(vi.A, V), energy_inf_sup(vi.A, sp.csr_array(vi.B), W)
+    )
+
+
+def certificate(
+    vi: VariationalInequality, u: np.ndarray, lam: np.ndarray, known: Stability | None = None
+) -> Certificate:
+    (found,) = certify([vi], [energy(vi)], [known or stability(vi)], u[:, None], lam[:, None])
     return found
 
 
-def stability(mu: np.ndarray) -> Stability:
-    vi = PROBLEM.assemble(mu)
-    inf_sup = inf_sup_full(PROBLEM.V, vi.B, nodal_multipliers(PROBLEM.W))
-    return Stability(inf_sup, *extreme_quotients(vi.A, PROBLEM.V))
+def bounds(vi: VariationalInequality, u: np.ndarray, lam: np.ndarray) -> Bounds:
+    found = certificate(vi, u, lam)
+    assert found.note == ""
+    assert found.bounds is not None
+    return found.bounds
 
 
-@pytest.mark.parametrize("n", [1, 2, 3, 40])
-def test_extreme_quotients_enclose_the_spectrum_closely(n: int) -> None:
-    A, V = spd(n, np.random.default_rng(n)), space(n, 5)
-    values = scipy.linalg.eigh(A, V.matrix.toarray(), eigvals_only=True)
-    low, high = extreme_quotients(sp.csc_array(A), V)
-    assert (1.0 - 2.0 * MARGIN) * values[0] <= low <= values[0]
-    assert values[-1] <= high <= (1.0 + 2.0 * MARGIN) * values[-1]
+@st.composite
+def inequalities(draw: st.DrawFn) -> VariationalInequality:
+    """Random ones with constraints that act; two of four rows may be the same, with different bounds."""
+    rng = np.random.default_rng(draw(st.integers(0, 10_000)))
+    B = rng.standard_normal((4, 6))
+    if draw(st.booleans()):
+        B[3] = draw(st.sampled_from([1.0, 2.5])) * B[0]
+    A, f = spd(6, rng, 10.0 ** draw(st.floats(0.0, 4.0))), rng.standard_normal(6)
+    g = B @ np.linalg.solve(A, f) - rng.uniform(-0.5, 1.0, 4)  # not all are active
+    if draw(st.booleans()):
+        g[3] = B[3, 0] / B[0, 0] * g[0]
+    return VariationalInequality(sp.csc_array(A), f, sp.csr_array(B), g)
 
 
-def test_an_indefinite_matrix_has_no_coercivity() -> None:
-    with pytest.raises(NumericalError, match="not positive definite"):
-        extreme_quotients(sp.csc_array(np.diag([1.0, -1.0, 1.0, 1.0])), space(4))
+@st.composite
+def approximations(draw: st.DrawFn) -> tuple[VariationalInequality, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """An inequality, its solution, any u_N near it or far from it, and a λ_N ≥ 0 with zeros, of the solution or not."""
+    vi = draw(inequalities())
+    rng, sizes = np.random.default_rng(draw(st.integers(0, 10_000))), st.sampled_from([0.0, 1e-5, 1e-2, 1.0, 30.0])
+    u, lam = exact(VariationalInequality(vi.A.toarray(), vi.f, vi.B.toarray(), vi.g))
+    u_N = u + draw(sizes) * np.linalg.norm(u) * rng.standard_normal(6)
+    lam_N = lam + draw(sizes) * np.linalg.norm(lam) * rng.standard_normal(4)
+    if draw(st.booleans()):
+        lam_N[lam == 0.0] = 0.0
+    if draw(st.booleans()):
+        lam_N[rng.integers(4)] = 0.0
+    return vi, u, lam, u_N, np.maximum(lam_N, 0.0)
 
 
-@given(st.integers(0, 10_000), st.floats(0.0, 1.0), st.sampled_from([1e-6, 1e-3, 1e-1, 10.0]))
-def test_no_error_is_above_its_bound(seed: int, angle: float, size: float) -> None:
-    """Whatever u is, and whatever λ ≥ 0: the bounds ask for nothing else."""
-    mu, rng = np.array([angle]), np.random.default_rng(seed)
-    vi = PROBLEM.assemble(mu)
-    exact = active_set.solve_high_fidelity(vi)
-    u = exact.u + size * rng.standard_normal(len(exact.u)) * np.abs(exact.u).max()
-    lam = np.maximum(exact.lam + size * rng.standard_normal(len(exact.lam)) * exact.lam.max(), 0.0)
-    found = bound(PROBLEM, vi, stability(mu), u, lam)
-    assert found is not None
-    assert found.u >= float(PROBLEM.V.norm(u - exact.u))
-    assert found.lam >= float(PROBLEM.W.norm(lam - exact.lam))
+@given(approximations())
+def test_no_error_is_above_its_bound(
+    given: tuple[VariationalInequality, np.ndarray, np.ndarray, np.ndarray, np.ndarray],
+) -> None:
+    """Whatever u_N is, feasible or not, whatever λ_N ≥ 0, and with redundant rows."""
+    vi, u, lam, u_N, lam_N = given
+    found, norm = bounds(vi, u_N, lam_N), energy(vi)
+    scale = norm.norm(u) + norm.norm(u_N) + norm.dual_norm(vi.f) + norm.dual_norm(vi.B.T @ lam_N)
+    allowed = ROUND_OFF * scale  # errors that are zero but for the round-off of the solution
+    force = vi.B.T @ (lam - lam_N)
+    assert norm.norm(u - u_N) <= found.u_energy + allowed
+    assert norm.dual_norm(force) <= found.lambda_natural + allowed
+    assert float(V.norm(u - u_N)) <= found.u + allowed / np.sqrt(stability(vi).coercivity.value)
+    if (beta := stability(vi).energy_inf_sup.value) > 0.0:
+        assert float(W.norm(lam - lam_N)) <= found.lam + allowed / beta
+    else:
+        assert found.lam == np.inf  # of dependent rows the multiplier is not unique
 
 
-def test_the_bounds_vanish_with_the_error() -> None:
-    mu = np.array([0.4])
-    vi = PROBLEM.assemble(mu)
-    exact = active_set.solve_high_fidelity(vi)
-    found = bound(PROBLEM, vi, stability(mu), exact.u, exact.lam)
-    assert found is not None
-    assert found.u < 1e-5 * float(PROBLEM.V.norm(exact.u))
-    # off the solution along a direction of V with λ kept and no penetration, the bound is residual over coercivity
-    known, free = stability(mu), np.zeros_like(exact.lam)
-    loose = Stability(known.inf_sup, known.coercivity, known.continuity)
-    u = active_set.solve_high_fidelity(type(vi)(vi.A, vi.f, vi.B, vi.g + 10.0)).u  # no contact
-    found = bound(PROBLEM, type(vi)(vi.A, 2.0 * vi.f, vi.B, vi.g + 10.0), loose, u, free)
-    assert found is not None
-    assert found.u == pytest.approx(float(np.linalg.norm(PROBLEM.V.whiten_functional(vi.f))) / known.coercivity)
+@given(approximations())
+def test_the_identity_the_bounds_follow_from(
+    given: tuple[VariationalInequality, np.ndarray, np.ndarray, np.ndarray, np.ndarray],
+) -> None:
+    vi, u, lam, u_N, lam_N = given
+    norm, s = energy(vi), vi.B @ u_N - vi.g
+    rho = norm.dual_norm(vi.f - vi.A @ u_N - vi.B.T @ lam_N)
+    left = norm.norm(u - u_N) ** 2 + norm.dual_norm(vi.B.T @ (lam - lam_N)) ** 2 + 2.0 * lam_N @ (vi.g - vi.B @ u)
+    right = rho**2 + 2.0 * lam @ s - 2.0 * lam_N @ s
+    scale = rho**2 + norm.norm(u) ** 2 + norm.norm(u_N) ** 2 + np.abs(lam) @ np.abs(s) + lam_N @ np.abs(s)
+    assert left == pytest.approx(right, rel=1e-10, abs=1e-12 * (scale + norm.dual_norm(vi.f) ** 2))
 
 
-def test_each_constant_enters_where_the_derivation_says() -> None:
-    """One dimension, one constraint u ≤ 0 (b = 1), f = 1: u = 0 and λ = 1; worked out by hand."""
-    V = W = space(1)
-    x = float(V.matrix.toarray()[0, 0])
-
-    class Scalar(Varying):
-        def __init__(self) -> None:
-            self.V, self.W = V, W
-
-    vi = type(PROBLEM.assemble(np.zeros(1)))(
-        sp.csc_array([[2.0]]), np.array([1.0]), sp.csr_array([[1.0]]), np.array([0.0])
+@given(approximations())
+def test_the_terms_are_those_of_a_lifting_that_is_feasible_in_exact_arithmetic(
+    given: tuple[VariationalInequality, np.ndarray, np.ndarray, np.ndarray, np.ndarray],
+) -> None:
+    vi, _, _, u_N, lam_N = given
+    w, norm = lifting(vi, energy(vi), u_N, lam_N), energy(vi)
+    scale = norm.norm(u_N) + norm.dual_norm(vi.f) + norm.dual_norm(vi.B.T @ lam_N)
+    assert w is not None
+    for row, g in zip(vi.B.toarray(), vi.g, strict=True):
+        slack = sum(Fraction(b) * (Fraction(x) - Fraction(v)) for b, x, v in zip(row, w, u_N, strict=True))
+        assert slack + Fraction(g) >= 0
+    found = bounds(vi, u_N, lam_N)
+    residual = vi.f - vi.A @ u_N - vi.B.T @ lam_N
+    assert found.rho == pytest.approx(float(np.sqrt(residual @ np.linalg.solve(vi.A.toarray(), residual))))
+    assert found.omega == pytest.approx(float(np.sqrt(w @ (vi.A @ w))))
+    assert found.kappa == pytest.approx(lam_N @ (vi.B @ w - (vi.B @ u_N - vi.g)), abs=1e-12 * (1.0 + np.sum(lam_N)))
+    assert found.u_energy == pytest.approx(float(np.sqrt(found.rho**2 + found.omega**2 + 2.0 * found.kappa)))
+    gap = found.u_energy**2 + 2.0 * residual @ w
+    assert found.lambda_natural == pytest.approx(
+        min(np.sqrt(max(gap, 0.0)), found.omega + found.u_energy), abs=ROUND_OFF * found.u_energy
     )
-    alpha, gamma, beta = 2.0 / x, 2.0 / x, 1.0 / x
-    u, lam = np.array([0.1]), np.array([0.5])
-    found = bound(Scalar(), vi, Stability(InfSup(beta, beta, beta, ""), alpha, gamma), u, lam)
-    residual, penetration = abs(1.0 - 2.0 * 0.1 - 0.5) / np.sqrt(x), 0.1 / np.sqrt(x)
-    mismatch = 0.1 * 0.5  # ⟨π, λ⟩, and −sᵀλ is negative
-    c1 = (residual + penetration * gamma / beta) / (2.0 * alpha)
-    expected = c1 + np.sqrt(c1**2 + (penetration * residual / beta + mismatch) / alpha)
-    assert found is not None
-    assert found.u == pytest.approx(expected)
-    assert found.lam == pytest.approx((residual + gamma * expected) / beta)
-    inside = bound(Scalar(), vi, Stability(InfSup(beta, beta, beta, ""), alpha, gamma), -u, lam)
-    residual, mismatch = abs(1.0 + 2.0 * 0.1 - 0.5) / np.sqrt(x), 0.1 * 0.5  # π = 0, −sᵀλ = 0.05
-    c1 = residual / (2.0 * alpha)
-    assert inside is not None
-    assert inside.u == pytest.approx(c1 + np.sqrt(c1**2 + mismatch / alpha))
+    assert found.omega**2 + 2.0 * found.kappa <= 1.001 * _least(vi, u_N, lam_N) + (10.0 * ROUND_OFF * scale) ** 2
 
 
-def test_nothing_is_certified_without_stability_or_outside_the_cone() -> None:
-    mu = np.array([0.2])
-    vi, known = PROBLEM.assemble(mu), stability(mu)
-    exact = active_set.solve_high_fidelity(vi)
-    unstable = Stability(InfSup(0.0, 0.0, 0.1, ""), known.coercivity, known.continuity)
-    found = bound(PROBLEM, vi, unstable, exact.u, exact.lam)
+def _least(vi: VariationalInequality, u: np.ndarray, lam: np.ndarray) -> float:
+    """The smallest ω² + 2κ, from every active set; not negative but for round-off."""
+    excess = vi.B @ u - vi.g
+    w, _ = exact(VariationalInequality(vi.A.toarray(), -vi.B.T @ lam, -vi.B.toarray(), -excess))
+    return max(0.0, float(w @ (vi.A @ w) + 2.0 * lam @ (vi.B @ w - excess)))
+
+
+def scalar(lam: float, u: float) -> tuple[VariationalInequality, np.ndarray, np.ndarray]:
+    """½ 4x² − 4x subject to 2x ≤ 1: the solution is ½, its multiplier 1."""
+    vi = VariationalInequality(sp.csc_array([[4.0]]), np.array([4.0]), sp.csr_array([[2.0]]), np.array([1.0]))
+    return vi, np.array([u]), np.array([lam])
+
+
+def test_each_term_enters_where_the_derivation_says() -> None:
+    vi, u, lam = scalar(lam=0.8, u=0.6)  # r = 4 − 2.4 − 1.6 = 0, s = 0.2, w = 0.1 and κ = 0
+    known = Stability(InfSup(0.0, 0.0, 0.0, ""), Constant(0.25, True), Constant(9.0, True), Constant(0.5, True))
+    (found,) = certify([vi], [energy(vi)], [known], u[:, None], lam[:, None])
+    expected = Bounds(u_energy=0.2, u=0.4, lambda_natural=0.2, lam=0.4, rho=0.0, omega=0.2, kappa=0.0)
+    assert found.bounds is not None
+    assert vars(found.bounds) == pytest.approx(vars(expected), abs=1e-7)
+    vi, u, lam = scalar(lam=0.2, u=0.3)  # r = 4 − 1.2 − 0.4 = 2.4, s = −0.4, w = −0.1 is best: κ = 0.2·(−0.2 + 0.4)
+    (found,) = certify([vi], [energy(vi)], [known], u[:, None], lam[:, None])
+    square = 1.2**2 + 0.2**2 + 2.0 * 0.04
+    natural = np.sqrt(square - 2.0 * 2.4 * 0.1)
+    expected = Bounds(np.sqrt(square), 2.0 * np.sqrt(square), natural, 2.0 * natural, 1.2, 0.2, 0.04)
+    assert found.bounds is not None
+    assert vars(found.bounds) == pytest.approx(vars(expected), abs=1e-7)
+
+
+def test_what_is_not_proved_is_said() -> None:
+    vi, u, lam = scalar(lam=0.8, u=0.6)
+    known = Stability(InfSup(0.0, 0.0, 0.0, ""), Constant(0.25, False), Constant(9.0, False), Constant(0.0, True))
+    found = certificate(vi, u, lam, known)
+    assert found.note == ESTIMATED
+    assert found.bounds is not None
+    assert found.bounds.lam == np.inf
+    assert certificate(vi, u, -lam, known) == Certificate(None, NOT_IN_CONE)
+
+
+def test_where_no_lifting_is_strictly_feasible_nothing_is_bounded() -> None:
+    """Two opposite constraints ask for x = ½ exactly; round-off decides whether w is feasible."""
+    vi = VariationalInequality(
+        sp.csc_array([[4.0]]), np.array([4.0]), sp.csr_array([[2.0], [-2.0]]), np.array([1.0, -1.0])
+    )
+    known = Stability(InfSup(0.0, 0.0, 0.0, ""), Constant(0.25, True), Constant(9.0, True), Constant(0.0, True))
+    assert certificate(vi, np.array([0.6]), np.array([0.8, 0.0]), known) == Certificate(None, NO_LIFTING)
+
+
+def test_an_active_set_method_that_fails_is_replaced(monkeypatch: pytest.MonkeyPatch) -> None:
+    vi, u, lam = scalar(lam=0.8, u=0.6)
+    known = Stability(InfSup(0.0, 0.0, 0.0, ""), Constant(0.25, True), Constant(9.0, True), Constant(0.5, True))
+    sharp = certificate(vi, u, lam, known).bounds
+    monkeypatch.setattr(error_bounds, "active_set_iterations", lambda system, active: None)
+    found = certificate(vi, u, lam, known).bounds
     assert found is not None
-    assert (found.u, found.lam) == (np.inf, np.inf)
-    assert bound(PROBLEM, vi, known, exact.u, exact.lam - 1e-3) is None
+    assert sharp is not None
+    assert sharp.u_energy == pytest.approx(found.u_energy, rel=1e-4)

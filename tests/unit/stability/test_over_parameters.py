@@ -10,11 +10,21 @@ from hypothesis import strategies as st
 from numerics import Varying
 
 from vibench.highfidelity import active_set
-from vibench.model.error_bounds import Stability, bounds, extreme_quotients
+from vibench.highfidelity.kkt_systems import CondensedStiffness
+from vibench.interfaces.problem import VariationalInequality
+from vibench.linalg.cholesky import SparseCholesky
+from vibench.model.energy import Energy
+from vibench.model.error_bounds import certify
 from vibench.model.errors import UNMEASURABLE, Reference, errors
+from vibench.model.hsw_bounds import hsw_bounds
 from vibench.reduction.supremizers import constraint_classes
+from vibench.stability.coercivity import Stability, coercivity_and_continuity, energy_inf_sup
 from vibench.stability.infsup import inf_sup_full, inf_sup_on, multipliers, nodal_multipliers
 from vibench.stability.over_parameters import constants_full, constants_on
+
+
+def energy(vi: VariationalInequality) -> Energy:
+    return Energy(vi.A, SparseCholesky(vi.A), CondensedStiffness(vi.A))
 
 
 def test_errors_as_defined() -> None:
@@ -25,16 +35,20 @@ def test_errors_as_defined() -> None:
     reference = Reference(exact.u[:, None], exact.lam[:, None], 0.0, 0.0)
     rng = np.random.default_rng(0)
     du, dlam = 1e-3 * rng.standard_normal(30), 1e-2 * rng.standard_normal(8)
-    (found,) = errors(problem, [vi], reference, (exact.u + du)[:, None], (exact.lam + dlam)[:, None])
+    (found,) = errors(problem, [vi], [energy(vi)], reference, (exact.u + du)[:, None], (exact.lam + dlam)[:, None])
     X, Y, A = problem.V.matrix, problem.W.matrix, vi.A
     assert np.isclose(found.error_u, np.sqrt((du @ (X @ du)) / (exact.u @ (X @ exact.u))))
     assert np.isclose(found.error_lambda, np.sqrt((dlam @ (Y @ dlam)) / (exact.lam @ (Y @ exact.lam))))
-    assert np.isclose(found.error_energy, np.sqrt((du @ (A @ du)) / (exact.u @ (A @ exact.u))))
+    assert np.isclose(found.error_u_energy, np.sqrt((du @ (A @ du)) / (exact.u @ (A @ exact.u))))
+    assert np.isclose(found.error_u_energy_absolute, np.sqrt(du @ (A @ du)))
+    natural, of_lam = (np.sqrt(b @ np.linalg.solve(A.toarray(), b)) for b in (vi.B.T @ dlam, vi.B.T @ exact.lam))
+    assert np.isclose(found.error_lambda_natural, natural / of_lam)
+    assert np.isclose(found.error_lambda_natural_absolute, natural)
     integrals = Y @ np.ones(8)
     assert np.isclose(found.violation, max(0.0, np.max((vi.B @ (exact.u + du) - vi.g) / integrals)))
     assert np.isclose(found.complementarity, exact.lam @ (vi.B @ du), atol=1e-12)
-    (nothing,) = errors(problem, [vi], reference, exact.u[:, None], exact.lam[:, None])
-    assert (nothing.error_u, nothing.error_lambda, nothing.error_energy) == (0.0, 0.0, 0.0)
+    (nothing,) = errors(problem, [vi], [energy(vi)], reference, exact.u[:, None], exact.lam[:, None])
+    assert (nothing.error_u, nothing.error_lambda, nothing.error_u_energy) == (0.0, 0.0, 0.0)
     assert nothing.violation < 1e-10
 
 
@@ -48,7 +62,7 @@ def test_what_is_zero_beside_the_training_set_has_no_relative_error(
     u, lam, du, dlam = (10.0**unit * rng.random((size, 1)) for size in (30, 8, 30, 8))
     scale_u, scale_lam = float(problem.V.norm(u)[0]), float(problem.W.norm(lam)[0])
     reference = Reference(10.0**share_u * u, 10.0**share_lam * lam, scale_u, scale_lam)
-    (found,) = errors(problem, [vi], reference, reference.u + du, reference.lam + dlam)
+    (found,) = errors(problem, [vi], [energy(vi)], reference, reference.u + du, reference.lam + dlam)
     for name, share, error, scale in (
         ("u", share_u, float(problem.V.norm(du)[0]), scale_u),
         ("lambda", share_lam, float(problem.W.norm(dlam)[0]), scale_lam),
@@ -58,14 +72,16 @@ def test_what_is_zero_beside_the_training_set_has_no_relative_error(
         assert relative is None or relative == pytest.approx(error / (10.0**share * scale))
         assert getattr(found, f"error_{name}_scaled") == pytest.approx(error / scale)
         assert getattr(found, f"error_{name}_absolute") == pytest.approx(error)
-    assert (found.error_energy is None) == (found.error_u is None)
+    assert (found.error_u_energy is None) == (found.error_u is None)
+    assert (found.error_lambda_natural is None) == (found.error_lambda is None)
 
 
 def test_without_a_training_solution_only_zero_is_zero() -> None:
     problem = Varying()
     vi = problem.assemble(np.array([0.5]))
     lam = np.column_stack([np.zeros(8), 1e-30 * np.ones(8)])
-    found = errors(problem, [vi, vi], Reference(np.zeros((30, 2)), lam, 0.0, 0.0), np.zeros((30, 2)), np.zeros((8, 2)))
+    reference = Reference(np.zeros((30, 2)), lam, 0.0, 0.0)
+    found = errors(problem, [vi, vi], [energy(vi)] * 2, reference, np.zeros((30, 2)), np.zeros((8, 2)))
     assert [(one.error_u, one.error_lambda) for one in found] == [(None, None), (None, 1.0)]
 
 
@@ -78,14 +94,30 @@ def test_errors_and_bounds_of_many_queries_are_those_of_each() -> None:
     u = reference.u + 1e-3 * rng.standard_normal(reference.u.shape)
     lam = reference.lam + 1e-2 * rng.random(reference.lam.shape)
     cone = nodal_multipliers(problem.W)
-    known = [Stability(inf_sup_full(problem.V, vi.B, cone), *extreme_quotients(vi.A, problem.V)) for vi in vis]
-    together, certified = errors(problem, vis, reference, u, lam), bounds(problem, vis, known, u, lam)
+    known = [
+        Stability(
+            inf_sup_full(problem.V, vi.B, cone),
+            *coercivity_and_continuity(vi.A, problem.V),
+            energy_inf_sup(vi.A, vi.B, problem.W),
+        )
+        for vi in vis
+    ]
+    energies = [energy(vi) for vi in vis]
+    together = (
+        errors(problem, vis, energies, reference, u, lam),
+        [found.bounds for found in certify(vis, energies, known, u, lam)],
+        hsw_bounds(problem, vis, known, u, lam),
+    )
     for k, vi in enumerate(vis):
-        (alone,) = errors(problem, [vi], reference.at([k]), u[:, [k]], lam[:, [k]])
-        assert astuple(together[k]) == pytest.approx(astuple(alone), rel=1e-10, abs=1e-12)
-        (bound,) = bounds(problem, [vi], [known[k]], u[:, [k]], lam[:, [k]])
-        assert certified[k] is not None
-        assert astuple(certified[k]) == pytest.approx(astuple(bound), rel=1e-10)
+        own = [energies[k]], u[:, [k]], lam[:, [k]]
+        alone = (
+            errors(problem, [vi], own[0], reference.at([k]), *own[1:])[0],
+            certify([vi], own[0], [known[k]], *own[1:])[0].bounds,
+            hsw_bounds(problem, [vi], [known[k]], *own[1:])[0],
+        )
+        for found, expected in zip(together, alone, strict=True):
+            assert expected is not None
+            assert astuple(found[k]) == pytest.approx(astuple(expected), rel=1e-10, abs=1e-12)
 
 
 def test_constants_shared_by_proportional_matrices_are_those_of_each() -> None:

@@ -279,9 +279,32 @@ def test_the_reference_constants_are_those_of_every_parameter(store: SampleStore
     assert scaled[0] > 0.0
     problem = PROBLEM.create()
     for c, mu in zip(constants, mus, strict=True):
-        values = scipy.linalg.eigh(problem.assemble(mu).A.toarray(), problem.V.matrix.toarray(), eigvals_only=True)
-        assert 0.998 * values[0] <= c.coercivity <= values[0]
-        assert values[-1] <= c.continuity <= 1.002 * values[-1]
+        vi = problem.assemble(mu)
+        values = scipy.linalg.eigh(vi.A.toarray(), problem.V.matrix.toarray(), eigvals_only=True)
+        assert c.coercivity.proved
+        assert 0.998 * values[0] <= c.coercivity.value <= values[0]
+        assert c.continuity.proved
+        assert values[-1] <= c.continuity.value <= 1.002 * values[-1]
+        compliance = vi.B @ np.linalg.solve(vi.A.toarray(), vi.B.toarray().T)
+        smallest = scipy.linalg.eigvalsh(compliance, problem.W.matrix.toarray())[0]
+        assert 0.998 * np.sqrt(smallest) <= c.energy_inf_sup.value <= np.sqrt(smallest)
+
+
+def test_every_query_has_proved_bounds_of_the_errors_in_the_same_norms(store: SampleStore) -> None:
+    rows = value_of(store, cell("offline-pga", 0.5))
+    for row in rows.queries:
+        assert (row["bound_note"], row["coercivity_proved"], row["continuity_proved"]) == ("", 1, 1)
+        terms = row["bound_rho"] ** 2 + row["bound_omega"] ** 2 + 2.0 * row["bound_kappa"]
+        assert row["bound_u_energy"] == pytest.approx(np.sqrt(terms))
+        assert row["bound_u"] == pytest.approx(row["bound_u_energy"] / np.sqrt(row["coercivity"]))
+        assert row["bound_lambda"] == pytest.approx(row["bound_lambda_natural"] / row["beta_energy"])
+        for name in ("u_energy", "u", "lambda_natural", "lambda"):
+            assert row[f"effectivity_{name}"] == row[f"bound_{name}"] / row[f"error_{name}_absolute"] >= 1.0
+        assert row["effectivity_hsw_u"] == row["bound_hsw_u"] / row["error_u_absolute"] >= 1.0
+        assert row["effectivity_hsw_lambda"] == row["bound_hsw_lambda"] / row["error_lambda_absolute"] >= 1.0
+    for name in ("u_energy", "hsw_lambda"):
+        median = np.median([row[f"effectivity_{name}"] for row in rows.queries])
+        assert rows.cell[f"effectivity_{name}_median"] == median
 
 
 def test_a_missing_artefact_is_named(tmp_path: Path) -> None:

@@ -1,0 +1,70 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import scipy.linalg
+import scipy.sparse as sp
+from numerics import Varying, space, spd
+
+from vibench.errors import NumericalError
+from vibench.stability import coercivity
+from vibench.stability.coercivity import MARGINS, Constant, coercivity_and_continuity, energy_inf_sup
+
+
+@pytest.mark.parametrize("n", [1, 2, 3, 40])
+def test_proved_constants_enclose_the_spectrum_closely(n: int) -> None:
+    A, V = spd(n, np.random.default_rng(n)), space(n, 5)
+    values = scipy.linalg.eigh(A, V.matrix.toarray(), eigvals_only=True)
+    low, high = coercivity_and_continuity(sp.csc_array(A), V)
+    assert low.proved
+    assert (1.0 - 2.0 * MARGINS[0]) * values[0] <= low.value <= values[0]
+    assert high.proved
+    assert values[-1] <= high.value <= (1.0 + 2.0 * MARGINS[0]) * values[-1]
+
+
+def test_an_indefinite_matrix_has_no_coercivity() -> None:
+    with pytest.raises(NumericalError, match="not positive definite"):
+        coercivity_and_continuity(sp.csc_array(np.diag([1.0, -1.0, 1.0, 1.0])), space(4))
+
+
+@pytest.mark.parametrize(("missed", "margin"), [(1.005, 1e-2), (1.05, 1e-1), (1.4, 0.5), (2.0, None)])
+def test_an_eigenvalue_that_lanczos_missed_costs_sharpness_or_the_proof(
+    monkeypatch: pytest.MonkeyPatch, missed: float, margin: float | None
+) -> None:
+    A, V = spd(40, np.random.default_rng(1)), space(40, 5)
+    values = scipy.linalg.eigh(A, V.matrix.toarray(), eigvals_only=True)
+    wrong = missed * values[0], values[-1] / missed
+    monkeypatch.setattr(coercivity, "_extreme_quotients", lambda A, V: wrong)
+    low, high = coercivity_and_continuity(sp.csc_array(A), V)
+    if margin is None:
+        assert not low.proved
+        assert not high.proved
+    else:
+        assert low == Constant(pytest.approx(wrong[0] / (1.0 + margin)), True)
+        assert high == Constant(pytest.approx(wrong[1] * (1.0 + margin)), True)
+        assert low.value <= values[0]
+        assert high.value >= values[-1]
+
+
+@pytest.mark.parametrize("few", [coercivity.FEW, 2])
+def test_the_inf_sup_constant_in_the_energy_norm_is_proved_closely(monkeypatch: pytest.MonkeyPatch, few: int) -> None:
+    """By a dense matrix, and by Lanczos iterations."""
+    monkeypatch.setattr(coercivity, "FEW", few)
+    problem = Varying()
+    vi = problem.assemble(np.array([0.3]))
+    compliance = vi.B @ np.linalg.solve(vi.A.toarray(), vi.B.toarray().T)
+    exact = float(np.sqrt(scipy.linalg.eigvalsh(compliance, problem.W.matrix.toarray())[0]))
+    found = energy_inf_sup(vi.A, vi.B, problem.W)
+    assert found.proved
+    assert (1.0 - 2.0 * MARGINS[0]) * exact <= found.value <= exact
+
+
+@pytest.mark.parametrize("few", [coercivity.FEW, 2])
+def test_dependent_constraints_have_no_inf_sup_constant(monkeypatch: pytest.MonkeyPatch, few: int) -> None:
+    monkeypatch.setattr(coercivity, "FEW", few)
+    problem = Varying()
+    vi = problem.assemble(np.array([0.3]))
+    twice = sp.csr_array(sp.vstack([vi.B[:7], vi.B[:1]]))
+    assert energy_inf_sup(vi.A, twice, problem.W) == Constant(0.0, True)
+    nothing = energy_inf_sup(sp.eye_array(3, format="csc"), sp.csr_array((0, 3)), space(1))
+    assert nothing == Constant(np.inf, True)

@@ -1,0 +1,173 @@
+"""Constants of A(µ) in the norms of V and W that error bounds need: estimated by Lanczos iterations, proved by inertia.
+
+    α = min vᵀAv / ‖v‖_V²,    γ_a = max vᵀAv / ‖v‖_V²,    β_A = min sup ηᵀBv / (‖v‖_A ‖η‖_W)   (min over η, sup over v)
+
+β_A² is the smallest eigenvalue of BA⁻¹Bᵀ against X_W. Lanczos approximates extreme eigenvalues from inside, so that a
+margin moves them outwards; that alone proves nothing, since an iteration may miss an eigenvalue. A number a ≤ α is
+proved by the n positive eigenvalues of A − aX_V, c ≥ γ_a by those of cX_V − A, and, where A is positive definite,
+b ≤ β_A by the m negative eigenvalues of
+
+    [ A    Bᵀ     ]
+    [ B    b²X_W  ],    whose Schur complement of A is b²X_W − BA⁻¹Bᵀ (Haynsworth),
+
+see `vibench.linalg.inertia` for what proves them in floating-point arithmetic.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import scipy.linalg
+import scipy.sparse as sp
+from scipy.sparse.linalg import LinearOperator, eigsh, splu
+
+from vibench.arrays import Array, Indices, SparseMatrix
+from vibench.linalg.cholesky import SYMMETRIC, SparseCholesky
+from vibench.linalg.inertia import proved_positive
+from vibench.linalg.inner_product import InnerProduct
+from vibench.stability.infsup import InfSup
+
+MARGINS = (1e-3, 1e-2, 1e-1, 0.5)
+"""Constants are moved outwards by the first of these shares for which they are proved; by the first one if by none.
+
+Lanczos iterations are accurate to 1e-4."""
+
+FEW = 30
+"""Spaces of at most this dimension have their eigenvalues from a dense matrix; Lanczos needs more than two."""
+
+
+@dataclass(frozen=True)
+class Constant:
+    """A constant, and whether it is proved or only estimated."""
+
+    value: float
+    proved: bool
+
+
+@dataclass(frozen=True)
+class Stability:
+    """Constants of the high-fidelity problem at one parameter.
+
+    Attributes
+    ----------
+    inf_sup
+        β_HF in the norms of V and W.
+    coercivity, continuity
+        Lower bound of α and upper bound of γ_a.
+    energy_inf_sup
+        Lower bound of β_A, the inf-sup constant over the span with the norm of A instead of that of V.
+    """
+
+    inf_sup: InfSup
+    coercivity: Constant
+    continuity: Constant
+    energy_inf_sup: Constant
+
+
+def coercivity_and_continuity(A: SparseMatrix, V: InnerProduct) -> tuple[Constant, Constant]:
+    """Lower bound of α and upper bound of γ_a for A (n×n).
+
+    Raises
+    ------
+    NumericalError
+        If A is not symmetric positive definite.
+    """
+    low, high = _extreme_quotients(A, V)
+    X, root_A, root_X = V.matrix, np.sqrt(A.diagonal()), np.sqrt(V.matrix.diagonal())
+
+    def coercive(a: float) -> bool:
+        return proved_positive([A, -a * X], root_A) == V.dim
+
+    def continuous(c: float) -> bool:
+        return proved_positive([c * X, -A], np.sqrt(c) * root_X) == V.dim
+
+    return _moved(low, -1.0, coercive), _moved(high, 1.0, continuous)
+
+
+def _moved(estimate: float, sign: float, proves: Callable[[float], bool]) -> Constant:
+    """The estimate moved outwards, downwards for a negative sign, until it is proved."""
+    candidates = [estimate * (1.0 + margin) ** sign for margin in MARGINS]
+    for candidate in candidates:
+        if proves(candidate):
+            return Constant(candidate, True)
+    return Constant(candidates[0], False)
+
+
+def _extreme_quotients(A: SparseMatrix, V: InnerProduct) -> tuple[float, float]:
+    """Estimates of α and γ_a."""
+    factor = SparseCholesky(A, "A")
+    if V.dim <= FEW:
+        values = scipy.linalg.eigvalsh(A.toarray(), V.matrix.toarray())
+        return float(values[0]), float(values[-1])
+    largest = eigsh(A, M=V.matrix, Minv=_operator(V.dim, V.riesz), which="LA", **_lanczos(V.dim))[0]
+    return _smallest(A, V.matrix, factor.solve), float(largest)
+
+
+def energy_inf_sup(A: SparseMatrix, B: SparseMatrix, W: InnerProduct) -> Constant:
+    """Lower bound of β_A, proved where A (n×n) is positive definite, for B (m×n); 0 where no other is proved.
+
+    Raises
+    ------
+    NumericalError
+        If A is not positive definite.
+    """
+    factor, (m, n) = SparseCholesky(A, "A"), B.shape
+    if not m:
+        return Constant(float("inf"), True)
+    order = np.concatenate([factor.order, n + np.arange(m)])  # multipliers last: their pivots are a Schur complement's
+    square = _smallest_compliance(A, sp.csc_array(B), W, factor, order)
+    if square <= 0.0:
+        return Constant(0.0, True)
+    roots = np.sqrt(A.diagonal()), np.sqrt(W.matrix.diagonal())
+
+    def stable(beta: float) -> bool:
+        saddle = -_saddle_point(A, B, beta**2 * W.matrix)
+        return bool(proved_positive([saddle], np.concatenate([roots[0], beta * roots[1]]), order) >= m)
+
+    found = _moved(float(np.sqrt(square)), -1.0, stable)
+    return found if found.proved else Constant(0.0, True)
+
+
+def _smallest_compliance(
+    A: SparseMatrix, B: SparseMatrix, W: InnerProduct, factor: SparseCholesky, order: Indices
+) -> float:
+    """Estimate of the smallest eigenvalue of BA⁻¹Bᵀ against X_W; 0 where it is singular."""
+    m, n = B.shape
+    if m <= FEW:
+        compliance = np.asarray(B @ factor.solve(B.toarray().T))
+        return float(scipy.linalg.eigvalsh(compliance, W.matrix.toarray())[0])
+    saddle = _saddle_point(A, B, sp.csc_array((m, m)))[order][:, order]
+    try:
+        solve = splu(sp.csc_array(saddle), permc_spec="NATURAL", **SYMMETRIC).solve
+    except RuntimeError:
+        return 0.0
+
+    def inverse(y: Array) -> Array:
+        """−(BA⁻¹Bᵀ)⁻¹ is the last block of the inverse."""
+        return np.asarray(-solve(np.concatenate([np.zeros(n), y]))[n:])
+
+    compliance = _operator(m, lambda y: B @ factor.solve(B.T @ y))
+    return _smallest(compliance, W.matrix, inverse)
+
+
+def _saddle_point(A: SparseMatrix, B: SparseMatrix, corner: SparseMatrix) -> SparseMatrix:
+    return sp.csc_array(sp.block_array([[A, B.T], [B, corner]]))
+
+
+def _smallest(matrix: SparseMatrix | LinearOperator, product: SparseMatrix, inverse: Callable[[Array], Array]) -> float:
+    """Estimate of the smallest eigenvalue of a positive definite matrix (k×k) with this inverse."""
+    size = matrix.shape[0]
+    values = eigsh(matrix, M=product, sigma=0.0, OPinv=_operator(size, inverse), which="LM", **_lanczos(size))
+    return float(values[0])
+
+
+def _operator(size: int, apply: Callable[[Array], Array]) -> LinearOperator:
+    return LinearOperator((size, size), matvec=apply)
+
+
+def _lanczos(size: int) -> dict[str, Any]:
+    start = np.random.default_rng(0).standard_normal(size)
+    return {"k": 1, "v0": start, "tol": 1e-4, "return_eigenvectors": False}
