@@ -159,6 +159,8 @@ def _described(value: Any) -> Any:
     """A field of a stage as JSON can hold it; another stage is described by its key."""
     if isinstance(value, Stage):
         return value.key
+    if isinstance(value, bytes):
+        return value.hex()
     if isinstance(value, tuple):
         return [_described(part) for part in value]
     return asdict(value) if is_dataclass(value) and not isinstance(value, type) else value
