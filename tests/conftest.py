@@ -24,7 +24,7 @@ from threadpoolctl import threadpool_limits
 from vibench.cli import main as main_module
 from vibench.results.database import FILE
 from vibench.stages.artefacts import CACHE_VARIABLE
-from vibench.study import registry
+from vibench.study import entry_points, registry
 
 settings.register_profile("any machine", deadline=None)
 settings.load_profile("any machine")
@@ -92,6 +92,7 @@ def register(monkeypatch: pytest.MonkeyPatch) -> Iterator[Register]:
     """Function that makes entry points, given as (group, name, value), the only ones there are."""
 
     def forget() -> None:
+        entry_points._readable.cache_clear()
         registry._registered.cache_clear()
         registry.code.cache_clear()
 

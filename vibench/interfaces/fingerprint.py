@@ -73,13 +73,14 @@ class ReferenceAssembly:
 
     def refuse_false_constants(self, mu: Array, vi: VariationalInequality) -> None:
         """Raise a `NumericalError` if a member declared `constant` is another one in the assembly at mu (d,)."""
-        # The same object needs no product; `refuse_overwritten` tells if its entries were replaced.
+        # The same object needs no product; `refuse_rewritten_constants` tells if its entries were replaced.
         names = [name for name in self._problem.constant if getattr(vi, name) is not getattr(self._vi, name)]
         for deviation in _of({name: getattr(vi, name) for name in names}).deviations(self.fingerprint):
             where = f"at mu = {mu.tolist()} from that at the first training parameter"
             raise NumericalError(f"a member declared `constant` depends on mu: {deviation} {where}")
 
-    def refuse_overwritten(self) -> None:
-        """Raise a `NumericalError` if later assemblies have overwritten the reference."""
-        for deviation in self.fingerprint.deviations(fingerprint(self._problem, self._vi)):
-            raise NumericalError(f"assemble overwrites earlier results, return new arrays: {deviation}")
+    def refuse_rewritten_constants(self) -> None:
+        """Raise a `NumericalError` if later assemblies have written other entries into a member declared `constant`."""
+        constants = {name: getattr(self._vi, name) for name in self._problem.constant}
+        for deviation in _of(constants).deviations(self.fingerprint):
+            raise NumericalError(f"a member declared `constant` is overwritten by later assemblies: {deviation}")

@@ -104,7 +104,9 @@ class TestFiles:
 def test_a_name_that_two_packages_register_is_completed_once(monkeypatch: pytest.MonkeyPatch) -> None:
     """The command then refuses it and names both packages; a prompt is no place for that."""
     both = [EntryPoint("mine", f"{module}:Problem", "vibench.problems") for module in ("one", "other")]
-    monkeypatch.setattr("importlib.metadata.entry_points", lambda *, group: both if group == both[0].group else [])
+    monkeypatch.setattr(
+        "vibench.study.entry_points.entry_points", lambda *, group: both if group == both[0].group else []
+    )
     assert completed("vibench run quick --problem ") == ["mine"]
 
 

@@ -123,13 +123,12 @@ class TestOutputFolder:
         refused(main("run", "--out", "full", *fresh), "'full'", "not empty")
         assert Path("full/notes.txt").read_text() == "precious"
 
-    @pytest.mark.parametrize("fresh", [[], ["--fresh"]])
     @pytest.mark.parametrize("content", ["hello", "SQLite format 3\0 and then nothing"])
-    def test_a_foreign_results_file_is_refused_and_kept(self, fresh: list[str], content: str, main: Main) -> None:
+    def test_a_foreign_results_file_is_refused_and_kept(self, content: str, main: Main) -> None:
         Path("foreign").mkdir()
         Path("foreign", FILE).write_text(content)
         Path("foreign/notes.txt").write_text("precious")
-        refused(main("run", "--out", "foreign", *fresh), "foreign", FILE)
+        refused(main("run", "--out", "foreign"), "foreign", FILE)
         assert Path("foreign", FILE).read_text() == content
         assert Path("foreign/notes.txt").read_text() == "precious"
 

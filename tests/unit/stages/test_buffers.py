@@ -11,11 +11,10 @@ from broken_problems import Declared
 from buffered import buffered
 from numerics import Varying
 from running import without_seconds
-from samples import carry_out
+from samples import SampleStore, carry_out
 
 from vibench.interfaces.problem import Problem
 from vibench.interfaces.strategies import Stop
-from vibench.stages.artefacts import Store
 from vibench.stages.assembly import AssemblyStage
 from vibench.stages.base import Row, value_of
 from vibench.stages.cell_queries import CellQueries
@@ -55,7 +54,7 @@ def cell(name: str, primal: str, interpolation: float | None) -> CellQueries:
     return CellQueries(AssemblyStage(enrichment, interpolation, 4, 1), "piqp", 1e-8, 20.0)
 
 
-def rows(stage: CellQueries, store: Store) -> list[Row]:
+def rows(stage: CellQueries, store: SampleStore) -> list[Row]:
     carry_out(stage, store)
     found = value_of(store, stage)
     return [without_seconds(row) for row in (found.cell | {"model": ""}, *found.queries)]
@@ -65,7 +64,7 @@ def rows(stage: CellQueries, store: Store) -> list[Row]:
 @pytest.mark.parametrize("interpolation", [None, 1e-6], ids=["full", "reduced"])
 @pytest.mark.parametrize("problem", ["wire", "string", "obstacle"])
 def test_arrays_that_are_used_again_change_no_number(
-    problem: str, primal: str, interpolation: float | None, store: Store
+    problem: str, primal: str, interpolation: float | None, store: SampleStore
 ) -> None:
     plain, other = (rows(cell(name, primal, interpolation), store) for name in (problem, f"{problem}, buffered"))
     assert plain[0]["status"] == "ok"
@@ -77,7 +76,7 @@ def test_arrays_that_are_used_again_change_no_number(
             assert same[name] == expected, name
 
 
-def test_arrays_that_are_used_again_change_no_picture(store: Store) -> None:
+def test_arrays_that_are_used_again_change_no_picture(store: SampleStore) -> None:
     drawn = []
     for name in ("wire", "wire, buffered"):
         carry_out(stage := PictureStage(plugin("problem", name)), store)
@@ -89,5 +88,5 @@ def test_arrays_that_are_used_again_change_no_picture(store: Store) -> None:
 
 
 @pytest.fixture(scope="module")
-def store(tmp_path_factory: pytest.TempPathFactory) -> Store:
-    return Store(tmp_path_factory.mktemp("artefacts"))
+def store(tmp_path_factory: pytest.TempPathFactory) -> SampleStore:
+    return SampleStore(tmp_path_factory.mktemp("artefacts"))

@@ -30,7 +30,6 @@ REASONS: Mapping[str, str] = {
     "ConstantConstraint": "a member declared `constant` depends on mu: row",
     "SingularDualNorm": "the Gram matrix",
     "NoisyLoad": "two assemblies at one parameter are not the same, as in another process: row",
-    "OneVector": "assemble overwrites earlier results, return new arrays: row",
     "NotANumberInACorner": "g has entries that are not finite at mu = [",
     "LoadOnAllNodes": "f has shape (49,) at mu = [1.0]; the spaces V and W require (25,)",
     "DualNormOfAllNodes": "B has shape (9, 54) at mu = ",

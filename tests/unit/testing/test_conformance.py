@@ -6,6 +6,7 @@ import importlib.metadata
 import inspect
 from collections.abc import Iterator, Mapping
 from functools import partial
+from pathlib import Path
 
 import broken_problems
 import broken_strategies
@@ -15,6 +16,7 @@ import scipy.sparse as sp
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numerics import Varying
+from packs import write_cable
 from running import Main, refused
 
 from vibench import testing
@@ -170,13 +172,14 @@ BUILT_IN = [
 
 
 @pytest.mark.parametrize(("word", "name"), BUILT_IN)
-def test_a_built_in_plugin_passes_every_check(word: str, name: str) -> None:
+def test_a_built_in_plugin_passes_every_check(word: str, name: str, tmp_path: Path) -> None:
     examine = {
         "problem": testing.examine_problem,
         "dual": testing.examine_dual,
         "primal": testing.examine_primal,
     }[word]
-    options = registry.check_options(registry.WORDS[word], name, {"resolution": "coarse"} if word == "problem" else {})
+    given = {"path": str(write_cable(tmp_path / "cable"))} if name == "pack" else {"resolution": "coarse"}
+    options = registry.check_options(registry.WORDS[word], name, given if word == "problem" else {})
     findings = examine(partial(registry.load(registry.WORDS[word], name), **options))
     assert [str(finding) for finding in findings if finding.verdict is not Verdict.PASSED] == []
 
