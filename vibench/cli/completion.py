@@ -14,6 +14,9 @@ import typer
 from vibench.errors import VibenchError
 from vibench.results.columns import TABLES
 
+SHOWN = ("summary", "best", "benefits", *TABLES)
+"""Tables that `vibench show` prints."""
+
 EXAMPLES: Mapping[str, tuple[str, ...]] = {
     "run": (
         "vibench run",
@@ -22,8 +25,15 @@ EXAMPLES: Mapping[str, tuple[str, ...]] = {
         "vibench run quick --pod-tol 1e-2 --pod-tol 1e-3",
     ),
     "list": ("vibench list", "vibench list solvers"),
-    "show": ("vibench show quick", "vibench show quick --table benefits", "vibench show runs/quick --format csv"),
+    "show": (
+        "vibench show quick",
+        "vibench show quick --table benefits",
+        "vibench show quick --where \"solver = 'piqp' and beta_span_min < 1e-3\"",
+        "vibench show quick --table queries --columns cell,query,error_u --sort -error_u",
+        "vibench show runs/quick --format csv",
+    ),
     "report": ("vibench report quick", "vibench report runs/quick --out quick.html"),
+    "figures": ("vibench figures quick", "vibench figures runs/quick --out pictures -j 1"),
     "diff": ("vibench diff runs/before runs/after", "vibench diff runs/before runs/after --limit 1.1 --format json"),
     "replay": ("vibench replay quick 3f9a", "vibench replay quick 3f9a --query 7"),
     "export-qps": ("vibench export-qps quick programs",),
@@ -60,7 +70,7 @@ def names(*groups: str) -> Callable[[str], list[str]]:
 
 plugin_names = names("problems", "primal_strategies", "dual_strategies")
 lists = words(lambda: ("problems", "dual", "primal", "solvers", "studies"))
-table_names = words(lambda: ("summary", "benefits", *TABLES))
+table_names = words(lambda: SHOWN)
 
 
 def studies(incomplete: str) -> list[str]:
@@ -94,6 +104,16 @@ def cells(context: typer.Context, incomplete: str) -> list[tuple[str, str]]:
         return []
     rows = found[["cell", "problem", "dual", "primal", "solver"]].astype(str).itertuples(index=False)
     return sorted((key, " · ".join(axes)) for key, *axes in rows if key.startswith(incomplete))
+
+
+def column_names(context: typer.Context, incomplete: str) -> list[str]:
+    """Completes the last name in a list of columns of the table that `--table` names."""
+    table = str(context.params.get("table") or "summary")
+    source = {"summary": "cells", "best": "cells", "benefits": "thresholds"}.get(table, table)
+    before, comma, last = incomplete.rpartition(",")
+    sign = "-" * last.startswith("-")
+    found = _beginning(last.removeprefix("-"), TABLES.get(source, ()))
+    return [f"{before}{comma}{sign}{name}" for name in found]
 
 
 def _registered(*groups: str) -> set[str]:
