@@ -5,8 +5,13 @@ A shell waits for completions, so names of plugins are read from entry points an
 
 from __future__ import annotations
 
+import contextlib
+import io
+import os
+import re
 import sqlite3
-from collections.abc import Callable, Iterable, Mapping
+import sys
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 
 import typer
@@ -54,6 +59,37 @@ def examples(command: str) -> str:
     return "\n".join(["\b", "Examples:", *(f"  {line}" for line in EXAMPLES[command])])
 
 
+@contextlib.contextmanager
+def whole_words() -> Iterator[None]:
+    """Give the completion of bash words that it breaks at ":" and "=": `primal:name` and `key=value` are one.
+
+    What bash completes of such a word is what comes after its last break, so what is printed begins there.
+    """
+    if "_VIBENCH_COMPLETE" in os.environ:  # it would look for plugins of pydantic, which typer checks words with
+        os.environ["PYDANTIC_DISABLE_PLUGINS"] = "__all__"
+    if os.environ.get("_VIBENCH_COMPLETE") != "complete_bash":
+        yield
+        return
+    asked, current = os.environ["COMP_WORDS"], int(os.environ["COMP_CWORD"])
+    pieces = asked.split("\n" if "\n" in asked else " ")
+    joined: list[str] = []
+    for k, piece in enumerate(pieces[: current + 1]):
+        together = joined and (piece[:1] in BREAKS or (piece and pieces[k - 1][-1:] in BREAKS))
+        joined[-1 if together else len(joined) :] = [joined[-1] + piece if together else piece]
+    last = joined[-1] if len(joined) > 1 else ""
+    os.environ.update(COMP_WORDS="\n".join(joined), COMP_CWORD=str(len(joined) - 1))
+    try:
+        with contextlib.redirect_stdout(io.StringIO()) as printed:
+            yield
+    finally:
+        done = len(re.match(".*[:=]|", last)[0])  # type: ignore[index]  # it matches any text
+        sys.stdout.write("".join(f"{line[done:]}\n" for line in printed.getvalue().splitlines()))
+
+
+BREAKS = (":", "=")
+"""Characters at which bash breaks words, and which words of vibench have."""
+
+
 def words(known: Callable[[], Iterable[str]]) -> Callable[[str], list[str]]:
     """Completes the words of a function, which is called when a shell asks."""
 
@@ -68,7 +104,30 @@ def names(*groups: str) -> Callable[[str], list[str]]:
     return words(lambda: _registered(*groups))
 
 
-plugin_names = names("problems", "primal_strategies", "dual_strategies")
+def plugins(incomplete: str) -> list[str]:
+    """Completes names of plugins, each also with its kind before it: "primal:offline-pga"."""
+    with_kind = (f"{kind}:{name}" for kind, group in PLUGIN_GROUPS.items() for name in _registered(group))
+    plain = _registered(*PLUGIN_GROUPS.values()) if ":" not in incomplete else ()
+    kinds = (f"{kind}:" for kind in PLUGIN_GROUPS)
+    return _beginning(incomplete, [*plain, *(with_kind if ":" in incomplete else kinds)])
+
+
+def plugin_options(context: typer.Context, incomplete: str) -> list[str]:
+    """Completes the options of the plugin named before, as "resolution=", without importing it."""
+    from importlib.metadata import entry_points
+
+    from vibench.cli import overview
+
+    kind, colon, name = (context.params.get("plugin") or "".join(context.args[:1])).rpartition(":")
+    groups = [PLUGIN_GROUPS[kind]] if kind in PLUGIN_GROUPS else [] if colon else PLUGIN_GROUPS.values()
+    entries = (entry for group in groups for entry in entry_points(group=f"vibench.{group}", name=name))
+    found = {option for entry in entries for option in overview.options(overview.plugin_class(entry))}
+    return _beginning(incomplete, (f"{option}=" for option in found))
+
+
+PLUGIN_GROUPS = {"problem": "problems", "primal": "primal_strategies", "dual": "dual_strategies"}
+"""Groups of entry points of the plugins that `vibench check` takes, by their names on the command line."""
+
 lists = words(lambda: ("problems", "dual", "primal", "solvers", "studies"))
 table_names = words(lambda: SHOWN)
 

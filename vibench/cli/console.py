@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
-import pandas as pd
 from rich import box
 from rich.cells import cell_len
 from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from vibench.results import tables
 from vibench.text import printable, printable_lines
+
+if TYPE_CHECKING:  # lists of plugins are printed without it
+    import pandas as pd
 
 WIDTH = 10_000
 """Columns where the output is no terminal and `COLUMNS` is not set: whoever reads it can scroll."""
@@ -56,17 +58,37 @@ def print_frame(frame: pd.DataFrame, title: str, priority: Sequence[str] = (), *
     every
         Print columns with the same value in every row, too, as columns.
     """
+    from vibench.results.tables import cell_text
+
+    columns = [
+        PrintedColumn(str(name), tuple(map(cell_text, frame[name])), frame[name].dtype.kind in "iufb")
+        for name in frame.columns
+    ]
+    print_columns(columns, title, priority, every=every)
+
+
+def print_rows(rows: Iterable[Sequence[str]], headings: Sequence[str], title: str) -> None:
+    """Print rows of texts as `print_frame` prints a table."""
+    cells = list(zip(*rows, strict=True)) or [()] * len(headings)
+    print_columns([PrintedColumn(name, tuple(own)) for name, own in zip(headings, cells, strict=True)], title)
+
+
+def print_columns(
+    columns: Sequence[PrintedColumn], title: str, priority: Sequence[str] = (), *, every: bool = False
+) -> None:
+    """Print columns as `print_frame` prints a table."""
     console = new_console()
-    shared = [name for name in frame.columns if not every and len(frame) > 1 and _same(frame[name])]
-    values = [(name, tables.cell_text(frame[name].iloc[0])) for name in shared]
-    title = ", ".join([title, *(f"{name} {value}" for name, value in values if value)])
-    console.print(shown(title if len(frame) else f"{title}: no rows"), overflow="fold")
-    if frame.empty:
+    count = len(columns[0].cells) if columns else 0
+    shared = [column for column in columns if not every and count > 1 and len(set(column.cells)) == 1]
+    values = [f"{column.heading} {column.cells[0]}" for column in shared if column.cells[0]]
+    title = ", ".join([title, *values])
+    console.print(shown(title if count else f"{title}: no rows"), overflow="fold")
+    if not count:
         return
-    columns = [_Column.of(frame[name]) for name in frame.columns if name not in shared]
+    own = [column for column in columns if column not in shared]
     rank = {name: k for k, name in enumerate(priority)}
-    kept = _fitting(sorted(columns, key=lambda column: rank.get(column.heading, len(rank))), console.width)
-    drawn = [column for column in columns if column in kept]
+    kept = _fitting(sorted(own, key=lambda column: rank.get(column.heading, len(rank))), console.width)
+    drawn = [column for column in own if column in kept]
     whole = sum(max(column.width, cell_len(column.heading)) + 2 for column in drawn) <= console.width
     # the box has a blank between columns; there is another where there is room
     table = Table(box=box.SIMPLE_HEAD, show_edge=False, pad_edge=False, padding=(0, int(whole), 0, 0))
@@ -78,42 +100,43 @@ def print_frame(frame: pd.DataFrame, title: str, priority: Sequence[str] = (), *
     for row in zip(*(column.cells for column in drawn), strict=True):
         table.add_row(*map(shown, row))
     console.print(table)
-    if left_out := [column.heading for column in columns if column not in kept]:
+    if left_out := [column.heading for column in own if column not in kept]:
         text = f"not shown at {console.width} columns: {', '.join(left_out)} (`vibench show --columns`)"
         console.print(shown(text), overflow="fold")
 
 
 @dataclass(frozen=True, eq=False)
-class _Column:
+class PrintedColumn:
     """A column of a printed table: its texts, and the characters it needs; a long text may have lines of its own."""
 
     heading: str
     cells: tuple[str, ...]
-    numeric: bool
-
-    @classmethod
-    def of(cls, column: pd.Series) -> _Column:
-        cells = tuple(printable_lines(tables.cell_text(value)) for value in column)
-        return cls(str(column.name), cells, pd.api.types.is_numeric_dtype(column))
+    numeric: bool = False
 
     @property
     def long(self) -> bool:
+        """Whether a text may be wrapped."""
         return self._longest > SHORT
 
     @property
     def width(self) -> int:
         """Characters that it needs at least: whole texts where they are short, of long ones whole words."""
-        words = [*self.heading.split(), *(word for cell in self.cells for word in cell.split() if self.long)]
+        words = [
+            *self.heading.split(),
+            *(word for cell in self.cells for word in printable_lines(cell).split() if self.long),
+        ]
         return max([min(cell_len(word), SHORT) for word in words] + [1 if self.long else self._longest])
 
     @property
     def _longest(self) -> int:
-        return max((cell_len(line) for cell in self.cells for line in cell.split("\n")), default=1)
+        return max(
+            (cell_len(line) for cell in map(printable_lines, self.cells) for line in cell.split("\n")), default=1
+        )
 
 
-def _fitting(columns: Sequence[_Column], width: int) -> list[_Column]:
+def _fitting(columns: Sequence[PrintedColumn], width: int) -> list[PrintedColumn]:
     """Those columns, the first at least, that find room one after the other."""
-    kept: list[_Column] = []
+    kept: list[PrintedColumn] = []
     left = width
     for column in columns:
         if not kept or column.width + 1 <= left:
@@ -125,7 +148,3 @@ def _fitting(columns: Sequence[_Column], width: int) -> list[_Column]:
 def shown(text: str) -> Text:
     """A text of some lines in a table, without markup and without what is not printable."""
     return Text(printable_lines(text))
-
-
-def _same(column: pd.Series) -> bool:
-    return bool(column.nunique(dropna=False) == 1)

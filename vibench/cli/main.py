@@ -15,7 +15,7 @@ import typer
 from typer import Argument, Option
 
 from vibench.cli import result_commands
-from vibench.cli.completion import examples, names, solvers, studies
+from vibench.cli.completion import examples, names, solvers, studies, whole_words
 from vibench.cli.output import echo
 from vibench.cli.plugin_commands import check_plugin, list_plugins, new_plugin
 from vibench.cli.result_commands import compare_runs, draw_figures, export_qps, replay_query, show, write_report
@@ -187,7 +187,8 @@ def main() -> None:
     """Entry point: an expected error is one line; exit code 2 for a wrong request, 1 for anything else."""
     usage_error = typer.BadParameter.__mro__[2]  # click's ClickException, whichever copy of click typer brings
     try:
-        code = app(args=sys.argv[1:] or ["--help"], standalone_mode=False)
+        with whole_words():
+            code = app(args=sys.argv[1:] or ["--help"], standalone_mode=False)
     except VibenchError as error:
         code = _print_error(error, 2 if isinstance(error, RequestError) else 1)
     except OSError as error:

@@ -87,9 +87,9 @@ def draw_all(
             pool = ProcessPoolExecutor(jobs - 1, get_context("spawn"))
             stack.callback(pool.shutdown, cancel_futures=True)
             with _interrupts_ignored():  # the processes inherit it: Ctrl-C is for this one to handle
-                others = {k: pool.submit(_draw, path, folder, formats, k) for k in range(len(known))}
-        # the others draw from the first figure on, this process from the last one on what they have not begun
-        for k in reversed(range(len(known))):
+                others = {k: pool.submit(_draw, path, folder, formats, k) for k in reversed(range(len(known)))}
+        # the others draw from the last figure on, this process from the first one on what they have not begun
+        for k in range(len(known)):
             if k not in others or others[k].cancel():
                 others.pop(k, None)
                 progress(known[k][0], len(written) + sum(other.done() for other in others.values()), len(known))
