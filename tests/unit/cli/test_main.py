@@ -262,9 +262,30 @@ def test_list_shows_every_plugin_and_its_options(main: Main) -> None:
     for kind in LISTS.values():
         for name in registry.names(kind):
             assert name in out
-    for option in registry.options("problem", "obstacle"):
+    options = registry.options("problem", "obstacle")
+    assert ", ".join(option.name for option in options) in out
+    _, out, _ = main("list", "problems")
+    for option in options:
         assert f"{option.name}: " in out
     assert "'coarse', 'medium'" in out
+
+
+@pytest.mark.parametrize("arguments", [["--version"], ["-h"], ["run", "-h"]])
+def test_short_options_and_the_version(arguments: list[str], main: Main) -> None:
+    code, out, err = main(*arguments)
+    assert (code, err) == (0, "")
+    assert out.startswith(f"vibench {importlib.metadata.version('vibench')}" if "-h" not in arguments else "Usage: ")
+
+
+def test_ctrl_c_while_drawing_says_what_is_there(main: Main, quick_run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupted(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("vibench.report.figures.draw_all", interrupted)
+    code, out, _ = main("figures", str(quick_run), "--out", "pictures")
+    assert code == 130
+    assert "interrupted while drawing: results and tables are complete" in out
+    assert f"`vibench figures {quick_run}`" in out
 
 
 @pytest.mark.parametrize(("what", "kind"), LISTS.items())
@@ -303,8 +324,16 @@ def test_a_run_ends_with_the_summary_and_says_where_things_are(quick_run: Path) 
     fine = read(quick_run / FILE, "cells")["status"] == "ok"
     assert f"{len(fine)} cells, {fine.sum()} ok, {len(fine) - fine.sum()} not ok" in printed
     assert str(quick_run / FILE) in printed
-    assert "online [ms]" in printed
+    assert "next:\n  vibench show " in printed
+    assert len(printed.splitlines()) < 100
     assert "\x1b" not in printed
+
+
+@pytest.mark.parametrize("form", ["markdown", "latex", "json"])
+def test_a_condition_holds_in_every_format(form: str, main: Main, quick_run: Path) -> None:
+    _, out, _ = main("show", str(quick_run), "--where", "solver = 'osqp'", "--format", form)
+    assert "osqp" in out
+    assert "piqp" not in out
 
 
 @pytest.mark.parametrize("table", ["summary", "benefits", *TABLES])

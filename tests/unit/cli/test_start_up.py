@@ -29,6 +29,12 @@ def test_help_imports_no_heavy_library(name: str, command: str) -> None:
     assert found & HEAVY == set()
 
 
+def test_the_list_imports_no_plugin_and_no_table(command: str) -> None:
+    found, printed = imported(command, "list")
+    assert "obstacle" in printed
+    assert found & (HEAVY - {"rich", "numpy"} | {"vibench_strategies"}) == {"vibench_problems"}  # paths of its studies
+
+
 @pytest.mark.parametrize(
     ("line", "word"),
     [
@@ -38,6 +44,7 @@ def test_help_imports_no_heavy_library(name: str, command: str) -> None:
         ("vibench check ", "obstacle"),
         ("vibench list ", "solvers"),
         ("vibench show quick --table ", "histories"),
+        ("vibench check obstacle --option ", "resolution="),
     ],
 )
 def test_completion_imports_no_heavy_library(line: str, word: str, command: str) -> None:
