@@ -34,7 +34,7 @@ EXAMPLES: Mapping[str, tuple[str, ...]] = {
         "vibench show quick",
         "vibench show quick --table benefits",
         "vibench show quick --where \"solver = 'piqp' and beta_span_min < 1e-3\"",
-        "vibench show quick --table queries --columns cell,query,error_u --sort -error_u",
+        "vibench show quick --columns cell,solver,error_u_mean --sort -error_u_mean",
         "vibench show runs/quick --format csv",
     ),
     "report": ("vibench report quick", "vibench report runs/quick --out quick.html"),

@@ -136,9 +136,10 @@ def clean(
     dry_run: Annotated[bool, Option("--dry-run", help="Only show what is stored.")] = False,
     yes: Annotated[bool, Option("--yes", "-y", help="Delete without asking.")] = False,
 ) -> None:
-    """Show the disk usage of stored intermediate results, and delete them. The results of runs are kept.
+    """Show and delete stored snapshots, bases and cones.
 
-    Stored are snapshots, bases, cones, enrichments and inf-sup constants; later runs compute again what they need.
+    Enrichments and inf-sup constants are stored, too. The results of runs are kept; later runs compute again what they
+    need.
     """
     import pandas as pd
 

@@ -28,7 +28,10 @@ def list_plugins(
         Argument(help="problems, primal, dual, solvers or studies; all of them by default.", autocompletion=lists),
     ] = None,
 ) -> None:
-    """List problems, strategies, studies and QP solvers; a list of one kind has the values of options, too."""
+    """List problems, strategies, studies and QP solvers.
+
+    Plugins are listed with their options; a list of one kind has the values of the options, too.
+    """
     from vibench.cli import overview
     from vibench.cli.console import print_rows
 

@@ -65,8 +65,8 @@ def duration(seconds: float) -> str:
 def progress_bar(console: Console) -> Progress:
     """A bar that fits 80 columns: what is being done, how much of it is done, and the time left."""
     bar = BarColumn(bar_width=16)
-    columns = ("[progress.description]{task.description}", bar, MofNCompleteColumn(), TimeElapsedColumn())
-    return Progress(*columns, TextColumn("{task.fields[left]}"), console=console)
+    what, left = (TextColumn(text, markup=False) for text in ("{task.description}", "{task.fields[left]}"))
+    return Progress(what, bar, MofNCompleteColumn(), TimeElapsedColumn(), left, console=console)
 
 
 class DrawingDisplay:

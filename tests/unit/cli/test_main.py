@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import importlib.metadata
 import io
+import re
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -294,7 +295,8 @@ def test_one_list_shows_only_its_own(what: str, kind: str, main: Main) -> None:
     assert code == 0
     assert out.startswith(what)
     assert all(name in out for name in registry.names(kind))
-    assert [title for title in (*LISTS, "solvers") if title != what and f"\n{title}" in out] == []
+    others = [title for title in (*LISTS, "solvers") if title != what]
+    assert [title for title in others if re.search(rf"^{title}(,|$)", out, re.MULTILINE)] == []
 
 
 def test_the_list_of_solvers_says_which_are_installed(main: Main) -> None:

@@ -273,8 +273,9 @@ def test_what_is_not_installed_is_one_line(report: Make, cells: list[Cell]) -> N
 def test_the_figure_that_is_being_drawn_is_named(terminal: bool) -> None:
     printed = io.StringIO()
     with DrawingDisplay(Console(file=printed, force_terminal=terminal, width=80)) as display:
-        display.show("hertz-errors", 2, 25)
-    assert ("hertz-errors" in printed.getvalue()) is terminal
+        display.show("[red]hertz-errors", 2, 25)
+    assert "description" not in printed.getvalue()
+    assert ("[red]hertz-errors" in printed.getvalue()) is terminal
     assert "figures" in printed.getvalue()
 
 
