@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -41,11 +41,13 @@ def print_line(console: Console, line: str) -> None:
     console.print(Text(printable(line)), soft_wrap=True)
 
 
-def print_frame(frame: pd.DataFrame, title: str, priority: Sequence[str] = (), *, every: bool = False) -> None:
+def print_frame(
+    frame: pd.DataFrame, title: str, priority: Sequence[str] = (), *, axes: Collection[str] = (), every: bool = False
+) -> None:
     """Print a table that fits the width; nothing is cut, and no number is wrapped.
 
-    Columns with the same value in every row go into the title, and empty ones are left out. Where there is not room for
-    all others, those of the smallest priority are left out, and a line below names them.
+    Text columns with the same value in every row go into the title, and empty ones are left out. Where there is not
+    room for all others, those of the smallest priority are left out, and a line below names them.
 
     Parameters
     ----------
@@ -55,6 +57,8 @@ def print_frame(frame: pd.DataFrame, title: str, priority: Sequence[str] = (), *
         Its title.
     priority
         Columns, those that matter most first; the order of the table by default.
+    axes
+        Columns of numbers that go into the title, too, where they are the same in every row.
     every
         Print columns with the same value in every row, too, as columns.
     """
@@ -64,7 +68,7 @@ def print_frame(frame: pd.DataFrame, title: str, priority: Sequence[str] = (), *
         PrintedColumn(str(name), tuple(map(cell_text, frame[name])), frame[name].dtype.kind in "iufb")
         for name in frame.columns
     ]
-    print_columns(columns, title, priority, every=every)
+    print_columns(columns, title, priority, axes=axes, every=every)
 
 
 def print_rows(rows: Iterable[Sequence[str]], headings: Sequence[str], title: str) -> None:
@@ -74,12 +78,18 @@ def print_rows(rows: Iterable[Sequence[str]], headings: Sequence[str], title: st
 
 
 def print_columns(
-    columns: Sequence[PrintedColumn], title: str, priority: Sequence[str] = (), *, every: bool = False
+    columns: Sequence[PrintedColumn],
+    title: str,
+    priority: Sequence[str] = (),
+    *,
+    axes: Collection[str] = (),
+    every: bool = False,
 ) -> None:
     """Print columns as `print_frame` prints a table."""
     console = new_console()
     count = len(columns[0].cells) if columns else 0
-    shared = [column for column in columns if not every and count > 1 and len(set(column.cells)) == 1]
+    alike = [column for column in columns if not every and count > 1 and len(set(column.cells)) == 1]
+    shared = [column for column in alike if not column.numeric or column.heading in axes or not column.cells[0]]
     values = [f"{column.heading} {column.cells[0]}" for column in shared if column.cells[0]]
     title = ", ".join([title, *values])
     console.print(shown(title if count else f"{title}: no rows"), overflow="fold")
@@ -89,7 +99,7 @@ def print_columns(
     rank = {name: k for k, name in enumerate(priority)}
     kept = _fitting(sorted(own, key=lambda column: rank.get(column.heading, len(rank))), console.width)
     drawn = [column for column in own if column in kept]
-    whole = sum(max(column.width, cell_len(column.heading)) + 2 for column in drawn) <= console.width
+    whole = sum(max(column.width, cell_len(column.heading)) + 2 for column in drawn) <= console.width + 2
     # the box has a blank between columns; there is another where there is room
     table = Table(box=box.SIMPLE_HEAD, show_edge=False, pad_edge=False, padding=(0, int(whole), 0, 0))
     for column in drawn:
@@ -137,7 +147,7 @@ class PrintedColumn:
 def _fitting(columns: Sequence[PrintedColumn], width: int) -> list[PrintedColumn]:
     """Those columns, the first at least, that find room one after the other."""
     kept: list[PrintedColumn] = []
-    left = width
+    left = width + 1  # no blank after the last one
     for column in columns:
         if not kept or column.width + 1 <= left:
             kept.append(column)

@@ -44,7 +44,7 @@ def show(
     path = tables.results_file(run)
     found = views.look_up(path, table, columns=parts(columns), where=where, sort=parts(sort), limit=limit)
     if form == "terminal":
-        print_frame(found.readable, f"{path.parent.name}: {table}", found.priority, every=found.chosen)
+        print_frame(found.readable, f"{path.parent.name}: {table}", found.priority, axes=found.axes, every=found.chosen)
     else:
         sys.stdout.write(tables.FORMS[form](found.exact if form in {"csv", "json"} else found.readable))
 

@@ -38,7 +38,7 @@ def print_summary(study: str, path: Path, rows: Rows) -> None:
     table = views.look_up(path, "summary" if len(cells) <= WHOLE else "best")
     if len(table.rows):
         title = study if len(cells) <= WHOLE else f"{study}, the fastest query at every error reached"
-        print_frame(table.readable, title, table.priority)
+        print_frame(table.readable, title, table.priority, axes=table.axes)
     not_ok = [row for row in rows if row["status"] != Status.OK]
     echo(*failures(not_ok))
     echo(f"{len(rows)} cells, {len(rows) - len(not_ok)} ok, {len(not_ok)} not ok")

@@ -21,7 +21,7 @@ OF_CELLS = (
 )  # fmt: skip
 
 OF_BENEFITS = (
-    "problem", "dual", "primal_a", "primal_b", "primal_tol_b", "benefit_threshold", "solver", "assembly_a",
+    "problem", "dual", "primal_a", "primal_b", "benefit_threshold", "primal_tol_b", "solver", "assembly_a",
     "assembly_b", "threshold_high", "pod_tol", "dual_tol", "accuracy", "online_b_s", "online_a_s", "offline_b_s",
     "offline_a_s",
 )  # fmt: skip
@@ -118,8 +118,16 @@ class Table:
     @property
     def priority(self) -> list[str]:
         """Headings, those that matter most first."""
-        known = self.view.headings or {}
-        return [known[name].heading or name if name in known else name for name in self.columns]
+        return [self._heading(name) for name in self.columns]
+
+    @property
+    def axes(self) -> set[str]:
+        """Headings of the columns that tell rows apart."""
+        return {self._heading(name) for name in (*AXES, "primal_tol_b")}
+
+    def _heading(self, name: str) -> str:
+        column = (self.view.headings or {}).get(name)
+        return column.heading or name if column is not None else name
 
 
 def look_up(

@@ -68,12 +68,15 @@ def test_the_columns_that_matter_least_go_first() -> None:
     frame = pd.DataFrame({name: [1.23456, 2.34567] for name in ("alpha", "bravo", "charlie")})
     lines = printed(frame.assign(bravo=[1, 2], charlie=[3, 4]), 13, ["charlie", "alpha", "bravo"])
     assert lines[1].split() == ["alpha", "charlie"]
-    assert "bravo" in " ".join(lines[-3:])
+    assert "bravo" in " ".join(lines[5:])
 
 
 def test_values_that_all_rows_share_stand_in_the_title_unless_asked_for() -> None:
     frame = pd.DataFrame({"solver": ["piqp", "piqp"], "N": [8, 8], "k": [1, 2], "none": [None, None]})
-    assert printed(frame, 80)[0] == "table, solver piqp, N 8"
+    assert printed(frame, 80)[:2] == ["table, solver piqp", "N  k"]
+    with contextlib.redirect_stdout(io.StringIO()) as out:
+        print_frame(frame, "table", axes=["N"])
+    assert out.getvalue().splitlines()[0] == "table, solver piqp, N 8"
     with contextlib.redirect_stdout(io.StringIO()) as out:
         print_frame(frame, "table", every=True)
     assert out.getvalue().splitlines()[1].split() == ["solver", "N", "k", "none"]
