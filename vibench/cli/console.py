@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 from rich import box
@@ -123,12 +124,12 @@ class PrintedColumn:
     cells: tuple[str, ...]
     numeric: bool = False
 
-    @property
+    @cached_property
     def long(self) -> bool:
         """Whether a text may be wrapped."""
         return self._longest > SHORT
 
-    @property
+    @cached_property
     def width(self) -> int:
         """Characters that it needs at least: whole texts where they are short, of long ones whole words."""
         words = [
@@ -137,7 +138,7 @@ class PrintedColumn:
         ]
         return max([min(cell_len(word), SHORT) for word in words] + [1 if self.long else self._longest])
 
-    @property
+    @cached_property
     def _longest(self) -> int:
         return max(
             (cell_len(line) for cell in map(printable_lines, self.cells) for line in cell.split("\n")), default=1
