@@ -18,7 +18,6 @@ from palette import use_palette
 from vibench.report import figures
 from vibench.report.figures.style import save, styled
 from vibench.results import tables
-from vibench.results.break_even import HIGH_FIDELITY
 
 
 @dataclass(frozen=True)
@@ -141,7 +140,7 @@ def page(path: Path, target: Path) -> str:
 def break_evens(path: Path) -> list[str]:
     """The section on break-even: the number of queries from which one enrichment is cheaper in total than another."""
     thresholds = tables.read(path, "thresholds")
-    of_enrichments = thresholds[thresholds["primal_a"] != HIGH_FIDELITY]
+    of_enrichments = thresholds[thresholds["cell_a"].notna()]
     if of_enrichments.empty:
         return []
     return ["## Break-even of fixed enrichments", tables.to_markdown(tables.benefits(of_enrichments))]

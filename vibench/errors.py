@@ -45,9 +45,17 @@ def _message(error: BaseException) -> str:
         return "its message cannot be read"
 
 
+MANY = 30
+"""Names up to which an error lists all that are known."""
+
+
 def unknown_name(kind: str, name: str, known: Iterable[str]) -> RequestError:
     """Build the error for a name nobody registered, with the nearest known one suggested."""
     choices = sorted(known)
-    near = difflib.get_close_matches(name, choices, n=1)
+    near = difflib.get_close_matches(name, choices, n=5)
     hint = f"; did you mean '{near[0]}'?" if near else ""
-    return RequestError(f"no {kind} is called '{name}'{hint} (known: {', '.join(choices) or 'none'})")
+    if len(choices) > MANY:
+        listed = f"{len(choices)} are known{', such as ' * bool(near[1:])}{', '.join(near[1:])}"
+    else:
+        listed = f"known: {', '.join(choices) or 'none'}"
+    return RequestError(f"no {kind} is called '{name}'{hint} ({listed})")

@@ -45,10 +45,15 @@ def distribution_version(name: str) -> str:
         return ""
 
 
+def solver_distribution(solver: str) -> str:
+    """The distribution a QP solver comes in."""
+    return SOLVER_DISTRIBUTIONS.get(solver, solver)
+
+
 @cache
 def solver_version(solver: str) -> str:
     """Version of the distribution a QP solver comes in, "" where it is not installed."""
-    return distribution_version(SOLVER_DISTRIBUTIONS.get(solver, solver))
+    return distribution_version(solver_distribution(solver))
 
 
 NUMERICAL = (

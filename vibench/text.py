@@ -38,6 +38,12 @@ def one_line(text: str) -> str:
     return _cut(unbroken(text[:LONGEST]), len(text), LONGEST)
 
 
+def above(value: float, limit: float) -> str:
+    """Such as "3.1e-07 above 1e-07": a number above a limit, with the digits that tell it from the limit."""
+    digits = next((n for n in range(1, 16) if float(f"{value:.{n}e}") > limit), 16)
+    return f"{value:.{digits}e} above {limit:g}"
+
+
 def _cut(shown: str, length: int, longest: int) -> str:
     """What is shown of a text of that length, of which no more than the `longest` first characters were looked at."""
     if max(length, len(shown)) <= longest:

@@ -39,7 +39,7 @@ def test_a_run_that_was_stopped_goes_on_later(
     before = rows(folder)
     assert [row["dual"] for row in before] == ["cpg"]
     if kill is signal.SIGINT:
-        assert "interrupted: 1 cells have no row yet" in out
+        assert "interrupted: 1 cells have no row yet; the same command resumes the run" in out
         assert len(pd.read_csv(folder / "tables" / "cells.csv")) == 1
 
     (waiting / "go on").touch()
@@ -68,7 +68,9 @@ def test_workers_do_not_see_ctrl_c(command: str, plugins_folder: Path, waiting: 
 
 
 def test_a_second_interrupt_changes_nothing(command: str, plugins_folder: Path, waiting: Path) -> None:
-    with started([command, "run", "study.toml", "--jobs", "2", "--no-figures"], waiting, plugins_folder) as process:
+    """Under --fresh the same command would begin anew, and says so."""
+    run = [command, "run", "study.toml", "--jobs", "2", "--no-figures", "--fresh"]
+    with started(run, waiting, plugins_folder) as process:
         read_until(process, "[1/2] ok")
         for _ in range(20):
             with contextlib.suppress(ProcessLookupError):
@@ -76,7 +78,7 @@ def test_a_second_interrupt_changes_nothing(command: str, plugins_folder: Path, 
             time.sleep(0.01)
         out, err = process.communicate(timeout=60)
     assert (process.returncode, err) == (130, "")
-    assert "interrupted: 1 cells have no row yet; the same command resumes the run" in out
+    assert "interrupted: 1 cells have no row yet; the same command without --fresh resumes the run" in out
     assert len(rows(waiting / "runs" / "wire")) == 1
 
 
@@ -105,7 +107,7 @@ def test_two_runs_do_not_write_into_one_folder(
             second = vibench(waiting, "run", "study.toml", *options)
             assert second.returncode == 2
             assert f"another run writes into 'runs/wire' (process {process.pid} on" in second.stderr
-        refused = vibench(waiting, "clean")
+        refused = vibench(waiting, "clean", "--yes")
         assert refused.returncode == 2
         assert "a run uses the artefacts in" in refused.stderr
         (waiting / "go on").touch()

@@ -178,7 +178,25 @@ def test_a_plugin_whose_requirements_are_missing_is_unavailable(vibench: Vibench
     found = {row["dual"]: row for row in rows(tmp_path / "runs" / "wire")}
     assert {dual: row["status"] for dual, row in found.items()} == {"cone-needs": "unavailable", "cpg": "ok"}
     reason = "the dual strategy 'cone-needs' needs no-such-distribution, which is not installed"
-    assert found["cone-needs"]["reason"] == reason
+    assert found["cone-needs"]["reason"] == f"{reason}: `pip install no-such-distribution`"
+    assert done.stdout.count(reason) == 2  # when the run begins, and among what is not ok
+
+
+def test_a_run_of_which_nothing_can_run_here_is_an_error(vibench: Vibench, tmp_path: Path) -> None:
+    study = write_study(tmp_path, wire_study(primal=["decorrelated", "online-supremizers"], solvers=["ecos"]))
+    done = vibench(tmp_path, "run", study, "--jobs", "1")
+    assert done.returncode == 1
+    assert "no cell could run here" in done.stderr
+    assert done.stdout.count("the QP solver 'ecos' is not installed: `pip install ecos`") == 2
+    assert "2 cells unavailable: " in done.stdout
+
+
+def test_clean_deletes_nothing_unasked(vibench: Vibench, again: Path, artefacts: Path) -> None:
+    before = sorted(artefacts.glob(f"*{SUFFIX}"))
+    done = vibench(again, "clean")
+    assert done.returncode == 2
+    assert "--yes" in done.stderr
+    assert sorted(artefacts.glob(f"*{SUFFIX}")) == before != []
 
 
 @pytest.fixture(scope="module")
@@ -290,10 +308,10 @@ def test_clean_shows_and_frees_what_artefacts_take(
     vibench(tmp_path, "run", write_study(tmp_path, wire_study()), "--jobs", "1")
     artefacts = tmp_path / "cache" / "artefacts"
     count = len(list(artefacts.glob(f"*{SUFFIX}")))
-    for options, left in ((("--dry-run",), count), (("--older-than", "1"), count), ((), 0)):
+    for options, left in ((("--dry-run",), count), (("--older-than", "1"), count), (("--yes",), 0)):
         done = vibench(tmp_path, "clean", *options)
         assert (done.returncode, done.stderr) == (0, "")
-        assert re.search(rf"high-fidelity-solutions +{2 * CHUNKS} ", done.stdout)
+        assert re.search(rf"high-fidelity solutions +{2 * CHUNKS} ", done.stdout)
         assert len(list(artefacts.glob(f"*{SUFFIX}"))) == left
     assert "MiB freed" in done.stdout
     assert (tmp_path / "runs" / "wire" / FILE).exists()

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from vibench.errors import in_a_line
-from vibench.text import LONGEST, brief, one_line, printable, printable_lines, unbroken
+from vibench.text import LONGEST, above, brief, one_line, printable, printable_lines, unbroken
 
 ANYTHING = st.text(st.characters())
 """All of Unicode: `st.text()` alone draws no surrogates."""
@@ -79,3 +79,15 @@ class UnreadableError(Exception):
 
 def test_an_exception_without_a_readable_message_has_its_name() -> None:
     assert in_a_line(UnreadableError()) == "UnreadableError: its message cannot be read"
+
+
+@given(st.floats(1e-15, 1.0), st.floats(1.0 + 1e-12, 100.0))
+def test_a_number_above_a_limit_is_said_with_digits_that_differ(limit: float, factor: float) -> None:
+    value, _ = above(limit * factor, limit).split(" above ")
+    assert float(value) > limit
+
+
+def test_a_residual_just_above_the_accuracy_is_told_from_it() -> None:
+    assert above(1.0234e-7, 1e-7) == "1.02e-07 above 1e-07"
+    assert above(3.14e-7, 1e-7) == "3.1e-07 above 1e-07"
+    assert above(1.0000001e-7, 1e-7) == "1.0000001e-07 above 1e-07"

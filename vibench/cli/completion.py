@@ -5,14 +5,22 @@ A shell waits for completions, so names of plugins are read from entry points an
 
 from __future__ import annotations
 
+import contextlib
+import io
+import os
+import re
 import sqlite3
-from collections.abc import Callable, Iterable, Mapping
+import sys
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 
 import typer
 
 from vibench.errors import VibenchError
 from vibench.results.columns import TABLES
+
+SHOWN = ("summary", "best", "benefits", *TABLES)
+"""Tables that `vibench show` prints."""
 
 EXAMPLES: Mapping[str, tuple[str, ...]] = {
     "run": (
@@ -22,8 +30,15 @@ EXAMPLES: Mapping[str, tuple[str, ...]] = {
         "vibench run quick --pod-tol 1e-2 --pod-tol 1e-3",
     ),
     "list": ("vibench list", "vibench list solvers"),
-    "show": ("vibench show quick", "vibench show quick --table benefits", "vibench show runs/quick --format csv"),
+    "show": (
+        "vibench show quick",
+        "vibench show quick --table benefits",
+        "vibench show quick --where \"solver = 'piqp' and beta_span_min < 1e-3\"",
+        "vibench show quick --columns cell,solver,error_u_mean --sort -error_u_mean",
+        "vibench show runs/quick --format csv",
+    ),
     "report": ("vibench report quick", "vibench report runs/quick --out quick.html"),
+    "figures": ("vibench figures quick", "vibench figures runs/quick --out pictures -j 1"),
     "diff": ("vibench diff runs/before runs/after", "vibench diff runs/before runs/after --limit 1.1 --format json"),
     "replay": ("vibench replay quick 3f9a", "vibench replay quick 3f9a --query 7"),
     "export-qps": ("vibench export-qps quick programs",),
@@ -51,6 +66,37 @@ def examples(command: str) -> str:
     return "\n".join(["\b", "Examples:", *(f"  {line}" for line in EXAMPLES[command])])
 
 
+@contextlib.contextmanager
+def whole_words() -> Iterator[None]:
+    """Give the completion of bash words that it breaks at ":" and "=": `primal:name` and `key=value` are one.
+
+    What bash completes of such a word is what comes after its last break, so what is printed begins there.
+    """
+    if "_VIBENCH_COMPLETE" in os.environ:  # it would look for plugins of pydantic, which typer checks words with
+        os.environ["PYDANTIC_DISABLE_PLUGINS"] = "__all__"
+    if os.environ.get("_VIBENCH_COMPLETE") != "complete_bash":
+        yield
+        return
+    asked, current = os.environ["COMP_WORDS"], int(os.environ["COMP_CWORD"])
+    pieces = asked.split("\n" if "\n" in asked else " ")
+    joined: list[str] = []
+    for k, piece in enumerate(pieces[: current + 1]):
+        together = joined and (piece[:1] in BREAKS or (piece and pieces[k - 1][-1:] in BREAKS))
+        joined[-1 if together else len(joined) :] = [joined[-1] + piece if together else piece]
+    last = joined[-1] if len(joined) > 1 else ""
+    os.environ.update(COMP_WORDS="\n".join(joined), COMP_CWORD=str(len(joined) - 1))
+    try:
+        with contextlib.redirect_stdout(io.StringIO()) as printed:
+            yield
+    finally:
+        done = len(re.match(".*[:=]|", last)[0])  # type: ignore[index]  # it matches any text
+        sys.stdout.write("".join(f"{line[done:]}\n" for line in printed.getvalue().splitlines()))
+
+
+BREAKS = (":", "=")
+"""Characters at which bash breaks words, and which words of vibench have."""
+
+
 def words(known: Callable[[], Iterable[str]]) -> Callable[[str], list[str]]:
     """Completes the words of a function, which is called when a shell asks."""
 
@@ -65,11 +111,32 @@ def names(*groups: str) -> Callable[[str], list[str]]:
     return words(lambda: _registered(*groups))
 
 
+def plugins(incomplete: str) -> list[str]:
+    """Completes names of plugins, alone or with their kind before them: "primal:offline-pga", "solver:piqp"."""
+    kind, colon, name = incomplete.partition(":")
+    if not colon:
+        return _beginning(incomplete, [*_registered(*KINDS.values()), *(f"{kind}:" for kind in KINDS)])
+    known = solvers(name) if kind == "solver" else _registered(KINDS[kind]) if kind in KINDS else ()
+    return _beginning(incomplete, (f"{kind}:{found}" for found in known))
+
+
+def plugin_options(context: typer.Context, incomplete: str) -> list[str]:
+    """Completes the options of the plugin named before, as "resolution=", without importing it."""
+    from vibench.cli import overview
+    from vibench.study.entry_points import entry_points
+
+    kind, colon, name = (context.params.get("plugin") or "".join(context.args[:1])).rpartition(":")
+    groups = [KINDS[kind]] if kind in KINDS else [] if colon else KINDS.values()
+    entries = (entry for group in groups for entry in entry_points(group=f"vibench.{group}") if entry.name == name)
+    found = {option for entry in entries for option in overview.options(overview.plugin_class(entry))}
+    return _beginning(incomplete, (f"{option}=" for option in found))
+
+
 KINDS = {"problem": "problems", "primal": "primal_strategies", "dual": "dual_strategies", "solver": "qp_solvers"}
 """Groups of entry points by the word that `vibench check` knows them by."""
 
 lists = words(lambda: ("problems", "dual", "primal", "solvers", "studies"))
-table_names = words(lambda: ("summary", "benefits", *TABLES))
+table_names = words(lambda: SHOWN)
 
 
 def studies(incomplete: str) -> list[str]:
@@ -84,15 +151,6 @@ def solvers(incomplete: str) -> list[str]:
     from vibench.qp.settings import SETTINGS
 
     return _beginning(incomplete, {*SETTINGS, *_registered("qp_solvers")})
-
-
-def checkable(incomplete: str) -> list[str]:
-    """Completes names of plugins, after the kind of plugin where that is given: "solver:" stands for QP solvers."""
-    kind, colon, name = incomplete.partition(":")
-    if not colon:
-        return [*_beginning(incomplete, _registered(*KINDS.values())), *_beginning(incomplete, ("solver:",))]
-    known = solvers(name) if kind == "solver" else _beginning(name, _registered(KINDS[kind]) if kind in KINDS else ())
-    return [f"{kind}:{found}" for found in known]
 
 
 def runs(incomplete: str) -> list[str]:
@@ -112,6 +170,16 @@ def cells(context: typer.Context, incomplete: str) -> list[tuple[str, str]]:
         return []
     rows = found[["cell", "problem", "dual", "primal", "solver"]].astype(str).itertuples(index=False)
     return sorted((key, " · ".join(axes)) for key, *axes in rows if key.startswith(incomplete))
+
+
+def column_names(context: typer.Context, incomplete: str) -> list[str]:
+    """Completes the last name in a list of columns of the table that `--table` names."""
+    table = str(context.params.get("table") or "summary")
+    source = {"summary": "cells", "best": "cells", "benefits": "thresholds"}.get(table, table)
+    before, comma, last = incomplete.rpartition(",")
+    sign = "-" * last.startswith("-")
+    found = _beginning(last.removeprefix("-"), TABLES.get(source, ()))
+    return [f"{before}{comma}{sign}{name}" for name in found]
 
 
 def _registered(*groups: str) -> set[str]:

@@ -23,7 +23,6 @@ from threadpoolctl import threadpool_info, threadpool_limits
 
 from vibench import provenance
 from vibench.cli import solver_check
-from vibench.cli.output import echo
 from vibench.errors import RequestError, in_a_line
 from vibench.locking import locked
 from vibench.qp.settings import SETTINGS
@@ -34,6 +33,7 @@ from vibench.study import registry
 from vibench.study.entry_points import unreadable
 from vibench.study.reader import read_study
 from vibench.terminal.console import new_console, shown
+from vibench.terminal.output import echo
 from vibench.timing import DISTURBED, WAITED, Calibration, Stopwatch
 
 MIN_GIB = 1.0

@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 from vibench.cli.interrupts import INTERRUPTED, Interrupted, interrupted_at_once, interruptible
 
@@ -18,12 +18,13 @@ with interrupted_at_once():
     import typer
     from typer import Argument, Option
 
-    from vibench.cli.completion import examples, names, solvers, studies
-    from vibench.cli.output import echo
+    from vibench.cli import result_commands
+    from vibench.cli.completion import examples, names, solvers, studies, whole_words
     from vibench.cli.pack_commands import import_pack, reduce_cones, write_pack
     from vibench.cli.plugin_commands import check_plugin, list_plugins, new_plugin
-    from vibench.cli.result_commands import compare_runs, export_qps, replay_query, show, write_report
+    from vibench.cli.result_commands import compare_runs, draw_figures, export_qps, replay_query, show, write_report
     from vibench.errors import RequestError, VibenchError
+    from vibench.terminal.output import echo
     from vibench.text import unbroken
 
 Names = list[str] | None
@@ -35,8 +36,28 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
     # Typer would import pydantic to convert the missing values of these options before a command prints its help.
-    context_settings={"default_map": dict.fromkeys(("help", "install_completion", "show_completion"), False)},
+    context_settings={
+        "default_map": dict.fromkeys(("help", "install_completion", "show_completion", "version"), False),
+        "help_option_names": ["--help", "-h"],
+    },
 )
+
+
+def _print_version(asked: bool) -> None:
+    if asked:
+        from vibench.provenance import distribution_version
+
+        echo(f"vibench {distribution_version('vibench')}")
+        raise typer.Exit
+
+
+@app.callback()
+def _options(
+    version: Annotated[
+        bool, Option("--version", callback=_print_version, is_eager=True, help="Print the version and stop.")
+    ] = False,
+) -> None:
+    pass
 
 
 def run(
@@ -53,7 +74,9 @@ def run(
     dual_tol: Annotated[Tolerances, Option(help="Replace the tolerances (or sizes) of the dual strategies.")] = None,
     primal_tol: Annotated[Tolerances, Option(help="Replace the tolerances of the primal strategies.")] = None,
     out: Annotated[Path | None, Option(help="Results folder; runs/STUDY by default.")] = None,
-    jobs: Annotated[int, Option(min=0, help="Worker processes; 0 for one per core. Does not affect results.")] = 0,
+    jobs: Annotated[
+        int, Option("--jobs", "-j", min=0, help="Worker processes; 0 for one per core. Does not affect results.")
+    ] = 0,
     dry_run: Annotated[bool, Option("--dry-run", help="List the cells of the matrix and stop.")] = False,
     fresh: Annotated[bool, Option("--fresh", help="Remove earlier results and recompute everything.")] = False,
     retry: Annotated[bool, Option("--retry", help="Also rerun cells that did not end ok.")] = False,
@@ -73,6 +96,7 @@ def run(
         from vibench.results import tables
         from vibench.study.cells import expand
         from vibench.study.reader import read_study
+        from vibench.terminal import run_summary
         from vibench.terminal.console import new_console
         from vibench.terminal.progress import ProgressDisplay
 
@@ -99,74 +123,54 @@ def run(
     if outcome.damaged:
         echo(f"computed again, as their rows were damaged: {', '.join(outcome.damaged)}")
     if outcome.interrupted:
-        echo(f"interrupted: {outcome.missing} cells have no row yet; the same command resumes the run")
+        missing = f"{outcome.missing} cells have no row yet" if outcome.missing else "all cells have their rows"
+        again = "the same command without --fresh" if fresh else "the same command"
+        echo(f"interrupted: {missing}; {again} resumes the run")
         raise typer.Exit(INTERRUPTED)
-    drawn: list[Path] = []
+    run_summary.print_summary(loaded.name, path, outcome.rows)
+    echo(f"results: {path}, tables: {folder / 'tables'}")
     if draw or fresh:
         from vibench.report import figures
 
         figures.remove(folder / "figures")
     if draw:
-        drawn = figures.draw_all(path, folder / "figures", jobs=min(options.jobs, provenance.cores()))
-    _summarise(loaded.name, path, outcome.rows)
-    echo(f"results: {path}, tables: {folder / 'tables'}, {len(drawn)} figures: {folder / 'figures'}")
-    if strict and any(row["status"] not in (Status.OK, Status.UNAVAILABLE) for row in outcome.rows):
+        result_commands.draw(path, folder / "figures", options.jobs)
+    statuses = [row["status"] for row in outcome.rows]
+    run_summary.next_steps(folder, len(statuses), len(statuses) - statuses.count(Status.OK), figures=draw)
+    if strict and any(status not in (Status.OK, Status.UNAVAILABLE) for status in statuses):
         raise typer.Exit(1)
-
-
-def _summarise(study: str, path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
-    """Print the summary of a run, its rows that are not ok, and violated invariants."""
-    from vibench.qp.status import Status
-    from vibench.results import invariants, tables
-    from vibench.results.solver_agreement import sentence
-    from vibench.terminal.console import print_frame
-
-    cells, queries = tables.read(path, "cells"), tables.read(path, "queries")
-    print_frame(tables.summary(cells), study)
-    not_ok = [row for row in rows if row["status"] != Status.OK]
-    for line in outcomes(not_ok):
-        echo(line)
-    echo(f"{len(rows)} cells, {len(rows) - len(not_ok)} ok, {len(not_ok)} not ok")
-    violations = invariants.violations(queries, cells.set_index("cell")["enrichment_kind"])
-    for violation in violations:
-        echo(f"invariant: {violation}; this is a bug of vibench or of a plugin's inner products")
-    if not violations:
-        echo(f"invariants of the constants and the error bounds hold in all {len(queries)} queries")
-    echo(sentence(tables.read(path, "disagreements")))
-
-
-def outcomes(rows: Sequence[Mapping[str, Any]]) -> list[str]:
-    """A line for every status and reason of cells that are not ok: the first of these cells, and how many others."""
-    groups: dict[tuple[str, str], list[Mapping[str, Any]]] = {}
-    for row in rows:
-        groups.setdefault((row["status"], row["reason"]), []).append(row)
-    lines = []
-    for (status, reason), (first, *others) in groups.items():
-        tolerance = "" if first["primal_tol"] is None else f" {first['primal_tol']:g}"
-        cell = f"{first['problem']} · {first['dual']} · {first['primal']}{tolerance} · {first['solver']}"
-        more = f" and {len(others)} more" if others else ""
-        lines.append(f"{status}: {cell}{more}: {first['queries_ok']} of {first['queries']} queries ok; {reason}")
-    return lines
 
 
 def clean(
     older_than: Annotated[float, Option(min=0.0, metavar="DAYS", help="Keep younger artefacts.")] = 0.0,
     dry_run: Annotated[bool, Option("--dry-run", help="Only show what is stored.")] = False,
+    yes: Annotated[bool, Option("--yes", "-y", help="Delete without asking.")] = False,
 ) -> None:
-    """Show the disk usage of stored artefacts, and delete them. Results are kept."""
+    """Show and delete stored snapshots, bases and cones.
+
+    Enrichments and inf-sup constants are stored, too. The results of runs are kept; later runs compute again what they
+    need.
+    """
     import pandas as pd
 
     from vibench.stages.artefacts import usable_store
     from vibench.terminal.console import print_frame
 
     store = usable_store()
-    found = pd.DataFrame(store.contents(), columns=["stage", "MiB", "days"])
+    found = pd.DataFrame(store.contents(), columns=["stored", "MiB", "days"])
+    going = int((found["days"] >= older_than * 86400.0).sum())
     found["MiB"], found["days"] = found["MiB"] / 2**20, found["days"] / 86400.0
-    columns = {"artefacts": ("MiB", "size"), "MiB": ("MiB", "sum"), "oldest [days]": ("days", "max")}
-    print_frame(found.groupby("stage", as_index=False).agg(**columns), f"artefacts in {store.folder}")
-    if not dry_run:
-        freed = store.clear(older_than * 86400.0)
-        echo(f"{freed / 2**20:.1f} MiB freed; later runs recompute what they need")
+    found["stored"] = found["stored"].str.replace("-", " ")
+    columns = {"files": ("MiB", "size"), "MiB": ("MiB", "sum"), "oldest [days]": ("days", "max")}
+    print_frame(found.groupby("stored", as_index=False).agg(**columns), f"stored in {store.folder}")
+    if dry_run:
+        return
+    if going and not yes:
+        if not sys.stdin.isatty():
+            raise RequestError("nothing was deleted: answer the question on a terminal, or say --yes")
+        typer.confirm(f"Delete {going} of {len(found)} files?", abort=True)
+    freed = store.clear(older_than * 86400.0)
+    echo(f"{freed / 2**20:.1f} MiB freed; later runs recompute what they need")
 
 
 def doctor(out: Annotated[Path, Option(metavar="DIR", help="Folder of the runs.")] = Path("runs")) -> None:
@@ -182,8 +186,8 @@ def doctor(out: Annotated[Path, Option(metavar="DIR", help="Folder of the runs."
 
 
 COMMANDS: dict[str, Callable[..., None]] = {
-    "run": run, "list": list_plugins, "show": show, "report": write_report, "diff": compare_runs,
-    "replay": replay_query, "export-qps": export_qps, "clean": clean, "doctor": doctor,
+    "run": run, "list": list_plugins, "show": show, "report": write_report, "figures": draw_figures,
+    "diff": compare_runs, "replay": replay_query, "export-qps": export_qps, "clean": clean, "doctor": doctor,
     "check": check_plugin, "new": new_plugin,
     "import": import_pack, "pack": write_pack, "cones": reduce_cones,
 }  # fmt: skip
@@ -196,14 +200,17 @@ def main() -> None:
     usage_error = typer.BadParameter.__mro__[2]  # click's ClickException, whichever copy of click typer brings
     try:
         _search_working_directory_last()
-        code = app(args=sys.argv[1:] or ["--help"], standalone_mode=False)
+        with whole_words():
+            code = app(args=sys.argv[1:] or ["--help"], standalone_mode=False)
     except VibenchError as error:
         code = _print_error(error, 2 if isinstance(error, RequestError) else 1)
     except OSError as error:
         where = f"'{error.filename}' cannot be written or read: " if error.filename else ""
         code = _print_error(f"{where}{error.strerror or error}", 1)
-    except (Interrupted, typer.Abort):
+    except Interrupted:
         code = _print_error("interrupted", INTERRUPTED)
+    except typer.Abort:  # a question that was answered with no
+        code = _print_error("stopped; nothing was changed", INTERRUPTED)
     except Exception as error:
         if not isinstance(error, usage_error):
             raise

@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING, Annotated
 from typer import Argument, Option
 
 from vibench.cli.completion import names
-from vibench.cli.output import echo
 from vibench.cli.plugin_commands import key_value
 from vibench.errors import NumericalError
 from vibench.files import write_atomically
+from vibench.terminal.output import echo
 
 if TYPE_CHECKING:
     from vibench.packs.pack import ModelPack

@@ -10,12 +10,14 @@ from typing import Annotated, Any, Literal
 
 from typer import Argument, Exit, Option
 
-from vibench.cli.completion import checkable, lists
-from vibench.cli.output import echo
+from vibench.cli.completion import lists, plugin_options, plugins
 from vibench.errors import RequestError, in_a_line, unknown_name
+from vibench.terminal.output import echo
 
 LISTS = {"problems": "problem", "primal": "primal strategy", "dual": "dual strategy", "studies": "study"}
 """Kind of plugin that each list shows; QP solvers are listed whether they are plugins or not."""
+
+HEADINGS = ("name", "from", "what", "options")
 
 SECONDS = 120.0
 """Default of `--seconds`: that of `vibench.testing`, which is too slow to import for a help text."""
@@ -37,32 +39,39 @@ def list_plugins(
         Argument(help="problems, primal, dual, solvers or studies; all of them by default.", autocompletion=lists),
     ] = None,
 ) -> None:
-    """List problems, strategies, studies and QP solvers. Plugins are listed with their options."""
-    import pandas as pd
+    """List problems, strategies, studies and QP solvers.
 
+    Plugins are listed with their options; a list of one kind has the values of the options, too.
+    """
+    from vibench.cli import overview
     from vibench.study.entry_points import unreadable
-    from vibench.terminal.console import print_frame
+    from vibench.terminal.console import print_rows
 
-    if what is not None and what not in (*LISTS, "solvers"):
-        raise unknown_name("list", what, (*LISTS, "solvers"))
-    for title in [what] if what else [*LISTS, "solvers"]:
-        rows = _solver_rows() if title == "solvers" else _plugin_rows(LISTS[title])
-        columns = ("name", "version" if title == "solvers" else "from", "what", "options")
-        print_frame(pd.DataFrame(rows, columns=columns), title)
-    for distribution, reason in unreadable().items():
-        echo(f"{distribution}: {reason}")
+    if what is None:
+        for title in overview.KINDS:
+            rows = _solvers_by_version() if title == "solvers" else list(overview.rows(title))
+            print_rows(rows, HEADINGS, title)
+        for distribution, reason in unreadable().items():
+            echo(f"{distribution}: {reason}")
+        echo("", f"vibench list {'|'.join(overview.KINDS)} shows what options are, and whether it can be loaded")
+        return
+    if what not in overview.KINDS:
+        raise unknown_name("list", what, overview.KINDS)
+    rows = _solver_rows() if what == "solvers" else _plugin_rows(LISTS[what])
+    print_rows(rows, HEADINGS, what)
 
 
 def check_plugin(
     plugin: Annotated[
         str,
         Argument(
-            metavar="PLUGIN",
-            help="A name, problem|primal|dual|solver:NAME, or MODULE:NAME.",
-            autocompletion=checkable,
+            metavar="PLUGIN", help="A name, problem|primal|dual|solver:NAME, or MODULE:NAME.", autocompletion=plugins
         ),
     ],
-    option: Annotated[list[str] | None, Option(metavar="KEY=VALUE", help="Option of the plugin (repeatable).")] = None,
+    option: Annotated[
+        list[str] | None,
+        Option(metavar="KEY=VALUE", help="Option of the plugin (repeatable).", autocompletion=plugin_options),
+    ] = None,
     seconds: Annotated[float, Option(min=0.0, help="Time limit of all checks; a slow plugin gets fewer.")] = SECONDS,
 ) -> None:
     """Check a plugin: shapes, signs, tolerances, determinism, time.
@@ -155,6 +164,20 @@ def _plugin_rows(kind: str) -> list[tuple[str, str, str, str]]:
         lines = [f"{o.name}: {o.expected}" + f" = {o.default}" * bool(o.default) for o in options]
         rows.append((name, registry.version(kind, name), description, "\n".join(lines)))
     return rows
+
+
+def _solvers_by_version() -> list[tuple[str, str, str, str]]:
+    """QP solvers and their versions, without loading them."""
+    from vibench import provenance
+    from vibench.cli import overview
+    from vibench.qp.settings import SETTINGS
+
+    ours = []
+    for name in SETTINGS:
+        version = provenance.solver_version(name)
+        package = provenance.solver_distribution(name)
+        ours.append((name, version, "" if version else f"not installed: `pip install {package}`", ""))
+    return sorted([*ours, *overview.rows("solvers")])
 
 
 def _solver_rows() -> list[tuple[str, str, str, str]]:

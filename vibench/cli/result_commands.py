@@ -8,10 +8,11 @@ from typing import Annotated, Literal
 
 from typer import Argument, Exit, Option
 
-from vibench.cli.completion import cells, runs, table_names
-from vibench.cli.output import echo
-from vibench.errors import unknown_name
-from vibench.results.columns import TABLES
+from vibench.cli.completion import SHOWN, cells, column_names, runs, table_names
+from vibench.terminal.output import echo, run_argument
+
+EXAMPLE = "solver = 'piqp' and beta_span_min < 1e-3"
+"""Condition in the help of `--where`."""
 
 Form = Literal["terminal", "markdown", "csv", "latex", "json"]
 FormOption = Annotated[Form, Option("--format", help="Output format.")]
@@ -20,25 +21,32 @@ RunArgument = Annotated[str, Argument(metavar="RUN", help="A run folder, or its 
 
 def show(
     run: RunArgument,
-    table: Annotated[
-        str, Option(help=f"summary, benefits, {', '.join(TABLES)}.", autocompletion=table_names)
-    ] = "summary",
+    table: Annotated[str, Option(help=f"{', '.join(SHOWN)}.", autocompletion=table_names)] = "summary",
+    columns: Annotated[
+        str, Option(metavar="NAME,…", help="Columns to print, or all.", autocompletion=column_names)
+    ] = "",
+    where: Annotated[str, Option(metavar="CONDITION", help=f'Rows to print: "{EXAMPLE}".')] = "",
+    sort: Annotated[
+        str,
+        Option(metavar="NAME,…", help="Columns to sort by; -NAME for the largest first.", autocompletion=column_names),
+    ] = "",
+    limit: Annotated[int, Option(min=0, metavar="N", help="Print the first N rows; 0 for all.")] = 0,
     form: FormOption = "terminal",
 ) -> None:
-    """Print a table of a run."""
-    from vibench.results import tables
+    """Print a table of a run.
+
+    On a terminal, columns that do not fit are left out; csv and json have the values and names of the results file.
+    """
+    from vibench.results import tables, views
+    from vibench.results.selection import parts
     from vibench.terminal.console import print_frame
 
     path = tables.results_file(run)
-    derived = {"summary": ("cells", tables.summary), "benefits": ("thresholds", tables.benefits)}
-    if table not in derived and table not in TABLES:
-        raise unknown_name("table", table, (*derived, *TABLES))
-    source, view = derived.get(table, (table, tables.in_order))
-    frame = view(tables.read(path, source))
+    found = views.look_up(path, table, columns=parts(columns), where=where, sort=parts(sort), limit=limit)
     if form == "terminal":
-        print_frame(frame, f"{path.parent.name}: {table}")
+        print_frame(found.readable, f"{path.parent.name}: {table}", found.priority, axes=found.axes, every=found.chosen)
     else:
-        sys.stdout.write(tables.FORMS[form](frame))
+        sys.stdout.write(tables.FORMS[form](found.exact if form in {"csv", "json"} else found.readable))
 
 
 def write_report(
@@ -51,6 +59,38 @@ def write_report(
 
     path = tables.results_file(run)
     echo(f"report: {html.write(path, out or path.parent / REPORT)}")
+
+
+def draw_figures(
+    run: RunArgument,
+    out: Annotated[Path | None, Option(metavar="DIR", help="Folder; RUN/figures by default.")] = None,
+    jobs: Annotated[int, Option("--jobs", "-j", min=0, help="Processes; 0 for one per core.")] = 0,
+) -> None:
+    """Draw the figures of a run as PNG and SVG."""
+    from vibench.results import tables
+
+    path = tables.results_file(run)
+    draw(path, out or path.parent / "figures", jobs)
+
+
+def draw(path: Path, folder: Path, jobs: int) -> None:
+    """Draw all figures of a results file and say so; Ctrl-C leaves those that are drawn, and the results."""
+    from vibench import provenance
+    from vibench.report import figures
+    from vibench.terminal.console import new_console
+    from vibench.terminal.progress import DrawingDisplay
+
+    cores = provenance.cores()
+    try:
+        with DrawingDisplay(new_console()) as display:
+            drawn = figures.draw_all(path, folder, jobs=min(jobs or cores, cores), progress=display.show)
+    except KeyboardInterrupt:
+        echo(
+            "interrupted while drawing: results and tables are complete, some figures are missing; "
+            f"`vibench figures {run_argument(path.parent)}` draws them"
+        )
+        raise Exit(130) from None
+    echo(f"{len(drawn)} figures: {folder}")
 
 
 def compare_runs(

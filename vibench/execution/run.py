@@ -18,6 +18,7 @@ from vibench.execution.graph import Graph
 from vibench.execution.result_writer import ResultWriter, labels_of
 from vibench.execution.supervisor import Job
 from vibench.execution.timing_plan import TimingPlan
+from vibench.provenance import solver_distribution
 from vibench.qp.solve import installed_solvers
 from vibench.qp.status import Status
 from vibench.results.break_even import break_even_rows
@@ -68,6 +69,9 @@ class Observer:
 
     def start(self, agenda: Agenda) -> None:
         """The run begins."""
+
+    def begin(self, stage: Stage) -> None:
+        """A stage begins."""
 
     def stage(self, stage: Stage, wall: float) -> None:
         """A stage is done, after so many wall seconds."""
@@ -270,6 +274,7 @@ class _Run:
             for stage in self.graph.begin(workers.slots - len(running)):
                 cell_seconds = stage.weight * limits.cell_seconds
                 job = Job(str(self.store.folder), stage, limits.query_seconds, cell_seconds, limits.memory_gib)
+                self.observer.begin(stage)
                 running[workers.submit(job)] = stage
             if not running:
                 raise ExecutorError(
@@ -325,9 +330,11 @@ def unavailable(cell: Cell) -> str:
     for plugin in plugins:
         missing = registry.missing(plugin.kind, plugin.name)
         if missing:
-            return f"the {plugin.kind} '{plugin.name}' needs {', '.join(missing)}, which is not installed"
-    installed = installed_solvers(registry.names("QP solver"))
-    return "" if cell.solver in installed else f"the QP solver '{cell.solver}' is not installed"
+            what = f"the {plugin.kind} '{plugin.name}' needs {', '.join(missing)}, which is not installed"
+            return f"{what}: `pip install {' '.join(missing)}`"
+    if cell.solver in installed_solvers(registry.names("QP solver")):
+        return ""
+    return f"the QP solver '{cell.solver}' is not installed: `pip install {solver_distribution(cell.solver)}`"
 
 
 def _outcome(future: Future[Any]) -> Done | Failed:

@@ -12,6 +12,7 @@ from vibench.interfaces.problem import VariationalInequality
 from vibench.qp.scaling import peak, prescribed, ratio, row_norms, size
 from vibench.qp.solution import QPSolution
 from vibench.qp.status import Status
+from vibench.text import above
 
 ENERGY_FLOOR = 1e-4
 """Share of the energy of load or constraints below which the scale of the gap never falls."""
@@ -115,7 +116,7 @@ def verify(program: VariationalInequality, answer: QPSolution, accuracy: float) 
         return Status.INFEASIBLE, "no point satisfies the constraints (certified)", found
     name = max(("primal", "dual", "gap"), key=lambda key: getattr(found, key))
     clipped = f" after setting multipliers down to -{answer.negative:.0e} to zero" if answer.negative else ""
-    reason = f"{name} residual {getattr(found, name):.1e} above {accuracy:.0e}{clipped}: {answer.solver_status}"
+    reason = f"{name} residual {above(getattr(found, name), accuracy)}{clipped}: {answer.solver_status}"
     return Status.INACCURATE, reason, found
 
 

@@ -25,7 +25,6 @@ from vibench.report.figures.data import (
     solved_too_loosely,
 )
 from vibench.results import invariants, tables
-from vibench.results.break_even import HIGH_FIDELITY
 from vibench.results.solver_agreement import sentence
 from vibench.stability.infsup import VANISHES
 
@@ -151,7 +150,7 @@ def _costs(cells: pd.DataFrame, thresholds: pd.DataFrame) -> Iterator[str]:
         f"{1e3 * row['online_solve_s']:.3g} ms; a high-fidelity solution takes {1e3 * row['hf_s']:.3g} ms "
         f"after a set-up of {1e3 * row['hf_setup_s']:.3g} ms."
     )
-    against = thresholds[(thresholds["cell_b"] == row["cell"]) & (thresholds["primal_a"] == HIGH_FIDELITY)]
+    against = thresholds[(thresholds["cell_b"] == row["cell"]) & thresholds["cell_a"].isna()]
     for found in against.itertuples():
         number = "" if pd.isna(found.benefit_threshold) else f" {math.ceil(found.benefit_threshold)} queries"
         interval = tables.interval(found.threshold_low, found.threshold_high)

@@ -22,7 +22,6 @@ from vibench.report.figures import drawings
 from vibench.report.figures.style import styled, write_figure
 from vibench.report.findings import findings
 from vibench.results import pictures, tables
-from vibench.results.break_even import HIGH_FIDELITY
 from vibench.results.database import read_meta, study_of
 from vibench.text import printable
 
@@ -101,7 +100,7 @@ def _tables(path: Path, cells: pd.DataFrame) -> Iterator[tuple[str, str, str, pd
     """Identifier, title, caption and rows."""
     yield "summary", "All cells", ERRORS, tables.summary(cells)
     thresholds = tables.read(path, "thresholds")
-    model = thresholds["primal_a"] == HIGH_FIDELITY
+    model = thresholds["cell_a"].isna()
     caption = (
         "When b is cheaper than a, offline and online together, by the number of queries, with its 95 % interval; "
         "undecided where the measured rounds do not tell the sign of a difference."

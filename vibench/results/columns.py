@@ -83,11 +83,15 @@ def _medians(*names: str) -> dict[str, Column]:
 
 CELLS: Mapping[str, Column] = {
     "cell": Column(
-        KEY, "", "Hash of everything that determines the cell's numbers, the code aside; what `replay` takes."
+        KEY,
+        "",
+        "Hash of everything that determines the cell's numbers, the code aside; `replay` takes it, or its beginning.",
+        "cell",
+        0,
     ),
     **KEYS,
     "model": Column(TEXT, "", "Hash of the reduced model; cells that differ in their solver alone share it."),
-    "status": Column(f"{TEXT} NOT NULL", "", "The worst status of its queries, or what became of a stage they need."),
+    "status": Column(f"{TEXT} NOT NULL", "", "The worst status of its queries, or of a stage they need.", "status", 10),
     "reason": Column(TEXT, "", "Why it is not ok: the first query with this status and what was wrong there."),
     "queries": Column(INTEGER, "", "Queries asked: one per validation parameter."),
     "queries_ok": Column(INTEGER, "", "Queries that are ok; means and maxima are over these.", "ok", 10),

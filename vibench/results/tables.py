@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +13,7 @@ import pandas as pd
 
 from vibench.errors import RequestError
 from vibench.files import write_atomically
+from vibench.qp.status import Status
 from vibench.results.columns import CELLS, INTEGER, KEYS, STORED, TABLES, THRESHOLDS, VERSION, Column, shown_columns
 from vibench.results.database import FILE, read_meta, read_rows
 from vibench.text import printable_lines, unbroken
@@ -66,7 +67,7 @@ EXPORTED = (*(f"{table}.csv" for table in TABLES), SUMMARY)
 def export(path: Path, folder: Path) -> list[Path]:
     """Write every table as CSV and the summary as Markdown into a folder; returns the files."""
     folder.mkdir(parents=True, exist_ok=True)
-    texts = {f"{table}.csv": to_csv(in_order(read(path, table))) for table in TABLES}
+    texts = {f"{table}.csv": to_csv(whole_numbers(in_order(read(path, table)))) for table in TABLES}
     texts[SUMMARY] = to_markdown(summary(read(path, "cells")))
     for name, text in texts.items():
         write_atomically(folder / name, text.encode("utf-8"))
@@ -92,16 +93,29 @@ def benefits(thresholds: pd.DataFrame) -> pd.DataFrame:
 
 def _for_reading(frame: pd.DataFrame, table: Mapping[str, Column]) -> pd.DataFrame:
     """The columns that have a heading, under it; some only where they say something."""
-    kept = [(name, column) for name, column in shown_columns(table).items() if _says_something(frame, name)]
-    return pd.DataFrame({column.heading: _shown(frame, name, column) for name, column in kept}, index=frame.index)
+    return under_headings(frame, [name for name in shown_columns(table) if says_something(frame, name)], table)
 
 
-def _says_something(frame: pd.DataFrame, name: str) -> bool:
-    """Whether to show a column: the accuracy where it is an axis, zero solutions where a query has one."""
+def says_something(frame: pd.DataFrame, name: str) -> bool:
+    """Whether to show a column unasked: the accuracy where it is an axis, zero solutions where there are any."""
     if name == "accuracy":
         return bool(frame[name].nunique() > 1)
+    if name == "status":
+        return bool((frame[name] != Status.OK).any())
     zero = re.fullmatch(r"queries_zero_(u|lambda)|error_(u|lambda)_zero_max", name)
     return zero is None or bool((frame[f"queries_zero_{zero[1] or zero[2]}"] > 0).any())
+
+
+def under_headings(frame: pd.DataFrame, names: Sequence[str], table: Mapping[str, Column]) -> pd.DataFrame:
+    """Columns of a table under their headings, in the form and unit that these name; others as they are."""
+    headed = {name: column for name, column in table.items() if column.heading}
+    shown = {
+        headed[name].heading if name in headed else name: _shown(frame, name, headed[name])
+        if name in headed
+        else frame[name]
+        for name in names
+    }
+    return pd.DataFrame(shown, index=frame.index)
 
 
 def _shown(frame: pd.DataFrame, name: str, column: Column) -> pd.Series | list[str]:
@@ -109,10 +123,7 @@ def _shown(frame: pd.DataFrame, name: str, column: Column) -> pd.Series | list[s
     if name in ("pod_tol", "dual_tol"):
         return [asked(row, name.removesuffix("_tol")) for row in frame.to_dict("records")]
     if name == "queries_ok":
-        return [
-            f"{fine}/{count}" + ("" if status == "ok" else f" {status}")
-            for fine, count, status in zip(frame["queries_ok"], frame["queries"], frame["status"], strict=True)
-        ]
+        return [f"{fine:.0f}/{count:.0f}" for fine, count in zip(frame[name], frame["queries"], strict=True)]
     if name == "benefit_threshold":
         return [m if pd.isna(n) else f"{m} {n:.0f}" for n, m in zip(frame[name], frame["meaning"], strict=True)]
     if name == "threshold_high":
@@ -120,6 +131,16 @@ def _shown(frame: pd.DataFrame, name: str, column: Column) -> pd.Series | list[s
     if column.kind == INTEGER:
         return frame[name].astype("Int64")
     return 1e3 * frame[name] if column.heading.endswith("[ms]") else frame[name]
+
+
+def whole_numbers(frame: pd.DataFrame) -> pd.DataFrame:
+    """A table of the results file with whole numbers where its columns hold them: a missing one makes them floats."""
+    whole = {name: "Int64" for name in frame.columns if name in WHOLE and frame[name].dtype.kind in "if"}
+    return frame.astype(whole)
+
+
+WHOLE = {name for table in TABLES.values() for name, column in table.items() if column.kind == INTEGER}
+"""Columns of whole numbers; no name is a column of whole numbers in one table and of others in another."""
 
 
 def to_csv(frame: pd.DataFrame) -> str:
@@ -150,9 +171,13 @@ def to_markdown(frame: pd.DataFrame) -> str:
 
 
 def to_latex(frame: pd.DataFrame) -> str:
-    """A LaTeX tabular (package booktabs), numbers with three significant digits."""
+    """A LaTeX tabular (package booktabs), numbers with three significant digits.
+
+    What vibench itself writes compiles with every engine; labels in scripts other than Latin need LuaLaTeX or XeLaTeX.
+    """
     columns = "".join("r" if pd.api.types.is_numeric_dtype(kind) else "l" for kind in frame.dtypes)
-    return str(_as_text(frame, _latex).to_latex(index=False, column_format=columns))
+    table = str(_as_text(frame, _latex).to_latex(index=False, column_format=columns))
+    return f"% needs \\usepackage{{booktabs}}\n{table}"
 
 
 MARKUP = re.compile(r"[\\`*|]|\](?=[(\[])|(?<![^\W_])_|_(?![^\W_])")
@@ -167,7 +192,11 @@ LATEX = str.maketrans({
     **{sign: f"\\{sign}" for sign in "&%$#_{}"}, "\\": r"\textbackslash{}", "~": r"\textasciitilde{}",
     "^": r"\textasciicircum{}", "<": r"\textless{}", ">": r"\textgreater{}", "|": r"\textbar{}",
     "[": "{[}", "*": "{*}",  # arguments of the line break before them, at the beginning of a row
-    "µ": r"$\mu$", "β": r"$\beta$", "δ": r"$\delta$", "λ": r"$\lambda$", "σ": r"$\sigma$",
+    **{sign: f"${command}$" for sign, command in {
+        "≤": r"\leq", "≥": r"\geq", "→": r"\to", "−": "-", "√": r"\surd", "∞": r"\infty", "‖": r"\|", "Δ": r"\Delta",
+        "²": "^2", "·": r"\cdot", "×": r"\times", "γ": r"\gamma", "α": r"\alpha",
+    }.items()}, "–": "--", "…": r"\dots{}", "\u202f": r"\,",
+    "µ": r"$\mu$", "μ": r"$\mu$", "β": r"$\beta$", "δ": r"$\delta$", "λ": r"$\lambda$", "σ": r"$\sigma$",
 })  # fmt: skip
 
 
@@ -186,11 +215,20 @@ def _as_text(frame: pd.DataFrame, escape: Callable[[str], str]) -> pd.DataFrame:
 
 
 def to_json(frame: pd.DataFrame) -> str:
-    """A JSON array of objects with full precision; missing values are null, infinite ones the text "inf" or "-inf"."""
+    """A JSON array of objects with full precision; missing values are null, infinite ones the numbers ±1e999.
+
+    JSON has no infinity; parsers read a number beyond the largest double as infinite.
+    """
     # DataFrame.to_json keeps 15 digits at most and writes infinite values as null.
     known = frame.astype(object).where(frame.notna(), None).to_dict("records")
-    rows = [{name: str(v) if v in (math.inf, -math.inf) else v for name, v in row.items()} for row in known]
-    return printable_lines(json.dumps(rows, ensure_ascii=False, indent=1)) + "\n"
+    rows = [",\n".join(f"  {_json(str(name))}: {_json(value)}" for name, value in row.items()) for row in known]
+    return printable_lines("[\n" + ",\n".join(f" {{\n{row}\n }}" for row in rows) + "\n]\n")
+
+
+def _json(value: Any) -> str:
+    if isinstance(value, float) and math.isinf(value):
+        return "1e999" if value > 0.0 else "-1e999"
+    return json.dumps(value, ensure_ascii=False)
 
 
 def cell_text(value: Any) -> str:
@@ -206,6 +244,15 @@ def asked(row: Mapping[str, Any] | pd.Series, axis: str) -> str:
     """The tolerance of `axis`, "pod" or "dual", or the dimension where the study prescribes one."""
     tolerance, count = row[f"{axis}_tol"], row[f"{axis}_size"]
     return f"{'N' if axis == 'pod' else 'R'}={int(count)}" if pd.notna(count) else f"{tolerance:g}"
+
+
+def name_of_cell(row: Mapping[str, Any] | pd.Series) -> str:
+    """A cell by all its axes, as `Cell` prints itself."""
+    tolerance = "" if pd.isna(row["primal_tol"]) else f" {row['primal_tol']:g}"
+    sizes = ", ".join(asked(row, axis) for axis in ("pod", "dual"))
+    assembly = "" if row["assembly"] == "full" else f" · {row['assembly']}"
+    way = f"{row['problem']} · {row['dual']} · {row['primal']}{tolerance}"
+    return f"{way} · {sizes} · {row['solver']} {row['accuracy']:g}{assembly}"
 
 
 def interval(low: float | None, high: float | None) -> str:

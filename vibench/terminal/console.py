@@ -2,23 +2,37 @@
 
 from __future__ import annotations
 
-import pandas as pd
+import os
+from collections.abc import Collection, Iterable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING
+
 from rich import box
+from rich.cells import cell_len
 from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from vibench.results import tables
 from vibench.text import printable, printable_lines
 
-WIDTH = 180
-"""Columns of a table where the output is no terminal."""
+if TYPE_CHECKING:  # lists of plugins are printed without it
+    import pandas as pd
+
+WIDTH = 10_000
+"""Columns where the output is no terminal and `COLUMNS` is not set: whoever reads it can scroll."""
+
+SHORT = 24
+"""A text of more characters may be wrapped, between words if it can."""
+
+LONG = 60
+"""Characters of a line of a long text, where there is room."""
 
 
 def new_console() -> Console:
     """A console for the standard output, which takes no text for markup."""
     console = Console(highlight=False, markup=False, emoji=False)
-    if not console.is_terminal:
+    if not console.is_terminal and not os.environ.get("COLUMNS"):
         console.width = WIDTH
     return console
 
@@ -28,30 +42,120 @@ def print_line(console: Console, line: str) -> None:
     console.print(Text(printable(line)), soft_wrap=True)
 
 
-def print_frame(frame: pd.DataFrame, title: str) -> None:
-    """Print a table without truncated cells; text columns with the same value in every row go into the title."""
+def print_frame(
+    frame: pd.DataFrame, title: str, priority: Sequence[str] = (), *, axes: Collection[str] = (), every: bool = False
+) -> None:
+    """Print a table that fits the width; nothing is cut, and no number is wrapped.
+
+    Text columns with the same value in every row go into the title, and empty ones are left out. Where there is not
+    room for all others, those of the smallest priority are left out, and a line below names them.
+
+    Parameters
+    ----------
+    frame
+        The table.
+    title
+        Its title.
+    priority
+        Columns, those that matter most first; the order of the table by default.
+    axes
+        Columns of numbers that go into the title, too, where they are the same in every row.
+    every
+        Print columns with the same value in every row, too, as columns.
+    """
+    from vibench.results.tables import cell_text
+
+    columns = [
+        PrintedColumn(str(name), tuple(map(cell_text, frame[name])), frame[name].dtype.kind in "iufb")
+        for name in frame.columns
+    ]
+    print_columns(columns, title, priority, axes=axes, every=every)
+
+
+def print_rows(rows: Iterable[Sequence[str]], headings: Sequence[str], title: str) -> None:
+    """Print rows of texts as `print_frame` prints a table."""
+    cells = list(zip(*rows, strict=True)) or [()] * len(headings)
+    print_columns([PrintedColumn(name, tuple(own)) for name, own in zip(headings, cells, strict=True)], title)
+
+
+def print_columns(
+    columns: Sequence[PrintedColumn],
+    title: str,
+    priority: Sequence[str] = (),
+    *,
+    axes: Collection[str] = (),
+    every: bool = False,
+) -> None:
+    """Print columns as `print_frame` prints a table."""
     console = new_console()
-    shared = [name for name in frame.columns if len(frame) > 1 and _same_text(frame[name])]
-    title = ", ".join([title, *(f"{name} {tables.cell_text(frame[name].iloc[0])}" for name in shared)])
-    table = Table(title=shown(title), title_justify="left", pad_edge=False, padding=(0, 1, 0, 0), box=box.SIMPLE_HEAD)
-    kept = frame.drop(columns=shared)
-    rows = [[shown(tables.cell_text(value)) for value in row] for row in kept.itertuples(index=False)]
-    for k, name in enumerate(kept.columns):
-        widest = max((len(word) for row in rows for word in row[k].plain.split()), default=1)
-        numeric = pd.api.types.is_numeric_dtype(kept[name])
-        table.add_column(shown(str(name)), justify="right" if numeric else "left", min_width=min(widest, 24))
-    for row in rows:
-        table.add_row(*row)
-    # On a narrow terminal, lines wider than the window that wrap are better than cells cut off by rich.
-    natural = console.measure(table, options=console.options.update(width=10 * WIDTH)).maximum
-    console.width = max(console.width, min(natural, WIDTH))
+    count = len(columns[0].cells) if columns else 0
+    alike = [column for column in columns if not every and count > 1 and len(set(column.cells)) == 1]
+    shared = [column for column in alike if not column.numeric or column.heading in axes or not column.cells[0]]
+    values = [f"{column.heading} {column.cells[0]}" for column in shared if column.cells[0]]
+    title = ", ".join([title, *values])
+    console.print(shown(title if count else f"{title}: no rows"), overflow="fold")
+    if not count:
+        return
+    own = [column for column in columns if column not in shared]
+    rank = {name: k for k, name in enumerate(priority)}
+    kept = _fitting(sorted(own, key=lambda column: rank.get(column.heading, len(rank))), console.width)
+    drawn = [column for column in own if column in kept]
+    whole = sum(max(column.width, cell_len(column.heading)) + 2 for column in drawn) <= console.width + 2
+    # the box has a blank between columns; there is another where there is room
+    table = Table(box=box.SIMPLE_HEAD, show_edge=False, pad_edge=False, padding=(0, int(whole), 0, 0))
+    for column in drawn:
+        width = max(column.width, cell_len(column.heading)) if whole else column.width
+        limits = {"min_width": width, "max_width": LONG} if column.long else {"width": width}
+        justify = "right" if column.numeric else "left"
+        table.add_column(shown(column.heading), justify=justify, overflow="fold", **limits)  # type: ignore[arg-type]
+    for row in zip(*(column.cells for column in drawn), strict=True):
+        table.add_row(*map(shown, row))
     console.print(table)
+    if left_out := [column.heading for column in own if column not in kept]:
+        text = f"not shown at {console.width} columns: {', '.join(left_out)} (`vibench show --columns`)"
+        console.print(shown(text), overflow="fold")
+
+
+@dataclass(frozen=True, eq=False)
+class PrintedColumn:
+    """A column of a printed table: its texts, and the characters it needs; a long text may have lines of its own."""
+
+    heading: str
+    cells: tuple[str, ...]
+    numeric: bool = False
+
+    @cached_property
+    def long(self) -> bool:
+        """Whether a text may be wrapped."""
+        return self._longest > SHORT
+
+    @cached_property
+    def width(self) -> int:
+        """Characters that it needs at least: whole texts where they are short, of long ones whole words."""
+        words = [
+            *self.heading.split(),
+            *(word for cell in self.cells for word in printable_lines(cell).split() if self.long),
+        ]
+        return max([min(cell_len(word), SHORT) for word in words] + [1 if self.long else self._longest])
+
+    @cached_property
+    def _longest(self) -> int:
+        return max(
+            (cell_len(line) for cell in map(printable_lines, self.cells) for line in cell.split("\n")), default=1
+        )
+
+
+def _fitting(columns: Sequence[PrintedColumn], width: int) -> list[PrintedColumn]:
+    """Those columns, the first at least, that find room one after the other."""
+    kept: list[PrintedColumn] = []
+    left = width + 1  # no blank after the last one
+    for column in columns:
+        if not kept or column.width + 1 <= left:
+            kept.append(column)
+            left -= column.width + 1
+    return kept
 
 
 def shown(text: str) -> Text:
     """A text of some lines in a table, without markup and without what is not printable."""
     return Text(printable_lines(text))
-
-
-def _same_text(column: pd.Series) -> bool:
-    return not pd.api.types.is_numeric_dtype(column) and column.nunique(dropna=False) == 1

@@ -11,12 +11,21 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
 from vibench.execution.run import Agenda, Observer
+from vibench.qp.status import Status
 from vibench.stages.base import Stage
 from vibench.study.cells import Cell
 from vibench.terminal.console import print_line
+from vibench.terminal.run_summary import REASONS, kind_of_failure
+from vibench.text import printable
 
 LINE_EVERY = 4
 """Parts of a stage that share one line of progress."""
+
+CELL_LINES = 25
+"""Lines about ok cells where there is no terminal: of larger runs, some cells have one."""
+
+ALIKE = 3
+"""Lines about cells that are not ok for reasons that differ in their numbers alone."""
 
 
 class TimeLeft:
@@ -53,6 +62,38 @@ def duration(seconds: float) -> str:
     return f"{minutes} min" if minutes < 90 else f"{minutes // 60} h {minutes % 60} min"
 
 
+def progress_bar(console: Console) -> Progress:
+    """A bar that fits 80 columns: what is being done, how much of it is done, and the time left."""
+    bar = BarColumn(bar_width=16)
+    what, left = (TextColumn(text, markup=False) for text in ("{task.description}", "{task.fields[left]}"))
+    return Progress(what, bar, MofNCompleteColumn(), TimeElapsedColumn(), left, console=console)
+
+
+class DrawingDisplay:
+    """Shows which figure is being drawn: a bar on a terminal, one line elsewhere."""
+
+    def __init__(self, console: Console) -> None:
+        self._bar = progress_bar(console) if console.is_terminal else None
+        if self._bar is None:
+            print_line(console, "figures …")
+        else:
+            self._task = self._bar.add_task("figures", total=None, left="")
+
+    def __enter__(self) -> DrawingDisplay:
+        if self._bar is not None:
+            self._bar.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._bar is not None:
+            self._bar.stop()
+
+    def show(self, name: str, done: int, count: int) -> None:
+        """A figure is being drawn; `done` of `count` are there."""
+        if self._bar is not None:
+            self._bar.update(self._task, completed=done, total=count, left=printable(name))
+
+
 class ProgressDisplay(Observer):
     """Shows the progress of a run: a bar on a terminal, lines elsewhere; the observer of `run_study`."""
 
@@ -62,6 +103,8 @@ class ProgressDisplay(Observer):
         self._cells = self._total = 0
         self._parts: Counter[str] = Counter()
         self._done: Counter[str] = Counter()
+        self._failures: Counter[tuple[str, str]] = Counter()
+        self._begun: set[str] = set()
         self._bar: Progress | None = None
 
     def __enter__(self) -> ProgressDisplay:
@@ -84,12 +127,17 @@ class ProgressDisplay(Observer):
         to_run = agenda.to_run - agenda.unavailable
         print_line(self._console, f"{agenda.cells} cells, {to_run} to run, {len(agenda.stages)} stages{workers}")
         if self._console.is_terminal and agenda.stages:
-            columns = ("[progress.description]{task.description}", BarColumn(), MofNCompleteColumn())
-            self._bar = Progress(
-                *columns, TimeElapsedColumn(), TextColumn("{task.fields[left]}"), console=self._console
-            )
+            self._bar = progress_bar(self._console)
             self._task = self._bar.add_task("stages", total=len(agenda.stages), left="")
             self._bar.start()
+
+    def begin(self, stage: Stage) -> None:
+        """A stage begins: the bar names it, lines name each sort once."""
+        if self._bar is not None:
+            self._bar.update(self._task, description=stage.label)
+        elif stage.label not in self._begun:
+            self._begun.add(stage.label)
+            print_line(self._console, f"{stage.label} …")
 
     def stage(self, stage: Stage, wall: float) -> None:
         """A stage is done."""
@@ -109,12 +157,21 @@ class ProgressDisplay(Observer):
             self._bar.update(self._task, total=(self._bar.tasks[0].total or 0) + 1)
 
     def cell(self, cell: Cell, row: Mapping[str, Any]) -> None:
-        """A cell has its row."""
+        """A cell has its row: said of some cells, and of the first ones that are not ok for a reason."""
         self._cells += 1
-        reason = f" ({row['reason']})" if row["reason"] else ""
-        if self._bar is None or row["reason"]:
-            line = f"[{self._cells}/{self._total}] {row['status']}: {cell}{reason}"
-            print_line(self._console, line + self._left_text(", "))
+        count = f"[{self._cells}/{self._total}]"
+        if row["reason"]:
+            kind = kind_of_failure(row)
+            self._failures[kind] += 1
+            if row["status"] == Status.UNAVAILABLE:
+                if self._failures[kind] == 1:
+                    print_line(self._console, f"{row['status']}: {row['reason']}")
+            elif self._failures[kind] <= ALIKE and len(self._failures) <= REASONS:
+                print_line(self._console, f"{count} {row['status']}: {cell} ({row['reason']})")
+                if self._failures[kind] == ALIKE:
+                    print_line(self._console, "others like these are counted at the end")
+        elif self._bar is None and (self._cells % -(-self._total // CELL_LINES) == 0 or self._cells == self._total):
+            print_line(self._console, f"{count} {row['status']}: {cell}{self._left_text(', ')}")
 
     def _left_text(self, before: str = "") -> str:
         seconds = self._left.seconds()

@@ -13,13 +13,14 @@ import pytest
 import typer
 from running import Main
 
-from vibench.cli import completion
+from vibench.cli import completion, overview
 from vibench.cli.main import app
 from vibench.cli.plugin_commands import LISTS
 from vibench.qp.settings import SETTINGS
 from vibench.results import tables
 from vibench.results.columns import TABLES
 from vibench.results.database import FILE
+from vibench.results.views import VIEWS
 from vibench.study import registry
 
 GROUP: Any = typer.main.get_command(app)
@@ -49,6 +50,12 @@ def completed(line: str) -> list[str]:
         ("vibench check sol", ["solver:"]),
         ("vibench check solver:p", ["solver:piqp", "solver:proxqp"]),
         ("vibench check dual:c", ["dual:cpg"]),
+        ("vibench check pri", ["primal:"]),
+        ("vibench check primal:o", ["primal:offline-pga", "primal:online-supremizers"]),
+        ("vibench check obstacle --option res", ["resolution="]),
+        ("vibench check problem:radial-obstacle --option ", ["length=", "resolution="]),
+        ("vibench show quick --columns cell,beta_span", ["cell,beta_span_min"]),
+        ("vibench show quick --table thresholds --sort -threshold_l", ["-threshold_low"]),
         ("vibench list s", ["solvers", "studies"]),
         ("vibench show quick --table th", ["thresholds"]),
         ("vibench show quick --table s", ["summary"]),
@@ -59,8 +66,8 @@ def test_values_are_completed_with_what_there_is(line: str, words: list[str]) ->
 
 
 def test_the_lists_and_tables_offered_are_all_there_are() -> None:
-    assert set(completion.lists("")) == {*LISTS, "solvers"}
-    assert set(completion.table_names("")) == {"summary", "benefits", *TABLES}
+    assert set(completion.lists("")) == {*LISTS, "solvers"} == set(overview.KINDS)
+    assert set(completion.table_names("")) == set(completion.SHOWN) == set(VIEWS) > set(TABLES)
 
 
 class TestFiles:
@@ -114,6 +121,33 @@ def test_the_installed_command_completes_for_bash(command: str, tmp_path: Path) 
     asked = {"_VIBENCH_COMPLETE": "complete_bash", "COMP_WORDS": "vibench run paper-", "COMP_CWORD": "2"}
     done = subprocess.run([command], cwd=tmp_path, env=os.environ | asked, capture_output=True, text=True, check=False)
     assert (done.stdout.split(), done.stderr) == (["paper-hertz", "paper-obstacle"], "")
+
+
+@pytest.mark.parametrize(
+    ("words", "completed"),
+    [
+        (["check", "primal", ":", "of"], ["offline-pga"]),
+        (["check", "dual", ":"], ["angle-greedy", "cpg"]),
+        (["check", "obstacle", "--option", "reso"], ["resolution="]),
+        (["run", "--fr"], ["--fresh"]),
+    ],
+)
+def test_words_that_bash_breaks_are_completed_after_the_break(
+    words: list[str], completed: list[str], command: str, tmp_path: Path
+) -> None:
+    asked = {"_VIBENCH_COMPLETE": "complete_bash", "COMP_WORDS": "\n".join(["vibench", *words])}
+    asked["COMP_CWORD"] = str(len(words))
+    done = subprocess.run([command], cwd=tmp_path, env=os.environ | asked, capture_output=True, text=True, check=False)
+    assert (done.stdout.split()[: len(completed)], done.stderr) == (completed, "")
+
+
+@pytest.mark.parametrize("kind", ["problems", "primal", "dual"])
+def test_the_overview_reads_the_options_that_the_registry_knows(kind: str) -> None:
+    """Without importing any plugin."""
+    for name, _, what, options in overview.rows(kind):
+        known = [option.name for option in registry.options(LISTS[kind], name)]
+        assert options == ", ".join(known)
+        assert what == (registry.load(LISTS[kind], name).__doc__ or "").split("\n")[0]
 
 
 @pytest.mark.parametrize("name", completion.EXAMPLES)

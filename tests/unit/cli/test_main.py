@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import importlib.metadata
 import io
+import re
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -12,9 +13,8 @@ from typing import Any
 
 import pytest
 from running import Main, Register, refused
-from samples import STUDY, cell_row, changed, write_study
+from samples import STUDY, changed, write_study
 
-from vibench.cli.main import outcomes
 from vibench.cli.plugin_commands import LISTS
 from vibench.qp.settings import SETTINGS
 from vibench.results.columns import TABLES
@@ -262,9 +262,30 @@ def test_list_shows_every_plugin_and_its_options(main: Main) -> None:
     for kind in LISTS.values():
         for name in registry.names(kind):
             assert name in out
-    for option in registry.options("problem", "obstacle"):
+    options = registry.options("problem", "obstacle")
+    assert ", ".join(option.name for option in options) in out
+    _, out, _ = main("list", "problems")
+    for option in options:
         assert f"{option.name}: " in out
     assert "'coarse', 'medium'" in out
+
+
+@pytest.mark.parametrize("arguments", [["--version"], ["-h"], ["run", "-h"]])
+def test_short_options_and_the_version(arguments: list[str], main: Main) -> None:
+    code, out, err = main(*arguments)
+    assert (code, err) == (0, "")
+    assert out.startswith(f"vibench {importlib.metadata.version('vibench')}" if "-h" not in arguments else "Usage: ")
+
+
+def test_ctrl_c_while_drawing_says_what_is_there(main: Main, quick_run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupted(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("vibench.report.figures.draw_all", interrupted)
+    code, out, _ = main("figures", str(quick_run), "--out", "pictures")
+    assert code == 130
+    assert "interrupted while drawing: results and tables are complete" in out
+    assert f"`vibench figures {quick_run}`" in out
 
 
 @pytest.mark.parametrize(("what", "kind"), LISTS.items())
@@ -273,7 +294,8 @@ def test_one_list_shows_only_its_own(what: str, kind: str, main: Main) -> None:
     assert code == 0
     assert out.startswith(what)
     assert all(name in out for name in registry.names(kind))
-    assert [title for title in (*LISTS, "solvers") if title != what and f"\n{title}" in out] == []
+    others = [title for title in (*LISTS, "solvers") if title != what]
+    assert [title for title in others if re.search(rf"^{title}(,|$)", out, re.MULTILINE)] == []
 
 
 def test_the_list_of_solvers_says_which_are_installed(main: Main) -> None:
@@ -303,8 +325,16 @@ def test_a_run_ends_with_the_summary_and_says_where_things_are(quick_run: Path) 
     fine = read(quick_run / FILE, "cells")["status"] == "ok"
     assert f"{len(fine)} cells, {fine.sum()} ok, {len(fine) - fine.sum()} not ok" in printed
     assert str(quick_run / FILE) in printed
-    assert "online [ms]" in printed
+    assert "next:\n  vibench show " in printed
+    assert len(printed.splitlines()) < 100
     assert "\x1b" not in printed
+
+
+@pytest.mark.parametrize("form", ["markdown", "latex", "json"])
+def test_a_condition_holds_in_every_format(form: str, main: Main, quick_run: Path) -> None:
+    _, out, _ = main("show", str(quick_run), "--where", "solver = 'osqp'", "--format", form)
+    assert "osqp" in out
+    assert "piqp" not in out
 
 
 @pytest.mark.parametrize("table", ["summary", "benefits", *TABLES])
@@ -380,13 +410,3 @@ def test_an_error_that_nobody_foresaw_is_not_hidden(main: Main, monkeypatch: pyt
     monkeypatch.setattr("vibench.study.reader.read_study", broken)
     with pytest.raises(ZeroDivisionError):
         main("run")
-
-
-def test_cells_that_are_not_ok_for_one_reason_are_one_line() -> None:
-    cells = [cell_row(f"c{k}", solver=f"s{k}", status="error", reason="A is not symmetric") for k in range(48)]
-    other = cell_row("c48", solver="piqp", status="timeout", reason="stopped", primal_tol=None)
-    lines = outcomes([*cells, other])
-    assert lines == [
-        "error: text · text · text 0.5 · s0 and 47 more: 3 of 3 queries ok; A is not symmetric",
-        "timeout: text · text · text · piqp: 3 of 3 queries ok; stopped",
-    ]

@@ -29,6 +29,12 @@ def test_help_imports_no_heavy_library(name: str, command: str) -> None:
     assert found & HEAVY == set()
 
 
+def test_the_list_imports_no_plugin_and_no_table(command: str) -> None:
+    found, printed = imported(command, "list")
+    assert "obstacle" in printed
+    assert found & {"scipy", "pandas", "skfem", "qpsolvers", "matplotlib"} == set()
+
+
 @pytest.mark.parametrize(
     ("line", "word"),
     [
@@ -38,6 +44,7 @@ def test_help_imports_no_heavy_library(name: str, command: str) -> None:
         ("vibench check ", "obstacle"),
         ("vibench list ", "solvers"),
         ("vibench show quick --table ", "histories"),
+        ("vibench check obstacle --option ", "resolution="),
     ],
 )
 def test_completion_imports_no_heavy_library(line: str, word: str, command: str) -> None:
@@ -45,4 +52,5 @@ def test_completion_imports_no_heavy_library(line: str, word: str, command: str)
     found, printed = imported(command, _VIBENCH_COMPLETE="complete_bash", **words)
     assert word in printed.split()
     assert "vibench" in found
-    assert found & (HEAVY - {"pydantic"}) == set()  # typer itself checks the words before with pydantic
+    package = {"vibench_problems"} if "--option" in line else set()  # the package that holds the module, not the module
+    assert found & (HEAVY - {"pydantic"}) == package  # typer itself checks the words before with pydantic

@@ -194,3 +194,11 @@ def test_a_run_without_any_query_has_a_report(changed: Changed) -> None:
     page = html.page(changed(*emptied, lost))
     assert "There is nothing to draw" in page
     assert "0 with every query ok" in page
+
+
+def test_a_strategy_that_is_labelled_high_fidelity_is_no_high_fidelity_model(changed: Changed) -> None:
+    path = changed("UPDATE thresholds SET primal_a = 'high-fidelity'")
+    thresholds = tables.read(path, "thresholds")
+    found = {name: len(rows) for name, _, _, rows in html._tables(path, tables.read(path, "cells"))}
+    assert found["enrichments"] == thresholds["cell_a"].notna().sum() > 0
+    assert found["model"] == thresholds["cell_a"].isna().sum() > 0

@@ -21,7 +21,7 @@ from vibench.stages.offline import PODStage
 from vibench.stages.snapshots import CHUNKS, SnapshotStage
 from vibench.study.cells import Cell, Plugin, expand
 from vibench.study.reader import read_study
-from vibench.terminal.progress import ProgressDisplay, TimeLeft, duration
+from vibench.terminal.progress import ALIKE, DrawingDisplay, ProgressDisplay, TimeLeft, duration
 
 PROBLEM = Plugin("problem", "p", "{}", "")
 PODS: list[Stage] = [PODStage(PROBLEM, Stop(size=k)) for k in range(1, 5)]
@@ -235,6 +235,48 @@ def test_a_terminal_gets_a_bar_and_only_what_fell_short(report: Make, cells: lis
     assert "left" in text
     assert f"error: {cells[1]}" in text
     assert f"ok: {cells[0]}" not in text
+
+
+def test_a_stage_is_named_when_it_begins(report: Make, cells: list[Cell], queries: list[Stage]) -> None:
+    made, printed = report()
+    made.start(agenda(1, PODS, 2))
+    for stage in (*PODS, queries[0]):
+        made.begin(stage)
+    assert printed.getvalue().splitlines()[1:] == ["POD …", "queries …"]
+    made, printed = report(terminal=True)
+    with made:
+        made.start(agenda(1, PODS, 2))
+        made.begin(PODS[0])
+    assert "POD" in printed.getvalue()
+
+
+def test_a_thousand_cells_are_not_a_thousand_lines(report: Make, cells: list[Cell], queries: list[Stage]) -> None:
+    made, printed = report()
+    made.start(agenda(1000, queries[:1] * 1000, 2))
+    for k in range(1000):
+        row = {"status": "timeout", "reason": f"took {k}.5 s"} if k % 2 else OK
+        made.cell(cells[0], row)
+    lines = printed.getvalue().splitlines()
+    assert len(lines) < 60
+    assert sum("timeout: " in line for line in lines) == ALIKE
+
+
+def test_what_is_not_installed_is_one_line(report: Make, cells: list[Cell]) -> None:
+    made, printed = report()
+    made.start(Agenda(24, 24, 24, [], 0))
+    for _ in range(24):
+        made.cell(cells[0], {"status": "unavailable", "reason": "no solver: `pip install it`"})
+    assert printed.getvalue().splitlines()[1:] == ["unavailable: no solver: `pip install it`"]
+
+
+@pytest.mark.parametrize("terminal", [False, True])
+def test_the_figure_that_is_being_drawn_is_named(terminal: bool) -> None:
+    printed = io.StringIO()
+    with DrawingDisplay(Console(file=printed, force_terminal=terminal, width=80)) as display:
+        display.show("[red]hertz-errors", 2, 25)
+    assert "description" not in printed.getvalue()
+    assert ("[red]hertz-errors" in printed.getvalue()) is terminal
+    assert "figures" in printed.getvalue()
 
 
 def test_a_terminal_gets_no_bar_where_nothing_is_to_be_done(report: Make) -> None:

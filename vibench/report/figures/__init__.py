@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
+import signal
+import threading
 from collections.abc import Callable, Iterator, Mapping
-from concurrent.futures import ProcessPoolExecutor
-from itertools import islice, zip_longest
+from concurrent.futures import Future, ProcessPoolExecutor
+from functools import cache
 from multiprocessing import get_context
 from pathlib import Path
 
@@ -94,25 +97,73 @@ def remove(folder: Path) -> None:
                 file.unlink()
 
 
-def draw_all(path: Path, folder: Path, formats: tuple[str, ...] = FORMATS, jobs: int = 1) -> list[Path]:
+def draw_all(
+    path: Path,
+    folder: Path,
+    formats: tuple[str, ...] = FORMATS,
+    jobs: int = 1,
+    progress: Callable[[str, int, int], None] = lambda *_: None,
+) -> list[Path]:
     """Draw every figure that a results file has data for, in every format; returns the files written to the folder.
 
-    `jobs` is the number of processes that draw, this one included.
+    Parameters
+    ----------
+    path
+        The results file.
+    folder
+        Where the figures go.
+    formats
+        Formats of Matplotlib.
+    jobs
+        Processes that draw, this one included.
+    progress
+        Called before a figure is drawn here, with its name, the number of those done, and that of all there may be.
     """
-    if jobs == 1:
-        return [file for files in _part(path, folder, formats, 0, 1) for file in files]
-    with ProcessPoolExecutor(jobs - 1, get_context("spawn")) as pool:
-        others = [pool.submit(_part, path, folder, formats, k, jobs) for k in range(1, jobs)]
-        parts = [_part(path, folder, formats, 0, jobs), *(other.result() for other in others)]
-    return [file for turn in zip_longest(*parts, fillvalue=[]) for files in turn for file in files]
+    known = _drawings(path)
+    written: dict[int, list[Path]] = {}
+    with contextlib.ExitStack() as stack:
+        others: dict[int, Future[list[Path]]] = {}
+        if jobs > 1:
+            pool = ProcessPoolExecutor(jobs - 1, get_context("spawn"))
+            stack.callback(pool.shutdown, cancel_futures=True)
+            with _interrupts_ignored():  # the processes inherit it: Ctrl-C is for this one to handle
+                others = {k: pool.submit(_draw, path, folder, formats, k) for k in reversed(range(len(known)))}
+        # the others draw from the last figure on, this process from the first one on what they have not begun
+        for k in range(len(known)):
+            if k not in others or others[k].cancel():
+                others.pop(k, None)
+                progress(known[k][0], len(written) + sum(other.done() for other in others.values()), len(known))
+                written[k] = _draw(path, folder, formats, k)
+        for k, other in others.items():
+            progress(known[k][0], len(written), len(known))
+            written[k] = other.result()
+    _drawings.cache_clear()
+    return [file for k in sorted(written) for file in written[k]]
 
 
-def _part(path: Path, folder: Path, formats: tuple[str, ...], first: int, step: int) -> list[list[Path]]:
-    """Draw every `step`-th figure from number `first` on; returns the files of each."""
-    written = []
-    for name, draw, data in islice(drawings(path), first, None, step):
-        folder.mkdir(parents=True, exist_ok=True)
-        with styled():
-            figure = draw(data)
-            written.append([] if figure is None else save(figure, folder, name, formats))
-    return written
+@cache
+def _drawings(path: Path) -> list[tuple[str, Drawing, Data]]:
+    """The drawings of a results file, read once in a process that draws."""
+    return list(drawings(path))
+
+
+def _draw(path: Path, folder: Path, formats: tuple[str, ...], number: int) -> list[Path]:
+    """Draw one figure of `drawings`; returns the files."""
+    name, draw, data = _drawings(path)[number]
+    folder.mkdir(parents=True, exist_ok=True)
+    with styled():
+        figure = draw(data)
+        return [] if figure is None else save(figure, folder, name, formats)
+
+
+@contextlib.contextmanager
+def _interrupts_ignored() -> Iterator[None]:
+    """Ignore Ctrl-C inside the block, and in the processes that start there."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)

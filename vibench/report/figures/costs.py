@@ -112,7 +112,7 @@ def _marks(panel: Axes, cells: pd.DataFrame, thresholds: pd.DataFrame) -> None:
     """Break-even points between the lines of a panel, at their cost, with their intervals."""
     drawn = set(cells["cell"])
     for row in thresholds.itertuples():
-        n, between = row.benefit_threshold, row.primal_a == HIGH_FIDELITY or row.cell_a in drawn
+        n, between = row.benefit_threshold, pd.isna(row.cell_a) or row.cell_a in drawn
         if row.cell_b in drawn and between and 1.0 <= n <= MOST_QUERIES:
             cost, name = row.offline_b_s + n * row.online_b_s, f"break-even: cheaper {row.meaning} here"
             panel.plot(n, cost, MARKS[row.meaning], c="black", ms=5, mfc="none", label=name, zorder=5)

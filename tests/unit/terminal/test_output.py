@@ -12,8 +12,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from rich.console import Console
 
-from vibench.cli.output import echo
 from vibench.terminal.console import new_console, print_frame, print_line
+from vibench.terminal.output import echo
 
 ANYTHING = st.text(st.characters())
 

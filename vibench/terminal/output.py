@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import shlex
+from pathlib import Path
+
 import typer
 
 from vibench.text import printable
@@ -9,4 +12,10 @@ from vibench.text import printable
 
 def echo(*lines: str) -> None:
     """Print lines; what is not printable in them, such as an escape sequence or a line break, is shown as an escape."""
-    typer.echo("\n".join(map(printable, lines)))
+    if lines:
+        typer.echo("\n".join(map(printable, lines)))
+
+
+def run_argument(folder: Path) -> str:
+    """How a command names a run folder."""
+    return shlex.quote(folder.name if folder == Path("runs") / folder.name else str(folder))

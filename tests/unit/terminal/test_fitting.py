@@ -1,0 +1,126 @@
+"""Tables fit the terminal: nothing is cut, no number is wrapped, and what is left out is named."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import re
+from pathlib import Path
+
+import pandas as pd
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from rich.cells import cell_len
+from running import Main
+
+from vibench.cli.completion import SHOWN
+from vibench.results import tables, views
+from vibench.terminal.console import print_frame
+
+WIDTHS = (80, 120, 200)
+
+
+def printed(frame: pd.DataFrame, width: int, priority: list[str] | None = None) -> list[str]:
+    with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(io.StringIO()) as out:
+        patch.setenv("COLUMNS", str(width))
+        print_frame(frame, "table", priority or [])
+    return out.getvalue().splitlines()
+
+
+@pytest.mark.parametrize("width", WIDTHS)
+@pytest.mark.parametrize("table", SHOWN)
+def test_every_table_of_a_run_fits(
+    table: str, width: int, main: Main, quick_run: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Every printed word with a digit in it is a whole word of the table: none is cut, and none is wrapped."""
+    monkeypatch.setenv("COLUMNS", str(width))
+    code, out, _ = main("show", str(quick_run), "--table", table, "--limit", "60")
+    assert code == 0
+    assert max(map(cell_len, out.splitlines())) <= width
+    assert "…" not in out
+    found = views.look_up(tables.results_file(str(quick_run)), table, limit=60)
+    frame = found.readable
+    texts = [*map(str, frame.columns), *(tables.cell_text(value) for name in frame for value in frame[name])]
+    whole = {word for text in texts for word in text.split()} | {f"{width}"}
+    shown = out.split("\n", 1)[1].replace(",", " ")
+    words = {word for word in shown.split() if re.search(r"\d", word)}
+    assert words - {word.strip(",") for word in whole} - {part for word in whole for part in word.split(",")} == set()
+    assert len(words) > 3
+
+
+numbers = st.floats(1e-12, 1e12, allow_nan=False)
+frames = st.lists(st.tuples(numbers, numbers, numbers, st.sampled_from(["decorrelated", "offline-pga"])), min_size=2)
+
+
+@given(frames, st.integers(24, 90))
+def test_what_has_no_room_is_left_out_whole_and_named(rows: list[tuple[float, float, float, str]], width: int) -> None:
+    frame = pd.DataFrame(rows, columns=["first", "second", "third", "way"]).assign(k=range(len(rows)))
+    lines = printed(frame, width, ["k", "way"])
+    assert max(map(cell_len, lines)) <= width
+    whole = {tables.cell_text(value) for name in frame for value in frame[name]} | {str(width)}
+    title_end = next(k for k, line in enumerate(lines) if set(line.strip()) == {"─"})
+    body = [word for line in lines[title_end + 1 :] for word in line.split() if re.search(r"\d", word)]
+    assert set(body) <= whole
+
+
+def test_the_columns_that_matter_least_go_first() -> None:
+    frame = pd.DataFrame({name: [1.23456, 2.34567] for name in ("alpha", "bravo", "charlie")})
+    lines = printed(frame.assign(bravo=[1, 2], charlie=[3, 4]), 13, ["charlie", "alpha", "bravo"])
+    assert lines[1].split() == ["alpha", "charlie"]
+    assert "bravo" in " ".join(lines[5:])
+
+
+def test_values_that_all_rows_share_stand_in_the_title_unless_asked_for() -> None:
+    frame = pd.DataFrame({"solver": ["piqp", "piqp"], "N": [8, 8], "k": [1, 2], "none": [None, None]})
+    assert printed(frame, 80)[:2] == ["table, solver piqp", "N  k"]
+    with contextlib.redirect_stdout(io.StringIO()) as out:
+        print_frame(frame, "table", axes=["N"])
+    assert out.getvalue().splitlines()[0] == "table, solver piqp, N 8"
+    with contextlib.redirect_stdout(io.StringIO()) as out:
+        print_frame(frame, "table", every=True)
+    assert out.getvalue().splitlines()[1].split() == ["solver", "N", "k", "none"]
+
+
+def test_a_table_without_rows_says_so() -> None:
+    assert printed(pd.DataFrame({"a": []}), 80) == ["table: no rows"]
+
+
+class TestShow:
+    """Rows and columns that are asked for."""
+
+    def test_columns_are_those_asked_for_by_name_or_heading(self, main: Main, quick_run: Path) -> None:
+        _, out, _ = main("show", str(quick_run), "--columns", "solver,online [ms],online_s", "--format", "csv")
+        assert out.splitlines()[0] == "solver,online_s"
+        _, out, _ = main("show", str(quick_run), "--table", "cells", "--columns", "solver,online_s", "--limit", "3")
+        assert out.splitlines()[1].split() == ["solver", "online_s"]
+        assert len(out.splitlines()) == 1 + 1 + 1 + 3
+
+    def test_rows_are_selected_sorted_and_limited(self, main: Main, quick_run: Path) -> None:
+        asked = ("--where", "solver = 'piqp' and N > 0", "--sort", "-error_u_mean", "--limit", "5")
+        _, out, _ = main("show", str(quick_run), "--table", "cells", *asked, "--format", "csv")
+        found = pd.read_csv(io.StringIO(out))
+        cells = tables.read(tables.results_file(str(quick_run)), "cells")
+        best = cells[cells["solver"] == "piqp"].nlargest(5, "error_u_mean")
+        assert list(found["cell"]) == list(best["cell"])
+
+    def test_keys_of_the_summary_are_those_that_replay_takes(self, main: Main, quick_run: Path) -> None:
+        _, out, _ = main("show", str(quick_run), "--columns", "cell,solver", "--limit", "3")
+        keys = tables.read(tables.results_file(str(quick_run)), "cells")["cell"]
+        for line in out.splitlines()[3:]:
+            assert keys.str.startswith(line.split()[0]).sum() == 1
+
+    @pytest.mark.parametrize("table", SHOWN)
+    def test_json_has_numbers_as_numbers(self, table: str, main: Main, quick_run: Path) -> None:
+        _, out, _ = main("show", str(quick_run), "--table", table, "--format", "json", "--limit", "20")
+        found = pd.read_json(io.StringIO(out))
+        source = tables.read(tables.results_file(str(quick_run)), views.VIEWS[table].source)
+        for name in found.columns.intersection(source.columns):
+            if source[name].dtype.kind in "if" and found[name].notna().any():
+                assert found[name].dtype.kind in "if", name
+
+    def test_a_wrong_column_is_refused(self, main: Main, quick_run: Path) -> None:
+        for option in ("--columns", "--sort"):
+            code, out, err = main("show", str(quick_run), option, "solvr")
+            assert (code, out) == (2, "")
+            assert "did you mean 'solver'" in err

@@ -1,0 +1,62 @@
+"""The end of a run: reasons are grouped, cells are named wholly, and what to do next are commands."""
+
+from __future__ import annotations
+
+import shlex
+from pathlib import Path
+from typing import Any
+
+import pytest
+import typer.main
+from samples import cell_row
+
+from vibench.cli.main import app
+from vibench.terminal.output import run_argument
+from vibench.terminal.run_summary import REASONS, failures, next_steps
+
+
+def row(cell: str, reason: str, status: str = "inaccurate", **more: Any) -> dict[str, Any]:
+    own = {"problem": "box", "dual": "cpg", "primal": "pga", "primal_tol": 0.5, "pod_tol": 1e-3, "dual_size": 4,
+           "solver": "osqp", "accuracy": 1e-8, "assembly": "reduced", "queries": 16, "queries_ok": 15}  # fmt: skip
+    return cell_row(**own | {"pod_size": None, "cell": cell, "reason": reason, "status": status} | more)
+
+
+def test_reasons_that_differ_in_their_numbers_alone_are_one_line() -> None:
+    rows = [row(f"c{k}", f"{k} of 16 queries, first mu=({k}.5, -1e-0{k}): gap residual {k}.1e-07") for k in range(1, 9)]
+    (line,) = failures(rows)
+    assert line.startswith("8 cells inaccurate: the first is c1, ")
+
+
+def test_a_cell_is_named_by_all_its_axes() -> None:
+    (line,) = failures([row("c1", "broke", "error")])
+    assert line == "error: c1, box · cpg · pga 0.5 · 0.001, R=4 · osqp 1e-08 · reduced: 15 of 16 queries ok; broke"
+
+
+def test_what_is_not_installed_is_said_once_with_the_command_that_installs_it() -> None:
+    rows = [row(f"c{k}", "the QP solver 'ecos' is not installed: `pip install ecos`", "unavailable") for k in range(24)]
+    (line,) = failures(rows)
+    assert line == "24 cells unavailable: the QP solver 'ecos' is not installed: `pip install ecos`"
+
+
+def test_never_more_lines_than_reasons_that_matter() -> None:
+    rows = [row(f"c{k}", "a" * k, "error") for k in range(1000)]
+    lines = list(failures(rows))
+    assert len(lines) == REASONS + 1
+    assert lines[-1] == f"{1000 - REASONS} cells not ok for {1000 - REASONS} other reasons"
+
+
+def test_what_to_do_next_are_commands(capsys: pytest.CaptureFixture[str]) -> None:
+    group: Any = typer.main.get_command(app)
+    next_steps(Path("a folder's"), 36, 3, figures=False)
+    lines = [line for line in capsys.readouterr().out.splitlines() if line.startswith("  ")]
+    assert len(lines) == 4
+    for line in lines:
+        program, command, *arguments = shlex.split(line.rsplit("  ", 1)[0])
+        assert program == "vibench"
+        context = group.get_command(None, command).make_context(command, arguments)
+        assert context.params["run"] == "a folder's"
+
+
+def test_a_run_is_named_as_briefly_as_it_can_be() -> None:
+    assert run_argument(Path("runs/quick")) == "quick"
+    assert run_argument(Path("other/quick")) == "other/quick"

@@ -1,0 +1,84 @@
+"""What is registered, read without importing any of it: a plugin's class stands in its source.
+
+`vibench list` and completion answer at once this way; what a plugin does when it is imported is for `vibench list KIND`
+to show.
+"""
+
+from __future__ import annotations
+
+import ast
+import importlib.util
+from collections.abc import Iterator, Sequence
+from importlib.metadata import EntryPoint
+from pathlib import Path
+
+from vibench.study.entry_points import entry_points
+
+KINDS = {
+    "problems": "problems", "primal": "primal_strategies", "dual": "dual_strategies", "studies": "studies",
+    "solvers": "qp_solvers",
+}  # fmt: skip
+"""Group of entry points of every list, without `vibench.`."""
+
+Row = tuple[str, str, str, str]
+
+
+def rows(kind: str) -> Iterator[Row]:
+    """Name, origin, description and names of the options of what is registered."""
+    registered = {entry.name: entry for entry in entry_points(group=f"vibench.{KINDS[kind]}")}
+    for name, entry in sorted(registered.items()):
+        origin = f"{entry.dist.name} {entry.dist.version}" if entry.dist is not None else "unknown"
+        if kind == "studies":
+            yield name, origin, _comment(entry), ""
+        else:
+            found = plugin_class(entry)
+            text = ast.get_docstring(found) or "" if found is not None else ""
+            yield name, origin, text.split("\n")[0], ", ".join(options(found))
+
+
+def plugin_class(entry: EntryPoint) -> ast.ClassDef | None:
+    """The class that an entry point names, if its module defines it."""
+    tree = _parsed(_source(entry.module))
+    classes = (node for node in tree.body if isinstance(node, ast.ClassDef))
+    return next((node for node in classes if node.name == entry.attr), None)
+
+
+def options(found: ast.ClassDef | None) -> Sequence[str]:
+    """Names of the options of a plugin, the arguments of its constructor."""
+    methods = (node for node in found.body if isinstance(node, ast.FunctionDef)) if found is not None else ()
+    constructor = next((node for node in methods if node.name == "__init__"), None)
+    if constructor is None:
+        return []
+    return [argument.arg for argument in (*constructor.args.args[1:], *constructor.args.kwonlyargs)]
+
+
+def _comment(entry: EntryPoint) -> str:
+    """The first sentence at the top of a study file; the member that an entry point names holds its path."""
+    file = _study_file(entry)
+    if file is None or not file.is_file():
+        return ""
+    lines = file.read_text(encoding="utf-8").split("\n")
+    top = lines[: next((k for k, line in enumerate(lines) if not line.startswith("#")), len(lines))]
+    return " ".join(line.removeprefix("#").strip() for line in top).split(". ")[0].removesuffix(".")
+
+
+def _study_file(entry: EntryPoint) -> Path | None:
+    try:
+        return Path(entry.load())
+    except Exception:  # noqa: BLE001  importing a plugin runs third-party code; `vibench list studies` names the error
+        return None
+
+
+def _parsed(source: Path | None) -> ast.Module:
+    try:
+        return ast.parse(source.read_bytes()) if source is not None else ast.Module([], [])
+    except (OSError, SyntaxError, ValueError):
+        return ast.Module([], [])
+
+
+def _source(module: str) -> Path | None:
+    try:
+        spec = importlib.util.find_spec(module)
+    except Exception:  # noqa: BLE001  it imports the packages that hold the module
+        return None
+    return Path(spec.origin) if spec is not None and spec.origin is not None else None

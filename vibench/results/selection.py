@@ -1,0 +1,119 @@
+"""Rows and columns that a user asks for, by names and by an expression; nothing in it can write, or run anything."""
+
+from __future__ import annotations
+
+import contextlib
+import re
+import sqlite3
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+from vibench.arrays import Array
+from vibench.errors import RequestError, unknown_name
+from vibench.results.database import open_read_only
+from vibench.text import printable
+
+LONGEST = 1000
+"""Characters of an expression."""
+
+OPERATORS = {"like", "glob"}
+"""Operators that SQLite runs as functions; all other functions are refused."""
+
+QUOTED = re.compile(r"'(?:[^']|'')*'")
+
+EXAMPLE = "solver = 'piqp' and beta_span_min < 1e-3"
+
+
+def matching(path: Path, table: str, expression: str, columns: Iterable[str]) -> Array:
+    """Which rows of a table satisfy an expression of SQLite over its columns, in the order they are read in.
+
+    The expression may use columns, numbers, texts in single quotes and operators. It runs on a connection that cannot
+    write, under an authoriser that refuses functions, subqueries and other tables.
+
+    Raises
+    ------
+    RequestError
+        If it is no such expression, or names a column that the table does not have.
+    """
+    outside = QUOTED.sub("''", expression)
+    if len(expression) > LONGEST:
+        raise RequestError(f"--where has {len(expression)} characters, at most {LONGEST} are read")
+    if re.search(r'["`;\[\]\'?@$#:\0]|--|/\*', outside.replace("''", "")):
+        raise _wrong(expression, "it may hold columns, numbers, operators and texts in single quotes")
+    _refuse_unbalanced(expression, outside)
+
+    def allowed(action: int, first: str | None, second: str | None, *_: str | None) -> int:
+        fine = (
+            (action == sqlite3.SQLITE_READ and first == table)
+            or (action == sqlite3.SQLITE_FUNCTION and second in OPERATORS)
+            or (action == sqlite3.SQLITE_SELECT and next(selects, None) is not None)
+        )
+        return sqlite3.SQLITE_OK if fine else sqlite3.SQLITE_DENY
+
+    selects = iter(["the one around the expression"])
+    query = f'SELECT ({expression}) IS TRUE FROM "{table}" NOT INDEXED ORDER BY rowid'
+    with open_read_only(path) as db:
+        db.setlimit(sqlite3.SQLITE_LIMIT_EXPR_DEPTH, 100)
+        db.set_authorizer(allowed)
+        try:
+            return np.array([found for (found,) in db.execute(query)], dtype=bool)
+        except sqlite3.Error as error:
+            unknown = re.fullmatch(r"no such column: (.+)", str(error))
+            if unknown:
+                raise unknown_name(f"column of {table}", printable(unknown[1]), columns) from None
+            raise _wrong(expression, _in_words(error)) from None
+
+
+def _refuse_unbalanced(expression: str, outside: str) -> None:
+    """Refuse an expression that would close the parenthesis around it."""
+    depth = 0
+    for sign in outside:
+        depth += (sign == "(") - (sign == ")")
+        if depth < 0:
+            break
+    if depth:
+        raise _wrong(expression, "its parentheses do not match")
+
+
+def _in_words(error: sqlite3.Error) -> str:
+    """What SQLite says, or that something is refused."""
+    if any(word in str(error) for word in ("prohibited", "authorized")):
+        return "functions, subqueries and other tables are refused"
+    return printable(str(error))
+
+
+def _wrong(expression: str, why: str) -> RequestError:
+    return RequestError(f'--where {printable(expression)!r} is no condition on a row: {why}, as in "{EXAMPLE}"')
+
+
+def parts(text: str) -> list[str]:
+    """The names in a list with commas."""
+    return [name for part in text.split(",") if (name := part.strip())]
+
+
+def sorted_by(frame: pd.DataFrame, keys: Sequence[str], what: str) -> pd.DataFrame:
+    """Rows sorted by columns, each named with a "-" before it for the largest first; missing values are last.
+
+    Raises
+    ------
+    RequestError
+        If there is no such column; `what` names the table in the message.
+    """
+    names = [key.removeprefix("-") for key in keys]
+    for name in names:
+        if name not in frame:
+            raise unknown_name(f"column of {what}", name, frame.columns)
+    rising = [not key.startswith("-") for key in keys]
+    return frame.sort_values(names, ascending=rising, kind="stable", na_position="last", ignore_index=True)
+
+
+def short_keys(keys: Iterable[str], least: int = 4) -> int:
+    """Number of characters that tell the keys of cells apart, at least `least`."""
+    known = set(keys)
+    longest = max(map(len, known), default=least)
+    with contextlib.suppress(StopIteration):
+        return next(n for n in range(least, longest) if len({key[:n] for key in known}) == len(known))
+    return longest

@@ -1,0 +1,163 @@
+"""The tables that `vibench show` prints: where their rows come from, and which columns matter most."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import pandas as pd
+
+from vibench.errors import unknown_name
+from vibench.results import best, selection, tables
+from vibench.results.columns import CELLS, THRESHOLDS, Column
+
+AXES = ("problem", "dual", "primal", "primal_tol", "solver", "pod_tol", "dual_tol", "accuracy", "assembly")
+"""Columns that tell rows apart; where all rows have one value, it stands in the title and takes no room."""
+
+OF_CELLS = (
+    *AXES, "cell", "queries_ok", "error_lambda_mean", "online_s", "error_u_mean", "N", "R", "status", "offline_s",
+    "beta_cone_lower_min", "beta_span_min", "enrichment",
+)  # fmt: skip
+
+OF_BENEFITS = (
+    "problem", "dual", "primal_a", "primal_b", "benefit_threshold", "primal_tol_b", "solver", "assembly_a",
+    "assembly_b", "threshold_high", "pod_tol", "dual_tol", "accuracy", "online_b_s", "online_a_s", "offline_b_s",
+    "offline_a_s",
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class View:
+    """A table for reading.
+
+    Attributes
+    ----------
+    source
+        Table of the results file that it is made of.
+    columns
+        Its columns by their names there, those that matter most first: on a narrow terminal the last ones are left out.
+    headings
+        Columns with headings and places of their own; empty where names are headings.
+    rows
+        Its rows, in their order, from those of the source.
+    """
+
+    source: str
+    columns: tuple[str, ...]
+    headings: Mapping[str, Column] | None = None
+    rows: Callable[[pd.DataFrame], pd.DataFrame] = tables.in_order
+
+
+VIEWS: Mapping[str, View] = {
+    "summary": View("cells", (*OF_CELLS, *(name for name in CELLS if CELLS[name].heading)), CELLS),
+    "best": View("cells", ("problem", best.BAND, *OF_CELLS), best.HEADINGS, best.fastest),
+    "benefits": View("thresholds", (*OF_BENEFITS, *(n for n in THRESHOLDS if THRESHOLDS[n].heading)), THRESHOLDS),
+    "cells": View("cells", (*OF_CELLS, "reason")),
+    "queries": View(
+        "queries",
+        (*AXES, "cell", "query", "status", "error_u", "error_lambda", "total_s", "mu_1", "mu_2", "mu_3",
+         "beta_cone_lower", "beta_span", "primal_residual", "dual_residual", "gap", "iterations", "reason"),
+    ),
+    "histories": View(
+        "histories",
+        ("stage", "quantity", "step", "value", "problem", "dual", "primal", "primal_tol", "pod_tol", "dual_tol"),
+    ),
+    "timings": View(
+        "timings", (*AXES, "cell", "round", "total_s", "assemble_s", "solve_s", "queries", "slowdown"),
+    ),
+    "thresholds": View("thresholds", OF_BENEFITS),
+    "disagreements": View(
+        "disagreements",
+        ("solver_a", "solver_b", "problem", "dual", "primal", "primal_tol", "pod_tol", "dual_tol", "accuracy",
+         "assembly", "difference_max", "flagged", "queries", "allowed_worst", "query_flagged"),
+    ),
+}  # fmt: skip
+"""Tables that `vibench show` prints, by name: three for reading, and those of the results file."""
+
+TOGETHER: Mapping[str, tuple[str, ...]] = {
+    "pod_tol": ("pod_size",), "dual_tol": ("dual_size",), "queries_ok": ("queries",),
+    "benefit_threshold": ("meaning",), "threshold_high": ("threshold_low",),
+}  # fmt: skip
+"""What a column of a table for reading shows beside its own value."""
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table as it was asked for: its rows with the columns of the results file, and how to show them."""
+
+    rows: pd.DataFrame
+    columns: tuple[str, ...]
+    view: View
+    chosen: bool
+    key_length: int
+
+    @property
+    def exact(self) -> pd.DataFrame:
+        """Every value as it is recorded, under the column's name: for programs."""
+        if not self.view.headings and not self.chosen:
+            return tables.whole_numbers(self.rows)
+        more = {name: () if self.chosen else TOGETHER.get(name, ()) for name in self.columns}
+        return tables.whole_numbers(self.rows[[part for name in self._placed for part in (name, *more[name])]])
+
+    @property
+    def readable(self) -> pd.DataFrame:
+        """The values as people read them, under headings; keys of cells are shortened."""
+        names = [name for name in self._placed if self.chosen or tables.says_something(self.rows, name)]
+        rows = self.rows.assign(cell=self.rows["cell"].str[: self.key_length]) if "cell" in self.rows else self.rows
+        return tables.under_headings(rows, names, self.view.headings or {})
+
+    @property
+    def _placed(self) -> list[str]:
+        """The columns in their places, or in the order in which they were asked for."""
+        known = self.view.headings
+        order = list(known or self.rows.columns)
+        by_place = sorted(self.columns, key=lambda name: (known[name].place if known else 0, order.index(name)))
+        return list(self.columns) if self.chosen else by_place
+
+    @property
+    def priority(self) -> list[str]:
+        """Headings, those that matter most first."""
+        return [self._heading(name) for name in self.columns]
+
+    @property
+    def axes(self) -> set[str]:
+        """Headings of the columns that tell rows apart."""
+        return {self._heading(name) for name in (*AXES, "primal_tol_b")}
+
+    def _heading(self, name: str) -> str:
+        column = (self.view.headings or {}).get(name)
+        return column.heading or name if column is not None else name
+
+
+def look_up(
+    path: Path, name: str, *, columns: Sequence[str] = (), where: str = "", sort: Sequence[str] = (), limit: int = 0
+) -> Table:
+    """A table of a results file: the rows that satisfy a condition, sorted, the first `limit` of them.
+
+    Raises
+    ------
+    RequestError
+        If there is no such table or column, or the condition is none.
+    """
+    if name not in VIEWS:
+        raise unknown_name("table", name, VIEWS)
+    view = VIEWS[name]
+    found = tables.read(path, view.source)
+    keys = found.get("cell", [])
+    if where:
+        found = found[selection.matching(path, view.source, where, found.columns)]
+    rows = view.rows(found)
+    by_heading = {column.heading: key for key, column in (view.headings or {}).items() if column.heading}
+    if sort:
+        resolved = [f"{'-' * key.startswith('-')}{by_heading.get(k, k)}" for key in sort for k in [key.lstrip("-")]]
+        rows = selection.sorted_by(rows, resolved, name)
+    asked = [by_heading.get(column, column) for column in columns]
+    if asked == ["all"]:
+        asked = list(rows.columns)
+    for column in asked:
+        if column not in rows:
+            raise unknown_name(f"column of {name}", column, rows.columns)
+    default = [column for column in dict.fromkeys(view.columns) if column in rows]
+    shown = rows.head(limit) if limit else rows
+    return Table(shown, tuple(dict.fromkeys(asked or default)), view, bool(asked), selection.short_keys(keys))

@@ -1,0 +1,99 @@
+"""What a run prints at its end: the best cells, what failed, whether the numbers agree, and what to do next."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from vibench.qp.status import Status
+from vibench.results import invariants, tables, views
+from vibench.results.solver_agreement import sentence
+from vibench.terminal.console import print_frame
+from vibench.terminal.output import echo, run_argument
+
+WHOLE = 20
+"""Cells up to which the summary is printed whole."""
+
+REASONS = 10
+"""Reasons for which cells are not ok that are printed."""
+
+Rows = Sequence[Mapping[str, Any]]
+
+
+def print_summary(study: str, path: Path, rows: Rows) -> None:
+    """Print the summary of a run, why cells are not ok, and violated invariants.
+
+    Parameters
+    ----------
+    study
+        Its name.
+    path
+        Its results file.
+    rows
+        The cells of its matrix.
+    """
+    cells, queries = tables.read(path, "cells"), tables.read(path, "queries")
+    table = views.look_up(path, "summary" if len(cells) <= WHOLE else "best")
+    if len(table.rows):
+        title = study if len(cells) <= WHOLE else f"{study}, the fastest query at every error reached"
+        print_frame(table.readable, title, table.priority, axes=table.axes)
+    not_ok = [row for row in rows if row["status"] != Status.OK]
+    echo(*failures(not_ok))
+    echo(f"{len(rows)} cells, {len(rows) - len(not_ok)} ok, {len(not_ok)} not ok")
+    violations = invariants.violations(queries, cells.set_index("cell")["enrichment_kind"])
+    for violation in violations[:REASONS]:
+        echo(f"invariant: {violation}; this is a bug of vibench or of a plugin's inner products")
+    if violations[REASONS:]:
+        echo(f"invariant: {len(violations) - REASONS} more like these")
+    if len(queries) and not violations:
+        echo(f"invariants of the constants and the error bounds hold in all {len(queries)} queries")
+    echo(sentence(tables.read(path, "disagreements")))
+
+
+def failures(not_ok: Rows) -> Iterator[str]:
+    """A line for every reason why cells are not ok; reasons that differ in their numbers alone are one."""
+    groups: dict[tuple[str, str], list[Mapping[str, Any]]] = {}
+    for row in not_ok:
+        groups.setdefault(kind_of_failure(row), []).append(row)
+    ranked = sorted(groups.values(), key=len, reverse=True)
+    for group in ranked[:REASONS]:
+        first = group[0]
+        count = f"{len(group)} cells " * (len(group) > 1)
+        if first["status"] == Status.UNAVAILABLE:
+            yield f"{count}{first['status']}: {first['reason']}"
+            continue
+        which = f"the first is {first['cell']}, " if len(group) > 1 else f"{first['cell']}, "
+        queries = f"{first['queries_ok']} of {first['queries']} queries ok"
+        yield f"{count}{first['status']}: {which}{tables.name_of_cell(first)}: {queries}; {first['reason']}"
+    if others := sum(map(len, ranked[REASONS:])):
+        yield f"{others} cells not ok for {len(ranked) - REASONS} other reasons"
+
+
+def kind_of_failure(row: Mapping[str, Any]) -> tuple[str, str]:
+    """Status and reason of a cell without the numbers in it."""
+    return row["status"], re.sub(r"[-+]?\d[\d.]*(e[-+]?\d+)?", "#", row["reason"] or "")
+
+
+def next_steps(folder: Path, cells: int, not_ok: int, *, figures: bool) -> None:
+    """Print the commands that show more of a run."""
+    run = run_argument(folder)
+    steps = [(f"vibench show {run}", f"all {cells} cells" if cells > WHOLE else "this table again")]
+    if not_ok:
+        steps.append((f"vibench show {run} --columns cell,reason --where \"status != 'ok'\"", "what is not ok"))
+    steps.append((f"vibench report {run}", "one HTML page: findings, tables, figures"))
+    if not figures:
+        steps.append((f"vibench figures {run}", "the figures as PNG and SVG"))
+    echo("next:", *aligned(steps))
+
+
+def aligned(steps: Iterable[tuple[str, str]]) -> list[str]:
+    """Commands and what they do, in two columns; a command that is too long for the first has a line of its own."""
+    steps = list(steps)
+    width = max([len(command) for command, _ in steps if len(command) < SHORT_COMMAND], default=0)
+    return [f"  {command:<{width}}  {what}" for command, what in steps]
+
+
+SHORT_COMMAND = 40
+"""Characters of a command that others are aligned with."""
