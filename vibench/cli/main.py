@@ -15,6 +15,7 @@ import typer
 from typer import Argument, Option
 
 from vibench.cli.completion import examples, names, solvers, studies
+from vibench.cli.export_commands import export_reduced_model
 from vibench.cli.output import echo
 from vibench.cli.plugin_commands import check_plugin, list_plugins, new_plugin
 from vibench.cli.result_commands import compare_runs, export_qps, replay_query, show, write_report
@@ -161,8 +162,8 @@ def doctor(out: Annotated[Path, Option(metavar="DIR", help="Folder of the runs."
 
 COMMANDS: dict[str, Callable[..., None]] = {
     "run": run, "list": list_plugins, "show": show, "report": write_report, "diff": compare_runs,
-    "replay": replay_query, "export-qps": export_qps, "clean": clean, "doctor": doctor,
-    "check": check_plugin, "new": new_plugin,
+    "replay": replay_query, "export-qps": export_qps, "export-model": export_reduced_model,
+    "clean": clean, "doctor": doctor, "check": check_plugin, "new": new_plugin,
 }  # fmt: skip
 for _name, _command in COMMANDS.items():
     app.command(_name, epilog=examples(_name))(_command)
