@@ -123,8 +123,7 @@ def _polished(A: Array, f: Array, B: Array, g: Array, active: NDArray[np.bool_])
 
 def _enriched(plain: Array, vectors: Array) -> Array:
     """Orthonormal columns `plain`, and an orthonormal basis of what vectors add to them."""
-    rest = vectors / np.linalg.norm(vectors, axis=0)
-    rest -= plain @ (plain.T @ rest)
+    rest = (vectors - plain @ (plain.T @ vectors)) / np.linalg.norm(vectors, axis=0)
     left, sigma, _ = np.linalg.svd(rest, full_matrices=False)
     return np.linalg.qr(np.hstack([plain, left[:, sigma > 1e-12]]))[0]
 
