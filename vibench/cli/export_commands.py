@@ -29,7 +29,7 @@ def export_reduced_model(
     bases: Annotated[bool, Option("--bases/--no-bases", help="With the bases that give u and λ.")] = True,
     c: Annotated[bool, Option("--c", help="Also write a C99 source, under the same name.")] = False,
 ) -> None:
-    """Write a reduced model to a file, with a script that answers queries without vibench."""
+    """Export a reduced model for use without vibench."""
     from vibench.library.export import ROUND_OFF, RUNTIME, export_model
     from vibench.library.runs import open_run
     from vibench.model.chebyshev import MEASURED

@@ -49,7 +49,7 @@ def check_plugin(
     option: Annotated[list[str] | None, Option(metavar="KEY=VALUE", help="Option of the plugin (repeatable).")] = None,
     seconds: Annotated[float, Option(min=0.0, help="Longest time that one call of the plugin may take.")] = SECONDS,
 ) -> None:
-    """Check a plugin: shapes, signs, tolerances, determinism, time.
+    """Check a plugin: shapes, signs, tolerances, repetition, time.
 
     One line per requirement of the interface; exit code 1 if one is violated.
     """

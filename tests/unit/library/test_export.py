@@ -113,7 +113,12 @@ def largest_errors(model: vibench.Model, answers: Any, count: int) -> tuple[floa
 
 @pytest.mark.parametrize(
     ("problem", "assembly", "count"),
-    [("radial-obstacle", "reduced", 1000), ("radial-obstacle", "full", 20), ("obstacle", "reduced", 40), ("string", "", 100)],
+    [
+        ("radial-obstacle", "reduced", 1000),
+        ("radial-obstacle", "full", 20),
+        ("obstacle", "reduced", 40),
+        ("string", "", 100),
+    ],
 )
 def test_an_exported_model_reproduces_random_queries(
     run: vibench.Run, problem: str, assembly: str, count: int, tmp_path: Path
