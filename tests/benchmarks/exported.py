@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 import vibench
-from vibench.library.export import ROUND_OFF
+from vibench.library.export import TOLERANCE
 from vibench.library.reduced_model import Model
 from vibench.qp.exact import exact_solution
 
@@ -67,4 +67,4 @@ def main(run: str, cell: str, tolerance: float) -> None:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1], sys.argv[2], float(sys.argv[3]) if len(sys.argv) > 3 else ROUND_OFF)
+    main(sys.argv[1], sys.argv[2], float(sys.argv[3]) if len(sys.argv) > 3 else TOLERANCE)

@@ -21,7 +21,7 @@ def export_reduced_model(
     file: Annotated[Path, Argument(metavar="FILE", help="A new file, whose name ends in .npz.")],
     interpolate: Annotated[
         float | None,
-        Option(metavar="TOL", help="Relative error of polynomials in place of A, f, B, g; round-off by default."),
+        Option(metavar="TOL", help="Relative error of polynomials in place of A, f, B, g; 1e-11 by default."),
     ] = None,
     evaluations: Annotated[
         int, Option(min=16, help="Parameters at which these are evaluated, at most, on one grid.")
@@ -30,12 +30,12 @@ def export_reduced_model(
     c: Annotated[bool, Option("--c", help="Also write a C99 source, under the same name.")] = False,
 ) -> None:
     """Export a reduced model for use without vibench."""
-    from vibench.library.export import ROUND_OFF, RUNTIME, export_model
+    from vibench.library.export import TOLERANCE, RUNTIME, export_model
     from vibench.library.runs import open_run
     from vibench.model.chebyshev import MEASURED
 
     model = open_run(run).model(cell)
-    tolerance = ROUND_OFF if interpolate is None else interpolate
+    tolerance = TOLERANCE if interpolate is None else interpolate
     found = export_model(model, file, tolerance, evaluations=evaluations, bases=bases, c=c)
     echo(*(f"{name}: {_in_words(member)}" for name, member in found.members.items()))
     echo(f"relative errors are those at {MEASURED} random parameters and at the corners of the box")

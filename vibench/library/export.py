@@ -34,8 +34,8 @@ from vibench.study.registry import version
 RUNTIME = "reduced_model.py"
 """The runtime, written beside the exported files."""
 
-ROUND_OFF = 1e-12
-"""Polynomials with a smaller relative error are the members of the reduced program up to round-off."""
+TOLERANCE = 1e-11
+"""Largest relative error of a polynomial where nothing else is asked for; solutions then agree to 1e-9 and better."""
 
 EVALUATIONS = 4096
 """Points of the largest grid on which the members are interpolated, where nothing else is asked for."""
@@ -76,7 +76,7 @@ class ExportedModel:
 def export_model(
     model: Model,
     file: Path | str,
-    tolerance: float = ROUND_OFF,
+    tolerance: float = TOLERANCE,
     evaluations: int = EVALUATIONS,
     bases: bool = True,
     c: bool = False,
@@ -130,7 +130,7 @@ def export_model(
 
 
 def exported(
-    model: Model, tolerance: float = ROUND_OFF, evaluations: int = EVALUATIONS, bases: bool = True
+    model: Model, tolerance: float = TOLERANCE, evaluations: int = EVALUATIONS, bases: bool = True
 ) -> ExportedModel:
     """The model as `export_model` writes it."""
     queried, box = model.reduced, model.parameters
