@@ -30,7 +30,7 @@ def export_reduced_model(
     c: Annotated[bool, Option("--c", help="Also write a C99 source, under the same name.")] = False,
 ) -> None:
     """Export a reduced model for use without vibench."""
-    from vibench.library.export import TOLERANCE, RUNTIME, export_model
+    from vibench.library.export import RUNTIME, TOLERANCE, export_model
     from vibench.library.runs import open_run
     from vibench.model.chebyshev import MEASURED
 
