@@ -28,6 +28,8 @@ from .interfaces.strategies import no_free as no_free
 from .interfaces.validation import check_cone as check_cone
 from .interfaces.validation import check_enrichment as check_enrichment
 from .interfaces.validation import checked_assembly as checked_assembly
+from .library.export import ExportedModel as ExportedModel
+from .library.export import export_model as export_model
 from .library.models import Model as Model
 from .library.models import Solution as Solution
 from .library.runs import Run as Run

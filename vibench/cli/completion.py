@@ -42,6 +42,10 @@ EXAMPLES: Mapping[str, tuple[str, ...]] = {
     "diff": ("vibench diff runs/before runs/after", "vibench diff runs/before runs/after --limit 1.1 --format json"),
     "replay": ("vibench replay quick 3f9a", "vibench replay quick 3f9a --query 7"),
     "export-qps": ("vibench export-qps quick programs",),
+    "export-model": (
+        "vibench export-model quick 3f9a membrane.npz",
+        "vibench export-model quick 3f9a membrane.npz --interpolate 1e-6 --c",
+    ),
     "check": (
         "vibench check my-problem --option resolution=medium",
         "vibench check primal:mine",

@@ -74,7 +74,7 @@ def check_plugin(
     ] = None,
     seconds: Annotated[float, Option(min=0.0, help="Time limit of all checks; a slow plugin gets fewer.")] = SECONDS,
 ) -> None:
-    """Check a plugin: shapes, signs, tolerances, determinism, time.
+    """Check a plugin: shapes, signs, tolerances, repetition, time.
 
     One line per requirement of the interface, as soon as it is checked; exit code 1 if one is violated.
     """

@@ -196,47 +196,60 @@ class HyperReducedModel:
         NumericalError
             If the reduced problem has entries that are not finite.
         """
-        operators = self._operators
-        samples = self._sampler(mu)
-        contact = self.problem.contact(mu) if operators.B is None or operators.g is None else None
-        A, f = operators.A.at(samples.get("A")), operators.f.at(samples.get("f"))
-        g = operators.g.at(samples.get("g")) if operators.g is not None else _projected_bound(self.model, contact)
-        if operators.supremizer_coordinates is not None:
-            Y, B = self._enriched(operators.supremizer_coordinates, samples, contact)
+        members, space = self.members(mu), self.space
+        A, f, B, g = members.A, members.f, members.B, members.g
+        if space is not None:
+            Y, B = self._enriched(space, B)
             A, f, B = Y.T @ (A @ Y), Y.T @ f, B @ Y
             A = 0.5 * (A + A.T)
-            lift = partial(_lift, operators.supremizer_coordinates, Y)
+            lift = partial(_lift, space, Y)
         else:
-            B = self._constraint(samples, contact)
-            Z = operators.basis if operators.basis is not None else self.fixed_basis
-            lift = partial(np.matmul, Z)
+            lift = partial(np.matmul, self.basis)
         if not all(np.isfinite(member.sum()) for member in (A, f, B, g)):
             raise NumericalError(f"the reduced problem has entries that are not finite at mu = {mu.tolist()}")
-        return ReducedProblem(VariationalInequality(A, f, B, g), lift, operators.factor)
+        return ReducedProblem(VariationalInequality(A, f, B, g), lift, self._operators.factor)
 
     def lift(self, mu: Array, vi: VariationalInequality, x: Array) -> Array:  # noqa: ARG002
         """Vectors u = Z x (n×k) with coordinates x (N'×k) at mu, for reconstruction; it assembles again."""
         return self.assemble(mu).lift(x)
 
+    def members(self, mu: Array) -> VariationalInequality:
+        """A, f, B, g at mu (d,) on Φ, a space that does not depend on mu; B on (η, χ) where Φ has `space`."""
+        operators = self._operators
+        samples = self._sampler(mu)
+        contact = self.problem.contact(mu) if operators.B is None or operators.g is None else None
+        A, f = operators.A.at(samples.get("A")), operators.f.at(samples.get("f"))
+        g = operators.g.at(samples.get("g")) if operators.g is not None else _projected_bound(self.model, contact)
+        return VariationalInequality(A, f, self._constraint(samples, contact), g)
+
+    @property
+    def space(self) -> Coordinates | None:
+        """Coordinates of Φ = V_N + supremizers where the enrichment varies in it; `None` for a fixed space."""
+        return self._operators.supremizer_coordinates
+
+    @property
+    def basis(self) -> Array:
+        """The vectors of Φ (n×d)."""
+        if self.space is not None:
+            return self.space.vectors(np.eye(self.space.plain.shape[0]))
+        return self.fixed_basis if self._operators.basis is None else self._operators.basis
+
     def _constraint(self, samples: Samples, contact: Contact | None) -> Array:
         operators = self._operators
         if operators.B is not None:
             return operators.B.at(samples.get("B"))
-        assert contact is not None and operators.contact_basis is not None  # noqa: PT018  set by `hyper_reduce`
+        assert contact is not None  # evaluated by `members`
+        if isinstance(self.space, ContactCoordinates):
+            eta = self.model.enrichment.eta
+            assert eta is not None  # implied by `supremizer_coordinates`
+            return self.space.supremizers(np.asarray(contact.B.T @ np.hstack([eta, self.generators]))).T
+        assert operators.contact_basis is not None  # set by `hyper_reduce`
         return np.asarray(self.model.generators.T @ (contact.B @ operators.contact_basis))
 
-    def _enriched(self, space: Coordinates, samples: Samples, contact: Contact | None) -> tuple[Array, Array]:
+    def _enriched(self, space: Coordinates, B: Array) -> tuple[Array, Array]:
         """Orthonormal coordinates Y (d×N') of V_N and the supremizers, and the constraint (R×d) in coordinates."""
-        eta = self.model.enrichment.eta
-        assert eta is not None  # implied by `supremizer_coordinates`
-        if isinstance(space, ContactCoordinates) and contact is not None:
-            represented = space.supremizers(np.asarray(contact.B.T @ np.hstack([eta, self.model.generators])))
-        else:
-            assert self._operators.B is not None
-            represented = self._operators.B.at(samples.get("B")).T
-        k = eta.shape[1]
-        added = orthonormal_range(represented[:, :k], space.plain)
-        return np.hstack([space.plain, added]), represented[:, k:].T
+        count = len(B) - self.generators.shape[1]
+        return np.hstack([space.plain, orthonormal_range(B[:count].T, space.plain)]), B[count:]
 
 
 def _lift(space: Coordinates, Y: Array, x: Array) -> Array:

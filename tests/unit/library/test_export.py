@@ -1,0 +1,358 @@
+"""Exported models answer as the models do, without vibench; what cannot be exported is refused with a line."""
+
+from __future__ import annotations
+
+import ast
+import json
+import subprocess
+import sys
+import warnings
+from importlib.metadata import distribution
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import scipy.sparse as sp
+from numerics import Varying
+from running import Main, refused
+
+import vibench
+from vibench.highfidelity.active_set import HighFidelitySolver
+from vibench.library import reduced_model
+from vibench.library.export import RUNTIME, export_model
+from vibench.library.reduced_model import Model as Exported
+from vibench.model.affine import affine_decomposition
+from vibench.model.galerkin import ReducedModel
+from vibench.model.hyperreduced import HyperReducedModel, hyper_reduce
+from vibench.qp.exact import exact_solution
+from vibench.stability.infsup import multipliers
+
+STUDY = vibench.Study(
+    name="small",
+    problem=[
+        {"name": "radial-obstacle", "options": {"resolution": 200}},
+        {"name": "obstacle", "options": {"resolution": 150}},
+    ],
+    dual=["mcpg"],
+    primal=["online-supremizers", "offline-pga"],
+    assembly=["full", "reduced"],
+    tolerances=[{"pod": [1e-2], "dual": [1e-1], "primal": {"offline-pga": [0.5]}}],
+    solvers=["piqp"],
+    accuracy=1e-10,
+    validation=2,
+    timing_rounds=1,
+)
+FILES = {"model.npz", RUNTIME}
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> vibench.Run:
+    return vibench.run(STUDY, tmp_path_factory.mktemp("export") / "run", progress=False)
+
+
+def model_of(run: vibench.Run, problem: str, primal: str = "offline-pga", assembly: str = "reduced") -> vibench.Model:
+    rows = run.cells.set_index(["problem", "primal", "assembly"])
+    return run.model(str(rows.loc[(problem, primal, assembly), "cell"]))
+
+
+class Rotating(Varying):
+    """The string whose constraints rotate, by two matrices in proportions that vary smoothly with the parameter."""
+
+    entrywise = frozenset(vibench.MEMBERS)
+
+    def __init__(self) -> None:
+        super().__init__(30, 8, 9)
+        self._two = [super(Rotating, self).assemble(np.array([t])).B for t in (0.0, 1.0)]
+
+    def assemble(self, mu: vibench.Array) -> vibench.VariationalInequality:
+        found = super().assemble(np.zeros(1))
+        B = sp.csr_array(self._two[0] + np.sin(3.0 * mu[0]) * self._two[1])
+        return vibench.VariationalInequality(found.A * (1.0 + mu[0]), found.f, B, found.g * np.exp(-mu[0]))
+
+    def sampler(self, wanted: Any) -> vibench.Sampler:
+        def sample(mu: vibench.Array) -> dict[str, vibench.Array]:
+            vi = self.assemble(mu)
+            dense = {"A": vi.A.toarray(), "f": vi.f[:, None], "B": vi.B.toarray(), "g": vi.g[:, None]}
+            return {name: dense[name][places] for name, places in wanted.items()}
+
+        return sample
+
+
+def per_parameter(template: vibench.Model) -> vibench.Model:
+    """A model whose supremizers are added at every parameter, on another problem, with the row of a real cell."""
+    problem = Rotating()
+    solver, training = HighFidelitySolver(problem), problem.training_set()
+    found = [solver.solve(mu) for mu in training]
+    basis = vibench.pod(np.column_stack([s.u for s in found]), problem.V, vibench.Stop(size=2)).basis
+    cone = vibench.greedy_cone(np.column_stack([s.lam for s in found]), problem.W, vibench.Stop(size=3))
+    span = multipliers(cone.generators, problem.W).span
+    enrichment = vibench.Enrichment(vibench.Kind.PER_PARAMETER, eta=span)
+    reduced = ReducedModel(problem, basis, enrichment, cone.generators, span)
+    queried = HyperReducedModel(reduced, hyper_reduce(reduced, affine_decomposition(problem, training, 1e-12)))
+    assert queried.kind is vibench.Kind.PER_PARAMETER
+    cell: Any = SimpleNamespace(row=template.row, model=queried, cell=SimpleNamespace(solver="piqp", accuracy=1e-10))
+    return vibench.Model(cell)
+
+
+def largest_errors(model: vibench.Model, answers: Any, count: int) -> tuple[float, float]:
+    """Largest relative errors of u and λ, against the reduced programs that vibench assembles, solved to round-off."""
+    errors, V, W, unique = [], model.problem.V, model.problem.W, 0
+    for mu in model.parameters.sample(count, seed=7):
+        reduced = model.reduced.assemble(mu)
+        exact = exact_solution(reduced.program)
+        assert exact is not None
+        u, lam = reduced.lift(exact.x[:, None])[:, 0], model.reduced.generators @ exact.alpha
+        found_u, found_lam = answers(mu)
+        unique += exact.unique
+        errors.append((V.norm(found_u - u) / V.norm(u), exact.unique * W.norm(found_lam - lam) / W.norm(lam)))
+    assert unique > 0.9 * count
+    return tuple(np.max(errors, axis=0).tolist())
+
+
+@pytest.mark.parametrize(
+    ("problem", "assembly", "count"),
+    [
+        ("radial-obstacle", "reduced", 1000),
+        ("radial-obstacle", "full", 20),
+        ("obstacle", "reduced", 40),
+        ("string", "", 100),
+    ],
+)
+def test_an_exported_model_reproduces_random_queries(
+    run: vibench.Run, problem: str, assembly: str, count: int, tmp_path: Path
+) -> None:
+    string = problem == "string"
+    model = per_parameter(model_of(run, "radial-obstacle")) if string else model_of(run, problem, assembly=assembly)
+    found = export_model(model, tmp_path / "model.npz", tolerance=1e-11)
+    exported = Exported(tmp_path / "model.npz")
+
+    def answers(mu: np.ndarray) -> tuple[np.ndarray | None, np.ndarray | None]:
+        solution = exported.solve(mu)
+        assert solution.status == "ok"
+        assert max(solution.residuals) <= 1e-12
+        return solution.u, solution.lam
+
+    assert max(largest_errors(model, answers, count)) <= 1e-9
+    assert found.error <= 1e-11
+    assert {file.name for file in tmp_path.iterdir()} == FILES
+
+
+def test_residuals_are_those_of_vibench(run: vibench.Run, tmp_path: Path) -> None:
+    model = model_of(run, "obstacle")
+    exported = per_file(model, tmp_path)
+    mu = model.parameters.sample(1, seed=3)[0]
+    A, f, B, g, _ = exported.program(mu)
+    rows = np.linalg.norm(B, axis=1)
+    random = np.random.default_rng(0)
+    for load in (f, np.zeros(len(f))):  # without a load other scales count
+        x, alpha = random.standard_normal(len(f)), random.random(len(g))
+        program = vibench.VariationalInequality(A, load, B, g)
+        expected = vibench.kkt_residuals(program, x, alpha)
+        found = reduced_model.residuals(A, load, B / rows[:, None], g / rows, x, rows * alpha)
+        assert found == pytest.approx((expected.primal, expected.dual, expected.gap), rel=1e-12)
+
+
+def per_file(model: vibench.Model, folder: Path, solver: str = "") -> Exported:
+    file = folder / "model.npz"
+    if not file.exists():
+        export_model(model, file, tolerance=1e-8)
+    return Exported(file, solver)
+
+
+ALONE = """
+import sys, warnings
+sys.path[:0] = [{runtime!r}, {site!r}]
+import numpy as np
+from reduced_model import Model
+model = Model({file!r})
+expected = np.load({values!r})
+for mu, u, lam in zip(expected["mus"], expected["u"], expected["lam"]):
+    solution = model.solve(mu)
+    assert solution.status == "ok"
+    assert np.abs(solution.u - u).max() <= 1e-9 * np.abs(u).max()
+    assert np.abs(solution.lam - lam).max() <= 1e-9 * np.abs(lam).max()
+for name in ("vibench", "scipy", "qpsolvers", "proxsuite"):
+    try:
+        __import__(name)
+    except ImportError:
+        continue
+    raise AssertionError(f"{{name}} can be imported")
+print(len(expected["mus"]))
+"""
+
+
+def test_the_runtime_needs_numpy_and_one_solver_alone(run: vibench.Run, tmp_path: Path) -> None:
+    site = tmp_path / "site"
+    site.mkdir()
+    for name in ("numpy", "piqp"):
+        parts = {Path(file).parts[0] for file in distribution(name).files or [] if ".." not in Path(file).parts}
+        for part in parts:
+            (site / part).symlink_to(str(distribution(name).locate_file(part)))
+    model = model_of(run, "radial-obstacle")
+    export_model(model, tmp_path / "out" / "model.npz")
+    solutions = []
+    for mu in (mus := model.parameters.sample(20, seed=1)):
+        reduced = model.reduced.assemble(mu)
+        exact = exact_solution(reduced.program)
+        assert exact is not None
+        solutions.append((reduced.lift(exact.x), model.reduced.generators @ exact.alpha))
+    u, lam = (np.stack(part) for part in zip(*solutions, strict=True))
+    np.savez(tmp_path / "values.npz", mus=mus, u=u, lam=lam)
+    script = ALONE.format(
+        runtime=str(tmp_path / "out"), site=str(site), file=str(tmp_path / "out" / "model.npz"),
+        values=str(tmp_path / "values.npz"),
+    )  # fmt: skip
+    done = subprocess.run([sys.executable, "-I", "-S", "-c", script], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout == "20\n"
+
+
+def test_the_runtime_is_one_short_file_that_imports_no_vibench() -> None:
+    text = Path(reduced_model.__file__).read_text(encoding="utf-8")
+    assert len(text.splitlines()) < 150
+    nodes = list(ast.walk(ast.parse(text)))
+    modules = {alias.name for node in nodes if isinstance(node, ast.Import) for alias in node.names}
+    modules |= {str(node.module) for node in nodes if isinstance(node, ast.ImportFrom)}
+    given = {module for module in modules if module.split(".")[0] not in sys.stdlib_module_names}
+    assert given == {"numpy", "numpy.typing", "piqp", "proxsuite"}
+
+
+def test_solvers_give_the_same_answer(run: vibench.Run, tmp_path: Path) -> None:
+    model = model_of(run, "obstacle")
+    one, other = per_file(model, tmp_path, "piqp"), per_file(model, tmp_path, "proxqp")
+    for mu in model.parameters.sample(10, seed=2):
+        assert np.allclose(one.solve(mu).x, other.solve(mu).x, rtol=0.0, atol=1e-12)
+    with pytest.raises(ValueError, match="the solver is 'osqp', expected one of piqp, proxqp"):
+        Exported(tmp_path / "model.npz", "osqp")
+
+
+def test_a_solver_that_gives_up_is_not_believed(
+    run: vibench.Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    exported = per_file(model_of(run, "radial-obstacle"), tmp_path)
+    assert exported.solve([0.17, 0.1]).status == "ok"
+    monkeypatch.setitem(
+        reduced_model.SOLVERS, "piqp", lambda A, f, B, g, _: (np.full(len(f), np.nan), np.full(len(g), np.inf))
+    )
+    monkeypatch.setattr(reduced_model, "_polished", lambda A, f, B, g, _: (np.zeros(len(f)), np.zeros(len(g))))
+    assert exported.solve([0.17, 0.1]).status == "inaccurate"
+
+
+def test_parameters_outside_the_box_are_warned_of_and_wrong_ones_refused(run: vibench.Run, tmp_path: Path) -> None:
+    model = model_of(run, "radial-obstacle")
+    exported = per_file(model, tmp_path)
+    outside = [0.17, 0.3]
+    with pytest.warns(UserWarning, match="outside the box"):
+        solution = exported.solve(outside)
+    with pytest.warns(UserWarning, match="outside the parameter domain"):
+        assert np.allclose(solution.x, model.solve(outside, accuracy=1e-12).x, rtol=0.0, atol=1e-6)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        exported.solve(exported.upper)
+    for wrong in ([0.17], [0.17, float("nan")]):
+        with pytest.raises(ValueError, match="expected height, curvature"):
+            exported.solve(wrong)
+
+
+def test_what_a_file_says(run: vibench.Run, tmp_path: Path) -> None:
+    model = model_of(run, "obstacle")
+    export_model(model, tmp_path / "model.npz", tolerance=1e-6, bases=False)
+    exported = Exported(tmp_path / "model.npz")
+    about = exported.about
+    assert about["parameters"] == {"names": ["scale", "centre_x", "centre_y"], "units": ["1", "m", "m"]}
+    assert about["cell"]["cell"] == model.row["cell"]
+    assert about["cell"]["error_u_mean"] == model.row["error_u_mean"]
+    assert json.loads(about["cell"]["definition"])["problem"]["name"] == "obstacle"
+    assert about["source"] == {"distribution": f"vibench {distribution('vibench').version}", "licence": "MIT"}
+    assert 0.0 < about["members"]["A"]["error"] <= 1e-6
+    solution = exported.solve([1.0, 0.0, 0.0])
+    assert solution.u is None
+    assert solution.lam is None
+    with np.load(tmp_path / "model.npz", allow_pickle=False) as data:
+        assert not {"basis", "generators"} & set(data.files)
+
+
+def test_a_file_that_is_no_model_is_refused(tmp_path: Path) -> None:
+    np.savez(tmp_path / "other.npz", format=np.array("something else"))
+    np.savez(tmp_path / "objects.npz", format=np.array([{}], dtype=object))
+    with pytest.raises(ValueError, match=r"other\.npz' is no vibench reduced model 1"):
+        Exported(tmp_path / "other.npz")
+    with pytest.raises(ValueError, match="Object arrays cannot be loaded"):
+        Exported(tmp_path / "objects.npz")
+
+
+@pytest.mark.parametrize(
+    ("name", "options", "line"),
+    [
+        ("model.txt", {}, "whose name must end in .npz"),
+        ("model.npz", {"tolerance": 0.0}, "the tolerance of the interpolation is 0, expected"),
+        ("old.npz", {}, "old.npz' exists; remove it"),
+        ("old.npz/model.npz", {}, "old.npz' is no folder"),
+        ("taken.npz", {"c": True}, "taken.c' exists; remove it"),
+        ("model.npz", {"tolerance": 1e-13, "evaluations": 30}, r"A depends on mu .* `--interpolate \d"),
+    ],
+)
+def test_what_is_not_exported_leaves_nothing_behind(
+    run: vibench.Run, name: str, options: dict[str, Any], line: str, tmp_path: Path
+) -> None:
+    for present in ("old.npz", "taken.c"):
+        (tmp_path / present).write_text("precious")
+    with pytest.raises(vibench.RequestError, match=line) as caught:
+        export_model(model_of(run, "obstacle"), tmp_path / name, **options)
+    assert "\n" not in str(caught.value)
+    assert {file.name: file.read_text() for file in tmp_path.iterdir()} == dict.fromkeys(
+        ("old.npz", "taken.c"), "precious"
+    )
+
+
+def test_a_runtime_of_somebody_else_is_kept(run: vibench.Run, tmp_path: Path) -> None:
+    (tmp_path / RUNTIME).write_text("precious")
+    with pytest.raises(vibench.RequestError, match="is not the runtime of this version"):
+        export_model(model_of(run, "radial-obstacle"), tmp_path / "model.npz")
+    assert [file.name for file in tmp_path.iterdir()] == [RUNTIME]
+
+
+def test_an_approximation_is_offered_with_its_error(run: vibench.Run, tmp_path: Path) -> None:
+    model = model_of(run, "obstacle")
+    with pytest.raises(vibench.RequestError, match="exports this approximation") as caught:
+        export_model(model, tmp_path / "model.npz", tolerance=1e-13, evaluations=200)
+    offered = float(str(caught.value).split("`--interpolate ")[1].split("`")[0])
+    found = export_model(model, tmp_path / "model.npz", tolerance=offered, evaluations=200)
+    assert 1e-13 < found.error <= offered
+    mu = model.parameters.sample(1, seed=1)[0]
+    assert Exported(tmp_path / "model.npz").solve(mu).u == pytest.approx(model.solve(mu).u, abs=10.0 * offered)
+
+
+def test_a_basis_that_changes_needs_reduced_assembly(run: vibench.Run, tmp_path: Path) -> None:
+    with pytest.raises(vibench.RequestError, match='export the same cell with assembly = "reduced"'):
+        export_model(model_of(run, "obstacle", "online-supremizers", "full"), tmp_path / "model.npz")
+    with pytest.raises(vibench.RequestError, match="C sources are for fixed bases"):
+        export_model(per_parameter(model_of(run, "radial-obstacle")), tmp_path / "model.npz", c=True)
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_problem_that_fails_in_the_box_is_named(
+    run: vibench.Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    model = model_of(run, "radial-obstacle")
+
+    def only_once(_: np.ndarray) -> Any:
+        raise KeyError("mu is not in the list")
+
+    monkeypatch.setattr(type(model.reduced), "members", lambda self, mu: only_once(mu))
+    with pytest.raises(vibench.RequestError, match="cannot be evaluated in the whole parameter box: KeyError"):
+        export_model(model, tmp_path / "model.npz")
+
+
+def test_the_command(run: vibench.Run, main: Main, tmp_path: Path) -> None:
+    cell = str(model_of(run, "obstacle").row["cell"])
+    asked = ("export-model", str(run.path.parent), cell, str(tmp_path / "out" / "model.npz"))
+    code, out, err = main(*asked, "--interpolate", "1e-4", "--c")
+    assert (code, err) == (0, "")
+    assert "B: 1 term, polynomials of degree (2, 0, 0)" in out
+    assert f"Model('{tmp_path / 'out' / 'model.npz'}').solve(mu)" in out
+    assert {file.name for file in (tmp_path / "out").iterdir()} == FILES | {"model.c"}
+    refused(main(*asked), "model.npz' exists; remove it")
+    refused(main(*asked[:-1], str(tmp_path / "b.npz"), "--interpolate", "1e-14"), "A depends on mu", "--evaluations")

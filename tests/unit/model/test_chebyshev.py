@@ -1,0 +1,69 @@
+"""Polynomials on a box: exact where the arrays are polynomials, and honest about their error where they are not."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from vibench.model.chebyshev import interpolate_on_box
+
+LOWER, UPPER = np.array([0.5, -2.0]), np.array([1.5, 3.0])
+UNIT = np.random.default_rng(1).random((50, 2))
+POINTS = LOWER + UNIT * (UPPER - LOWER)
+
+
+def test_polynomials_are_found_with_their_degrees_and_terms() -> None:
+    first, second = np.random.default_rng(0).standard_normal((2, 7))
+
+    def evaluate(mu: np.ndarray) -> dict[str, np.ndarray]:
+        x, y = mu
+        return {"p": (1.0 + x**3) * first + x * y**2 * second, "constant": 3.0 * second, "zero": np.zeros(4)}
+
+    found = interpolate_on_box(evaluate, LOWER, UPPER, 1e-12, 1000)
+    assert {name: (p.degrees, len(p.terms)) for name, p in found.items()} == {
+        "p": ((3, 2), 2), "constant": ((0, 0), 1), "zero": ((0, 0), 1),
+    }  # fmt: skip
+    assert len(found["p"].indices) < 12  # products that do not occur are left out
+    for name, p in found.items():
+        expected = np.array([evaluate(mu)[name] for mu in POINTS])
+        assert np.abs(p.at(UNIT) - expected).max() <= 1e-12 * np.abs(first).max() * 30.0
+        assert p.error <= 1e-12
+
+
+def test_degrees_follow_the_decay_in_every_direction() -> None:
+    found = interpolate_on_box(
+        lambda mu: {"a": np.array([np.exp(mu[0]) / (1.0 + mu[1] ** 2), mu[0]])}, LOWER, UPPER, 1e-9, 4000
+    )["a"]
+    assert found.error <= 1e-9
+    assert found.degrees[0] < 12 < found.degrees[1]  # the poles ±i are near
+    expected = np.array([[np.exp(x) / (1.0 + y**2), x] for x, y in POINTS])
+    assert np.linalg.norm(found.at(UNIT) - expected, axis=1).max() <= 2e-9 * np.exp(1.5)
+
+
+@pytest.mark.parametrize("dimension", [1, 2])
+def test_what_is_not_smooth_misses_the_tolerance_and_says_by_how_much(dimension: int) -> None:
+    lower, upper, budget = LOWER[:dimension], UPPER[:dimension], 100
+    evaluated: list[np.ndarray] = []
+
+    def kink(mu: np.ndarray) -> dict[str, np.ndarray]:
+        evaluated.append(mu)
+        return {"a": np.array([abs(mu[0] - 1.03)]), "b": np.array([1.0 + mu[-1]])}
+
+    found = interpolate_on_box(kink, lower, upper, 1e-9, budget)
+    assert found["b"].error <= 1e-12
+    unit = np.random.default_rng(2).random((400, dimension))
+    expected = np.abs(lower[0] + unit[:, 0] * (upper[0] - lower[0]) - 1.03)
+    true = np.abs(found["a"].at(unit)[:, 0] - expected).max() / expected.max()
+    assert 0.2 * true <= found["a"].error <= 5.0 * true
+    assert found["a"].error > 1e-4
+    assert np.prod(np.array(found["a"].degrees) + 1) <= budget
+    assert len(evaluated) <= 12 * budget
+
+
+def test_it_is_deterministic() -> None:
+    def evaluate(mu: np.ndarray) -> dict[str, np.ndarray]:
+        return {"a": np.sin(mu)}
+
+    one, other = (interpolate_on_box(evaluate, LOWER, UPPER, 1e-6, 500)["a"] for _ in range(2))
+    assert np.array_equal(one.coefficients, other.coefficients)
+    assert one.error == other.error

@@ -1,0 +1,243 @@
+"""Export of a reduced model: one file with its operators, and a runtime that needs no vibench."""
+
+from __future__ import annotations
+
+import io
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import partial
+from importlib.metadata import PackageNotFoundError, metadata
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from vibench.arrays import Array
+from vibench.errors import NumericalError, RequestError, in_a_line
+from vibench.files import write_atomically
+from vibench.interfaces.problem import MEMBERS, VariationalInequality
+from vibench.interfaces.strategies import Kind
+from vibench.library import c_source
+from vibench.library.models import Model
+from vibench.library.reduced_model import FORMAT, SOLVERS
+from vibench.model.chebyshev import AffinePolynomial, interpolate_on_box
+from vibench.model.hyperreduced import HyperReducedModel
+from vibench.provenance import distribution_version
+from vibench.qp.settings import SETTINGS
+from vibench.qp.solve import MARGIN
+from vibench.stages.assembly import Model as Queried
+from vibench.study.cells import Cell
+from vibench.study.registry import version
+
+RUNTIME = "reduced_model.py"
+"""The runtime, written beside the exported files."""
+
+TOLERANCE = 1e-11
+"""Largest relative error of a polynomial where nothing else is asked for; solutions then agree to 1e-9 and better."""
+
+EVALUATIONS = 4096
+"""Points of the largest grid on which the members are interpolated, where nothing else is asked for."""
+
+RECORDED = (
+    "cell", "problem", "problem_options", "dual", "dual_options", "primal", "primal_options", "pod_tol", "pod_size",
+    "dual_tol", "dual_size", "primal_tol", "solver", "accuracy", "assembly", "queries", "queries_ok", "N", "R",
+    "enrichment", "error_u_mean", "error_u_max", "error_lambda_mean", "error_lambda_max", "assembly_error_max",
+    "seed", "code", "versions", "definition",
+)  # fmt: skip
+"""Columns of the cell that an exported model repeats."""
+
+
+@dataclass(frozen=True)
+class ExportedModel:
+    """A reduced model as an exported file holds it.
+
+    Attributes
+    ----------
+    members
+        A as packed upper triangle (row by row), f, B and g, as polynomials on the parameter box.
+    arrays
+        The other arrays of the file.
+    about
+        Everything else in it.
+    """
+
+    members: Mapping[str, AffinePolynomial]
+    arrays: Mapping[str, Array]
+    about: Mapping[str, Any]
+
+    @property
+    def error(self) -> float:
+        """Largest relative error of a member at random parameters."""
+        return max(member.error for member in self.members.values())
+
+
+def export_model(
+    model: Model,
+    file: Path | str,
+    tolerance: float = TOLERANCE,
+    evaluations: int = EVALUATIONS,
+    bases: bool = True,
+    c: bool = False,
+) -> ExportedModel:
+    """Write a reduced model to `file`, its runtime beside it and, if asked, its C source.
+
+    Parameters
+    ----------
+    model
+        The model.
+    file
+        Its name ends in .npz.
+    tolerance
+        Largest relative error of the polynomials that take the place of A, f, B and g.
+    evaluations
+        Points of the largest grid of parameters at which these are evaluated.
+    bases
+        Whether the file has the primal basis and the generators, from which u and λ are reconstructed.
+    c
+        Whether to write a C99 source, under the same name, too.
+
+    Raises
+    ------
+    RequestError
+        If polynomials do not reach the tolerance, the model has no form of this kind, or a file exists.
+    """
+    file = Path(file)
+    if file.suffix != ".npz":
+        raise RequestError(f"'{file}': the model is written as an npz file, whose name must end in .npz")
+    if not 0.0 < tolerance < 1.0:
+        raise RequestError(f"the tolerance of the interpolation is {tolerance:g}, expected a number between 0 and 1")
+    if file.parent.exists() and not file.parent.is_dir():
+        raise RequestError(f"'{file.parent}' is no folder")
+    runtime = (files("vibench.library") / RUNTIME).read_bytes()
+    source, script = file.with_suffix(".c"), file.with_name(RUNTIME)
+    for path in [file, *([source] if c else [])]:
+        if path.exists():
+            raise RequestError(f"'{path}' exists; remove it, or choose another name")
+    if script.exists() and (not script.is_file() or script.read_bytes() != runtime):
+        raise RequestError(f"'{script}' exists and is not the runtime of this version; choose another folder")
+    if c and isinstance(model.reduced, HyperReducedModel) and model.reduced.space is not None:
+        raise RequestError("the enrichment changes the basis at every parameter; C sources are for fixed bases")
+    found = exported(model, tolerance, evaluations, bases)
+    contents = {file: _npz(found), script: runtime}
+    if c:
+        contents[source] = c_source.source(found.members, found.arrays, found.about, file.stem).encode()
+    file.parent.mkdir(parents=True, exist_ok=True)
+    for path, content in contents.items():
+        write_atomically(path, content)
+    return found
+
+
+def exported(
+    model: Model, tolerance: float = TOLERANCE, evaluations: int = EVALUATIONS, bases: bool = True
+) -> ExportedModel:
+    """The model as `export_model` writes it."""
+    queried, box = model.reduced, model.parameters
+    try:
+        first = members_of(queried, box.lower)
+        if not len(first.f) or not len(first.g):
+            raise RequestError("the model has no unknowns or no constraints")
+        evaluate = partial(_packed, queried, len(first.f))
+        members = interpolate_on_box(evaluate, box.lower, box.upper, tolerance, evaluations)
+    except NumericalError as error:
+        raise RequestError(f"the model cannot be evaluated in the whole parameter box: {error}") from None
+    except (ArithmeticError, ValueError, LookupError) as error:  # what the code of a problem raises
+        raise RequestError(f"the model cannot be evaluated in the whole parameter box: {in_a_line(error)}") from None
+    _refuse_inaccurate(members, tolerance, evaluations)
+    arrays = {"lower": box.lower, "upper": box.upper}
+    if isinstance(queried, HyperReducedModel) and queried.space is not None:
+        arrays["plain"] = queried.space.plain
+    if bases:
+        basis = queried.basis if isinstance(queried, HyperReducedModel) else queried.fixed_basis
+        arrays |= {"basis": basis, "generators": queried.generators}
+    return ExportedModel(members, arrays, _about(model, members))
+
+
+def members_of(queried: Queried, mu: Array) -> VariationalInequality:
+    """A, f, B, g at a parameter, on a space that does not depend on it.
+
+    Raises
+    ------
+    RequestError
+        If the model has no such space.
+    """
+    if isinstance(queried, HyperReducedModel):
+        return queried.members(mu)
+    if queried.kind is Kind.PER_PARAMETER:
+        raise RequestError(
+            "the enrichment changes the basis at every parameter, and the cell assembles in full; export the same cell "
+            'with assembly = "reduced"'
+        )
+    return queried.assemble(mu).program
+
+
+def _packed(queried: Queried, size: int, mu: Array) -> dict[str, Array]:
+    """The members as flat arrays; of A the upper triangle."""
+    found = members_of(queried, mu)
+    if len(found.f) != size:
+        raise RequestError(f"the reduced program has {len(found.f)} unknowns at mu = {mu.tolist()}, {size} elsewhere")
+    arrays = {name: np.asarray(getattr(found, name)) for name in MEMBERS}
+    arrays["A"] = 0.5 * (arrays["A"] + arrays["A"].T)[np.triu_indices(size)]
+    if not all(np.all(np.isfinite(array)) for array in arrays.values()):
+        raise NumericalError(f"it has entries that are not finite at mu = {mu.tolist()}")
+    return {name: array.ravel() for name, array in arrays.items()}
+
+
+def _refuse_inaccurate(members: Mapping[str, AffinePolynomial], tolerance: float, evaluations: int) -> None:
+    missed = {name: member for name, member in members.items() if member.error > tolerance}
+    if not missed:
+        return
+    worst = max(missed, key=lambda name: missed[name].error)
+    error, degrees = missed[worst].error, ", ".join(map(str, missed[worst].degrees))
+    raise RequestError(
+        f"{worst} depends on mu through the code of the problem, which the file cannot hold, and polynomials of degree "
+        f"({degrees}) reach a relative error of {error:.1e}, not {tolerance:.0e}; `--interpolate {1.05 * error:.1e}` "
+        f"exports this approximation, more `--evaluations` than {evaluations} may reach a better one"
+    )
+
+
+def _about(model: Model, members: Mapping[str, AffinePolynomial]) -> dict[str, Any]:
+    """What the file says in words: parameters, solver, errors, provenance."""
+    box, row = model.parameters, model.row
+    accuracy, solver = float(row["accuracy"]), str(row["solver"])
+    origin = version("problem", Cell.from_definition(str(row["definition"])).problem.name)
+    return {
+        "parameters": {"names": list(box.names), "units": list(box.units)},
+        "solver": solver if solver in SOLVERS else next(iter(SOLVERS)),
+        "settings": {name: SETTINGS[name].at(MARGIN * accuracy) for name in SOLVERS},
+        "accuracy": accuracy,
+        "members": {
+            name: {"degrees": list(member.degrees), "terms": len(member.terms), "error": member.error}
+            for name, member in members.items()
+        },
+        "cell": {name: _plain(row[name]) for name in RECORDED if name in row},
+        "exported_by": f"vibench {distribution_version('vibench')}",
+        "source": {"distribution": origin, "licence": _licence(origin.split()[0])},
+    }
+
+
+def _plain(value: Any) -> Any:
+    """A value of a row as JSON can hold it."""
+    value = value.item() if isinstance(value, np.generic) else value
+    return None if isinstance(value, float) and not np.isfinite(value) else value
+
+
+def _licence(distribution: str) -> str:
+    """Licence that a distribution declares."""
+    try:
+        declared = metadata(distribution)
+    except PackageNotFoundError:
+        return "unknown"
+    return next((str(declared[key]) for key in ("License-Expression", "License") if key in declared), "unknown")
+
+
+def _npz(model: ExportedModel) -> bytes:
+    arrays: dict[str, Any] = {"format": np.array(FORMAT), "about": np.array(json.dumps(dict(model.about)))}
+    arrays |= model.arrays
+    for name, member in model.members.items():
+        arrays |= {f"{name}_indices": member.indices, f"{name}_coefficients": member.coefficients}
+        arrays |= {f"{name}_terms": member.terms}
+    content = io.BytesIO()
+    np.savez_compressed(content, **arrays)
+    return content.getvalue()

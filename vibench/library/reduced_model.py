@@ -1,0 +1,149 @@
+"""A reduced model exported by vibench: `Model(file).solve(mu)`. Needs NumPy and piqp or proxsuite, not vibench.
+
+The model is min ½ xᵀA x − fᵀx subject to B x ≤ g, A x + Bᵀα = f with α ≥ 0; u = basis · x and λ = generators · α.
+A, f, B, g are Σ_q θ_q(mu) · terms_q; the θ_q are sums of products of Chebyshev polynomials on the parameter box.
+"""
+
+from __future__ import annotations
+
+import json
+import warnings
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+FORMAT = "vibench reduced model 1"
+
+
+class Solution(NamedTuple):
+    """Status ("ok" up to the accuracy in the file, or "inaccurate"), x, α, u and λ if the file has bases, residuals."""
+
+    status: str
+    x: Array
+    alpha: Array
+    u: Array | None
+    lam: Array | None
+    residuals: tuple[float, float, float]
+
+
+class Model:
+    """A reduced model from a file; `about` says where it comes from, `solver` is "piqp" or "proxqp"."""
+
+    def __init__(self, file: str | Path, solver: str = "") -> None:
+        with np.load(file, allow_pickle=False) as data:
+            if "format" not in data or str(data["format"]) != FORMAT:
+                raise ValueError(f"'{file}' is no {FORMAT}")
+            self._data = {name: data[name] for name in data.files}
+        self.about: dict[str, Any] = json.loads(str(self._data["about"]))
+        self.lower, self.upper = self._data["lower"], self._data["upper"]
+        self.solver = solver or self.about["solver"]
+        if self.solver not in SOLVERS:
+            raise ValueError(f"the solver is '{self.solver}', expected one of {', '.join(SOLVERS)}")
+
+    def program(self, mu: Sequence[float] | Array) -> tuple[Array, Array, Array, Array, Array]:
+        """A, f, B, g at a parameter, and the coordinates Y of their unknowns in the basis; warns outside the box."""
+        at = np.asarray(mu, dtype=float)
+        if at.shape != self.lower.shape or not np.all(np.isfinite(at)):
+            raise ValueError(f"mu is {at.tolist()}, expected {', '.join(self.about['parameters']['names'])}")
+        if np.any(at < self.lower) or np.any(at > self.upper):
+            warnings.warn(f"mu = {at.tolist()} is outside the box, where the model was not trained", stacklevel=3)
+        packed, f, B, g = (self._member(name, at) for name in "AfBg")
+        A, Y, B = np.zeros((len(f), len(f))), np.eye(len(f)), B.reshape(-1, len(f))
+        A[np.triu_indices(len(f))] = packed
+        A += np.triu(A, 1).T
+        if "plain" in self._data:  # V_N in a larger space; the supremizers that enrich it are the first rows of B
+            Y = _enriched(self._data["plain"], B[: len(B) - len(g)].T)
+            A, f, B = Y.T @ A @ Y, Y.T @ f, B[len(B) - len(g) :] @ Y
+        return A, f, B, g, Y
+
+    def _member(self, name: str, mu: Array) -> Array:
+        indices = self._data[f"{name}_indices"]
+        unit = (2.0 * mu - self.lower - self.upper) / (self.upper - self.lower)
+        values = np.cos(np.arccos(unit[:, None] + 0j) * np.arange(indices.max() + 1)).real  # inside the box and outside
+        products = np.prod(values[np.arange(len(mu)), indices], axis=1)
+        return np.asarray(products @ self._data[f"{name}_coefficients"] @ self._data[f"{name}_terms"])
+
+    def solve(self, mu: Sequence[float] | Array) -> Solution:
+        """The solution at a parameter, verified; look at its status."""
+        A, f, B, g, Y = self.program(mu)
+        rows = np.where((norms := np.linalg.norm(B, axis=1)) > 0.0, norms, 1.0)
+        N, b = B / rows[:, None], g / rows
+        length, force = _scales(A, f, b)[:2]  # units in which the solver's tolerances are relative ones
+        settings = self.about["settings"][self.solver]
+        answer = SOLVERS[self.solver](A * (length / force), f / force, N, b / length, settings)
+        y, z = (np.nan_to_num(vector, nan=0.0, posinf=0.0, neginf=0.0) for vector in answer)
+        answers = [(length * y, force * np.maximum(z, 0.0)), _polished(A, f, N, b, z > b / length - N @ y)]
+        x, forces = min(answers, key=lambda answer: max(residuals(A, f, N, b, *answer)))
+        found = residuals(A, f, N, b, x, forces)
+        x, alpha = Y @ x, forces / rows
+        parts = (("basis", x), ("generators", alpha))
+        u, lam = (self._data[name] @ part if name in self._data else None for name, part in parts)
+        return Solution("ok" if max(found) <= self.about["accuracy"] else "inaccurate", x, alpha, u, lam, found)
+
+
+def residuals(A: Array, f: Array, B: Array, g: Array, x: Array, alpha: Array) -> tuple[float, float, float]:
+    """Relative residuals, with rows of B of norm 1: max (B x − g)₊, ‖A x − f + Bᵀα‖∞, |xᵀA x − fᵀx + gᵀα|."""
+    _, _, length, force, energy = _scales(A, f, g)
+    parts, terms = np.stack([A @ x, -f, B.T @ alpha]), (float(x @ A @ x), -float(f @ x), float(g @ alpha))
+    dual = max(force, float(abs(parts).max())) or 1.0
+    gap = max(0.5 * abs(terms[0]), abs(terms[1]), abs(terms[2]), energy) or 1.0
+    excess, rest = float((B @ x - g).max(initial=0.0)), float(abs(parts.sum(axis=0)).max())
+    return excess / length, rest / dual, abs(sum(terms)) / gap
+
+
+def _scales(A: Array, f: Array, g: Array) -> tuple[float, float, float, float, float]:
+    """Units of length and force for the solver; the least length, force and energy that residuals are relative to."""
+    longest, k, load = float(abs(g).max()), float(A.trace()) / len(f), float(abs(f).max())
+    if load > 1e-10 * k * (-g).max(initial=0.0):
+        return 1.0, load, max(1.0, longest), 0.0, 0.5e-4 * float(f @ f) ** 2 / float(f @ A @ f)
+    length = longest or 1.0  # no load: the constraints prescribe a length and a force
+    return length, 1e-3 * k * length, length, 1e-4 * k * length, 1e-4 * k * length**2
+
+
+def _polished(A: Array, f: Array, B: Array, g: Array, active: NDArray[np.bool_]) -> tuple[Array, Array]:
+    """The solution up to round-off: equations on the active set, which changes until all signs are right."""
+    k = np.sqrt(A.trace() / len(A))
+    for _ in range(20):
+        N = B[active]
+        system = np.block([[A / k, k * N.T], [k * N, np.zeros((len(N), len(N)))]])
+        found = np.linalg.lstsq(system, np.append(f / k, k * g[active]), rcond=None)[0]
+        x, alpha = found[: len(f)], np.zeros(len(g))
+        alpha[active] = k**2 * found[len(f) :]
+        violated = B @ x - g > 1e-12 * (abs(B) @ abs(x) + abs(g))
+        pulling = alpha < -1e-12 * abs(alpha).max(initial=0.0)
+        active = violated | (active & ~pulling)
+        if not np.any(violated | pulling):
+            break
+    return x, np.maximum(alpha, 0.0)
+
+
+def _enriched(plain: Array, vectors: Array) -> Array:
+    """Orthonormal columns `plain`, and an orthonormal basis of what vectors add to them."""
+    rest = (vectors - plain @ (plain.T @ vectors)) / np.linalg.norm(vectors, axis=0)
+    left, sigma, _ = np.linalg.svd(rest, full_matrices=False)
+    return np.linalg.qr(np.hstack([plain, left[:, sigma > 1e-12]]))[0]
+
+
+def _piqp(A: Array, f: Array, B: Array, g: Array, settings: Mapping[str, Any]) -> tuple[Array, Array]:
+    import piqp  # noqa: PLC0415
+
+    solver = piqp.DenseSolver()
+    for name, value in settings.items():
+        setattr(solver.settings, name, value)
+    solver.setup(A, -f, np.zeros((0, len(f))), np.zeros(0), B, None, g, None, None)
+    solver.solve()
+    return solver.result.x, solver.result.z_u
+
+
+def _proxqp(A: Array, f: Array, B: Array, g: Array, settings: Mapping[str, Any]) -> tuple[Array, Array]:
+    from proxsuite import proxqp  # noqa: PLC0415
+
+    result = proxqp.dense.solve(A, -f, None, None, B, None, g, **settings)
+    return result.x, result.z
+
+
+SOLVERS = {"piqp": _piqp, "proxqp": _proxqp}

@@ -1,0 +1,192 @@
+"""Polynomial interpolation of parametrised arrays in Chebyshev points of a box, its error measured at random points."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from math import prod
+
+import numpy as np
+import scipy.fft
+
+from vibench.arrays import Array, Indices
+from vibench.linalg.dense import svd
+
+Evaluate = Callable[[Array], Mapping[str, Array]]
+"""From a parameter mu (d,) to flat arrays (size,) by name, of the same sizes everywhere."""
+
+LINES = 3
+"""Lines through random points, in every direction, along which degrees are chosen."""
+
+TRIALS = 3
+"""Grids that are tried, each with a quarter more points per direction than the last."""
+
+MEASURED = 100
+"""Random points at which the error is measured."""
+
+
+@dataclass(frozen=True)
+class AffinePolynomial:
+    """An array Σ_q θ_q(mu) · terms_q whose coefficients θ_q are polynomials on a box.
+
+    Attributes
+    ----------
+    indices
+        Degrees (K×d) of the products of Chebyshev polynomials that occur, in (2 mu − lower − upper)/(upper − lower).
+    coefficients
+        Coefficients of θ in these products (K×Q).
+    terms
+        Flat terms (Q×size).
+    error
+        Largest Euclidean error at `MEASURED` random points of the box and at its corners, over the largest norm there.
+    """
+
+    indices: Indices
+    coefficients: Array
+    terms: Array
+    error: float
+
+    @property
+    def degrees(self) -> tuple[int, ...]:
+        """Degree in every parameter."""
+        return tuple(int(degree) for degree in self.indices.max(axis=0))
+
+    def at(self, unit: Array) -> Array:
+        """Values (P×size) at points (P×d) of the unit box."""
+        return products(self.indices, unit) @ self.coefficients @ self.terms
+
+
+def products(indices: Indices, unit: Array) -> Array:
+    """Products (P×K) of Chebyshev polynomials of these degrees (K×d) at points (P×d) of the unit box."""
+    factors = [
+        np.polynomial.chebyshev.chebvander(2.0 * at - 1.0, int(degrees.max()))[:, degrees]
+        for at, degrees in zip(unit.T, indices.T, strict=True)
+    ]
+    return np.asarray(np.prod(factors, axis=0))
+
+
+def interpolate_on_box(
+    evaluate: Evaluate, lower: Array, upper: Array, tolerance: float, budget: int, seed: int = 0
+) -> dict[str, AffinePolynomial]:
+    """Tensor-product Chebyshev interpolation of arrays on a box (Trefethen 2013, chapters 3 and 8).
+
+    Degrees differ by direction: along random lines, the arrays are interpolated with more and more points until the
+    coefficients have decayed to a tenth of the tolerance, relative to the largest array (`_degree`). One grid has these
+    degrees, or larger ones if its measured error is above the tolerance. Every array loses the coefficients it does not
+    need; the others are factorised into θ and terms by a singular value decomposition.
+
+    Parameters
+    ----------
+    evaluate
+        The arrays at a parameter.
+    lower, upper
+        The box (d,).
+    tolerance
+        Relative error asked for. It may be missed: functions that are not smooth take too many points. The errors of
+        the result say so.
+    budget
+        Largest number of points of a grid.
+    seed
+        Of the random points.
+    """
+    random = np.random.default_rng(seed)
+    anchors, corners = random.random((LINES, len(lower))), np.array(np.meshgrid(*[[0.0, 1.0]] * len(lower)))
+    anchors = anchors if len(lower) > 1 else anchors[:1]
+    unit = np.vstack([random.random((MEASURED, len(lower))), corners.reshape(len(lower), -1).T])
+    points = lower + unit * (upper - lower)
+    values = _stacked([evaluate(mu) for mu in points])
+    scale = {name: float(np.linalg.norm(found, axis=-1).max()) or 1.0 for name, found in values.items()}
+    along = _Sampled(evaluate, lower, upper, scale)
+    # A function that needs more points than that along a line has a grid beyond the budget, or nearly.
+    limit = max(9, round(4 * budget ** (1.0 / len(lower)))) if len(lower) > 1 else budget
+    counts = [max(along.degree(k, at, 0.1 * tolerance, limit) for at in anchors) + 1 for k in range(len(lower))]
+    for _ in range(TRIALS):
+        counts = _within(counts, budget)
+        grid = along.coefficients(counts)
+        found = {name: _compressed(c, scale[name], 0.1 * tolerance) for name, c in grid.items()}
+        found = {name: replace(p, error=_error(p.at(unit), values[name], scale[name])) for name, p in found.items()}
+        if max(p.error for p in found.values()) <= tolerance or prod(counts) >= 0.7 * budget:
+            break
+        counts = [count + max(1, count // 4) if count > 1 else count for count in counts]
+    return found
+
+
+class _Sampled:
+    """Arrays over their largest norms, sampled on lines and grids of Chebyshev points."""
+
+    def __init__(self, evaluate: Evaluate, lower: Array, upper: Array, scale: Mapping[str, float]) -> None:
+        self._evaluate, self._lower, self._upper, self._scale = evaluate, lower, upper, scale
+
+    def _at(self, unit: Array) -> dict[str, Array]:
+        """The arrays at points (P×d) of the unit box, (P×size) each."""
+        found = _stacked([self._evaluate(self._lower + at * (self._upper - self._lower)) for at in unit])
+        return {name: values / self._scale[name] for name, values in found.items()}
+
+    def degree(self, direction: int, anchor: Array, tolerance: float, limit: int) -> int:
+        """The degree in one direction from which on coefficients on the line through a point sum up to the tolerance.
+
+        The number of points is doubled until the last third of the coefficients is not needed.
+        """
+        count = 3
+        while True:
+            line = np.tile(anchor, (count, 1))
+            line[:, direction] = _chebyshev_points(count)
+            norms = [np.linalg.norm(_transformed(values, 0), axis=1) for values in self._at(line).values()]
+            tails = np.max([np.cumsum(sizes[::-1])[::-1] for sizes in norms], axis=0)
+            needed = int(np.count_nonzero(tails > tolerance))
+            if 3 * needed <= 2 * count or count >= limit:
+                return max(needed, 1) - 1
+            count = min(2 * count, limit)
+
+    def coefficients(self, counts: Sequence[int]) -> dict[str, Array]:
+        """Coefficients (n₁×…×n_d×size) of the interpolants on a grid with this many points per direction."""
+        grid = np.stack(np.meshgrid(*map(_chebyshev_points, counts), indexing="ij"), axis=-1)
+        found = {name: v.reshape(*counts, -1) for name, v in self._at(grid.reshape(-1, len(counts))).items()}
+        for axis in range(len(counts)):
+            found = {name: _transformed(values, axis) for name, values in found.items()}
+        return found
+
+
+def _chebyshev_points(count: int) -> Array:
+    """Zeros of the Chebyshev polynomial of this degree, in [0, 1], falling."""
+    return np.asarray(0.5 + 0.5 * np.cos(np.pi * (np.arange(count) + 0.5) / count))
+
+
+def _transformed(values: Array, axis: int) -> Array:
+    """Chebyshev coefficients from values in the points above, along an axis."""
+    count = values.shape[axis]
+    found = np.moveaxis(np.asarray(scipy.fft.dct(values, type=2, axis=axis)) / count, axis, 0)
+    found[0] *= 0.5
+    return np.moveaxis(found, 0, axis)
+
+
+def _within(counts: Sequence[int], budget: int) -> list[int]:
+    """Numbers of points per direction, the largest ones reduced until the grid is within the budget."""
+    kept = list(counts)
+    while prod(kept) > budget:
+        kept[kept.index(max(kept))] -= 1
+    return kept
+
+
+def _compressed(coefficients: Array, scale: float, tolerance: float) -> AffinePolynomial:
+    """A polynomial from its coefficients (n₁×…×n_d×size), without those that sum up to less than a tolerance."""
+    shape = coefficients.shape
+    flat = coefficients.reshape(-1, shape[-1])
+    norms = np.linalg.norm(flat, axis=1)
+    rising = np.argsort(norms, kind="stable")
+    kept = np.sort(rising[np.cumsum(norms[rising]) > tolerance]) if norms.sum() > tolerance else np.zeros(1, np.intp)
+    left, sigma, right = svd(flat[kept])
+    # a value is a sum over all rows, with factors of at most 1
+    lost = np.sqrt(len(kept) * np.append(np.cumsum(sigma[::-1] ** 2)[::-1], 0.0))
+    count = max(1, int(np.argmax(lost <= tolerance)))
+    indices = np.stack(np.unravel_index(kept, shape[:-1]), axis=1)
+    return AffinePolynomial(indices, left[:, :count] * sigma[:count], right[:count] * scale, np.inf)
+
+
+def _error(found: Array, values: Array, scale: float) -> float:
+    return float(np.linalg.norm(found - values, axis=-1).max()) / scale
+
+
+def _stacked(found: Sequence[Mapping[str, Array]]) -> dict[str, Array]:
+    """Arrays (P×size) by name from those at P parameters."""
+    return {name: np.stack([arrays[name] for arrays in found]) for name in found[0]}
