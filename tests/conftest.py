@@ -23,7 +23,7 @@ from threadpoolctl import threadpool_limits
 
 from vibench.cli import main as main_module
 from vibench.results.database import FILE
-from vibench.stages.artefacts import CACHE_VARIABLE
+from vibench.storage.artefacts import CACHE_VARIABLE
 from vibench.study import entry_points, registry
 
 settings.register_profile("any machine", deadline=None)
@@ -48,6 +48,7 @@ def artefacts(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
         patch.setenv(CACHE_VARIABLE, str(folder))
         # Hundreds of processes are started; each would compile the sources again where bytecode is not kept.
         patch.delenv("PYTHONDONTWRITEBYTECODE", raising=False)
+        patch.delenv("COLUMNS", raising=False)  # pytest-xdist sets it: tables would leave out what does not fit
         yield folder / "artefacts"
 
 

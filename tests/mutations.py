@@ -305,7 +305,7 @@ FAULTS = (
     ),
     Fault(
         "checksum-not-verified",
-        "vibench/stages/artefacts.py",
+        "vibench/storage/artefacts.py",
         "if digest != _digest(key, content):",
         "if False:",
         ("tests/unit/stages/test_artefacts.py",),

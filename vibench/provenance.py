@@ -58,7 +58,7 @@ def solver_version(solver: str) -> str:
 
 NUMERICAL = (
     "arrays.py", "errors.py", "timing.py", "linalg", "interfaces", "qp", "reduction", "stability", "highfidelity",
-    "model", "stages",
+    "model", "storage", "stages",
 )  # fmt: skip
 """Rooms and modules whose code determines numbers; the others carry requests and records, and show them."""
 

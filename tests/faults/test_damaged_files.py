@@ -20,8 +20,8 @@ from vibench.report import compare
 from vibench.results import tables
 from vibench.results.columns import STORED
 from vibench.results.database import FILE, ResultsDatabase, read_meta, read_rows, study_of
-from vibench.stages.artefacts import CACHE_VARIABLE, SUFFIX, Store
-from vibench.stages.serialisation import dumps
+from vibench.storage.artefacts import CACHE_VARIABLE, SUFFIX, Store
+from vibench.storage.serialisation import dumps
 
 STUDY = {
     "name": "small",

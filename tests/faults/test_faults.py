@@ -18,7 +18,7 @@ from running import Vibench, assert_same_numbers, rows, started, without_seconds
 from samples import wire_study, write_study
 
 from vibench.results.database import FILE
-from vibench.stages.artefacts import CACHE_VARIABLE
+from vibench.storage.artefacts import CACHE_VARIABLE
 
 STUDY = wire_study(
     problem=[{"name": "wire", "label": f"{nodes}", "options": {"nodes": nodes}} for nodes in (20, 40)],

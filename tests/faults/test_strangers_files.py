@@ -22,7 +22,7 @@ from vibench.report import figures
 from vibench.results import tables
 from vibench.results.database import FILE, LOCK, claimed
 from vibench.stages import artefacts
-from vibench.stages.artefacts import CACHE_VARIABLE, SUFFIX, Artefact, Store, usable_store
+from vibench.storage.artefacts import CACHE_VARIABLE, SUFFIX, Artefact, Store, usable_store
 from vibench.timing import NO_TIME
 
 

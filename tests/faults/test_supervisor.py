@@ -20,8 +20,8 @@ from fake_stages import InPieces, OfAPlugin, Whole
 from vibench.execution import supervisor
 from vibench.execution.supervisor import Begun, Job, StoppedError, Supervisor
 from vibench.qp.status import Status
-from vibench.stages.artefacts import Store
 from vibench.stages.base import Done, Failed, Stage, Unstored
+from vibench.storage.artefacts import Store
 from vibench.study import registry
 from vibench.study.cells import Plugin
 

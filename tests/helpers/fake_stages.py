@@ -15,8 +15,8 @@ from typing import Any
 import fake_plugins
 import numpy as np
 
-from vibench.stages.artefacts import Store
 from vibench.stages.base import Failed, Pieces, PiecewiseStage, Result, Stage
+from vibench.storage.artefacts import Store
 from vibench.study.cells import Plugin
 from vibench.timing import Seconds
 

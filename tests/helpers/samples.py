@@ -13,8 +13,8 @@ from typing import Any
 import fake_plugins
 
 from vibench.results.columns import CELLS, QUERIES
-from vibench.stages.artefacts import Artefact, Store
 from vibench.stages.base import Stage
+from vibench.storage.artefacts import Artefact, Store
 
 STUDY: Mapping[str, Any] = {
     "name": "sample",

@@ -12,7 +12,10 @@ from sources import SOURCES, mentions
 PLUGINS = ("vibench.problems", "vibench.dual_strategies", "vibench.primal_strategies")
 
 ENTRIES = [entry for entry in importlib.metadata.distribution("vibench").entry_points if entry.group in PLUGINS]
-NAMES = sorted({entry.name for entry in ENTRIES})
+FORMAT = "pack"
+"""Also the name of a file format that the core reads and writes; the problem of that name is a thin plugin on it."""
+
+NAMES = sorted({entry.name for entry in ENTRIES} - {FORMAT})
 PACKAGES = sorted({entry.module.split(".")[0] for entry in ENTRIES})
 
 

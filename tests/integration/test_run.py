@@ -19,8 +19,8 @@ from samples import wire_study, write_study
 import vibench.execution.run  # noqa: F401  lists the classes of all stages
 from vibench.results.columns import TABLES
 from vibench.results.database import FILE
-from vibench.stages.artefacts import CACHE_VARIABLE, SUFFIX, Store, encoded
 from vibench.stages.snapshots import CHUNKS
+from vibench.storage.artefacts import CACHE_VARIABLE, SUFFIX, Store, encoded
 
 SOLVERS = ["piqp", "careful", "gives-up"]
 
@@ -311,7 +311,7 @@ def test_clean_shows_and_frees_what_artefacts_take(
     for options, left in ((("--dry-run",), count), (("--older-than", "1"), count), (("--yes",), 0)):
         done = vibench(tmp_path, "clean", *options)
         assert (done.returncode, done.stderr) == (0, "")
-        assert re.search(rf"high-fidelity solutions +{2 * CHUNKS} ", done.stdout)
+        assert re.search(rf"high fidelity solutions +{2 * CHUNKS} ", done.stdout)
         assert len(list(artefacts.glob(f"*{SUFFIX}"))) == left
     assert "MiB freed" in done.stdout
     assert (tmp_path / "runs" / "wire" / FILE).exists()

@@ -55,10 +55,10 @@ EXAMPLES: Mapping[str, tuple[str, ...]] = {
     "new": ("vibench new problem cable", "vibench new solver my-qp", "vibench new dual my-cone --out packages"),
     "import": ("vibench import my-model",),
     "pack": (
-        "vibench pack obstacle my-model --option resolution=coarse",
-        "vibench pack hertz my-model --seed 2022 --validation 16 --solutions",
+        "vibench pack my-problem my-model --option resolution=coarse",
+        "vibench pack my-problem my-model --seed 2022 --validation 16 --solutions",
     ),
-    "cones": ("vibench cones my-model", "vibench cones my-model --dual cpg --dual-tol 1e-3"),
+    "cones": ("vibench cones my-model", "vibench cones my-model --dual-tol 1e-3"),
     "clean": ("vibench clean --dry-run", "vibench clean --older-than 30"),
     "doctor": ("vibench doctor", "vibench doctor --out /scratch/runs"),
 }
@@ -116,7 +116,7 @@ def names(*groups: str) -> Callable[[str], list[str]]:
 
 
 def plugins(incomplete: str) -> list[str]:
-    """Completes names of plugins, alone or with their kind before them: "primal:offline-pga", "solver:piqp"."""
+    """Completes names of plugins, alone or with their kind before them: "primal:NAME", "solver:NAME"."""
     kind, colon, name = incomplete.partition(":")
     if not colon:
         return _beginning(incomplete, [*_registered(*KINDS.values()), *(f"{kind}:" for kind in KINDS)])

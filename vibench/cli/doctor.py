@@ -28,7 +28,7 @@ from vibench.locking import locked
 from vibench.qp.settings import SETTINGS
 from vibench.qp.solve import installed_solvers
 from vibench.qp.status import Status
-from vibench.stages.artefacts import CACHE_VARIABLE, LOCK, Store, default_folder
+from vibench.storage.artefacts import CACHE_VARIABLE, LOCK, Store, default_folder
 from vibench.study import registry
 from vibench.study.entry_points import unreadable
 from vibench.study.reader import read_study

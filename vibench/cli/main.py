@@ -140,6 +140,8 @@ def run(
     run_summary.next_steps(folder, len(statuses), len(statuses) - statuses.count(Status.OK), figures=draw)
     if strict and any(status not in (Status.OK, Status.UNAVAILABLE) for status in statuses):
         raise typer.Exit(1)
+    if set(statuses) == {Status.UNAVAILABLE}:
+        raise VibenchError("no cell could run here: what all of them need is not installed")
 
 
 def clean(
@@ -154,7 +156,7 @@ def clean(
     """
     import pandas as pd
 
-    from vibench.stages.artefacts import usable_store
+    from vibench.storage.artefacts import usable_store
     from vibench.terminal.console import print_frame
 
     store = usable_store()

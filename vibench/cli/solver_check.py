@@ -14,8 +14,8 @@ from vibench.interfaces.problem import VariationalInequality
 from vibench.qp.solve import solve_qp
 from vibench.qp.status import Status
 from vibench.qp.verification import verify
-from vibench.stages.artefacts import Store
 from vibench.stages.base import Done, Failed, Pieces, PiecewiseStage, Stage
+from vibench.storage.artefacts import Store
 from vibench.study import registry
 from vibench.study.spec import Limits
 

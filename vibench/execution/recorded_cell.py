@@ -19,9 +19,9 @@ from vibench.interfaces.validation import validation_parameters
 from vibench.results import tables
 from vibench.results.database import read_rows
 from vibench.results.tables import results_file
-from vibench.stages.artefacts import Store, usable_store
 from vibench.stages.assembly import Model, assembly_stage
 from vibench.stages.base import Done, Stage
+from vibench.storage.artefacts import Store, usable_store
 from vibench.study.cells import Cell
 
 UNLIMITED = (1e6, 1e6, 1e6)

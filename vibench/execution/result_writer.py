@@ -9,10 +9,10 @@ from typing import Any
 
 from vibench import provenance
 from vibench.results.database import ResultsDatabase
-from vibench.stages.artefacts import History, Store
 from vibench.stages.base import Row, Stage, value_of
 from vibench.stages.cell_queries import CellRows
 from vibench.stages.timing_rounds import TimedCell, round_rows, seconds_of_cell, seconds_of_queries
+from vibench.storage.artefacts import History, Store
 from vibench.study.cells import Axes, Cell, Plugin, digest
 from vibench.study.spec import Study
 

@@ -26,10 +26,10 @@ from vibench.results.database import FILE, DamagedError, ResultsDatabase, claime
 from vibench.results.solver_agreement import disagreement_rows
 from vibench.results.sqlite_files import DAMAGED, set_aside
 from vibench.results.tables import EXPORTED
-from vibench.stages.artefacts import Store, usable_store
 from vibench.stages.base import Done, Failed, Stage, Unstored
 from vibench.stages.cell_queries import CellRows, cell_queries
 from vibench.stages.pictures import PictureStage
+from vibench.storage.artefacts import Store, usable_store
 from vibench.study import registry
 from vibench.study.cells import Cell, expand
 from vibench.study.spec import Study

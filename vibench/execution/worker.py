@@ -24,8 +24,8 @@ from vibench.execution.descendants import MARK, kill_marked
 from vibench.execution.parts import Part, PartDone
 from vibench.execution.supervisor import Begun, Finished, Job, OutOfMemory, Progress, Watch, code_here
 from vibench.qp.status import Status
-from vibench.stages.artefacts import Store
 from vibench.stages.base import Done, Failed, Pieces, PiecewiseStage, Unstored
+from vibench.storage.artefacts import Store
 
 T = TypeVar("T")
 Send = Callable[[Any], None]

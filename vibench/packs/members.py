@@ -15,8 +15,11 @@ from vibench.arrays import Array, Indices, SparseMatrix
 from vibench.errors import NumericalError
 from vibench.packs.expressions import Expression
 
-SAME_RTOL = 1e-12
-"""Largest distance between a parameter and a listed one that count as the same, relative to the widths of the box."""
+SAME_RTOL = 1e-8
+"""Largest distance between a parameter and a listed one that count as the same, relative to the widths of the box.
+
+Far above round-off, since assemblies are timed next to a parameter, far below the distances of listed ones.
+"""
 
 
 @dataclass(frozen=True)

@@ -50,6 +50,10 @@ UNITS: Mapping[str, str] = {
     "V": "the unit of the norm of V",
     "V²": "its square",
     "W": "the unit of the norm of W",
+    "b/AW": "that of b(v, η) over those of the energy norm and the norm of W",
+    "A/V²": "that of the energy over the square of that of the norm of V",
+    "A": "the unit of the energy norm, the norm of A(µ)",
+    "A²": "its square, that of the energy",
     "b": "the unit of b(v, η), as that of the energy",
     "b/VW": "that of b(v, η) over those of the norms of V and W",
 }

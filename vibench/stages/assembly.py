@@ -23,11 +23,11 @@ from vibench.model.hyperreduced import (
 )
 from vibench.qp.exact import ExactSolution, exact_solution
 from vibench.reduction.supremizers import ContactCoordinates, SpannedCoordinates
-from vibench.stages.artefacts import Store
 from vibench.stages.assemblies import assemblies
 from vibench.stages.base import Result, Stage, build_problem, value_of
 from vibench.stages.enrichment import EnrichmentStage, GrowthStage, enrichment_stage
-from vibench.stages.serialisation import storable
+from vibench.storage.artefacts import Store
+from vibench.storage.serialisation import storable
 from vibench.study.cells import Cell, Plugin
 from vibench.timing import timed
 

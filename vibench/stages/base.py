@@ -14,7 +14,7 @@ from vibench.errors import NumericalError
 from vibench.interfaces.problem import Problem
 from vibench.provenance import core_code, libraries
 from vibench.qp.status import Status
-from vibench.stages.artefacts import History, Store
+from vibench.storage.artefacts import History, Store
 from vibench.study import registry
 from vibench.study.cells import Axes, Plugin, digest
 from vibench.timing import NO_TIME, Seconds

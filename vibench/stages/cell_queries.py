@@ -19,7 +19,6 @@ from vibench.qp.status import Status
 from vibench.results.solver_agreement import vectors
 from vibench.stability.coercivity import Stability
 from vibench.stability.infsup import InfSup, share
-from vibench.stages.artefacts import Artefact, Store
 from vibench.stages.assembly import AssemblyStage, ExactSolutions, assembly_stage
 from vibench.stages.base import Failed, Pieces, PiecewiseStage, Row, Stage, value_of
 from vibench.stages.cell_summary import summarise
@@ -33,6 +32,7 @@ from vibench.stages.infsup_constants import (
 from vibench.stages.offline import ReducedCone
 from vibench.stages.query import Queries, Query, error_columns, run_query
 from vibench.stages.snapshots import gather, training_stages, validation_stages
+from vibench.storage.artefacts import Artefact, Store
 from vibench.study import registry
 from vibench.study.cells import Cell
 from vibench.timing import median_interval, median_of

@@ -18,10 +18,10 @@ from vibench.model.galerkin import ReducedModel
 from vibench.reduction.nested import Grown, Milestone, grow_through
 from vibench.reduction.supremizers import ConstraintClasses, projected_supremizers
 from vibench.stability.growth import ProjectedSupremizers
-from vibench.stages.artefacts import History, Store
 from vibench.stages.base import Result, Stage, build_problem, faults_of, value_of
 from vibench.stages.offline import ConeStage, PODStage, ReducedCone, TrainingConstants
-from vibench.stages.serialisation import storable
+from vibench.storage.artefacts import History, Store
+from vibench.storage.serialisation import storable
 from vibench.study.cells import Axes, Cell, Plugin
 from vibench.timing import timed
 

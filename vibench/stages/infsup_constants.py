@@ -14,12 +14,12 @@ from vibench.reduction.supremizers import ConstraintClasses, constraint_classes
 from vibench.stability.coercivity import Constant, Stability, coercivity_and_continuity, energy_inf_sup
 from vibench.stability.infsup import InfSup, Multipliers, inf_sup, nodal_multipliers
 from vibench.stability.over_parameters import constants_full, constants_on, everywhere
-from vibench.stages.artefacts import Store
 from vibench.stages.assemblies import assemblies
 from vibench.stages.base import Result, Stage, build_problem, value_of
 from vibench.stages.enrichment import EnrichmentStage
 from vibench.stages.offline import ConeStage, PODStage
-from vibench.stages.serialisation import storable
+from vibench.storage.artefacts import Store
+from vibench.storage.serialisation import storable
 from vibench.study.cells import Plugin
 
 for _kind in (ConstraintClasses, Stability, Constant, InfSup):

@@ -10,10 +10,10 @@ from vibench.reduction.cones import orthogonality
 from vibench.reduction.pod import POD, pod
 from vibench.reduction.supremizers import ConstraintClasses, constraint_classes, isometric_supremizers
 from vibench.stability.infsup import Multipliers, beta_span, multipliers
-from vibench.stages.artefacts import History, Store
 from vibench.stages.base import Result, Stage, build_problem, faults_of, value_of
-from vibench.stages.serialisation import storable
 from vibench.stages.snapshots import gather, training_stages
+from vibench.storage.artefacts import History, Store
+from vibench.storage.serialisation import storable
 from vibench.study.cells import Axes, Plugin
 from vibench.timing import timed
 

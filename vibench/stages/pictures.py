@@ -11,10 +11,10 @@ from vibench.arrays import Array
 from vibench.errors import NumericalError
 from vibench.interfaces.problem import ParameterBox, Picture
 from vibench.results.pictures import ARRAYS, failure_rows, picture_rows
-from vibench.stages.artefacts import Store
 from vibench.stages.base import Result, Row, Stage, build_problem
-from vibench.stages.serialisation import storable
 from vibench.stages.snapshots import gather, training_stages
+from vibench.storage.artefacts import Store
+from vibench.storage.serialisation import storable
 from vibench.study.cells import Axes, Plugin
 from vibench.text import one_line
 

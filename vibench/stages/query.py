@@ -25,11 +25,11 @@ from vibench.qp.status import Status
 from vibench.qp.verification import verify
 from vibench.results.solver_agreement import solution_row
 from vibench.stability.coercivity import Stability
-from vibench.stages.artefacts import Store
 from vibench.stages.assemblies import assemblies
 from vibench.stages.assembly import AssemblyStage, Model, ReducedPrograms
 from vibench.stages.base import Row, value_of
 from vibench.stages.repeats import in_units, nearby, units
+from vibench.storage.artefacts import Store
 from vibench.study import registry
 from vibench.timing import SLOW, Seconds, timed
 

@@ -16,10 +16,10 @@ from vibench.highfidelity.active_set import HighFidelitySolution, HighFidelitySo
 from vibench.interfaces.fingerprint import Fingerprint, ReferenceAssembly
 from vibench.interfaces.problem import Problem, VariationalInequality
 from vibench.interfaces.validation import checked_assembly, training_parameters, validation_parameters
-from vibench.stages.artefacts import History, Store
 from vibench.stages.base import Result, Stage, build_problem, faults_of, value_of
 from vibench.stages.repeats import nearby
-from vibench.stages.serialisation import storable
+from vibench.storage.artefacts import History, Store
+from vibench.storage.serialisation import storable
 from vibench.study.cells import Axes, Plugin
 from vibench.timing import NO_TIME, Seconds, median_seconds, timed
 

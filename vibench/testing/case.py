@@ -16,7 +16,7 @@ import numpy as np
 from vibench.arrays import Array
 from vibench.errors import NumericalError, in_a_line
 from vibench.interfaces.problem import MEMBERS, Problem
-from vibench.stages.serialisation import dumps, loads
+from vibench.storage.serialisation import dumps, loads
 from vibench.study import registry
 from vibench.testing.checks import ConformanceError, Doubt, Note, plugin_line
 from vibench.testing.comparisons import Arrays, at, copies, differences

@@ -17,8 +17,8 @@ from typing import Any
 from vibench.errors import in_a_line
 from vibench.execution.supervisor import Job, Supervisor
 from vibench.qp.status import Status
-from vibench.stages.artefacts import Store
 from vibench.stages.base import Done, Failed, Pieces, PiecewiseStage
+from vibench.storage.artefacts import Store
 from vibench.study.spec import Limits
 from vibench.testing.checks import Check, ConformanceError, Finding, Verdict, examine_one
 

@@ -16,7 +16,7 @@ from vibench.interfaces.strategies import Cone, Enrichment, Kind, Offline, Prima
 from vibench.interfaces.validation import check_enrichment
 from vibench.reduction.nested import NestedStrategy, grow_through
 from vibench.stages.enrichment import BuiltEnrichment
-from vibench.stages.serialisation import dumps, loads
+from vibench.storage.serialisation import dumps, loads
 from vibench.testing.case import Case
 from vibench.testing.checks import SECONDS, Check, ConformanceError, Finding, Note, examine, raised, raising
 from vibench.testing.comparisons import Arrays, array_fault, at, difference, unmutated

@@ -18,7 +18,7 @@ from vibench.errors import RequestError
 from vibench.qp.settings import SETTINGS
 from vibench.qp.solve import installed_solvers
 from vibench.qp.status import Status
-from vibench.stages.artefacts import CACHE_VARIABLE, Store, default_folder
+from vibench.storage.artefacts import CACHE_VARIABLE, Store, default_folder
 from vibench.timing import NO_TIME, Seconds, Stopwatch
 
 FINE = Trial(Status.OK, 2e-9, "")

@@ -24,8 +24,8 @@ from vibench.execution import dask
 from vibench.execution.dask import Dask
 from vibench.execution.executors import Local
 from vibench.execution.supervisor import Job
-from vibench.stages.artefacts import Store
 from vibench.stages.base import Done, Stage
+from vibench.storage.artefacts import Store
 
 
 def elsewhere(_: str) -> tuple[bool, str, str]:

@@ -10,10 +10,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from vibench.execution.graph import Graph
-from vibench.stages.artefacts import Store
 from vibench.stages.base import Result, Stage
 from vibench.stages.cell_queries import cell_queries
 from vibench.stages.pictures import PictureStage
+from vibench.storage.artefacts import Store
 from vibench.study import registry
 from vibench.study.cells import expand
 from vibench.study.reader import read_study

@@ -21,7 +21,6 @@ from vibench.model.hyperreduced import HyperReducedModel
 from vibench.qp.solution import QPSolution
 from vibench.qp.solve import solve_qp
 from vibench.stages import snapshots, timing_rounds
-from vibench.stages.artefacts import Store
 from vibench.stages.assembly import AssemblyStage
 from vibench.stages.cell_queries import CellQueries
 from vibench.stages.enrichment import SingleEnrichment
@@ -30,6 +29,7 @@ from vibench.stages.query import Query
 from vibench.stages.repeats import APART, in_units, nearby, units
 from vibench.stages.snapshots import SnapshotStage
 from vibench.stages.timing_rounds import TimingRounds
+from vibench.storage.artefacts import Store
 from vibench.study import registry
 from vibench.study.cells import Plugin
 

@@ -17,9 +17,9 @@ from running import Register
 
 from vibench import NumericalError, Problem, VariationalInequality
 from vibench.interfaces.fingerprint import AGREEMENT_RTOL, Fingerprint, ReferenceAssembly, fingerprint
-from vibench.stages.artefacts import Store
 from vibench.stages.base import build_problem
 from vibench.stages.snapshots import fingerprint_here, gather, training_stages
+from vibench.storage.artefacts import Store
 from vibench.study.cells import Plugin
 from vibench.testing.elsewhere import call_elsewhere
 

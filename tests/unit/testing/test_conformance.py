@@ -16,7 +16,7 @@ import scipy.sparse as sp
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numerics import Varying
-from packs import write_cable
+from packs import manifest, write_cable, write_manifest
 from running import Main, refused
 
 from vibench import testing
@@ -171,6 +171,14 @@ BUILT_IN = [
 ]
 
 
+def unlisted(folder: Path) -> Path:
+    """A pack whose validation parameters are drawn in the box."""
+    content = manifest()
+    del content["parameters"]["validation"]
+    write_manifest(write_cable(folder), content)
+    return folder
+
+
 @pytest.mark.parametrize(("word", "name"), BUILT_IN)
 def test_a_built_in_plugin_passes_every_check(word: str, name: str, tmp_path: Path) -> None:
     examine = {
@@ -178,7 +186,7 @@ def test_a_built_in_plugin_passes_every_check(word: str, name: str, tmp_path: Pa
         "dual": testing.examine_dual,
         "primal": testing.examine_primal,
     }[word]
-    given = {"path": str(write_cable(tmp_path / "cable"))} if name == "pack" else {"resolution": "coarse"}
+    given = {"path": str(unlisted(tmp_path / "cable"))} if name == "pack" else {"resolution": "coarse"}
     options = registry.check_options(registry.WORDS[word], name, given if word == "problem" else {})
     findings = examine(partial(registry.load(registry.WORDS[word], name), **options))
     assert [str(finding) for finding in findings if finding.verdict is not Verdict.PASSED] == []

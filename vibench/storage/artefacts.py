@@ -18,7 +18,7 @@ from vibench.errors import RequestError, StorageError
 from vibench.files import PART, TEMPORARY, write_atomically
 from vibench.locking import locked
 from vibench.provenance import machine
-from vibench.stages.serialisation import DamagedError, dumps, loads, storable
+from vibench.storage.serialisation import DamagedError, dumps, loads, storable
 from vibench.text import one_line
 from vibench.timing import Seconds
 

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from vibench.errors import NumericalError, RequestError, StorageError
 from vibench.stages import artefacts as module
-from vibench.stages.artefacts import SUFFIX, Artefact, History, Store, encoded
+from vibench.storage.artefacts import SUFFIX, Artefact, History, Store, encoded
 from vibench.timing import Seconds
 
 TIME = Seconds(1.5, 2.5)
