@@ -308,7 +308,7 @@ FAULTS = (
         "vibench/storage/artefacts.py",
         "if digest != _digest(key, content):",
         "if False:",
-        ("tests/unit/stages/test_artefacts.py",),
+        ("tests/unit/storage/test_artefacts.py",),
     ),
     Fault(
         "rows-not-compared-with-their-digests",
@@ -369,8 +369,8 @@ FAULTS = (
     Fault(
         "contact-load-dropped",
         "vibench/model/hyperreduced.py",
-        "added = orthonormal_range(represented[:, :k], space.plain)",
-        "added = orthonormal_range(represented[:, 1:k], space.plain)",
+        "orthonormal_range(B[:count].T, space.plain)",
+        "orthonormal_range(B[1:count].T, space.plain)",
         ("tests/unit/model/test_hyperreduced.py",),
     ),
     Fault(

@@ -21,7 +21,7 @@ from vibench.locking import locked
 from vibench.report import figures
 from vibench.results import tables
 from vibench.results.database import FILE, LOCK, claimed
-from vibench.stages import artefacts
+from vibench.storage import artefacts
 from vibench.storage.artefacts import CACHE_VARIABLE, SUFFIX, Artefact, Store, usable_store
 from vibench.timing import NO_TIME
 

@@ -189,7 +189,7 @@ def test_another_vibench_than_planned_with_is_refused(watcher: Supervisor, tmp_p
 
 
 def test_a_suspended_run_is_not_late(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    state = supervisor._JobState(Job(str(tmp_path), Whole("fine"), 1.0, 30.0, 8.0))
+    state = supervisor._JobState(Job(str(tmp_path), Whole("fine"), 1.0, 30.0, 8.0), lambda _: None)
     state.update(Begun())
     now = time.monotonic()
     monkeypatch.setattr(supervisor.time, "monotonic", lambda: now + 3600.0)
@@ -207,7 +207,7 @@ def test_a_process_that_never_begins_is_given_up(
     watcher: Supervisor, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(supervisor, "START_SECONDS", 0.1)
-    found = watcher.run(Job(str(tmp_path), Whole("fine"), 1.0, 30.0, 8.0))
+    found = watcher.run(Job(str(tmp_path), Whole("fine"), 1.0, 30.0, 8.0), lambda _: None)
     assert found == Failed(Status.CRASHED, "no worker process began within 0.1 s")
 
 
@@ -247,7 +247,7 @@ def test_a_process_that_forks_answers_once(run: Run) -> None:
 
 def test_what_cannot_be_stored_is_not_the_fault_of_the_stage(watcher: Supervisor, tmp_path: Path) -> None:
     (tmp_path / "file").touch()
-    found = watcher.run(Job(str(tmp_path / "file"), Whole("fine"), 1.0, 30.0, 8.0))
+    found = watcher.run(Job(str(tmp_path / "file"), Whole("fine"), 1.0, 30.0, 8.0), lambda _: None)
     assert isinstance(found, Unstored)
     assert "cannot be written" in found.reason
 

@@ -62,7 +62,7 @@ class OddEnrichment(PrimalStrategy):
     """Adds nothing, and reports a number that no integer of a results file can hold."""
 
     def build(self, offline: Offline, tolerance: float | None) -> Enrichment:
-        history = np.array([2**80, 1], dtype=object)
+        history = np.array([2.0**80, 1.0])
         return Enrichment(Kind.NONE, history={ODD: history}, fallbacks=(ODD, 100_000 * ODD))
 
 

@@ -25,15 +25,26 @@ Row = tuple[str, str, str, str]
 
 def rows(kind: str) -> Iterator[Row]:
     """Name, origin, description and names of the options of what is registered."""
-    registered = {entry.name: entry for entry in entry_points(group=f"vibench.{KINDS[kind]}")}
-    for name, entry in sorted(registered.items()):
-        origin = f"{entry.dist.name} {entry.dist.version}" if entry.dist is not None else "unknown"
-        if kind == "studies":
+    from vibench.qp.settings import SETTINGS
+
+    registered: dict[str, dict[str, EntryPoint]] = {}
+    for entry in entry_points(group=f"vibench.{KINDS[kind]}"):
+        registered.setdefault(entry.name, {}).setdefault(entry.value, entry)
+    for name, entries in sorted(registered.items()):
+        origins = [*(["qpsolvers"] if kind == "solvers" and name in SETTINGS else []), *map(_origin, entries.values())]
+        origin, entry = ", ".join(origins), next(iter(entries.values()))
+        if len(origins) > 1:  # as `registry.conflict` says, which would take a second to import
+            yield name, origin, f"several packages provide '{name}', so that none is used", ""
+        elif kind == "studies":
             yield name, origin, _comment(entry), ""
         else:
             found = plugin_class(entry)
             text = ast.get_docstring(found) or "" if found is not None else ""
             yield name, origin, text.split("\n")[0], ", ".join(options(found))
+
+
+def _origin(entry: EntryPoint) -> str:
+    return f"{entry.dist.name} {entry.dist.version}" if entry.dist is not None else "unknown"
 
 
 def plugin_class(entry: EntryPoint) -> ast.ClassDef | None:

@@ -51,14 +51,13 @@ def list_plugins(
         for title in overview.KINDS:
             rows = _solvers_by_version() if title == "solvers" else list(overview.rows(title))
             print_rows(rows, HEADINGS, title)
-        for distribution, reason in unreadable().items():
-            echo(f"{distribution}: {reason}")
         echo("", f"vibench list {'|'.join(overview.KINDS)} shows what options are, and whether it can be loaded")
-        return
-    if what not in overview.KINDS:
+    elif what in overview.KINDS:
+        print_rows(_solver_rows() if what == "solvers" else _plugin_rows(LISTS[what]), HEADINGS, what)
+    else:
         raise unknown_name("list", what, overview.KINDS)
-    rows = _solver_rows() if what == "solvers" else _plugin_rows(LISTS[what])
-    print_rows(rows, HEADINGS, what)
+    for distribution, reason in unreadable().items():
+        echo(f"{distribution}: {reason}")
 
 
 def check_plugin(

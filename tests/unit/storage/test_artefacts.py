@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from vibench.errors import NumericalError, RequestError, StorageError
-from vibench.stages import artefacts as module
+from vibench.storage import artefacts as module
 from vibench.storage.artefacts import SUFFIX, Artefact, History, Store, encoded
 from vibench.timing import Seconds
 
