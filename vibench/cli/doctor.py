@@ -22,8 +22,9 @@ from rich.text import Text
 from threadpoolctl import threadpool_info, threadpool_limits
 
 from vibench import provenance
-from vibench.cli import solver_check
 from vibench.errors import RequestError, in_a_line
+from vibench.execution.solver_trials import solver_trials
+from vibench.interfaces.problem import VariationalInequality
 from vibench.locking import locked
 from vibench.qp.settings import SETTINGS
 from vibench.qp.solve import installed_solvers
@@ -35,6 +36,12 @@ from vibench.study.reader import read_study
 from vibench.terminal.console import new_console, shown
 from vibench.terminal.output import echo
 from vibench.timing import DISTURBED, WAITED, Calibration, Stopwatch
+
+ACCURACY = 1e-7
+"""Relative accuracy that solvers are tried at: the default of studies."""
+
+UNKNOWNS = 12
+"""Of the program that they are tried with."""
 
 MIN_GIB = 1.0
 """Less free memory or disk space than this is a note."""
@@ -109,15 +116,24 @@ def requirements() -> dict[str, list[str]]:
 def solvers() -> Iterator[Finding]:
     """All known QP solvers; the installed ones solve a small program each."""
     extra = registry.names("QP solver")
-    trials = solver_check.attempts(installed_solvers(extra))
+    trials = solver_trials(wire(), ACCURACY, installed_solvers(extra))
     for name in sorted({*SETTINGS, *extra}):
         version = provenance.solver_version(name) if name in SETTINGS else registry.version("QP solver", name)
         if name not in trials:
             yield _unavailable(name, version)
-        elif (trial := trials[name]).status is Status.OK:
-            yield Finding(name, f"{version}: largest residual {trial.residual:.0e}")
+        elif (trial := trials[name]).status is Status.OK and trial.residuals is not None:
+            yield Finding(name, f"{version}: largest residual {trial.residuals.worst:.0e}")
         else:
             yield Finding(name, f"{version}: {trial.status}, {trial.reason}", Health.BROKEN)
+
+
+def wire() -> VariationalInequality:
+    """A wire of `UNKNOWNS` nodes in contact with a flat support around its middle; dense, like reduced programs."""
+    step = 1.0 / (UNKNOWNS + 1)
+    A = (2.0 * np.eye(UNKNOWNS) - np.eye(UNKNOWNS, k=1) - np.eye(UNKNOWNS, k=-1)) / step
+    return VariationalInequality(
+        A, np.full(UNKNOWNS, -4.0 * step), -step * np.eye(UNKNOWNS), np.full(UNKNOWNS, 0.2 * step)
+    )
 
 
 def _unavailable(solver: str, version: str) -> Finding:

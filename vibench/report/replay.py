@@ -6,9 +6,9 @@ import contextlib
 import io
 import tempfile
 from collections.abc import Iterator, Sequence
-from functools import partial
+from dataclasses import asdict
 from importlib.resources import files
-from itertools import chain, count
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -17,19 +17,18 @@ import pandas as pd
 import qpsolvers
 
 from vibench.arrays import Array
-from vibench.errors import RequestError, in_a_line
+from vibench.errors import RequestError
 from vibench.execution.recorded_cell import RecordedCell, recorded_cells
+from vibench.execution.solver_trials import Trial, solver_trials
 from vibench.files import PART, TEMPORARY, write_atomically
 from vibench.interfaces.problem import VariationalInequality
-from vibench.qp import verification
 from vibench.qp.solution import QPSolution
-from vibench.qp.solve import installed_solvers, solve_qp
+from vibench.qp.solve import installed_solvers
 from vibench.qp.status import Status
+from vibench.qp.verification import verify
 from vibench.results.solver_agreement import vectors
 from vibench.results.tables import to_csv
-from vibench.stages.repeats import in_units, units
 from vibench.study import registry
-from vibench.timing import median_seconds
 
 CHECKER = "check.py"
 """Script in an exported test set that recomputes its residuals; it needs only NumPy."""
@@ -45,7 +44,7 @@ def worst_query(recorded: RecordedCell) -> int:
 
 
 def replay(recorded: RecordedCell, query: int, file: Path) -> pd.DataFrame:
-    """Write the program of one query to a file, and solve it with every installed solver.
+    """Write the program of one query to a file, and solve it with every installed solver, each within limits.
 
     Returns
     -------
@@ -71,25 +70,23 @@ def replay(recorded: RecordedCell, query: int, file: Path) -> pd.DataFrame:
     if found := recorded.rows("solutions").get(query):
         known, alpha = vectors(found)
         solution = QPSolution(known, alpha, rows[query]["solver_status"] or "", rows[query]["iterations"])
-        line = _line(program, solution, accuracy, None) | {"seconds": rows[query]["solve_s"]}
+        status, reason, residuals = verify(program, solution, accuracy)
+        line = _line(Trial(status, reason, solution, residuals), None) | {"seconds": rows[query]["solve_s"]}
         table.append({"solver": f"{recorded.cell.solver} (recorded)"} | line)
-    for solver in installed_solvers(registry.names("QP solver")):
-        try:
-            solve = partial(solve_qp, solver=solver, accuracy=accuracy, extra=registry.qp_solver(solver))
-            repeats = (in_units(program, units(len(program.f), accuracy, repeat)) for repeat in count())
-            solution, seconds = median_seconds(solve, chain([program], repeats))
-            line = _line(program, solution, accuracy, known) | {"seconds": seconds.cpu}
-        except (Exception, SystemExit) as error:  # noqa: BLE001  a solver may raise anything; its row says what
-            line = {"claims": in_a_line(error), "status": Status.ERROR.value}
-        table.append({"solver": solver} | line)
+    solvers = installed_solvers(registry.names("QP solver"))
+    for solver, trial in solver_trials(program, accuracy, solvers).items():
+        table.append({"solver": solver} | _line(trial, known))
     return pd.DataFrame(table)
 
 
-def _line(program: VariationalInequality, solution: QPSolution, accuracy: float, known: Array | None) -> dict[str, Any]:
-    status, _, residuals = verification.verify(program, solution, accuracy)
-    line: dict[str, Any] = {"claims": solution.solver_status, "status": status.value, "iterations": solution.iterations}
-    if residuals is not None:
-        line |= {"primal": residuals.primal, "dual": residuals.dual, "gap": residuals.gap}
+def _line(trial: Trial, known: Array | None) -> dict[str, Any]:
+    solution = trial.solution
+    if solution is None:
+        return {"claims": trial.reason, "status": trial.status.value}
+    line: dict[str, Any] = {"claims": solution.solver_status, "status": trial.status.value}
+    line |= {"iterations": solution.iterations, "seconds": trial.seconds.cpu}
+    if trial.residuals is not None:
+        line |= asdict(trial.residuals)
     if known is not None and solution.x is not None:
         line["distance"] = float(np.linalg.norm(solution.x - known))
     return line

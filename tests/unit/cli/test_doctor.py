@@ -11,24 +11,25 @@ import pytest
 from running import Main, Register
 
 from vibench import provenance
-from vibench.cli import doctor, solver_check
+from vibench.cli import doctor
 from vibench.cli.doctor import Finding, Health
-from vibench.cli.solver_check import Trial
 from vibench.errors import RequestError
+from vibench.execution.solver_trials import Trial
 from vibench.qp.settings import SETTINGS
 from vibench.qp.solve import installed_solvers
 from vibench.qp.status import Status
+from vibench.qp.verification import Residuals
 from vibench.storage.artefacts import CACHE_VARIABLE, Store, default_folder
 from vibench.timing import NO_TIME, Seconds, Stopwatch
 
-FINE = Trial(Status.OK, 2e-9, "")
+FINE = Trial(Status.OK, "", residuals=Residuals(0.0, 2e-9, 0.0))
 
 
 @pytest.fixture
 def trials(monkeypatch: pytest.MonkeyPatch) -> dict[str, Trial]:
     """What trials are to end with, by solver; the others are fine, and nothing is solved."""
     found: dict[str, Trial] = {}
-    monkeypatch.setattr(solver_check, "attempts", lambda names: {name: found.get(name, FINE) for name in names})
+    monkeypatch.setattr(doctor, "solver_trials", lambda _, __, names: {name: found.get(name, FINE) for name in names})
     return found
 
 
@@ -54,7 +55,7 @@ def test_where_all_is_well_the_exit_code_is_zero(main: Main) -> None:
 
 
 def test_what_is_broken_is_named_at_the_end_and_in_the_exit_code(main: Main, trials: dict[str, Trial]) -> None:
-    trials["piqp"] = Trial(Status.INACCURATE, 3e-2, "dual residual 3.0e-02 above 1e-07: solved")
+    trials["piqp"] = Trial(Status.INACCURATE, "dual residual 3.0e-02 above 1e-07: solved")
     code, out, _ = main("doctor")
     assert code == 1
     assert out.splitlines()[-1] == "broken: piqp"

@@ -19,6 +19,7 @@ from vibench.execution.recorded_cell import RecordedCell, recorded_cell, recorde
 from vibench.qp import verification
 from vibench.qp.solve import installed_solvers, solve_qp
 from vibench.report import replay
+from vibench.study import registry
 
 STUDY = """
 name = "small"
@@ -89,6 +90,19 @@ def test_replay_names_every_solver_and_keeps_the_program(run: Path, tmp_path: Pa
     program = qpsolvers.Problem.load(str(tmp_path / "program.npz"))
     assert np.array_equal(program.P, recorded.program(2).A)
     assert np.array_equal(program.q, -recorded.program(2).f)
+
+
+def test_a_solver_that_ends_its_process_costs_its_own_line(
+    run: Path, tmp_path: Path, plugins_folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.syspath_prepend(str(plugins_folder))
+    registry._registered.cache_clear()
+    monkeypatch.setattr(replay, "installed_solvers", lambda _: ["segfaults", "piqp"])
+    frame = replay.replay(recorded_cell(str(run), key(run)), 0, tmp_path / "program.npz").set_index("solver")
+    registry._registered.cache_clear()
+    assert frame.loc["segfaults", "status"] == "crashed"
+    assert "SIGSEGV" in frame.loc["segfaults", "claims"]
+    assert frame.loc["piqp", "status"] == "ok"
 
 
 def test_the_exported_set_is_rechecked_by_a_script_that_knows_nothing_of_vibench(run: Path, tmp_path: Path) -> None:

@@ -1,28 +1,28 @@
-"""Every QP solver on one small program, in a worker process that a solver may hang or kill."""
+"""Every QP solver on one program, in worker processes that a solver may hang or kill."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from contextlib import closing
 from dataclasses import dataclass
-from functools import cached_property
-
-import numpy as np
+from functools import cached_property, partial
+from itertools import chain, count
 
 from vibench.execution.supervisor import Job, Supervisor
 from vibench.interfaces.problem import VariationalInequality
+from vibench.qp.solution import QPSolution
 from vibench.qp.solve import solve_qp
 from vibench.qp.status import Status
-from vibench.qp.verification import verify
+from vibench.qp.verification import Residuals, verify
 from vibench.stages.base import Done, Failed, Pieces, PiecewiseStage, Stage
+from vibench.stages.repeats import in_units, units
 from vibench.storage.artefacts import Store
+from vibench.storage.serialisation import dumps, loads, storable
 from vibench.study import registry
 from vibench.study.spec import Limits
+from vibench.timing import NO_TIME, Seconds, median_seconds
 
-ACCURACY = 1e-7
-"""Relative accuracy of the solutions: the default of studies."""
-
-UNKNOWNS = 12
+storable(VariationalInequality)
 
 SECONDS = 60.0
 """Time limit of one solver; importing it counts."""
@@ -30,28 +30,23 @@ SECONDS = 60.0
 
 @dataclass(frozen=True)
 class Trial:
-    """Outcome of a solver: status, largest KKT residual (`None` without a solution), and why it is not ok."""
+    """Outcome of a solver: the verified status, why it is not ok, and its solution with residuals and seconds."""
 
     status: Status
-    residual: float | None
     reason: str
-
-
-def program() -> VariationalInequality:
-    """A wire of `UNKNOWNS` nodes in contact with a flat support around its middle; dense, like reduced programs."""
-    step = 1.0 / (UNKNOWNS + 1)
-    A = (2.0 * np.eye(UNKNOWNS) - np.eye(UNKNOWNS, k=1) - np.eye(UNKNOWNS, k=-1)) / step
-    return VariationalInequality(
-        A, np.full(UNKNOWNS, -4.0 * step), -step * np.eye(UNKNOWNS), np.full(UNKNOWNS, 0.2 * step)
-    )
+    solution: QPSolution | None = None
+    residuals: Residuals | None = None
+    seconds: Seconds = NO_TIME
 
 
 @dataclass(frozen=True)
 class SolverTrials(PiecewiseStage, Pieces):
-    """The program solved by one solver after the other. A solver is a piece; the pieces share no preparation."""
+    """A program solved by one solver after the other. A solver is a piece; the pieces share no preparation."""
 
     label = "QP solvers"
 
+    program: bytes
+    accuracy: float
     solvers: tuple[str, ...]
 
     @property
@@ -66,7 +61,7 @@ class SolverTrials(PiecewiseStage, Pieces):
 
     def stage_of(self, number: int) -> Stage:
         """The trial of one solver."""
-        return SolverTrials(self.solvers[number : number + 1])
+        return SolverTrials(self.program, self.accuracy, self.solvers[number : number + 1])
 
     def begin(self, store: Store) -> Pieces:  # noqa: ARG002
         """Nothing to prepare."""
@@ -75,27 +70,31 @@ class SolverTrials(PiecewiseStage, Pieces):
     def piece(self, number: int, watch: Callable[[bool], None]) -> Trial:
         """Solve the program with one solver and verify its solution; the time limit includes loading a plugin."""
         watch(True)
-        solver = self.solvers[number]
-        solution = solve_qp(program(), solver, ACCURACY, registry.qp_solver(solver))
-        status, reason, residuals = verify(program(), solution, ACCURACY)
-        return Trial(status, None if residuals is None else residuals.worst, reason)
+        name, program, accuracy = self.solvers[number], loads(self.program), self.accuracy
+        solve = partial(solve_qp, solver=name, accuracy=accuracy, extra=registry.qp_solver(name))
+        repeats = (in_units(program, units(len(program.f), accuracy, repeat)) for repeat in count())
+        solution, seconds = median_seconds(solve, chain([program], repeats))
+        status, reason, residuals = verify(program, solution, accuracy)
+        return Trial(status, reason, solution, residuals, seconds)
 
     def lost(self, number: int, failed: Failed) -> Trial:  # noqa: ARG002
         """Outcome of a solver that raised an error, hung, or ended the process."""
-        return Trial(failed.status, None, failed.reason)
+        return Trial(failed.status, failed.reason)
 
     def finish(self, pieces: Sequence[Trial]) -> list[Trial]:
         """Outcomes in the order of the solvers."""
         return list(pieces)
 
 
-def attempts(solvers: Sequence[str], seconds: float = SECONDS) -> dict[str, Trial]:
-    """Outcomes of installed solvers by name; `seconds` is the time limit of each."""
+def solver_trials(
+    program: VariationalInequality, accuracy: float, solvers: Sequence[str], seconds: float = SECONDS
+) -> dict[str, Trial]:
+    """Outcomes of installed solvers on a dense program, by name; `seconds` is the time limit of each."""
     limits = Limits()
     with closing(Supervisor()) as supervisor:
-        job = Job("", SolverTrials(tuple(solvers)), seconds, limits.cell_seconds, limits.memory_gib)
-        answer = supervisor.run(job)
+        stage = SolverTrials(dumps(program), accuracy, tuple(solvers))
+        answer = supervisor.run(Job("", stage, seconds, limits.cell_seconds, limits.memory_gib))
     if isinstance(answer, Done):
         return dict(zip(solvers, answer.value, strict=True))
     status = answer.status if isinstance(answer, Failed) else Status.ERROR
-    return dict.fromkeys(solvers, Trial(status, None, answer.reason))
+    return dict.fromkeys(solvers, Trial(status, answer.reason))

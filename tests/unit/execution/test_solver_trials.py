@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from vibench.cli.solver_check import ACCURACY, UNKNOWNS, attempts, program
+from vibench.cli.doctor import ACCURACY, UNKNOWNS, wire
+from vibench.execution.solver_trials import SECONDS, Trial, solver_trials
 from vibench.qp.solve import installed_solvers, solve_qp
 from vibench.qp.status import Status
 from vibench.study import registry
+
+
+def attempts(solvers: Sequence[str], seconds: float = SECONDS) -> dict[str, Trial]:
+    return solver_trials(wire(), ACCURACY, solvers, seconds)
 
 
 @pytest.fixture
@@ -23,12 +28,12 @@ def _fakes(plugins_folder: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[No
 
 
 def test_the_program_has_constraints_that_hold_and_constraints_that_do_not_matter() -> None:
-    wire = program()
-    free = np.linalg.solve(wire.A, wire.f)
-    assert np.any(wire.B @ free > wire.g)
-    answer = solve_qp(wire, "piqp", ACCURACY)
+    program = wire()
+    free = np.linalg.solve(program.A, program.f)
+    assert np.any(program.B @ free > program.g)
+    answer = solve_qp(program, "piqp", ACCURACY)
     assert answer.x is not None
-    active = np.abs(wire.B @ answer.x - wire.g) < 1e-6 * wire.g
+    active = np.abs(program.B @ answer.x - program.g) < 1e-6 * program.g
     assert 0 < active.sum() < UNKNOWNS
 
 
@@ -37,8 +42,9 @@ def test_every_installed_solver_solves_the_program() -> None:
     assert list(found) == installed_solvers()
     for trial in found.values():
         assert (trial.status, trial.reason) == (Status.OK, "")
-        assert trial.residual is not None
-        assert 0.0 < trial.residual <= ACCURACY
+        assert trial.residuals is not None
+        assert 0.0 < trial.residuals.worst <= ACCURACY
+        assert trial.seconds.cpu > 0.0
 
 
 @pytest.mark.usefixtures("_fakes")
@@ -57,7 +63,7 @@ def test_what_goes_wrong_is_said_and_costs_nobody_else_a_trial() -> None:
 @pytest.mark.usefixtures("_fakes")
 def test_a_solver_that_hangs_is_stopped() -> None:
     found = attempts(["hangs", "piqp"], seconds=1.0)
-    assert (found["hangs"].status, found["hangs"].residual) == (Status.TIMEOUT, None)
+    assert (found["hangs"].status, found["hangs"].solution) == (Status.TIMEOUT, None)
     assert "1 s" in found["hangs"].reason
     assert found["piqp"].status is Status.OK
 
@@ -66,5 +72,5 @@ def test_a_solver_that_hangs_is_stopped() -> None:
 def test_a_wrong_answer_is_not_believed() -> None:
     trial = attempts(["wrong"])["wrong"]
     assert trial.status is Status.INACCURATE
-    assert trial.residual is not None
-    assert trial.residual > ACCURACY
+    assert trial.residuals is not None
+    assert trial.residuals.worst > ACCURACY
