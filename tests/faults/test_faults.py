@@ -66,9 +66,9 @@ def seen(folder: Path) -> dict[str, dict[str, Any]]:
     return {}
 
 
-def kill_at_random(command: str, place: Path, plugins: Path, out: str, rng: random.Random, within: float) -> bool:
+def kill_at_random(command: list[str], place: Path, plugins: Path, rng: random.Random, within: float) -> bool:
     """Begin a run and kill it, or all its processes, within some seconds; `False` if it was quicker."""
-    with started([command, *OPTIONS[:-1], out], place, plugins) as process:
+    with started(command, place, plugins) as process:
         with contextlib.suppress(subprocess.TimeoutExpired):
             process.wait(timeout=within * rng.random())
         if process.returncode is not None:
@@ -82,15 +82,26 @@ def kill_at_random(command: str, place: Path, plugins: Path, out: str, rng: rand
     return True
 
 
-@pytest.mark.parametrize("kills", [2, pytest.param(50, marks=pytest.mark.long)])
+@pytest.mark.parametrize(
+    ("kills", "executor"),
+    [(2, "local"), *(pytest.param(50, executor, marks=pytest.mark.long) for executor in ("local", "dask"))],
+)
 def test_a_run_that_is_killed_again_and_again_loses_and_doubles_nothing(
-    kills: int, undisturbed: Undisturbed, command: str, plugins_folder: Path, vibench: Vibench, place: Path
+    kills: int,
+    executor: str,
+    undisturbed: Undisturbed,
+    command: str,
+    plugins_folder: Path,
+    vibench: Vibench,
+    place: Path,
 ) -> None:
     rng, killed, number, at_work = random.Random(kills), 0, 0, 0
+    seconds = 0.8 * undisturbed.seconds
     while killed < kills:
         number += 1
         out, known = f"out{number}", {}
-        while killed < kills and kill_at_random(command, place, plugins_folder, out, rng, 0.8 * undisturbed.seconds):
+        again = [command, *OPTIONS[:-1], out, "--executor", executor]
+        while killed < kills and kill_at_random(again, place, plugins_folder, rng, seconds):
             killed += 1
             found = seen(place / out)
             assert {key: found.get(key) for key in known} == known  # not one that was there is gone, or another one
