@@ -1,0 +1,114 @@
+"""Models of other codes: the examples are exported by these codes' own programs, where they are installed."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import vibench
+
+EXAMPLES = Path(__file__).parents[2] / "examples"
+PYTHON = "/usr/bin/python3"
+"""The interpreter that Debian's packages are for."""
+
+NEEDED = "VIBENCH_NEEDS_OTHER_CODES"
+"""Environment variable under which a code that is not installed is a failure."""
+
+SIZE = 530
+"""Number of nodes of vibench's own mesh, about that of FreeFEM's."""
+
+FEW = {"resolution = 1189": f"resolution = {SIZE}", '"cpg", "mcpg"': '"mcpg"', '"online-supremizers", ': ""}
+"""What is replaced in the study of an example where not all of its matrix is to be run."""
+
+
+def skip_without(code: str, there: bool) -> None:
+    if not there:
+        assert NEEDED not in os.environ, f"{code} is not installed"
+        pytest.skip(f"{code} is not installed")
+
+
+def exported(folder: Path, example: str, *command: str) -> Path:
+    """A copy of an example, in which its script has written the arrays of the pack."""
+    shutil.copytree(EXAMPLES / example, folder / example)
+    subprocess.run(command, cwd=folder / example, check=True, capture_output=True, timeout=300)
+    return folder / example
+
+
+@pytest.fixture(scope="module")
+def freefem(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    skip_without("FreeFEM", shutil.which("FreeFem++") is not None)
+    command = ("FreeFem++", "-nw", "obstacle.edp", "obstacle", "5")
+    return exported(tmp_path_factory.mktemp("freefem"), "freefem", *command)
+
+
+@pytest.fixture(scope="module")
+def getfem(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    there = subprocess.run([PYTHON, "-c", "import getfem"], capture_output=True, check=False).returncode == 0
+    skip_without("GetFEM", there)
+    return exported(tmp_path_factory.mktemp("getfem"), "getfem", PYTHON, "hertz.py", "hertz", "80")
+
+
+def run(example: Path, monkeypatch: pytest.MonkeyPatch) -> vibench.Run:
+    """A part of the study of an example, timed once."""
+    monkeypatch.chdir(example)
+    text = (EXAMPLES / example.name / "study.toml").read_text(encoding="utf-8")
+    for whole, part in FEW.items():
+        text = text.replace(whole, part)
+    (example / "study.toml").write_text(f"timing_rounds = 1\n{text}", encoding="utf-8")
+    return vibench.run(vibench.read_study("study.toml"), progress=False)
+
+
+@pytest.mark.parametrize("script", ["freefem/obstacle.edp", "getfem/hertz.py"])
+def test_a_script_has_sixty_lines_at_most(script: str) -> None:
+    assert len((EXAMPLES / script).read_text(encoding="utf-8").splitlines()) <= 60
+
+
+def test_freefem_and_the_built_in_problem_have_the_same_solutions(freefem: Path) -> None:
+    """Up to what two meshes of this width differ by."""
+    pack = vibench.create("problem", "pack", {"path": str(freefem / "obstacle")})
+    ours = vibench.create("problem", "obstacle", {"resolution": SIZE})
+    for mu in pack.validation_set(4, 0):
+        found = [vibench.HighFidelitySolver(problem).solve(mu) for problem in (pack, ours)]
+        energy = [solution.u @ (p.assemble(mu).A @ solution.u) for p, solution in zip((pack, ours), found, strict=True)]
+        force = [p.multiplier_integrals() @ solution.lam for p, solution in zip((pack, ours), found, strict=True)]
+        assert energy[0] == pytest.approx(energy[1], rel=0.02)
+        assert force[0] == pytest.approx(force[1], rel=0.05)
+
+
+def test_the_model_of_freefem_runs_through_the_matrix(freefem: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    found = run(freefem, monkeypatch)
+    cells = found.cells
+    assert len(cells) == 4
+    assert set(cells["status"]) == {"ok"}
+    theirs, ours = (cells[cells["problem"] == label].set_index(["dual", "primal"]) for label in ("FreeFEM", "vibench"))
+    assert (abs(theirs["N"] - ours["N"]) <= 2).all()
+    # Generators are snapshots themselves; a mesh without any symmetry needs more of them than a perturbed one.
+    assert (theirs["R"] / ours["R"]).between(0.5, 2.0).all()
+    constants = found.queries.groupby("problem")["beta_hf_span"].min()
+    assert constants["FreeFEM"] == pytest.approx(constants["vibench"], rel=0.1)
+
+
+def test_the_model_of_getfem_agrees_with_hertz(getfem: Path) -> None:
+    """Half-width a = √(4PR*/(πE*)) and peak 2P/(πa) of a line contact, by a fit of p² against x² in the contact."""
+    pack = vibench.create("problem", "pack", {"path": str(getfem / "hertz")})
+    x, solver = np.load(getfem / "hertz" / "vectors.npz")["x"], vibench.HighFidelitySolver(pack)
+    for radius in (0.7, 1.0, 1.3):
+        pressure = solver.solve(np.array([radius, 0.02])).lam
+        force = 2.0 * pack.multiplier_integrals() @ pressure
+        half_width = np.sqrt(4.0 * force / (1.0 + 1.0 / radius) / (np.pi * 15.0 / (1.0 - 0.35**2)))
+        inside = x < 0.85 * half_width
+        slope, peak = np.polyfit(x[inside] ** 2, pressure[inside] ** 2, 1)
+        assert np.sqrt(peak) == pytest.approx(2.0 * force / (np.pi * half_width), rel=0.02)
+        assert np.sqrt(-peak / slope) == pytest.approx(half_width, rel=0.03)
+
+
+def test_the_model_of_getfem_runs_through_the_matrix(getfem: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    cells = run(getfem, monkeypatch).cells
+    assert len(cells) == 2
+    assert set(cells["status"]) == {"ok"}
+    assert (cells[cells["primal"] != "decorrelated"]["error_lambda_mean"] < 0.05).all()
