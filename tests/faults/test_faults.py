@@ -22,6 +22,7 @@ from vibench.storage.artefacts import CACHE_VARIABLE
 
 STUDY = wire_study(
     problem=[{"name": "wire", "label": f"{nodes}", "options": {"nodes": nodes}} for nodes in (20, 40)],
+    timing_rounds=2,
     dual=["cpg", "mcpg"],
     primal=["decorrelated", "online-supremizers", "offline-pga"],
     solvers=["piqp", "osqp", "gives-up"],

@@ -99,12 +99,14 @@ def run(vibench: Vibench, tmp_path_factory: pytest.TempPathFactory) -> Run:
             primal=FINE["primal"],
             solvers=FINE["solver"],
             limits=limits,
+            timing_rounds=2,
         ),
         wire_study(
             dual=[*FINE["dual"], "cone-raises", waits, *duals],
             primal=["decorrelated", "enrichment-raises", *primals],
             solvers=[*FINE["solver"], *BAD_SOLVERS],
             limits=limits,
+            timing_rounds=2,
         ),
     ]
     found = Run([], [], [], [])

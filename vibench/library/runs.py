@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-from contextlib import AbstractContextManager, nullcontext
+import signal
+import threading
+from collections.abc import Iterator
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -138,6 +141,17 @@ class Run:
         return Model(recorded_cell(str(self.path), cell))
 
 
+@contextmanager
+def _interrupts_as_before() -> Iterator[None]:
+    """Block after which Ctrl-C does what it did before: a run that it ends ignores any other until all is written."""
+    before = signal.getsignal(signal.SIGINT)
+    try:
+        yield
+    finally:
+        if threading.current_thread() is threading.main_thread():
+            signal.signal(signal.SIGINT, before)
+
+
 def _following(observer: Observer | None, progress: bool) -> AbstractContextManager[Observer]:
     """Who follows a run."""
     if observer is not None or not progress:
@@ -206,7 +220,7 @@ def run(
     if jobs < 0:
         raise RequestError(f"jobs is {jobs}, expected a number of processes, or 0 for one per core")
     options = Options(jobs or provenance.cores(), fresh, retry, executor, scheduler)
-    with _following(observer, progress) as following:
+    with _following(observer, progress) as following, _interrupts_as_before():
         outcome = run_study(study, folder, following, options)
     if outcome.interrupted:
         raise KeyboardInterrupt(f"{outcome.missing} cells have no row yet; the same call continues the run")

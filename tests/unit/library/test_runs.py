@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 from pathlib import Path
 from typing import Any
 
@@ -133,8 +134,10 @@ def test_ctrl_c_raises_and_the_next_call_continues(tmp_path: Path, monkeypatch: 
             super().cell(cell, row)
             raise KeyboardInterrupt
 
+    handler = signal.getsignal(signal.SIGINT)
     with pytest.raises(KeyboardInterrupt, match="3 cells have no row yet"):
         vibench.run(vibench.Study(**SETTINGS), tmp_path, observer=Interrupting(), jobs=1)
+    assert signal.getsignal(signal.SIGINT) is handler
     again = Following()
     assert len(vibench.run(vibench.Study(**SETTINGS), tmp_path, observer=again).cells) == 4
     assert again.cells == 3

@@ -6,7 +6,7 @@ import math
 import pickle
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from vibench.errors import NumericalError, RequestError
@@ -27,6 +27,7 @@ def larger(inner: st.SearchStrategy[str]) -> st.SearchStrategy[str]:
     )
 
 
+@settings(max_examples=40)
 @given(st.recursive(leaves, larger, max_leaves=8), st.floats(-10.0, 10.0), st.floats(-10.0, 10.0))
 def test_safe_expressions_have_the_values_of_python(text: str, a: float, b: float) -> None:
     expression = pickle.loads(pickle.dumps(Expression.parse(text, NAMES)))
