@@ -19,7 +19,7 @@ PYTHON = "/usr/bin/python3"
 NEEDED = "VIBENCH_NEEDS_OTHER_CODES"
 """Environment variable under which a code that is not installed is a failure."""
 
-SIZE = 530
+SIZE = 677
 """Number of nodes of vibench's own mesh, about that of FreeFEM's."""
 
 FEW = {"resolution = 1189": f"resolution = {SIZE}", '"cpg", "mcpg"': '"mcpg"', '"online-supremizers", ': ""}
@@ -42,7 +42,7 @@ def exported(folder: Path, example: str, *command: str) -> Path:
 @pytest.fixture(scope="module")
 def freefem(tmp_path_factory: pytest.TempPathFactory) -> Path:
     skip_without("FreeFEM", shutil.which("FreeFem++") is not None)
-    command = ("FreeFem++", "-nw", "obstacle.edp", "obstacle", "5")
+    command = ("FreeFem++", "-nw", "obstacle.edp", "obstacle", "6")
     return exported(tmp_path_factory.mktemp("freefem"), "freefem", *command)
 
 
@@ -80,6 +80,7 @@ def test_freefem_and_the_built_in_problem_have_the_same_solutions(freefem: Path)
         assert force[0] == pytest.approx(force[1], rel=0.05)
 
 
+@pytest.mark.long
 def test_the_model_of_freefem_runs_through_the_matrix(freefem: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     found = run(freefem, monkeypatch)
     cells = found.cells
@@ -107,6 +108,7 @@ def test_the_model_of_getfem_agrees_with_hertz(getfem: Path) -> None:
         assert np.sqrt(-peak / slope) == pytest.approx(half_width, rel=0.03)
 
 
+@pytest.mark.long
 def test_the_model_of_getfem_runs_through_the_matrix(getfem: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     cells = run(getfem, monkeypatch).cells
     assert len(cells) == 2
