@@ -53,12 +53,13 @@ def write_report(
     run: RunArgument, out: Annotated[Path | None, Option(help="HTML file; RUN/report.html by default.")] = None
 ) -> None:
     """Write the report of a run as one HTML page."""
+    from vibench import provenance
     from vibench.execution.run import REPORT
     from vibench.report import html
     from vibench.results import tables
 
     path = tables.results_file(run)
-    echo(f"report: {html.write(path, out or path.parent / REPORT)}")
+    echo(f"report: {html.write(path, out or path.parent / REPORT, provenance.cores())}")
 
 
 def draw_figures(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import signal
 import threading
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import Future, ProcessPoolExecutor
 from functools import cache
 from multiprocessing import get_context
@@ -44,7 +44,12 @@ OF_DUAL: dict[str, Drawing] = {"enrichment": enrichment, "inf-sup": inf_sup}
 
 def drawings(path: Path) -> Iterator[tuple[str, Drawing, Data]]:
     """Every figure a results file may have: its name, the function that draws it, and the data."""
-    for name, data in problems(path):
+    return drawings_of(problems(path))
+
+
+def drawings_of(known: Iterable[tuple[str, Data]]) -> Iterator[tuple[str, Drawing, Data]]:
+    """Every figure of some problems, from their data and what the names of their files begin with."""
+    for name, data in known:
         yield from ((f"{name}-{kind}", draw, data) for kind, draw in OF_PROBLEM.items())
         for dual, file in zip(data.duals, file_names(data.duals), strict=True):
             yield from ((f"{name}-{file}-{kind}", draw, data.of_dual(dual)) for kind, draw in OF_DUAL.items())
