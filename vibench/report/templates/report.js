@@ -296,6 +296,7 @@ function drawPanel(plot, panel, place) {
 }
 
 function drawPlot(figure) {
+  if (figure.classList.contains("live")) return;
   const plot = PLOTS[figure.dataset.plot];
   const places = plot.panels.map(() => element("div"));
   const legend = element("div", { class: "legend", role: "group", "aria-label": "series" });
