@@ -23,7 +23,15 @@ with interrupted_at_once():
     from vibench.cli.export_commands import export_reduced_model
     from vibench.cli.pack_commands import import_pack, reduce_cones, write_pack
     from vibench.cli.plugin_commands import check_plugin, list_plugins, new_plugin
-    from vibench.cli.result_commands import compare_runs, draw_figures, export_qps, replay_query, show, write_report
+    from vibench.cli.result_commands import (
+        compare_runs,
+        diff_runs,
+        draw_figures,
+        export_qps,
+        replay_query,
+        show,
+        write_report,
+    )
     from vibench.errors import RequestError, VibenchError
     from vibench.terminal.output import echo
     from vibench.text import unbroken
@@ -195,7 +203,7 @@ def doctor(out: Annotated[Path, Option(metavar="DIR", help="Folder of the runs."
 
 COMMANDS: dict[str, Callable[..., None]] = {
     "run": run, "list": list_plugins, "show": show, "report": write_report, "figures": draw_figures,
-    "diff": compare_runs, "replay": replay_query, "export-qps": export_qps,
+    "diff": diff_runs, "compare": compare_runs, "replay": replay_query, "export-qps": export_qps,
     "export-model": export_reduced_model, "clean": clean, "doctor": doctor,
     "check": check_plugin, "new": new_plugin,
     "import": import_pack, "pack": write_pack, "cones": reduce_cones,

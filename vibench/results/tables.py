@@ -34,7 +34,7 @@ def results_file(run: str) -> Path:
         If there is no results file, or its schema has another version.
     """
     for folder in (Path(run), Path("runs") / run):
-        path = folder if folder.name == FILE else folder / FILE
+        path = folder if folder.is_file() else folder / FILE
         if path.is_file():
             schema = read_meta(path).get("schema")
             if schema != str(VERSION):
