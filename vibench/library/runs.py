@@ -199,9 +199,11 @@ def run(
         Remove earlier results of the study and compute everything again.
     retry
         Also redo cells that did not end ok.
-    executor, scheduler
-        Where the work is done: processes of this machine, or a dask cluster and the address of its scheduler; without
-        an address a cluster is started, for which a script needs the guard `if __name__ == "__main__"`.
+    executor
+        Where the work is done: "local" for processes of this machine, "dask" for a dask cluster.
+    scheduler
+        Address of the scheduler of an existing dask cluster; without one a cluster is started on this machine, for
+        which a script needs the guard `if __name__ == "__main__"`.
     observer
         Follows the run, in place of the progress display.
     progress
