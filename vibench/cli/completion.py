@@ -28,6 +28,7 @@ EXAMPLES: Mapping[str, tuple[str, ...]] = {
         "vibench run quick --solver piqp --dry-run",
         "vibench run my-study.toml --jobs 4 --out results",
         "vibench run quick --pod-tol 1e-2 --pod-tol 1e-3",
+        "vibench run results.sqlite --cell 3f9a --out again",
     ),
     "list": ("vibench list", "vibench list solvers"),
     "show": (
