@@ -12,10 +12,10 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import pandas as pd
 
-from vibench import provenance
-from vibench.errors import RequestError, unknown_name
+from vibench.errors import unknown_name
 from vibench.execution.recorded_cell import recorded_cell
-from vibench.execution.run import REPORT, Observer, Options, run_study
+from vibench.execution.run import Observer, Options, run_study
+from vibench.execution.run_folder import REPORT
 from vibench.library.models import Model
 from vibench.results import tables
 from vibench.results.columns import TABLES
@@ -212,16 +212,14 @@ def run(
     Raises
     ------
     RequestError
-        If the folder or the cache cannot be used.
+        If the folder or the cache cannot be used, or there would be too many worker processes.
     StorageError
         If something cannot be written; what was written before is kept.
     KeyboardInterrupt
         On Ctrl-C: what is finished is written, and the same call continues the run.
     """
     folder = Path("runs") / study.name if out is None else Path(out)
-    if jobs < 0:
-        raise RequestError(f"jobs is {jobs}, expected a number of processes, or 0 for one per core")
-    options = Options(jobs or provenance.cores(), fresh, retry, executor, scheduler)
+    options = Options(jobs, fresh, retry, executor, scheduler)
     with _following(observer, progress) as following, _interrupts_as_before():
         outcome = run_study(study, folder, following, options)
     if outcome.interrupted:
