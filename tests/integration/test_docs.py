@@ -122,7 +122,7 @@ def test_the_plugins_of_the_pages_run_through_the_whole_benchmark(
     assert done.returncode == 0, done.stderr
     assert "invariants of the constants and the error bounds hold in all" in done.stdout
     cells = rows(tmp_path / "runs" / "mine")
-    assert len(cells) == 2 * 2 * 4 * 2
+    assert len(cells) == 3 * 2 * 4 * 2
     assert {(cell["status"], cell["reason"]) for cell in cells} == {("ok", "")}
     assert {cell["primal"]: cell["enrichment_kind"] for cell in cells} == {
         "centre": "fixed",
@@ -131,7 +131,7 @@ def test_the_plugins_of_the_pages_run_through_the_whole_benchmark(
         "unconstrained": "per-parameter",
     }
     for cell in cells:
-        can_be_reduced = cell["problem"] == "separable-cable" and cell["primal"] != "unconstrained"
+        can_be_reduced = cell["problem"] != "cable" and cell["primal"] != "unconstrained"
         assert (cell["fallbacks"] == "") is can_be_reduced, cell
         assert cell["beta_span_min"] > 0.0
     assert sum(row["flagged"] for row in rows(tmp_path / "runs" / "mine", "disagreements")) == 0

@@ -128,10 +128,12 @@ CELLS: Mapping[str, Column] = {
     ),
     "interpolation_error": Column(REAL, "1", "Largest relative interpolation error of a member over the training set."),
     "terms_A": Column(
-        INTEGER, "", "Entries of A that a reduced query evaluates; 0 if A is constant, empty if A is not interpolated."
+        INTEGER,
+        "",
+        "Terms of A in a reduced query, each with a coefficient to evaluate; 0 if A is constant, empty if assembled.",
     ),
     "terms_f": Column(INTEGER, "", "Likewise for f."),
-    "terms_B": Column(INTEGER, "", "Likewise for B; also empty if B is assembled on the contact unknowns."),
+    "terms_B": Column(INTEGER, "", "Likewise for B; empty if B is assembled on the contact unknowns."),
     "terms_g": Column(INTEGER, "", "Likewise for g."),
     "offline_snapshots_s": Column(REAL, "s", "High-fidelity solutions at the training parameters, with one set-up."),
     "offline_pod_s": Column(REAL, "s", "POD."),
