@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import NamedTuple
 
-VERSION = 10
+VERSION = 11
 """Schema version of a results file; a file of another version is refused."""
 
 TEXT, REAL, INTEGER, BLOB = "TEXT", "REAL", "INTEGER", "BLOB"
@@ -62,6 +62,8 @@ UNITS: Mapping[str, str] = {
 KEYS: Mapping[str, Column] = {
     "problem": Column(TEXT, "", "Problem: its label in the study, or its name.", "problem", 1),
     "problem_options": Column(TEXT, "", "Options of the problem that are not at their default, as JSON.", whole=True),
+    "training": Column(TEXT, "", "Training set: own, or the label or name of its sampling strategy.", "training", 2),
+    "training_options": Column(TEXT, "", "Options of the sampling strategy, likewise.", whole=True),
     "dual": Column(TEXT, "", "Dual strategy, likewise.", "dual", 4),
     "dual_options": Column(TEXT, "", "Its options, likewise.", whole=True),
     "primal": Column(TEXT, "", "Primal strategy, likewise.", "primal", 5),
@@ -99,6 +101,9 @@ CELLS: Mapping[str, Column] = {
     "reason": Column(TEXT, "", "Why it is not ok: the first query with this status and what was wrong there."),
     "queries": Column(INTEGER, "", "Queries asked: one per validation parameter."),
     "queries_ok": Column(INTEGER, "", "Queries that are ok; means and maxima are over these.", "ok", 10),
+    "snapshots": Column(
+        INTEGER, "", "High-fidelity solutions that the training took: parameters of the training set.", "solved", 11
+    ),
     "dim_V": Column(INTEGER, "", "Dimension n of V."),
     "dim_W": Column(INTEGER, "", "Dimension m of W."),
     "N": Column(INTEGER, "", "Dimension of V_N.", "N", 11),
@@ -200,6 +205,10 @@ CELLS: Mapping[str, Column] = {
         INTEGER, "", "1 where the slowdown is above 1.3, or wall seconds above 1.5 times the CPU seconds."
     ),
     "seed": Column(INTEGER, "", "Seed of the study."),
+    "validation": Column(TEXT, "", "Validation set: own, or the label or name of its sampling strategy."),
+    "validation_options": Column(
+        TEXT, "", "Options of that strategy that are not at their default, as JSON.", whole=True
+    ),
     "study_hash": Column(TEXT, "", "Hash of the whole study file as it was read."),
     "code": Column(TEXT, "", "Hash of the code: core, plugins, solver."),
     "machine": Column(TEXT, "", "Machines that measured the seconds."),
