@@ -97,9 +97,11 @@ def _for_reading(frame: pd.DataFrame, table: Mapping[str, Column]) -> pd.DataFra
 
 
 def says_something(frame: pd.DataFrame, name: str) -> bool:
-    """Whether to show a column unasked: the accuracy where it is an axis, zero solutions where there are any."""
+    """Whether to show a column unasked: accuracy and training sets where they are an axis, zero solutions if any."""
     if name == "accuracy":
         return bool(frame[name].nunique() > 1)
+    if name in ("training", "snapshots"):
+        return bool(frame["training"].nunique() > 1)
     if name == "status":
         return bool((frame[name] != Status.OK).any())
     zero = re.fullmatch(r"queries_zero_(u|lambda)|error_(u|lambda)_zero_max", name)
@@ -251,7 +253,8 @@ def name_of_cell(row: Mapping[str, Any] | pd.Series) -> str:
     tolerance = "" if pd.isna(row["primal_tol"]) else f" {row['primal_tol']:g}"
     sizes = ", ".join(asked(row, axis) for axis in ("pod", "dual"))
     assembly = "" if row["assembly"] == "full" else f" · {row['assembly']}"
-    way = f"{row['problem']} · {row['dual']} · {row['primal']}{tolerance}"
+    trained = "" if row["training"] == "own" else f" ({row['training']})"
+    way = f"{row['problem']}{trained} · {row['dual']} · {row['primal']}{tolerance}"
     return f"{way} · {sizes} · {row['solver']} {row['accuracy']:g}{assembly}"
 
 
