@@ -15,6 +15,7 @@ from typing import Any, get_type_hints
 from pydantic import ConfigDict, PydanticUserError, TypeAdapter, ValidationError
 
 from vibench.errors import RequestError, in_a_line, unknown_name
+from vibench.interfaces.figures import FigurePlugin
 from vibench.interfaces.problem import Problem
 from vibench.interfaces.strategies import DualStrategy, PrimalStrategy
 from vibench.provenance import distribution_version, source_hash
@@ -28,11 +29,17 @@ GROUPS: Mapping[str, str] = {
     "primal strategy": "vibench.primal_strategies",
     "QP solver": "vibench.qp_solvers",
     "study": "vibench.studies",
+    "figure plugin": "vibench.figures",
 }
 FINITE = ConfigDict(allow_inf_nan=False)
 """Options of plugins are finite."""
 
-BASES: Mapping[str, type] = {"problem": Problem, "dual strategy": DualStrategy, "primal strategy": PrimalStrategy}
+BASES: Mapping[str, type] = {
+    "problem": Problem,
+    "dual strategy": DualStrategy,
+    "primal strategy": PrimalStrategy,
+    "figure plugin": FigurePlugin,
+}
 """Abstract base classes of the kinds of plugins that are classes."""
 
 WORDS: Mapping[str, str] = {
@@ -85,7 +92,7 @@ def create(kind: str, name: str, options: Mapping[str, Any] | None = None) -> An
     Parameters
     ----------
     kind
-        "problem", "dual strategy" or "primal strategy".
+        A key of `BASES`.
     name
         Name under which the plugin is registered.
     options
