@@ -23,7 +23,15 @@ with interrupted_at_once():
     from vibench.cli.export_commands import export_reduced_model
     from vibench.cli.pack_commands import import_pack, reduce_cones, write_pack
     from vibench.cli.plugin_commands import check_plugin, list_plugins, new_plugin
-    from vibench.cli.result_commands import compare_runs, draw_figures, export_qps, replay_query, show, write_report
+    from vibench.cli.result_commands import (
+        compare_runs,
+        diff_runs,
+        draw_figures,
+        export_qps,
+        replay_query,
+        show,
+        write_report,
+    )
     from vibench.errors import RequestError, VibenchError
     from vibench.terminal.output import echo
     from vibench.text import unbroken
@@ -90,8 +98,6 @@ def run(
 ) -> None:
     """Run a study. An interrupted run resumes where it stopped."""
     with interrupted_at_once():  # the libraries and plugins of a study take a second to import
-        from vibench import provenance
-        from vibench.execution.dask import is_authenticated
         from vibench.execution.run import Options, run_study
         from vibench.qp.status import Status
         from vibench.results import tables
@@ -110,13 +116,10 @@ def run(
         cells = expand(loaded)
         echo(*(f"{cell.key}  {cell}" for cell in cells), f"{len(cells)} cells")
         return
-    if scheduler is not None and executor != "dask":
-        raise RequestError(f"--scheduler {scheduler} is for --executor dask")
-    if scheduler is not None and not is_authenticated(scheduler):
-        warning = "the connection is not authenticated: others who reach the scheduler can run code on its workers"
-        sys.stderr.write(f"vibench: {unbroken(scheduler)}: {warning}\n")
+    if scheduler is not None:
+        _warn_of_open_scheduler(scheduler, executor)
     folder = out or Path("runs") / loaded.name
-    options = Options(jobs or provenance.cores(), fresh, retry, executor, scheduler)
+    options = Options(jobs, fresh, retry, executor, scheduler)
     with ProgressDisplay(new_console()) as progress:
         outcome = run_study(loaded, folder, progress, options)
     path = tables.results_file(str(folder))
@@ -135,13 +138,23 @@ def run(
 
         figures.remove(folder / "figures")
     if draw:
-        result_commands.draw(path, folder / "figures", options.jobs)
+        result_commands.draw(path, folder / "figures", options.workers)
     statuses = [row["status"] for row in outcome.rows]
     run_summary.next_steps(folder, len(statuses), len(statuses) - statuses.count(Status.OK), figures=draw)
     if strict and any(status not in (Status.OK, Status.UNAVAILABLE) for status in statuses):
         raise typer.Exit(1)
     if set(statuses) == {Status.UNAVAILABLE}:
         raise VibenchError("no cell could run here: what all of them need is not installed")
+
+
+def _warn_of_open_scheduler(scheduler: str, executor: str) -> None:
+    from vibench.execution.dask import is_authenticated
+
+    if executor != "dask":
+        raise RequestError(f"--scheduler {scheduler} is for --executor dask")
+    if not is_authenticated(scheduler):
+        warning = "the connection is not authenticated: others who reach the scheduler can run code on its workers"
+        sys.stderr.write(f"vibench: {unbroken(scheduler)}: {warning}\n")
 
 
 def clean(
@@ -190,7 +203,7 @@ def doctor(out: Annotated[Path, Option(metavar="DIR", help="Folder of the runs."
 
 COMMANDS: dict[str, Callable[..., None]] = {
     "run": run, "list": list_plugins, "show": show, "report": write_report, "figures": draw_figures,
-    "diff": compare_runs, "replay": replay_query, "export-qps": export_qps,
+    "diff": diff_runs, "compare": compare_runs, "replay": replay_query, "export-qps": export_qps,
     "export-model": export_reduced_model, "clean": clean, "doctor": doctor,
     "check": check_plugin, "new": new_plugin,
     "import": import_pack, "pack": write_pack, "cones": reduce_cones,

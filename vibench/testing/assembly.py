@@ -15,15 +15,12 @@ import scipy.sparse as sp
 from vibench.arrays import Array, Indices
 from vibench.errors import NumericalError
 from vibench.interfaces.problem import MEMBERS, Contact, Problem, VariationalInequality
-from vibench.linalg.inner_product import InnerProduct
+from vibench.linalg.inner_product import SYMMETRY_RTOL, InnerProduct
 from vibench.model.affine import CONSTANT_RTOL
 from vibench.testing.case import MOST_POINTS, ProblemCase, assembled
 from vibench.testing.checks import ConformanceError, Doubt, Note, raised
 from vibench.testing.comparisons import Arrays, array_fault, at, copies, difference, differences, peak, unmutated
 from vibench.testing.elsewhere import NotImportableError, call_elsewhere
-
-SYMMETRY_RTOL = 1e-12
-"""Largest difference of a symmetric matrix and its transpose, relative to its largest entry."""
 
 PARTIAL_RTOL = 1e-10
 """Largest difference of partial and full assembly, relative to the largest entry of the member."""
