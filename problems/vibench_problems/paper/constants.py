@@ -37,9 +37,11 @@ def comparison(curves: Curves, paper: Published, parameter: str) -> CaptionedFig
             for name, symbol in STRATEGIES.items():
                 look: Look = looks[Series(name)]
                 values = rows[COLUMNS[name] + part].to_numpy(float)
-                plot(panel, x, positive(values), look, symbol)
+                wide = {"linewidth": 3.0} if symbol == "β_on" else {}  # another curve may lie upon it
+                plot(panel, x, positive(values), look, symbol, **wide)
                 if row == 0 and values.max() < ZERO:
-                    panel.text(0.02, 0.03, f"{symbol} = 0 over the span", transform=panel.transAxes, fontsize=7)
+                    text = f"{symbol} = 0" if values.max() == 0.0 else f"{symbol} ≤ {values.max():.0e}"
+                    panel.text(0.02, 0.03, text, transform=panel.transAxes, fontsize=7)
             panel.set(ylabel=f"β over {generated}", yscale="log")
             panel.set_xlabel(parameter or "validation parameters, sorted by β_off")
         sheet.at(0, column).set_title(f"(N, R) = {curves.size(pair)}, δ = {pair.loose:g}; paper {pair.name}")

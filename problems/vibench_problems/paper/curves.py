@@ -42,8 +42,10 @@ class Curves:
         return rows[np.logical_and.reduce([*wanted, *(rows[c].isna() for c in SIZES if c not in pair.prescribed)])]
 
     def has(self, pair: Pair) -> bool:
-        """Whether the run has a model without, one with fixed and one with an enrichment per parameter of a pair."""
-        return set(self.of(pair, self.queries)["enrichment_kind"]) >= {"none", "fixed", "per-parameter"}
+        """Whether the run has a model without enrichment, one with one per parameter, and PGA at both tolerances."""
+        mine = self.of(pair, self.queries)
+        tolerances = set(mine["primal_tol"][mine["enrichment_kind"] == "fixed"])
+        return set(mine["enrichment_kind"]) >= {"none", "per-parameter"} and tolerances >= {pair.tight, pair.loose}
 
     def size(self, pair: Pair) -> tuple[int, int]:
         """(N, R) here."""

@@ -33,21 +33,20 @@ def configuration(tables: ProblemTables) -> CaptionedFigure:
     mu = np.array([1.0])
     sheet = Sheet(1, 1, "Figure 9: configuration, §5.2, Hertz contact", Layout(width=3.6, height=5.2))
     (panel,) = sheet.panels
-    discs = ((problem.slave, "1"), (problem.master, "2"))
-    for points, (disc, number) in zip(problem.points(mu), discs, strict=True):
+    discs = ((problem.slave, "Ω₁", 0.5), (problem.master, "Ω₂(µ)", -0.5))
+    for points, (disc, name, height) in zip(problem.points(mu), discs, strict=True):
         panel.triplot(points[0], points[1], disc.mesh.t.T, color="0.8", linewidth=0.3)
-        for nodes, colour, name in ((disc.axis, "#0072B2", "left"), (disc.flat, "#009E73", "moved flat")):
+        for nodes, colour, boundary in ((disc.axis, "#0072B2", "left"), (disc.flat, "#009E73", "moved flat")):
             ordered = nodes[np.lexsort(points[:, nodes])]
-            panel.plot(*points[:, ordered], color=colour, linewidth=2.0, label=f"Γ {name}")
+            panel.plot(*points[:, ordered], color=colour, linewidth=2.0, label=f"Γ {boundary}")
         panel.plot(*points[:, disc.zone], color="#D55E00", linewidth=2.0, label="Γ_c, potential contact")
-        height = 0.5 if number == "1" else -0.5
-        panel.text(0.3, height, f"Ω_{number}" if number == "1" else "Ω_2(µ)", fontsize=11, ha="center")
+        panel.text(0.3, height, name, fontsize=11, ha="center")
     panel.annotate(f"γ₀ = {problem.gap:g} m", (0.0, 0.0), (0.62, 0.03), fontsize=8, arrowprops={"arrowstyle": "->"})
-    panel.text(0.55, 0.97, "R₁ = 1 m, moves by −d", fontsize=8)
-    panel.text(0.55, -0.98, "R₂ = µ, moves by d", fontsize=8, va="top")
+    panel.text(0.5, 1.03, "R₁ = 1 m, moves by −d", fontsize=8, ha="center")
+    panel.text(0.5, -1.04, "R₂ = µ, moves by d", fontsize=8, ha="center", va="top")
     panel.set_aspect("equal")
     panel.grid(visible=False)
-    panel.set(xlabel="x [m]", ylabel="y [m]")
+    panel.set(xlabel="x [m]", ylabel="y [m]", ylim=(-1.15, 1.15))
     slaves = len(problem.slave.zone)
     figure = sheet.finish(
         f"The two quarter discs of the Hertz problem at µ = {mu[0]:g} m before they touch, with their meshes of "

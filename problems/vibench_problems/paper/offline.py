@@ -155,7 +155,7 @@ def greedy(curves: Curves, paper: Published, parameter: str) -> CaptionedFigure 
         f"The projected greedy algorithm, {paper.section}, a row for every pair (N, R). Left, the largest σ over the "
         "training set against the number n of vectors; middle, the smallest β over the span on the training set; both "
         f"for δ_PGA = {paper.pairs[0].tight:g}. Right, β_off over the span at the validation parameters, for this and "
-        "the looser δ_PGA of the pair."
+        "the looser δ_PGA of the pair. On logarithmic axes, zeros are not drawn."
     )
     loose = ", ".join(f"{pair.loose:g} for {pair.name}" for pair in paper.pairs)
     figure.published = (
