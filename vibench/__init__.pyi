@@ -72,8 +72,12 @@ from .reduction.supremizers import projected_supremizers as projected_supremizer
 from .reduction.supremizers import supremizer_coordinates as supremizer_coordinates
 from .reduction.supremizers import supremizers as supremizers
 from .report.figures.looks import HIGH_FIDELITY_LOOK as HIGH_FIDELITY_LOOK
+from .report.figures.looks import Look as Look
 from .report.figures.looks import Looks as Looks
 from .report.figures.looks import Series as Series
+from .report.figures.solutions import draw_field as draw_field
+from .report.figures.solutions import draw_multiplier as draw_multiplier
+from .report.figures.solutions import name_axes as name_axes
 from .report.figures.style import CaptionedFigure as CaptionedFigure
 from .report.figures.style import Layout as Layout
 from .report.figures.style import Sheet as Sheet

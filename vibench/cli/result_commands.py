@@ -72,19 +72,46 @@ def write_report(
 
 
 def draw_figures(
-    run: RunArgument,
-    out: Annotated[Path | None, Option(metavar="DIR", help="Folder; RUN/figures by default.")] = None,
+    names: Annotated[
+        list[str], Argument(metavar="RUN", help="A run folder, or its name in runs/ (several).", autocompletion=runs)
+    ],
+    out: Annotated[
+        Path | None, Option(metavar="DIR", help="Folder; RUN/figures, or paper-figures with --paper, by default.")
+    ] = None,
+    paper: Annotated[
+        bool, Option("--paper", help="Draw the figures of a publication again, on one page with what it says.")
+    ] = False,
     formats: Annotated[
         list[Picture] | None, Option("--format", help="Format (repeatable); PNG and SVG by default.")
     ] = None,
     jobs: Annotated[int, Option("--jobs", "-j", min=0, help="Processes; 0 for one per core.")] = 0,
 ) -> None:
-    """Draw the figures of a run, with their captions in captions.json."""
+    """Draw the figures of runs, with their captions in captions.json."""
+    from vibench.errors import RequestError
     from vibench.report.figures.style import FORMATS
     from vibench.results import tables
 
-    path = tables.results_file(run)
-    draw(path, out or path.parent / "figures", jobs, tuple(dict.fromkeys(map(str, formats or FORMATS))))
+    paths = [tables.results_file(name) for name in dict.fromkeys(names)]
+    forms = tuple(dict.fromkeys(map(str, formats or FORMATS)))
+    if paper:
+        draw_paper(paths, out or Path("paper-figures"), forms)
+        return
+    if out is not None and len(paths) > 1:
+        raise RequestError("--out is for the figures of one run, and --paper; those of several go into their folders")
+    for path in paths:
+        draw(path, out or path.parent / "figures", jobs, forms)
+
+
+def draw_paper(paths: list[Path], folder: Path, formats: tuple[str, ...]) -> None:
+    """Draw the figures of publications again, and say where their page is."""
+    from vibench.report.figures.publication import PAGE, draw_published
+    from vibench.terminal.console import new_console
+    from vibench.terminal.progress import DrawingDisplay
+
+    notes: list[str] = []
+    with DrawingDisplay(new_console()) as display:
+        drawn = draw_published(paths, folder, formats, display.show, notes.append)
+    echo(*notes, f"{len(drawn)} figures: {folder}", f"page: {folder / PAGE}")
 
 
 def draw(path: Path, folder: Path, jobs: int, formats: tuple[str, ...] = ("png", "svg")) -> None:

@@ -136,14 +136,17 @@ def _tell_apart(axis: str, cells: pd.DataFrame, frames: list[pd.DataFrame]) -> N
 def _plugin_name(cells: pd.DataFrame, axis: str) -> str:
     """The name under which the plugin on an axis of some cells is registered; "" where no cell says so."""
     for definition in cells["definition"].dropna():
-        plugin = json.loads(definition)[axis]  # none for a set of the problem itself
-        return str(plugin["name"]) if plugin else ""
+        plugin = _options(definition).get(axis)
+        return str(plugin.get("name", "")) if isinstance(plugin, dict) else ""
     return ""
 
 
 def _options(text: Any) -> dict[str, Any]:
-    """Options of a plugin from their JSON."""
-    found = json.loads(text) if isinstance(text, str) and text else {}
+    """A JSON object, such as the options of a plugin; empty where a strangers' file has something else."""
+    try:
+        found = json.loads(text) if isinstance(text, str) else {}
+    except ValueError:
+        return {}
     return found if isinstance(found, dict) else {}
 
 

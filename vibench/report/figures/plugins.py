@@ -29,13 +29,14 @@ def of_plugins(data: Data, taken: set[str]) -> dict[str, Callable[[Data], Figure
     """
     found: dict[str, Callable[[Data], Figure | None]] = {}
     for name in registry.names(KIND):
-        reason = f"{KIND} '{name}' has the name of a figure of vibench; another one is needed" if name in taken else ""
+        reason = f"{KIND} '{name}' has the name of a figure of vibench, and needs another" if name in taken else ""
         try:
             plugin = None if reason else loaded(name)
             if plugin is not None and not plugin.publication:
                 kinds = dict(named(name, plugin, data))
                 found |= {
-                    f"{name}-{kind}" if kind else name: partial(_drawn, name, draw) for kind, draw in kinds.items()
+                    f"{name}-{kind}" if kind else name: partial(_drawn, name, kind, draw)
+                    for kind, draw in kinds.items()
                 }
         except VibenchError as error:
             reason = str(error)
@@ -96,7 +97,7 @@ def named(name: str, plugin: FigurePlugin, data: Data) -> Iterator[tuple[str, Dr
     yield from ((file if kind else "", draw) for (kind, draw), file in zip(found.items(), files, strict=True))
 
 
-def draw_guarded(name: str, draw: Drawing) -> Figure | None:
+def draw_guarded(name: str, kind: str, draw: Drawing) -> Figure | None:
     """A figure of a plugin with its caption.
 
     Raises
@@ -109,16 +110,17 @@ def draw_guarded(name: str, draw: Drawing) -> Figure | None:
         if isinstance(figure, Figure):
             figure.draw_without_rendering()
     except (Exception, SystemExit) as error:  # noqa: BLE001  third-party code
-        raise FigureError(f"a figure of {KIND} '{name}' cannot be drawn: {in_a_line(error)}") from None
+        raise FigureError(f"figure '{kind}' of {KIND} '{name}' cannot be drawn: {in_a_line(error)}") from None
     if figure is not None and not isinstance(figure, Figure):
-        raise FigureError(f"{KIND} '{name}' drew a {type(figure).__name__}, expected a matplotlib Figure or None")
+        returned = type(figure).__name__
+        raise FigureError(f"figure '{kind}' of {KIND} '{name}' is a {returned}, expected a matplotlib Figure or None")
     if figure is not None:
         set_caption(figure, inspect.getdoc(draw) or "")
     return figure
 
 
-def _drawn(name: str, draw: Drawing, _: Data) -> Figure | None:
-    return draw_guarded(name, draw)
+def _drawn(name: str, kind: str, draw: Drawing, _: Data) -> Figure | None:
+    return draw_guarded(name, kind, draw)
 
 
 def _refused(reason: str, _: Data) -> Figure | None:
