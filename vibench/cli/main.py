@@ -109,8 +109,6 @@ def run(
 ) -> None:
     """Run a study. An interrupted run resumes where it stopped."""
     with interrupted_at_once():  # the libraries and plugins of a study take a second to import
-        from vibench import provenance
-        from vibench.execution.dask import is_authenticated
         from vibench.execution.run import Options, run_study
         from vibench.qp.status import Status
         from vibench.results import tables
@@ -128,13 +126,10 @@ def run(
         cells = expand(loaded)
         echo(*(f"{cell.key}  {cell}" for cell in cells), f"{len(cells)} cells")
         return
-    if scheduler is not None and executor != "dask":
-        raise RequestError(f"--scheduler {scheduler} is for --executor dask")
-    if scheduler is not None and not is_authenticated(scheduler):
-        warning = "the connection is not authenticated: others who reach the scheduler can run code on its workers"
-        sys.stderr.write(f"vibench: {unbroken(scheduler)}: {warning}\n")
+    if scheduler is not None:
+        _warn_of_open_scheduler(scheduler, executor)
     folder = out or Path("runs") / loaded.name
-    options = Options(jobs or provenance.cores(), fresh, retry, executor, scheduler)
+    options = Options(jobs, fresh, retry, executor, scheduler)
     with ProgressDisplay(new_console()) as progress:
         outcome = run_study(loaded, folder, progress, options)
     path = tables.results_file(str(folder))
@@ -153,13 +148,23 @@ def run(
 
         figures.remove(folder / "figures")
     if draw:
-        result_commands.draw(path, folder / "figures", options.jobs)
+        result_commands.draw(path, folder / "figures", options.workers)
     statuses = [row["status"] for row in outcome.rows]
     run_summary.next_steps(folder, len(statuses), len(statuses) - statuses.count(Status.OK), figures=draw)
     if strict and any(status not in (Status.OK, Status.UNAVAILABLE) for status in statuses):
         raise typer.Exit(1)
     if set(statuses) == {Status.UNAVAILABLE}:
         raise VibenchError("no cell could run here: what all of them need is not installed")
+
+
+def _warn_of_open_scheduler(scheduler: str, executor: str) -> None:
+    from vibench.execution.dask import is_authenticated
+
+    if executor != "dask":
+        raise RequestError(f"--scheduler {scheduler} is for --executor dask")
+    if not is_authenticated(scheduler):
+        warning = "the connection is not authenticated: others who reach the scheduler can run code on its workers"
+        sys.stderr.write(f"vibench: {unbroken(scheduler)}: {warning}\n")
 
 
 def _study(request: str, key: str, overrides: dict[str, list[Any]]) -> Study:

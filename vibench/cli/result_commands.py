@@ -53,7 +53,7 @@ def write_report(
     run: RunArgument, out: Annotated[Path | None, Option(help="HTML file; RUN/report.html by default.")] = None
 ) -> None:
     """Write the report of a run as one HTML page."""
-    from vibench.execution.run import REPORT
+    from vibench.execution.run_folder import REPORT
     from vibench.report import html
     from vibench.results import tables
 

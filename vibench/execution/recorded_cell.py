@@ -17,7 +17,6 @@ from vibench.errors import RequestError
 from vibench.execution.graph import Graph
 from vibench.execution.supervisor import Job, Supervisor
 from vibench.interfaces.problem import VariationalInequality
-from vibench.interfaces.validation import validation_parameters
 from vibench.results import tables
 from vibench.results.database import read_meta, read_rows, study_of
 from vibench.results.tables import results_file
@@ -73,7 +72,7 @@ class RecordedCell:
     @cached_property
     def parameters(self) -> Array:
         """The validation parameters (queries×d)."""
-        return validation_parameters(self.model.problem, self.cell.validation, self.cell.seed)
+        return assembly_stage(self.cell).parameters(self.model.problem)
 
     def program(self, query: int) -> VariationalInequality:
         """The reduced quadratic program of one query, exactly as it was solved."""

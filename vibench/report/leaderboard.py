@@ -80,9 +80,9 @@ class Standings:
     ----------
     problem, options
         Label of the problem and its options as JSON, as the cells table has them.
-    cells, unstable, incomplete, loose, inexact
-        Number of its cells, and of those that take no part: since the inf-sup constant β over the span vanishes at a
-        parameter, so that the multiplier is not unique there; since a query is not ok; since the QP solver makes too
+    cells, incomplete, unstable, loose, inexact
+        Number of its cells, and of those that take no part: since a query is not ok; since the inf-sup constant β over
+        the span vanishes at a parameter, so that the multiplier is not unique there; since the QP solver makes too
         large a share of the error; and since a mean error is above `LARGEST_BAND` or unknown.
     """
 
@@ -90,8 +90,8 @@ class Standings:
     options: str
     bands: tuple[Band, ...]
     cells: int
-    unstable: int
     incomplete: int
+    unstable: int
     loose: int
     inexact: int
 
@@ -114,19 +114,33 @@ def leaderboard(cells: pd.DataFrame) -> tuple[Standings, ...]:
     return tuple(_standings(str(problem), str(options), mine) for (problem, options), mine in groups)
 
 
+def eligible(cells: pd.DataFrame) -> pd.Series:
+    """Which rows of the cells table take part in a leaderboard; `Standings` says why the others do not."""
+    return ~_excluded(cells).any(axis=1)
+
+
 def _standings(problem: str, options: str, cells: pd.DataFrame) -> Standings:
-    error = cells[list(ERRORS)].astype(float).max(axis=1, skipna=True)
-    incomplete = cells["status"] != Status.OK
-    unstable = ~incomplete & (cells["beta_span_min"].astype(float) < VANISHES)
-    loose = ~incomplete & ~unstable & solved_too_loosely(cells)
-    inexact = ~incomplete & ~unstable & ~loose & ~(error <= LARGEST_BAND)
-    counts = {
-        "cells": len(cells), "unstable": int(unstable.sum()), "incomplete": int(incomplete.sum()),
-        "loose": int(loose.sum()), "inexact": int(inexact.sum()),
-    }  # fmt: skip
-    taking_part = ~(incomplete | unstable | loose | inexact)
-    known = cells.assign(**{COLUMNS[Criterion.ERROR]: error})[taking_part]
-    return Standings(problem, options, tuple(_distinct(_bands(known))), **counts)
+    excluded = _excluded(cells)
+    known = cells.assign(**{COLUMNS[Criterion.ERROR]: _error(cells)})[~excluded.any(axis=1)]
+    counts = {str(reason): int(count) for reason, count in excluded.sum().items()}
+    return Standings(problem, options, tuple(_distinct(_bands(known))), len(cells), **counts)
+
+
+def _error(cells: pd.DataFrame) -> pd.Series:
+    return cells[list(ERRORS)].astype(float).max(axis=1, skipna=True)
+
+
+def _excluded(cells: pd.DataFrame) -> pd.DataFrame:
+    """Whether a row takes no part, for each reason; a row has the first reason that holds."""
+    reasons = {
+        "incomplete": cells["status"] != Status.OK,
+        "unstable": cells["beta_span_min"].astype(float) < VANISHES,
+        "loose": solved_too_loosely(cells),
+        "inexact": ~(_error(cells) <= LARGEST_BAND),
+    }
+    found = pd.DataFrame(reasons, index=cells.index).astype(bool)
+    earlier = found.astype(int).cumsum(axis=1).shift(1, axis=1, fill_value=0) > 0
+    return found & ~earlier
 
 
 def _bands(cells: pd.DataFrame) -> Iterator[Band]:
