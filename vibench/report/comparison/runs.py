@@ -35,9 +35,11 @@ class ComparedRun:
 
     @cached_property
     def identity(self) -> dict[str, Any]:
-        """Name, seed and number of validation parameters of the study."""
+        """Name and seed of the study, and its validation parameters: their number, or their sampling as JSON."""
         study = study_of(self.path, read_meta(self.path))
-        return {"study": study.get("name"), "seed": study.get("seed"), "validation": study.get("validation")}
+        validation = study.get("validation")
+        shown = validation if isinstance(validation, int) else json.dumps(validation, sort_keys=True)
+        return {"study": study.get("name"), "seed": study.get("seed"), "validation": shown}
 
     @property
     def ok(self) -> int:
