@@ -136,6 +136,9 @@ class Problem(ABC):
     """Members of `VariationalInequality`, "A", "f", "B" or "g", that do not depend on mu."""
     entrywise: ClassVar[frozenset[str]] = frozenset()
     """Members that `sampler` evaluates entry by entry."""
+    affine: Mapping[str, int] = {}
+    """Members of `entrywise` that are combinations of fixed terms at every mu, with the number of these terms. Their
+    interpolation has no error if it has as many terms; a certificate at online cost relies on it."""
     requires: ClassVar[tuple[str, ...]] = ()
     """Optional distributions it cannot do without; where one is not installed its cells are unavailable."""
 
