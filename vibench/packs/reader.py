@@ -6,6 +6,7 @@ import contextlib
 import hashlib
 import os
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -15,11 +16,11 @@ import scipy.sparse as sp
 
 from vibench.arrays import Array, Indices
 from vibench.errors import NumericalError, RequestError
+from vibench.interfaces.expressions import Expression
 from vibench.interfaces.problem import MEMBERS, ParameterBox
 from vibench.linalg.inner_product import InnerProduct
 from vibench.packs import manifest as schema
 from vibench.packs.array_files import ArrayFiles, memory_limit, safe_path, size_of
-from vibench.packs.expressions import Expression
 from vibench.packs.manifest import FILE, Manifest, read_manifest
 from vibench.packs.members import Affine, Constant, Listed, Listing, PackMember, Table, Theta
 from vibench.packs.pack import ModelPack, PackMesh, Reference
@@ -130,6 +131,8 @@ class _Reader:
         if spaces.integrals is not None:
             integrals = self._files.vector(spaces.integrals, "spaces.integrals")
             self._expect("spaces.integrals", integrals, (m,))
+        if not all(member.everywhere for member in members.values()):
+            box = replace(box, listed=self._listed)
         return ModelPack(
             self._manifest, box, training, validation, V, W, members, self._contact(members, n), integrals,
             None if solutions is None else self._reference(solutions, n, m),

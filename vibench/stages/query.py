@@ -12,7 +12,6 @@ from vibench.arrays import Array
 from vibench.errors import in_a_line
 from vibench.interfaces.problem import ParameterBox, VariationalInequality
 from vibench.interfaces.strategies import Kind
-from vibench.interfaces.validation import validation_parameters
 from vibench.model.error_bounds import Certificate, certify
 from vibench.model.errors import UNMEASURABLE, Errors, Reference, errors
 from vibench.model.hsw_bounds import HSWBounds, hsw_bounds
@@ -108,7 +107,7 @@ class Queries:
 
     def __init__(self, store: Store, assembly: AssemblyStage) -> None:
         self.model, self.note = assembly.model(store)
-        self.mus, self._seed = validation_parameters(self.model.problem, assembly.count, assembly.seed), assembly.seed
+        self.mus, self._seed = assembly.parameters(self.model.problem), assembly.seed
         self.reduced: ReducedPrograms = value_of(store, assembly)
 
     @cached_property

@@ -58,7 +58,8 @@ def draw(path: Path, kind: str, problem: str | None = None, dual: str | None = N
     kind
         A key of `OF_PROBLEM` or `OF_DUAL`.
     problem, dual
-        Label of the problem, and of the dual strategy for a kind of `OF_DUAL`; `None` where there is only one.
+        Label of the problem ("LABEL, TRAINING" where it has several training sets), and of the dual strategy for a kind
+        of `OF_DUAL`; `None` where there is only one.
 
     Raises
     ------
