@@ -24,6 +24,11 @@ class Thetas:
 
     functions: tuple[float | Callable[[Array], float], ...]
 
+    @property
+    def constant(self) -> bool:
+        """Whether all are numbers."""
+        return not any(callable(theta) for theta in self.functions)
+
     def __call__(self, mu: Array) -> Array:
         """Evaluate all at mu (d,)."""
         return np.array([theta(mu) if callable(theta) else theta for theta in self.functions], float)
