@@ -11,6 +11,7 @@ import scipy.sparse as sp
 
 from vibench.arrays import Array, Indices
 from vibench.errors import NumericalError
+from vibench.interfaces.outputs import Output
 from vibench.interfaces.problem import MEMBERS, ParameterBox, VariationalInequality
 from vibench.linalg.inner_product import InnerProduct
 from vibench.packs.manifest import Manifest
@@ -64,6 +65,8 @@ class ModelPack:
         Reference solutions, or `None`.
     mesh
         Data of pictures, or `None`.
+    outputs
+        Quantities of interest.
     """
 
     manifest: Manifest
@@ -77,6 +80,7 @@ class ModelPack:
     integrals: Array | None
     reference: Reference | None
     mesh: PackMesh | None
+    outputs: tuple[Output, ...] = ()
 
     @property
     def constant(self) -> frozenset[str]:

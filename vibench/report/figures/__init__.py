@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 from vibench.errors import RequestError, unknown_name
 from vibench.report.figures.constants import inf_sup, shares
 from vibench.report.figures.convergence import diagnostics, enrichment, orthogonality, projection_errors
-from vibench.report.figures.costs import dimension, total_cost, work_precision
+from vibench.report.figures.costs import dimension, outputs, total_cost, work_precision
 from vibench.report.figures.data import Data, file_names, problems
 from vibench.report.figures.solutions import solutions
 from vibench.report.figures.solvers import precision, solvers
@@ -35,6 +35,7 @@ OF_PROBLEM: dict[str, Drawing] = {
     "solvers": solvers,
     "precision": precision,
     "total-cost": total_cost,
+    "outputs": outputs,
 }
 """Figures of every problem, by the end of their file names."""
 

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 
 from vibench.report.common_queries import on_common_queries
 from vibench.report.figures.data import Data, best_solver, by_dimensions, label
-from vibench.report.figures.style import BLACK, POINTS, Sheet, legend_label, line, plot, style_of
+from vibench.report.figures.style import BLACK, POINTS, Sheet, legend_label, line, plot, positive, style_of
 from vibench.results.break_even import HIGH_FIDELITY, Meaning
 
 ERRORS = {"error_u_mean": "mean relative error of u", "error_lambda_mean": "mean relative error of λ"}
@@ -63,6 +63,28 @@ def _scatter(
             line_of = _front(x[drawn.index].to_numpy(float), drawn[column].to_numpy(float))
             panel.plot(*line_of, color="0.6", linewidth=0.8, drawstyle="steps-post", zorder=0)
         panel.set(xlabel=xlabel, ylabel=ylabel, xscale="log", yscale="log")
+    return sheet.finish()
+
+
+def outputs(data: Data) -> Figure | None:
+    """Errors of every quantity of interest, over its largest value of the training set, against the time of a query."""
+    cells = best_solver(data.cells).set_index("cell", drop=False)
+    mine = data.outputs[data.outputs["cell"].isin(cells.index) & data.outputs["error_scaled_mean"].notna()]
+    if mine.empty:
+        return None
+    names = list(mine["output"].unique())
+    sheet = Sheet(1, len(names), f"{data.problem}, {cells['solver'].iloc[0]}: quantities of interest")
+    kinds = list(dict.fromkeys(zip(cells["primal"], cells["assembly"], strict=True)))
+    duals = list(cells["dual"].unique())
+    for panel, name in zip(sheet.panels, names, strict=True):
+        found = mine[mine["output"] == name]
+        for (primal, assembly, dual), one in found.groupby(["primal", "assembly", "dual"]):
+            point = _point(kinds.index((primal, assembly)), duals.index(dual))
+            seconds = 1e3 * cells.loc[one["cell"], "online_s"].to_numpy(float)
+            text = legend_label(f"{label(primal, None, assembly)}, {dual}")
+            panel.plot(seconds, positive(one["error_scaled_mean"]), label=text, **point)
+        panel.set(xlabel="mean time of a query [ms]", ylabel="mean error over the scale", title=str(name))
+        panel.set(xscale="log", yscale="log")
     return sheet.finish()
 
 

@@ -13,7 +13,7 @@ import pandas as pd
 
 from vibench.results import pictures, tables
 
-TABLES = ("cells", "queries", "histories", "thresholds")
+TABLES = ("cells", "queries", "histories", "thresholds", "outputs")
 
 PAIR = ["pod_tol", "pod_size", "dual_tol", "dual_size"]
 """Tolerances or prescribed sizes that determine the dimensions (N, R)."""
@@ -36,6 +36,7 @@ class Data:
     queries: pd.DataFrame
     histories: pd.DataFrame
     thresholds: pd.DataFrame
+    outputs: pd.DataFrame
     pictures: tuple[pictures.Shown, ...]
 
     def of_dual(self, dual: str) -> Data:
