@@ -38,6 +38,7 @@ class Pack(Problem):
         self.parameters, self.V, self.W = pack.box, pack.V, pack.W
         # Declared by classes of other problems; here by what the folder holds.
         self.constant, self.entrywise = pack.constant, pack.entrywise  # type: ignore[misc]
+        self.affine = pack.affine
 
     @classmethod
     def data_digest(cls, **options: Any) -> str:

@@ -76,7 +76,7 @@ def check_plugin(
         list[str] | None,
         Option(metavar="KEY=VALUE", help="Option of the plugin (repeatable).", autocompletion=plugin_options),
     ] = None,
-    seconds: Annotated[float, Option(min=0.0, help="Time limit of all checks; a slow plugin gets fewer.")] = SECONDS,
+    seconds: Annotated[float, Option(min=0.0, help="Time limit for all checks; a slow plugin gets fewer.")] = SECONDS,
 ) -> None:
     """Check a plugin: shapes, signs, tolerances, repetition, time.
 

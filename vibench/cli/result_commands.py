@@ -53,7 +53,7 @@ def write_report(
     run: RunArgument, out: Annotated[Path | None, Option(help="HTML file; RUN/report.html by default.")] = None
 ) -> None:
     """Write the report of a run as one HTML page."""
-    from vibench.execution.run import REPORT
+    from vibench.execution.run_folder import REPORT
     from vibench.report import html
     from vibench.results import tables
 
@@ -93,29 +93,65 @@ def draw(path: Path, folder: Path, jobs: int) -> None:
     echo(f"{len(drawn)} figures: {folder}")
 
 
-def compare_runs(
+LimitOption = Annotated[float, Option(min=1.0, help="Factor by which a number may get worse.")]
+
+
+def diff_runs(
     a: Annotated[
         str, Argument(metavar="A", help="The earlier run: a folder, or its name in runs/.", autocompletion=runs)
     ],
     b: Annotated[str, Argument(metavar="B", help="The later run.", autocompletion=runs)],
-    limit: Annotated[float, Option(min=1.0, help="Factor by which a number may get worse.")] = 1.25,
+    limit: LimitOption = 1.25,
     form: FormOption = "terminal",
 ) -> None:
-    """Compare two runs; exit code 1 if a number got worse."""
-    from vibench.report import compare
+    """List changes between two runs; exit code 1 on a regression."""
+    from vibench.report.comparison.compare import compare
     from vibench.results import tables
-    from vibench.terminal.console import print_frame
+    from vibench.terminal import comparison
 
-    found = compare.compare(tables.results_file(a), tables.results_file(b), limit)
-    if form != "terminal":
-        sys.stdout.write(tables.FORMS[form](found.changes))
+    found = compare([tables.results_file(a), tables.results_file(b)], limit)
+    if form == "terminal":
+        comparison.print_changes(found, limit)
     else:
-        if len(found.changes):
-            print_frame(found.changes, f"{a} → {b}")
-        last = f"{len(found.changes)} changes beyond a factor of {limit:g}, {found.regressions} for the worse"
-        echo(*found.notes, last)
+        sys.stdout.write(tables.FORMS[form](found.changes))
     if found.regressions:
         raise Exit(1)
+
+
+def compare_runs(
+    run: Annotated[
+        list[str],
+        Argument(metavar="RUN…", help="Run folders or results files; the first is the reference.", autocompletion=runs),
+    ],
+    limit: LimitOption = 1.25,
+    table: Annotated[
+        Literal["changes", "columns", "runs", "cells"] | None,
+        Option(help="Print one table: changes, what moved by column, the runs, or cells that only some runs have."),
+    ] = None,
+    column: Annotated[str, Option(metavar="NAME", help="Print a column of the cells in every run.")] = "",
+    form: FormOption = "terminal",
+) -> None:
+    """Compare runs: what is equal, what moved, and by how much.
+
+    Numbers are compared with the first run, seconds with the first run of the same machine.
+    """
+    from vibench.report.comparison.compare import compare
+    from vibench.results import tables
+    from vibench.terminal import comparison
+    from vibench.terminal.console import print_frame
+
+    found = compare([tables.results_file(one) for one in run], limit)
+    if column:
+        title, frame = f"{column} of the cells", found.values(column)
+    elif table is None and form == "terminal":
+        comparison.print_comparison(found, limit)
+        return
+    else:
+        title, frame = table or "changes", found.table(table or "changes")
+    if form == "terminal":
+        print_frame(frame, title, comparison.PRIORITY, rest=comparison.REST)
+    else:
+        sys.stdout.write(tables.FORMS[form](tables.whole_numbers(frame)))
 
 
 def replay_query(

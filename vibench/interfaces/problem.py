@@ -5,6 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import Any, ClassVar
 
 import numpy as np
@@ -12,6 +13,7 @@ import scipy.sparse as sp
 
 from vibench.arrays import Array, Indices, SparseMatrix
 from vibench.errors import RequestError, unknown_name
+from vibench.interfaces.affine import AffineSum
 from vibench.interfaces.outputs import Output
 from vibench.linalg.inner_product import InnerProduct
 
@@ -163,6 +165,11 @@ class Problem(ABC):
     """Inner product of the multiplier space, X_W (m×m), in a basis whose nonnegative coefficients are the cone W⁺."""
     constant: ClassVar[frozenset[str]] = frozenset()
     """Members of `VariationalInequality`, "A", "f", "B" or "g", that do not depend on mu."""
+    affine: Mapping[str, AffineSum] = MappingProxyType({})
+    """Members that are sums Σ_q θ_q(mu) · terms_q, by name; reduced assembly projects the terms and is exact.
+
+    `affine["A"].terms` and `affine["A"].coefficients(mu)` are the terms and θ(mu), as for bounds of the coercivity.
+    """
     entrywise: ClassVar[frozenset[str]] = frozenset()
     """Members that `sampler` evaluates entry by entry."""
     requires: ClassVar[tuple[str, ...]] = ()

@@ -12,10 +12,10 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import pandas as pd
 
-from vibench import provenance
-from vibench.errors import RequestError, unknown_name
+from vibench.errors import unknown_name
 from vibench.execution.recorded_cell import recorded_cell
-from vibench.execution.run import REPORT, Observer, Options, run_study
+from vibench.execution.run import Observer, Options, run_study
+from vibench.execution.run_folder import REPORT
 from vibench.library.models import Model
 from vibench.results import tables
 from vibench.results.columns import TABLES
@@ -199,9 +199,11 @@ def run(
         Remove earlier results of the study and compute everything again.
     retry
         Also redo cells that did not end ok.
-    executor, scheduler
-        Where the work is done: processes of this machine, or a dask cluster and the address of its scheduler; without
-        an address a cluster is started, for which a script needs the guard `if __name__ == "__main__"`.
+    executor
+        Where the work is done: "local" for processes of this machine, "dask" for a dask cluster.
+    scheduler
+        Address of the scheduler of an existing dask cluster; without one a cluster is started on this machine, for
+        which a script needs the guard `if __name__ == "__main__"`.
     observer
         Follows the run, in place of the progress display.
     progress
@@ -210,16 +212,14 @@ def run(
     Raises
     ------
     RequestError
-        If the folder or the cache cannot be used.
+        If the folder or the cache cannot be used, or there would be too many worker processes.
     StorageError
         If something cannot be written; what was written before is kept.
     KeyboardInterrupt
         On Ctrl-C: what is finished is written, and the same call continues the run.
     """
     folder = Path("runs") / study.name if out is None else Path(out)
-    if jobs < 0:
-        raise RequestError(f"jobs is {jobs}, expected a number of processes, or 0 for one per core")
-    options = Options(jobs or provenance.cores(), fresh, retry, executor, scheduler)
+    options = Options(jobs, fresh, retry, executor, scheduler)
     with _following(observer, progress) as following, _interrupts_as_before():
         outcome = run_study(study, folder, following, options)
     if outcome.interrupted:

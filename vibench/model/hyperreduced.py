@@ -19,7 +19,7 @@ from vibench.model.galerkin import ReducedModel, ReducedProblem
 from vibench.reduction.supremizers import ContactCoordinates, Coordinates, SpannedCoordinates, supremizers
 
 Samples = Mapping[str, Array]
-"""Values θ of the sampled entries at one parameter, by member."""
+"""Coefficients θ of the terms at one parameter, by member."""
 
 
 @dataclass(frozen=True)
@@ -81,6 +81,8 @@ class Operators:
     ----------
     sampled_entries
         Entries of the members that are evaluated at a parameter: rows and columns by member.
+    affine
+        Members whose coefficients are those of `Problem.affine`.
     A, f
         Stiffness (d×d) and load (d,) on Φ.
     g
@@ -100,6 +102,7 @@ class Operators:
     """
 
     sampled_entries: Mapping[str, tuple[Indices, Indices]]
+    affine: tuple[str, ...]
     A: ProjectedMember
     f: ProjectedMember
     g: ProjectedMember | None
@@ -136,6 +139,7 @@ def hyper_reduce(model: ReducedModel, members: Mapping[str, AffineMember]) -> Op
     dual_is_regular = A.constant and coordinates is None and A.shape[0] >= count == rank > 0
     return Operators(
         sampled_entries={name: (m.rows, m.columns) for name, m in members.items() if m.way is Evaluation.INTERPOLATED},
+        affine=tuple(name for name, m in members.items() if m.way is Evaluation.AFFINE),
         A=A,
         f=ProjectedMember.of([Z.T @ term for term in members["f"].terms], members["f"]),
         g=None
@@ -188,6 +192,11 @@ class HyperReducedModel:
         entries = self._operators.sampled_entries
         return self.problem.sampler(entries) if entries else lambda _: {}
 
+    def coefficients(self, mu: Array) -> Samples:
+        """The values θ (Q,) at mu (d,) of all members that are sums of terms: declared ones and sampled entries."""
+        declared = {name: self.problem.affine[name].coefficients(mu) for name in self._operators.affine}
+        return {**declared, **self._sampler(mu)}
+
     def assemble(self, mu: Array) -> ReducedProblem:
         """The reduced problem at mu (d,).
 
@@ -216,7 +225,7 @@ class HyperReducedModel:
     def members(self, mu: Array) -> VariationalInequality:
         """A, f, B, g at mu (d,) on Φ, a space that does not depend on mu; B on (η, χ) where Φ has `space`."""
         operators = self._operators
-        samples = self._sampler(mu)
+        samples = self.coefficients(mu)
         contact = self.problem.contact(mu) if operators.B is None or operators.g is None else None
         A, f = operators.A.at(samples.get("A")), operators.f.at(samples.get("f"))
         g = operators.g.at(samples.get("g")) if operators.g is not None else _projected_bound(self.model, contact)

@@ -16,12 +16,12 @@ import scipy.sparse as sp
 
 from vibench.arrays import Array, Indices
 from vibench.errors import NumericalError, RequestError
+from vibench.interfaces.expressions import Expression
 from vibench.interfaces.outputs import Output
 from vibench.interfaces.problem import MEMBERS, ParameterBox
 from vibench.linalg.inner_product import InnerProduct
 from vibench.packs import manifest as schema
 from vibench.packs.array_files import ArrayFiles, memory_limit, safe_path, size_of
-from vibench.packs.expressions import Expression
 from vibench.packs.manifest import FILE, Manifest, read_manifest
 from vibench.packs.members import Affine, Constant, Listed, Listing, PackMember, Table, Theta
 from vibench.packs.pack import ModelPack, PackMesh, Reference

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-import math
 from collections import defaultdict
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from enum import IntEnum
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -24,6 +26,7 @@ from vibench.report.figures.data import (
     problems,
     solved_too_loosely,
 )
+from vibench.report.leaderboard import LARGEST_BAND, Criterion, Standings, eligible, leaderboard
 from vibench.results import invariants, tables
 from vibench.results.solver_agreement import sentence
 from vibench.stability.infsup import VANISHES
@@ -32,60 +35,189 @@ SHARE_ATOL = 1e-8
 """Shares of an inf-sup constant that differ by less are equal up to round-off."""
 
 
+class Weight(IntEnum):
+    """How much a finding says of a run: where only a few are shown, smaller ones come first."""
+
+    ALARM = 0
+    WHOLE_RUN = 1
+    ANSWER = 2
+    COMPARISON = 3
+    DETAIL = 4
+
+
+@dataclass(frozen=True)
+class Finding:
+    """A sentence, what it is about ("" for the whole run), and its weight."""
+
+    subject: str
+    text: str
+    weight: Weight
+
+
+Said = Iterator[tuple[Weight, str]]
+
+
 def findings(path: Path) -> dict[str, list[str]]:
     """Sentences on completeness, stability, errors, costs and solvers by subject, "" for the whole run."""
-    found = defaultdict(list, {"": list(_whole_run(path))})
+    found = defaultdict[str, list[str]](list)
+    for one in all_findings(path):
+        found[one.subject].append(one.text)
+    return dict(found)
+
+
+def all_findings(path: Path) -> list[Finding]:
+    """Every finding of a run, by subject: the whole run, then problem by problem."""
+    found = list(_about("", _whole_run(path)))
     for name, data in problems(path):
+        found += _about(name, _answer(data))
         for title, cells in by_dimensions(best_solver(data.cells)):
             compared = on_common_queries(cells, data.queries)
-            found[f"{name}, {title}"] += [*_stability(cells, compared), *_costs(cells, data.thresholds)]
-        found[f"{name}, enrichments"] += _off_training(data)
-        found[f"{name}, zero solutions"] += _zero_solutions(data)
-        found[f"{name}, solvers"] += _solvers(data)
-    return {subject: sentences for subject, sentences in found.items() if sentences}
+            found += _about(f"{name}, {title}", _stability(cells, compared))
+            found += _about(f"{name}, {title}", _costs(cells, data.thresholds))
+        found += _about(f"{name}, enrichments", _off_training(data))
+        found += _about(f"{name}, zero solutions", _zero_solutions(data))
+        found += _about(f"{name}, solvers", _solvers(data))
+    return found
 
 
-def _whole_run(path: Path) -> Iterator[str]:
+def _about(subject: str, said: Said) -> Iterator[Finding]:
+    return (Finding(subject, text, weight) for weight, text in said)
+
+
+MOST = 10
+"""Findings that a report begins with; the others are folded."""
+
+
+def leading(found: Iterable[Finding], most: int = MOST) -> list[Finding]:
+    """The findings that say most, by weight; of equal weight, every subject has its first one before its second."""
+    before = defaultdict[tuple[Weight, str], int](int)
+    ranked = list[tuple[Weight, int, Finding]]()
+    for one in found:
+        ranked.append((one.weight, before[one.weight, one.subject], one))
+        before[one.weight, one.subject] += 1
+    return [one for *_, one in sorted(ranked, key=lambda entry: entry[:2])][:most]
+
+
+def _whole_run(path: Path) -> Said:
     cells, queries = tables.read(path, "cells"), tables.read(path, "queries")
     ok = int((cells["status"] == Status.OK).sum())
     count, accurate = (int(cells[name].fillna(0).sum()) for name in ("queries", "queries_ok"))
     yield (
-        f"{len(cells)} cells, {ok} with every query ok; {accurate} of {count} queries meet the prescribed accuracy in "
-        "their recomputed KKT residuals."
+        Weight.WHOLE_RUN,
+        f"{_number(len(cells), 'cell')}, {ok} with every query ok; {accurate} of {count} queries meet the prescribed "
+        "accuracy in their recomputed KKT residuals.",
     )
     violated = invariants.violations(queries, cells.set_index("cell")["enrichment_kind"]) if len(queries) else []
     if violated:
-        yield f"{len(violated)} invariants of the inf-sup constants and the error bounds are violated: {violated[0]}."
-    elif len(queries):
-        yield f"The invariants of the inf-sup constants and the error bounds hold in all {len(queries)} queries."
-    agreement = sentence(tables.read(path, "disagreements"))
-    yield f"{agreement[:1].upper()}{agreement[1:]}."
-    if loose := int(solved_too_loosely(cells).sum()):
         yield (
-            f"{loose} cells are not compared with others: their QP solver makes {100.0 * SOLVER_SHARE:.0f} % or more "
-            "of an error (column `solver_share_mean`). A smaller `accuracy` would help."
+            Weight.ALARM,
+            f"{_number(len(violated), 'invariant')} of the inf-sup constants and the error bounds {_are(violated)} "
+            f"violated: {violated[0]}.",
         )
-    if few := int((cells["queries_ok"] < FEWEST * cells["queries"]).sum()):
-        yield f"{few} cells have fewer than half of their queries ok: their errors are not compared with others."
-    if disturbed := int((cells["disturbed"] == 1).sum()):
-        yield f"{disturbed} cells were timed while other processes slowed the machine down (column `disturbed`)."
+    elif len(queries):
+        yield (
+            Weight.WHOLE_RUN,
+            f"The invariants of the inf-sup constants and the error bounds hold in all {len(queries)} queries.",
+        )
+    disagreements = tables.read(path, "disagreements")
+    if agreement := sentence(disagreements, cells["solver"].nunique()):
+        flagged = bool(disagreements["flagged"].sum())
+        yield Weight.ALARM if flagged else Weight.WHOLE_RUN, f"{agreement[:1].upper()}{agreement[1:]}."
+    loose = cells[solved_too_loosely(cells)]
+    if len(loose):
+        yield (
+            Weight.WHOLE_RUN,
+            f"{_number(len(loose), 'cell')} {_are(loose)} not compared with others: the QP solver makes "
+            f"{100.0 * SOLVER_SHARE:.0f} % or more of an error there (column `solver_share_mean`). A smaller "
+            "`accuracy` would help.",
+        )
+    few = cells[cells["queries_ok"] < FEWEST * cells["queries"]]
+    if len(few):
+        yield (
+            Weight.WHOLE_RUN,
+            f"{_number(len(few), 'cell')} {'has' if len(few) == 1 else 'have'} fewer than half of the queries ok: "
+            "such errors are not compared with others.",
+        )
+    disturbed = cells[cells["disturbed"] == 1]
+    if len(disturbed):
+        yield (
+            Weight.WHOLE_RUN,
+            f"{_number(len(disturbed), 'cell')} {'was' if len(disturbed) == 1 else 'were'} timed while other processes "
+            "slowed the machine down (column `disturbed`).",
+        )
 
 
-def _stability(cells: pd.DataFrame, compared: Comparable) -> Iterator[str]:
+def _number(count: int, noun: str) -> str:
+    return f"{count} {noun}{'s' * (count != 1)}"
+
+
+def _are(found: pd.DataFrame | list[Any]) -> str:
+    return "is" if len(found) == 1 else "are"
+
+
+def _answer(data: Data) -> Said:
+    """The fastest query of a problem in the widest and in the narrowest band of the leaderboard."""
+    for standings in leaderboard(data.cells):
+        if not standings.bands:
+            yield Weight.ANSWER, _no_winner(standings)
+        for band in standings.bands[:1] + standings.bands[1:][-1:]:
+            winner = band.winner(Criterion.QUERY)
+            if winner is None:
+                continue
+            cell = winner.cell
+            yield (
+                Weight.ANSWER,
+                f"Of {_number(band.cells, 'cell')} with mean errors of at most {_share(band.error)}, the fastest query "
+                f"is that of {_way(cell)}, {_sizes(cell)}: {_milliseconds(winner.value)}, with mean errors of "
+                f"{_errors(cell)}; a high-fidelity solution takes {_milliseconds(cell['hf_s'])}.",
+            )
+
+
+def _no_winner(standings: Standings) -> str:
+    return (
+        f"None of {_number(standings.cells, 'cell')} is stable over the span, has every query ok and mean errors of at "
+        f"most {_share(LARGEST_BAND)}."
+    )
+
+
+def _way(cell: Any) -> str:
+    return f"{label(cell['primal'], cell['primal_tol'], cell['assembly'])} on the cone of {cell['dual']}"
+
+
+def _sizes(cell: Any) -> str:
+    return f"(N, R) = ({cell['N']:.0f}, {cell['R']:.0f}), {cell['solver']}"
+
+
+def _share(error: float) -> str:
+    return f"{100.0 * error:g} %"
+
+
+def _milliseconds(seconds: float) -> str:
+    return f"{1e3 * seconds:.3g} ms"
+
+
+def _errors(cell: Any) -> str:
+    known = {"u": cell["error_u_mean"], "λ": cell["error_lambda_mean"]}
+    return " and ".join(f"{value:.3g} in {name}" for name, value in known.items() if not pd.isna(value))
+
+
+def _stability(cells: pd.DataFrame, compared: Comparable) -> Said:
     """Effect of the enrichments on the inf-sup constant over the span and on the error of the multiplier."""
     for row in cells[cells["enrichment_kind"] == Kind.NONE].head(1).itertuples():
         if np.isfinite(row.beta_span_min):
             value = "zero" if row.beta_span_min < VANISHES else f"{row.beta_span_min:.3g}"
             yield (
+                Weight.COMPARISON,
                 f"Without enrichment, min β over the span is {value} and min β over the cone at least "
-                f"{row.beta_cone_lower_min:.3g}{_mean_error(row.cell, compared)}."
+                f"{row.beta_cone_lower_min:.3g}{_mean_error(row.cell, compared)}.",
             )
     fixed = cells[(cells["enrichment_kind"] == Kind.FIXED) & np.isfinite(cells["beta_span_min"])]
     for row in fixed.drop_duplicates(PRIMAL).itertuples():
         yield (
+            Weight.COMPARISON,
             f"{label(row.primal, row.primal_tol)} adds {row.enrichment:.0f} vectors, with which min β over the span is "
             f"{row.beta_span_min:.3g}, at every validation parameter at least {100.0 * row.share_validation:.0f} % of "
-            f"the constant of the whole of V{_mean_error(row.cell, compared)}."
+            f"the constant of the whole of V{_mean_error(row.cell, compared)}.",
         )
 
 
@@ -95,70 +227,77 @@ def _mean_error(cell: str, compared: Comparable) -> str:
     return "" if found is None or pd.isna(found) else f"; the mean error of λ is {found:.3g}{compared.over}"
 
 
-def _off_training(data: Data) -> Iterator[str]:
+def _off_training(data: Data) -> Said:
     """Whether the share of the inf-sup constant that holds on the training set holds off it."""
     fixed = data.cells[data.cells["share_training"].notna()].drop_duplicates([*PRIMAL, "dual", "pair"])
     lost = fixed["share_training"] - fixed["share_validation"]
     if lost.max() > SHARE_ATOL:
         worst = fixed.loc[lost.idxmax()]
         yield (
+            Weight.DETAIL,
             f"The share of β over the span in that of the whole of V is smaller at validation parameters than at "
             f"training parameters in {(lost > SHARE_ATOL).sum()} of {len(fixed)} fixed enrichments, at worst "
             f"{worst['share_validation']:.3f} against {worst['share_training']:.3f} "
-            f"({label(worst['primal'], worst['primal_tol'])}, {worst['dual']})."
+            f"({label(worst['primal'], worst['primal_tol'])}, {worst['dual']}).",
         )
     bounded = fixed[fixed["share_guaranteed"].notna()]
     broken = bounded[bounded["share_validation"] < bounded["share_guaranteed"] - SHARE_ATOL]
     if len(bounded):
         yield (
+            Weight.DETAIL,
             f"√(1 − σ²), which bounds this share at training parameters, is not reached at a validation parameter in "
-            f"{len(broken)} of {len(bounded)} fixed enrichments that record σ."
+            f"{len(broken)} of {len(bounded)} fixed enrichments that record σ.",
         )
 
 
-def _zero_solutions(data: Data) -> Iterator[str]:
+def _zero_solutions(data: Data) -> Said:
     """Queries that have no relative error since the high-fidelity u or λ is zero, and how large the reduced one is."""
     for name, symbol in (("u", "u"), ("lambda", "λ")):
         zero = data.queries[data.queries[f"zero_{name}"] == 1]
         if zero.empty:
             continue
         yield (
+            Weight.DETAIL,
             f"{symbol} is zero, at most {UNMEASURABLE:g} of the largest of the training set, at "
             f"{zero['query'].nunique()} of {data.queries['query'].nunique()} validation parameters: it has no relative "
-            "error there, and means are over the other queries."
+            "error there, and means are over the other queries.",
         )
         answered = zero[zero["status"] == Status.OK]
         if len(answered):
             scaled = answered[f"error_{name}_scaled"]
             worst = answered.loc[scaled.idxmax()]
             yield (
+                Weight.DETAIL,
                 f"The reduced {symbol} is at most {scaled.max():.2g} of the largest of the training set there "
                 f"({label(worst['primal'], worst['primal_tol'], worst['assembly'])}, {worst['dual']}, "
-                f"{worst['solver']}), in the median {scaled.median():.2g}."
+                f"{worst['solver']}), in the median {scaled.median():.2g}.",
             )
 
 
-def _costs(cells: pd.DataFrame, thresholds: pd.DataFrame) -> Iterator[str]:
-    """The fastest query among cells whose queries are all ok, and the break-even of its cell."""
-    timed = cells[cells["online_s"].notna() & (cells["queries_ok"] == cells["queries"])]
+def _costs(cells: pd.DataFrame, thresholds: pd.DataFrame) -> Said:
+    """The fastest query among cells of one pair that can win on the leaderboard, and the break-even of its cell."""
+    timed = cells[eligible(cells) & cells["online_s"].notna()]
     if timed.empty:
         return
     row = timed.loc[timed["online_s"].idxmin()]
     name = label(row["primal"], row["primal_tol"], row["assembly"])
     yield (
-        f"The fastest query is that of {name}: {1e3 * row['online_s']:.3g} ms, of which the QP solver takes "
-        f"{1e3 * row['online_solve_s']:.3g} ms; a high-fidelity solution takes {1e3 * row['hf_s']:.3g} ms "
-        f"after a set-up of {1e3 * row['hf_setup_s']:.3g} ms."
+        Weight.COMPARISON,
+        f"The fastest query with mean errors of at most {_share(LARGEST_BAND)} is that of {name}: "
+        f"{_milliseconds(row['online_s'])}, of which the QP solver takes {_milliseconds(row['online_solve_s'])}, with "
+        f"mean errors of {_errors(row)}; a high-fidelity solution takes {_milliseconds(row['hf_s'])} after a set-up of "
+        f"{_milliseconds(row['hf_setup_s'])}.",
     )
     against = thresholds[(thresholds["cell_b"] == row["cell"]) & thresholds["cell_a"].isna()]
     for found in against.itertuples():
-        number = "" if pd.isna(found.benefit_threshold) else f" {math.ceil(found.benefit_threshold)} queries"
+        number = "" if pd.isna(found.benefit_threshold) else " queries"
         interval = tables.interval(found.threshold_low, found.threshold_high)
         within = f", 95 % interval {interval}" if interval else ""
-        yield f"Break-even of {name} against high-fidelity solutions: {found.meaning}{number}{within}."
+        break_even = f"{tables.break_even(found.meaning, found.benefit_threshold)}{number}{within}"
+        yield Weight.COMPARISON, f"Break-even of {name} against high-fidelity solutions: {break_even}."
 
 
-def _solvers(data: Data) -> Iterator[str]:
+def _solvers(data: Data) -> Said:
     """Number of the programs that each solver solved, at each accuracy; median time and mean errors on common ones."""
     several = data.cells["accuracy"].nunique() > 1
     solved = data.queries[data.queries["status"] == Status.OK].groupby(WAY).size()
@@ -171,6 +310,6 @@ def _solvers(data: Data) -> Iterator[str]:
             over = f" over the {common} programs that all solved" if common < asked else ""
             median = f", with a median of {1e3 * shared[way]['solve_s'].median():.3g} ms{over}"
             errors.append(f"{solver} {' and '.join(f'{shared[way][name].mean():.3g}' for name in MEANS.values())}")
-        yield f"{solver} solved {solved.get(way, 0)} of {asked} programs{median}."
+        yield Weight.DETAIL, f"{solver} solved {solved.get(way, 0)} of {asked} programs{median}."
     if len(errors) > 1 and common < solved.max():
-        yield f"Mean errors of u and λ over these {common} programs: {'; '.join(errors)}."
+        yield Weight.DETAIL, f"Mean errors of u and λ over these {common} programs: {'; '.join(errors)}."

@@ -11,11 +11,10 @@ from pathlib import Path
 from typing import Any
 
 from vibench.errors import RequestError, StorageError
-from vibench.locking import locked
 from vibench.qp.status import Status
 from vibench.results.columns import HISTORY_KEYS, STORED, VERSION
 from vibench.results.digests import CREATE, DigestError, Digests
-from vibench.results.sqlite_files import BUSY_SECONDS, DAMAGE, DAMAGED, LOG, code_of, connected_read_only
+from vibench.results.sqlite_files import BUSY_SECONDS, DAMAGE, DAMAGED, code_of, connected_read_only
 from vibench.results.values import UnstorableError, error_row, storable
 from vibench.text import one_line, printable
 
@@ -30,34 +29,9 @@ OF_CELLS = tuple(table for table, columns in STORED.items() if "cell" in columns
 DERIVED = ("thresholds", "disagreements")
 """Tables that every run makes anew from the others."""
 
-LOCK = ".lock"
-"""Lock file in a run folder, held during a run."""
-
 
 class DamagedError(RequestError):
     """A results file that cannot be read: cut off, overwritten, or from a disk that failed."""
-
-
-@contextlib.contextmanager
-def claimed(folder: Path) -> Iterator[None]:
-    """Lock a run folder, which is created if it does not exist.
-
-    Raises
-    ------
-    RequestError
-        If the folder is a file, holds files but no results file, cannot be written, or is locked by another run.
-    """
-    try:
-        if folder.exists() and not folder.is_dir():
-            raise RequestError(f"output folder '{folder}' is a file")
-        known = {LOCK, FILE + DAMAGED, FILE + DAMAGED + LOG}
-        if folder.is_dir() and not (folder / FILE).exists() and {path.name for path in folder.iterdir()} - known:
-            raise RequestError(f"output folder '{folder}' is not empty and holds no {FILE}; choose another with --out")
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise RequestError(f"output folder '{folder}' cannot be written: {error.strerror}") from None
-    with locked(folder / LOCK, busy=f"another run writes into '{folder}'"):
-        yield
 
 
 UNWRITABLE = {

@@ -62,8 +62,10 @@ def disagreement_rows(
     return [keys[programs] | row for programs, found in answers.items() for row in compare(found)]
 
 
-def sentence(disagreements: pd.DataFrame) -> str:
-    """The disagreements table in one sentence."""
+def sentence(disagreements: pd.DataFrame, solvers: int) -> str:
+    """The disagreements table in one sentence; "" for a run of fewer than two solvers, which leaves nothing to say."""
+    if solvers < 2:
+        return ""
     if disagreements.empty:
         return "no two solvers were ok on the same reduced problem"
     pairs, flagged = int(disagreements["queries"].sum()), int(disagreements["flagged"].sum())

@@ -34,7 +34,7 @@ def results_file(run: str) -> Path:
         If there is no results file, or its schema has another version.
     """
     for folder in (Path(run), Path("runs") / run):
-        path = folder if folder.name == FILE else folder / FILE
+        path = folder if folder.is_file() else folder / FILE
         if path.is_file():
             schema = read_meta(path).get("schema")
             if schema != str(VERSION):
@@ -127,7 +127,7 @@ def _shown(frame: pd.DataFrame, name: str, column: Column) -> pd.Series | list[s
     if name == "queries_ok":
         return [f"{fine:.0f}/{count:.0f}" for fine, count in zip(frame[name], frame["queries"], strict=True)]
     if name == "benefit_threshold":
-        return [m if pd.isna(n) else f"{m} {n:.0f}" for n, m in zip(frame[name], frame["meaning"], strict=True)]
+        return [break_even(*row) for row in zip(frame["meaning"], frame[name], strict=True)]
     if name == "threshold_high":
         return [interval(*ends) for ends in zip(frame["threshold_low"], frame[name], strict=True)]
     if column.kind == INTEGER:
@@ -256,6 +256,11 @@ def name_of_cell(row: Mapping[str, Any] | pd.Series) -> str:
     trained = "" if row["training"] == "own" else f" ({row['training']})"
     way = f"{row['problem']}{trained} · {row['dual']} · {row['primal']}{tolerance}"
     return f"{way} · {sizes} · {row['solver']} {row['accuracy']:g}{assembly}"
+
+
+def break_even(meaning: str, number: float | None) -> str:
+    """When one model is cheaper than another, such as "from 203": the one place where the number of it is rounded."""
+    return meaning if pd.isna(number) else f"{meaning} {number:.0f}"
 
 
 def interval(low: float | None, high: float | None) -> str:

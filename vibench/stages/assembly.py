@@ -199,7 +199,7 @@ class AssemblyStage(Stage):
         return {
             "interpolation_tol": self.interpolation,
             "interpolation_error": max((member.error for member in summed.values()), default=0.0),
-            **{f"terms_{name}": len(m.rows) if m.way is Evaluation.INTERPOLATED else 0 for name, m in summed.items()},
+            **{f"terms_{n}": 0 if m.way is Evaluation.CONSTANT else len(m.terms) for n, m in summed.items()},
         }
 
 

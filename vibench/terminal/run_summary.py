@@ -49,7 +49,8 @@ def print_summary(study: str, path: Path, rows: Rows) -> None:
         echo(f"invariant: {len(violations) - REASONS} more like these")
     if len(queries) and not violations:
         echo(f"invariants of the constants and the error bounds hold in all {len(queries)} queries")
-    echo(sentence(tables.read(path, "disagreements")))
+    if agreement := sentence(tables.read(path, "disagreements"), cells["solver"].nunique()):
+        echo(agreement)
 
 
 def failures(not_ok: Rows) -> Iterator[str]:

@@ -201,6 +201,7 @@ CHECKS: tuple[Check[ProblemCase], ...] = (
     Check("independence of mu", assembly.independence, ("determinism",)),
     Check("continuity in mu", assembly.continuity, ("independence of mu",)),
     Check("assembly on the contact", assembly.on_contact, ("determinism",)),
+    Check("affine sums", assembly.affine, ("determinism",)),
     Check("assembly by entries", assembly.by_entries, ("determinism",)),
     Check("pickling", ProblemCase.pickling, ("determinism",)),
     Check(

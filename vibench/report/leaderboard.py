@@ -1,0 +1,173 @@
+"""The leaderboard of a run: who answers a query fastest, costs least offline and errs least, within a stated error."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from vibench.qp.status import Status
+from vibench.report.figures.data import solved_too_loosely
+from vibench.stability.infsup import VANISHES
+
+LARGEST_BAND = 0.1
+"""Mean errors above this are no answer: such cells win nothing, however fast they are."""
+
+ERRORS = ("error_u_mean", "error_lambda_mean")
+
+
+class Criterion(StrEnum):
+    """What is the smallest of the winner; its column of the cells table, but for the error, stands in `COLUMNS`."""
+
+    QUERY = "fastest query"
+    OFFLINE = "fewest offline seconds"
+    ERROR = "smallest error"
+
+
+COLUMNS: Mapping[Criterion, str] = {
+    Criterion.QUERY: "online_s",
+    Criterion.OFFLINE: "offline_s",
+    Criterion.ERROR: "largest_mean_error",
+}
+"""What is compared: CPU seconds of a query, CPU seconds offline, the larger of the mean relative errors of u and λ."""
+
+
+@dataclass(frozen=True)
+class Winner:
+    """A cell with the smallest value among the cells of its problem whose mean errors are within a band.
+
+    Attributes
+    ----------
+    value
+        What is compared, as `COLUMNS` says: seconds, or a relative error.
+    cell
+        The whole row of the cells table, its key under "cell".
+    """
+
+    criterion: Criterion
+    value: float
+    cell: Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class Band:
+    """The winners among the cells whose mean errors of u and λ are both at most `error`, a power of ten.
+
+    Attributes
+    ----------
+    cells
+        Number of cells that the band has.
+    """
+
+    error: float
+    cells: int
+    winners: tuple[Winner, ...]
+
+    def winner(self, criterion: Criterion) -> Winner | None:
+        """Who wins by a criterion; `None` where no cell of the band has a value of it."""
+        return next((one for one in self.winners if one.criterion is criterion), None)
+
+
+@dataclass(frozen=True)
+class Standings:
+    """The leaderboard of one problem: its bands from the largest error to the smallest that is reached.
+
+    Attributes
+    ----------
+    problem, options
+        Label of the problem and its options as JSON, as the cells table has them.
+    cells, incomplete, unstable, loose, inexact
+        Number of its cells, and of those that take no part: since a query is not ok; since the inf-sup constant β over
+        the span vanishes at a parameter, so that the multiplier is not unique there; since the QP solver makes too
+        large a share of the error; and since a mean error is above `LARGEST_BAND` or unknown.
+    """
+
+    problem: str
+    options: str
+    bands: tuple[Band, ...]
+    cells: int
+    incomplete: int
+    unstable: int
+    loose: int
+    inexact: int
+
+
+def leaderboard(cells: pd.DataFrame) -> tuple[Standings, ...]:
+    """The winners of every problem in every band of accuracy, in the order of the cells.
+
+    Parameters
+    ----------
+    cells
+        Rows of the cells table: of one run, or of several that one machine measured, since seconds are compared.
+
+    Returns
+    -------
+    :
+        One leaderboard per problem and options of it; without bands where no cell takes part. Of equal values the
+        first cell wins. A band in which the same cells win as in the next smaller one is left out.
+    """
+    groups = cells.groupby(["problem", "problem_options"], dropna=False, sort=False)
+    return tuple(_standings(str(problem), str(options), mine) for (problem, options), mine in groups)
+
+
+def eligible(cells: pd.DataFrame) -> pd.Series:
+    """Which rows of the cells table take part in a leaderboard; `Standings` says why the others do not."""
+    return ~_excluded(cells).any(axis=1)
+
+
+def _standings(problem: str, options: str, cells: pd.DataFrame) -> Standings:
+    excluded = _excluded(cells)
+    known = cells.assign(**{COLUMNS[Criterion.ERROR]: _error(cells)})[~excluded.any(axis=1)]
+    counts = {str(reason): int(count) for reason, count in excluded.sum().items()}
+    return Standings(problem, options, tuple(_distinct(_bands(known))), len(cells), **counts)
+
+
+def _error(cells: pd.DataFrame) -> pd.Series:
+    return cells[list(ERRORS)].astype(float).max(axis=1, skipna=True)
+
+
+def _excluded(cells: pd.DataFrame) -> pd.DataFrame:
+    """Whether a row takes no part, for each reason; a row has the first reason that holds."""
+    reasons = {
+        "incomplete": cells["status"] != Status.OK,
+        "unstable": cells["beta_span_min"].astype(float) < VANISHES,
+        "loose": solved_too_loosely(cells),
+        "inexact": ~(_error(cells) <= LARGEST_BAND),
+    }
+    found = pd.DataFrame(reasons, index=cells.index).astype(bool)
+    earlier = found.astype(int).cumsum(axis=1).shift(1, axis=1, fill_value=0) > 0
+    return found & ~earlier
+
+
+def _bands(cells: pd.DataFrame) -> Iterator[Band]:
+    """The bands of one problem, from the largest error to the smallest."""
+    error = cells[COLUMNS[Criterion.ERROR]]
+    # An error of 1e-3 belongs to the band 1e-3: its logarithm may be above -3 by round-off.
+    digits = np.ceil(np.log10(error.clip(lower=np.finfo(float).tiny)) - 1e-12)
+    for digit in sorted(set(digits), reverse=True):
+        mine = cells[digits <= digit]
+        yield Band(10.0**digit, len(mine), tuple(_winners(mine)))
+
+
+def _winners(cells: pd.DataFrame) -> Iterator[Winner]:
+    for criterion, column in COLUMNS.items():
+        values = cells[column].astype(float)
+        if values.notna().any():
+            best = values.idxmin()
+            yield Winner(criterion, float(values[best]), cells.drop(columns=COLUMNS[Criterion.ERROR]).loc[best])
+
+
+def _distinct(bands: Iterable[Band]) -> Iterator[Band]:
+    """Bands without those whose winners are also those of the next smaller one."""
+    found = list(bands)
+    for k, band in enumerate(found):
+        if k + 1 == len(found) or _keys(band) != _keys(found[k + 1]):
+            yield band
+
+
+def _keys(band: Band) -> list[tuple[Criterion, str]]:
+    return [(one.criterion, str(one.cell["cell"])) for one in band.winners]
