@@ -14,6 +14,7 @@ from .interfaces.affine import AffineSum as AffineSum
 from .interfaces.affine_problem import AffineProblem as AffineProblem
 from .interfaces.figures import FigurePlugin as FigurePlugin
 from .interfaces.figures import ProblemTables as ProblemTables
+from .interfaces.outputs import Output as Output
 from .interfaces.problem import MEMBERS as MEMBERS
 from .interfaces.problem import Contact as Contact
 from .interfaces.problem import ParameterBox as ParameterBox

@@ -15,6 +15,7 @@ from vibench.interfaces.strategies import Kind
 from vibench.model.error_bounds import Certificate, certify
 from vibench.model.errors import UNMEASURABLE, Errors, Reference, errors
 from vibench.model.hsw_bounds import HSWBounds, hsw_bounds
+from vibench.model.output_errors import output_errors
 from vibench.qp.accuracy_bounds import slack
 from vibench.qp.exact import ExactSolution
 from vibench.qp.repeats import in_units, nearby, units
@@ -214,6 +215,9 @@ def error_columns(
         strict=True,
     )
     rows = [_columns(*one) for one in found]
+    compared = (u, lam), (reference.u, reference.lam), reference.scale_outputs
+    for row, of_query in zip(rows, output_errors(problem.outputs, mus, *compared), strict=True):
+        row["outputs"] = of_query
     norms = zip(problem.V.norm(reference.u), problem.W.norm(reference.lam), strict=True)
     for row, (x, alpha), program, (norm_u, norm_lam) in zip(rows, solutions, exact, norms, strict=True):
         if program is None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -118,10 +117,7 @@ def _boards(runs: Sequence[PublishedRun]) -> Iterator[tuple[str, tuple[Standings
     machines = dict.fromkeys(machine for run in runs for machine in run.run.machines)
     for machine in machines:
         rows = [
-            row | {"run": run.run.name}
-            for run in runs
-            for row in run.run.cells.values()
-            if row["machine"] == machine
+            row | {"run": run.run.name} for run in runs for row in run.run.cells.values() if row["machine"] == machine
         ]
         yield machine, leaderboard(pd.DataFrame(rows))
 
