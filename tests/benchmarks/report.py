@@ -15,7 +15,7 @@ import sysconfig
 import time
 from pathlib import Path
 
-sys.path[:0] = [str(Path(__file__).parents[1]), str(Path(__file__).parents[1] / "helpers")]
+sys.path.insert(0, str(Path(__file__).parents[1] / "helpers"))
 
 from browsing import chromium, complaints, look
 from many_cells import write_many

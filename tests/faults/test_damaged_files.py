@@ -16,7 +16,7 @@ from samples import write_study
 
 from vibench.errors import RequestError
 from vibench.execution import run  # noqa: F401  lists the classes of all stages
-from vibench.report import compare
+from vibench.report.comparison.compare import compare
 from vibench.results import tables
 from vibench.results.columns import STORED
 from vibench.results.database import FILE, ResultsDatabase, read_meta, read_rows, study_of
@@ -114,7 +114,7 @@ def test_damage_of_a_results_file_is_found_or_has_no_effect(
         assert found == original
         harmless += 1
         if harmless < 4:
-            changes = compare.compare(made / "out" / FILE, results, 1.0).changes
+            changes = compare([made / "out" / FILE, results], 1.0).changes
             assert not len(changes)
     assert len(lines) > 50
     assert all(line.isprintable() and str(results.parent) in line for line in lines)
@@ -162,6 +162,7 @@ def test_commands_refuse_a_damaged_cell_by_its_name(results: Path, main: Main) -
         ("show", folder, "--table", "queries", "--format", "json"),
         ("report", folder),
         ("diff", folder, folder),
+        ("compare", folder, folder),
         ("replay", folder, cell),
         ("export-qps", folder, "set"),
     ):
@@ -188,7 +189,7 @@ def test_a_resumed_run_computes_damaged_cells_again(made: Path, results: Path, v
         done = vibench(results.parent.parent, "run", "study.toml", "--jobs", "1", "--out", "run")
     assert done.returncode == 0, done.stderr
     assert f"computed again, as their rows were damaged: {first}, {second}" in done.stdout
-    changes = compare.compare(made / "out" / FILE, results, 1.0 + 1e-9).changes
+    changes = compare([made / "out" / FILE, results], 1.0 + 1e-9).changes
     assert not len(changes[~changes["what"].str.contains(r"_s$|benefit|threshold")])
     everything(results)
 

@@ -15,12 +15,12 @@ from running import seal
 
 from vibench.cli.result_commands import export_qps, replay_query, show, write_report
 from vibench.errors import NumericalError, RequestError
-from vibench.execution.run import REPORT
+from vibench.execution.run_folder import LOCK, REPORT, claimed
 from vibench.files import write_atomically
 from vibench.locking import locked
 from vibench.report import figures
 from vibench.results import tables
-from vibench.results.database import FILE, LOCK, claimed
+from vibench.results.database import FILE
 from vibench.storage import artefacts
 from vibench.storage.artefacts import CACHE_VARIABLE, SUFFIX, Artefact, Store, usable_store
 from vibench.timing import NO_TIME

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import copy
 import importlib.util
+import inspect
 import io
 import json
 import pkgutil
@@ -23,12 +24,14 @@ from pydantic import BaseModel
 from running import Main, Vibench, rows
 from samples import toml
 
+import vibench
 from vibench.cli.main import app
 from vibench.errors import RequestError
 from vibench.results import columns, tables
+from vibench.study.entries import Entry, ProblemEntry, SamplingEntry
 from vibench.study.reader import read_study
 from vibench.study.registry import GROUPS
-from vibench.study.spec import Entry, Limits, Study, ToleranceTable
+from vibench.study.spec import Limits, Study, ToleranceTable
 
 ROOT = Path(__file__).parents[2]
 DOCS = ROOT / "docs"
@@ -120,7 +123,7 @@ def test_the_plugins_of_the_pages_run_through_the_whole_benchmark(
     assert done.returncode == 0, done.stderr
     assert "invariants of the constants and the error bounds hold in all" in done.stdout
     cells = rows(tmp_path / "runs" / "mine")
-    assert len(cells) == 2 * 2 * 4 * 2
+    assert len(cells) == 3 * 2 * 4 * 2
     assert {(cell["status"], cell["reason"]) for cell in cells} == {("ok", "")}
     assert {cell["primal"]: cell["enrichment_kind"] for cell in cells} == {
         "centre": "fixed",
@@ -129,7 +132,7 @@ def test_the_plugins_of_the_pages_run_through_the_whole_benchmark(
         "unconstrained": "per-parameter",
     }
     for cell in cells:
-        can_be_reduced = cell["problem"] == "separable-cable" and cell["primal"] != "unconstrained"
+        can_be_reduced = cell["problem"] != "cable" and cell["primal"] != "unconstrained"
         assert (cell["fallbacks"] == "") is can_be_reduced, cell
         assert cell["beta_span_min"] > 0.0
     assert sum(row["flagged"] for row in rows(tmp_path / "runs" / "mine", "disagreements")) == 0
@@ -150,7 +153,9 @@ def test_seconds_are_in_seconds(name: str) -> None:
 @pytest.mark.parametrize("table", ["cells", "thresholds"])
 def test_the_tables_for_reading_have_the_columns_that_are_described(table: str, reference: ModuleType) -> None:
     zero = {name: [0, 1] for name in ("queries_zero_u", "queries_zero_lambda") if table == "cells"}
-    several = pd.DataFrame({"accuracy": [1e-7, 1e-10], **zero})  # with one for all, or none, they have no columns
+    several = pd.DataFrame(
+        {"accuracy": [1e-7, 1e-10], "training": ["own", "another"], **zero}
+    )  # with one for all, or none, they have no columns
     empty = several.reindex(columns=list(columns.STORED[table])).astype({"accuracy": float})
     name, view = {"cells": ("summary", tables.summary), "thresholds": ("benefits", tables.benefits)}[table]
     headings = re.findall(r"^\| (?!column|---)([^|]+?) \|", reference.GENERATED[name](), re.MULTILINE)
@@ -158,7 +163,7 @@ def test_the_tables_for_reading_have_the_columns_that_are_described(table: str, 
     assert len(headings) == len(set(headings)) > 10
 
 
-@pytest.mark.parametrize("model", [Study, ToleranceTable, Entry, Limits])
+@pytest.mark.parametrize("model", [Study, ToleranceTable, Entry, ProblemEntry, SamplingEntry, Limits])
 def test_every_field_of_a_study_file_is_described_and_in_the_reference(
     model: type[BaseModel], reference: ModuleType
 ) -> None:
@@ -211,12 +216,21 @@ def test_there_are_rules() -> None:
     assert len(RULES) >= 5
 
 
-def test_the_page_on_python_prints_what_it_says(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(
+    ("page", "texts", "written"),
+    [
+        ("library.md", 11, {"runs", "tables", "decision.html", "inf-sup.svg"}),
+        ("tolerances.md", 2, {"runs"}),
+    ],
+)
+def test_a_page_prints_what_it_says(
+    page: str, texts: int, written: set[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Its examples build on each other; what one prints is in the block that follows it."""
     monkeypatch.chdir(tmp_path)
-    page, names = blocks(DOCS / "library.md"), dict[str, Any]()
+    parts, names = blocks(DOCS / page), dict[str, Any]()
     compared = 0
-    for (language, _, code), (following, _, text) in pairwise([*page, ("", "", "")]):
+    for (language, _, code), (following, _, text) in pairwise([*parts, ("", "", "")]):
         if language != "python":
             continue
         with contextlib.redirect_stdout(io.StringIO()) as printed:
@@ -224,8 +238,32 @@ def test_the_page_on_python_prints_what_it_says(tmp_path: Path, monkeypatch: pyt
         if following == "text":
             assert printed.getvalue().endswith(text), code
             compared += 1
-    assert compared > 7
-    assert {file.name for file in tmp_path.iterdir()} == {"runs", "tables", "decision.html", "inf-sup.svg"}
+    assert compared == texts
+    assert {file.name for file in tmp_path.iterdir()} == written
+
+
+def test_the_api_reference_has_every_public_name_once() -> None:
+    listed = re.findall(r"^::: vibench\.(\w+)$", (DOCS / "api.md").read_text(encoding="utf-8"), re.MULTILINE)
+    assert sorted(listed) == sorted(vibench.__all__)
+
+
+def _described(docstring: str) -> list[str]:
+    """Names under "Parameters" in a docstring."""
+    section = re.search(r"^Parameters\n-+\n(.*?)(?=^\w+\n-+$|\Z)", docstring, re.MULTILINE | re.DOTALL)
+    heads = re.findall(r"^(\S.*)$", section[1], re.MULTILINE) if section else []
+    return [name.strip() for head in heads for name in head.split(",")]
+
+
+CALLABLE = [
+    name for name in vibench.__all__ if inspect.isfunction(thing := getattr(vibench, name)) or inspect.isclass(thing)
+]
+
+
+@pytest.mark.parametrize("name", CALLABLE)
+def test_described_parameters_exist(name: str) -> None:
+    thing = getattr(vibench, name)
+    described = _described(inspect.getdoc(thing) or "")
+    assert set(described) <= (set(inspect.signature(thing).parameters) if described else set())
 
 
 def test_the_script_of_the_readme_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -21,12 +21,12 @@ def export_reduced_model(
     file: Annotated[Path, Argument(metavar="FILE", help="A new file, whose name ends in .npz.")],
     interpolate: Annotated[
         float | None,
-        Option(metavar="TOL", help="Relative error of polynomials in place of A, f, B, g; 1e-11 by default."),
+        Option(metavar="TOL", help="Allowed error of the polynomials that replace members; 1e-11 by default."),
     ] = None,
     evaluations: Annotated[
-        int, Option(min=16, help="Parameters at which these are evaluated, at most, on one grid.")
+        int, Option(min=16, help="Largest number of parameters at which a member is evaluated.")
     ] = 4096,
-    bases: Annotated[bool, Option("--bases/--no-bases", help="With the bases that give u and λ.")] = True,
+    bases: Annotated[bool, Option("--bases/--no-bases", help="Include the bases that reconstruct u and λ.")] = True,
     c: Annotated[bool, Option("--c", help="Also write a C99 source, under the same name.")] = False,
 ) -> None:
     """Export a reduced model for use without vibench."""

@@ -16,22 +16,21 @@ from vibench.execution.dask import Dask
 from vibench.execution.executors import Executor, Local
 from vibench.execution.graph import Graph
 from vibench.execution.result_writer import ResultWriter, labels_of
+from vibench.execution.run_folder import LOG, claimed, clear
 from vibench.execution.supervisor import Job
 from vibench.execution.timing_plan import TimingPlan
 from vibench.provenance import solver_distribution
 from vibench.qp.solve import installed_solvers
 from vibench.qp.status import Status
 from vibench.results.break_even import break_even_rows
-from vibench.results.database import FILE, DamagedError, ResultsDatabase, claimed, read_meta, study_of
+from vibench.results.database import ResultsDatabase
 from vibench.results.solver_agreement import disagreement_rows
-from vibench.results.sqlite_files import DAMAGED, set_aside
-from vibench.results.tables import EXPORTED
 from vibench.stages.base import Done, Failed, Stage, Unstored
 from vibench.stages.cell_queries import CellRows, cell_queries
 from vibench.stages.pictures import PictureStage
 from vibench.storage.artefacts import Store, usable_store
 from vibench.study import registry
-from vibench.study.cells import Cell, expand
+from vibench.study.cells import Cell, Plugin, expand
 from vibench.study.spec import Study
 
 CHECK_INTERVAL = 5.0
@@ -39,12 +38,6 @@ CHECK_INTERVAL = 5.0
 
 JOBS_PER_CORE = 16
 """Most worker processes per core: more than one makes a run slower, and thousands stop the machine."""
-
-REPORT = "report.html"
-"""File in the run folder that `vibench report` writes unless told otherwise."""
-
-LOG = "workers.log"
-"""File in the run folder for the output of plugins and solvers."""
 
 
 @dataclass(frozen=True)
@@ -95,7 +88,9 @@ class Outcome:
 
 def identity(study: Study) -> dict[str, Any]:
     """The settings that all numbers of a study depend on; a run folder holds results of one identity only."""
-    return {"name": study.name, "seed": study.seed, "validation": study.validation}
+    known = study.validation
+    validation = known if isinstance(known, int) else known.model_dump(mode="json", exclude={"label"})
+    return {"name": study.name, "seed": study.seed, "validation": validation}
 
 
 @dataclass(frozen=True)
@@ -105,7 +100,7 @@ class Options:
     Attributes
     ----------
     jobs
-        Worker processes.
+        Worker processes; 0 for one per core.
     fresh
         Remove earlier results of this study and compute all artefacts again.
     retry
@@ -114,13 +109,31 @@ class Options:
         "local" or "dask".
     scheduler
         Address of a dask scheduler; `None` for a cluster on this machine.
+
+    Raises
+    ------
+    RequestError
+        If there would be too many worker processes for this machine.
     """
 
-    jobs: int = 1
+    jobs: int = 0
     fresh: bool = False
     retry: bool = False
     executor: str = "local"
     scheduler: str | None = None
+
+    def __post_init__(self) -> None:
+        cores = provenance.cores()
+        if not 0 <= self.jobs <= JOBS_PER_CORE * cores:
+            expected = (
+                f"at most {JOBS_PER_CORE * cores} worker processes, {JOBS_PER_CORE} per core, or 0 for one per core"
+            )
+            raise RequestError(f"jobs is {self.jobs}, expected {expected}")
+
+    @property
+    def workers(self) -> int:
+        """Number of worker processes."""
+        return self.jobs or provenance.cores()
 
 
 def run_study(study: Study, folder: Path, observer: Observer, options: Options = Options()) -> Outcome:
@@ -140,15 +153,14 @@ def run_study(study: Study, folder: Path, observer: Observer, options: Options =
     Raises
     ------
     RequestError
-        If the folder, the store of artefacts or the executor cannot be used, or there are too many jobs.
+        If the folder, the store of artefacts or the executor cannot be used.
     StorageError
         If something cannot be written; what was written before is kept.
     """
-    _check_jobs(options.jobs)
     cells, store = expand(study), usable_store()
     with claimed(folder), store.used():
         if options.fresh:
-            _clear(folder, study, observer)
+            clear(folder, study.name, observer.note)
         database = ResultsDatabase(folder, identity(study), anew=options.fresh)
         try:
             finished = database.finished()
@@ -167,35 +179,9 @@ def run_study(study: Study, folder: Path, observer: Observer, options: Options =
     return Outcome(rows, len(cells) - len(rows), interrupted, database.damaged)
 
 
-def _check_jobs(jobs: int) -> None:
-    most = JOBS_PER_CORE * provenance.cores()
-    if not 1 <= jobs <= most:
-        raise RequestError(f"--jobs {jobs}: expected 1 to {most} worker processes, {JOBS_PER_CORE} per core")
-
-
 def _to_do(cell: Cell, finished: Mapping[str, tuple[str, str]], retry: bool) -> bool:
     status, code = finished.get(cell.key, (None, None))
     return code != cell.code or (retry and status != Status.OK)
-
-
-def _clear(folder: Path, study: Study, observer: Observer) -> None:
-    """Remove the tables, log and report of a study's earlier run; refuse the folder of another study.
-
-    Nothing else: a user may keep notes beside them. Figures are removed when they are drawn anew. A results file that
-    cannot be read is kept under another name.
-    """
-    path = folder / FILE
-    try:
-        meta = read_meta(path) if path.is_file() else {}
-    except DamagedError as error:
-        set_aside(path)
-        observer.note(f"{error}; it is kept as '{path}{DAMAGED}'")
-        meta = {}
-    there = study_of(path, meta).get("name") if meta else study.name
-    if there != study.name:
-        raise RequestError(f"'{folder}' holds results of the study '{there}'; --fresh removes only '{study.name}'")
-    for name in (LOG, REPORT, *(f"tables/{file}" for file in EXPORTED)):
-        (folder / name).unlink(missing_ok=True)
 
 
 @dataclass
@@ -226,9 +212,12 @@ class _Run:
         try:
             workers = self._workers() if runnable or untimed else None
             self.machines = self.machines if workers is None else workers.machines
+            pictured: dict[Plugin, Stage] = {}  # one training set of a problem is drawn: the first one
+            for cell in cells:
+                pictured.setdefault(cell.problem, PictureStage(cell.problem, cell.training))
             for cell in runnable:
                 self.cells.setdefault(goals[cell].key, []).append(cell)
-                for stage in (goals[cell], PictureStage(cell.problem)):
+                for stage in (goals[cell], pictured[cell.problem]):
                     self.graph.add_goal(stage, self._is_there)
             for group in untimed:
                 self.graph.add_goal(group, self._is_there)
@@ -251,8 +240,8 @@ class _Run:
     def _workers(self) -> Executor:
         options = self.options
         if options.executor == "dask":
-            return Dask(options.scheduler, options.jobs, self.store.folder)
-        return Local(options.jobs, self.folder / LOG)
+            return Dask(options.scheduler, options.workers, self.store.folder)
+        return Local(options.workers, self.folder / LOG)
 
     def _is_there(self, stage: Stage) -> bool:
         """Whether the artefact of a stage can be reused; its histories are recorded if so.
@@ -323,11 +312,10 @@ def unavailable(cell: Cell) -> str:
 
     A name that several packages use is as good as none.
     """
-    plugins = (cell.problem, cell.dual, cell.primal)
-    for kind, name in (*((plugin.kind, plugin.name) for plugin in plugins), ("QP solver", cell.solver)):
+    for kind, name in (*((plugin.kind, plugin.name) for plugin in cell.plugins), ("QP solver", cell.solver)):
         if reason := registry.conflict(kind, name):
             return reason
-    for plugin in plugins:
+    for plugin in cell.plugins:
         missing = registry.missing(plugin.kind, plugin.name)
         if missing:
             what = f"the {plugin.kind} '{plugin.name}' needs {', '.join(missing)}, which is not installed"

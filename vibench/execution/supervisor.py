@@ -1,7 +1,8 @@
 """Stages in worker processes with hard limits: every job has an outcome, even if its process dies or hangs.
 
-A supervisor owns one worker process and talks to it through a socket. It follows what the worker reports, kills it when
-a limit is exceeded, and starts another one. Of a piecewise stage only the current piece is lost.
+A supervisor runs one job at a time, in a worker process for the packages that the job needs, and talks to it through a
+socket. It follows what the worker reports, kills it when a limit is exceeded, and starts another one. Of a piecewise
+stage only the current piece is lost.
 """
 
 from __future__ import annotations

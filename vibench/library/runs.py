@@ -4,18 +4,19 @@ from __future__ import annotations
 
 import signal
 import threading
-from collections.abc import Iterator
+import warnings
+from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import pandas as pd
 
-from vibench import provenance
-from vibench.errors import RequestError, unknown_name
+from vibench.errors import unknown_name
 from vibench.execution.recorded_cell import recorded_cell
-from vibench.execution.run import REPORT, Observer, Options, run_study
+from vibench.execution.run import Observer, Options, run_study
+from vibench.execution.run_folder import REPORT
 from vibench.library.models import Model
 from vibench.results import tables
 from vibench.results.columns import TABLES
@@ -113,11 +114,17 @@ class Run:
         """Write every table as CSV, and the summary as Markdown; into `tables` beside the results file by default."""
         return tables.export(self.path, self.path.parent / "tables" if folder is None else Path(folder))
 
-    def write_figures(self, folder: Path | str | None = None) -> list[Path]:
-        """Write every figure as PNG and SVG; into `figures` beside the results file by default."""
+    def write_figures(
+        self, folder: Path | str | None = None, formats: Sequence[Literal["png", "svg", "pdf"]] = ("png", "svg")
+    ) -> list[Path]:
+        """Write every figure, and their captions; into `figures` beside the results file by default.
+
+        A figure of a plugin that cannot be drawn is a warning.
+        """
         from vibench.report.figures import draw_all  # noqa: PLC0415  loads matplotlib
 
-        return draw_all(self.path, self.path.parent / "figures" if folder is None else Path(folder))
+        target = self.path.parent / "figures" if folder is None else Path(folder)
+        return draw_all(self.path, target, tuple(formats), note=partial(warnings.warn, stacklevel=2))
 
     def report(self, path: Path | str | None = None) -> Path:
         """Write the report, one HTML page; into the folder of the run by default. Returns its path."""
@@ -199,9 +206,11 @@ def run(
         Remove earlier results of the study and compute everything again.
     retry
         Also redo cells that did not end ok.
-    executor, scheduler
-        Where the work is done: processes of this machine, or a dask cluster and the address of its scheduler; without
-        an address a cluster is started, for which a script needs the guard `if __name__ == "__main__"`.
+    executor
+        Where the work is done: "local" for processes of this machine, "dask" for a dask cluster.
+    scheduler
+        Address of the scheduler of an existing dask cluster; without one a cluster is started on this machine, for
+        which a script needs the guard `if __name__ == "__main__"`.
     observer
         Follows the run, in place of the progress display.
     progress
@@ -210,16 +219,14 @@ def run(
     Raises
     ------
     RequestError
-        If the folder or the cache cannot be used.
+        If the folder or the cache cannot be used, or there would be too many worker processes.
     StorageError
         If something cannot be written; what was written before is kept.
     KeyboardInterrupt
         On Ctrl-C: what is finished is written, and the same call continues the run.
     """
     folder = Path("runs") / study.name if out is None else Path(out)
-    if jobs < 0:
-        raise RequestError(f"jobs is {jobs}, expected a number of processes, or 0 for one per core")
-    options = Options(jobs or provenance.cores(), fresh, retry, executor, scheduler)
+    options = Options(jobs, fresh, retry, executor, scheduler)
     with _following(observer, progress) as following, _interrupts_as_before():
         outcome = run_study(study, folder, following, options)
     if outcome.interrupted:

@@ -12,6 +12,9 @@ from vibench.errors import NumericalError
 from vibench.linalg.cholesky import SparseCholesky
 from vibench.linalg.dense import orthonormal_range
 
+SYMMETRY_RTOL = 1e-12
+"""Difference of two entries of a symmetric matrix, relative to its largest entry, that is taken for round-off."""
+
 
 class InnerProduct:
     """The inner product ⟨u, v⟩ = uᵀ X v of a space, X sparse symmetric positive definite.
@@ -88,6 +91,13 @@ class InnerProduct:
         return self.unwhiten(orthonormal_range(self.whiten(u), fixed))
 
 
+def asymmetry(matrix: SparseMatrix) -> float:
+    """Largest difference of an entry of a square matrix from that of its transpose; 0.0 if they differ by round-off."""
+    scale = abs(matrix).max() if matrix.nnz else 0.0
+    off = float(abs(matrix - matrix.T).max()) if matrix.nnz else 0.0
+    return off if off > SYMMETRY_RTOL * scale else 0.0
+
+
 def check_symmetric(matrix: SparseMatrix, name: str) -> None:
     """Raise a `NumericalError` if a matrix is not square, not finite or not symmetric up to round-off."""
     rows, columns = matrix.shape
@@ -95,6 +105,5 @@ def check_symmetric(matrix: SparseMatrix, name: str) -> None:
         raise NumericalError(f"{name} must be square, it is {rows}×{columns}")
     if not np.all(np.isfinite(matrix.data)):
         raise NumericalError(f"{name} has entries that are not finite")
-    scale = abs(matrix).max() if matrix.nnz else 0.0
-    if rows and abs(matrix - matrix.T).max() > 1e-12 * scale:
+    if asymmetry(matrix):
         raise NumericalError(f"{name} is not symmetric")

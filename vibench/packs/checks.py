@@ -14,7 +14,7 @@ from vibench.arrays import Array
 from vibench.errors import NumericalError, RequestError
 from vibench.interfaces.problem import MEMBERS, VariationalInequality
 from vibench.linalg.cholesky import SparseCholesky
-from vibench.linalg.inner_product import InnerProduct
+from vibench.linalg.inner_product import InnerProduct, asymmetry
 from vibench.packs.members import Affine
 from vibench.packs.pack import ModelPack
 from vibench.packs.reader import naming, one_triangle, read_pack
@@ -25,9 +25,6 @@ FACTORISED = 3
 
 PENALTY = 1e10
 """Ratio of the largest to the median diagonal entry of A above which the former penalises Dirichlet unknowns."""
-
-SYMMETRY_RTOL = 1e-12
-"""Largest asymmetry, relative to the largest entry; that of `vibench.linalg`."""
 
 NEGATIVE_RTOL = 1e-8
 """Size of negative entries of λ, relative to its largest one, that count as round-off."""
@@ -78,8 +75,7 @@ def _check_operators(pack: ModelPack) -> None:
     for k, matrix in enumerate(A.arrays):
         what = "operators.A" if len(A.arrays) == 1 else f"operators.A, array {k}"
         one_triangle(matrix, what)
-        off = abs(matrix - matrix.T).max() if matrix.nnz else 0.0
-        if off > SYMMETRY_RTOL * abs(matrix).max():
+        if off := asymmetry(matrix):
             hint = "; rows of Dirichlet unknowns were replaced and their columns kept" if _replaced_rows(matrix) else ""
             raise RequestError(f"{what} is not symmetric: entries differ by {off:.1e}{hint}")
     if all(matrix.nnz == 0 or not np.any(matrix.data) for matrix in B.arrays):
@@ -89,7 +85,7 @@ def _check_operators(pack: ModelPack) -> None:
         if isinstance(member, Affine):
             try:
                 for mu in listed:
-                    member.coefficients(mu)
+                    member.sum.coefficients(mu)
             except NumericalError as error:
                 raise RequestError(f"operators.{name}: {error}") from None
     for mu in listed[np.linspace(0, len(listed) - 1, FACTORISED).round().astype(int)]:

@@ -72,7 +72,7 @@ def page(path: Path, jobs: int = 1) -> str:
     key_length = short_keys(cells["cell"])
     rows = {str(cell): k for k, cell in enumerate(cells["cell"])}
     live = [plot for name, data in known for plot in plots.plots(name, data, rows)]
-    drawn = stills([one for name, data in known for one in _drawings(name, data)], jobs)
+    drawn, undrawable = stills([one for name, data in known for one in _drawings(name, data)], jobs)
     template = _environment().get_template("report.html.j2")
     return template.render(
         study=study.get("name", path.parent.name),
@@ -86,7 +86,10 @@ def page(path: Path, jobs: int = 1) -> str:
         more_findings=[(subject, list(group)) for subject, group in groupby(rest, key=lambda one: one.subject)],
         cells=len(cells),
         failed=int((cells["status"] != Status.OK).sum()),
-        missing=[f"no picture of {one.key[0]}: {one.reason}" for one in pictures.read(path) if one.reason],
+        missing=[
+            *(f"no picture of {one.key[0]}: {one.reason}" for one in pictures.read(path) if one.reason),
+            *dict.fromkeys(undrawable),
+        ],
         grids=grids,
         stills=drawn,
         undrawn=sum(max(0, len(data.duals) - MOST_DUALS) for _, data in known),

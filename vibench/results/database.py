@@ -11,11 +11,10 @@ from pathlib import Path
 from typing import Any
 
 from vibench.errors import RequestError, StorageError
-from vibench.locking import locked
 from vibench.qp.status import Status
 from vibench.results.columns import HISTORY_KEYS, STORED, VERSION
 from vibench.results.digests import CREATE, DigestError, Digests
-from vibench.results.sqlite_files import BUSY_SECONDS, DAMAGE, DAMAGED, LOG, code_of, connected_read_only
+from vibench.results.sqlite_files import BUSY_SECONDS, DAMAGE, DAMAGED, code_of, connected_read_only
 from vibench.results.values import UnstorableError, error_row, storable
 from vibench.text import one_line, printable
 
@@ -30,34 +29,9 @@ OF_CELLS = tuple(table for table, columns in STORED.items() if "cell" in columns
 DERIVED = ("thresholds", "disagreements")
 """Tables that every run makes anew from the others."""
 
-LOCK = ".lock"
-"""Lock file in a run folder, held during a run."""
-
 
 class DamagedError(RequestError):
     """A results file that cannot be read: cut off, overwritten, or from a disk that failed."""
-
-
-@contextlib.contextmanager
-def claimed(folder: Path) -> Iterator[None]:
-    """Lock a run folder, which is created if it does not exist.
-
-    Raises
-    ------
-    RequestError
-        If the folder is a file, holds files but no results file, cannot be written, or is locked by another run.
-    """
-    try:
-        if folder.exists() and not folder.is_dir():
-            raise RequestError(f"output folder '{folder}' is a file")
-        known = {LOCK, FILE + DAMAGED, FILE + DAMAGED + LOG}
-        if folder.is_dir() and not (folder / FILE).exists() and {path.name for path in folder.iterdir()} - known:
-            raise RequestError(f"output folder '{folder}' is not empty and holds no {FILE}; choose another with --out")
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise RequestError(f"output folder '{folder}' cannot be written: {error.strerror}") from None
-    with locked(folder / LOCK, busy=f"another run writes into '{folder}'"):
-        yield
 
 
 UNWRITABLE = {
@@ -123,7 +97,7 @@ class ResultsDatabase:
         for table, columns in STORED.items():
             declared = ", ".join(f'"{name}" {column.kind}' for name, column in columns.items())
             self._db.execute(f"CREATE TABLE IF NOT EXISTS {table} ({declared})")
-        for table in ("queries", "solutions", "timings"):
+        for table in ("queries", "solutions", "timings", "outputs"):
             self._db.execute(f"CREATE INDEX IF NOT EXISTS {table}_of_cell ON {table}(cell)")
         self._db.execute(f"CREATE INDEX IF NOT EXISTS histories_named ON histories({', '.join(NAMED)})")
         entries = {"schema": str(VERSION), "study": json.dumps(study, sort_keys=True)}
@@ -178,9 +152,13 @@ class ResultsDatabase:
         return {key: (status, code) for key, status, code in self._db.execute("SELECT cell, status, code FROM cells")}
 
     def write_cell(
-        self, cell: Mapping[str, Any], queries: Sequence[Mapping[str, Any]], solutions: Sequence[Mapping[str, Any]] = ()
+        self,
+        cell: Mapping[str, Any],
+        queries: Sequence[Mapping[str, Any]],
+        solutions: Sequence[Mapping[str, Any]] = (),
+        outputs: Sequence[Mapping[str, Any]] = (),
     ) -> dict[str, Any]:
-        """Write a cell, its queries and solutions in one transaction; earlier rows of the cell are replaced.
+        """Write a cell, its queries, solutions and outputs in one transaction; its earlier rows are replaced.
 
         Rows that cannot be stored because of their values cost the cell, not the run: it gets an `error` row instead.
 
@@ -195,17 +173,15 @@ class ResultsDatabase:
             If the file cannot be written.
         """
         try:
-            return self._write_cell(cell, queries, solutions)
+            return self._write_cell(cell, queries=queries, solutions=solutions, outputs=outputs)
         except (UnstorableError, sqlite3.Error) as error:
-            return self._write_cell(error_row(cell, str(error)), (), ())
+            return self._write_cell(error_row(cell, str(error)))
 
-    def _write_cell(
-        self, cell: Mapping[str, Any], queries: Sequence[Mapping[str, Any]], solutions: Sequence[Mapping[str, Any]]
-    ) -> dict[str, Any]:
+    def _write_cell(self, cell: Mapping[str, Any], **others: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
         with self._writing():
-            self._add_columns(queries)
+            self._add_columns(others.get("queries", ()))
             self._remove(cell["cell"])
-            for table, rows in (("cells", [cell]), ("queries", queries), ("solutions", solutions)):
+            for table, rows in {"cells": [cell], **others}.items():
                 self._insert(table, rows)
                 self._digests.count(table, "cell = ?", (cell["cell"],))
         return storable("cells", cell)

@@ -43,7 +43,13 @@ def print_line(console: Console, line: str) -> None:
 
 
 def print_frame(
-    frame: pd.DataFrame, title: str, priority: Sequence[str] = (), *, axes: Collection[str] = (), every: bool = False
+    frame: pd.DataFrame,
+    title: str,
+    priority: Sequence[str] = (),
+    *,
+    axes: Collection[str] = (),
+    every: bool = False,
+    rest: str = "vibench show --columns",
 ) -> None:
     """Print a table that fits the width; nothing is cut, and no number is wrapped.
 
@@ -62,6 +68,8 @@ def print_frame(
         Columns of numbers that go into the title, too, where they are the same in every row.
     every
         Print columns with the same value in every row, too, as columns.
+    rest
+        The command, or its option, that prints the columns that are left out.
     """
     from vibench.results.tables import cell_text
 
@@ -69,7 +77,7 @@ def print_frame(
         PrintedColumn(str(name), tuple(map(cell_text, frame[name])), frame[name].dtype.kind in "iufb")
         for name in frame.columns
     ]
-    print_columns(columns, title, priority, axes=axes, every=every)
+    print_columns(columns, title, priority, axes=axes, every=every, rest=rest)
 
 
 def print_rows(rows: Iterable[Sequence[str]], headings: Sequence[str], title: str) -> None:
@@ -85,6 +93,7 @@ def print_columns(
     *,
     axes: Collection[str] = (),
     every: bool = False,
+    rest: str = "vibench show --columns",
 ) -> None:
     """Print columns as `print_frame` prints a table."""
     console = new_console()
@@ -112,7 +121,7 @@ def print_columns(
         table.add_row(*map(shown, row))
     console.print(table)
     if left_out := [column.heading for column in own if column not in kept]:
-        text = f"not shown at {console.width} columns: {', '.join(left_out)} (`vibench show --columns`)"
+        text = f"not shown at {console.width} columns: {', '.join(left_out)} (`{rest}`)"
         console.print(shown(text), overflow="fold")
 
 

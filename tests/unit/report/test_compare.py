@@ -2,29 +2,47 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
+import pandas as pd
 import pytest
-from running import DECIDED, Changed
+from running import DECIDED, Changed, Main, refused
 
-from vibench.cli.result_commands import compare_runs
+from vibench.cli.result_commands import diff_runs
 from vibench.errors import RequestError
-from vibench.report.compare import Verdict, compare
+from vibench.report.comparison.compare import compare
+from vibench.report.comparison.differences import Verdict
+from vibench.report.comparison.runs import run_names
 from vibench.results.database import FILE
+
+STEADY = (
+    "UPDATE cells SET offline_low_s = offline_s, offline_high_s = offline_s, disturbed = 0",
+    "UPDATE timings SET total_s = (SELECT online_s FROM cells WHERE cells.cell = timings.cell)",
+)
+"""Statements after which the same seconds were measured in every round, however busy the machine was."""
+
+DECISIVE = (*DECIDED, *STEADY)
 
 ONE = "solver = 'piqp' AND problem = 'hertz' AND dual = 'mcpg' AND primal = 'offline-pga'"
 
 
 def test_a_run_does_not_differ_from_itself(quick_run: Path) -> None:
-    found = compare(quick_run / FILE, quick_run / FILE, 1.0)
+    found = compare([quick_run / FILE, quick_run / FILE], 1.0)
     assert found.changes.empty
     assert found.regressions == 0
+
+
+@pytest.fixture
+def steady(changed: Changed, tmp_path: Path) -> Path:
+    """A run with the same seconds in every round."""
+    return changed(*STEADY).rename(tmp_path / "steady.sqlite")
 
 
 @pytest.mark.parametrize(
     ("statement", "what", "verdict"),
     [
-        (f"UPDATE cells SET queries_ok = queries_ok - 1 WHERE {ONE}", "queries ok", Verdict.WORSE),
+        (f"UPDATE cells SET queries_ok = queries_ok - 1 WHERE {ONE}", "queries_ok", Verdict.WORSE),
         (f"UPDATE cells SET error_lambda_mean = 2 * error_lambda_mean WHERE {ONE}", "error_lambda_mean", Verdict.WORSE),
         (f"UPDATE cells SET error_u_max = 0.5 * error_u_max WHERE {ONE}", "error_u_max", Verdict.BETTER),
         (f"UPDATE cells SET beta_span_min = 0.5 * beta_span_min WHERE {ONE}", "beta_span_min", Verdict.WORSE),
@@ -39,9 +57,9 @@ def test_a_run_does_not_differ_from_itself(quick_run: Path) -> None:
     ],
 )
 def test_a_change_of_one_cell_is_told_with_its_meaning(
-    statement: str, what: str, verdict: Verdict, changed: Changed, quick_run: Path
+    statement: str, what: str, verdict: Verdict, changed: Changed, steady: Path
 ) -> None:
-    found = compare(quick_run / FILE, changed(statement), 1.25)
+    found = compare([steady, changed(statement, *STEADY)], 1.25)
     (row,) = found.changes.to_dict("records")
     assert (row["what"], row["verdict"]) == (what, verdict.value)
     assert (row["problem"], row["dual"], row["primal"], row["solver"]) == ("hertz", "mcpg", "offline-pga", "piqp")
@@ -54,31 +72,75 @@ def test_errors_are_compared_on_the_queries_that_are_ok_in_both_runs(changed: Ch
         f"UPDATE cells SET queries_ok = 4, error_u_mean = 1e-3 * error_u_mean, error_u_max = 1e-3 * error_u_max,"
         f" error_lambda_mean = 1e-3 * error_lambda_mean WHERE {ONE}",
     )
-    found = compare(quick_run / FILE, after, 1.25)
-    assert list(found.changes["what"]) == ["queries ok"]
+    found = compare([quick_run / FILE, after], 1.25)
+    assert list(found.changes["what"]) == ["queries_ok"]
     assert "errors of 1 of them are compared on the queries that are ok in both" in found.notes
     worse = changed(
         f"UPDATE queries SET status = 'inaccurate' WHERE {ONE} AND query > 3",
         f"UPDATE queries SET error_u = 2 * error_u WHERE {ONE} AND query < 4",
         f"UPDATE cells SET queries_ok = 4 WHERE {ONE}",
     )
-    assert set(compare(quick_run / FILE, worse, 1.25).changes["what"]) == {"queries ok", "error_u_mean", "error_u_max"}
+    assert set(compare([quick_run / FILE, worse], 1.25).changes["what"]) == {
+        "queries_ok",
+        "error_u_mean",
+        "error_u_max",
+    }
 
 
-def test_changes_within_the_limit_are_not_told(changed: Changed, quick_run: Path) -> None:
-    after = changed("UPDATE cells SET online_s = 1.2 * online_s, error_u_mean = 1.2 * error_u_mean")
-    assert compare(quick_run / FILE, after, 1.25).changes.empty
-    assert compare(quick_run / FILE, after, 1.1).regressions == 2 * 36
+def test_changes_within_the_limit_are_not_told(changed: Changed, steady: Path) -> None:
+    after = changed("UPDATE cells SET online_s = 1.2 * online_s, error_u_mean = 1.2 * error_u_mean", *STEADY)
+    assert compare([steady, after], 1.25).changes.empty
+    assert compare([steady, after], 1.1).regressions == 2 * 36
+
+
+def test_an_error_that_moves_by_no_more_than_the_solvers_contributed_has_not_changed(
+    changed: Changed, tmp_path: Path
+) -> None:
+    before = changed("UPDATE cells SET error_u_mean = 1e-6, solver_error_u_max = 2e-6").rename(tmp_path / "a.sqlite")
+    for moved, verdict in ((4.9e-6, Verdict.WITHIN_ACCURACY), (5.1e-6, Verdict.WORSE)):
+        after = changed(f"UPDATE cells SET error_u_mean = {moved}, solver_error_u_max = 2e-6")
+        columns = compare([before, after], 1.25).by_column.set_index("what")
+        assert columns.loc["error_u_mean", verdict.value] == 36
+
+
+ROUNDS = "UPDATE timings SET total_s = {} * (SELECT online_s FROM cells WHERE cells.cell = timings.cell)"
+
+
+def test_seconds_have_not_changed_where_the_rounds_do_not_tell(changed: Changed, tmp_path: Path) -> None:
+    """Medians that differ by half, each of rounds as far apart: the interval of their ratio contains 1."""
+    noisy = ROUNDS.format("(0.3 + 0.13 * round)")
+    before = changed(noisy).rename(tmp_path / "a.sqlite")
+    after = changed("UPDATE cells SET online_s = 1.5 * online_s", noisy)
+    columns = compare([before, after], 1.25).by_column.set_index("what")
+    assert columns.loc["online_s", Verdict.UNDECIDED.value] == 36
+    assert columns.loc["online_s", "ratio"] == pytest.approx(1.5)
+    disturbed = changed("UPDATE cells SET online_s = 9 * online_s", *STEADY, "UPDATE cells SET disturbed = 1")
+    columns = compare([before, disturbed], 1.25).by_column.set_index("what")
+    assert columns.loc["online_s", Verdict.UNDECIDED.value] == 36
+    few = changed("UPDATE cells SET online_s = 9 * online_s", "DELETE FROM timings WHERE round >= 5", *STEADY)
+    columns = compare([before, few], 1.25).by_column.set_index("what")
+    assert columns.loc["online_s", Verdict.UNDECIDED.value] == 36
+
+
+def test_a_ratio_of_seconds_has_the_interval_of_resampled_rounds(changed: Changed, tmp_path: Path) -> None:
+    rounds = (ROUNDS.format("(0.95 + 0.01 * (round % 11))"), "UPDATE cells SET disturbed = 0")
+    before = changed(*rounds).rename(tmp_path / "a.sqlite")
+    after = changed("UPDATE cells SET online_s = 2 * online_s", *rounds)
+    rows = compare([before, after], 1.25).changes
+    online = rows[rows["what"] == "online_s"]
+    assert len(online) == 36
+    assert ((online["ratio_low"] > 1.8) & (online["ratio_low"] < 2.0)).all()
+    assert ((online["ratio_high"] < 2.2) & (online["ratio_high"] > 2.0)).all()
 
 
 def test_errors_of_round_off_are_not_compared(changed: Changed, tmp_path: Path) -> None:
     before = changed("UPDATE cells SET error_u_mean = 1e-14").rename(tmp_path / "before.sqlite")
     after = changed("UPDATE cells SET error_u_mean = 9e-14")
-    assert compare(before, after, 1.25).changes.empty
+    assert compare([before, after], 1.25).changes.empty
 
 
 def test_times_of_another_machine_are_left_out(changed: Changed, quick_run: Path) -> None:
-    found = compare(quick_run / FILE, changed("UPDATE cells SET machine = 'other', online_s = 9 * online_s"), 1.25)
+    found = compare([quick_run / FILE, changed("UPDATE cells SET machine = 'other', online_s = 9 * online_s")], 1.25)
     assert found.changes.empty
     assert any("different machines" in note for note in found.notes)
 
@@ -92,25 +154,27 @@ LATER = ", ".join(f"{name} = 30 * {name}" for name in NUMBERS)
 @pytest.fixture
 def decided(changed: Changed, tmp_path: Path) -> Path:
     """A run whose break-evens against the high-fidelity model are decided."""
-    return changed(*DECIDED).rename(tmp_path / "decided.sqlite")
+    return changed(*DECISIVE).rename(tmp_path / "decided.sqlite")
 
 
 def test_a_threshold_within_the_interval_of_the_other_is_no_change(changed: Changed, decided: Path) -> None:
     moved = "benefit_threshold = threshold_high, threshold_high = 3 * threshold_high, offline_b_s = 3 * offline_b_s"
-    after = changed(*DECIDED, f"UPDATE thresholds SET {moved} WHERE primal_a = 'high-fidelity'")
-    assert compare(decided, after, 1.0 + 1e-9).changes.empty
+    after = changed(*DECISIVE, f"UPDATE thresholds SET {moved} WHERE primal_a = 'high-fidelity'")
+    assert compare([decided, after], 1.0 + 1e-9).changes.empty
 
 
 def test_a_threshold_is_worse_where_its_own_side_got_slower(changed: Changed, decided: Path) -> None:
     later = f"{LATER}, offline_b_s = 3 * offline_b_s"
     never = "benefit_threshold = NULL, threshold_low = NULL, threshold_high = NULL, meaning = 'never'"
     found = compare(
-        decided,
-        changed(
-            *DECIDED,
-            f"UPDATE thresholds SET {later} {THRESHOLD} AND primal_b = 'decorrelated'",
-            f"UPDATE thresholds SET {never}, online_b_s = 9 * online_b_s {THRESHOLD} AND primal_b = 'offline-pga'",
-        ),
+        [
+            decided,
+            changed(
+                *DECISIVE,
+                f"UPDATE thresholds SET {later} {THRESHOLD} AND primal_b = 'decorrelated'",
+                f"UPDATE thresholds SET {never}, online_b_s = 9 * online_b_s {THRESHOLD} AND primal_b = 'offline-pga'",
+            ),
+        ],
         1.25,
     )
     assert set(found.changes["primal"]) == {"decorrelated", "offline-pga"}
@@ -120,43 +184,154 @@ def test_a_threshold_is_worse_where_its_own_side_got_slower(changed: Changed, de
 
 def test_a_competitor_that_got_quicker_is_no_regression(changed: Changed, decided: Path) -> None:
     later = f"{LATER}, online_a_s = online_a_s / 3"
-    found = compare(decided, changed(*DECIDED, f"UPDATE thresholds SET {later} {THRESHOLD}"), 1.25)
+    found = compare([decided, changed(*DECISIVE, f"UPDATE thresholds SET {later} {THRESHOLD}")], 1.25)
     assert len(found.changes) == 3
     assert found.regressions == 0
 
 
 def test_what_was_missing_and_is_there_is_no_regression(changed: Changed, quick_run: Path) -> None:
     before = changed(f"UPDATE cells SET beta_span_min = NULL, beta_cone_lower_min = NULL WHERE {ONE}")
-    assert compare(before, quick_run / FILE, 1.25).regressions == 0
+    assert compare([before, quick_run / FILE], 1.25).regressions == 0
 
 
 def test_constants_of_round_off_are_not_compared(changed: Changed, tmp_path: Path) -> None:
     before = changed("UPDATE cells SET beta_span_min = 9e-17").rename(tmp_path / "before.sqlite")
-    assert compare(before, changed("UPDATE cells SET beta_span_min = 1e-17"), 1.25).changes.empty
+    assert compare([before, changed("UPDATE cells SET beta_span_min = 1e-17")], 1.25).changes.empty
 
 
 def test_columns_without_any_value_are_no_obstacle(changed: Changed, quick_run: Path) -> None:
     emptied = changed(
         "UPDATE thresholds SET primal_tol_b = NULL, dual_tol = NULL", "UPDATE cells SET primal_tol = NULL"
     )
-    compare(quick_run / FILE, emptied, 1.25)
+    compare([quick_run / FILE, emptied], 1.25)
 
 
 def test_a_new_cell_is_no_regression(changed: Changed, quick_run: Path) -> None:
-    found = compare(changed(f"DELETE FROM cells WHERE {ONE}"), quick_run / FILE, 1.25)
+    found = compare([changed(f"DELETE FROM cells WHERE {ONE}"), quick_run / FILE], 1.25)
     (row,) = found.changes.to_dict("records")
     assert (row["after"], row["verdict"]) == ("new", Verdict.CHANGED.value)
 
 
 def test_the_command_ends_with_one_where_something_got_worse(
-    changed: Changed, quick_run: Path, capsys: pytest.CaptureFixture[str]
+    changed: Changed, steady: Path, quick_run: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    after = changed(f"UPDATE cells SET online_s = 2 * online_s WHERE {ONE}")
+    after = changed(f"UPDATE cells SET online_s = 2 * online_s WHERE {ONE}", *STEADY)
     with pytest.raises(Exception, match="1") as ended:
-        compare_runs(str(quick_run), str(after), 1.25, "terminal")
+        diff_runs(str(steady), str(after), 1.25, "terminal")
     assert getattr(ended.value, "exit_code", None) == 1
     assert "1 for the worse" in capsys.readouterr().out
-    compare_runs(str(quick_run), str(quick_run), 1.25, "csv")
-    assert capsys.readouterr().out.startswith("problem,dual,primal,asked")
+    diff_runs(str(quick_run), str(quick_run), 1.25, "csv")
+    assert capsys.readouterr().out.startswith("run,against,problem,dual,primal,asked")
     with pytest.raises(RequestError, match="no results in 'nowhere'"):
-        compare_runs(str(quick_run), "nowhere")
+        diff_runs(str(quick_run), "nowhere")
+
+
+@pytest.fixture
+def three(changed: Changed, steady: Path, tmp_path: Path) -> list[Path]:
+    """Three runs: on one machine, on another, where one cell failed, and on this one again, slower and less exact."""
+    there = changed(
+        "UPDATE cells SET machine = 'server', online_s = 0.1 * online_s",
+        f"UPDATE cells SET status = 'crashed' WHERE {ONE}",
+        *STEADY,
+    ).rename(tmp_path / "server.sqlite")
+    later = changed(
+        f"UPDATE cells SET machine = 'server', online_s = 0.3 * online_s, error_u_mean = 4 * error_u_mean WHERE {ONE}",
+        f"UPDATE cells SET online_s = 3 * online_s WHERE NOT ({ONE})",
+        "DELETE FROM cells WHERE solver = 'osqp'",
+        *STEADY,
+    ).rename(tmp_path / "later.sqlite")
+    return [steady, there, later]
+
+
+def test_seconds_of_many_runs_are_compared_with_the_first_run_of_the_same_machine(three: list[Path]) -> None:
+    found = compare(three, 1.25)
+    seconds = found.changes[found.changes["what"] == "online_s"].set_index(["run", "against"])
+    assert set(seconds.index) == {("later", "steady"), ("later", "server")}
+    assert len(seconds.loc[[("later", "steady")]]) == 23
+    assert seconds.loc[("later", "steady"), "ratio"].to_list() == pytest.approx([3.0] * 23)
+    (row,) = seconds.loc[[("later", "server")]].to_dict("records")
+    assert row["ratio"] == pytest.approx(3.0)
+    numbers = found.changes[~found.changes["what"].isin(["online_s", "offline_s"])]
+    assert set(numbers["against"]) == {"steady"}
+    assert "server: times and break-even of different machines are not compared" in found.notes
+    assert not any(note.startswith("later: times") for note in found.notes)
+
+
+def test_a_comparison_of_many_says_what_only_some_runs_have(three: list[Path]) -> None:
+    found = compare(three, 1.25)
+    runs = found.by_run.set_index("run")
+    assert list(runs["cells"]) == [36, 36, 24]
+    assert set(runs["in all runs"]) == {24}
+    assert list(runs["same code"]) == [36, 36, 24]
+    assert list(found.present[["steady", "server", "later"]].drop_duplicates().itertuples(index=False, name=None)) == [
+        ("yes", "yes", "no")
+    ]
+    assert len(found.present) == 12
+    values = found.values("online_s")
+    assert len(values) == 36
+    assert values["later"].isna().sum() == 12
+    assert (values["server"] / values["steady"]).to_list() == pytest.approx([0.1] * 36)
+    with pytest.raises(RequestError, match="did you mean 'online_s'"):
+        found.values("online")
+
+
+def test_comparing_two_of_many_gives_what_comparing_these_two_gives(three: list[Path]) -> None:
+    """What `diff` lists of the first run and any other one is what `compare` lists of all, but for other machines."""
+    everything = compare(three, 1.25).changes
+    for path in three[1:]:
+        alone = compare([three[0], path], 1.25).changes
+        of_it = everything[(everything["run"] == path.stem) & (everything["against"] == "steady")]
+        assert len(alone) > 0
+        pd.testing.assert_frame_equal(alone, of_it.reset_index(drop=True))
+
+
+def test_compare_prints_what_diff_prints_of_two_runs(three: list[Path], main: Main) -> None:
+    pair = (str(three[0]), str(three[2]))
+    code, listed, _ = main("diff", *pair, "--format", "csv")
+    assert code == 1
+    assert main("compare", *pair, "--format", "csv") == (0, listed, "")
+    code, shown, _ = main("diff", *pair)
+    assert main("compare", *pair)[1].endswith(shown)
+
+
+@pytest.mark.parametrize("width", [80, 120, 200])
+def test_a_comparison_fits_the_terminal(
+    width: int, three: list[Path], main: Main, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", str(width))
+    code, shown, _ = main("compare", *map(str, three))
+    assert code == 0
+    tables = [line for line in shown.splitlines() if not line.startswith("not shown at")]
+    assert max(map(len, tables)) <= width
+    assert {"server", "later", "online_s"} <= set(shown.split())
+    assert len(shown.splitlines()) < 120
+
+
+def test_every_table_of_a_comparison_has_every_format(three: list[Path], main: Main) -> None:
+    paths = list(map(str, three))
+    for table, rows in (("changes", 38), ("runs", 3), ("cells", 12)):
+        code, text, _ = main("compare", *paths, "--table", table, "--format", "json")
+        assert code == 0
+        assert len(json.loads(text)) == rows
+        assert main("compare", *paths, "--table", table, "--format", "markdown")[1].startswith("|")
+    (found,) = (
+        row
+        for row in json.loads(main("compare", *paths, "--table", "columns", "--format", "json")[1])
+        if (row["what"], row["run"], row["against"]) == ("error_u_mean", "later", "steady")
+    )
+    assert (found["cells"], found["equal"], found["worse"], found["ratio"]) == (24, 23, 1, 1.0)
+    assert found["farthest_ratio"] == pytest.approx(4.0)
+    code, text, _ = main("compare", *paths, "--column", "N", "--format", "csv")
+    assert code == 0
+    assert text.splitlines()[0].endswith(",cell,steady,server,later")
+
+
+def test_one_run_is_nothing_to_compare(quick_run: Path, main: Main) -> None:
+    refused(main("compare", str(quick_run)), "expected two or more")
+
+
+def test_runs_of_folders_with_the_same_name_are_told_apart(tmp_path: Path) -> None:
+    paths = [tmp_path / "a" / "quick" / FILE, tmp_path / "b" / "quick" / FILE, tmp_path / "c" / "other.sqlite"]
+    assert run_names(paths) == ["a/quick", "b/quick", "c/other"]
+    assert run_names([paths[0], paths[2]]) == ["quick", "other"]
+    assert run_names([paths[0], paths[0]]) == ["quick", "quick (2)"]

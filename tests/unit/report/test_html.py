@@ -84,7 +84,7 @@ def test_findings_tables_and_facts_are_in_it(made: Path, quick_run: Path) -> Non
 
 
 def test_every_failure_has_its_reason_and_nothing_is_markup(changed: Changed, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(html, "stills", lambda *_: [])
+    monkeypatch.setattr(html, "stills", lambda *_: ([], []))
     reason = "<script>alert(''the solver said & did nothing'')</script>"
     results = changed(
         f"UPDATE cells SET status = 'failed', reason = '{reason}' WHERE solver = 'osqp'",
@@ -110,7 +110,7 @@ def test_every_failure_has_its_reason_and_nothing_is_markup(changed: Changed, mo
 )
 def test_a_label_is_no_markup_wherever_it_stands(label: str, changed: Changed, monkeypatch: pytest.MonkeyPatch) -> None:
     """In tables, attributes, findings and facts, those that come from JSON included."""
-    monkeypatch.setattr(html, "stills", lambda *_: [])
+    monkeypatch.setattr(html, "stills", lambda *_: ([], []))
     plain = elements(html.page(changed()))
     label += "\x1b[31m\n\ud800"
     known = json.dumps({"name": label, "seed": label})
@@ -165,7 +165,7 @@ def test_a_large_study_has_pictures_of_the_cones_that_win(changed: Changed, monk
 def test_only_rows_of_a_disturbed_machine_are_said_to_be_marked(
     changed: Changed, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(html, "stills", lambda *_: [])
+    monkeypatch.setattr(html, "stills", lambda *_: ([], []))
     calm = "UPDATE cells SET disturbed = 0"
     page = html.page(changed(calm))
     assert "marks rows" not in page

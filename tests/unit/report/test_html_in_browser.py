@@ -332,7 +332,7 @@ def test_on_paper_pictures_take_the_place_of_plots(browser: Chrome, made: Path) 
 def test_a_page_of_many_cells_shows_some_rows_at_a_time(
     browser: Chrome, quick_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(html, "stills", lambda *_: [])
+    monkeypatch.setattr(html, "stills", lambda *_: ([], []))
     page = html.write(write_many(quick_run, tmp_path / "many", 300, queries=1), tmp_path / "many.html")
     look(browser, page)
     count = '[data-table="summary"] .count'

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import json
-import os
 import shutil
 import sqlite3
 import tempfile
@@ -22,7 +21,7 @@ from samples import cell_row, query_rows
 from vibench.errors import RequestError, StorageError
 from vibench.results import database as module
 from vibench.results.columns import CELLS, TABLES, VERSION
-from vibench.results.database import FILE, ResultsDatabase, claimed, open_read_only, read_meta
+from vibench.results.database import FILE, ResultsDatabase, open_read_only, read_meta
 from vibench.results.values import LONGEST_TEXT
 
 STUDY = {"name": "sample", "seed": 1, "validation": 4, "accuracy": 1e-7}
@@ -51,20 +50,6 @@ def refusal(action: Callable[[], object]) -> str:
     line = str(caught.value)
     assert "\n" not in line
     return line
-
-
-def claim(folder: Path) -> None:
-    with claimed(folder):
-        pass
-
-
-def test_a_folder_has_one_run_at_a_time(tmp_path: Path) -> None:
-    """The second one is told who the first is; a folder that was claimed before is no foreign one."""
-    with claimed(tmp_path / "run"):
-        assert f"another run writes into '{tmp_path / 'run'}' (process {os.getpid()} on" in refusal(
-            lambda: claim(tmp_path / "run")
-        )
-    claim(tmp_path / "run")
 
 
 def test_a_new_folder_gets_every_table(journal: ResultsDatabase, tmp_path: Path) -> None:
@@ -303,17 +288,7 @@ def test_a_refused_folder_is_left_as_it_was(journal: ResultsDatabase, tmp_path: 
 
 def test_a_file_in_place_of_the_folder_is_refused(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
-    assert "is a file" in refusal(lambda: claim(tmp_path / "file"))
-    assert "cannot be written" in refusal(lambda: claim(tmp_path / "file" / "below"))
     assert "cannot be written" in refusal(lambda: ResultsDatabase(tmp_path / "file" / "below", STUDY))
-
-
-def test_a_folder_with_other_things_is_refused(tmp_path: Path) -> None:
-    (tmp_path / "notes.txt").touch()
-    line = refusal(lambda: claim(tmp_path))
-    assert "not empty" in line
-    assert FILE in line
-    assert [path.name for path in tmp_path.iterdir()] == ["notes.txt"]
 
 
 def test_an_empty_folder_will_do(tmp_path: Path) -> None:

@@ -14,8 +14,9 @@ import pytest
 from samples import cell_row
 
 from vibench.errors import RequestError, StorageError
+from vibench.execution.run_folder import claimed
 from vibench.results import tables
-from vibench.results.database import FILE, DamagedError, ResultsDatabase, claimed, open_read_only, read_meta
+from vibench.results.database import FILE, DamagedError, ResultsDatabase, open_read_only, read_meta
 from vibench.results.sqlite_files import DAMAGED, set_aside
 
 STUDY = {"name": "sample", "seed": 1, "validation": 4}

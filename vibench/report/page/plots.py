@@ -17,14 +17,17 @@ import pandas as pd
 
 from vibench.report.common_queries import on_common_queries
 from vibench.report.figures.data import Data, best_solver, label
-from vibench.report.figures.style import COLOURS, style_of
+from vibench.report.figures.looks import Look, Looks, Series
 from vibench.report.page.embedded import short
 from vibench.text import printable
 
 ERRORS = {"error_u_mean": "mean relative error of u", "error_lambda_mean": "mean relative error of λ"}
 
-MARKERS = ("circle", "square", "triangle", "diamond", "inverted_triangle", "hex", "star")
-"""Markers of BokehJS; a colour that comes again has another one."""
+MARKERS = {
+    "o": "circle", "s": "square", "^": "triangle", "v": "inverted_triangle", "D": "diamond", "P": "plus",
+    "X": "square_x", "*": "star", "d": "diamond_dot", "p": "hex_dot", "h": "hex",
+}  # fmt: skip
+"""Markers of the pictures and those of BokehJS that stand for them."""
 
 FILLS = (0.85, 0.0, 0.4)
 """Opacity of the points of the first, second and third dual strategy, and so on."""
@@ -100,12 +103,10 @@ def _plot(name: str, title: str, cells: pd.DataFrame, panels: list[Axes], rows: 
     drawn = [(panel, points) for panel, points in drawn if points.notna().to_numpy().any()]
     if not drawn:
         return
-    ways = [label(*key) for key in zip(cells["primal"], [None] * len(cells), cells["assembly"], strict=True)]
-    styles: dict[str, int] = {}
-    series = {way: {"name": printable(way), **_look(style_of(way, styles))} for way in dict.fromkeys(ways)}
-    places, duals = list(series), list(dict.fromkeys(cells["dual"]))
+    ways = [Series(*way) for way in zip(cells["primal"], cells["assembly"], strict=True)]
+    looks, places, duals = Looks(ways), list(dict.fromkeys(ways)), list(dict.fromkeys(cells["dual"]))
     data = {
-        "series": list(series.values()),
+        "series": [_series(way, looks[way]) for way in places],
         "rows": [rows[cell] for cell in cells["cell"]],
         "of": [places.index(way) for way in ways],
         "fills": [FILLS[duals.index(dual) % len(FILLS)] for dual in cells["dual"]],
@@ -114,8 +115,10 @@ def _plot(name: str, title: str, cells: pd.DataFrame, panels: list[Axes], rows: 
     yield Plot(name, printable(title), data)
 
 
-def _look(style: int) -> dict[str, str]:
-    return {"colour": COLOURS[style % len(COLOURS)], "marker": MARKERS[style // len(COLOURS) % len(MARKERS)]}
+def _series(way: Series, look: Look) -> dict[str, Any]:
+    """A series: its name, and how its points look; what shares colour and marker differs in the width of the edge."""
+    name = printable(label(way.name, None, str(way.variant)))
+    return {"name": name, "colour": look.colour, "marker": MARKERS[look.marker], "edge": 1.0 + 1.4 * look.rank}
 
 
 def _coordinates(cells: pd.DataFrame, panel: Axes) -> pd.DataFrame:

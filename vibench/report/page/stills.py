@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-import inspect
 import io
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
@@ -19,9 +18,10 @@ from matplotlib.lines import Line2D
 from PIL import Image
 
 from vibench.arrays import Array
-from vibench.report.figures import Drawing
+from vibench.report.figures import OF_DUAL, OF_PROBLEM, Drawing
 from vibench.report.figures.data import Data
-from vibench.report.figures.style import styled
+from vibench.report.figures.plugins import FigureError
+from vibench.report.figures.style import caption_of, styled
 from vibench.text import unbroken
 
 DPI = 110
@@ -46,33 +46,46 @@ class Still:
     height: int
 
 
-def stills(known: Sequence[tuple[str, Drawing, Data]], jobs: int = 1) -> list[Still]:
-    """The pictures that there are data for, drawn by so many processes."""
-    if jobs < 2 or len(known) <= FEW:
-        return [found for one in known if (found := _drawn(*one)) is not None]
-    shares = [known[k::jobs] for k in range(jobs)]
+Known = Sequence[tuple[str, Drawing, Data]]
+"""Figures: their names, the functions that draw them, and the data."""
+
+
+def stills(known: Known, jobs: int = 1) -> tuple[list[Still], list[str]]:
+    """The pictures that there are data for, drawn by so many processes, and why figures of plugins have none."""
+    found = _in_parallel(known, jobs) if jobs > 1 and len(known) > FEW else _draw_all(known)
+    return [one for one in found if isinstance(one, Still)], [one for one in found if isinstance(one, str)]
+
+
+def _in_parallel(known: Known, jobs: int) -> list[Still | str | None]:
+    """All pictures in their order. Those of plugins are drawn here: their functions need not go to other processes."""
+    shared = [k for k, (_, draw, _) in enumerate(known) if draw in {*OF_PROBLEM.values(), *OF_DUAL.values()}]
+    own = [k for k in range(len(known)) if k not in set(shared)]
+    shares = [[*shared[0::jobs], *own], *(shared[k::jobs] for k in range(1, jobs))]
     with ProcessPoolExecutor(jobs - 1, get_context("spawn")) as pool:
-        others = [pool.submit(_draw_all, share) for share in shares[1:]]
-        drawn = [_draw_all(shares[0]), *(other.result() for other in others)]
-    in_order = (drawn[k % jobs][k // jobs] for k in range(len(known)))
-    return [found for found in in_order if found is not None]
+        others = [pool.submit(_draw_all, [known[k] for k in share]) for share in shares[1:]]
+        drawn = [_draw_all([known[k] for k in shares[0]]), *(other.result() for other in others)]
+    placed = {k: one for share, found in zip(shares, drawn, strict=True) for k, one in zip(share, found, strict=True)}
+    return [placed[k] for k in range(len(known))]
 
 
-def _draw_all(known: Sequence[tuple[str, Drawing, Data]]) -> list[Still | None]:
+def _draw_all(known: Known) -> list[Still | str | None]:
     return [_drawn(*one) for one in known]
 
 
-def _drawn(name: str, draw: Drawing, data: Data) -> Still | None:
+def _drawn(name: str, draw: Drawing, data: Data) -> Still | str | None:
+    """A picture, `None` where there is nothing to draw, or why a plugin could not draw it."""
     with styled():
-        figure = draw(data)
+        try:
+            figure = draw(data)
+        except FigureError as error:
+            return str(error)
         if figure is None:
             return None
         picture = _picture(figure)
     stream = io.BytesIO()
     picture.save(stream, "webp", lossless=True, method=2)
     source = "data:image/webp;base64," + base64.b64encode(stream.getvalue()).decode("ascii")
-    caption = " ".join((inspect.getdoc(draw) or "").split())
-    return Still(name, caption, seen(figure), source, *picture.size)
+    return Still(name, caption_of(figure), seen(figure), source, *picture.size)
 
 
 def _picture(figure: Figure) -> Image.Image:

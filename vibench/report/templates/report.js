@@ -284,7 +284,7 @@ function drawPanel(plot, panel, place) {
     if (!data.x.length) return null;
     const source = new Bokeh.ColumnDataSource({ data }), colour = visible(series.colour);
     return made.scatter({ field: "x" }, { field: "y" }, {
-      source, marker: series.marker, size: 8, line_color: colour, fill_color: colour, fill_alpha: { field: "fill" },
+      source, marker: series.marker, size: 8, line_color: colour, line_width: series.edge, fill_color: colour, fill_alpha: { field: "fill" },
     });
   });
   const tooltips = [["cell", "@cell"], ["model", "@model"], [panel.x_label, "@x_text"], [panel.y_label, "@y_text"]];

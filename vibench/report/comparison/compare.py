@@ -1,0 +1,248 @@
+"""Comparison of runs: what is equal, and what moved by more than a limit, a solver's accuracy and the spread allow."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import pandas as pd
+
+from vibench.errors import unknown_name
+from vibench.report.comparison.differences import (
+    ERRORS,
+    MOVED,
+    UNKNOWN,
+    WHATS,
+    Difference,
+    Verdict,
+    of_numbers,
+    of_seconds,
+)
+from vibench.report.comparison.runs import AXES, ComparedRun, compared_runs
+from vibench.results import tables
+from vibench.results.break_even import FEWEST_ROUNDS
+from vibench.results.columns import CELLS
+from vibench.timing import median_interval
+
+COLUMNS = [
+    "run", "against", "problem", "dual", "primal", "asked", "solver", "accuracy", "assembly", "what", "before", "after",
+    "ratio", "ratio_low", "ratio_high", "verdict", "cell",
+]  # fmt: skip
+"""Columns of the changes."""
+
+
+class Pair(NamedTuple):
+    """All differences of a run from an earlier one."""
+
+    run: str
+    against: str
+    differences: list[Difference]
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """The differences of runs from earlier ones.
+
+    Every run is compared with the first one; its seconds, cell by cell, with the first one of the same machine.
+    """
+
+    runs: tuple[ComparedRun, ...]
+    pairs: tuple[Pair, ...]
+    notes: tuple[str, ...]
+
+    @cached_property
+    def changes(self) -> pd.DataFrame:
+        """What moved, a row per column of a cell, in the order of the cells."""
+        rows = [_row(pair, found) for pair in self.pairs for found in pair.differences if found.verdict in MOVED]
+        return pd.DataFrame(rows, columns=COLUMNS)
+
+    @property
+    def regressions(self) -> int:
+        """Number of changes for the worse."""
+        return int((self.changes["verdict"] == Verdict.WORSE).sum())
+
+    def table(self, name: str) -> pd.DataFrame:
+        """One of the tables "changes", "columns", "runs" and "cells"."""
+        made = {"changes": "changes", "columns": "by_column", "runs": "by_run", "cells": "present"}
+        found: pd.DataFrame = getattr(self, made[name])
+        return found
+
+    @property
+    def by_column(self) -> pd.DataFrame:
+        """A row per column and pair of runs: how many cells have which verdict; the median ratio and its 95 % interval.
+
+        The interval is that of the median over the cells (order statistics, `timing.median_interval`).
+        """
+        rows = []
+        for pair in self.pairs:
+            by_what: dict[str, list[Difference]] = {}
+            for found in pair.differences:
+                by_what.setdefault(found.what, []).append(found)
+            for what, differences in by_what.items():
+                counts = {verdict.value: sum(d.verdict == verdict for d in differences) for verdict in Verdict}
+                ratios = [d.ratio for d in differences if np.isfinite(d.ratio) and d.ratio > 0.0]
+                low, high = median_interval(ratios) if len(ratios) >= FEWEST_ROUNDS else UNKNOWN
+                middle = float(np.median(ratios)) if ratios else float("nan")
+                farthest = max(ratios, key=lambda ratio: abs(np.log(ratio)), default=float("nan"))
+                numbers = {"ratio": middle, "ratio_low": low, "ratio_high": high, "farthest_ratio": farthest}
+                about = {"what": what, "run": pair.run, "against": pair.against, "cells": len(differences)}
+                rows.append(about | counts | numbers)
+        return pd.DataFrame(rows).sort_values("what", kind="stable", ignore_index=True, key=_places)
+
+    @property
+    def by_run(self) -> pd.DataFrame:
+        """A row per run: its study, cells and machine, and the versions in which the runs differ.
+
+        "same code" counts the cells that the code of the first run computed.
+        """
+        first, everywhere = self.runs[0], set.intersection(*(set(run.cells) for run in self.runs))
+        differing = _differing([run.versions for run in self.runs])
+        rows = [
+            {
+                "run": run.name,
+                **run.identity,
+                "cells": len(run.cells),
+                "ok": run.ok,
+                "in all runs": len(everywhere),
+                "only here": len(set(run.cells).difference(*(o.cells for o in self.runs if o is not run))),
+                "machine": "; ".join(run.machines),
+                "same code": sum(
+                    run.cells[key]["code"] == row["code"] for key, row in first.cells.items() if key in run.cells
+                ),
+                **{name: run.versions.get(name, "") for name in differing},
+            }
+            for run in self.runs
+        ]
+        return pd.DataFrame(rows)
+
+    @property
+    def present(self) -> pd.DataFrame:
+        """A row per cell that is not in all runs, and in which of them it is."""
+        keys = dict.fromkeys(key for run in self.runs for key in run.cells)
+        partial = [key for key in keys if not all(key in run.cells for run in self.runs)]
+        rows = [
+            {**_named(self._cell(key)), **{run.name: "yes" if key in run.cells else "no" for run in self.runs}}
+            for key in partial
+        ]
+        return pd.DataFrame(rows, columns=[*AXES, "cell", *(run.name for run in self.runs)])
+
+    def values(self, column: str) -> pd.DataFrame:
+        """One column of the table of cells in every run, a row per cell that several runs have.
+
+        Raises
+        ------
+        RequestError
+            If there is no such column.
+        """
+        if column not in CELLS:
+            raise unknown_name("column of cells", column, CELLS)
+        keys = dict.fromkeys(key for run in self.runs for key in run.cells)
+        shared = [key for key in keys if sum(key in run.cells for run in self.runs) > 1]
+        rows = [
+            {**_named(self._cell(key)), **{run.name: run.cells.get(key, {}).get(column) for run in self.runs}}
+            for key in shared
+        ]
+        return pd.DataFrame(rows, columns=[*AXES, "cell", *(run.name for run in self.runs)])
+
+    def _cell(self, key: str) -> Mapping[str, Any]:
+        return next(run.cells[key] for run in self.runs if key in run.cells)
+
+
+def compare(paths: Sequence[Path], limit: float) -> Comparison:
+    """Compare results files cell by cell; cells of the same definition are the same cell.
+
+    Changes for the worse are: a missing cell, fewer ok queries, a more severe status, an error, seconds or a dimension
+    that grew by more than the factor `limit`, a constant that shrank by more than this factor, and a break-even that
+    moved by more than this factor because the reduced model itself became slower.
+
+    An error has not changed where the difference is at most the sum of what the QP solver contributed to it in the two
+    runs. Seconds are compared only where one machine measured both, and have changed only where the 95 % interval of
+    their ratio, from resampled rounds, does not contain 1; with fewer than six rounds they are undecided.
+
+    Parameters
+    ----------
+    paths
+        Two results files or more; the first one is what the others are compared with.
+    limit
+        Factor, at least 1, within which a number may change.
+
+    Raises
+    ------
+    RequestError
+        If there are fewer than two files, or one of them twice, or one cannot be read.
+    """
+    runs = compared_runs(paths)
+    first, *others = runs
+    found: dict[tuple[str, str], list[Difference]] = {}
+    notes: list[str] = []
+    for k, run in enumerate(others, start=1):
+        of_run = f"{run.name}: " if len(others) > 1 else ""
+        shared = [key for key in first.cells if key in run.cells]
+        differences = found.setdefault((run.name, first.name), [])
+        gone = [first.cells[key] for key in first.cells if key not in run.cells]
+        new = [run.cells[key] for key in run.cells if key not in first.cells]
+        differences += [Difference(cell, "cell", "present", "gone", Verdict.WORSE) for cell in gone]
+        differences += [Difference(cell, "cell", "", "new", Verdict.CHANGED) for cell in new]
+        means = _on_common_queries(first, run, shared)
+        for key in shared:
+            one, two = first.cells[key] | means[0].get(key, {}), run.cells[key] | means[1].get(key, {})
+            differences += of_numbers(one, two, limit)
+        notes.append(f"{of_run}{len(shared)} cells are in both runs")
+        if means[0]:
+            notes.append(f"{of_run}errors of {len(means[0])} of them are compared on the queries that are ok in both")
+        compared = 0
+        for earlier in runs[:k]:
+            same = run.measured_beside(earlier, unless=runs[: runs.index(earlier)])
+            compared += len(same)
+            if same:
+                found.setdefault((run.name, earlier.name), []).extend(of_seconds(earlier, run, same, limit))
+        if compared < len([key for key in run.cells if any(key in earlier.cells for earlier in runs[:k])]):
+            notes.append(f"{of_run}times and break-even of different machines are not compared")
+    pairs = tuple(Pair(*names, differences) for names, differences in found.items())
+    return Comparison(tuple(runs), pairs, tuple(notes))
+
+
+Means = dict[str, dict[str, float]]
+"""Columns of cells, by key."""
+
+
+def _on_common_queries(one: ComparedRun, two: ComparedRun, shared: Sequence[str]) -> tuple[Means, Means]:
+    """Means and maxima over the queries that are ok in both runs, of the cells where those differ."""
+    different = set(one.ok_queries.index.symmetric_difference(two.ok_queries.index).get_level_values("cell"))
+    keys = [key for key in shared if key in different]
+    both = one.ok_queries.index.intersection(two.ok_queries.index)
+    found: list[Means] = []
+    for run in (one, two):
+        common = run.ok_queries[run.ok_queries.index.isin(both)].groupby("cell")
+        means = {column: common[name].agg(how).reindex(keys) for column, (name, how) in ERRORS.items()}
+        found.append({key: {column: float(values[key]) for column, values in means.items()} for key in keys})
+    return found[0], found[1]
+
+
+def _row(pair: Pair, found: Difference) -> dict[str, Any]:
+    shown = {"before": tables.cell_text(found.before), "after": tables.cell_text(found.after)}
+    ratio = {"ratio": found.ratio, "ratio_low": found.interval[0], "ratio_high": found.interval[1]}
+    about = {"run": pair.run, "against": pair.against, "what": found.what, "verdict": found.verdict.value}
+    return about | _named(found.cell) | shown | ratio
+
+
+def _named(cell: Mapping[str, Any]) -> dict[str, Any]:
+    """The columns that tell a cell from others."""
+    tolerance = "" if pd.isna(cell["primal_tol"]) else f", δ {cell['primal_tol']:g}"
+    asked = f"{tables.asked(cell, 'pod')}, {tables.asked(cell, 'dual')}{tolerance}"
+    return {name: cell[name] for name in (*AXES, "cell") if name != "asked"} | {"asked": asked}
+
+
+def _places(whats: pd.Series) -> pd.Series:
+    """Places of columns in the table by column: the order in which they are compared, break-even last."""
+    return whats.map(lambda what: WHATS.index(what) if what in WHATS else len(WHATS))
+
+
+def _differing(versions: Sequence[Mapping[str, str]]) -> list[str]:
+    """Names whose versions are not the same in all runs that have them."""
+    names = dict.fromkeys(name for some in versions for name in some)
+    return [name for name in names if len({some.get(name, "") for some in versions}) > 1]

@@ -1,0 +1,185 @@
+"""Differences of a cell between two runs: its numbers, its seconds and its break-even, each with a verdict."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from enum import StrEnum
+from typing import Any, NamedTuple
+
+import numpy as np
+import pandas as pd
+
+from vibench.qp.status import Status
+from vibench.report.comparison.runs import ComparedRun
+from vibench.results.break_even import DRAWS, FEWEST_ROUNDS, TAIL, BreakEven, Meaning
+from vibench.results.columns import THRESHOLDS
+from vibench.stability.infsup import VANISHES
+
+ERROR_FLOOR = 1e-10
+"""Errors below this are round-off, and their ratio is meaningless."""
+
+CONSTANTS = ("beta_span_min", "beta_cone_lower_min")
+ERRORS = {
+    **{f"error_{name}_{how}": (f"error_{name}", how) for name in ("u", "lambda") for how in ("mean", "max")},
+    "violation_max": ("violation", "max"),
+}
+"""Columns of a cell that are means or maxima over its ok queries: of which column, and which of the two."""
+
+ZERO_ERRORS = ("error_u_zero_max", "error_lambda_zero_max")
+
+DIMENSIONS = ("N", "R", "rank", "enrichment")
+
+SECONDS = ("offline_s", "online_s")
+
+NUMBERS = ("benefit_threshold", "threshold_low", "threshold_high")
+
+WHATS = ("cell", "queries_ok", "status", *DIMENSIONS, *CONSTANTS, *ERRORS, *ZERO_ERRORS, *SECONDS)
+"""What is compared, in its order; break-even comes last."""
+
+Interval = tuple[float, float]
+UNKNOWN: Interval = (float("nan"), float("nan"))
+"""Of a ratio that has no interval."""
+
+
+class Verdict(StrEnum):
+    """What a difference between two numbers means."""
+
+    EQUAL = "equal"
+    WITHIN_ACCURACY = "within accuracy"
+    WITHIN_LIMIT = "within limit"
+    UNDECIDED = "undecided"
+    CHANGED = "changed"
+    BETTER = "better"
+    WORSE = "worse"
+
+
+MOVED = (Verdict.WORSE, Verdict.BETTER, Verdict.CHANGED)
+"""Verdicts on what is listed as a change, those first that matter most."""
+
+
+class Difference(NamedTuple):
+    """A column of a cell in two runs: the values, the verdict, and the 95 % interval of the ratio of seconds."""
+
+    cell: Mapping[str, Any]
+    what: str
+    before: Any
+    after: Any
+    verdict: Verdict
+    interval: Interval = UNKNOWN
+
+    @property
+    def ratio(self) -> float:
+        """After over before; NaN where either is no number or the denominator is zero."""
+        numbers = isinstance(self.before, float | int) and isinstance(self.after, float | int)
+        return float(self.after) / float(self.before) if numbers and self.before else float("nan")
+
+
+def of_numbers(one: Mapping[str, Any], two: Mapping[str, Any], limit: float) -> Iterator[Difference]:
+    """Differences of a cell in what does not depend on the machine; nothing of columns that are empty in both runs."""
+    severities = (Status(one["status"]).severity, Status(two["status"]).severity)
+    found: dict[str, Verdict | None] = {
+        "queries_ok": _verdict(one["queries_ok"], two["queries_ok"], 1.0, more_is_better=True),
+        "status": _verdict(*severities, 1.0),
+    }
+    for name in DIMENSIONS:
+        verdict = _verdict(one[name], two[name], limit)
+        found[name] = Verdict.CHANGED if verdict is Verdict.WITHIN_LIMIT else verdict
+    for name in CONSTANTS:
+        found[name] = _verdict(one[name], two[name], limit, floor=VANISHES, more_is_better=True)
+    for name in (*ERRORS, *ZERO_ERRORS):
+        allowed = _solvers_part(one, name) + _solvers_part(two, name)
+        found[name] = _verdict(one[name], two[name], limit, floor=ERROR_FLOOR, allowed=allowed)
+    for name, verdict in found.items():
+        if verdict is not None:
+            yield Difference(one, name, one[name], two[name], verdict)
+
+
+def _solvers_part(cell: Mapping[str, Any], error: str) -> float:
+    """What the QP solver contributed to an error at most: by the triangle inequality a mean moves by no more."""
+    largest = cell.get(f"solver_{error.rpartition('_')[0]}_max") if error in ERRORS else None
+    return 0.0 if largest is None or pd.isna(largest) else float(largest)
+
+
+def _verdict(
+    before: Any, after: Any, limit: float, *, floor: float = 0.0, allowed: float = 0.0, more_is_better: bool = False
+) -> Verdict | None:
+    """Verdict on a number that should be small, or large, `None` where there is none; one that is gone is worse."""
+    if pd.isna(before) or pd.isna(after):
+        return None if pd.isna(before) and pd.isna(after) else Verdict.WORSE if pd.isna(after) else Verdict.CHANGED
+    if before == after:
+        return Verdict.EQUAL
+    if abs(after - before) <= allowed:
+        return Verdict.WITHIN_ACCURACY
+    small, large = (max(before, floor), max(after, floor))
+    if more_is_better:
+        small, large = large, small
+    if large > limit * small:
+        return Verdict.WORSE
+    return Verdict.BETTER if small > limit * large else Verdict.WITHIN_LIMIT
+
+
+def of_seconds(one: ComparedRun, two: ComparedRun, shared: Sequence[str], limit: float) -> Iterator[Difference]:
+    """Differences in seconds and break-even of cells that one machine measured in both runs.
+
+    They are undecided where a row is marked as disturbed: other work on the machine slowed down what it measured.
+    """
+    disturbed = {key for key in shared if one.cells[key]["disturbed"] == 1 or two.cells[key]["disturbed"] == 1}
+    for key in shared:
+        before, after = one.cells[key], two.cells[key]
+        intervals: dict[str, Callable[[], Interval]] = {
+            "offline_s": lambda b=before, a=after: _offline_interval(b, a),  # type: ignore[misc]
+            "online_s": lambda k=key: _online_interval(one.rounds(k), two.rounds(k)),  # type: ignore[misc]
+        }
+        for name in SECONDS:
+            verdict, interval = _verdict(before[name], after[name], limit), UNKNOWN
+            if verdict in (Verdict.WORSE, Verdict.BETTER) and pd.notna(after[name]):
+                interval = intervals[name]()
+                decided = key not in disturbed and (interval[0] > 1.0 or interval[1] < 1.0)
+                verdict = verdict if decided else Verdict.UNDECIDED
+            if verdict is not None:
+                yield Difference(before, name, before[name], after[name], verdict, interval)
+    calm = [key for key in shared if key not in disturbed]
+    yield from _break_evens(one.thresholds_of(calm), two.thresholds_of(calm), limit)
+
+
+def _offline_interval(before: Mapping[str, Any], after: Mapping[str, Any]) -> Interval:
+    """Interval of the ratio of offline seconds, which are measured once: from the slowdowns during the two runs."""
+    low, high = (float(after[f"offline_{end}_s"]) for end in ("low", "high"))
+    return low / float(before["offline_high_s"]), high / float(before["offline_low_s"])
+
+
+def _online_interval(before: Sequence[float], after: Sequence[float]) -> Interval:
+    """Interval of the ratio of medians over rounds, which are drawn again with replacement in each of the runs."""
+    if min(len(before), len(after)) < FEWEST_ROUNDS:
+        return UNKNOWN
+    rng = np.random.default_rng(0)
+    drawn = [np.array(some)[rng.integers(len(some), size=(DRAWS, len(some)))] for some in (before, after)]
+    medians_before, medians_after = (np.median(rounds, axis=1) for rounds in drawn)
+    low, high = np.quantile(medians_after / medians_before, (TAIL, 1.0 - TAIL))
+    return float(low), float(high)
+
+
+def _break_evens(one: pd.DataFrame, two: pd.DataFrame, limit: float) -> Iterator[Difference]:
+    keys = [name for name in THRESHOLDS if not name.endswith(("_s", *NUMBERS, "meaning"))]
+    for row in one.merge(two, on=keys, suffixes=("_one", "_two")).to_dict("records"):
+        before, after = (_break_even(row, k) for k in ("one", "two"))
+        verdict: Verdict | None = Verdict.CHANGED
+        if before == after:
+            verdict = Verdict.EQUAL
+        elif before.overlaps(after):
+            verdict = Verdict.WITHIN_LIMIT
+        elif before.meaning == after.meaning:
+            verdict = _verdict(before.number, after.number, limit, more_is_better=before.meaning == Meaning.UNTIL)
+        own = [_verdict(row[f"{phase}_b_s_one"], row[f"{phase}_b_s_two"], limit) for phase in ("offline", "online")]
+        if Verdict.WORSE not in own and verdict is Verdict.WORSE:  # because the model it is compared with became faster
+            verdict = Verdict.CHANGED
+        elif Verdict.WORSE in own and verdict is Verdict.CHANGED and after.meaning == Meaning.NEVER:
+            verdict = Verdict.WORSE
+        cell = row | {name: row[f"{name}_b"] for name in ("cell", "primal", "assembly", "primal_tol")}
+        if verdict is not None:
+            yield Difference(cell, f"break-even against {row['primal_a']}", str(before), str(after), verdict)
+
+
+def _break_even(row: Mapping[Any, Any], run: str) -> BreakEven:
+    number, low, high = (None if pd.isna(n := row[f"{name}_{run}"]) else float(n) for name in NUMBERS)
+    return BreakEven(number, Meaning(row[f"meaning_{run}"]), low, high)
