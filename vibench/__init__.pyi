@@ -10,8 +10,11 @@ from .errors import VibenchError as VibenchError
 from .highfidelity.active_set import HighFidelitySolution as HighFidelitySolution
 from .highfidelity.active_set import HighFidelitySolver as HighFidelitySolver
 from .highfidelity.active_set import solve_high_fidelity as solve_high_fidelity
+from .interfaces.affine import AffineSum as AffineSum
+from .interfaces.affine_problem import AffineProblem as AffineProblem
 from .interfaces.figures import FigurePlugin as FigurePlugin
 from .interfaces.figures import ProblemTables as ProblemTables
+from .interfaces.outputs import Output as Output
 from .interfaces.problem import MEMBERS as MEMBERS
 from .interfaces.problem import Contact as Contact
 from .interfaces.problem import ParameterBox as ParameterBox
@@ -19,6 +22,7 @@ from .interfaces.problem import Picture as Picture
 from .interfaces.problem import Problem as Problem
 from .interfaces.problem import Sampler as Sampler
 from .interfaces.problem import VariationalInequality as VariationalInequality
+from .interfaces.sampling import Sampling as Sampling
 from .interfaces.strategies import Cone as Cone
 from .interfaces.strategies import DualStrategy as DualStrategy
 from .interfaces.strategies import Enrichment as Enrichment

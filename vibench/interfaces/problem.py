@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import Any, ClassVar
 
 import numpy as np
 import scipy.sparse as sp
 
 from vibench.arrays import Array, Indices, SparseMatrix
+from vibench.errors import RequestError, unknown_name
+from vibench.interfaces.affine import AffineSum
+from vibench.interfaces.outputs import Output
 from vibench.linalg.inner_product import InnerProduct
 
 
@@ -26,12 +30,15 @@ class ParameterBox:
         Bounds (d,).
     units
         One unit per parameter, "1" if dimensionless.
+    listed
+        The only parameters (L×d) at which the problem can be assembled; `None` if it can be everywhere in the box.
     """
 
     names: tuple[str, ...]
     lower: Array
     upper: Array
     units: tuple[str, ...]
+    listed: Array | None = None
 
     @property
     def dim(self) -> int:
@@ -47,6 +54,30 @@ class ParameterBox:
         """`count` uniform random points (count×d), the same for the same seed."""
         uniform = np.random.default_rng(seed).random((count, self.dim))
         return np.asarray(self.lower + uniform * (self.upper - self.lower))
+
+    def from_unit(self, unit: Array, log: Sequence[str] = ()) -> Array:
+        """The points (P×d) of the box at the places `unit` (P×d) of the unit cube, some parameters on a log scale.
+
+        Raises
+        ------
+        RequestError
+            If `log` names no parameter, or one whose lower bound is not positive.
+        """
+        linear = np.asarray(self.lower + unit * (self.upper - self.lower))
+        for i in self.logarithmic(log):
+            low, high = np.log(self.lower[i]), np.log(self.upper[i])
+            linear[:, i] = np.clip(np.exp(low + unit[:, i] * (high - low)), self.lower[i], self.upper[i])
+        return linear
+
+    def logarithmic(self, log: Sequence[str]) -> list[int]:
+        """Numbers of the parameters that `log` names; with the errors of `from_unit`."""
+        for name in log:
+            if name not in self.names:
+                raise unknown_name("parameter", name, self.names)
+            if self.lower[self.names.index(name)] <= 0.0:
+                low = self.lower[self.names.index(name)]
+                raise RequestError(f"'{name}' cannot have a log scale: its lower bound is {low:g}, expected > 0")
+        return [self.names.index(name) for name in dict.fromkeys(log)]
 
 
 @dataclass(frozen=True)
@@ -137,8 +168,16 @@ class Problem(ABC):
     """Inner product of the multiplier space, X_W (m×m), in a basis whose nonnegative coefficients are the cone W⁺."""
     constant: ClassVar[frozenset[str]] = frozenset()
     """Members of `VariationalInequality`, "A", "f", "B" or "g", that do not depend on mu."""
+    affine: Mapping[str, AffineSum] = MappingProxyType({})
+    """Members that are sums Σ_q θ_q(mu) · terms_q, by name; reduced assembly projects the terms and is exact.
+
+    `affine["A"].terms` and `affine["A"].coefficients(mu)` are the terms and θ(mu), as for bounds of the coercivity.
+    """
     entrywise: ClassVar[frozenset[str]] = frozenset()
     """Members that `sampler` evaluates entry by entry."""
+    separable: ClassVar[Mapping[str, int]] = MappingProxyType({})
+    """Members of `entrywise` that are combinations of fixed terms at every mu, with the number of these terms. Their
+    interpolation has no error if it has as many terms; a certificate at online cost relies on it."""
     requires: ClassVar[tuple[str, ...]] = ()
     """Optional distributions it cannot do without; where one is not installed its cells are unavailable."""
 
@@ -205,6 +244,11 @@ class Problem(ABC):
     def refuse(self, mu: Array, u: Array, lam: Array) -> str:  # noqa: ARG002
         """Why a high-fidelity solution u (n,), λ (m,) at mu (d,) is outside the scope of the model; "" if it is not."""
         return ""
+
+    @property
+    def outputs(self) -> tuple[Output, ...]:
+        """Quantities of interest, whose errors are recorded; none by default."""
+        return ()
 
     def picture(self, mu: Array, u: Array, lam: Array) -> Picture | None:  # noqa: ARG002
         """The picture of a solution u (n,), λ (m,) at mu (d,); `None` if not implemented."""

@@ -11,12 +11,16 @@ import numpy as np
 import scipy.sparse as sp
 
 from vibench.arrays import Array, Indices, SparseMatrix
+from vibench.errors import NumericalError
 from vibench.interfaces.problem import MEMBERS, Problem
 from vibench.interfaces.validation import checked_assembly
 from vibench.model.deim import interpolate
 
 CONSTANT_RTOL = 1e-13
 """A member whose entries vary by less over the training set, relative to the largest one, is constant."""
+
+AFFINE_RTOL = 1e-9
+"""Largest difference of a declared affine sum from the assembled member, relative to its largest entry."""
 
 MAX_TERMS_SHARE = 0.75
 """Interpolation is used where it needs no more terms than this share of the training parameters."""
@@ -26,6 +30,7 @@ class Evaluation(StrEnum):
     """How a member is evaluated at a parameter."""
 
     CONSTANT = "constant"
+    AFFINE = "affine"
     INTERPOLATED = "interpolated"
     CONTACT = "contact"
     FULL = "full"
@@ -42,7 +47,8 @@ class AffineMember:
     terms
         Matrices or vectors; one for a constant member, none where there is no decomposition.
     rows, columns
-        Positions (Q,) of the entries whose values at mu are the θ_q; `columns` is zero for vectors.
+        Positions (Q,) of the entries whose values at mu are the θ_q of an interpolated member; `columns` is zero for
+        vectors. The θ_q of a declared affine member are those of `Problem.affine`.
     error
         Largest relative error over the training set.
     reason
@@ -60,20 +66,44 @@ class AffineMember:
 def affine_decomposition(problem: Problem, training: Array, tolerance: float) -> dict[str, AffineMember]:
     """The members "A", "f", "B", "g", each with its cheapest evaluation.
 
-    Declared constants are not checked here; the others are assembled at all training parameters. Members that do not
-    vary there are constants, too. Members that the problem evaluates entry by entry are interpolated where that takes
-    few terms; a matrix that is one matrix times a function of mu takes one. Else B and g are left to `Problem.contact`,
-    if the problem has it. `training` is (P×d), `tolerance` the largest relative interpolation error.
+    Declared constants are not checked here. Declared affine sums are exact; they are compared with the assembly at the
+    first, the middle and the last training parameter. The others are assembled at all training parameters. Members that
+    do not vary there are constants, too. Members that the problem evaluates entry by entry are interpolated where that
+    takes few terms; a matrix that is one matrix times a function of mu takes one. Else B and g are left to
+    `Problem.contact`, if the problem has it. `training` is (P×d), `tolerance` the largest relative interpolation error.
+
+    Raises
+    ------
+    NumericalError
+        If an assembly is invalid, or a declared affine sum differs from it.
     """
     first = checked_assembly(problem, training[0]).copy()
-    varying = [name for name in MEMBERS if name not in problem.constant]
+    _check_affine(problem, training)
+    varying = [name for name in MEMBERS if name not in problem.constant and name not in problem.affine]
     assembled = _assembled(problem, training, varying) if varying else {}
-    return {
-        name: _member(name, assembled[name], problem, tolerance)
-        if name in varying
-        else AffineMember(Evaluation.CONSTANT, (getattr(first, name),))
-        for name in MEMBERS
-    }
+    found: dict[str, AffineMember] = {}
+    for name in MEMBERS:
+        if name in problem.constant:
+            found[name] = AffineMember(Evaluation.CONSTANT, (getattr(first, name),))
+        elif name in problem.affine:
+            found[name] = AffineMember(Evaluation.AFFINE, problem.affine[name].terms)
+        else:
+            found[name] = _member(name, assembled[name], problem, tolerance)
+    return found
+
+
+def _check_affine(problem: Problem, training: Array) -> None:
+    """Refuse affine sums that are not the assembled members."""
+    for mu in training[[0, len(training) // 2, -1]] if problem.affine else ():
+        vi = checked_assembly(problem, mu)
+        for name, declared in problem.affine.items():
+            exact, found = getattr(vi, name), declared.at(mu)
+            if found.shape != exact.shape:
+                raise NumericalError(f"the affine sum of {name} has shape {found.shape}, {name} itself {exact.shape}")
+            away, size = float(abs(found - exact).max()), float(abs(exact).max())
+            if not away <= AFFINE_RTOL * size:
+                what = f"by {away:.1e} at mu = {mu.tolist()}, where its largest entry is {size:.1e}"
+                raise NumericalError(f"the affine sum declared for {name} differs from the assembled {name} {what}")
 
 
 def _assembled(problem: Problem, training: Array, names: Sequence[str]) -> Mapping[str, list[Any]]:

@@ -85,7 +85,7 @@ def _check_operators(pack: ModelPack) -> None:
         if isinstance(member, Affine):
             try:
                 for mu in listed:
-                    member.coefficients(mu)
+                    member.sum.coefficients(mu)
             except NumericalError as error:
                 raise RequestError(f"operators.{name}: {error}") from None
     for mu in listed[np.linspace(0, len(listed) - 1, FACTORISED).round().astype(int)]:

@@ -9,11 +9,11 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-import scipy.sparse as sp
 
-from vibench.arrays import Array, Indices, SparseMatrix
+from vibench.arrays import Array, Indices
 from vibench.errors import NumericalError
-from vibench.packs.expressions import Expression
+from vibench.interfaces.affine import AffineSum, Thetas, entries_of
+from vibench.interfaces.expressions import Expression
 
 SAME_RTOL = 1e-8
 """Largest distance between a parameter and a listed one that count as the same, relative to the widths of the box.
@@ -120,35 +120,18 @@ class Affine(PackMember):
         """Whether no coefficient is tabulated."""
         return not any(isinstance(theta, Table) for theta in self.thetas)
 
-    def coefficients(self, mu: Array) -> Array:
-        """θ(µ) (Q,)."""
-        return np.array([theta(mu) for theta in self.thetas])
+    @cached_property
+    def sum(self) -> AffineSum:
+        """The sum, as problems declare it."""
+        return AffineSum(self.terms, Thetas(self.thetas))
 
     def at(self, mu: Array) -> Any:
         """The sum; matrices have the same sparsity pattern, the union of those of the terms, at every mu."""
-        theta = self.coefficients(mu)
-        if isinstance(self.terms[0], np.ndarray):
-            return np.stack(self.terms, axis=-1) @ theta
-        pattern, values = self._stacked
-        return sp.csr_array((values @ theta, pattern.indices, pattern.indptr), shape=pattern.shape)
-
-    @cached_property
-    def _stacked(self) -> tuple[SparseMatrix, SparseMatrix]:
-        """The union of the patterns, and the entries of the terms on it (k×Q)."""
-        coo = [sp.coo_array(term) for term in self.terms]
-        rows, columns = (np.concatenate([term.coords[axis] for term in coo]) for axis in (0, 1))
-        shape = self.terms[0].shape
-        pattern = sp.csr_array((np.ones(len(rows)), (rows, columns)), shape=shape)
-        keys = np.repeat(np.arange(shape[0]), np.diff(pattern.indptr)) * shape[1] + pattern.indices
-        places = np.searchsorted(keys, rows.astype(np.int64) * shape[1] + columns)
-        number = np.repeat(np.arange(len(coo)), [term.nnz for term in coo])
-        data = np.concatenate([term.data for term in coo])
-        return pattern, sp.csr_array((data, (places, number)), shape=(len(keys), len(coo)))
+        return self.sum.at(mu)
 
     def entries(self, rows: Indices, columns: Indices) -> Callable[[Array], Array]:
         """The sum of these entries of the terms."""
-        values = np.stack([entries_of(term, rows, columns) for term in self.terms], axis=-1)
-        return lambda mu: np.asarray(values @ self.coefficients(mu))
+        return self.sum.entries(rows, columns)
 
     @property
     def arrays(self) -> Sequence[Any]:
@@ -187,10 +170,3 @@ class Listed(PackMember):
 
     def __str__(self) -> str:
         return f"one array for each of {len(self.values)} listed parameters"
-
-
-def entries_of(array: Any, rows: Indices, columns: Indices) -> Array:
-    """Entries (k,) of a vector or a sparse matrix."""
-    if isinstance(array, np.ndarray):
-        return array[rows]
-    return np.asarray(sp.csr_array(array)[rows, columns]).ravel()

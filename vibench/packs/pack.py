@@ -11,6 +11,8 @@ import scipy.sparse as sp
 
 from vibench.arrays import Array, Indices
 from vibench.errors import NumericalError
+from vibench.interfaces.affine import AffineSum
+from vibench.interfaces.outputs import Output
 from vibench.interfaces.problem import MEMBERS, ParameterBox, VariationalInequality
 from vibench.linalg.inner_product import InnerProduct
 from vibench.packs.manifest import Manifest
@@ -64,6 +66,8 @@ class ModelPack:
         Reference solutions, or `None`.
     mesh
         Data of pictures, or `None`.
+    outputs
+        Quantities of interest.
     """
 
     manifest: Manifest
@@ -77,6 +81,7 @@ class ModelPack:
     integrals: Array | None
     reference: Reference | None
     mesh: PackMesh | None
+    outputs: tuple[Output, ...] = ()
 
     @property
     def constant(self) -> frozenset[str]:
@@ -89,6 +94,12 @@ class ModelPack:
         operators = self.manifest.operators
         given = None if operators is None else operators.entrywise
         return frozenset(self.members if given is None else map(str, given)) - self.constant
+
+    @property
+    def affine(self) -> Mapping[str, AffineSum]:
+        """Affine members that reduced assembly may use."""
+        members = {name: self.members[name] for name in MEMBERS if name in self.entrywise}
+        return {name: member.sum for name, member in members.items() if isinstance(member, Affine)}
 
     @property
     def everywhere(self) -> bool:

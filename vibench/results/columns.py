@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import NamedTuple
 
-VERSION = 10
+VERSION = 11
 """Schema version of a results file; a file of another version is refused."""
 
 TEXT, REAL, INTEGER, BLOB = "TEXT", "REAL", "INTEGER", "BLOB"
@@ -56,12 +56,17 @@ UNITS: Mapping[str, str] = {
     "A²": "the unit of the energy",
     "b": "the unit of b(v, η), which is that of the energy",
     "b/VW": "the unit of b(v, η) divided by those of the norms of V and W",
+    "o": "the unit of the output, in the column unit",
 }
 """The units and what they stand for; those of V, W and b depend on the problem."""
 
 KEYS: Mapping[str, Column] = {
     "problem": Column(TEXT, "", "Problem: its label in the study, or its name.", "problem", 1),
     "problem_options": Column(TEXT, "", "Options of the problem that are not at their default, as JSON.", whole=True),
+    "training": Column(TEXT, "", "Training set: own, or the label or name of its sampling strategy.", "training", 2),
+    "training_options": Column(
+        TEXT, "", "Options of the sampling strategy that are not at their default, as JSON.", whole=True
+    ),
     "dual": Column(TEXT, "", "Dual strategy: its label in the study, or its name.", "dual", 4),
     "dual_options": Column(
         TEXT, "", "Options of the dual strategy that are not at their default, as JSON.", whole=True
@@ -105,6 +110,9 @@ CELLS: Mapping[str, Column] = {
     "reason": Column(TEXT, "", "Why the cell is not ok: the first query with this status, and its fault."),
     "queries": Column(INTEGER, "", "Number of queries, one per validation parameter."),
     "queries_ok": Column(INTEGER, "", "Number of queries with status ok; means and maxima are over these.", "ok", 10),
+    "snapshots": Column(
+        INTEGER, "", "High-fidelity solutions that the training took: parameters of the training set.", "solved", 11
+    ),
     "dim_V": Column(INTEGER, "", "Dimension n of V."),
     "dim_W": Column(INTEGER, "", "Dimension m of W."),
     "N": Column(INTEGER, "", "Dimension N of V_N.", "N", 11),
@@ -128,10 +136,12 @@ CELLS: Mapping[str, Column] = {
     ),
     "interpolation_error": Column(REAL, "1", "Largest relative interpolation error of a member over the training set."),
     "terms_A": Column(
-        INTEGER, "", "Entries of A that a reduced query evaluates; 0 if A is constant, empty if A is not interpolated."
+        INTEGER,
+        "",
+        "Terms of A in a reduced query, each with a coefficient to evaluate; 0 if A is constant, empty if assembled.",
     ),
     "terms_f": Column(INTEGER, "", "Likewise for f."),
-    "terms_B": Column(INTEGER, "", "Likewise for B; also empty if B is assembled on the contact unknowns."),
+    "terms_B": Column(INTEGER, "", "Likewise for B; empty if B is assembled on the contact unknowns."),
     "terms_g": Column(INTEGER, "", "Likewise for g."),
     "offline_snapshots_s": Column(REAL, "s", "High-fidelity solutions at the training parameters, with one set-up."),
     "offline_pod_s": Column(REAL, "s", "POD."),
@@ -215,6 +225,10 @@ CELLS: Mapping[str, Column] = {
         INTEGER, "", "1 if the slowdown exceeds 1.3, or the wall seconds exceed 1.5 times the CPU seconds; else 0."
     ),
     "seed": Column(INTEGER, "", "Seed of the study."),
+    "validation": Column(TEXT, "", "Validation set: own, or the label or name of its sampling strategy."),
+    "validation_options": Column(
+        TEXT, "", "Options of that strategy that are not at their default, as JSON.", whole=True
+    ),
     "study_hash": Column(TEXT, "", "Hash of the study file."),
     "code": Column(TEXT, "", "Hash of the code of the core, the plugins and the solver."),
     "machine": Column(TEXT, "", "Machines that measured the seconds."),
@@ -328,6 +342,12 @@ QUERIES: Mapping[str, Column] = {
     "beta_energy": Column(
         REAL, "b/AW", "β_A, proved lower bound of the inf-sup constant of V in the norm of A(µ) and W over the span."
     ),
+    "outputs": Column(
+        TEXT,
+        "",
+        "Quantities of interest as JSON: value, high-fidelity reference, relative error, error over the scale.",
+        whole=True,
+    ),
     "violation": Column(
         REAL, "u", "Largest (B u_N − g)₊, each row divided by the integral of its multiplier function."
     ),
@@ -430,6 +450,22 @@ SOLUTIONS: Mapping[str, Column] = {
     "slack_constant": Column(REAL, "V²", "Constant c in the square of that distance."),
 }
 
+OUTPUTS: Mapping[str, Column] = {
+    "cell": Column(MEMBER, "", "The cell it belongs to.", "cell", 0),
+    **KEYS,
+    "output": Column(TEXT, "", "Quantity of interest, as its problem names it.", "output", 10),
+    "unit": Column(TEXT, "", "Its unit.", "unit", 11),
+    "linear": Column(INTEGER, "", "1 where it is linear in u and λ with fixed coefficients, else 0."),
+    "scale": Column(REAL, "o", "Its largest absolute value over the training set.", "scale", 12),
+    "queries_ok": Column(INTEGER, "", "Ok queries, over which means and maxima are."),
+    "error_mean": Column(REAL, "1", "Mean relative error, where the output is not zero.", "error", 13),
+    "error_max": Column(REAL, "1", "Largest relative error, likewise.", "largest", 14),
+    "queries_zero": Column(INTEGER, "", "Ok queries where it is at most 1e-8 of its scale: no contact, for instance."),
+    "error_zero_max": Column(REAL, "1", "Largest error of these, over the scale."),
+    "error_scaled_mean": Column(REAL, "1", "Mean error over the scale, of all ok queries.", "error / scale", 15),
+    "error_scaled_max": Column(REAL, "1", "Largest error over the scale, likewise."),
+}
+
 PICTURES: Mapping[str, Column] = {
     "problem": Column(TEXT, "", "Problem: its label in the study, or its name."),
     "problem_options": Column(TEXT, "", "Options of the problem that are not at their default, as JSON.", whole=True),
@@ -447,6 +483,7 @@ TABLES: Mapping[str, Mapping[str, Column]] = {
     "timings": TIMINGS,
     "thresholds": THRESHOLDS,
     "disagreements": DISAGREEMENTS,
+    "outputs": OUTPUTS,
 }
 """The tables for reading; each is exported as CSV."""
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 import resource
 from collections.abc import Callable, Mapping, Sequence
@@ -13,6 +14,8 @@ import numpy as np
 from vibench.errors import in_a_line
 from vibench.interfaces.strategies import Kind
 from vibench.model.errors import Reference, zeros
+from vibench.model.output_errors import scales as output_scales
+from vibench.model.output_errors import summarise_outputs
 from vibench.provenance import machine
 from vibench.qp.exact import ExactSolution
 from vibench.qp.status import Status
@@ -31,7 +34,7 @@ from vibench.stages.infsup_constants import (
 )
 from vibench.stages.offline import ReducedCone
 from vibench.stages.query import Queries, Query, error_columns, run_query
-from vibench.stages.snapshots import gather, training_stages, validation_stages
+from vibench.stages.snapshots import gather, validation_stages
 from vibench.storage.artefacts import Artefact, Store
 from vibench.study import registry
 from vibench.study.cells import Cell
@@ -46,11 +49,12 @@ QueryRows = tuple[Row, Row | None]
 
 @dataclass(frozen=True)
 class CellRows:
-    """The rows of one cell: its own, one per query, and the solutions of the queries that have one."""
+    """The rows of one cell: its own, one per query, the solutions of those that have one, and one per output."""
 
     cell: Row
     queries: tuple[Row, ...]
     solutions: tuple[Row, ...] = ()
+    outputs: tuple[Row, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -102,7 +106,8 @@ class CellQueries(PiecewiseStage):
 
     @property
     def _constraints(self) -> ValidationConstraints:
-        return ValidationConstraints(self.assembly.enrichment.pod.problem, self.assembly.count, self.assembly.seed)
+        assembly = self.assembly
+        return ValidationConstraints(assembly.enrichment.pod.problem, assembly.count, assembly.seed, assembly.sampling)
 
     @property
     def exact(self) -> ExactSolutions:
@@ -112,12 +117,13 @@ class CellQueries(PiecewiseStage):
     @property
     def training(self) -> tuple[Stage, ...]:
         """The stages of the training snapshots."""
-        return training_stages(self.assembly.enrichment.pod.problem)
+        return self.assembly.enrichment.pod.inputs()
 
     @property
     def validation(self) -> tuple[Stage, ...]:
         """The stages of the reference solutions."""
-        return validation_stages(self.assembly.enrichment.pod.problem, self.assembly.count, self.assembly.seed)
+        assembly = self.assembly
+        return validation_stages(assembly.enrichment.pod.problem, assembly.count, assembly.seed, assembly.sampling)
 
     @property
     def offline(self) -> Mapping[str, tuple[Stage, ...]]:
@@ -157,11 +163,14 @@ class _Queries(Pieces):
         self._cone: ReducedCone = value_of(store, stage.assembly.enrichment.cone)
         self._training, self._reference = gather(store, stage.training), gather(store, stage.validation)
         problem = self._model.problem
-        scales = (
-            float(np.max(space.norm(columns), initial=0.0))
-            for space, columns in ((problem.V, self._training.u), (problem.W, self._training.lam))
+        trained = self._training
+        self._compared = Reference(
+            self._reference.u,
+            self._reference.lam,
+            float(np.max(problem.V.norm(trained.u), initial=0.0)),
+            float(np.max(problem.W.norm(trained.lam), initial=0.0)),
+            output_scales(problem.outputs, trained.mu, trained.u, trained.lam),
         )
-        self._compared = Reference(self._reference.u, self._reference.lam, *scales)
         self._zeros = zeros(problem, self._compared)
         self._own, self._full, self._plain = (value_of(store, known) for known in stage.constants)
         self._stability: list[Stability] = value_of(store, stage.reference)
@@ -183,7 +192,15 @@ class _Queries(Pieces):
         assessed = dict(zip(solutions, self._assess(solutions), strict=True))
         rows = [row | assessed.get(k, {}) for k, (row, _) in enumerate(pieces)]
         own = summarise(rows) | self._sizes() | self._shares() | self._offline()
-        return CellRows(own, tuple(rows), tuple(solutions.values()))
+        outputs = self._outputs(rows)
+        written = [row | {"outputs": json.dumps(found) if (found := row.get("outputs")) else None} for row in rows]
+        return CellRows(own, tuple(written), tuple(solutions.values()), outputs)
+
+    def _outputs(self, rows: Sequence[Row]) -> tuple[Row, ...]:
+        """Rows of the problem's outputs, over the ok queries."""
+        fine = [row["outputs"] for row in rows if row["status"] == Status.OK]
+        outputs, scale = self._model.problem.outputs, self._compared.scale_outputs
+        return tuple(dict(row) for row in summarise_outputs(outputs, scale, fine))
 
     def _assess(self, solutions: Mapping[int, Row]) -> list[Row]:
         """Error columns of some queries, all at once; where that fails, one by one, and a row says why it failed."""
@@ -242,6 +259,7 @@ class _Queries(Pieces):
             "rank": cone.prepared.rank,
             "rank_gap": cone.prepared.rank_gap,
             "gram_condition": cone.prepared.gram_condition,
+            "snapshots": len(self._training.mu),
             "enrichment": cone.prepared.rank if built.kind is Kind.PER_PARAMETER else added,
             **assembly.columns(self._store),
             "fallbacks": "; ".join(fallbacks),

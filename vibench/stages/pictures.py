@@ -33,15 +33,16 @@ class PictureStage(Stage):
     rooms = ("interfaces",)
 
     problem: Plugin
+    training: Plugin | None = None
 
     @property
     def axes(self) -> Axes:
-        """The problem alone."""
+        """The problem alone: its pictures are those of one training set."""
         return Axes(problem=self.problem)
 
     def inputs(self) -> tuple[Stage, ...]:
         """The training snapshots."""
-        return training_stages(self.problem)
+        return training_stages(self.problem, self.training)
 
     def run(self, store: Store) -> Result:
         """Titles and pictures, in the order of `CORNERS`; empty for a problem without pictures."""

@@ -218,7 +218,7 @@ def on_contact(case: ProblemCase) -> Iterator[str]:
     defined = type(problem).contact is not Problem.contact
     if dofs is None:
         yield Note("not declared")
-        if defined:
+        if defined and problem.contact(case.mus[0].copy()) is not None:
             yield "`contact` is defined but `contact_dofs` is not, so it is never used; name the unknowns B may touch"
     elif fault := _dofs_fault(dofs, problem.V.dim):
         raise ConformanceError(f"`contact_dofs` {fault}")
@@ -255,6 +255,27 @@ def _check_contact(case: ProblemCase, dofs: Indices, mu: Array, full: Arrays) ->
         raise ConformanceError(f"{fault} ({at(mu)})")
     columns = "B[:, contact_dofs]"
     _compare("contact", mu, {columns: contact.B, "g": contact.g}, full | {columns: full["B"][:, dofs]})
+
+
+def affine(case: ProblemCase) -> Iterator[str]:
+    """Sums declared in `affine` agree with `assemble`."""
+    problem = case.plugin
+    yield from _undeclarable("affine", problem.affine)
+    declared = {name: each for name, each in problem.affine.items() if name in MEMBERS}
+    if not declared:
+        yield Note("not declared")
+        return
+    yield Note(", ".join(f"{name}: {len(each.terms)} terms" for name, each in declared.items()))
+    for where, mu in case.arguments.items():
+        for name, each in declared.items():
+            try:
+                found = each.at(mu.copy())
+            except NumericalError as error:
+                raise ConformanceError(f"the affine sum of {name} {where}: {error}") from error
+            full = case.results[where]
+            if fault := array_fault(f"the affine sum of {name}", found, full[name].shape, sparse=name in "AB"):
+                raise ConformanceError(f"{fault} ({where})")
+            _compare("affine", mu, {name: found}, full)
 
 
 def by_entries(case: ProblemCase) -> Iterator[str]:

@@ -19,6 +19,7 @@ from numerics import Varying
 
 from vibench.errors import NumericalError
 from vibench.highfidelity.active_set import HighFidelitySolver
+from vibench.interfaces.affine import AffineSum
 from vibench.interfaces.problem import MEMBERS, Contact, Problem, VariationalInequality
 from vibench.interfaces.strategies import Enrichment, Kind
 from vibench.interfaces.validation import checked_assembly
@@ -170,6 +171,23 @@ def test_programs_are_those_of_the_full_assembly(constraint: str, stiffness: str
     reduced = online(model)
     for mu in NEW:
         assert_same_program(model, reduced, mu, 1e-9)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("constraint", ["constant", "one", "several"])
+@pytest.mark.parametrize("declared", ["ABfg", "Ag", "B"])
+def test_declared_terms_give_the_program_up_to_round_off(constraint: str, kind: str, declared: str) -> None:
+    problem = Rope(constraint)
+    problem.affine = {
+        name: AffineSum(tuple(problem._terms[name]), lambda mu, name=name: problem.factors(name, float(mu[0])))
+        for name in declared
+    }
+    members = separation(problem)
+    assert {name for name in MEMBERS if members[name].way is Evaluation.AFFINE} == set(declared)
+    model = reduced_model(problem, kind, 3, 2, problem.training_set()[:5])
+    accuracy = 1e-13 if declared == "ABfg" else 1e-9
+    for mu in NEW:
+        assert_same_program(model, HyperReducedModel(model, hyper_reduce(model, members)), mu, accuracy)
 
 
 class Mixed(Rope):

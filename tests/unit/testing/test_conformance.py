@@ -96,6 +96,9 @@ MORE_PROBLEMS: Mapping[str, Case] = {
     "WrongSign": ("high-fidelity solution", ["no constraint is active at any of 9", "B u ≤ g"]),
     "OutOfReach": ("high-fidelity solution", ["no solution at mu = [8.0]", "more than the wire bears"]),
     "PaintsNothing": ("picture and diagnostics", ["picture.values has shape (11,); expected (12,)", "points 0 to 12"]),
+    "OutputsOfOneName": ("outputs", ["two outputs have the same name: force, force"]),
+    "OutputOfNothing": ("outputs", ["the output 'peak' fails at mu = [4.0]: ValueError: zero-size array"]),
+    "OutputOfAnotherSize": ("outputs", ["the output 'force' has coefficients of λ of shape (13,); expected (12,)"]),
     "Unfinished": ("construction", ["abstract class Unfinished", "assemble"]),
 }  # fmt: skip
 
@@ -228,7 +231,7 @@ def test_one_error_lists_all_failures() -> None:
     with pytest.raises(testing.ConformanceError) as caught:
         testing.check_problem(broken_problems.Worse)
     lines = str(caught.value).splitlines()
-    assert lines[0] == "Worse fails 2 of 22 checks"
+    assert lines[0] == "Worse fails 2 of 23 checks"
     assert [line.split(":")[0] for line in lines[1:]] == ["training set", "pickling"]
 
 

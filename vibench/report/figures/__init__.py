@@ -21,7 +21,7 @@ from vibench.files import write_atomically
 from vibench.report.figures import constants, convergence, costs
 from vibench.report.figures.constants import inf_sup, shares
 from vibench.report.figures.convergence import diagnostics, enrichment, orthogonality, projection_errors
-from vibench.report.figures.costs import dimension, total_cost, work_precision
+from vibench.report.figures.costs import dimension, outputs, total_cost, work_precision
 from vibench.report.figures.data import Data, file_names, problems
 from vibench.report.figures.plugins import FigureError, of_plugins
 from vibench.report.figures.solutions import solutions
@@ -41,6 +41,7 @@ OF_PROBLEM: dict[str, Drawing] = {
     "solvers": solvers,
     "precision": precision,
     "total-cost": total_cost,
+    "outputs": outputs,
 }
 """Figures of every problem, by the end of their file names."""
 
@@ -51,6 +52,7 @@ LONG: dict[str, tuple[Callable[[Data], int], int]] = {
     "dimension": (costs.sized, DEEP),
     "work-precision": (costs.timed, DEEP),
     "total-cost": (costs.pairs, ABREAST * DEEP),
+    "outputs": (costs.reported, ABREAST * DEEP),
     "enrichment": (convergence.enriched, DEEP),
     "inf-sup": (constants.pairs, constants.MOST_PAIRS),
 }
@@ -90,7 +92,8 @@ def draw(path: Path, kind: str, problem: str | None = None, dual: str | None = N
     kind
         A key of `OF_PROBLEM` or `OF_DUAL`, or a figure of a plugin.
     problem, dual
-        Label of the problem, and of the dual strategy for a kind of `OF_DUAL`; `None` where there is only one.
+        Label of the problem ("LABEL, TRAINING" where it has several training sets), and of the dual strategy for a kind
+        of `OF_DUAL`; `None` where there is only one.
 
     Raises
     ------

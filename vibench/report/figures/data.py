@@ -16,10 +16,12 @@ import pandas as pd
 from vibench.report.figures.looks import Series
 from vibench.results import pictures, tables
 
-TABLES = ("cells", "queries", "histories", "thresholds")
+TABLES = ("cells", "queries", "histories", "thresholds", "outputs")
 
 PAIR = ["pod_tol", "pod_size", "dual_tol", "dual_size"]
 """Tolerances or prescribed sizes that determine the dimensions (N, R)."""
+
+PROBLEM = ["problem", "problem_options"]
 
 PRIMAL = ["primal", "primal_options", "primal_tol"]
 
@@ -28,7 +30,9 @@ Panel = TypeVar("Panel")
 
 @dataclass(frozen=True)
 class Data:
-    """The tables of one problem of a run: what figures and findings are made from (`vibench.ProblemTables`).
+    """The tables of one problem of a run, and of one training set where it has several.
+
+    They are what figures and findings are made from (`vibench.ProblemTables`).
 
     Each has a column `pair`, a text of the values of `PAIR`; queries also have the columns `enrichment_kind`, `N` and
     `R` of their cells.
@@ -41,6 +45,7 @@ class Data:
     queries: pd.DataFrame
     histories: pd.DataFrame
     thresholds: pd.DataFrame
+    outputs: pd.DataFrame
     pictures: tuple[pictures.Shown, ...]
     page: tuple[int, int] | None = None
     """Which of how many pages of a long figure is drawn, from 0; `None` for all panels in one figure."""
@@ -82,27 +87,31 @@ class Data:
 
 
 def problems(path: Path) -> Iterator[tuple[str, Data]]:
-    """Every problem of a results file that has queries, with the name its files begin with."""
+    """Every problem and training set of a results file that has queries, with the name its files begin with.
+
+    The training set is named where a problem has several.
+    """
     read = {name: tables.in_order(tables.read(path, name)) for name in TABLES}
     if read["queries"].empty:
         return
-    for axis in ("dual", "primal"):
+    for axis in ("training", "dual", "primal"):
         _tell_apart(axis, read["cells"], [frame for frame in read.values() if axis in frame])
     read["queries"] = read["queries"].merge(read["cells"][["cell", "enrichment_kind", "N", "R"]], "left", "cell")
     for frame in read.values():
         frame["pair"] = [str(pair) for pair in frame[PAIR].astype(float).itertuples(index=False, name=None)]
     shown = tuple(pictures.read(path))
-    keys = list(dict.fromkeys(zip(read["queries"]["problem"], read["queries"]["problem_options"], strict=True)))
-    for name, (problem, options) in zip(file_names([str(problem) for problem, _ in keys]), keys, strict=True):
+    keys = list(dict.fromkeys(read["queries"][[*PROBLEM, "training"]].itertuples(index=False, name=None)))
+    several = {key[:2] for key in keys if len({one for one in keys if one[:2] == key[:2]}) > 1}
+    labels = [f"{key[0]}, {key[2]}" if key[:2] in several else str(key[0]) for key in keys]
+    for name, label, (*problem, training) in zip(file_names(labels), labels, keys, strict=True):
         mine = {
-            table: frame[(frame["problem"] == problem) & (frame["problem_options"] == options)]
+            # What a problem tells of its validation solutions belongs to no training set.
+            table: frame[(frame[PROBLEM] == problem).all(axis=1) & frame["training"].isin([training, None])]
             for table, frame in read.items()
         }
-        drawn = tuple(one for one in shown if one.key == (problem, options))
-        yield (
-            name,
-            Data(str(problem), _plugin_name(mine["cells"], "problem"), _options(options), **mine, pictures=drawn),
-        )
+        drawn = tuple(one for one in shown if one.key == tuple(problem))
+        options = _options(problem[1])
+        yield name, Data(label, _plugin_name(mine["cells"], "problem"), options, **mine, pictures=drawn)
 
 
 def _tell_apart(axis: str, cells: pd.DataFrame, frames: list[pd.DataFrame]) -> None:

@@ -1,0 +1,171 @@
+"""Affine sums and problems that consist of them."""
+
+from __future__ import annotations
+
+import math
+import pickle
+from typing import Any
+
+import numpy as np
+import pytest
+import scipy.sparse as sp
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from vibench import (
+    AffineProblem,
+    AffineSum,
+    Array,
+    HighFidelitySolver,
+    InnerProduct,
+    NumericalError,
+    ParameterBox,
+    RequestError,
+)
+from vibench.model.affine import Evaluation, affine_decomposition
+from vibench.testing import ConformanceError, check_problem
+
+
+def squared(mu: Array) -> float:
+    return float(mu[0] ** 2)
+
+
+class Strings(AffineProblem):
+    """Two strings side by side over a floor, the second of them free of contact; A, f and g vary."""
+
+    parameters = ParameterBox(("tension", "depth"), np.array([0.5, 0.1]), np.array([2.0, 0.3]), ("N", "m"))
+
+    def __init__(self, nodes: int = 12, contact: int = 5) -> None:
+        h, off = 1.0 / (nodes + 1), np.ones(nodes - 1)
+        K = sp.diags_array([2.0 * np.ones(nodes), -off, -off], offsets=[0, 1, -1]) / h
+        zero = sp.csr_array((nodes, nodes))
+        first, second = sp.block_diag([K, zero]), sp.block_diag([zero, K])
+        B = sp.csr_array((np.full(contact, -h), (np.arange(contact), np.arange(contact) + 2)), (contact, 2 * nodes))
+        self.V = InnerProduct(sp.csr_array(sp.block_diag([K, K])))
+        self.W = InnerProduct(sp.csr_array(sp.diags_array(np.full(contact, h))))
+        load = np.full(2 * nodes, -h)
+        self.declare(
+            A=[("tension", first), (squared, second), (0.5, second)],
+            f=[("4 + sin(tension)", load)],
+            B=B,
+            g=[("depth", np.full(contact, h))],
+        )
+
+    def training_set(self) -> Array:
+        return self.parameters.grid(4, 3)
+
+
+def test_a_declared_problem_passes_the_conformance_checks() -> None:
+    check_problem(Strings)
+
+
+class Wrong(Strings):
+    """Declares half of the load that it assembles."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.affine = {**self.affine, "f": self.affine["f"].mapped(lambda term: 0.5 * term)}
+
+
+def test_the_conformance_checks_name_a_sum_that_is_not_the_member() -> None:
+    with pytest.raises(ConformanceError, match="affine sums: f of `affine` differs from that of `assemble`"):
+        check_problem(Wrong)
+
+
+def test_members_are_the_sums_that_were_declared() -> None:
+    problem, mu = Strings(), np.array([1.3, 0.2])
+    vi = problem.assemble(mu)
+    terms = [term.toarray() for term in problem.affine["A"].terms]
+    assert np.allclose(vi.A.toarray(), 1.3 * terms[0] + (1.3**2 + 0.5) * terms[1], rtol=1e-15)
+    assert np.allclose(vi.f, -(4.0 + math.sin(1.3)) / 13)
+    assert np.allclose(vi.g, 0.2 / 13)
+    assert problem.constant == {"B"}
+    assert problem.contact_dofs is not None
+    assert problem.contact_dofs.tolist() == [2, 3, 4, 5, 6]
+    assert np.array_equal(problem.constraint(mu)[0].toarray(), vi.B.toarray())
+    assert np.allclose(problem.affine["A"].coefficients(mu), [1.3, 1.69, 0.5])
+
+
+def test_constraints_on_most_unknowns_declare_no_contact() -> None:
+    class Everywhere(Strings):
+        def __init__(self) -> None:
+            super().__init__()
+            self.W = InnerProduct(sp.csr_array(sp.eye_array(24)))
+            self.declare(A=self.V.matrix, f=np.ones(24), B=sp.csr_array(sp.eye_array(24)), g=[("depth", np.ones(24))])
+
+    problem = Everywhere()
+    assert problem.contact_dofs is None
+    assert problem.contact(np.ones(2)) is None
+    solution = HighFidelitySolver(problem).solve(np.array([1.0, 0.2]))
+    assert solution.u.max() == pytest.approx(0.2)
+
+
+def test_the_decomposition_has_the_declared_terms() -> None:
+    problem = Strings()
+    members = affine_decomposition(problem, problem.training_set(), 1e-6)
+    assert {name: (m.way, len(m.terms), m.error) for name, m in members.items()} == {
+        "A": (Evaluation.AFFINE, 3, 0.0),
+        "f": (Evaluation.AFFINE, 1, 0.0),
+        "B": (Evaluation.CONSTANT, 1, 0.0),
+        "g": (Evaluation.AFFINE, 1, 0.0),
+    }
+
+
+def test_a_sum_that_is_not_the_member_is_refused() -> None:
+    problem = Strings()
+    problem.affine = {
+        **problem.affine,
+        "f": AffineSum.of([("tension", problem.affine["f"].terms[0])], ["tension", "d"]),
+    }
+    with pytest.raises(
+        NumericalError, match=r"the affine sum declared for f differs from the assembled f by 3\.1e-01 at mu"
+    ):
+        affine_decomposition(problem, problem.training_set(), 1e-6)
+    problem.affine = {"A": AffineSum.of([(1.0, sp.csr_array(sp.eye_array(3)))], ())}
+    with pytest.raises(NumericalError, match=r"the affine sum of A has shape \(3, 3\), A itself \(24, 24\)"):
+        affine_decomposition(problem, problem.training_set(), 1e-6)
+
+
+@given(data=st.data())
+@settings(max_examples=25, deadline=None)
+def test_a_sum_of_sparse_matrices_is_that_of_dense_ones(data: st.DataObject) -> None:
+    shape, count = (data.draw(st.integers(1, 5)), data.draw(st.integers(1, 5))), data.draw(st.integers(1, 4))
+    rng = np.random.default_rng(data.draw(st.integers(0, 99)))
+    dense = [rng.standard_normal(shape) * (rng.random(shape) < 0.4) for _ in range(count)]
+    theta = rng.standard_normal(count)
+    total = AffineSum(tuple(sp.csr_array(term) for term in dense), lambda mu: mu[0] * theta)
+    found = total.at(np.array([2.0]))
+    expected = sum(2.0 * t * term for t, term in zip(theta, dense, strict=True))
+    assert np.allclose(found.toarray(), expected, rtol=1e-14, atol=1e-14)
+    rows, columns = np.unravel_index(np.arange(shape[0] * shape[1]), shape)
+    assert np.allclose(total.entries(rows, columns)(np.array([2.0])), np.ravel(expected), rtol=1e-14, atol=1e-14)
+
+
+@pytest.mark.parametrize(
+    ("declared", "error", "message"),
+    [
+        ({"f": np.ones(23)}, NumericalError, r"f has shape \(23,\); the spaces V and W require \(24,\)"),
+        ({"f": [("tensoin", np.ones(24))]}, RequestError, "no parameter is called 'tensoin'; did you mean 'tension'"),
+        ({"f": [(1.0, np.ones(24)), (1.0, np.ones(23))]}, NumericalError, r"shapes \[\(24,\), \(23,\)\]"),
+        ({"f": []}, NumericalError, r"shapes \[\]; expected one shape"),
+    ],
+)
+def test_a_wrong_declaration_is_refused(declared: dict[str, Any], error: type[Exception], message: str) -> None:
+    problem = Strings()
+    members: dict[str, Any] = dict(problem._members) | declared
+    with pytest.raises(error, match=message):
+        problem.declare(**members)
+
+
+def test_coefficients_are_finite_and_one_for_each_term() -> None:
+    total = AffineSum((np.ones(2), np.ones(2)), lambda mu: mu)
+    with pytest.raises(NumericalError, match="2 terms need as many finite coefficients, found at mu"):
+        total.coefficients(np.ones(3))
+    with pytest.raises(NumericalError, match="finite"):
+        total.coefficients(np.array([1.0, np.nan]))
+
+
+def test_expressions_travel_to_other_processes() -> None:
+    total = AffineSum.of([("x**2", np.ones(2)), (3.0, np.arange(2.0))], ("x",))
+    again = pickle.loads(pickle.dumps(total))
+    assert np.array_equal(again.at(np.array([2.0])), [4.0, 7.0])
