@@ -92,7 +92,7 @@ def draw_figures(
     from vibench.report.figures.style import FORMATS
     from vibench.results import tables
 
-    paths = [tables.results_file(name) for name in dict.fromkeys(names)]
+    paths = list({tables.results_file(name).resolve(): tables.results_file(name) for name in names}.values())
     forms = tuple(dict.fromkeys(map(str, formats or FORMATS)))
     if paper:
         draw_paper(paths, out or Path("paper-figures"), forms)
