@@ -15,6 +15,7 @@ from vibench.model.certificates.spectral import SpectralBounds
 from vibench.model.hyperreduced import HyperReducedModel
 from vibench.stages.assembly import AffineDecomposition, AssemblyStage
 from vibench.stages.base import Result, Stage, build_problem, value_of
+from vibench.stages.snapshots import training_of
 from vibench.storage.artefacts import Store
 from vibench.storage.serialisation import storable
 from vibench.timing import timed
@@ -36,7 +37,8 @@ class CertificateBaseStage(Stage):
         """Factorise, bound the spectrum, measure interpolation errors."""
         problem = build_problem(self.decomposition.problem)
         members: Mapping[str, AffineMember] = value_of(store, self.decomposition)
-        return Result(*timed(lambda: certificate_base(problem, members)))
+        training = training_of(problem, self.decomposition.training)
+        return Result(*timed(lambda: certificate_base(problem, members, training)))
 
 
 @dataclass(frozen=True)
@@ -51,7 +53,7 @@ class CertificateStage(Stage):
     @property
     def base(self) -> CertificateBaseStage:
         """The stage of what it shares with other models."""
-        assert self.assembly.reduction is not None  # `certificate_stage` has no other cells
+        assert self.assembly.reduction is not None  # certified cells have reduced assembly
         return CertificateBaseStage(self.assembly.reduction.decomposition)
 
     def inputs(self) -> tuple[Stage, ...]:
@@ -71,4 +73,5 @@ class CertificateStage(Stage):
             raise UnsupportedError(f"a certificate at online cost needs reduced assembly, and the model is {why}")
         members: Mapping[str, AffineMember] = value_of(store, self.base.decomposition)
         base: CertificateBase = value_of(store, self.base)
-        return Result(*timed(lambda: prepare(model, members, base)))
+        training = training_of(model.problem, self.base.decomposition.training)
+        return Result(*timed(lambda: prepare(model, members, base, training)))
