@@ -55,6 +55,8 @@ def _fields(model: Mapping[str, Any]) -> str:
 def _default(value: Any) -> str:
     if value in (None, "", {}) or (isinstance(value, dict) and "query_seconds" in value):
         return ""
+    if isinstance(value, list) and value and isinstance(value[0], dict):  # entries, which may be given by their names
+        value = [entry["name"] for entry in value]
     return f"`{json.dumps(value)}`"
 
 

@@ -207,5 +207,5 @@ class Hertz(Problem):
         middles = upper[:1, self.slave.zone[1::2]]
         return Picture(
             np.hstack([upper, lower]) + moved, triangles, moved[1], "vertical displacement [m]", middles, lam,
-            "contact pressure [Pa]",
+            "contact pressure [Pa]", "m",
         )  # fmt: skip

@@ -199,7 +199,7 @@ class Obstacle(Problem):
         deflection[self.free] = u
         points = self.points(mu)
         disc = points[:, self.disc_nodes]
-        return Picture(points, self.mesh.t, deflection, "deflection u [m]", disc, lam, "multiplier λ [1/m]")
+        return Picture(points, self.mesh.t, deflection, "deflection u [m]", disc, lam, "multiplier λ [1/m]", "m")
 
     def diagnostics(self, mu: Array) -> Mapping[str, float]:
         """Largest aspect ratio of the mapped mesh (paper, Figure 3; 1 for equilateral triangles)."""

@@ -156,4 +156,4 @@ class Radial(AffineProblem):
         deflection = np.zeros(self.mesh.p.shape[1])
         deflection[self.free] = u
         disc = self.mesh.p[:, self.disc_nodes]
-        return Picture(self.mesh.p, self.mesh.t, deflection, "deflection u [m]", disc, lam, "multiplier λ [1/m]")
+        return Picture(self.mesh.p, self.mesh.t, deflection, "deflection u [m]", disc, lam, "multiplier λ [1/m]", "m")

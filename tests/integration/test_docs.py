@@ -28,9 +28,10 @@ import vibench
 from vibench.cli.main import app
 from vibench.errors import RequestError
 from vibench.results import columns, tables
+from vibench.study.entries import Entry, ProblemEntry, SamplingEntry
 from vibench.study.reader import read_study
 from vibench.study.registry import GROUPS
-from vibench.study.spec import Entry, Limits, Study, ToleranceTable
+from vibench.study.spec import Limits, Study, ToleranceTable
 
 ROOT = Path(__file__).parents[2]
 DOCS = ROOT / "docs"
@@ -152,7 +153,9 @@ def test_seconds_are_in_seconds(name: str) -> None:
 @pytest.mark.parametrize("table", ["cells", "thresholds"])
 def test_the_tables_for_reading_have_the_columns_that_are_described(table: str, reference: ModuleType) -> None:
     zero = {name: [0, 1] for name in ("queries_zero_u", "queries_zero_lambda") if table == "cells"}
-    several = pd.DataFrame({"accuracy": [1e-7, 1e-10], **zero})  # with one for all, or none, they have no columns
+    several = pd.DataFrame(
+        {"accuracy": [1e-7, 1e-10], "training": ["own", "another"], **zero}
+    )  # with one for all, or none, they have no columns
     empty = several.reindex(columns=list(columns.STORED[table])).astype({"accuracy": float})
     name, view = {"cells": ("summary", tables.summary), "thresholds": ("benefits", tables.benefits)}[table]
     headings = re.findall(r"^\| (?!column|---)([^|]+?) \|", reference.GENERATED[name](), re.MULTILINE)
@@ -160,7 +163,7 @@ def test_the_tables_for_reading_have_the_columns_that_are_described(table: str, 
     assert len(headings) == len(set(headings)) > 10
 
 
-@pytest.mark.parametrize("model", [Study, ToleranceTable, Entry, Limits])
+@pytest.mark.parametrize("model", [Study, ToleranceTable, Entry, ProblemEntry, SamplingEntry, Limits])
 def test_every_field_of_a_study_file_is_described_and_in_the_reference(
     model: type[BaseModel], reference: ModuleType
 ) -> None:

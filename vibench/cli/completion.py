@@ -28,6 +28,7 @@ EXAMPLES: Mapping[str, tuple[str, ...]] = {
         "vibench run quick --solver piqp --dry-run",
         "vibench run my-study.toml --jobs 4 --out results",
         "vibench run quick --pod-tol 1e-2 --pod-tol 1e-3",
+        "vibench run results.sqlite --cell 3f9a --out again",
     ),
     "list": ("vibench list", "vibench list solvers"),
     "show": (
@@ -44,6 +45,10 @@ EXAMPLES: Mapping[str, tuple[str, ...]] = {
         "vibench compare runs/laptop runs/server runs/cluster",
         "vibench compare runs/2024 runs/2025 --column online_s",
         "vibench compare runs/2024 runs/2025 --table columns --format csv",
+    ),
+    "publish": (
+        "vibench publish quick site",
+        'vibench publish runs/* site --title "Obstacle problems" --author "Doe, Jane" --doi 10.5281/zenodo.1234567',
     ),
     "replay": ("vibench replay quick 3f9a", "vibench replay quick 3f9a --query 7"),
     "export-qps": ("vibench export-qps quick programs",),
@@ -144,7 +149,7 @@ def plugin_options(context: typer.Context, incomplete: str) -> list[str]:
 KINDS = {"problem": "problems", "primal": "primal_strategies", "dual": "dual_strategies", "solver": "qp_solvers"}
 """Groups of entry points by the word that `vibench check` knows them by."""
 
-lists = words(lambda: ("problems", "dual", "primal", "solvers", "studies"))
+lists = words(lambda: ("problems", "sampling", "dual", "primal", "solvers", "studies"))
 table_names = words(lambda: SHOWN)
 
 

@@ -10,7 +10,7 @@ import os
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from vibench.cli.interrupts import INTERRUPTED, Interrupted, interrupted_at_once, interruptible
 
@@ -23,6 +23,7 @@ with interrupted_at_once():
     from vibench.cli.export_commands import export_reduced_model
     from vibench.cli.pack_commands import import_pack, reduce_cones, write_pack
     from vibench.cli.plugin_commands import check_plugin, list_plugins, new_plugin
+    from vibench.cli.publish_command import publish_runs
     from vibench.cli.result_commands import (
         compare_runs,
         diff_runs,
@@ -36,8 +37,14 @@ with interrupted_at_once():
     from vibench.terminal.output import echo
     from vibench.text import unbroken
 
+if TYPE_CHECKING:
+    from vibench.study.spec import Study
+
 Names = list[str] | None
 Tolerances = list[float] | None
+
+SQLITE = ".sqlite"
+"""How the name of a results file ends."""
 
 app = typer.Typer(
     name="vibench",
@@ -70,7 +77,11 @@ def _options(
 
 
 def run(
-    study: Annotated[str, Argument(help="A registered study, or a TOML file.", autocompletion=studies)] = "quick",
+    study: Annotated[
+        str,
+        Argument(help="A registered study, or a TOML file; with --cell a results file, too.", autocompletion=studies),
+    ] = "quick",
+    cell: Annotated[str, Option(metavar="KEY", help="Run one cell alone, by its key or the beginning of that.")] = "",
     problem: Annotated[
         Names, Option(help="Replace the problems of the study (repeatable).", autocompletion=names("problems"))
     ] = None,
@@ -102,7 +113,6 @@ def run(
         from vibench.qp.status import Status
         from vibench.results import tables
         from vibench.study.cells import expand
-        from vibench.study.reader import read_study
         from vibench.terminal import run_summary
         from vibench.terminal.console import new_console
         from vibench.terminal.progress import ProgressDisplay
@@ -111,7 +121,7 @@ def run(
             "problem": problem, "dual": dual, "primal": primal, "solvers": solver,
             "pod": pod_tol, "dual_tol": dual_tol, "primal_tol": primal_tol,
         }  # fmt: skip
-        loaded = read_study(study, {axis: values for axis, values in overrides.items() if values})
+        loaded = _study(study, cell, {axis: values for axis, values in overrides.items() if values})
     if dry_run:
         cells = expand(loaded)
         echo(*(f"{cell.key}  {cell}" for cell in cells), f"{len(cells)} cells")
@@ -155,6 +165,24 @@ def _warn_of_open_scheduler(scheduler: str, executor: str) -> None:
     if not is_authenticated(scheduler):
         warning = "the connection is not authenticated: others who reach the scheduler can run code on its workers"
         sys.stderr.write(f"vibench: {unbroken(scheduler)}: {warning}\n")
+
+
+def _study(request: str, key: str, overrides: dict[str, list[Any]]) -> Study:
+    """The study that is asked for, or what it has, or a results file, of one cell."""
+    from vibench.execution.recorded_cell import recorded_study
+    from vibench.study.cells import expand
+    from vibench.study.reader import read_study
+    from vibench.study.single_cell import only_cell, study_of_cell
+
+    if key and Path(request).suffix == SQLITE:
+        if overrides:
+            raise RequestError(f"a cell of a results file is run as it is recorded: leave out {', '.join(overrides)}")
+        return recorded_study(request, key)
+    study = read_study(request, overrides)
+    if not key:
+        return study
+    cell = only_cell(expand(study), key, f"'{request}'")
+    return study_of_cell(cell, study.name, timing_rounds=study.timing_rounds, limits=study.limits)
 
 
 def clean(
@@ -203,7 +231,8 @@ def doctor(out: Annotated[Path, Option(metavar="DIR", help="Folder of the runs."
 
 COMMANDS: dict[str, Callable[..., None]] = {
     "run": run, "list": list_plugins, "show": show, "report": write_report, "figures": draw_figures,
-    "diff": diff_runs, "compare": compare_runs, "replay": replay_query, "export-qps": export_qps,
+    "diff": diff_runs, "compare": compare_runs, "publish": publish_runs,
+    "replay": replay_query, "export-qps": export_qps,
     "export-model": export_reduced_model, "clean": clean, "doctor": doctor,
     "check": check_plugin, "new": new_plugin,
     "import": import_pack, "pack": write_pack, "cones": reduce_cones,

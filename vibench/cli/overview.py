@@ -15,8 +15,8 @@ from pathlib import Path
 from vibench.study.entry_points import entry_points
 
 KINDS = {
-    "problems": "problems", "primal": "primal_strategies", "dual": "dual_strategies", "studies": "studies",
-    "solvers": "qp_solvers",
+    "problems": "problems", "sampling": "sampling", "primal": "primal_strategies", "dual": "dual_strategies",
+    "studies": "studies", "solvers": "qp_solvers",
 }  # fmt: skip
 """Group of entry points of every list, without `vibench.`."""
 

@@ -14,7 +14,10 @@ from vibench.cli.completion import lists, plugin_options, plugins
 from vibench.errors import RequestError, in_a_line, unknown_name
 from vibench.terminal.output import echo
 
-LISTS = {"problems": "problem", "primal": "primal strategy", "dual": "dual strategy", "studies": "study"}
+LISTS = {
+    "problems": "problem", "sampling": "sampling strategy", "primal": "primal strategy", "dual": "dual strategy",
+    "studies": "study",
+}  # fmt: skip
 """Kind of plugin that each list shows; QP solvers are listed whether they are plugins or not."""
 
 HEADINGS = ("name", "from", "what", "options")
@@ -36,7 +39,9 @@ class Found:
 def list_plugins(
     what: Annotated[
         str | None,
-        Argument(help="problems, primal, dual, solvers or studies; all of them by default.", autocompletion=lists),
+        Argument(
+            help="problems, sampling, primal, dual, solvers or studies; all of them by default.", autocompletion=lists
+        ),
     ] = None,
 ) -> None:
     """List problems, strategies, studies and QP solvers.

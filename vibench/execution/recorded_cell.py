@@ -10,19 +10,22 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+import pandas as pd
+
 from vibench.arrays import Array
 from vibench.errors import RequestError
 from vibench.execution.graph import Graph
 from vibench.execution.supervisor import Job, Supervisor
 from vibench.interfaces.problem import VariationalInequality
-from vibench.interfaces.validation import validation_parameters
 from vibench.results import tables
-from vibench.results.database import read_rows
+from vibench.results.database import read_meta, read_rows, study_of
 from vibench.results.tables import results_file
 from vibench.stages.assembly import Model, assembly_stage
 from vibench.stages.base import Done, Stage
 from vibench.storage.artefacts import Store, usable_store
 from vibench.study.cells import Cell
+from vibench.study.single_cell import study_of_cell
+from vibench.study.spec import Study
 
 UNLIMITED = (1e6, 1e6, 1e6)
 """Limits (seconds, seconds, GiB) of stages that are run again: they succeeded before."""
@@ -69,7 +72,7 @@ class RecordedCell:
     @cached_property
     def parameters(self) -> Array:
         """The validation parameters (queries×d)."""
-        return validation_parameters(self.model.problem, self.cell.validation, self.cell.seed)
+        return assembly_stage(self.cell).parameters(self.model.problem)
 
     def program(self, query: int) -> VariationalInequality:
         """The reduced quadratic program of one query, exactly as it was solved."""
@@ -134,11 +137,35 @@ def recorded_cell(run: str, cell: str) -> RecordedCell:
     RequestError
         If the prefix fits no cell or several, or the cell failed before it had a reduced model.
     """
+    found = _matching(run, cell)
+    if not found.row["model"]:
+        raise RequestError(f"cell {found.row['cell']} has no reduced model: {found.row['reason']}")
+    return found
+
+
+def recorded_study(run: str, cell: str) -> Study:
+    """The study that makes one row of a run again: it has this cell alone.
+
+    Raises
+    ------
+    RequestError
+        If the prefix fits no cell or several, or the cell cannot be run here: its plugins or options are others.
+    """
+    found = _matching(run, cell)
+    name = str(study_of(found.path, read_meta(found.path)).get("name"))
+    rounds = found.row["timing_rounds"]
+    settings = {} if pd.isna(rounds) else {"timing_rounds": int(rounds)}
+    try:
+        recorded = found.cell
+    except (ValueError, TypeError, KeyError) as error:  # whoever wrote the file need not know what a cell is
+        raise RequestError(f"'{found.path}': the definition of cell {found.row['cell']} cannot be read") from error
+    return study_of_cell(recorded, name, **settings)
+
+
+def _matching(run: str, cell: str) -> RecordedCell:
     path, rows = _rows(run)
     matching = [row for row in rows if str(row["cell"]).startswith(cell)]
     if len(matching) != 1:
         known = "the column 'cell' of `vibench show RUN --table cells` lists them"
         raise RequestError(f"{len(matching)} cells of '{run}' begin with '{cell}', expected one; {known}")
-    if not matching[0]["model"]:
-        raise RequestError(f"cell {matching[0]['cell']} has no reduced model: {matching[0]['reason']}")
     return RecordedCell(path, matching[0])

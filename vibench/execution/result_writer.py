@@ -13,7 +13,7 @@ from vibench.stages.base import Row, Stage, value_of
 from vibench.stages.cell_queries import CellRows
 from vibench.stages.timing_rounds import TimedCell, round_rows, seconds_of_cell, seconds_of_queries
 from vibench.storage.artefacts import History, Store
-from vibench.study.cells import Axes, Cell, Plugin, digest
+from vibench.study.cells import OWN, Axes, Cell, Plugin, digest
 from vibench.study.spec import Study
 
 
@@ -31,6 +31,7 @@ class ResultWriter:
         row = {"cell": cell.key, **keys, "machine": provenance.machine(), **found.cell}
         row |= {
             "seed": cell.seed,
+            **_set_columns("validation", cell.validation_sampling, cell.set_labels[1]),
             "study_hash": digest(self.study.model_dump(mode="json")),
             "code": cell.code,
             "threads": 1,
@@ -73,7 +74,7 @@ class ResultWriter:
 
 def cell_columns(cell: Cell) -> dict[str, Any]:
     """The key columns of a cell."""
-    labels = dict(zip((cell.problem, cell.dual, cell.primal), cell.labels, strict=True))
+    labels = labels_of([cell])
     how = {"solver": cell.solver, "accuracy": cell.accuracy, "assembly": cell.assembly}
     return axis_columns(cell.axes, labels) | how
 
@@ -84,13 +85,24 @@ def labels_of(cells: Iterable[Cell]) -> dict[Plugin, str]:
     for cell in cells:
         for plugin, label in zip((cell.problem, cell.dual, cell.primal), cell.labels, strict=True):
             found.setdefault(plugin, label)
+        if cell.training is not None:
+            found.setdefault(cell.training, cell.set_labels[0])
     return found
+
+
+def _set_columns(name: str, sampling: Plugin | None, label: str) -> dict[str, Any]:
+    """Label and options of a parameter set."""
+    return {name: label, f"{name}_options": "{}" if sampling is None else sampling.options}
 
 
 def axis_columns(axes: Axes, labels: Mapping[Plugin, str]) -> dict[str, Any]:
     """The key columns of some axes; unset axes have none."""
     columns: dict[str, Any] = {}
-    for name, plugin in (("problem", axes.problem), ("dual", axes.dual), ("primal", axes.primal)):
+    if axes.problem is not None:
+        columns |= {"problem": labels[axes.problem], "problem_options": axes.problem.options}
+    for training in axes.training:
+        columns |= _set_columns("training", training, OWN if training is None else labels[training])
+    for name, plugin in (("dual", axes.dual), ("primal", axes.primal)):
         if plugin is not None:
             columns |= {name: labels[plugin], f"{name}_options": plugin.options}
     for name, stop in (("pod", axes.pod), ("dual", axes.cone)):

@@ -30,7 +30,7 @@ from vibench.stages.cell_queries import CellRows, cell_queries
 from vibench.stages.pictures import PictureStage
 from vibench.storage.artefacts import Store, usable_store
 from vibench.study import registry
-from vibench.study.cells import Cell, expand
+from vibench.study.cells import Cell, Plugin, expand
 from vibench.study.spec import Study
 
 CHECK_INTERVAL = 5.0
@@ -88,7 +88,9 @@ class Outcome:
 
 def identity(study: Study) -> dict[str, Any]:
     """The settings that all numbers of a study depend on; a run folder holds results of one identity only."""
-    return {"name": study.name, "seed": study.seed, "validation": study.validation}
+    known = study.validation
+    validation = known if isinstance(known, int) else known.model_dump(mode="json", exclude={"label"})
+    return {"name": study.name, "seed": study.seed, "validation": validation}
 
 
 @dataclass(frozen=True)
@@ -210,9 +212,12 @@ class _Run:
         try:
             workers = self._workers() if runnable or untimed else None
             self.machines = self.machines if workers is None else workers.machines
+            pictured: dict[Plugin, Stage] = {}  # one training set of a problem is drawn: the first one
+            for cell in cells:
+                pictured.setdefault(cell.problem, PictureStage(cell.problem, cell.training))
             for cell in runnable:
                 self.cells.setdefault(goals[cell].key, []).append(cell)
-                for stage in (goals[cell], PictureStage(cell.problem)):
+                for stage in (goals[cell], pictured[cell.problem]):
                     self.graph.add_goal(stage, self._is_there)
             for group in untimed:
                 self.graph.add_goal(group, self._is_there)
@@ -307,11 +312,10 @@ def unavailable(cell: Cell) -> str:
 
     A name that several packages use is as good as none.
     """
-    plugins = (cell.problem, cell.dual, cell.primal)
-    for kind, name in (*((plugin.kind, plugin.name) for plugin in plugins), ("QP solver", cell.solver)):
+    for kind, name in (*((plugin.kind, plugin.name) for plugin in cell.plugins), ("QP solver", cell.solver)):
         if reason := registry.conflict(kind, name):
             return reason
-    for plugin in plugins:
+    for plugin in cell.plugins:
         missing = registry.missing(plugin.kind, plugin.name)
         if missing:
             what = f"the {plugin.kind} '{plugin.name}' needs {', '.join(missing)}, which is not installed"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Any, ClassVar
@@ -12,6 +12,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from vibench.arrays import Array, Indices, SparseMatrix
+from vibench.errors import RequestError, unknown_name
 from vibench.interfaces.affine import AffineSum
 from vibench.linalg.inner_product import InnerProduct
 
@@ -28,12 +29,15 @@ class ParameterBox:
         Bounds (d,).
     units
         One unit per parameter, "1" if dimensionless.
+    listed
+        The only parameters (L×d) at which the problem can be assembled; `None` if it can be everywhere in the box.
     """
 
     names: tuple[str, ...]
     lower: Array
     upper: Array
     units: tuple[str, ...]
+    listed: Array | None = None
 
     @property
     def dim(self) -> int:
@@ -49,6 +53,30 @@ class ParameterBox:
         """`count` uniform random points (count×d), the same for the same seed."""
         uniform = np.random.default_rng(seed).random((count, self.dim))
         return np.asarray(self.lower + uniform * (self.upper - self.lower))
+
+    def from_unit(self, unit: Array, log: Sequence[str] = ()) -> Array:
+        """The points (P×d) of the box at the places `unit` (P×d) of the unit cube, some parameters on a log scale.
+
+        Raises
+        ------
+        RequestError
+            If `log` names no parameter, or one whose lower bound is not positive.
+        """
+        linear = np.asarray(self.lower + unit * (self.upper - self.lower))
+        for i in self.logarithmic(log):
+            low, high = np.log(self.lower[i]), np.log(self.upper[i])
+            linear[:, i] = np.clip(np.exp(low + unit[:, i] * (high - low)), self.lower[i], self.upper[i])
+        return linear
+
+    def logarithmic(self, log: Sequence[str]) -> list[int]:
+        """Numbers of the parameters that `log` names; with the errors of `from_unit`."""
+        for name in log:
+            if name not in self.names:
+                raise unknown_name("parameter", name, self.names)
+            if self.lower[self.names.index(name)] <= 0.0:
+                low = self.lower[self.names.index(name)]
+                raise RequestError(f"'{name}' cannot have a log scale: its lower bound is {low:g}, expected > 0")
+        return [self.names.index(name) for name in dict.fromkeys(log)]
 
 
 @dataclass(frozen=True)
@@ -103,6 +131,8 @@ class Picture:
         Points of the multiplier (1×m on a line, 2×m in the plane) and its values (m,).
     multiplier_name
         Name of the multiplier, with its unit.
+    length_unit
+        Unit of the coordinates; "" where it is not said.
     """
 
     points: Array
@@ -112,6 +142,7 @@ class Picture:
     positions: Array
     multiplier: Array
     multiplier_name: str
+    length_unit: str = ""
 
 
 MEMBERS = ("A", "f", "B", "g")
@@ -143,6 +174,9 @@ class Problem(ABC):
     """
     entrywise: ClassVar[frozenset[str]] = frozenset()
     """Members that `sampler` evaluates entry by entry."""
+    affine: Mapping[str, int] = {}
+    """Members of `entrywise` that are combinations of fixed terms at every mu, with the number of these terms. Their
+    interpolation has no error if it has as many terms; a certificate at online cost relies on it."""
     requires: ClassVar[tuple[str, ...]] = ()
     """Optional distributions it cannot do without; where one is not installed its cells are unavailable."""
 

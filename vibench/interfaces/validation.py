@@ -7,6 +7,7 @@ import numpy as np
 from vibench.arrays import Array
 from vibench.errors import NumericalError
 from vibench.interfaces.problem import Problem, VariationalInequality
+from vibench.interfaces.sampling import Sampling, check_sample
 from vibench.interfaces.strategies import Cone, Enrichment
 from vibench.linalg.inner_product import InnerProduct
 
@@ -74,13 +75,17 @@ def _matrix(name: str, value: object, rows: int) -> Array:
     return value
 
 
-def training_parameters(problem: Problem) -> Array:
-    """The training set (P×d); refused if it is empty, has the wrong shape or is not finite."""
+def training_parameters(problem: Problem, sampling: Sampling | None = None) -> Array:
+    """The training set (P×d), by default the problem's; refused if it is empty, of the wrong shape or not finite."""
+    if sampling is not None:
+        return check_sample(problem.parameters, sampling.parameters(problem.parameters))
     return _checked(problem, "training_set", np.asarray(problem.training_set(), float), None)
 
 
-def validation_parameters(problem: Problem, count: int, seed: int) -> Array:
-    """The validation set (count×d), with the same checks."""
+def validation_parameters(problem: Problem, count: int, seed: int, sampling: Sampling | None = None) -> Array:
+    """The validation set (count×d), by default the problem's, with the same checks."""
+    if sampling is not None:
+        return check_sample(problem.parameters, sampling.parameters(problem.parameters))
     return _checked(problem, "validation_set", np.asarray(problem.validation_set(count, seed), float), count)
 
 

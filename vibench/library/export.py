@@ -41,10 +41,11 @@ EVALUATIONS = 4096
 """Points of the largest grid on which the members are interpolated, where nothing else is asked for."""
 
 RECORDED = (
-    "cell", "problem", "problem_options", "dual", "dual_options", "primal", "primal_options", "pod_tol", "pod_size",
-    "dual_tol", "dual_size", "primal_tol", "solver", "accuracy", "assembly", "queries", "queries_ok", "N", "R",
-    "enrichment", "error_u_mean", "error_u_max", "error_lambda_mean", "error_lambda_max", "assembly_error_max",
-    "seed", "code", "versions", "definition",
+    "cell", "problem", "problem_options", "training", "training_options", "dual", "dual_options", "primal",
+    "primal_options", "pod_tol", "pod_size", "dual_tol", "dual_size", "primal_tol", "solver", "accuracy", "assembly",
+    "queries", "queries_ok", "snapshots", "N", "R", "enrichment", "error_u_mean", "error_u_max", "error_lambda_mean",
+    "error_lambda_max", "assembly_error_max", "seed", "validation", "validation_options", "code", "versions",
+    "definition",
 )  # fmt: skip
 """Columns of the cell that an exported model repeats."""
 

@@ -6,6 +6,7 @@ import contextlib
 import hashlib
 import os
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -130,6 +131,8 @@ class _Reader:
         if spaces.integrals is not None:
             integrals = self._files.vector(spaces.integrals, "spaces.integrals")
             self._expect("spaces.integrals", integrals, (m,))
+        if not all(member.everywhere for member in members.values()):
+            box = replace(box, listed=self._listed)
         return ModelPack(
             self._manifest, box, training, validation, V, W, members, self._contact(members, n), integrals,
             None if solutions is None else self._reference(solutions, n, m),

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-import inspect
 import io
 import json
 from collections.abc import Iterator
@@ -19,7 +18,8 @@ from vibench.errors import RequestError
 from vibench.files import write_atomically
 from vibench.qp.status import Status
 from vibench.report.figures import drawings
-from vibench.report.figures.style import styled, write_figure
+from vibench.report.figures.plugins import FigureError
+from vibench.report.figures.style import caption_of, styled, write_figure
 from vibench.report.findings import findings
 from vibench.results import pictures, tables
 from vibench.results.database import read_meta, study_of
@@ -60,6 +60,8 @@ def page(path: Path) -> str:
     template = environment.get_template("grid.html.j2")
     cells, queries = tables.read(path, "cells"), tables.read(path, "queries")
     study = study_of(path, read_meta(path))
+    failures: list[str] = []
+    drawn = list(_figures(path, failures))
 
     def grid(frame: pd.DataFrame) -> Markup:
         shown = frame.dropna(axis=1, how="all")
@@ -73,9 +75,12 @@ def page(path: Path) -> str:
         cells=len(cells),
         failed=cells[cells["status"] != Status.OK][["cell", *IDENTITY, "queries_ok", "queries", "reason"]],
         failed_queries=queries[queries["status"] != Status.OK][["cell", "query", *IDENTITY, "reason"]],
-        missing=[f"no picture of {one.key[0]}: {one.reason}" for one in pictures.read(path) if one.reason],
+        missing=[
+            *(f"no picture of {one.key[0]}: {one.reason}" for one in pictures.read(path) if one.reason),
+            *dict.fromkeys(failures),
+        ],
         tables=list(_tables(path, cells)),
-        figures=list(_figures(path)),
+        figures=drawn,
         grid=grid,
     )
 
@@ -125,14 +130,18 @@ def _entry(value: Any) -> tuple[str, str, str]:
     return plain, text, "number" if number else "long" if len(text) > 48 else ""
 
 
-def _figures(path: Path) -> Iterator[tuple[str, str, str]]:
-    """Name, caption and data URI of every figure."""
+def _figures(path: Path, failures: list[str]) -> Iterator[tuple[str, str, str]]:
+    """Name, caption and data URI of every figure; a line is added to `failures` for each that cannot be drawn."""
     for name, draw, data in drawings(path):
         with styled():
-            figure = draw(data)
+            try:
+                figure = draw(data)
+            except FigureError as error:
+                failures.append(str(error))
+                continue
             if figure is None:
                 continue
             stream = io.BytesIO()
             write_figure(figure, stream, "svg")
         source = "data:image/svg+xml;base64," + base64.b64encode(stream.getvalue()).decode("ascii")
-        yield name, " ".join((inspect.getdoc(draw) or "").split()), source
+        yield name, caption_of(figure), source

@@ -108,6 +108,9 @@ SHARED_PHASES = ("offline_snapshots_s", "offline_pod_s", "offline_cone_s")
 NORMAL_95 = 1.96
 """Half the width of the 95 % interval of a normal distribution, in standard deviations."""
 
+VALIDATION = ("validation", "validation_options")
+"""Columns that name the validation set: seconds of a query are means over its queries."""
+
 _SHARED = tuple(name for name in THRESHOLDS if name in KEYS)
 
 
@@ -126,7 +129,7 @@ def break_even_rows(cells: Iterable[Mapping[str, Any]], timings: Iterable[Mappin
         rows.append(_row(model, b, resampling.against_high_fidelity(b)))
         if b["enrichment_kind"] == Kind.FIXED:
             others = (a for a in timed if a["enrichment_kind"] == Kind.PER_PARAMETER)
-            same = (a for a in others if all(a[name] == b[name] for name in (*_SHARED, "machine")))
+            same = (a for a in others if all(a[name] == b[name] for name in (*_SHARED, *VALIDATION, "machine")))
             rows += [_row(a, b, resampling.between(a, b)) for a in same]
     return rows
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import NamedTuple
 
-VERSION = 10
+VERSION = 11
 """Schema version of a results file; a file of another version is refused."""
 
 TEXT, REAL, INTEGER, BLOB = "TEXT", "REAL", "INTEGER", "BLOB"
@@ -62,6 +62,10 @@ UNITS: Mapping[str, str] = {
 KEYS: Mapping[str, Column] = {
     "problem": Column(TEXT, "", "Problem: its label in the study, or its name.", "problem", 1),
     "problem_options": Column(TEXT, "", "Options of the problem that are not at their default, as JSON.", whole=True),
+    "training": Column(TEXT, "", "Training set: own, or the label or name of its sampling strategy.", "training", 2),
+    "training_options": Column(
+        TEXT, "", "Options of the sampling strategy that are not at their default, as JSON.", whole=True
+    ),
     "dual": Column(TEXT, "", "Dual strategy: its label in the study, or its name.", "dual", 4),
     "dual_options": Column(
         TEXT, "", "Options of the dual strategy that are not at their default, as JSON.", whole=True
@@ -105,6 +109,9 @@ CELLS: Mapping[str, Column] = {
     "reason": Column(TEXT, "", "Why the cell is not ok: the first query with this status, and its fault."),
     "queries": Column(INTEGER, "", "Number of queries, one per validation parameter."),
     "queries_ok": Column(INTEGER, "", "Number of queries with status ok; means and maxima are over these.", "ok", 10),
+    "snapshots": Column(
+        INTEGER, "", "High-fidelity solutions that the training took: parameters of the training set.", "solved", 11
+    ),
     "dim_V": Column(INTEGER, "", "Dimension n of V."),
     "dim_W": Column(INTEGER, "", "Dimension m of W."),
     "N": Column(INTEGER, "", "Dimension N of V_N.", "N", 11),
@@ -217,6 +224,10 @@ CELLS: Mapping[str, Column] = {
         INTEGER, "", "1 if the slowdown exceeds 1.3, or the wall seconds exceed 1.5 times the CPU seconds; else 0."
     ),
     "seed": Column(INTEGER, "", "Seed of the study."),
+    "validation": Column(TEXT, "", "Validation set: own, or the label or name of its sampling strategy."),
+    "validation_options": Column(
+        TEXT, "", "Options of that strategy that are not at their default, as JSON.", whole=True
+    ),
     "study_hash": Column(TEXT, "", "Hash of the study file."),
     "code": Column(TEXT, "", "Hash of the code of the core, the plugins and the solver."),
     "machine": Column(TEXT, "", "Machines that measured the seconds."),

@@ -97,9 +97,11 @@ def _for_reading(frame: pd.DataFrame, table: Mapping[str, Column]) -> pd.DataFra
 
 
 def says_something(frame: pd.DataFrame, name: str) -> bool:
-    """Whether to show a column unasked: the accuracy where it is an axis, zero solutions where there are any."""
+    """Whether to show a column unasked: accuracy and training sets where they are an axis, zero solutions if any."""
     if name == "accuracy":
         return bool(frame[name].nunique() > 1)
+    if name in ("training", "snapshots"):
+        return bool(frame["training"].nunique() > 1)
     if name == "status":
         return bool((frame[name] != Status.OK).any())
     zero = re.fullmatch(r"queries_zero_(u|lambda)|error_(u|lambda)_zero_max", name)
@@ -176,7 +178,7 @@ def to_latex(frame: pd.DataFrame) -> str:
     What vibench itself writes compiles with every engine; labels in scripts other than Latin need LuaLaTeX or XeLaTeX.
     """
     columns = "".join("r" if pd.api.types.is_numeric_dtype(kind) else "l" for kind in frame.dtypes)
-    table = str(_as_text(frame, _latex).to_latex(index=False, column_format=columns))
+    table = str(_as_text(frame, to_latex_text).to_latex(index=False, column_format=columns))
     return f"% needs \\usepackage{{booktabs}}\n{table}"
 
 
@@ -204,7 +206,8 @@ def _markdown(text: str) -> str:
     return MARKUP.sub(r"\\\g<0>", text).translate(ENTITIES)
 
 
-def _latex(text: str) -> str:
+def to_latex_text(text: str) -> str:
+    """A text whose characters LaTeX shows, and acts on none of them."""
     return text.translate(LATEX)
 
 
@@ -251,7 +254,8 @@ def name_of_cell(row: Mapping[str, Any] | pd.Series) -> str:
     tolerance = "" if pd.isna(row["primal_tol"]) else f" {row['primal_tol']:g}"
     sizes = ", ".join(asked(row, axis) for axis in ("pod", "dual"))
     assembly = "" if row["assembly"] == "full" else f" · {row['assembly']}"
-    way = f"{row['problem']} · {row['dual']} · {row['primal']}{tolerance}"
+    trained = "" if row["training"] == "own" else f" ({row['training']})"
+    way = f"{row['problem']}{trained} · {row['dual']} · {row['primal']}{tolerance}"
     return f"{way} · {sizes} · {row['solver']} {row['accuracy']:g}{assembly}"
 
 

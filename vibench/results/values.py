@@ -16,7 +16,20 @@ from vibench.text import LONGEST, brief, printable
 LONGEST_TEXT = 2 * LONGEST
 """Characters of a text in a column: a reason quotes what a plugin said, and adds to it."""
 
-IDENTITY = ("cell", *KEYS, "queries", "seed", "study_hash", "code", "machine", "threads", "versions", "definition")
+IDENTITY = (
+    "cell",
+    *KEYS,
+    "queries",
+    "seed",
+    "validation",
+    "validation_options",
+    "study_hash",
+    "code",
+    "machine",
+    "threads",
+    "versions",
+    "definition",
+)
 """Columns of a cell that do not depend on what its stages compute."""
 
 

@@ -8,8 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from vibench.arrays import Array
-from vibench.interfaces.problem import MEMBERS, VariationalInequality
-from vibench.interfaces.validation import training_parameters, validation_parameters
+from vibench.interfaces.problem import MEMBERS, Problem, VariationalInequality
 from vibench.linalg.cholesky import SparseCholesky
 from vibench.linalg.inner_product import InnerProduct
 from vibench.model.affine import AffineMember, Evaluation, affine_decomposition
@@ -26,6 +25,7 @@ from vibench.reduction.supremizers import ContactCoordinates, SpannedCoordinates
 from vibench.stages.assemblies import assemblies
 from vibench.stages.base import Result, Stage, build_problem, value_of
 from vibench.stages.enrichment import EnrichmentStage, GrowthStage, enrichment_stage
+from vibench.stages.snapshots import training_of, validation_of
 from vibench.storage.artefacts import Store
 from vibench.storage.serialisation import storable
 from vibench.study.cells import Cell, Plugin
@@ -43,7 +43,7 @@ Model = ReducedModel | HyperReducedModel
 
 @dataclass(frozen=True)
 class AffineDecomposition(Stage):
-    """Affine decomposition of A, f, B and g for their evaluation at reduced cost; it depends only on the problem.
+    """Affine decomposition of A, f, B and g over the training set, for their evaluation at reduced cost.
 
     The training matrices are not stored, they are assembled again.
     """
@@ -53,11 +53,13 @@ class AffineDecomposition(Stage):
 
     problem: Plugin
     tolerance: float
+    training: Plugin | None = None
 
     def run(self, store: Store) -> Result:  # noqa: ARG002
         """An `AffineMember` by name."""
         problem = build_problem(self.problem)
-        return Result(*timed(lambda: affine_decomposition(problem, training_parameters(problem), self.tolerance)))
+        mus = training_of(problem, self.training)
+        return Result(*timed(lambda: affine_decomposition(problem, mus, self.tolerance)))
 
 
 @dataclass(frozen=True)
@@ -92,6 +94,7 @@ class NestedPrograms(Stage):
     growth: GrowthStage
     count: int
     seed: int
+    sampling: Plugin | None = None
 
     def inputs(self) -> tuple[Stage, ...]:
         """The growth, and the POD and the cone of its model."""
@@ -100,7 +103,8 @@ class NestedPrograms(Stage):
     def run(self, store: Store) -> Result:
         """One program per validation parameter; not timed."""
         model = self.growth.model(store)
-        mus, kept = validation_parameters(model.problem, self.count, self.seed), assemblies(model.problem)
+        mus = validation_of(model.problem, self.count, self.seed, self.sampling)
+        kept = assemblies(model.problem)
         return Result(tuple(model.reduce(kept.at(mu)).program for mu in mus))
 
 
@@ -136,19 +140,21 @@ class AssemblyStage(Stage):
     interpolation: float | None
     count: int
     seed: int
+    sampling: Plugin | None = None
 
     @property
     def reduction(self) -> HyperReduction | None:
         """The offline stage of reduced assembly; `None` for full assembly."""
         if self.interpolation is None:
             return None
-        return HyperReduction(self.enrichment, AffineDecomposition(self.enrichment.pod.problem, self.interpolation))
+        pod = self.enrichment.pod
+        return HyperReduction(self.enrichment, AffineDecomposition(pod.problem, self.interpolation, pod.training))
 
     @property
     def nested(self) -> NestedPrograms | None:
         """The stage of the fully assembled programs of a nested strategy; `None` for any other."""
         growth = self.enrichment.growth
-        return None if growth is None else NestedPrograms(growth, self.count, self.seed)
+        return None if growth is None else NestedPrograms(growth, self.count, self.seed, self.sampling)
 
     @property
     def model_inputs(self) -> tuple[Stage, ...]:
@@ -164,11 +170,15 @@ class AssemblyStage(Stage):
     def run(self, store: Store) -> Result:
         """Assemble at every parameter; compare reduced programs with full ones."""
         model, _ = self.model(store)
-        mus = validation_parameters(model.problem, self.count, self.seed)
+        mus = self.parameters(model.problem)
         known = None if self.nested is None else value_of(store, self.nested)
         if isinstance(model, HyperReducedModel):
             return Result(_reduced(model, mus, known))
         return Result(_in_full(model, mus, known))
+
+    def parameters(self, problem: Problem) -> Array:
+        """The validation set (count×d)."""
+        return validation_of(problem, self.count, self.seed, self.sampling)
 
     def model(self, store: Store) -> tuple[Model, str]:
         """The model that queries use, and why requested reduced assembly was replaced by full assembly, or ""."""
@@ -242,4 +252,5 @@ class ExactSolutions(Stage):
 
 def assembly_stage(cell: Cell) -> AssemblyStage:
     """The stage that assembles the reduced programs of a cell."""
-    return AssemblyStage(enrichment_stage(cell), cell.interpolation, cell.validation, cell.seed)
+    sampling = cell.validation_sampling
+    return AssemblyStage(enrichment_stage(cell), cell.interpolation, cell.validation, cell.seed, sampling)

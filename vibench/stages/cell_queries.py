@@ -31,7 +31,7 @@ from vibench.stages.infsup_constants import (
 )
 from vibench.stages.offline import ReducedCone
 from vibench.stages.query import Queries, Query, error_columns, run_query
-from vibench.stages.snapshots import gather, training_stages, validation_stages
+from vibench.stages.snapshots import gather, validation_stages
 from vibench.storage.artefacts import Artefact, Store
 from vibench.study import registry
 from vibench.study.cells import Cell
@@ -102,7 +102,8 @@ class CellQueries(PiecewiseStage):
 
     @property
     def _constraints(self) -> ValidationConstraints:
-        return ValidationConstraints(self.assembly.enrichment.pod.problem, self.assembly.count, self.assembly.seed)
+        assembly = self.assembly
+        return ValidationConstraints(assembly.enrichment.pod.problem, assembly.count, assembly.seed, assembly.sampling)
 
     @property
     def exact(self) -> ExactSolutions:
@@ -112,12 +113,13 @@ class CellQueries(PiecewiseStage):
     @property
     def training(self) -> tuple[Stage, ...]:
         """The stages of the training snapshots."""
-        return training_stages(self.assembly.enrichment.pod.problem)
+        return self.assembly.enrichment.pod.inputs()
 
     @property
     def validation(self) -> tuple[Stage, ...]:
         """The stages of the reference solutions."""
-        return validation_stages(self.assembly.enrichment.pod.problem, self.assembly.count, self.assembly.seed)
+        assembly = self.assembly
+        return validation_stages(assembly.enrichment.pod.problem, assembly.count, assembly.seed, assembly.sampling)
 
     @property
     def offline(self) -> Mapping[str, tuple[Stage, ...]]:
@@ -242,6 +244,7 @@ class _Queries(Pieces):
             "rank": cone.prepared.rank,
             "rank_gap": cone.prepared.rank_gap,
             "gram_condition": cone.prepared.gram_condition,
+            "snapshots": len(self._training.mu),
             "enrichment": cone.prepared.rank if built.kind is Kind.PER_PARAMETER else added,
             **assembly.columns(self._store),
             "fallbacks": "; ".join(fallbacks),

@@ -13,13 +13,14 @@ import numpy as np
 from vibench.arrays import Array
 from vibench.errors import NumericalError
 from vibench.interfaces.strategies import Enrichment, Kind, Offline, PrimalStrategy
-from vibench.interfaces.validation import check_enrichment, training_parameters
+from vibench.interfaces.validation import check_enrichment
 from vibench.model.galerkin import ReducedModel
 from vibench.reduction.nested import Grown, Milestone, grow_through
 from vibench.reduction.supremizers import ConstraintClasses, projected_supremizers
 from vibench.stability.growth import ProjectedSupremizers
 from vibench.stages.base import Result, Stage, build_problem, faults_of, value_of
 from vibench.stages.offline import ConeStage, PODStage, ReducedCone, TrainingConstants
+from vibench.stages.snapshots import training_of
 from vibench.storage.artefacts import History, Store
 from vibench.storage.serialisation import storable
 from vibench.study.cells import Axes, Cell, Plugin
@@ -135,7 +136,8 @@ class EnrichmentStage(Stage):
     @property
     def axes(self) -> Axes:
         """The axes of POD and cone, the primal strategy and its tolerance."""
-        return Axes(self.pod.problem, self.cone.dual, self.primal, self.pod.stop, self.cone.stop, self.tolerance)
+        stops = self.pod.stop, self.cone.stop
+        return Axes(self.pod.problem, self.cone.dual, self.primal, *stops, self.tolerance, (self.pod.training,))
 
     @property
     def growth(self) -> GrowthStage | None:
@@ -233,7 +235,8 @@ class NestedEnrichment(EnrichmentStage):
 
 def enrichment_stage(cell: Cell) -> EnrichmentStage:
     """The stage that completes the reduced model of a cell."""
-    pods, cone = PODStage(cell.problem, cell.pod), ConeStage(cell.problem, cell.dual, cell.cone)
+    pods = PODStage(cell.problem, cell.pod, cell.training)
+    cone = ConeStage(cell.problem, cell.dual, cell.cone, cell.training)
     if cell.nested_tolerances:
         return NestedEnrichment(pods, cone, cell.primal, cell.primal_tol, cell.nested_tolerances)
     return SingleEnrichment(pods, cone, cell.primal, cell.primal_tol)
@@ -247,7 +250,7 @@ def _offline(store: Store, pod: PODStage, cone: ConeStage) -> Offline:
     """The offline data that a primal strategy is built from."""
     problem, basis = build_problem(pod.problem), value_of(store, pod).basis
     reduced: ReducedCone = value_of(store, cone)
-    return Offline(problem, basis, reduced.cone, reduced.prepared.span, training_parameters(problem))
+    return Offline(problem, basis, reduced.cone, reduced.prepared.span, training_of(problem, pod.training))
 
 
 def _projected(offline: Offline, vectors: Array, classes: ConstraintClasses) -> ProjectedSupremizers:

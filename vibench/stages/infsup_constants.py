@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from vibench.interfaces.problem import VariationalInequality
+from vibench.arrays import Array
+from vibench.interfaces.problem import Problem, VariationalInequality
 from vibench.interfaces.strategies import Kind
-from vibench.interfaces.validation import validation_parameters
 from vibench.model.galerkin import ReducedModel
 from vibench.reduction.supremizers import ConstraintClasses, constraint_classes
 from vibench.stability.coercivity import Constant, Stability, coercivity_and_continuity, energy_inf_sup
@@ -18,6 +18,7 @@ from vibench.stages.assemblies import assemblies
 from vibench.stages.base import Result, Stage, build_problem, value_of
 from vibench.stages.enrichment import EnrichmentStage
 from vibench.stages.offline import ConeStage, PODStage
+from vibench.stages.snapshots import validation_of
 from vibench.storage.artefacts import Store
 from vibench.storage.serialisation import storable
 from vibench.study.cells import Plugin
@@ -36,12 +37,16 @@ class ValidationConstraints(Stage):
     problem: Plugin
     count: int
     seed: int
+    sampling: Plugin | None = None
 
     def run(self, store: Store) -> Result:  # noqa: ARG002
         """The `ConstraintClasses`."""
         problem = build_problem(self.problem)
-        mus = validation_parameters(problem, self.count, self.seed)
-        return Result(constraint_classes(assemblies(problem).at(mu).B for mu in mus))
+        return Result(constraint_classes(assemblies(problem).at(mu).B for mu in self.parameters(problem)))
+
+    def parameters(self, problem: Problem) -> Array:
+        """The validation set (count×d)."""
+        return validation_of(problem, self.count, self.seed, self.sampling)
 
 
 @dataclass(frozen=True)
@@ -57,7 +62,7 @@ class ReferenceConstants(Stage):
         """Compute the constants."""
         problem, known = build_problem(self.constraints.problem), self.constraints
         inf_sup = constants_full(problem.V, value_of(store, known), nodal_multipliers(problem.W))
-        mus = validation_parameters(problem, known.count, known.seed)
+        mus = known.parameters(problem)
         different = mus[:1] if "A" in problem.constant else mus  # the eigenvalue problems are the expensive part
         quotients = [coercivity_and_continuity(assemblies(problem).at(mu).A, problem.V) for mu in different]
         quotients *= len(mus) // len(different)
@@ -122,7 +127,7 @@ class OwnConstants(Stage):
         classes: ConstraintClasses = value_of(store, self.constraints)
         if model.kind is not Kind.PER_PARAMETER:
             return Result(constants_on(model.fixed_basis, classes, cone))
-        mus = validation_parameters(model.problem, self.constraints.count, self.constraints.seed)
+        mus = self.constraints.parameters(model.problem)
         if model.enrichment.eta is None:
             return Result([_constants_at(model, assemblies(model.problem).at(mu), cone) for mu in mus])
         at_firsts = (assemblies(model.problem).at(mu) for mu in mus[classes.firsts])  # a class shares one space

@@ -5,13 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from vibench.interfaces.strategies import Cone, Stop
-from vibench.interfaces.validation import check_cone, training_parameters
+from vibench.interfaces.validation import check_cone
 from vibench.reduction.cones import orthogonality
 from vibench.reduction.pod import POD, pod
 from vibench.reduction.supremizers import ConstraintClasses, constraint_classes, isometric_supremizers
 from vibench.stability.infsup import Multipliers, beta_span, multipliers
 from vibench.stages.base import Result, Stage, build_problem, faults_of, value_of
-from vibench.stages.snapshots import gather, training_stages
+from vibench.stages.snapshots import gather, training_of, training_stages
 from vibench.storage.artefacts import History, Store
 from vibench.storage.serialisation import storable
 from vibench.study.cells import Axes, Plugin
@@ -30,15 +30,16 @@ class PODStage(Stage):
 
     problem: Plugin
     stop: Stop
+    training: Plugin | None = None
 
     @property
     def axes(self) -> Axes:
-        """The problem and the tolerance of the POD."""
-        return Axes(problem=self.problem, pod=self.stop)
+        """The problem, the training set and the tolerance of the POD."""
+        return Axes(problem=self.problem, pod=self.stop, training=(self.training,))
 
     def inputs(self) -> tuple[Stage, ...]:
         """The training snapshots."""
-        return training_stages(self.problem)
+        return training_stages(self.problem, self.training)
 
     def run(self, store: Store) -> Result:
         """Compute the modes; the history is the relative tail over the number of modes."""
@@ -66,20 +67,21 @@ class ConeStage(Stage):
     problem: Plugin
     dual: Plugin
     stop: Stop
+    training: Plugin | None = None
 
     @property
     def axes(self) -> Axes:
-        """The problem, the dual strategy and its tolerance."""
-        return Axes(problem=self.problem, dual=self.dual, cone=self.stop)
+        """The problem, the training set, the dual strategy and its tolerance."""
+        return Axes(problem=self.problem, dual=self.dual, cone=self.stop, training=(self.training,))
 
     @property
     def constraints(self) -> TrainingConstraints:
         """The stage of the training constraint matrices, used to assess the cone."""
-        return TrainingConstraints(self.problem)
+        return TrainingConstraints(self.problem, self.training)
 
     def inputs(self) -> tuple[Stage, ...]:
         """The training snapshots."""
-        return training_stages(self.problem)
+        return training_stages(self.problem, self.training)
 
     def run(self, store: Store) -> Result:
         """Reduce; histories are the projection error and e_orth over the number of generators."""
@@ -102,11 +104,12 @@ class TrainingConstraints(Stage):
     rooms = ("linalg", "interfaces", "reduction")
 
     problem: Plugin
+    training: Plugin | None = None
 
     def run(self, store: Store) -> Result:  # noqa: ARG002
         """The `ConstraintClasses`."""
         problem = build_problem(self.problem)
-        return Result(constraint_classes(problem.constraint(mu)[0] for mu in training_parameters(problem)))
+        return Result(constraint_classes(problem.constraint(mu)[0] for mu in training_of(problem, self.training)))
 
 
 @dataclass(frozen=True)

@@ -12,12 +12,12 @@ from vibench.arrays import Array
 from vibench.errors import in_a_line
 from vibench.interfaces.problem import ParameterBox, VariationalInequality
 from vibench.interfaces.strategies import Kind
-from vibench.interfaces.validation import validation_parameters
 from vibench.model.error_bounds import Certificate, certify
 from vibench.model.errors import UNMEASURABLE, Errors, Reference, errors
 from vibench.model.hsw_bounds import HSWBounds, hsw_bounds
 from vibench.qp.accuracy_bounds import slack
 from vibench.qp.exact import ExactSolution
+from vibench.qp.repeats import in_units, nearby, units
 from vibench.qp.scaling import ratio
 from vibench.qp.solution import QPSolution
 from vibench.qp.solve import solve_qp, takes_start
@@ -28,7 +28,6 @@ from vibench.stability.coercivity import Stability
 from vibench.stages.assemblies import assemblies
 from vibench.stages.assembly import AssemblyStage, Model, ReducedPrograms
 from vibench.stages.base import Row, value_of
-from vibench.stages.repeats import in_units, nearby, units
 from vibench.storage.artefacts import Store
 from vibench.study import registry
 from vibench.timing import SLOW, Seconds, timed
@@ -58,7 +57,7 @@ class Query:
     start: tuple[int, VariationalInequality] | None = None
 
     def repeated(self, *seed: int) -> Query:
-        """The same query in other units of the unknowns, which depend on the seed; see `vibench.stages.repeats`."""
+        """The same query in other units of the unknowns, which depend on the seed; see `vibench.qp.repeats`."""
         d = units(len(self.program.f), self.accuracy, *seed)
         return replace(
             self,
@@ -108,7 +107,7 @@ class Queries:
 
     def __init__(self, store: Store, assembly: AssemblyStage) -> None:
         self.model, self.note = assembly.model(store)
-        self.mus, self._seed = validation_parameters(self.model.problem, assembly.count, assembly.seed), assembly.seed
+        self.mus, self._seed = assembly.parameters(self.model.problem), assembly.seed
         self.reduced: ReducedPrograms = value_of(store, assembly)
 
     @cached_property

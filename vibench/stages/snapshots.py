@@ -16,8 +16,8 @@ from vibench.highfidelity.active_set import HighFidelitySolution, HighFidelitySo
 from vibench.interfaces.fingerprint import Fingerprint, ReferenceAssembly
 from vibench.interfaces.problem import Problem, VariationalInequality
 from vibench.interfaces.validation import checked_assembly, training_parameters, validation_parameters
+from vibench.qp.repeats import nearby
 from vibench.stages.base import Result, Stage, build_problem, faults_of, value_of
-from vibench.stages.repeats import nearby
 from vibench.storage.artefacts import History, Store
 from vibench.storage.serialisation import storable
 from vibench.study.cells import Axes, Plugin
@@ -75,11 +75,12 @@ class SnapshotStage(Stage):
     count: int
     seed: int
     chunk: int
+    sampling: Plugin | None = None
 
     @property
     def axes(self) -> Axes:
-        """The problem alone."""
-        return Axes(problem=self.problem)
+        """The problem, and the training set if it is a part of that."""
+        return Axes(problem=self.problem, training=(self.sampling,) if self.purpose == "training" else ())
 
     def run(self, store: Store) -> Result:  # noqa: ARG002
         """Assemble and solve at every parameter of the chunk."""
@@ -132,8 +133,8 @@ class SnapshotStage(Stage):
     def parameters(self, problem: Problem) -> Array:
         """Training or validation parameters (P×d), of which the stage solves a part."""
         if self.purpose == "training":
-            return training_parameters(problem)
-        return validation_parameters(problem, self.count, self.seed)
+            return training_of(problem, self.sampling)
+        return validation_of(problem, self.count, self.seed, self.sampling)
 
     def part(self, everything: Array) -> tuple[int, Array]:
         """Number of the first parameter of the chunk, and its parameters."""
@@ -148,14 +149,24 @@ class SnapshotStage(Stage):
         return tuple(History.of(self.purpose, quantity, values, first) for quantity, values in found.items())
 
 
-def training_stages(problem: Plugin) -> tuple[Stage, ...]:
-    """The chunks of the training set, which depends only on the problem."""
-    return tuple(SnapshotStage(problem, "training", 0, 0, chunk) for chunk in range(CHUNKS))
+def training_of(problem: Problem, sampling: Plugin | None) -> Array:
+    """The training set (P×d) of a sampling strategy, or of the problem itself."""
+    return training_parameters(problem, None if sampling is None else sampling.create())
 
 
-def validation_stages(problem: Plugin, count: int, seed: int) -> tuple[Stage, ...]:
+def validation_of(problem: Problem, count: int, seed: int, sampling: Plugin | None) -> Array:
+    """The validation set (count×d), likewise; the seed is for that of the problem itself."""
+    return validation_parameters(problem, count, seed, None if sampling is None else sampling.create())
+
+
+def training_stages(problem: Plugin, sampling: Plugin | None = None) -> tuple[Stage, ...]:
+    """The chunks of the training set of a sampling strategy, or of the problem itself."""
+    return tuple(SnapshotStage(problem, "training", 0, 0, chunk, sampling) for chunk in range(CHUNKS))
+
+
+def validation_stages(problem: Plugin, count: int, seed: int, sampling: Plugin | None = None) -> tuple[Stage, ...]:
     """The chunks of the validation set."""
-    return tuple(SnapshotStage(problem, "validation", count, seed, chunk) for chunk in range(CHUNKS))
+    return tuple(SnapshotStage(problem, "validation", count, seed, chunk, sampling) for chunk in range(CHUNKS))
 
 
 def reference_assembly(problem: Problem) -> ReferenceAssembly:
@@ -178,7 +189,7 @@ def gather(store: Store, chunks: tuple[Stage, ...]) -> Snapshots:
         If the problem was assembled otherwise for a chunk than it is in this process.
     """
     parts = [value_of(store, chunk) for chunk in chunks]
-    (problem,) = {plugin for chunk in chunks for plugin in chunk.plugins()}
+    (problem,) = {plugin for chunk in chunks for plugin in chunk.plugins() if plugin.kind == "problem"}
     with faults_of(problem):
         here = fingerprint_here(problem)
         for deviation in (text for part in parts for text in part.fingerprint.deviations(here)):

@@ -13,11 +13,11 @@ from vibench.interfaces.problem import VariationalInequality
 from vibench.interfaces.validation import checked_assembly
 from vibench.model.hyperreduced import HyperReducedModel
 from vibench.provenance import machine
+from vibench.qp.repeats import check_answer
 from vibench.stages.assembly import AssemblyStage
 from vibench.stages.base import Failed, Pieces, PiecewiseStage, Row, Stage
 from vibench.stages.cell_queries import CellQueries
 from vibench.stages.query import Queries, Watch
-from vibench.stages.repeats import check_answer
 from vibench.storage.artefacts import Store
 from vibench.timing import DISTURBED, WAITED, Seconds, calibration, timed
 

@@ -16,9 +16,11 @@ from vibench.interfaces.strategies import Stop
 from vibench.provenance import NUMERICAL, core_code, solver_version
 from vibench.reduction.nested import NestedStrategy
 from vibench.study import registry
+from vibench.study.parameter_sets import size_of_set
 
 if TYPE_CHECKING:  # worker processes have no use for the schema of study files
-    from vibench.study.spec import Entry, Study, ToleranceTable
+    from vibench.study.entries import Entry, ProblemEntry
+    from vibench.study.spec import Study, ToleranceTable
 
 
 def digest(content: Any) -> str:
@@ -64,9 +66,20 @@ class Plugin:
         return shlex.join(["vibench", "check", f"{word}:{self.name}", *(f"--option={text}" for text in options)])
 
 
+PLUGINS = ("problem", "dual", "primal", "training", "validation_sampling")
+"""Fields of a `Cell` that are plugins; the last two are `None` for sets of the problem itself."""
+
+OWN = "own"
+"""Name of the training and the validation set that a problem itself has."""
+
+
 @dataclass(frozen=True)
 class Axes:
-    """Values on the axes of a study; `None` on an axis that does not matter."""
+    """Values on the axes of a study; `None` on an axis that does not matter.
+
+    `training` holds the sampling strategy of the training set, which is `None` for the problem's own set, and nothing
+    where that axis does not matter.
+    """
 
     problem: Plugin | None = None
     dual: Plugin | None = None
@@ -74,15 +87,18 @@ class Axes:
     pod: Stop | None = None
     cone: Stop | None = None
     primal_tol: float | None = None
+    training: tuple[Plugin | None, ...] = ()
 
 
 @dataclass(frozen=True)
 class Cell:
-    """One cell: problem × dual strategy × primal strategy × tolerances × QP solver × accuracy × assembly.
+    """One cell: problem × training set × dual × primal strategy × tolerances × QP solver × accuracy × assembly.
 
-    `interpolation` is the tolerance of reduced assembly, `None` for full assembly. `labels` of problem, dual and primal
-    strategy are no part of the identity; nor are `nested_tolerances`, all tolerances of a nested primal strategy in the
-    study, whose enrichments are stages of one.
+    `training` and `validation_sampling` are the sampling strategies of its sets, `None` for the problem's own ones;
+    `validation` is the number of validation parameters. `interpolation` is the tolerance of reduced assembly, `None`
+    for full assembly. `labels` of problem, dual and primal strategy and `set_labels` of training and validation are no
+    part of the identity; nor are `nested_tolerances`, all tolerances of a nested primal strategy in the study, whose
+    enrichments are stages of one.
     """
 
     problem: Plugin
@@ -100,14 +116,20 @@ class Cell:
     accuracy: float
     labels: tuple[str, str, str]
     nested_tolerances: tuple[float, ...] = ()
+    training: Plugin | None = None
+    validation_sampling: Plugin | None = None
+    set_labels: tuple[str, str] = (OWN, OWN)
 
     @cached_property
     def key(self) -> str:
         """Hash of everything but the code that determines the cell's numbers."""
         content = asdict(self)
-        del content["labels"], content["nested_tolerances"]
-        for plugin in ("problem", "dual", "primal"):
-            del content[plugin]["code"]
+        del content["labels"], content["nested_tolerances"], content["set_labels"]
+        for name in PLUGINS:
+            if content[name] is None:
+                del content[name]
+            else:
+                del content[name]["code"]
         return digest(content)
 
     @property
@@ -125,27 +147,34 @@ class Cell:
             If a plugin is not installed, or a file that its options name cannot be read.
         """
         content = json.loads(text)
-        for axis in ("problem", "dual", "primal"):
-            content[axis] = Plugin(**content[axis]).as_installed()
+        for name in PLUGINS:  # older definitions have no sampling strategies
+            content[name] = Plugin(**content[name]).as_installed() if content.get(name) else None
         for axis in ("pod", "cone"):
             content[axis] = Stop(**content[axis])
-        return cls(**content | {name: tuple(content[name]) for name in ("labels", "nested_tolerances")})
+        labels = ("labels", "nested_tolerances", "set_labels")
+        return cls(**content | {name: tuple(content[name]) for name in labels if name in content})
 
     @property
     def axes(self) -> Axes:
         """The axes of the cell, without solver and assembly."""
-        return Axes(self.problem, self.dual, self.primal, self.pod, self.cone, self.primal_tol)
+        return Axes(self.problem, self.dual, self.primal, self.pod, self.cone, self.primal_tol, (self.training,))
+
+    @property
+    def plugins(self) -> tuple[Plugin, ...]:
+        """Its plugins, the solver aside."""
+        return tuple(found for name in PLUGINS if (found := getattr(self, name)) is not None)
 
     @property
     def code(self) -> str:
         """Hash of the code that computes the cell: the numerical rooms of the core, its plugins and its solver."""
-        plugins_used = [plugin.code for plugin in (self.problem, self.dual, self.primal)]
+        plugins_used = [plugin.code for plugin in self.plugins]
         registered = self.solver in registry.names("QP solver")
         solver = registry.code("QP solver", self.solver) if registered else solver_version(self.solver)
         return digest([core_code(*NUMERICAL), *plugins_used, solver])
 
     def __str__(self) -> str:
         problem, dual, primal = self.labels
+        problem += f" ({self.set_labels[0]})" if self.training is not None else ""
         tolerance = "" if self.primal_tol is None else f" {self.primal_tol:g}"
         pod, cone = (
             f"{size}={stop.size}" if stop.tolerance is None else f"{stop.tolerance:g}"
@@ -166,7 +195,8 @@ def expand(study: Study) -> list[Cell]:
     cells: dict[str, Cell] = {}
     for problem, table in product(study.problem, study.tolerances):
         nested = {entry.title: _nested_tolerances(entry, table) for entry in study.primal}
-        for dual, pod, cone, primal, tolerance in _combinations(study, table):
+        sets = _sets(study, problem)
+        for trained, (dual, pod, cone, primal, tolerance) in product(sets, _combinations(study, table)):
             for assembly, solver, accuracy in product(study.assembly, study.solver_names(), study.accuracy):
                 cell = Cell(
                     problem=Plugin.from_entry("problem", problem),
@@ -180,15 +210,47 @@ def expand(study: Study) -> list[Cell]:
                     interpolation=study.interpolation if assembly == "reduced" else None,
                     warm_start=study.warm_start,
                     seed=study.seed,
-                    validation=study.validation,
                     accuracy=accuracy,
                     labels=(problem.title, dual.title, primal.title),
                     nested_tolerances=nested[primal.title],
+                    validation=trained.validation,
+                    training=trained.training,
+                    validation_sampling=trained.validation_sampling,
+                    set_labels=trained.labels,
                 )
                 cells.setdefault(cell.key, cell)
     if not cells:
         raise RequestError(f"study '{study.name}': the matrix is empty")
     return list(cells.values())
+
+
+@dataclass(frozen=True)
+class _Sets:
+    """A training set and the validation set of a problem, as in the fields of a `Cell`."""
+
+    training: Plugin | None
+    validation: int
+    validation_sampling: Plugin | None
+    labels: tuple[str, str]
+
+
+def _sets(study: Study, problem: ProblemEntry) -> list[_Sets]:
+    """The training sets of a problem in a study, each with the validation set."""
+    built, asked = Plugin.from_entry("problem", problem), study.validation_of(problem)
+    if isinstance(asked, int):
+        count, checked, label = asked, None, OWN
+    else:
+        checked, label = Plugin.from_entry("sampling strategy", asked), asked.title
+        count = size_of_set(built, checked)
+    return [
+        _Sets(
+            None if entry.name == OWN else Plugin.from_entry("sampling strategy", entry),
+            count,
+            checked,
+            (entry.title, label),
+        )
+        for entry in study.training_of(problem)
+    ]
 
 
 def _nested_tolerances(primal: Entry, table: ToleranceTable) -> tuple[float, ...]:

@@ -62,10 +62,34 @@ def read_study(request: str, overrides: Mapping[str, Sequence[Any]] | None = Non
     source = str(path) if path == Path(request) else f"study '{request}'"
     source += " with the options of the command line" if given else ""
     content = _replace_axes(content, given)
+    _anchor(content, path.absolute().parent)
     try:
         return Study.model_validate(content)
     except RequestError as error:
         raise RequestError(f"{source}: {error}") from None
+
+
+def _anchor(content: dict[str, Any], folder: Path) -> None:
+    """Take the paths among the options of sampling strategies, in unchecked content, relative to a folder."""
+    problems = content.get("problem")
+    tables = [
+        content,
+        *(entry for entry in (problems if isinstance(problems, list) else []) if isinstance(entry, dict)),
+    ]
+    for table in tables:
+        for key in ("training", "validation"):
+            entries = table.get(key)
+            for entry in entries if isinstance(entries, list) else [entries]:
+                if isinstance(entry, dict):
+                    _anchor_options(entry, folder)
+
+
+def _anchor_options(entry: dict[str, Any], folder: Path) -> None:
+    given = entry.get("options")
+    for options in (entry, given if isinstance(given, dict) else {}):
+        for name in registry.path_options("sampling strategy", str(entry.get("name"))):
+            if isinstance(options.get(name), str):
+                options[name] = str(folder / options[name])
 
 
 def _replace_axes(content: dict[str, Any], given: Mapping[str, list[Any]]) -> dict[str, Any]:

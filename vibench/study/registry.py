@@ -15,7 +15,9 @@ from typing import Any, get_type_hints
 from pydantic import ConfigDict, PydanticUserError, TypeAdapter, ValidationError
 
 from vibench.errors import RequestError, in_a_line, unknown_name
+from vibench.interfaces.figures import FigurePlugin
 from vibench.interfaces.problem import Problem
+from vibench.interfaces.sampling import Sampling
 from vibench.interfaces.strategies import DualStrategy, PrimalStrategy
 from vibench.provenance import distribution_version, source_hash
 from vibench.qp.settings import SETTINGS
@@ -27,13 +29,21 @@ GROUPS: Mapping[str, str] = {
     "dual strategy": "vibench.dual_strategies",
     "primal strategy": "vibench.primal_strategies",
     "QP solver": "vibench.qp_solvers",
+    "sampling strategy": "vibench.sampling",
     "study": "vibench.studies",
+    "figure plugin": "vibench.figures",
 }
 FINITE = ConfigDict(allow_inf_nan=False)
 """Options of plugins are finite."""
 
-BASES: Mapping[str, type] = {"problem": Problem, "dual strategy": DualStrategy, "primal strategy": PrimalStrategy}
+BASES: Mapping[str, type] = {
+    "problem": Problem, "dual strategy": DualStrategy, "primal strategy": PrimalStrategy,
+    "sampling strategy": Sampling, "figure plugin": FigurePlugin,
+}  # fmt: skip
 """Abstract base classes of the kinds of plugins that are classes."""
+
+READERS = ("problem", "sampling strategy")
+"""Kinds of plugins that may read files, of which they have a `data_digest`."""
 
 WORDS: Mapping[str, str] = {
     "problem": "problem", "primal": "primal strategy", "dual": "dual strategy", "solver": "QP solver",
@@ -85,7 +95,7 @@ def create(kind: str, name: str, options: Mapping[str, Any] | None = None) -> An
     Parameters
     ----------
     kind
-        "problem", "dual strategy" or "primal strategy".
+        A key of `BASES`.
     name
         Name under which the plugin is registered.
     options
@@ -150,7 +160,7 @@ def code(kind: str, name: str) -> str:
 
 
 def code_and_data(kind: str, name: str, options: Mapping[str, Any]) -> str:
-    """`code`, and the digest of the files that a problem reads with these options (`Problem.data_digest`).
+    """`code`, and the digest of the files that the plugin reads with these options (`data_digest`).
 
     Raises
     ------
@@ -162,11 +172,11 @@ def code_and_data(kind: str, name: str, options: Mapping[str, Any]) -> str:
 
 
 def data_digest(kind: str, name: str, options: Mapping[str, Any]) -> str:
-    """Digest of the files that a problem reads with these options, "" for other plugins and problems without files.
+    """Digest of the files that a problem or a sampling strategy reads with these options, "" if it reads none.
 
     It is "" for a name that several packages use, too: nothing is computed with it.
     """
-    if kind != "problem" or conflict(kind, name) or missing(kind, name):
+    if kind not in READERS or conflict(kind, name) or missing(kind, name):
         return ""
     return str(load(kind, name).data_digest(**check_options(kind, name, options)))
 
@@ -223,6 +233,13 @@ def checked_arguments(plugin: type, what: str, given: Mapping[str, Any]) -> dict
         elif default is inspect.Parameter.empty:
             raise RequestError(f"{what} needs the option '{option}' ({_expected(annotation)})")
     return checked
+
+
+def path_options(kind: str, name: str) -> list[str]:
+    """Options of a plugin that are paths; none of a name that nobody, or several, registered."""
+    if name not in names(kind) or conflict(kind, name):
+        return []
+    return [option for option, (_, annotation) in _parameters(load(kind, name)).items() if annotation is Path]
 
 
 def doubtful_options(plugin: type) -> dict[str, str]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Annotated, Any, Literal, TypeAlias, TypeVar
 
 from annotated_types import Ge, Gt, Le, Lt, MinLen
@@ -11,7 +11,6 @@ from pydantic import (
     AllowInfNan,
     BaseModel,
     BeforeValidator,
-    ConfigDict,
     Discriminator,
     Field,
     ModelWrapValidatorHandler,
@@ -20,28 +19,34 @@ from pydantic import (
     model_validator,
 )
 
-from vibench.errors import NumericalError, RequestError, unknown_name
+from vibench.errors import RequestError, unknown_name
 from vibench.interfaces.strategies import Stop
-from vibench.interfaces.validation import validation_parameters
 from vibench.qp.settings import SETTINGS
 from vibench.qp.solve import installed_solvers
 from vibench.study import registry
+from vibench.study.cells import OWN, Plugin
+from vibench.study.entries import (
+    STRICT,
+    Entry,
+    Name,
+    ProblemEntry,
+    SamplingEntry,
+    Size,
+    Training,
+    Validation,
+    as_list,
+)
+from vibench.study.parameter_sets import check_own_validation, check_unseen, is_available
 
 Tolerance: TypeAlias = Annotated[float, Gt(0.0), Lt(1.0), AllowInfNan(False)]
-Size: TypeAlias = Annotated[int, Ge(1), Le(100_000)]
 Seconds: TypeAlias = Annotated[float, Gt(0.0), Le(1e7), AllowInfNan(False)]
 Tolerances: TypeAlias = Annotated[list[Tolerance], MinLen(1)]
 Sizes: TypeAlias = Annotated[list[Size], MinLen(1)]
-Name: TypeAlias = Annotated[str, MinLen(1)]
 Names: TypeAlias = Annotated[list[Name], MinLen(1)]
 
 
-def _as_list(value: Any) -> Any:
-    return value if isinstance(value, list) else [value]
-
-
 Accuracy: TypeAlias = Annotated[float, Ge(1e-14), Le(1e-2), AllowInfNan(False)]
-Accuracies: TypeAlias = Annotated[list[Accuracy], MinLen(1), BeforeValidator(_as_list)]
+Accuracies: TypeAlias = Annotated[list[Accuracy], MinLen(1), BeforeValidator(as_list)]
 
 
 def _only_available(value: Any) -> Any:
@@ -71,25 +76,7 @@ FileName: TypeAlias = Annotated[Name, AfterValidator(_file_name)]
 
 
 class _Model(BaseModel):
-    model_config = ConfigDict(extra="forbid", strict=True, frozen=True)
-
-
-class Entry(_Model):
-    """One entry of an axis of plugins."""
-
-    name: Annotated[Name, Field(description="Name the plugin is registered under.")]
-    label: Annotated[str, Field(description="Label in tables; its name by default.")] = ""
-    options: Annotated[dict[str, Any], Field(description="Keyword arguments of its constructor.")] = {}
-
-    @model_validator(mode="before")
-    @classmethod
-    def _from_name(cls, value: Any) -> Any:
-        return {"name": value} if isinstance(value, str) else value
-
-    @property
-    def title(self) -> str:
-        """Label, or name."""
-        return self.label or self.name
+    model_config = STRICT
 
 
 class ToleranceTable(_Model):
@@ -161,7 +148,13 @@ class Study(_Model):
 
     name: Annotated[FileName, Field(description="Name of the study; its results are in the folder `runs/<name>`.")]
     seed: Annotated[int, Ge(0), Lt(2**63), Field(description="Seed of the validation set.")] = 0
-    validation: Annotated[Size, Field(description="Number of validation parameters, the queries of every cell.")]
+    validation: Annotated[
+        Validation,
+        Field(description="Validation set, the queries of every cell: a number for the problem's own, or a sampling."),
+    ]
+    training: Annotated[Training, Field(description="Training sets: an axis; `own` is that of the problem itself.")] = [
+        SamplingEntry(name=OWN)
+    ]
     accuracy: Annotated[
         Accuracies, Field(description="Relative accuracy prescribed to QP solvers, or a list of accuracies: an axis.")
     ] = [1e-7]
@@ -183,7 +176,7 @@ class Study(_Model):
         Lt(1000),
         Field(description="Rounds of timing; break-even is undecided with fewer than six."),
     ] = 12
-    problem: Annotated[list[Entry], MinLen(1), Field(description="Problems.")]
+    problem: Annotated[list[ProblemEntry], MinLen(1), Field(description="Problems.")]
     tolerances: Annotated[
         list[ToleranceTable], MinLen(1), Field(description="Grids of tolerances; cells are their union.")
     ]
@@ -199,12 +192,20 @@ class Study(_Model):
         _check_names(study)
         return study
 
+    def training_of(self, problem: ProblemEntry) -> list[SamplingEntry]:
+        """The training sets of a problem."""
+        return problem.training or self.training
+
+    def validation_of(self, problem: ProblemEntry) -> int | SamplingEntry:
+        """The validation set of a problem; a number means its own."""
+        return self.validation if problem.validation is None else problem.validation
+
     def solver_names(self) -> list[str]:
         """Solvers to run: those named, or all that are installed."""
         return installed_solvers(registry.names("QP solver")) if self.solvers == "available" else list(self.solvers)
 
 
-MODELS: Mapping[str, type[BaseModel]] = {"tolerances": ToleranceTable, "limits": Limits}
+MODELS: Mapping[str, type[BaseModel]] = {"tolerances": ToleranceTable, "limits": Limits, "problem": ProblemEntry}
 """Models of the tables in a study file, by their key; those under other keys are entries of an axis."""
 
 
@@ -223,7 +224,7 @@ def _message(error: Any) -> str:
         case "missing":
             message = "required, but not given"
         case "model_type":
-            of_plugin = where[0] in ("problem", "dual", "primal")
+            of_plugin = where[0] in ("problem", "dual", "primal", "training", "validation")
             message = "expected a name, or a table with one" if of_plugin else "expected a table"
     place = ".".join(str(part) for part in where)
     return f"{place + ': ' if place else ''}{message}{found}"
@@ -231,12 +232,16 @@ def _message(error: Any) -> str:
 
 def _check_names(study: Study) -> None:
     """Check names and options of plugins, and that exactly the strategies which take a tolerance have one."""
-    axes = {"problem": study.problem, "dual strategy": study.dual, "primal strategy": study.primal}
+    axes: dict[str, Sequence[Entry]] = {
+        "problem": study.problem,
+        "dual strategy": study.dual,
+        "primal strategy": study.primal,
+    }
     for kind, axis in axes.items():
         for entry in axis:
             registry.check_options(kind, entry.name, entry.options)
-    for entry in study.problem:
-        _check_data(study, entry)
+    for problem in study.problem:
+        _check_sets(study, problem)
     known = {*SETTINGS, *registry.names("QP solver")}
     for solver in study.solver_names():
         if solver not in known:  # installed or not
@@ -247,15 +252,26 @@ def _check_names(study: Study) -> None:
         _check_tolerances(study, table)
 
 
-def _check_data(study: Study, entry: Entry) -> None:
-    """Build a problem that reads files: what is wrong with them is found before a run, and not in all of its cells."""
-    if not registry.data_digest("problem", entry.name, entry.options):
+def _check_sets(study: Study, entry: ProblemEntry) -> None:
+    """Check the parameter sets of a problem, for which it is built if it reads files or a strategy samples its box.
+
+    What is wrong with them is found before a run, and not in all of its cells.
+    """
+    validation, trained = study.validation_of(entry), study.training_of(entry)
+    named = [found for found in (*trained, validation) if isinstance(found, SamplingEntry) and found.name != OWN]
+    for found in named:
+        registry.check_options("sampling strategy", found.name, found.options)
+    if not named and not registry.data_digest("problem", entry.name, entry.options):
         return
-    problem = registry.create("problem", entry.name, entry.options)
-    try:
-        validation_parameters(problem, study.validation, study.seed)
-    except NumericalError as error:
-        raise RequestError(f"problem '{entry.title}': {error}") from None
+    problem = Plugin.from_entry("problem", entry)
+    by = validation if isinstance(validation, int) else Plugin.from_entry("sampling strategy", validation)
+    samplings = [None if one.name == OWN else Plugin.from_entry("sampling strategy", one) for one in trained]
+    if not is_available(*(found for found in (problem, by, *samplings) if isinstance(found, Plugin))):
+        return
+    if isinstance(by, int):
+        check_own_validation(problem, by, study.seed)
+    for sampling in samplings:
+        check_unseen(problem, sampling, by, study.seed)
 
 
 def _check_tolerances(study: Study, table: ToleranceTable) -> None:

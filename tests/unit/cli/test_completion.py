@@ -56,7 +56,7 @@ def completed(line: str) -> list[str]:
         ("vibench check problem:radial-obstacle --option ", ["length=", "resolution="]),
         ("vibench show quick --columns cell,beta_span", ["cell,beta_span_min"]),
         ("vibench show quick --table thresholds --sort -threshold_l", ["-threshold_low"]),
-        ("vibench list s", ["solvers", "studies"]),
+        ("vibench list s", ["sampling", "solvers", "studies"]),
         ("vibench show quick --table th", ["thresholds"]),
         ("vibench show quick --table s", ["summary"]),
     ],

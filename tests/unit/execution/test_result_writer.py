@@ -56,7 +56,8 @@ def test_a_cell_is_named_by_the_key_columns(cell: Cell) -> None:
     columns = cell_columns(cell)
     assert tuple(columns) == tuple(KEYS)
     assert columns == {
-        "problem": "membrane", "problem_options": '{"resolution": "coarse"}', "dual": "widened", "dual_options": "{}",
+        "problem": "membrane", "problem_options": '{"resolution": "coarse"}', "training": "own",
+        "training_options": "{}", "dual": "widened", "dual_options": "{}",
         "primal": "greedy", "primal_options": "{}", "pod_tol": 1e-2, "pod_size": None, "dual_tol": 1e-1,
         "dual_size": None, "primal_tol": 0.5, "solver": "piqp", "accuracy": cell.accuracy, "assembly": "full",
     }  # fmt: skip
@@ -68,14 +69,15 @@ def test_prescribed_sizes_have_columns_of_their_own(cell: Cell) -> None:
 
 
 PROBLEM = {"problem", "problem_options"}
-POD = PROBLEM | {"pod_tol", "pod_size"}
-CONE = PROBLEM | {"dual", "dual_options", "dual_tol", "dual_size"}
+TRAINED = PROBLEM | {"training", "training_options"}
+POD = TRAINED | {"pod_tol", "pod_size"}
+CONE = TRAINED | {"dual", "dual_options", "dual_tol", "dual_size"}
 
 
 @pytest.mark.parametrize(
     ("sort", "names"),
     [
-        (SnapshotStage, PROBLEM),
+        (SnapshotStage, TRAINED),
         (PODStage, POD),
         (ConeStage, CONE),
         (NestedEnrichment, POD | CONE | {"primal", "primal_options", "primal_tol"}),

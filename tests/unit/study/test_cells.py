@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import fields, replace
+from dataclasses import asdict, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -169,12 +169,15 @@ OTHER: Mapping[str, Mapping[str, Any]] = {
     "seed": {"seed": 2},
     "validation": {"validation": 9},
     "accuracy": {"accuracy": 1e-8},
+    "training": {"training": Plugin("sampling strategy", "s", "{}", "package 1")},
+    "training options": {"training": Plugin("sampling strategy", "s", '{"a": 1}', "package 1")},
+    "validation sampling": {"validation_sampling": Plugin("sampling strategy", "s", "{}", "package 1")},
 }
 
 
 def test_the_cases_cover_every_member_of_a_cell() -> None:
     covered = {name for change in OTHER.values() for name in change}
-    assert covered | {"labels", "nested_tolerances"} == {field.name for field in fields(Cell)}
+    assert covered | {"labels", "set_labels", "nested_tolerances"} == {field.name for field in fields(Cell)}
 
 
 @pytest.mark.parametrize("case", OTHER)
@@ -187,14 +190,25 @@ def test_no_two_changes_give_the_same_key() -> None:
 
 
 def test_the_key_does_not_depend_on_labels_or_code() -> None:
-    assert replace(SAMPLE, labels=("x", "y", "z")).key == SAMPLE.key
+    assert replace(SAMPLE, labels=("x", "y", "z"), set_labels=("x", "y")).key == SAMPLE.key
     newer = {axis: replace(getattr(SAMPLE, axis), code="package 2") for axis in ("problem", "dual", "primal")}
     assert replace(SAMPLE, **newer).key == SAMPLE.key
 
 
-@pytest.mark.parametrize("axis", ["problem", "dual", "primal"])
+def test_the_key_of_a_cell_with_the_sets_of_its_problem_is_what_it_was_before_there_were_others() -> None:
+    content = asdict(SAMPLE)
+    for name in ("labels", "nested_tolerances", "training", "validation_sampling", "set_labels"):
+        del content[name]
+    for plugin in ("problem", "dual", "primal"):
+        del content[plugin]["code"]
+    assert SAMPLE.key == digest(content)
+
+
+@pytest.mark.parametrize("axis", ["problem", "dual", "primal", "training", "validation_sampling"])
 def test_the_code_changes_with_every_plugin(axis: str) -> None:
-    assert replace(SAMPLE, **{axis: replace(getattr(SAMPLE, axis), code="package 2")}).code != SAMPLE.code
+    given = getattr(SAMPLE, axis) or Plugin("sampling strategy", "s", "{}", "package 1")
+    one, other = (replace(SAMPLE, **{axis: replace(given, code=f"package {k}")}).code for k in (1, 2))
+    assert one != other
 
 
 @pytest.mark.parametrize("what", ["core_code", "solver_version"])

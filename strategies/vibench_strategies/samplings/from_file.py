@@ -1,0 +1,58 @@
+"""Parameters in a file."""
+
+from __future__ import annotations
+
+import hashlib
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from vibench import Array, ParameterBox, RequestError, Sampling
+
+
+class File(Sampling):
+    """The rows of a file: an array of NumPy (.npy, P×d), or text with commas (.csv) under the parameters' names.
+
+    Parameters
+    ----------
+    path
+        The file, relative to the folder of the study file. The columns of a .csv may have any order.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    @classmethod
+    def data_digest(cls, **options: Any) -> str:
+        """Digest of the file."""
+        return hashlib.sha256(_read(Path(options["path"]))).hexdigest()[:16]
+
+    def parameters(self, box: ParameterBox) -> Array:
+        """The rows in their order."""
+        _read(self.path)
+        try:
+            if self.path.suffix == ".npy":
+                found: Array = np.load(self.path, allow_pickle=False)
+                if found.dtype.kind not in "fiu":
+                    raise RequestError(f"'{self.path}' holds values of the type {found.dtype}; expected real numbers")
+                return found[:, None] if found.ndim == 1 and box.dim == 1 else found
+            if self.path.suffix != ".csv":
+                raise RequestError(f"'{self.path}' is neither a .csv nor a .npy file")
+            head, *lines = self.path.read_text(encoding="utf-8-sig").strip().splitlines() or [""]
+            names = [name.strip() for name in head.split(",")]
+            if sorted(names) != sorted(box.names):
+                raise RequestError(f"'{self.path}' has the columns {', '.join(names)}; expected {', '.join(box.names)}")
+            rows = [[float(value) for value in line.split(",")] for line in lines]
+            if any(len(row) != box.dim for row in rows):
+                raise RequestError(f"'{self.path}' has a row without {box.dim} values")
+            return np.array(rows).reshape(-1, box.dim)[:, [names.index(name) for name in box.names]]
+        except (OSError, ValueError) as error:
+            raise RequestError(f"'{self.path}' cannot be read: {error}") from None
+
+
+def _read(path: Path) -> bytes:
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise RequestError(f"'{path}' cannot be read: {error.strerror}") from None

@@ -1,0 +1,73 @@
+"""Sampling strategies: points of the box, the same in every call, with the property that gives each its name."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from vibench import Array, ParameterBox, Sampling, create
+from vibench.interfaces.sampling import check_sample
+
+BOX = ParameterBox(("a", "b", "c"), np.array([1e-3, -2.0, 5.0]), np.array([1e3, 3.0, 5.5]), ("m", "1", "N"))
+DRAWN = ("random", "sobol", "latin-hypercube")
+
+
+def points(name: str, box: ParameterBox = BOX, **options: object) -> Array:
+    strategy = create("sampling strategy", name, options)
+    assert isinstance(strategy, Sampling)
+    return check_sample(box, strategy.parameters(box))
+
+
+@pytest.mark.parametrize("name", DRAWN)
+@settings(max_examples=20, deadline=None)
+@given(size=st.integers(1, 70), seed=st.integers(0, 2**63 - 1), log=st.sampled_from([[], ["a"], ["c", "a"]]))
+def test_drawn_points_are_in_the_box_and_the_same_for_the_same_seed(
+    name: str, size: int, seed: int, log: list[str]
+) -> None:
+    found = points(name, size=size, seed=seed, log=log)
+    assert found.shape == (size, 3)
+    assert found.tobytes() == points(name, size=size, seed=seed, log=log).tobytes()
+    assert found.tobytes() != points(name, size=size, seed=(seed + 1) % 2**63, log=log).tobytes()
+
+
+@pytest.mark.parametrize("name", DRAWN)
+def test_a_log_scale_spreads_the_logarithm_and_leaves_the_other_parameters(name: str) -> None:
+    plain, scaled = (points(name, size=64, seed=2, log=log) for log in ([], ["a"]))
+    assert np.array_equal(plain[:, 1:], scaled[:, 1:])
+    places = (plain[:, 0] - BOX.lower[0]) / (BOX.upper[0] - BOX.lower[0])
+    np.testing.assert_allclose(np.log10(scaled[:, 0]), -3.0 + 6.0 * places, atol=1e-9)
+
+
+@pytest.mark.parametrize("size", [1, 7, 32])
+def test_a_latin_hypercube_has_one_point_in_every_interval_of_every_parameter(size: int) -> None:
+    found = points("latin-hypercube", size=size, seed=5, log=["a"])
+    found[:, 0] = np.log(found[:, 0])
+    lower, upper = BOX.lower.copy(), BOX.upper.copy()
+    lower[0], upper[0] = np.log(lower[0]), np.log(upper[0])
+    cells = np.floor(size * (found - lower) / (upper - lower)).astype(int)
+    assert [sorted(column) for column in cells.T] == [list(range(size))] * 3
+
+
+def test_a_sobol_sequence_is_balanced_and_its_sizes_are_nested() -> None:
+    unit = ParameterBox(("a", "b"), np.zeros(2), np.ones(2), ("1", "1"))
+    found = points("sobol", unit, size=64, seed=3)
+    assert np.array_equal(points("sobol", unit, size=37, seed=3), found[:37])
+    for across in range(7):  # a (0, 6, 2)-net in base 2: one point in each box of volume 1/64
+        shape = np.array([2**across, 2 ** (6 - across)])
+        assert len(np.unique(np.floor(found * shape), axis=0)) == 64
+
+
+def test_a_grid_is_that_of_the_box_and_geometric_on_a_log_scale() -> None:
+    assert points("grid", counts=[3, 1, 4]).tobytes() == BOX.grid(3, 1, 4).tobytes()
+    assert points("grid", counts=[2]).tobytes() == BOX.grid(2, 2, 2).tobytes()
+    found = points("grid", counts=[7, 1, 2], log=["a"])
+    np.testing.assert_allclose(found[::2, 0], np.geomspace(1e-3, 1e3, 7), rtol=1e-12)
+    assert np.array_equal(found[:, 2], [5.0, 5.5] * 7)
+
+
+def test_a_list_keeps_its_order_and_a_single_parameter_needs_no_brackets() -> None:
+    assert points("list", points=[[2, 0.5, 5.5], [1, 0, 5]]).tolist() == [[2, 0.5, 5.5], [1, 0, 5]]
+    line = ParameterBox(("a",), np.zeros(1), np.ones(1), ("1",))
+    assert points("list", line, points=[0.5, 0.25]).tolist() == [[0.5], [0.25]]

@@ -1,0 +1,74 @@
+"""A study of one cell has that cell: a row can be made again from what is recorded of it."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from running import Changed, Main, refused
+
+from vibench.errors import RequestError
+from vibench.execution.recorded_cell import recorded_study
+from vibench.results import tables
+from vibench.results.database import FILE
+from vibench.study.cells import Cell, expand
+from vibench.study.reader import read_study
+from vibench.study.single_cell import only_cell, study_of_cell
+from vibench.study.spec import Study
+
+
+@pytest.mark.parametrize("name", ["quick", "benefit", "hertz-quadrature", "paper-hertz"])
+def test_a_study_of_one_cell_has_the_same_cell(name: str) -> None:
+    """With prescribed sizes, tolerances by strategy, options, labels and reduced assembly."""
+    cells = expand(read_study(name))
+    for cell in (*cells[:4], *cells[-4:], *cells[:: max(len(cells) // 8, 1)]):
+        (again,) = expand(study_of_cell(cell, name))
+        assert (again.key, str(again), again.code) == (cell.key, str(cell), cell.code)
+
+
+def test_a_study_of_one_cell_has_its_parameter_sets() -> None:
+    quick = read_study("quick")
+    drawn = {"name": "random", "label": "drawn", "options": {"size": 20, "seed": 3}}
+    sampled = Study(**quick.model_dump() | {"training": ["own", drawn], "validation": drawn | {"options": {"size": 9}}})
+    for cell in expand(sampled):
+        (again,) = expand(study_of_cell(cell, "quick"))
+        assert (again.key, str(again), again.validation) == (cell.key, str(cell), 9)
+
+
+def test_a_definition_without_parameter_sets_is_one_with_those_of_the_problem() -> None:
+    cell = expand(read_study("quick"))[0]
+    older = json.loads(cell.definition)
+    for name in ("training", "validation_sampling", "set_labels"):
+        del older[name]
+    assert Cell.from_definition(json.dumps(older)) == cell
+
+
+def test_a_row_is_made_again_from_its_results_file(quick_run: Path, main: Main) -> None:
+    row = tables.read(quick_run / FILE, "cells").iloc[3]
+    study = recorded_study(str(quick_run / FILE), row["cell"][:6])
+    assert [cell.key for cell in expand(study)] == [row["cell"]]
+    assert (study.name, study.timing_rounds) == ("quick", row["timing_rounds"])
+    code, out, err = main("run", str(quick_run / FILE), "--cell", row["cell"][:6], "--dry-run")
+    assert (code, err) == (0, "")
+    assert out == f"{row['cell']}  {tables.name_of_cell(row)}\n1 cells\n"
+    assert main("run", "quick", "--cell", row["cell"], "--dry-run") == (code, out, err)
+
+
+def test_what_is_no_cell_is_refused(quick_run: Path, changed: Changed, main: Main) -> None:
+    results = str(quick_run / FILE)
+    refused(main("run", results, "--cell", "xyz"), "0 cells", "begin with 'xyz'", "expected one")
+    refused(main("run", "quick", "--cell", "xyz"), "0 cells of 'quick' begin with 'xyz'")
+    refused(main("run", results, "--cell", "a", "--solver", "piqp"), "leave out solvers")
+    for definition in ("", "[]", "{}", '{"problem": 3}'):
+        broken = changed(f"UPDATE cells SET definition = '{definition}'")
+        key = tables.read(broken, "cells")["cell"].iloc[0]
+        refused(main("run", str(broken), "--cell", key), key, "cannot be read")
+
+
+def test_a_cell_is_found_by_a_beginning_that_no_other_has() -> None:
+    cells = expand(read_study("quick"))
+    assert only_cell(cells, cells[5].key, "quick") is cells[5]
+    with pytest.raises(RequestError, match=f"{len(cells)} cells of quick begin with ''"):
+        only_cell(cells, "", "quick")
+    assert isinstance(cells[5], Cell)

@@ -1,0 +1,99 @@
+"""The schema of the entries on the axes of a study file: plugins with their options, problems, parameter sets."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, TypeAlias
+
+from annotated_types import Ge, Le, MinLen
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Discriminator,
+    Field,
+    Tag,
+    model_validator,
+)
+
+from vibench.study.cells import OWN
+
+Size: TypeAlias = Annotated[int, Ge(1), Le(100_000)]
+Name: TypeAlias = Annotated[str, MinLen(1)]
+
+
+def as_list(value: Any) -> Any:
+    """A value that may stand for a list of one."""
+    return value if isinstance(value, list) else [value]
+
+
+STRICT = ConfigDict(extra="forbid", strict=True, frozen=True)
+"""Configuration of the tables of a study file: unknown keys are refused, and no type is converted."""
+
+
+class Entry(BaseModel):
+    """One entry of an axis of plugins."""
+
+    model_config = STRICT
+
+    name: Annotated[Name, Field(description="Name the plugin is registered under.")]
+    label: Annotated[str, Field(description="Label in tables; its name by default.")] = ""
+    options: Annotated[dict[str, Any], Field(description="Keyword arguments of its constructor.")] = {}
+
+    @model_validator(mode="before")
+    @classmethod
+    def _from_name(cls, value: Any) -> Any:
+        return {"name": value} if isinstance(value, str) else value
+
+    @property
+    def title(self) -> str:
+        """Label, or name."""
+        return self.label or self.name
+
+
+class SamplingEntry(Entry):
+    """A parameter set: `own`, that of the problem itself, or a sampling strategy; other keys are its options."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _from_name(cls, value: Any) -> Any:
+        if not isinstance(value, dict):
+            return {"name": value} if isinstance(value, str) else value
+        own = {key: part for key, part in value.items() if key in cls.model_fields}
+        short = {key: part for key, part in value.items() if key not in cls.model_fields}
+        given = own.get("options", {})
+        return own | {"options": given | short} if isinstance(given, dict) else own
+
+    @model_validator(mode="after")
+    def _no_options_of_own(self) -> SamplingEntry:
+        if self.name == OWN and self.options:
+            raise ValueError(f"the problem's own set has no options (found {', '.join(map(repr, self.options))})")
+        if self.label == OWN != self.name:
+            raise ValueError(f"'{OWN}' is the problem's own set and no label of another")
+        return self
+
+
+def _number_or_table(value: Any) -> str:
+    return "<table>" if isinstance(value, dict | str | SamplingEntry) else "<number>"
+
+
+def _drawn(entry: SamplingEntry) -> SamplingEntry:
+    if entry.name == OWN:
+        raise ValueError("give the number of parameters in the problem's own set, or a sampling strategy")
+    return entry
+
+
+Training: TypeAlias = Annotated[list[SamplingEntry], MinLen(1), BeforeValidator(as_list)]
+Validation: TypeAlias = Annotated[
+    Annotated[Size, Tag("<number>")] | Annotated[SamplingEntry, AfterValidator(_drawn), Tag("<table>")],
+    Discriminator(_number_or_table),
+]
+
+
+class ProblemEntry(Entry):
+    """One entry of the axis of problems."""
+
+    training: Annotated[
+        Training | None, Field(description="Training sets of this problem instead of those of all.")
+    ] = None
+    validation: Annotated[Validation | None, Field(description="Validation set of this problem, likewise.")] = None
