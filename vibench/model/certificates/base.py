@@ -78,9 +78,7 @@ def unsupported(problem: Problem, members: Mapping[str, AffineMember]) -> str:
 
 def is_exact(problem: Problem, name: str, member: AffineMember) -> bool:
     """Whether a member has no interpolation error."""
-    if member.way is Evaluation.CONSTANT:
-        return name in problem.constant or problem.affine.get(name) == 1
-    return member.way is Evaluation.INTERPOLATED and problem.affine.get(name) == len(member.terms)
+    return member.way is Evaluation.AFFINE or (member.way is Evaluation.CONSTANT and name in problem.constant)
 
 
 def certificate_base(problem: Problem, members: Mapping[str, AffineMember]) -> CertificateBase:
@@ -128,8 +126,11 @@ class _Coefficients:
     def __init__(self, problem: Problem, name: str, member: AffineMember) -> None:
         self._name, sampled = name, member.way is Evaluation.INTERPOLATED
         self._sampler = problem.sampler({name: (member.rows, member.columns)}) if sampled else None
+        self._declared = problem.affine[name] if member.way is Evaluation.AFFINE else None
 
     def at(self, mu: Array) -> Array:
+        if self._declared is not None:
+            return self._declared.coefficients(mu)
         return np.ones(1) if self._sampler is None else np.asarray(self._sampler(mu)[self._name])
 
 
