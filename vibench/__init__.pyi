@@ -1,5 +1,6 @@
 """The public surface: what authors of plugins and users of the library import from `vibench` itself."""
 
+from . import fem as fem
 from .arrays import Array as Array
 from .arrays import Indices as Indices
 from .arrays import Mask as Mask
