@@ -146,6 +146,9 @@ CELLS: Mapping[str, Column] = {
     "terms_B": Column(INTEGER, "", "Likewise for B; empty if B is assembled on the contact unknowns."),
     "terms_g": Column(INTEGER, "", "Likewise for g."),
     "offline_snapshots_s": Column(REAL, "s", "High-fidelity solutions at the training parameters, with one set-up."),
+    "offline_selection_s": Column(
+        REAL, "s", "Choice of the training parameters by error bounds, a part of the time before; 0 for fixed sets."
+    ),
     "offline_pod_s": Column(REAL, "s", "POD."),
     "offline_cone_s": Column(REAL, "s", "Dual strategy, with the orthonormal basis of the span."),
     "offline_enrichment_s": Column(REAL, "s", "Primal strategy."),

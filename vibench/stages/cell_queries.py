@@ -298,6 +298,7 @@ class _Queries(Pieces):
         spent["snapshots"].append(setup)
         row: Row = {f"offline_{name}_s": sum(s.cpu for s in parts) for name, parts in spent.items()}
         row["offline_s"] = sum(row.values())
+        row["offline_selection_s"] = self._training.selecting.cpu
         row["offline_wall_s"] = sum(s.wall for parts in spent.values() for s in parts)
         marginal = [seconds.cpu for seconds in self._reference.seconds]
         row |= {"hf_setup_s": setup.cpu, "hf_s": float(np.median(marginal))}
