@@ -11,7 +11,7 @@ from typing import Any, TypeVar
 import pytest
 from pytest_benchmark.fixture import BenchmarkFixture
 
-from vibench.timing import timed
+from vibench.timing import calibration, timed
 
 T = TypeVar("T")
 
@@ -69,10 +69,12 @@ def measure(
     if seconds < FEWEST * budget:
         seconds = min(seconds, _timed(work, given())[1])  # the first call may have imported something
     rounds, calls = _how_often(seconds, budget, together)
+    before = calibration().seconds().cpu
     if fresh:
-        benchmark.pedantic(work, setup=lambda: (given(), {}), rounds=rounds)
+        benchmark.pedantic(work, setup=lambda: (given(), {}), rounds=rounds)  # type: ignore[no-untyped-call]
     else:
-        benchmark.pedantic(work, rounds=rounds, iterations=calls)
+        benchmark.pedantic(work, rounds=rounds, iterations=calls)  # type: ignore[no-untyped-call]
+    benchmark.extra_info["calibration_s"] = (before + calibration().seconds().cpu) / 2.0
 
 
 def _timed(work: Callable[..., T], arguments: tuple[Any, ...]) -> tuple[T, float]:
