@@ -6,8 +6,9 @@ import importlib.util
 import json
 import math
 import os
+import statistics
 import subprocess
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,7 +19,7 @@ from running import Main, Register, refused
 from samples import install_fakes
 
 from vibench.benchmarks import cases
-from vibench.benchmarks.measure import _how_often, plain
+from vibench.benchmarks.measure import PASSES, _how_often, plain
 from vibench.errors import RequestError
 
 REGISTERED = """\
@@ -120,7 +121,18 @@ def test_what_cannot_be_made_fails_with_its_reason_and_is_not_timed(third_party:
 def test_the_file_says_where_it_was_measured(third_party: Timed) -> None:
     assert set(third_party.file["machine_info"]["vibench"]) == {"machine", "libraries", "code"}
     assert {entry["options"]["timer"] for entry in third_party.benchmarks.values()} == {"process_time"}
-    assert all(entry["extra_info"]["calibration_s"] > 0.0 for entry in third_party.benchmarks.values())
+
+
+def test_what_is_not_slow_is_timed_in_passes_whose_rounds_are_put_together(third_party: Timed) -> None:
+    several = {name: entry["extra_info"]["passes"] for name, entry in third_party.benchmarks.items()}
+    assert {len(passes) for passes in several.values()} <= {1, PASSES}
+    assert len(several["enrichment[wire-decorrelated]"]) == PASSES
+    for name, passes in several.items():
+        stats = third_party.benchmarks[name]["stats"]
+        assert sum(one["rounds"] for one in passes) == stats["rounds"] == len(stats["data"])
+        assert min(one["q1"] for one in passes) <= stats["median"] <= max(one["q3"] for one in passes)
+        assert stats["median"] == pytest.approx(statistics.median(stats["data"]))
+        assert all(one["calibration_s"] > 0.0 for one in passes)
 
 
 def test_the_tables_fit_eighty_columns_and_have_every_benchmark(third_party: Timed) -> None:
@@ -176,7 +188,7 @@ def test_without_pytest_benchmark_one_line_names_the_command(main: Main, monkeyp
 @pytest.mark.parametrize(
     ("seconds", "budget", "together", "expected"),
     [(1e-5, 1.0, 1, (30, 200)), (1e-5, 1.0, 8, (30, 200)), (3e-4, 1.0, 8, (30, 8)), (0.02, 1.0, 8, (6, 8)),
-     (0.4, 1.0, 1, (3, 1)), (0.4, 1.0, 8, (3, 1)), (4.0, 1.0, 1, (1, 1)), (0.0, 1.0, 1, (30, 20000))],
+     (0.4, 1.0, 1, (2, 1)), (0.4, 1.0, 8, (2, 1)), (4.0, 1.0, 1, (1, 1)), (0.0, 1.0, 1, (30, 20000))],
 )  # fmt: skip
 def test_what_is_quick_is_repeated_and_what_is_slow_is_not(seconds, budget, together, expected) -> None:
     assert _how_often(seconds, budget, together) == expected
@@ -194,10 +206,12 @@ def entry(
     *,
     iqr: float = 0.0,
     calibration: float = 1.0,
+    more: Sequence[tuple[float, float]] = (),
     **extra: str,
 ) -> dict[str, Any]:
     stats = {"median": seconds, "q1": seconds - iqr / 2, "q3": seconds + iqr / 2, "rounds": 9}
-    info = {"accuracy": accuracy, "calibration_s": calibration, **extra}
+    passes = [stats | {"calibration_s": calibration}, *({"q1": q1, "q3": q3} for q1, q3 in more)]
+    info = {"accuracy": accuracy, "passes": passes, **extra}
     return {"fullname": f"benchmarks/bench_stages.py::test_{name}", "stats": stats, "extra_info": info}
 
 
@@ -217,6 +231,12 @@ COMPARED: Mapping[str, tuple[Pair, str]] = {
     "slower": ((BEFORE, entry("x", 1.26, SAME)), "slower"),
     "within the quartiles": ((entry("x", 1.0, SAME, iqr=0.4), entry("x", 1.5, SAME, iqr=0.7)), ""),
     "beyond the quartiles": ((entry("x", 1.0, SAME, iqr=0.4), entry("x", 1.5, SAME, iqr=0.5)), "slower"),
+    "within the quartiles of another pass": (
+        (entry("x", 1.0, SAME, more=[(1.0, 1.4)]), entry("x", 1.5, SAME, more=[(1.39, 1.4)])), "",
+    ),
+    "beyond the quartiles of all passes": (
+        (entry("x", 1.0, SAME, more=[(1.0, 1.4)]), entry("x", 1.5, SAME, more=[(1.41, 1.5)])), "slower",
+    ),
     "by less than 10 µs": ((entry("x", 1e-6, SAME), entry("x", 10.9e-6, SAME)), ""),
     "by more than 10 µs": ((entry("x", 1e-6, SAME), entry("x", 11.1e-6, SAME)), "slower"),
     "on a slower machine": ((BEFORE, entry("x", 2.4, SAME, calibration=2.0)), ""),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import statistics
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -37,6 +38,8 @@ class Measured:
         What is timed, and with which plugins.
     seconds, q1, q3
         Median and quartiles over the rounds, in CPU seconds of one call.
+    low, high
+        The smallest lower and the largest upper quartile of a pass; the quartiles, where there was one.
     rounds
         Their number.
     accuracy
@@ -44,7 +47,7 @@ class Measured:
     status
         Of what a QP solver answered, "" where none was asked.
     calibration
-        CPU seconds of fixed work beside it: how fast the machine was then; NaN where it was not measured.
+        CPU seconds of fixed work beside it, median over the passes: how fast the machine was then; NaN where unknown.
     """
 
     group: str
@@ -52,6 +55,8 @@ class Measured:
     seconds: float
     q1: float
     q3: float
+    low: float
+    high: float
     rounds: int
     accuracy: Mapping[str, float | None]
     status: str
@@ -99,19 +104,23 @@ def _measured(entry: Mapping[str, Any]) -> Measured:
     extra, stats = entry.get("extra_info", {}), entry["stats"]
     axes = {str(name): unbroken(str(value)) for name, value in extra.get("axes", {}).items()}
     known = {"problem": axes.get("case", "")} | axes
+    passes = [stats, *extra.get("passes", [])]
+    calibrations = [float(one["calibration_s"]) for one in passes if "calibration_s" in one]
     return Measured(
         group=unbroken(str(entry.get("group") or _name(entry["fullname"]).partition("[")[0])),
         axes={name: known[name] for name in AXES if known.get(name)},
         seconds=float(stats["median"]),
         q1=float(stats["q1"]),
         q3=float(stats["q3"]),
+        low=min(float(one["q1"]) for one in passes),
+        high=max(float(one["q3"]) for one in passes),
         rounds=int(stats["rounds"]),
         accuracy={
             unbroken(str(name)): None if value is None else float(value)
             for name, value in extra.get("accuracy", {}).items()
         },
         status=unbroken(str(extra.get("status", ""))),
-        calibration=float(extra.get("calibration_s", math.nan)),
+        calibration=statistics.median(calibrations) if calibrations else math.nan,
     )
 
 
@@ -154,10 +163,10 @@ def is_worse(figure: Figures) -> bool:
 def is_slower(before: Measured, after: Measured, limit: float) -> bool:
     """Whether the seconds grew beyond a limit, beyond their spread, and beyond what the machine was slower by.
 
-    The ranges between the quartiles must not meet, the medians must be more than 10 µs apart, and their ratio must be
-    above the limit as measured and relative to the calibration, fixed work that was timed beside both.
+    The ranges between the quartiles of any two passes must not meet, the medians must be more than 10 µs apart, and
+    their ratio must be above the limit, also relative to the calibration, fixed work that was timed beside both.
     """
-    if after.seconds - before.seconds <= SHORTEST or after.q1 <= before.q3:
+    if after.seconds - before.seconds <= SHORTEST or after.low <= before.high:
         return False
     slowdown = after.calibration / before.calibration if before.calibration > 0.0 else math.nan
     allowed = limit * (slowdown if slowdown > 1.0 else 1.0)
@@ -213,7 +222,7 @@ def compared(before: Timed, after: Timed, limit: float) -> pd.DataFrame:
                 "before_s": was.seconds,
                 "after_s": now.seconds,
                 "ratio": now.seconds / was.seconds if was.seconds > 0.0 else math.nan,
-                "apart": "yes" if now.q1 > was.q3 or was.q1 > now.q3 else "no",
+                "apart": "yes" if now.low > was.high or was.low > now.high else "no",
                 "figure": worst[0],
                 "before": worst[1],
                 "after": worst[2],

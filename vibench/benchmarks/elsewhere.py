@@ -8,6 +8,7 @@ import os
 import subprocess
 import sys
 import tempfile
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -112,20 +113,22 @@ def _command(request: Request, file: Path, scratch: Path, progress: int) -> list
 
 
 def _followed(reports: Any, show: Callable[[str], None]) -> Outcome:
-    """What the process reports, told line by line."""
-    outcome, count, done = Outcome(), 0, 0
+    """What the process reports: every benchmark by name in the first pass, then how far the others are."""
+    outcome, count, passes, ended = Outcome(), 0, 1, Counter[str]()
     for report in reports:
         if "count" in report:
-            count = report["count"]
+            count, passes = report["count"], report["passes"]
             continue
-        done += 1
         name, reason = report["name"], one_line(report["reason"])
-        match report["outcome"]:
-            case "failed":
-                outcome.failed[name] = reason
-                show(f"[{done}/{count}] failed: {name}: {reason}")
-            case "skipped":
-                outcome.skipped[name] = reason
-            case _:
-                show(f"[{done}/{count}] {name}")
+        number = ended[name]
+        ended[name] += 1
+        if report["outcome"] == "skipped":
+            outcome.skipped[name] = reason
+        elif report["outcome"] == "failed":
+            outcome.failed[name] = reason
+            show(f"[{len(ended)}/{count}] failed: {name}: {reason}")
+        elif number == 0:
+            show(f"[{len(ended)}/{count}] {name}")
+        elif max(ended.values()) == ended[name] and sum(times > number for times in ended.values()) == 1:
+            show(f"pass {number + 1} of {passes}")
     return outcome

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import json
 import os
+import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cache
-from typing import Any
+from typing import Any, ClassVar
 
 import pytest
 from threadpoolctl import threadpool_limits
@@ -25,6 +26,7 @@ from vibench.benchmarks.cases import (
     takes_no_option,
 )
 from vibench.benchmarks.material import Material
+from vibench.benchmarks.measure import PASSES
 from vibench.qp.solve import installed_solvers
 from vibench.study import registry
 
@@ -32,6 +34,9 @@ KINDS: Mapping[str, str] = {
     "case": "problem", "size": "problem", "dual": "dual", "primal": "primal", "solver": "solver",
 }  # fmt: skip
 """The word for the kind of plugin (`registry.WORDS`) that an argument of a benchmark is about."""
+
+PASS = re.compile(r"-@\d+(?=[-\]])")
+"""The pass in the name of a benchmark."""
 
 Chosen = Mapping[str, Sequence[str]]
 """Names of the plugins to time, by the word for their kind; all that are registered where there is none of any kind."""
@@ -61,6 +66,7 @@ def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
     for name, values in axes.items():
         if name in metafunc.fixturenames:
             metafunc.parametrize(name, values(), ids=str)
+    metafunc.parametrize("number", range(PASSES), ids="@{}".format)
 
 
 def _problems(chosen: Chosen, config: pytest.Config) -> Sequence[str]:
@@ -77,10 +83,10 @@ def _sizes(problems: Sequence[str], resolutions: Sequence[Resolution]) -> list[S
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Leave out benchmarks in which no chosen plugin takes part."""
+    """Leave out benchmarks in which no chosen plugin takes part; all others once, then all once more, and so on."""
     chosen: Chosen = config.getoption("chosen")
-    if chosen:
-        items[:] = [item for item in items if _kinds(item) & chosen.keys()]
+    kept = [item for item in items if not chosen or _kinds(item) & chosen.keys()]
+    items[:] = sorted(kept, key=lambda item: int(_parameters(item)["number"]))
 
 
 def _kinds(item: pytest.Item) -> set[str]:
@@ -97,25 +103,42 @@ def _setting(config: pytest.Config) -> Setting:
     return setting(config.getoption("study"))
 
 
-@pytest.hookimpl
-def pytest_runtest_logreport(report: pytest.TestReport) -> None:
-    """Tell whoever started the benchmarks how one of them ended, in a line of JSON."""
-    if _Progress.descriptor is not None and (report.when == "call" or report.outcome != "passed"):
-        line = {"name": plain_name(report.nodeid), "outcome": report.outcome, "reason": _reason(report)}
-        os.write(_Progress.descriptor, json.dumps(line).encode() + b"\n")
+class _Session:
+    """What the hooks of this process have in common, some of which do not know its configuration.
 
+    `progress` is the descriptor to write to; `done` has the benchmarks that need no other pass.
+    """
 
-class _Progress:
-    """Where the progress of this process is written; a report does not know its configuration."""
-
-    descriptor: int | None = None
+    progress: int | None = None
+    done: ClassVar[set[str]] = set()
 
 
 def pytest_collection_finish(session: pytest.Session) -> None:
-    """Tell how many benchmarks there are."""
-    _Progress.descriptor = session.config.getoption("progress")
-    if _Progress.descriptor is not None:
-        os.write(_Progress.descriptor, json.dumps({"count": len(session.items)}).encode() + b"\n")
+    """Tell how many benchmarks there are in a pass."""
+    _Session.progress = session.config.getoption("progress")
+    _tell({"count": len(session.items) // PASSES, "passes": PASSES})
+
+
+def pytest_runtest_setup(item: pytest.Item) -> None:
+    """Leave out what failed, was left out, or is slow in a pass before."""
+    if plain_name(item.nodeid) in _Session.done:
+        pytest.skip("one pass is enough")
+
+
+def pytest_runtest_logreport(report: pytest.TestReport) -> None:
+    """Tell whoever started the benchmarks how one of them ended in its pass."""
+    if report.when != "call" and report.outcome == "passed":
+        return
+    name = plain_name(report.nodeid)
+    if name not in _Session.done:
+        _tell({"name": name, "outcome": report.outcome, "reason": _reason(report)})
+    if report.outcome != "passed":
+        _Session.done.add(name)
+
+
+def _tell(line: Mapping[str, Any]) -> None:
+    if _Session.progress is not None:
+        os.write(_Session.progress, json.dumps(line).encode() + b"\n")
 
 
 def _reason(report: pytest.TestReport) -> str:
@@ -128,8 +151,8 @@ def _reason(report: pytest.TestReport) -> str:
 
 
 def plain_name(fullname: str) -> str:
-    """Name of a benchmark without the file and what every function begins with."""
-    return fullname.rsplit("::", 1)[-1].removeprefix("test_")
+    """Name of a benchmark without the file, what every function begins with, and the pass."""
+    return PASS.sub("", fullname.rsplit("::", 1)[-1].removeprefix("test_"))
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -159,9 +182,45 @@ def material(case: Case, materials: Callable[[Case], Material]) -> Material:
 
 
 @pytest.fixture(autouse=True)
-def axes(request: pytest.FixtureRequest, benchmark: Any) -> None:
-    """Keep what a benchmark is about beside its seconds."""
-    benchmark.extra_info["axes"] = {name: str(value) for name, value in _parameters(request.node).items()}
+def about(request: pytest.FixtureRequest, benchmark: Any, number: int) -> Iterator[None]:
+    """Keep what a benchmark is about beside its seconds; what is slow is timed in one pass."""
+    parameters = {name: str(value) for name, value in _parameters(request.node).items() if name != "number"}
+    benchmark.extra_info.update({"axes": parameters, "pass": number})
+    yield
+    if benchmark.extra_info.get("slow"):
+        _Session.done.add(plain_name(request.node.nodeid))
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_benchmark_update_json(output_json: dict[str, Any]) -> None:
+    """Make one entry of the passes of a benchmark: its statistics are over all rounds."""
+    entries: dict[str, list[dict[str, Any]]] = {}
+    for entry in output_json["benchmarks"]:
+        entries.setdefault(plain_name(entry["fullname"]), []).append(entry)
+    output_json["benchmarks"] = [_merged(name, passes) for name, passes in entries.items()]
+
+
+def _merged(name: str, passes: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    from pytest_benchmark.stats import Stats  # noqa: PLC0415  it is not installed wherever this module is read
+
+    first, together = passes[0], Stats()  # type: ignore[no-untyped-call]
+    for one in passes:
+        for seconds in one["stats"]["data"]:
+            together.update(seconds)  # type: ignore[no-untyped-call]
+    statistics = {field: getattr(together, field) for field in Stats.fields}
+    kept = ("q1", "median", "q3", "rounds")
+    several = [
+        {key: one["stats"][key] for key in kept} | {"calibration_s": one["extra_info"]["calibration_s"]}
+        for one in passes
+    ]
+    extra = {key: value for key, value in first["extra_info"].items() if key not in ("pass", "slow", "calibration_s")}
+    stats = first["stats"] | statistics | {"data": together.data}
+    return first | {
+        "name": f"test_{name}",
+        "fullname": PASS.sub("", first["fullname"]),
+        "stats": stats,
+        "extra_info": extra | {"passes": several},
+    }
 
 
 @pytest.hookimpl(optionalhook=True)
