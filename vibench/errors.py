@@ -28,6 +28,10 @@ class NumericalError(VibenchError):
     """A computation cannot go on: a matrix that is not SPD, values that are not finite, no convergence."""
 
 
+class UnsupportedError(VibenchError):
+    """What was asked for does not exist for this problem or model; its cells are unavailable."""
+
+
 def in_a_line(error: BaseException) -> str:
     """The sort of an exception and its message, in one line of bounded length."""
     return one_line(f"{type(error).__name__}: {_message(error)}")

@@ -46,6 +46,10 @@ EXAMPLES: Mapping[str, tuple[str, ...]] = {
         "vibench compare runs/2024 runs/2025 --column online_s",
         "vibench compare runs/2024 runs/2025 --table columns --format csv",
     ),
+    "publish": (
+        "vibench publish quick site",
+        'vibench publish runs/* site --title "Obstacle problems" --author "Doe, Jane" --doi 10.5281/zenodo.1234567',
+    ),
     "replay": ("vibench replay quick 3f9a", "vibench replay quick 3f9a --query 7"),
     "export-qps": ("vibench export-qps quick programs",),
     "export-model": (

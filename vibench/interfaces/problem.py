@@ -132,6 +132,8 @@ class Picture:
         Points of the multiplier (1×m on a line, 2×m in the plane) and its values (m,).
     multiplier_name
         Name of the multiplier, with its unit.
+    length_unit
+        Unit of the coordinates; "" where it is not said.
     """
 
     points: Array
@@ -141,6 +143,7 @@ class Picture:
     positions: Array
     multiplier: Array
     multiplier_name: str
+    length_unit: str = ""
 
 
 MEMBERS = ("A", "f", "B", "g")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property, partial
 
@@ -10,11 +10,30 @@ import numpy as np
 
 from vibench.arrays import Array
 from vibench.errors import NumericalError
-from vibench.interfaces.problem import Problem, VariationalInequality
+from vibench.interfaces.problem import Contact, Problem, VariationalInequality
 from vibench.interfaces.strategies import Enrichment
 from vibench.interfaces.validation import checked_assembly
 from vibench.linalg.dense import orthonormal_range
 from vibench.reduction.supremizers import ContactCoordinates, projected_supremizers
+
+
+@dataclass(frozen=True)
+class Evaluated:
+    """What a hyper-reduced assembly evaluates at one parameter.
+
+    Attributes
+    ----------
+    samples
+        Values of the sampled entries, by member.
+    contact
+        The constraint on the contact unknowns, where B or g are evaluated there.
+    coordinates
+        Those (d×N') of the primal basis Z in the space Φ of the model; `None` where they are the same.
+    """
+
+    samples: Mapping[str, Array]
+    contact: Contact | None
+    coordinates: Array | None
 
 
 @dataclass(frozen=True)
@@ -29,11 +48,14 @@ class ReducedProblem:
         From coordinates (N'×k) in the V-orthonormal primal basis Z at this parameter to vectors (n×k): u = Z x.
     factor
         Cholesky factor (lower, N'×N') of A, where it was computed offline.
+    evaluated
+        What a hyper-reduced assembly evaluated at the parameter.
     """
 
     program: VariationalInequality
     lift: Callable[[Array], Array]
     factor: Array | None = None
+    evaluated: Evaluated | None = None
 
     @property
     def basis(self) -> Array:

@@ -15,7 +15,7 @@ from vibench.interfaces.problem import MEMBERS, Contact, Sampler, VariationalIne
 from vibench.interfaces.strategies import Kind
 from vibench.linalg.dense import orthonormal_range
 from vibench.model.affine import AffineMember, Evaluation
-from vibench.model.galerkin import ReducedModel, ReducedProblem
+from vibench.model.galerkin import Evaluated, ReducedModel, ReducedProblem
 from vibench.reduction.supremizers import ContactCoordinates, Coordinates, SpannedCoordinates, supremizers
 
 Samples = Mapping[str, Array]
@@ -205,8 +205,10 @@ class HyperReducedModel:
         NumericalError
             If the reduced problem has entries that are not finite.
         """
-        members, space = self.members(mu), self.space
+        samples, contact = self._evaluate(mu)
+        members, space = self._members(samples, contact), self.space
         A, f, B, g = members.A, members.f, members.B, members.g
+        Y = None
         if space is not None:
             Y, B = self._enriched(space, B)
             A, f, B = Y.T @ (A @ Y), Y.T @ f, B @ Y
@@ -216,7 +218,8 @@ class HyperReducedModel:
             lift = partial(np.matmul, self.basis)
         if not all(np.isfinite(member.sum()) for member in (A, f, B, g)):
             raise NumericalError(f"the reduced problem has entries that are not finite at mu = {mu.tolist()}")
-        return ReducedProblem(VariationalInequality(A, f, B, g), lift, self._operators.factor)
+        evaluated = Evaluated(samples, contact, Y)
+        return ReducedProblem(VariationalInequality(A, f, B, g), lift, self._operators.factor, evaluated)
 
     def lift(self, mu: Array, vi: VariationalInequality, x: Array) -> Array:  # noqa: ARG002
         """Vectors u = Z x (n×k) with coordinates x (N'×k) at mu, for reconstruction; it assembles again."""
@@ -224,9 +227,15 @@ class HyperReducedModel:
 
     def members(self, mu: Array) -> VariationalInequality:
         """A, f, B, g at mu (d,) on Φ, a space that does not depend on mu; B on (η, χ) where Φ has `space`."""
+        return self._members(*self._evaluate(mu))
+
+    def _evaluate(self, mu: Array) -> tuple[Samples, Contact | None]:
         operators = self._operators
-        samples = self.coefficients(mu)
-        contact = self.problem.contact(mu) if operators.B is None or operators.g is None else None
+        of_contact = operators.B is None or operators.g is None
+        return self.coefficients(mu), self.problem.contact(mu) if of_contact else None
+
+    def _members(self, samples: Samples, contact: Contact | None) -> VariationalInequality:
+        operators = self._operators
         A, f = operators.A.at(samples.get("A")), operators.f.at(samples.get("f"))
         g = operators.g.at(samples.get("g")) if operators.g is not None else _projected_bound(self.model, contact)
         return VariationalInequality(A, f, self._constraint(samples, contact), g)

@@ -35,6 +35,9 @@ MARGINS = (1e-3, 1e-2, 1e-1, 0.5)
 
 Lanczos iterations are accurate to 1e-4."""
 
+ROUGH = 1e-2
+"""Relative accuracy of the estimate of an operator norm, which enters bounds with a small factor."""
+
 FEW = 30
 """Spaces of at most this dimension have their eigenvalues from a dense matrix; Lanczos needs more than two."""
 
@@ -85,6 +88,24 @@ def coercivity_and_continuity(A: SparseMatrix, V: InnerProduct) -> tuple[Constan
         return proved_positive([c * X, -A], np.sqrt(c) * root_X) == V.dim
 
     return _moved(low, -1.0, coercive), _moved(high, 1.0, continuous)
+
+
+def operator_norm(M: SparseMatrix, X: InnerProduct) -> Constant:
+    """Upper bound of max |vᵀMv| / ‖v‖² over v for a symmetric M (n×n), with ‖v‖ the norm of X."""
+    if not abs(M).sum():
+        return Constant(0.0, True)
+    if X.dim <= FEW:
+        estimate = float(np.abs(scipy.linalg.eigvalsh(M.toarray(), X.matrix.toarray())).max())
+    else:
+        whitened = _operator(X.dim, lambda v: X.whiten_functional(M @ X.unwhiten(v)))
+        estimate = float(np.abs(eigsh(whitened, which="LM", **_lanczos(X.dim, ROUGH))[0]))
+    root = np.sqrt(estimate * X.matrix.diagonal())
+
+    def above(c: float) -> bool:
+        scaled = np.sqrt(c / estimate) * root
+        return all(proved_positive([c * X.matrix, sign * M], scaled) == X.dim for sign in (-1.0, 1.0))
+
+    return _moved(estimate, 1.0, above)
 
 
 def _moved(estimate: float, sign: float, proves: Callable[[float], bool]) -> Constant:
@@ -168,6 +189,6 @@ def _operator(size: int, apply: Callable[[Array], Array]) -> LinearOperator:
     return LinearOperator((size, size), matvec=apply)
 
 
-def _lanczos(size: int) -> dict[str, Any]:
+def _lanczos(size: int, tolerance: float = 1e-4) -> dict[str, Any]:
     start = np.random.default_rng(0).standard_normal(size)
-    return {"k": 1, "v0": start, "tol": 1e-4, "return_eigenvectors": False}
+    return {"k": 1, "v0": start, "tol": tolerance, "return_eigenvectors": False}

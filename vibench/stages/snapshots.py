@@ -18,8 +18,8 @@ from vibench.interfaces.problem import Problem, VariationalInequality
 from vibench.interfaces.sampling import AdaptiveSampling
 from vibench.interfaces.validation import checked_assembly, training_parameters, validation_parameters
 from vibench.model.growing import GrowingTrainer
+from vibench.qp.repeats import nearby
 from vibench.stages.base import Result, Stage, build_problem, faults_of, value_of
-from vibench.stages.repeats import nearby
 from vibench.storage.artefacts import History, Store
 from vibench.storage.serialisation import storable
 from vibench.study import registry

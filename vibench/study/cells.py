@@ -96,9 +96,9 @@ class Cell:
 
     `training` and `validation_sampling` are the sampling strategies of its sets, `None` for the problem's own ones;
     `validation` is the number of validation parameters. `interpolation` is the tolerance of reduced assembly, `None`
-    for full assembly. `labels` of problem, dual and primal strategy and `set_labels` of training and validation are no
-    part of the identity; nor are `nested_tolerances`, all tolerances of a nested primal strategy in the study, whose
-    enrichments are stages of one.
+    for full assembly; certified queries are assembled as reduced ones. `labels` of problem, dual and primal strategy
+    and `set_labels` of training and validation are no part of the identity; nor are `nested_tolerances`, all tolerances
+    of a nested primal strategy in the study, whose enrichments are stages of one.
     """
 
     problem: Plugin
@@ -147,11 +147,12 @@ class Cell:
             If a plugin is not installed, or a file that its options name cannot be read.
         """
         content = json.loads(text)
-        for name in PLUGINS:
-            content[name] = content[name] and Plugin(**content[name]).as_installed()
+        for name in PLUGINS:  # older definitions have no sampling strategies
+            content[name] = Plugin(**content[name]).as_installed() if content.get(name) else None
         for axis in ("pod", "cone"):
             content[axis] = Stop(**content[axis])
-        return cls(**content | {name: tuple(content[name]) for name in ("labels", "nested_tolerances", "set_labels")})
+        labels = ("labels", "nested_tolerances", "set_labels")
+        return cls(**content | {name: tuple(content[name]) for name in labels if name in content})
 
     @property
     def axes(self) -> Axes:
@@ -206,7 +207,7 @@ def expand(study: Study) -> list[Cell]:
                     primal_tol=tolerance,
                     solver=solver,
                     assembly=assembly,
-                    interpolation=study.interpolation if assembly == "reduced" else None,
+                    interpolation=None if assembly == "full" else study.interpolation,
                     warm_start=study.warm_start,
                     seed=study.seed,
                     accuracy=accuracy,

@@ -162,7 +162,7 @@ class Study(_Model):
     dual: Annotated[list[Entry], MinLen(1), Field(description="Dual strategies.")]
     primal: Annotated[list[Entry], MinLen(1), Field(description="Primal strategies.")]
     assembly: Annotated[
-        list[Literal["full", "reduced"]], MinLen(1), Field(description="How queries are assembled.")
+        list[Literal["full", "reduced", "certified"]], MinLen(1), Field(description="How queries are assembled.")
     ] = ["full"]
     interpolation: Annotated[
         Tolerance, Field(description="Tolerance of empirical interpolation in reduced assembly.")

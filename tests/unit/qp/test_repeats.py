@@ -18,6 +18,7 @@ from vibench.errors import NumericalError
 from vibench.interfaces.problem import MEMBERS, ParameterBox, VariationalInequality
 from vibench.interfaces.strategies import Stop
 from vibench.model.hyperreduced import HyperReducedModel
+from vibench.qp.repeats import APART, in_units, nearby, units
 from vibench.qp.solution import QPSolution
 from vibench.qp.solve import solve_qp
 from vibench.stages import snapshots, timing_rounds
@@ -26,7 +27,6 @@ from vibench.stages.cell_queries import CellQueries
 from vibench.stages.enrichment import SingleEnrichment
 from vibench.stages.offline import ConeStage, PODStage
 from vibench.stages.query import Query
-from vibench.stages.repeats import APART, in_units, nearby, units
 from vibench.stages.snapshots import SnapshotStage
 from vibench.stages.timing_rounds import TimingRounds
 from vibench.storage.artefacts import Store

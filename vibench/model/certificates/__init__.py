@@ -1,0 +1,1 @@
+"""Certificates of reduced solutions at online cost: derived and evaluated in `bounds`, prepared in the others."""

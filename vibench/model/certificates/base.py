@@ -1,0 +1,159 @@
+"""What certificates of all reduced models of a problem have in common: the inner product, and A against it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from enum import StrEnum
+
+import numpy as np
+
+from vibench.arrays import Array, Indices, SparseMatrix
+from vibench.errors import UnsupportedError
+from vibench.interfaces.problem import Problem
+from vibench.interfaces.validation import checked_assembly
+from vibench.linalg.inner_product import InnerProduct
+from vibench.model.affine import AffineMember, Evaluation
+from vibench.model.certificates.spectral import SpectralBounds, rotated, spectral_bounds
+from vibench.stability.coercivity import operator_norm
+
+VERIFICATION = 16
+"""Random parameters at which interpolation errors are measured."""
+
+SEED = 21
+"""Their seed: they are none of the training or validation parameters."""
+
+SAFETY = 2.0
+"""Factor on the largest error measured."""
+
+
+class Guarantee(StrEnum):
+    """What a bound is worth: proved, valid up to interpolation errors that were measured, or not there."""
+
+    CERTIFIED = "certified"
+    VERIFIED = "verified"
+    NONE = "none"
+
+
+@dataclass(frozen=True)
+class CertificateBase:
+    """What certificates of all reduced models of a problem have in common.
+
+    Attributes
+    ----------
+    X
+        The inner product; that of A where it is constant.
+    compliance
+        C (k×k) of the contact unknowns E.
+    terms, rotation
+        Terms of A, and what takes coefficients of its interpolation (Q,) to those of these; `None` for a constant A.
+    spectral
+        Bounds of A against X; `None` where A is X.
+    load_error, stiffness_error
+        Bounds of ‖f − f̃‖ in the dual norm of X and of the operator norm of A − Ã; zero where they are exact.
+    """
+
+    X: InnerProduct
+    compliance: Array
+    terms: tuple[SparseMatrix, ...]
+    rotation: Array | None
+    spectral: SpectralBounds | None
+    load_error: float
+    stiffness_error: float
+
+    @property
+    def guarantee(self) -> Guarantee:
+        """What bounds are worth."""
+        proved = self.spectral is None or self.spectral.proved
+        exact = self.load_error == self.stiffness_error == 0.0
+        return Guarantee.CERTIFIED if proved and exact else Guarantee.VERIFIED
+
+
+def unsupported(problem: Problem, members: Mapping[str, AffineMember]) -> str:
+    """Why reduced models of a problem cannot be certified at online cost; "" if they can."""
+    if not problem.has_contact:
+        return "the problem does not assemble its constraint on its contact unknowns (`contact_dofs` and `contact`)"
+    return "; ".join(members[name].reason for name in ("A", "f") if members[name].way is Evaluation.FULL)
+
+
+def is_exact(problem: Problem, name: str, member: AffineMember) -> bool:
+    """Whether a member has no interpolation error."""
+    return member.way is Evaluation.AFFINE or (member.way is Evaluation.CONSTANT and name in problem.constant)
+
+
+def certificate_base(problem: Problem, members: Mapping[str, AffineMember], training: Array) -> CertificateBase:
+    """Prepare certificates of reduced models of a problem whose members have been decomposed over `training` (P×d).
+
+    Raises
+    ------
+    UnsupportedError
+        If `unsupported` gives a reason.
+    """
+    if reason := unsupported(problem, members):
+        raise UnsupportedError(reason)
+    A, f, dofs = members["A"], members["f"], contact_unknowns(problem)
+    constant = is_exact(problem, "A", A) and A.way is Evaluation.CONSTANT
+    box = problem.parameters
+    X = InnerProduct(A.terms[0] if constant else checked_assembly(problem, 0.5 * (box.lower + box.upper)).A, "A")
+    compliance = X.riesz(injected(problem))[dofs]
+    load, stiffness = _interpolation_errors(problem, X, A, f)
+    terms, rotation, spectral = list(A.terms), None, None
+    if not constant:
+        coefficients = _Coefficients(problem, "A", A)
+        samples = np.column_stack([coefficients.at(mu) for mu in training])
+        rotation, terms = T, _ = rotated(A.terms, samples)
+        spectral = spectral_bounds(problem, X, terms, lambda mu: T @ coefficients.at(mu), stiffness)
+    return CertificateBase(X, 0.5 * (compliance + compliance.T), tuple(terms), rotation, spectral, load, stiffness)
+
+
+def injected(problem: Problem) -> Array:
+    """E (n×k): the functionals that act on one contact unknown each."""
+    dofs = contact_unknowns(problem)
+    found = np.zeros((problem.V.dim, len(dofs)))
+    found[dofs, np.arange(len(dofs))] = 1.0
+    return found
+
+
+def contact_unknowns(problem: Problem) -> Indices:
+    """E (k,): the contact unknowns of a problem that certificates support."""
+    assert problem.contact_dofs is not None  # `unsupported` refuses problems without
+    return problem.contact_dofs
+
+
+class _Coefficients:
+    """The coefficients θ (Q,) of one member as a function of mu."""
+
+    def __init__(self, problem: Problem, name: str, member: AffineMember) -> None:
+        self._name, sampled = name, member.way is Evaluation.INTERPOLATED
+        self._sampler = problem.sampler({name: (member.rows, member.columns)}) if sampled else None
+        self._declared = problem.affine[name] if member.way is Evaluation.AFFINE else None
+
+    def at(self, mu: Array) -> Array:
+        if self._declared is not None:
+            return self._declared.coefficients(mu)
+        return np.ones(1) if self._sampler is None else np.asarray(self._sampler(mu)[self._name])
+
+
+def _interpolation_errors(problem: Problem, X: InnerProduct, A: AffineMember, f: AffineMember) -> tuple[float, float]:
+    """Bounds of the errors of f̃ and Ã, from random parameters."""
+    exact = {name: is_exact(problem, name, member) for name, member in (("A", A), ("f", f))}
+    if all(exact.values()):
+        return 0.0, 0.0
+    theta = {name: _Coefficients(problem, name, member) for name, member in (("A", A), ("f", f))}
+    load = stiffness = 0.0
+    for mu in problem.parameters.sample(VERIFICATION, SEED):
+        vi = checked_assembly(problem, mu)
+        if not exact["f"]:
+            interpolated = sum(t * term for t, term in zip(theta["f"].at(mu), f.terms, strict=True))
+            load = max(load, float(np.linalg.norm(X.whiten_functional(vi.f - interpolated))))
+        if not exact["A"]:
+            difference = vi.A - sum(t * term for t, term in zip(theta["A"].at(mu), A.terms, strict=True))
+            stiffness = max(stiffness, operator_norm(difference, X).value)
+    return SAFETY * load, SAFETY * stiffness
+
+
+def coefficients(base: CertificateBase, samples: Mapping[str, Array]) -> dict[str, Array]:
+    """θ of f, A and B; those of A rotated, one for what does not depend on the parameter."""
+    one = np.ones(1)
+    theta = {name: samples.get(name, one) for name in ("f", "A", "B")}
+    return theta if base.rotation is None else theta | {"A": base.rotation @ theta["A"]}

@@ -1,0 +1,138 @@
+"""Dual norms of residuals at online cost, from their coordinates in an orthonormal basis.
+
+A residual is r = Σ_j z_j t_j with functionals t_j that do not depend on the parameter and coefficients z that do. With
+X = FᵀF, its norm in X⁻¹ is ‖Σ_j z_j F⁻ᵀt_j‖. It is evaluated from coordinates in an orthonormal basis U of the F⁻ᵀt_j:
+the sum over products z_i z_j of a Gram matrix would keep half the digits (Buhr, Engwer, Ohlberger and Rave, 2014).
+
+Terms that hardly ever contribute, and directions of the others that do not, are left out of U, with bounds of what they
+contribute, whatever z is. With R = (F⁻ᵀt_j) of the terms that are kept, a scale d > 0 of their coefficients and
+P = I − UUᵀ,
+
+    ‖P R z‖ ≤ ‖P R D‖ ‖D⁻¹z‖,      and    Σ_j |z_j| ‖F⁻ᵀt_j‖    over the terms that are left out.
+
+Sharpness alone depends on d: samples of z give it, and how much is left out is a share of the norms that they have.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from vibench.arrays import Array, Indices
+from vibench.linalg.inner_product import InnerProduct
+
+TERMS, DIRECTIONS = 0.02, 0.2
+"""Bounds of what is left out are these shares of the typical norm: of terms, and of directions, which are orthogonal to
+those that are kept."""
+
+NEGLIGIBLE = 1e-12
+"""Contributions below this share of the largest one are not worth computing."""
+
+FEW = 1000
+"""All directions of up to so many terms are kept."""
+
+MOST, OVERSAMPLING = 400, 100
+"""Largest number of principal directions, and how many more a randomised method computes."""
+
+
+@dataclass(frozen=True)
+class ResidualBasis:
+    """An orthonormal basis U of residuals; see above.
+
+    Attributes
+    ----------
+    kept
+        Positions (p,) in z of the terms that U represents.
+    factor
+        Uᵀ R (K×p).
+    inverse_scale
+        1/d (p,).
+    remainder
+        Bound of ‖P R D‖.
+    norms
+        Norms (Z,) of the terms that are left out; zero for those that are kept.
+    """
+
+    kept: Indices
+    factor: Array
+    inverse_scale: Array
+    remainder: float
+    norms: Array
+
+    def coordinates(self, z: Array) -> Array:
+        """Coordinates (K,) in U of the residual with coefficients z (Z,)."""
+        return np.asarray(self.factor @ z[self.kept])
+
+    def left_out(self, z: Array) -> tuple[float, float]:
+        """Bounds of the part of the residual that is orthogonal to U, and of the terms that are left out."""
+        beside = self.remainder * float(np.linalg.norm(self.inverse_scale * z[self.kept])) if self.remainder else 0.0
+        return beside, float(self.norms @ np.abs(z))
+
+    def norm(self, z: Array) -> float:
+        """Upper bound of the dual norm of the residual."""
+        beside, missing = self.left_out(z)
+        return float(np.hypot(np.linalg.norm(self.coordinates(z)), beside)) + missing
+
+
+def residual_basis(
+    X: InnerProduct, blocks: Sequence[Array], samples: Array, beside: float
+) -> tuple[ResidualBasis, Array]:
+    """Basis of the terms t_j, given as blocks (n×·), from samples of their coefficients (Z×S), and U itself (n×K).
+
+    What is left out is compared with the sampled norms and `beside`, what else enters the same bound in quadrature.
+    """
+    sizes, ends = np.abs(samples), np.cumsum([0, *(block.shape[1] for block in blocks)])
+    scale = sizes.max(axis=1, initial=0.0)
+    whitened = [X.whiten_functional(block) for block in blocks]
+    norms = np.concatenate([np.linalg.norm(block, axis=0) for block in whitened])
+    typical = float(np.hypot(_typical_norm(whitened, ends, samples), beside))
+    kept = _worth_keeping(norms * scale, norms * sizes.mean(axis=1), TERMS * typical)
+    pairs = zip(whitened, ends, ends[1:], strict=False)
+    R = np.hstack([block[:, kept[(kept >= a) & (kept < b)] - a] for block, a, b in pairs])
+    inverse = 1.0 / scale[kept]
+    reach = float(np.linalg.norm(inverse[:, None] * samples[kept], axis=0).mean())
+    U, remainder = _directions(R * scale[kept], DIRECTIONS * typical / max(reach, np.finfo(float).tiny))
+    norms[kept] = 0.0
+    return ResidualBasis(kept, U.T @ R, inverse, remainder, norms), U
+
+
+def _typical_norm(whitened: Sequence[Array], ends: Array, samples: Array) -> float:
+    """Median norm of the sampled residuals."""
+    pairs = zip(whitened, ends, ends[1:], strict=False)
+    return float(np.median(np.linalg.norm(sum(block @ samples[a:b] for block, a, b in pairs), axis=0)))
+
+
+def _worth_keeping(largest: Array, mean: Array, allowed: float) -> Indices:
+    """Positions of the terms to keep, rising: the others contribute `allowed` at most on average."""
+    order = np.argsort(mean)
+    dropped = np.cumsum(mean[order]) <= allowed
+    keep = np.ones(len(mean), bool)
+    keep[order[dropped]] = False
+    return np.flatnonzero(keep & (largest > NEGLIGIBLE * largest.max(initial=0.0)))
+
+
+def _directions(scaled: Array, allowed: float) -> tuple[Array, float]:
+    """Orthonormal basis (n×K) of the columns (n×p) up to a remainder of norm `allowed`, and a bound of this norm.
+
+    All of the columns where they are few, or `MOST` principal directions not enough: then nothing remains.
+    """
+    if scaled.shape[1] > FEW:
+        mixed = scaled @ np.random.default_rng(0).standard_normal((scaled.shape[1], MOST + OVERSAMPLING))
+        Q = np.linalg.qr(mixed)[0]  # a randomised range finder (Halko, Martinsson and Tropp, 2011)
+        Q = np.linalg.qr(scaled @ (scaled.T @ Q))[0]
+        rest = float(np.linalg.norm(_beside(Q, scaled)))
+        left, sigma, _ = np.linalg.svd(Q.T @ scaled, full_matrices=False)
+        remainders = np.hypot(np.append(sigma, 0.0), rest)
+        count = int(np.argmax(remainders <= allowed))
+        if remainders[count] <= allowed and count <= MOST:
+            return Q @ left[:, :count], float(remainders[count])
+    return np.linalg.qr(scaled)[0], 0.0  # but for round-off
+
+
+def _beside(U: Array, columns: Array) -> Array:
+    """(I − UUᵀ) applied twice to columns (n×p)."""
+    for _ in range(2):
+        columns = columns - U @ (U.T @ columns)
+    return columns

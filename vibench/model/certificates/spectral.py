@@ -1,0 +1,133 @@
+"""Bounds α(µ) X ≼ A(µ) ≼ γ(µ) X against one inner product X, without matrices of mesh size at the parameter.
+
+Let A(µ) = Σ_q θ_q(µ) A_q + D(µ) with ‖D(µ)‖ ≤ η in the operator norm of X, and α_i X ≼ A(µ_i) ≼ γ_i X with proved
+constants at a few anchors µ_i. For any weights c ≥ 0 and δ = θ(µ) − Σ_i c_i θ(µ_i),
+
+    A(µ) = Σ_i c_i A(µ_i) + Σ_q δ_q A_q + D(µ) − Σ_i c_i D(µ_i),
+
+so that, with ‖A_q‖ ≤ s_q,
+
+    α(µ) = Σ_i c_i α_i − Σ_q |δ_q| s_q − (1 + Σ_i c_i) η,     γ(µ) = Σ_i c_i γ_i + Σ_q |δ_q| s_q + (1 + Σ_i c_i) η
+
+are bounds whatever c is: each c is a feasible point of the dual of the linear program that the successive constraint
+method solves (Huynh, Rozza, Sen and Patera, C. R. Math. 345, 2007). Anchors form a grid of the parameter box, and c are
+the weights of multilinear interpolation on it, which leave a small δ and take no optimisation. The A_q are rotated to
+the principal directions of A over the parameters first, so that the sum is close to the norm of Σ_q δ_q A_q.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.sparse as sp
+
+from vibench.arrays import Array, Indices, SparseMatrix
+from vibench.interfaces.problem import ParameterBox, Problem
+from vibench.interfaces.validation import checked_assembly
+from vibench.linalg.inner_product import InnerProduct
+from vibench.stability.coercivity import coercivity_and_continuity, operator_norm
+
+ANCHORS = 81
+"""Largest number of anchors; a grid has from 2 to 9 points per direction, or one point alone where 2^d are too many."""
+
+MOST_PER_DIRECTION = 9
+
+
+@dataclass(frozen=True)
+class SpectralBounds:
+    """What α(µ) and γ(µ) follow from; see above.
+
+    Attributes
+    ----------
+    lower, upper
+        Ends (d,) of the grid of anchors.
+    count
+        Its points per direction.
+    alpha, gamma
+        α_i and γ_i (P,).
+    theta
+        θ(µ_i) (Q×P) in the rotated coordinates.
+    norms
+        s_q (Q,) of the rotated A_q.
+    error
+        η.
+    proved
+        Whether all of α_i, γ_i and s_q are proved.
+    """
+
+    lower: Array
+    upper: Array
+    count: int
+    alpha: Array
+    gamma: Array
+    theta: Array
+    norms: Array
+    error: float
+    proved: bool
+
+    def at(self, mu: Array, theta: Array) -> tuple[float, float]:
+        """α(µ) and γ(µ) at mu (d,) with the rotated θ(µ) (Q,); α(µ) ≤ 0 says nothing."""
+        where, c = self._weights(mu)
+        lacking = float(np.abs(theta - self.theta[:, where] @ c) @ self.norms) + 2.0 * self.error
+        return float(c @ self.alpha[where]) - lacking, float(c @ self.gamma[where]) + lacking
+
+    def _weights(self, mu: Array) -> tuple[Indices, Array]:
+        """The anchors around mu and their weights, which sum to 1; outside the box those of the nearest point in it."""
+        d = len(self.lower)
+        if self.count == 1:
+            return np.zeros(1, np.intp), np.ones(1)
+        width = np.maximum(self.upper - self.lower, np.finfo(float).tiny)
+        place = np.clip((mu - self.lower) / width, 0.0, 1.0) * (self.count - 1)
+        first = np.minimum(place.astype(np.intp), self.count - 2)
+        share, strides = place - first, self.count ** np.arange(d - 1, -1, -1)
+        where: Indices = np.zeros(1, np.intp)
+        c = np.ones(1)
+        for axis in range(d):
+            start = first[axis] * strides[axis]
+            where = np.concatenate([where + start, where + start + strides[axis]])
+            c = np.concatenate([c * (1.0 - share[axis]), c * share[axis]])
+        return where, c
+
+
+def anchors(box: ParameterBox) -> tuple[Array, int]:
+    """The grid of anchors (P×d), and its points per direction."""
+    fitting = [count for count in range(2, MOST_PER_DIRECTION + 1) if count**box.dim <= ANCHORS]
+    if not fitting:
+        return 0.5 * (box.lower + box.upper)[None, :], 1
+    return box.grid(*[fitting[-1]] * box.dim), fitting[-1]
+
+
+def spectral_bounds(
+    problem: Problem, X: InnerProduct, terms: list[SparseMatrix], theta: Callable[[Array], Array], error: float
+) -> SpectralBounds:
+    """Bounds from the terms A_q (n×n) of A, their coefficients θ (Q,) as a function of mu, and η."""
+    points, count = anchors(problem.parameters)
+    known = [coercivity_and_continuity(checked_assembly(problem, mu).A, X) for mu in points]
+    norms = [operator_norm(term, X) for term in terms]
+    return SpectralBounds(
+        lower=problem.parameters.lower,
+        upper=problem.parameters.upper,
+        count=count,
+        alpha=np.array([alpha.value for alpha, _ in known]),
+        gamma=np.array([gamma.value for _, gamma in known]),
+        theta=np.column_stack([theta(mu) for mu in points]),
+        norms=np.array([norm.value for norm in norms]),
+        error=error,
+        proved=all(constant.proved for pair in known for constant in pair) and all(norm.proved for norm in norms),
+    )
+
+
+def rotated(terms: tuple[SparseMatrix, ...], theta: Array) -> tuple[Array, list[SparseMatrix]]:
+    """Principal directions of Σ_q θ_q A_q over samples θ (Q×P): a rotation T (Q×Q) and terms for Tθ.
+
+    The new terms are orthonormal as vectors of entries, by falling norm of their coefficients over the samples.
+    """
+    pattern = sp.csr_array(sum(abs(sp.csr_array(term)) for term in terms))
+    rows, columns = pattern.nonzero()
+    entries = np.column_stack([np.asarray(sp.csr_array(term)[rows, columns]).ravel() for term in terms])
+    q, r = np.linalg.qr(entries)
+    left, _, _ = np.linalg.svd(r @ theta)
+    found = [sp.csr_array((mode, (rows, columns)), shape=pattern.shape) for mode in (q @ left).T]
+    return np.asarray(left.T @ r), found

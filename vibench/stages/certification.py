@@ -1,0 +1,77 @@
+"""What certificates of reduced models at online cost need: prepared offline, in stages of their own."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from vibench.errors import UnsupportedError
+from vibench.model.affine import AffineMember
+from vibench.model.certificates.base import CertificateBase, certificate_base
+from vibench.model.certificates.bounds import OnlineCertificate, prepare
+from vibench.model.certificates.lifting import ContactCompliance
+from vibench.model.certificates.residual import ResidualBasis
+from vibench.model.certificates.spectral import SpectralBounds
+from vibench.model.hyperreduced import HyperReducedModel
+from vibench.stages.assembly import AffineDecomposition, AssemblyStage
+from vibench.stages.base import Result, Stage, build_problem, value_of
+from vibench.stages.snapshots import training_of
+from vibench.storage.artefacts import Store
+from vibench.storage.serialisation import storable
+from vibench.timing import timed
+
+for _kind in (CertificateBase, ContactCompliance, OnlineCertificate, ResidualBasis, SpectralBounds):
+    storable(_kind)
+
+
+@dataclass(frozen=True)
+class CertificateBaseStage(Stage):
+    """What certificates of all reduced models of a problem have in common; the value is a `CertificateBase`."""
+
+    label = "certificate base"
+    rooms = ("linalg", "interfaces", "stability", "model")
+
+    decomposition: AffineDecomposition
+
+    def run(self, store: Store) -> Result:
+        """Factorise, bound the spectrum, measure interpolation errors."""
+        problem = build_problem(self.decomposition.problem)
+        members: Mapping[str, AffineMember] = value_of(store, self.decomposition)
+        training = training_of(problem, self.decomposition.training)
+        return Result(*timed(lambda: certificate_base(problem, members, training)))
+
+
+@dataclass(frozen=True)
+class CertificateStage(Stage):
+    """What certifies the queries of one reduced model; the value is an `OnlineCertificate`."""
+
+    label = "certificate"
+    rooms = ("linalg", "interfaces", "qp", "stability", "reduction", "model")
+
+    assembly: AssemblyStage
+
+    @property
+    def base(self) -> CertificateBaseStage:
+        """The stage of what it shares with other models."""
+        assert self.assembly.reduction is not None  # certified cells have reduced assembly
+        return CertificateBaseStage(self.assembly.reduction.decomposition)
+
+    def inputs(self) -> tuple[Stage, ...]:
+        """The model, its members, and the base."""
+        return (*self.assembly.model_inputs, self.base.decomposition, self.base)
+
+    def run(self, store: Store) -> Result:
+        """Prepare the certificate.
+
+        Raises
+        ------
+        UnsupportedError
+            If the model is assembled in full.
+        """
+        model, why = self.assembly.model(store)
+        if not isinstance(model, HyperReducedModel):
+            raise UnsupportedError(f"a certificate at online cost needs reduced assembly, and the model is {why}")
+        members: Mapping[str, AffineMember] = value_of(store, self.base.decomposition)
+        base: CertificateBase = value_of(store, self.base)
+        training = training_of(model.problem, self.base.decomposition.training)
+        return Result(*timed(lambda: prepare(model, members, base, training)))
