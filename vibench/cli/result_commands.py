@@ -92,7 +92,7 @@ def draw_figures(
     from vibench.report.figures.style import FORMATS
     from vibench.results import tables
 
-    paths = [tables.results_file(name) for name in dict.fromkeys(names)]
+    paths = list({tables.results_file(name).resolve(): tables.results_file(name) for name in names}.values())
     forms = tuple(dict.fromkeys(map(str, formats or FORMATS)))
     if paper:
         draw_paper(paths, out or Path("paper-figures"), forms)
@@ -163,7 +163,7 @@ def diff_runs(
 def compare_runs(
     run: Annotated[
         list[str],
-        Argument(metavar="RUN…", help="Run folders or results files; the first is the reference.", autocompletion=runs),
+        Argument(metavar="RUN", help="Run folders or results files; the first is the reference.", autocompletion=runs),
     ],
     limit: LimitOption = 1.25,
     table: Annotated[
