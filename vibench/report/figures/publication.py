@@ -64,7 +64,7 @@ def draw_published(
     RequestError
         If no plugin draws figures of these runs' problems, or a figure plugin cannot be loaded.
     """
-    twins = sorted(_twins(paths), key=lambda twin: (twin.publication, _natural(twin.name)))
+    twins = sorted(_twins(paths, note), key=lambda twin: (twin.publication, _natural(twin.name)))
     if not twins:
         named_runs = ", ".join(unbroken(path.parent.name) for path in paths)
         raise RequestError(f"no installed plugin draws figures of a publication from {named_runs}")
@@ -89,13 +89,19 @@ def draw_published(
     return files
 
 
-def _twins(paths: Sequence[Path]) -> Iterator[Twin]:
+def _twins(paths: Sequence[Path], note: Callable[[str], None]) -> Iterator[Twin]:
     """What can be drawn; of figures that several runs have, each after the first is numbered."""
     seen: dict[str, int] = {}
+    plugins = list(publications())
     for path in paths:
         for _, data in problems(path):
-            for plugin_name, plugin in publications():
-                for kind, draw in named(plugin_name, plugin, data):
+            for plugin_name, plugin in plugins:
+                try:
+                    kinds = list(named(plugin_name, plugin, data))
+                except FigureError as error:
+                    note(str(error))
+                    continue
+                for kind, draw in kinds:
                     count = seen[kind] = seen.get(kind, 0) + 1
                     name = kind + f"-run-{count}" * (count > 1)
                     yield Twin(plugin.publication, plugin_name, name, draw, path.parent.name, data.machine)
