@@ -227,7 +227,10 @@ def test_figures_of_a_publication_are_drawn_on_request_alone(register: Register,
     text = (tmp_path / "twins" / publication.PAGE).read_text(encoding="utf-8")
     assert "Author, Title with\\_underscores &amp; &lt;tags&gt;, 2020." in text
     assert text.index("## Figure 9") < text.index("## Figure 10")
-    assert "What is \\[shown\\].\n\n**Published.** N = 19.\n\n**Here.** Differs: N = " in text
+    assert (
+        "What is \\[shown\\]. Run quick, problem obstacle: resolution = coarse.\n\n**Published.** N = 19.\n\n**Here.** Differs: N = "
+        in text
+    )
     assert "![Figure 10](figure-10.png)" in text
 
 
@@ -244,7 +247,7 @@ def test_a_publication_that_raises_is_a_line_and_the_others_are_drawn(
 def test_several_runs_have_figures_of_their_own(register: Register, results: Path, tmp_path: Path) -> None:
     registered(register, "twins")
     files = publication.draw_published([results, results], tmp_path, ("png",))
-    assert [file.stem for file in files] == ["figure-9", "figure-9-run-2", "figure-10", "figure-10-run-2"]
+    assert [file.stem for file in files] == ["figure-9", "figure-9-quick", "figure-10", "figure-10-quick"]
 
 
 @pytest.mark.parametrize("names", [(), ("sizes",)])
