@@ -1,5 +1,6 @@
 """The public surface: what authors of plugins and users of the library import from `vibench` itself."""
 
+from . import fem as fem
 from .arrays import Array as Array
 from .arrays import Indices as Indices
 from .arrays import Mask as Mask
@@ -22,7 +23,9 @@ from .interfaces.problem import Picture as Picture
 from .interfaces.problem import Problem as Problem
 from .interfaces.problem import Sampler as Sampler
 from .interfaces.problem import VariationalInequality as VariationalInequality
+from .interfaces.sampling import AdaptiveSampling as AdaptiveSampling
 from .interfaces.sampling import Sampling as Sampling
+from .interfaces.sampling import Trainer as Trainer
 from .interfaces.strategies import Cone as Cone
 from .interfaces.strategies import DualStrategy as DualStrategy
 from .interfaces.strategies import Enrichment as Enrichment

@@ -175,9 +175,6 @@ class Problem(ABC):
     """
     entrywise: ClassVar[frozenset[str]] = frozenset()
     """Members that `sampler` evaluates entry by entry."""
-    separable: ClassVar[Mapping[str, int]] = MappingProxyType({})
-    """Members of `entrywise` that are combinations of fixed terms at every mu, with the number of these terms. Their
-    interpolation has no error if it has as many terms; a certificate at online cost relies on it."""
     requires: ClassVar[tuple[str, ...]] = ()
     """Optional distributions it cannot do without; where one is not installed its cells are unavailable."""
 

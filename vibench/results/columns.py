@@ -82,7 +82,9 @@ KEYS: Mapping[str, Column] = {
     "primal_tol": Column(REAL, "1", "Tolerance δ of the primal strategy; empty for strategies that take none.", "δ", 6),
     "solver": Column(TEXT, "", "QP solver.", "solver", 7),
     "accuracy": Column(REAL, "1", "Relative accuracy prescribed to the solver.", "accuracy", 8),
-    "assembly": Column(TEXT, "", "Assembly of the queries: full or reduced.", "assembly", 9),
+    "assembly": Column(
+        TEXT, "", "Assembly of the queries: full, reduced, or certified: reduced with bounds.", "assembly", 9
+    ),
 }
 """What names a cell. Where a study prescribes N or R, `pod_size` or `dual_size` is filled instead of the tolerance."""
 
@@ -144,11 +146,15 @@ CELLS: Mapping[str, Column] = {
     "terms_B": Column(INTEGER, "", "Likewise for B; empty if B is assembled on the contact unknowns."),
     "terms_g": Column(INTEGER, "", "Likewise for g."),
     "offline_snapshots_s": Column(REAL, "s", "High-fidelity solutions at the training parameters, with one set-up."),
+    "offline_selection_s": Column(
+        REAL, "s", "Choice of the training parameters by error bounds, a part of the time before; 0 for fixed sets."
+    ),
     "offline_pod_s": Column(REAL, "s", "POD."),
     "offline_cone_s": Column(REAL, "s", "Dual strategy, with the orthonormal basis of the span."),
     "offline_enrichment_s": Column(REAL, "s", "Primal strategy."),
     "offline_assembly_s": Column(REAL, "s", "Preparation of reduced assembly; 0 with full assembly."),
-    "offline_s": Column(REAL, "s", "Sum of the five above: the offline time of this cell alone.", "offline [s]", 22),
+    "offline_certificate_s": Column(REAL, "s", "Preparation of certificates at online cost; 0 without."),
+    "offline_s": Column(REAL, "s", "Sum of the six above: the offline time of this cell alone.", "offline [s]", 22),
     "offline_low_s": Column(
         REAL,
         "s",
@@ -159,7 +165,7 @@ CELLS: Mapping[str, Column] = {
     "online_s": Column(
         REAL,
         "s",
-        "One query, assembly and solution: median over the rounds of the mean over ok queries.",
+        "One query, assembly, solution and certificate: median over the rounds of the mean over ok queries.",
         "online [ms]",
         23,
     ),
@@ -168,6 +174,9 @@ CELLS: Mapping[str, Column] = {
     "online_wall_s": Column(REAL, "s", "The same as online_s, in wall seconds."),
     "online_assemble_s": Column(REAL, "s", "Assembly of a query: median over the rounds."),
     "online_solve_s": Column(REAL, "s", "Solution of a query by the solver: median over the rounds."),
+    "online_certify_s": Column(
+        REAL, "s", "Certificate of a query: median over the rounds; empty without certificates."
+    ),
     "timing_rounds": Column(INTEGER, "", "Number of timing rounds; empty if the cell has not been timed yet."),
     "timing_reason": Column(TEXT, "", "Why rounds are missing."),
     "hf_setup_s": Column(
@@ -206,7 +215,13 @@ CELLS: Mapping[str, Column] = {
         INTEGER, "", "Ok queries with zero_lambda = 1, which means and maxima of the error of λ leave out.", "λ = 0", 20
     ),
     "error_lambda_zero_max": Column(REAL, "1", "Largest error_lambda_scaled of these queries.", "error, λ = 0", 21),
-    **_medians("u_energy", "u", "lambda_natural", "lambda", "hsw_u", "hsw_lambda"),
+    **_medians(
+        "u_energy", "u", "lambda_natural", "lambda", "online_u_energy", "online_lambda_natural", "hsw_u", "hsw_lambda"
+    ),
+    "certificate": Column(TEXT, "", "Bounds at online cost: certified, verified, or none.", "certificate", 10),
+    "bound_online_violations": Column(
+        INTEGER, "", "Ok queries where bound_online_violated is 1; empty without a certificate."
+    ),
     "solver_error_u_max": Column(REAL, "1", "Largest contribution of the QP solver to the relative error of u."),
     "solver_error_lambda_max": Column(REAL, "1", "Largest contribution of the QP solver to the relative error of λ."),
     "solver_share_max": Column(REAL, "1", "Largest ratio of this contribution to the error, over the queries."),
@@ -276,7 +291,8 @@ QUERIES: Mapping[str, Column] = {
     "assembly_error": Column(REAL, "1", "Largest relative difference of a member of the program from its projection."),
     "assemble_s": Column(REAL, "s", "Assembly of the reduced program: median over the rounds."),
     "solve_s": Column(REAL, "s", "The solver: median over the rounds."),
-    "total_s": Column(REAL, "s", "Sum of the two."),
+    "certify_s": Column(REAL, "s", "The certificate: median over the rounds; empty without one."),
+    "total_s": Column(REAL, "s", "Sum of the three."),
     "total_wall_s": Column(REAL, "s", "The same in wall seconds."),
     "hf_s": Column(
         REAL,
@@ -328,6 +344,22 @@ QUERIES: Mapping[str, Column] = {
     "bound_note": Column(
         TEXT, "", "Why there are no bounds, or which of their constants is estimated; empty if they are proved."
     ),
+    "certificate": Column(
+        TEXT, "", "Bounds at online cost: certified, verified up to interpolation errors that were measured, or none."
+    ),
+    "bound_online_u_energy": Column(REAL, "A", "Bound of error_u_energy_absolute at online cost."),
+    "bound_online_lambda_natural": Column(REAL, "A", "Bound of error_lambda_natural_absolute at online cost."),
+    **_effectivities("online_u_energy", "online_lambda_natural"),
+    "bound_online_rho": Column(REAL, "A", "Its bound of ρ."),
+    "bound_online_omega": Column(REAL, "A", "Its bound of ω."),
+    "bound_online_kappa": Column(REAL, "A²", "Its κ."),
+    "coercivity_online": Column(
+        REAL, "1", "Lower bound of A(µ) against A at the centre of the parameters; 1 where A is constant."
+    ),
+    "bound_online_violated": Column(
+        INTEGER, "", "1 where an error is above its bound by more than 1e-10 of the solution, else 0; empty without."
+    ),
+    "bound_online_note": Column(TEXT, "", "Why there are no bounds at online cost."),
     "bound_hsw_u": Column(
         REAL,
         "V",
@@ -375,7 +407,8 @@ TIMINGS: Mapping[str, Column] = {
     "queries": Column(INTEGER, "", "Number of ok queries solved in the round."),
     "assemble_s": Column(REAL, "s", "Assembly of a query: mean over these, or with full assembly that of one of them."),
     "solve_s": Column(REAL, "s", "Solution of a query by the solver: mean over these."),
-    "total_s": Column(REAL, "s", "Sum of the two."),
+    "certify_s": Column(REAL, "s", "Certificate of a query: mean over these; empty without one."),
+    "total_s": Column(REAL, "s", "Sum of the three."),
     "total_wall_s": Column(REAL, "s", "The same in wall seconds."),
     "slowdown": Column(REAL, "1", "Time of the calibration next to the round, divided by its best in that process."),
 }

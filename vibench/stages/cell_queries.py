@@ -13,6 +13,8 @@ import numpy as np
 
 from vibench.errors import in_a_line
 from vibench.interfaces.strategies import Kind
+from vibench.model.certificates.base import Guarantee
+from vibench.model.certificates.bounds import OnlineCertificate
 from vibench.model.errors import Reference, zeros
 from vibench.model.output_errors import scales as output_scales
 from vibench.model.output_errors import summarise_outputs
@@ -25,6 +27,7 @@ from vibench.stability.infsup import InfSup, share
 from vibench.stages.assembly import AssemblyStage, ExactSolutions, assembly_stage
 from vibench.stages.base import Failed, Pieces, PiecewiseStage, Row, Stage, value_of
 from vibench.stages.cell_summary import summarise
+from vibench.stages.certification import CertificateStage
 from vibench.stages.infsup_constants import (
     FullConstants,
     OwnConstants,
@@ -69,6 +72,7 @@ class CellQueries(PiecewiseStage):
     accuracy: float
     query_seconds: float
     warm_start: bool = False
+    certificate: CertificateStage | None = None
 
     @property
     def sort(self) -> str:
@@ -135,6 +139,7 @@ class CellQueries(PiecewiseStage):
             "cone": (enrichment.cone,),
             "enrichment": (enrichment,),
             "assembly": () if reduction is None else (reduction.decomposition, reduction),
+            "certificate": () if self.certificate is None else (self.certificate.base, self.certificate),
         }
 
     def inputs(self) -> tuple[Stage, ...]:
@@ -151,7 +156,9 @@ class CellQueries(PiecewiseStage):
 
 def cell_queries(cell: Cell, query_seconds: float) -> CellQueries:
     """The last stage of a cell; all its other stages are inputs of it, directly or indirectly."""
-    return CellQueries(assembly_stage(cell), cell.solver, cell.accuracy, query_seconds, cell.warm_start)
+    assembly = assembly_stage(cell)
+    certificate = CertificateStage(assembly) if cell.assembly == "certified" else None
+    return CellQueries(assembly, cell.solver, cell.accuracy, query_seconds, cell.warm_start, certificate)
 
 
 class _Queries(Pieces):
@@ -175,6 +182,9 @@ class _Queries(Pieces):
         self._own, self._full, self._plain = (value_of(store, known) for known in stage.constants)
         self._stability: list[Stability] = value_of(store, stage.reference)
         self._exact: tuple[ExactSolution | None, ...] = value_of(store, stage.exact)
+        self._certificate: OnlineCertificate | None = (
+            None if stage.certificate is None else value_of(store, stage.certificate)
+        )
 
     def piece(self, number: int, watch: Callable[[bool], None]) -> QueryRows:
         """The rows of one query."""
@@ -213,6 +223,7 @@ class _Queries(Pieces):
                 self._compared.at(numbers),
                 [self._stability[k] for k in numbers],
                 [self._exact[k] for k in numbers],
+                self._certificate,
             )
         except MemoryError:
             raise
@@ -262,6 +273,7 @@ class _Queries(Pieces):
             "snapshots": len(self._training.mu),
             "enrichment": cone.prepared.rank if built.kind is Kind.PER_PARAMETER else added,
             **assembly.columns(self._store),
+            "certificate": (Guarantee.NONE if self._certificate is None else self._certificate.base.guarantee).value,
             "fallbacks": "; ".join(fallbacks),
             "peak_memory_mib": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
         }
@@ -286,6 +298,7 @@ class _Queries(Pieces):
         spent["snapshots"].append(setup)
         row: Row = {f"offline_{name}_s": sum(s.cpu for s in parts) for name, parts in spent.items()}
         row["offline_s"] = sum(row.values())
+        row["offline_selection_s"] = self._training.selecting.cpu
         row["offline_wall_s"] = sum(s.wall for parts in spent.values() for s in parts)
         marginal = [seconds.cpu for seconds in self._reference.seconds]
         row |= {"hf_setup_s": setup.cpu, "hf_s": float(np.median(marginal))}

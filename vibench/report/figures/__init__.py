@@ -7,7 +7,7 @@ import json
 import re
 import signal
 import threading
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import Future, ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cache
@@ -67,7 +67,12 @@ def drawings(path: Path) -> Iterator[tuple[str, Drawing, Data]]:
 
     The functions of plugins raise `FigureError`; those of this package do not.
     """
-    for name, data in problems(path):
+    return drawings_of(problems(path))
+
+
+def drawings_of(known: Iterable[tuple[str, Data]]) -> Iterator[tuple[str, Drawing, Data]]:
+    """Every figure of some problems, from their data and what the names of their files begin with."""
+    for name, data in known:
         for kind, draw in OF_PROBLEM.items():
             yield from _pages(f"{name}-{kind}", kind, draw, data)
         for dual, file in zip(data.duals, file_names(data.duals), strict=True):
