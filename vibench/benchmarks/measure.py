@@ -18,8 +18,8 @@ T = TypeVar("T")
 PASSES = 5
 """Passes over all benchmarks, minutes apart: rounds in succession do not see how a machine changes meanwhile."""
 
-MOST = 30
-"""Rounds of what is quick in one pass; what takes longer than there is for all passes together is timed in one."""
+MOST, SLOW = 30, 3
+"""Rounds of what is quick in one pass; what takes `SLOW` times what there is for all passes is timed in the first."""
 
 SHORTEST = 2e-3
 """Seconds of a round: as many calls as it takes."""
@@ -72,9 +72,9 @@ def measure(
         benchmark.extra_info.update(plain(judge(result)))
         if seconds <= TRACED:
             benchmark.extra_info["peak_memory_mib"] = peak_memory(work, given())
-        if seconds < budget:
+        if seconds < SLOW * budget:
             seconds = min(seconds, _timed(work, given())[1])  # the first call may have imported something
-        benchmark.extra_info["slow"] = seconds >= budget
+        benchmark.extra_info["slow"] = seconds >= SLOW * budget
     rounds, calls = _how_often(seconds, budget / PASSES, together)
     before = calibration().seconds().cpu
     if fresh:
