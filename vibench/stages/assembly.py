@@ -57,10 +57,15 @@ class AffineDecomposition(Stage):
 
     def run(self, store: Store) -> Result:
         """An `AffineMember` by name."""
-        problem = build_problem(self.problem)
-        # Terms need assemblies and no solutions: an adaptive training has too few parameters for them.
-        mus = training_of(store, self.problem, None if is_adaptive(self.training) else self.training)
+        problem, mus = build_problem(self.problem), self.parameters(store)
         return Result(*timed(lambda: affine_decomposition(problem, mus, self.tolerance)))
+
+    def parameters(self, store: Store) -> Array:
+        """Parameters (P×d) at which members are assembled: the training set, or the problem's own.
+
+        That needs no solutions, and an adaptive training has too few parameters for it.
+        """
+        return training_of(store, self.problem, None if is_adaptive(self.training) else self.training)
 
 
 @dataclass(frozen=True)

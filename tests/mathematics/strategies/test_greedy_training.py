@@ -49,13 +49,15 @@ def test_all_candidates_meet_the_tolerance_where_all_are_checked() -> None:
     assert {tuple(mu) for mu in trainer.solved} <= {tuple(mu) for mu in candidates}
     apart = np.linalg.norm(candidates[:, None] - np.array(trainer.solved), axis=2).min(axis=1)
     assert apart.max() <= 0.2
-    assert np.linalg.norm(trainer.solved[0] - [1.0, 0.5]) < 0.1  # the middle of the box
+    assert trainer.solved[0].tolist() == [1.0, 0.5]  # the middle of the box
+    assert {(x, y) for x in (0.0, 2.0) for y in (0.0, 1.0)} <= {tuple(mu) for mu in candidates}
+    assert len(candidates) == 400
     assert len(trainer.solved) < 40  # 2 / (0.2² · π / 2) discs cannot do with fewer than 16
     assert len(trainer.asked) < 400 + 10 * len(trainer.solved)  # lazy: not all candidates in all steps
 
 
 def test_reasons_are_above_the_tolerance_and_nearly_the_worst_of_the_pool() -> None:
-    _, trainer = trained(candidates=300, tolerance=0.25, pool=300, checked=300)
+    _, trainer = trained(candidates=300, tolerance=0.25, drawn=300, checked=300)
     reasons = np.array(trainer.reasons[1:])
     assert np.isnan(trainer.reasons[0])
     assert reasons.min() > 0.25
@@ -75,6 +77,12 @@ def test_it_ends_after_so_many_candidates_in_a_row_or_solutions() -> None:
     assert np.array_equal(bounded.solved, again.solved)
     other = trained(candidates=500, tolerance=1e-6, most=7, seed=1)[1]
     assert not np.array_equal(bounded.solved, other.solved)
+
+
+@pytest.mark.parametrize("candidates", [2, 3, 8])
+def test_it_ends_where_every_candidate_is_solved(candidates: int) -> None:
+    _, trainer = trained(candidates=candidates, tolerance=1e-9)
+    assert len(np.unique(trainer.solved, axis=0)) == len(trainer.solved) == candidates
 
 
 PROBLEM = Plugin("problem", "obstacle", '{"resolution": 160}', "test")
