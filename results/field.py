@@ -20,7 +20,8 @@ from matplotlib.figure import Figure
 from palette import use_palette
 
 from vibench.report.figures.data import label
-from vibench.report.figures.style import COLOURS, MARKERS, Sheet, plot, save, styled
+from vibench.report.figures.looks import COLOURS, MARKERS, Looks, Series
+from vibench.report.figures.style import Sheet, plot, save, styled
 from vibench.results import tables
 
 SHARES = (0.3, 0.5, 0.7, 0.9)
@@ -28,7 +29,7 @@ REFERENCE = "mcpg"
 CONTROL = "pod-dual (negative control)"
 """Its generators are not in W⁺: it is drawn and left out of the fronts."""
 
-HUES = (*COLOURS, "0.6")
+HUES = (*COLOURS, "0.2", "0.6")
 PAIR = ["problem", "pod_tol", "dual_tol"]
 CELL = [*PAIR, "dual", "primal", "primal_tol"]
 
@@ -163,9 +164,11 @@ def draw_shares(field: Field) -> Figure:
     chosen = [(key, steps) for key, steps in field.longest() if key[3] == REFERENCE]
     pairs = list(dict.fromkeys(key[:3] for key, _ in chosen))
     sheet = Sheet(2, -(-len(pairs) // 2), "Smallest share of β_S(µ) in β_on(µ) over the training set, cone of mcpg")
+    looks = Looks(Series(key[4]) for key, _ in chosen)
     for panel, pair in zip(sheet.panels, pairs, strict=True):
-        for k, (key, steps) in enumerate((key, steps) for key, steps in chosen if key[:3] == pair):
-            plot(panel, steps["step"], steps["share"], k, key[4])
+        for key, steps in chosen:
+            if key[:3] == pair:
+                plot(panel, steps["step"], steps["share"], looks[Series(key[4])], key[4])
         panel.set(
             title=f"{pair[0]}, δ_POD = {pair[1]:g}, δ = {pair[2]:g}", xlabel="vectors added", ylabel="share of β_on"
         )

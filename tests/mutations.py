@@ -74,8 +74,8 @@ FAULTS = (
     Fault(
         "wrong-sign-of-b",
         "problems/vibench_problems/obstacle.py",
-        "self._on_disc(-areas @ self._masses)",
-        "self._on_disc(areas @ self._masses)",
+        "tuple(-sp.csr_array(term) for term in masses)",
+        "tuple(sp.csr_array(term) for term in masses)",
         ("tests/mathematics/problems/test_obstacle.py",),
     ),
     Fault(
@@ -430,6 +430,20 @@ FAULTS = (
         ("tests/unit/model/test_affine.py",),
     ),
     Fault(
+        "declared-terms-in-another-order",
+        "vibench/model/hyperreduced.py",
+        "self.problem.affine[name].coefficients(mu) for name",
+        "self.problem.affine[name].coefficients(mu)[::-1] for name",
+        ("tests/unit/model/test_hyperreduced.py",),
+    ),
+    Fault(
+        "lift-left-in-the-bound",
+        "vibench/interfaces/affine_problem.py",
+        'sums["g"] = _minus(sums["g"], sums["B"], sums["lift"])',
+        'sums["g"] = sums["g"]',
+        ("tests/unit/test_fem.py",),
+    ),
+    Fault(
         "patterns-told-apart-by-their-size",
         "vibench/model/affine.py",
         "all(np.array_equal(keys[0], key) for key in keys)",
@@ -488,8 +502,8 @@ FAULTS = (
     Fault(
         "sampler-with-the-wrong-weight",
         "problems/vibench_problems/obstacle.py",
-        "return np.asarray(self._map.monomials(weights) @ terms)",
-        "return np.asarray(self._map.monomials(weights) @ terms / (1.0 + weights[1]))",
+        "lambda weights: self.load * integrals(weights)",
+        "lambda weights: self.load * integrals(weights) / (1.0 + weights[1])",
         ("tests/mathematics/problems/test_p1_entries.py",),
     ),
     Fault(

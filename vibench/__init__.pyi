@@ -1,5 +1,6 @@
 """The public surface: what authors of plugins and users of the library import from `vibench` itself."""
 
+from . import fem as fem
 from .arrays import Array as Array
 from .arrays import Indices as Indices
 from .arrays import Mask as Mask
@@ -12,6 +13,9 @@ from .highfidelity.active_set import HighFidelitySolver as HighFidelitySolver
 from .highfidelity.active_set import solve_high_fidelity as solve_high_fidelity
 from .interfaces.affine import AffineSum as AffineSum
 from .interfaces.affine_problem import AffineProblem as AffineProblem
+from .interfaces.figures import FigurePlugin as FigurePlugin
+from .interfaces.figures import ProblemTables as ProblemTables
+from .interfaces.outputs import Output as Output
 from .interfaces.problem import MEMBERS as MEMBERS
 from .interfaces.problem import Contact as Contact
 from .interfaces.problem import ParameterBox as ParameterBox
@@ -19,7 +23,9 @@ from .interfaces.problem import Picture as Picture
 from .interfaces.problem import Problem as Problem
 from .interfaces.problem import Sampler as Sampler
 from .interfaces.problem import VariationalInequality as VariationalInequality
+from .interfaces.sampling import AdaptiveSampling as AdaptiveSampling
 from .interfaces.sampling import Sampling as Sampling
+from .interfaces.sampling import Trainer as Trainer
 from .interfaces.strategies import Cone as Cone
 from .interfaces.strategies import DualStrategy as DualStrategy
 from .interfaces.strategies import Enrichment as Enrichment
@@ -69,6 +75,18 @@ from .reduction.supremizers import constraint_classes as constraint_classes
 from .reduction.supremizers import projected_supremizers as projected_supremizers
 from .reduction.supremizers import supremizer_coordinates as supremizer_coordinates
 from .reduction.supremizers import supremizers as supremizers
+from .report.figures.looks import HIGH_FIDELITY_LOOK as HIGH_FIDELITY_LOOK
+from .report.figures.looks import Look as Look
+from .report.figures.looks import Looks as Looks
+from .report.figures.looks import Series as Series
+from .report.figures.solutions import draw_field as draw_field
+from .report.figures.solutions import draw_multiplier as draw_multiplier
+from .report.figures.solutions import name_axes as name_axes
+from .report.figures.style import CaptionedFigure as CaptionedFigure
+from .report.figures.style import Layout as Layout
+from .report.figures.style import Sheet as Sheet
+from .report.figures.style import plot as plot
+from .report.figures.style import scatter as scatter
 from .results.break_even import BreakEven as BreakEven
 from .results.break_even import break_even as break_even
 from .stability.infsup import beta_span as beta_span

@@ -32,7 +32,7 @@ def cores() -> int:
 
 def versions(solver: str) -> dict[str, str]:
     """Versions of Python, the numerical libraries, vibench and one solver."""
-    found = {name: distribution_version(name) for name in ("numpy", "scipy", "qpsolvers", "vibench")}
+    found = {name: distribution_version(name) for name in ("numpy", "scipy", "scikit-fem", "qpsolvers", "vibench")}
     return {"python": platform.python_version(), **found, solver: solver_version(solver)}
 
 

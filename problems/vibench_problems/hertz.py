@@ -8,9 +8,20 @@ import numpy as np
 import scipy.sparse as sp
 from annotated_types import Ge, Gt, Le, Lt
 from skfem import Basis, BilinearForm, ElementTriP1, ElementVector
-from skfem.helpers import ddot, dot, eye, grad, sym_grad, trace
+from skfem.helpers import ddot, eye, sym_grad, trace
 
-from vibench import Array, Contact, Indices, InnerProduct, ParameterBox, Picture, Problem, VariationalInequality
+from vibench import (
+    Array,
+    Contact,
+    Indices,
+    InnerProduct,
+    Output,
+    ParameterBox,
+    Picture,
+    Problem,
+    VariationalInequality,
+    fem,
+)
 from vibench_problems.graded_mesh import Triangulation, quarter_disc
 from vibench_problems.mortar import Pairing
 
@@ -36,12 +47,6 @@ def elasticity(u, v, w):  # type: ignore[no-untyped-def]
     """∫ σ(u) : ε(v) with Lamé's constants, equation (47)."""
     strain = sym_grad(u)
     return ddot(w.lame * eye(trace(strain), 2) + 2.0 * w.shear * strain, sym_grad(v))
-
-
-@BilinearForm
-def norm_form(u, v, w):  # type: ignore[no-untyped-def]
-    """∫ u·v + ℓ̂² ∫ ∇u : ∇v, equation (44)."""
-    return dot(u, v) + w.length**2 * ddot(grad(u), grad(v))
 
 
 class Hertz(Problem):
@@ -116,7 +121,7 @@ class Hertz(Problem):
         for disc in (self.slave, self.master):
             basis = Basis(disc.mesh, ElementVector(ElementTriP1()))
             blocks.append(elasticity.assemble(basis, lame=lame, shear=shear))
-            norms.append(norm_form.assemble(basis, length=length))
+            norms.append(fem.h1_gram(basis, length=length))
             fixed += [offset + 2 * disc.axis, offset + 2 * disc.flat + 1]
             fixed += [offset + 2 * disc.flat] if flats == "clamped" else []
             offset += basis.N
@@ -205,6 +210,21 @@ class Hertz(Problem):
         upper, lower = 2 * self.slave.flat + 1, self._second + 2 * self.master.flat + 1
         return -float(forces[upper].sum()), float(forces[lower].sum())
 
+    @property
+    def outputs(self) -> tuple[Output, ...]:
+        """Contact force of the whole discs per unit thickness, half-width of the contact, and indentation of disc 1.
+
+        The indentation is the vertical displacement of the apex relative to the flat, which the lifting moves.
+        """
+        widths = np.diff(self.slave.mesh.p[0, self.slave.zone[::2]])  # of the macro-edges, along the abscissa
+        apex = np.zeros(self.V.dim)
+        apex[np.searchsorted(self.free, 2 * self.slave.zone[0] + 1)] = 1.0
+        return (
+            Output("contact force", "N/m", lam=2.0 * self.macro_lengths),
+            Output("contact half-width", "m", function=lambda _mu, _u, lam: float(widths @ (lam > 0.0))),
+            Output("indentation", "m", u=apex),
+        )
+
     def picture(self, mu: Array, u: Array, lam: Array) -> Picture:
         """Deformed discs coloured by the vertical displacement, and the contact pressure (paper, Figure 10)."""
         upper, lower = self.points(mu)
@@ -213,5 +233,5 @@ class Hertz(Problem):
         middles = upper[:1, self.slave.zone[1::2]]
         return Picture(
             np.hstack([upper, lower]) + moved, triangles, moved[1], "vertical displacement [m]", middles, lam,
-            "contact pressure [Pa]",
+            "contact pressure [Pa]", "m",
         )  # fmt: skip

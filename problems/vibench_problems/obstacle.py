@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from functools import partial
 from typing import Annotated, ClassVar, Literal
 
 import numpy as np
@@ -13,16 +12,18 @@ from skfem import Basis, BilinearForm, ElementTriP1, LinearForm, MeshTri
 from skfem.helpers import dot
 
 from vibench import (
+    AffineSum,
     Array,
     Contact,
     Indices,
     InnerProduct,
+    Output,
     ParameterBox,
     Picture,
     Problem,
     Sampler,
-    SparseMatrix,
     VariationalInequality,
+    fem,
 )
 from vibench_problems.disc_map import DiscMap, stiffness
 from vibench_problems.disc_mesh import aspect_ratios, disc_in_square, displaced_around_disc
@@ -41,24 +42,6 @@ WITH_BULGE = ParameterBox(
     units=("1", "m", "m", "1"),
 )
 """The parameter box with the bulge as fourth parameter."""
-
-
-@BilinearForm
-def mass(u, v, _):  # type: ignore[no-untyped-def]
-    """∫ u v."""
-    return u * v
-
-
-@LinearForm
-def unit_load(v, _):  # type: ignore[no-untyped-def]
-    """∫ v."""
-    return v
-
-
-@LinearForm
-def paraboloid(v, w):  # type: ignore[no-untyped-def]
-    """∫ |x|² v."""
-    return dot(w.x, w.x) * v
 
 
 @BilinearForm
@@ -112,7 +95,7 @@ class Obstacle(Problem):
         units=("1", "m", "m"),
     )
 
-    entrywise: ClassVar[frozenset[str]] = frozenset({"A", "f", "B", "g"})
+    entrywise: ClassVar[frozenset[str]] = frozenset({"A", "f"})
 
     def __init__(
         self,
@@ -136,21 +119,27 @@ class Obstacle(Problem):
         self.free = basis.complement_dofs(basis.get_dofs())
         self.disc_nodes = np.flatnonzero(np.linalg.norm(self.mesh.p, axis=0) <= RADIUS * (1.0 + 1e-9))
         self._map = DiscMap(self.mesh, self.disc_nodes, RADIUS, bulge)
-        laplacian, full_mass = stiffness.assemble(basis), mass.assemble(basis)
-        self.V = InnerProduct((full_mass + length**2 * laplacian)[self.free][:, self.free])
+        self.V = InnerProduct(fem.h1_gram(basis, self.free, length))
         self._contact_dofs = np.searchsorted(self.free, self.disc_nodes)
         self._assemble_disc(basis.with_elements("disc"))
 
     def _assemble_disc(self, disc: Basis) -> None:
-        """Mass matrices on ω̂ and integrals of |x̂|², by monomial of the areas; the first mass matrix is that of W."""
+        """W, and B and g on ω̂ as sums over the monomials of the areas, the first of which is that of W."""
         nodes, areas = self.disc_nodes, self._map.areas(self.mesh.t[:, disc.tind])
-        densities = [np.repeat(ratio[:, None], disc.dx.shape[1], axis=1) for ratio in areas[1:]]
-        masses = [mass.assemble(disc), *(weighted_mass.assemble(disc, density=rho) for rho in densities)]
-        integrals = [paraboloid.assemble(disc), *(weighted_paraboloid.assemble(disc, density=rho) for rho in densities)]
-        self.W = InnerProduct(masses[0][nodes][:, nodes])
-        places = sp.coo_array(self.W.matrix).coords
-        self._masses = np.stack([sp.csr_array(member)[nodes][:, nodes][places] for member in masses])
-        self._paraboloids = np.stack([member[nodes] for member in integrals])
+        densities = [np.repeat(ratio[:, None], disc.dx.shape[1], axis=1) for ratio in areas]
+        densities[0] = np.ones_like(densities[0])
+        self.W = InnerProduct(fem.mass(disc)[nodes][:, nodes])
+        masses = [weighted_mass.assemble(disc, density=rho)[nodes][:, nodes] for rho in densities]
+        integrals = [weighted_paraboloid.assemble(disc, density=rho)[nodes] for rho in densities]
+        on_disc = AffineSum(tuple(-sp.csr_array(term) for term in masses), self._monomials)
+        g = AffineSum(tuple(-self.obstacle * term for term in integrals), self._monomials)
+        unknowns = sp.csr_array((np.ones(len(nodes)), (np.arange(len(nodes)), self._contact_dofs)))
+        unknowns.resize((len(nodes), len(self.free)))
+        self._B_on_disc, self.affine = on_disc, {"B": on_disc.mapped(lambda term: term @ unknowns), "g": g}
+
+    def _monomials(self, mu: Array) -> Array:
+        """Coefficients θ(mu) (1,) or (3,) of B and g."""
+        return self._map.monomials(self._map.weights(mu))
 
     @property
     def nodes(self) -> int:
@@ -171,7 +160,7 @@ class Obstacle(Problem):
         B, g = self.constraint(mu)
         return VariationalInequality(
             A=stiffness.assemble(basis)[self.free][:, self.free],
-            f=self.load * unit_load.assemble(basis)[self.free],
+            f=self.load * fem.lumped_mass(basis)[self.free],
             B=B,
             g=g,
         )
@@ -183,16 +172,10 @@ class Obstacle(Problem):
 
     def contact(self, mu: Array) -> Contact:
         """B and g on the disc; they depend on the parameter only through the areas of the triangles."""
-        areas = self._map.monomials(self._map.weights(mu))
-        return Contact(self._on_disc(-areas @ self._masses), -areas * self.obstacle @ self._paraboloids)
-
-    def _on_disc(self, entries: Array) -> SparseMatrix:
-        """A matrix with the sparsity pattern of the Gram matrix of W."""
-        pattern = self.W.matrix
-        return sp.csc_array((entries, pattern.indices, pattern.indptr), shape=pattern.shape)
+        return Contact(self._B_on_disc.at(mu), self.affine["g"].at(mu))
 
     def sampler(self, wanted: Mapping[str, tuple[Indices, Indices]]) -> Sampler:
-        """Entries of A and f from the triangles at their nodes; those of B and g are monomials times constants."""
+        """Entries of A and f from the triangles at their nodes."""
         evaluated: dict[str, Callable[[Array], Array]] = {}
         if "A" in wanted:
             rows, columns = (self.free[places] for places in wanted["A"])
@@ -200,10 +183,6 @@ class Obstacle(Problem):
         if "f" in wanted:
             integrals = LoadEntries(self._map.modes, self.mesh.t, self.free[wanted["f"][0]])
             evaluated["f"] = lambda weights: self.load * integrals(weights)
-        if "B" in wanted:
-            evaluated["B"] = partial(self._combined, -self._mass_entries(*wanted["B"]))
-        if "g" in wanted:
-            evaluated["g"] = partial(self._combined, -self.obstacle * self._paraboloids[:, wanted["g"][0]])
 
         def sample(mu: Array) -> Mapping[str, Array]:
             weights = self._map.weights(mu)
@@ -211,20 +190,28 @@ class Obstacle(Problem):
 
         return sample
 
-    def _mass_entries(self, rows: Indices, columns: Indices) -> Array:
-        """Entries (1×k or 3×k) of the mass matrices by monomial; columns are unknowns."""
-        unknowns = sp.csr_array(
-            (np.ones(len(self._contact_dofs)), (np.arange(len(self._contact_dofs)), self._contact_dofs)),
-            shape=(self.W.dim, self.V.dim),
-        )
-        return np.stack([np.asarray((self._on_disc(m) @ unknowns)[rows, columns]).ravel() for m in self._masses])
-
-    def _combined(self, terms: Array, weights: Array) -> Array:
-        return np.asarray(self._map.monomials(weights) @ terms)
-
     def points(self, mu: Array) -> Array:
         """Nodes (2×nodes) of the mesh of Ω at mu: h(mu) of the reference nodes."""
         return self._map.points(mu)
+
+    @property
+    def outputs(self) -> tuple[Output, ...]:
+        """Force and area of the contact at mu, and the deflection of a point outside the disc, which moves with h(mu).
+
+        The point is the node nearest to (0.35 m, 0) of the reference domain, half-way between the disc and the edge.
+        """
+        place = np.linalg.norm(self.mesh.p[:, self.free] - np.array([[0.35], [0.0]]), axis=0).argmin()
+        at_point = np.zeros(self.V.dim)
+        at_point[place] = 1.0
+        return (
+            Output("contact force", "m", function=lambda mu, _, lam: float(self._integrals(mu) @ lam)),
+            Output("contact area", "m²", function=lambda mu, _, lam: float(self._integrals(mu) @ (lam > 0.0))),
+            Output("deflection", "m", u=at_point),
+        )
+
+    def _integrals(self, mu: Array) -> Array:
+        """Integrals (m,) of the multiplier functions over the disc at mu."""
+        return -np.asarray(self.contact(mu).B.sum(axis=1)).ravel()
 
     def picture(self, mu: Array, u: Array, lam: Array) -> Picture:
         """The membrane's deflection on the mapped mesh and the contact pressure on the disc (paper, Figure 4)."""
@@ -232,7 +219,7 @@ class Obstacle(Problem):
         deflection[self.free] = u
         points = self.points(mu)
         disc = points[:, self.disc_nodes]
-        return Picture(points, self.mesh.t, deflection, "deflection u [m]", disc, lam, "multiplier λ [1/m]")
+        return Picture(points, self.mesh.t, deflection, "deflection u [m]", disc, lam, "multiplier λ [1/m]", "m")
 
     def diagnostics(self, mu: Array) -> Mapping[str, float]:
         """Largest aspect ratio of the mapped mesh (paper, Figure 3; 1 for equilateral triangles)."""

@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, Literal
 
 import numpy as np
 from annotated_types import Ge, Gt, Le
 from scipy.special import lambertw
 from skfem import Basis, ElementTriP1, MeshTri
+from skfem.models.poisson import laplace
 
-from vibench import Array, Indices, InnerProduct, ParameterBox, Picture, Problem, Sampler, VariationalInequality
-from vibench_problems.disc_map import stiffness
+from vibench import AffineProblem, Array, InnerProduct, ParameterBox, Picture, fem
 from vibench_problems.disc_mesh import rings_in_disc
-from vibench_problems.obstacle import mass, paraboloid, unit_load
 
 RINGS = {"coarse": 11, "medium": 20, "paper": 34, "fine": 68}
 """Rings of nodes behind each named resolution: 397, 1261, 3571 and 14 077 nodes."""
@@ -67,7 +66,12 @@ class RadialSolution:
         return np.where(r <= self.contact_radius, 1.0 + 4.0 * self.curvature, 0.0)
 
 
-class Radial(Problem):
+def squared_radius(x: Array) -> Array:
+    """|x|² at points (2×…)."""
+    return np.asarray(np.sum(x**2, axis=0))
+
+
+class Radial(AffineProblem):
     """Membrane of load −1 on the unit disc above ψ(x) = −h − c|x|², h and c the parameters; closed-form solution.
 
     P1 displacements, zero on the circle, P1 multipliers on the inner half of the rings: |x| ≤ ½, or 5/11 at "coarse".
@@ -85,8 +89,6 @@ class Radial(Problem):
     parameters = ParameterBox(
         names=("height", "curvature"), lower=np.array([0.14, 0.0]), upper=np.array([0.2, 0.25]), units=("m", "1/m")
     )
-    constant: ClassVar[frozenset[str]] = frozenset({"A", "f", "B"})
-    entrywise: ClassVar[frozenset[str]] = frozenset({"g"})
 
     def __init__(
         self,
@@ -98,34 +100,22 @@ class Radial(Problem):
         self.mesh = MeshTri(np.ascontiguousarray(points.T), np.ascontiguousarray(triangles.T))
         self.length = length
         zone_nodes = 1 + 3 * (rings // 2) * (rings // 2 + 1)
-        self.disc_nodes = np.arange(zone_nodes)
-        self._basis = Basis(self.mesh, ElementTriP1())
-        self._disc = self._basis.with_elements(np.flatnonzero(np.all(self.mesh.t < zone_nodes, axis=0)))
-        self.free = self._basis.complement_dofs(self._basis.get_dofs())
-        laplacian, disc_mass = stiffness.assemble(self._basis), mass.assemble(self._disc)[self.disc_nodes].tocsr()
-        self._stiffness = laplacian[self.free][:, self.free]
-        self._load = -unit_load.assemble(self._basis)[self.free]
-        self._coupling = -disc_mass[:, self.free]
-        self._one = unit_load.assemble(self._disc)[self.disc_nodes]
-        self._square = paraboloid.assemble(self._disc, intorder=4)[self.disc_nodes]
-        self.V = InnerProduct((mass.assemble(self._basis) + length**2 * laplacian)[self.free][:, self.free])
-        self.W = InnerProduct(disc_mass[:, self.disc_nodes])
+        basis = Basis(self.mesh, ElementTriP1())
+        zone = np.flatnonzero(np.all(self.mesh.t < zone_nodes, axis=0))
+        contact = fem.unilateral(basis.with_elements(zone), ">=", lumped=False)
+        self.free, self.disc_nodes, self._zone = basis.complement_dofs(basis.get_dofs()), contact.nodes, zone
+        self.V, self.W = InnerProduct(fem.h1_gram(basis, self.free, length)), contact.W
+        self.declare(
+            A=laplace.assemble(basis),
+            f=-fem.lumped_mass(basis),
+            B=contact.B,
+            g=[("-height", contact.bound(np.ones(len(contact.nodes)))), ("-curvature", contact.bound(squared_radius))],
+            free=self.free,
+        )
 
     def training_set(self) -> Array:
         """The 7×7 grid."""
         return self.parameters.grid(7, 7)
-
-    def assemble(self, mu: Array) -> VariationalInequality:
-        """The forms of the obstacle problem; b = −∫ v η and g = −∫ ψ η, so that B u ≤ g states u ≥ ψ."""
-        return VariationalInequality(
-            A=self._stiffness, f=self._load, B=self._coupling, g=mu[0] * self._one + mu[1] * self._square
-        )
-
-    def sampler(self, wanted: Mapping[str, tuple[Indices, Indices]]) -> Sampler:
-        """Entries of g, the only member that depends on mu."""
-        rows = wanted["g"][0]
-        one, square = self._one[rows], self._square[rows]
-        return lambda mu: {"g": mu[0] * one + mu[1] * square}
 
     def exact(self, mu: Array) -> RadialSolution:
         """The solution in closed form at mu = (h, c)."""
@@ -137,7 +127,7 @@ class Radial(Problem):
         deflection, multiplier = nothing.copy(), nothing.copy()
         deflection[self.free], multiplier[self.disc_nodes] = u, lam
         whole, disc = (
-            Basis(self.mesh, ElementTriP1(), elements=elements, intorder=8) for elements in (None, self._disc.tind)
+            Basis(self.mesh, ElementTriP1(), elements=elements, intorder=8) for elements in (None, self._zone)
         )
 
         def distance(basis: Basis, field: Array, value: Radially, slope: Radially | None) -> float:
@@ -166,4 +156,4 @@ class Radial(Problem):
         deflection = np.zeros(self.mesh.p.shape[1])
         deflection[self.free] = u
         disc = self.mesh.p[:, self.disc_nodes]
-        return Picture(self.mesh.p, self.mesh.t, deflection, "deflection u [m]", disc, lam, "multiplier λ [1/m]")
+        return Picture(self.mesh.p, self.mesh.t, deflection, "deflection u [m]", disc, lam, "multiplier λ [1/m]", "m")

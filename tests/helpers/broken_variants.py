@@ -14,7 +14,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 import scipy.sparse as sp
-from other_problems import Block, Put, Torsion, mass, nodal
+from other_problems import Block, Put, Torsion, nodal
 from skfem import Basis, ElementTriP1, MeshTri
 
 from vibench import (
@@ -23,18 +23,33 @@ from vibench import (
     Indices,
     InnerProduct,
     ParameterBox,
+    Problem,
     QPSolution,
     Sampler,
     VariationalInequality,
+    fem,
     solve_qp,
 )
 
 
-class Bar(Torsion):
-    """A small bar."""
+class Bar(Problem):
+    """A small bar under torsion, assembled by its author."""
+
+    parameters = Torsion.parameters
+    constant: ClassVar[frozenset[str]] = frozenset({"A", "B", "g"})
 
     def __init__(self) -> None:
-        super().__init__(cells=6)
+        bar = Torsion(cells=6)
+        vi = bar.assemble(np.ones(1))
+        self.V, self.W = bar.V, bar.W
+        self._stiffness, self._weights, self._distance = vi.A, vi.f, vi.g / vi.f
+
+    def training_set(self) -> Array:
+        return self.parameters.grid(15)
+
+    def assemble(self, mu: Array) -> VariationalInequality:
+        weights = self._weights
+        return VariationalInequality(self._stiffness, mu[0] * weights, nodal(weights), weights * self._distance)
 
 
 class Option(Put):
@@ -44,11 +59,30 @@ class Option(Put):
         super().__init__(cells=24)
 
 
-class Cube(Block):
-    """A coarse block."""
+class Cube(Problem):
+    """A coarse block, assembled by its author."""
+
+    constant: ClassVar[frozenset[str]] = frozenset({"A", "f", "B"})
+    entrywise: ClassVar[frozenset[str]] = frozenset({"g"})
 
     def __init__(self) -> None:
-        super().__init__(cells=2)
+        self._block = Block(cells=2)
+        self.parameters, self.V, self.W = self._block.parameters, self._block.V, self._block.W
+        vi = self._block.assemble(self.parameters.lower)
+        self._stiffness, self._coupling = vi.A, vi.B
+
+    def training_set(self) -> Array:
+        return self._block.training_set()
+
+    def bound(self, mu: Array) -> Array:
+        return self._block.assemble(mu).g
+
+    def assemble(self, mu: Array) -> VariationalInequality:
+        return VariationalInequality(self._stiffness, np.zeros(self.V.dim), self._coupling, self.bound(mu))
+
+    def sampler(self, wanted: Mapping[str, tuple[Indices, Indices]]) -> Sampler:
+        rows = wanted["g"][0]
+        return lambda mu: {"g": self.bound(mu)[rows]}
 
 
 class SkewStiffness(Option):
@@ -98,7 +132,7 @@ class MassNorm(Bar):
         cells = np.linspace(0.0, 1.0, 7)
         basis = Basis(MeshTri.init_tensor(cells, cells), ElementTriP1())
         free = basis.complement_dofs(basis.get_dofs())
-        self.V = InnerProduct(sp.csr_array(mass.assemble(basis))[free][:, free])
+        self.V = InnerProduct(fem.mass(basis)[free][:, free])
 
 
 class EuclideanNorm(Cube):

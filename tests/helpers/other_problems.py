@@ -2,48 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Annotated, Any, ClassVar
+from typing import Annotated
 
 import numpy as np
 import scipy.sparse as sp
 from annotated_types import Ge, Le
-from skfem import (
-    Basis,
-    BilinearForm,
-    ElementHex1,
-    ElementQuad1,
-    ElementTriP1,
-    ElementVector,
-    MeshHex,
-    MeshQuad,
-    MeshTri,
-)
-from skfem.helpers import ddot, dot, eye, grad, sym_grad, trace
+from skfem import Basis, ElementHex1, ElementTriP1, ElementVector, MeshHex, MeshTri
+from skfem.models.elasticity import linear_elasticity
+from skfem.models.poisson import laplace
 
-from vibench import Array, Indices, InnerProduct, ParameterBox, Problem, Sampler, VariationalInequality
-
-
-@BilinearForm
-def stiffness(u: Any, v: Any, _: Any) -> Any:
-    return dot(grad(u), grad(v))
-
-
-@BilinearForm
-def mass(u: Any, v: Any, _: Any) -> Any:
-    return u * v
-
-
-def lumped(basis: Basis) -> Array:
-    """Row sums of the mass matrix of a scalar basis: the integrals of its functions."""
-    return np.asarray(mass.assemble(basis).sum(axis=1)).ravel()
+from vibench import AffineProblem, Array, InnerProduct, ParameterBox, Problem, VariationalInequality, fem
 
 
 def nodal(entries: Array) -> sp.csr_array:
     return sp.csr_array(sp.diags_array(entries))
 
 
-class Torsion(Problem):
+class Torsion(AffineProblem):
     """Elastic–plastic torsion of a square bar: −Δu = twist where |∇u| < 1, as the obstacle problem u ≤ dist(x, ∂Ω).
 
     The obstacle problem is equivalent (Brezis and Sibony 1971). The bar yields first in the middle of its sides, at a
@@ -51,25 +26,19 @@ class Torsion(Problem):
     """
 
     parameters = ParameterBox(("twist",), np.array([1.0]), np.array([8.0]), ("1/m",))
-    constant: ClassVar[frozenset[str]] = frozenset({"A", "B", "g"})
 
     def __init__(self, cells: Annotated[int, Ge(4), Le(64)] = 12) -> None:
-        mesh = MeshTri.init_tensor(np.linspace(0.0, 1.0, cells + 1), np.linspace(0.0, 1.0, cells + 1))
-        basis = Basis(mesh, ElementTriP1())
+        ticks = np.linspace(0.0, 1.0, cells + 1)
+        basis = Basis(MeshTri.init_tensor(ticks, ticks), ElementTriP1())
         free = basis.complement_dofs(basis.get_dofs())
-        x, y = mesh.p[:, free]
-        self._stiffness = sp.csr_array(stiffness.assemble(basis)[free][:, free])
-        self._weights = lumped(basis)[free]
-        self._distance = np.minimum.reduce([x, 1.0 - x, y, 1.0 - y])
-        self.V = InnerProduct(self._stiffness + sp.csr_array(mass.assemble(basis)[free][:, free]))
-        self.W = InnerProduct(nodal(self._weights))
+        contact = fem.unilateral(basis, "<=", free=free)
+        distance = np.minimum(contact.points, 1.0 - contact.points).min(axis=0)
+        self.V, self.W = InnerProduct(fem.h1_gram(basis, free)), contact.W
+        load = [("twist", fem.lumped_mass(basis))]
+        self.declare(A=laplace.assemble(basis), f=load, B=contact.B, g=contact.bound(distance), free=free)
 
     def training_set(self) -> Array:
         return self.parameters.grid(15)
-
-    def assemble(self, mu: Array) -> VariationalInequality:
-        weights = self._weights
-        return VariationalInequality(self._stiffness, mu[0] * weights, nodal(weights), weights * self._distance)
 
 
 class Put(Problem):
@@ -120,15 +89,12 @@ class Put(Problem):
         return self.symmetrised(mu, value)
 
 
-class Block(Problem):
+class Block(AffineProblem):
     """A linearly elastic cube, clamped below, into which a rigid paraboloid is pressed: no load, g drives it alone.
 
     The parameters are the depth of the indentation, contact being lost below 0, and the place of the apex. Trilinear
     hexahedra, lumped multipliers at the nodes of the top: the force per area that keeps u_z ≤ gap − depth.
     """
-
-    constant: ClassVar[frozenset[str]] = frozenset({"A", "f", "B"})
-    entrywise: ClassVar[frozenset[str]] = frozenset({"g"})
 
     def __init__(
         self,
@@ -142,42 +108,22 @@ class Block(Problem):
         )
         ticks = np.linspace(0.0, size, cells + 1)
         basis = Basis(MeshHex.init_tensor(ticks, ticks, ticks), ElementVector(ElementHex1()))
-        shear, compression = modulus / 2.6, modulus * 0.3 / (1.3 * 0.4)  # ν = 0.3
-
-        @BilinearForm
-        def elasticity(u: Any, v: Any, _: Any) -> Any:
-            strain = sym_grad(u)
-            return ddot(2.0 * shear * strain + compression * eye(trace(strain), 3), sym_grad(v))
-
-        @BilinearForm
-        def norm(u: Any, v: Any, _: Any) -> Any:
-            return dot(u, v) + size**2 * ddot(grad(u), grad(v))
-
         free = basis.complement_dofs(basis.get_dofs(lambda x: x[2] < 1e-6 * size))
-        nodes = np.flatnonzero(basis.mesh.p[2] > (1.0 - 1e-6) * size)
-        self._xy, self._size = basis.mesh.p[:2, nodes], size
-        top = Basis(MeshQuad.init_tensor(ticks, ticks), ElementQuad1())
-        order = [int(np.argmin(np.sum((top.mesh.p - point[:, None]) ** 2, axis=0))) for point in self._xy.T]
-        self._weights = lumped(top)[order]
-        columns = np.searchsorted(free, basis.nodal_dofs[2, nodes])
-        rows = np.arange(len(nodes))
-        self._stiffness = sp.csr_array(elasticity.assemble(basis)[free][:, free])
-        self._coupling = sp.csr_array((self._weights, (rows, columns)), shape=(len(nodes), len(free)))
-        self.V = InnerProduct(sp.csr_array(norm.assemble(basis)[free][:, free]))
-        self.W = InnerProduct(nodal(self._weights))
+        top = basis.mesh.facets_satisfying(lambda x: x[2] > (1.0 - 1e-6) * size)
+        contact = fem.normal_constraint(basis, top, free=free)
+        elasticity = linear_elasticity(modulus * 0.3 / (1.3 * 0.4), modulus / 2.6)  # ν = 0.3
+        self.V, self.W = InnerProduct(fem.h1_gram(basis, free, size)), contact.W
+        x, y = contact.points[:2]
+        # The gap below the paraboloid, ((x − place)² + (y − size/2)²)/(2 size) − depth, in powers of the place.
+        gap = (x**2 + (y - 0.5 * size) ** 2) / (2.0 * size)
+        g = [(1.0, gap), ("place", -x / size), ("place**2", np.full_like(x, 0.5 / size)), ("-depth", np.ones_like(x))]
+        self.declare(
+            A=elasticity.assemble(basis),
+            f=np.zeros(basis.N),
+            B=contact.B,
+            g=[(theta, contact.bound(values)) for theta, values in g],
+            free=free,
+        )
 
     def training_set(self) -> Array:
         return self.parameters.grid(6, 3)
-
-    def bound(self, mu: Array) -> Array:
-        """g: the gap below the paraboloid, weighted."""
-        x, y = self._xy
-        gap = ((x - mu[1]) ** 2 + (y - 0.5 * self._size) ** 2) / (2.0 * self._size)
-        return np.asarray(self._weights * (gap - mu[0]))
-
-    def assemble(self, mu: Array) -> VariationalInequality:
-        return VariationalInequality(self._stiffness, np.zeros(self.V.dim), self._coupling, self.bound(mu))
-
-    def sampler(self, wanted: Mapping[str, tuple[Indices, Indices]]) -> Sampler:
-        rows = wanted["g"][0]
-        return lambda mu: {"g": self.bound(mu)[rows]}

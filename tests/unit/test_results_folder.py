@@ -2,12 +2,20 @@
 
 from __future__ import annotations
 
+import importlib
 import re
 import subprocess
 import sys
 from pathlib import Path
 
+import pandas as pd
 import pytest
+
+from vibench.execution.recorded_cell import recorded_study
+from vibench.report import html
+from vibench.results import tables
+from vibench.results.database import FILE
+from vibench.study.cells import expand
 
 ROOT = Path(__file__).parents[2]
 RESULTS = ROOT / "results"
@@ -73,6 +81,27 @@ def test_a_page_made_anew_is_as_light(quick_run: Path, tmp_path: Path) -> None:
     text = page.read_text(encoding="utf-8")
     assert "`vibench run benefit` leaves the tables of all queries and histories under `runs/benefit/tables`" in text
     assert "## Break-even of fixed enrichments" in text
+
+
+def test_the_results_are_published_by_one_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(str(RESULTS))
+    script = importlib.import_module("publish")
+    monkeypatch.setattr(html, "page", lambda _: "<!doctype html>")
+    monkeypatch.setattr(sys, "argv", ["publish.py", str(tmp_path / "site")])
+    script.main()
+    index = (tmp_path / "site" / "index.html").read_text(encoding="utf-8")
+    for name in NAMES:
+        own = tmp_path / "site" / "runs" / name
+        assert f'href="runs/{name}/index.html"' in index
+        committed, published = pd.read_csv(RESULTS / name / "cells.csv"), tables.read(own / FILE, "cells")
+        assert set(committed["cell"]) == set(published["cell"])
+        both = committed.merge(published, on="cell")
+        assert both["online_s_x"].equals(both["online_s_y"])
+        key = committed["cell"].iloc[0]
+        page = (own / "index.html").read_text(encoding="utf-8")
+        assert f"vibench run results.sqlite --cell {key} --out again" in page
+        assert f"`vibench run {name}` makes all of it" in page
+        assert [cell.key for cell in expand(recorded_study(str(own / FILE), key))] == [key]
 
 
 def test_the_readme_says_what_a_query_is_compared_with() -> None:

@@ -46,6 +46,10 @@ EXAMPLES: Mapping[str, tuple[str, ...]] = {
         "vibench compare runs/2024 runs/2025 --column online_s",
         "vibench compare runs/2024 runs/2025 --table columns --format csv",
     ),
+    "publish": (
+        "vibench publish quick site",
+        'vibench publish a b site --author "Doe, Jane" --doi 10.5281/zenodo.1234567',
+    ),
     "replay": ("vibench replay quick 3f9a", "vibench replay quick 3f9a --query 7"),
     "export-qps": ("vibench export-qps quick programs",),
     "export-model": (
@@ -57,6 +61,12 @@ EXAMPLES: Mapping[str, tuple[str, ...]] = {
         "vibench check primal:mine",
         "vibench check my_package.cable:Cable",
         "vibench check solver:piqp",
+    ),
+    "bench": (
+        "vibench bench my-problem",
+        "vibench bench my-problem piqp --out before.json",
+        "vibench bench my-problem piqp --against before.json",
+        "vibench bench --read after.json --against before.json --format csv",
     ),
     "new": ("vibench new problem cable", "vibench new solver my-qp", "vibench new dual my-cone --out packages"),
     "import": ("vibench import my-model",),

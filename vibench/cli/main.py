@@ -19,10 +19,12 @@ with interrupted_at_once():
     from typer import Argument, Option
 
     from vibench.cli import result_commands
+    from vibench.cli.bench_command import bench_plugins
     from vibench.cli.completion import examples, names, solvers, studies, whole_words
     from vibench.cli.export_commands import export_reduced_model
     from vibench.cli.pack_commands import import_pack, reduce_cones, write_pack
     from vibench.cli.plugin_commands import check_plugin, list_plugins, new_plugin
+    from vibench.cli.publish_command import publish_runs
     from vibench.cli.result_commands import (
         compare_runs,
         diff_runs,
@@ -230,9 +232,10 @@ def doctor(out: Annotated[Path, Option(metavar="DIR", help="Folder of the runs."
 
 COMMANDS: dict[str, Callable[..., None]] = {
     "run": run, "list": list_plugins, "show": show, "report": write_report, "figures": draw_figures,
-    "diff": diff_runs, "compare": compare_runs, "replay": replay_query, "export-qps": export_qps,
+    "diff": diff_runs, "compare": compare_runs, "publish": publish_runs,
+    "replay": replay_query, "export-qps": export_qps,
     "export-model": export_reduced_model, "clean": clean, "doctor": doctor,
-    "check": check_plugin, "new": new_plugin,
+    "check": check_plugin, "bench": bench_plugins, "new": new_plugin,
     "import": import_pack, "pack": write_pack, "cones": reduce_cones,
 }  # fmt: skip
 for _name, _command in COMMANDS.items():

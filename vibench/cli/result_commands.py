@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from enum import StrEnum
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -10,6 +11,15 @@ from typer import Argument, Exit, Option
 
 from vibench.cli.completion import SHOWN, cells, column_names, runs, table_names
 from vibench.terminal.output import echo, run_argument
+
+
+class Picture(StrEnum):
+    """Formats of figures."""
+
+    PNG = "png"
+    SVG = "svg"
+    PDF = "pdf"
+
 
 EXAMPLE = "solver = 'piqp' and beta_span_min < 1e-3"
 """Condition in the help of `--where`."""
@@ -53,44 +63,76 @@ def write_report(
     run: RunArgument, out: Annotated[Path | None, Option(help="HTML file; RUN/report.html by default.")] = None
 ) -> None:
     """Write the report of a run as one HTML page."""
+    from vibench import provenance
     from vibench.execution.run_folder import REPORT
     from vibench.report import html
     from vibench.results import tables
 
     path = tables.results_file(run)
-    echo(f"report: {html.write(path, out or path.parent / REPORT)}")
+    echo(f"report: {html.write(path, out or path.parent / REPORT, provenance.cores())}")
 
 
 def draw_figures(
-    run: RunArgument,
-    out: Annotated[Path | None, Option(metavar="DIR", help="Folder; RUN/figures by default.")] = None,
+    names: Annotated[
+        list[str], Argument(metavar="RUN", help="A run folder, or its name in runs/ (several).", autocompletion=runs)
+    ],
+    out: Annotated[
+        Path | None, Option(metavar="DIR", help="Folder; RUN/figures, or paper-figures with --paper, by default.")
+    ] = None,
+    paper: Annotated[
+        bool, Option("--paper", help="Draw the figures of a publication again, on one page with what it says.")
+    ] = False,
+    formats: Annotated[
+        list[Picture] | None, Option("--format", help="Format (repeatable); PNG and SVG by default.")
+    ] = None,
     jobs: Annotated[int, Option("--jobs", "-j", min=0, help="Processes; 0 for one per core.")] = 0,
 ) -> None:
-    """Draw the figures of a run as PNG and SVG."""
+    """Draw the figures of runs, with their captions in captions.json."""
+    from vibench.errors import RequestError
+    from vibench.report.figures.style import FORMATS
     from vibench.results import tables
 
-    path = tables.results_file(run)
-    draw(path, out or path.parent / "figures", jobs)
+    paths = list({tables.results_file(name).resolve(): tables.results_file(name) for name in names}.values())
+    forms = tuple(dict.fromkeys(map(str, formats or FORMATS)))
+    if paper:
+        draw_paper(paths, out or Path("paper-figures"), forms)
+        return
+    if out is not None and len(paths) > 1:
+        raise RequestError("--out is for the figures of one run, and --paper; those of several go into their folders")
+    for path in paths:
+        draw(path, out or path.parent / "figures", jobs, forms)
 
 
-def draw(path: Path, folder: Path, jobs: int) -> None:
+def draw_paper(paths: list[Path], folder: Path, formats: tuple[str, ...]) -> None:
+    """Draw the figures of publications again, and say where their page is."""
+    from vibench.report.figures.publication import PAGE, draw_published
+    from vibench.terminal.console import new_console
+    from vibench.terminal.progress import DrawingDisplay
+
+    notes: list[str] = []
+    with DrawingDisplay(new_console()) as display:
+        drawn = draw_published(paths, folder, formats, display.show, notes.append)
+    echo(*notes, f"{len(drawn)} figures: {folder}", f"page: {folder / PAGE}")
+
+
+def draw(path: Path, folder: Path, jobs: int, formats: tuple[str, ...] = ("png", "svg")) -> None:
     """Draw all figures of a results file and say so; Ctrl-C leaves those that are drawn, and the results."""
     from vibench import provenance
     from vibench.report import figures
     from vibench.terminal.console import new_console
     from vibench.terminal.progress import DrawingDisplay
 
-    cores = provenance.cores()
+    cores, failures = provenance.cores(), list[str]()
     try:
         with DrawingDisplay(new_console()) as display:
-            drawn = figures.draw_all(path, folder, jobs=min(jobs or cores, cores), progress=display.show)
+            drawn = figures.draw_all(path, folder, formats, min(jobs or cores, cores), display.show, failures.append)
     except KeyboardInterrupt:
         echo(
             "interrupted while drawing: results and tables are complete, some figures are missing; "
             f"`vibench figures {run_argument(path.parent)}` draws them"
         )
         raise Exit(130) from None
-    echo(f"{len(drawn)} figures: {folder}")
+    echo(*failures, f"{len(drawn)} figures: {folder}")
 
 
 LimitOption = Annotated[float, Option(min=1.0, help="Factor by which a number may get worse.")]
@@ -121,7 +163,7 @@ def diff_runs(
 def compare_runs(
     run: Annotated[
         list[str],
-        Argument(metavar="RUN…", help="Run folders or results files; the first is the reference.", autocompletion=runs),
+        Argument(metavar="RUN", help="Run folders or results files; the first is the reference.", autocompletion=runs),
     ],
     limit: LimitOption = 1.25,
     table: Annotated[

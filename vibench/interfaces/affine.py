@@ -24,6 +24,11 @@ class Thetas:
 
     functions: tuple[float | Callable[[Array], float], ...]
 
+    @property
+    def constant(self) -> bool:
+        """Whether all are numbers."""
+        return not any(callable(theta) for theta in self.functions)
+
     def __call__(self, mu: Array) -> Array:
         """Evaluate all at mu (d,)."""
         return np.array([theta(mu) if callable(theta) else theta for theta in self.functions], float)
@@ -87,9 +92,14 @@ class AffineSum:
         """The sum at mu (d,); a matrix has the union of the patterns of the terms at every mu."""
         theta = self.coefficients(mu)
         if isinstance(self.terms[0], np.ndarray):
-            return np.stack(self.terms, axis=-1) @ theta
+            return self._columns @ theta
         pattern, values = self._stacked
         return sp.csr_array((values @ theta, pattern.indices, pattern.indptr), shape=pattern.shape)
+
+    @cached_property
+    def _columns(self) -> Array:
+        """The terms of a vector (n×Q)."""
+        return np.stack(self.terms, axis=-1)
 
     @cached_property
     def _stacked(self) -> tuple[SparseMatrix, SparseMatrix]:

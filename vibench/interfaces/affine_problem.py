@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -10,11 +11,14 @@ import scipy.sparse as sp
 
 from vibench.arrays import Array, Indices
 from vibench.errors import NumericalError
-from vibench.interfaces.affine import AffineSum, Theta
+from vibench.interfaces.affine import AffineSum, Theta, Thetas
 from vibench.interfaces.problem import MEMBERS, Contact, Problem, VariationalInequality
 
 Declaration: TypeAlias = Any | Sequence[tuple[Theta, Any]] | AffineSum
 """A constant matrix or vector, the pairs (θ_q, term_q) of an affine sum, or the sum."""
+
+NOWHERE = np.zeros(0)
+"""Where coefficients that do not depend on the parameter are evaluated."""
 
 MAX_CONTACT_SHARE = 0.5
 """Unknowns of the constraint are declared where they are at most this share of all; else condensation gains nothing."""
@@ -28,7 +32,14 @@ class AffineProblem(Problem):
     """
 
     def declare(
-        self, *, A: Declaration, f: Declaration, B: Declaration, g: Declaration, lift: Declaration | None = None
+        self,
+        *,
+        A: Declaration,
+        f: Declaration,
+        B: Declaration,
+        g: Declaration,
+        free: Indices | None = None,
+        lift: Declaration | None = None,
     ) -> None:
         """Declare the members.
 
@@ -38,15 +49,19 @@ class AffineProblem(Problem):
         Parameters
         ----------
         A
-            Sparse, symmetric (n×n).
+            Sparse, symmetric (N×N).
         f
-            Load (n,), with the contribution of the lift.
+            Load (N,).
         B
-            Constraint, sparse (m×n); A u + Bᵀλ = f with λ ≥ 0.
+            Constraint, sparse (m×N); A u + Bᵀλ = f with λ ≥ 0.
         g
-            Bound (m,), with the contribution of the lift.
+            Bound (m,).
+        free
+            Unknowns (n,) that are not prescribed, rising. The members are declared for all N unknowns and restricted to
+            these. By default N = n.
         lift
-            Lifting of inhomogeneous Dirichlet data, for pictures.
+            Prescribed values (N,) of the other unknowns, any values elsewhere; zero by default. The unknowns of the
+            model are those of u − lift: f − A·lift and g − B·lift take the place of f and g.
 
         Raises
         ------
@@ -56,35 +71,43 @@ class AffineProblem(Problem):
             If a member has a wrong shape.
         """
         n, m = self.V.dim, self.W.dim
-        shapes = {"A": (n, n), "f": (n,), "B": (m, n), "g": (m,)}
-        given = dict(zip(MEMBERS, (A, f, B, g), strict=True))
-        self._members = {name: self._declared(name, member, shapes[name]) for name, member in given.items()}
-        self._lift = None if lift is None else self._declared("lift", lift, None)
-        constants = [name for name, member in self._members.items() if not isinstance(member, AffineSum)]
+        N = n if free is None else int(np.shape(_first(A))[0])
+        if free is not None and (len(free) != n or np.max(free, initial=-1) >= N):
+            raise NumericalError(f"there are {len(free)} free unknowns of {N}; V has the dimension {n}")
+        shapes = {"A": (N, N), "f": (N,), "B": (m, N), "g": (m,), "lift": (N,)}
+        given = {"A": A, "f": f, "B": B, "g": g} | ({} if lift is None else {"lift": lift})
+        sums = {name: self._declared(name, member, shapes[name]) for name, member in given.items()}
+        if lift is not None:
+            sums["f"] = _minus(sums["f"], sums["A"], sums["lift"])
+            sums["g"] = _minus(sums["g"], sums["B"], sums["lift"])
+        if free is not None:
+            sums["A"] = sums["A"].mapped(lambda term: sp.csr_array(term[free][:, free]))
+            sums["f"] = sums["f"].mapped(lambda term: term[free])
+            sums["B"] = sums["B"].mapped(lambda term: sp.csr_array(term[:, free]))
+        self._members = {name: _constant_or_sum(each) for name, each in sums.items()}
+        constants = [name for name in MEMBERS if not isinstance(self._members[name], AffineSum)]
         # Declared by classes of other problems; here by what was declared.
         self.constant = frozenset(constants)  # type: ignore[misc]
-        self.affine = {name: member for name, member in self._members.items() if isinstance(member, AffineSum)}
-        B_terms = self.affine["B"].terms if "B" in self.affine else (self._members["B"],)
-        touched = np.unique(np.concatenate([sp.coo_array(term).coords[1] for term in B_terms]))
+        self.affine = {name: sums[name] for name in MEMBERS if name not in self.constant}
+        touched = np.unique(np.concatenate([term.indices for term in sums["B"].terms])).astype(np.intp)
         self._contact_dofs = touched if 0 < len(touched) <= MAX_CONTACT_SHARE * n else None
         if self._contact_dofs is not None:
-            self._contact_columns = _mapped(self._members["B"], lambda term: sp.csr_array(term)[:, touched])
+            on_contact = sums["B"].mapped(lambda term: sp.csr_array(term[:, touched]))
+            self._contact_columns = _constant_or_sum(on_contact)
 
-    def _declared(self, name: str, member: Declaration, shape: tuple[int, ...] | None) -> Any:
-        """A constant or an `AffineSum` of this shape."""
-        if isinstance(member, list | tuple):
-            member = AffineSum.of(member, self.parameters.names)
-        terms = member.terms if isinstance(member, AffineSum) else (member,)
-        if shape is not None and np.shape(terms[0]) != shape:
-            found = f"shape {np.shape(terms[0])}"
-            raise NumericalError(f"{name} has {found}; the spaces V and W require {shape}")
-        return _mapped(member, lambda term: sp.csr_array(term) if sp.issparse(term) else np.asarray(term, float))
+    def _declared(self, name: str, member: Declaration, shape: tuple[int, ...]) -> AffineSum:
+        """A member as a sum of sparse matrices or vectors of this shape."""
+        if not isinstance(member, AffineSum):
+            pairs = member if isinstance(member, list | tuple) else [(1.0, member)]
+            member = AffineSum.of(pairs, self.parameters.names)
+        found = np.shape(member.terms[0])
+        if found != shape:
+            raise NumericalError(f"{name} has shape {found}; the spaces V and W require {shape}")
+        return member.mapped(lambda term: sp.csr_array(term) if len(shape) > 1 else np.asarray(term, float))
 
     def assemble(self, mu: Array) -> VariationalInequality:
-        """The declared members at mu (d,)."""
-        return VariationalInequality(
-            **{name: _at(self._members[name], mu) for name in MEMBERS}, lift=_at(self._lift, mu)
-        )
+        """The declared members at mu (d,), in the free unknowns."""
+        return VariationalInequality(**{name: _at(member, mu) for name, member in self._members.items()})
 
     @property
     def contact_dofs(self) -> Indices | None:
@@ -98,8 +121,42 @@ class AffineProblem(Problem):
         return Contact(_at(self._contact_columns, mu), _at(self._members["g"], mu))
 
 
-def _mapped(member: Any, change: Any) -> Any:
-    return member.mapped(change) if isinstance(member, AffineSum) else change(member)
+@dataclass(frozen=True)
+class _OfProduct:
+    """θ of first − second·third: those of the first, then minus the products of those of the others."""
+
+    first: Callable[[Array], Any]
+    second: Callable[[Array], Any]
+    third: Callable[[Array], Any]
+
+    def __call__(self, mu: Array) -> Array:
+        return np.concatenate([self.first(mu), -np.outer(self.second(mu), self.third(mu)).ravel()])
+
+
+def _minus(total: AffineSum, matrix: AffineSum, vector: AffineSum) -> AffineSum:
+    """Total − matrix · vector."""
+    products = [A @ v for A in matrix.terms for v in vector.terms]
+    thetas = [each.thetas for each in (total, matrix, vector)]
+    if all(isinstance(theta, Thetas) and theta.constant for theta in thetas):  # stays a constant
+        minus = -np.outer(matrix.coefficients(NOWHERE), vector.coefficients(NOWHERE)).ravel()
+        return AffineSum((*total.terms, *products), Thetas((*total.coefficients(NOWHERE), *minus)))
+    return AffineSum((*total.terms, *products), _OfProduct(*thetas))
+
+
+def _first(member: Declaration) -> Any:
+    """The first term of a declared member."""
+    if isinstance(member, AffineSum):
+        return member.terms[0]
+    return member[0][1] if isinstance(member, list | tuple) else member
+
+
+def _constant_or_sum(member: AffineSum) -> Any:
+    """The sum, or its value where no coefficient depends on the parameter."""
+    if not (isinstance(member.thetas, Thetas) and member.thetas.constant):
+        return member
+    if len(member.terms) == 1 and member.coefficients(NOWHERE)[0] == 1.0:
+        return member.terms[0]
+    return member.at(NOWHERE)
 
 
 def _at(member: Any, mu: Array) -> Any:

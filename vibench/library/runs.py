@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import signal
 import threading
-from collections.abc import Iterator
+import warnings
+from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -113,11 +114,17 @@ class Run:
         """Write every table as CSV, and the summary as Markdown; into `tables` beside the results file by default."""
         return tables.export(self.path, self.path.parent / "tables" if folder is None else Path(folder))
 
-    def write_figures(self, folder: Path | str | None = None) -> list[Path]:
-        """Write every figure as PNG and SVG; into `figures` beside the results file by default."""
+    def write_figures(
+        self, folder: Path | str | None = None, formats: Sequence[Literal["png", "svg", "pdf"]] = ("png", "svg")
+    ) -> list[Path]:
+        """Write every figure, and their captions; into `figures` beside the results file by default.
+
+        A figure of a plugin that cannot be drawn is a warning.
+        """
         from vibench.report.figures import draw_all  # noqa: PLC0415  loads matplotlib
 
-        return draw_all(self.path, self.path.parent / "figures" if folder is None else Path(folder))
+        target = self.path.parent / "figures" if folder is None else Path(folder)
+        return draw_all(self.path, target, tuple(formats), note=partial(warnings.warn, stacklevel=2))
 
     def report(self, path: Path | str | None = None) -> Path:
         """Write the report, one HTML page; into the folder of the run by default. Returns its path."""

@@ -56,6 +56,7 @@ UNITS: Mapping[str, str] = {
     "A²": "the unit of the energy",
     "b": "the unit of b(v, η), which is that of the energy",
     "b/VW": "the unit of b(v, η) divided by those of the norms of V and W",
+    "o": "the unit of the output, in the column unit",
 }
 """The units and what they stand for; those of V, W and b depend on the problem."""
 
@@ -145,6 +146,9 @@ CELLS: Mapping[str, Column] = {
     "terms_B": Column(INTEGER, "", "Likewise for B; empty if B is assembled on the contact unknowns."),
     "terms_g": Column(INTEGER, "", "Likewise for g."),
     "offline_snapshots_s": Column(REAL, "s", "High-fidelity solutions at the training parameters, with one set-up."),
+    "offline_selection_s": Column(
+        REAL, "s", "Choice of the training parameters by error bounds, a part of the time before; 0 for fixed sets."
+    ),
     "offline_pod_s": Column(REAL, "s", "POD."),
     "offline_cone_s": Column(REAL, "s", "Dual strategy, with the orthonormal basis of the span."),
     "offline_enrichment_s": Column(REAL, "s", "Primal strategy."),
@@ -370,6 +374,12 @@ QUERIES: Mapping[str, Column] = {
     "beta_energy": Column(
         REAL, "b/AW", "β_A, proved lower bound of the inf-sup constant of V in the norm of A(µ) and W over the span."
     ),
+    "outputs": Column(
+        TEXT,
+        "",
+        "Quantities of interest as JSON: value, high-fidelity reference, relative error, error over the scale.",
+        whole=True,
+    ),
     "violation": Column(
         REAL, "u", "Largest (B u_N − g)₊, each row divided by the integral of its multiplier function."
     ),
@@ -473,6 +483,22 @@ SOLUTIONS: Mapping[str, Column] = {
     "slack_constant": Column(REAL, "V²", "Constant c in the square of that distance."),
 }
 
+OUTPUTS: Mapping[str, Column] = {
+    "cell": Column(MEMBER, "", "The cell it belongs to.", "cell", 0),
+    **KEYS,
+    "output": Column(TEXT, "", "Quantity of interest, as its problem names it.", "output", 10),
+    "unit": Column(TEXT, "", "Its unit.", "unit", 11),
+    "linear": Column(INTEGER, "", "1 where it is linear in u and λ with fixed coefficients, else 0."),
+    "scale": Column(REAL, "o", "Its largest absolute value over the training set.", "scale", 12),
+    "queries_ok": Column(INTEGER, "", "Ok queries, over which means and maxima are."),
+    "error_mean": Column(REAL, "1", "Mean relative error, where the output is not zero.", "error", 13),
+    "error_max": Column(REAL, "1", "Largest relative error, likewise.", "largest", 14),
+    "queries_zero": Column(INTEGER, "", "Ok queries where it is at most 1e-8 of its scale: no contact, for instance."),
+    "error_zero_max": Column(REAL, "1", "Largest error of these, over the scale."),
+    "error_scaled_mean": Column(REAL, "1", "Mean error over the scale, of all ok queries.", "error / scale", 15),
+    "error_scaled_max": Column(REAL, "1", "Largest error over the scale, likewise."),
+}
+
 PICTURES: Mapping[str, Column] = {
     "problem": Column(TEXT, "", "Problem: its label in the study, or its name."),
     "problem_options": Column(TEXT, "", "Options of the problem that are not at their default, as JSON.", whole=True),
@@ -490,6 +516,7 @@ TABLES: Mapping[str, Mapping[str, Column]] = {
     "timings": TIMINGS,
     "thresholds": THRESHOLDS,
     "disagreements": DISAGREEMENTS,
+    "outputs": OUTPUTS,
 }
 """The tables for reading; each is exported as CSV."""
 

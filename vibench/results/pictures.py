@@ -15,13 +15,15 @@ from vibench.interfaces.problem import Picture
 from vibench.results.database import read_rows
 from vibench.text import printable
 
-ARRAYS = tuple(field.name for field in fields(Picture) if not field.name.endswith("name"))
+ARRAYS = tuple(field.name for field in fields(Picture) if field.type in {"Array", "Indices"})
+TEXTS = tuple(field.name for field in fields(Picture) if field.name not in ARRAYS)
+"""Members of a picture that hold arrays, and those that are texts."""
 
 
 def picture_rows(drawn: Iterable[tuple[str, Picture]]) -> list[dict[str, Any]]:
     """Rows of the pictures table, one for every title and picture, without the columns that identify the problem."""
     return [
-        {"number": k, "title": title, "names": json.dumps([one.name, one.multiplier_name]), "data": _packed(one)}
+        {"number": k, "title": title, "names": json.dumps([getattr(one, text) for text in TEXTS]), "data": _packed(one)}
         for k, (title, one) in enumerate(drawn)
     ]
 
@@ -59,6 +61,9 @@ def _packed(picture: Picture) -> bytes:
 
 def _unpacked(data: bytes, names: str) -> Picture:
     with np.load(io.BytesIO(data), allow_pickle=False) as found:
-        arrays = {name: found[name].astype(np.intp if name == "triangles" else float) for name in ARRAYS}
-    name, multiplier_name = (printable(str(text)) for text in json.loads(names))
-    return Picture(**arrays, name=name, multiplier_name=multiplier_name)
+        members: dict[str, Any] = {
+            name: found[name].astype(np.intp if name == "triangles" else float) for name in ARRAYS
+        }
+    # a file of an earlier version has no unit of length
+    members |= zip(TEXTS, (printable(str(text)) for text in json.loads(names)), strict=False)
+    return Picture(**members)

@@ -178,7 +178,7 @@ def to_latex(frame: pd.DataFrame) -> str:
     What vibench itself writes compiles with every engine; labels in scripts other than Latin need LuaLaTeX or XeLaTeX.
     """
     columns = "".join("r" if pd.api.types.is_numeric_dtype(kind) else "l" for kind in frame.dtypes)
-    table = str(_as_text(frame, _latex).to_latex(index=False, column_format=columns))
+    table = str(_as_text(frame, to_latex_text).to_latex(index=False, column_format=columns))
     return f"% needs \\usepackage{{booktabs}}\n{table}"
 
 
@@ -206,7 +206,8 @@ def _markdown(text: str) -> str:
     return MARKUP.sub(r"\\\g<0>", text).translate(ENTITIES)
 
 
-def _latex(text: str) -> str:
+def to_latex_text(text: str) -> str:
+    """A text whose characters LaTeX shows, and acts on none of them."""
     return text.translate(LATEX)
 
 

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
 from vibench.arrays import Array
 from vibench.errors import NumericalError
 from vibench.interfaces.problem import ParameterBox, Picture
-from vibench.results.pictures import ARRAYS, failure_rows, picture_rows
+from vibench.results.pictures import ARRAYS, TEXTS, failure_rows, picture_rows
 from vibench.stages.base import Result, Row, Stage, build_problem
 from vibench.stages.snapshots import gather, training_stages
 from vibench.storage.artefacts import Store
@@ -83,7 +84,7 @@ def _checked(picture: Picture) -> Picture:
         Naming the member that does not.
     """
     mistyped = [name for name in ARRAYS if getattr(picture, name).dtype.kind not in "fiu"]
-    mistyped += [name for name in ("name", "multiplier_name") if not isinstance(getattr(picture, name), str)]
+    mistyped += [name for name in TEXTS if not isinstance(getattr(picture, name), str)]
     if mistyped:
         raise NumericalError(f"the problem's picture has {' and '.join(mistyped)} of the wrong type")
     count, places = picture.points.shape[-1], picture.positions.shape[-1]
@@ -99,5 +100,7 @@ def _checked(picture: Picture) -> Picture:
     wrong = [name for name, right in fits.items() if not right]
     if wrong:
         raise NumericalError(f"the problem's picture has {' and '.join(wrong)} of the wrong shape")
-    own = {name: getattr(picture, name).copy() for name in ARRAYS}  # the next picture may use the same arrays
-    return replace(picture, name=one_line(picture.name), multiplier_name=one_line(picture.multiplier_name), **own)
+    own: dict[str, Any] = {
+        name: getattr(picture, name).copy() for name in ARRAYS
+    }  # the next picture may use the same arrays
+    return replace(picture, **own | {name: one_line(getattr(picture, name)) for name in TEXTS})

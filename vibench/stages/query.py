@@ -18,6 +18,7 @@ from vibench.model.error_bounds import Certificate, certify
 from vibench.model.errors import UNMEASURABLE, Errors, Reference, errors
 from vibench.model.hsw_bounds import HSWBounds, hsw_bounds
 from vibench.model.hyperreduced import HyperReducedModel
+from vibench.model.output_errors import output_errors
 from vibench.qp.accuracy_bounds import slack
 from vibench.qp.exact import ExactSolution
 from vibench.qp.repeats import in_units, nearby, units
@@ -222,6 +223,9 @@ def error_columns(
         strict=True,
     )
     rows = [_columns(*one) for one in found]
+    compared = (u, lam), (reference.u, reference.lam), reference.scale_outputs
+    for row, of_query in zip(rows, output_errors(problem.outputs, mus, *compared), strict=True):
+        row["outputs"] = of_query
     if online is not None and isinstance(model, HyperReducedModel):
         for row, mu, (x, alpha) in zip(rows, mus, solutions, strict=True):
             row.update(_online_columns(online.evaluate(problem, mu, model.assemble(mu), x, alpha), row))

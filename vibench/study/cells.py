@@ -147,11 +147,12 @@ class Cell:
             If a plugin is not installed, or a file that its options name cannot be read.
         """
         content = json.loads(text)
-        for name in PLUGINS:
-            content[name] = content[name] and Plugin(**content[name]).as_installed()
+        for name in PLUGINS:  # older definitions have no sampling strategies
+            content[name] = Plugin(**content[name]).as_installed() if content.get(name) else None
         for axis in ("pod", "cone"):
             content[axis] = Stop(**content[axis])
-        return cls(**content | {name: tuple(content[name]) for name in ("labels", "nested_tolerances", "set_labels")})
+        labels = ("labels", "nested_tolerances", "set_labels")
+        return cls(**content | {name: tuple(content[name]) for name in labels if name in content})
 
     @property
     def axes(self) -> Axes:

@@ -15,6 +15,7 @@ from typing import Any, get_type_hints
 from pydantic import ConfigDict, PydanticUserError, TypeAdapter, ValidationError
 
 from vibench.errors import RequestError, in_a_line, unknown_name
+from vibench.interfaces.figures import FigurePlugin
 from vibench.interfaces.problem import Problem
 from vibench.interfaces.sampling import Sampling
 from vibench.interfaces.strategies import DualStrategy, PrimalStrategy
@@ -30,12 +31,14 @@ GROUPS: Mapping[str, str] = {
     "QP solver": "vibench.qp_solvers",
     "sampling strategy": "vibench.sampling",
     "study": "vibench.studies",
+    "figure plugin": "vibench.figures",
 }
 FINITE = ConfigDict(allow_inf_nan=False)
 """Options of plugins are finite."""
 
 BASES: Mapping[str, type] = {
-    "problem": Problem, "dual strategy": DualStrategy, "primal strategy": PrimalStrategy, "sampling strategy": Sampling,
+    "problem": Problem, "dual strategy": DualStrategy, "primal strategy": PrimalStrategy,
+    "sampling strategy": Sampling, "figure plugin": FigurePlugin,
 }  # fmt: skip
 """Abstract base classes of the kinds of plugins that are classes."""
 

@@ -218,7 +218,7 @@ def on_contact(case: ProblemCase) -> Iterator[str]:
     defined = type(problem).contact is not Problem.contact
     if dofs is None:
         yield Note("not declared")
-        if defined:
+        if defined and problem.contact(case.mus[0].copy()) is not None:
             yield "`contact` is defined but `contact_dofs` is not, so it is never used; name the unknowns B may touch"
     elif fault := _dofs_fault(dofs, problem.V.dim):
         raise ConformanceError(f"`contact_dofs` {fault}")

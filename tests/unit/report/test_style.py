@@ -9,11 +9,16 @@ import matplotlib as mpl
 import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
+from matplotlib.backends.backend_agg import RendererAgg
 from matplotlib.figure import Figure
 
 from vibench.report.figures.data import file_names
-from vibench.report.figures.style import Sheet, plot, styled, write_figure
+from vibench.report.figures.looks import Looks, Series, look_of
+from vibench.report.figures.style import WRITTEN, Sheet, caption_of, plot, styled, write_figure
+from vibench.study import registry
 from vibench.text import printable
+
+SOLVERS = ("piqp", "proxqp", "osqp", "clarabel", "daqp", "quadprog", "highs", "scs", "cvxopt", "ecos")
 
 LABELS = [
     "$", "$x$", "$x^{ $", r"$\frac{", r"\$ $a", "_hidden", "__", "_", "漢字 שלום नमस्ते", "-->", "]]>", "<b>&amp;",
@@ -25,9 +30,10 @@ def sheet(text: str) -> Figure:
     """A figure with a text wherever one from others may stand."""
     made = Sheet(1, 2, text)
     for panel in made.panels:
-        plot(panel, [1.0, 2.0], [1.0, 10.0], 0, text)
+        plot(panel, [1.0, 2.0], [1.0, 10.0], look_of(text), text)
+        made.label(panel, 1.5, 3.0, text)
         panel.set(xlabel=text, ylabel=text, title=text, yscale="log")
-    return made.finish()
+    return made.finish(text)
 
 
 def drawn(text: str, form: str = "svg") -> tuple[Figure, bytes]:
@@ -83,3 +89,81 @@ def test_file_names_are_the_labels_where_they_can_be() -> None:
         "unnamed",
         "δ-=-0.1",
     ]
+
+
+NAMES = st.lists(st.text(max_size=12), min_size=1, max_size=10, unique=True)
+
+
+@given(NAMES, NAMES)
+def test_a_strategy_looks_the_same_in_every_figure_of_every_run(one: list[str], other: list[str]) -> None:
+    """Whatever else a run compares, in whatever order, and at whatever tolerances."""
+    alone, among = Looks([Series(one[0])]), Looks([Series(name, 0.5) for name in [*reversed(other), one[0]]])
+    first, second = alone[Series(one[0])], among[Series(one[0], 0.5)]
+    assert (first.colour, first.marker) == (second.colour, second.marker)
+
+
+@given(NAMES, st.lists(st.floats(0.0, 1.0), max_size=6, unique=True))
+def test_no_two_series_of_a_figure_look_the_same(names: list[str], tolerances: list[float]) -> None:
+    series = [Series(name, variant) for name in names for variant in ("", "reduced", *tolerances)][:10]
+    looks = Looks(series)
+    assert len({looks[one] for one in series}) == len(series)
+    lines = [looks[one].line() for one in series]
+    assert len(
+        {(line["color"], line["marker"], str(line["linestyle"]), line["markerfacecolor"]) for line in lines}
+    ) == len(series)
+
+
+@pytest.mark.parametrize("names", [registry.names("primal strategy"), registry.names("dual strategy"), SOLVERS])
+def test_what_is_shipped_has_colours_and_markers_of_its_own(names: list[str]) -> None:
+    looks = [look_of(name) for name in names]
+    assert len(set(looks)) == len(looks)
+    if len(names) <= 6:
+        assert len({look.colour for look in looks}) == len(looks)
+
+
+@pytest.mark.parametrize("form", WRITTEN)
+def test_a_file_has_its_caption_and_no_date(form: str) -> None:
+    text = "A caption with δ = 0.1, <b> & (parentheses)."
+    files = []
+    for _ in range(2):
+        stream = io.BytesIO()
+        with styled():
+            figure = sheet(text)
+            write_figure(figure, stream, form)
+        files.append(stream.getvalue())
+    assert caption_of(figure) == text
+    assert files[0] == files[1]
+    expected = {
+        "png": [text.encode(), b"Description"],
+        "svg": [b"A caption with \xce\xb4 = 0.1, &lt;b&gt; &amp; (parentheses)."],
+        "pdf": [b"/Subject", text.encode("utf-16-be").replace(b"(", b"\\(").replace(b")", b"\\)")],
+    }
+    assert all(part in files[0] for part in expected[form])
+    assert b"Date" not in files[0].split(b"stream")[0] or form == "svg"
+
+
+def test_a_sheet_has_three_panels_in_a_row_and_hides_what_is_left_over() -> None:
+    made = Sheet.of(7, "seven", share="all")
+    assert len(made.panels) == 9
+    assert [panel.axison for panel in made.panels] == [True] * 7 + [False] * 2
+    assert made.at(1, 0) is made.panels[3]
+
+
+@given(st.lists(st.tuples(st.floats(0.0, 1.0), st.floats(0.0, 1.0)), min_size=1, max_size=60))
+@settings(max_examples=8, deadline=None)
+def test_labels_of_points_cover_neither_each_other_nor_leave_the_panel(points: list[tuple[float, float]]) -> None:
+    made = Sheet(1, 1)
+    (panel,) = made.panels
+    panel.set(xlim=(-0.1, 1.1), ylim=(-0.1, 1.1))
+    for k, (x, y) in enumerate(points):
+        made.label(panel, x, y, f"({k}, 43), δ = 0.5")
+    figure = made.finish()
+    boxes = [text.get_window_extent(RendererAgg(10, 10, figure.dpi)) for text in panel.texts]
+    assert 1 <= len(boxes) <= len(points)
+    frame = panel.get_window_extent()
+    for k, box in enumerate(boxes):
+        assert frame.x0 - 1 <= box.x0 <= box.x1 <= frame.x1 + 1
+        assert frame.y0 - 1 <= box.y0 <= box.y1 <= frame.y1 + 1
+        assert not any(box.overlaps(other) for other in boxes[:k])
+    missing = len(points) - len(boxes)
+    assert caption_of(figure) == (f"{missing} points have no label for want of room." if missing else "")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import pytest
@@ -14,6 +15,7 @@ from vibench.results.database import FILE
 from vibench.study.cells import Cell, expand
 from vibench.study.reader import read_study
 from vibench.study.single_cell import only_cell, study_of_cell
+from vibench.study.spec import Study
 
 
 @pytest.mark.parametrize("name", ["quick", "benefit", "hertz-quadrature", "paper-hertz"])
@@ -23,6 +25,25 @@ def test_a_study_of_one_cell_has_the_same_cell(name: str) -> None:
     for cell in (*cells[:4], *cells[-4:], *cells[:: max(len(cells) // 8, 1)]):
         (again,) = expand(study_of_cell(cell, name))
         assert (again.key, str(again), again.code) == (cell.key, str(cell), cell.code)
+
+
+def test_a_study_of_one_cell_has_its_parameter_sets() -> None:
+    quick = read_study("quick")
+    drawn = {"name": "random", "label": "drawn", "options": {"size": 20, "seed": 3}}
+    sampled = Study(
+        **quick.model_dump() | {"training": ["own", drawn], "validation": drawn | {"options": {"size": 9, "seed": 5}}}
+    )
+    for cell in expand(sampled):
+        (again,) = expand(study_of_cell(cell, "quick"))
+        assert (again.key, str(again), again.validation) == (cell.key, str(cell), 9)
+
+
+def test_a_definition_without_parameter_sets_is_one_with_those_of_the_problem() -> None:
+    cell = expand(read_study("quick"))[0]
+    older = json.loads(cell.definition)
+    for name in ("training", "validation_sampling", "set_labels"):
+        del older[name]
+    assert Cell.from_definition(json.dumps(older)) == cell
 
 
 def test_a_row_is_made_again_from_its_results_file(quick_run: Path, main: Main) -> None:

@@ -124,13 +124,13 @@ class _Coefficients:
     """The coefficients θ (Q,) of one member as a function of mu."""
 
     def __init__(self, problem: Problem, name: str, member: AffineMember) -> None:
-        self._affine = problem.affine[name] if member.way is Evaluation.AFFINE else None
-        sampled = member.way is Evaluation.INTERPOLATED
-        self._name, self._sampler = name, problem.sampler({name: (member.rows, member.columns)}) if sampled else None
+        self._name, sampled = name, member.way is Evaluation.INTERPOLATED
+        self._sampler = problem.sampler({name: (member.rows, member.columns)}) if sampled else None
+        self._declared = problem.affine[name] if member.way is Evaluation.AFFINE else None
 
     def at(self, mu: Array) -> Array:
-        if self._affine is not None:
-            return np.asarray(self._affine.coefficients(mu))
+        if self._declared is not None:
+            return self._declared.coefficients(mu)
         return np.ones(1) if self._sampler is None else np.asarray(self._sampler(mu)[self._name])
 
 

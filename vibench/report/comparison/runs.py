@@ -35,9 +35,11 @@ class ComparedRun:
 
     @cached_property
     def identity(self) -> dict[str, Any]:
-        """Name, seed and number of validation parameters of the study."""
+        """Name and seed of the study, and its validation parameters: their number, or their sampling as JSON."""
         study = study_of(self.path, read_meta(self.path))
-        return {"study": study.get("name"), "seed": study.get("seed"), "validation": study.get("validation")}
+        validation = study.get("validation")
+        shown = validation if isinstance(validation, int) else json.dumps(validation, sort_keys=True)
+        return {"study": study.get("name"), "seed": study.get("seed"), "validation": shown}
 
     @property
     def ok(self) -> int:
@@ -53,9 +55,9 @@ class ComparedRun:
     def versions(self) -> dict[str, str]:
         """Versions of Python, libraries and solvers; several, where its cells were run with several."""
         found: dict[str, set[str]] = {}
-        for text in {row["versions"] for row in self.cells.values() if row["versions"]}:
-            for name, version in dict(json.loads(text)).items():
-                found.setdefault(str(name), set()).add(str(version))
+        for text in {row["versions"] for row in self.cells.values() if isinstance(row["versions"], str)}:
+            for name, version in _json_object(self.path, text).items():
+                found.setdefault(name, set()).add(str(version))
         return {name: ", ".join(sorted(several)) for name, several in sorted(found.items())}
 
     @cached_property
@@ -96,6 +98,16 @@ class ComparedRun:
     def has_seconds_of(self, cell: str, machine: str) -> bool:
         """Whether this run has the cell, measured by that machine."""
         return cell in self.cells and self.cells[cell]["machine"] == machine
+
+
+def _json_object(path: Path, text: str) -> dict[str, Any]:
+    try:
+        found = json.loads(text)
+    except ValueError:
+        found = None
+    if not isinstance(found, dict):
+        raise RequestError(f"'{path}' has versions that are no JSON object: {text[:60]!a}")
+    return found
 
 
 def compared_runs(paths: Sequence[Path]) -> list[ComparedRun]:

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import contextlib
+import json
+import re
 import signal
 import threading
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import Future, ProcessPoolExecutor
+from dataclasses import dataclass, replace
 from functools import cache
 from multiprocessing import get_context
 from pathlib import Path
@@ -14,13 +17,16 @@ from pathlib import Path
 from matplotlib.figure import Figure
 
 from vibench.errors import RequestError, unknown_name
+from vibench.files import write_atomically
+from vibench.report.figures import constants, convergence, costs
 from vibench.report.figures.constants import inf_sup, shares
 from vibench.report.figures.convergence import diagnostics, enrichment, orthogonality, projection_errors
-from vibench.report.figures.costs import dimension, total_cost, work_precision
+from vibench.report.figures.costs import dimension, outputs, total_cost, work_precision
 from vibench.report.figures.data import Data, file_names, problems
+from vibench.report.figures.plugins import FigureError, of_plugins
 from vibench.report.figures.solutions import solutions
 from vibench.report.figures.solvers import precision, solvers
-from vibench.report.figures.style import FORMATS, save, styled
+from vibench.report.figures.style import ABREAST, DEEP, FORMATS, WRITTEN, caption_of, save, styled
 
 Drawing = Callable[[Data], Figure | None]
 
@@ -35,19 +41,52 @@ OF_PROBLEM: dict[str, Drawing] = {
     "solvers": solvers,
     "precision": precision,
     "total-cost": total_cost,
+    "outputs": outputs,
 }
 """Figures of every problem, by the end of their file names."""
 
 OF_DUAL: dict[str, Drawing] = {"enrichment": enrichment, "inf-sup": inf_sup}
 """Figures of every problem and dual strategy."""
 
+LONG: dict[str, tuple[Callable[[Data], int], int]] = {
+    "dimension": (costs.sized, DEEP),
+    "work-precision": (costs.timed, DEEP),
+    "total-cost": (costs.pairs, ABREAST * DEEP),
+    "outputs": (costs.reported, ABREAST * DEEP),
+    "enrichment": (convergence.enriched, DEEP),
+    "inf-sup": (constants.pairs, constants.MOST_PAIRS),
+}
+"""Figures that grow with the study: how many panels or rows of panels they have, and how many go into one file."""
+
+CAPTIONS = "captions.json"
+"""File beside the figures: the caption of every figure, by the name of its files."""
+
 
 def drawings(path: Path) -> Iterator[tuple[str, Drawing, Data]]:
-    """Every figure a results file may have: its name, the function that draws it, and the data."""
-    for name, data in problems(path):
-        yield from ((f"{name}-{kind}", draw, data) for kind, draw in OF_PROBLEM.items())
+    """Every figure a results file may have: its name, the function that draws it, and the data.
+
+    The functions of plugins raise `FigureError`; those of this package do not.
+    """
+    return drawings_of(problems(path))
+
+
+def drawings_of(known: Iterable[tuple[str, Data]]) -> Iterator[tuple[str, Drawing, Data]]:
+    """Every figure of some problems, from their data and what the names of their files begin with."""
+    for name, data in known:
+        for kind, draw in OF_PROBLEM.items():
+            yield from _pages(f"{name}-{kind}", kind, draw, data)
         for dual, file in zip(data.duals, file_names(data.duals), strict=True):
-            yield from ((f"{name}-{file}-{kind}", draw, data.of_dual(dual)) for kind, draw in OF_DUAL.items())
+            for kind, draw in OF_DUAL.items():
+                yield from _pages(f"{name}-{file}-{kind}", kind, draw, data.of_dual(dual))
+        yield from ((f"{name}-{kind}", draw, data) for kind, draw in of_plugins(data, {*OF_PROBLEM, *OF_DUAL}).items())
+
+
+def _pages(name: str, kind: str, draw: Drawing, data: Data) -> Iterator[tuple[str, Drawing, Data]]:
+    """A drawing, or several of a figure that is too long for one."""
+    count, most = LONG.get(kind, (lambda _: 1, 1))
+    pages = max(1, -(-count(data) // most))
+    for page in range(pages):
+        yield name + f"-{page + 1}" * (page > 0), draw, replace(data, page=(page, pages))
 
 
 def draw(path: Path, kind: str, problem: str | None = None, dual: str | None = None) -> Figure:
@@ -56,7 +95,7 @@ def draw(path: Path, kind: str, problem: str | None = None, dual: str | None = N
     Parameters
     ----------
     kind
-        A key of `OF_PROBLEM` or `OF_DUAL`.
+        A key of `OF_PROBLEM` or `OF_DUAL`, or a figure of a plugin.
     problem, dual
         Label of the problem ("LABEL, TRAINING" where it has several training sets), and of the dual strategy for a kind
         of `OF_DUAL`; `None` where there is only one.
@@ -65,14 +104,19 @@ def draw(path: Path, kind: str, problem: str | None = None, dual: str | None = N
     ------
     RequestError
         If there is no such figure, or nothing to draw in it.
+    FigureError
+        If it is a plugin's figure, which cannot be drawn.
     """
-    if kind not in OF_PROBLEM and kind not in OF_DUAL:
-        raise unknown_name("figure", kind, (*OF_PROBLEM, *OF_DUAL))
-    data = _only("problem", {one.problem: one for _, one in problems(path)}, problem)
+    known = {one.problem: one for _, one in problems(path)}
+    others = {name for one in known.values() for name in of_plugins(one, {*OF_PROBLEM, *OF_DUAL})}
+    if kind not in {*OF_PROBLEM, *OF_DUAL, *others}:
+        raise unknown_name("figure", kind, (*OF_PROBLEM, *OF_DUAL, *sorted(others)))
+    data = _only("problem", known, problem)
     if kind in OF_DUAL:
         data = _only("dual strategy", {name: data.of_dual(name) for name in data.duals}, dual)
+    drawing = (OF_PROBLEM | OF_DUAL | of_plugins(data, {*OF_PROBLEM, *OF_DUAL})).get(kind)
     with styled():
-        figure = (OF_PROBLEM | OF_DUAL)[kind](data)
+        figure = None if drawing is None else drawing(data)
     if figure is None:
         raise RequestError(f"the run has no data for the figure '{kind}' of {data.problem}")
     return figure
@@ -92,10 +136,30 @@ def _only(what: str, found: Mapping[str, Data], label: str | None) -> Data:
 
 def remove(folder: Path) -> None:
     """Remove the figures that an earlier call of `draw_all` may have left in a folder; other files stay."""
-    for kind in (*OF_PROBLEM, *OF_DUAL):
-        for form in FORMATS:
-            for file in folder.glob(f"*-{kind}.{form}"):
-                file.unlink()
+    forms = f".({'|'.join(WRITTEN)})"
+    own = re.compile(rf".*-({'|'.join(map(re.escape, (*OF_PROBLEM, *OF_DUAL)))})(-\d+)?\{forms}")
+    known = {f"{name}.{form}" for name in read_captions(folder) for form in WRITTEN}
+    for file in folder.glob("*"):
+        if file.is_file() and (file.name in known or file.name == CAPTIONS or own.fullmatch(file.name)):
+            file.unlink()
+
+
+def read_captions(folder: Path) -> dict[str, str]:
+    """The captions beside the figures of a folder, by the names of the figures; empty where there are none."""
+    try:
+        found = json.loads((folder / CAPTIONS).read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return {}
+    return {str(name): str(text) for name, text in found.items()} if isinstance(found, dict) else {}
+
+
+@dataclass(frozen=True)
+class Written:
+    """What became of one drawing: the files, their caption, and why a figure could not be drawn."""
+
+    files: tuple[Path, ...] = ()
+    caption: str = ""
+    failure: str = ""
 
 
 def draw_all(
@@ -104,8 +168,11 @@ def draw_all(
     formats: tuple[str, ...] = FORMATS,
     jobs: int = 1,
     progress: Callable[[str, int, int], None] = lambda *_: None,
+    note: Callable[[str], None] = lambda _: None,
 ) -> list[Path]:
     """Draw every figure that a results file has data for, in every format; returns the files written to the folder.
+
+    Beside them is `CAPTIONS`, with the caption of every figure.
 
     Parameters
     ----------
@@ -114,16 +181,18 @@ def draw_all(
     folder
         Where the figures go.
     formats
-        Formats of Matplotlib.
+        Keys of `style.WRITTEN`.
     jobs
         Processes that draw, this one included.
     progress
         Called before a figure is drawn here, with its name, the number of those done, and that of all there may be.
+    note
+        Called with a line for every figure of a plugin that could not be drawn.
     """
     known = _drawings(path)
-    written: dict[int, list[Path]] = {}
+    written: dict[int, Written] = {}
     with contextlib.ExitStack() as stack:
-        others: dict[int, Future[list[Path]]] = {}
+        others: dict[int, Future[Written]] = {}
         if jobs > 1:
             pool = ProcessPoolExecutor(jobs - 1, get_context("spawn"))
             stack.callback(pool.shutdown, cancel_futures=True)
@@ -139,7 +208,13 @@ def draw_all(
             progress(known[k][0], len(written), len(known))
             written[k] = other.result()
     _drawings.cache_clear()
-    return [file for k in sorted(written) for file in written[k]]
+    for line in dict.fromkeys(written[k].failure for k in sorted(written) if written[k].failure):
+        note(line)
+    captions = {known[k][0]: written[k].caption for k in sorted(written) if written[k].files}
+    if captions:
+        text = json.dumps(read_captions(folder) | captions, ensure_ascii=False, indent=1) + "\n"
+        write_atomically(folder / CAPTIONS, text.encode("utf-8"))
+    return [file for k in sorted(written) for file in written[k].files]
 
 
 @cache
@@ -148,13 +223,16 @@ def _drawings(path: Path) -> list[tuple[str, Drawing, Data]]:
     return list(drawings(path))
 
 
-def _draw(path: Path, folder: Path, formats: tuple[str, ...], number: int) -> list[Path]:
-    """Draw one figure of `drawings`; returns the files."""
+def _draw(path: Path, folder: Path, formats: tuple[str, ...], number: int) -> Written:
+    """Draw one figure of `drawings`."""
     name, draw, data = _drawings(path)[number]
     folder.mkdir(parents=True, exist_ok=True)
     with styled():
-        figure = draw(data)
-        return [] if figure is None else save(figure, folder, name, formats)
+        try:
+            figure = draw(data)
+        except FigureError as error:
+            return Written(failure=str(error))
+        return Written() if figure is None else Written(tuple(save(figure, folder, name, formats)), caption_of(figure))
 
 
 @contextlib.contextmanager

@@ -2,49 +2,167 @@
 
 from __future__ import annotations
 
+from typing import Any, NamedTuple
+
 import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 
 from vibench.interfaces.strategies import Kind
-from vibench.report.figures.data import PRIMAL, Data, at_best_tolerance, by_strategy, dimensions, one_solver
-from vibench.report.figures.style import BLACK, POINTS, Sheet, counted, line, plot, positive, style_of
+from vibench.report.figures.data import (
+    PRIMAL,
+    Data,
+    at_best_tolerance,
+    by_strategy,
+    common_tolerances,
+    dimensions,
+    one_solver,
+    parts,
+    point_names,
+    series,
+    some,
+)
+from vibench.report.figures.looks import HIGH_FIDELITY_LOOK, Look, Looks, Series
+from vibench.report.figures.style import (
+    ABREAST,
+    SERIES,
+    CaptionedFigure,
+    Layout,
+    Sheet,
+    counted,
+    plot,
+    positive,
+    scatter,
+    two_rows,
+)
 from vibench.stability.infsup import VANISHES
 
+MOST_PAIRS = 2 * ABREAST
+"""Panels over the span in a figure; each has one over the cone below it."""
 
-def inf_sup(data: Data) -> Figure:
+
+class _Panel(NamedTuple):
+    """What one panel over the span and the one below it over the cone show."""
+
+    title: str
+    strategies: list[tuple[Series, str, pd.DataFrame]]
+    reference: pd.DataFrame
+
+
+def inf_sup(data: Data) -> CaptionedFigure:
     """Inf-sup constants β of every primal strategy and of the high-fidelity pair over the validation set.
 
     First row: over the span; second row: over the cone, with the certified interval as a band. Fixed enrichments are
-    shown at the tolerance of the smallest mean, and parameters are sorted by the constant of the first of these.
+    shown at the tolerance of the smallest mean, the same in every panel.
     """
-    pairs = list(data.queries.groupby("pair", sort=False))
-    sheet = Sheet(2, len(pairs), f"{data.problem}, {data.duals[0]}: inf-sup constants over the validation set")
-    styles: dict[str, int] = {}
-    for column, (_, of_pair) in enumerate(pairs):
-        group = one_solver(of_pair)
-        fixed = group[group["enrichment_kind"] == Kind.FIXED]
-        smallest = -fixed.groupby(["primal", "primal_tol"], dropna=False)["beta_span"].mean()
-        loosest = at_best_tolerance(fixed, smallest)
-        sorting = loosest if len(loosest) else group
+    constants = _constants(data)
+    shown = loosest(constants)
+    panels = data.on_page(_panels(data, shown), MOST_PAIRS)
+    axis = data.parameter
+    sheet, over, below = two_rows(len(panels), f"{data.problem}, {data.duals[0]}: inf-sup constants")
+    looks = Looks(one for panel in panels for one, _, _ in panel.strategies)
+    zeros: list[list[str]] = []
+    for panel, span, cone in zip(panels, over, below, strict=True):
+        x = _abscissae(panel, axis)
+        _draw((span, cone), x, panel.reference, "beta_hf_", HIGH_FIDELITY_LOOK, "high-fidelity")
+        drawn = {name: _draw((span, cone), x, rows, "beta_", looks[one], name) for one, name, rows in panel.strategies}
+        zeros.append([name for name, zero in drawn.items() if zero])
+        span.set_title(panel.title)
+        for axes, generated in ((span, "span"), (cone, "cone")):
+            axes.set(ylabel=f"β over {generated}", xlabel=axis or "validation parameters, sorted", yscale="log")
+            if not axis:
+                counted(axes)
+    _name_zeros(over, zeros)
+    return sheet.finish(_caption(data, constants, shown, bool(axis)))
+
+
+def pairs(data: Data) -> int:
+    """Number of panels of `inf_sup` over the span."""
+    return len(_panels(data, loosest(_constants(data))))
+
+
+def _constants(data: Data) -> pd.DataFrame:
+    return pd.concat([one_solver(rows) for _, rows in data.queries.groupby("pair", sort=False)])
+
+
+def loosest(constants: pd.DataFrame) -> pd.DataFrame:
+    """The rows of fixed enrichments at the tolerance of the smallest mean β, and those of all other strategies."""
+    fixed = constants["enrichment_kind"] == Kind.FIXED
+    compared = common_tolerances(constants[fixed])
+    # each pair weighs the same, whatever the size of its constants
+    means = compared.groupby(["primal", "primal_tol", "pair"])["beta_span"].mean().unstack()
+    score = -(means / means.max()).mean(axis=1).astype(float)
+    return constants.loc[~fixed | constants.index.isin(at_best_tolerance(compared, score).index)]
+
+
+def _panels(data: Data, shown: pd.DataFrame) -> list[_Panel]:
+    """A panel for each pair, and several where there are more strategies than a panel takes."""
+    found = []
+    for pair, of_pair in data.queries.groupby("pair", sort=False):
+        rows = shown[shown["pair"] == pair]
+        fixed = rows[rows["enrichment_kind"] == Kind.FIXED]
+        sorting = fixed if len(fixed) else rows
         first = sorting[sorting["cell"] == sorting["cell"].iloc[0]]
-        order = first.sort_values("beta_span", kind="stable")["query"]
-        kept = group[(group["enrichment_kind"] != Kind.FIXED) | group["cell"].isin(loosest["cell"])]
-        axes = sheet.at(0, column), sheet.at(1, column)
-        for number, (name, found) in enumerate(by_strategy(kept)):
-            rows = found.set_index("query").reindex(order)
-            _draw(axes, rows, "beta_", style_of(name, styles), name)
-            if number == 0:
-                _draw(axes, rows, "beta_hf_", BLACK, "high-fidelity")
-        axes[0].set_title(dimensions(of_pair))
-        for panel, generated in zip(axes, ("span", "cone"), strict=True):
-            panel.set(ylabel=f"β over {generated}", xlabel="validation parameters, sorted", yscale="log")
-            counted(panel)
-    return sheet.finish()
+        order = first.sort_values("mu_1" if data.parameter else "beta_span", kind="stable")["query"]
+        strategies = [
+            (series(one["primal"].iloc[0], one["primal_tol"].iloc[0]), name, one.set_index("query").reindex(order))
+            for name, one in by_strategy(rows)
+        ]
+        reference = strategies[0][2]
+        groups = parts(strategies, SERIES - 1)
+        for k, group in enumerate(groups, 1):
+            more = f", strategies {k} of {len(groups)}" if len(groups) > 1 else ""
+            found.append(_Panel(f"{dimensions(of_pair)}{more}", group, reference))
+    return found
 
 
-def shares(data: Data) -> Figure | None:
+def _abscissae(panel: _Panel, axis: str) -> Any:
+    """The only parameter, or the places of the parameters in their order."""
+    known = panel.reference
+    return known["mu_1"].to_numpy(float) if axis else np.arange(1, len(known) + 1)
+
+
+def _draw(axes: tuple[Axes, Axes], x: Any, rows: pd.DataFrame, prefix: str, look: Look, name: str) -> bool:
+    """Constants over the span, and the interval over the cone as its upper end with a band; whether β is 0 there."""
+    top, below = axes
+    span = rows[f"{prefix}span"].to_numpy(float)
+    known = span[np.isfinite(span)]
+    plot(top, x, positive(span, VANISHES), look, name)
+    lower, upper = rows[f"{prefix}cone_lower"].to_numpy(float), rows[f"{prefix}cone_upper"].to_numpy(float)
+    plot(below, x, positive(upper, VANISHES), look)
+    below.fill_between(x, lower, upper, color=look.colour, alpha=0.2, linewidth=0.0)
+    return bool(known.size and known.max() < VANISHES)
+
+
+def _name_zeros(panels: list[Axes], zeros: list[list[str]]) -> None:
+    """Write below the curves what a logarithmic axis cannot show; the panels share their axis."""
+    low, high = panels[0].get_ylim()
+    lines = max(map(len, zeros))
+    if lines and 0.0 < low < high:
+        panels[0].set_ylim(low * (low / high) ** (0.1 * lines), high)
+    for panel, names in zip(panels, zeros, strict=True):
+        if names:
+            text = "\n".join(f"β = 0: {name}" for name in names)
+            panel.text(0.02, 0.03, text, transform=panel.transAxes, fontsize=7)
+
+
+def _caption(data: Data, constants: pd.DataFrame, shown: pd.DataFrame, along: bool) -> str:
+    """What is shown, and which tolerances are not."""
+    text = [
+        f"Inf-sup constants β of {data.problem} with the cones of {data.duals[0]} at the validation parameters, "
+        f"{data.queries['query'].nunique()} of them, for the high-fidelity pair and every primal strategy: over the "
+        "span of the generators (upper row) and over their cone (lower row, with certified intervals as bands).",
+        "" if along else "Parameters are sorted by the constant of the first fixed enrichment, or else strategy.",
+    ]
+    for primal, rows in constants.groupby("primal", sort=False):
+        given, kept = rows["primal_tol"].dropna().unique(), shown[shown["primal"] == primal]["primal_tol"].dropna()
+        if len(given) > kept.nunique():
+            left_out = [value for value in given if value not in set(kept)]
+            text.append(f"{primal} is shown at δ = {some(kept)}, its loosest; left out: {some(left_out)}.")
+    return " ".join(text) + data.part
+
+
+def shares(data: Data) -> CaptionedFigure | None:
     """Smallest shares of β over the span in that of the whole of V: over the validation against the training set.
 
     One point per fixed enrichment. Below the diagonal, validation parameters are less stable than the training set; the
@@ -53,26 +171,27 @@ def shares(data: Data) -> Figure | None:
     cells = data.cells[data.cells["share_training"].notna()].drop_duplicates([*PRIMAL, "dual", "pair"])
     if cells.empty:
         return None
-    sheet = Sheet(1, len(cells["dual"].unique()), f"{data.problem}: shares of the inf-sup constant")
-    styles: dict[str, int] = {}
-    for panel, (dual, group) in zip(sheet.panels, cells.groupby("dual", sort=False), strict=True):
-        panel.plot([0.0, 1.0], [0.0, 1.0], color="0.6", linewidth=0.8, zorder=0)
-        for primal, mine in group.groupby("primal", sort=False):
-            k = style_of(str(primal), styles)
-            plot(panel, mine["share_training"], mine["share_validation"], k, str(primal), **POINTS)
-            panel.plot(mine["share_guaranteed"], mine["share_validation"], "|", color=line(k)["color"])
-        panel.set(title=str(dual), xlabel="smallest share, training set", ylabel="smallest share, validation set")
-    return sheet.finish()
-
-
-def _draw(axes: tuple[Axes, Axes], rows: pd.DataFrame, prefix: str, k: int, name: str) -> None:
-    """Constants over the span, and the interval over the cone as its upper end with a band."""
-    top, below = axes
-    x = np.arange(1, len(rows) + 1)
-    span = rows[f"{prefix}span"].to_numpy(float)
-    known = span[np.isfinite(span)]
-    zero = known.size and known.max() < VANISHES
-    plot(top, x, positive(span, VANISHES), k, f"{name} (0 over span)" if zero else name)
-    lower, upper = rows[f"{prefix}cone_lower"].to_numpy(float), rows[f"{prefix}cone_upper"].to_numpy(float)
-    plot(below, x, positive(upper, VANISHES), k)
-    below.fill_between(x, lower, upper, color=line(k)["color"], alpha=0.2, linewidth=0.0)
+    groups = [
+        (str(dual) + f", strategies {k}" * (k > 0), rows[rows["primal"].isin(names)])
+        for dual, rows in cells.groupby("dual", sort=False)
+        for k, names in enumerate(parts(list(rows["primal"].unique()), SERIES))
+    ]
+    sheet = Sheet.of(
+        len(groups), f"{data.problem}: shares of the inf-sup constant", Layout(width=4.0, height=3.2), "all"
+    )
+    looks = Looks(Series(str(name)) for name in cells["primal"].unique())
+    for panel, (title, rows) in zip(sheet.panels, groups, strict=False):
+        panel.axline((1.0, 1.0), slope=1.0, color="0.6", linewidth=0.8, zorder=0)
+        for primal, mine in rows.groupby("primal", sort=False):
+            look = looks[Series(str(primal))]
+            scatter(panel, mine["share_training"], mine["share_validation"], look, str(primal))
+            panel.plot(mine["share_guaranteed"], mine["share_validation"], "|", color=look.colour)
+            for k, text in point_names(mine).items():
+                sheet.label(panel, mine.at[k, "share_training"], mine.at[k, "share_validation"], text)
+        panel.set(title=title, xlabel="smallest share, training set", ylabel="smallest share, validation set")
+    return sheet.finish(
+        f"Smallest share of β over the span in that of the whole of V for {data.problem}: over the validation set "
+        "against over the training set, one point for each fixed enrichment with its (N, R) and tolerance δ; a number "
+        "alone is another δ. Below the diagonal, validation parameters are less stable than the training set. The tick "
+        "left of a point is √(1 − σ²), which bounds the share on the training set."
+    )

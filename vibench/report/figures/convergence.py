@@ -3,16 +3,27 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from itertools import starmap
 
 import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 
 from vibench.arrays import Array
 from vibench.interfaces.strategies import Kind
-from vibench.report.figures.data import Data, at_best_tolerance, by_strategy, dimensions, label, longest, one_solver
-from vibench.report.figures.style import POINTS, Sheet, counted, plot, positive, style_of
+from vibench.report.figures.data import (
+    Data,
+    at_best_tolerance,
+    by_strategy,
+    dimensions,
+    longest,
+    one_solver,
+    parts,
+    series,
+    some,
+)
+from vibench.report.figures.looks import Looks, Series
+from vibench.report.figures.style import DEEP, SERIES, CaptionedFigure, Sheet, counted, plot, positive, scatter
 
 ROUND_OFF = 1e-12
 """The tail of a POD below this is round-off."""
@@ -23,95 +34,176 @@ SINE_FLOOR = 1e-14
 DIAGNOSED = ("training", "validation")
 GROWTH = {"sigma": "largest σ, training set", "beta_span_min": "min β over span, training set"}
 
+POD = Series("POD")
 
-def diagnostics(data: Data) -> Figure | None:
+
+def diagnostics(data: Data) -> CaptionedFigure | None:
     """Quantities that the problem reports at every parameter, such as the largest aspect ratio (paper, Figure 3)."""
     found = data.histories[data.histories["stage"].isin(DIAGNOSED)]
     if found.empty:
         return None
-    quantities = found["quantity"].unique()
-    sheet = Sheet(1, len(quantities), f"{data.problem}: diagnostics over the parameters")
-    for panel, quantity in zip(sheet.panels, quantities, strict=True):
-        first = 0
-        for k, stage in enumerate(DIAGNOSED):
+    quantities = list(found["quantity"].unique())
+    sheet = Sheet.of(len(quantities), f"{data.problem}: diagnostics over the parameters")
+    looks = Looks(map(Series, DIAGNOSED))
+    for panel, quantity in zip(sheet.panels, quantities, strict=False):
+        first = 1
+        for stage in DIAGNOSED:
             mine = found[(found["stage"] == stage) & (found["quantity"] == quantity)]
             values = mine.drop_duplicates("step").sort_values("step")["value"].to_numpy()
-            plot(panel, first + np.arange(len(values)), values, k, f"{stage} parameters", **POINTS)
+            scatter(panel, first + np.arange(len(values)), values, looks[Series(stage)], f"{stage} parameters")
             first += len(values)
-        panel.set(xlabel="parameter, training then validation", ylabel=quantity.replace("_", " "))
-    return sheet.finish()
+        panel.set(xlabel="parameter, training then validation", ylabel=str(quantity).replace("_", " "))
+        counted(panel)
+    named = ", ".join(str(quantity).replace("_", " ") for quantity in quantities)
+    return sheet.finish(
+        f"What {data.problem} reports at every training parameter and every validation parameter: {named}."
+    )
 
 
-def projection_errors(data: Data) -> Figure:
+def projection_errors(data: Data) -> CaptionedFigure:
     """Relative projection errors of the POD and of the cones against their size (paper, Figures 5 and 11)."""
-    sheet = Sheet(1, 2, f"{data.problem}: projection errors over the training set")
-    left, right = sheet.panels
     errors = data.histories[data.histories["quantity"] == "error"]
+    cones = _in_panels(errors[errors["stage"] == "cone"])
+    sheet = Sheet.of(1 + len(cones), f"{data.problem}: projection errors over the training set")
+    left, *others = sheet.panels
     for _, found in longest(errors[errors["stage"] == "pod"]):
         shown = found[found["value"] > ROUND_OFF]
-        plot(left, shown["step"], shown["value"], 0, "POD")
+        plot(left, shown["step"], shown["value"], Looks([POD])[POD], POD.name)
     left.set(xlabel="number of modes N", ylabel="relative error of the POD", title="primal", yscale="log")
     counted(left)
-    right.set(title="dual")
-    _cones(right, errors[errors["stage"] == "cone"], "number of generators R", "largest relative error of the cone")
-    return sheet.finish()
+    for panel, names in zip(others, cones, strict=False):
+        panel.set(title="dual")
+        _cones(panel, names, "number of generators R", "largest relative error of the cone")
+    return sheet.finish(
+        f"Projection errors of {data.problem} over the training set: left, the relative tail of the POD against the "
+        "number N of modes; right, the largest relative distance of a multiplier from the cone of the first R "
+        "generators, for every dual strategy. Each curve is that of the tightest tolerance, which contains the others."
+    )
 
 
-def orthogonality(data: Data) -> Figure | None:
+def orthogonality(data: Data) -> CaptionedFigure | None:
     """Relative distance of every generator from the cone of the preceding ones (paper, Figures 6 and 12)."""
     found = data.histories[(data.histories["stage"] == "cone") & (data.histories["quantity"] == "e_orth")]
     if found.empty:
         return None
-    sheet = Sheet(1, 1, f"{data.problem}: angles between generators")
-    _cones(sheet.panels[0], found, "number of preceding generators r", "e_orth(r)")
-    return sheet.finish()
+    cones = _in_panels(found)
+    sheet = Sheet.of(len(cones), f"{data.problem}: angles between generators", share="all")
+    for panel, names in zip(sheet.panels, cones, strict=False):
+        _cones(panel, names, "number of preceding generators r", "e_orth(r)")
+    return sheet.finish(
+        f"Distance e_orth(r) of generator r + 1 of {data.problem} from the cone of the r generators before it, for "
+        "every dual strategy: 1 for a generator orthogonal to that cone, near 0 for one that is nearly in it."
+    )
 
 
-def cone_errors(title: str, errors: Mapping[str, Array]) -> Figure:
+def cone_errors(title: str, errors: Mapping[str, Array]) -> CaptionedFigure:
     """Relative errors of cones, by dual strategy, against their numbers of generators 0 … R."""
-    sheet = Sheet(1, 1, f"{title}: projection errors of the multipliers")
-    for k, (dual, values) in enumerate(errors.items(), 1):
-        plot(sheet.panels[0], np.arange(len(values)), positive(values), k, dual)
-    sheet.panels[0].set(xlabel="number of generators R", ylabel="largest relative error of the cone", yscale="log")
-    counted(sheet.panels[0])
-    return sheet.finish()
+    groups = parts(sorted(errors), SERIES)
+    sheet = Sheet.of(len(groups), f"{title}: projection errors of the multipliers", share="all")
+    looks = Looks(map(Series, errors))
+    for panel, names in zip(sheet.panels, groups, strict=False):
+        for dual in names:
+            plot(panel, np.arange(len(errors[dual])), positive(errors[dual]), looks[Series(dual)], dual)
+        panel.set(xlabel="number of generators R", ylabel="largest relative error of the cone", yscale="log")
+        counted(panel)
+    return sheet.finish(
+        f"Largest relative distance of a multiplier of {title} from the cone of the first R generators, for every dual "
+        "strategy."
+    )
 
 
-def _cones(axes: Axes, histories: pd.DataFrame, xlabel: str, ylabel: str) -> None:
-    """A line for the longest cone of every dual strategy."""
-    for k, (dual, found) in enumerate(longest(histories), 1):
-        plot(axes, found["step"], positive(found["value"]), k, dual)
+def _in_panels(histories: pd.DataFrame) -> list[dict[str, pd.DataFrame]]:
+    """The longest cone of every dual strategy, in groups of as many as a panel takes."""
+    found = [(str(dual), rows) for dual, rows in longest(histories)]
+    return [dict(group) for group in parts(found, SERIES)] or [{}]
+
+
+def _cones(axes: Axes, cones: Mapping[str, pd.DataFrame], xlabel: str, ylabel: str) -> None:
+    """A line for every cone."""
+    looks = Looks(map(Series, cones))
+    for dual, found in cones.items():
+        plot(axes, found["step"], positive(found["value"]), looks[Series(dual)], dual)
     axes.set(xlabel=xlabel, ylabel=ylabel, yscale="log")
     counted(axes)
 
 
-def enrichment(data: Data) -> Figure | None:
+def enrichment(data: Data) -> CaptionedFigure | None:
     """Fixed enrichments: σ and min β against the vectors added, β over the validation set (paper, Figures 7 and 14).
 
-    σ and min β are those over the training set, at the tightest tolerance of every strategy.
+    One row of panels for every pair; the histories are those of the tolerance that went farthest, which contain the
+    others.
     """
     fixed = data.queries[data.queries["enrichment_kind"] == Kind.FIXED]
     if fixed.empty:
         return None
-    sheet = Sheet(fixed["pair"].nunique(), 3, f"{data.problem}, {data.duals[0]}: fixed enrichments")
-    styles: dict[str, int] = {}
-    for row in fixed.drop_duplicates(["primal", "primal_tol"]).itertuples():
-        style_of(label(row.primal, row.primal_tol), styles)  # styles in the order of the tables, whatever panels show
-    for row, (pair, group) in enumerate(fixed.groupby("pair", sort=False)):
+    rows = data.on_page(_rows(fixed), DEEP)
+    sheet = Sheet(len(rows), 3, f"{data.problem}, {data.duals[0]}: fixed enrichments", sharey="col")
+    known = fixed.drop_duplicates(["primal", "primal_tol"])
+    looks = Looks(starmap(series, zip(known["primal"], known["primal_tol"], strict=True)))
+    for row, (title, pair, names) in enumerate(rows):
         histories = data.histories[(data.histories["stage"] == "enrichment") & (data.histories["pair"] == pair)]
-        steps = _tightest(histories)
+        steps = _tightest(histories[histories["primal"].isin({name for name, _ in names})])
         for column, (quantity, ylabel) in enumerate(GROWTH.items()):
             panel = sheet.at(row, column)
             for name, one in by_strategy(steps[steps["quantity"] == quantity]):
-                plot(panel, one["step"], positive(one["value"], SINE_FLOOR), style_of(name, styles), name)
-            panel.set(xlabel="vectors added", ylabel=ylabel, title=dimensions(group), xlim=(0, None), yscale="log")
+                look = looks[series(one["primal"].iloc[0], one["primal_tol"].iloc[0])]
+                plot(panel, one["step"], positive(one["value"], SINE_FLOOR), look, name)
+            panel.set(xlabel="vectors added", ylabel=ylabel, title=title, xlim=(0, None), yscale="log")
             counted(panel)
-        panel = sheet.at(row, 2)
-        for name, one in by_strategy(one_solver(group)):
-            plot(panel, np.arange(1, len(one) + 1), np.sort(one["beta_span"]), style_of(name, styles), name)
-        panel.set(xlabel="validation parameters, sorted", ylabel="β over span", title=dimensions(group), ylim=(0, None))
+        _validation(sheet.at(row, 2), data, fixed[fixed["pair"] == pair], names, looks)
+        sheet.at(row, 2).set_title(title)
+    sheet.at(0, 2).set_ylim(0, None)  # of all rows: they share the axis
+    tolerances = ", ".join(
+        f"{primal} at δ = {some(mine['primal_tol'].dropna())}"
+        for primal, mine in fixed.groupby("primal", sort=False)
+        if mine["primal_tol"].notna().any()
+    )
+    return sheet.finish(
+        f"Fixed enrichments of {data.problem} with the cones of {data.duals[0]}, a row for every pair (N, R). Left, "
+        "the largest σ over the training set against the number of vectors added, for strategies that report it; "
+        "middle, the smallest β over the span on the training set; both for the tolerance that went farthest. Right, "
+        f"β over the span at the validation parameters, for every tolerance{f' ({tolerances})' * bool(tolerances)}."
+        f"{data.part}"
+    )
+
+
+def enriched(data: Data) -> int:
+    """Number of rows of panels of `enrichment`."""
+    return len(_rows(data.queries[data.queries["enrichment_kind"] == Kind.FIXED]))
+
+
+def _rows(fixed: pd.DataFrame) -> list[tuple[str, str, list[tuple[str, float]]]]:
+    """Title, pair, and strategies with their tolerances of every row of panels."""
+    return [
+        (f"{dimensions(group)}{f', strategies {k} of {len(groups)}' * (len(groups) > 1)}", str(pair), names)
+        for pair, group in fixed.groupby("pair", sort=False)
+        for groups in [_enrichments(group)]
+        for k, names in enumerate(groups, 1)
+    ]
+
+
+def _enrichments(group: pd.DataFrame) -> list[list[tuple[str, float]]]:
+    """Strategies and tolerances of fixed enrichments, in groups of as many as a panel takes."""
+    found = group.drop_duplicates(["primal", "primal_tol"]).sort_values(["primal", "primal_tol"])
+    return parts(list(zip(found["primal"], found["primal_tol"], strict=True)), SERIES)
+
+
+def _validation(panel: Axes, data: Data, queries: pd.DataFrame, names: list[tuple[str, float]], looks: Looks) -> None:
+    """β at the validation parameters: over the only parameter, or each curve sorted for itself."""
+    wanted = {str(series(*name)) for name in names}
+    for name, one in by_strategy(one_solver(queries)):
+        of = series(one["primal"].iloc[0], one["primal_tol"].iloc[0])
+        if str(of) not in wanted:
+            continue
+        if data.parameter:
+            ordered = one.sort_values("mu_1")
+            plot(panel, ordered["mu_1"], ordered["beta_span"], looks[of], name)
+        else:
+            plot(panel, np.arange(1, len(one) + 1), np.sort(one["beta_span"]), looks[of], name)
+    xlabel = data.parameter or "validation parameters, sorted by β"
+    panel.set(xlabel=xlabel, ylabel="β over span")
+    if not data.parameter:
         counted(panel)
-    return sheet.finish()
 
 
 def _tightest(steps: pd.DataFrame) -> pd.DataFrame:

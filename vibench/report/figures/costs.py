@@ -2,16 +2,25 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 
 from vibench.report.common_queries import on_common_queries
-from vibench.report.figures.data import Data, best_solver, by_dimensions, label
-from vibench.report.figures.style import BLACK, POINTS, Sheet, legend_label, line, plot, style_of
+from vibench.report.figures.data import (
+    Data,
+    best_solver,
+    by_dimensions,
+    label,
+    parts,
+    point_names,
+    series,
+)
+from vibench.report.figures.looks import HIGH_FIDELITY_LOOK, Looks, Series
+from vibench.report.figures.style import ABREAST, DEEP, SERIES, CaptionedFigure, Layout, Sheet, plot, positive, scatter
 from vibench.results.break_even import HIGH_FIDELITY, Meaning
 
 ERRORS = {"error_u_mean": "mean relative error of u", "error_lambda_mean": "mean relative error of λ"}
@@ -19,21 +28,17 @@ ERRORS = {"error_u_mean": "mean relative error of u", "error_lambda_mean": "mean
 MOST_QUERIES = 1e6
 """Total cost is drawn up to this number of queries."""
 
-ABREAST = 6
-"""Panels in a row."""
-
 MARKS = {Meaning.FROM: ">", Meaning.UNTIL: "<"}
 
 
-def dimension(data: Data) -> Figure | None:
+def dimension(data: Data) -> CaptionedFigure | None:
     """Errors against the dimension of the reduced problem, N + S + R; means over the queries that all cells solved."""
-    cells = best_solver(data.cells)
-    cells = cells[(cells["assembly"] == "full") | ~(cells["assembly"] == "full").any()]
+    cells = _of_one_assembly(best_solver(data.cells))
     size = cells["N"] + cells["enrichment"].fillna(0) + cells["R"]
     return _scatter(data, cells, size, "dimension N + S + R", "errors against dimension")
 
 
-def work_precision(data: Data) -> Figure | None:
+def work_precision(data: Data) -> CaptionedFigure | None:
     """Errors against the time of a query; no cell is both faster and more accurate than those on the line.
 
     Errors are means over the queries that all of these cells solved; a cell that solved fewer than half has no point.
@@ -44,33 +49,105 @@ def work_precision(data: Data) -> Figure | None:
 
 def _scatter(
     data: Data, cells: pd.DataFrame, x: pd.Series, xlabel: str, title: str, *, front: bool = False
-) -> Figure | None:
-    """One point per cell: colour and marker for primal strategy and assembly, filling for the dual strategy."""
+) -> CaptionedFigure | None:
+    """One point per cell with its (N, R) and δ; a row of panels for every dual strategy and assembly."""
     compared = on_common_queries(cells[x.notna()], data.queries)
     cells = compared.cells[compared.cells[list(ERRORS)].notna().any(axis=1)]
     if cells.empty:
         return None
-    sheet = Sheet(1, 2, f"{data.problem}, {cells['solver'].iloc[0]}: {title}{compared.over}")
-    kinds = list(dict.fromkeys(zip(cells["primal"], cells["assembly"], strict=True)))
-    duals = list(cells["dual"].unique())
-    for panel, (column, ylabel) in zip(sheet.panels, ERRORS.items(), strict=True):
-        for (primal, assembly, dual), mine in cells.groupby(["primal", "assembly", "dual"]):
-            point = _point(kinds.index((primal, assembly)), duals.index(dual))
-            name = f"{label(primal, None, assembly)}, {dual}"
-            panel.plot(x[mine.index], mine[column], label=legend_label(name), **point)
-        if front:
-            drawn = cells[cells[column].notna()]
-            line_of = _front(x[drawn.index].to_numpy(float), drawn[column].to_numpy(float))
-            panel.plot(*line_of, color="0.6", linewidth=0.8, drawstyle="steps-post", zorder=0)
-        panel.set(xlabel=xlabel, ylabel=ylabel, xscale="log", yscale="log")
-    return sheet.finish()
+    rows = data.on_page(list(_rows(cells)), DEEP)
+    if not rows:
+        return None
+    heading = f"{data.problem}, {cells['solver'].iloc[0]}: {title}{compared.over}"
+    sheet = Sheet(len(rows), 2, heading, Layout(width=4.4, height=3.3), "all", "col")
+    looks = Looks(Series(str(primal)) for primal in cells["primal"].unique())
+    for row, (name, mine, names) in enumerate(rows):
+        for place, (column, ylabel) in enumerate(ERRORS.items()):
+            panel = sheet.at(row, place)
+            drawn = mine[mine[column].notna()]
+            for primal in names:
+                one = drawn[drawn["primal"] == primal]
+                scatter(panel, x[one.index], one[column], looks[Series(str(primal))], str(primal))
+            for index, text in point_names(drawn[drawn["primal"].isin(names)]).items():
+                sheet.label(panel, x[index], drawn.at[index, column], text)
+            if front:
+                line = _front(x[drawn.index].to_numpy(float), drawn[column].to_numpy(float))
+                panel.plot(*line, color="0.6", linewidth=0.8, drawstyle="steps-post", zorder=0)
+            panel.set(xlabel=xlabel, ylabel=ylabel, title=name, xscale="log", yscale="log")
+    over = compared.over or f" over all {compared.asked} queries"
+    beyond = "The thin line is the Pareto front: no model is both faster and more accurate." if front else ""
+    return sheet.finish(
+        f"Relative errors of u (left) and of λ (right) of the reduced models of {data.problem}, means{over}, against "
+        f"the {xlabel}; solver {cells['solver'].iloc[0]}. A row for every dual strategy and assembly, a point for "
+        "every model, with its (N, R) and the tolerance δ of its primal strategy; a number alone is another δ. "
+        f"{beyond}"
+        f"{data.part}"
+    )
 
 
-def _point(k: int, dual: int) -> dict[str, Any]:
-    style = line(k)
-    faces = (style["color"], "white", "0.75")
-    look = {"markersize": 5, "markerfacecolor": faces[dual % len(faces)], "markeredgewidth": 1.0 + dual // len(faces)}
-    return style | POINTS | look
+def sized(data: Data) -> int:
+    """Number of rows of panels of `dimension`."""
+    return len(list(_rows(_of_one_assembly(best_solver(data.cells)))))
+
+
+def timed(data: Data) -> int:
+    """Number of rows of panels of `work_precision`."""
+    return len(list(_rows(best_solver(data.cells))))
+
+
+def _of_one_assembly(cells: pd.DataFrame) -> pd.DataFrame:
+    """Cells of full assembly, where there are any: reduced assembly changes no dimension."""
+    return cells[(cells["assembly"] == "full") | ~(cells["assembly"] == "full").any()]
+
+
+def _rows(cells: pd.DataFrame) -> Iterator[tuple[str, pd.DataFrame, list[str]]]:
+    """Title, cells and primal strategies of every row of panels."""
+    for (dual, assembly), mine in cells.groupby(["dual", "assembly"], sort=False):
+        groups = parts([str(name) for name in mine["primal"].unique()], SERIES)
+        how = f", {assembly} assembly" * (assembly != "full")
+        for k, names in enumerate(groups, 1):
+            yield f"{dual}{how}{f', strategies {k} of {len(groups)}' * (len(groups) > 1)}", mine, names
+
+
+def outputs(data: Data) -> CaptionedFigure | None:
+    """Errors of every quantity of interest, over its largest value of the training set, against the time of a query."""
+    panels = data.on_page(_reported(data), ABREAST * DEEP)
+    if not panels:
+        return None
+    solver = data.cells.loc[data.cells["cell"] == panels[0][1]["cell"].iloc[0], "solver"].iloc[0]
+    sheet = Sheet.of(len(panels), f"{data.problem}, {solver}: quantities of interest")
+    looks = Looks(Series(name) for _, _, names in panels for name in names)
+    for panel, (title, mine, names) in zip(sheet.panels, panels, strict=True):
+        for name in names:
+            one = mine[mine["primal"] == name]
+            scatter(panel, 1e3 * one["online_s"], positive(one["error_scaled_mean"]), looks[Series(name)], name)
+        for index, text in point_names(mine[mine["primal"].isin(names)]).items():
+            sheet.label(panel, 1e3 * mine.at[index, "online_s"], mine.at[index, "error_scaled_mean"], text)
+        panel.set(xlabel="mean time of a query [ms]", ylabel="mean error over the scale", title=title)
+        panel.set(xscale="log", yscale="log")
+    return sheet.finish(
+        f"Mean errors of the quantities of interest of {data.problem} over their largest value on the training set, "
+        f"against the mean time of a query; solver {solver}. A panel for every quantity, dual strategy and assembly, a "
+        "point for every model, with its (N, R) and the tolerance δ of its primal strategy; a number alone is another "
+        f"δ.{data.part}"
+    )
+
+
+def reported(data: Data) -> int:
+    """Number of panels of `outputs`."""
+    return len(_reported(data))
+
+
+def _reported(data: Data) -> list[tuple[str, pd.DataFrame, list[str]]]:
+    """Title, models and primal strategies of every panel of `outputs`."""
+    known = ["cell", "output", "error_scaled_mean"]
+    found = data.outputs.loc[data.outputs["error_scaled_mean"].notna(), known]
+    mine = best_solver(data.cells).merge(found, "inner", "cell")
+    return [
+        (f"{name}, {title}", rows, names)
+        for name, of_output in mine.groupby("output", sort=False)
+        for title, rows, names in _rows(of_output)
+    ]
 
 
 def _front(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -81,31 +158,59 @@ def _front(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return x[order][kept], y[order][kept]
 
 
-def total_cost(data: Data) -> Figure | None:
+def total_cost(data: Data) -> CaptionedFigure | None:
     """Offline and online seconds against the number of queries; triangles mark where two models break even."""
     cells = best_solver(data.cells)
     if cells.empty:
         return None
-    shown = by_dimensions(cells)
-    columns = min(len(shown), ABREAST)
-    sheet = Sheet(-(-len(shown) // columns), columns, f"{data.problem}, {cells['solver'].iloc[0]}: total cost")
-    styles: dict[str, int] = {}
+    shown = data.on_page(_pairs(cells), DEEP * ABREAST)
+    sheet = Sheet.of(len(shown), f"{data.problem}, {cells['solver'].iloc[0]}: total cost", share="all")
+    looks = Looks(_model(cell) for _, mine in shown for cell in mine.itertuples())
     for panel, (title, mine) in zip(sheet.panels, shown, strict=False):
-        # The most vectors stand for every strategy and assembly: a line per tolerance would hide the crossings.
-        added = mine.assign(added=mine["enrichment"].fillna(0)).sort_values("added", ascending=False, kind="stable")
-        most = added.drop_duplicates(["primal", "primal_options", "assembly"]).sort_index()
         queries = np.geomspace(1.0, MOST_QUERIES, 61)
-        model = most.iloc[0]
-        plot(panel, queries, model["hf_setup_s"] + queries * model["hf_s"], BLACK, HIGH_FIDELITY)
-        for cell in most.itertuples():
+        model = mine.iloc[0]
+        plot(panel, queries, model["hf_setup_s"] + queries * model["hf_s"], HIGH_FIDELITY_LOOK, HIGH_FIDELITY)
+        for cell in mine.itertuples():
             name = label(cell.primal, cell.primal_tol, cell.assembly)
-            plot(panel, queries, cell.offline_s + queries * cell.online_s, style_of(name, styles), name)
-        _marks(panel, most, data.thresholds)
+            plot(panel, queries, cell.offline_s + queries * cell.online_s, looks[_model(cell)], name)
+        _marks(panel, mine, data.thresholds)
         panel.set(xlabel="number of queries", ylabel="offline + online [s]", title=title)
         panel.set(xlim=(1.0, MOST_QUERIES), xscale="log", yscale="log")
-    for panel in sheet.panels[len(shown) :]:
-        panel.set_axis_off()
-    return sheet.finish()
+    return sheet.finish(
+        f"CPU seconds offline and online of the models of {data.problem} together against the number of queries; "
+        f"solver {cells['solver'].iloc[0]}. A panel for every dual strategy and pair (N, R); every primal strategy and "
+        "assembly is shown at the tolerance δ with the most vectors. Triangles mark where two models cost the same and "
+        "point to the side on which the reduced model is cheaper than the high-fidelity one, or the fixed enrichment "
+        "than the one per parameter; bars are 95 % intervals of that number of queries."
+        f"{data.part}"
+    )
+
+
+def pairs(data: Data) -> int:
+    """Number of panels of `total_cost`."""
+    return len(_pairs(best_solver(data.cells)))
+
+
+def _pairs(cells: pd.DataFrame) -> list[tuple[str, pd.DataFrame]]:
+    """Title and cells of every panel."""
+    return [
+        (f"{title}{f', models {k} of {len(groups)}' * (len(groups) > 1)}", pd.concat(group))
+        for title, mine in by_dimensions(cells)
+        for groups in [parts([rows for _, rows in _most_vectors(mine).groupby("cell", sort=False)], SERIES - 1)]
+        for k, group in enumerate(groups, 1)
+    ]
+
+
+def _most_vectors(cells: pd.DataFrame) -> pd.DataFrame:
+    """The cells with the most vectors of every strategy and assembly: a line per tolerance would hide the crossings."""
+    added = cells.assign(added=cells["enrichment"].fillna(0)).sort_values(
+        ["added", "primal_tol"], ascending=[False, True], kind="stable"
+    )
+    return added.drop_duplicates(["primal", "primal_options", "assembly"]).sort_index()
+
+
+def _model(cell: Any) -> Series:
+    return series(cell.primal, cell.primal_tol, cell.assembly)
 
 
 def _marks(panel: Axes, cells: pd.DataFrame, thresholds: pd.DataFrame) -> None:

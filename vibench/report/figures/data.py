@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+import json
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
-from itertools import count
+from itertools import count, pairwise
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
+import numpy as np
 import pandas as pd
 
+from vibench.report.figures.looks import Series
 from vibench.results import pictures, tables
 
-TABLES = ("cells", "queries", "histories", "thresholds")
+TABLES = ("cells", "queries", "histories", "thresholds", "outputs")
 
 PAIR = ["pod_tol", "pod_size", "dual_tol", "dual_size"]
 """Tolerances or prescribed sizes that determine the dimensions (N, R)."""
@@ -22,26 +25,60 @@ PROBLEM = ["problem", "problem_options"]
 
 PRIMAL = ["primal", "primal_options", "primal_tol"]
 
+Panel = TypeVar("Panel")
+
 
 @dataclass(frozen=True)
 class Data:
     """The tables of one problem of a run, and of one training set where it has several.
+
+    They are what figures and findings are made from (`vibench.ProblemTables`).
 
     Each has a column `pair`, a text of the values of `PAIR`; queries also have the columns `enrichment_kind`, `N` and
     `R` of their cells.
     """
 
     problem: str
+    problem_name: str
+    problem_options: Mapping[str, Any]
     cells: pd.DataFrame
     queries: pd.DataFrame
     histories: pd.DataFrame
     thresholds: pd.DataFrame
+    outputs: pd.DataFrame
     pictures: tuple[pictures.Shown, ...]
+    page: tuple[int, int] | None = None
+    """Which of how many pages of a long figure is drawn, from 0; `None` for all panels in one figure."""
+
+    def on_page(self, panels: list[Panel], most: int) -> list[Panel]:
+        """The panels of the page, of which each has at most `most`."""
+        return panels if self.page is None else panels[self.page[0] * most : (self.page[0] + 1) * most]
+
+    @property
+    def part(self) -> str:
+        """Which page it is, as a sentence; "" if there is one."""
+        return "" if self.page is None or self.page[1] < 2 else f" Part {self.page[0] + 1} of {self.page[1]}."
 
     def of_dual(self, dual: str) -> Data:
         """The rows of one dual strategy."""
         frames = {name: getattr(self, name) for name in TABLES}
         return replace(self, **{name: frame[frame["dual"] == dual] for name, frame in frames.items()})
+
+    @property
+    def machine(self) -> str:
+        """Machines that measured the seconds."""
+        return ", ".join(str(name) for name in self.cells["machine"].dropna().unique())
+
+    @property
+    def parameter(self) -> str:
+        """Name of the only parameter with its unit, for an axis; "" if there are several."""
+        if self.queries.filter(regex=r"^mu_\d+$").notna().any().sum() != 1:
+            return ""
+        # the titles of pictures, "radius = 0.7 m", are the one place where a results file has the name and the unit
+        named = (one.title.rpartition(" = ") for one in self.pictures if one.picture is not None)
+        name, _, value = next(named, ("", "", ""))
+        unit = value.partition(" ")[2]
+        return f"{name} µ" * bool(name) + "µ" * (not name) + f" [{unit}]" * bool(unit)
 
     @property
     def duals(self) -> list[str]:
@@ -58,7 +95,7 @@ def problems(path: Path) -> Iterator[tuple[str, Data]]:
     if read["queries"].empty:
         return
     for axis in ("training", "dual", "primal"):
-        _tell_apart(axis, [frame for frame in read.values() if axis in frame])
+        _tell_apart(axis, read["cells"], [frame for frame in read.values() if axis in frame])
     read["queries"] = read["queries"].merge(read["cells"][["cell", "enrichment_kind", "N", "R"]], "left", "cell")
     for frame in read.values():
         frame["pair"] = [str(pair) for pair in frame[PAIR].astype(float).itertuples(index=False, name=None)]
@@ -72,18 +109,46 @@ def problems(path: Path) -> Iterator[tuple[str, Data]]:
             table: frame[(frame[PROBLEM] == problem).all(axis=1) & frame["training"].isin([training, None])]
             for table, frame in read.items()
         }
-        yield name, Data(label, **mine, pictures=tuple(one for one in shown if one.key == tuple(problem)))
+        drawn = tuple(one for one in shown if one.key == tuple(problem))
+        options = _options(problem[1])
+        yield name, Data(label, _plugin_name(mine["cells"], "problem"), options, **mine, pictures=drawn)
 
 
-def _tell_apart(axis: str, frames: list[pd.DataFrame]) -> None:
-    """Number the labels of a plugin that occurs with different options."""
+def _tell_apart(axis: str, cells: pd.DataFrame, frames: list[pd.DataFrame]) -> None:
+    """Add the options to the labels of strategies, so that a label means the same strategy in every run.
+
+    A label that the study gives stands for the options; they are added where several strategies have the same one.
+    """
     columns = [axis, f"{axis}_options"]
     found = pd.concat([frame[columns].dropna().drop_duplicates() for frame in frames]).drop_duplicates()
-    found["label"] = found[axis] + " (" + (found.groupby(axis).cumcount() + 1).astype(str) + ")"
-    numbered = found[found.duplicated(axis, keep=False)].set_index(columns)["label"]
+    names = {tuple(key): _plugin_name(rows, axis) for key, rows in cells.groupby(columns)}
+    shared = found.duplicated(axis, keep=False)
+    labels = {}
+    for (label, text), several in zip(found.itertuples(index=False, name=None), shared, strict=True):
+        options = _options(text)
+        named = ", ".join(f"{name} = {value}" for name, value in options.items())
+        if options and (several or names.get((label, text)) == label):
+            labels[label, text] = f"{label} ({named})"
     for frame in frames:
-        rows = frame[axis].isin(numbered.index.get_level_values(0))
-        frame.loc[rows, axis] = numbered.loc[pd.MultiIndex.from_frame(frame.loc[rows, columns])].to_numpy()
+        keys = zip(frame[axis], frame[columns[1]], strict=True)
+        frame[axis] = pd.Series([labels.get(key, key[0]) for key in keys], frame.index, frame[axis].dtype)
+
+
+def _plugin_name(cells: pd.DataFrame, axis: str) -> str:
+    """The name under which the plugin on an axis of some cells is registered; "" where no cell says so."""
+    for definition in cells["definition"].dropna():
+        plugin = _options(definition).get(axis)
+        return str(plugin.get("name", "")) if isinstance(plugin, dict) else ""
+    return ""
+
+
+def _options(text: Any) -> dict[str, Any]:
+    """A JSON object, such as the options of a plugin; empty where a strangers' file has something else."""
+    try:
+        found = json.loads(text) if isinstance(text, str) else {}
+    except ValueError:
+        return {}
+    return found if isinstance(found, dict) else {}
 
 
 def dimensions(rows: pd.DataFrame) -> str:
@@ -107,10 +172,41 @@ def by_strategy(rows: pd.DataFrame) -> Iterator[tuple[str, pd.DataFrame]]:
         yield label(primal, tolerance), group
 
 
+def series(name: Any, tolerance: Any = None, assembly: str = "full") -> Series:
+    """A primal strategy, told from itself at other tolerances and assemblies."""
+    variant = "" if pd.isna(tolerance) else float(tolerance)
+    return Series(str(name), variant if assembly in {"full", ""} else f"{assembly} {variant}")
+
+
+def some(values: Any, most: int = 6) -> str:
+    """Numbers as an enumeration, in their order; the middle of many is left out."""
+    known = [f"{value:g}" for value in np.unique(np.asarray(values, float))]
+    return ", ".join(known if len(known) <= most else [*known[: most - 1], "…", known[-1]])
+
+
+def parts(items: list[Any], most: int) -> list[list[Any]]:
+    """A list in parts of at most `most` items, of about the same size."""
+    count = -(-len(items) // most)
+    ends = [round(k * len(items) / count) for k in range(count + 1)] if count else []
+    return [items[a:b] for a, b in pairwise(ends)]
+
+
 def label(name: Any, tolerance: Any = None, assembly: str = "full") -> str:
     """A primal strategy with its tolerance and, unless it is full, its assembly."""
     with_tolerance = str(name) if pd.isna(tolerance) else f"{name}, δ = {tolerance:g}"
     return with_tolerance if assembly in ("full", "") else f"{with_tolerance}, {assembly}"
+
+
+def point_names(cells: pd.DataFrame) -> dict[Any, str]:
+    """(N, R) and δ of cells, for labels at their points, by index; of several tolerances only the first has (N, R)."""
+    found, named = {}, set()
+    for index, cell in cells.iterrows():
+        size = f"({cell['N']:.0f}, {cell['R']:.0f})"
+        tolerance = "" if pd.isna(cell["primal_tol"]) else f"{cell['primal_tol']:g}"
+        key = (cell["primal"], cell["dual"], size)
+        found[index] = tolerance if tolerance and key in named else size + f", δ = {tolerance}" * bool(tolerance)
+        named.add(key)
+    return found
 
 
 def one_solver(queries: pd.DataFrame) -> pd.DataFrame:
@@ -140,14 +236,29 @@ def best_solver(cells: pd.DataFrame) -> pd.DataFrame:
     return timed[(timed["solver"] == solver) & (timed["accuracy"] == accuracy)]
 
 
+TIED = 1e-6
+"""Scores of tolerances that differ by less, relative to the largest one, are equal."""
+
+
 def at_best_tolerance(rows: pd.DataFrame, score: pd.Series) -> pd.DataFrame:
     """Rows of every primal strategy at the tolerance of its largest score, and all rows without a tolerance.
 
-    `score` has the index (primal, primal_tol); of equal scores the first counts.
+    `score` has the index (primal, primal_tol). Of tolerances whose scores are equal up to round-off the largest counts,
+    so that a figure does not depend on the last digits of a run.
     """
-    best = score.sort_values(ascending=False, kind="stable").reset_index().drop_duplicates("primal")
-    tolerances = best.set_index("primal")["primal_tol"]
+    known = score.dropna().rename("score").reset_index()
+    top = known.groupby("primal")["score"].transform("max")
+    near = known[known["score"] >= top - TIED * top.abs()]
+    tolerances = near.groupby("primal")["primal_tol"].max()
     return rows[rows["primal_tol"].isna() | (rows["primal_tol"] == rows["primal"].map(tolerances))]
+
+
+def common_tolerances(rows: pd.DataFrame) -> pd.DataFrame:
+    """The rows at tolerances that a strategy has at every pair, where it has such ones."""
+    pairs = rows.groupby(["primal", "primal_tol"])["pair"].nunique()
+    everywhere = pairs[pairs == rows.groupby("primal")["pair"].nunique().reindex(pairs.index, level="primal")]
+    common = pd.MultiIndex.from_frame(rows[["primal", "primal_tol"]]).isin(everywhere.index)
+    return rows[common | ~rows["primal"].isin(everywhere.index.get_level_values("primal"))]
 
 
 def longest(histories: pd.DataFrame) -> Iterator[tuple[Any, pd.DataFrame]]:

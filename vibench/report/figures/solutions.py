@@ -2,55 +2,162 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from typing import Any
+
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
-from matplotlib.figure import Figure
 from matplotlib.tri import Triangulation
 
 from vibench.arrays import Array
+from vibench.interfaces.problem import Picture
 from vibench.report.figures.data import Data
-from vibench.report.figures.style import COLOURS, Layout, Sheet
+from vibench.report.figures.looks import BLACK, COLOURS
+from vibench.report.figures.style import ABREAST, CaptionedFigure, Layout, Sheet
+
+Limits = tuple[float, float]
+"""Range of the values of a field."""
 
 MAP = "cividis"
 """A colour map of evenly rising lightness, legible in grey print and to colour-blind readers."""
 
+EDGE = "#D55E00"
+"""Colour of the boundary of the contact."""
 
-def solutions(data: Data) -> Figure | None:
-    """High-fidelity solution above and multiplier below, at some training parameters."""
-    shown = [(one.title, one.picture) for one in data.pictures if one.picture is not None]
-    if not shown:
-        return None
-    layout = Layout(width=3.3, height=2.9, right=1.0)  # right: room for a colour bar
-    sheet = Sheet(2, len(shown), f"{data.problem}: high-fidelity solutions", layout)
-    for column, (title, picture) in enumerate(shown):
+
+def solutions(data: Data) -> CaptionedFigure | None:
+    """High-fidelity solution above and multiplier below, at some training parameters; one range of values for all."""
+    shown = [(one.title, one.picture) for one in data.pictures if one.picture is not None][:ABREAST]
+    return draw_solutions(f"{data.problem}: high-fidelity solutions", shown) if shown else None
+
+
+def draw_solutions(title: str, shown: Sequence[tuple[str, Picture]]) -> CaptionedFigure:
+    """A column for each of some titled pictures of one problem: the solution above, the multiplier below."""
+    pictures = [picture for _, picture in shown]
+    layout = Layout(width=2.7, height=2.4, tail=0.9)
+    sheet = Sheet(2, len(shown), title, layout)
+    ranges = (_range([one.values for one in pictures]), _range([one.multiplier for one in pictures]))
+    for column, (heading, picture) in enumerate(shown):
         field, multiplier = sheet.at(0, column), sheet.at(1, column)
-        field.set_title(title)
-        if len(picture.points) == 1:
-            _graph(field, picture.points[0], picture.values, picture.name, 0, "default")
-        else:
-            mesh = Triangulation(picture.points[0], picture.points[1], picture.triangles.T)
-            colours = field.tripcolor(mesh, picture.values, shading="gouraud", cmap=MAP, rasterized=True)
-            field.grid(visible=False)
-            _plane(field, colours, picture.name)
-        if len(picture.positions) == 1:
-            _graph(multiplier, picture.positions[0], picture.multiplier, picture.multiplier_name, 1, "steps-mid")
-        else:
-            size = float(np.clip(3000.0 / max(len(picture.multiplier), 1), 4.0, 40.0))
-            x, y = picture.positions
-            points = multiplier.scatter(x, y, c=picture.multiplier, s=size, cmap=MAP, rasterized=True)
-            _plane(multiplier, points, picture.multiplier_name)
-    return sheet.finish()
+        field.set_title(heading, fontsize=8)
+        last = column == len(shown) - 1
+        draw_field(field, picture, ranges[0], bar=last)
+        draw_multiplier(multiplier, picture, ranges[1], bar=last)
+    for row, places in enumerate(([one.points for one in pictures], [one.positions for one in pictures])):
+        for panel in (sheet.at(row, column) for column in range(len(shown))):
+            name_axes(panel, pictures[0].length_unit, places)
+    first = pictures[0]
+    parameters = "; ".join(heading for heading, _ in shown)
+    return sheet.finish(
+        f"High-fidelity solutions ({title.partition(':')[0]}) at {parameters}: {first.name} above, from "
+        f"{_ends(ranges[0])}; {first.multiplier_name} below, from {_ends(ranges[1])}. Colours and axes of values have "
+        "the same range at all parameters. The orange line is the boundary of the contact, where the multiplier "
+        "becomes zero."
+    )
 
 
-def _graph(axes: Axes, x: Array, values: Array, name: str, k: int, drawstyle: str) -> None:
+def draw_field(axes: Axes, picture: Picture, limits: Limits, *, bar: bool = True) -> None:
+    """The solution on its mesh: a filled field in the plane, a graph on a line."""
+    if len(picture.points) == 1:
+        _graph(axes, picture.points[0], picture.values, picture.name, limits, COLOURS[0], "default")
+        _ends_of_contact(axes, picture)
+        return
+    mesh = Triangulation(picture.points[0], picture.points[1], picture.triangles.T)
+    filled = axes.tripcolor(mesh, picture.values, shading="gouraud", **_colours(limits))
+    _contact_boundary(axes, picture)
+    _plane(axes, filled, picture.name if bar else "")
+
+
+def draw_multiplier(axes: Axes, picture: Picture, limits: Limits, *, bar: bool = True) -> None:
+    """The multiplier: a filled field where its points are nodes of the mesh, else points; on a line a graph."""
+    if len(picture.positions) == 1:
+        name = picture.multiplier_name
+        _graph(axes, picture.positions[0], picture.multiplier, name, limits, COLOURS[2], "steps-mid")
+        _ends_of_contact(axes, picture)
+        return
+    part = _on_mesh(picture)
+    filled: ScalarMappable
+    if part is not None:
+        filled = axes.tripcolor(part, picture.multiplier, shading="gouraud", **_colours(limits))
+        _contact_boundary(axes, picture)
+    else:
+        size = float(np.clip(3000.0 / max(len(picture.multiplier), 1), 4.0, 40.0))
+        x, y = picture.positions
+        filled = axes.scatter(x, y, c=picture.multiplier, s=size, **_colours(limits))
+    _plane(axes, filled, picture.multiplier_name if bar else "")
+
+
+def name_axes(axes: Axes, unit: str, places: Sequence[Array]) -> None:
+    """Name the axes of space, with the same limits wherever the points of these pictures are drawn."""
+    known = np.hstack(places)
+    ends = np.array([known.min(axis=1), known.max(axis=1)]) if known.size else np.zeros((2, len(known)))
+    room = 0.04 * float((ends[1] - ends[0]).max()) or 0.5
+    for name, low, high in zip("xy", *ends, strict=False):
+        axes.set(**{f"{name}label": f"{name}{f' [{unit}]' * bool(unit)}", f"{name}lim": (low - room, high + room)})
+
+
+def _range(values: Sequence[Array]) -> Limits:
+    """One range for several fields; that of a constant field is not empty."""
+    everything = np.concatenate([one[np.isfinite(one)] for one in values])
+    low, high = (float(everything.min()), float(everything.max())) if everything.size else (0.0, 1.0)
+    return low, high if high > low else low + max(abs(low), 1.0)
+
+
+def _colours(limits: Limits) -> dict[str, Any]:
+    return {"vmin": limits[0], "vmax": limits[1], "cmap": MAP, "rasterized": True}
+
+
+def _ends(limits: Limits) -> str:
+    return f"{limits[0]:.3g} to {limits[1]:.3g}"
+
+
+def _on_mesh(picture: Picture) -> Triangulation | None:
+    """The triangles between points of the multiplier, if each of these is a node of the mesh."""
+    if len(picture.points) != 2 or not len(picture.multiplier):
+        return None
+    places = {tuple(point): k for k, point in enumerate(picture.points.T)}
+    nodes = [places.get(tuple(point)) for point in picture.positions.T]
+    if None in nodes or len(set(nodes)) < len(nodes):
+        return None
+    numbers = np.full(picture.points.shape[1], -1)
+    numbers[np.array(nodes, dtype=int)] = np.arange(len(nodes))
+    triangles = numbers[picture.triangles]
+    inside = np.all(triangles >= 0, axis=0)
+    x, y = picture.positions
+    return Triangulation(x, y, triangles[:, inside].T) if inside.any() else None
+
+
+def _contact_boundary(axes: Axes, picture: Picture) -> None:
+    """The line between nodes with and without contact."""
+    part = _on_mesh(picture) if len(picture.positions) == 2 else None
+    touching = (picture.multiplier > 0.0).astype(float)
+    if part is not None and 0.0 < touching.mean() < 1.0:
+        axes.tricontour(part, touching, levels=[0.5], colors=EDGE, linewidths=1.0)
+
+
+def _ends_of_contact(axes: Axes, picture: Picture) -> None:
+    """Lines where intervals of contact end; those that end at the last point of the multiplier have no line there."""
+    if len(picture.positions) != 1:
+        return
+    order = np.argsort(picture.positions[0])
+    x, touching = picture.positions[0][order], picture.multiplier[order] > 0.0
+    for k in np.flatnonzero(touching[1:] != touching[:-1]):
+        axes.axvline(0.5 * (x[k] + x[k + 1]), color=EDGE, linewidth=1.0, linestyle=(0, (1, 1)))
+
+
+def _graph(axes: Axes, x: Array, values: Array, name: str, limits: Limits, colour: str, drawstyle: str) -> None:
     order = np.argsort(x)
-    axes.plot(x[order], values[order], color=COLOURS[k], drawstyle=drawstyle)
-    axes.set(xlabel="x", ylabel=name)
+    axes.plot(x[order], values[order], color=colour, drawstyle=drawstyle)
+    room = 0.05 * (limits[1] - limits[0])
+    axes.set(xlabel="x", ylabel=name, ylim=(limits[0] - room, limits[1] + room))
 
 
 def _plane(axes: Axes, colours: ScalarMappable, name: str) -> None:
-    """Axes of the plane, and a colour bar in the room right of the panel."""
-    axes.set_aspect("equal", adjustable="datalim")
+    """Axes of the plane, and a colour bar in the room right of the panel if it has a name."""
+    axes.set_aspect("equal", adjustable="box")
+    axes.grid(visible=False)
     axes.set(xlabel="x", ylabel="y")
-    axes.figure.colorbar(colours, cax=axes.inset_axes((1.03, 0.0, 0.04, 1.0)), label=name)
+    if name:
+        bar = axes.figure.colorbar(colours, cax=axes.inset_axes((1.03, 0.0, 0.04, 1.0)), label=name)
+        bar.outline.set_edgecolor(BLACK)

@@ -1,4 +1,4 @@
-"""Style of the figures: panels of fixed size, colours and lines legible in grey print, reproducible files."""
+"""Style of the figures: panels of fixed size, captions, reproducible files."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from collections.abc import Iterable
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, Literal
 
 import matplotlib as mpl
 import numpy as np
@@ -17,27 +17,33 @@ from matplotlib import ticker
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
-"""Okabe and Ito's palette, which colour-blind readers can distinguish; lines and markers differ, too."""
+from vibench.report.figures.labels import label_points
+from vibench.report.figures.looks import Look
+from vibench.text import printable
 
-LINES: tuple[Any, ...] = ("-", "--", "-.", ":", (0, (5, 1)), (0, (3, 1, 1, 1)), (0, (1, 1)))
-MARKERS = "os^vDPX"
-BLACK = 6
-"""Index of the style reserved for the high-fidelity model."""
-
-MARKED = 9
-"""Number of markers on a line, to identify it in grey print."""
-
-POINTS: dict[str, Any] = {"linestyle": "none", "markevery": None}
-"""Changes a line to points."""
+Share = Literal["none", "all", "row", "col"]
 
 WRITTEN: dict[str, dict[str, Any]] = {
     "png": {"metadata": {"Software": None}, "pil_kwargs": {"compress_level": 3}},
     "svg": {"metadata": {"Date": None}},
+    "pdf": {"metadata": {"CreationDate": None}},
 }
 """Options of `savefig`: no date, so that the same results give the same files."""
 
-FORMATS = tuple(WRITTEN)
+DESCRIBED = {"png": "Description", "svg": "Description", "pdf": "Subject"}
+"""Where a file of each format has the caption."""
+
+FORMATS = ("png", "svg")
+"""Formats that are written where none is asked for."""
+
+ABREAST = 3
+"""Panels in a row."""
+
+SERIES = 10
+"""Series in a panel, that of the high-fidelity model included."""
+
+DEEP = 4
+"""Rows of panels in a figure; the others are in further figures."""
 
 STYLE: Any = {
     "font.size": 9,
@@ -52,6 +58,7 @@ STYLE: Any = {
     "legend.frameon": False,
     "savefig.dpi": 150,
     "svg.hashsalt": "vibench",
+    "pdf.fonttype": 42,  # journals refuse the Type 3 fonts of Matplotlib's default
     # Labels are text of others: a dollar sign in them is no formula, whatever the user's own settings are.
     "text.parse_math": False,
     "text.usetex": False,
@@ -69,7 +76,10 @@ SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 @dataclass(frozen=True)
 class Layout:
-    """Size of a panel and of the margins around it for ticks, labels and its title, in inches."""
+    """Size of a panel and of the margins around it for ticks, labels and its title, in inches.
+
+    `tail` is the room right of the last panels, for a colour bar.
+    """
 
     width: float = 3.1
     height: float = 2.5
@@ -77,28 +87,95 @@ class Layout:
     right: float = 0.16
     below: float = 0.55
     above: float = 0.34
+    tail: float = 0.0
+
+
+class CaptionedFigure(Figure):
+    """A figure with its caption.
+
+    Attributes
+    ----------
+    caption
+        What it shows, in sentences for readers who do not see it, and what it leaves out.
+    published, compared
+        Of a figure of a publication that is drawn again: what is published, and what agrees and what differs.
+    """
+
+    caption: str = ""
+    published: str = ""
+    compared: str = ""
+
+
+def caption_of(figure: Figure) -> str:
+    """The caption of a figure in a line; "" if it has none."""
+    return " ".join(str(getattr(figure, "caption", "")).split())
+
+
+def set_caption(figure: Figure, text: str) -> None:
+    """Give a figure a caption, unless it has one."""
+    if not caption_of(figure):
+        setattr(figure, "caption", text)  # noqa: B010  a figure of Matplotlib has no such attribute
 
 
 class Sheet:
-    """A figure of rows × columns equal panels with a title above and one legend below them all.
+    """A figure of equal panels with a title above and one legend below them all.
 
     Sizes follow from the layout and the number of characters of title and legend: no text is rendered to measure it.
+
+    Parameters
+    ----------
+    rows, columns
+        Numbers of panels.
+    title
+        Line above them.
+    layout
+        Size of a panel.
+    sharex, sharey
+        Which panels share an axis, so that they can be compared: "all", "row", "col" or "none".
     """
 
-    def __init__(self, rows: int, columns: int, title: str = "", layout: Layout = Layout()) -> None:
+    def __init__(
+        self,
+        rows: int,
+        columns: int,
+        title: str = "",
+        layout: Layout = Layout(),
+        sharex: Share = "none",
+        sharey: Share = "none",
+    ) -> None:
         self._rows, self._columns, self._title, self._layout = rows, columns, title, layout
-        self.figure = Figure()
-        self.panels: list[Axes] = list(self.figure.subplots(rows, columns, squeeze=False).ravel())
+        self.figure = CaptionedFigure()
+        made = self.figure.subplots(rows, columns, squeeze=False, sharex=sharex, sharey=sharey)
+        self.panels: list[Axes] = list(made.ravel())
+        self._labels: dict[int, list[tuple[float, float, str]]] = {}
+        for panel in self.panels:  # numbers at every panel, shared axes or not
+            panel.tick_params(labelbottom=True, labelleft=True)
+
+    @classmethod
+    def of(cls, count: int, title: str = "", layout: Layout = Layout(), share: Share = "none") -> Sheet:
+        """A sheet with at least `count` panels, at most `ABREAST` in a row; those beyond `count` are not shown."""
+        columns = max(1, min(count, ABREAST))
+        sheet = cls(-(-count // columns) or 1, columns, title, layout, share, share)
+        for panel in sheet.panels[count:]:
+            panel.set_axis_off()
+        return sheet
 
     def at(self, row: int, column: int) -> Axes:
         """One panel."""
         return self.panels[row * self._columns + column]
 
-    def finish(self) -> Figure:
-        """Set ticks, sizes and a legend in which every label of the panels occurs once; returns the figure."""
+    def label(self, panel: Axes, x: float, y: float, text: str) -> None:
+        """Write a text at a point, where there is room for it in the finished figure."""
+        self._labels.setdefault(self.panels.index(panel), []).append((x, y, text))
+
+    def finish(self, caption: str = "") -> CaptionedFigure:
+        """Set ticks, sizes and a legend in which every label of the panels occurs once; returns the figure.
+
+        The caption says, too, how many labels of points have no room.
+        """
         layout = self._layout
         column, row = layout.left + layout.width + layout.right, layout.above + layout.height + layout.below
-        wide = self._columns * column
+        wide = self._columns * column + layout.tail
         legend = self._legend(wide)
         lines = textwrap.wrap(self._title, int(wide / TITLE_CHARACTER))
         high = self._rows * row + legend + 0.17 * len(lines) + 0.1
@@ -109,6 +186,9 @@ class Sheet:
             left, bottom = along * column + layout.left, legend + (self._rows - 1 - down) * row + layout.below
             panel.set_position((left / wide, bottom / high, layout.width / wide, layout.height / high))
             _ticks(panel)
+        missing = sum(label_points(self.panels[k], points) for k, points in self._labels.items())
+        unlabelled = f"{missing} points have no label for want of room." if missing else ""
+        self.figure.caption = " ".join(part for part in (" ".join(caption.split()), unlabelled) if part)
         return self.figure
 
     def _legend(self, wide: float) -> float:
@@ -125,30 +205,30 @@ class Sheet:
         return 0.19 * math.ceil(len(named) / columns) + 0.12
 
 
-def line(k: int, count: int = 0) -> dict[str, Any]:
-    """Style k: colour, line and marker; lines and markers change where the colours repeat.
-
-    `count` is the number of points; of many, only about `MARKED` carry the marker.
-    """
-    colour, other = COLOURS[k % len(COLOURS)], k + k // len(COLOURS)
-    return {
-        "color": colour,
-        "linestyle": LINES[other % len(LINES)],
-        "marker": MARKERS[other % len(MARKERS)],
-        "markersize": 3.5,
-        "markevery": (k % 3, max(1, count // MARKED)),
-        "markerfacecolor": "white" if k % 2 else colour,
-    }
-
-
-def style_of(name: str, known: dict[str, int]) -> int:
-    """Style of a name in all panels of a figure; a new name takes the next one and is added to `known`."""
-    return known.setdefault(name, len(known) + (len(known) >= BLACK))
+def two_rows(count: int, title: str) -> tuple[Sheet, list[Axes], list[Axes]]:
+    """A sheet of `count` upper panels with a lower one each; upper panels share their axes, and so do lower ones."""
+    columns = max(1, min(count, ABREAST))
+    blocks = -(-count // columns) or 1
+    sheet = Sheet(2 * blocks, columns, title, sharex="all")
+    upper, lower = (
+        [sheet.at(2 * (k // columns) + row, k % columns) for k in range(blocks * columns)] for row in (0, 1)
+    )
+    for panels in (upper, lower):
+        for panel in panels[1:]:
+            panel.sharey(panels[0])
+        for panel in panels[count:]:
+            panel.set_axis_off()
+    return sheet, upper[:count], lower[:count]
 
 
-def plot(axes: Axes, x: Any, y: Any, k: int, label: str | None = None, **more: Any) -> None:
-    """Draw a line in style k."""
-    axes.plot(x, y, label=legend_label(label), **line(k, len(x)) | more)
+def plot(axes: Axes, x: Any, y: Any, look: Look, label: str | None = None, **more: Any) -> None:
+    """Draw a line in a look."""
+    axes.plot(x, y, label=legend_label(label), **look.line(len(x)) | more)
+
+
+def scatter(axes: Axes, x: Any, y: Any, look: Look, label: str | None = None, **more: Any) -> None:
+    """Draw points in a look."""
+    axes.plot(x, y, label=legend_label(label), **look.point() | more)
 
 
 def legend_label(text: str | None) -> str | None:
@@ -203,7 +283,10 @@ def save(figure: Figure, folder: Path, name: str, formats: Iterable[str] = FORMA
 
 
 def write_figure(figure: Figure, target: Path | BinaryIO, form: str) -> None:
-    """Write a figure in a format; a character that the font does not have is a box, and no warning."""
+    """Write a figure in a format, with its caption; a character that the font does not have is a box, no warning."""
+    options = dict(WRITTEN[form])
+    if caption := caption_of(figure):
+        options["metadata"] = options["metadata"] | {DESCRIBED[form]: printable(caption)}
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", r"Glyph \d+|Matplotlib currently does not support", UserWarning)
-        figure.savefig(target, format=form, **WRITTEN[form])
+        figure.savefig(target, format=form, **options)

@@ -1,0 +1,83 @@
+"""Publish the results of this folder as a static site.
+
+python results/publish.py SITE
+
+The tables that the pages show are put into results files again: cells, break-even and disagreements, with the six
+digits that are committed. Tables of all queries are not committed, so that reports have no figures of queries; on the
+page of every run stands the command that makes them.
+"""
+
+from __future__ import annotations
+
+import sys
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+
+from vibench.report.site.citation import Citation
+from vibench.report.site.publish import publish
+from vibench.results.columns import STORED
+from vibench.results.database import FILE, ResultsDatabase
+from vibench.study.cells import expand
+from vibench.study.reader import read_study
+
+RESULTS = Path(__file__).parent
+
+CITATION = Citation(
+    "vibench: results of the reduced-order models of the paper and of the field",
+    ("The vibench developers",),
+)
+
+
+def main() -> None:
+    if len(sys.argv) != 2:
+        sys.exit("usage: python results/publish.py SITE")
+    with tempfile.TemporaryDirectory() as scratch:
+        files = {
+            restore(table.parent, Path(scratch)): table.parent.name for table in sorted(RESULTS.glob("*/cells.csv"))
+        }
+        notes = {
+            file: f"made of the tables in results/{name}, with six digits and without queries; `vibench run {name}` "
+            "makes all of it"
+            for file, name in files.items()
+        }
+        print(publish(list(files), Path(sys.argv[1]), CITATION, notes))
+
+
+def restore(tables: Path, folder: Path) -> Path:
+    """Write a results file of committed tables; columns that were added after them are empty."""
+    cells = rows(tables / "cells.csv")
+    if "definition" not in cells[0]:  # left out of a large table: the study says the same
+        definitions = {cell.key: cell.definition for cell in expand(read_study(tables.name))}
+        cells = [row | {"definition": definitions[row["cell"]]} for row in cells]
+    identity = {"name": tables.name, "seed": int(cells[0]["seed"]), "validation": int(cells[0]["queries"])}
+    database = ResultsDatabase(folder / tables.name, identity)
+    try:
+        for row in cells:
+            database.write_cell(known("cells", row), ())
+        for name in ("thresholds", "disagreements"):
+            if (tables / f"{name}.csv").exists():
+                database.replace(name, [known(name, row) for row in rows(tables / f"{name}.csv")])
+    finally:
+        database.close()
+    return folder / tables.name / FILE
+
+
+def rows(table: Path) -> list[dict[str, Any]]:
+    """Rows of a CSV table; what is empty is missing."""
+    frame = pd.read_csv(table, keep_default_na=False, na_values=[""])
+    return [
+        {str(name): None if pd.isna(value) else value for name, value in row.items()}
+        for row in frame.to_dict("records")
+    ]
+
+
+def known(table: str, row: dict[str, Any]) -> dict[str, Any]:
+    """The columns of a row that the results file has."""
+    return {name: value for name, value in row.items() if name in STORED[table]}
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,356 @@
+"""The site of some runs: whole, alive in a real browser, reproducible, and careful with files of others."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+from html.parser import HTMLParser
+from pathlib import Path
+from urllib.parse import unquote
+
+import pandas as pd
+import pytest
+from chromium import observed
+from outputs import clean, elements
+from running import Changed, Main, execute, refused
+
+from vibench.errors import RequestError
+from vibench.report import html
+from vibench.report.site import folder
+from vibench.report.site.citation import Citation, requirements
+from vibench.report.site.publish import publish
+from vibench.report.site.published_run import folder_names
+from vibench.results import tables
+from vibench.results.database import FILE
+
+CITATION = Citation("Tests & <trials>", ("Doe, Jane", "The {team}"), "10.5281/zenodo.1234567")
+
+
+@pytest.fixture(scope="module")
+def three(quick_run: Path, tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    """Three runs of two machines: as it was run, of another machine with fewer cells, of this one with failures."""
+    base = tmp_path_factory.mktemp("runs")
+    changes = {
+        "here": (),
+        "server #1": (
+            "UPDATE cells SET machine = 'a server, 64 cores', online_s = 0.5 * online_s",
+            "DELETE FROM cells WHERE solver = 'osqp'",
+        ),
+        "later": (
+            "UPDATE cells SET status = 'failed', reason = 'why <not>', queries_ok = 0 WHERE problem = 'hertz'",
+            "UPDATE cells SET error_u_mean = 3 * error_u_mean",
+        ),
+    }
+    for name, statements in changes.items():
+        (base / name).mkdir()
+        shutil.copy(quick_run / FILE, base / name / FILE)
+        execute(base / name, *statements)
+    return [base / name / FILE for name in changes]
+
+
+REPORT = "<!doctype html><html><body>report</body></html>"
+
+
+@pytest.fixture(scope="module")
+def site(three: list[Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Their site; reports have tests of their own, and take long to draw."""
+    made = tmp_path_factory.mktemp("site") / "site"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(html, "page", lambda _: REPORT)
+        publish(three, made, CITATION, {three[1]: "measured on a <server>"})
+    return made
+
+
+class Links(HTMLParser):
+    """What a page links to, and the anchors that it has."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.targets: list[str] = []
+        self.ids: set[str] = set()
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        for name, value in attrs:
+            if name in ("href", "src"):
+                self.targets.append(str(value))
+            elif name == "id":
+                self.ids.add(str(value))
+
+
+def links(page: Path) -> Links:
+    found = Links()
+    found.feed(page.read_text(encoding="utf-8"))
+    return found
+
+
+def test_every_link_of_every_page_leads_to_a_file_of_the_site_and_to_its_anchor(site: Path) -> None:
+    pages = {page: links(page) for page in site.rglob("*.html")}
+    assert len(pages) == 3 + 2 * 3
+    reached = {site / "index.html"}
+    for page, found in pages.items():
+        for target in found.targets:
+            if target.startswith(("data:", "https://doi.org/10.5281/")):
+                continue
+            assert not target.startswith("/"), target
+            path, _, anchor = target.partition("#")
+            linked = (page.parent / unquote(path)).resolve() if path else page
+            assert linked.is_file(), (page, target)
+            assert linked.is_relative_to(site)
+            assert not anchor or anchor in pages[linked].ids, (page, target)
+            reached.add(linked)
+    assert {path for path in site.rglob("*") if path.is_file()} - reached == {site / folder.CATALOGUE}
+
+
+OBSERVE = """
+  return {
+    wide: document.documentElement.scrollWidth, window: innerWidth,
+    links: [...document.links].map(link => link.href),
+    rows: [...document.querySelectorAll("table")].map(table => table.tBodies[0].rows.length),
+  };
+"""
+
+
+@pytest.mark.parametrize("width", [1280, 500])
+@pytest.mark.parametrize("page", ["index.html", "leaderboard.html", "comparison.html", "runs/server-1/index.html"])
+def test_a_browser_shows_every_page_without_an_error(page: str, width: int, site: Path, tmp_path: Path) -> None:
+    seen = observed(site / page, OBSERVE, tmp_path, width=width)
+    assert seen["errors"] == []
+    assert seen["wide"] <= seen["window"]  # tables scroll inside themselves
+    assert all(count > 0 for count in seen["rows"])
+    assert len(seen["rows"]) > 0
+    local = [link for link in seen["links"] if not link.startswith("https://doi.org/")]
+    assert all(link.startswith(site.as_uri()) for link in local)
+
+
+FILTER = """
+  const form = document.querySelector("form.filters"), table = document.getElementById(form.dataset.table);
+  const rows = [...table.tBodies[0].rows];
+  const shown = () => rows.filter(row => row.offsetHeight > 0).map(row => row.cells[0].textContent);
+  const found = { start: shown(), said: form.querySelector("output").textContent };
+  const set = (name, value) => {
+    form.elements[name].value = value;
+    form.elements[name].dispatchEvent(new Event("input", { bubbles: true }));
+  };
+  if (form.elements.solver) {
+    set("solver", "osqp"); found.osqp = shown();
+    set("machine", "a server, 64 cores"); found.both = shown();
+    set("solver", ""); found.machine = shown(); found.hash = location.hash;
+    set("machine", "");
+  }
+  set("text", "SERVER"); found.text = shown();
+  set("text", "no such words"); found.none = shown(); found.count = form.querySelector("output").textContent;
+  return found;
+"""
+
+
+def test_filters_of_the_list_of_runs_filter(site: Path, tmp_path: Path) -> None:
+    seen = observed(site / "index.html", FILTER, tmp_path)
+    everything = ["here", "server #1", "later"]
+    assert (seen["start"], seen["said"]) == (everything, "3 of 3")
+    assert seen["osqp"] == ["here", "later"]
+    assert seen["both"] == seen["none"] == []
+    assert seen["machine"] == seen["text"] == ["server #1"]
+    assert seen["count"] == "0 of 3"
+    again = observed(site / "index.html", FILTER, tmp_path, fragment=seen["hash"])
+    assert again["start"] == ["server #1"]  # the address keeps what was asked for
+
+
+def test_filters_of_cells_filter(site: Path, tmp_path: Path) -> None:
+    seen = observed(site / "runs" / "later" / "index.html", FILTER.replace("SERVER", "proxqp OFFLINE"), tmp_path)
+    cells = tables.read(site / "runs" / "later" / FILE, "cells")
+    chosen = cells[(cells["solver"] == "proxqp") & (cells["primal"] == "offline-pga")]
+    assert len(seen["start"]) == 36
+    assert sorted(seen["text"]) == sorted(key[:8] for key in chosen["cell"])
+
+
+def test_a_run_has_its_report_its_data_and_where_it_comes_from(site: Path, three: list[Path]) -> None:
+    own = site / "runs" / "server-1"
+    assert (own / "report.html").read_text(encoding="utf-8") == REPORT
+    for name in ("cells", "queries", "thresholds", "timings", "solutions", "pictures"):
+        pd.testing.assert_frame_equal(tables.read(own / FILE, name), tables.read(three[1], name))
+    page = (own / "index.html").read_text(encoding="utf-8")
+    row = tables.read(three[1], "cells").iloc[0]
+    for text in ("measured on a &lt;server&gt;", "a server, 64 cores", row["code"], row["study_hash"]):
+        assert text in page
+    known = json.loads((own / "provenance.json").read_text())
+    assert (known["cells"], known["seed"], known["machines"]) == (24, 2022, ["a server, 64 cores"])
+    assert known["versions"]["numpy"] in json.loads(row["versions"]).values()
+    assert len(pd.read_csv(own / "tables" / "cells.csv")) == 24
+
+
+def test_every_row_has_the_command_that_makes_it_again(site: Path, main: Main, monkeypatch: pytest.MonkeyPatch) -> None:
+    own = site / "runs" / "server-1"
+    page = (own / "index.html").read_text(encoding="utf-8")
+    commands = re.findall(r"<code>vibench (run results.sqlite --cell (\w+) --out again)</code>", page)
+    assert [key for _, key in commands] == list(tables.in_order(tables.read(own / FILE, "cells"))["cell"])
+    monkeypatch.chdir(own)
+    command, key = commands[5]
+    code, out, err = main(*command.split(), "--dry-run")
+    assert (code, err) == (0, "")
+    assert out.startswith(f"{key}  ")
+
+
+def test_requirements_are_the_versions_recorded_and_nothing_that_pip_would_act_on(
+    site: Path, three: list[Path]
+) -> None:
+    text = (site / "runs" / "here" / "requirements.txt").read_text()
+    versions = json.loads(tables.read(three[0], "cells")["versions"].iloc[0])
+    assert f"numpy=={versions['numpy']}\n" in text
+    assert {"piqp", "osqp", "proxsuite"} <= {line.split("==")[0] for line in text.splitlines()}
+    evil = {"numpy": "1.0 --index-url http://x", "-r /etc/passwd": "1", "scipy": "1\n-e .", "piqp": "1.0, 2.0", "a": ""}
+    assert all(line.startswith("#") for line in requirements(evil, "code\n--pre").splitlines())
+
+
+def test_the_leaderboard_compares_seconds_within_one_machine_and_links_its_cells(site: Path, three: list[Path]) -> None:
+    page = (site / "leaderboard.html").read_text(encoding="utf-8")
+    here, server = page.split("<h2>a server, 64 cores</h2>")
+    assert "server-1/index.html#" in server
+    assert "server-1" not in here
+    assert "runs/here/index.html#" in here
+    assert server.count("<td>fastest query</td>") >= 2
+
+
+def test_runs_of_one_study_are_compared(site: Path) -> None:
+    page = (site / "comparison.html").read_text(encoding="utf-8")
+    changes = pd.read_csv(site / "comparison-1.csv")
+    assert {"server #1", "later"} == set(changes["run"])
+    assert f"{len(changes)} changes" in page
+    errors = changes[(changes["run"] == "later") & (changes["what"] == "error_u_mean")]
+    assert len(errors) > 0
+    assert (errors["ratio"] > 2.9).all()
+
+
+def test_the_same_runs_give_the_same_site(
+    site: Path, three: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(html, "page", lambda _: REPORT)
+    publish(three, tmp_path / "again", CITATION, {three[1]: "measured on a <server>"})
+    names = sorted(path.relative_to(site) for path in site.rglob("*"))
+    assert names == sorted(path.relative_to(tmp_path / "again") for path in (tmp_path / "again").rglob("*"))
+    different = [
+        n for n in names if (site / n).is_file() and (site / n).read_bytes() != (tmp_path / "again" / n).read_bytes()
+    ]
+    assert different == []
+
+
+def of_yaml(text: str) -> dict[str, str]:
+    """Keys and values at the top of a file of YAML that has strings in double quotes, which are JSON's."""
+    lines = (line.partition(": ") for line in text.splitlines() if line[:1].isalpha() and ": " in line)
+    return {key: json.loads(value) if value.startswith('"') else value for key, _, value in lines}
+
+
+def test_a_citation_is_valid_and_its_texts_are_data(site: Path) -> None:
+    text = (site / "CITATION.cff").read_text(encoding="utf-8")
+    known = of_yaml(text)
+    assert (known["cff-version"], known["type"]) == ("1.2.0", "dataset")
+    assert (known["title"], known["doi"]) == (CITATION.title, CITATION.doi)
+    assert '  - family-names: "Doe"\n    given-names: "Jane"\n  - name: "The {team}"\n' in text
+    bib = (site / "citation.bib").read_text(encoding="utf-8")
+    assert "author = {Doe, Jane and {The \\{team\\}}}," in bib
+    assert f"doi = {{{CITATION.doi}}}," in bib
+    without = Citation('a "title": #1\n- b', ()).cff()
+    assert of_yaml(without)["title"] == 'a "title": #1 - b'
+    assert "doi" not in of_yaml(without)
+    assert "# doi:" in without
+    with pytest.raises(RequestError, match="is no DOI, expected such as"):
+        Citation("a", doi="https://doi.org/10.5281/zenodo.1")
+
+
+@pytest.mark.parametrize(
+    "label", ["</script><script>alert(1)</script>", "<img src=x onerror=alert(1)>", "' onclick='x"]
+)
+def test_a_label_is_no_markup_on_any_page(
+    label: str, site: Path, changed: Changed, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(html, "page", lambda _: REPORT)
+    quoted = label.replace("'", "''") + "' || char(27) || '"
+    axes = ("problem", "dual", "primal", "solver", "machine", "code", "study_hash")
+    broken = changed(*(f"UPDATE cells SET {axis} = '{quoted}'" for axis in axes))
+    publish([broken, broken], tmp_path / "out", Citation(label, (label,)))
+    for page in ("index.html", "leaderboard.html", "comparison.html", "runs/changed/index.html"):
+        text = (tmp_path / "out" / page).read_text(encoding="utf-8")
+        like = page.replace("changed", "here")
+        assert elements(text) <= elements((site / like).read_text(encoding="utf-8")) | {"td.class"}, page
+        assert text.count("<script") == text.count("</script") == 1
+        assert clean(text)
+
+
+@pytest.fixture
+def small(three: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A site of one run whose report is empty."""
+    monkeypatch.setattr(html, "page", lambda _: REPORT)
+    publish(three[:1], tmp_path / "small", CITATION)
+    return tmp_path / "small"
+
+
+def test_a_site_is_replaced_and_files_of_others_stay(small: Path, three: list[Path]) -> None:
+    (small / "CNAME").write_text("results.example")
+    (small / "runs" / "here" / "notes.txt").write_text("mine")
+    publish(three[1:], small, CITATION)
+    assert (small / "CNAME").read_text() == "results.example"
+    assert [path.name for path in (small / "runs" / "here").iterdir()] == ["notes.txt"]
+    assert {path.name for path in (small / "runs").iterdir()} == {"here", "server-1", "later"}
+    assert "server #1" in (small / "index.html").read_text(encoding="utf-8")
+    assert not list(small.parent.glob("vibench-*"))
+    publish(three[1:], small, CITATION)  # once more
+
+
+def test_a_file_that_somebody_changed_or_put_there_is_not_replaced(small: Path, three: list[Path]) -> None:
+    before = (small / "CITATION.cff").read_bytes()
+    (small / "index.html").write_text("my own")
+    with pytest.raises(RequestError, match=r"index.html' was not written by vibench, or changed since"):
+        publish(three[1:], small, Citation("other"))
+    assert (small / "index.html").read_text() == "my own"
+    assert (small / "CITATION.cff").read_bytes() == before
+    assert not (small / "runs" / "later").exists()
+
+
+def test_links_in_a_site_are_not_followed(small: Path, three: list[Path], tmp_path: Path) -> None:
+    (tmp_path / "elsewhere").mkdir()
+    (small / "runs" / "later").symlink_to(tmp_path / "elsewhere")
+    with pytest.raises(RequestError, match="later' is a symbolic link"):
+        publish(three, small, CITATION)
+    assert list((tmp_path / "elsewhere").iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    "catalogue", ["", "[]", '{"files": 3}', '{"files": {"../../outside": ["x"]}}', '{"files": {"/etc/hostname": []}}']
+)
+def test_a_list_of_files_that_cannot_be_trusted_is_refused(catalogue: str, small: Path, three: list[Path]) -> None:
+    (small / folder.CATALOGUE).write_text(catalogue)
+    with pytest.raises(RequestError, match=r"vibench-site.json' (cannot be read|lists)"):
+        publish(three, small, CITATION)
+
+
+def test_a_folder_of_others_is_refused(three: list[Path], main: Main, tmp_path: Path) -> None:
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "thesis.tex").write_text("all of it")
+    refused(main("publish", str(three[0]), str(tmp_path / "mine")), "mine", "not written by `vibench publish`")
+    assert [path.name for path in (tmp_path / "mine").iterdir()] == ["thesis.tex"]
+    refused(main("publish", str(three[0]), str(tmp_path / "mine" / "thesis.tex")), "is not a folder")
+    refused(main("publish", "nowhere", str(tmp_path / "new")), "no results in 'nowhere'")
+    refused(main("publish", str(three[0]), str(tmp_path / "new"), "--doi", "abc"), "no DOI")
+    assert not (tmp_path / "new").exists()
+
+
+def test_the_command_writes_a_site(
+    three: list[Path], main: Main, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(html, "page", lambda _: REPORT)
+    arguments = ("--title", "Ours", "--author", "Doe, Jane", "--url", "https://example.org/")
+    code, out, err = main("publish", *map(str, three), str(tmp_path / "new" / "site"), *arguments)
+    assert (code, err) == (0, "")
+    assert out == f"site of 3 runs: {tmp_path / 'new' / 'site' / 'index.html'}\n"
+    assert of_yaml((tmp_path / "new" / "site" / "CITATION.cff").read_text())["url"] == "https://example.org/"
+
+
+def test_folders_have_names_that_a_link_needs_no_escapes_for() -> None:
+    assert folder_names(["a/b", "a b", "ünïcode?", "..", "A-B", ""]) == [
+        "a-b",
+        "a-b-2",
+        "n-code",
+        "run",
+        "A-B-3",
+        "run-2",
+    ]

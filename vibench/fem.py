@@ -1,0 +1,264 @@
+"""What problems discretised with scikit-fem share: Gram matrices, masses, unilateral constraints, Dirichlet data."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+import numpy as np
+import scipy.sparse as sp
+from skfem import Basis, BilinearForm, ElementVector, FacetBasis, LinearForm
+from skfem.helpers import ddot, dot, grad
+
+from vibench.arrays import Array, Indices, SparseMatrix
+from vibench.errors import NumericalError
+from vibench.interfaces.problem import VariationalInequality
+from vibench.linalg.inner_product import InnerProduct
+
+__all__ = ["Unilateral", "eliminate", "h1_gram", "lumped_mass", "mass", "normal_constraint", "unilateral"]
+
+Sense = Literal["<=", ">="]
+
+
+PRODUCTS = {False: BilinearForm(lambda u, v, _: u * v), True: BilinearForm(lambda u, v, _: dot(u, v))}
+GRADIENTS = {
+    False: BilinearForm(lambda u, v, _: dot(grad(u), grad(v))),
+    True: BilinearForm(lambda u, v, _: ddot(grad(u), grad(v))),
+}
+"""∫ v·w and ∫ ∇v : ∇w, of scalar and of vector bases."""
+
+ROUND_OFF = 1e-14
+"""Entries of a constraint below this, relative to the largest, are components of a normal that vanish."""
+
+
+def mass(basis: Basis) -> SparseMatrix:
+    """∫ v·w (N×N) over the elements or facets of a scalar or vector basis; zero for functions that vanish there."""
+    return sp.csr_array(PRODUCTS[_is_vector(basis)].assemble(basis))
+
+
+def lumped_mass(basis: Basis) -> Array:
+    """∫ φ_i (N,) over the elements or facets of a scalar basis: the row sums of its mass matrix."""
+    return np.asarray(LinearForm(lambda v, _: v).assemble(basis))
+
+
+def h1_gram(basis: Basis, free: Indices | None = None, length: float = 1.0) -> SparseMatrix:
+    """Gram matrix of ‖v‖² = ∫ |v|² + ℓ² ∫ |∇v|² for a scalar or vector basis (paper, equation (44)).
+
+    Parameters
+    ----------
+    basis
+        The basis, with N functions.
+    free
+        Unknowns (n,) that are kept; by default all.
+    length
+        ℓ, in the unit of length of the mesh.
+    """
+    gradients = sp.csr_array(GRADIENTS[_is_vector(basis)].assemble(basis))
+    gram = sp.csr_array(mass(basis) + length**2 * gradients)
+    return gram if free is None else sp.csr_array(gram[free][:, free])
+
+
+@dataclass(frozen=True)
+class Unilateral:
+    """A constraint in weak form with nodal multipliers: ∫ c(u) η ≤ ∫ bound η for every nonnegative η, or with ≥.
+
+    c(u) is a scalar field or a component of a displacement field. Signs are those of B u ≤ g: for ≥ both sides change
+    theirs.
+
+    Attributes
+    ----------
+    B
+        Constraint (m×N) on all unknowns of the basis.
+    W
+        L² product of the multipliers (m×m), consistent or lumped.
+    nodes
+        Vertices (m,) of the mesh that carry a multiplier, rising.
+    points
+        Their places (dim×m).
+    sense
+        "<=" or ">=".
+    """
+
+    B: SparseMatrix
+    W: InnerProduct
+    nodes: Indices
+    points: Array
+    sense: Sense
+    _integrals: Callable[[Callable[[Array], Array]], Array] | None = field(repr=False, default=None)
+
+    def bound(self, values: Callable[[Array], Array] | Array) -> Array:
+        """G (m,) of a bound, which is a function of x (dim×…) or has values at `points` (m,).
+
+        With a consistent mass a function is integrated by the quadrature of the basis; values are interpolated.
+        """
+        sign = 1.0 if self.sense == "<=" else -1.0
+        if callable(values) and self._integrals is not None:
+            return sign * self._integrals(values)
+        given = np.broadcast_to(values(self.points) if callable(values) else values, self.W.dim)
+        return sign * self.W.apply(np.asarray(given, float))
+
+
+def unilateral(
+    basis: Basis, sense: Sense, *, free: Indices | None = None, lumped: bool = True, among: Indices | None = None
+) -> Unilateral:
+    """The constraint u ≤ bound or u ≥ bound of a scalar field, on a domain, a patch or a part of the boundary.
+
+    Parameters
+    ----------
+    basis
+        Scalar basis with one function per vertex, linear on edges (P1, Q1), over all elements, some
+        (`basis.with_elements`), or facets (`FacetBasis`).
+    sense
+        "<=" or ">=".
+    free
+        Unknowns that are not prescribed; vertices with prescribed values carry no multiplier. By default all.
+    lumped
+        Whether the mass is lumped: the constraint is then imposed vertex by vertex, and X_W is diagonal.
+    among
+        Vertices that may carry a multiplier; by default those of the elements or facets.
+
+    Raises
+    ------
+    NumericalError
+        If the integral of a function is not positive, as with quadratic elements.
+    """
+    vertices = _vertices(basis)
+    if free is not None:
+        vertices = vertices[np.isin(basis.nodal_dofs[0, vertices], free)]
+    if among is not None:
+        vertices = np.intersect1d(vertices, among)
+    dofs = basis.nodal_dofs[0, vertices]
+    sign = 1.0 if sense == "<=" else -1.0
+    if lumped:
+        weights = _positive(lumped_mass(basis), dofs)
+        B = sp.csr_array((sign * weights, (np.arange(len(dofs)), dofs)), shape=(len(dofs), basis.N))
+        return Unilateral(B, _diagonal(weights), vertices, basis.mesh.p[:, vertices], sense)
+    rows = mass(basis)[dofs]
+    integrals = _Integrals(basis, dofs)
+    return Unilateral(
+        sp.csr_array(sign * rows),
+        InnerProduct(sp.csr_array(rows[:, dofs]), "X_W"),
+        vertices,
+        basis.mesh.p[:, vertices],
+        sense,
+        integrals,
+    )
+
+
+def normal_constraint(
+    basis: Basis,
+    facets: Indices,
+    *,
+    direction: Array | None = None,
+    free: Indices | None = None,
+    lumped: bool = True,
+) -> Unilateral:
+    """The constraint n·u ≤ gap of a displacement field on a part of the boundary, such as contact with a rigid body.
+
+    Parameters
+    ----------
+    basis
+        Vector basis with a function per vertex and component, such as `Basis(mesh, ElementVector(ElementTriP1()))`.
+    facets
+        Facets of the potential contact zone, as from `mesh.facets_satisfying`.
+    direction
+        Vector (dim,) in place of the outward normal n.
+    free
+        Unknowns that are not prescribed; a vertex carries a multiplier if one of its components in the constraint is
+        free. By default all.
+    lumped
+        Whether multipliers act at single vertices: row i is ∫ φ_i n, applied to the displacement of vertex i.
+
+    Raises
+    ------
+    NumericalError
+        If the basis is scalar, or the integral of a function is not positive.
+    """
+    if not _is_vector(basis):
+        raise NumericalError("normal displacements need a vector basis: Basis(mesh, ElementVector(element))")
+    scalar = FacetBasis(basis.mesh, basis.elem.elem, facets=facets)
+    vertices = np.unique(basis.mesh.facets[:, facets])
+
+    def component(k: int) -> Callable[[Any], Any]:
+        return (lambda w: w.n[k]) if direction is None else (lambda w: float(direction[k]) + 0.0 * w.x[0])
+
+    parts = []
+    multipliers = scalar.nodal_dofs[0, vertices]
+    for k, unknowns in enumerate(basis.nodal_dofs):
+        form = BilinearForm(lambda u, v, w, k=k: component(k)(w) * u * v)
+        weighted = sp.csr_array(form.assemble(scalar))[multipliers][:, multipliers]
+        part = sp.diags_array(np.asarray(weighted.sum(axis=1)).ravel()) if lumped else weighted
+        places = sp.csr_array(
+            (np.ones(len(vertices)), (np.arange(len(vertices)), unknowns[vertices])), (len(vertices), basis.N)
+        )
+        parts.append(sp.csr_array(part @ places))
+    B = sp.csr_array(sum(parts[1:], start=parts[0]))
+    B.data[np.abs(B.data) <= ROUND_OFF * np.max(np.abs(B.data), initial=0.0)] = 0.0
+    B.eliminate_zeros()
+    kept = np.arange(len(vertices)) if free is None else np.flatnonzero(abs(B[:, free]).sum(axis=1) > 0.0)
+    gram = sp.csr_array(mass(scalar)[multipliers][:, multipliers])
+    vertices = vertices[kept]
+    points = basis.mesh.p[:, vertices]
+    if lumped:
+        weights = _positive(lumped_mass(scalar), multipliers[kept])
+        return Unilateral(sp.csr_array(B[kept]), _diagonal(weights), vertices, points, "<=")
+    integrals = _Integrals(scalar, multipliers[kept])
+    W = InnerProduct(sp.csr_array(gram[kept][:, kept]), "X_W")
+    return Unilateral(sp.csr_array(B[kept]), W, vertices, points, "<=", integrals)
+
+
+def eliminate(vi: VariationalInequality, free: Indices, lift: Array | None = None) -> VariationalInequality:
+    """The variational inequality in the free unknowns, from that in all N.
+
+    Parameters
+    ----------
+    vi
+        A (N×N), f (N,), B (m×N) and g (m,), without boundary conditions.
+    free
+        Unknowns (n,) that are not prescribed.
+    lift
+        Vector (N,) with the prescribed values, any values elsewhere; by default zero. The unknowns are those of
+        u − lift: f − A·lift and g − B·lift take the place of f and g.
+    """
+    A, B, f, g = sp.csr_array(vi.A), sp.csr_array(vi.B), vi.f, vi.g
+    if lift is not None:
+        f, g = f - A @ lift, g - B @ lift
+    return VariationalInequality(sp.csr_array(A[free][:, free]), f[free], sp.csr_array(B[:, free]), g, lift)
+
+
+@dataclass(frozen=True)
+class _Integrals:
+    """∫ bound η for chosen functions η of a scalar basis, by its quadrature."""
+
+    basis: Basis
+    dofs: Indices
+
+    def __call__(self, values: Callable[[Array], Array]) -> Array:
+        return np.asarray(LinearForm(lambda v, w: values(np.asarray(w.x)) * v).assemble(self.basis))[self.dofs]
+
+
+def _is_vector(basis: Basis) -> bool:
+    return isinstance(basis.elem, ElementVector)
+
+
+def _vertices(basis: Basis) -> Indices:
+    """Vertices of the elements or facets of a basis, rising."""
+    mesh, chosen = basis.mesh, basis.find if isinstance(basis, FacetBasis) else basis.tind
+    table = mesh.facets if isinstance(basis, FacetBasis) else mesh.t
+    return np.unique(table if chosen is None else table[:, chosen]).astype(np.intp)
+
+
+def _positive(integrals: Array, dofs: Indices) -> Array:
+    """The integrals (m,) of chosen functions; refused unless all are positive."""
+    weights = integrals[dofs]
+    if np.min(weights, initial=np.inf) <= ROUND_OFF * np.max(integrals, initial=0.0):
+        raise NumericalError(
+            f"a basis function has the integral {weights.min():.1e}; multipliers need nonnegative functions: linear or "
+            "bilinear elements"
+        )
+    return weights
+
+
+def _diagonal(weights: Array) -> InnerProduct:
+    return InnerProduct(sp.csr_array(sp.diags_array(weights)), "X_W")

@@ -1,0 +1,127 @@
+"""Figures of plugins: loaded, drawn, and reported in a line where that fails."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable, Iterator, Mapping
+from functools import partial
+
+from matplotlib.figure import Figure
+
+from vibench.errors import RequestError, VibenchError, in_a_line
+from vibench.interfaces.figures import Drawing, FigurePlugin
+from vibench.report.figures.data import Data, file_names
+from vibench.report.figures.style import set_caption
+from vibench.study import registry
+
+KIND = "figure plugin"
+
+
+class FigureError(VibenchError):
+    """A figure of a plugin that cannot be drawn."""
+
+
+def of_plugins(data: Data, taken: set[str]) -> dict[str, Callable[[Data], Figure | None]]:
+    """The figures that plugins have for a problem, by the end of their file names, publications left out.
+
+    A plugin that cannot be loaded, or whose name is `taken` by a figure of vibench, has one figure, whose drawing
+    raises `FigureError` with the reason.
+    """
+    found: dict[str, Callable[[Data], Figure | None]] = {}
+    for name in registry.names(KIND):
+        reason = f"{KIND} '{name}' has the name of a figure of vibench, and needs another" if name in taken else ""
+        try:
+            plugin = None if reason else loaded(name)
+            if plugin is not None and not plugin.publication:
+                kinds = dict(named(name, plugin, data))
+                found |= {
+                    f"{name}-{kind}" if kind else name: partial(_drawn, name, kind, draw)
+                    for kind, draw in kinds.items()
+                }
+        except VibenchError as error:
+            reason = str(error)
+        if reason:
+            found[name] = partial(_refused, reason)
+    return found
+
+
+def publications() -> Iterator[tuple[str, FigurePlugin]]:
+    """The plugins that draw the figures of a publication again, with their names.
+
+    Raises
+    ------
+    RequestError
+        If a figure plugin cannot be loaded: it may be the one that is asked for.
+    """
+    for name in registry.names(KIND):
+        plugin = loaded(name)
+        if plugin.publication:
+            yield name, plugin
+
+
+def loaded(name: str) -> FigurePlugin:
+    """A figure plugin.
+
+    Raises
+    ------
+    RequestError
+        If it cannot be loaded or created.
+    """
+    missing = registry.missing(KIND, name)
+    if missing:
+        raise RequestError(f"{KIND} '{name}' needs {', '.join(missing)}, which is not installed")
+    try:
+        plugin: FigurePlugin = registry.create(KIND, name)
+    except RequestError:
+        raise
+    except (Exception, SystemExit) as error:  # noqa: BLE001  third-party code
+        raise RequestError(f"{KIND} '{name}' cannot be created: {in_a_line(error)}") from None
+    return plugin
+
+
+def named(name: str, plugin: FigurePlugin, data: Data) -> Iterator[tuple[str, Drawing]]:
+    """The drawings of a plugin for a problem, by names that are part of a file name.
+
+    Raises
+    ------
+    FigureError
+        If the plugin raises, or returns something else.
+    """
+    try:
+        found = plugin.drawings(data)
+    except (Exception, SystemExit) as error:  # noqa: BLE001  third-party code
+        raise FigureError(f"{KIND} '{name}' has no figures of {data.problem}: {in_a_line(error)}") from None
+    if not isinstance(found, Mapping) or not all(isinstance(k, str) and callable(f) for k, f in found.items()):
+        raise FigureError(f"{KIND} '{name}' returned {type(found).__name__}, expected functions by their names")
+    files = file_names([kind or "unnamed" for kind in found])
+    yield from ((file if kind else "", draw) for (kind, draw), file in zip(found.items(), files, strict=True))
+
+
+def draw_guarded(name: str, kind: str, draw: Drawing) -> Figure | None:
+    """A figure of a plugin with its caption.
+
+    Raises
+    ------
+    FigureError
+        If it cannot be drawn or rendered, or is no figure.
+    """
+    try:
+        figure = draw()
+        if isinstance(figure, Figure):
+            figure.draw_without_rendering()
+    except (Exception, SystemExit) as error:  # noqa: BLE001  third-party code
+        raise FigureError(f"figure '{kind}' of {KIND} '{name}' cannot be drawn: {in_a_line(error)}") from None
+    if figure is not None and not isinstance(figure, Figure):
+        returned = type(figure).__name__
+        raise FigureError(f"figure '{kind}' of {KIND} '{name}' is a {returned}, expected a matplotlib Figure or None")
+    if figure is not None:
+        set_caption(figure, inspect.getdoc(draw) or "")
+    return figure
+
+
+def _drawn(name: str, kind: str, draw: Drawing, _: Data) -> Figure | None:
+    return draw_guarded(name, kind, draw)
+
+
+def _refused(reason: str, _: Data) -> Figure | None:
+    raise FigureError(reason)

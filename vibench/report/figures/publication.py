@@ -1,0 +1,142 @@
+"""The figures of publications, drawn again from runs: a page with each figure, what is published, and a comparison."""
+
+from __future__ import annotations
+
+import html
+import re
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from matplotlib.figure import Figure
+
+from vibench.errors import RequestError
+from vibench.files import write_atomically
+from vibench.interfaces.figures import Drawing
+from vibench.report.figures.data import problems
+from vibench.report.figures.plugins import FigureError, draw_guarded, named, publications
+from vibench.report.figures.style import FORMATS, caption_of, save, styled
+from vibench.results.database import read_meta, study_of
+from vibench.text import unbroken
+
+PAGE = "paper-figures.md"
+"""File with the page."""
+
+MARKDOWN = re.compile(r"([\\`*_\[\]|#])")
+
+
+@dataclass(frozen=True)
+class Twin:
+    """A figure of a publication that can be drawn from a run."""
+
+    publication: str
+    plugin: str
+    name: str
+    draw: Drawing
+    run: str
+    machine: str
+
+
+def draw_published(
+    paths: Sequence[Path],
+    folder: Path,
+    formats: Sequence[str] = FORMATS,
+    progress: Callable[[str, int, int], None] = lambda *_: None,
+    note: Callable[[str], None] = lambda _: None,
+) -> list[Path]:
+    """Draw the figures of publications for which runs have data, and write a page that compares them: `PAGE`.
+
+    Parameters
+    ----------
+    paths
+        Results files.
+    folder
+        Where figures and page go; figures of the same names and the page are replaced.
+    formats
+        Keys of `style.WRITTEN`; the page shows the first one that a browser can.
+    progress
+        Called before a figure is drawn, with its name, the number of those done, and that of all.
+    note
+        Called with a line for every figure that could not be drawn, or that has no data.
+
+    Raises
+    ------
+    RequestError
+        If no plugin draws figures of these runs' problems, or a figure plugin cannot be loaded.
+    """
+    twins = sorted(_twins(paths), key=lambda twin: (twin.publication, _natural(twin.name)))
+    if not twins:
+        named_runs = ", ".join(unbroken(path.parent.name) for path in paths)
+        raise RequestError(f"no installed plugin draws figures of a publication from {named_runs}")
+    files: list[Path] = []
+    drawn: list[tuple[Twin, Figure]] = []
+    folder.mkdir(parents=True, exist_ok=True)
+    for k, twin in enumerate(twins):
+        progress(twin.name, k, len(twins))
+        with styled():
+            try:
+                figure = draw_guarded(twin.plugin, twin.name, twin.draw)
+            except FigureError as error:
+                note(str(error))
+                continue
+            if figure is None:
+                note(f"{twin.name}: {twin.run} has no data for it")
+                continue
+            files += save(figure, folder, twin.name, formats)
+        drawn.append((twin, figure))
+    shown = next((form for form in formats if form != "pdf"), formats[0])  # no page shows a PDF
+    write_atomically(folder / PAGE, _page(drawn, paths, shown).encode("utf-8"))
+    return files
+
+
+def _twins(paths: Sequence[Path]) -> Iterator[Twin]:
+    """What can be drawn; of figures that several runs have, each after the first is numbered."""
+    seen: dict[str, int] = {}
+    for path in paths:
+        for _, data in problems(path):
+            for plugin_name, plugin in publications():
+                for kind, draw in named(plugin_name, plugin, data):
+                    count = seen[kind] = seen.get(kind, 0) + 1
+                    name = kind + f"-run-{count}" * (count > 1)
+                    yield Twin(plugin.publication, plugin_name, name, draw, path.parent.name, data.machine)
+
+
+def _page(drawn: Sequence[tuple[Twin, Figure]], paths: Sequence[Path], form: str) -> str:
+    """The page in Markdown."""
+    runs = [path.parent.name for path in paths]
+    studies = list(dict.fromkeys(str(study_of(path, read_meta(path)).get("name", "")) for path in paths))
+    machines = list(dict.fromkeys(twin.machine for twin, _ in drawn))
+    parts = ["# Figures of a publication, drawn again"]
+    parts += [f"{_text(publication)}." for publication in dict.fromkeys(twin.publication for twin, _ in drawn)]
+    parts.append(
+        f"Drawn by `vibench figures {_code(' '.join(runs))} --paper` from runs of the studies "
+        f"{', '.join(f'`{_code(study)}`' for study in studies)}, measured on {_text('; '.join(machines))}. Below each "
+        "figure: its caption, what the publication says of it in text, captions and tables, and what agrees and what "
+        "differs, computed from the run. No curve was read off a published figure."
+    )
+    for twin, figure in drawn:
+        published, compared = (getattr(figure, name, "") for name in ("published", "compared"))
+        title = twin.name.replace("-", " ").capitalize()
+        parts += [
+            f"## {_text(title)}",
+            f"![{_text(title)}]({twin.name}.{form})",
+            _text(caption_of(figure)),
+            *([f"**Published.** {_text(published)}"] if published else []),
+            *([f"**Here.** {_text(compared)}"] if compared else []),
+        ]
+    return "\n\n".join(parts) + "\n"
+
+
+def _text(text: str) -> str:
+    """Text from others in Markdown: one line, in which no character acts."""
+    return MARKDOWN.sub(r"\\\1", html.escape(unbroken(text), quote=False))
+
+
+def _code(text: str) -> str:
+    """Text from others inside backticks."""
+    return unbroken(text).replace("`", "'")
+
+
+def _natural(name: str) -> list[tuple[int, str]]:
+    """A name for sorting: numbers by value."""
+    return [(int(part), "") if part.isdigit() else (-1, part) for part in re.split(r"(\d+)", name)]

@@ -1,0 +1,122 @@
+"""What cites a site and what installs the versions of a run: CITATION.cff, BibTeX, and a file of requirements."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from vibench.errors import RequestError
+from vibench.provenance import distribution_version, solver_distribution
+from vibench.results.tables import to_latex_text
+from vibench.text import unbroken
+
+DOI = re.compile(r"10\.\d{4,9}/[!-~]+")
+"""A DOI without a resolver before it (DOI Handbook, section 2.2)."""
+
+SOFTWARE = "vibench: a benchmark framework for reduced-order models of parametrised variational inequalities"
+
+NAME, VERSION = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*"), re.compile(r"[A-Za-z0-9.!+_-]+")
+"""A distribution and its version, as a file of requirements names them: anything else could be an option of pip."""
+
+
+@dataclass(frozen=True)
+class Citation:
+    """What a site is called, by whom it is, and where it is deposited.
+
+    Attributes
+    ----------
+    title
+        Its title.
+    authors
+        Names, "Family, Given" for persons; without a comma the name of a group.
+    doi
+        DOI of the deposit, "" where there is none yet.
+    url
+        Address of the site, "" where it has none yet.
+
+    Raises
+    ------
+    RequestError
+        If the DOI is none.
+    """
+
+    title: str
+    authors: tuple[str, ...] = ()
+    doi: str = ""
+    url: str = ""
+
+    def __post_init__(self) -> None:
+        if self.doi and not DOI.fullmatch(self.doi):
+            raise RequestError(f"'{unbroken(self.doi)}' is no DOI, expected such as 10.5281/zenodo.1234567")
+
+    def cff(self) -> str:
+        """The file CITATION.cff (Citation File Format 1.2.0)."""
+        lines = [
+            "cff-version: 1.2.0",
+            'message: "If you use these results, please cite them, and vibench, which computed them."',
+            "type: dataset",
+            f"title: {_yaml(self.title)}",
+            "authors:",
+            *(line for author in self.authors or ("unnamed",) for line in _cff_author(author)),
+            f"doi: {_yaml(self.doi)}" if self.doi else "# doi: 10.…/…   of the deposit, once it has one",
+            *([f"url: {_yaml(self.url)}"] if self.url else []),
+            "references:",
+            "  - type: software",
+            f"    title: {_yaml(SOFTWARE)}",
+            "    authors:",
+            '      - name: "The vibench developers"',
+            f"    version: {_yaml(distribution_version('vibench'))}",
+        ]
+        return "\n".join(lines) + "\n"
+
+    def bibtex(self) -> str:
+        """The same as an entry of BibTeX."""
+        names = [to_latex_text(unbroken(author)) for author in self.authors or ("unnamed",)]
+        fields = {
+            "title": f"{{{to_latex_text(unbroken(self.title))}}}",
+            "author": " and ".join(name if "," in name else f"{{{name}}}" for name in names),
+            "doi": self.doi,
+            "url": unbroken(self.url),
+            "note": f"Computed by vibench {distribution_version('vibench')}",
+        }
+        lines = (f"  {name} = {{{value}}}," for name, value in fields.items())
+        return "@misc{vibench-results,\n" + "\n".join(lines) + "\n}\n"
+
+
+def _yaml(text: str) -> str:
+    """A string of YAML: JSON's strings are a subset of its double-quoted ones."""
+    return json.dumps(unbroken(text), ensure_ascii=False)
+
+
+def _cff_author(author: str) -> list[str]:
+    family, comma, given = author.partition(",")
+    if not comma:
+        return [f"  - name: {_yaml(author.strip())}"]
+    return [f"  - family-names: {_yaml(family.strip())}", f"    given-names: {_yaml(given.strip())}"]
+
+
+def requirements(versions: Mapping[str, str], code: str) -> str:
+    """The file of requirements with which pip installs the versions that a run was computed with.
+
+    Parameters
+    ----------
+    versions
+        Versions by name of distribution or solver, as the cells record them; several, separated by ", ", where cells
+        differ: none of them is required then.
+    code
+        Hashes of the code, for the comment: a version of vibench under development has no release.
+    """
+    lines = [f"# versions recorded in the results file; code of the cells: {unbroken(code)}"]
+    for name, version in sorted(versions.items()):
+        distribution = solver_distribution(name)
+        if name == "python":
+            lines.append(f"# python {unbroken(version)}")
+        elif not version:
+            lines.append(f"# {unbroken(distribution)} was not installed")
+        elif NAME.fullmatch(distribution) and VERSION.fullmatch(version):
+            lines.append(f"{distribution}=={version}")
+        else:
+            lines.append(f"# {unbroken(distribution)}: {unbroken(version)}")
+    return "\n".join(lines) + "\n"

@@ -1,0 +1,162 @@
+"""A static site of some runs: pages and data with relative links, for any host of files and for none."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+from jinja2 import Environment, PackageLoader, StrictUndefined
+from markupsafe import Markup
+
+from vibench.provenance import distribution_version
+from vibench.report import html
+from vibench.report.comparison.compare import Comparison, compare
+from vibench.report.comparison.runs import ComparedRun, run_names
+from vibench.report.leaderboard import Criterion, Standings, leaderboard
+from vibench.report.site import folder
+from vibench.report.site.citation import Citation, requirements
+from vibench.report.site.published_run import FILTERED, SHOWN_CELLS, PublishedRun, folder_names
+from vibench.results import tables
+from vibench.results.database import FILE, open_read_only
+from vibench.text import printable
+
+TABLES = ("cells", "thresholds", "disagreements")
+"""Tables that are published as CSV, too; all of them are in the results file."""
+
+LIMIT = 1.25
+"""Factor of the comparisons on a site."""
+
+MOST_CHANGES = 500
+"""Changes that a page lists; the CSV beside it has all."""
+
+
+def publish(paths: Sequence[Path], site: Path, citation: Citation, notes: Mapping[Path, str] | None = None) -> Path:
+    """Write the site of some results files; the same files give the same site.
+
+    Parameters
+    ----------
+    paths
+        The results files.
+    site
+        Folder of the site: new, empty, or one that was written by this function, whose files are replaced.
+    citation
+        How the site is cited.
+    notes
+        Remarks on results files, which stand on the pages of their runs.
+
+    Returns
+    -------
+    Path
+        Its first page.
+
+    Raises
+    ------
+    RequestError
+        If a results file cannot be read, or the folder holds files of others or cannot be written.
+    """
+    folder.check(site)
+    runs = [ComparedRun(path, name) for path, name in zip(paths, run_names(paths), strict=True)]
+    published = [
+        PublishedRun(run, own, (notes or {}).get(run.path, ""))
+        for run, own in zip(runs, folder_names([run.name for run in runs]), strict=True)
+    ]
+    folder.write(site, lambda new: _fill(new, published, citation))
+    return site / folder.FIRST_PAGE
+
+
+def _fill(site: Path, runs: Sequence[PublishedRun], citation: Citation) -> None:
+    """Write all files of the site."""
+    pages = _Pages(citation)
+    comparisons = {study: compare([run.run.path for run in group], LIMIT) for study, group in _comparable(runs)}
+    for run in runs:
+        _write_run(site / "runs" / run.folder, run, pages)
+    links = {run.run.name: f"runs/{run.folder}/index.html" for run in runs}
+    pages.write(site / "leaderboard.html", "leaderboard", "", boards=list(_boards(runs)), links=links)
+    sections = [_section(site, number, *item) for number, item in enumerate(comparisons.items(), start=1)]
+    pages.write(site / "comparison.html", "comparison", "", sections=sections, limit=LIMIT)
+    filters = {name: sorted({value for run in runs for value in run.values[name]}) for name in FILTERED}
+    pages.write(site / folder.FIRST_PAGE, "index", "", runs=runs, filters=filters)
+    _write(site / "CITATION.cff", citation.cff())
+    _write(site / "citation.bib", citation.bibtex())
+
+
+def _write_run(own: Path, run: PublishedRun, pages: _Pages) -> None:
+    """Write the folder of one run: its page and report, its data, and what installs its versions."""
+    (own / "tables").mkdir(parents=True)
+    with open_read_only(run.run.path) as db:
+        db.execute("VACUUM INTO ?", (str((own / FILE).absolute()),))
+    _write(own / "report.html", html.page(run.run.path))
+    for name in TABLES:
+        _write(own / "tables" / f"{name}.csv", _csv(run.run.path, name))
+    _write(own / "requirements.txt", requirements(run.run.versions, run.code))
+    _write(own / "provenance.json", json.dumps(run.provenance, indent=1, ensure_ascii=True, sort_keys=True) + "\n")
+    pages.write(own / "index.html", "run", "../../", run=run, cells=run.cells(), columns=SHOWN_CELLS, tables=TABLES)
+
+
+def _csv(path: Path, table: str) -> str:
+    return tables.to_csv(tables.whole_numbers(tables.in_order(tables.read(path, table))))
+
+
+def _comparable(runs: Sequence[PublishedRun]) -> Iterator[tuple[str, list[PublishedRun]]]:
+    """Runs that have cells in common with the first one of their study, by the study's name."""
+    by_study: dict[str, list[PublishedRun]] = {}
+    for run in runs:
+        by_study.setdefault(str(run.run.identity["study"]), []).append(run)
+    for study, group in by_study.items():
+        first = group[0].run.cells.keys()
+        found = [run for run in group if run.run.cells.keys() & first]
+        if len(found) > 1:
+            yield study, found
+
+
+def _boards(runs: Sequence[PublishedRun]) -> Iterator[tuple[str, tuple[Standings, ...]]]:
+    """The leaderboards of every machine: seconds are compared within one."""
+    machines = dict.fromkeys(machine for run in runs for machine in run.run.machines)
+    for machine in machines:
+        rows = [
+            row | {"run": run.run.name} for run in runs for row in run.run.cells.values() if row["machine"] == machine
+        ]
+        yield machine, leaderboard(pd.DataFrame(rows))
+
+
+def _section(site: Path, number: int, study: str, found: Comparison) -> dict[str, Any]:
+    """What the page of comparisons says of the runs of one study; their changes are a file, too."""
+    file = f"comparison-{number}.csv"
+    _write(site / file, tables.to_csv(found.changes))
+    frames = {"runs": found.by_run, "cells by column": found.by_column, "changes": found.changes.head(MOST_CHANGES)}
+    return {"study": study, "file": file, "notes": found.notes, "count": len(found.changes), "tables": frames}
+
+
+def _write(path: Path, text: str) -> None:
+    path.write_text(text, encoding="utf-8", newline="\n")
+
+
+class _Pages:
+    """The templates, with what all pages show."""
+
+    def __init__(self, citation: Citation) -> None:
+        self._environment = Environment(
+            loader=PackageLoader("vibench.report", "templates/site"),
+            autoescape=True,
+            undefined=StrictUndefined,
+            finalize=_shown,
+        )
+        self._environment.filters["number"] = tables.cell_text
+        self._shared = {
+            "citation": citation,
+            "vibench": distribution_version("vibench"),
+            "criteria": list(Criterion),
+        }
+
+    def write(self, path: Path, name: str, root: str, **content: Any) -> None:
+        """Write a page of the template of that name; `root` leads from it to the folder of the site."""
+        template = self._environment.get_template(f"{name}.html.j2")
+        _write(path, template.render(**self._shared, **content, root=root, page=name))
+
+
+def _shown(value: Any) -> Any:
+    """A text that a template shows; what it has rendered itself stays as it is."""
+    return printable(value) if isinstance(value, str) and not isinstance(value, Markup) else value
