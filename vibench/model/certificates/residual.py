@@ -23,7 +23,7 @@ import numpy as np
 from vibench.arrays import Array, Indices
 from vibench.linalg.inner_product import InnerProduct
 
-TERMS, DIRECTIONS = 0.02, 0.2
+TERMS, DIRECTIONS = 0.05, 0.4
 """Bounds of what is left out are these shares of the typical norm: of terms, and of directions, which are orthogonal to
 those that are kept."""
 
