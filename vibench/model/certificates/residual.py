@@ -33,7 +33,7 @@ NEGLIGIBLE = 1e-12
 FEW = 1000
 """All directions of up to so many terms are kept."""
 
-MOST, OVERSAMPLING = 400, 100
+MOST, OVERSAMPLING = 800, 100
 """Largest number of principal directions, and how many more a randomised method computes."""
 
 
