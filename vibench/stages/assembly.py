@@ -57,10 +57,16 @@ class AffineDecomposition(Stage):
 
     def run(self, store: Store) -> Result:
         """An `AffineMember` by name."""
-        problem = build_problem(self.problem)
-        # Terms need assemblies and no solutions: an adaptive training has too few parameters for them.
-        mus = training_of(store, self.problem, None if is_adaptive(self.training) else self.training)
+        problem, mus = build_problem(self.problem), self.parameters(store)
         return Result(*timed(lambda: affine_decomposition(problem, mus, self.tolerance)))
+
+    def parameters(self, store: Store) -> Array:
+        """The parameters (P×d) that members are decomposed over.
+
+        Terms need assemblies and no solutions: for an adaptive training, which has few parameters, they are those of
+        the problem's own set.
+        """
+        return training_of(store, self.problem, None if is_adaptive(self.training) else self.training)
 
 
 @dataclass(frozen=True)

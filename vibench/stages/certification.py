@@ -15,7 +15,6 @@ from vibench.model.certificates.spectral import SpectralBounds
 from vibench.model.hyperreduced import HyperReducedModel
 from vibench.stages.assembly import AffineDecomposition, AssemblyStage
 from vibench.stages.base import Result, Stage, build_problem, value_of
-from vibench.stages.snapshots import training_of
 from vibench.storage.artefacts import Store
 from vibench.storage.serialisation import storable
 from vibench.timing import timed
@@ -37,7 +36,7 @@ class CertificateBaseStage(Stage):
         """Factorise, bound the spectrum, measure interpolation errors."""
         problem = build_problem(self.decomposition.problem)
         members: Mapping[str, AffineMember] = value_of(store, self.decomposition)
-        training = training_of(problem, self.decomposition.training)
+        training = self.decomposition.parameters(store)
         return Result(*timed(lambda: certificate_base(problem, members, training)))
 
 
@@ -73,5 +72,5 @@ class CertificateStage(Stage):
             raise UnsupportedError(f"a certificate at online cost needs reduced assembly, and the model is {why}")
         members: Mapping[str, AffineMember] = value_of(store, self.base.decomposition)
         base: CertificateBase = value_of(store, self.base)
-        training = training_of(model.problem, self.base.decomposition.training)
+        training = self.base.decomposition.parameters(store)
         return Result(*timed(lambda: prepare(model, members, base, training)))
