@@ -163,7 +163,7 @@ def diff_runs(
 def compare_runs(
     run: Annotated[
         list[str],
-        Argument(metavar="RUN…", help="Run folders or results files; the first is the reference.", autocompletion=runs),
+        Argument(metavar="RUN", help="Run folders or results files; the first is the reference.", autocompletion=runs),
     ],
     limit: LimitOption = 1.25,
     table: Annotated[

@@ -61,10 +61,9 @@ class AffineDecomposition(Stage):
         return Result(*timed(lambda: affine_decomposition(problem, mus, self.tolerance)))
 
     def parameters(self, store: Store) -> Array:
-        """The parameters (P×d) that members are decomposed over.
+        """Parameters (P×d) at which members are assembled: the training set, or the problem's own.
 
-        Terms need assemblies and no solutions: for an adaptive training, which has few parameters, they are those of
-        the problem's own set.
+        That needs no solutions, and an adaptive training has too few parameters for it.
         """
         return training_of(store, self.problem, None if is_adaptive(self.training) else self.training)
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 benefit = Path(__file__).with_name("benefit.toml")
+certified = Path(__file__).with_name("certified.toml")
 field = Path(__file__).with_name("field.toml")
 quick = Path(__file__).with_name("quick.toml")
 hertz_quadrature = Path(__file__).with_name("hertz-quadrature.toml")
