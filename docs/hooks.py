@@ -12,6 +12,7 @@ from mkdocs.structure.files import File
 from reference import GENERATED
 
 FIGURES = ("paper-obstacle", "paper-hertz", "field")
+TWINS = "paper-figures"
 ELSEWHERE = re.compile(
     r"""<(?:script|img|iframe|link\s[^>]*rel=["']?stylesheet)[^>]*(?:src|href)=["']?(?:https?:)?//"""
 )
@@ -29,6 +30,8 @@ def on_files(files: Any, config: Any) -> Any:
     for study in FIGURES:
         for path in sorted((results / study).glob("*.png")):
             files.append(File.generated(config, f"figures/{path.name}", abs_src_path=str(path)))
+    for path in sorted((results / TWINS).glob("*")):  # a page with its figures
+        files.append(File.generated(config, f"{TWINS}/{path.name}", abs_src_path=str(path)))
     return files
 
 

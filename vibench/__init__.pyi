@@ -15,6 +15,7 @@ from .interfaces.affine import AffineSum as AffineSum
 from .interfaces.affine_problem import AffineProblem as AffineProblem
 from .interfaces.figures import FigurePlugin as FigurePlugin
 from .interfaces.figures import ProblemTables as ProblemTables
+from .interfaces.outputs import Output as Output
 from .interfaces.problem import MEMBERS as MEMBERS
 from .interfaces.problem import Contact as Contact
 from .interfaces.problem import ParameterBox as ParameterBox
@@ -22,7 +23,9 @@ from .interfaces.problem import Picture as Picture
 from .interfaces.problem import Problem as Problem
 from .interfaces.problem import Sampler as Sampler
 from .interfaces.problem import VariationalInequality as VariationalInequality
+from .interfaces.sampling import AdaptiveSampling as AdaptiveSampling
 from .interfaces.sampling import Sampling as Sampling
+from .interfaces.sampling import Trainer as Trainer
 from .interfaces.strategies import Cone as Cone
 from .interfaces.strategies import DualStrategy as DualStrategy
 from .interfaces.strategies import Enrichment as Enrichment

@@ -10,7 +10,18 @@ from annotated_types import Ge, Gt, Le, Lt
 from skfem import Basis, BilinearForm, ElementTriP1, ElementVector
 from skfem.helpers import ddot, eye, sym_grad, trace
 
-from vibench import Array, Contact, Indices, InnerProduct, ParameterBox, Picture, Problem, VariationalInequality, fem
+from vibench import (
+    Array,
+    Contact,
+    Indices,
+    InnerProduct,
+    Output,
+    ParameterBox,
+    Picture,
+    Problem,
+    VariationalInequality,
+    fem,
+)
 from vibench_problems.graded_mesh import Triangulation, quarter_disc
 from vibench_problems.mortar import Pairing
 
@@ -198,6 +209,21 @@ class Hertz(Problem):
         forces = self._all_stiffness @ self.displacement(mu, u).T.ravel()
         upper, lower = 2 * self.slave.flat + 1, self._second + 2 * self.master.flat + 1
         return -float(forces[upper].sum()), float(forces[lower].sum())
+
+    @property
+    def outputs(self) -> tuple[Output, ...]:
+        """Contact force of the whole discs per unit thickness, half-width of the contact, and indentation of disc 1.
+
+        The indentation is the vertical displacement of the apex relative to the flat, which the lifting moves.
+        """
+        widths = np.diff(self.slave.mesh.p[0, self.slave.zone[::2]])  # of the macro-edges, along the abscissa
+        apex = np.zeros(self.V.dim)
+        apex[np.searchsorted(self.free, 2 * self.slave.zone[0] + 1)] = 1.0
+        return (
+            Output("contact force", "N/m", lam=2.0 * self.macro_lengths),
+            Output("contact half-width", "m", function=lambda _mu, _u, lam: float(widths @ (lam > 0.0))),
+            Output("indentation", "m", u=apex),
+        )
 
     def picture(self, mu: Array, u: Array, lam: Array) -> Picture:
         """Deformed discs coloured by the vertical displacement, and the contact pressure (paper, Figure 10)."""

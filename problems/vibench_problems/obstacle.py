@@ -17,6 +17,7 @@ from vibench import (
     Contact,
     Indices,
     InnerProduct,
+    Output,
     ParameterBox,
     Picture,
     Problem,
@@ -192,6 +193,25 @@ class Obstacle(Problem):
     def points(self, mu: Array) -> Array:
         """Nodes (2×nodes) of the mesh of Ω at mu: h(mu) of the reference nodes."""
         return self._map.points(mu)
+
+    @property
+    def outputs(self) -> tuple[Output, ...]:
+        """Force and area of the contact at mu, and the deflection of a point outside the disc, which moves with h(mu).
+
+        The point is the node nearest to (0.35 m, 0) of the reference domain, half-way between the disc and the edge.
+        """
+        place = np.linalg.norm(self.mesh.p[:, self.free] - np.array([[0.35], [0.0]]), axis=0).argmin()
+        at_point = np.zeros(self.V.dim)
+        at_point[place] = 1.0
+        return (
+            Output("contact force", "m", function=lambda mu, _, lam: float(self._integrals(mu) @ lam)),
+            Output("contact area", "m²", function=lambda mu, _, lam: float(self._integrals(mu) @ (lam > 0.0))),
+            Output("deflection", "m", u=at_point),
+        )
+
+    def _integrals(self, mu: Array) -> Array:
+        """Integrals (m,) of the multiplier functions over the disc at mu."""
+        return -np.asarray(self.contact(mu).B.sum(axis=1)).ravel()
 
     def picture(self, mu: Array, u: Array, lam: Array) -> Picture:
         """The membrane's deflection on the mapped mesh and the contact pressure on the disc (paper, Figure 4)."""

@@ -11,6 +11,7 @@ from vibench import (
     Array,
     Contact,
     Indices,
+    Output,
     Picture,
     Problem,
     RequestError,
@@ -70,6 +71,11 @@ class Pack(Problem):
         """Entries of the terms of affine members, and of the arrays of members by parameter."""
         evaluate = {name: self._pack.members[name].entries(*places) for name, places in wanted.items()}
         return lambda mu: {name: entries(mu) for name, entries in evaluate.items()}
+
+    @property
+    def outputs(self) -> tuple[Output, ...]:
+        """Those of the pack."""
+        return self._pack.outputs
 
     def multiplier_integrals(self) -> Array:
         """Those of the pack, or X_W applied to ones."""

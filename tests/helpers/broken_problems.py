@@ -9,7 +9,7 @@ import numpy as np
 import scipy.sparse as sp
 from fake_plugins import Wire
 
-from vibench import Array, Contact, InnerProduct, ParameterBox, Picture, Problem, VariationalInequality
+from vibench import Array, Contact, InnerProduct, Output, ParameterBox, Picture, Problem, VariationalInequality
 
 
 class Declared(Wire):
@@ -285,6 +285,24 @@ class SamplesNothing(Wire):
 class OneSample(Wire):
     def training_set(self) -> Array:
         return np.array([[5.0], [5.0]])
+
+
+class OutputsOfOneName(Wire):
+    @property
+    def outputs(self) -> tuple[Output, ...]:
+        return (Output("force", "N", lam=np.ones(self.W.dim)), Output("force", "N", u=np.ones(self.V.dim)))
+
+
+class OutputOfNothing(Wire):
+    @property
+    def outputs(self) -> tuple[Output, ...]:
+        return (Output("peak", "m", function=lambda mu, u, lam: float(u[lam > 0.0].max())),)
+
+
+class OutputOfAnotherSize(Wire):
+    @property
+    def outputs(self) -> tuple[Output, ...]:
+        return (Output("force", "N", lam=np.ones(self.W.dim + 1)),)
 
 
 class Outside(Wire):

@@ -2,30 +2,25 @@
 
 from __future__ import annotations
 
+import importlib.util
 import json
 import math
 import os
+import statistics
 import subprocess
-import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import pytest
+from outputs import clean
+from running import Main, Register, refused
 from samples import install_fakes
 
-from benchmarks import compare
-from benchmarks.measure import _how_often, plain
-
-ROOT = Path(__file__).parents[2]
-
-
-def test_the_usual_run_leaves_benchmarks_out(pytestconfig: pytest.Config) -> None:
-    ignored = pytestconfig.hook.pytest_ignore_collect(
-        collection_path=ROOT / "tests" / "benchmarks", config=pytestconfig
-    )
-    assert ignored
-
+from vibench.benchmarks import cases
+from vibench.benchmarks.measure import PASSES, _how_often, plain
+from vibench.errors import RequestError
 
 REGISTERED = """\
 [vibench.problems]
@@ -41,93 +36,159 @@ lost = no_such_module:solve
 """
 
 
+@dataclass(frozen=True)
+class Timed:
+    """Exit code, output, errors and file of the benchmarks of a package that is installed, and known to nobody."""
+
+    code: int
+    out: str
+    err: str
+    file: dict[str, Any]
+
+    @property
+    def benchmarks(self) -> dict[str, dict[str, Any]]:
+        """Entries of the file by name."""
+        return {entry["name"].removeprefix("test_"): entry for entry in self.file["benchmarks"]}
+
+
 @pytest.fixture(scope="module")
-def third_party(tmp_path_factory: pytest.TempPathFactory) -> tuple[int, str, dict[str, Any]]:
-    """Exit code, output and file of the benchmarks of a package that is installed, and known to nobody."""
+def third_party(command: str, tmp_path_factory: pytest.TempPathFactory) -> Timed:
+    """The benchmarks of two problems and two solvers, and one dual strategy that fails."""
     folder = tmp_path_factory.mktemp("third-party")
     site = install_fakes(folder / "site")
     (site / "fake_plugins-1.0.dist-info" / "entry_points.txt").write_text(REGISTERED)
-    asked = (
-        "--problems wire,wire-broken,obstacle --resolutions coarse --solvers careful,lost --benchmark-max-time 0.001"
-    )
-    plain_output = "-p no:cacheprovider --tb=line -rf"
-    command = [sys.executable, "-m", "pytest", "tests/benchmarks", *asked.split(), *plain_output.split()]
-    command += ["-k", "wire or N5-R5", f"--basetemp={folder / 'temp'}", f"--benchmark-json={folder / 'file.json'}"]
-    clean = {name: value for name, value in os.environ.items() if not name.startswith("PYTEST_")}
+    plugins = ["wire", "wire-broken", "careful", "lost", "cone-raises", "mcpg", *PRIMALS]
     paths = os.pathsep.join(filter(None, [str(site), os.environ.get("PYTHONPATH")]))
     done = subprocess.run(
-        command,
-        cwd=ROOT,
-        env=clean | {"PYTHONPATH": paths, "COLUMNS": "500"},
+        [command, "bench", *plugins, "--seconds", "0.001", "--out", str(folder / "file.json")],
+        cwd=folder,
+        env=os.environ | {"PYTHONPATH": paths, "COLUMNS": "80"},
         capture_output=True,
         text=True,
         check=False,
         timeout=120,
     )
     assert done.returncode in {0, 1}, done.stdout + done.stderr
-    return done.returncode, done.stdout, json.loads((folder / "file.json").read_text(encoding="utf-8"))
+    return Timed(done.returncode, done.stdout, done.stderr, json.loads((folder / "file.json").read_text("utf-8")))
 
 
-def test_a_problem_that_is_only_registered_is_timed_in_every_stage(third_party) -> None:
-    timed = {entry["name"]: entry for entry in third_party[2]["benchmarks"]}
-    expected = [f"{stage}[wire]" for stage in ("high_fidelity_solution", "high_fidelity_sweep", "pod", "separation")]
-    expected += [f"cone[wire-{dual}]" for dual in ("cpg", "mcpg")]
-    primals = ("decorrelated", "offline-pga-0.5", "offline-pga-0.1", "online-supremizers", "enrichment-counts")
-    expected += [f"{s}[wire-{primal}]" for s in ("enrichment", "assembly_in_full", "query") for primal in primals]
-    assert {f"test_{name}" for name in expected} <= set(timed)
-    assert all(entry["stats"]["median"] > 0.0 for entry in timed.values())
-    assert timed["test_query[wire-decorrelated]"]["extra_info"]["problem"] == "wire"
+PRIMALS = ("decorrelated", "offline-pga", "enrichment-counts")
 
 
-def test_what_was_reached_is_beside_every_time(third_party) -> None:
-    reached = {entry["name"]: entry["extra_info"]["accuracy"] for entry in third_party[2]["benchmarks"]}
+def test_a_problem_that_is_only_registered_is_timed_in_every_stage(third_party: Timed) -> None:
+    stages = ("high_fidelity_solution", "high_fidelity_sweep", "pod", "separation")
+    expected = {f"{stage}[wire]" for stage in stages} | {"cone[wire-mcpg]"}
+    primals = ("decorrelated", "offline-pga-0.5", "offline-pga-0.1", "enrichment-counts")
+    expected |= {f"{s}[wire-{primal}]" for s in ("enrichment", "assembly_in_full", "query") for primal in primals}
+    assert expected <= set(third_party.benchmarks)
+    assert all(entry["stats"]["median"] > 0.0 for entry in third_party.benchmarks.values())
+    assert third_party.benchmarks["query[wire-decorrelated]"]["extra_info"]["problem"] == "wire"
+
+
+def test_what_was_reached_is_beside_every_time(third_party: Timed) -> None:
+    reached = {name: entry["extra_info"]["accuracy"] for name, entry in third_party.benchmarks.items()}
     assert all(figures and all(0.0 <= value < 2.0 for value in figures.values()) for figures in reached.values())
-    assert reached["test_high_fidelity_sweep[wire]"].keys() == {"primal_residual", "dual_residual", "gap"}
-    assert max(reached["test_high_fidelity_sweep[wire]"].values()) <= 1e-10
-    assert reached["test_pod[wire]"]["tail"] <= 1e-3
-    assert reached["test_cone[wire-mcpg]"]["projection_error"] <= 1e-2
-    assert (
-        reached["test_enrichment[wire-decorrelated]"]["sigma"]
-        > reached["test_enrichment[wire-offline-pga-0.1]"]["sigma"]
-    )
-    assert reached["test_query[wire-online-supremizers]"]["error_u"] < 1e-2
+    assert reached["high_fidelity_sweep[wire]"].keys() == {"primal_residual", "dual_residual", "gap"}
+    assert max(reached["high_fidelity_sweep[wire]"].values()) <= 1e-10
+    assert reached["pod[wire]"]["tail"] <= 1e-3
+    assert reached["cone[wire-mcpg]"]["projection_error"] <= 1e-2
+    assert reached["enrichment[wire-decorrelated]"]["sigma"] > reached["enrichment[wire-offline-pga-0.1]"]["sigma"]
+    assert reached["query[wire-offline-pga-0.1]"]["error_u"] < 1e-2
 
 
-def test_a_registered_solver_is_timed_on_reduced_programs(third_party) -> None:
-    (entry,) = (
-        e for e in third_party[2]["benchmarks"] if e["name"] == "test_solver[obstacle-medium-N5-R5-careful-1e-10]"
-    )
-    info = entry["extra_info"]
+def test_a_registered_solver_is_timed_on_reduced_programs(third_party: Timed) -> None:
+    info = third_party.benchmarks["solver[wire-N5-R5-careful-1e-10]"]["extra_info"]
     assert info["status"] == "ok"
     assert max(info["accuracy"].values()) <= 1e-10
-    assert (info["R"], info["N"], info["form"]) == (5, 5, "primal")
-    assert info["dimension"] >= 10
+    assert (info["N"], info["R"], info["form"]) == (3, 4, "primal")
+    assert info["dimension"] >= 3
+    assert "benchmarks left out: the snapshots of wire give N = " in third_party.err
 
 
-def test_what_cannot_be_made_fails_with_its_reason_and_is_not_timed(third_party) -> None:
-    code, output, file = third_party
-    assert code == 1
-    timed = " ".join(entry["name"] for entry in file["benchmarks"])
+def test_what_cannot_be_made_fails_with_its_reason_and_is_not_timed(third_party: Timed) -> None:
+    assert third_party.code == 1
     for name, reason in (
-        ("test_pod[wire-broken]", "no wire in stock"),
-        ("test_query[wire-broken-decorrelated]", "no wire in stock"),
-        ("test_cone[wire-cone-raises]", "no generator found"),
-        ("test_solver[obstacle-medium-N5-R5-lost-1e-06]", "no_such_module"),
+        ("pod[wire-broken]", "no wire in stock"),
+        ("query[wire-broken-decorrelated]", "no wire in stock"),
+        ("cone[wire-cone-raises]", "no generator found"),
+        ("solver[wire-N5-R5-lost-1e-06]", "no_such_module"),
     ):
-        assert any(name in line and reason in line for line in output.splitlines() if line.startswith("FAILED")), name
-        assert name not in timed
-    assert "ERROR" not in output
+        failed = (line for line in third_party.err.splitlines() if f" failed: {name}: " in line)
+        assert any(reason in line for line in failed), name
+        assert name not in third_party.benchmarks
 
 
-def test_the_file_says_where_it_was_measured(third_party) -> None:
-    assert set(third_party[2]["machine_info"]["vibench"]) == {"machine", "libraries", "code"}
-    assert {entry["options"]["timer"] for entry in third_party[2]["benchmarks"]} == {"process_time"}
+def test_the_file_says_where_it_was_measured(third_party: Timed) -> None:
+    assert set(third_party.file["machine_info"]["vibench"]) == {"machine", "libraries", "code"}
+    assert {entry["options"]["timer"] for entry in third_party.benchmarks.values()} == {"process_time"}
+
+
+def test_what_is_not_slow_is_timed_in_passes_whose_rounds_are_put_together(third_party: Timed) -> None:
+    several = {name: entry["extra_info"]["passes"] for name, entry in third_party.benchmarks.items()}
+    assert {len(passes) for passes in several.values()} <= {1, PASSES}
+    assert len(several["enrichment[wire-decorrelated]"]) == PASSES
+    for name, passes in several.items():
+        stats = third_party.benchmarks[name]["stats"]
+        assert sum(one["rounds"] for one in passes) == stats["rounds"] == len(stats["data"])
+        assert min(one["q1"] for one in passes) <= stats["median"] <= max(one["q3"] for one in passes)
+        assert stats["median"] == pytest.approx(statistics.median(stats["data"]))
+        assert all(one["calibration_s"] > 0.0 for one in passes)
+
+
+def test_the_tables_fit_eighty_columns_and_have_every_benchmark(third_party: Timed) -> None:
+    lines = third_party.out.splitlines()
+    assert max(map(len, lines)) <= 80
+    assert "POD" in lines
+    assert f"{len(third_party.benchmarks)} benchmarks; times are CPU times" in lines[-1]
+    assert sum(line.startswith(("decorrelated", "offline-pga")) for line in lines) == 3 * 3
+
+
+def test_only_benchmarks_with_a_chosen_plugin_are_timed(third_party: Timed) -> None:
+    duals = {entry["extra_info"]["axes"].get("dual") for entry in third_party.benchmarks.values()}
+    assert duals == {None, "mcpg"}
+    solvers = {entry["extra_info"]["axes"].get("solver") for entry in third_party.benchmarks.values()}
+    assert solvers == {None, "careful"}
+
+
+def test_plugins_are_chosen_by_the_names_of_lists(register: Register) -> None:
+    assert cases.chosen(["obstacle", "piqp", "dual:mcpg"]) == {
+        "problem": ["obstacle"], "solver": ["piqp"], "dual": ["mcpg"],
+    }  # fmt: skip
+    for name, words in (
+        ("obstacel", "did you mean 'obstacle'"), ("dual:obstacle", "no dual strategy is called 'obstacle'"),
+        ("pack", "needs options"), ("thing:x", "no plugin is called 'x'"),
+    ):  # fmt: skip
+        with pytest.raises(RequestError, match=words):
+            cases.chosen([name])
+    register(
+        ("vibench.problems", "same", "fake_plugins:Wire"),
+        ("vibench.dual_strategies", "same", "vibench_strategies.cpg:CPG"),
+    )
+    with pytest.raises(RequestError, match="say problem:same or dual:same"):
+        cases.chosen(["same"])
+
+
+def test_a_wrong_request_is_refused_before_anything_is_timed(main: Main, tmp_path: Path) -> None:
+    refused(main("bench", "obstacle", "--resolution", "huge"), "no problem has the resolution 'huge'")
+    refused(main("bench", "obstacle", "--study", "quik"), "did you mean 'quick'")
+    refused(main("bench", "obstacle", "--out", str(tmp_path / "no" / "file.json")), "is not a folder")
+    refused(main("bench", "--read", str(tmp_path / "file.json")), "cannot be read")
+    good = written(tmp_path / "good.json", entry("a", 1.0, SAME))
+    refused(main("bench", "obstacle", "--read", good), "leave out the plugins")
+
+
+def test_without_pytest_benchmark_one_line_names_the_command(main: Main, monkeypatch: pytest.MonkeyPatch) -> None:
+    found = importlib.util.find_spec
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == "pytest_benchmark" else found(name))
+    code, out, err = main("bench", "obstacle")
+    assert (code, out) == (1, "")
+    assert err == "vibench: `vibench bench` needs pytest-benchmark: pip install 'vibench[bench]'\n"
 
 
 @pytest.mark.parametrize(
     ("seconds", "budget", "together", "expected"),
     [(1e-5, 1.0, 1, (30, 200)), (1e-5, 1.0, 8, (30, 200)), (3e-4, 1.0, 8, (30, 8)), (0.02, 1.0, 8, (6, 8)),
-     (0.4, 1.0, 1, (3, 1)), (0.4, 1.0, 8, (3, 1)), (4.0, 1.0, 1, (1, 1)), (0.0, 1.0, 1, (30, 20000))],
+     (0.4, 1.0, 1, (2, 1)), (0.4, 1.0, 8, (2, 1)), (4.0, 1.0, 1, (1, 1)), (0.0, 1.0, 1, (30, 20000))],
 )  # fmt: skip
 def test_what_is_quick_is_repeated_and_what_is_slow_is_not(seconds, budget, together, expected) -> None:
     assert _how_often(seconds, budget, together) == expected
@@ -138,9 +199,20 @@ def test_what_json_has_no_number_for_is_nothing() -> None:
     assert plain(given) == {"a": None, "b": {"c": None, "d": 2}, "e": "text", "f": None, "g": True}
 
 
-def entry(name: str, seconds: float, accuracy: Mapping[str, float | None], **extra: str) -> dict[str, Any]:
-    fullname = f"tests/benchmarks/bench_stages.py::test_{name}"
-    return {"fullname": fullname, "stats": {"median": seconds}, "extra_info": {"accuracy": accuracy, **extra}}
+def entry(
+    name: str,
+    seconds: float,
+    accuracy: Mapping[str, float | None],
+    *,
+    iqr: float = 0.0,
+    calibration: float = 1.0,
+    more: Sequence[tuple[float, float]] = (),
+    **extra: str,
+) -> dict[str, Any]:
+    stats = {"median": seconds, "q1": seconds - iqr / 2, "q3": seconds + iqr / 2, "rounds": 9}
+    passes = [stats | {"calibration_s": calibration}, *({"q1": q1, "q3": q3} for q1, q3 in more)]
+    info = {"accuracy": accuracy, "passes": passes, **extra}
+    return {"fullname": f"benchmarks/bench_stages.py::test_{name}", "stats": stats, "extra_info": info}
 
 
 def written(path: Path, *entries: Mapping[str, Any], machine: str = "one core") -> str:
@@ -151,17 +223,32 @@ def written(path: Path, *entries: Mapping[str, Any], machine: str = "one core") 
 
 Pair = tuple[dict[str, Any], dict[str, Any]]
 SAME = {"error_u": 1e-3, "gap": 1e-12}
+BEFORE = entry("x", 1.0, SAME)
 COMPARED: Mapping[str, tuple[Pair, str]] = {
-    "the same": ((entry("x", 1.0, SAME), entry("x", 1.0, SAME)), ""),
-    "quicker and better": ((entry("x", 1.0, SAME), entry("x", 0.1, {"error_u": 1e-6, "gap": 0.0})), ""),
-    "within the limit": ((entry("x", 1.0, SAME), entry("x", 1.24, SAME)), ""),
-    "slower": ((entry("x", 1.0, SAME), entry("x", 1.26, SAME)), "slower"),
-    "one figure worse": ((entry("x", 1.0, SAME), entry("x", 1.0, SAME | {"gap": 2e-9})), "less accurate"),
-    "worse below what counts": ((entry("x", 1.0, SAME), entry("x", 1.0, SAME | {"gap": 0.9e-9})), ""),
-    "worse by less than ten": ((entry("x", 1.0, SAME), entry("x", 1.0, SAME | {"error_u": 9e-3})), ""),
-    "both": ((entry("x", 1.0, SAME), entry("x", 2.0, SAME | {"error_u": 0.1})), "slower, less accurate"),
-    "no longer finite": ((entry("x", 1.0, SAME), entry("x", 1.0, SAME | {"gap": None})), "less accurate"),
-    "no longer there": ((entry("x", 1.0, SAME), entry("x", 1.0, {"gap": 1e-12})), "less accurate"),
+    "the same": ((BEFORE, BEFORE), ""),
+    "quicker and better": ((BEFORE, entry("x", 0.1, {"error_u": 1e-6, "gap": 0.0})), "faster"),
+    "within the limit": ((BEFORE, entry("x", 1.24, SAME)), ""),
+    "slower": ((BEFORE, entry("x", 1.26, SAME)), "slower"),
+    "within the quartiles": ((entry("x", 1.0, SAME, iqr=0.4), entry("x", 1.5, SAME, iqr=0.7)), ""),
+    "beyond the quartiles": ((entry("x", 1.0, SAME, iqr=0.4), entry("x", 1.5, SAME, iqr=0.5)), "slower"),
+    "within the quartiles of another pass": (
+        (entry("x", 1.0, SAME, more=[(1.0, 1.4)]), entry("x", 1.5, SAME, more=[(1.39, 1.4)])), "",
+    ),
+    "beyond the quartiles of all passes": (
+        (entry("x", 1.0, SAME, more=[(1.0, 1.4)]), entry("x", 1.5, SAME, more=[(1.41, 1.5)])), "slower",
+    ),
+    "by less than 10 µs": ((entry("x", 1e-6, SAME), entry("x", 10.9e-6, SAME)), ""),
+    "by more than 10 µs": ((entry("x", 1e-6, SAME), entry("x", 11.1e-6, SAME)), "slower"),
+    "on a slower machine": ((BEFORE, entry("x", 2.4, SAME, calibration=2.0)), ""),
+    "on a slower machine, and slower": ((BEFORE, entry("x", 2.6, SAME, calibration=2.0)), "slower"),
+    "on a faster machine": ((BEFORE, entry("x", 1.1, SAME, calibration=0.5)), ""),
+    "one figure worse": ((BEFORE, entry("x", 1.0, SAME | {"gap": 2e-9})), "less accurate"),
+    "worse below what counts": ((BEFORE, entry("x", 1.0, SAME | {"gap": 0.9e-9})), ""),
+    "worse by less than ten": ((BEFORE, entry("x", 1.0, SAME | {"error_u": 9e-3})), ""),
+    "both": ((BEFORE, entry("x", 2.0, SAME | {"error_u": 0.1})), "slower, less accurate"),
+    "faster and wrong": ((BEFORE, entry("x", 0.5, SAME | {"error_u": 0.1})), "faster, less accurate"),
+    "no longer finite": ((BEFORE, entry("x", 1.0, SAME | {"gap": None})), "less accurate"),
+    "no longer there": ((BEFORE, entry("x", 1.0, {"gap": 1e-12})), "less accurate"),
     "finite at last": ((entry("x", 1.0, {"gap": None}), entry("x", 1.0, {"gap": 1.0})), ""),
     "solved no more": (
         (entry("x", 1.0, SAME, status="ok"), entry("x", 1.0, SAME, status="inaccurate")), "ok, now inaccurate",
@@ -170,49 +257,52 @@ COMPARED: Mapping[str, tuple[Pair, str]] = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize(("pair", "worse"), COMPARED.values(), ids=COMPARED)
-def test_what_got_worse_is_said_and_told_by_the_exit_code(pair: Pair, worse: str, tmp_path: Path, capsys) -> None:
-    files = [written(tmp_path / f"{k}.json", some) for k, some in enumerate(pair)]
-    assert compare.main(files) == int(bool(worse))
-    lines = capsys.readouterr().out.splitlines()
-    assert ([line for line in lines if line.startswith("x: ")] == [f"x: {worse}"]) is bool(worse)
-    assert f"1 benchmarks in both files, median of the ratios {pair[1]['stats']['median']:.3g}" in lines[-1]
+@pytest.mark.parametrize(("pair", "verdict"), COMPARED.values(), ids=COMPARED)
+def test_what_got_worse_is_said_and_told_by_the_exit_code(pair: Pair, verdict: str, tmp_path: Path, main: Main) -> None:
+    before, after = (written(tmp_path / f"{k}.json", some) for k, some in enumerate(pair))
+    worse = verdict not in ("", "faster")
+    code, out, _ = main("bench", "--read", after, "--against", before)
+    assert code == int(worse)
+    assert out.splitlines()[-1].startswith("1 benchmarks in both files, median of the ratios ")
+    assert out.splitlines()[-1].endswith(f"; {int(worse)} worse (limit 1.25)")
+    (row,) = json.loads(main("bench", "--read", after, "--against", before, "--format", "json")[1])
+    assert row["verdict"] == verdict
+    assert row["ratio"] == pytest.approx(pair[1]["stats"]["median"] / pair[0]["stats"]["median"])
 
 
-def test_a_table_has_times_their_ratio_and_the_figure_that_changed_most(tmp_path: Path, capsys) -> None:
+def test_a_row_has_the_figure_that_changed_most(tmp_path: Path, main: Main) -> None:
     before = written(tmp_path / "before.json", entry("pod[rope]", 2e-3, SAME))
     after = written(tmp_path / "after.json", entry("pod[rope]", 3e-3, SAME | {"gap": 4e-9}))
-    assert compare.main([before, after, "--limit", "2"]) == 1
-    row = [cell.strip() for cell in capsys.readouterr().out.splitlines()[2].strip("|").split("|")]
-    assert row == ["pod[rope]", "2", "3", "1.5", "gap", "1e-12", "4e-09", "less accurate"]
+    code, out, _ = main("bench", "--read", after, "--against", before, "--limit", "2")
+    assert code == 1
+    assert {"2", "3", "1.5", "gap", "1e-12", "4e-09", "less"} <= set(out.split())
 
 
-def test_what_is_new_or_gone_and_machines_that_differ_are_said(tmp_path: Path, capsys) -> None:
+def test_what_is_new_or_gone_and_machines_that_differ_are_said(tmp_path: Path, main: Main) -> None:
     before = written(tmp_path / "before.json", entry("a", 1.0, SAME), entry("b", 1.0, SAME))
     after = written(tmp_path / "after.json", entry("b", 1.0, SAME), entry("c", 1.0, SAME), machine="two cores")
-    assert compare.main([before, after]) == 0
-    lines = capsys.readouterr().out.splitlines()
-    assert {"new: c", "gone: a", "machine before: one core", "machine after:  two cores"} <= set(lines)
+    code, out, _ = main("bench", "--read", after, "--against", before)
+    assert code == 0
+    assert {"new: c", "gone: a", "machine before: one core", "machine after:  two cores"} <= set(out.splitlines())
 
 
-def test_files_that_have_nothing_in_common_are_not_worse(tmp_path: Path, capsys) -> None:
-    files = [written(tmp_path / f"{name}.json", entry(name, 1.0, SAME)) for name in "ab"]
-    assert compare.main(files) == 0
-    assert "0 benchmarks in both files; 0 worse" in capsys.readouterr().out
+def test_files_that_have_nothing_in_common_are_not_worse(tmp_path: Path, main: Main) -> None:
+    before, after = (written(tmp_path / f"{name}.json", entry(name, 1.0, SAME)) for name in "ab")
+    code, out, _ = main("bench", "--read", after, "--against", before)
+    assert code == 0
+    assert "0 benchmarks in both files; 0 worse" in out
+
+
+def test_texts_of_a_file_are_data(tmp_path: Path, main: Main) -> None:
+    path = written(tmp_path / "a.json", entry("a\x1b[31m\n", 1.0, {"b\x07": 1.0}, status="\x1b[2J"), machine="\x1b]0;")
+    other = written(tmp_path / "b.json", entry("a\x1b[31m\n", 1.0, {"b\x07": 1.0}))
+    for form in ("terminal", "csv", "json", "markdown"):
+        assert clean(main("bench", "--read", path, "--against", other, "--format", form)[1])
 
 
 @pytest.mark.parametrize("content", ["", "[]", "{}", '{"benchmarks": [{}], "machine_info": {}}'])
-def test_a_file_of_something_else_is_refused_in_a_line(content: str, tmp_path: Path, capsys) -> None:
+def test_a_file_of_something_else_is_refused_in_a_line(content: str, tmp_path: Path, main: Main) -> None:
     good, other = written(tmp_path / "good.json", entry("a", 1.0, SAME)), tmp_path / "other.json"
     other.write_text(content)
-    for files in ([good, str(other)], [str(other), good], [good, str(tmp_path / "missing.json")]):
-        assert compare.main(files) == 2
-        assert len(capsys.readouterr().err.splitlines()) == 1
-
-
-@pytest.mark.parametrize("limit", ["0", "-1", "nan"])
-def test_a_limit_that_nothing_can_keep_is_refused(limit: str, tmp_path: Path) -> None:
-    file = written(tmp_path / "file.json", entry("a", 1.0, SAME))
-    with pytest.raises(SystemExit) as caught:
-        compare.main([file, file, "--limit", limit])
-    assert caught.value.code == 2
+    for before, after in ((good, str(other)), (str(other), good), (good, str(tmp_path / "missing.json"))):
+        refused(main("bench", "--read", after, "--against", before), "cannot be read as a file of pytest-benchmark")

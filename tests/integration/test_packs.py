@@ -40,10 +40,14 @@ def numbers(folder: Path, table: str, problem: str) -> pd.DataFrame:
         found = found.join(cells[["problem", "dual", "primal", "assembly"]], on="cell")
     if table == "histories":
         found = found[found["quantity"] != "aspect_ratio"]  # diagnostics are no part of a pack
+    if table == "outputs":
+        found = found[found["linear"] == 1]  # nor are functions of the solution
+    if table == "queries":
+        found = found.drop(columns="outputs")
     found = found[found["problem"] == problem]
     seconds = {name for name in found if name.endswith("_s")}
     kept = found[[name for name in found if name not in ORIGIN | MEASURED | seconds]]
-    keys = ["primal", "assembly", "query", "stage", "quantity", "step", "dual_tol"]
+    keys = ["primal", "assembly", "output", "query", "stage", "quantity", "step", "dual_tol"]
     return kept.sort_values([key for key in keys if key in kept]).reset_index(drop=True)
 
 
@@ -60,7 +64,7 @@ def test_a_study_on_packs_gives_the_numbers_of_their_problems(vibench: Vibench, 
     done = vibench(tmp_path, "run", "study.toml", "--strict", timeout=600.0)
     assert done.returncode == 0, done.stdout + done.stderr
     for problem in RESOLUTION:
-        for table in ("cells", "queries", "histories", "solutions"):
+        for table in ("cells", "queries", "histories", "solutions", "outputs"):
             found, expected = (numbers(tmp_path, table, name) for name in (f"{problem}-pack", problem))
             assert len(found) == len(expected) > 0
             for name in set(expected) - {"problem"}:

@@ -48,7 +48,7 @@ EXAMPLES: Mapping[str, tuple[str, ...]] = {
     ),
     "publish": (
         "vibench publish quick site",
-        'vibench publish runs/* site --title "Obstacle problems" --author "Doe, Jane" --doi 10.5281/zenodo.1234567',
+        'vibench publish a b site --author "Doe, Jane" --doi 10.5281/zenodo.1234567',
     ),
     "replay": ("vibench replay quick 3f9a", "vibench replay quick 3f9a --query 7"),
     "export-qps": ("vibench export-qps quick programs",),
@@ -61,6 +61,12 @@ EXAMPLES: Mapping[str, tuple[str, ...]] = {
         "vibench check primal:mine",
         "vibench check my_package.cable:Cable",
         "vibench check solver:piqp",
+    ),
+    "bench": (
+        "vibench bench my-problem",
+        "vibench bench my-problem piqp --out before.json",
+        "vibench bench my-problem piqp --against before.json",
+        "vibench bench --read after.json --against before.json --format csv",
     ),
     "new": ("vibench new problem cable", "vibench new solver my-qp", "vibench new dual my-cone --out packages"),
     "import": ("vibench import my-model",),

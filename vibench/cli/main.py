@@ -19,6 +19,7 @@ with interrupted_at_once():
     from typer import Argument, Option
 
     from vibench.cli import result_commands
+    from vibench.cli.bench_command import bench_plugins
     from vibench.cli.completion import examples, names, solvers, studies, whole_words
     from vibench.cli.export_commands import export_reduced_model
     from vibench.cli.pack_commands import import_pack, reduce_cones, write_pack
@@ -234,7 +235,7 @@ COMMANDS: dict[str, Callable[..., None]] = {
     "diff": diff_runs, "compare": compare_runs, "publish": publish_runs,
     "replay": replay_query, "export-qps": export_qps,
     "export-model": export_reduced_model, "clean": clean, "doctor": doctor,
-    "check": check_plugin, "new": new_plugin,
+    "check": check_plugin, "bench": bench_plugins, "new": new_plugin,
     "import": import_pack, "pack": write_pack, "cones": reduce_cones,
 }  # fmt: skip
 for _name, _command in COMMANDS.items():

@@ -16,7 +16,7 @@ from vibench.study.entry_points import entry_points
 
 KINDS = {
     "problems": "problems", "sampling": "sampling", "primal": "primal_strategies", "dual": "dual_strategies",
-    "studies": "studies", "solvers": "qp_solvers",
+    "figures": "figures", "studies": "studies", "solvers": "qp_solvers",
 }  # fmt: skip
 """Group of entry points of every list, without `vibench.`."""
 

@@ -16,7 +16,7 @@ from vibench.terminal.output import echo
 
 LISTS = {
     "problems": "problem", "sampling": "sampling strategy", "primal": "primal strategy", "dual": "dual strategy",
-    "studies": "study",
+    "figures": "figure plugin", "studies": "study",
 }  # fmt: skip
 """Kind of plugin that each list shows; QP solvers are listed whether they are plugins or not."""
 
@@ -40,11 +40,12 @@ def list_plugins(
     what: Annotated[
         str | None,
         Argument(
-            help="problems, sampling, primal, dual, solvers or studies; all of them by default.", autocompletion=lists
+            help="problems, sampling, primal, dual, figures, solvers or studies; all of them by default.",
+            autocompletion=lists,
         ),
     ] = None,
 ) -> None:
-    """List problems, strategies, studies and QP solvers.
+    """List problems, strategies, figures, studies and QP solvers.
 
     Plugins are listed with their options; a list of one kind has the values of the options, too.
     """

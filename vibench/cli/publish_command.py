@@ -14,7 +14,7 @@ from vibench.terminal.output import echo
 
 def publish_runs(
     run: Annotated[
-        list[str], Argument(metavar="RUN…", help="Run folders, results files, or names in runs/.", autocompletion=runs)
+        list[str], Argument(metavar="RUN", help="Run folders, results files, or names in runs/.", autocompletion=runs)
     ],
     site: Annotated[Path, Argument(metavar="SITE", help="A new folder, or one that this command wrote.")],
     title: Annotated[str, Option(help="Title of the site.")] = "Benchmark results",

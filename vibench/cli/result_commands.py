@@ -63,12 +63,13 @@ def write_report(
     run: RunArgument, out: Annotated[Path | None, Option(help="HTML file; RUN/report.html by default.")] = None
 ) -> None:
     """Write the report of a run as one HTML page."""
+    from vibench import provenance
     from vibench.execution.run_folder import REPORT
     from vibench.report import html
     from vibench.results import tables
 
     path = tables.results_file(run)
-    echo(f"report: {html.write(path, out or path.parent / REPORT)}")
+    echo(f"report: {html.write(path, out or path.parent / REPORT, provenance.cores())}")
 
 
 def draw_figures(
@@ -91,7 +92,7 @@ def draw_figures(
     from vibench.report.figures.style import FORMATS
     from vibench.results import tables
 
-    paths = [tables.results_file(name) for name in dict.fromkeys(names)]
+    paths = list({tables.results_file(name).resolve(): tables.results_file(name) for name in names}.values())
     forms = tuple(dict.fromkeys(map(str, formats or FORMATS)))
     if paper:
         draw_paper(paths, out or Path("paper-figures"), forms)
@@ -162,7 +163,7 @@ def diff_runs(
 def compare_runs(
     run: Annotated[
         list[str],
-        Argument(metavar="RUN…", help="Run folders or results files; the first is the reference.", autocompletion=runs),
+        Argument(metavar="RUN", help="Run folders or results files; the first is the reference.", autocompletion=runs),
     ],
     limit: LimitOption = 1.25,
     table: Annotated[

@@ -39,7 +39,9 @@ class ResultWriter:
             "definition": cell.definition,
         }
         queries = [{"cell": cell.key, **keys, "query": k, **query} for k, query in enumerate(found.queries)]
-        return self.database.write_cell(row, queries, [{"cell": cell.key, **solution} for solution in found.solutions])
+        solutions = [{"cell": cell.key, **solution} for solution in found.solutions]
+        outputs = [{"cell": cell.key, **keys, **output} for output in found.outputs]
+        return self.database.write_cell(row, queries, solutions, outputs)
 
     def seconds(self, cell: Cell, timed: TimedCell, asked: int) -> None:
         """Write the seconds of a cell that has its rows."""

@@ -19,7 +19,7 @@ from typing import Any, TypeVar
 
 from threadpoolctl import threadpool_limits
 
-from vibench.errors import NumericalError, StorageError, VibenchError, in_a_line, message_of
+from vibench.errors import NumericalError, StorageError, UnsupportedError, VibenchError, in_a_line, message_of
 from vibench.execution.descendants import MARK, kill_marked
 from vibench.execution.parts import Part, PartDone
 from vibench.execution.supervisor import Begun, Finished, Job, OutOfMemory, Progress, Watch, code_here
@@ -158,6 +158,8 @@ def _guarded(memory_gib: float, work: Callable[[], T]) -> T | Failed:
         raise _NoMemoryError from None
     except (StorageError, _NoMemoryError):
         raise
+    except UnsupportedError as error:
+        return Failed(Status.UNAVAILABLE, message_of(error))
     except VibenchError as error:
         return Failed(Status.ERROR, message_of(error))
     except (Exception, SystemExit, KeyboardInterrupt) as error:  # noqa: BLE001  plugins may raise anything

@@ -14,6 +14,7 @@ import scipy.sparse as sp
 from vibench.arrays import Array, Indices, SparseMatrix
 from vibench.errors import RequestError, unknown_name
 from vibench.interfaces.affine import AffineSum
+from vibench.interfaces.outputs import Output
 from vibench.linalg.inner_product import InnerProduct
 
 
@@ -240,6 +241,11 @@ class Problem(ABC):
     def refuse(self, mu: Array, u: Array, lam: Array) -> str:  # noqa: ARG002
         """Why a high-fidelity solution u (n,), λ (m,) at mu (d,) is outside the scope of the model; "" if it is not."""
         return ""
+
+    @property
+    def outputs(self) -> tuple[Output, ...]:
+        """Quantities of interest, whose errors are recorded; none by default."""
+        return ()
 
     def picture(self, mu: Array, u: Array, lam: Array) -> Picture | None:  # noqa: ARG002
         """The picture of a solution u (n,), λ (m,) at mu (d,); `None` if not implemented."""

@@ -43,6 +43,29 @@ class Sampling(ABC):
         """
 
 
+class Trainer(ABC):
+    """What an adaptive sampling strategy trains: a reduced model that grows with every high-fidelity solution."""
+
+    @abstractmethod
+    def solve(self, mu: Array, bound: float = float("nan")) -> None:
+        """Solve at mu (d,) and add the solution to the training set; `bound`, the reason to do so, is recorded."""
+
+    @abstractmethod
+    def bound(self, mu: Array) -> float:
+        """Relative error bound of the model of all solutions so far at mu (d,); infinite where there is none."""
+
+
+class AdaptiveSampling(Sampling):
+    """Chooses training parameters one after the other, by what the solutions so far know; `parameters` are candidates.
+
+    It makes no validation set.
+    """
+
+    @abstractmethod
+    def train(self, box: ParameterBox, trainer: Trainer) -> None:
+        """Call `trainer.solve` at every training parameter, at one at least, in an order that is always the same."""
+
+
 def check_sample(box: ParameterBox, found: object) -> Array:
     """The parameters (P×d) that a sampling strategy returned, refused if they are none of the box.
 

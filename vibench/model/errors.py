@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -19,16 +19,20 @@ training solution. High-fidelity solutions have residuals up to 1e-10, so that e
 
 @dataclass(frozen=True)
 class Reference:
-    """High-fidelity solutions, columns of u (n×P) and λ (m×P), and the largest training norms of both in V and W."""
+    """High-fidelity solutions, columns of u (n×P) and λ (m×P), and what is largest over the training set.
+
+    `scale_u` and `scale_lam` are norms in V and W, `scale_outputs` absolute values of the problem's outputs.
+    """
 
     u: Array
     lam: Array
     scale_u: float
     scale_lam: float
+    scale_outputs: tuple[float, ...] = ()
 
     def at(self, numbers: Sequence[int]) -> Reference:
         """The solutions at some of the parameters."""
-        return Reference(self.u[:, numbers], self.lam[:, numbers], self.scale_u, self.scale_lam)
+        return replace(self, u=self.u[:, numbers], lam=self.lam[:, numbers])
 
 
 @dataclass(frozen=True)

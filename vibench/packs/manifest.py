@@ -148,6 +148,21 @@ class Mesh(_Model):
     multiplier: Annotated[str, Field(description="Name of the multiplier, with its unit.")] = "λ"
 
 
+class LinearOutput(_Model):
+    """A quantity of interest that is linear in u and λ; coefficients of at least one of them."""
+
+    name: Annotated[Text, Field(description="What it is.")]
+    unit: Annotated[Text, Field(description="Its unit.")] = "1"
+    u: Annotated[str | None, Field(description="Coefficients of the unknowns (n,).")] = None
+    lam: Annotated[str | None, Field(description="Coefficients of the multipliers (m,).")] = None
+
+    @model_validator(mode="after")
+    def _some(self) -> LinearOutput:
+        if self.u is None and self.lam is None:
+            raise ValueError("give coefficients of 'u', of 'lam', or of both")
+        return self
+
+
 class Manifest(_Model):
     """`pack.toml`."""
 
@@ -164,6 +179,7 @@ class Manifest(_Model):
     operators: Annotated[Operators | None, Field(description="Without them the pack has its dual half only.")] = None
     solutions: Annotated[Solutions | None, Field(description="Reference solutions, which show signs.")] = None
     mesh: Annotated[Mesh | None, Field(description="A mesh, for pictures.")] = None
+    outputs: Annotated[list[LinearOutput], Field(description="Quantities of interest.")] = []
 
     def references(self) -> Iterator[tuple[str, str]]:
         """The arrays that the manifest names, "FILE" or "FILE:NAME", and the mesh, each after its place."""
@@ -209,6 +225,9 @@ def read_manifest(folder: Path) -> Manifest:
     try:
         manifest = Manifest.model_validate(content)
         _check_parameters(manifest.parameters)
+        names = [output.name for output in manifest.outputs]
+        if len(set(names)) < len(names):
+            raise RequestError(f"outputs: two of them have the same name: {', '.join(names)}")
     except ValidationError as error:
         raise RequestError(f"{FILE}: {_line(error.errors(include_url=False)[0])}") from None
     except RequestError as error:

@@ -12,6 +12,7 @@ import scipy.sparse as sp
 from vibench.arrays import Array, Indices
 from vibench.errors import NumericalError
 from vibench.interfaces.affine import AffineSum
+from vibench.interfaces.outputs import Output
 from vibench.interfaces.problem import MEMBERS, ParameterBox, VariationalInequality
 from vibench.linalg.inner_product import InnerProduct
 from vibench.packs.manifest import Manifest
@@ -65,6 +66,8 @@ class ModelPack:
         Reference solutions, or `None`.
     mesh
         Data of pictures, or `None`.
+    outputs
+        Quantities of interest.
     """
 
     manifest: Manifest
@@ -78,6 +81,7 @@ class ModelPack:
     integrals: Array | None
     reference: Reference | None
     mesh: PackMesh | None
+    outputs: tuple[Output, ...] = ()
 
     @property
     def constant(self) -> frozenset[str]:

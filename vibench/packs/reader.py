@@ -17,6 +17,7 @@ import scipy.sparse as sp
 from vibench.arrays import Array, Indices
 from vibench.errors import NumericalError, RequestError
 from vibench.interfaces.expressions import Expression
+from vibench.interfaces.outputs import Output
 from vibench.interfaces.problem import MEMBERS, ParameterBox
 from vibench.linalg.inner_product import InnerProduct
 from vibench.packs import manifest as schema
@@ -137,6 +138,7 @@ class _Reader:
             self._manifest, box, training, validation, V, W, members, self._contact(members, n), integrals,
             None if solutions is None else self._reference(solutions, n, m),
             None if mesh is None else self._mesh(mesh, n, m),
+            tuple(self._output(k, output, n, m) for k, output in enumerate(self._manifest.outputs)),
         )  # fmt: skip
 
     def _domain(self, given: schema.Parameters) -> tuple[Array, Array | None, ParameterBox]:
@@ -283,6 +285,19 @@ class _Reader:
             u = self._columns(given.u, "solutions.u", full, count)
             u = u if self._free is None else u[self._free]
         return Reference(mus, u, lam, given.tolerance)
+
+    def _output(self, number: int, given: schema.LinearOutput, n: int, m: int) -> Output:
+        if not n:
+            raise RequestError("outputs need the table [operators]")
+        u = lam = None
+        if given.u is not None:
+            u = self._files.vector(given.u, f"outputs.{number}.u")
+            self._expect(f"outputs.{number}.u", u, (n if self._free is None else self._all,))
+            u = u if self._free is None else u[self._free]
+        if given.lam is not None:
+            lam = self._files.vector(given.lam, f"outputs.{number}.lam")
+            self._expect(f"outputs.{number}.lam", lam, (m,))
+        return Output(given.name, given.unit, u, lam)
 
     def _mesh(self, given: schema.Mesh, n: int, m: int) -> PackMesh:
         path = safe_path(self._folder, given.file)

@@ -57,6 +57,7 @@ def write_pack(
         lines += _parameters(problem, len(training), listed, part) + _spaces(problem, part)
         lines += _operators(problem, listed, part)
         lines += _solutions(problem, listed, part) if solutions else []
+        lines += _outputs(problem, part)
         (part / FILE).write_text(EXPLANATION + "\n".join(lines) + "\n", encoding="utf-8")
 
 
@@ -123,6 +124,22 @@ def _solutions(problem: Problem, listed: Array, part: Path) -> list[str]:
     u, lam = (np.column_stack([getattr(one, name) for one in found]) for name in ("u", "lam"))
     _save(part / "solutions.npz", {"u": u, "lam": lam})
     return ["[solutions]", 'u = "solutions.npz:u"', 'lam = "solutions.npz:lam"', ""]
+
+
+def _outputs(problem: Problem, part: Path) -> list[str]:
+    """The tables of the linear outputs; a function has no place in a pack."""
+    lines: list[str] = []
+    arrays: dict[str, Array] = {}
+    for k, output in enumerate(output for output in problem.outputs if output.linear):
+        lines += ["[[outputs]]", f"name = {_text(output.name)}", f"unit = {_text(output.unit)}"]
+        for key, values in (("u", output.u), ("lam", output.lam)):
+            if values is not None:
+                arrays[f"{key}{k}"] = values
+                lines.append(f'{key} = "outputs.npz:{key}{k}"')
+        lines.append("")
+    if arrays:
+        _save(part / "outputs.npz", arrays)
+    return lines
 
 
 def _stored(name: str, value: Any) -> dict[str, Any]:

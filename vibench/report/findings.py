@@ -60,15 +60,15 @@ Said = Iterator[tuple[Weight, str]]
 def findings(path: Path) -> dict[str, list[str]]:
     """Sentences on completeness, stability, errors, costs and solvers by subject, "" for the whole run."""
     found = defaultdict[str, list[str]](list)
-    for one in all_findings(path):
+    for one in all_findings(path, problems(path)):
         found[one.subject].append(one.text)
     return dict(found)
 
 
-def all_findings(path: Path) -> list[Finding]:
-    """Every finding of a run, by subject: the whole run, then problem by problem."""
+def all_findings(path: Path, known: Iterable[tuple[str, Data]]) -> list[Finding]:
+    """Every finding of a run, by subject: the whole run, then problem by problem, of which `known` has the data."""
     found = list(_about("", _whole_run(path)))
-    for name, data in problems(path):
+    for name, data in known:
         found += _about(name, _answer(data))
         for title, cells in by_dimensions(best_solver(data.cells)):
             compared = on_common_queries(cells, data.queries)

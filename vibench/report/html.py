@@ -1,12 +1,11 @@
-"""A run as one self-contained HTML page: setting, findings, failures, tables and figures."""
+"""A run as one self-contained HTML page: who wins, findings, failures, tables and plots to work with."""
 
 from __future__ import annotations
 
-import base64
-import io
 import json
 from collections.abc import Iterator
-from numbers import Real
+from importlib.resources import files
+from itertools import groupby
 from pathlib import Path
 from typing import Any
 
@@ -17,12 +16,16 @@ from markupsafe import Markup
 from vibench.errors import RequestError
 from vibench.files import write_atomically
 from vibench.qp.status import Status
-from vibench.report.figures import drawings
-from vibench.report.figures.plugins import FigureError
-from vibench.report.figures.style import caption_of, styled, write_figure
-from vibench.report.findings import findings
+from vibench.report import findings
+from vibench.report.figures import OF_DUAL, Drawing, drawings_of
+from vibench.report.figures.data import Data, label, problems
+from vibench.report.leaderboard import LARGEST_BAND, Criterion, Winner, leaderboard
+from vibench.report.page import plots
+from vibench.report.page.embedded import Grid, grid_of, grid_of_cells, grid_of_thresholds, script_safe, to_json
+from vibench.report.page.stills import stills
 from vibench.results import pictures, tables
 from vibench.results.database import read_meta, study_of
+from vibench.results.selection import short_keys
 from vibench.text import printable
 
 ERRORS = (
@@ -35,8 +38,14 @@ IDENTITY = ["problem", "dual", "primal", "primal_tol", "solver", "accuracy", "as
 """Columns that cells and queries share in the tables of failures."""
 
 
-def write(path: Path, target: Path) -> Path:
+def write(path: Path, target: Path, jobs: int = 1) -> Path:
     """Write the page of a results file as `target`; an interrupted call leaves no incomplete file under its name.
+
+    Parameters
+    ----------
+    jobs
+        Processes that draw its pictures, this one included. The others import the main module: with more than one, a
+        script that calls this has to guard what it does by ``if __name__ == "__main__"``.
 
     Raises
     ------
@@ -46,48 +55,92 @@ def write(path: Path, target: Path) -> Path:
     if target.resolve() == path.resolve():
         raise RequestError(f"'{target}' is the results file itself; choose another file for the report")
     try:
-        write_atomically(target, page(path).encode("utf-8"))
+        write_atomically(target, page(path, jobs).encode("utf-8"))
     except OSError as error:
         raise RequestError(f"'{target}' cannot be written: {error.strerror}") from None
     return target
 
 
-def page(path: Path) -> str:
-    """The page of a results file."""
-    environment = Environment(
-        loader=PackageLoader("vibench.report"), autoescape=True, undefined=StrictUndefined, finalize=_printable
-    )
-    template = environment.get_template("grid.html.j2")
-    cells, queries = tables.read(path, "cells"), tables.read(path, "queries")
-    study = study_of(path, read_meta(path))
-    failures: list[str] = []
-    drawn = list(_figures(path, failures))
-
-    def grid(frame: pd.DataFrame) -> Markup:
-        shown = frame.dropna(axis=1, how="all")
-        rows = [map(_entry, row) for row in shown.itertuples(index=False)]
-        return Markup(template.render(columns=shown.columns, rows=rows))
-
-    return environment.get_template("report.html.j2").render(
+def page(path: Path, jobs: int = 1) -> str:
+    """The page of a results file, its pictures drawn by so many processes."""
+    cells = tables.in_order(tables.read(path, "cells"))
+    study, known = study_of(path, read_meta(path)), list(problems(path))
+    grids = list(_grids(path, cells))
+    found = findings.all_findings(path, known)
+    first = findings.leading(found)
+    rest = [one for one in found if one not in first]
+    key_length = short_keys(cells["cell"])
+    rows = {str(cell): k for k, cell in enumerate(cells["cell"])}
+    live = [plot for name, data in known for plot in plots.plots(name, data, rows)]
+    drawn, undrawable = stills([one for name, data in known for one in _drawings(name, data)], jobs)
+    template = _environment().get_template("report.html.j2")
+    return template.render(
         study=study.get("name", path.parent.name),
         facts=list(_facts(study, cells)),
-        findings=findings(path),
+        standings=leaderboard(cells),
+        criteria=Criterion,
+        largest_band=LARGEST_BAND,
+        way=_way,
+        short=lambda cell: str(cell)[:key_length],
+        findings=first,
+        more_findings=[(subject, list(group)) for subject, group in groupby(rest, key=lambda one: one.subject)],
         cells=len(cells),
-        failed=cells[cells["status"] != Status.OK][["cell", *IDENTITY, "queries_ok", "queries", "reason"]],
-        failed_queries=queries[queries["status"] != Status.OK][["cell", "query", *IDENTITY, "reason"]],
+        failed=int((cells["status"] != Status.OK).sum()),
         missing=[
             *(f"no picture of {one.key[0]}: {one.reason}" for one in pictures.read(path) if one.reason),
-            *dict.fromkeys(failures),
+            *dict.fromkeys(undrawable),
         ],
-        tables=list(_tables(path, cells)),
-        figures=drawn,
-        grid=grid,
+        grids=grids,
+        stills=drawn,
+        undrawn=sum(max(0, len(data.duals) - MOST_DUALS) for _, data in known),
+        plots={plot.name: plot for plot in live},
+        plots_alone=[plot for plot in live if plot.name not in {still.name for still in drawn}],
+        table_data=Markup(to_json(grids)),
+        plot_data=Markup(script_safe({plot.name: plot.data for plot in live})),
+        library=Markup(plots.library()) if live else "",
+        style=Markup(_asset("report.css")),
+        script=Markup(_asset("report.js")),
     )
+
+
+def _environment() -> Environment:
+    return Environment(
+        loader=PackageLoader("vibench.report"),
+        autoescape=True,
+        undefined=StrictUndefined,
+        finalize=_printable,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+
+
+def _asset(name: str) -> str:
+    return (files("vibench.report") / "templates" / name).read_text(encoding="utf-8").strip()
 
 
 def _printable(value: Any) -> Any:
     """A text that a template shows; what it has rendered itself stays as it is."""
     return printable(value) if isinstance(value, str) and not isinstance(value, Markup) else value
+
+
+MOST_DUALS = 4
+"""Dual strategies of a problem that have pictures of their own: those of the leaderboard first, then the others."""
+
+
+def _drawings(name: str, data: Data) -> Iterator[tuple[str, Drawing, Data]]:
+    """The pictures of a problem: not those of every dual strategy of a large study, which look alike."""
+    winners = (winner for one in leaderboard(data.cells) for band in one.bands for winner in band.winners)
+    ranked = dict.fromkeys([*(str(winner.cell["dual"]) for winner in winners), *data.duals])
+    few = list(ranked)[:MOST_DUALS]
+    of_dual = set(OF_DUAL.values())
+    return (one for one in drawings_of([(name, data)]) if one[1] not in of_dual or set(one[2].duals) <= set(few))
+
+
+def _way(winner: Winner) -> str:
+    """The model of a cell that wins: its enrichment, cone, dimensions and solver."""
+    cell = winner.cell
+    size = f"N = {cell['N']:.0f}, R = {cell['R']:.0f}"
+    return f"{label(cell['primal'], cell['primal_tol'], cell['assembly'])}; {cell['dual']}, {size}; {cell['solver']}"
 
 
 def _facts(study: dict[str, Any], cells: pd.DataFrame) -> Iterator[tuple[str, str]]:
@@ -96,14 +149,22 @@ def _facts(study: dict[str, Any], cells: pd.DataFrame) -> Iterator[tuple[str, st
         yield axis, ", ".join(str(name) for name in cells[axis].unique())
     yield "cells", f"{len(cells)}, {int(cells['queries'].fillna(0).sum())} queries"
     yield "machine", "; ".join(str(name) for name in cells["machine"].unique())
-    versions = {name: text for row in cells["versions"].dropna() for name, text in json.loads(row).items()}
+    versions = {name: text for row in cells["versions"].dropna().unique() for name, text in json.loads(row).items()}
     yield "versions", ", ".join(f"{name} {text}" for name, text in versions.items())
     yield "seconds", "CPU seconds of one process; the offline time of a cell includes every stage it depends on"
 
 
-def _tables(path: Path, cells: pd.DataFrame) -> Iterator[tuple[str, str, str, pd.DataFrame]]:
-    """Identifier, title, caption and rows."""
-    yield "summary", "All cells", ERRORS, tables.summary(cells)
+def _grids(path: Path, cells: pd.DataFrame) -> Iterator[Grid]:
+    """The tables of the page, those of failures first; a table without rows is none."""
+    keys = short_keys(cells["cell"])
+    failed = cells[cells["status"] != Status.OK][["cell", *IDENTITY, "queries_ok", "queries", "reason"]]
+    queries = tables.read(path, "queries")
+    failed_queries = queries[queries["status"] != Status.OK][["cell", "query", *IDENTITY, "reason"]]
+    found = [
+        grid_of("failed", "Cells that are not ok", "", failed, IDENTITY, keys),
+        grid_of("failed-queries", "Queries that are not ok", "", failed_queries, IDENTITY, keys),
+        grid_of_cells(cells, ERRORS),
+    ]
     thresholds = tables.read(path, "thresholds")
     model = thresholds["cell_a"].isna()
     caption = (
@@ -115,33 +176,10 @@ def _tables(path: Path, cells: pd.DataFrame) -> Iterator[tuple[str, str, str, pd
         ("model", "Break-even against the high-fidelity model", thresholds[model]),
     ):
         if len(rows):
-            yield name, title, caption, tables.benefits(rows)
-    disagreements = tables.in_order(tables.read(path, "disagreements")).drop(columns="problem_options")
-    if len(disagreements):
-        caption = "Any two solvers on one reduced model: relative differences of u in V, and the differences allowed."
-        yield "disagreements", "Agreement of the solvers", caption, disagreements
-
-
-def _entry(value: Any) -> tuple[str, str, str]:
-    """A value as JavaScript sorts it, as it is printed, and its class; "long" text may be wrapped."""
-    text = tables.cell_text(value)
-    number = isinstance(value, Real) and not isinstance(value, bool)
-    plain = "" if not text else repr(float(value)).replace("inf", "Infinity") if number else text
-    return plain, text, "number" if number else "long" if len(text) > 48 else ""
-
-
-def _figures(path: Path, failures: list[str]) -> Iterator[tuple[str, str, str]]:
-    """Name, caption and data URI of every figure; a line is added to `failures` for each that cannot be drawn."""
-    for name, draw, data in drawings(path):
-        with styled():
-            try:
-                figure = draw(data)
-            except FigureError as error:
-                failures.append(str(error))
-                continue
-            if figure is None:
-                continue
-            stream = io.BytesIO()
-            write_figure(figure, stream, "svg")
-        source = "data:image/svg+xml;base64," + base64.b64encode(stream.getvalue()).decode("ascii")
-        yield name, caption_of(figure), source
+            found.append(grid_of_thresholds(name, title, caption, rows, cells))
+    caption = "Any two solvers on one reduced model: relative differences of u in V, and the differences allowed."
+    disagreements = tables.in_order(tables.read(path, "disagreements"))
+    disagreements = disagreements[["solver_a", *disagreements.columns.drop(["solver_a", "problem_options"])]]
+    axes = ["problem", "dual", "primal", "primal_tol", "accuracy", "assembly", "solver_a", "solver_b"]
+    found.append(grid_of("disagreements", "Agreement of the solvers", caption, disagreements, axes, keys))
+    return (grid for grid in found if len(grid.frame))

@@ -99,11 +99,19 @@ def resampled_break_even(a: Costs, b: Costs) -> BreakEven:
 
 UNDECIDED = BreakEven(None, Meaning.UNDECIDED)
 
+CERTIFIED = "certified"
+"""Value of `assembly` of queries that are assembled as reduced ones, and have certificates."""
+
+STRATEGY = ("primal", "primal_options", "primal_tol")
+
 HIGH_FIDELITY = "high-fidelity"
 """Value of `primal_a` where a is the high-fidelity model."""
 
 SHARED_PHASES = ("offline_snapshots_s", "offline_pod_s", "offline_cone_s")
 """Offline phases that compared cells have in common; measured once for both, they do not differ between them."""
+
+MODEL_PHASES = (*SHARED_PHASES, "offline_enrichment_s", "offline_assembly_s")
+"""Those that cells of the same model have in common, with certificates and without."""
 
 NORMAL_95 = 1.96
 """Half the width of the 95 % interval of a normal distribution, in standard deviations."""
@@ -118,8 +126,9 @@ def break_even_rows(cells: Iterable[Mapping[str, Any]], timings: Iterable[Mappin
     """Rows of the thresholds table from rows of the tables of cells and timings.
 
     Every per-parameter enrichment (a) is compared with every fixed one (b) of the same problem, cone, tolerances and
-    solver, if one machine measured both; the high-fidelity model (a, whose offline phase is its set-up) with every
-    strategy (b). Cells without an ok query are left out.
+    solver, if one machine measured both and both or none have certificates; every reduced cell (a) with that of the
+    same model with certificates (b); the high-fidelity model (a, whose offline phase is its set-up) with every strategy
+    (b). Cells without an ok query are left out.
     """
     timed, resampling = [cell for cell in cells if cell["online_s"] is not None], _Resampling(timings)
     rows = []
@@ -127,11 +136,16 @@ def break_even_rows(cells: Iterable[Mapping[str, Any]], timings: Iterable[Mappin
         model = {"cell": None, "primal": HIGH_FIDELITY, "primal_tol": None, "assembly": ""}
         model |= {"offline_s": b["hf_setup_s"], "online_s": b["hf_s"]}
         rows.append(_row(model, b, resampling.against_high_fidelity(b)))
-        if b["enrichment_kind"] == Kind.FIXED:
-            others = (a for a in timed if a["enrichment_kind"] == Kind.PER_PARAMETER)
-            same = (a for a in others if all(a[name] == b[name] for name in (*_SHARED, *VALIDATION, "machine")))
-            rows += [_row(a, b, resampling.between(a, b)) for a in same]
+        alike = [a for a in timed if all(a[name] == b[name] for name in (*_SHARED, *VALIDATION, "machine"))]
+        rows += [_row(a, b, resampling.between(a, b)) for a in alike if _compared(a, b)]
     return rows
+
+
+def _compared(a: Mapping[str, Any], b: Mapping[str, Any]) -> bool:
+    """Whether b is an alternative to a: fixed to per-parameter enrichment, or the same with certificates to without."""
+    if (a["assembly"] == CERTIFIED) == (b["assembly"] == CERTIFIED):
+        return bool(a["enrichment_kind"] == Kind.PER_PARAMETER and b["enrichment_kind"] == Kind.FIXED)
+    return a["assembly"] == "reduced" and all(a[name] == b[name] for name in STRATEGY)
 
 
 class _Resampling:
@@ -159,7 +173,8 @@ class _Resampling:
         """Break-even of two cells, whose snapshots, POD and cone are the same."""
         rng = np.random.default_rng(0)
         common = sorted(self._rounds.get(a["cell"], {}).keys() & self._rounds.get(b["cell"], {}).keys())
-        shared = sum(a[name] for name in SHARED_PHASES if a[name] == b[name])
+        phases = MODEL_PHASES if b["assembly"] == CERTIFIED != a["assembly"] else SHARED_PHASES
+        shared = sum(a[name] for name in phases if a[name] == b[name])
         which = rng.integers(max(len(common), 1), size=(DRAWS, len(common)))
         costs = [self._costs(cell, common, which, shared, rng) for cell in (a, b)]
         return resampled_break_even(*costs) if len(common) >= FEWEST_ROUNDS else UNDECIDED

@@ -56,6 +56,7 @@ UNITS: Mapping[str, str] = {
     "A²": "the unit of the energy",
     "b": "the unit of b(v, η), which is that of the energy",
     "b/VW": "the unit of b(v, η) divided by those of the norms of V and W",
+    "o": "the unit of the output, in the column unit",
 }
 """The units and what they stand for; those of V, W and b depend on the problem."""
 
@@ -81,7 +82,9 @@ KEYS: Mapping[str, Column] = {
     "primal_tol": Column(REAL, "1", "Tolerance δ of the primal strategy; empty for strategies that take none.", "δ", 6),
     "solver": Column(TEXT, "", "QP solver.", "solver", 7),
     "accuracy": Column(REAL, "1", "Relative accuracy prescribed to the solver.", "accuracy", 8),
-    "assembly": Column(TEXT, "", "Assembly of the queries: full or reduced.", "assembly", 9),
+    "assembly": Column(
+        TEXT, "", "Assembly of the queries: full, reduced, or certified: reduced with bounds.", "assembly", 9
+    ),
 }
 """What names a cell. Where a study prescribes N or R, `pod_size` or `dual_size` is filled instead of the tolerance."""
 
@@ -143,11 +146,15 @@ CELLS: Mapping[str, Column] = {
     "terms_B": Column(INTEGER, "", "Likewise for B; empty if B is assembled on the contact unknowns."),
     "terms_g": Column(INTEGER, "", "Likewise for g."),
     "offline_snapshots_s": Column(REAL, "s", "High-fidelity solutions at the training parameters, with one set-up."),
+    "offline_selection_s": Column(
+        REAL, "s", "Choice of the training parameters by error bounds, a part of the time before; 0 for fixed sets."
+    ),
     "offline_pod_s": Column(REAL, "s", "POD."),
     "offline_cone_s": Column(REAL, "s", "Dual strategy, with the orthonormal basis of the span."),
     "offline_enrichment_s": Column(REAL, "s", "Primal strategy."),
     "offline_assembly_s": Column(REAL, "s", "Preparation of reduced assembly; 0 with full assembly."),
-    "offline_s": Column(REAL, "s", "Sum of the five above: the offline time of this cell alone.", "offline [s]", 22),
+    "offline_certificate_s": Column(REAL, "s", "Preparation of certificates at online cost; 0 without."),
+    "offline_s": Column(REAL, "s", "Sum of the six above: the offline time of this cell alone.", "offline [s]", 22),
     "offline_low_s": Column(
         REAL,
         "s",
@@ -158,7 +165,7 @@ CELLS: Mapping[str, Column] = {
     "online_s": Column(
         REAL,
         "s",
-        "One query, assembly and solution: median over the rounds of the mean over ok queries.",
+        "One query, assembly, solution and certificate: median over the rounds of the mean over ok queries.",
         "online [ms]",
         23,
     ),
@@ -167,6 +174,9 @@ CELLS: Mapping[str, Column] = {
     "online_wall_s": Column(REAL, "s", "The same as online_s, in wall seconds."),
     "online_assemble_s": Column(REAL, "s", "Assembly of a query: median over the rounds."),
     "online_solve_s": Column(REAL, "s", "Solution of a query by the solver: median over the rounds."),
+    "online_certify_s": Column(
+        REAL, "s", "Certificate of a query: median over the rounds; empty without certificates."
+    ),
     "timing_rounds": Column(INTEGER, "", "Number of timing rounds; empty if the cell has not been timed yet."),
     "timing_reason": Column(TEXT, "", "Why rounds are missing."),
     "hf_setup_s": Column(
@@ -205,7 +215,13 @@ CELLS: Mapping[str, Column] = {
         INTEGER, "", "Ok queries with zero_lambda = 1, which means and maxima of the error of λ leave out.", "λ = 0", 20
     ),
     "error_lambda_zero_max": Column(REAL, "1", "Largest error_lambda_scaled of these queries.", "error, λ = 0", 21),
-    **_medians("u_energy", "u", "lambda_natural", "lambda", "hsw_u", "hsw_lambda"),
+    **_medians(
+        "u_energy", "u", "lambda_natural", "lambda", "online_u_energy", "online_lambda_natural", "hsw_u", "hsw_lambda"
+    ),
+    "certificate": Column(TEXT, "", "Bounds at online cost: certified, verified, or none.", "certificate", 10),
+    "bound_online_violations": Column(
+        INTEGER, "", "Ok queries where bound_online_violated is 1; empty without a certificate."
+    ),
     "solver_error_u_max": Column(REAL, "1", "Largest contribution of the QP solver to the relative error of u."),
     "solver_error_lambda_max": Column(REAL, "1", "Largest contribution of the QP solver to the relative error of λ."),
     "solver_share_max": Column(REAL, "1", "Largest ratio of this contribution to the error, over the queries."),
@@ -275,7 +291,8 @@ QUERIES: Mapping[str, Column] = {
     "assembly_error": Column(REAL, "1", "Largest relative difference of a member of the program from its projection."),
     "assemble_s": Column(REAL, "s", "Assembly of the reduced program: median over the rounds."),
     "solve_s": Column(REAL, "s", "The solver: median over the rounds."),
-    "total_s": Column(REAL, "s", "Sum of the two."),
+    "certify_s": Column(REAL, "s", "The certificate: median over the rounds; empty without one."),
+    "total_s": Column(REAL, "s", "Sum of the three."),
     "total_wall_s": Column(REAL, "s", "The same in wall seconds."),
     "hf_s": Column(
         REAL,
@@ -327,6 +344,22 @@ QUERIES: Mapping[str, Column] = {
     "bound_note": Column(
         TEXT, "", "Why there are no bounds, or which of their constants is estimated; empty if they are proved."
     ),
+    "certificate": Column(
+        TEXT, "", "Bounds at online cost: certified, verified up to interpolation errors that were measured, or none."
+    ),
+    "bound_online_u_energy": Column(REAL, "A", "Bound of error_u_energy_absolute at online cost."),
+    "bound_online_lambda_natural": Column(REAL, "A", "Bound of error_lambda_natural_absolute at online cost."),
+    **_effectivities("online_u_energy", "online_lambda_natural"),
+    "bound_online_rho": Column(REAL, "A", "Its bound of ρ."),
+    "bound_online_omega": Column(REAL, "A", "Its bound of ω."),
+    "bound_online_kappa": Column(REAL, "A²", "Its κ."),
+    "coercivity_online": Column(
+        REAL, "1", "Lower bound of A(µ) against A at the centre of the parameters; 1 where A is constant."
+    ),
+    "bound_online_violated": Column(
+        INTEGER, "", "1 where an error is above its bound by more than 1e-10 of the solution, else 0; empty without."
+    ),
+    "bound_online_note": Column(TEXT, "", "Why there are no bounds at online cost."),
     "bound_hsw_u": Column(
         REAL,
         "V",
@@ -340,6 +373,12 @@ QUERIES: Mapping[str, Column] = {
     "continuity_proved": Column(INTEGER, "", "1 if a factorisation proves it, 0 if it is a Lanczos estimate."),
     "beta_energy": Column(
         REAL, "b/AW", "β_A, proved lower bound of the inf-sup constant of V in the norm of A(µ) and W over the span."
+    ),
+    "outputs": Column(
+        TEXT,
+        "",
+        "Quantities of interest as JSON: value, high-fidelity reference, relative error, error over the scale.",
+        whole=True,
     ),
     "violation": Column(
         REAL, "u", "Largest (B u_N − g)₊, each row divided by the integral of its multiplier function."
@@ -368,7 +407,8 @@ TIMINGS: Mapping[str, Column] = {
     "queries": Column(INTEGER, "", "Number of ok queries solved in the round."),
     "assemble_s": Column(REAL, "s", "Assembly of a query: mean over these, or with full assembly that of one of them."),
     "solve_s": Column(REAL, "s", "Solution of a query by the solver: mean over these."),
-    "total_s": Column(REAL, "s", "Sum of the two."),
+    "certify_s": Column(REAL, "s", "Certificate of a query: mean over these; empty without one."),
+    "total_s": Column(REAL, "s", "Sum of the three."),
     "total_wall_s": Column(REAL, "s", "The same in wall seconds."),
     "slowdown": Column(REAL, "1", "Time of the calibration next to the round, divided by its best in that process."),
 }
@@ -443,6 +483,22 @@ SOLUTIONS: Mapping[str, Column] = {
     "slack_constant": Column(REAL, "V²", "Constant c in the square of that distance."),
 }
 
+OUTPUTS: Mapping[str, Column] = {
+    "cell": Column(MEMBER, "", "The cell it belongs to.", "cell", 0),
+    **KEYS,
+    "output": Column(TEXT, "", "Quantity of interest, as its problem names it.", "output", 10),
+    "unit": Column(TEXT, "", "Its unit.", "unit", 11),
+    "linear": Column(INTEGER, "", "1 where it is linear in u and λ with fixed coefficients, else 0."),
+    "scale": Column(REAL, "o", "Its largest absolute value over the training set.", "scale", 12),
+    "queries_ok": Column(INTEGER, "", "Ok queries, over which means and maxima are."),
+    "error_mean": Column(REAL, "1", "Mean relative error, where the output is not zero.", "error", 13),
+    "error_max": Column(REAL, "1", "Largest relative error, likewise.", "largest", 14),
+    "queries_zero": Column(INTEGER, "", "Ok queries where it is at most 1e-8 of its scale: no contact, for instance."),
+    "error_zero_max": Column(REAL, "1", "Largest error of these, over the scale."),
+    "error_scaled_mean": Column(REAL, "1", "Mean error over the scale, of all ok queries.", "error / scale", 15),
+    "error_scaled_max": Column(REAL, "1", "Largest error over the scale, likewise."),
+}
+
 PICTURES: Mapping[str, Column] = {
     "problem": Column(TEXT, "", "Problem: its label in the study, or its name."),
     "problem_options": Column(TEXT, "", "Options of the problem that are not at their default, as JSON.", whole=True),
@@ -460,6 +516,7 @@ TABLES: Mapping[str, Mapping[str, Column]] = {
     "timings": TIMINGS,
     "thresholds": THRESHOLDS,
     "disagreements": DISAGREEMENTS,
+    "outputs": OUTPUTS,
 }
 """The tables for reading; each is exported as CSV."""
 

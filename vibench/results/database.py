@@ -97,7 +97,7 @@ class ResultsDatabase:
         for table, columns in STORED.items():
             declared = ", ".join(f'"{name}" {column.kind}' for name, column in columns.items())
             self._db.execute(f"CREATE TABLE IF NOT EXISTS {table} ({declared})")
-        for table in ("queries", "solutions", "timings"):
+        for table in ("queries", "solutions", "timings", "outputs"):
             self._db.execute(f"CREATE INDEX IF NOT EXISTS {table}_of_cell ON {table}(cell)")
         self._db.execute(f"CREATE INDEX IF NOT EXISTS histories_named ON histories({', '.join(NAMED)})")
         entries = {"schema": str(VERSION), "study": json.dumps(study, sort_keys=True)}
@@ -152,9 +152,13 @@ class ResultsDatabase:
         return {key: (status, code) for key, status, code in self._db.execute("SELECT cell, status, code FROM cells")}
 
     def write_cell(
-        self, cell: Mapping[str, Any], queries: Sequence[Mapping[str, Any]], solutions: Sequence[Mapping[str, Any]] = ()
+        self,
+        cell: Mapping[str, Any],
+        queries: Sequence[Mapping[str, Any]],
+        solutions: Sequence[Mapping[str, Any]] = (),
+        outputs: Sequence[Mapping[str, Any]] = (),
     ) -> dict[str, Any]:
-        """Write a cell, its queries and solutions in one transaction; earlier rows of the cell are replaced.
+        """Write a cell, its queries, solutions and outputs in one transaction; its earlier rows are replaced.
 
         Rows that cannot be stored because of their values cost the cell, not the run: it gets an `error` row instead.
 
@@ -169,17 +173,15 @@ class ResultsDatabase:
             If the file cannot be written.
         """
         try:
-            return self._write_cell(cell, queries, solutions)
+            return self._write_cell(cell, queries=queries, solutions=solutions, outputs=outputs)
         except (UnstorableError, sqlite3.Error) as error:
-            return self._write_cell(error_row(cell, str(error)), (), ())
+            return self._write_cell(error_row(cell, str(error)))
 
-    def _write_cell(
-        self, cell: Mapping[str, Any], queries: Sequence[Mapping[str, Any]], solutions: Sequence[Mapping[str, Any]]
-    ) -> dict[str, Any]:
+    def _write_cell(self, cell: Mapping[str, Any], **others: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
         with self._writing():
-            self._add_columns(queries)
+            self._add_columns(others.get("queries", ()))
             self._remove(cell["cell"])
-            for table, rows in (("cells", [cell]), ("queries", queries), ("solutions", solutions)):
+            for table, rows in {"cells": [cell], **others}.items():
                 self._insert(table, rows)
                 self._digests.count(table, "cell = ?", (cell["cell"],))
         return storable("cells", cell)

@@ -12,7 +12,7 @@ from vibench.errors import unknown_name
 from vibench.results import best, selection, tables
 from vibench.results.columns import CELLS, THRESHOLDS, Column
 
-AXES = ("problem", "dual", "primal", "primal_tol", "solver", "pod_tol", "dual_tol", "accuracy", "assembly")
+AXES = ("problem", "training", "dual", "primal", "primal_tol", "solver", "pod_tol", "dual_tol", "accuracy", "assembly")
 """Columns that tell rows apart; where all rows have one value, it stands in the title and takes no room."""
 
 OF_CELLS = (
@@ -67,6 +67,12 @@ VIEWS: Mapping[str, View] = {
         "timings", (*AXES, "cell", "round", "total_s", "assemble_s", "solve_s", "queries", "slowdown"),
     ),
     "thresholds": View("thresholds", OF_BENEFITS),
+    "outputs": View(
+        "outputs",
+        ("problem", "training", "dual", "primal", "primal_tol", "solver", "assembly", "output", "unit", "error_mean",
+         "error_max", "error_scaled_mean", "scale", "queries_ok", "queries_zero", "pod_tol", "dual_tol", "accuracy",
+         "cell"),
+    ),
     "disagreements": View(
         "disagreements",
         ("solver_a", "solver_b", "problem", "dual", "primal", "primal_tol", "pod_tol", "dual_tol", "accuracy",

@@ -25,7 +25,7 @@ from vibench.reduction.supremizers import ContactCoordinates, SpannedCoordinates
 from vibench.stages.assemblies import assemblies
 from vibench.stages.base import Result, Stage, build_problem, value_of
 from vibench.stages.enrichment import EnrichmentStage, GrowthStage, enrichment_stage
-from vibench.stages.snapshots import training_of, validation_of
+from vibench.stages.snapshots import is_adaptive, training_of, validation_of
 from vibench.storage.artefacts import Store
 from vibench.storage.serialisation import storable
 from vibench.study.cells import Cell, Plugin
@@ -55,11 +55,17 @@ class AffineDecomposition(Stage):
     tolerance: float
     training: Plugin | None = None
 
-    def run(self, store: Store) -> Result:  # noqa: ARG002
+    def run(self, store: Store) -> Result:
         """An `AffineMember` by name."""
-        problem = build_problem(self.problem)
-        mus = training_of(problem, self.training)
+        problem, mus = build_problem(self.problem), self.parameters(store)
         return Result(*timed(lambda: affine_decomposition(problem, mus, self.tolerance)))
+
+    def parameters(self, store: Store) -> Array:
+        """Parameters (P×d) at which members are assembled: the training set, or the problem's own.
+
+        That needs no solutions, and an adaptive training has too few parameters for it.
+        """
+        return training_of(store, self.problem, None if is_adaptive(self.training) else self.training)
 
 
 @dataclass(frozen=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 import resource
 from collections.abc import Callable, Mapping, Sequence
@@ -12,7 +13,11 @@ import numpy as np
 
 from vibench.errors import in_a_line
 from vibench.interfaces.strategies import Kind
+from vibench.model.certificates.base import Guarantee
+from vibench.model.certificates.bounds import OnlineCertificate
 from vibench.model.errors import Reference, zeros
+from vibench.model.output_errors import scales as output_scales
+from vibench.model.output_errors import summarise_outputs
 from vibench.provenance import machine
 from vibench.qp.exact import ExactSolution
 from vibench.qp.status import Status
@@ -22,6 +27,7 @@ from vibench.stability.infsup import InfSup, share
 from vibench.stages.assembly import AssemblyStage, ExactSolutions, assembly_stage
 from vibench.stages.base import Failed, Pieces, PiecewiseStage, Row, Stage, value_of
 from vibench.stages.cell_summary import summarise
+from vibench.stages.certification import CertificateStage
 from vibench.stages.infsup_constants import (
     FullConstants,
     OwnConstants,
@@ -46,11 +52,12 @@ QueryRows = tuple[Row, Row | None]
 
 @dataclass(frozen=True)
 class CellRows:
-    """The rows of one cell: its own, one per query, and the solutions of the queries that have one."""
+    """The rows of one cell: its own, one per query, the solutions of those that have one, and one per output."""
 
     cell: Row
     queries: tuple[Row, ...]
     solutions: tuple[Row, ...] = ()
+    outputs: tuple[Row, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -65,6 +72,7 @@ class CellQueries(PiecewiseStage):
     accuracy: float
     query_seconds: float
     warm_start: bool = False
+    certificate: CertificateStage | None = None
 
     @property
     def sort(self) -> str:
@@ -131,6 +139,7 @@ class CellQueries(PiecewiseStage):
             "cone": (enrichment.cone,),
             "enrichment": (enrichment,),
             "assembly": () if reduction is None else (reduction.decomposition, reduction),
+            "certificate": () if self.certificate is None else (self.certificate.base, self.certificate),
         }
 
     def inputs(self) -> tuple[Stage, ...]:
@@ -147,7 +156,9 @@ class CellQueries(PiecewiseStage):
 
 def cell_queries(cell: Cell, query_seconds: float) -> CellQueries:
     """The last stage of a cell; all its other stages are inputs of it, directly or indirectly."""
-    return CellQueries(assembly_stage(cell), cell.solver, cell.accuracy, query_seconds, cell.warm_start)
+    assembly = assembly_stage(cell)
+    certificate = CertificateStage(assembly) if cell.assembly == "certified" else None
+    return CellQueries(assembly, cell.solver, cell.accuracy, query_seconds, cell.warm_start, certificate)
 
 
 class _Queries(Pieces):
@@ -159,15 +170,21 @@ class _Queries(Pieces):
         self._cone: ReducedCone = value_of(store, stage.assembly.enrichment.cone)
         self._training, self._reference = gather(store, stage.training), gather(store, stage.validation)
         problem = self._model.problem
-        scales = (
-            float(np.max(space.norm(columns), initial=0.0))
-            for space, columns in ((problem.V, self._training.u), (problem.W, self._training.lam))
+        trained = self._training
+        self._compared = Reference(
+            self._reference.u,
+            self._reference.lam,
+            float(np.max(problem.V.norm(trained.u), initial=0.0)),
+            float(np.max(problem.W.norm(trained.lam), initial=0.0)),
+            output_scales(problem.outputs, trained.mu, trained.u, trained.lam),
         )
-        self._compared = Reference(self._reference.u, self._reference.lam, *scales)
         self._zeros = zeros(problem, self._compared)
         self._own, self._full, self._plain = (value_of(store, known) for known in stage.constants)
         self._stability: list[Stability] = value_of(store, stage.reference)
         self._exact: tuple[ExactSolution | None, ...] = value_of(store, stage.exact)
+        self._certificate: OnlineCertificate | None = (
+            None if stage.certificate is None else value_of(store, stage.certificate)
+        )
 
     def piece(self, number: int, watch: Callable[[bool], None]) -> QueryRows:
         """The rows of one query."""
@@ -185,7 +202,15 @@ class _Queries(Pieces):
         assessed = dict(zip(solutions, self._assess(solutions), strict=True))
         rows = [row | assessed.get(k, {}) for k, (row, _) in enumerate(pieces)]
         own = summarise(rows) | self._sizes() | self._shares() | self._offline()
-        return CellRows(own, tuple(rows), tuple(solutions.values()))
+        outputs = self._outputs(rows)
+        written = [row | {"outputs": json.dumps(found) if (found := row.get("outputs")) else None} for row in rows]
+        return CellRows(own, tuple(written), tuple(solutions.values()), outputs)
+
+    def _outputs(self, rows: Sequence[Row]) -> tuple[Row, ...]:
+        """Rows of the problem's outputs, over the ok queries."""
+        fine = [row["outputs"] for row in rows if row["status"] == Status.OK]
+        outputs, scale = self._model.problem.outputs, self._compared.scale_outputs
+        return tuple(dict(row) for row in summarise_outputs(outputs, scale, fine))
 
     def _assess(self, solutions: Mapping[int, Row]) -> list[Row]:
         """Error columns of some queries, all at once; where that fails, one by one, and a row says why it failed."""
@@ -198,6 +223,7 @@ class _Queries(Pieces):
                 self._compared.at(numbers),
                 [self._stability[k] for k in numbers],
                 [self._exact[k] for k in numbers],
+                self._certificate,
             )
         except MemoryError:
             raise
@@ -247,6 +273,7 @@ class _Queries(Pieces):
             "snapshots": len(self._training.mu),
             "enrichment": cone.prepared.rank if built.kind is Kind.PER_PARAMETER else added,
             **assembly.columns(self._store),
+            "certificate": (Guarantee.NONE if self._certificate is None else self._certificate.base.guarantee).value,
             "fallbacks": "; ".join(fallbacks),
             "peak_memory_mib": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
         }
@@ -271,6 +298,7 @@ class _Queries(Pieces):
         spent["snapshots"].append(setup)
         row: Row = {f"offline_{name}_s": sum(s.cpu for s in parts) for name, parts in spent.items()}
         row["offline_s"] = sum(row.values())
+        row["offline_selection_s"] = self._training.selecting.cpu
         row["offline_wall_s"] = sum(s.wall for parts in spent.values() for s in parts)
         marginal = [seconds.cpu for seconds in self._reference.seconds]
         row |= {"hf_setup_s": setup.cpu, "hf_s": float(np.median(marginal))}

@@ -11,7 +11,9 @@ from vibench.model.errors import UNMEASURABLE
 from vibench.qp.status import Status
 from vibench.stages.base import Row
 
-BOUNDS = ("u_energy", "u", "lambda_natural", "lambda", "hsw_u", "hsw_lambda")
+BOUNDS = (
+    "u_energy", "u", "lambda_natural", "lambda", "online_u_energy", "online_lambda_natural", "hsw_u", "hsw_lambda",
+)  # fmt: skip
 """Error bounds, as in the names of their columns."""
 
 
@@ -53,6 +55,7 @@ def summarise(rows: Sequence[Row]) -> Row:
             f"error_{name}_zero_max": largest(f"error_{name}_scaled", zero),
         }
 
+    certified = column("bound_online_violated").size > 0
     residuals = [largest(name) for name in ("primal_residual", "dual_residual", "gap")]
     return {
         "status": worst.value,
@@ -62,6 +65,7 @@ def summarise(rows: Sequence[Row]) -> Row:
         **errors("u"),
         **errors("lambda"),
         **{f"effectivity_{name}_median": median(f"effectivity_{name}") for name in BOUNDS},
+        "bound_online_violations": int(column("bound_online_violated").sum()) if certified else None,
         **{f"{name}_max": largest(name) for name in ("solver_error_u", "solver_error_lambda", "solver_share")},
         "solver_share_mean": max(
             (share for name in ("u", "lambda") if (share := solver_share(name)) is not None), default=None

@@ -36,7 +36,8 @@ class CertificateBaseStage(Stage):
         """Factorise, bound the spectrum, measure interpolation errors."""
         problem = build_problem(self.decomposition.problem)
         members: Mapping[str, AffineMember] = value_of(store, self.decomposition)
-        return Result(*timed(lambda: certificate_base(problem, members)))
+        training = self.decomposition.parameters(store)
+        return Result(*timed(lambda: certificate_base(problem, members, training)))
 
 
 @dataclass(frozen=True)
@@ -51,7 +52,7 @@ class CertificateStage(Stage):
     @property
     def base(self) -> CertificateBaseStage:
         """The stage of what it shares with other models."""
-        assert self.assembly.reduction is not None  # `certificate_stage` has no other cells
+        assert self.assembly.reduction is not None  # certified cells have reduced assembly
         return CertificateBaseStage(self.assembly.reduction.decomposition)
 
     def inputs(self) -> tuple[Stage, ...]:
@@ -71,4 +72,5 @@ class CertificateStage(Stage):
             raise UnsupportedError(f"a certificate at online cost needs reduced assembly, and the model is {why}")
         members: Mapping[str, AffineMember] = value_of(store, self.base.decomposition)
         base: CertificateBase = value_of(store, self.base)
-        return Result(*timed(lambda: prepare(model, members, base)))
+        training = self.base.decomposition.parameters(store)
+        return Result(*timed(lambda: prepare(model, members, base, training)))

@@ -250,7 +250,7 @@ def _offline(store: Store, pod: PODStage, cone: ConeStage) -> Offline:
     """The offline data that a primal strategy is built from."""
     problem, basis = build_problem(pod.problem), value_of(store, pod).basis
     reduced: ReducedCone = value_of(store, cone)
-    return Offline(problem, basis, reduced.cone, reduced.prepared.span, training_of(problem, pod.training))
+    return Offline(problem, basis, reduced.cone, reduced.prepared.span, training_of(store, pod.problem, pod.training))
 
 
 def _projected(offline: Offline, vectors: Array, classes: ConstraintClasses) -> ProjectedSupremizers:

@@ -11,7 +11,7 @@ from vibench.reduction.pod import POD, pod
 from vibench.reduction.supremizers import ConstraintClasses, constraint_classes, isometric_supremizers
 from vibench.stability.infsup import Multipliers, beta_span, multipliers
 from vibench.stages.base import Result, Stage, build_problem, faults_of, value_of
-from vibench.stages.snapshots import gather, training_of, training_stages
+from vibench.stages.snapshots import chosen_by, gather, training_of, training_stages
 from vibench.storage.artefacts import History, Store
 from vibench.storage.serialisation import storable
 from vibench.study.cells import Axes, Plugin
@@ -106,10 +106,14 @@ class TrainingConstraints(Stage):
     problem: Plugin
     training: Plugin | None = None
 
-    def run(self, store: Store) -> Result:  # noqa: ARG002
+    def inputs(self) -> tuple[Stage, ...]:
+        """The training set, where it is known only when it is solved."""
+        return chosen_by(self.problem, self.training)
+
+    def run(self, store: Store) -> Result:
         """The `ConstraintClasses`."""
-        problem = build_problem(self.problem)
-        return Result(constraint_classes(problem.constraint(mu)[0] for mu in training_of(problem, self.training)))
+        problem, mus = build_problem(self.problem), training_of(store, self.problem, self.training)
+        return Result(constraint_classes(problem.constraint(mu)[0] for mu in mus))
 
 
 @dataclass(frozen=True)

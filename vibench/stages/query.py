@@ -12,9 +12,13 @@ from vibench.arrays import Array
 from vibench.errors import in_a_line
 from vibench.interfaces.problem import ParameterBox, VariationalInequality
 from vibench.interfaces.strategies import Kind
+from vibench.model.certificates.base import Guarantee
+from vibench.model.certificates.bounds import OnlineBound, OnlineCertificate
 from vibench.model.error_bounds import Certificate, certify
 from vibench.model.errors import UNMEASURABLE, Errors, Reference, errors
 from vibench.model.hsw_bounds import HSWBounds, hsw_bounds
+from vibench.model.hyperreduced import HyperReducedModel
+from vibench.model.output_errors import output_errors
 from vibench.qp.accuracy_bounds import slack
 from vibench.qp.exact import ExactSolution
 from vibench.qp.repeats import in_units, nearby, units
@@ -31,6 +35,9 @@ from vibench.stages.base import Row, value_of
 from vibench.storage.artefacts import Store
 from vibench.study import registry
 from vibench.timing import SLOW, Seconds, timed
+
+VIOLATION = 1e-10
+"""An error above its bound by more than this share of the solution violates it; less is round-off."""
 
 Watch = Callable[[bool], None]
 """Called with True before an operation that has a time limit of its own, and with False after it."""
@@ -191,10 +198,12 @@ def error_columns(
     reference: Reference,
     known: Sequence[Stability],
     exact: Sequence[ExactSolution | None],
+    online: OnlineCertificate | None = None,
 ) -> list[Row]:
     """Errors of solutions (x, α), one per parameter of `mus` (P×d), their error bounds and effectivities.
 
-    `exact` are the same programs solved to round-off: what the solver contributes to the errors.
+    `exact` are the same programs solved to round-off: what the solver contributes to the errors. `online` gives bounds
+    at online cost, too.
     """
     if not solutions:
         return []
@@ -214,6 +223,12 @@ def error_columns(
         strict=True,
     )
     rows = [_columns(*one) for one in found]
+    compared = (u, lam), (reference.u, reference.lam), reference.scale_outputs
+    for row, of_query in zip(rows, output_errors(problem.outputs, mus, *compared), strict=True):
+        row["outputs"] = of_query
+    if online is not None and isinstance(model, HyperReducedModel):
+        for row, mu, (x, alpha) in zip(rows, mus, solutions, strict=True):
+            row.update(_online_columns(online.evaluate(problem, mu, model.assemble(mu), x, alpha), row))
     norms = zip(problem.V.norm(reference.u), problem.W.norm(reference.lam), strict=True)
     for row, (x, alpha), program, (norm_u, norm_lam) in zip(rows, solutions, exact, norms, strict=True):
         if program is None:
@@ -249,6 +264,23 @@ def _columns(error: Errors, certificate: Certificate, hsw: HSWBounds | None) -> 
         if measurable:
             row[f"effectivity_{name}"] = ratio(bound, absolute)
     return row
+
+
+def _online_columns(bound: OnlineBound, error: Row) -> Row:
+    """The bounds at online cost, and the effectivities of those whose bounds at high-fidelity cost have one."""
+    row: Row = {"certificate": bound.guarantee.value, "bound_online_note": bound.note}
+    if bound.guarantee is Guarantee.NONE:
+        return row
+    violated = False
+    for name, value in (("u_energy", bound.u_energy), ("lambda_natural", bound.lambda_natural)):
+        absolute, relative = error[f"error_{name}_absolute"], error[f"error_{name}"]
+        row[f"bound_online_{name}"] = value
+        if f"effectivity_{name}" in error:
+            row[f"effectivity_online_{name}"] = ratio(value, absolute)
+        size = absolute / relative if relative else value
+        violated |= not absolute <= value + VIOLATION * size
+    row |= {"bound_online_rho": bound.rho, "bound_online_omega": bound.omega, "bound_online_kappa": bound.kappa}
+    return row | {"coercivity_online": bound.coercivity, "bound_online_violated": int(violated)}
 
 
 def _measured(relative: float | None, scaled: float) -> float:

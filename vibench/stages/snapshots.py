@@ -15,11 +15,14 @@ from vibench.errors import NumericalError
 from vibench.highfidelity.active_set import HighFidelitySolution, HighFidelitySolver, check_stiffness
 from vibench.interfaces.fingerprint import Fingerprint, ReferenceAssembly
 from vibench.interfaces.problem import Problem, VariationalInequality
+from vibench.interfaces.sampling import AdaptiveSampling
 from vibench.interfaces.validation import checked_assembly, training_parameters, validation_parameters
+from vibench.model.growing import GrowingTrainer
 from vibench.qp.repeats import nearby
 from vibench.stages.base import Result, Stage, build_problem, faults_of, value_of
 from vibench.storage.artefacts import History, Store
 from vibench.storage.serialisation import storable
+from vibench.study import registry
 from vibench.study.cells import Axes, Plugin
 from vibench.timing import NO_TIME, Seconds, median_seconds, timed
 
@@ -51,6 +54,8 @@ class Snapshots:
         Fallbacks of the active set method per solution, "" where it needed none.
     fingerprint
         Of the problem at the first training parameter, as the process of the chunk assembled it.
+    selecting
+        Seconds of the choice of the parameters, none unless the training is adaptive.
     """
 
     mu: Array
@@ -60,6 +65,7 @@ class Snapshots:
     setups: tuple[Seconds, ...]
     fallbacks: tuple[str, ...]
     fingerprint: Fingerprint
+    selecting: Seconds = NO_TIME
 
 
 @dataclass(frozen=True)
@@ -133,7 +139,7 @@ class SnapshotStage(Stage):
     def parameters(self, problem: Problem) -> Array:
         """Training or validation parameters (P×d), of which the stage solves a part."""
         if self.purpose == "training":
-            return training_of(problem, self.sampling)
+            return training_parameters(problem, None if self.sampling is None else self.sampling.create())
         return validation_of(problem, self.count, self.seed, self.sampling)
 
     def part(self, everything: Array) -> tuple[int, Array]:
@@ -149,9 +155,65 @@ class SnapshotStage(Stage):
         return tuple(History.of(self.purpose, quantity, values, first) for quantity, values in found.items())
 
 
-def training_of(problem: Problem, sampling: Plugin | None) -> Array:
+@dataclass(frozen=True)
+class AdaptiveTraining(Stage):
+    """Training parameters chosen one after the other by a sampling strategy, with their high-fidelity solutions.
+
+    The value is a `Snapshots`; the seconds of the stage have those of the choice, which is made of error bounds.
+    """
+
+    label = "adaptive training"
+    rooms = ("linalg", "interfaces", "qp", "highfidelity", "reduction", "stability", "model")
+
+    problem: Plugin
+    sampling: Plugin
+
+    @property
+    def axes(self) -> Axes:
+        """The problem and the training set."""
+        return Axes(problem=self.problem, training=(self.sampling,))
+
+    def run(self, store: Store) -> Result:  # noqa: ARG002
+        """Train; histories are the bounds that led to solutions, the parameters, and the number of bounds so far."""
+        with faults_of(self.problem):
+            problem, strategy = build_problem(self.problem), self.sampling.create()
+            reference = reference_assembly(problem)
+            trainer = GrowingTrainer(problem, reference)
+            strategy.train(problem.parameters, trainer)
+            reference.refuse_rewritten_constants()
+        solved = trainer.solved
+        if not solved:
+            raise NumericalError(f"the sampling strategy '{self.sampling.name}' has solved at no parameter")
+        seconds, mus = tuple(one.seconds for one in solved), np.array([one.mu for one in solved])
+        u, lam = (np.column_stack([getattr(one.solution, name) for one in solved]) for name in ("u", "lam"))
+        fallbacks, setups = tuple(one.solution.fallback for one in solved), (trainer.setup,)
+        found = Snapshots(mus, u, lam, seconds, setups, fallbacks, reference.fingerprint, trainer.selecting)
+        histories = (
+            History.of("selection", "bound", [one.bound for one in solved]),
+            History.of("selection", "bounds evaluated", [one.evaluated for one in solved]),
+            *(
+                History.of("selection", name, column)
+                for name, column in zip(problem.parameters.names, mus.T, strict=True)
+            ),
+        )
+        return Result(found, sum(seconds, trainer.selecting), histories)
+
+
+def is_adaptive(sampling: Plugin | None) -> bool:
+    """Whether a training set is chosen as its solutions are known."""
+    return sampling is not None and issubclass(registry.load(sampling.kind, sampling.name), AdaptiveSampling)
+
+
+def training_of(store: Store, problem: Plugin, sampling: Plugin | None) -> Array:
     """The training set (P×d) of a sampling strategy, or of the problem itself."""
-    return training_parameters(problem, None if sampling is None else sampling.create())
+    if is_adaptive(sampling):
+        return gather(store, training_stages(problem, sampling)).mu
+    return training_parameters(build_problem(problem), None if sampling is None else sampling.create())
+
+
+def chosen_by(problem: Plugin, sampling: Plugin | None) -> tuple[Stage, ...]:
+    """The stages that `training_of` reads."""
+    return training_stages(problem, sampling) if is_adaptive(sampling) else ()
 
 
 def validation_of(problem: Problem, count: int, seed: int, sampling: Plugin | None) -> Array:
@@ -160,7 +222,9 @@ def validation_of(problem: Problem, count: int, seed: int, sampling: Plugin | No
 
 
 def training_stages(problem: Plugin, sampling: Plugin | None = None) -> tuple[Stage, ...]:
-    """The chunks of the training set of a sampling strategy, or of the problem itself."""
+    """The chunks of the training set of a sampling strategy, or of the problem itself; one stage if it is adaptive."""
+    if sampling is not None and is_adaptive(sampling):
+        return (AdaptiveTraining(problem, sampling),)
     return tuple(SnapshotStage(problem, "training", 0, 0, chunk, sampling) for chunk in range(CHUNKS))
 
 
@@ -205,4 +269,5 @@ def gather(store: Store, chunks: tuple[Stage, ...]) -> Snapshots:
         tuple(seconds for part in parts for seconds in part.setups),
         tuple(note for part in parts for note in part.fallbacks),
         here,
+        sum((part.selecting for part in parts), NO_TIME),
     )

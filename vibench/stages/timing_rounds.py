@@ -2,21 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import partial
+from typing import Any
 
 import numpy as np
 
 from vibench.arrays import Array
 from vibench.interfaces.problem import VariationalInequality
 from vibench.interfaces.validation import checked_assembly
+from vibench.model.certificates.bounds import OnlineCertificate
 from vibench.model.hyperreduced import HyperReducedModel
 from vibench.provenance import machine
-from vibench.qp.repeats import check_answer
+from vibench.qp.repeats import check_answer, units
 from vibench.stages.assembly import AssemblyStage
-from vibench.stages.base import Failed, Pieces, PiecewiseStage, Row, Stage
+from vibench.stages.base import Failed, Pieces, PiecewiseStage, Row, Stage, value_of
 from vibench.stages.cell_queries import CellQueries
+from vibench.stages.certification import CertificateStage
 from vibench.stages.query import Queries, Watch
 from vibench.storage.artefacts import Store
 from vibench.timing import DISTURBED, WAITED, Seconds, calibration, timed
@@ -32,8 +35,8 @@ SPREAD = (0.025, 0.975)
 """Quantiles of the slowdowns of a cell's rounds: what is timed once may have met any of them."""
 
 CELL_SECONDS = (
-    "online_s", "online_q1_s", "online_q3_s", "online_wall_s", "online_assemble_s", "online_solve_s", "slowdown",
-    "disturbed", "offline_low_s", "offline_high_s",
+    "online_s", "online_q1_s", "online_q3_s", "online_wall_s", "online_assemble_s", "online_solve_s",
+    "online_certify_s", "slowdown", "disturbed", "offline_low_s", "offline_high_s",
 )  # fmt: skip
 """Columns of a cell that follow from its rounds."""
 
@@ -50,11 +53,14 @@ class TimedRound:
         Seconds of the solver.
     slowdown
         Of the calibration, before or after, whichever is larger.
+    certify
+        Seconds of the certificate; nothing without one.
     """
 
     assemble: Mapping[int, Seconds]
     solve: Mapping[int, Seconds]
     slowdown: float
+    certify: Mapping[int, Seconds] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -93,7 +99,8 @@ class TimingRounds(PiecewiseStage):
 
     def inputs(self) -> tuple[Stage, ...]:
         """The models and the programs of the cells."""
-        read = (stage for cell in self.cells for stage in (*cell.assembly.model_inputs, cell.assembly))
+        read = [stage for cell in self.cells for stage in (*cell.assembly.model_inputs, cell.assembly)]
+        read += [cell.certificate for cell in self.cells if cell.certificate is not None]
         return tuple(dict.fromkeys(read))
 
     def place(self, piece: int) -> tuple[int, int]:
@@ -116,6 +123,7 @@ class _Rounds(Pieces):
     def __init__(self, stage: TimingRounds, store: Store) -> None:
         self._stage, self._store = stage, store
         self._models: dict[str, Queries] = {}
+        self._certificates: dict[str, OnlineCertificate] = {}
         self._warm: set[int] = set()
         self._forms: dict[tuple[int, int], tuple[VariationalInequality, Seconds]] = {}
 
@@ -126,13 +134,13 @@ class _Rounds(Pieces):
             self._round(at, cell, watch, warm_up=True)
             self._warm.add(cell)
         before = calibration().slowdown()
-        assemble, solve = self._round(at, cell, watch)
-        return TimedRound(assemble, solve, max(before, calibration().slowdown()))
+        assemble, solve, certify = self._round(at, cell, watch)
+        return TimedRound(assemble, solve, max(before, calibration().slowdown()), certify)
 
     def _round(
         self, at: int, cell: int, watch: Watch, *, warm_up: bool = False
-    ) -> tuple[dict[int, Seconds], dict[int, Seconds]]:
-        """Seconds of assembly and solution of the cell's queries, or of one to warm up.
+    ) -> tuple[dict[int, Seconds], dict[int, Seconds], dict[int, Seconds]]:
+        """Seconds of assembly, solution and certificate of the cell's queries, or of one to warm up.
 
         What is timed is equivalent to the queries and nowhere the same: nothing is gained by remembering it.
         """
@@ -142,13 +150,29 @@ class _Rounds(Pieces):
         order = fine[at % share :: share][: 1 if warm_up else None]
         assemble = self._assemblies(queries, order, at, cell, warm_up=warm_up)
         solve: dict[int, Seconds] = {}
+        certify: dict[int, Seconds] = {}
         for k in order:
-            query = stage.query(queries, k).repeated(stage.assembly.seed, k, at, cell, int(warm_up))
+            seed = (stage.assembly.seed, k, at, cell, int(warm_up))
+            query = stage.query(queries, k).repeated(*seed)
             answer, solve[k] = query.prepare(watch)()
             check_answer(query.program, answer, query.accuracy)
+            if stage.certificate is not None and answer.x is not None and answer.alpha is not None:
+                x = units(len(answer.x), query.accuracy, *seed) * answer.x
+                near = queries.near(k, at, cell, int(warm_up))
+                certify[k] = self._certified(stage.certificate, queries, near, (x, answer.alpha))
             if sum(seconds.wall for seconds in solve.values()) > ROUND_SECONDS:
                 break
-        return assemble, solve
+        return assemble, solve, certify
+
+    def _certified(
+        self, stage: CertificateStage, queries: Queries, near: Array, solution: tuple[Array, Array]
+    ) -> Seconds:
+        """Seconds of the certificate of a solution at a parameter."""
+        if stage.key not in self._certificates:
+            self._certificates[stage.key] = value_of(self._store, stage)
+        certificate, model = self._certificates[stage.key], queries.model
+        reduced = model.assemble(near)
+        return timed(partial(certificate.evaluate, model.problem, near, reduced, *solution))[1]
 
     def _queries(self, assembly: AssemblyStage) -> Queries:
         if assembly.key not in self._models:
@@ -196,20 +220,23 @@ def round_rows(rounds: Sequence[TimedRound]) -> list[Row]:
     """Rows of the timings table: seconds of a query, mean over the queries of the round."""
     return [
         {"round": number, "queries": len(one.solve), "slowdown": one.slowdown}
-        | _columns(np.mean(_array(one.assemble.values()), axis=0), np.mean(_array(one.solve.values()), axis=0))
+        | _columns(*(_of_all(np.mean, parts.values()) for parts in (one.assemble, one.solve, one.certify)))
         for number, one in enumerate(rounds)
     ]
 
 
-def _array(parts: Iterable[Seconds]) -> Array:
-    """CPU and wall seconds (k×2)."""
-    return np.array([(seconds.cpu, seconds.wall) for seconds in parts])
+def _of_all(average: Callable[..., Any], parts: Iterable[Seconds]) -> Array | None:
+    """Average CPU and wall seconds (2,); `None` of none."""
+    every = np.array([(seconds.cpu, seconds.wall) for seconds in parts])
+    return np.asarray(average(every, axis=0)) if len(every) else None
 
 
-def _columns(assemble: Array, solve: Array) -> Row:
-    """The columns that rounds and queries share, from CPU and wall seconds of assembly and solution (2,)."""
-    total, wall = assemble + solve
-    return {"assemble_s": assemble[0], "solve_s": solve[0], "total_s": total, "total_wall_s": wall}
+def _columns(assemble: Array | None, solve: Array | None, certify: Array | None) -> Row:
+    """The columns that rounds and queries share, from CPU and wall seconds of the parts of a query (2,)."""
+    parts = {"assemble_s": assemble, "solve_s": solve, "certify_s": certify}
+    total, wall = sum((part for part in parts.values() if part is not None), np.zeros(2))
+    seconds = {name: None if part is None else part[0] for name, part in parts.items()}
+    return seconds | {"total_s": total, "total_wall_s": wall}
 
 
 def seconds_of_cell(rows: Sequence[Row], offline: float) -> Row:
@@ -220,6 +247,7 @@ def seconds_of_cell(rows: Sequence[Row], offline: float) -> Row:
     if not rows:
         return dict.fromkeys(CELL_SECONDS)
     total, wall, slowdown = (np.array([row[name] for row in rows]) for name in ("total_s", "total_wall_s", "slowdown"))
+    certified = [row["certify_s"] for row in rows if row["certify_s"] is not None]
     low, middle, high = np.quantile(total, (0.25, 0.5, 0.75))
     quickest, slowest = np.quantile(slowdown / np.median(slowdown), SPREAD)
     return {
@@ -229,6 +257,7 @@ def seconds_of_cell(rows: Sequence[Row], offline: float) -> Row:
         "online_wall_s": np.median(wall),
         "online_assemble_s": np.median([row["assemble_s"] for row in rows]),
         "online_solve_s": np.median([row["solve_s"] for row in rows]),
+        "online_certify_s": np.median(certified) if certified else None,
         "offline_low_s": offline * quickest,
         "offline_high_s": offline * slowest,
         "slowdown": np.median(slowdown),
@@ -243,5 +272,6 @@ def seconds_of_queries(rounds: Sequence[TimedRound]) -> dict[int, Row]:
         # In full, a query is not assembled in every round: the other queries' seconds stand for its own.
         assembled = [one.assemble[k] if k in one.assemble else next(iter(one.assemble.values())) for one in rounds]
         solved = [one.solve[k] for one in rounds if k in one.solve]
-        rows[k] = _columns(np.median(_array(assembled), axis=0), np.median(_array(solved), axis=0))
+        certified = [one.certify[k] for one in rounds if k in one.certify]
+        rows[k] = _columns(*(_of_all(np.median, parts) for parts in (assembled, solved, certified)))
     return rows

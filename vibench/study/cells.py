@@ -96,9 +96,9 @@ class Cell:
 
     `training` and `validation_sampling` are the sampling strategies of its sets, `None` for the problem's own ones;
     `validation` is the number of validation parameters. `interpolation` is the tolerance of reduced assembly, `None`
-    for full assembly. `labels` of problem, dual and primal strategy and `set_labels` of training and validation are no
-    part of the identity; nor are `nested_tolerances`, all tolerances of a nested primal strategy in the study, whose
-    enrichments are stages of one.
+    for full assembly; certified queries are assembled as reduced ones. `labels` of problem, dual and primal strategy
+    and `set_labels` of training and validation are no part of the identity; nor are `nested_tolerances`, all tolerances
+    of a nested primal strategy in the study, whose enrichments are stages of one.
     """
 
     problem: Plugin
@@ -207,7 +207,7 @@ def expand(study: Study) -> list[Cell]:
                     primal_tol=tolerance,
                     solver=solver,
                     assembly=assembly,
-                    interpolation=study.interpolation if assembly == "reduced" else None,
+                    interpolation=None if assembly == "full" else study.interpolation,
                     warm_start=study.warm_start,
                     seed=study.seed,
                     accuracy=accuracy,

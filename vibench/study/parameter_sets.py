@@ -10,7 +10,7 @@ import numpy as np
 from vibench.arrays import Array
 from vibench.errors import NumericalError, RequestError
 from vibench.interfaces.problem import ParameterBox, Problem
-from vibench.interfaces.sampling import Sampling
+from vibench.interfaces.sampling import AdaptiveSampling, Sampling
 from vibench.interfaces.validation import training_parameters, validation_parameters
 from vibench.study import registry
 
@@ -64,6 +64,15 @@ def sampled(problem: Plugin, sampling: Plugin) -> Array:
 def size_of_set(problem: Plugin, sampling: Plugin) -> int:
     """Number of parameters of a set; 0 if the problem or the strategy is not available, and nothing can be run."""
     return len(sampled(problem, sampling)) if is_available(problem, sampling) else 0
+
+
+def check_no_training(validation: Plugin) -> None:
+    """Refuse a sampling strategy that makes training sets alone as one of a validation set."""
+    if isinstance(validation.create(), AdaptiveSampling):
+        raise RequestError(
+            f"sampling strategy '{validation.name}' chooses training parameters by what solutions know; it makes no "
+            "validation set"
+        )
 
 
 def check_own_validation(problem: Plugin, count: int, seed: int) -> None:

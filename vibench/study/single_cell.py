@@ -8,7 +8,7 @@ from typing import Any
 
 from vibench.errors import RequestError
 from vibench.interfaces.strategies import Stop
-from vibench.study.cells import Cell, Plugin
+from vibench.study.cells import OWN, Cell, Plugin
 from vibench.study.spec import Study
 
 
@@ -36,9 +36,12 @@ def study_of_cell(cell: Cell, name: str, **settings: Any) -> Study:
     if cell.primal_tol is not None:
         tolerances["primal"] = {cell.labels[2]: [cell.primal_tol]}
     content: dict[str, Any] = {
+        "training": OWN if cell.training is None else _entry(cell.training, cell.set_labels[0]),
         "name": name,
         "seed": cell.seed,
-        "validation": cell.validation,
+        "validation": cell.validation
+        if cell.validation_sampling is None
+        else _entry(cell.validation_sampling, cell.set_labels[1]),
         "accuracy": [cell.accuracy],
         "solvers": [cell.solver],
         "problem": [problem],

@@ -36,7 +36,7 @@ from vibench.study.entries import (
     Validation,
     as_list,
 )
-from vibench.study.parameter_sets import check_own_validation, check_unseen, is_available
+from vibench.study.parameter_sets import check_no_training, check_own_validation, check_unseen, is_available
 
 Tolerance: TypeAlias = Annotated[float, Gt(0.0), Lt(1.0), AllowInfNan(False)]
 Seconds: TypeAlias = Annotated[float, Gt(0.0), Le(1e7), AllowInfNan(False)]
@@ -162,7 +162,7 @@ class Study(_Model):
     dual: Annotated[list[Entry], MinLen(1), Field(description="Dual strategies.")]
     primal: Annotated[list[Entry], MinLen(1), Field(description="Primal strategies.")]
     assembly: Annotated[
-        list[Literal["full", "reduced"]], MinLen(1), Field(description="How queries are assembled.")
+        list[Literal["full", "reduced", "certified"]], MinLen(1), Field(description="How queries are assembled.")
     ] = ["full"]
     interpolation: Annotated[
         Tolerance, Field(description="Tolerance of empirical interpolation in reduced assembly.")
@@ -270,6 +270,8 @@ def _check_sets(study: Study, entry: ProblemEntry) -> None:
         return
     if isinstance(by, int):
         check_own_validation(problem, by, study.seed)
+    else:
+        check_no_training(by)
     for sampling in samplings:
         check_unseen(problem, sampling, by, study.seed)
 

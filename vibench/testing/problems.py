@@ -9,6 +9,7 @@ import numpy as np
 from vibench.arrays import Array
 from vibench.errors import NumericalError
 from vibench.highfidelity import active_set
+from vibench.interfaces.outputs import Output
 from vibench.interfaces.problem import ParameterBox, Picture, Problem
 from vibench.interfaces.validation import training_parameters, validation_parameters
 from vibench.linalg.inner_product import InnerProduct
@@ -160,6 +161,28 @@ def _picture_faults(picture: Picture, m: int) -> Iterator[str]:
         yield f"picture.triangles refers to points {triangles.min()} to {triangles.max()}; there are {count}"
 
 
+def outputs(case: ProblemCase) -> Iterator[str]:
+    """Quantities of interest have names and units, and finite values that a second call repeats."""
+    found, mu = case.plugin.outputs, training_parameters(case.plugin)[:1]
+    strange = [type(one).__name__ for one in found if not isinstance(one, Output)]
+    if strange:
+        yield f"outputs holds a {strange[0]}; expected objects of vibench.Output"
+        return
+    for one in found:
+        if not all(isinstance(text, str) and text.strip() for text in (one.name, one.unit)):
+            yield f"an output has the name {one.name!r} and the unit {one.unit!r}; expected texts, '1' for a number"
+    names = [one.name for one in found]
+    if len(set(names)) < len(names):
+        yield f"two outputs have the same name: {', '.join(map(str, names))}"
+    solved = active_set.HighFidelitySolver(case.plugin).solve(mu[0].copy())
+    u, lam = solved.u[:, None], solved.lam[:, None]
+    for one, again in zip(found, case.plugin.outputs, strict=True):
+        for columns in ((u, lam), (0.0 * u, 0.0 * lam)):  # a reduced solution may have no contact
+            if one.values(mu, *columns) != again.values(mu, *columns):
+                yield f"the output '{one.name}' differs in a second call {at(mu[0])}"
+    yield Note(f"{', '.join(names)}" if names else "no outputs")
+
+
 CHECKS: tuple[Check[ProblemCase], ...] = (
     Check("construction", ProblemCase.construction),
     Check("options", ProblemCase.options, ("construction",)),
@@ -187,6 +210,7 @@ CHECKS: tuple[Check[ProblemCase], ...] = (
         ("training set", "definiteness of A", "independence of mu", "assembly on the contact"),
     ),
     Check("picture and diagnostics", pictures, ("high-fidelity solution",)),
+    Check("outputs", outputs, ("high-fidelity solution",)),
     Check("time", ProblemCase.duration, ("assembly",)),
 )
 

@@ -165,7 +165,12 @@ def greedy(curves: Curves, paper: Published, parameter: str) -> CaptionedFigure 
     tight, sizes = paper.pairs[0].tight, [curves.size(pair)[1] for pair in pairs]
     growth = ", ".join(f"{first:.2g} → {last:.3g}" for first, last in least)
     figure.compared = compared(
-        (None not in vectors, f"σ reaches {tight:g} with {named(vectors)} vectors, R being {named(sizes)}"),
+        (
+            None not in vectors,
+            f"σ stays above {tight:g}"
+            if None in vectors
+            else f"σ reaches {tight:g} with {named(vectors)} vectors, R being {named(sizes)}",
+        ),
         (all(last > max(first, ZERO) for first, last in least), f"min β over D_train recovers: {growth}"),
         (
             min(shares) >= STABLE,

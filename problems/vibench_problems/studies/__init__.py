@@ -5,10 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 
 benefit = Path(__file__).with_name("benefit.toml")
+certified = Path(__file__).with_name("certified.toml")
 field = Path(__file__).with_name("field.toml")
 quick = Path(__file__).with_name("quick.toml")
 hertz_quadrature = Path(__file__).with_name("hertz-quadrature.toml")
 meshes = Path(__file__).with_name("meshes.toml")
+hertz_direct = Path(__file__).with_name("hertz-direct.toml")
 paper_hertz = Path(__file__).with_name("paper-hertz.toml")
 solvers = Path(__file__).with_name("solvers.toml")
 paper_obstacle = Path(__file__).with_name("paper-obstacle.toml")

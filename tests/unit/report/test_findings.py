@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 from running import DECIDED, Changed
 
+from vibench.report.figures.data import problems
 from vibench.report.findings import MOST, Finding, Weight, all_findings, findings, leading
 from vibench.results import tables
 from vibench.results.database import FILE
@@ -225,7 +226,7 @@ def test_the_fastest_of_a_problem_is_named_with_its_errors(said: Said, quick_run
 
 
 def test_findings_that_say_most_come_first_and_every_subject_has_a_turn(quick_run: Path) -> None:
-    found = all_findings(quick_run / FILE)
+    found = all_findings(quick_run / FILE, problems(quick_run / FILE))
     first = leading(found)
     assert len(first) == MOST < len(found)
     assert [one.weight for one in first] == sorted(one.weight for one in first)

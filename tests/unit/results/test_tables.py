@@ -59,7 +59,8 @@ def run(tmp_path: Path) -> Path:
     """A run folder with two cells, one of which never got an answer."""
     journal = ResultsDatabase(tmp_path / "runs" / "sample", STUDY)
     missing = dict.fromkeys(CELLS) | {"cell": "c2", "status": "error", "reason": "broke", "queries": 4, "queries_ok": 0}
-    journal.write_cell(CELL | {"cell": "c1"}, query_rows("c1", 4, gap=1.0 / 3.0))
+    output = {"cell": "c1", "output": "force", "unit": "N", "scale": 2.0, "queries_ok": 4, "error_mean": 0.1}
+    journal.write_cell(CELL | {"cell": "c1"}, query_rows("c1", 4, gap=1.0 / 3.0), outputs=[output])
     journal.write_cell(missing | {name: CELL[name] for name in KEYS} | {"solver": "osqp"}, [])
     journal.write_histories([[{"artefact": "pod-1", "quantity": "error", "step": 0, "value": 1.0}]])
     journal.write_seconds(

@@ -133,6 +133,16 @@ def test_a_lost_round_is_told_and_the_others_count() -> None:
     assert timed[1 - unlucky].reason == ""
 
 
+def test_a_certificate_is_a_part_of_its_query() -> None:
+    rounds = [replace(steady(1.0), certify=dict.fromkeys((0, 1), Seconds(spent, 2.0))) for spent in (0.25, 0.5, 4.0)]
+    rows = round_rows(rounds)
+    assert [(row["certify_s"], row["total_s"], row["total_wall_s"]) for row in rows] == [
+        (0.25, 2.25, 4.0), (0.5, 2.5, 4.0), (4.0, 6.0, 4.0),
+    ]  # fmt: skip
+    assert (seconds_of_cell(rows, 1.0)["online_certify_s"], seconds_of_cell(rows, 1.0)["online_s"]) == (0.5, 2.5)
+    assert seconds_of_queries(rounds)[1]["certify_s"] == 0.5
+
+
 def test_columns_are_medians_and_quartiles_over_the_rounds() -> None:
     rounds = [
         TimedRound({k: Seconds(0.5, 1.0)}, {k: Seconds(spent, spent), k + 4: Seconds(spent, spent)}, slow)
@@ -150,7 +160,8 @@ def test_columns_are_medians_and_quartiles_over_the_rounds() -> None:
     ends = 10.0 * np.quantile(slowdowns, (0.025, 0.975))
     assert (own["offline_low_s"], own["offline_high_s"]) == pytest.approx(tuple(ends))
     queries = seconds_of_queries([replace(one, assemble={k: one.assemble[k]}) for k, one in enumerate(rounds)])
-    assert queries[2] == {"assemble_s": 0.5, "solve_s": 2.0, "total_s": 2.5, "total_wall_s": 3.0}
+    assert queries[2] == {"assemble_s": 0.5, "solve_s": 2.0, "certify_s": None, "total_s": 2.5, "total_wall_s": 3.0}
+    assert own["online_certify_s"] is None
     assert set(seconds_of_cell([], 10.0)) == set(own)
     assert set(seconds_of_cell([], 10.0).values()) == {None}
 

@@ -15,6 +15,7 @@ from vibench.errors import RequestError
 from vibench.study.cells import Cell, Plugin, expand
 from vibench.study.parameter_sets import sampled
 from vibench.study.reader import read_study
+from vibench.study.single_cell import study_of_cell
 
 SOBOL = {"name": "sobol", "size": 8, "seed": 1}
 
@@ -62,6 +63,8 @@ def test_a_cell_is_restored_with_its_sets(tmp_path: Path) -> None:
     content = changed(changed(STUDY, "training", to=SOBOL), "validation", to={"name": "random", "size": 7, "seed": 4})
     cell = cells_of(content, tmp_path)[0]
     assert Cell.from_definition(cell.definition) == cell
+    (alone,) = expand(study_of_cell(cell, "sample"))
+    assert (alone.key, str(alone), alone.set_labels) == (cell.key, str(cell), ("sobol", "random"))
 
 
 def test_a_file_is_beside_the_study_and_its_content_is_part_of_the_code(
@@ -121,6 +124,9 @@ BAD: dict[str, tuple[tuple[str, Any], list[str]]] = {
     "complex": (("training", {"name": "file", "path": "complex.npy"}), ["of the type complex128; expected real"]),
     "flat": (("training", {"name": "file", "path": "flat.npy"}), ["parameters of shape (3,); expected (P, 3)"]),
     "not finite": (("training", {"name": "file", "path": "nan.npy"}), ["parameter 0 has 'scale' = nan, which is not"]),
+    "greedy validation": (
+        ("validation", {"name": "greedy", "candidates": 9, "tolerance": 0.1}), ["'greedy' chooses training parameters"],
+    ),
     "same": (("validation", {"name": "grid", "counts": [5]}), ["all validation parameters of problem 'obstacle' are"]),
 }  # fmt: skip
 

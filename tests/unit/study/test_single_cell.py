@@ -30,7 +30,9 @@ def test_a_study_of_one_cell_has_the_same_cell(name: str) -> None:
 def test_a_study_of_one_cell_has_its_parameter_sets() -> None:
     quick = read_study("quick")
     drawn = {"name": "random", "label": "drawn", "options": {"size": 20, "seed": 3}}
-    sampled = Study(**quick.model_dump() | {"training": ["own", drawn], "validation": drawn | {"options": {"size": 9}}})
+    sampled = Study(
+        **quick.model_dump() | {"training": ["own", drawn], "validation": drawn | {"options": {"size": 9, "seed": 5}}}
+    )
     for cell in expand(sampled):
         (again,) = expand(study_of_cell(cell, "quick"))
         assert (again.key, str(again), again.validation) == (cell.key, str(cell), 9)

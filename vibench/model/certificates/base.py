@@ -11,7 +11,7 @@ import numpy as np
 from vibench.arrays import Array, Indices, SparseMatrix
 from vibench.errors import UnsupportedError
 from vibench.interfaces.problem import Problem
-from vibench.interfaces.validation import checked_assembly, training_parameters
+from vibench.interfaces.validation import checked_assembly
 from vibench.linalg.inner_product import InnerProduct
 from vibench.model.affine import AffineMember, Evaluation
 from vibench.model.certificates.spectral import SpectralBounds, rotated, spectral_bounds
@@ -81,8 +81,8 @@ def is_exact(problem: Problem, name: str, member: AffineMember) -> bool:
     return member.way is Evaluation.AFFINE or (member.way is Evaluation.CONSTANT and name in problem.constant)
 
 
-def certificate_base(problem: Problem, members: Mapping[str, AffineMember]) -> CertificateBase:
-    """Prepare certificates of reduced models of a problem whose members have been decomposed.
+def certificate_base(problem: Problem, members: Mapping[str, AffineMember], training: Array) -> CertificateBase:
+    """Prepare certificates of reduced models of a problem whose members have been decomposed over `training` (P×d).
 
     Raises
     ------
@@ -100,7 +100,7 @@ def certificate_base(problem: Problem, members: Mapping[str, AffineMember]) -> C
     terms, rotation, spectral = list(A.terms), None, None
     if not constant:
         coefficients = _Coefficients(problem, "A", A)
-        samples = np.column_stack([coefficients.at(mu) for mu in training_parameters(problem)])
+        samples = np.column_stack([coefficients.at(mu) for mu in training])
         rotation, terms = T, _ = rotated(A.terms, samples)
         spectral = spectral_bounds(problem, X, terms, lambda mu: T @ coefficients.at(mu), stiffness)
     return CertificateBase(X, 0.5 * (compliance + compliance.T), tuple(terms), rotation, spectral, load, stiffness)

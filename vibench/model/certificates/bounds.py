@@ -14,11 +14,11 @@ A, α = γ = 1, and nothing is lost. Elsewhere X is A at the centre of the param
 - w is the lifting of `vibench.model.certificates.lifting` with the compliance C = Eᵀ X⁻¹ E of the contact unknowns E.
 - α and γ are those of `vibench.model.certificates.spectral`.
 
-Members that are interpolated have errors, unless the problem declares that they are exactly affine and the
-interpolation has as many terms. With A = Ã + D and f = f̃ + d, the residual of Ã and f̃ lacks d − D u_N, and ρ grows by
-the largest ‖d‖ and ‖D‖ ‖u_N‖_X. These are measured at random parameters and doubled, which proves nothing: the bounds
-are then called verified instead of certified. They are certified where α, γ and the norms in them are proved, too.
-Round-off is bounded where it decides whether w is feasible, and nowhere else.
+Members that the problem declares to be constant or affine sums are exact, those that are interpolated are not. With
+A = Ã + D and f = f̃ + d, the residual of Ã and f̃ lacks d − D u_N, and ρ grows by the largest ‖d‖ and ‖D‖ ‖u_N‖_X. These
+are measured at random parameters and doubled, which proves nothing: the bounds are then called verified instead of
+certified. They are certified where α, γ and the norms in them are proved, too. Round-off is bounded where it decides
+whether w is feasible, and nowhere else.
 """
 
 from __future__ import annotations
@@ -34,7 +34,6 @@ from vibench.arrays import Array, Indices
 from vibench.errors import UnsupportedError
 from vibench.highfidelity.active_set import FALLBACK_SOLVER
 from vibench.interfaces.problem import Contact, Problem
-from vibench.interfaces.validation import training_parameters
 from vibench.model.affine import AffineMember
 from vibench.model.certificates.base import (
     CertificateBase,
@@ -172,23 +171,28 @@ def residual_coefficients(theta: Mapping[str, Array], y: Array, of_lam: Array) -
     return np.concatenate([theta["f"], -np.outer(theta["A"], y).ravel(), -of_lam])
 
 
-def prepare(model: HyperReducedModel, members: Mapping[str, AffineMember], base: CertificateBase) -> OnlineCertificate:
-    """Prepare what bounds the errors of a reduced model, from the members it was made of and `certificate_base`."""
+def prepare(
+    model: HyperReducedModel, members: Mapping[str, AffineMember], base: CertificateBase, training: Array
+) -> OnlineCertificate:
+    """Prepare what bounds the errors of a reduced model, from the members it was made of and `certificate_base`.
+
+    Sharpness alone depends on `training` (P×d), parameters that show which terms of residuals contribute.
+    """
     problem, Phi, chi, B = model.problem, model.basis, model.generators, members["B"]
     functionals, on_contact = injected(problem), not is_exact(problem, "B", B)
     blocks = [np.column_stack(members["f"].terms), *(np.asarray(term @ Phi) for term in base.terms)]
     blocks += [functionals] if on_contact else [np.asarray(term.T @ chi) for term in B.terms]
-    compliance = ContactCompliance(base.compliance, _near(problem, chi))
-    residual, U = residual_basis(base.X, blocks, *_sampled(model, base, compliance, on_contact))
+    compliance = ContactCompliance(base.compliance, _near(problem, chi, training))
+    residual, U = residual_basis(base.X, blocks, *_sampled(model, base, compliance, on_contact, training))
     directions = base.X.whiten_functional(functionals).T @ U
     contact_basis = np.ascontiguousarray(Phi[contact_unknowns(problem)])
     return OnlineCertificate(base, residual, directions, compliance, contact_basis, chi, on_contact)
 
 
-def _near(problem: Problem, chi: Array) -> Indices:
+def _near(problem: Problem, chi: Array, training: Array) -> Indices:
     """Contact unknowns that rows in the support of a generator, or next to it, touch at some training parameter."""
     found = np.zeros(len(contact_unknowns(problem)), bool)
-    for mu in training_parameters(problem):
+    for mu in training:
         contact = problem.contact(mu)
         assert contact is not None  # `unsupported` refuses problems without
         touches, rows = abs(sp.csr_array(contact.B)) > 0.0, np.any(chi > 0.0, axis=1)
@@ -199,11 +203,11 @@ def _near(problem: Problem, chi: Array) -> Indices:
 
 
 def _sampled(
-    model: HyperReducedModel, base: CertificateBase, compliance: ContactCompliance, on_contact: bool
+    model: HyperReducedModel, base: CertificateBase, compliance: ContactCompliance, on_contact: bool, training: Array
 ) -> tuple[Array, float]:
     """Coefficients of residuals (Z×S) of reduced solutions at training parameters, and the median norm of liftings."""
     problem, found, norms = model.problem, [], [0.0]
-    training, rows = training_parameters(problem), model.basis[contact_unknowns(problem)]
+    rows = model.basis[contact_unknowns(problem)]
     for number, mu in enumerate(training[:: -(-len(training) // SAMPLES)]):
         reduced = model.assemble(mu)
         answer = solve_qp(reduced.program, FALLBACK_SOLVER, SAMPLE_ACCURACY, factor=reduced.factor)

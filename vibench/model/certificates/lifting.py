@@ -111,9 +111,11 @@ def lift(
     lam, gamma
         λ ≥ 0 (m,) and γ.
     """
-    B = sp.csr_array(contact.B, copy=True)
-    B.sum_duplicates()
-    size, terms = abs(B), 1.01 * UNIT * (np.diff(B.indptr) + 4.0)
+    B = sp.csr_array(contact.B)
+    if not B.has_canonical_format or len(B.indices) > B.nnz:
+        B = B.copy()
+        B.sum_duplicates()
+    size, terms = sp.csr_array((np.abs(B.data), B.indices, B.indptr), B.shape), 1.01 * UNIT * (np.diff(B.indptr) + 4.0)
     excess = B @ on_contact - contact.g
     round_off = 1.01 * (size @ uncertain) + terms * (size @ np.abs(on_contact) + np.abs(contact.g))
     reach = size @ compliance.root
@@ -146,6 +148,7 @@ class _Program:
         gamma: float,
     ) -> None:
         self._C, self._B, self._near, self._gamma, self._lam = C, B, near, gamma, lam
+        self._size = sp.csr_array((np.abs(B.data), B.indices, B.indptr), B.shape)
         self._excess, self._round_off, self._reach, self._terms = excess, round_off, reach, terms
 
     def best(self) -> tuple[Array, float, float] | None:
@@ -154,7 +157,7 @@ class _Program:
         for _ in range(ATTEMPTS):
             for load, values, norm in self._minimisers(self._excess + margin):
                 slack = self._B @ values - self._excess
-                lacking = self._terms * (abs(self._B) @ np.abs(values)) + self._round_off - slack
+                lacking = self._terms * (self._size @ np.abs(values)) + self._round_off - slack
                 far = self._reach * norm * (1.0 + 1e-10) + self._excess + self._round_off
                 lacking = np.where(self._near, lacking, far)
                 if np.all(lacking <= 0.0):  # NaN is not
@@ -195,20 +198,19 @@ def _complementary(factor: Array, excess: Array, lam: Array) -> Array:
     """ν ≥ 0 (i,) with ν = λ + S⁻¹(s + v), v ≥ 0 and νᵀv = 0, from the Cholesky factor (lower) of S."""
     fixed: Array = lam + dpotrs(factor, excess, lower=1)[0]
     nu, v, released = fixed, np.zeros(len(lam)), np.zeros(len(lam), bool)
-    columns, inverse = np.zeros(0, np.intp), np.zeros((len(lam), 0))  # some columns of S⁻¹
+    inverse, known = np.zeros((len(lam), len(lam)), order="F"), np.zeros(len(lam), bool)  # some columns of S⁻¹
     for _ in range(STEPS):
         wanted = np.where(released, v >= 0.0, nu < 0.0)
         if np.array_equal(wanted, released):
             break
-        released = wanted
-        new = np.setdiff1d(np.flatnonzero(released), columns)
-        units = np.zeros((len(lam), len(new)), order="F")
-        units[new, np.arange(len(new))] = 1.0
-        columns, inverse = np.append(columns, new), np.hstack([inverse, dpotrs(factor, units, lower=1)[0]])
-        among = np.flatnonzero(released[columns])
-        rows = columns[among]
-        v = np.zeros(len(lam))
-        v[rows] = np.linalg.solve(inverse[np.ix_(rows, among)], -fixed[rows])
-        nu = fixed + inverse[:, among] @ v[rows]
+        released, new = wanted, np.flatnonzero(wanted & ~known)
+        if len(new):
+            units = np.zeros((len(lam), len(new)), order="F")
+            units[new, np.arange(len(new))] = 1.0
+            inverse[:, new], known[new] = dpotrs(factor, units, lower=1, overwrite_b=1)[0], True
+        rows, v = np.flatnonzero(released), np.zeros(len(lam))
+        among = inverse[:, rows]
+        v[rows] = np.linalg.solve(among[rows], -fixed[rows])
+        nu = fixed + among @ v[rows]
         nu[rows] = 0.0
     return np.maximum(nu, 0.0)

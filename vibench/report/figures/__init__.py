@@ -7,7 +7,7 @@ import json
 import re
 import signal
 import threading
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import Future, ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cache
@@ -21,7 +21,7 @@ from vibench.files import write_atomically
 from vibench.report.figures import constants, convergence, costs
 from vibench.report.figures.constants import inf_sup, shares
 from vibench.report.figures.convergence import diagnostics, enrichment, orthogonality, projection_errors
-from vibench.report.figures.costs import dimension, total_cost, work_precision
+from vibench.report.figures.costs import dimension, outputs, total_cost, work_precision
 from vibench.report.figures.data import Data, file_names, problems
 from vibench.report.figures.plugins import FigureError, of_plugins
 from vibench.report.figures.solutions import solutions
@@ -41,6 +41,7 @@ OF_PROBLEM: dict[str, Drawing] = {
     "solvers": solvers,
     "precision": precision,
     "total-cost": total_cost,
+    "outputs": outputs,
 }
 """Figures of every problem, by the end of their file names."""
 
@@ -51,6 +52,7 @@ LONG: dict[str, tuple[Callable[[Data], int], int]] = {
     "dimension": (costs.sized, DEEP),
     "work-precision": (costs.timed, DEEP),
     "total-cost": (costs.pairs, ABREAST * DEEP),
+    "outputs": (costs.reported, ABREAST * DEEP),
     "enrichment": (convergence.enriched, DEEP),
     "inf-sup": (constants.pairs, constants.MOST_PAIRS),
 }
@@ -65,7 +67,12 @@ def drawings(path: Path) -> Iterator[tuple[str, Drawing, Data]]:
 
     The functions of plugins raise `FigureError`; those of this package do not.
     """
-    for name, data in problems(path):
+    return drawings_of(problems(path))
+
+
+def drawings_of(known: Iterable[tuple[str, Data]]) -> Iterator[tuple[str, Drawing, Data]]:
+    """Every figure of some problems, from their data and what the names of their files begin with."""
+    for name, data in known:
         for kind, draw in OF_PROBLEM.items():
             yield from _pages(f"{name}-{kind}", kind, draw, data)
         for dual, file in zip(data.duals, file_names(data.duals), strict=True):

@@ -20,7 +20,7 @@ from vibench.report.figures.data import (
     series,
 )
 from vibench.report.figures.looks import HIGH_FIDELITY_LOOK, Looks, Series
-from vibench.report.figures.style import ABREAST, DEEP, SERIES, CaptionedFigure, Layout, Sheet, plot, scatter
+from vibench.report.figures.style import ABREAST, DEEP, SERIES, CaptionedFigure, Layout, Sheet, plot, positive, scatter
 from vibench.results.break_even import HIGH_FIDELITY, Meaning
 
 ERRORS = {"error_u_mean": "mean relative error of u", "error_lambda_mean": "mean relative error of λ"}
@@ -107,6 +107,47 @@ def _rows(cells: pd.DataFrame) -> Iterator[tuple[str, pd.DataFrame, list[str]]]:
         how = f", {assembly} assembly" * (assembly != "full")
         for k, names in enumerate(groups, 1):
             yield f"{dual}{how}{f', strategies {k} of {len(groups)}' * (len(groups) > 1)}", mine, names
+
+
+def outputs(data: Data) -> CaptionedFigure | None:
+    """Errors of every quantity of interest, over its largest value of the training set, against the time of a query."""
+    panels = data.on_page(_reported(data), ABREAST * DEEP)
+    if not panels:
+        return None
+    solver = data.cells.loc[data.cells["cell"] == panels[0][1]["cell"].iloc[0], "solver"].iloc[0]
+    sheet = Sheet.of(len(panels), f"{data.problem}, {solver}: quantities of interest")
+    looks = Looks(Series(name) for _, _, names in panels for name in names)
+    for panel, (title, mine, names) in zip(sheet.panels, panels, strict=True):
+        for name in names:
+            one = mine[mine["primal"] == name]
+            scatter(panel, 1e3 * one["online_s"], positive(one["error_scaled_mean"]), looks[Series(name)], name)
+        for index, text in point_names(mine[mine["primal"].isin(names)]).items():
+            sheet.label(panel, 1e3 * mine.at[index, "online_s"], mine.at[index, "error_scaled_mean"], text)
+        panel.set(xlabel="mean time of a query [ms]", ylabel="mean error over the scale", title=title)
+        panel.set(xscale="log", yscale="log")
+    return sheet.finish(
+        f"Mean errors of the quantities of interest of {data.problem} over their largest value on the training set, "
+        f"against the mean time of a query; solver {solver}. A panel for every quantity, dual strategy and assembly, a "
+        "point for every model, with its (N, R) and the tolerance δ of its primal strategy; a number alone is another "
+        f"δ.{data.part}"
+    )
+
+
+def reported(data: Data) -> int:
+    """Number of panels of `outputs`."""
+    return len(_reported(data))
+
+
+def _reported(data: Data) -> list[tuple[str, pd.DataFrame, list[str]]]:
+    """Title, models and primal strategies of every panel of `outputs`."""
+    known = ["cell", "output", "error_scaled_mean"]
+    found = data.outputs.loc[data.outputs["error_scaled_mean"].notna(), known]
+    mine = best_solver(data.cells).merge(found, "inner", "cell")
+    return [
+        (f"{name}, {title}", rows, names)
+        for name, of_output in mine.groupby("output", sort=False)
+        for title, rows, names in _rows(of_output)
+    ]
 
 
 def _front(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

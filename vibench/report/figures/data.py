@@ -16,7 +16,7 @@ import pandas as pd
 from vibench.report.figures.looks import Series
 from vibench.results import pictures, tables
 
-TABLES = ("cells", "queries", "histories", "thresholds")
+TABLES = ("cells", "queries", "histories", "thresholds", "outputs")
 
 PAIR = ["pod_tol", "pod_size", "dual_tol", "dual_size"]
 """Tolerances or prescribed sizes that determine the dimensions (N, R)."""
@@ -45,6 +45,7 @@ class Data:
     queries: pd.DataFrame
     histories: pd.DataFrame
     thresholds: pd.DataFrame
+    outputs: pd.DataFrame
     pictures: tuple[pictures.Shown, ...]
     page: tuple[int, int] | None = None
     """Which of how many pages of a long figure is drawn, from 0; `None` for all panels in one figure."""

@@ -53,7 +53,7 @@ def draw_published(
     folder
         Where figures and page go; figures of the same names and the page are replaced.
     formats
-        Keys of `style.WRITTEN`; the page shows the first one.
+        Keys of `style.WRITTEN`; the page shows the first one that a browser can.
     progress
         Called before a figure is drawn, with its name, the number of those done, and that of all.
     note
@@ -84,7 +84,8 @@ def draw_published(
                 continue
             files += save(figure, folder, twin.name, formats)
         drawn.append((twin, figure))
-    write_atomically(folder / PAGE, _page(drawn, paths, formats[0]).encode("utf-8"))
+    shown = next((form for form in formats if form != "pdf"), formats[0])  # no page shows a PDF
+    write_atomically(folder / PAGE, _page(drawn, paths, shown).encode("utf-8"))
     return files
 
 

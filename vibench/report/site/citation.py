@@ -15,6 +15,8 @@ from vibench.text import unbroken
 DOI = re.compile(r"10\.\d{4,9}/[!-~]+")
 """A DOI without a resolver before it (DOI Handbook, section 2.2)."""
 
+SOFTWARE = "vibench: a benchmark framework for reduced-order models of parametrised variational inequalities"
+
 NAME, VERSION = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*"), re.compile(r"[A-Za-z0-9.!+_-]+")
 """A distribution and its version, as a file of requirements names them: anything else could be an option of pip."""
 
@@ -62,7 +64,7 @@ class Citation:
             *([f"url: {_yaml(self.url)}"] if self.url else []),
             "references:",
             "  - type: software",
-            '    title: "vibench: a benchmark framework for reduced-order models of parametrised variational inequalities"',
+            f"    title: {_yaml(SOFTWARE)}",
             "    authors:",
             '      - name: "The vibench developers"',
             f"    version: {_yaml(distribution_version('vibench'))}",

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -70,7 +69,7 @@ def publish(paths: Sequence[Path], site: Path, citation: Citation, notes: Mappin
 
 def _fill(site: Path, runs: Sequence[PublishedRun], citation: Citation) -> None:
     """Write all files of the site."""
-    pages = _Pages(site, citation)
+    pages = _Pages(citation)
     comparisons = {study: compare([run.run.path for run in group], LIMIT) for study, group in _comparable(runs)}
     for run in runs:
         _write_run(site / "runs" / run.folder, run, pages)
@@ -118,10 +117,7 @@ def _boards(runs: Sequence[PublishedRun]) -> Iterator[tuple[str, tuple[Standings
     machines = dict.fromkeys(machine for run in runs for machine in run.run.machines)
     for machine in machines:
         rows = [
-            row | {"run": run.run.name}
-            for run in runs
-            for row in run.run.cells.values()
-            if row["machine"] == machine
+            row | {"run": run.run.name} for run in runs for row in run.run.cells.values() if row["machine"] == machine
         ]
         yield machine, leaderboard(pd.DataFrame(rows))
 
@@ -141,7 +137,7 @@ def _write(path: Path, text: str) -> None:
 class _Pages:
     """The templates, with what all pages show."""
 
-    def __init__(self, site: Path, citation: Citation) -> None:
+    def __init__(self, citation: Citation) -> None:
         self._environment = Environment(
             loader=PackageLoader("vibench.report", "templates/site"),
             autoescape=True,

@@ -68,7 +68,10 @@ class PublishedRun:
         yield "cells", f"{len(rows)}: " + ", ".join(f"{count} {status}" for status, count in counts.items())
         yield "machine", "; ".join(self.run.machines)
         disturbed = sum(row["disturbed"] == 1 for row in rows)
-        yield "seconds", f"CPU seconds on one thread; {disturbed} of {len(rows)} cells were timed on a disturbed machine"
+        yield (
+            "seconds",
+            f"CPU seconds on one thread; {disturbed} of {len(rows)} cells were timed on a disturbed machine",
+        )
         yield "versions", ", ".join(f"{name} {text}" for name, text in self.run.versions.items() if text)
         yield "code", self.code
         yield "study file", ", ".join(sorted({str(row["study_hash"]) for row in rows if row["study_hash"]}))

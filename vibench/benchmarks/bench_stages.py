@@ -8,11 +8,11 @@ from itertools import cycle
 import pytest
 from pytest_benchmark.fixture import BenchmarkFixture
 
-from benchmarks import reached
-from benchmarks.cases import USUAL, Primal
-from benchmarks.material import INTERPOLATION, QUERIES, Material, model_with, solve_all
-from benchmarks.measure import MARKS, Info, measure
 from vibench.arrays import Array
+from vibench.benchmarks import reached
+from vibench.benchmarks.cases import Primal
+from vibench.benchmarks.material import INTERPOLATION, QUERIES, Material, model_with, solve_all
+from vibench.benchmarks.measure import MARKS, Info, measure
 from vibench.highfidelity.active_set import HighFidelitySolver
 from vibench.interfaces.strategies import Cone, Enrichment
 from vibench.interfaces.validation import check_cone, check_enrichment
@@ -55,21 +55,26 @@ def test_high_fidelity_sweep(benchmark: BenchmarkFixture, material: Material) ->
 
 
 def test_pod(benchmark: BenchmarkFixture, material: Material) -> None:
+    """POD of the snapshots."""
     problem, (u, _) = material.problem, material.snapshots
-    measure(benchmark, "POD", lambda: pod(u, problem.V, USUAL.pod), lambda found: reached.of_pod(material, found))
+    measure(
+        benchmark, "POD", lambda: pod(u, problem.V, material.usual.pod), lambda found: reached.of_pod(material, found)
+    )
 
 
 def test_cone(benchmark: BenchmarkFixture, material: Material, dual: str) -> None:
+    """A cone by one dual strategy."""
     W, (_, lam) = material.problem.W, material.snapshots
     strategy = registry.create("dual strategy", dual, {})
 
     def judge(found: Cone) -> Info:
         return reached.of_cone(material, check_cone(found, W))
 
-    measure(benchmark, "cone", lambda: strategy.reduce(lam, W, USUAL.cone), judge)
+    measure(benchmark, "cone", lambda: strategy.reduce(lam, W, material.usual.cone), judge)
 
 
 def test_enrichment(benchmark: BenchmarkFixture, material: Material, primal: Primal) -> None:
+    """An enrichment by one primal strategy."""
     offline = material.offline()
     strategy = registry.create("primal strategy", primal.name, {})
 
@@ -81,6 +86,7 @@ def test_enrichment(benchmark: BenchmarkFixture, material: Material, primal: Pri
 
 
 def test_separation(benchmark: BenchmarkFixture, material: Material) -> None:
+    """The members as sums of parameter-independent terms, or samples of them."""
     problem, training = material.problem, material.training
     measure(
         benchmark,
@@ -91,6 +97,7 @@ def test_separation(benchmark: BenchmarkFixture, material: Material) -> None:
 
 
 def test_projection_of_members(benchmark: BenchmarkFixture, material: Material, primal: Primal) -> None:
+    """What reduced assembly prepares for one enrichment."""
     members = material.members
     why = material.operators(primal)
     if isinstance(why, str):
@@ -109,10 +116,12 @@ def test_projection_of_members(benchmark: BenchmarkFixture, material: Material, 
 
 
 def test_assembly_in_full(benchmark: BenchmarkFixture, material: Material, primal: Primal) -> None:
+    """A reduced program from matrices of full size."""
     _assembly(benchmark, "assembly in full", material, material.model(primal))
 
 
 def test_assembly_reduced(benchmark: BenchmarkFixture, material: Material, primal: Primal) -> None:
+    """A reduced program from projected members."""
     model, why = material.online(primal)
     if why:
         pytest.skip(f"queries have to be assembled in full: {why}")

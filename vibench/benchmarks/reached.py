@@ -6,9 +6,9 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 
 import numpy as np
 
-from benchmarks.material import Material, Query, spread
-from benchmarks.measure import Info
 from vibench.arrays import Array
+from vibench.benchmarks.material import Material, Query, spread
+from vibench.benchmarks.measure import Info
 from vibench.highfidelity.active_set import HighFidelitySolution
 from vibench.interfaces.problem import MEMBERS, VariationalInequality
 from vibench.interfaces.strategies import Cone, Enrichment
@@ -150,11 +150,11 @@ def of_queries(material: Material, model: Model, solve: Solve, accuracy: float) 
         if residuals is not None and answer.x is not None and answer.alpha is not None:
             u, lam = reduced.basis @ answer.x, model.generators @ answer.alpha
             figures.append(_residuals(residuals) | _errors(material, query, u, lam))
-    _, status, reason = max(statuses)
+    _, worst_status, why = max(statuses)
     form = "primal" if reduced is None or reduced.factor is None else "dual"
     shape = _shape(None if reduced is None else reduced.program)
     complete = worst(figures) if len(figures) == len(statuses) else {}
-    return about(material, **shape, form=form, status=status, reason=reason, accuracy=complete)
+    return about(material, **shape, form=form, status=worst_status, reason=why, accuracy=complete)
 
 
 def _errors(material: Material, query: Query, u: Array, lam: Array) -> dict[str, float]:

@@ -9,8 +9,8 @@ from typing import Any, TypeVar
 import numpy as np
 import pytest
 
-from benchmarks.cases import USUAL, Case, Primal, Spaces
 from vibench.arrays import Array
+from vibench.benchmarks.cases import Case, Primal, Spaces
 from vibench.errors import in_a_line
 from vibench.highfidelity.active_set import HighFidelitySolution, HighFidelitySolver
 from vibench.interfaces.problem import Problem, VariationalInequality
@@ -55,10 +55,18 @@ class Material:
     """The problem of a case and what comes of it, each made when it is first asked for.
 
     What cannot be made fails every benchmark that asks for it, with the same line.
+
+    Parameters
+    ----------
+    case
+        The problem.
+    usual
+        Where V_N and the cone stop, unless a method is told.
     """
 
-    def __init__(self, case: Case) -> None:
+    def __init__(self, case: Case, usual: Spaces) -> None:
         self.case = case
+        self.usual = usual
         self._made: dict[Hashable, tuple[Any, str]] = {}
 
     def _once(self, what: str, make: Callable[[], T], *which: Hashable) -> T:
@@ -75,10 +83,14 @@ class Material:
 
     @property
     def problem(self) -> Problem:
-        return self._once("problem", lambda: registry.create("problem", self.case.problem, self.case.options))
+        """The problem."""
+        case = self.case
+        found: Problem = self._once("problem", lambda: registry.create("problem", case.problem, case.options))
+        return found
 
     @property
     def training(self) -> Array:
+        """The training parameters (P×d)."""
         problem = self.problem
         return self._once("training set", lambda: training_parameters(problem))
 
@@ -96,12 +108,14 @@ class Material:
             "snapshots", lambda: (np.column_stack([s.u for s in sweep]), np.column_stack([s.lam for s in sweep]))
         )
 
-    def pod(self, spaces: Spaces = USUAL) -> POD:
-        V, u = self.problem.V, self.snapshots[0]
+    def pod(self, spaces: Spaces | None = None) -> POD:
+        """V_N."""
+        V, u, spaces = self.problem.V, self.snapshots[0], spaces or self.usual
         return self._once("POD", lambda: pod(u, V, spaces.pod), spaces.pod)
 
-    def cone(self, spaces: Spaces = USUAL) -> ReducedCone:
-        W, lam = self.problem.W, self.snapshots[1]
+    def cone(self, spaces: Spaces | None = None) -> ReducedCone:
+        """The reduced cone."""
+        W, lam, spaces = self.problem.W, self.snapshots[1], spaces or self.usual
 
         def make() -> ReducedCone:
             found = registry.create("dual strategy", spaces.dual, {}).reduce(lam, W, spaces.cone)
@@ -110,12 +124,13 @@ class Material:
 
         return self._once(f"cone of {spaces.dual}", make, spaces.cone)
 
-    def offline(self, spaces: Spaces = USUAL) -> Offline:
+    def offline(self, spaces: Spaces | None = None) -> Offline:
         """What primal strategies start from."""
         reduced = self.cone(spaces)
         return Offline(self.problem, self.pod(spaces).basis, reduced.cone, reduced.prepared.span, self.training)
 
-    def enrichment(self, primal: Primal, spaces: Spaces = USUAL) -> Enrichment:
+    def enrichment(self, primal: Primal, spaces: Spaces | None = None) -> Enrichment:
+        """What a primal strategy adds."""
         offline = self.offline(spaces)
 
         def make() -> Enrichment:
@@ -124,16 +139,17 @@ class Material:
 
         return self._once(f"enrichment by {primal}", make, spaces)
 
-    def model(self, primal: Primal, spaces: Spaces = USUAL) -> ReducedModel:
+    def model(self, primal: Primal, spaces: Spaces | None = None) -> ReducedModel:
         """A new reduced model: it has nothing in store from earlier queries."""
         return model_with(self.offline(spaces), self.enrichment(primal, spaces))
 
     @property
     def members(self) -> Mapping[str, AffineMember]:
+        """The members as sums of parameter-independent terms, or samples of them."""
         problem, training = self.problem, self.training
         return self._once("separation", lambda: affine_decomposition(problem, training, INTERPOLATION))
 
-    def operators(self, primal: Primal, spaces: Spaces = USUAL) -> Operators | str:
+    def operators(self, primal: Primal, spaces: Spaces | None = None) -> Operators | str:
         """The projected members, or why queries have to be assembled in full."""
         model, members = self.model(primal, spaces), self.members
         return self._once(
@@ -142,13 +158,14 @@ class Material:
             spaces,
         )
 
-    def online(self, primal: Primal, spaces: Spaces = USUAL) -> tuple[Model, str]:
+    def online(self, primal: Primal, spaces: Spaces | None = None) -> tuple[Model, str]:
         """A new model that assembles in the quickest way there is, and why that is in full; "" where it is not."""
         model, operators = self.model(primal, spaces), self.operators(primal, spaces)
         return (model, operators) if isinstance(operators, str) else (HyperReducedModel(model, operators), "")
 
     @property
     def queries(self) -> list[Query]:
+        """The validation parameters, with what is exact there."""
         problem, (u, lam) = self.problem, self.snapshots
         scales = float(problem.V.norm(u).max()), float(problem.W.norm(lam).max())
 

@@ -1,0 +1,60 @@
+"""Weak greedy training: solve where the error bound of the model of all solutions so far is worst."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import numpy as np
+from annotated_types import Ge, Gt, Le, Lt
+
+from vibench import AdaptiveSampling, Array, ParameterBox, Trainer
+from vibench_strategies.samplings.sobol import Sobol
+
+WEAK = 0.8
+"""The worst bound is at least this share of all known ones, most of which are those of earlier models."""
+
+
+class Greedy(AdaptiveSampling):
+    """Weak greedy training (Haasdonk, Salomon and Wohlmuth 2012) over random subsets (Hesthaven, Stamm, Zhang 2014).
+
+    `drawn` new candidates are evaluated for every solution; it ends when all known bounds, and those of `checked` new
+    candidates in a row, meet the tolerance: with 95 % confidence fewer than 3 in `checked` do not, or with `most`.
+    """
+
+    def __init__(
+        self,
+        candidates: Annotated[int, Ge(2), Le(1_000_000)],
+        tolerance: Annotated[float, Gt(0.0), Lt(1.0)],
+        seed: Annotated[int, Ge(0), Lt(2**63)] = 0,
+        drawn: Annotated[int, Ge(1)] = 8,
+        checked: Annotated[int, Ge(1)] = 100,
+        most: Annotated[int, Ge(1)] = 1000,
+    ) -> None:
+        self.candidates, self.tolerance, self.seed = candidates, tolerance, seed
+        self.drawn, self.checked, self.most = drawn, checked, most
+
+    def parameters(self, box: ParameterBox) -> Array:
+        """The candidates: the middle of the box, its corners and middles of edges and faces, then the sequence."""
+        regular = box.grid(*[3] * box.dim)[: self.candidates // 2]
+        mus = np.vstack([(box.lower + box.upper) / 2.0, regular, Sobol(self.candidates, self.seed).parameters(box)])
+        return mus[np.sort(np.unique(mus, axis=0, return_index=True)[1])][: self.candidates]
+
+    def train(self, box: ParameterBox, trainer: Trainer) -> None:
+        """Solve in the middle of the box, then where the bound is worst."""
+        mus, first = self.parameters(box), min(3**box.dim, self.candidates // 2)
+        unseen = [*(first + np.random.default_rng(self.seed).permutation(len(mus) - first)), *range(first - 1, 0, -1)]
+        trainer.solve(mus[0])
+        known, solved, passed, draws = dict[int, float](), 1, 0, first + self.drawn
+        while solved < self.most and (known or unseen):
+            for k in [unseen.pop() for _ in range(min(draws, len(unseen)))]:
+                known[k] = trainer.bound(mus[k])
+                passed = 0 if known[k] > self.tolerance else passed + 1
+            k, draws = max(known, key=known.__getitem__), 0
+            known[k] = trainer.bound(mus[k])  # of the present model
+            if known[k] > self.tolerance and known[k] >= WEAK * max(known.values()):
+                trainer.solve(mus[k], known.pop(k))
+                solved, passed, draws = solved + 1, 0, self.drawn
+            elif max(known.values()) <= self.tolerance:
+                if passed >= self.checked or not unseen:
+                    return
+                draws = self.drawn

@@ -1,0 +1,76 @@
+"""What reports of large runs take: seconds to write, megabytes, and seconds until Chromium has opened them.
+
+    python tests/benchmarks/report.py FOLDER [RUN]
+
+Results of 704 cells with 32 queries each and of 20,000 cells with one are made of the cells of RUN, a run of the study
+`quick` (FOLDER/quick by default, which is run where it is missing). The command ends with exit code 1 if the report of
+704 cells takes ten seconds to write, five megabytes, or two seconds to open, or if one of the pages does not open.
+"""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import sysconfig
+import time
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "helpers"))
+
+from browsing import chromium, complaints, look
+from many_cells import write_many
+
+from vibench.results.database import FILE
+
+SIZES = {704: 32, 20_000: 1}
+"""Cells, and queries of each."""
+
+SECONDS_TO_WRITE, MEGABYTES, SECONDS_TO_OPEN = 10.0, 5.0, 2.0
+"""What the report of 704 cells has to stay under."""
+
+OPENED = """
+const [entry] = performance.getEntriesByType("navigation");
+return [entry.loadEventEnd / 1e3, document.querySelectorAll('[data-table="summary"] tbody tr').length];
+"""
+
+
+def command(*arguments: str) -> float:
+    """Wall seconds of a vibench command."""
+    start = time.perf_counter()
+    subprocess.run([str(Path(sysconfig.get_path("scripts")) / "vibench"), *arguments], check=True, capture_output=True)
+    return time.perf_counter() - start
+
+
+def opened(page: Path, folder: Path) -> float:
+    """Seconds from the beginning of the navigation to the end of the load event, the script included."""
+    with chromium(folder) as browser:
+        look(browser, page)
+        seconds, rows = browser.execute_script(OPENED)
+        wrong = complaints(browser)
+        if not rows or wrong:
+            raise SystemExit(f"'{page}' does not open: {rows} rows, {wrong}")
+        return float(seconds)
+
+
+def main() -> int:
+    """Measure, print and judge."""
+    folder = Path(sys.argv[1])
+    run = Path(sys.argv[2]) if len(sys.argv) > 2 else folder / "quick"
+    if not (run / FILE).exists():
+        command("run", "quick", "--out", str(run), "--no-figures")
+    missed = False
+    for cells, queries in SIZES.items():
+        results = folder / str(cells)
+        if not (results / FILE).exists():
+            write_many(run, results, cells, queries)
+        page = results / "report.html"
+        written = command("report", str(results), "--out", str(page))
+        size, seconds = page.stat().st_size / 1e6, opened(page, folder)
+        print(f"{cells} cells: {written:.1f} s to write, {size:.2f} MB, {seconds:.2f} s to open")
+        asked = written < SECONDS_TO_WRITE and size < MEGABYTES and seconds < SECONDS_TO_OPEN
+        missed |= cells == min(SIZES) and not asked
+    return int(missed)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

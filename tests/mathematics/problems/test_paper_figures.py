@@ -1,0 +1,171 @@
+"""Twins of the paper's figures: they show the numbers of the run and of the paper, and judge by both."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from matplotlib.axes import Axes
+from running import Changed
+
+from vibench.highfidelity.active_set import HighFidelitySolver
+from vibench.report.figures import problems
+from vibench.results import tables
+from vibench_problems.hertz import Hertz
+from vibench_problems.line_contact import theory
+from vibench_problems.obstacle import RADIUS, Obstacle
+from vibench_problems.paper import published
+from vibench_problems.paper.curves import compared, reached, violations
+from vibench_problems.paper.figures import PaperFigures
+
+FIXED = "primal = 'offline-pga'"
+TABLES = ("queries", "cells", "histories")
+
+
+def as_published(problem: str, sizes: str, loose: float, tight: float) -> list[str]:
+    """SQL that makes the model of one tolerance one of the paper's pair, at its two tolerances."""
+    statements = []
+    for table in TABLES:
+        stage = " AND stage IN ('enrichment', 'cone', 'pod')" * (table == "histories")
+        statements.append(f"UPDATE {table} SET {sizes} WHERE problem = '{problem}'{stage}")
+        statements.append(f"UPDATE {table} SET primal_tol = {loose} WHERE problem = '{problem}' AND {FIXED}")
+    for table in ("queries", "histories"):
+        statements += [
+            f"CREATE TABLE again AS SELECT * FROM {table} WHERE problem = '{problem}' AND {FIXED}",
+            f"UPDATE again SET primal_tol = {tight}",
+            f"INSERT INTO {table} SELECT * FROM again",
+            "DROP TABLE again",
+        ]
+    return statements
+
+
+HERTZ = as_published("hertz", "pod_tol = NULL, pod_size = 46, dual_tol = NULL, dual_size = 12", 0.4, 0.3)
+OBSTACLE = as_published("obstacle", "pod_tol = 0.001", 0.5, 0.001)
+
+
+def twins(path: Path, problem: str) -> dict[str, Callable[[], Any]]:
+    (data,) = [one for _, one in problems(path) if one.problem == problem]
+    return dict(PaperFigures().drawings(data))
+
+
+def line_called(axes: Axes, label: str) -> np.ndarray:
+    (line,) = [line for line in axes.get_lines() if line.get_label() == label]
+    return np.asarray(line.get_xydata(), float)
+
+
+def test_every_figure_from_3_to_15_has_a_twin(changed: Changed) -> None:
+    path = changed(*OBSTACLE, *HERTZ)
+    found = {name: draw for problem in ("obstacle", "hertz") for name, draw in twins(path, problem).items()}
+    assert list(found) == [f"figure-{number}" for number in range(3, 16)]
+    for name, draw in found.items():
+        figure = draw()
+        number = name.removeprefix("figure-")
+        assert figure.get_suptitle().startswith(f"Figure {number}: "), name
+        assert figure.caption, name
+        assert figure.published, name
+        assert figure.compared.startswith(("Agrees: ", "Differs: ")), name
+
+
+def test_a_run_without_the_pairs_of_the_paper_has_fewer(quick_run: Path) -> None:
+    for problem, missing in (
+        ("obstacle", {"figure-7", "figure-8"}),
+        ("hertz", {"figure-13", "figure-14", "figure-15"}),
+    ):
+        found = twins(quick_run / "results.sqlite", problem)
+        assert {name for name in missing if found[name]() is None} == missing
+
+
+@pytest.mark.parametrize(
+    ("problem", "options"), [("obstacle", '{"bulge": true}'), ("hertz", '{"approach": "parameter"}')]
+)
+def test_a_problem_with_another_parameter_is_not_the_paper_s(problem: str, options: str, changed: Changed) -> None:
+    path = changed(
+        *(f"UPDATE {table} SET problem_options = '{options}' WHERE problem = '{problem}'" for table in TABLES)
+    )
+    assert twins(path, problem) == {}
+
+
+def test_projection_errors_stand_beside_the_published_sizes(quick_run: Path) -> None:
+    path = quick_run / "results.sqlite"
+    figure = twins(path, "obstacle")["figure-5"]()
+    left, right = figure.axes
+    crosses = "paper: size for a tolerance"
+    np.testing.assert_array_equal(line_called(left, crosses), [(19, 1e-3), (51, 1e-4), (89, 1e-6)])
+    np.testing.assert_array_equal(line_called(right, crosses), [(50, 1e-2), (70, 1e-3)])
+    cells = tables.read(path, "cells")
+    mine = cells[(cells["problem"] == "obstacle") & (cells["dual"] == "mcpg")].iloc[0]
+    assert f"N = {mine['N']} for δ_POD = 0.001, 19 published" in figure.compared
+    assert f"R = {mine['R']} for δ_mCPG = 0.01, 50 published" in figure.compared
+    assert "R = none for δ_mCPG = 0.001, 70 published" in figure.compared.partition("Differs: ")[2]
+
+
+def test_a_violated_inequality_differs(changed: Changed) -> None:
+    path = changed(*OBSTACLE)
+    assert "the inequalities hold at all 16 points" in twins(path, "obstacle")["figure-8"]().compared
+    path = changed(*OBSTACLE, "UPDATE queries SET beta_hf_span = 2.0 * beta_full_span WHERE query = 3")
+    text = twins(path, "obstacle")["figure-8"]().compared
+    assert "the inequalities do not hold at all 16 points" in text.partition("Differs: ")[2]
+
+
+def test_constants_of_the_third_pair_are_over_the_only_parameter(changed: Changed) -> None:
+    path = changed(*HERTZ)
+    figure = twins(path, "hertz")["figure-13"]()
+    queries = tables.read(path, "queries")
+    mine = queries[(queries["problem"] == "hertz") & (queries["dual"] == "mcpg") & (queries["primal_tol"] == 0.4)]
+    mine = mine[mine["solver"] == "piqp"].sort_values("mu_1")
+    expected = mine[["mu_1", "beta_plain_span"]].to_numpy(float)
+    np.testing.assert_allclose(line_called(figure.axes[0], "β_dec over the span"), expected)
+    (panel, *_) = twins(path, "hertz")["figure-15"]().axes
+    np.testing.assert_allclose(line_called(panel, "β_off"), mine[["mu_1", "beta_span"]].to_numpy(float))
+
+
+def test_the_greedy_algorithm_is_that_of_the_histories(changed: Changed) -> None:
+    path = changed(*HERTZ)
+    figure = twins(path, "hertz")["figure-14"]()
+    sigma, least, _ = figure.axes
+    histories = tables.read(path, "histories")
+    mine = histories[
+        (histories["problem"] == "hertz") & (histories["dual"] == "mcpg") & (histories["primal_tol"] == 0.3)
+    ]
+    for panel, quantity in ((sigma, "sigma"), (least, "beta_span_min")):
+        steps = mine[mine["quantity"] == quantity].sort_values("step")[["step", "value"]].to_numpy(float)
+        shown = line_called(panel, "offline-pga, δ = 0.3")
+        np.testing.assert_array_equal(shown[np.isfinite(shown[:, 1])], steps[steps[:, 1] > 1e-12])
+    assert "σ stays above 0.3" in figure.compared.partition("Differs: ")[2]  # δ was 0.5
+
+
+def test_the_membrane_is_that_of_figure_4(quick_run: Path) -> None:
+    figure = twins(quick_run / "results.sqlite", "obstacle")["figure-4"]()
+    problem = Obstacle("coarse")
+    mu = np.array(published.MEMBRANE)
+    assert RADIUS * mu[0] == pytest.approx(0.18)
+    found = HighFidelitySolver(problem).solve(mu)
+    left, right = (axes.collections[0] for axes in figure.axes[:2])
+    assert left.get_clim()[0] == pytest.approx(float(problem.picture(mu, found.u, found.lam).values.min()), rel=1e-6)
+    assert right.get_clim() == (0.0, pytest.approx(float(found.lam.max()), rel=1e-6))
+    assert f"{np.count_nonzero(found.lam > 0.0)} of {problem.W.dim} multipliers are positive" in figure.compared
+
+
+def test_five_pressures_lie_in_one_panel_with_hertz_s_theory(quick_run: Path) -> None:
+    figure = twins(quick_run / "results.sqlite", "hertz")["figure-10"]()
+    problem = Hertz("coarse")
+    panel = figure.axes[1]
+    ellipses = [line for line in panel.get_lines() if line.get_label() == "Hertz's theory"]
+    assert len(ellipses) == len(published.RADII) == 5
+    for radius, ellipse in zip(published.RADII, ellipses, strict=True):
+        found = HighFidelitySolver(problem).solve(np.array([radius]))
+        np.testing.assert_allclose(line_called(panel, f"λ(µ), µ = {radius:g} m")[:, 1], found.lam, rtol=1e-9)
+        exact = theory(problem, np.array([radius]), found.u)
+        x, pressure = np.asarray(ellipse.get_xydata(), float).T
+        np.testing.assert_allclose((x / exact.half_width) ** 2 + (pressure / exact.peak) ** 2, 1.0, rtol=1e-12)
+
+
+def test_facts_are_sorted_by_what_the_paper_says() -> None:
+    facts = ((True, "a"), (np.bool_(False), "b"), (None, "c"), (np.bool_(True), "d"))
+    assert compared(*facts) == "Agrees: a; d. Differs: b. Not published: c."
+    assert reached({0: 1.0, 3: 0.1, 4: 0.05}, 0.1) == 3
+    assert reached({0: 1.0}, 0.1) is None
+    assert violations({1: 1.0, 2: 3.0, 9: 1.0}, {1: 1.0, 2: 2.0}) == [2]

@@ -1,0 +1,138 @@
+"""Greedy training: it solves where the bound is worst until the candidates meet the tolerance, as the rows say."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from samples import SampleStore, carry_out
+
+from vibench import AdaptiveSampling, Array, HighFidelitySolver, ParameterBox, Stop, Trainer, create
+from vibench.stages.assembly import AffineDecomposition
+from vibench.stages.base import value_of
+from vibench.stages.offline import PODStage, TrainingConstraints
+from vibench.stages.snapshots import gather, training_of, training_stages
+from vibench.study.cells import Plugin
+
+BOX = ParameterBox(("x", "y"), np.zeros(2), np.array([2.0, 1.0]), ("1", "1"))
+
+
+class Distance(Trainer):
+    """A trainer whose bound is the distance to the nearest solution: greedy training covers the box."""
+
+    def __init__(self) -> None:
+        self.solved: list[Array] = []
+        self.reasons: list[float] = []
+        self.asked: list[tuple[Array, float]] = []
+
+    def solve(self, mu: Array, bound: float = float("nan")) -> None:
+        self.solved.append(mu)
+        self.reasons.append(bound)
+
+    def bound(self, mu: Array) -> float:
+        found = float(np.linalg.norm(np.array(self.solved) - mu, axis=1).min())
+        self.asked.append((mu, found))
+        return found
+
+
+def trained(**options: object) -> tuple[AdaptiveSampling, Distance]:
+    strategy, trainer = create("sampling strategy", "greedy", options), Distance()
+    assert isinstance(strategy, AdaptiveSampling)
+    strategy.train(BOX, trainer)
+    return strategy, trainer
+
+
+def test_all_candidates_meet_the_tolerance_where_all_are_checked() -> None:
+    strategy, trainer = trained(candidates=400, tolerance=0.2, checked=400)
+    candidates = strategy.parameters(BOX)
+    assert {tuple(mu) for mu in trainer.solved} <= {tuple(mu) for mu in candidates}
+    apart = np.linalg.norm(candidates[:, None] - np.array(trainer.solved), axis=2).min(axis=1)
+    assert apart.max() <= 0.2
+    assert trainer.solved[0].tolist() == [1.0, 0.5]  # the middle of the box
+    assert {(x, y) for x in (0.0, 2.0) for y in (0.0, 1.0)} <= {tuple(mu) for mu in candidates}
+    assert len(candidates) == 400
+    assert len(trainer.solved) < 40  # 2 / (0.2² · π / 2) discs cannot do with fewer than 16
+    assert len(trainer.asked) < 400 + 10 * len(trainer.solved)  # lazy: not all candidates in all steps
+
+
+def test_reasons_are_above_the_tolerance_and_nearly_the_worst_of_the_pool() -> None:
+    _, trainer = trained(candidates=300, tolerance=0.25, drawn=300, checked=300)
+    reasons = np.array(trainer.reasons[1:])
+    assert np.isnan(trainer.reasons[0])
+    assert reasons.min() > 0.25
+    candidates = create("sampling strategy", "greedy", {"candidates": 300, "tolerance": 0.5}).parameters(BOX)
+    for k, reason in enumerate(reasons, 1):
+        worst = np.linalg.norm(candidates[:, None] - np.array(trainer.solved[:k]), axis=2).min(axis=1).max()
+        assert reason >= 0.8 * worst - 1e-12
+
+
+def test_it_ends_after_so_many_candidates_in_a_row_or_solutions() -> None:
+    _, trainer = trained(candidates=10_000, tolerance=0.3, checked=50)
+    assert all(bound <= 0.3 for _, bound in trainer.asked[-50:])
+    assert len(trainer.asked) < 1000
+    _, bounded = trained(candidates=500, tolerance=1e-6, most=7)
+    assert len(bounded.solved) == 7
+    again = trained(candidates=500, tolerance=1e-6, most=7)[1]
+    assert np.array_equal(bounded.solved, again.solved)
+    other = trained(candidates=500, tolerance=1e-6, most=7, seed=1)[1]
+    assert not np.array_equal(bounded.solved, other.solved)
+
+
+@pytest.mark.parametrize("candidates", [2, 3, 8])
+def test_it_ends_where_every_candidate_is_solved(candidates: int) -> None:
+    _, trainer = trained(candidates=candidates, tolerance=1e-9)
+    assert len(np.unique(trainer.solved, axis=0)) == len(trainer.solved) == candidates
+
+
+PROBLEM = Plugin("problem", "obstacle", '{"resolution": 160}', "test")
+GREEDY = Plugin("sampling strategy", "greedy", '{"candidates": 200, "tolerance": 0.1, "checked": 20}', "test")
+
+
+@pytest.fixture(scope="module")
+def store(tmp_path_factory: pytest.TempPathFactory) -> SampleStore:
+    store = SampleStore(tmp_path_factory.mktemp("greedy"))
+    carry_out(PODStage(PROBLEM, Stop(tolerance=1e-6), GREEDY), store)
+    carry_out(TrainingConstraints(PROBLEM, GREEDY), store)
+    return store
+
+
+def test_the_solutions_of_the_training_are_the_snapshots(store: SampleStore) -> None:
+    (stage,) = training_stages(PROBLEM, GREEDY)
+    found = gather(store, (stage,))
+    solver = HighFidelitySolver(create("problem", "obstacle", {"resolution": 160}))
+    for k, mu in enumerate(found.mu):
+        exact = solver.solve(mu)
+        np.testing.assert_allclose(found.u[:, k], exact.u, atol=1e-9 * np.abs(exact.u).max())
+        np.testing.assert_allclose(found.lam[:, k], exact.lam, atol=1e-8 * np.abs(exact.lam).max())
+    assert 3 <= len(found.mu) < 60
+    assert np.array_equal(training_of(store, PROBLEM, GREEDY), found.mu)
+    assert len(value_of(store, TrainingConstraints(PROBLEM, GREEDY)).members) == len(found.mu)
+
+
+def test_history_and_seconds_are_recorded(store: SampleStore) -> None:
+    (stage,) = training_stages(PROBLEM, GREEDY)
+    artefact = store.get(stage.key)
+    assert artefact is not None
+    histories = {history.quantity: history for history in artefact.histories}
+    assert set(histories) == {"bound", "bounds evaluated", "scale", "centre_x", "centre_y"}
+    assert {history.stage for history in histories.values()} == {"selection"}
+    bounds, evaluated = histories["bound"].values, histories["bounds evaluated"].values
+    assert min(bounds[1:]) > 0.1
+    assert list(evaluated) == sorted(evaluated)
+    assert evaluated[0] == 0
+    found = gather(store, (stage,))
+    assert np.array_equal(histories["scale"].values, found.mu[:, 0])
+    solving = sum(seconds.cpu for seconds in found.seconds)
+    assert artefact.seconds.cpu == pytest.approx(solving + found.selecting.cpu)
+    assert found.selecting.cpu > 0.0
+
+
+def test_terms_are_interpolated_over_the_set_of_the_problem_which_takes_no_solutions(tmp_path: Path) -> None:
+    stage = AffineDecomposition(PROBLEM, 1e-3, GREEDY)
+    assert stage.inputs() == ()
+    store = SampleStore(tmp_path)
+    carry_out(stage, store)
+    own = AffineDecomposition(PROBLEM, 1e-3)
+    carry_out(own, store)
+    assert len(value_of(store, stage)["A"].rows) == len(value_of(store, own)["A"].rows)

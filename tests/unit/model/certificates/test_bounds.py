@@ -1,0 +1,200 @@
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import lru_cache
+from types import MappingProxyType
+
+import numpy as np
+import pytest
+import scipy.sparse as sp
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numerics import exact, space, spd
+
+from vibench.errors import UnsupportedError
+from vibench.interfaces.affine import AffineSum
+from vibench.interfaces.problem import Contact, ParameterBox, Problem, Sampler, VariationalInequality
+from vibench.interfaces.strategies import Enrichment, Kind
+from vibench.linalg.inner_product import InnerProduct
+from vibench.model.affine import affine_decomposition
+from vibench.model.certificates import base as base_module
+from vibench.model.certificates.base import CertificateBase, Guarantee, certificate_base, unsupported
+from vibench.model.certificates.bounds import OnlineBound, OnlineCertificate, prepare
+from vibench.model.error_bounds import NOT_IN_CONE
+from vibench.model.galerkin import ReducedModel
+from vibench.model.hyperreduced import HyperReducedModel, hyper_reduce
+
+N, M = 14, 5
+CONTACT = np.arange(3, 11)
+BOX = ParameterBox(("a", "b"), np.array([0.5, -1.0]), np.array([2.0, 1.0]), ("1", "1"))
+
+
+def theta(mu: np.ndarray) -> np.ndarray:
+    return np.array([1.0, mu[0] ** 2, np.exp(mu[1])])
+
+
+class Family(Problem):
+    """Random matrices; A is constant, an affine sum, or interpolated, B and g vary on the contact unknowns."""
+
+    parameters = BOX
+
+    def __init__(self, stiffness: str, seed: int = 0) -> None:
+        rng = np.random.default_rng(seed)
+        self.V, self.W, self._stiffness = space(N, 1), InnerProduct(sp.eye_array(M, format="csc")), stiffness
+        self._terms = tuple(sp.csr_array(0.3 * spd(N, rng, 30.0)) for _ in range(3))
+        self._f, self._B, self._turn = rng.standard_normal(N), rng.standard_normal((M, 8)), rng.standard_normal((M, 8))
+        self._g = rng.uniform(-0.3, 0.1, M)
+        constant = {"constant": {"A", "f"}, "affine": {"f"}, "interpolated": {"f"}}[stiffness]
+        self.constant = frozenset(constant)  # type: ignore[misc]
+        self.entrywise = frozenset({"A"} if stiffness == "interpolated" else set())  # type: ignore[misc]
+        self.affine = MappingProxyType({"A": AffineSum(self._terms, theta)} if stiffness == "affine" else {})
+
+    def training_set(self) -> np.ndarray:
+        return self.parameters.grid(4, 4)
+
+    def stiffness(self, mu: np.ndarray) -> sp.csr_array:
+        if self._stiffness == "constant":
+            return sum(self._terms)
+        A = sp.csr_array(sum(t * term for t, term in zip(theta(mu), self._terms, strict=True)))
+        if self._stiffness == "interpolated":  # a little of what is no combination of few matrices
+            A = A + sp.diags_array(0.05 * np.cos(np.arange(N) * (mu[0] + mu[1])))
+        return sp.csr_array(A)
+
+    def assemble(self, mu: np.ndarray) -> VariationalInequality:
+        B, g = self.constraint(mu)
+        return VariationalInequality(self.stiffness(mu), self._f.copy(), B, g)
+
+    @property
+    def contact_dofs(self) -> np.ndarray:
+        return CONTACT
+
+    def contact(self, mu: np.ndarray) -> Contact:
+        return Contact(sp.csr_array(self._B + np.sin(mu[0] + mu[1]) * self._turn), self._g * (1.0 + 0.2 * mu[1]))
+
+    def sampler(self, wanted: Mapping[str, tuple[np.ndarray, np.ndarray]]) -> Sampler:
+        return lambda mu: {"A": np.asarray(self.stiffness(mu).toarray()[wanted["A"]])}
+
+
+class Without(Family):
+    """The same without a contact of its own."""
+
+    has_contact = False
+
+
+Prepared = tuple[Family, HyperReducedModel, OnlineCertificate]
+
+
+@lru_cache
+def prepared(stiffness: str, per_parameter: bool = False, tolerance: float = 1e-3) -> Prepared:
+    problem = Family(stiffness)
+    rng, training = np.random.default_rng(5), problem.training_set()
+    members = affine_decomposition(problem, training, tolerance)
+    basis = problem.V.orthonormalise(rng.standard_normal((N, 4)))
+    generators = np.maximum(rng.standard_normal((M, 3)), 0.0) + 0.05
+    enrichment = Enrichment(Kind.PER_PARAMETER, eta=generators[:, :2]) if per_parameter else Enrichment(Kind.NONE)
+    span = np.linalg.qr(generators)[0]
+    model = ReducedModel(problem, basis, enrichment, generators, span)
+    reduced = HyperReducedModel(model, hyper_reduce(model, members))
+    return problem, reduced, prepare(reduced, members, certificate_base(problem, members, training), training)
+
+
+KINDS = [("constant", False), ("constant", True), ("affine", False), ("affine", True), ("interpolated", False)]
+
+
+def found(kind: Prepared, mu: np.ndarray, x: np.ndarray, alpha: np.ndarray) -> tuple[OnlineBound, float, float, float]:
+    """The bound of some x and α, the errors, and the norm of u."""
+    problem, model, certificate = kind
+    reduced, vi = model.assemble(mu), problem.assemble(mu)
+    u, lam = exact(VariationalInequality(vi.A.toarray(), vi.f, vi.B.toarray(), vi.g))
+    bound = certificate.evaluate(problem, mu, reduced, x, alpha)
+    e, force = u - reduced.lift(x[:, None])[:, 0], vi.B.T @ (lam - model.generators @ alpha)
+    A = vi.A.toarray()
+    energies = (e @ A @ e, force @ np.linalg.solve(A, force), u @ A @ u)
+    error, natural, size = (float(np.sqrt(value)) for value in energies)
+    return bound, error, natural, size
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@given(st.integers(0, 10_000), st.sampled_from([0.0, 1e-3, 1.0, 20.0]), st.floats(0.5, 2.0), st.floats(-1.0, 1.0))
+@settings(max_examples=40)
+def test_no_error_is_above_its_bound(kind: tuple[str, bool], seed: int, size: float, a: float, b: float) -> None:
+    """At any parameter of the box, for any x and any α ≥ 0."""
+    rng, mu = np.random.default_rng(seed), np.array([a, b])
+    given = prepared(*kind)
+    program = given[1].assemble(mu).program
+    x, alpha = exact(program)
+    x = x + size * rng.standard_normal(len(x))
+    alpha = np.maximum(alpha + size * rng.standard_normal(len(alpha)), 0.0)
+    bound, error, natural, norm = found(given, mu, x, alpha)
+    assert bound.note == ""
+    scale = norm + np.linalg.norm(x) + np.linalg.norm(alpha)
+    assert error <= bound.u_energy + 1e-7 * scale
+    assert natural <= bound.lambda_natural + 1e-7 * scale
+    assert error <= bound.relative * norm * (1.0 + 1e-9) + 1e-7 * scale
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_bounds_of_reduced_solutions_are_sharp(kind: tuple[str, bool]) -> None:
+    given, effectivities = prepared(*kind), []
+    for mu in BOX.sample(12, 4):
+        bound, error, natural, _ = found(given, mu, *exact(given[1].assemble(mu).program))
+        effectivities.append((bound.u_energy / error, bound.lambda_natural / natural))
+    assert np.all(np.median(effectivities, axis=0) <= (4.0, 8.0))
+
+
+def test_what_bounds_are_worth() -> None:
+    assert prepared("constant")[2].base.guarantee is Guarantee.CERTIFIED
+    assert prepared("affine")[2].base.guarantee is Guarantee.CERTIFIED
+    verified = prepared("interpolated")[2].base
+    assert verified.guarantee is Guarantee.VERIFIED
+    assert verified.stiffness_error > 0.0
+    assert prepared("constant")[2].base.spectral is None
+
+
+def test_interpolation_errors_are_in_the_bound(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A coarse interpolation alone makes a large error that the residual of the interpolated A does not see."""
+    problem, model, certificate = prepared("interpolated", tolerance=0.3)
+    assert certificate.base.stiffness_error > 0.01
+    for mu in BOX.sample(20, 8):
+        bound, error, natural, _ = found((problem, model, certificate), mu, *exact(model.assemble(mu).program))
+        assert error <= bound.u_energy
+        assert natural <= bound.lambda_natural
+        assert bound.rho >= certificate.base.stiffness_error * 0.1 * np.sqrt(error)
+
+
+def test_multipliers_outside_the_cone_have_no_bound() -> None:
+    given = prepared("constant")
+    mu, alpha = np.array([1.0, 0.0]), np.array([-10.0, 0.0, 0.0])
+    bound = given[2].evaluate(given[0], mu, given[1].assemble(mu), np.zeros(4), alpha)
+    assert (bound.guarantee, bound.note, bound.u_energy) == (Guarantee.NONE, NOT_IN_CONE, np.inf)
+
+
+def test_problems_that_cannot_be_certified_say_why() -> None:
+    problem = Without("constant")
+    members = affine_decomposition(problem, problem.training_set(), 1e-3)
+    assert "contact unknowns" in unsupported(problem, members)
+    with pytest.raises(UnsupportedError, match="contact unknowns"):
+        certificate_base(problem, members, problem.training_set())
+
+
+def test_verification_parameters_are_none_of_the_training_set() -> None:
+    mus = BOX.sample(base_module.VERIFICATION, base_module.SEED)
+    assert not any(np.allclose(mu, other) for mu in mus for other in Family("constant").training_set())
+
+
+def test_what_is_stored_is_of_contact_and_reduced_size() -> None:
+    """Only the base has arrays of mesh size, which no evaluation reads."""
+    problem, model, certificate = prepared("affine")
+    forgetful = OnlineCertificate(
+        CertificateBase(**(vars(certificate.base) | {"X": None, "terms": ()})),
+        certificate.residual,
+        certificate.contact_directions,
+        certificate.compliance,
+        certificate.contact_basis,
+        certificate.generators,
+        certificate.on_contact,
+    )
+    mu = np.array([1.2, 0.3])
+    reduced = model.assemble(mu)
+    solution = exact(reduced.program)
+    assert forgetful.evaluate(problem, mu, reduced, *solution) == certificate.evaluate(problem, mu, reduced, *solution)

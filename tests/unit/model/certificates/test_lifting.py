@@ -1,0 +1,111 @@
+from __future__ import annotations
+
+from fractions import Fraction
+
+import numpy as np
+import pytest
+import scipy.sparse as sp
+from hypothesis import given
+from hypothesis import strategies as st
+from numerics import exact, spd
+
+from vibench.interfaces.problem import Contact, VariationalInequality
+from vibench.model.certificates.lifting import ContactCompliance, Lifting, lift
+
+K, M = 7, 6
+
+
+@st.composite
+def programs(draw: st.DrawFn) -> tuple[np.ndarray, Contact, np.ndarray, np.ndarray, float]:
+    """C, B and g, u_N and λ ≥ 0 with zeros, γ; rows may be the same, and u_N is feasible in some of them."""
+    rng = np.random.default_rng(draw(st.integers(0, 10_000)))
+    B = rng.standard_normal((M, K)) * (rng.random((M, K)) < 0.7)
+    if draw(st.booleans()):
+        B[3] = 2.0 * B[0]
+    u, lam = rng.standard_normal(K), np.maximum(rng.standard_normal(M), 0.0) * draw(st.sampled_from([0.0, 0.1, 3.0]))
+    g = B @ u - draw(st.sampled_from([1e-6, 1.0])) * rng.uniform(-1.0, 0.5, M)
+    B[np.abs(B).sum(axis=1) == 0.0, 0] = 1.0
+    return np.linalg.inv(spd(K, rng, 100.0)), Contact(sp.csr_array(B), g), u, lam, draw(st.sampled_from([1.0, 2.5]))
+
+
+def lifted(
+    given: tuple[np.ndarray, Contact, np.ndarray, np.ndarray, float], near: np.ndarray | None = None
+) -> Lifting | None:
+    C, contact, u, lam, gamma = given
+    return lift(ContactCompliance(C, np.arange(K) if near is None else near), contact, u, np.zeros(K), lam, gamma)
+
+
+def values(C: np.ndarray, found: Lifting) -> np.ndarray:
+    load = np.zeros(K)
+    load[found.unknowns] = found.load
+    return np.asarray(C @ load)
+
+
+@given(programs())
+def test_liftings_are_feasible_also_in_exact_arithmetic_and_close_to_the_best_one(
+    given: tuple[np.ndarray, Contact, np.ndarray, np.ndarray, float],
+) -> None:
+    C, contact, u, lam, gamma = given
+    found = lifted(given)
+    if found is None:  # opposite rows: round-off decides
+        return
+    w = values(C, found)
+    for row, g in zip(contact.B.toarray(), contact.g, strict=True):
+        slack = sum(Fraction(b) * (Fraction(x) - Fraction(v)) for b, x, v in zip(row, w, u, strict=True))
+        assert slack + Fraction(g) >= 0
+    s = contact.B @ u - contact.g
+    assert found.norm == pytest.approx(float(np.sqrt(w @ np.linalg.solve(C, w))), rel=1e-6, abs=1e-12)
+    assert found.kappa == pytest.approx(float(lam @ (contact.B @ w - s)), abs=1e-12 * (1.0 + lam.sum()))
+    B, A = contact.B.toarray(), gamma * np.linalg.inv(C)
+    if np.linalg.cond(B @ B.T) > 1e6:  # the active set method need not find the best one among dependent rows
+        return
+    best, _ = exact(VariationalInequality(0.5 * (A + A.T), -B.T @ lam, -B, -s))
+    least = 0.5 * best @ A @ best + lam @ (B @ best - s)
+    scale = gamma * found.norm**2 + lam @ np.abs(s) + 1e-12
+    assert 0.5 * gamma * found.norm**2 + found.kappa <= least + 1e-5 * scale
+
+
+def test_no_random_program_is_without_a_lifting() -> None:
+    rng = np.random.default_rng(3)
+    for _ in range(50):
+        B = rng.standard_normal((M, K))
+        u, lam = rng.standard_normal(K), np.maximum(rng.standard_normal(M), 0.0)
+        contact = Contact(sp.csr_array(B), B @ u - rng.uniform(-1.0, 0.5, M))
+        assert lifted((np.linalg.inv(spd(K, rng, 100.0)), contact, u, lam, 1.0)) is not None
+
+
+def chain(far: float) -> tuple[np.ndarray, Contact, np.ndarray, np.ndarray, float]:
+    """Two rows on two unknowns each, coupled by C; the first one is violated by 1."""
+    C = np.eye(K) + 0.5
+    B = sp.csr_array(np.array([[-1.0, -1.0, 0, 0, 0, 0, 0], [0, 0, 0, -1.0, 1.0, 0, 0]]))
+    return C, Contact(B, np.array([-1.0, far])), np.zeros(K), np.array([1.0, 0.0]), 1.0
+
+
+def test_rows_far_from_the_contact_are_evaluated_only_where_the_inequality_of_cauchy_and_schwarz_is_not_enough() -> (
+    None
+):
+    away = lifted(chain(far=10.0), near=np.array([0, 1]))
+    assert away is not None
+    assert list(away.unknowns) == [0, 1]
+    close = lifted(chain(far=-0.5), near=np.array([0, 1]))
+    assert close is not None
+    assert len(close.unknowns) == K
+    C, contact, *_ = chain(far=-0.5)
+    assert np.all(contact.B @ values(C, close) >= -contact.g)
+
+
+def test_nothing_is_lifted_where_nothing_is_violated() -> None:
+    C, contact, u, _, gamma = chain(far=1.0)
+    found = lifted((C, Contact(contact.B, np.array([1.0, 1.0])), u, np.zeros(2), gamma))
+    assert found is not None
+    assert (found.norm, found.kappa) == (0.0, 0.0)
+
+
+def test_a_larger_uncertainty_of_u_asks_for_more() -> None:
+    C, contact, u, lam, gamma = chain(far=10.0)
+    plain, careful = (
+        lift(ContactCompliance(C, np.arange(K)), contact, u, np.full(K, size), lam, gamma) for size in (0.0, 0.1)
+    )
+    assert plain is not None
+    assert careful is not None
+    assert np.all((contact.B @ values(C, careful))[:1] >= (contact.B @ values(C, plain))[:1] + 0.2)

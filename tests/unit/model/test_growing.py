@@ -1,0 +1,71 @@
+"""The model that adaptive trainings grow with: its bounds hold, and are nothing where a solution is known."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numerics import Varying
+
+from vibench import create
+from vibench.highfidelity.active_set import HighFidelitySolver
+from vibench.interfaces.fingerprint import ReferenceAssembly
+from vibench.interfaces.problem import Problem
+from vibench.linalg.cholesky import SparseCholesky
+from vibench.model.growing import GrowingModel, GrowingTrainer
+
+PROBLEMS = {"B and A vary": Varying, "A is constant": lambda: create("problem", "hertz", {"resolution": 300})}
+
+
+@pytest.mark.parametrize("case", PROBLEMS)
+def test_bounds_hold_everywhere_and_vanish_at_the_solutions(case: str) -> None:
+    problem: Problem = PROBLEMS[case]()
+    solver = HighFidelitySolver(problem)
+    model = GrowingModel(problem, solver)
+    solved = problem.parameters.sample(4, 1)
+    for mu in [*solved, solved[0]]:  # one of them twice
+        vi = problem.assemble(mu).copy()
+        model.add(vi, solver.solve_assembled(mu, vi))
+    assert max(model.bound(mu) for mu in solved) < 1e-5
+    unseen = problem.parameters.sample(20, 2)
+    for mu in unseen:
+        vi, found = problem.assemble(mu).copy(), solver.solve(mu)
+        reduced, bound = model.solution(vi), model.bound(mu)
+        assert reduced is not None
+        u, lam = reduced
+        inverse = SparseCholesky(vi.A, "A")
+        e, r = found.u - u, vi.B.T @ (found.lam - lam)
+        pressed = vi.B.T @ lam
+        assert np.sqrt(e @ (vi.A @ e)) <= bound * np.sqrt(u @ (vi.A @ u)) * (1.0 + 1e-6)
+        assert np.sqrt(r @ inverse.solve(r)) <= bound * np.sqrt(pressed @ inverse.solve(pressed)) * (1.0 + 1e-6)
+    assert max(model.bound(mu) for mu in unseen) > 1e-4  # there is something to bound
+
+
+def test_a_model_without_contact_has_bounds_of_u_alone() -> None:
+    """A string that touches nothing in its solutions so far: λ_N = 0, and the bound is infinite or that of u."""
+    problem = Varying()
+    solver, mu = HighFidelitySolver(problem), np.array([0.5])
+    vi = problem.assemble(mu)
+    free = vi.__class__(vi.A, 1e-6 * vi.f, vi.B, vi.g)  # a load too small for contact
+    model = GrowingModel(problem, solver)
+    model.add(free, solver.solve_assembled(mu, free))
+    reduced = model.solution(vi)
+    assert reduced is not None
+    assert reduced[1].max(initial=0.0) == 0.0
+    assert 0.0 < model.bound(mu) < np.inf
+
+
+def test_a_trainer_counts_bounds_and_seconds() -> None:
+    problem = Varying()
+    trainer = GrowingTrainer(problem, ReferenceAssembly(problem, problem.assemble(np.array([0.0]))))
+    given = np.array([0.5])
+    trainer.solve(given)
+    given[0] = 7.0  # what is kept is a copy
+    first = trainer.bound(np.array([0.9]))
+    trainer.solve(np.array([0.9]), first)
+    assert [(one.mu.tolist(), one.evaluated) for one in trainer.solved] == [([0.5], 0), ([0.9], 1)]
+    assert np.isnan(trainer.solved[0].bound)
+    assert trainer.solved[1].bound == first
+    assert trainer.bound(np.array([0.9])) < 1e-5 < first
+    assert trainer.selecting.cpu > 0.0
+    exact = HighFidelitySolver(problem).solve(np.array([0.9]))
+    np.testing.assert_allclose(trainer.solved[1].solution.u, exact.u, rtol=1e-10)

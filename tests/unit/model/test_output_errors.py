@@ -1,0 +1,90 @@
+"""Errors of quantities of interest: by hand on a few numbers, zeros apart, and one line for what is wrong."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+
+from vibench.errors import NumericalError
+from vibench.interfaces.outputs import Output
+from vibench.model.output_errors import output_errors, scales, summarise_outputs
+
+MUS = np.array([[1.0], [2.0], [3.0]])
+U, LAM = np.array([[1.0, 2.0, 0.0], [1.0, 1.0, 0.0]]), np.array([[0.0, 4.0, 0.0]])
+TOTAL = Output("total", "m", u=np.array([1.0, 1.0]), lam=np.array([0.5]))
+LARGEST = Output("largest", "1", function=lambda mu, u, lam: mu[0] * u.max() + lam.sum())
+FLOATS = st.floats(-1e3, 1e3)
+
+
+def test_values_are_what_the_coefficients_or_the_function_give() -> None:
+    assert TOTAL.values(MUS, U, LAM).tolist() == [2.0, 5.0, 0.0]
+    assert LARGEST.values(MUS, U, LAM).tolist() == [1.0, 8.0, 0.0]
+    assert (TOTAL.linear, LARGEST.linear) == (True, False)
+    assert scales((TOTAL, LARGEST), MUS, U, LAM) == (5.0, 8.0)
+
+
+@given(u=arrays(float, (2, 3), elements=FLOATS), v=arrays(float, (2, 3), elements=FLOATS), t=FLOATS)
+def test_a_linear_output_is_linear(u: np.ndarray, v: np.ndarray, t: float) -> None:
+    together = TOTAL.values(MUS, u + t * v, LAM * (1.0 + t))
+    apart = TOTAL.values(MUS, u, LAM) + t * TOTAL.values(MUS, v, LAM)
+    np.testing.assert_allclose(together, apart, atol=1e-8)
+
+
+def test_errors_are_relative_but_for_zeros_which_are_counted_apart() -> None:
+    reduced = U + np.array([[0.2, 0.0, 0.1], [0.0, -0.5, 0.0]]), LAM
+    found = output_errors((TOTAL,), MUS, reduced, (U, LAM), scales((TOTAL,), MUS, U, LAM))
+    rows = [row for (row,) in found]
+    assert [row["error"] for row in rows] == [pytest.approx(0.1), pytest.approx(0.1), None]
+    assert [row["scaled"] for row in rows] == [pytest.approx(x) for x in (0.04, 0.1, 0.02)]
+    assert (rows[1]["value"], rows[1]["reference"], rows[1]["unit"]) == (4.5, 5.0, "m")
+    (summary,) = summarise_outputs((TOTAL,), (5.0,), found)
+    assert summary == {
+        "output": "total", "unit": "m", "linear": 1, "scale": 5.0, "queries_ok": 3,
+        "error_mean": pytest.approx(0.1), "error_max": pytest.approx(0.1), "queries_zero": 1,
+        "error_zero_max": pytest.approx(0.02), "error_scaled_mean": pytest.approx(0.16 / 3),
+        "error_scaled_max": pytest.approx(0.1),
+    }  # fmt: skip
+
+
+def test_an_output_that_vanishes_on_the_whole_training_set_has_absolute_errors() -> None:
+    (row,), *_ = output_errors((TOTAL,), MUS[:1], (U[:, :1], LAM[:, :1]), (0.0 * U[:, :1], LAM[:, :1]), (0.0,))
+    assert (row["error"], row["scaled"]) == (None, 2.0)
+
+
+def test_without_an_ok_query_there_are_no_errors() -> None:
+    (row,) = summarise_outputs((TOTAL,), (5.0,), [])
+    assert (row["error_mean"], row["error_scaled_max"], row["queries_ok"]) == (None, None, 0)
+
+
+@pytest.mark.parametrize(
+    ("output", "words"),
+    [
+        (Output("long", "m", u=np.ones(3)), r"'long' has coefficients of u of shape \(3,\); expected \(2,\)"),
+        (Output("flat", "m", lam=np.ones((1, 1))), r"'flat' has coefficients of λ of shape \(1, 1\)"),
+        (Output("fails", "m", function=lambda *_: 1 / 0), r"'fails' fails at mu = \[1.0\]: ZeroDivisionError"),
+        (Output("none", "m", function=lambda *_: None), "'none' fails at .*TypeError"),  # type: ignore[arg-type, return-value]
+        (Output("nan", "m", function=lambda mu, *_: np.nan if mu[0] > 1 else 0.0), r"'nan' is nan at mu = \[2.0\]"),
+    ],
+)
+def test_what_is_wrong_is_named(output: Output, words: str) -> None:
+    with pytest.raises(NumericalError, match=words):
+        output.values(MUS, U, LAM)
+
+
+def test_a_function_cannot_change_the_solution() -> None:
+    def greedy(mu: np.ndarray, u: np.ndarray, lam: np.ndarray) -> float:
+        u *= 0.0
+        return 1.0
+
+    given = U.copy()
+    Output("greedy", "1", function=greedy).values(MUS, given, LAM)
+    assert np.array_equal(given, U)
+
+
+def test_an_output_is_linear_or_a_function() -> None:
+    for more in ({}, {"u": np.ones(2), "function": lambda *_: 0.0}):
+        with pytest.raises(ValueError, match="the output 's' has either coefficients of u and λ, or a function"):
+            Output("s", "1", **more)

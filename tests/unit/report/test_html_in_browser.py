@@ -1,0 +1,345 @@
+"""The report in a real browser: what it shows at desktop and phone width, in light and dark, and what it does."""
+
+from __future__ import annotations
+
+import csv
+import io
+import shutil
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+import pytest
+from browsing import chromium, complaints, look
+from many_cells import write_many
+from running import execute
+from selenium.webdriver import ActionChains, Chrome
+from selenium.webdriver.common.by import By
+from selenium.webdriver.support.ui import WebDriverWait
+
+from vibench.report import html
+from vibench.results import tables
+from vibench.results.database import FILE
+
+MATTERS = {"cell", "problem", "dual", "primal", "δ", "solver", "error λ", "error u", "online [ms]", "offline [s]"}
+"""Columns that are seen at 1280 pixels without scrolling."""
+
+FORMULA = "=decorrelated"
+"""Label of a strategy that a spreadsheet would take for a formula."""
+
+GEOMETRY = """
+const outside = [], wide = document.documentElement.scrollWidth;
+for (const one of document.querySelectorAll("main *, header *")) {
+  const box = one.getBoundingClientRect();
+  if (!box.width || one.closest(".wide, .picker div, .panels")) continue;
+  if (box.right > innerWidth + 0.5 || box.left < -0.5) outside.push(one.outerHTML.slice(0, 80));
+}
+const wrapped = [...document.querySelectorAll("td.number, .n")].filter(one => {
+  const range = document.createRange();
+  range.selectNodeContents(one);
+  return new Set([...range.getClientRects()].filter(r => r.width).map(r => Math.round(r.top / 8))).size > 1;
+}).map(one => one.textContent);
+const cut = [...document.querySelectorAll("td, th, .legend button, option, li, p")].filter(one =>
+  one.offsetWidth && one.scrollWidth > one.clientWidth + 1 && getComputedStyle(one).overflowX === "hidden").length;
+return { wide, outside, wrapped, cut, paper: getComputedStyle(document.body).backgroundColor };
+"""
+
+POINT = """
+const view = [...Bokeh.index.roots].find(view => view.el.closest("#" + arguments[0]));
+const shown = view.model.renderers.filter(one => one.visible);
+const { data } = shown[arguments[1]].data_source;
+const box = view.canvas_view.el.getBoundingClientRect();
+const [x, y] = [view.frame.x_scale.compute(data.x[0]), view.frame.y_scale.compute(data.y[0])];
+return { x: box.left + x, y: box.top + y, cell: data.cell[0], error: data.y_text[0], series: shown.length };
+"""
+
+TOOLTIP = """
+const texts = [];
+const visit = node => {
+  for (const one of node.querySelectorAll("*")) if (one.shadowRoot) visit(one.shadowRoot);
+  const values = [...node.querySelectorAll(".bk-tooltip-row-value")].filter(one => one.getClientRects().length);
+  texts.push(...values.map(one => one.textContent.trim()));
+};
+visit(document);
+return texts;
+"""
+
+
+@pytest.fixture(scope="module")
+def results(quick_run: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The results of a real run, a strategy under a label that looks like a formula, two cells disturbed."""
+    folder = tmp_path_factory.mktemp("results")
+    shutil.copy(quick_run / FILE, folder / FILE)
+    execute(
+        folder,
+        *(
+            f"UPDATE {table} SET primal = '{FORMULA}' WHERE primal = 'decorrelated'"
+            for table in ("cells", "queries", "histories", "disagreements")
+        ),
+        "UPDATE cells SET disturbed = 0",
+        "UPDATE cells SET disturbed = 1 WHERE rowid IN (2, 9)",
+    )
+    return folder / FILE
+
+
+@pytest.fixture(scope="module")
+def made(results: Path) -> Path:
+    """Its report."""
+    return html.write(results, results.parent / "report.html")
+
+
+@pytest.fixture(scope="module")
+def cells(results: Path) -> pd.DataFrame:
+    return tables.in_order(tables.read(results, "cells"))
+
+
+@pytest.fixture(scope="module")
+def downloads(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("downloads")
+
+
+@pytest.fixture(scope="module")
+def browser(downloads: Path) -> Iterator[Chrome]:
+    with chromium(downloads) as found:
+        yield found
+
+
+def awaited(browser: Chrome, condition: Callable[[Chrome], Any]) -> Any:
+    return WebDriverWait(browser, 20, 0.1).until(condition)
+
+
+def shown_rows(browser: Chrome, table: str = "summary") -> list[dict[str, str]]:
+    """The rows of a table as they are seen, by the headings."""
+    read = """
+    const table = document.querySelector(`[data-table="${arguments[0]}"] table`);
+    const texts = row => [...row.cells].map(cell => cell.textContent);
+    return [texts(table.tHead.rows[0]), [...table.tBodies[0].rows].map(texts)];
+    """
+    headings, found = browser.execute_script(read, table)
+    return [dict(zip(headings, row, strict=True)) for row in found]
+
+
+def choose(browser: Chrome, axis: str, value: str) -> None:
+    """Choose a value in the list of an axis, as a user does."""
+    (label,) = [
+        one
+        for one in browser.find_elements(By.CSS_SELECTOR, '[data-table="summary"] .tools label')
+        if one.text.split("\n")[0].split(" all")[0].strip() == axis
+    ]
+    label.find_element(By.XPATH, f".//option[normalize-space(.)='{value}']").click()
+
+
+@pytest.mark.parametrize("theme", ["light", "dark"])
+@pytest.mark.parametrize("width", [1280, 390])
+def test_nothing_is_cut_or_wrapped_inside_a_number(width: int, theme: str, browser: Chrome, made: Path) -> None:
+    look(browser, made, width=width, theme=theme)
+    browser.execute_script("for (const figure of document.querySelectorAll('[data-plot]')) drawPlot(figure);")
+    ready = "return [...Bokeh.index.roots].filter(view => view.model.type === 'Figure').length === drawn.length"
+    awaited(browser, lambda b: b.execute_script(ready))
+    assert browser.execute_script("return drawn.length") > 8
+    seen = browser.execute_script(GEOMETRY)
+    assert complaints(browser) == []
+    assert seen["wide"] <= width
+    assert seen["outside"] == []
+    assert seen["wrapped"] == []
+    assert seen["cut"] == 0
+    red = int(seen["paper"].split("(")[1].split(",")[0])
+    assert red > 240 if theme == "light" else red < 40
+    pictures = browser.execute_script(
+        "return [...document.images].map(image => { image.loading = 'eager'; return image.alt.length; })"
+    )
+    assert min(pictures) > 40
+    awaited(browser, lambda b: b.execute_script("return [...document.images].every(image => image.naturalWidth > 100)"))
+
+
+def test_columns_that_matter_are_seen_at_once(browser: Chrome, made: Path) -> None:
+    look(browser, made)
+    seen = browser.execute_script(
+        """
+        const frame = document.querySelector('[data-table="summary"] .wide');
+        const right = one => one.getBoundingClientRect().right;
+        const heads = [...frame.querySelectorAll("th")].filter(head => right(head) <= right(frame));
+        return heads.map(head => head.textContent);
+        """
+    )
+    assert seen[0] == "cell"
+    assert set(seen) >= MATTERS
+    assert "accuracy" not in seen, "a column with one value in all rows is hidden at first"
+
+
+def test_the_switch_changes_the_theme_and_back(browser: Chrome, made: Path) -> None:
+    look(browser, made)
+    paper = "return getComputedStyle(document.body).backgroundColor"
+    light = browser.execute_script(paper)
+    browser.find_element(By.ID, "theme").click()
+    assert browser.execute_script(paper) != light
+    browser.find_element(By.ID, "theme").click()
+    assert browser.execute_script(paper) == light
+
+
+def test_the_filter_filters_and_its_address_brings_it_back(browser: Chrome, made: Path, cells: pd.DataFrame) -> None:
+    look(browser, made)
+    assert len(shown_rows(browser)) == len(cells)
+    choose(browser, "problem", "obstacle")
+    choose(browser, "solver", "piqp")
+    found = shown_rows(browser)
+    expected = cells[(cells["problem"] == "obstacle") & (cells["solver"] == "piqp")]
+    assert [row["error λ"] for row in found] == [tables.cell_text(error) for error in expected["error_lambda_mean"]]
+    assert {row["problem"] for row in found} == {"obstacle"}
+    search = browser.find_element(By.CSS_SELECTOR, '[data-table="summary"] input[type=search]')
+    search.send_keys("pga mcpg")
+    (row,) = shown_rows(browser)
+    assert (row["primal"], row["dual"]) == ("offline-pga", "mcpg")
+    fragment = browser.execute_script("return location.hash")
+    look(browser, made, fragment=fragment)
+    assert shown_rows(browser) == [row]
+    browser.find_element(By.CSS_SELECTOR, '[data-table="summary"] .reset').click()
+    assert len(shown_rows(browser)) == len(cells)
+    assert browser.execute_script("return location.hash") == "#summary"
+
+
+def test_columns_sort_numbers_as_numbers_and_missing_ones_last(
+    browser: Chrome, made: Path, cells: pd.DataFrame
+) -> None:
+    look(browser, made)
+    heads = "[...document.querySelectorAll('[data-table=summary] th button')]"
+    sort = f"{heads}.find(head => head.textContent === 'online [ms]').click()"
+    for falling in (False, True):
+        browser.execute_script(sort)
+        known = (1e3 * cells["online_s"]).sort_values(ascending=not falling, na_position="last", kind="stable")
+        assert [row["online [ms]"] for row in shown_rows(browser)] == [tables.cell_text(value) for value in known]
+
+
+def test_a_winner_of_the_leaderboard_is_a_link_to_its_row(browser: Chrome, made: Path) -> None:
+    look(browser, made)
+    link = browser.find_element(By.CSS_SELECTOR, ".board a")
+    key = link.text
+    link.click()
+    awaited(browser, lambda b: len(shown_rows(b)) == 1)
+    assert shown_rows(browser)[0]["cell"].startswith(key)
+
+
+def test_the_csv_is_what_is_shown(browser: Chrome, made: Path, downloads: Path, cells: pd.DataFrame) -> None:
+    look(browser, made, fragment="#summary?is+problem=hertz&sort=-error+u&hide=N")
+    browser.find_element(By.CSS_SELECTOR, '[data-table="summary"] .download').click()
+    file = downloads / "summary.csv"
+    awaited(browser, lambda _: file.exists())
+    while not (text := file.read_text(encoding="utf-8")):
+        time.sleep(0.05)
+    rows = list(csv.DictReader(io.StringIO(text)))
+    shown = shown_rows(browser)
+    assert list(rows[0]) == [*shown[0], "disturbed"]
+    assert "N" not in rows[0]
+    assert len(rows) == len(shown) == (cells["problem"] == "hertz").sum()
+    assert [row["disturbed"] for row in rows] == ["1" if "⚑" in row["cell"] else "0" for row in shown]
+    plain = {f"'{FORMULA}": FORMULA}
+    assert [plain.get(row["primal"], row["primal"]) for row in rows] == [row["primal"] for row in shown]
+    assert f"'{FORMULA}" in text
+    assert f",{FORMULA}" not in text
+    assert [float(row["error u"] or "nan") for row in rows] == pytest.approx(
+        [float(row["error u"] or "nan") for row in shown], rel=1e-2, nan_ok=True
+    )
+
+
+def test_rows_of_a_disturbed_machine_are_flagged(browser: Chrome, made: Path, cells: pd.DataFrame) -> None:
+    look(browser, made)
+    flagged = [row["cell"].split()[0] for row in shown_rows(browser) if "⚑" in row["cell"]]
+    expected = cells["cell"][cells["disturbed"] == 1]
+    assert len(flagged) == len(expected) == 2
+    assert all(key.startswith(short) for key, short in zip(expected, flagged, strict=True))
+
+
+def hover(browser: Chrome, name: str, series: int) -> dict[str, Any]:
+    """Hover over the first point of a series that is shown; returns where it is and what it is."""
+    found: dict[str, Any] = browser.execute_script(POINT, name, series)
+    body = ActionChains(browser)
+    body.w3c_actions.pointer_action.move_to_location(2, 2)
+    body.w3c_actions.pointer_action.move_to_location(round(found["x"]), round(found["y"]))
+    body.perform()
+    return found
+
+
+def show_plot(browser: Chrome, name: str) -> None:
+    browser.execute_script("document.getElementById(arguments[0]).scrollIntoView()", name)
+    ready = (
+        "return [...Bokeh.index.roots].some(view => view.el.closest('#' + arguments[0]) && view.frame.x_range.start)"
+    )
+    awaited(browser, lambda b: b.execute_script(ready, name))
+    time.sleep(0.3)  # pictures above it may still take their places
+
+
+def test_hover_tells_the_cell_and_the_legend_hides_it(browser: Chrome, made: Path, cells: pd.DataFrame) -> None:
+    name = "obstacle-work-precision"
+    look(browser, made)
+    show_plot(browser, name)
+    found = hover(browser, name, 1)
+    told = awaited(browser, lambda b: b.execute_script(TOOLTIP))
+    assert found["cell"] in told
+    assert found["error"] in told
+    (row,) = [row for _, row in cells.iterrows() if row["cell"].startswith(found["cell"])]
+    model = next(text for text in told if row["dual"] in text)
+    assert row["primal"] in model
+    assert row["problem"] in model
+    assert tables.cell_text(row["error_u_mean"]) == found["error"]
+
+    (button,) = [
+        one for one in browser.find_elements(By.CSS_SELECTOR, f"#{name} .legend button") if one.text == row["primal"]
+    ]
+    button.click()
+    assert button.get_attribute("aria-pressed") == "false"
+    left = browser.execute_script(POINT, name, 0)
+    assert left["series"] == found["series"] - 1
+    hover(browser, name, 0)
+    awaited(browser, lambda b: left["cell"] in b.execute_script(TOOLTIP))
+    body = ActionChains(browser)
+    body.w3c_actions.pointer_action.move_to_location(round(found["x"]), round(found["y"]))
+    body.perform()
+    awaited(browser, lambda b: found["cell"] not in b.execute_script(TOOLTIP))
+    button.click()
+    assert browser.execute_script(POINT, name, 1)["series"] == found["series"]
+
+
+def test_a_plot_zooms_where_a_box_is_drawn(browser: Chrome, made: Path) -> None:
+    name = "obstacle-dimension"
+    look(browser, made)
+    show_plot(browser, name)
+    limits = """
+    const { x_range } = [...Bokeh.index.roots].find(view => view.el.closest("#" + arguments[0])).model;
+    return x_range.end - x_range.start;
+    """
+    before = browser.execute_script(limits, name)
+    panel = browser.find_element(By.CSS_SELECTOR, f"#{name} .panels > div")
+    drag = ActionChains(browser).move_to_element_with_offset(panel, -60, -60)
+    drag.click_and_hold().move_by_offset(80, 80).release().perform()
+    awaited(browser, lambda b: b.execute_script(limits, name) < 0.7 * before)
+
+
+def test_on_paper_pictures_take_the_place_of_plots(browser: Chrome, made: Path) -> None:
+    look(browser, made)
+    show_plot(browser, "obstacle-dimension")
+    shown = """
+    const seen = selector => document.querySelector("#obstacle-dimension " + selector).getClientRects().length > 0;
+    return [seen("img"), seen(".panels")];
+    """
+    assert browser.execute_script(shown) == [False, True]
+    browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"media": "print"})
+    assert browser.execute_script(shown) == [True, False]
+    browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"media": ""})
+
+
+def test_a_page_of_many_cells_shows_some_rows_at_a_time(
+    browser: Chrome, quick_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(html, "stills", lambda *_: ([], []))
+    page = html.write(write_many(quick_run, tmp_path / "many", 300, queries=1), tmp_path / "many.html")
+    look(browser, page)
+    count = '[data-table="summary"] .count'
+    first = shown_rows(browser)
+    assert len(first) == 50
+    assert browser.find_element(By.CSS_SELECTOR, count).text == "rows 1–50 of 300"
+    browser.find_element(By.CSS_SELECTOR, '[data-table="summary"] [aria-label="next rows"]').click()
+    assert browser.find_element(By.CSS_SELECTOR, count).text == "rows 51–100 of 300"
+    assert {row["cell"] for row in first}.isdisjoint(row["cell"] for row in shown_rows(browser))
+    assert complaints(browser) == []

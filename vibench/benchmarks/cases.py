@@ -1,0 +1,188 @@
+"""What is timed: registered problems at resolutions, registered strategies, sizes of reduced programs."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from vibench.errors import RequestError, unknown_name
+from vibench.interfaces.strategies import Stop
+from vibench.qp.solve import installed_solvers
+from vibench.study import registry
+from vibench.study.reader import read_study
+
+Resolution = str | int
+"""A name that a problem knows, or a number of nodes."""
+
+TOLERANCES = (0.5, 0.1)
+"""Tolerances of the primal strategies that take one."""
+
+
+@dataclass(frozen=True)
+class Case:
+    """A registered problem at a resolution; `None` where it has no such option and is timed as it is."""
+
+    problem: str
+    resolution: Resolution | None
+
+    def __str__(self) -> str:
+        return self.problem if self.resolution is None else f"{self.problem}-{self.resolution}"
+
+    @property
+    def options(self) -> dict[str, Resolution]:
+        """Options of the problem."""
+        return {} if self.resolution is None else {"resolution": self.resolution}
+
+
+@dataclass(frozen=True)
+class Primal:
+    """A registered primal strategy and its tolerance, `None` where it takes none."""
+
+    name: str
+    tolerance: float | None
+
+    def __str__(self) -> str:
+        return self.name if self.tolerance is None else f"{self.name}-{self.tolerance:g}"
+
+
+@dataclass(frozen=True)
+class Spaces:
+    """Where V_N and the reduced cone of a registered dual strategy stop."""
+
+    pod: Stop
+    cone: Stop
+    dual: str
+
+
+@dataclass(frozen=True)
+class Setting:
+    """What completes a reduced model of which one part is timed: the last strategies and first tolerances of a study.
+
+    Attributes
+    ----------
+    problems
+        Problems of the study.
+    spaces
+        Where V_N and the cone stop, and the dual strategy.
+    primal
+        The primal strategy.
+    """
+
+    problems: tuple[str, ...]
+    spaces: Spaces
+    primal: Primal
+
+
+def setting(study: str) -> Setting:
+    """The setting of a study, by its name or file.
+
+    Raises
+    ------
+    RequestError
+        If there is no such study.
+    """
+    found = read_study(study)
+    table, dual, primal = found.tolerances[0], found.dual[-1], found.primal[-1]
+    pod = Stop(tolerance=table.pod[0]) if table.pod else Stop(size=(table.N or [0])[0])
+    spaces = Spaces(pod, table.of_dual(dual)[0], dual.name)
+    problems = tuple(dict.fromkeys(entry.name for entry in found.problem))
+    return Setting(problems, spaces, Primal(primal.name, table.of_primal(primal)[0]))
+
+
+@dataclass(frozen=True)
+class Size:
+    """A reduced program by what is prescribed of it; the enrichment adds to N."""
+
+    case: Case
+    N: int
+    R: int
+
+    def __str__(self) -> str:
+        return f"{self.case}-N{self.N}-R{self.R}"
+
+
+DIMENSIONS = ((5, 5), (10, 12), (20, 30), (46, 60), (80, 70))
+"""N and R of the reduced programs that QP solvers are timed on, as far as the snapshots of a problem give them."""
+
+ACCURACIES = (1e-6, 1e-10)
+"""What the QP solvers are asked for."""
+
+
+def problem_cases(problems: Sequence[str], wanted: Sequence[Resolution]) -> list[Case]:
+    """Every problem at those of the resolutions that it knows; once, as it is, where it knows none of them."""
+    found: list[Case] = []
+    for name in problems:
+        known = [Case(name, resolution) for resolution in wanted if knows(name, resolution)]
+        found += known or [Case(name, None)]
+    return found
+
+
+def knows(problem: str, resolution: Resolution) -> bool:
+    """Whether a problem has such a resolution; one that cannot be loaded has none."""
+    try:
+        registry.check_options("problem", problem, {"resolution": resolution})
+    except RequestError:
+        return False
+    return True
+
+
+def takes_no_option(problem: str) -> bool:
+    """Whether a problem needs no option, as a folder; one that cannot be loaded counts, its case then fails."""
+    try:
+        return all(option.default for option in registry.options("problem", problem))
+    except RequestError:
+        return True
+
+
+def primal_cases() -> list[Primal]:
+    """Every registered primal strategy, at all `TOLERANCES` if it takes one."""
+    return [Primal(name, tolerance) for name in registry.names("primal strategy") for tolerance in _tolerances(name)]
+
+
+def _tolerances(primal: str) -> tuple[float | None, ...]:
+    try:
+        return TOLERANCES if registry.load("primal strategy", primal).takes_tolerance else (None,)
+    except RequestError:  # its benchmarks fail, and say why
+        return (None,)
+
+
+def chosen(plugins: Sequence[str]) -> dict[str, list[str]]:
+    """Names of plugins by the word for their kind, from names as `vibench list` shows them, or KIND:NAME.
+
+    Raises
+    ------
+    RequestError
+        If there is no such plugin, several have the name, or a solver is not installed.
+    """
+    known = {word: registry.names(kind) for word, kind in registry.WORDS.items()}
+    known["solver"] = installed_solvers(known["solver"])
+    found: dict[str, list[str]] = {}
+    for plugin in plugins:
+        prefix, colon, rest = plugin.partition(":")
+        name = rest if colon else plugin
+        words = [prefix] if colon else [word for word, names in known.items() if plugin in names]
+        if len(words) > 1:
+            choices = " or ".join(f"{word}:{plugin}" for word in words)
+            raise RequestError(f"several plugins are called '{plugin}': say {choices}")
+        if not words or words[0] not in known or name not in known[words[0]]:
+            kind = registry.WORDS.get(words[0], "plugin") if words else "plugin"
+            choices_of = known.get(words[0], []) if words else [one for names in known.values() for one in names]
+            raise unknown_name(kind, name, choices_of or known)
+        if words[0] == "problem" and not takes_no_option(name):
+            raise RequestError(f"the problem '{name}' needs options, which `vibench bench` has no place for")
+        found.setdefault(words[0], []).append(name)
+    return found
+
+
+def check_resolutions(resolutions: Sequence[str]) -> None:
+    """Refuse resolutions that no problem has.
+
+    Raises
+    ------
+    RequestError
+        For the first one.
+    """
+    for text in resolutions:
+        resolution: Resolution = int(text) if text.isdigit() else text
+        if not any(knows(problem, resolution) for problem in registry.names("problem")):
+            raise RequestError(f"no problem has the resolution {text!r}")

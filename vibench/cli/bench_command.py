@@ -1,0 +1,96 @@
+"""The command that times plugins."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+from typer import Argument, Exit, Option
+
+from vibench.cli.completion import plugins, studies
+from vibench.cli.result_commands import FormOption
+from vibench.errors import RequestError
+
+if TYPE_CHECKING:
+    from vibench.benchmarks.comparison import Timed
+
+
+def bench_plugins(
+    plugin: Annotated[
+        list[str] | None,
+        Argument(
+            metavar="PLUGIN", help="Names, or problem|primal|dual|solver:NAME; all by default.", autocompletion=plugins
+        ),
+    ] = None,
+    out: Annotated[Path | None, Option(metavar="FILE", help="Keep the JSON file of pytest-benchmark.")] = None,
+    against: Annotated[Path | None, Option(metavar="FILE", help="Compare with an earlier file.")] = None,
+    read: Annotated[Path | None, Option(metavar="FILE", help="Time nothing: read a file that was kept.")] = None,
+    resolution: Annotated[
+        list[str] | None, Option(metavar="NAME", help="Resolution of the problems (repeatable); coarse by default.")
+    ] = None,
+    study: Annotated[
+        str, Option(help="Study whose strategies complete what is timed.", autocompletion=studies)
+    ] = "quick",
+    seconds: Annotated[float, Option(min=0.001, help="Seconds for each benchmark, about.")] = 1.0,
+    limit: Annotated[float, Option(min=1.0, help="Factor by which a median may grow.")] = 1.25,
+    form: FormOption = "terminal",
+) -> None:
+    """Time plugins in every stage, with what they reach.
+
+    Each benchmark in which one of the plugins takes part is timed. Exit code 1 if one fails, or something is slower or
+    less accurate than in the file of --against.
+    """
+    from vibench.benchmarks import comparison
+    from vibench.benchmarks.tables import print_benchmarks
+    from vibench.results import tables
+
+    earlier = comparison.read(against) if against is not None else None
+    failed = 0
+    if read is not None:
+        if plugin or out is not None:
+            raise RequestError("--read times nothing: leave out the plugins and --out")
+        found = comparison.read(read)
+    else:
+        found, failed = _timed(plugin or [], out, resolution or ["coarse"], study, seconds)
+    if form == "terminal":
+        print_benchmarks(found, earlier, limit)
+    else:
+        frame = comparison.table(found) if earlier is None else comparison.compared(earlier, found, limit)
+        sys.stdout.write(tables.FORMS[form](frame))
+    if failed or (earlier is not None and comparison.regressions(earlier, found, limit)):
+        raise Exit(1)
+
+
+def _timed(
+    plugins: list[str], out: Path | None, resolutions: list[str], study: str, seconds: float
+) -> tuple[Timed, int]:
+    """What was timed, kept in a file if asked to, and how many benchmarks failed."""
+    from vibench.benchmarks import cases, comparison, elsewhere
+    from vibench.files import write_atomically
+
+    elsewhere.check_installed()
+    chosen = cases.chosen(plugins)
+    cases.check_resolutions(resolutions)
+    cases.setting(study)
+    if out is not None and not out.absolute().parent.is_dir():
+        raise RequestError(f"'{out}' cannot be written: '{out.absolute().parent}' is not a folder")
+    request = elsewhere.Request(chosen, resolutions, study, seconds)
+    outcome = elsewhere.run(request, _tell)
+    if out is not None:
+        try:
+            write_atomically(out, outcome.content)
+        except OSError as error:
+            raise RequestError(f"'{out}' cannot be written: {error.strerror}") from None
+    reasons = list(outcome.skipped.values())
+    for reason in dict.fromkeys(reasons):
+        _tell(f"{reasons.count(reason)} benchmarks left out: {reason}")
+    return comparison.parsed(outcome.content), len(outcome.failed)
+
+
+def _tell(line: str) -> None:
+    """Tell the progress on the standard error, so that the output holds the tables alone."""
+    from vibench.text import printable
+
+    sys.stderr.write(f"{printable(line)}\n")
+    sys.stderr.flush()

@@ -1,0 +1,147 @@
+"""The model that an adaptive training grows with: all solutions so far, and an error bound at any parameter."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from vibench.arrays import Array
+from vibench.highfidelity.active_set import HighFidelitySolution, HighFidelitySolver
+from vibench.interfaces.fingerprint import ReferenceAssembly
+from vibench.interfaces.problem import Problem, VariationalInequality
+from vibench.interfaces.sampling import Trainer
+from vibench.interfaces.validation import checked_assembly
+from vibench.linalg.cholesky import SparseCholesky
+from vibench.linalg.dense import orthonormal_range
+from vibench.model.energy import Energy
+from vibench.model.error_bounds import certificate
+from vibench.model.galerkin import project
+from vibench.qp.exact import ExactSolution, exact_solution
+from vibench.qp.scaling import ratio
+from vibench.qp.solution import QPSolution
+from vibench.qp.solve import solve_qp
+from vibench.reduction.supremizers import supremizers
+from vibench.stability.coercivity import Constant
+from vibench.timing import NO_TIME, Seconds, timed
+
+UNIT_CONSTANT = Constant(1.0, proved=False)
+"""Bounds in the energy norm need no constants; those in the norms of V and W are not used."""
+
+SOLVER, ACCURACY = "piqp", 1e-9
+"""Solver of the programs that cannot be solved to round-off."""
+
+
+class GrowingModel:
+    """A reduced model of all high-fidelity solutions that were added to it, without compression.
+
+    Its space is spanned by the u(µ_i) and the supremizers T(µ_i)λ(µ_i), its cone by the λ(µ_i) (Haasdonk, Salomon and
+    Wohlmuth 2012, §5). The bound is (ii) of `vibench.model.error_bounds`, at the cost of the mesh.
+    """
+
+    def __init__(self, problem: Problem, solver: HighFidelitySolver) -> None:
+        self._problem, self._solver = problem, solver
+        self._whitened = np.zeros((problem.V.dim, 0))
+        self._basis = np.zeros((problem.V.dim, 0))
+        self._generators = np.zeros((problem.W.dim, 0))
+        self._factor: SparseCholesky | None = None
+
+    def add(self, vi: VariationalInequality, found: HighFidelitySolution) -> None:
+        """Add the solution of `vi`."""
+        V, norm = self._problem.V, float(self._problem.W.norm(found.lam))
+        new = [found.u[:, None]]
+        if norm > 0.0:
+            new.append(supremizers(V, vi.B, found.lam[:, None]))
+            self._generators = np.hstack([self._generators, found.lam[:, None] / norm])
+        for column in new:  # one after the other: u must not lose to its supremizer
+            more = orthonormal_range(V.whiten(column), self._whitened)
+            self._whitened = np.hstack([self._whitened, more])
+            self._basis = np.hstack([self._basis, V.unwhiten(more)])
+
+    def solution(self, vi: VariationalInequality) -> tuple[Array, Array] | None:
+        """The reduced solution u_N (n,) and λ_N ≥ 0 (m,) of `vi`; `None` if its program cannot be solved."""
+        program = project(vi, self._basis, self._generators)
+        found: ExactSolution | QPSolution | None = exact_solution(program)
+        if found is None:
+            found = solve_qp(program, SOLVER, ACCURACY)
+        if found.x is None or found.alpha is None:
+            return None
+        return self._basis @ found.x, self._generators @ np.maximum(found.alpha, 0.0)
+
+    def bound(self, mu: Array) -> float:
+        """The larger of the bounds of u and λ at mu (d,), relative to the reduced solution; infinite without one.
+
+        That of u is in the energy norm over that of u_N, that of λ in the norm of A⁻¹ over that of Bᵀλ_N.
+        """
+        vi = checked_assembly(self._problem, mu)
+        solved = self.solution(vi)
+        if solved is None:
+            return float("inf")
+        u, lam = solved
+        energy = self._energy(vi)
+        found = certificate(vi, energy, UNIT_CONSTANT, UNIT_CONSTANT, u, lam).bounds
+        if found is None:
+            return float("inf")
+        of_u = ratio(found.u_energy, energy.norm(u))
+        pressed = energy.dual_norm(vi.B.T @ lam)
+        return max(of_u, ratio(found.lambda_natural, pressed)) if pressed > 0.0 else of_u
+
+    def _energy(self, vi: VariationalInequality) -> Energy:
+        if self._factor is None or "A" not in self._problem.constant:
+            self._factor = SparseCholesky(vi.A, "A")
+        return Energy(vi.A, self._factor, self._solver.condensed(vi))
+
+
+@dataclass(frozen=True)
+class Solved:
+    """One solution of an adaptive training, the bound that led to it, and the number of bounds evaluated before it."""
+
+    mu: Array
+    solution: HighFidelitySolution
+    seconds: Seconds
+    bound: float
+    evaluated: int
+
+
+class GrowingTrainer(Trainer):
+    """High-fidelity solutions, and bounds of the model that they make, with the seconds of both.
+
+    Attributes
+    ----------
+    solved
+        The solutions in their order.
+    setup
+        Seconds of the set-up: what the first solution took beyond its repetition.
+    selecting
+        Seconds of bounds and of the growth of their model.
+    """
+
+    def __init__(self, problem: Problem, reference: ReferenceAssembly) -> None:
+        self._problem, self._reference, self._solver = problem, reference, HighFidelitySolver(problem)
+        self._model, self._evaluated = GrowingModel(problem, self._solver), 0
+        self.solved: list[Solved] = []
+        self.setup = self.selecting = NO_TIME
+
+    def solve(self, mu: Array, bound: float = float("nan")) -> None:
+        """Assemble, solve, and let the model grow."""
+        mu = np.array(mu, float)
+
+        def work() -> tuple[VariationalInequality, HighFidelitySolution]:
+            vi = checked_assembly(self._problem, mu)
+            return vi, self._solver.solve_assembled(mu, vi)
+
+        (vi, solution), seconds = timed(work)
+        if not self.solved:
+            _, marginal = timed(work)
+            self.setup, seconds = seconds.beyond(marginal), marginal
+        self._solver.check_coercive(mu, vi)  # verification, which is not timed
+        self._reference.refuse_false_constants(mu, vi)
+        self._solver.remember(mu, solution)
+        self.solved.append(Solved(mu, solution, seconds, bound, self._evaluated))
+        self.selecting += timed(lambda: self._model.add(vi, solution))[1]
+
+    def bound(self, mu: Array) -> float:
+        """That of the model of all solutions."""
+        found, seconds = timed(lambda: self._model.bound(np.array(mu, float)))
+        self.selecting, self._evaluated = self.selecting + seconds, self._evaluated + 1
+        return found

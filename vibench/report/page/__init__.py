@@ -1,0 +1,1 @@
+"""What the HTML report is made of: its tables as compact data, its plots to work with, and its pictures."""

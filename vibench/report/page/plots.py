@@ -1,0 +1,138 @@
+"""Plots to work with: a point per cell that says which one it is, series that can be hidden, and zoom.
+
+BokehJS draws them in the browser; the page contains it, and the numbers of the points. A series is a primal strategy
+with its assembly, in the colour of the pictures; the filling of its points is that of the dual strategy.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from functools import cache
+from importlib.resources import files
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from vibench.report.common_queries import on_common_queries
+from vibench.report.figures.data import Data, best_solver, label
+from vibench.report.figures.looks import Look, Looks, Series
+from vibench.report.page.embedded import short
+from vibench.text import printable
+
+ERRORS = {"error_u_mean": "mean relative error of u", "error_lambda_mean": "mean relative error of λ"}
+
+MARKERS = {
+    "o": "circle", "s": "square", "^": "triangle", "v": "inverted_triangle", "D": "diamond", "P": "plus",
+    "X": "square_x", "*": "star", "d": "diamond_dot", "p": "hex_dot", "h": "hex",
+}  # fmt: skip
+"""Markers of the pictures and those of BokehJS that stand for them."""
+
+FILLS = (0.85, 0.0, 0.4)
+"""Opacity of the points of the first, second and third dual strategy, and so on."""
+
+LIBRARY = ("bokeh.min.js", "bokeh-api.min.js")
+"""BokehJS and its interface for plots, in the distribution of Bokeh."""
+
+
+@cache
+def library() -> str:
+    """The JavaScript that draws the plots, with its licence."""
+    folder = files("bokeh") / "server" / "static" / "js"
+    return "\n".join((folder / name).read_text(encoding="utf-8").strip() for name in LIBRARY)
+
+
+@dataclass(frozen=True)
+class Axes:
+    """A panel of a plot: columns of its rows, what they are called, and whether its axes are logarithmic."""
+
+    x: str
+    y: str
+    x_label: str
+    y_label: str
+    logarithmic: bool = True
+
+
+@dataclass(frozen=True)
+class Plot:
+    """A plot of one problem: its name, which is that of the picture whose place it takes, its title, and its data.
+
+    `data` has the names, colours and markers of the series, row in the table of cells, series and filling of every
+    point, and the panels, with the coordinates of the points; a point that a panel does not have is null there.
+    """
+
+    name: str
+    title: str
+    data: dict[str, Any]
+
+
+def plots(name: str, data: Data, rows: Mapping[str, int]) -> Iterator[Plot]:
+    """The plots of one problem.
+
+    Parameters
+    ----------
+    name
+        What the names of its pictures begin with.
+    rows
+        The row of every cell in the table of cells, from which the page takes what a point says.
+    """
+    compared = on_common_queries(best_solver(data.cells), data.queries)
+    cells = compared.cells
+    shown = cells.assign(
+        dimension=cells["N"] + cells["enrichment"].fillna(0) + cells["R"], online_ms=1e3 * cells["online_s"]
+    )
+    solver = f", {shown['solver'].iloc[0]}" if len(shown) else ""
+    kinds = {
+        "work-precision": ("work and precision", "online_ms", "time of a query [ms]"),
+        "dimension": ("errors against dimension", "dimension", "dimension N + S + R"),
+        "offline": ("errors against offline seconds", "offline_s", "offline [s]"),
+    }
+    for kind, (title, column, x_label) in kinds.items():
+        panels = [Axes(column, error, x_label, y_label) for error, y_label in ERRORS.items()]
+        yield from _plot(f"{name}-{kind}", f"{data.problem}{solver}: {title}{compared.over}", shown, panels, rows)
+    fixed = data.cells[data.cells["share_training"].notna()].drop_duplicates("model")
+    panels = [Axes("share_training", "share_validation", "training parameters", "validation parameters", False)]
+    title = "smallest share of β over the span in that of the whole of V"
+    yield from _plot(f"{name}-shares", f"{data.problem}: {title}", fixed, panels, rows)
+
+
+def _plot(name: str, title: str, cells: pd.DataFrame, panels: list[Axes], rows: Mapping[str, int]) -> Iterator[Plot]:
+    """A plot, unless no cell has a point in it."""
+    drawn = [(panel, _coordinates(cells, panel)) for panel in panels]
+    drawn = [(panel, points) for panel, points in drawn if points.notna().to_numpy().any()]
+    if not drawn:
+        return
+    ways = [Series(*way) for way in zip(cells["primal"], cells["assembly"], strict=True)]
+    looks, places, duals = Looks(ways), list(dict.fromkeys(ways)), list(dict.fromkeys(cells["dual"]))
+    data = {
+        "series": [_series(way, looks[way]) for way in places],
+        "rows": [rows[cell] for cell in cells["cell"]],
+        "of": [places.index(way) for way in ways],
+        "fills": [FILLS[duals.index(dual) % len(FILLS)] for dual in cells["dual"]],
+        "panels": [_panel(panel, points) for panel, points in drawn],
+    }
+    yield Plot(name, printable(title), data)
+
+
+def _series(way: Series, look: Look) -> dict[str, Any]:
+    """A series: its name, and how its points look; what shares colour and marker differs in the width of the edge."""
+    name = printable(label(way.name, None, str(way.variant)))
+    return {"name": name, "colour": look.colour, "marker": MARKERS[look.marker], "edge": 1.0 + 1.4 * look.rank}
+
+
+def _coordinates(cells: pd.DataFrame, panel: Axes) -> pd.DataFrame:
+    """Both values of every cell, missing where one of them is, or is not above zero on a logarithmic axis."""
+    values = cells[[panel.x, panel.y]].astype(float)
+    fine = np.isfinite(values).all(axis=1) & ((values > 0.0).all(axis=1) | (not panel.logarithmic))
+    return values.where(fine)
+
+
+def _panel(panel: Axes, points: pd.DataFrame) -> dict[str, Any]:
+    return {
+        "x_label": panel.x_label,
+        "y_label": panel.y_label,
+        "scale": "log" if panel.logarithmic else "linear",
+        "x": [short(value) for value in points[panel.x]],
+        "y": [short(value) for value in points[panel.y]],
+    }
