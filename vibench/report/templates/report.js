@@ -225,8 +225,6 @@ function readAddress() {
 
 // ---------------------------------------------------------------- plots
 
-const css = name => getComputedStyle(document.body).getPropertyValue(name).trim();
-
 /** The resolved colours of the page: a canvas knows no variables. */
 function pageColours() {
   const probe = element("span");
