@@ -177,7 +177,12 @@ def recorded_study(run: str, cell: str) -> Study:
     settings = {} if pd.isna(rounds) else {"timing_rounds": int(rounds)}
     try:
         recorded = found.cell
-    except (ValueError, TypeError, KeyError) as error:  # whoever wrote the file need not know what a cell is
+    except (
+        ValueError,
+        TypeError,
+        KeyError,
+        AttributeError,
+    ) as error:  # whoever wrote the file may have written anything
         raise RequestError(f"'{found.path}': the definition of cell {found.row['cell']} cannot be read") from error
     return study_of_cell(recorded, name, **settings)
 
