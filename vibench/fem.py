@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 import scipy.sparse as sp
@@ -88,7 +88,7 @@ class Unilateral:
     _integrals: Callable[[Callable[[Array], Array]], Array] | None = field(repr=False, default=None)
 
     def bound(self, values: Callable[[Array], Array] | Array) -> Array:
-        """G (m,) of a bound, which is a function of x (dim×…) or has values at `points` (m,).
+        """The vector g (m,) of a bound, which is a function of x (dim×…) or has values at `points` (m,).
 
         With a consistent mass a function is integrated by the quadrature of the basis; values are interpolated.
         """
@@ -99,9 +99,7 @@ class Unilateral:
         return sign * self.W.apply(np.asarray(given, float))
 
 
-def unilateral(
-    basis: Basis, sense: Sense, *, free: Indices | None = None, lumped: bool = True, among: Indices | None = None
-) -> Unilateral:
+def unilateral(basis: Basis, sense: Sense, *, free: Indices | None = None, lumped: bool = True) -> Unilateral:
     """The constraint u ≤ bound or u ≥ bound of a scalar field, on a domain, a patch or a part of the boundary.
 
     Parameters
@@ -115,8 +113,6 @@ def unilateral(
         Unknowns that are not prescribed; vertices with prescribed values carry no multiplier. By default all.
     lumped
         Whether the mass is lumped: the constraint is then imposed vertex by vertex, and X_W is diagonal.
-    among
-        Vertices that may carry a multiplier; by default those of the elements or facets.
 
     Raises
     ------
@@ -126,8 +122,6 @@ def unilateral(
     vertices = _vertices(basis)
     if free is not None:
         vertices = vertices[np.isin(basis.nodal_dofs[0, vertices], free)]
-    if among is not None:
-        vertices = np.intersect1d(vertices, among)
     dofs = basis.nodal_dofs[0, vertices]
     sign = 1.0 if sense == "<=" else -1.0
     if lumped:
@@ -179,33 +173,29 @@ def normal_constraint(
         raise NumericalError("normal displacements need a vector basis: Basis(mesh, ElementVector(element))")
     scalar = FacetBasis(basis.mesh, basis.elem.elem, facets=facets)
     vertices = np.unique(basis.mesh.facets[:, facets])
-
-    def component(k: int) -> Callable[[Any], Any]:
-        return (lambda w: w.n[k]) if direction is None else (lambda w: float(direction[k]) + 0.0 * w.x[0])
-
-    parts = []
-    multipliers = scalar.nodal_dofs[0, vertices]
+    B = sp.csr_array((len(vertices), basis.N))
     for k, unknowns in enumerate(basis.nodal_dofs):
-        form = BilinearForm(lambda u, v, w, k=k: component(k)(w) * u * v)
-        weighted = sp.csr_array(form.assemble(scalar))[multipliers][:, multipliers]
-        part = sp.diags_array(np.asarray(weighted.sum(axis=1)).ravel()) if lumped else weighted
-        places = sp.csr_array(
-            (np.ones(len(vertices)), (np.arange(len(vertices)), unknowns[vertices])), (len(vertices), basis.N)
-        )
-        parts.append(sp.csr_array(part @ places))
-    B = sp.csr_array(sum(parts[1:], start=parts[0]))
+        dofs = scalar.nodal_dofs[0, vertices]
+        part = _normal_mass(scalar, k, direction)[dofs][:, dofs]
+        part = sp.diags_array(part.sum(axis=1)) if lumped else part
+        places = (np.arange(len(vertices)), unknowns[vertices])
+        B = B + part @ sp.csr_array((np.ones(len(vertices)), places), shape=B.shape)
     B.data[np.abs(B.data) <= ROUND_OFF * np.max(np.abs(B.data), initial=0.0)] = 0.0
     B.eliminate_zeros()
     kept = np.arange(len(vertices)) if free is None else np.flatnonzero(abs(B[:, free]).sum(axis=1) > 0.0)
-    gram = sp.csr_array(mass(scalar)[multipliers][:, multipliers])
-    vertices = vertices[kept]
-    points = basis.mesh.p[:, vertices]
+    B, vertices = sp.csr_array(B[kept]), vertices[kept]
+    dofs, points = scalar.nodal_dofs[0, vertices], basis.mesh.p[:, vertices]
     if lumped:
-        weights = _positive(lumped_mass(scalar), multipliers[kept])
-        return Unilateral(sp.csr_array(B[kept]), _diagonal(weights), vertices, points, "<=")
-    integrals = _Integrals(scalar, multipliers[kept])
-    W = InnerProduct(sp.csr_array(gram[kept][:, kept]), "X_W")
-    return Unilateral(sp.csr_array(B[kept]), W, vertices, points, "<=", integrals)
+        return Unilateral(B, _diagonal(_positive(lumped_mass(scalar), dofs)), vertices, points, "<=")
+    W = InnerProduct(sp.csr_array(mass(scalar)[dofs][:, dofs]), "X_W")
+    return Unilateral(B, W, vertices, points, "<=", _Integrals(scalar, dofs))
+
+
+def _normal_mass(scalar: FacetBasis, k: int, direction: Array | None) -> SparseMatrix:
+    """∫ n_k φ_i φ_j, or with a fixed direction in place of the normal n."""
+    if direction is not None:
+        return float(direction[k]) * mass(scalar)
+    return sp.csr_array(BilinearForm(lambda u, v, w: w.n[k] * u * v).assemble(scalar))
 
 
 def eliminate(vi: VariationalInequality, free: Indices, lift: Array | None = None) -> VariationalInequality:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import copy
+import importlib
 import importlib.util
 import inspect
 import io
@@ -13,6 +14,7 @@ import re
 import sys
 import tomllib
 from collections.abc import Iterator
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from types import ModuleType
@@ -32,6 +34,7 @@ from vibench.study.entries import Entry, ProblemEntry, SamplingEntry
 from vibench.study.reader import read_study
 from vibench.study.registry import GROUPS
 from vibench.study.spec import Limits, Study, ToleranceTable
+from vibench.testing import check_problem
 
 ROOT = Path(__file__).parents[2]
 DOCS = ROOT / "docs"
@@ -104,6 +107,17 @@ SNIPPETS = [
 @pytest.mark.parametrize("text", SNIPPETS)
 def test_what_a_page_looks_at_is_as_it_says(text: str) -> None:
     exec(compile(text, "<documentation>", "exec"), {"__name__": "documentation"})
+
+
+@pytest.mark.usefixtures("importable")
+def test_the_membrane_of_fenicsx_is_a_problem() -> None:
+    pytest.importorskip("dolfinx", reason="FEniCSx is not installed: its example is not run")
+    membrane = importlib.import_module("vibench_mine.membrane_dolfinx").Membrane
+    check_problem(partial(membrane, cells=8))
+
+
+def test_the_torsion_problem_of_the_pages_takes_some_thirty_lines(package: Path) -> None:
+    assert len((package / "vibench_mine" / "torsion.py").read_text(encoding="utf-8").splitlines()) <= 33
 
 
 def test_the_package_of_the_pages_has_a_plugin_of_every_kind(package: Path) -> None:

@@ -75,10 +75,10 @@ def test_a_field_is_constrained_vertex_by_vertex_or_in_the_mean(sense: fem.Sense
         assert square[interior] == pytest.approx(sign * h**2 * ((2.0 / 3.0) ** 2 + h**2 / 6.0))
 
 
-def test_a_constraint_on_a_part_of_the_boundary_among_chosen_vertices() -> None:
+def test_a_constraint_on_a_part_of_the_boundary() -> None:
     top = FacetBasis(MESH, ElementTriP1(), facets="top")
     inner = np.flatnonzero((MESH.p[0] > 0.1) & (MESH.p[0] < 1.9))
-    found = fem.unilateral(top, "<=", among=inner)
+    found = fem.unilateral(top, "<=", free=inner)
     assert np.all(found.points[1] == 1.0)
     assert np.allclose(found.W.matrix.diagonal(), 1.0 / 3.0)
 

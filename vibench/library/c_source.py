@@ -44,12 +44,18 @@ def source(
 
 
 def _member(name: str, member: AffinePolynomial) -> str:
-    """Arrays of one member: degrees, coefficients, terms."""
+    """Arrays of one member: degrees, coefficients that are not zero, product by product, and terms."""
     products, terms = member.coefficients.shape
+    rows, columns = np.nonzero(member.coefficients)
+    starts = np.searchsorted(rows, np.arange(products + 1))
+    # C has no arrays without elements.
+    columns, values = (columns, member.coefficients[rows, columns]) if len(rows) else (np.zeros(1, int), np.zeros(1))
     return (
         f"enum {{ {name}_PRODUCTS = {products}, {name}_TERMS = {terms} }};\n"
         f"static const int {name}_degrees[] = {{\n{_numbers(member.indices)}\n}};\n"
-        f"static const double {name}_coefficients[] = {{\n{_numbers(member.coefficients)}\n}};\n"
+        f"static const int {name}_starts[] = {{\n{_numbers(starts)}\n}};\n"
+        f"static const int {name}_columns[] = {{\n{_numbers(columns)}\n}};\n"
+        f"static const double {name}_coefficients[] = {{\n{_numbers(values)}\n}};\n"
         f"static const double {name}_terms[] = {{\n{_numbers(member.terms)}\n}};\n"
     )
 

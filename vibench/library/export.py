@@ -139,8 +139,9 @@ def exported(
         first = members_of(queried, box.lower)
         if not len(first.f) or not len(first.g):
             raise RequestError("the model has no unknowns or no constraints")
-        evaluate = partial(_packed, queried, len(first.f))
-        members = interpolate_on_box(evaluate, box.lower, box.upper, tolerance, evaluations)
+        terms = queried.declared_terms() if isinstance(queried, HyperReducedModel) else {}
+        evaluate = partial(_evaluated, queried, len(first.f), frozenset(terms))
+        members = interpolate_on_box(evaluate, box.lower, box.upper, tolerance, evaluations, terms=terms)
     except NumericalError as error:
         raise RequestError(f"the model cannot be evaluated in the whole parameter box: {error}") from None
     except (ArithmeticError, ValueError, LookupError) as error:  # what the code of a problem raises
@@ -171,6 +172,13 @@ def members_of(queried: Queried, mu: Array) -> VariationalInequality:
             'with assembly = "reduced"'
         )
     return queried.assemble(mu).program
+
+
+def _evaluated(queried: Queried, size: int, declared: frozenset[str], mu: Array) -> dict[str, Array]:
+    """The members as flat arrays; of declared affine ones θ."""
+    found = _packed(queried, size, mu)
+    theta = queried.coefficients(mu) if isinstance(queried, HyperReducedModel) else {}
+    return found | {name: theta[name] for name in declared}
 
 
 def _packed(queried: Queried, size: int, mu: Array) -> dict[str, Array]:

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from math import prod
+from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 import scipy.fft
@@ -34,7 +36,7 @@ class AffinePolynomial:
     indices
         Degrees (K×d) of the products of Chebyshev polynomials that occur, in (2 mu − lower − upper)/(upper − lower).
     coefficients
-        Coefficients of θ in these products (K×Q).
+        Coefficients of θ in these products (K×Q), zero where no value needs them.
     terms
         Flat terms (Q×size).
     error
@@ -66,14 +68,20 @@ def products(indices: Indices, unit: Array) -> Array:
 
 
 def interpolate_on_box(
-    evaluate: Evaluate, lower: Array, upper: Array, tolerance: float, budget: int, seed: int = 0
+    evaluate: Evaluate,
+    lower: Array,
+    upper: Array,
+    tolerance: float,
+    budget: int,
+    seed: int = 0,
+    terms: Mapping[str, Array] = MappingProxyType({}),
 ) -> dict[str, AffinePolynomial]:
     """Tensor-product Chebyshev interpolation of arrays on a box (Trefethen 2013, chapters 3 and 8).
 
     Degrees differ by direction: along random lines, the arrays are interpolated with more and more points until the
     coefficients have decayed to a tenth of the tolerance, relative to the largest array (`_degree`). One grid has these
     degrees, or larger ones if its measured error is above the tolerance. Every array loses the coefficients it does not
-    need; the others are factorised into θ and terms by a singular value decomposition.
+    need; the others are factorised into θ and terms by a singular value decomposition, unless its terms are given.
 
     Parameters
     ----------
@@ -88,6 +96,8 @@ def interpolate_on_box(
         Largest number of points of a grid.
     seed
         Of the random points.
+    terms
+        Flat terms (Q×size) of those arrays for which `evaluate` returns the coefficients θ (Q,) instead.
     """
     random = np.random.default_rng(seed)
     anchors, corners = random.random((LINES, len(lower))), np.array(np.meshgrid(*[[0.0, 1.0]] * len(lower)))
@@ -95,15 +105,18 @@ def interpolate_on_box(
     unit = np.vstack([random.random((MEASURED, len(lower))), corners.reshape(len(lower), -1).T])
     points = lower + unit * (upper - lower)
     values = _stacked([evaluate(mu) for mu in points])
+    values = {name: found @ terms[name] if name in terms else found for name, found in values.items()}
     scale = {name: float(np.linalg.norm(found, axis=-1).max()) or 1.0 for name, found in values.items()}
-    along = _Sampled(evaluate, lower, upper, scale)
+    # A coefficient counts by what it adds to the array: times the norm of its term.
+    units = {name: scale[name] / _norms(terms[name]) if name in terms else scale[name] for name in scale}
+    along = _Sampled(evaluate, lower, upper, units)
     # A function that needs more points than that along a line has a grid beyond the budget, or nearly.
     limit = max(9, round(4 * budget ** (1.0 / len(lower)))) if len(lower) > 1 else budget
     counts = [max(along.degree(k, at, 0.1 * tolerance, limit) for at in anchors) + 1 for k in range(len(lower))]
     for _ in range(TRIALS):
         counts = _within(counts, budget)
         grid = along.coefficients(counts)
-        found = {name: _compressed(c, scale[name], 0.1 * tolerance) for name, c in grid.items()}
+        found = {name: _compressed(c, units[name], 0.1 * tolerance, terms.get(name)) for name, c in grid.items()}
         found = {name: replace(p, error=_error(p.at(unit), values[name], scale[name])) for name, p in found.items()}
         if max(p.error for p in found.values()) <= tolerance or prod(counts) >= 0.7 * budget:
             break
@@ -112,15 +125,15 @@ def interpolate_on_box(
 
 
 class _Sampled:
-    """Arrays over their largest norms, sampled on lines and grids of Chebyshev points."""
+    """Arrays over their units, sampled on lines and grids of Chebyshev points."""
 
-    def __init__(self, evaluate: Evaluate, lower: Array, upper: Array, scale: Mapping[str, float]) -> None:
-        self._evaluate, self._lower, self._upper, self._scale = evaluate, lower, upper, scale
+    def __init__(self, evaluate: Evaluate, lower: Array, upper: Array, units: Mapping[str, Any]) -> None:
+        self._evaluate, self._lower, self._upper, self._units = evaluate, lower, upper, units
 
     def _at(self, unit: Array) -> dict[str, Array]:
         """The arrays at points (P×d) of the unit box, (P×size) each."""
         found = _stacked([self._evaluate(self._lower + at * (self._upper - self._lower)) for at in unit])
-        return {name: values / self._scale[name] for name, values in found.items()}
+        return {name: values / self._units[name] for name, values in found.items()}
 
     def degree(self, direction: int, anchor: Array, tolerance: float, limit: int) -> int:
         """The degree in one direction from which on coefficients on the line through a point sum up to the tolerance.
@@ -168,19 +181,43 @@ def _within(counts: Sequence[int], budget: int) -> list[int]:
     return kept
 
 
-def _compressed(coefficients: Array, scale: float, tolerance: float) -> AffinePolynomial:
-    """A polynomial from its coefficients (n₁×…×n_d×size), without those that sum up to less than a tolerance."""
+def _compressed(coefficients: Array, unit: Any, tolerance: float, terms: Array | None) -> AffinePolynomial:
+    """A polynomial from its coefficients (n₁×…×n_d×size), without those that sum up to less than a tolerance.
+
+    The coefficients are in a unit, a number or an array (size,). With given terms they are those of θ.
+    """
     shape = coefficients.shape
     flat = coefficients.reshape(-1, shape[-1])
     norms = np.linalg.norm(flat, axis=1)
     rising = np.argsort(norms, kind="stable")
     kept = np.sort(rising[np.cumsum(norms[rising]) > tolerance]) if norms.sum() > tolerance else np.zeros(1, np.intp)
+    indices = np.stack(np.unravel_index(kept, shape[:-1]), axis=1)
+    if terms is not None:
+        return AffinePolynomial(indices, _sparse(flat[kept], tolerance) * unit, terms, np.inf)
     left, sigma, right = svd(flat[kept])
     # a value is a sum over all rows, with factors of at most 1
     lost = np.sqrt(len(kept) * np.append(np.cumsum(sigma[::-1] ** 2)[::-1], 0.0))
     count = max(1, int(np.argmax(lost <= tolerance)))
-    indices = np.stack(np.unravel_index(kept, shape[:-1]), axis=1)
-    return AffinePolynomial(indices, left[:, :count] * sigma[:count], right[:count] * scale, np.inf)
+    theta = _sparse(left[:, :count] * sigma[:count], tolerance)
+    return AffinePolynomial(indices, theta, right[:count] * unit, np.inf)
+
+
+def _sparse(coefficients: Array, tolerance: float) -> Array:
+    """Coefficients without the smallest ones, which sum up to at most a tolerance.
+
+    Products of Chebyshev polynomials are at most 1 on the box, and terms have norm 1: no value changes by more.
+    """
+    sizes = np.abs(coefficients).ravel()
+    rising = np.argsort(sizes, kind="stable")
+    found = coefficients.ravel().copy()
+    found[rising[np.cumsum(sizes[rising]) <= tolerance]] = 0.0
+    return np.asarray(found.reshape(coefficients.shape))
+
+
+def _norms(terms: Array) -> Array:
+    """Norms (Q,) of terms (Q×size), 1 for those that vanish."""
+    norms = np.linalg.norm(terms, axis=1)
+    return np.where(norms > 0.0, norms, 1.0)
 
 
 def _error(found: Array, values: Array, scale: float) -> float:

@@ -225,6 +225,10 @@ class HyperReducedModel:
         """Vectors u = Z x (n×k) with coordinates x (N'×k) at mu, for reconstruction; it assembles again."""
         return self.assemble(mu).lift(x)
 
+    def declared_terms(self) -> dict[str, Array]:
+        """Flat terms (Q×size) of the members declared affine, of A packed upper triangles, on Φ."""
+        return {name: getattr(self._operators, name).terms for name in self._operators.affine}
+
     def members(self, mu: Array) -> VariationalInequality:
         """A, f, B, g at mu (d,) on Φ, a space that does not depend on mu; B on (η, χ) where Φ has `space`."""
         return self._members(*self._evaluate(mu))

@@ -13,9 +13,9 @@ import pytest
 
 import vibench
 from vibench.library import c_source
-from vibench.library.export import export_model
+from vibench.library.export import export_model, exported
 from vibench.library.reduced_model import Model as Exported
-from vibench.model.chebyshev import AffinePolynomial
+from vibench.model.chebyshev import AffinePolynomial, products
 from vibench.qp.exact import exact_solution
 from vibench.qp.verification import infeasibility_certificate
 
@@ -65,8 +65,8 @@ def model(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFacto
 
 def test_a_c_source_gives_the_answers_of_the_model(model: vibench.Model, tmp_path: Path) -> None:
     export_model(model, tmp_path / "model.npz", tolerance=1e-11, c=True)
-    exported = Exported(tmp_path / "model.npz")
-    A, _, _, g, _ = exported.program(exported.lower)
+    script = Exported(tmp_path / "model.npz")
+    A, _, _, g, _ = script.program(script.lower)
     solve = compiled(tmp_path / "model.c", len(A), len(g))
     for mu in model.parameters.sample(100, seed=3):
         code, x, alpha, residuals = solve(mu)
@@ -77,9 +77,26 @@ def test_a_c_source_gives_the_answers_of_the_model(model: vibench.Model, tmp_pat
         assert np.linalg.norm(x - exact.x) <= 1e-9 * np.linalg.norm(exact.x)
         if exact.unique:
             assert np.linalg.norm(alpha - exact.alpha) <= 1e-9 * np.linalg.norm(exact.alpha)
-        assert np.allclose(x, exported.solve(mu).x, rtol=0.0, atol=1e-11 * np.abs(x).max())
-    width = exported.upper - exported.lower
-    assert [solve(mu)[0] & 16 for mu in (exported.upper, exported.upper + width, exported.lower - width)] == [0, 16, 16]
+        assert np.allclose(x, script.solve(mu).x, rtol=0.0, atol=1e-11 * np.abs(x).max())
+    width = script.upper - script.lower
+    assert [solve(mu)[0] & 16 for mu in (script.upper, script.upper + width, script.lower - width)] == [0, 16, 16]
+
+
+def test_terms_that_a_problem_declares_are_exported_as_they_are(model: vibench.Model) -> None:
+    found, declared = exported(model, bases=False), model.problem.affine
+    assert set(declared) == ({"g"} if "B" in model.problem.constant else {"B", "g"})
+    mu = model.parameters.sample(1, seed=5)[0]
+    theta = {name: member.coefficients(mu) for name, member in declared.items()}
+    unit = (mu - model.parameters.lower) / (model.parameters.upper - model.parameters.lower)
+    for name in declared:
+        terms = found.members[name].terms
+        assert len(terms) == len(declared[name].terms)
+        for q, term in enumerate(declared[name].terms):
+            projected = model.reduced.generators.T @ (term if name == "g" else term @ model.reduced.basis)
+            assert np.allclose(terms[q], np.ravel(projected), rtol=1e-12, atol=1e-15)
+        assert np.allclose(
+            products(found.members[name].indices, unit[None]) @ found.members[name].coefficients, theta[name]
+        )
 
 
 def linear(constant: np.ndarray, factors: dict[int, int], dimension: int) -> AffinePolynomial:

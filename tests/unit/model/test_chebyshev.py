@@ -67,3 +67,40 @@ def test_it_is_deterministic() -> None:
     one, other = (interpolate_on_box(evaluate, LOWER, UPPER, 1e-6, 500)["a"] for _ in range(2))
     assert np.array_equal(one.coefficients, other.coefficients)
     assert one.error == other.error
+
+
+def test_coefficients_that_no_value_needs_are_zero() -> None:
+    """Two entries of different size, each a function of one parameter, disturbed by round-off."""
+    decay, noise = 0.5 ** np.arange(30), np.random.default_rng(3)
+    decay[0] = 0.0
+
+    def evaluate(mu: np.ndarray) -> dict[str, np.ndarray]:
+        x, y = np.polynomial.chebyshev.chebval((2.0 * mu - LOWER - UPPER) / (UPPER - LOWER), decay)
+        return {"a": np.array([x, 1e-3 * y]) + 1e-15 * noise.standard_normal(2)}
+
+    found = interpolate_on_box(evaluate, LOWER, UPPER, 1e-11, 2000)["a"]
+    assert found.error <= 1e-11
+    assert found.coefficients.shape[1] == 2
+    needed = found.coefficients != 0.0
+    assert needed.sum(axis=1).max() == 1  # no product serves both
+    for k, parameter in enumerate(needed[:, np.argsort(-np.abs(found.coefficients).max(axis=0))].T):
+        assert np.all(found.indices[parameter, 1 - k] == 0)
+    dropped = interpolate_on_box(evaluate, LOWER, UPPER, 1e-5, 2000)["a"]
+    assert np.count_nonzero(dropped.coefficients) < np.count_nonzero(found.coefficients)
+    assert dropped.error <= 1e-5
+
+
+def test_given_terms_are_kept_and_their_coefficients_interpolated() -> None:
+    """The second coefficient is large and its term small, the last term vanishes."""
+    terms = np.vstack([np.random.default_rng(0).standard_normal((2, 6)) * [[1.0], [1e-8]], np.zeros((1, 6))])
+
+    def evaluate(mu: np.ndarray) -> dict[str, np.ndarray]:
+        x, y = mu
+        return {"a": np.array([1.0 + x * y, 1e8 * np.exp(x), abs(y - 0.3)]), "b": np.array([x])}
+
+    found = interpolate_on_box(evaluate, LOWER, UPPER, 1e-11, 2000, terms={"a": terms})
+    assert np.array_equal(found["a"].terms, terms)
+    expected = np.array([evaluate(mu)["a"] @ terms for mu in POINTS])
+    assert np.abs(found["a"].at(UNIT) - expected).max() <= 1e-11 * np.linalg.norm(expected, axis=1).max()
+    assert found["a"].error <= 1e-11
+    assert found["b"].degrees == (1, 0)
