@@ -206,10 +206,11 @@ def entry(
     *,
     iqr: float = 0.0,
     calibration: float = 1.0,
+    rounds: int = 9,
     more: Sequence[tuple[float, float]] = (),
     **extra: str,
 ) -> dict[str, Any]:
-    stats = {"median": seconds, "q1": seconds - iqr / 2, "q3": seconds + iqr / 2, "rounds": 9}
+    stats = {"median": seconds, "q1": seconds - iqr / 2, "q3": seconds + iqr / 2, "rounds": rounds}
     passes = [stats | {"calibration_s": calibration}, *({"q1": q1, "q3": q3} for q1, q3 in more)]
     info = {"accuracy": accuracy, "passes": passes, **extra}
     return {"fullname": f"benchmarks/bench_stages.py::test_{name}", "stats": stats, "extra_info": info}
@@ -237,6 +238,8 @@ COMPARED: Mapping[str, tuple[Pair, str]] = {
     "beyond the quartiles of all passes": (
         (entry("x", 1.0, SAME, more=[(1.0, 1.4)]), entry("x", 1.5, SAME, more=[(1.41, 1.5)])), "slower",
     ),
+    "timed once": ((entry("x", 1.0, SAME, rounds=1), entry("x", 1.5, SAME)), ""),
+    "timed once, much slower": ((BEFORE, entry("x", 1.6, SAME, rounds=1)), "slower"),
     "by less than 10 µs": ((entry("x", 1e-6, SAME), entry("x", 10.9e-6, SAME)), ""),
     "by more than 10 µs": ((entry("x", 1e-6, SAME), entry("x", 11.1e-6, SAME)), "slower"),
     "on a slower machine": ((BEFORE, entry("x", 2.4, SAME, calibration=2.0)), ""),

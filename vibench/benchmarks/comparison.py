@@ -164,12 +164,14 @@ def is_slower(before: Measured, after: Measured, limit: float) -> bool:
     """Whether the seconds grew beyond a limit, beyond their spread, and beyond what the machine was slower by.
 
     The ranges between the quartiles of any two passes must not meet, the medians must be more than 10 µs apart, and
-    their ratio must be above the limit, also relative to the calibration, fixed work that was timed beside both.
+    their ratio must be above the limit, also relative to the calibration, fixed work that was timed beside both. Where
+    one of them has a single round, which has no spread, the ratio must be above the square of the limit.
     """
     if after.seconds - before.seconds <= SHORTEST or after.low <= before.high:
         return False
     slowdown = after.calibration / before.calibration if before.calibration > 0.0 else math.nan
-    allowed = limit * (slowdown if slowdown > 1.0 else 1.0)
+    margin = limit**2 if min(before.rounds, after.rounds) == 1 else limit
+    allowed = margin * (slowdown if slowdown > 1.0 else 1.0)
     return after.seconds > allowed * before.seconds
 
 

@@ -18,8 +18,8 @@ T = TypeVar("T")
 PASSES = 5
 """Passes over all benchmarks, minutes apart: rounds in succession do not see how a machine changes meanwhile."""
 
-MOST = 30
-"""Rounds of what is quick in one pass; what takes longer than there is for all passes together is timed in one."""
+MOST, SLOW = 30, 3
+"""Rounds of what is quick in one pass; what takes `SLOW` times what there is for all passes is timed in the first."""
 
 SHORTEST = 2e-3
 """Seconds of a round: as many calls as it takes."""
@@ -66,15 +66,17 @@ def measure(
     """
     given = (lambda: (fresh(),)) if fresh else tuple
     budget = float(benchmark._max_time)
-    result, seconds = _timed(work, given())
+    result, first = timed(lambda: work(*given()))
+    seconds = first.wall
     benchmark.group = group
     if benchmark.extra_info["pass"] == 0:
         benchmark.extra_info.update(plain(judge(result)))
         if seconds <= TRACED:
             benchmark.extra_info["peak_memory_mib"] = peak_memory(work, given())
-        if seconds < budget:
-            seconds = min(seconds, _timed(work, given())[1])  # the first call may have imported something
-        benchmark.extra_info["slow"] = seconds >= budget
+        if first.cpu < SLOW * budget:
+            again = timed(lambda: work(*given()))[1]  # the first call may have imported something
+            first, seconds = again, min(seconds, again.wall)
+        benchmark.extra_info["slow"] = first.cpu >= SLOW * budget
     rounds, calls = _how_often(seconds, budget / PASSES, together)
     before = calibration().seconds().cpu
     if fresh:
@@ -82,11 +84,6 @@ def measure(
     else:
         benchmark.pedantic(work, rounds=rounds, iterations=calls)  # type: ignore[no-untyped-call]
     benchmark.extra_info["calibration_s"] = (before + calibration().seconds().cpu) / 2.0
-
-
-def _timed(work: Callable[..., T], arguments: tuple[Any, ...]) -> tuple[T, float]:
-    result, seconds = timed(lambda: work(*arguments))
-    return result, seconds.wall
 
 
 def _how_often(seconds: float, budget: float, together: int) -> tuple[int, int]:

@@ -87,7 +87,7 @@ def draw_figures(
     ] = None,
     jobs: Annotated[int, Option("--jobs", "-j", min=0, help="Processes; 0 for one per core.")] = 0,
 ) -> None:
-    """Draw the figures of runs, with their captions in captions.json."""
+    """Draw the figures of runs, with captions."""
     from vibench.errors import RequestError
     from vibench.report.figures.style import FORMATS
     from vibench.results import tables

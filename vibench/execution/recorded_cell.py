@@ -17,11 +17,13 @@ from vibench.errors import RequestError
 from vibench.execution.graph import Graph
 from vibench.execution.supervisor import Job, Supervisor
 from vibench.interfaces.problem import VariationalInequality
+from vibench.model.certificates.bounds import OnlineCertificate
 from vibench.results import tables
 from vibench.results.database import read_meta, read_rows, study_of
 from vibench.results.tables import results_file
 from vibench.stages.assembly import Model, assembly_stage
-from vibench.stages.base import Done, Stage
+from vibench.stages.base import Done, Stage, value_of
+from vibench.stages.cell_queries import cell_queries
 from vibench.storage.artefacts import Store, usable_store
 from vibench.study.cells import Cell
 from vibench.study.single_cell import study_of_cell
@@ -68,6 +70,24 @@ class RecordedCell:
         store, assembly = usable_store(), assembly_stage(self.cell)
         _provide(assembly.model_inputs, store)
         return assembly.model(store)[0]
+
+    @cached_property
+    def certificate(self) -> OnlineCertificate | None:
+        """What bounds the errors of the model at online cost; `None` where the cell is not certified.
+
+        Raises
+        ------
+        RequestError
+            As for `model`.
+        """
+        self.model  # noqa: B018  refuses other code
+        stage = cell_queries(self.cell, UNLIMITED[0]).certificate
+        if stage is None:
+            return None
+        store = usable_store()
+        _provide((stage,), store)
+        found: OnlineCertificate = value_of(store, stage)
+        return found
 
     @cached_property
     def parameters(self) -> Array:

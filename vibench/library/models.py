@@ -14,6 +14,7 @@ from vibench.errors import RequestError, unknown_name
 from vibench.execution.recorded_cell import RecordedCell
 from vibench.highfidelity.active_set import HighFidelitySolution, HighFidelitySolver
 from vibench.interfaces.problem import ParameterBox, Problem
+from vibench.model.certificates.bounds import OnlineBound
 from vibench.model.error_bounds import Certificate, certificate
 from vibench.model.galerkin import ReducedProblem
 from vibench.qp.settings import SETTINGS
@@ -46,6 +47,8 @@ class Solution:
         Its relative KKT residuals, recomputed; `None` without x and α.
     assembly, solution
         Seconds of the assembly of the program, and of its solution.
+    bound, tolerance
+        Its error bounds at online cost where the cell is certified, and the relative error asked for; else `None`.
     """
 
     mu: Array
@@ -58,6 +61,19 @@ class Solution:
     solution: Seconds
     _model: Model = field(repr=False)
     _reduced: ReducedProblem = field(repr=False)
+    bound: OnlineBound | None = None
+    tolerance: float | None = None
+
+    @property
+    def verdict(self) -> str:
+        """Whether the bound keeps the tolerance: what it is worth, "certified" or "verified", or "not certified".
+
+        "" where no tolerance was asked for. A solution that is not ok is not certified, however small its bound is.
+        """
+        if self.tolerance is None or self.bound is None:
+            return ""
+        kept = self.status is Status.OK and self.bound.relative <= self.tolerance
+        return self.bound.guarantee.value if kept else "not certified"
 
     @cached_property
     def u(self) -> Array:
@@ -106,6 +122,7 @@ class Model:
         self.row = recorded.row
         self.reduced: Queried = recorded.model
         self.problem: Problem = self.reduced.problem
+        self._certificate = recorded.certificate
         self._solver, self._accuracy = recorded.cell.solver, recorded.cell.accuracy
 
     @property
@@ -113,8 +130,16 @@ class Model:
         """The parameter domain."""
         return self.problem.parameters
 
-    def solve(self, mu: Parameters, solver: str | None = None, accuracy: float | None = None) -> Solution:
-        """Assemble and solve the reduced program at a parameter, and verify the solution.
+    def solve(
+        self,
+        mu: Parameters,
+        solver: str | None = None,
+        accuracy: float | None = None,
+        tolerance: float | None = None,
+    ) -> Solution:
+        """Assemble and solve the reduced program at a parameter, verify the solution, and bound its errors.
+
+        Bounds need a cell with `assembly = "certified"`.
 
         The solver runs in this process, without the limits of a study.
 
@@ -124,12 +149,21 @@ class Model:
             The parameter; outside the domain there is a warning, since the model was not trained there.
         solver, accuracy
             QP solver and the relative accuracy that it has to reach; those of the cell by default.
+        tolerance
+            Largest relative error of u in the energy norm; `verdict` of the solution says whether the bound keeps it.
 
         Raises
         ------
         RequestError
-            If mu is not a parameter of the problem, or the solver is not installed.
+            If mu is not a parameter of the problem, the solver is not installed, the tolerance is not positive, or
+            there is one and the cell is not certified.
         """
+        if tolerance is not None and not tolerance > 0.0:
+            raise RequestError(f"the tolerance is {tolerance:g}, expected a positive number")
+        if tolerance is not None and self._certificate is None:
+            raise RequestError(
+                f'cell {self.row["cell"]} has no error bounds: a tolerance needs a cell with assembly = "certified"'
+            )
         at, name = self._parameter(mu), solver or self._solver
         accuracy = self._accuracy if accuracy is None else accuracy
         own = registry.names("QP solver")
@@ -141,7 +175,13 @@ class Model:
         solve = partial(solve_qp, reduced.program, name, accuracy, registry.qp_solver(name), reduced.factor)
         found, solution = timed(solve)
         status, reason, residuals = verify(reduced.program, found, accuracy)
-        return Solution(at, status, reason, found.x, found.alpha, residuals, assembly, solution, self, reduced)
+        bound = None
+        if self._certificate is not None:
+            bound = OnlineBound.none(f"the program has no solution: {reason}")
+            if residuals is not None and found.x is not None and found.alpha is not None:
+                bound = self._certificate.evaluate(self.problem, at, reduced, found.x, found.alpha)
+        answer = at, status, reason, found.x, found.alpha, residuals
+        return Solution(*answer, assembly, solution, self, reduced, bound, tolerance)
 
     def reconstruct(self, mu: Parameters, x: Array, alpha: Array) -> tuple[Array, Array]:
         """The solution u (n,), λ (m,) with coordinates x (N',) in the primal basis at mu and α (R,) on generators."""

@@ -72,7 +72,8 @@ def page(path: Path, jobs: int = 1) -> str:
     key_length = short_keys(cells["cell"])
     rows = {str(cell): k for k, cell in enumerate(cells["cell"])}
     live = [plot for name, data in known for plot in plots.plots(name, data, rows)]
-    drawn, undrawable = stills([one for name, data in known for one in _drawings(name, data)], jobs)
+    few = [one for name, data in known for one in _drawings(name, data)]
+    drawn, undrawable = stills(few, jobs)
     template = _environment().get_template("report.html.j2")
     return template.render(
         study=study.get("name", path.parent.name),
@@ -92,7 +93,7 @@ def page(path: Path, jobs: int = 1) -> str:
         ],
         grids=grids,
         stills=drawn,
-        undrawn=sum(max(0, len(data.duals) - MOST_DUALS) for _, data in known),
+        undrawn=sum(1 for _ in drawings_of(known)) - len(few),
         plots={plot.name: plot for plot in live},
         plots_alone=[plot for plot in live if plot.name not in {still.name for still in drawn}],
         table_data=Markup(to_json(grids)),
@@ -123,17 +124,19 @@ def _printable(value: Any) -> Any:
     return printable(value) if isinstance(value, str) and not isinstance(value, Markup) else value
 
 
-MOST_DUALS = 4
+MOST_DUALS = 2
 """Dual strategies of a problem that have pictures of their own: those of the leaderboard first, then the others."""
 
 
 def _drawings(name: str, data: Data) -> Iterator[tuple[str, Drawing, Data]]:
-    """The pictures of a problem: not those of every dual strategy of a large study, which look alike."""
+    """The pictures of a problem: not those of every dual strategy of a large study, nor all parts of long figures."""
     winners = (winner for one in leaderboard(data.cells) for band in one.bands for winner in band.winners)
     ranked = dict.fromkeys([*(str(winner.cell["dual"]) for winner in winners), *data.duals])
-    few = list(ranked)[:MOST_DUALS]
-    of_dual = set(OF_DUAL.values())
-    return (one for one in drawings_of([(name, data)]) if one[1] not in of_dual or set(one[2].duals) <= set(few))
+    few, of_dual = set(list(ranked)[:MOST_DUALS]), set(OF_DUAL.values())
+    for one in drawings_of([(name, data)]):
+        _, draw, mine = one
+        if (mine.page is None or mine.page[0] == 0) and (draw not in of_dual or set(mine.duals) <= few):
+            yield one
 
 
 def _way(winner: Winner) -> str:

@@ -51,10 +51,6 @@ def study_of_cell(cell: Cell, name: str, **settings: Any) -> Study:
         "warm_start": cell.warm_start,
         "tolerances": [tolerances],
     }
-    if cell.training is not None:
-        content["training"] = [_entry(cell.training, cell.set_labels[0])]
-    if cell.validation_sampling is not None:
-        content["validation"] = _entry(cell.validation_sampling, cell.set_labels[1])
     if cell.interpolation is not None:
         content["interpolation"] = cell.interpolation
     return Study(**content, **settings)

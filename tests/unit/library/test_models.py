@@ -120,3 +120,50 @@ def test_a_cell_is_named_by_its_beginning(run: vibench.Run) -> None:
     assert run.model(key[:12]).row["cell"] == key
     with pytest.raises(vibench.RequestError, match="0 cells of"):
         run.model("zzz")
+
+
+@pytest.fixture(scope="module")
+def certified(tmp_path_factory: pytest.TempPathFactory) -> vibench.Run:
+    study = vibench.Study(
+        name="certified",
+        problem=[{"name": "hertz", "options": {"resolution": 300}}],
+        dual=["mcpg"],
+        primal=["decorrelated"],
+        assembly=["reduced", "certified"],
+        tolerances=[{"pod": [1e-2], "dual": [1e-1]}],
+        solvers=["piqp"],
+        accuracy=1e-10,
+        validation=3,
+        timing_rounds=1,
+    )
+    return vibench.run(study, tmp_path_factory.mktemp("certified") / "run", progress=False)
+
+
+def test_a_certified_model_bounds_its_errors_and_says_whether_they_keep_a_tolerance(certified: vibench.Run) -> None:
+    row = certified.cells.set_index("assembly").loc["certified"]
+    assert (row["certificate"], row["bound_online_violations"]) == ("certified", 0)
+    assert row["offline_certificate_s"] > 0.0
+    assert row["online_certify_s"] > 0.0
+    model = certified.model(row["cell"])
+    rows = certified.queries[certified.queries["cell"] == row["cell"]].set_index("query")
+    for query, mu in enumerate(validation_parameters(model.problem, 3, 0)):
+        solution = model.solve(mu)
+        assert solution.bound is not None
+        assert solution.verdict == ""
+        assert solution.bound.u_energy == pytest.approx(rows.loc[query, "bound_online_u_energy"], rel=1e-6)
+        assert rows.loc[query, "error_u_energy_absolute"] <= solution.bound.u_energy
+        relative = solution.bound.relative
+        assert rows.loc[query, "error_u_energy"] <= relative
+        assert model.solve(mu, tolerance=1.01 * relative).verdict == "certified"
+        assert model.solve(mu, tolerance=0.99 * relative).verdict == "not certified"
+        rough = model.solve(mu, accuracy=1e-14, tolerance=1.01 * relative)  # more than the solver reaches, or less
+        assert rough.verdict == ("certified" if rough.status == "ok" else "not certified")
+
+
+def test_a_tolerance_needs_a_certificate(certified: vibench.Run) -> None:
+    model = certified.model(certified.cells.set_index("assembly").loc["reduced", "cell"])
+    assert model.solve([1.0]).bound is None
+    with pytest.raises(vibench.RequestError, match="no error bounds"):
+        model.solve([1.0], tolerance=1e-2)
+    with pytest.raises(vibench.RequestError, match="expected a positive number"):
+        model.solve([1.0], tolerance=0.0)

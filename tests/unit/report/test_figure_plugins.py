@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -25,7 +26,7 @@ GROUP, HERE = "vibench.figures", __name__
 class Sizes(FigurePlugin):
     """A figure with a caption of its own, and one that has nothing to show."""
 
-    def drawings(self, tables: ProblemTables) -> Mapping[str, Callable[[], Figure | None]]:
+    def drawings(self, tables: ProblemTables) -> Mapping[str, Callable[..., Figure | None]]:
         if tables.problem_name != "obstacle":
             return {}
 
@@ -41,7 +42,7 @@ class Sizes(FigurePlugin):
             vibench.scatter(sheet.panels[0], [1.0], [2.0], vibench.Looks([vibench.Series(name)])[vibench.Series(name)])
             return sheet.finish("A caption of its own.")
 
-        return {"": sizes, "captioned": captioned, "none": lambda: None}
+        return {"": partial(sizes), "captioned": captioned, "none": lambda: None}
 
 
 class Twins(Sizes):
@@ -67,6 +68,12 @@ class Raises(FigurePlugin):
 
     def drawings(self, tables: ProblemTables) -> Mapping[str, Callable[[], Figure | None]]:
         raise ValueError("no\nidea")
+
+
+class Mute(Raises):
+    """The same of a publication."""
+
+    publication: ClassVar[str] = "Another"
 
 
 class Fails(FigurePlugin):
@@ -220,14 +227,25 @@ def test_figures_of_a_publication_are_drawn_on_request_alone(register: Register,
     text = (tmp_path / "twins" / publication.PAGE).read_text(encoding="utf-8")
     assert "Author, Title with\\_underscores &amp; &lt;tags&gt;, 2020." in text
     assert text.index("## Figure 9") < text.index("## Figure 10")
-    assert "What is \\[shown\\].\n\n**Published.** N = 19.\n\n**Here.** Differs: N = " in text
+    assert "What is \\[shown\\]. Run quick, problem obstacle: resolution = coarse.\n\n**Published.** N = 19." in text
+    assert "**Here.** Differs: N = " in text
     assert "![Figure 10](figure-10.png)" in text
+
+
+def test_a_publication_that_raises_is_a_line_and_the_others_are_drawn(
+    register: Register, results: Path, tmp_path: Path
+) -> None:
+    registered(register, "mute", "twins")
+    lines: list[str] = []
+    files = publication.draw_published([results], tmp_path, ("png",), note=lines.append)
+    assert [file.stem for file in files] == ["figure-9", "figure-10"]
+    assert "figure plugin 'mute' has no figures of obstacle: ValueError: no idea" in lines
 
 
 def test_several_runs_have_figures_of_their_own(register: Register, results: Path, tmp_path: Path) -> None:
     registered(register, "twins")
     files = publication.draw_published([results, results], tmp_path, ("png",))
-    assert [file.stem for file in files] == ["figure-9", "figure-9-run-2", "figure-10", "figure-10-run-2"]
+    assert [file.stem for file in files] == ["figure-9", "figure-9-quick", "figure-10", "figure-10-quick"]
 
 
 @pytest.mark.parametrize("names", [(), ("sizes",)])

@@ -127,6 +127,11 @@ class OnlineCertificate:
     on_contact: bool
 
     @cached_property
+    def _near_directions(self) -> Array:
+        """Rows of `contact_directions` for the unknowns of most liftings."""
+        return np.ascontiguousarray(self.contact_directions[self.compliance.near])
+
+    @cached_property
     def _round_off(self) -> Array:
         """Round-off (k,) of u_N at the contact unknowns, for coefficients of norm 1."""
         terms = self.contact_basis.shape[1] + 4.0
@@ -157,7 +162,8 @@ class OnlineCertificate:
         omega, kappa = lifting.norm * float(np.sqrt(upper)), lifting.kappa
         square = rho**2 / lower + omega**2 + 2.0 * kappa
         bound = float(np.sqrt(square))
-        along = lifting.load @ self.contact_directions[lifting.unknowns]
+        near = len(lifting.unknowns) == len(self.compliance.near)
+        along = lifting.load @ (self._near_directions if near else self.contact_directions)
         work = float(along @ coordinates) + (beside + missing + lacking) * lifting.norm  # at least rᵀw
         natural = min(float(np.sqrt(max(0.0, square + 2.0 * work))), omega + bound)
         least = float(np.sqrt(max(0.0, energy**2 - base.stiffness_error * u_norm**2))) - bound  # of ‖u‖

@@ -23,7 +23,7 @@ import numpy as np
 from vibench.arrays import Array, Indices
 from vibench.linalg.inner_product import InnerProduct
 
-TERMS, DIRECTIONS = 0.02, 0.2
+TERMS, DIRECTIONS = 0.05, 0.4
 """Bounds of what is left out are these shares of the typical norm: of terms, and of directions, which are orthogonal to
 those that are kept."""
 
@@ -33,7 +33,7 @@ NEGLIGIBLE = 1e-12
 FEW = 1000
 """All directions of up to so many terms are kept."""
 
-MOST, OVERSAMPLING = 400, 100
+MOST, OVERSAMPLING = 800, 100
 """Largest number of principal directions, and how many more a randomised method computes."""
 
 

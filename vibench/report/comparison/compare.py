@@ -173,7 +173,7 @@ def compare(paths: Sequence[Path], limit: float) -> Comparison:
     Raises
     ------
     RequestError
-        If there are fewer than two files, or one of them twice, or one cannot be read.
+        If there are fewer than two files, or one cannot be read.
     """
     runs = compared_runs(paths)
     first, *others = runs

@@ -115,7 +115,8 @@ def draw_guarded(name: str, kind: str, draw: Drawing) -> Figure | None:
         returned = type(figure).__name__
         raise FigureError(f"figure '{kind}' of {KIND} '{name}' is a {returned}, expected a matplotlib Figure or None")
     if figure is not None:
-        set_caption(figure, inspect.getdoc(draw) or "")
+        described = draw.func if isinstance(draw, partial) else draw
+        set_caption(figure, inspect.getdoc(described) or "")
     return figure
 
 

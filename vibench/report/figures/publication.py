@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from vibench.errors import RequestError
 from vibench.files import write_atomically
 from vibench.interfaces.figures import Drawing
-from vibench.report.figures.data import problems
+from vibench.report.figures.data import Data, file_names, problems
 from vibench.report.figures.plugins import FigureError, draw_guarded, named, publications
 from vibench.report.figures.style import FORMATS, caption_of, save, styled
 from vibench.results.database import read_meta, study_of
@@ -34,7 +34,13 @@ class Twin:
     name: str
     draw: Drawing
     run: str
-    machine: str
+    data: Data
+
+    @property
+    def origin(self) -> str:
+        """The run and the problem from which it is drawn, with the options that are not at their default."""
+        options = ", ".join(f"{name} = {value}" for name, value in self.data.problem_options.items())
+        return f"Run {self.run}, problem {self.data.problem}{f': {options}' * bool(options)}."
 
 
 def draw_published(
@@ -64,7 +70,7 @@ def draw_published(
     RequestError
         If no plugin draws figures of these runs' problems, or a figure plugin cannot be loaded.
     """
-    twins = sorted(_twins(paths), key=lambda twin: (twin.publication, _natural(twin.name)))
+    twins = sorted(_twins(paths, note), key=lambda twin: (twin.publication, _natural(twin.name)))
     if not twins:
         named_runs = ", ".join(unbroken(path.parent.name) for path in paths)
         raise RequestError(f"no installed plugin draws figures of a publication from {named_runs}")
@@ -89,23 +95,30 @@ def draw_published(
     return files
 
 
-def _twins(paths: Sequence[Path]) -> Iterator[Twin]:
-    """What can be drawn; of figures that several runs have, each after the first is numbered."""
+def _twins(paths: Sequence[Path], note: Callable[[str], None]) -> Iterator[Twin]:
+    """What can be drawn; of figures that several runs have, each after the first is named after its run."""
     seen: dict[str, int] = {}
+    plugins = list(publications())
     for path in paths:
         for _, data in problems(path):
-            for plugin_name, plugin in publications():
-                for kind, draw in named(plugin_name, plugin, data):
+            for plugin_name, plugin in plugins:
+                try:
+                    kinds = list(named(plugin_name, plugin, data))
+                except FigureError as error:
+                    note(str(error))
+                    continue
+                run = file_names([path.parent.name])[0]
+                for kind, draw in kinds:
                     count = seen[kind] = seen.get(kind, 0) + 1
-                    name = kind + f"-run-{count}" * (count > 1)
-                    yield Twin(plugin.publication, plugin_name, name, draw, path.parent.name, data.machine)
+                    name = kind + f"-{run}" * (count > 1) + f"-{count}" * (count > 2)
+                    yield Twin(plugin.publication, plugin_name, name, draw, path.parent.name, data)
 
 
 def _page(drawn: Sequence[tuple[Twin, Figure]], paths: Sequence[Path], form: str) -> str:
     """The page in Markdown."""
     runs = [path.parent.name for path in paths]
     studies = list(dict.fromkeys(str(study_of(path, read_meta(path)).get("name", "")) for path in paths))
-    machines = list(dict.fromkeys(twin.machine for twin, _ in drawn))
+    machines = list(dict.fromkeys(twin.data.machine for twin, _ in drawn))
     parts = ["# Figures of a publication, drawn again"]
     parts += [f"{_text(publication)}." for publication in dict.fromkeys(twin.publication for twin, _ in drawn)]
     parts.append(
@@ -120,7 +133,7 @@ def _page(drawn: Sequence[tuple[Twin, Figure]], paths: Sequence[Path], form: str
         parts += [
             f"## {_text(title)}",
             f"![{_text(title)}]({twin.name}.{form})",
-            _text(caption_of(figure)),
+            f"{_text(caption_of(figure))} {_text(twin.origin)}",
             *([f"**Published.** {_text(published)}"] if published else []),
             *([f"**Here.** {_text(compared)}"] if compared else []),
         ]

@@ -81,9 +81,7 @@ def chain(far: float) -> tuple[np.ndarray, Contact, np.ndarray, np.ndarray, floa
     return C, Contact(B, np.array([-1.0, far])), np.zeros(K), np.array([1.0, 0.0]), 1.0
 
 
-def test_rows_far_from_the_contact_are_evaluated_only_where_the_inequality_of_cauchy_and_schwarz_is_not_enough() -> (
-    None
-):
+def test_rows_far_from_the_contact_are_evaluated_where_the_inequality_of_cauchy_and_schwarz_is_not_enough() -> None:
     away = lifted(chain(far=10.0), near=np.array([0, 1]))
     assert away is not None
     assert list(away.unknowns) == [0, 1]

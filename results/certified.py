@@ -1,0 +1,140 @@
+"""Results of the study `certified`: effectivities, the cost of a certificate, greedy against fixed training.
+
+vibench run certified --no-figures && python results/certified.py runs/certified results/certified
+
+Everything comes from the results file.
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import pandas as pd
+from matplotlib.figure import Figure
+from palette import use_palette
+
+from vibench.report.figures.looks import look_of
+from vibench.report.figures.style import Sheet, save, scatter, styled
+from vibench.results import tables
+
+BOUNDS = {"HSW": ("hsw_u", "hsw_lambda"), "(ii)": ("u_energy", "lambda_natural")} | {
+    "(ii) online": ("online_u_energy", "online_lambda_natural")
+}
+"""Bounds of u and λ: those of Haasdonk, Salomon and Wohlmuth (2012) in V and W, the others in the energy norm and in
+the natural norm of the multiplier."""
+
+ERRORS = {
+    "HSW": ("error_u_absolute", "error_lambda_absolute"),
+    "(ii)": ("error_u_energy_absolute", "error_lambda_natural_absolute"),
+    "(ii) online": ("error_u_energy_absolute", "error_lambda_natural_absolute"),
+}
+
+MODEL = ["problem", "training", "primal", "primal_tol"]
+
+
+def effectivities(cells: pd.DataFrame, queries: pd.DataFrame) -> pd.DataFrame:
+    """Median effectivities over the ok queries of every certified model, and the number of violations."""
+    rows = []
+    for cell in cells[cells["assembly"] == "certified"].to_dict("records"):
+        mine = queries[(queries["cell"] == cell["cell"]) & (queries["status"] == "ok")]
+        row = {name: cell[name] for name in [*MODEL, "certificate"]} | {"queries": len(mine)}
+        for name, (u, lam) in BOUNDS.items():
+            row |= {f"u {name}": mine[f"effectivity_{u}"].median(), f"λ {name}": mine[f"effectivity_{lam}"].median()}
+        rows.append(row | {"violations": int(mine["bound_online_violated"].fillna(0).sum())})
+    return pd.DataFrame(rows)
+
+
+def costs(cells: pd.DataFrame) -> pd.DataFrame:
+    """Seconds of a query with and without its certificate, and of what is prepared offline."""
+    without, with_one = (cells[cells["assembly"] == assembly].set_index(MODEL) for assembly in ("reduced", "certified"))
+    found = pd.DataFrame(
+        {
+            "query without [ms]": 1e3 * without["online_s"],
+            "query with [ms]": 1e3 * with_one["online_s"],
+            "certificate [ms]": 1e3 * with_one["online_certify_s"],
+            "certificate / query without": with_one["online_certify_s"] / without["online_s"],
+            "offline without [s]": without["offline_s"],
+            "offline with [s]": with_one["offline_s"],
+            "certificates offline [s]": with_one["offline_certificate_s"],
+        }
+    )
+    return found.reset_index()
+
+
+def trainings(cells: pd.DataFrame) -> pd.DataFrame:
+    """Greedy and fixed training sets: high-fidelity solutions, dimensions, errors and offline seconds."""
+    columns = {
+        "snapshots": "high-fidelity solutions", "N": "N", "R": "R", "error_u_mean": "error u",
+        "error_u_max": "largest error u", "error_lambda_mean": "error λ", "error_lambda_max": "largest error λ",
+        "offline_s": "offline [s]",
+    }  # fmt: skip
+    return cells.loc[cells["assembly"] == "reduced", [*MODEL, *columns]].rename(columns=columns)
+
+
+def figure(cells: pd.DataFrame, queries: pd.DataFrame) -> Figure:
+    """Bounds against errors of all certified queries; on the grey line they are equal."""
+    certified = cells[cells["assembly"] == "certified"]
+    problems = list(certified["problem"].unique())
+    sheet = Sheet(2, len(problems), "bounds against errors, all queries of certified models")
+    for column, problem in enumerate(problems):
+        mine = queries[queries["cell"].isin(certified.loc[certified["problem"] == problem, "cell"])]
+        for row, unknown in enumerate("uλ"):
+            panel = sheet.at(row, column)
+            for name, bounds in BOUNDS.items():
+                error, bound = mine[ERRORS[name][row]], mine[f"bound_{bounds[row]}"]
+                scatter(panel, error, bound, look_of(name), name, markersize=3)
+            errors = mine[[pair[row] for pair in ERRORS.values()]].to_numpy(float)
+            ends = [errors[errors > 0.0].min(), errors[errors > 0.0].max()]
+            panel.plot(ends, ends, color="0.6", linewidth=0.8, zorder=0)
+            panel.set(xscale="log", yscale="log", xlabel=f"error of {unknown}", ylabel="bound", title=problem)
+    return sheet.finish()
+
+
+def table(frame: pd.DataFrame) -> str:
+    """A table in Markdown, numbers with three digits."""
+    text = frame.rename(columns={"primal_tol": "δ"}).map(lambda x: f"{x:.3g}" if isinstance(x, float) else x)
+    return str(text.replace("nan", "").to_markdown(index=False, disable_numparse=True))
+
+
+def page(folder: Path, target: Path) -> None:
+    """Write the page and its figure."""
+    path = tables.results_file(str(folder))
+    cells, queries = (tables.in_order(tables.read(path, name)) for name in ("cells", "queries"))
+    target.mkdir(parents=True, exist_ok=True)
+    with styled():
+        save(figure(cells, queries), target, "bounds", ("png",))
+    use_palette(target / "bounds.png")
+    failed = cells[cells["status"] != "ok"]
+    lines = [
+        "# certified",
+        "",
+        "Generated by `vibench run certified --no-figures && python results/certified.py runs/certified "
+        f"results/certified` on one machine: {'; '.join(cells['machine'].dropna().unique())}. Seconds are CPU seconds "
+        f"on one thread; {int((cells['disturbed'] == 1).sum())} of {len(cells)} cells were timed on a disturbed "
+        "machine.",
+        "",
+        "## Effectivities",
+        "",
+        "Medians of bound over error. u in the energy norm and λ in the natural norm, for HSW in V and W.",
+        "",
+        table(effectivities(cells, queries)),
+        "",
+        "![bounds against errors](bounds.png)",
+        "",
+        "## Cost of a certificate",
+        "",
+        table(costs(cells)),
+        "",
+        "## Greedy against fixed training",
+        "",
+        "Relative errors over the validation set, reduced assembly.",
+        "",
+        table(trainings(cells)),
+        *(f"\n- {row.cell}: {row.status}, {row.reason}" for row in failed.itertuples()),
+    ]
+    (target / "README.md").write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    page(Path(sys.argv[1]), Path(sys.argv[2]))
