@@ -134,7 +134,7 @@ class _OfProduct:
 
 
 def _minus(total: AffineSum, matrix: AffineSum, vector: AffineSum) -> AffineSum:
-    """Total − matrix · vector."""
+    """The sum of total − matrix · vector."""
     products = [A @ v for A in matrix.terms for v in vector.terms]
     thetas = [each.thetas for each in (total, matrix, vector)]
     if all(isinstance(theta, Thetas) and theta.constant for theta in thetas):  # stays a constant
@@ -147,7 +147,7 @@ def _first(member: Declaration) -> Any:
     """The first term of a declared member."""
     if isinstance(member, AffineSum):
         return member.terms[0]
-    return member[0][1] if isinstance(member, list | tuple) else member
+    return member[0][1] if isinstance(member, list | tuple) and member else member
 
 
 def _constant_or_sum(member: AffineSum) -> Any:
