@@ -348,7 +348,7 @@ FAULTS = (
     Fault(
         "validated-on-the-training-set",
         "vibench/stages/snapshots.py",
-        "return validation_parameters(problem, self.count, self.seed)",
+        "return validation_of(problem, self.count, self.seed, self.sampling)",
         "return training_parameters(problem)",
         ("tests/unit/stages/test_offline.py",),
     ),

@@ -155,7 +155,7 @@ def plugin_options(context: typer.Context, incomplete: str) -> list[str]:
 KINDS = {"problem": "problems", "primal": "primal_strategies", "dual": "dual_strategies", "solver": "qp_solvers"}
 """Groups of entry points by the word that `vibench check` knows them by."""
 
-lists = words(lambda: ("problems", "sampling", "dual", "primal", "solvers", "studies"))
+lists = words(lambda: ("problems", "sampling", "dual", "primal", "solvers", "figures", "studies"))
 table_names = words(lambda: SHOWN)
 
 

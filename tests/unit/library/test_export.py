@@ -92,7 +92,9 @@ def per_parameter(template: vibench.Model) -> vibench.Model:
     reduced = ReducedModel(problem, basis, enrichment, cone.generators, span)
     queried = HyperReducedModel(reduced, hyper_reduce(reduced, affine_decomposition(problem, training, 1e-12)))
     assert queried.kind is vibench.Kind.PER_PARAMETER
-    cell: Any = SimpleNamespace(row=template.row, model=queried, cell=SimpleNamespace(solver="piqp", accuracy=1e-10))
+    cell: Any = SimpleNamespace(
+        row=template.row, model=queried, certificate=None, cell=SimpleNamespace(solver="piqp", accuracy=1e-10)
+    )
     return vibench.Model(cell)
 
 
