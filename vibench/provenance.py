@@ -57,8 +57,8 @@ def solver_version(solver: str) -> str:
 
 
 NUMERICAL = (
-    "arrays.py", "errors.py", "timing.py", "linalg", "interfaces", "qp", "reduction", "stability", "highfidelity",
-    "model", "storage", "stages",
+    "arrays.py", "errors.py", "fem.py", "timing.py", "linalg", "interfaces", "qp", "reduction", "stability",
+    "highfidelity", "model", "storage", "stages",
 )  # fmt: skip
 """Rooms and modules whose code determines numbers; the others carry requests and records, and show them."""
 

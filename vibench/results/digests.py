@@ -72,7 +72,10 @@ class Digests:
     def _read(self, table: str, cell: str = "") -> tuple[list[str], list[tuple[Any, ...]]]:
         # An index may be damaged, too: the table itself is read.
         same, values = ("WHERE cell = ?", (cell,)) if cell else ("", ())
-        cursor = self._db.execute(f'SELECT * FROM "{table}" NOT INDEXED {same}', values)
+        try:
+            cursor = self._db.execute(f'SELECT * FROM "{table}" NOT INDEXED {same}', values)
+        except UnicodeDecodeError:  # of the name of a column
+            raise DigestError(f"the columns of the table '{table}' are not those that were written") from None
         names = [column[0] for column in cursor.description]
         declared, rows = META if table == "meta" else tuple(STORED[table]), cursor.fetchall()
         if names != [*declared, *(f"mu_{k + 1}" for k in range(len(names) - len(declared)))]:

@@ -100,6 +100,7 @@ class Stage(ABC):
         parts = (
             "arrays.py",
             "errors.py",
+            "fem.py",
             "timing.py",
             *self.rooms,
             __file__,

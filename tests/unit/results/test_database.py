@@ -21,7 +21,7 @@ from samples import cell_row, query_rows
 from vibench.errors import RequestError, StorageError
 from vibench.results import database as module
 from vibench.results.columns import CELLS, TABLES, VERSION
-from vibench.results.database import FILE, ResultsDatabase, open_read_only, read_meta
+from vibench.results.database import FILE, ResultsDatabase, open_read_only, read_meta, read_rows
 from vibench.results.values import LONGEST_TEXT
 
 STUDY = {"name": "sample", "seed": 1, "validation": 4, "accuracy": 1e-7}
@@ -289,6 +289,14 @@ def test_a_refused_folder_is_left_as_it_was(journal: ResultsDatabase, tmp_path: 
 def test_a_file_in_place_of_the_folder_is_refused(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     assert "cannot be written" in refusal(lambda: ResultsDatabase(tmp_path / "file" / "below", STUDY))
+
+
+def test_a_name_of_a_column_that_is_no_text_is_damage(tmp_path: Path) -> None:
+    ResultsDatabase(tmp_path, STUDY).close()
+    path = tmp_path / FILE
+    path.write_bytes(path.read_bytes().replace(b'"peak_memory_mib"', b'"\xa0eak_memory_mib"'))
+    assert "the columns of the table 'cells' are not those" in refusal(lambda: read_rows(path, "cells"))
+    assert "the columns of the table 'cells' are not those" in refusal(lambda: ResultsDatabase(tmp_path, STUDY))
 
 
 def test_an_empty_folder_will_do(tmp_path: Path) -> None:
