@@ -66,8 +66,8 @@ def exact(vi: VariationalInequality) -> tuple[np.ndarray, np.ndarray]:
         kkt = np.block([[vi.A, C.T], [C, np.zeros((len(active), len(active)))]])
         solution = np.linalg.lstsq(kkt, np.concatenate([vi.f, vi.g[active]]), rcond=None)[0]
         x, lam = solution[: len(vi.f)], solution[len(vi.f) :]
-        scale = np.abs(vi.B).sum(axis=1)
-        if np.all(lam >= -1e-9 * (1.0 + np.abs(lam).max(initial=0.0))) and np.all(vi.B @ x - vi.g <= 1e-10 * scale):
+        excess, scale = vi.B @ x - vi.g, np.abs(vi.B).sum(axis=1) * (1.0 + np.abs(x).max())
+        if np.all(lam >= -1e-9 * (1.0 + np.abs(lam).max(initial=0.0))) and np.all(excess <= 1e-10 * scale):
             alpha = np.zeros(m)
             alpha[active] = lam
             return x, alpha

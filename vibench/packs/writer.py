@@ -1,4 +1,4 @@
-"""Writing a model pack of any problem: constants where the problem declares them, else one array per parameter."""
+"""Writing a model pack of any problem: constants and affine sums as it declares them, else one array per parameter."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ import scipy.sparse as sp
 from vibench.arrays import Array
 from vibench.errors import RequestError
 from vibench.highfidelity.active_set import HighFidelitySolver
+from vibench.interfaces.affine import AffineSum
 from vibench.interfaces.problem import MEMBERS, Problem
 from vibench.interfaces.validation import checked_assembly, training_parameters, validation_parameters
 from vibench.packs.manifest import FILE, VERSION
@@ -109,13 +110,29 @@ def _operators(problem: Problem, listed: Array, part: Path) -> list[str]:
     for k, mu in enumerate(listed):
         vi = checked_assembly(problem, mu)
         for name in MEMBERS:
-            if k == 0 or name not in problem.constant:
+            if name not in problem.affine and (k == 0 or name not in problem.constant):
                 found[name] |= _stored(str(k), getattr(vi, name))
-    lines = ["[operators]", f"entrywise = [{', '.join(map(_text, sorted(problem.entrywise - problem.constant)))}]"]
+    entrywise = sorted(problem.entrywise - problem.constant - set(problem.affine))
+    lines = ["[operators]", f"entrywise = [{', '.join(map(_text, entrywise))}]"]
     for name in MEMBERS:
+        if name in problem.affine:
+            found[name], line = _affine(name, problem.affine[name], listed)
+        else:
+            constant = name in problem.constant
+            line = f'{name} = "{name}.npz:0"' if constant else f'{name}.each = "{name}.npz:{{}}"'
         _save(part / f"{name}.npz", found[name])
-        lines.append(f'{name} = "{name}.npz:0"' if name in problem.constant else f'{name}.each = "{name}.npz:{{}}"')
+        lines.append(line)
     return [*lines, ""]
+
+
+def _affine(name: str, declared: AffineSum, listed: Array) -> tuple[dict[str, Any], str]:
+    """Arrays and entry of an affine sum: its terms, and its coefficients at the listed parameters."""
+    theta = np.column_stack([declared.coefficients(mu) for mu in listed])
+    arrays: dict[str, Any] = {f"theta{q}": values for q, values in enumerate(theta)}
+    for q, term in enumerate(declared.terms):
+        arrays |= _stored(f"term{q}", term)
+    entries = (f'{{ table = "{name}.npz:theta{q}", array = "{name}.npz:term{q}" }}' for q in range(len(theta)))
+    return arrays, f"{name}.affine = [{', '.join(entries)}]"
 
 
 def _solutions(problem: Problem, listed: Array, part: Path) -> list[str]:
