@@ -112,7 +112,7 @@ def _operators(problem: Problem, listed: Array, part: Path) -> list[str]:
         for name in MEMBERS:
             if name not in problem.affine and (k == 0 or name not in problem.constant):
                 found[name] |= _stored(str(k), getattr(vi, name))
-    entrywise = sorted(problem.entrywise - problem.constant - set(problem.affine))
+    entrywise = sorted((problem.entrywise | set(problem.affine)) - problem.constant)
     lines = ["[operators]", f"entrywise = [{', '.join(map(_text, entrywise))}]"]
     for name in MEMBERS:
         if name in problem.affine:
