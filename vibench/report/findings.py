@@ -18,16 +18,15 @@ from vibench.qp.status import Status
 from vibench.report.common_queries import FEWEST, MEANS, WAY, Comparable, common_programs, on_common_queries
 from vibench.report.figures.data import (
     PRIMAL,
-    SOLVER_SHARE,
     Data,
     best_solver,
     by_dimensions,
     label,
     problems,
-    solved_too_loosely,
 )
-from vibench.report.leaderboard import LARGEST_BAND, Criterion, Standings, eligible, leaderboard
+from vibench.report.leaderboard import Criterion, Standings, leaderboard
 from vibench.results import invariants, tables
+from vibench.results.best import LARGEST_BAND, SOLVER_SHARE, eligible, solved_too_loosely
 from vibench.results.solver_agreement import sentence
 from vibench.stability.infsup import VANISHES
 

@@ -19,11 +19,12 @@ from vibench.qp.status import Status
 from vibench.report import findings
 from vibench.report.figures import OF_DUAL, Drawing, drawings_of
 from vibench.report.figures.data import Data, label, problems
-from vibench.report.leaderboard import LARGEST_BAND, Criterion, Winner, leaderboard
+from vibench.report.leaderboard import Criterion, Winner, leaderboard
 from vibench.report.page import plots
 from vibench.report.page.embedded import Grid, grid_of, grid_of_cells, grid_of_thresholds, script_safe, to_json
 from vibench.report.page.stills import stills
 from vibench.results import pictures, tables
+from vibench.results.best import LARGEST_BAND
 from vibench.results.database import read_meta, study_of
 from vibench.results.selection import short_keys
 from vibench.text import printable
@@ -72,7 +73,8 @@ def page(path: Path, jobs: int = 1) -> str:
     key_length = short_keys(cells["cell"])
     rows = {str(cell): k for k, cell in enumerate(cells["cell"])}
     live = [plot for name, data in known for plot in plots.plots(name, data, rows)]
-    few = [one for name, data in known for one in _drawings(name, data)]
+    every = {name: list(drawings_of([(name, data)])) for name, data in known}
+    few = [one for name, data in known for one in _few(data, every[name])]
     drawn, undrawable = stills(few, jobs)
     template = _environment().get_template("report.html.j2")
     return template.render(
@@ -93,7 +95,7 @@ def page(path: Path, jobs: int = 1) -> str:
         ],
         grids=grids,
         stills=drawn,
-        undrawn=sum(1 for _ in drawings_of(known)) - len(few),
+        undrawn=sum(map(len, every.values())) - len(few),
         plots={plot.name: plot for plot in live},
         plots_alone=[plot for plot in live if plot.name not in {still.name for still in drawn}],
         table_data=Markup(to_json(grids)),
@@ -124,16 +126,16 @@ def _printable(value: Any) -> Any:
     return printable(value) if isinstance(value, str) and not isinstance(value, Markup) else value
 
 
-MOST_DUALS = 2
+MOST_DUALS = 1
 """Dual strategies of a problem that have pictures of their own: those of the leaderboard first, then the others."""
 
 
-def _drawings(name: str, data: Data) -> Iterator[tuple[str, Drawing, Data]]:
+def _few(data: Data, every: list[tuple[str, Drawing, Data]]) -> Iterator[tuple[str, Drawing, Data]]:
     """The pictures of a problem: not those of every dual strategy of a large study, nor all parts of long figures."""
     winners = (winner for one in leaderboard(data.cells) for band in one.bands for winner in band.winners)
     ranked = dict.fromkeys([*(str(winner.cell["dual"]) for winner in winners), *data.duals])
     few, of_dual = set(list(ranked)[:MOST_DUALS]), set(OF_DUAL.values())
-    for one in drawings_of([(name, data)]):
+    for one in every:
         _, draw, mine = one
         if (mine.page is None or mine.page[0] == 0) and (draw not in of_dual or set(mine.duals) <= few):
             yield one

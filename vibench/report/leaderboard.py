@@ -7,17 +7,9 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any
 
-import numpy as np
 import pandas as pd
 
-from vibench.qp.status import Status
-from vibench.report.figures.data import solved_too_loosely
-from vibench.stability.infsup import VANISHES
-
-LARGEST_BAND = 0.1
-"""Mean errors above this are no answer: such cells win nothing, however fast they are."""
-
-ERRORS = ("error_u_mean", "error_lambda_mean")
+from vibench.results.best import digits_of, excluded, largest_error
 
 
 class Criterion(StrEnum):
@@ -83,7 +75,7 @@ class Standings:
     cells, incomplete, unstable, loose, inexact
         Number of its cells, and of those that take no part: since a query is not ok; since the inf-sup constant β over
         the span vanishes at a parameter, so that the multiplier is not unique there; since the QP solver makes too
-        large a share of the error; and since a mean error is above `LARGEST_BAND` or unknown.
+        large a share of the error; and since a mean error is above `best.LARGEST_BAND` or unknown.
     """
 
     problem: str
@@ -114,40 +106,16 @@ def leaderboard(cells: pd.DataFrame) -> tuple[Standings, ...]:
     return tuple(_standings(str(problem), str(options), mine) for (problem, options), mine in groups)
 
 
-def eligible(cells: pd.DataFrame) -> pd.Series:
-    """Which rows of the cells table take part in a leaderboard; `Standings` says why the others do not."""
-    return ~_excluded(cells).any(axis=1)
-
-
 def _standings(problem: str, options: str, cells: pd.DataFrame) -> Standings:
-    excluded = _excluded(cells)
-    known = cells.assign(**{COLUMNS[Criterion.ERROR]: _error(cells)})[~excluded.any(axis=1)]
-    counts = {str(reason): int(count) for reason, count in excluded.sum().items()}
+    without = excluded(cells)
+    known = cells.assign(**{COLUMNS[Criterion.ERROR]: largest_error(cells)})[~without.any(axis=1)]
+    counts = {str(reason): int(count) for reason, count in without.sum().items()}
     return Standings(problem, options, tuple(_distinct(_bands(known))), len(cells), **counts)
-
-
-def _error(cells: pd.DataFrame) -> pd.Series:
-    return cells[list(ERRORS)].astype(float).max(axis=1, skipna=True)
-
-
-def _excluded(cells: pd.DataFrame) -> pd.DataFrame:
-    """Whether a row takes no part, for each reason; a row has the first reason that holds."""
-    reasons = {
-        "incomplete": cells["status"] != Status.OK,
-        "unstable": cells["beta_span_min"].astype(float) < VANISHES,
-        "loose": solved_too_loosely(cells),
-        "inexact": ~(_error(cells) <= LARGEST_BAND),
-    }
-    found = pd.DataFrame(reasons, index=cells.index).astype(bool)
-    earlier = found.astype(int).cumsum(axis=1).shift(1, axis=1, fill_value=0) > 0
-    return found & ~earlier
 
 
 def _bands(cells: pd.DataFrame) -> Iterator[Band]:
     """The bands of one problem, from the largest error to the smallest."""
-    error = cells[COLUMNS[Criterion.ERROR]]
-    # An error of 1e-3 belongs to the band 1e-3: its logarithm may be above -3 by round-off.
-    digits = np.ceil(np.log10(error.clip(lower=np.finfo(float).tiny)) - 1e-12)
+    digits = digits_of(cells[COLUMNS[Criterion.ERROR]])
     for digit in sorted(set(digits), reverse=True):
         mine = cells[digits <= digit]
         yield Band(10.0**digit, len(mine), tuple(_winners(mine)))

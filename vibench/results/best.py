@@ -1,4 +1,4 @@
-"""The best cells of a run: the fastest query at every accuracy that is reached, problem by problem."""
+"""The best cells of a run: which take part in a comparison, and the fastest query at every accuracy that is reached."""
 
 from __future__ import annotations
 
@@ -9,6 +9,15 @@ import pandas as pd
 
 from vibench.qp.status import Status
 from vibench.results.columns import CELLS, REAL, Column
+from vibench.stability.infsup import VANISHES
+
+LARGEST_BAND = 0.1
+"""Mean errors above this are no answer: such cells win nothing, however fast they are."""
+
+SOLVER_SHARE = 0.1
+"""Cells whose QP solver makes a larger share of an error are not compared: the solver, not the strategy, decides."""
+
+ERRORS = ("error_u_mean", "error_lambda_mean")
 
 BAND = "error_below"
 """Column of the accuracy: a power of ten that the mean errors of u and λ do not exceed."""
@@ -19,21 +28,60 @@ HEADINGS: Mapping[str, Column] = {
 }
 
 
+def excluded(cells: pd.DataFrame) -> pd.DataFrame:
+    """Whether a row of the cells table takes no part, for each reason; a row has the first reason that holds.
+
+    A query is not ok (`incomplete`); the inf-sup constant β over the span vanishes at a parameter, so that the
+    multiplier is not unique there (`unstable`); the QP solver makes too large a share of the error (`loose`); a mean
+    error is above `LARGEST_BAND`, or none is known (`inexact`).
+    """
+    reasons = {
+        "incomplete": cells["status"] != Status.OK,
+        "unstable": cells["beta_span_min"].astype(float) < VANISHES,
+        "loose": solved_too_loosely(cells),
+        "inexact": ~(largest_error(cells) <= LARGEST_BAND),
+    }
+    found = pd.DataFrame(reasons, index=cells.index).astype(bool)
+    earlier = found.astype(int).cumsum(axis=1).shift(1, axis=1, fill_value=0) > 0
+    return found & ~earlier
+
+
+def eligible(cells: pd.DataFrame) -> pd.Series:
+    """Which rows of the cells table take part in a comparison; `excluded` says why the others do not."""
+    return ~excluded(cells).any(axis=1)
+
+
+def solved_too_loosely(cells: pd.DataFrame) -> pd.Series:
+    """Which cells are left out where strategies are compared."""
+    return cells["solver_share_mean"].astype(float) >= SOLVER_SHARE
+
+
+def largest_error(cells: pd.DataFrame) -> pd.Series:
+    """The larger of the mean relative errors of u and λ; the other one where one is missing."""
+    return cells[list(ERRORS)].astype(float).max(axis=1, skipna=True)
+
+
 def fastest(cells: pd.DataFrame) -> pd.DataFrame:
     """For every problem and power of ten, the timed cell with the fastest query whose mean errors do not exceed it.
 
-    Cells with a query that is not ok take no part. A band whose cell is that of the next smaller one is left out.
+    Cells that are not `eligible` take no part, as in the leaderboard of a report. A band whose cell is that of the next
+    smaller one is left out.
     """
-    errors = cells[["error_u_mean", "error_lambda_mean"]].max(axis=1, skipna=True)
-    known = cells.assign(error=errors)[(cells["status"] == Status.OK) & cells["online_s"].notna() & errors.notna()]
+    known = cells.assign(error=largest_error(cells))[eligible(cells) & cells["online_s"].notna()]
     rows = [row for _, mine in known.groupby(["problem", "problem_options"], dropna=False) for row in _bands(mine)]
     columns = ["problem", BAND, *cells.columns.drop("problem")]
     return pd.DataFrame(rows, columns=columns).astype({**cells.dtypes, BAND: float}).reset_index(drop=True)
 
 
+def digits_of(errors: pd.Series) -> pd.Series:
+    """The exponent of the smallest power of ten that an error does not exceed; that of an error of 1e-3 is -3."""
+    exponents = np.log10(errors.clip(lower=np.finfo(float).tiny))
+    return np.ceil(exponents - 1e-12)  # by round-off the logarithm of 1e-3 may be above -3
+
+
 def _bands(cells: pd.DataFrame) -> Iterator[pd.Series]:
     """The fastest cells of one problem, from the largest error to the smallest."""
-    digits = np.ceil(np.log10(cells["error"].clip(lower=np.finfo(float).tiny)))
+    digits = digits_of(cells["error"])
     found = [(band, cells.loc[cells.loc[digits <= band, "online_s"].idxmin()]) for band in sorted(set(digits))[::-1]]
     for k, (band, cell) in enumerate(found):
         if k + 1 == len(found) or found[k + 1][1]["cell"] != cell["cell"]:

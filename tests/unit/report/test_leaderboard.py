@@ -10,7 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from samples import cell_row
 
-from vibench.report.leaderboard import COLUMNS, LARGEST_BAND, Criterion, Standings, leaderboard
+from vibench.report.leaderboard import COLUMNS, Criterion, Standings, leaderboard
+from vibench.results.best import LARGEST_BAND
 from vibench.results.columns import CELLS
 
 

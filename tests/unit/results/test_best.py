@@ -13,7 +13,13 @@ from vibench.results.columns import CELLS
 
 
 def cells(*rows: dict[str, Any]) -> pd.DataFrame:
-    common = {"problem": "box", "problem_options": "{}", "status": "ok"}
+    common = {
+        "problem": "box",
+        "problem_options": "{}",
+        "status": "ok",
+        "beta_span_min": 0.1,
+        "solver_share_mean": 1e-6,
+    }
     return pd.DataFrame([cell_row(**common | row) for row in rows], columns=list(CELLS))
 
 
@@ -30,8 +36,11 @@ def test_an_exact_cell_that_is_the_fastest_stands_alone() -> None:
     assert list(fastest(cells(row("a", 0.05, 2.0), row("b", 1e-5, 1.0)))["cell"]) == ["b"]
 
 
-def test_cells_that_are_not_ok_not_timed_or_without_error_take_no_part() -> None:
-    others = (row("b", 1e-5, 0.1, status="inaccurate"), row("c", 1e-5, None), row("d", None, 0.1, error_u_mean=None))
+def test_cells_that_no_leaderboard_names_take_no_part() -> None:
+    others = (
+        row("b", 1e-5, 0.1, status="inaccurate"), row("c", 1e-5, None), row("d", None, 0.1, error_u_mean=None),
+        row("e", 1e-5, 0.1, beta_span_min=0.0), row("f", 1e-5, 0.1, solver_share_mean=0.5), row("g", 0.11, 0.1),
+    )  # fmt: skip
     assert list(fastest(cells(row("a", 0.05, 2.0), *others))["cell"]) == ["a"]
     assert fastest(cells(*others)).empty
     assert fastest(cells()).empty

@@ -78,7 +78,8 @@ def inf_sup(data: Data) -> CaptionedFigure:
 
 def pairs(data: Data) -> int:
     """Number of panels of `inf_sup` over the span."""
-    return len(_panels(data, loosest(_constants(data))))
+    shown = loosest(_constants(data)).groupby("pair", sort=False)
+    return sum(-(-len(rows.groupby(["primal", "primal_tol"], dropna=False)) // (SERIES - 1)) for _, rows in shown)
 
 
 def _constants(data: Data) -> pd.DataFrame:

@@ -15,6 +15,7 @@ import pandas as pd
 
 from vibench.report.figures.looks import Series
 from vibench.results import pictures, tables
+from vibench.results.best import solved_too_loosely
 
 TABLES = ("cells", "queries", "histories", "thresholds", "outputs")
 
@@ -212,15 +213,6 @@ def point_names(cells: pd.DataFrame) -> dict[Any, str]:
 def one_solver(queries: pd.DataFrame) -> pd.DataFrame:
     """One row per strategy, tolerance and query: inf-sup constants depend neither on solver nor on assembly."""
     return queries.drop_duplicates([*PRIMAL, "query"])
-
-
-SOLVER_SHARE = 0.1
-"""Cells whose QP solver makes a larger share of an error are not compared: the solver, not the strategy, decides."""
-
-
-def solved_too_loosely(cells: pd.DataFrame) -> pd.Series:
-    """Which cells are left out where strategies are compared."""
-    return cells["solver_share_mean"].astype(float) >= SOLVER_SHARE
 
 
 def best_solver(cells: pd.DataFrame) -> pd.DataFrame:
