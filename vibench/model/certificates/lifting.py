@@ -24,7 +24,9 @@ from itertools import pairwise
 
 import numpy as np
 import scipy.sparse as sp
+from scipy.linalg import solve_triangular
 from scipy.linalg.lapack import dpotrf, dpotrs
+from scipy.optimize import nnls
 
 from vibench.arrays import Array, Indices, Mask, SparseMatrix
 from vibench.interfaces.problem import Contact
@@ -285,4 +287,7 @@ def _complementary(factor: Array, excess: Array, lam: Array) -> Array:
         v[rows] = np.linalg.solve(among[rows], -fixed[rows])
         nu = fixed + among @ v[rows]
         nu[rows] = 0.0
+    else:  # it cycles, which it may where S is no M-matrix: the same minimiser, at more cost
+        L = np.tril(factor)
+        nu = nnls(L.T, L.T @ lam + solve_triangular(L, excess, lower=True, check_finite=False))[0]
     return np.maximum(nu, 0.0)
