@@ -20,10 +20,13 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import pairwise
 
 import numpy as np
 import scipy.sparse as sp
+from scipy.linalg import solve_triangular
 from scipy.linalg.lapack import dpotrf, dpotrs
+from scipy.optimize import nnls
 
 from vibench.arrays import Array, Indices, Mask, SparseMatrix
 from vibench.interfaces.problem import Contact
@@ -39,6 +42,12 @@ ATTEMPTS = 4
 
 MARGIN = 4.0
 """The first margin of s, as a multiple of the round-off in s."""
+
+NEGLIGIBLE = 1e-6
+"""Below this share of what a row lacks, a multiplier of it does not move the minimiser."""
+
+MOST_BLOCKS = 8
+"""Largest number of blocks of C that are treated one by one."""
 
 REGULAR = 1e-13
 """Share of the largest diagonal entry of S that is added to all, so that dependent rows have a factorisation."""
@@ -67,6 +76,58 @@ class Lifting:
 
 
 @dataclass(frozen=True)
+class BlockDiagonal:
+    """A symmetric matrix (l×l) of blocks on the diagonal: bodies that only the constraint couples have one block each.
+
+    Attributes
+    ----------
+    ends
+        Where blocks begin and end (blocks + 1,), rising from 0 to l.
+    blocks
+        The blocks.
+    """
+
+    ends: tuple[int, ...]
+    blocks: tuple[Array, ...]
+
+    @classmethod
+    def of(cls, matrix: Array) -> BlockDiagonal:
+        """The smallest blocks that have all of the entries that are not zero."""
+        nonzero, size = matrix != 0.0, len(matrix)
+        last = np.maximum(
+            np.where(nonzero.any(axis=1), size - 1 - np.argmax(nonzero[:, ::-1], axis=1), 0), np.arange(size)
+        )
+        ends = (0, *(np.flatnonzero(np.maximum.accumulate(last) == np.arange(size)) + 1).tolist())
+        if len(ends) > MOST_BLOCKS + 1:
+            ends = (0, size)
+        return cls(ends, tuple(np.ascontiguousarray(matrix[a:b, a:b]) for a, b in pairwise(ends)))
+
+    def __len__(self) -> int:
+        return self.ends[-1]
+
+    def __matmul__(self, x: Array) -> Array:
+        """The product with a vector (l,)."""
+        if len(self.blocks) == 1:
+            return np.asarray(self.blocks[0] @ x)
+        pairs = zip(self.blocks, pairwise(self.ends), strict=True)
+        return np.concatenate([block @ x[a:b] for block, (a, b) in pairs])
+
+    def between(self, rows: SparseMatrix) -> Array:
+        """R C Rᵀ (i×i) for rows R (i×l)."""
+        if len(self.blocks) == 1:
+            return np.asarray(rows @ (rows @ self.blocks[0]).T)
+        total = np.zeros((rows.shape[0], rows.shape[0]))
+        numbers = np.repeat(np.arange(rows.shape[0]), np.diff(rows.indptr))
+        for block, (a, b) in zip(self.blocks, pairwise(self.ends), strict=True):
+            kept = (rows.indices >= a) & (rows.indices < b)
+            counts = np.bincount(numbers[kept], minlength=rows.shape[0])
+            of_block = rows.data[kept], rows.indices[kept] - a, np.concatenate([[0], np.cumsum(counts)])
+            part = sp.csr_array(of_block, (rows.shape[0], b - a))
+            total += part @ (part @ block).T
+        return total
+
+
+@dataclass(frozen=True)
 class ContactCompliance:
     """C on all contact unknowns, and on those that liftings usually involve.
 
@@ -87,14 +148,14 @@ class ContactCompliance:
         return np.asarray(np.sqrt(np.diag(self.matrix)))
 
     @cached_property
-    def blocks(self) -> tuple[tuple[Indices, Indices, Array], tuple[Indices, Indices, Array]]:
+    def blocks(self) -> tuple[tuple[Indices, Indices, BlockDiagonal], tuple[Indices, Indices, BlockDiagonal]]:
         """Unknowns, the position of every unknown among them or −1, and C on them: the near ones, and all."""
         return self._block(self.near), self._block(np.arange(len(self.matrix)))
 
-    def _block(self, chosen: Indices) -> tuple[Indices, Indices, Array]:
+    def _block(self, chosen: Indices) -> tuple[Indices, Indices, BlockDiagonal]:
         position = np.full(len(self.matrix), -1, np.intp)
         position[chosen] = np.arange(len(chosen))
-        return chosen, position, np.ascontiguousarray(self.matrix[np.ix_(chosen, chosen)])
+        return chosen, position, BlockDiagonal.of(self.matrix[np.ix_(chosen, chosen)])
 
 
 def lift(
@@ -137,7 +198,7 @@ class _Program:
 
     def __init__(
         self,
-        C: Array,
+        compliance: BlockDiagonal,
         B: SparseMatrix,
         near: Mask,
         excess: Array,
@@ -147,7 +208,7 @@ class _Program:
         lam: Array,
         gamma: float,
     ) -> None:
-        self._C, self._B, self._near, self._gamma, self._lam = C, B, near, gamma, lam
+        self._compliance, self._B, self._near, self._gamma, self._lam = compliance, B, near, gamma, lam
         self._size = sp.csr_array((np.abs(B.data), B.indices, B.indptr), B.shape)
         self._excess, self._round_off, self._reach, self._terms = excess, round_off, reach, terms
 
@@ -170,28 +231,41 @@ class _Program:
 
     def _minimisers(self, excess: Array) -> Iterator[tuple[Array, Array, float]]:
         """The last w of the active set method: c, w on the unknowns of the block, and its norm."""
-        chosen = self._lam > 0.0
+        size = self._reach**2 / self._gamma  # at least the diagonal of S
+        chosen = (self._lam > 0.0) & (self._lam * size > -excess)
         for _ in range(EXTENSIONS):
-            rows = np.flatnonzero(chosen)
-            load = np.zeros(len(self._C))
-            if len(rows):
-                block = self._B[rows]
-                load = (block.T @ self._difference(block, excess[rows], self._lam[rows])) / self._gamma
-            values = self._C @ load
+            load = (self._B.T @ self._difference(chosen, excess, size)) / self._gamma
+            values = self._compliance @ load
             violated = self._near & ~chosen & (excess - self._B @ values > self._round_off)
             if not violated.any():
                 yield load, values, float(np.sqrt(max(0.0, float(load @ values))))
                 return
             chosen |= violated
 
-    def _difference(self, block: SparseMatrix, excess: Array, lam: Array) -> Array:
-        """ν − λ on the rows I of a block of B, from s and λ there."""
-        S = (block @ (block @ self._C).T) / self._gamma
+    def _difference(self, chosen: Mask, excess: Array, size: Array) -> Array:
+        """ν − λ (m,) with ν = 0 on rows that are not chosen."""
+        lam, rows = self._lam, np.flatnonzero(chosen)
+        found = np.where(chosen | (lam * size <= NEGLIGIBLE * np.abs(excess)), 0.0, -lam)
+        if not len(rows):
+            return found
+        block, wanted = _rows(self._B, chosen), excess[rows]
+        if found.any():
+            wanted = wanted - block @ (self._compliance @ (self._B.T @ found)) / self._gamma
+        S = self._compliance.between(block) / self._gamma
         S[np.diag_indices_from(S)] += REGULAR * S.diagonal().max()
         factor, singular = dpotrf(S, lower=1, clean=0)
-        if singular:
-            return np.asarray(np.linalg.lstsq(S, excess)[0])
-        return _complementary(factor, excess, lam) - lam
+        found[rows] = (
+            np.linalg.lstsq(S, wanted)[0] if singular else _complementary(factor, wanted, lam[rows]) - lam[rows]
+        )
+        return found
+
+
+def _rows(B: SparseMatrix, chosen: Mask) -> SparseMatrix:
+    """The chosen rows of a matrix; faster than its own selection, which checks indices."""
+    counts = np.diff(B.indptr)
+    kept = np.repeat(chosen, counts)
+    ends = np.concatenate([np.zeros(1, B.indptr.dtype), np.cumsum(counts[chosen], dtype=B.indptr.dtype)])
+    return sp.csr_array((B.data[kept], B.indices[kept], ends), (len(ends) - 1, B.shape[1]))
 
 
 def _complementary(factor: Array, excess: Array, lam: Array) -> Array:
@@ -213,4 +287,7 @@ def _complementary(factor: Array, excess: Array, lam: Array) -> Array:
         v[rows] = np.linalg.solve(among[rows], -fixed[rows])
         nu = fixed + among @ v[rows]
         nu[rows] = 0.0
+    else:  # it cycles, which it may where S is no M-matrix: the same minimiser, at more cost
+        L = np.tril(factor)
+        nu = nnls(L.T, L.T @ lam + solve_triangular(L, excess, lower=True, check_finite=False))[0]
     return np.maximum(nu, 0.0)

@@ -30,8 +30,8 @@ those that are kept."""
 NEGLIGIBLE = 1e-12
 """Contributions below this share of the largest one are not worth computing."""
 
-FEW = 1000
-"""All directions of up to so many terms are kept."""
+FEW, SHARE_OF_FEW = 1000, 0.25
+"""Of up to so many terms all principal directions are computed, and this share of the above is left out."""
 
 MOST, OVERSAMPLING = 800, 100
 """Largest number of principal directions, and how many more a randomised method computes."""
@@ -116,19 +116,24 @@ def _worth_keeping(largest: Array, mean: Array, allowed: float) -> Indices:
 def _directions(scaled: Array, allowed: float) -> tuple[Array, float]:
     """Orthonormal basis (n×K) of the columns (n×p) up to a remainder of norm `allowed`, and a bound of this norm.
 
-    All of the columns where they are few, or `MOST` principal directions not enough: then nothing remains.
+    All of the columns where `MOST` principal directions are not enough, or few of the columns are saved: then nothing
+    remains.
     """
-    if scaled.shape[1] > FEW:
-        mixed = scaled @ np.random.default_rng(0).standard_normal((scaled.shape[1], MOST + OVERSAMPLING))
+    count = scaled.shape[1]
+    if count > FEW:
+        mixed = scaled @ np.random.default_rng(0).standard_normal((count, MOST + OVERSAMPLING))
         Q = np.linalg.qr(mixed)[0]  # a randomised range finder (Halko, Martinsson and Tropp, 2011)
         Q = np.linalg.qr(scaled @ (scaled.T @ Q))[0]
-        rest = float(np.linalg.norm(_beside(Q, scaled)))
-        left, sigma, _ = np.linalg.svd(Q.T @ scaled, full_matrices=False)
-        remainders = np.hypot(np.append(sigma, 0.0), rest)
-        count = int(np.argmax(remainders <= allowed))
-        if remainders[count] <= allowed and count <= MOST:
-            return Q @ left[:, :count], float(remainders[count])
-    return np.linalg.qr(scaled)[0], 0.0  # but for round-off
+        small, rest = Q.T @ scaled, float(np.linalg.norm(_beside(Q, scaled)))
+    else:
+        Q, small = np.linalg.qr(scaled)
+        rest, allowed = 0.0, allowed * SHARE_OF_FEW  # but for round-off
+    left, sigma, _ = np.linalg.svd(small, full_matrices=False)
+    remainders = np.hypot(np.append(sigma, 0.0), rest)
+    enough = int(np.argmax(remainders <= allowed))
+    if remainders[enough] <= allowed and enough <= min(MOST, 0.7 * count):
+        return Q @ left[:, :enough], float(remainders[enough])
+    return (Q if count <= FEW else np.linalg.qr(scaled)[0]), 0.0
 
 
 def _beside(U: Array, columns: Array) -> Array:
