@@ -299,8 +299,8 @@ FAULTS = (
     Fault(
         "directions-left-out-and-forgotten",
         "vibench/model/certificates/residual.py",
-        "float(remainders[count])",
-        "0.0 * float(remainders[count])",
+        "float(remainders[enough])",
+        "0.0 * float(remainders[enough])",
         ("tests/unit/model/certificates/test_residual.py",),
     ),
     Fault(
