@@ -2,19 +2,14 @@
 
 from __future__ import annotations
 
-import os
-import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-import pytest
+from chromium import BROWSERS, program
 from selenium import webdriver
 from selenium.webdriver.chrome.service import Service
-
-REQUIRED = "VIBENCH_NEEDS_BROWSER"
-"""Where this is set, a missing browser is a failure."""
 
 OPTIONS = (
     "--headless=new", "--no-sandbox", "--disable-gpu", "--disable-dev-shm-usage", "--hide-scrollbars",
@@ -25,13 +20,7 @@ OPTIONS = (
 @contextmanager
 def chromium(downloads: Path) -> Iterator[webdriver.Chrome]:
     """A browser that saves what it downloads in a folder; skips, or fails, where there is none."""
-    found = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
-    driver = shutil.which("chromedriver")
-    if found is None or driver is None:
-        reason = "no Chromium is installed, which Debian's packages 'chromium' and 'chromium-driver' provide"
-        if os.environ.get(REQUIRED):
-            pytest.fail(reason)
-        pytest.skip(reason)
+    found, driver = program("chromium", *BROWSERS), program("chromium-driver", "chromedriver")
     options = webdriver.ChromeOptions()
     options.binary_location = found
     for option in OPTIONS:

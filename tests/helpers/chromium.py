@@ -31,11 +31,15 @@ addEventListener("load", () => {
 </script></body>"""
 
 
-def chromium() -> str:
-    """A Chromium on this machine; the test is skipped, or fails where one is required, if there is none."""
-    found = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+BROWSERS = ("chromium", "chromium-browser", "google-chrome")
+"""Names under which it is installed."""
+
+
+def program(package: str, *names: str) -> str:
+    """A program on this machine, by any of its names; the test is skipped, or fails where one is required, without."""
+    found = next(filter(None, map(shutil.which, names)), None)
     if found is None:
-        reason = "no Chromium is installed, which Debian's package 'chromium' provides"
+        reason = f"{names[0]} is not installed, which Debian's package '{package}' provides"
         if os.environ.get(REQUIRED):
             pytest.fail(reason)
         pytest.skip(reason)
@@ -47,7 +51,7 @@ def observed(page: Path, script: str, scratch: Path, *, width: int = 1280, fragm
 
     The page is opened where it is, so that its links and sources are its own; nothing may be said on the console.
     """
-    browser = chromium()
+    browser = program("chromium", *BROWSERS)
     text = page.read_text(encoding="utf-8")
     probed = page.with_name(f"probed-{page.name}")
     probed.write_text(text.replace("<head>", "<head>" + BEFORE).replace("</body>", AFTER % script), encoding="utf-8")
