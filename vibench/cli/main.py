@@ -1,4 +1,4 @@
-"""The command line: the commands that run studies and look after the machine, and the entry point.
+"""The command line: the commands that run studies and look after the machine, and what runs them all.
 
 Help and completion have to answer at once, so modules that define commands import nothing heavy at the top (no numpy,
 pandas, rich or pydantic): every command imports what it needs when it runs.
@@ -12,33 +12,32 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
+import typer
+from typer import Argument, Option
+
+from vibench.cli import result_commands
+from vibench.cli.bench_command import bench_plugins
+from vibench.cli.completion import examples, names, solvers, studies, whole_words
+from vibench.cli.export_commands import export_reduced_model
 from vibench.cli.interrupts import INTERRUPTED, Interrupted, interrupted_at_once, interruptible
-
-with interrupted_at_once():
-    import typer
-    from typer import Argument, Option
-
-    from vibench.cli import result_commands
-    from vibench.cli.bench_command import bench_plugins
-    from vibench.cli.completion import examples, names, solvers, studies, whole_words
-    from vibench.cli.export_commands import export_reduced_model
-    from vibench.cli.pack_commands import import_pack, reduce_cones, write_pack
-    from vibench.cli.plugin_commands import check_plugin, list_plugins, new_plugin
-    from vibench.cli.publish_command import publish_runs
-    from vibench.cli.result_commands import (
-        compare_runs,
-        diff_runs,
-        draw_figures,
-        export_qps,
-        replay_query,
-        show,
-        write_report,
-    )
-    from vibench.errors import RequestError, VibenchError
-    from vibench.terminal.output import echo
-    from vibench.text import unbroken
+from vibench.cli.pack_commands import import_pack, reduce_cones, write_pack
+from vibench.cli.plugin_commands import check_plugin, list_plugins, new_plugin
+from vibench.cli.publish_command import publish_runs
+from vibench.cli.result_commands import (
+    compare_runs,
+    diff_runs,
+    draw_figures,
+    export_qps,
+    replay_query,
+    show,
+    write_report,
+)
+from vibench.errors import RequestError, VibenchError
+from vibench.terminal.output import echo
+from vibench.text import unbroken
 
 if TYPE_CHECKING:
+    from vibench.execution.run import Outcome
     from vibench.study.spec import Study
 
 Names = list[str] | None
@@ -111,10 +110,7 @@ def run(
     """Run a study. An interrupted run resumes where it stopped."""
     with interrupted_at_once():  # the libraries and plugins of a study take a second to import
         from vibench.execution.run import Options, run_study
-        from vibench.qp.status import Status
-        from vibench.results import tables
         from vibench.study.cells import expand
-        from vibench.terminal import run_summary
         from vibench.terminal.console import new_console
         from vibench.terminal.progress import ProgressDisplay
 
@@ -133,6 +129,15 @@ def run(
     options = Options(jobs, fresh, retry, executor, scheduler)
     with ProgressDisplay(new_console()) as progress:
         outcome = run_study(loaded, folder, progress, options)
+    _conclude(loaded.name, outcome, folder, draw=options.workers if draw else None, fresh=fresh, strict=strict)
+
+
+def _conclude(name: str, outcome: Outcome, folder: Path, *, draw: int | None, fresh: bool, strict: bool) -> None:
+    """Export, print and draw what a run found, on as many processes as `draw` says; exit as its statuses ask for."""
+    from vibench.qp.status import Status
+    from vibench.results import tables
+    from vibench.terminal import run_summary
+
     path = tables.results_file(str(folder))
     tables.export(path, folder / "tables")
     if outcome.damaged:
@@ -142,16 +147,17 @@ def run(
         again = "the same command without --fresh" if fresh else "the same command"
         echo(f"interrupted: {missing}; {again} resumes the run")
         raise typer.Exit(INTERRUPTED)
-    run_summary.print_summary(loaded.name, path, outcome.rows)
+    run_summary.print_summary(name, path, outcome.rows)
     echo(f"results: {path}, tables: {folder / 'tables'}")
-    if draw or fresh:
+    if fresh or draw is not None:
         from vibench.report import figures
 
         figures.remove(folder / "figures")
-    if draw:
-        result_commands.draw(path, folder / "figures", options.workers)
+    if draw is not None:
+        result_commands.draw(path, folder / "figures", draw)
     statuses = [row["status"] for row in outcome.rows]
-    run_summary.next_steps(folder, len(statuses), len(statuses) - statuses.count(Status.OK), figures=draw)
+    fine = statuses.count(Status.OK)
+    run_summary.next_steps(folder, len(statuses), len(statuses) - fine, figures=draw is not None)
     if strict and any(status not in (Status.OK, Status.UNAVAILABLE) for status in statuses):
         raise typer.Exit(1)
     if set(statuses) == {Status.UNAVAILABLE}:
@@ -242,8 +248,11 @@ for _name, _command in COMMANDS.items():
     app.command(_name, epilog=examples(_name))(interruptible(_command))
 
 
-def main() -> None:
-    """Entry point: an expected error is one line; exit code 2 for a wrong request, 1 for anything else."""
+def run_command_line() -> None:
+    """Run the command that `sys.argv` gives.
+
+    An expected error is one line; the exit code is 2 for a wrong request, 1 for anything else.
+    """
     usage_error = typer.BadParameter.__mro__[2]  # click's ClickException, whichever copy of click typer brings
     try:
         _search_working_directory_last()

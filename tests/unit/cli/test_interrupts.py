@@ -1,0 +1,54 @@
+"""What Ctrl-C does outside of commands, in them, and where it was ignored; with signals: tests/faults."""
+
+from __future__ import annotations
+
+import os
+import signal
+from collections.abc import Iterator
+
+import pytest
+
+from vibench.cli.interrupts import Interrupted, interrupted_at_once, interruptible
+
+
+@pytest.fixture(autouse=True)
+def handler() -> Iterator[object]:
+    """The handler of Ctrl-C that Python starts with; the one of the test process comes back."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield signal.default_int_handler
+    signal.signal(signal.SIGINT, before)
+
+
+def now() -> object:
+    return signal.getsignal(signal.SIGINT)
+
+
+def test_a_command_can_catch_what_ends_the_process_outside(handler: object) -> None:
+    seen = []
+    with interrupted_at_once():
+        outside = now()
+        interruptible(lambda: seen.append(now()))()
+        assert now() is outside
+    assert outside is not handler
+    assert seen == [handler]
+    assert now() is handler
+
+
+def test_an_interrupted_command_raises_what_the_command_line_reports() -> None:
+    with interrupted_at_once(), pytest.raises(Interrupted):
+        interruptible(lambda: os.kill(os.getpid(), signal.SIGINT))()
+
+
+def test_a_command_may_ignore_interrupts_for_good() -> None:
+    with interrupted_at_once():
+        interruptible(lambda: signal.signal(signal.SIGINT, signal.SIG_IGN))()  # type: ignore[arg-type, return-value]
+        assert now() is signal.SIG_IGN
+    assert now() is signal.SIG_IGN
+
+
+def test_interrupts_that_are_ignored_remain_so() -> None:
+    """As in a script that runs a command in the background."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    with interrupted_at_once():
+        interruptible(lambda: os.kill(os.getpid(), signal.SIGINT))()
+        assert now() is signal.SIG_IGN
