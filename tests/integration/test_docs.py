@@ -30,6 +30,7 @@ import vibench
 from vibench.cli.main import app
 from vibench.errors import RequestError
 from vibench.results import columns, tables
+from vibench.study.cells import expand
 from vibench.study.entries import Entry, ProblemEntry, SamplingEntry
 from vibench.study.reader import read_study
 from vibench.study.registry import GROUPS
@@ -271,6 +272,13 @@ def _described(docstring: str) -> list[str]:
 CALLABLE = [
     name for name in vibench.__all__ if inspect.isfunction(thing := getattr(vibench, name)) or inspect.isclass(thing)
 ]
+
+
+def test_the_study_of_the_readme_is_one(tmp_path: Path) -> None:
+    (text,) = (code for language, _, code in blocks(ROOT / "README.md") if language == "toml")
+    path = tmp_path / "my-study.toml"
+    path.write_text(text, encoding="utf-8")
+    assert len(expand(read_study(str(path)))) == 128
 
 
 @pytest.mark.parametrize("name", CALLABLE)
