@@ -21,7 +21,7 @@ from running import Changed, Main, Register, Vibench, execute
 from samples import install_fakes
 from threadpoolctl import threadpool_limits
 
-from vibench.cli import entry
+from vibench.cli import start
 from vibench.results.database import FILE
 from vibench.storage.artefacts import CACHE_VARIABLE
 from vibench.study import entry_points, registry
@@ -142,7 +142,7 @@ def main(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tm
     def call(*arguments: str) -> tuple[int, str, str]:
         monkeypatch.setattr(sys, "argv", ["vibench", *arguments])
         with pytest.raises(SystemExit) as caught:
-            entry.main()
+            start()
         printed = capsys.readouterr()
         return int(caught.value.code or 0), printed.out, printed.err
 

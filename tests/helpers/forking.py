@@ -52,6 +52,6 @@ def _main(
     sys.path[:], sys.argv = path, ["vibench", *arguments]
     for descriptor, file in zip((1, 2), printed, strict=True):
         os.dup2(os.open(file, os.O_WRONLY | os.O_CREAT | os.O_TRUNC), descriptor)
-    from vibench.cli.entry import main  # noqa: PLC0415  in this process and no earlier
+    from vibench.cli import start  # noqa: PLC0415  in this process and no earlier
 
-    main()
+    start()

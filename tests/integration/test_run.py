@@ -217,7 +217,7 @@ def test_only_an_edit_of_what_computes_numbers_runs_anything_again(
     study = write_study(tmp_path, wire_study())
 
     def vibench(*arguments: str) -> str:
-        program = "import sys; from vibench.cli.entry import main; sys.argv[0] = 'vibench'; main()"
+        program = "import sys; from vibench.cli import start; sys.argv[0] = 'vibench'; start()"
         path = os.pathsep.join(map(str, (edited_core, plugins_folder)))
         done = subprocess.run(
             [sys.executable, "-c", program, *arguments],

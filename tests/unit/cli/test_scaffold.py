@@ -47,7 +47,7 @@ def installed(written: dict[str, Path], tmp_path_factory: pytest.TempPathFactory
     return run
 
 
-COMMAND = ("-c", "from vibench.cli.entry import main; main()")
+COMMAND = ("-c", "from vibench.cli import start; start()")
 
 
 def test_the_tests_of_new_packages_are_green(written: dict[str, Path], installed: Run, tmp_path: Path) -> None:
