@@ -6,7 +6,7 @@ import base64
 import io
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from multiprocessing import get_context
 from typing import Any
 
@@ -18,7 +18,7 @@ from matplotlib.lines import Line2D
 from PIL import Image
 
 from vibench.arrays import Array
-from vibench.report.figures import OF_DUAL, OF_PROBLEM, Drawing
+from vibench.report.figures import OF_DUAL, OF_HISTORIES, OF_PROBLEM, Drawing
 from vibench.report.figures.data import Data
 from vibench.report.figures.plugins import FigureError
 from vibench.report.figures.style import caption_of, styled
@@ -57,12 +57,18 @@ def stills(known: Known, jobs: int = 1) -> tuple[list[Still], list[str]]:
 
 
 def _in_parallel(known: Known, jobs: int) -> list[Still | str | None]:
-    """All pictures in their order. Those of plugins are drawn here: their functions need not go to other processes."""
-    shared = [k for k, (_, draw, _) in enumerate(known) if draw in {*OF_PROBLEM.values(), *OF_DUAL.values()}]
+    """All pictures in their order.
+
+    Those of plugins are drawn here, since their functions need not go to other processes, and so are those of
+    histories: of a large study these are millions of rows, which take longer to send than their few lines to draw.
+    """
+    elsewhere = {*OF_PROBLEM.values(), *OF_DUAL.values()} - OF_HISTORIES
+    shared = [k for k, (_, draw, _) in enumerate(known) if draw in elsewhere]
     own = [k for k in range(len(known)) if k not in set(shared)]
     shares = [[*shared[0::jobs], *own], *(shared[k::jobs] for k in range(1, jobs))]
+    sent = [(name, draw, replace(data, histories=data.histories.iloc[:0])) for name, draw, data in known]
     with ProcessPoolExecutor(jobs - 1, get_context("spawn")) as pool:
-        others = [pool.submit(_draw_all, [known[k] for k in share]) for share in shares[1:]]
+        others = [pool.submit(_draw_all, [sent[k] for k in share]) for share in shares[1:]]
         drawn = [_draw_all([known[k] for k in shares[0]]), *(other.result() for other in others)]
     placed = {k: one for share, found in zip(shares, drawn, strict=True) for k, one in zip(share, found, strict=True)}
     return [placed[k] for k in range(len(known))]
