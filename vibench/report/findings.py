@@ -215,13 +215,14 @@ def _errors(cell: Any) -> str:
 
 def _stability(cells: pd.DataFrame, compared: Comparable) -> Said:
     """Effect of the enrichments on the inf-sup constant over the span and on the error of the multiplier."""
+    errors = dict(zip(compared.cells["cell"], compared.cells["error_lambda_mean"], strict=True))
     for row in cells[cells["enrichment_kind"] == Kind.NONE].head(1).itertuples():
         if np.isfinite(row.beta_span_min):
             value = "zero" if row.beta_span_min < VANISHES else f"{row.beta_span_min:.3g}"
             yield (
                 Weight.COMPARISON,
                 f"Without enrichment, min β over the span is {value} and min β over the cone at least "
-                f"{row.beta_cone_lower_min:.3g}{_mean_error(row.cell, compared)}.",
+                f"{row.beta_cone_lower_min:.3g}{_mean_error(errors.get(row.cell), compared.over)}.",
             )
     fixed = cells[(cells["enrichment_kind"] == Kind.FIXED) & np.isfinite(cells["beta_span_min"])]
     for row in fixed.drop_duplicates(PRIMAL).itertuples():
@@ -229,14 +230,13 @@ def _stability(cells: pd.DataFrame, compared: Comparable) -> Said:
             Weight.COMPARISON,
             f"{label(row.primal, row.primal_tol)} adds {row.enrichment:.0f} vectors, with which min β over the span is "
             f"{row.beta_span_min:.3g}, at every validation parameter at least {100.0 * row.share_validation:.0f} % of "
-            f"the constant of the whole of V{_mean_error(row.cell, compared)}.",
+            f"the constant of the whole of V{_mean_error(errors.get(row.cell), compared.over)}.",
         )
 
 
-def _mean_error(cell: str, compared: Comparable) -> str:
+def _mean_error(error: float | None, over: str) -> str:
     """The mean error of λ of a cell over the queries that the cells it is compared with solved, too; "" without one."""
-    found = compared.cells.set_index("cell")["error_lambda_mean"].get(cell)
-    return "" if found is None or pd.isna(found) else f"; the mean error of λ is {found:.3g}{compared.over}"
+    return "" if error is None or pd.isna(error) else f"; the mean error of λ is {error:.3g}{over}"
 
 
 def _off_training(data: Data) -> Said:

@@ -22,7 +22,7 @@ from vibench.report.figures.data import Data, label, problems
 from vibench.report.leaderboard import Criterion, Winner, leaderboard
 from vibench.report.page import plots
 from vibench.report.page.embedded import Grid, grid_of, grid_of_cells, grid_of_thresholds, script_safe, to_json
-from vibench.report.page.stills import stills
+from vibench.report.page.stills import Helpers, helpers, stills
 from vibench.results import pictures, tables
 from vibench.results.best import LARGEST_BAND
 from vibench.results.database import read_meta, study_of
@@ -70,6 +70,11 @@ def write(path: Path, target: Path, jobs: int = 1) -> Path:
 
 def page(path: Path, jobs: int = 1) -> str:
     """The page of a results file, its pictures drawn by so many processes."""
+    with helpers(jobs) as others:
+        return _page(path, others)
+
+
+def _page(path: Path, others: Helpers | None) -> str:
     study, read = study_of(path, read_meta(path)), {name: tables.read(path, name) for name in SHARED}
     cells, known = tables.in_order(read["cells"]), list(problems(path, read))
     grids = list(_grids(read, cells))
@@ -80,7 +85,7 @@ def page(path: Path, jobs: int = 1) -> str:
     rows = {str(cell): k for k, cell in enumerate(cells["cell"])}
     live = [plot for name, data in known for plot in plots.plots(name, data, rows)]
     few = [one for name, data in known for one in for_report(name, data, _leading_duals(data))]
-    drawn, undrawable = stills(few, jobs)
+    drawn, undrawable = stills(few, others)
     template = _environment().get_template("report.html.j2")
     return template.render(
         study=study.get("name", path.parent.name),

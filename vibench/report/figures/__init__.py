@@ -225,7 +225,7 @@ def draw_all(
         if jobs > 1:
             pool = ProcessPoolExecutor(jobs - 1, get_context("spawn"))
             stack.callback(pool.shutdown, cancel_futures=True)
-            with _interrupts_ignored():  # the processes inherit it: Ctrl-C is for this one to handle
+            with interrupts_ignored():  # the processes inherit it: Ctrl-C is for this one to handle
                 others = {k: pool.submit(_draw, path, folder, formats, k) for k in reversed(range(len(known)))}
         # the others draw from the last figure on, this process from the first one on what they have not begun
         for k in range(len(known)):
@@ -265,7 +265,7 @@ def _draw(path: Path, folder: Path, formats: tuple[str, ...], number: int) -> Wr
 
 
 @contextlib.contextmanager
-def _interrupts_ignored() -> Iterator[None]:
+def interrupts_ignored() -> Iterator[None]:
     """Ignore Ctrl-C inside the block, and in the processes that start there."""
     if threading.current_thread() is not threading.main_thread():
         yield
