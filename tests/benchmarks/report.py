@@ -3,13 +3,15 @@
     python tests/benchmarks/report.py FOLDER [RUN]
 
 Results of 704 cells with 32 queries each and of 20,000 cells with one are made of the cells of RUN, a run of the study
-`quick` (FOLDER/quick by default, which is run where it is missing). The command ends with exit code 1 if the report of
-704 cells takes ten seconds to write, five megabytes, or two seconds to open, or if one of the pages does not open.
+`quick` (FOLDER/quick by default, which is run where it is missing). Printed are also CPU seconds and the memory of the
+largest process. The command ends with exit code 1 if the report of 704 cells takes ten seconds to write, five
+megabytes, or two seconds to open, or if one of the pages does not open.
 """
 
 from __future__ import annotations
 
 import os
+import resource
 import subprocess
 import sys
 import sysconfig
@@ -68,8 +70,13 @@ def main() -> int:
             write_many(run, results, cells, queries)
         page = results / "report.html"
         written, used = command("report", str(results), "--out", str(page))
+        most = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 2**20  # of one process, in KiB on Linux
         size, seconds = page.stat().st_size / 1e6, opened(page, folder)
-        print(f"{cells} cells: {written:.1f} s to write ({used:.1f} s of CPU), {size:.2f} MB, {seconds:.2f} s to open")
+        print(
+            f"{cells} cells: {written:.1f} s to write ({used:.1f} s of CPU, {most:.1f} GiB), {size:.2f} MB, "
+            f"{seconds:.2f} s to open",
+            flush=True,
+        )
         asked = written < SECONDS_TO_WRITE and size < MEGABYTES and seconds < SECONDS_TO_OPEN
         missed |= cells == min(SIZES) and not asked
     return int(missed)

@@ -98,7 +98,7 @@ def outputs(path: Path) -> list[str]:
 
 
 def page(path: Path) -> str:
-    with mock.patch.object(html, "drawings_of", return_value=()):
+    with mock.patch.object(html, "for_report", return_value=()):
         return html.page(path)
 
 

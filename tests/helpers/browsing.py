@@ -2,19 +2,38 @@
 
 from __future__ import annotations
 
+import os
+import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from chromium import BROWSERS, program
+import pytest
 from selenium import webdriver
 from selenium.webdriver.chrome.service import Service
+
+REQUIRED = "VIBENCH_NEEDS_BROWSER"
+"""Where this is set, a missing browser is a failure."""
+
+BROWSERS = ("chromium", "chromium-browser", "google-chrome")
+"""Names under which it is installed."""
 
 OPTIONS = (
     "--headless=new", "--no-sandbox", "--disable-gpu", "--disable-dev-shm-usage", "--hide-scrollbars",
     "--host-resolver-rules=MAP * ~NOTFOUND", "--force-color-profile=srgb",
 )  # fmt: skip
+
+
+def program(package: str, *names: str) -> str:
+    """A program on this machine, by any of its names; the test is skipped, or fails where one is required, without."""
+    found = next(filter(None, map(shutil.which, names)), None)
+    if found is None:
+        reason = f"{names[0]} is not installed, which Debian's package '{package}' provides"
+        if os.environ.get(REQUIRED):
+            pytest.fail(reason)
+        pytest.skip(reason)
+    return found
 
 
 @contextmanager
@@ -49,3 +68,13 @@ def look(browser: webdriver.Chrome, page: Path, *, width: int = 1280, theme: str
 def complaints(browser: webdriver.Chrome) -> list[Any]:
     """Errors and warnings in the console since the last call."""
     return [entry["message"] for entry in browser.get_log("browser") if entry["level"] in {"SEVERE", "WARNING"}]
+
+
+def observed(
+    browser: webdriver.Chrome, page: Path, script: str, *, width: int = 1280, fragment: str = ""
+) -> dict[str, Any]:
+    """What a script returns on a page once it is loaded; neither of them may have errors, or say anything."""
+    look(browser, page, width=width, fragment=fragment)
+    found = dict(browser.execute_script(script))
+    assert complaints(browser) == []
+    return found

@@ -55,6 +55,8 @@ def show(
     found = views.look_up(path, table, columns=parts(columns), where=where, sort=parts(sort), limit=limit)
     if form == "terminal":
         print_frame(found.readable, f"{path.parent.name}: {table}", found.priority, axes=found.axes, every=found.chosen)
+        if found.rows.empty and found.view.empty:
+            echo(found.view.empty)
     else:
         sys.stdout.write(tables.FORMS[form](found.exact if form in {"csv", "json"} else found.readable))
 

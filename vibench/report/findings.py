@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from enum import IntEnum
 from pathlib import Path
@@ -59,14 +59,27 @@ Said = Iterator[tuple[Weight, str]]
 def findings(path: Path) -> dict[str, list[str]]:
     """Sentences on completeness, stability, errors, costs and solvers by subject, "" for the whole run."""
     found = defaultdict[str, list[str]](list)
-    for one in all_findings(path, problems(path)):
+    read = {name: tables.read(path, name) for name in READ}
+    for one in all_findings(read, problems(path, read)):
         found[one.subject].append(one.text)
     return dict(found)
 
 
-def all_findings(path: Path, known: Iterable[tuple[str, Data]]) -> list[Finding]:
-    """Every finding of a run, by subject: the whole run, then problem by problem, of which `known` has the data."""
-    found = list(_about("", _whole_run(path)))
+READ = ("cells", "queries", "disagreements")
+"""Tables that findings on the whole run are made from."""
+
+
+def all_findings(read: Mapping[str, pd.DataFrame], known: Iterable[tuple[str, Data]]) -> list[Finding]:
+    """Every finding of a run, by subject: the whole run, then problem by problem.
+
+    Parameters
+    ----------
+    read
+        The tables `READ` of the run.
+    known
+        What `problems` finds: the names of the problems, and their data.
+    """
+    found = list(_about("", _whole_run(read)))
     for name, data in known:
         found += _about(name, _answer(data))
         for title, cells in by_dimensions(best_solver(data.cells)):
@@ -97,8 +110,8 @@ def leading(found: Iterable[Finding], most: int = MOST) -> list[Finding]:
     return [one for *_, one in sorted(ranked, key=lambda entry: entry[:2])][:most]
 
 
-def _whole_run(path: Path) -> Said:
-    cells, queries = tables.read(path, "cells"), tables.read(path, "queries")
+def _whole_run(read: Mapping[str, pd.DataFrame]) -> Said:
+    cells, queries = read["cells"], read["queries"]
     ok = int((cells["status"] == Status.OK).sum())
     count, accurate = (int(cells[name].fillna(0).sum()) for name in ("queries", "queries_ok"))
     yield (
@@ -118,7 +131,7 @@ def _whole_run(path: Path) -> Said:
             Weight.WHOLE_RUN,
             f"The invariants of the inf-sup constants and the error bounds hold in all {len(queries)} queries.",
         )
-    disagreements = tables.read(path, "disagreements")
+    disagreements = read["disagreements"]
     if agreement := sentence(disagreements, cells["solver"].nunique()):
         flagged = bool(disagreements["flagged"].sum())
         yield Weight.ALARM if flagged else Weight.WHOLE_RUN, f"{agreement[:1].upper()}{agreement[1:]}."
@@ -202,13 +215,14 @@ def _errors(cell: Any) -> str:
 
 def _stability(cells: pd.DataFrame, compared: Comparable) -> Said:
     """Effect of the enrichments on the inf-sup constant over the span and on the error of the multiplier."""
+    errors = dict(zip(compared.cells["cell"], compared.cells["error_lambda_mean"], strict=True))
     for row in cells[cells["enrichment_kind"] == Kind.NONE].head(1).itertuples():
         if np.isfinite(row.beta_span_min):
             value = "zero" if row.beta_span_min < VANISHES else f"{row.beta_span_min:.3g}"
             yield (
                 Weight.COMPARISON,
                 f"Without enrichment, min β over the span is {value} and min β over the cone at least "
-                f"{row.beta_cone_lower_min:.3g}{_mean_error(row.cell, compared)}.",
+                f"{row.beta_cone_lower_min:.3g}{_mean_error(errors.get(row.cell), compared.over)}.",
             )
     fixed = cells[(cells["enrichment_kind"] == Kind.FIXED) & np.isfinite(cells["beta_span_min"])]
     for row in fixed.drop_duplicates(PRIMAL).itertuples():
@@ -216,14 +230,13 @@ def _stability(cells: pd.DataFrame, compared: Comparable) -> Said:
             Weight.COMPARISON,
             f"{label(row.primal, row.primal_tol)} adds {row.enrichment:.0f} vectors, with which min β over the span is "
             f"{row.beta_span_min:.3g}, at every validation parameter at least {100.0 * row.share_validation:.0f} % of "
-            f"the constant of the whole of V{_mean_error(row.cell, compared)}.",
+            f"the constant of the whole of V{_mean_error(errors.get(row.cell), compared.over)}.",
         )
 
 
-def _mean_error(cell: str, compared: Comparable) -> str:
+def _mean_error(error: float | None, over: str) -> str:
     """The mean error of λ of a cell over the queries that the cells it is compared with solved, too; "" without one."""
-    found = compared.cells.set_index("cell")["error_lambda_mean"].get(cell)
-    return "" if found is None or pd.isna(found) else f"; the mean error of λ is {found:.3g}{compared.over}"
+    return "" if error is None or pd.isna(error) else f"; the mean error of λ is {error:.3g}{over}"
 
 
 def _off_training(data: Data) -> Said:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from importlib.resources import files
 from itertools import groupby
 from pathlib import Path
@@ -17,12 +17,12 @@ from vibench.errors import RequestError
 from vibench.files import write_atomically
 from vibench.qp.status import Status
 from vibench.report import findings
-from vibench.report.figures import OF_DUAL, Drawing, drawings_of
+from vibench.report.figures import for_report
 from vibench.report.figures.data import Data, label, problems
 from vibench.report.leaderboard import Criterion, Winner, leaderboard
 from vibench.report.page import plots
 from vibench.report.page.embedded import Grid, grid_of, grid_of_cells, grid_of_thresholds, script_safe, to_json
-from vibench.report.page.stills import stills
+from vibench.report.page.stills import Helpers, helpers, stills
 from vibench.results import pictures, tables
 from vibench.results.best import LARGEST_BAND
 from vibench.results.database import read_meta, study_of
@@ -34,6 +34,12 @@ ERRORS = (
     "others, columns u = 0 and λ = 0 have their number and their largest error over the largest training norm. Means "
     "over other queries are not comparable: findings and figures take those over queries that all solved."
 )
+
+SHARED = ("cells", "queries", "thresholds", "disagreements")
+"""Tables from which findings, tables and figures are all made: they are read once."""
+
+FOLDED = 300
+"""Findings that can be unfolded; thousands of a large study would be read by nobody."""
 
 IDENTITY = ["problem", "dual", "primal", "primal_tol", "solver", "accuracy", "assembly", "status"]
 """Columns that cells and queries share in the tables of failures."""
@@ -64,18 +70,22 @@ def write(path: Path, target: Path, jobs: int = 1) -> Path:
 
 def page(path: Path, jobs: int = 1) -> str:
     """The page of a results file, its pictures drawn by so many processes."""
-    cells = tables.in_order(tables.read(path, "cells"))
-    study, known = study_of(path, read_meta(path)), list(problems(path))
-    grids = list(_grids(path, cells))
-    found = findings.all_findings(path, known)
-    first = findings.leading(found)
-    rest = [one for one in found if one not in first]
+    with helpers(jobs) as others:
+        return _page(path, others)
+
+
+def _page(path: Path, others: Helpers | None) -> str:
+    study, read = study_of(path, read_meta(path)), {name: tables.read(path, name) for name in SHARED}
+    cells, known = tables.in_order(read["cells"]), list(problems(path, read))
+    grids = list(_grids(read, cells))
+    found = findings.all_findings(read, known)
+    first, kept = findings.leading(found), set(findings.leading(found, findings.MOST + FOLDED))
+    rest = [one for one in found if one in kept and one not in first]
     key_length = short_keys(cells["cell"])
     rows = {str(cell): k for k, cell in enumerate(cells["cell"])}
     live = [plot for name, data in known for plot in plots.plots(name, data, rows)]
-    every = {name: list(drawings_of([(name, data)])) for name, data in known}
-    few = [one for name, data in known for one in _few(data, every[name])]
-    drawn, undrawable = stills(few, jobs)
+    few = [one for name, data in known for one in for_report(name, data, _leading_duals(data))]
+    drawn, undrawable = stills(few, others)
     template = _environment().get_template("report.html.j2")
     return template.render(
         study=study.get("name", path.parent.name),
@@ -86,6 +96,7 @@ def page(path: Path, jobs: int = 1) -> str:
         way=_way,
         short=lambda cell: str(cell)[:key_length],
         findings=first,
+        findings_left_out=len(found) - len(first) - len(rest),
         more_findings=[(subject, list(group)) for subject, group in groupby(rest, key=lambda one: one.subject)],
         cells=len(cells),
         failed=int((cells["status"] != Status.OK).sum()),
@@ -95,7 +106,7 @@ def page(path: Path, jobs: int = 1) -> str:
         ],
         grids=grids,
         stills=drawn,
-        undrawn=sum(map(len, every.values())) - len(few),
+        cut=any(data.halved for *_, data in few) or any(len(data.duals) > MOST_DUALS for _, data in known),
         plots={plot.name: plot for plot in live},
         plots_alone=[plot for plot in live if plot.name not in {still.name for still in drawn}],
         table_data=Markup(to_json(grids)),
@@ -130,15 +141,11 @@ MOST_DUALS = 1
 """Dual strategies of a problem that have pictures of their own: those of the leaderboard first, then the others."""
 
 
-def _few(data: Data, every: list[tuple[str, Drawing, Data]]) -> Iterator[tuple[str, Drawing, Data]]:
-    """The pictures of a problem: not those of every dual strategy of a large study, nor all parts of long figures."""
+def _leading_duals(data: Data) -> list[str]:
+    """The dual strategies of a problem that have pictures of their own."""
     winners = (winner for one in leaderboard(data.cells) for band in one.bands for winner in band.winners)
     ranked = dict.fromkeys([*(str(winner.cell["dual"]) for winner in winners), *data.duals])
-    few, of_dual = set(list(ranked)[:MOST_DUALS]), set(OF_DUAL.values())
-    for one in every:
-        _, draw, mine = one
-        if (mine.page is None or mine.page[0] == 0) and (draw not in of_dual or set(mine.duals) <= few):
-            yield one
+    return list(ranked)[:MOST_DUALS]
 
 
 def _way(winner: Winner) -> str:
@@ -159,18 +166,18 @@ def _facts(study: dict[str, Any], cells: pd.DataFrame) -> Iterator[tuple[str, st
     yield "seconds", "CPU seconds of one process; the offline time of a cell includes every stage it depends on"
 
 
-def _grids(path: Path, cells: pd.DataFrame) -> Iterator[Grid]:
+def _grids(read: Mapping[str, pd.DataFrame], cells: pd.DataFrame) -> Iterator[Grid]:
     """The tables of the page, those of failures first; a table without rows is none."""
     keys = short_keys(cells["cell"])
     failed = cells[cells["status"] != Status.OK][["cell", *IDENTITY, "queries_ok", "queries", "reason"]]
-    queries = tables.read(path, "queries")
+    queries = read["queries"]
     failed_queries = queries[queries["status"] != Status.OK][["cell", "query", *IDENTITY, "reason"]]
     found = [
         grid_of("failed", "Cells that are not ok", "", failed, IDENTITY, keys),
         grid_of("failed-queries", "Queries that are not ok", "", failed_queries, IDENTITY, keys),
         grid_of_cells(cells, ERRORS),
     ]
-    thresholds = tables.read(path, "thresholds")
+    thresholds = read["thresholds"]
     model = thresholds["cell_a"].isna()
     caption = (
         "When b is cheaper than a, offline and online together, by the number of queries, with its 95 % interval; "
@@ -183,7 +190,7 @@ def _grids(path: Path, cells: pd.DataFrame) -> Iterator[Grid]:
         if len(rows):
             found.append(grid_of_thresholds(name, title, caption, rows, cells))
     caption = "Any two solvers on one reduced model: relative differences of u in V, and the differences allowed."
-    disagreements = tables.in_order(tables.read(path, "disagreements"))
+    disagreements = tables.in_order(read["disagreements"])
     disagreements = disagreements[["solver_a", *disagreements.columns.drop(["solver_a", "problem_options"])]]
     axes = ["problem", "dual", "primal", "primal_tol", "accuracy", "assembly", "solver_a", "solver_b"]
     found.append(grid_of("disagreements", "Agreement of the solvers", caption, disagreements, axes, keys))

@@ -17,6 +17,13 @@ LARGEST_BAND = 0.1
 SOLVER_SHARE = 0.1
 """Cells whose QP solver makes a larger share of an error are not compared: the solver, not the strategy, decides."""
 
+NOBODY = (
+    "no cell takes part in the comparison: one that does has every query ok, β over the span above zero at every "
+    f"parameter, mean errors of at most {100.0 * LARGEST_BAND:g} %, and less than {100.0 * SOLVER_SHARE:g} % of an "
+    "error made by the QP solver"
+)
+"""Why a run may have no best cell."""
+
 ERRORS = ("error_u_mean", "error_lambda_mean")
 
 BAND = "error_below"

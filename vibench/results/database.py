@@ -6,7 +6,8 @@ import contextlib
 import json
 import os
 import sqlite3
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -72,7 +73,7 @@ class ResultsDatabase:
             folder.mkdir(parents=True, exist_ok=True)
             self._path = path.absolute()  # SQLite may take a name that begins with "file:" for a URI
             self._db = sqlite3.connect(self._path, timeout=BUSY_SECONDS)
-            self._db.text_factory = read_text
+            self._db.text_factory = text_reader()
             self._digests = Digests(self._db)
             with contextlib.ExitStack() as opened:
                 opened.callback(self.close)
@@ -313,6 +314,15 @@ def read_text(stored: bytes) -> str:
     return printable(stored.decode("utf-8", errors="replace"))
 
 
+REMEMBERED = 1 << 16
+"""Texts that a connection remembers."""
+
+
+def text_reader() -> Callable[[bytes], str]:
+    """`read_text` for one connection: a text that most rows of a table have is read, and kept in memory, once."""
+    return lru_cache(maxsize=REMEMBERED)(read_text)
+
+
 def _refuse_other(path: Path, study: Mapping[str, Any]) -> None:
     try:
         found = read_meta(path) if path.exists() else {}
@@ -338,7 +348,7 @@ def open_read_only(path: Path) -> Iterator[sqlite3.Connection]:
     """
     with connected_read_only(path) as connection:
         connection.execute("PRAGMA trusted_schema=OFF")
-        connection.text_factory = read_text
+        connection.text_factory = text_reader()
         yield connection
 
 

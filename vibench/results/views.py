@@ -41,17 +41,20 @@ class View:
         Columns with headings and places of their own; empty where names are headings.
     rows
         Its rows, in their order, from those of the source.
+    empty
+        Why it may have no rows where the source has some.
     """
 
     source: str
     columns: tuple[str, ...]
     headings: Mapping[str, Column] | None = None
     rows: Callable[[pd.DataFrame], pd.DataFrame] = tables.in_order
+    empty: str = ""
 
 
 VIEWS: Mapping[str, View] = {
     "summary": View("cells", (*OF_CELLS, *(name for name in CELLS if CELLS[name].heading)), CELLS),
-    "best": View("cells", ("problem", best.BAND, *OF_CELLS), best.HEADINGS, best.fastest),
+    "best": View("cells", ("problem", best.BAND, *OF_CELLS), best.HEADINGS, best.fastest, best.NOBODY),
     "benefits": View("thresholds", (*OF_BENEFITS, *(n for n in THRESHOLDS if THRESHOLDS[n].heading)), THRESHOLDS),
     "cells": View("cells", (*OF_CELLS, "reason")),
     "queries": View(

@@ -39,6 +39,8 @@ def print_summary(study: str, path: Path, rows: Rows) -> None:
     if len(table.rows):
         title = study if len(cells) <= WHOLE else f"{study}, the fastest query at every error reached"
         print_frame(table.readable, title, table.priority, axes=table.axes)
+    elif len(cells):
+        echo(table.view.empty)
     not_ok = [row for row in rows if row["status"] != Status.OK]
     echo(*failures(not_ok))
     echo(f"{len(rows)} cells, {len(rows) - len(not_ok)} ok, {len(not_ok)} not ok")

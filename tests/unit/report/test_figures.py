@@ -7,6 +7,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -22,6 +23,7 @@ from running import DECIDED, Changed, execute
 from vibench.report import figures
 from vibench.report.figures import FORMATS, OF_PROBLEM, constants, convergence, costs, draw_all
 from vibench.report.figures import problems as of_file
+from vibench.report.figures.data import _per_combination
 from vibench.report.figures.style import save, styled
 from vibench.results import tables
 from vibench.results.database import FILE
@@ -358,20 +360,26 @@ def test_every_strategy_is_drawn_ten_to_a_panel(count: int, results: Path) -> No
 
 
 def test_thresholds_are_marked_where_the_lines_cross(results: Path, change: Callable[..., None]) -> None:
+    """With their intervals; however many there are, a panel has one artist for each meaning and one for intervals."""
     change(*DECIDED)
     data = dict(of_file(results))["obstacle"]
-    figure = costs.total_cost(data)
-    marks = [line for axes in figure.axes for line in axes.get_lines() if line.get_marker() in "<>"]
-    assert marks
+    figure, seen = costs.total_cost(data), 0
     for axes in figure.axes:
-        intervals = [line for line in axes.get_lines() if len(line.get_xydata()) == 2]
-        assert len(intervals) == sum(line.get_marker() in "<>" for line in axes.get_lines())
-        lines = [np.asarray(line.get_xydata()) for line in axes.get_lines() if len(line.get_xydata()) > 2]
-        for mark in (line for line in axes.get_lines() if line.get_marker() in "<>"):
-            ((n, cost),) = mark.get_xydata()
-            if 1.0 <= n <= costs.MOST_QUERIES:
-                through = [np.interp(n, *line.T) for line in lines]
-                assert sum(np.isclose(value, cost, rtol=0.02) for value in through) >= 2
+        marks = [line for line in axes.get_lines() if line.get_marker() in "<>"]
+        assert len({line.get_label() for line in marks}) == len(marks)
+        points = np.concatenate([np.empty((0, 2)), *(line.get_xydata() for line in marks)])
+        (intervals,) = axes.collections
+        ends = np.array([path.vertices for path in intervals.get_paths()])
+        assert len(ends) == len(points)
+        lines = [np.asarray(line.get_xydata()) for line in axes.get_lines() if line not in marks]
+        for n, cost in points:
+            through = [np.interp(n, *line.T) for line in lines]
+            assert sum(np.isclose(value, cost, rtol=0.02) for value in through) >= 2
+            (interval,) = ends[ends[:, 0, 1] == cost]
+            row = data.thresholds[data.thresholds["benefit_threshold"] == n]
+            assert [tuple(interval[:, 0])] == [*zip(row["threshold_low"], row["threshold_high"], strict=True)]
+            seen += 1
+    assert seen
 
 
 def test_no_strategy_beats_those_on_the_front(results: Path) -> None:
@@ -542,6 +550,45 @@ def test_a_long_figure_is_drawn_in_parts(results: Path) -> None:
     assert list(drawn) == ["name", "name-2"]
     assert [len([axes for axes in figure.axes if axes.get_title()]) for figure in drawn.values()] == [6, 2]
     assert [figure.caption[-12:] for figure in drawn.values()] == ["Part 1 of 2.", "Part 2 of 2."]
+
+
+def test_what_is_computed_once_per_combination_is_that_of_every_row() -> None:
+    """Missing values included, and in a table without rows."""
+    rows = [("a", 1.0, None), ("b", np.nan, "x"), ("a", 1.0, None), ("a", np.nan, "x"), ("b", np.nan, "x")]
+    frame = pd.DataFrame(rows, columns=["name", "number", "text"], index=[7, 7, 3, 2, 1])
+    calls = list[tuple[Any, ...]]()
+
+    def value(*row: Any) -> str:
+        calls.append(row)
+        return str(row)
+
+    found = _per_combination(frame, value)
+    assert list(found) == [str(row) for row in frame.itertuples(index=False, name=None)]
+    assert list(found.index) == list(frame.index)
+    assert len(calls) == 3
+    assert _per_combination(frame.iloc[:0], value).empty
+
+
+def test_a_report_has_half_a_page_of_a_long_figure_and_the_whole_of_any_other(results: Path) -> None:
+    name, data = next((name, data) for name, data in of_file(results) if name == "obstacle")
+    mine = data.of_dual("mcpg")
+
+    def long(frame: pd.DataFrame) -> pd.DataFrame:
+        clones = [frame.assign(dual=f"mcpg {k}", cell=frame["cell"] + str(k)) for k in range(13)]
+        return pd.concat(clones, ignore_index=True)
+
+    many = replace(data, cells=long(mine.cells), queries=pd.concat([long(mine.queries), data.of_dual("cpg").queries]))
+    found = {one: (draw, part) for one, draw, part in figures.for_report(name, many, ["cpg"])}
+    assert {one.removeprefix("obstacle-") for one in found} >= {*OF_PROBLEM, "cpg-inf-sup"}
+    assert "obstacle-mcpg-inf-sup" not in found
+    cut = {one for one, (_, part) in found.items() if part.page is not None and part.page[1] > 1}
+    long_ones = {"shares": (6, 3), "dimension": (4, 7), "work-precision": (4, 7), "total-cost": (6, 3)}
+    assert cut - {"obstacle-outputs"} == {f"obstacle-{kind}" for kind in long_ones}
+    for kind, (titles, parts) in long_ones.items():
+        draw, part = found[f"obstacle-{kind}"]
+        figure = draw(part)
+        assert len([axes for axes in figure.axes if axes.get_title()]) == titles
+        assert f"Part 1 of {parts}." in figure.caption
 
 
 def test_one_solver_has_no_profile_and_the_caption_says_so(change: Callable[..., None], draw: Draw) -> None:

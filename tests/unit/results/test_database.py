@@ -178,6 +178,16 @@ def test_what_others_have_written_is_printable_when_it_is_read(journal: ResultsD
         assert db.execute("SELECT problem, reason FROM cells").fetchall() == [("a\\n", "A\\u001b[2J\ufffd")]
 
 
+def test_a_text_of_many_rows_is_kept_once(journal: ResultsDatabase, tmp_path: Path) -> None:
+    """The histories of a large study have tens of millions of texts, and hundreds that differ."""
+    for key in ("one", "other"):
+        journal.write_cell(cell_row(cell=key, reason="neither a letter nor a name"), [])
+    names, (one, other) = read_rows(tmp_path / "run" / FILE, "cells")
+    reason = names.index("reason")
+    assert one[reason] == "neither a letter nor a name"
+    assert one[reason] is other[reason]
+
+
 def test_a_name_that_looks_like_a_uri_is_a_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     for name in ("file:run", "file:run?mode=memory", "a%20b#c", ":memory:", "\udcff"):

@@ -8,11 +8,14 @@ from typing import Any
 
 import pytest
 import typer.main
+from running import Main
 from samples import cell_row
 
 from vibench.cli.main import app
+from vibench.results.best import NOBODY
+from vibench.results.database import FILE, ResultsDatabase
 from vibench.terminal.output import run_argument
-from vibench.terminal.run_summary import REASONS, failures, next_steps
+from vibench.terminal.run_summary import REASONS, WHOLE, failures, next_steps, print_summary
 
 
 def row(cell: str, reason: str, status: str = "inaccurate", **more: Any) -> dict[str, Any]:
@@ -45,6 +48,24 @@ def test_never_more_lines_than_reasons_that_matter() -> None:
     lines = list(failures(rows))
     assert len(lines) == REASONS + 1
     assert lines[-1] == f"{1000 - REASONS} cells not ok for {1000 - REASONS} other reasons"
+
+
+def test_a_run_of_which_no_cell_is_the_best_says_why(
+    tmp_path: Path, main: Main, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """At the end of the run, and where the best cells are asked for; not for rows that were not asked for."""
+    rows = [row(f"c{k}", "broke") for k in range(WHOLE + 1)]
+    made = ResultsDatabase(tmp_path / "run", {"name": "sample"})
+    for one in rows:
+        made.write_cell(one, [])
+    made.close()
+    print_summary("sample", tmp_path / "run" / FILE, rows)
+    assert NOBODY in capsys.readouterr().out.splitlines()
+    code, out, _ = main("show", str(tmp_path / "run"), "--table", "best")
+    assert code == 0
+    assert out.splitlines() == ["run: best: no rows", NOBODY]
+    _, out, _ = main("show", str(tmp_path / "run"), "--where", "problem = 'none'")
+    assert out.splitlines() == ["run: summary: no rows"]
 
 
 def test_what_to_do_next_are_commands(capsys: pytest.CaptureFixture[str]) -> None:

@@ -7,7 +7,7 @@ import json
 import re
 import signal
 import threading
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from concurrent.futures import Future, ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cache
@@ -48,7 +48,11 @@ OF_PROBLEM: dict[str, Drawing] = {
 OF_DUAL: dict[str, Drawing] = {"enrichment": enrichment, "inf-sup": inf_sup}
 """Figures of every problem and dual strategy."""
 
+OF_HISTORIES: frozenset[Drawing] = frozenset({diagnostics, projection_errors, orthogonality, enrichment})
+"""Those that read the histories."""
+
 LONG: dict[str, tuple[Callable[[Data], int], int]] = {
+    "shares": (constants.compared, ABREAST * DEEP),
     "dimension": (costs.sized, DEEP),
     "work-precision": (costs.timed, DEEP),
     "total-cost": (costs.pairs, ABREAST * DEEP),
@@ -83,10 +87,35 @@ def drawings_of(known: Iterable[tuple[str, Data]]) -> Iterator[tuple[str, Drawin
 
 def _pages(name: str, kind: str, draw: Drawing, data: Data) -> Iterator[tuple[str, Drawing, Data]]:
     """A drawing, or several of a figure that is too long for one."""
-    count, most = LONG.get(kind, (lambda _: 1, 1))
-    pages = max(1, -(-count(data) // most))
+    panels, most = _length(kind, data)
+    pages = max(1, -(-panels // most))
     for page in range(pages):
         yield name + f"-{page + 1}" * (page > 0), draw, replace(data, page=(page, pages))
+
+
+def _length(kind: str, data: Data) -> tuple[int, int]:
+    """Number of panels, or rows of panels, of a figure, and how many go into one file."""
+    count, most = LONG.get(kind, (lambda _: 1, 1))
+    return count(data), most
+
+
+def for_report(name: str, data: Data, duals: Collection[str]) -> Iterator[tuple[str, Drawing, Data]]:
+    """The figures of a problem that a report shows: of these dual strategies, and of a long figure half a page."""
+    for kind, draw in OF_PROBLEM.items():
+        yield _beginning(f"{name}-{kind}", kind, draw, data)
+    for dual, file in zip(data.duals, file_names(data.duals), strict=True):
+        if dual in duals:
+            of_dual = data.of_dual(dual)
+            yield from (_beginning(f"{name}-{file}-{kind}", kind, draw, of_dual) for kind, draw in OF_DUAL.items())
+    yield from ((f"{name}-{kind}", draw, data) for kind, draw in of_plugins(data, {*OF_PROBLEM, *OF_DUAL}).items())
+
+
+def _beginning(name: str, kind: str, draw: Drawing, data: Data) -> tuple[str, Drawing, Data]:
+    """The drawing of a figure, or of its first panels where it is too long for one file."""
+    panels, most = _length(kind, data)
+    if panels <= most:
+        return name, draw, replace(data, page=(0, 1))
+    return name, draw, replace(data, page=(0, -(-panels // (most // 2))), halved=True)
 
 
 def draw(path: Path, kind: str, problem: str | None = None, dual: str | None = None) -> Figure:
@@ -196,7 +225,7 @@ def draw_all(
         if jobs > 1:
             pool = ProcessPoolExecutor(jobs - 1, get_context("spawn"))
             stack.callback(pool.shutdown, cancel_futures=True)
-            with _interrupts_ignored():  # the processes inherit it: Ctrl-C is for this one to handle
+            with interrupts_ignored():  # the processes inherit it: Ctrl-C is for this one to handle
                 others = {k: pool.submit(_draw, path, folder, formats, k) for k in reversed(range(len(known)))}
         # the others draw from the last figure on, this process from the first one on what they have not begun
         for k in range(len(known)):
@@ -236,7 +265,7 @@ def _draw(path: Path, folder: Path, formats: tuple[str, ...], number: int) -> Wr
 
 
 @contextlib.contextmanager
-def _interrupts_ignored() -> Iterator[None]:
+def interrupts_ignored() -> Iterator[None]:
     """Ignore Ctrl-C inside the block, and in the processes that start there."""
     if threading.current_thread() is not threading.main_thread():
         yield

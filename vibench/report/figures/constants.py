@@ -25,6 +25,7 @@ from vibench.report.figures.data import (
 from vibench.report.figures.looks import HIGH_FIDELITY_LOOK, Look, Looks, Series
 from vibench.report.figures.style import (
     ABREAST,
+    DEEP,
     SERIES,
     CaptionedFigure,
     Layout,
@@ -169,18 +170,13 @@ def shares(data: Data) -> CaptionedFigure | None:
     One point per fixed enrichment. Below the diagonal, validation parameters are less stable than the training set; the
     tick on the left of a point is √(1 − σ²), which bounds the share on the training set.
     """
-    cells = data.cells[data.cells["share_training"].notna()].drop_duplicates([*PRIMAL, "dual", "pair"])
-    if cells.empty:
+    groups = data.on_page(_groups(data), ABREAST * DEEP)
+    if not groups:
         return None
-    groups = [
-        (str(dual) + f", strategies {k}" * (k > 0), rows[rows["primal"].isin(names)])
-        for dual, rows in cells.groupby("dual", sort=False)
-        for k, names in enumerate(parts(list(rows["primal"].unique()), SERIES))
-    ]
     sheet = Sheet.of(
         len(groups), f"{data.problem}: shares of the inf-sup constant", Layout(width=4.0, height=3.2), "all"
     )
-    looks = Looks(Series(str(name)) for name in cells["primal"].unique())
+    looks = Looks(Series(str(name)) for _, rows in groups for name in rows["primal"].unique())
     for panel, (title, rows) in zip(sheet.panels, groups, strict=False):
         panel.axline((1.0, 1.0), slope=1.0, color="0.6", linewidth=0.8, zorder=0)
         for primal, mine in rows.groupby("primal", sort=False):
@@ -194,5 +190,21 @@ def shares(data: Data) -> CaptionedFigure | None:
         f"Smallest share of β over the span in that of the whole of V for {data.problem}: over the validation set "
         "against over the training set, one point for each fixed enrichment with its (N, R) and tolerance δ; a number "
         "alone is another δ. Below the diagonal, validation parameters are less stable than the training set. The tick "
-        "left of a point is √(1 − σ²), which bounds the share on the training set."
+        f"left of a point is √(1 − σ²), which bounds the share on the training set.{data.part}"
     )
+
+
+def compared(data: Data) -> int:
+    """Number of panels of `shares`."""
+    return len(_groups(data))
+
+
+def _groups(data: Data) -> list[tuple[str, pd.DataFrame]]:
+    """Title and fixed enrichments of every panel of `shares`."""
+    cells = data.cells[data.cells["share_training"].notna()].drop_duplicates([*PRIMAL, "dual", "pair"])
+    return [
+        (str(dual) + f", strategies {k} of {len(groups)}" * (len(groups) > 1), rows[rows["primal"].isin(names)])
+        for dual, rows in cells.groupby("dual", sort=False)
+        for groups in [parts(list(rows["primal"].unique()), SERIES)]
+        for k, names in enumerate(groups, 1)
+    ]

@@ -28,6 +28,9 @@ ERRORS = {"error_u_mean": "mean relative error of u", "error_lambda_mean": "mean
 MOST_QUERIES = 1e6
 """Total cost is drawn up to this number of queries."""
 
+MODEL = ["primal", "primal_options", "assembly"]
+"""Columns of which total cost has a line for every combination, at one tolerance."""
+
 MARKS = {Meaning.FROM: ">", Meaning.UNTIL: "<"}
 
 
@@ -188,15 +191,17 @@ def total_cost(data: Data) -> CaptionedFigure | None:
 
 def pairs(data: Data) -> int:
     """Number of panels of `total_cost`."""
-    return len(_pairs(best_solver(data.cells)))
+    models = best_solver(data.cells).drop_duplicates(["dual", "pair", *MODEL])
+    return int((-(-models.groupby(["dual", "pair"]).size() // (SERIES - 1))).sum())
 
 
 def _pairs(cells: pd.DataFrame) -> list[tuple[str, pd.DataFrame]]:
     """Title and cells of every panel."""
     return [
-        (f"{title}{f', models {k} of {len(groups)}' * (len(groups) > 1)}", pd.concat(group))
+        (f"{title}{f', models {k} of {len(groups)}' * (len(groups) > 1)}", shown.iloc[group])
         for title, mine in by_dimensions(cells)
-        for groups in [parts([rows for _, rows in _most_vectors(mine).groupby("cell", sort=False)], SERIES - 1)]
+        for shown in [_most_vectors(mine)]
+        for groups in [parts(list(range(len(shown))), SERIES - 1)]
         for k, group in enumerate(groups, 1)
     ]
 
@@ -206,7 +211,7 @@ def _most_vectors(cells: pd.DataFrame) -> pd.DataFrame:
     added = cells.assign(added=cells["enrichment"].fillna(0)).sort_values(
         ["added", "primal_tol"], ascending=[False, True], kind="stable"
     )
-    return added.drop_duplicates(["primal", "primal_options", "assembly"]).sort_index()
+    return added.drop_duplicates(MODEL).sort_index()
 
 
 def _model(cell: Any) -> Series:
@@ -215,10 +220,12 @@ def _model(cell: Any) -> Series:
 
 def _marks(panel: Axes, cells: pd.DataFrame, thresholds: pd.DataFrame) -> None:
     """Break-even points between the lines of a panel, at their cost, with their intervals."""
-    drawn = set(cells["cell"])
-    for row in thresholds.itertuples():
-        n, between = row.benefit_threshold, pd.isna(row.cell_a) or row.cell_a in drawn
-        if row.cell_b in drawn and between and 1.0 <= n <= MOST_QUERIES:
-            cost, name = row.offline_b_s + n * row.online_b_s, f"break-even: cheaper {row.meaning} here"
-            panel.plot(n, cost, MARKS[row.meaning], c="black", ms=5, mfc="none", label=name, zorder=5)
-            panel.plot([row.threshold_low, row.threshold_high], [cost, cost], c="black", lw=0.8, zorder=5)
+    drawn, number = cells["cell"], thresholds["benefit_threshold"]
+    between = thresholds["cell_a"].isna() | thresholds["cell_a"].isin(drawn)
+    found = thresholds[thresholds["cell_b"].isin(drawn) & between & number.between(1.0, MOST_QUERIES)]
+    found = found.assign(cost=found["offline_b_s"] + found["benefit_threshold"] * found["online_b_s"])
+    for meaning, mine in found.groupby("meaning"):
+        shape, name = MARKS[Meaning(meaning)], f"break-even: cheaper {meaning} here"
+        panel.plot(mine["benefit_threshold"], mine["cost"], shape, c="black", ms=5, mfc="none", label=name, zorder=5)
+    known = found[found[["threshold_low", "threshold_high"]].notna().all(axis=1)]
+    panel.hlines(known["cost"], known["threshold_low"], known["threshold_high"], colors="black", lw=0.8, zorder=5)

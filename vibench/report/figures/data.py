@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from itertools import count, pairwise
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, TypeVar
 
 import numpy as np
@@ -50,9 +51,12 @@ class Data:
     pictures: tuple[pictures.Shown, ...]
     page: tuple[int, int] | None = None
     """Which of how many pages of a long figure is drawn, from 0; `None` for all panels in one figure."""
+    halved: bool = False
+    """Whether pages have half as many panels as those of files."""
 
     def on_page(self, panels: list[Panel], most: int) -> list[Panel]:
         """The panels of the page, of which each has at most `most`."""
+        most = most // 2 if self.halved else most
         return panels if self.page is None else panels[self.page[0] * most : (self.page[0] + 1) * most]
 
     @property
@@ -87,19 +91,19 @@ class Data:
         return [str(dual) for dual in self.queries["dual"].unique()]
 
 
-def problems(path: Path) -> Iterator[tuple[str, Data]]:
+def problems(path: Path, known: Mapping[str, pd.DataFrame] = MappingProxyType({})) -> Iterator[tuple[str, Data]]:
     """Every problem and training set of a results file that has queries, with the name its files begin with.
 
-    The training set is named where a problem has several.
+    The training set is named where a problem has several. Tables that are `known` are not read again.
     """
-    read = {name: tables.in_order(tables.read(path, name)) for name in TABLES}
+    read = {name: tables.in_order(known[name] if name in known else tables.read(path, name)) for name in TABLES}
     if read["queries"].empty:
         return
     for axis in ("training", "dual", "primal"):
         _tell_apart(axis, read["cells"], [frame for frame in read.values() if axis in frame])
     read["queries"] = read["queries"].merge(read["cells"][["cell", "enrichment_kind", "N", "R"]], "left", "cell")
     for frame in read.values():
-        frame["pair"] = [str(pair) for pair in frame[PAIR].astype(float).itertuples(index=False, name=None)]
+        frame["pair"] = _per_combination(frame[PAIR].astype(float), lambda *pair: str(pair))
     shown = tuple(pictures.read(path))
     keys = list(dict.fromkeys(read["queries"][[*PROBLEM, "training"]].itertuples(index=False, name=None)))
     several = {key[:2] for key in keys if len({one for one in keys if one[:2] == key[:2]}) > 1}
@@ -124,15 +128,24 @@ def _tell_apart(axis: str, cells: pd.DataFrame, frames: list[pd.DataFrame]) -> N
     found = pd.concat([frame[columns].dropna().drop_duplicates() for frame in frames]).drop_duplicates()
     names = {tuple(key): _plugin_name(rows, axis) for key, rows in cells.groupby(columns)}
     shared = found.duplicated(axis, keep=False)
-    labels = {}
+    labels = dict[tuple[Any, ...], str]()
     for (label, text), several in zip(found.itertuples(index=False, name=None), shared, strict=True):
         options = _options(text)
         named = ", ".join(f"{name} = {value}" for name, value in options.items())
         if options and (several or names.get((label, text)) == label):
             labels[label, text] = f"{label} ({named})"
-    for frame in frames:
-        keys = zip(frame[axis], frame[columns[1]], strict=True)
-        frame[axis] = pd.Series([labels.get(key, key[0]) for key in keys], frame.index, frame[axis].dtype)
+    for frame in frames if labels else ():
+        made = _per_combination(frame[columns], lambda *key: labels.get(key, key[0]))
+        frame[axis] = made.astype(frame[axis].dtype)
+
+
+def _per_combination(frame: pd.DataFrame, value: Callable[..., Any]) -> pd.Series:
+    """A function of the values of a row, called once for every combination of them: millions of rows have few."""
+    number = frame.groupby(list(frame.columns), dropna=False, sort=False).ngroup().to_numpy()
+    _, first = np.unique(number, return_index=True)
+    found = np.empty(len(first), dtype=object)
+    found[:] = [value(*row) for row in frame.iloc[first].itertuples(index=False, name=None)]
+    return pd.Series(found[number], frame.index)
 
 
 def _plugin_name(cells: pd.DataFrame, axis: str) -> str:

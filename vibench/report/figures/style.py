@@ -48,6 +48,7 @@ DEEP = 4
 STYLE: Any = {
     "font.size": 9,
     "axes.titlesize": 9,
+    "axes.titley": 1.0,  # no ticks above a panel move its title: where they are need not be measured
     "axes.grid": True,
     "axes.grid.which": "major",
     "grid.alpha": 0.3,

@@ -129,14 +129,20 @@ def _columnar(grid: Grid) -> dict[str, Any]:
 
 
 def _column(name: str, values: pd.Series) -> dict[str, Any]:
-    """A column of numbers, of texts, or of numbers of texts where most of them occur often."""
+    """A column of numbers, of texts, or of numbers of texts where most of them occur often.
+
+    A value that all rows have stands there once.
+    """
     heading = printable(name)
     if pd.api.types.is_numeric_dtype(values) or _numbers_in_text(values):
-        return {"name": heading, "numbers": [short(value) for value in values]}
+        numbers = [short(value) for value in values]
+        return {"name": heading, "numbers": numbers if len(set(numbers)) > 1 else numbers[:1]}
     texts = [printable(tables.cell_text(value)) for value in values]
     levels = list(dict.fromkeys(texts))
     if 2 * len(levels) > len(texts):
         return {"name": heading, "texts": texts}
+    if len(levels) == 1:
+        return {"name": heading, "levels": levels}
     number = {text: k for k, text in enumerate(levels)}
     return {"name": heading, "levels": levels, "codes": [number[text] for text in texts]}
 
@@ -148,12 +154,12 @@ def _numbers_in_text(values: pd.Series) -> bool:
     return bool(pd.to_numeric(values.drop_duplicates(), errors="coerce").notna().all()) and values.name != "cell"
 
 
-def short(value: Any) -> float | int | str | None:
+def short(value: Any, digits: int = DIGITS) -> float | int | str | None:
     """A number with few digits; an infinite one is a text, since JSON has none."""
     if pd.isna(value):
         return None
     number = float(value)
     if math.isinf(number):
         return str(number)
-    found = float(f"{number:.{DIGITS}g}")
+    found = float(f"{number:.{digits}g}")
     return int(found) if found.is_integer() and abs(found) < 1e15 else found

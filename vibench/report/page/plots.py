@@ -32,6 +32,9 @@ MARKERS = {
 FILLS = (0.85, 0.0, 0.4)
 """Opacity of the points of the first, second and third dual strategy, and so on."""
 
+DIGITS = 4
+"""Significant digits of coordinates: more than a screen shows, or the text that a point has."""
+
 LIBRARY = ("bokeh.min.js", "bokeh-api.min.js")
 """BokehJS and its interface for plots, in the distribution of Bokeh."""
 
@@ -133,6 +136,6 @@ def _panel(panel: Axes, points: pd.DataFrame) -> dict[str, Any]:
         "x_label": panel.x_label,
         "y_label": panel.y_label,
         "scale": "log" if panel.logarithmic else "linear",
-        "x": [short(value) for value in points[panel.x]],
-        "y": [short(value) for value in points[panel.y]],
+        "x": [short(value, DIGITS) for value in points[panel.x]],
+        "y": [short(value, DIGITS) for value in points[panel.y]],
     }

@@ -6,7 +6,8 @@ import base64
 import io
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
 from multiprocessing import get_context
 from typing import Any
 
@@ -18,7 +19,7 @@ from matplotlib.lines import Line2D
 from PIL import Image
 
 from vibench.arrays import Array
-from vibench.report.figures import OF_DUAL, OF_PROBLEM, Drawing
+from vibench.report.figures import OF_DUAL, OF_HISTORIES, OF_PROBLEM, Drawing, interrupts_ignored
 from vibench.report.figures.data import Data
 from vibench.report.figures.plugins import FigureError
 from vibench.report.figures.style import caption_of, styled
@@ -29,9 +30,6 @@ DPI = 110
 
 NAMED = 6
 """Series of a panel that an alternative text describes one by one."""
-
-FEW = 8
-"""Pictures up to which another process would take longer to start than they take to draw."""
 
 
 @dataclass(frozen=True)
@@ -50,20 +48,47 @@ Known = Sequence[tuple[str, Drawing, Data]]
 """Figures: their names, the functions that draw them, and the data."""
 
 
-def stills(known: Known, jobs: int = 1) -> tuple[list[Still], list[str]]:
-    """The pictures that there are data for, drawn by so many processes, and why figures of plugins have none."""
-    found = _in_parallel(known, jobs) if jobs > 1 and len(known) > FEW else _draw_all(known)
+@dataclass(frozen=True)
+class Helpers:
+    """Processes that draw beside this one."""
+
+    pool: ProcessPoolExecutor
+    count: int
+
+
+@contextmanager
+def helpers(jobs: int) -> Iterator[Helpers | None]:
+    """Context with processes that draw: as many as `jobs`, this one included. They load Matplotlib in the meantime."""
+    if jobs < 2:
+        yield None
+        return
+    with ProcessPoolExecutor(jobs - 1, get_context("spawn")) as pool:
+        with interrupts_ignored():  # the processes inherit it: Ctrl-C is for this one to handle
+            for _ in range(jobs - 1):
+                pool.submit(_draw_all, ())
+        yield Helpers(pool, jobs - 1)
+
+
+def stills(known: Known, others: Helpers | None = None) -> tuple[list[Still], list[str]]:
+    """The pictures that there are data for, drawn here and by others, and why figures of plugins have none."""
+    found = _draw_all(known) if others is None else _in_parallel(known, others)
     return [one for one in found if isinstance(one, Still)], [one for one in found if isinstance(one, str)]
 
 
-def _in_parallel(known: Known, jobs: int) -> list[Still | str | None]:
-    """All pictures in their order. Those of plugins are drawn here: their functions need not go to other processes."""
-    shared = [k for k, (_, draw, _) in enumerate(known) if draw in {*OF_PROBLEM.values(), *OF_DUAL.values()}]
+def _in_parallel(known: Known, others: Helpers) -> list[Still | str | None]:
+    """All pictures in their order.
+
+    Those of plugins are drawn here, since their functions need not go to other processes, and so are those of
+    histories: of a large study these are millions of rows, which take longer to send than their few lines to draw.
+    """
+    elsewhere = {*OF_PROBLEM.values(), *OF_DUAL.values()} - OF_HISTORIES
+    shared = [k for k, (_, draw, _) in enumerate(known) if draw in elsewhere]
     own = [k for k in range(len(known)) if k not in set(shared)]
+    jobs = 1 + others.count
     shares = [[*shared[0::jobs], *own], *(shared[k::jobs] for k in range(1, jobs))]
-    with ProcessPoolExecutor(jobs - 1, get_context("spawn")) as pool:
-        others = [pool.submit(_draw_all, [known[k] for k in share]) for share in shares[1:]]
-        drawn = [_draw_all([known[k] for k in shares[0]]), *(other.result() for other in others)]
+    sent = [(name, draw, replace(data, histories=data.histories.iloc[:0])) for name, draw, data in known]
+    awaited = [others.pool.submit(_draw_all, [sent[k] for k in share]) for share in shares[1:]]
+    drawn = [_draw_all([known[k] for k in shares[0]]), *(other.result() for other in awaited)]
     placed = {k: one for share, found in zip(shares, drawn, strict=True) for k, one in zip(share, found, strict=True)}
     return [placed[k] for k in range(len(known))]
 

@@ -29,13 +29,13 @@ function numberText(value) {
 
 const infinite = value => typeof value === "string" ? (value.startsWith("-") ? -Infinity : Infinity) : value;
 
-/** A column with one way to its values, however they are embedded. */
+/** A column with one way to its values, however they are embedded: a value that all rows have stands there once. */
 function opened({ name, numbers, texts, levels, codes }) {
   if (numbers) {
-    const values = numbers.map(infinite);
-    return { name, number: true, value: row => values[row], text: row => numberText(values[row]) };
+    const values = numbers.map(infinite), value = values.length === 1 ? () => values[0] : row => values[row];
+    return { name, number: true, value, text: row => numberText(value(row)) };
   }
-  const text = levels ? row => levels[codes[row]] : row => texts[row];
+  const text = codes ? row => levels[codes[row]] : levels ? () => levels[0] : row => texts[row];
   return { name, number: false, value: text, text };
 }
 
