@@ -35,7 +35,7 @@ with interrupted_at_once():
         write_report,
     )
     from vibench.errors import RequestError, VibenchError
-    from vibench.terminal.output import echo
+    from vibench.terminal.output import echo, warn
     from vibench.text import unbroken
 
 if TYPE_CHECKING:
@@ -134,7 +134,7 @@ def run(
     with ProgressDisplay(new_console()) as progress:
         outcome = run_study(loaded, folder, progress, options)
     path = tables.results_file(str(folder))
-    tables.export(path, folder / "tables")
+    tables.export(path, folder / "tables", warn)
     if outcome.damaged:
         echo(f"computed again, as their rows were damaged: {', '.join(outcome.damaged)}")
     if outcome.interrupted:

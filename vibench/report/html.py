@@ -26,6 +26,7 @@ from vibench.report.page.stills import stills
 from vibench.results import pictures, tables
 from vibench.results.best import LARGEST_BAND
 from vibench.results.database import read_meta, study_of
+from vibench.results.plugin_columns import Extended
 from vibench.results.selection import short_keys
 from vibench.text import printable
 
@@ -64,9 +65,10 @@ def write(path: Path, target: Path, jobs: int = 1) -> Path:
 
 def page(path: Path, jobs: int = 1) -> str:
     """The page of a results file, its pictures drawn by so many processes."""
-    cells = tables.in_order(tables.read(path, "cells"))
+    extended = tables.extended(path, "cells")
+    cells = tables.in_order(extended.frame)
     study, known = study_of(path, read_meta(path)), list(problems(path))
-    grids = list(_grids(path, cells))
+    grids = list(_grids(path, extended.of(cells)))
     found = findings.all_findings(path, known)
     first = findings.leading(found)
     rest = [one for one in found if one not in first]
@@ -91,7 +93,7 @@ def page(path: Path, jobs: int = 1) -> str:
         failed=int((cells["status"] != Status.OK).sum()),
         missing=[
             *(f"no picture of {one.key[0]}: {one.reason}" for one in pictures.read(path) if one.reason),
-            *dict.fromkeys(undrawable),
+            *dict.fromkeys([*extended.faults, *undrawable]),
         ],
         grids=grids,
         stills=drawn,
@@ -159,8 +161,9 @@ def _facts(study: dict[str, Any], cells: pd.DataFrame) -> Iterator[tuple[str, st
     yield "seconds", "CPU seconds of one process; the offline time of a cell includes every stage it depends on"
 
 
-def _grids(path: Path, cells: pd.DataFrame) -> Iterator[Grid]:
+def _grids(path: Path, extended: Extended) -> Iterator[Grid]:
     """The tables of the page, those of failures first; a table without rows is none."""
+    cells, thresholds = extended.frame, tables.extended(path, "thresholds")
     keys = short_keys(cells["cell"])
     failed = cells[cells["status"] != Status.OK][["cell", *IDENTITY, "queries_ok", "queries", "reason"]]
     queries = tables.read(path, "queries")
@@ -168,20 +171,19 @@ def _grids(path: Path, cells: pd.DataFrame) -> Iterator[Grid]:
     found = [
         grid_of("failed", "Cells that are not ok", "", failed, IDENTITY, keys),
         grid_of("failed-queries", "Queries that are not ok", "", failed_queries, IDENTITY, keys),
-        grid_of_cells(cells, ERRORS),
+        grid_of_cells(extended, ERRORS),
     ]
-    thresholds = tables.read(path, "thresholds")
-    model = thresholds["cell_a"].isna()
+    model = thresholds.frame["cell_a"].isna()
     caption = (
         "When b is cheaper than a, offline and online together, by the number of queries, with its 95 % interval; "
         "undecided where the measured rounds do not tell the sign of a difference."
     )
     for name, title, rows in (
-        ("enrichments", "Break-even between enrichments", thresholds[~model]),
-        ("model", "Break-even against the high-fidelity model", thresholds[model]),
+        ("enrichments", "Break-even between enrichments", thresholds.frame[~model]),
+        ("model", "Break-even against the high-fidelity model", thresholds.frame[model]),
     ):
         if len(rows):
-            found.append(grid_of_thresholds(name, title, caption, rows, cells))
+            found.append(grid_of_thresholds(name, title, caption, thresholds.of(rows), cells))
     caption = "Any two solvers on one reduced model: relative differences of u in V, and the differences allowed."
     disagreements = tables.in_order(tables.read(path, "disagreements"))
     disagreements = disagreements[["solver_a", *disagreements.columns.drop(["solver_a", "problem_options"])]]

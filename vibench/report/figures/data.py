@@ -92,7 +92,7 @@ def problems(path: Path) -> Iterator[tuple[str, Data]]:
 
     The training set is named where a problem has several.
     """
-    read = {name: tables.in_order(tables.read(path, name)) for name in TABLES}
+    read = {name: tables.in_order(tables.extended(path, name).frame) for name in TABLES}
     if read["queries"].empty:
         return
     for axis in ("training", "dual", "primal"):
