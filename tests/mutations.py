@@ -382,7 +382,7 @@ FAULTS = (
     ),
     Fault(
         "rows-not-compared-with-their-digests",
-        "vibench/results/digests.py",
+        "vibench/results/sqlite/digests.py",
         "if known.get(key, NONE) != found.get(key, NONE)",
         "if False",
         ("tests/faults/test_damaged_files.py",),

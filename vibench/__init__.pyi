@@ -13,8 +13,10 @@ from .highfidelity.active_set import HighFidelitySolver as HighFidelitySolver
 from .highfidelity.active_set import solve_high_fidelity as solve_high_fidelity
 from .interfaces.affine import AffineSum as AffineSum
 from .interfaces.affine_problem import AffineProblem as AffineProblem
+from .interfaces.figures import DerivedColumn as DerivedColumn
 from .interfaces.figures import FigurePlugin as FigurePlugin
 from .interfaces.figures import ProblemTables as ProblemTables
+from .interfaces.figures import RunTables as RunTables
 from .interfaces.outputs import Output as Output
 from .interfaces.problem import MEMBERS as MEMBERS
 from .interfaces.problem import Contact as Contact

@@ -15,7 +15,7 @@ import pandas as pd
 
 from vibench.results.columns import KEYS, STORED, TABLES
 from vibench.results.database import FILE, read_text
-from vibench.results.digests import Digests
+from vibench.results.sqlite.digests import Digests
 
 Vibench = Callable[..., "subprocess.CompletedProcess[str]"]
 """Runs the installed command in a folder."""

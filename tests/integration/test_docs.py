@@ -35,7 +35,7 @@ from vibench.study.entries import Entry, ProblemEntry, SamplingEntry
 from vibench.study.reader import read_study
 from vibench.study.registry import GROUPS
 from vibench.study.spec import Limits, Study, ToleranceTable
-from vibench.testing import check_problem
+from vibench.testing import check_figure, check_problem
 
 ROOT = Path(__file__).parents[2]
 DOCS = ROOT / "docs"
@@ -124,6 +124,11 @@ def test_the_torsion_problem_of_the_pages_takes_some_thirty_lines(package: Path)
 def test_the_package_of_the_pages_has_a_plugin_of_every_kind(package: Path) -> None:
     project = tomllib.loads((package / "pyproject.toml").read_text())["project"]
     assert {*project["entry-points"], GROUPS["study"]} == set(GROUPS.values())
+
+
+@pytest.mark.usefixtures("importable")
+def test_the_columns_of_the_pages_pass_their_checks() -> None:
+    check_figure(importlib.import_module("vibench_mine.columns").Savings)
 
 
 def test_the_plugins_of_the_pages_run_through_the_whole_benchmark(

@@ -146,6 +146,10 @@ def _tolerances(primal: str) -> tuple[float | None, ...]:
         return (None,)
 
 
+TIMED = ("problem", "primal", "dual", "solver")
+"""Kinds of plugins that benchmarks time, by the word for each."""
+
+
 def chosen(plugins: Sequence[str]) -> dict[str, list[str]]:
     """Names of plugins by the word for their kind, from names as `vibench list` shows them, or KIND:NAME.
 
@@ -154,7 +158,7 @@ def chosen(plugins: Sequence[str]) -> dict[str, list[str]]:
     RequestError
         If there is no such plugin, several have the name, or a solver is not installed.
     """
-    known = {word: registry.names(kind) for word, kind in registry.WORDS.items()}
+    known = {word: registry.names(registry.WORDS[word]) for word in TIMED}
     known["solver"] = installed_solvers(known["solver"])
     found: dict[str, list[str]] = {}
     for plugin in plugins:

@@ -61,6 +61,8 @@ EXAMPLES: Mapping[str, tuple[str, ...]] = {
         "vibench check primal:mine",
         "vibench check my_package.cable:Cable",
         "vibench check solver:piqp",
+        "vibench check sampling:my-points --option size=32 --option seed=1",
+        "vibench check figure:my-figures --run runs/mine",
     ),
     "bench": (
         "vibench bench my-problem",
@@ -152,7 +154,10 @@ def plugin_options(context: typer.Context, incomplete: str) -> list[str]:
     return _beginning(incomplete, (f"{option}=" for option in found))
 
 
-KINDS = {"problem": "problems", "primal": "primal_strategies", "dual": "dual_strategies", "solver": "qp_solvers"}
+KINDS = {
+    "problem": "problems", "primal": "primal_strategies", "dual": "dual_strategies", "solver": "qp_solvers",
+    "sampling": "sampling", "figure": "figures",
+}  # fmt: skip
 """Groups of entry points by the word that `vibench check` knows them by."""
 
 lists = words(lambda: ("problems", "sampling", "dual", "primal", "solvers", "figures", "studies"))

@@ -33,7 +33,7 @@ from vibench.cli.result_commands import (
     write_report,
 )
 from vibench.errors import RequestError, VibenchError
-from vibench.terminal.output import echo
+from vibench.terminal.output import echo, warn
 from vibench.text import unbroken
 
 if TYPE_CHECKING:
@@ -139,7 +139,7 @@ def _conclude(name: str, outcome: Outcome, folder: Path, *, draw: int | None, fr
     from vibench.terminal import run_summary
 
     path = tables.results_file(str(folder))
-    tables.export(path, folder / "tables")
+    tables.export(path, folder / "tables", warn)
     if outcome.damaged:
         echo(f"computed again, as their rows were damaged: {', '.join(outcome.damaged)}")
     if outcome.interrupted:

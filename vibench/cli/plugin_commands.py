@@ -10,8 +10,8 @@ from typing import Annotated, Any, Literal
 
 from typer import Argument, Exit, Option
 
-from vibench.cli.completion import lists, plugin_options, plugins
-from vibench.errors import RequestError, in_a_line, unknown_name
+from vibench.cli.completion import lists, plugin_options, plugins, runs
+from vibench.errors import RequestError, VibenchError, in_a_line, unknown_name
 from vibench.terminal.output import echo
 
 LISTS = {
@@ -70,7 +70,9 @@ def check_plugin(
     plugin: Annotated[
         str,
         Argument(
-            metavar="PLUGIN", help="A name, problem|primal|dual|solver:NAME, or MODULE:NAME.", autocompletion=plugins
+            metavar="PLUGIN",
+            help="A name, problem|primal|dual|solver|sampling|figure:NAME, or MODULE:NAME.",
+            autocompletion=plugins,
         ),
     ],
     option: Annotated[
@@ -78,19 +80,26 @@ def check_plugin(
         Option(metavar="KEY=VALUE", help="Option of the plugin (repeatable).", autocompletion=plugin_options),
     ] = None,
     seconds: Annotated[float, Option(min=0.0, help="Time limit for all checks; a slow plugin gets fewer.")] = SECONDS,
+    run: Annotated[
+        str | None,
+        Option(metavar="RUN", help="Run that figures are drawn from; a made-up one by default.", autocompletion=runs),
+    ] = None,
 ) -> None:
     """Check a plugin: shapes, signs, tolerances, repetition, time.
 
     One line per requirement of the interface, as soon as it is checked; exit code 1 if one is violated.
     """
+    from vibench.results.tables import results_file
     from vibench.testing import Verdict
     from vibench.testing.elsewhere import Examination, examine_elsewhere
 
     found = _find(plugin)
+    if run is not None and found.kind != "figure":
+        raise RequestError(f"--run is for figure plugins; {_title(found)} is none")
+    given = {} if run is None else {"run": str(results_file(run).resolve())}
     options, remark = _options(found, dict(map(key_value, option or [])))
     echo(f"{_title(found)}{remark}")
-    module = {"problem": "problems", "dual": "duals", "primal": "primals", "solver": "solvers"}[found.kind]
-    examination = Examination(module, found.reference, options, seconds)
+    examination = Examination(f"{found.kind}s", found.reference, options, seconds, given)
     findings = examine_elsewhere(examination, lambda finding: echo(str(finding)))
     counts = {verdict: sum(finding.verdict is verdict for finding in findings) for verdict in Verdict}
     told = (f"{count} {verdict}" for verdict, count in counts.items() if count or verdict is not Verdict.WARNING)
@@ -115,6 +124,8 @@ def _options(found: Found, given: dict[str, Any]) -> tuple[dict[str, Any] | None
         if given:
             raise RequestError(f"{title} has no options")
         return ({"solver": found.name} if found.plugin is of_qpsolvers else None), ""
+    if found.kind == "sampling":
+        return _sampling_options(found, given)
     options = registry.checked_arguments(found.plugin, title, given)
     if found.kind == "problem" and "resolution" not in given:
         with suppress(RequestError):  # the problem has no resolution of that name
@@ -123,10 +134,25 @@ def _options(found: Found, given: dict[str, Any]) -> tuple[dict[str, Any] | None
     return options, ""
 
 
+def _sampling_options(found: Found, given: dict[str, Any]) -> tuple[dict[str, Any], str]:
+    """Options of a sampling strategy; a size and a seed that it needs are chosen, if not told."""
+    from vibench.study import registry
+
+    needed = {option.name for option in registry.options_of(found.plugin) if not option.default}
+    chosen = {name: value for name, value in SAMPLE.items() if name in needed and name not in given}
+    options = registry.checked_arguments(found.plugin, _title(found), chosen | given)
+    told = " and ".join(f"{name} = {value}" for name, value in chosen.items())
+    return options, f", with {told} (--option {next(iter(chosen))}=… for another)" if chosen else ""
+
+
+SAMPLE = {"size": 16, "seed": 0}
+"""Options of a sampling strategy that `vibench check` chooses, where it needs them."""
+
+
 def new_plugin(
     kind: Annotated[
-        Literal["problem", "primal", "dual", "solver"],
-        Argument(metavar="problem|primal|dual|solver", help="Kind of plugin."),
+        Literal["problem", "primal", "dual", "solver", "sampling", "figure"],
+        Argument(metavar="KIND", help="Kind of plugin."),
     ],
     name: Annotated[str, Argument(metavar="NAME", help="Name of the plugin: a-z, 0-9 and hyphens.")],
     out: Annotated[Path, Option(metavar="DIR", help="Folder in which the package is created.")] = Path(),
@@ -155,20 +181,31 @@ def _plugin_rows(kind: str) -> list[tuple[str, str, str, str]]:
 
     rows = []
     for name in registry.names(kind):
-        options = []
+        options, columns = [], []
         try:
             if kind == "study":
                 description = f"{len(expand(read_study(name)))} cells"
             else:
                 description = (registry.load(kind, name).__doc__ or "").strip().split("\n")[0]
                 options = registry.options(kind, name)
-        except RequestError as error:
+            columns = _columns(name) if kind == LISTS["figures"] else []
+        except VibenchError as error:
             description = str(error)
         except Exception as error:  # noqa: BLE001  annotations of plugins are evaluated
             description = f"{kind} '{name}' cannot be read: {in_a_line(error)}"
         lines = [f"{o.name}: {o.expected}" + f" = {o.default}" * bool(o.default) for o in options]
-        rows.append((name, registry.version(kind, name), description, "\n".join(lines)))
+        rows.append((name, registry.version(kind, name), description, "\n".join([*lines, *columns])))
     return rows
+
+
+def _columns(name: str) -> list[str]:
+    """The columns that a figure plugin adds to tables, a line for each."""
+    from vibench.results.plugin_columns import declared, loaded
+
+    return [
+        f"column {one.name} of {one.table}{f' [{one.unit}]' * bool(one.unit)}: {one.meaning}"
+        for one in declared(name, loaded(name))
+    ]
 
 
 def _solvers_by_version() -> list[tuple[str, str, str, str]]:
@@ -265,7 +302,8 @@ def _find_object(module: str, name: str) -> Found:
         for word, kind in WORDS.items():
             if kind in BASES and issubclass(found, BASES[kind]):
                 return Found(word, where, found, where)
-        raise RequestError(f"{title} is no subclass of Problem, PrimalStrategy or DualStrategy, and no QP solver")
+        names = ", ".join(base.__name__ for base in bases)
+        raise RequestError(f"{title} is no subclass of {names}, and no QP solver")
     if callable(found):
         return Found("solver", where, found, where)
     classes = [value for value in contents.values() if isinstance(value, type)]

@@ -10,7 +10,7 @@ from typing import Annotated, Literal
 from typer import Argument, Exit, Option
 
 from vibench.cli.completion import SHOWN, cells, column_names, runs, table_names
-from vibench.terminal.output import echo, run_argument
+from vibench.terminal.output import echo, run_argument, warn
 
 
 class Picture(StrEnum):
@@ -53,6 +53,7 @@ def show(
 
     path = tables.results_file(run)
     found = views.look_up(path, table, columns=parts(columns), where=where, sort=parts(sort), limit=limit)
+    warn(*found.faults)
     if form == "terminal":
         print_frame(found.readable, f"{path.parent.name}: {table}", found.priority, axes=found.axes, every=found.chosen)
         if found.rows.empty and found.view.empty:

@@ -13,7 +13,10 @@ from vibench.provenance import distribution_version
 from vibench.qp.settings import SETTINGS
 from vibench.study.registry import GROUPS, WORDS, names, version
 
-MODULES = {"problem": "problem", "primal": "strategy", "dual": "strategy", "solver": "solver"}
+MODULES = {
+    "problem": "problem", "primal": "strategy", "dual": "strategy", "solver": "solver", "sampling": "sampling",
+    "figure": "figures",
+}  # fmt: skip
 """Module of the plugin by kind."""
 
 NAME = re.compile(r"[a-z][a-z0-9]*(-[a-z0-9]+)*")
@@ -26,7 +29,7 @@ RESERVED = ("problems", "strategies")
 def write_package(kind: str, name: str, parent: Path) -> Path:
     """Write a package with one plugin, completely or not at all; returns its folder `parent/vibench-NAME`.
 
-    The kind is "problem", "primal", "dual" or "solver". The parent folder is created if necessary.
+    The kind is a key of `MODULES`. The parent folder is created if necessary.
 
     Raises
     ------
@@ -96,6 +99,7 @@ def _contents(kind: str, name: str) -> dict[str, str]:
         "title": WORDS[kind],
         "group": GROUPS[WORDS[kind]],
         "test": snake,
+        "column": f"{snake}_speed_up",
         "version": distribution_version("vibench"),
     }
     sources = {

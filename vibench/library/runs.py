@@ -21,6 +21,7 @@ from vibench.library.models import Model
 from vibench.results import tables
 from vibench.results.columns import TABLES
 from vibench.results.database import read_meta, study_of
+from vibench.results.plugin_columns import Extended
 from vibench.study.spec import Study
 
 if TYPE_CHECKING:
@@ -50,6 +51,8 @@ class Run:
     def table(self, name: str) -> pd.DataFrame:
         """A table of the results file, its rows in the order of the axes; the documentation lists the columns.
 
+        Columns that plugins add come last; one that cannot be computed is missing, with a warning.
+
         Raises
         ------
         RequestError
@@ -57,7 +60,14 @@ class Run:
         """
         if name not in TABLES:
             raise unknown_name("table", name, TABLES)
-        return tables.in_order(tables.read(self.path, name))
+        return tables.in_order(self._extended(name).frame)
+
+    def _extended(self, name: str) -> Extended:
+        """A table with the columns of plugins; what cannot be used is a warning."""
+        found = tables.extended(self.path, name)
+        for line in found.faults:
+            warnings.warn(line, stacklevel=3)
+        return found
 
     @property
     def cells(self) -> pd.DataFrame:
@@ -82,7 +92,8 @@ class Run:
     @property
     def summary(self) -> pd.DataFrame:
         """The table that `vibench show` prints."""
-        return tables.summary(tables.read(self.path, "cells"))
+        found = self._extended("cells")
+        return tables.summary(found.frame, found.columns)
 
     @property
     def findings(self) -> dict[str, list[str]]:
@@ -112,7 +123,8 @@ class Run:
 
     def write_tables(self, folder: Path | str | None = None) -> list[Path]:
         """Write every table as CSV, and the summary as Markdown; into `tables` beside the results file by default."""
-        return tables.export(self.path, self.path.parent / "tables" if folder is None else Path(folder))
+        target = self.path.parent / "tables" if folder is None else Path(folder)
+        return tables.export(self.path, target, partial(warnings.warn, stacklevel=3))
 
     def write_figures(
         self, folder: Path | str | None = None, formats: Sequence[Literal["png", "svg", "pdf"]] = ("png", "svg")

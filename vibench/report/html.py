@@ -26,6 +26,7 @@ from vibench.report.page.stills import Helpers, helpers, stills
 from vibench.results import pictures, tables
 from vibench.results.best import LARGEST_BAND
 from vibench.results.database import read_meta, study_of
+from vibench.results.plugin_columns import Extended
 from vibench.results.selection import short_keys
 from vibench.text import printable
 
@@ -75,9 +76,10 @@ def page(path: Path, jobs: int = 1) -> str:
 
 
 def _page(path: Path, others: Helpers | None) -> str:
-    study, read = study_of(path, read_meta(path)), {name: tables.read(path, name) for name in SHARED}
+    study, extended = study_of(path, read_meta(path)), {name: tables.extended(path, name) for name in SHARED}
+    read = {name: one.frame for name, one in extended.items()}
     cells, known = tables.in_order(read["cells"]), list(problems(path, read))
-    grids = list(_grids(read, cells))
+    grids = list(_grids({**extended, "cells": extended["cells"].of(cells)}))
     found = findings.all_findings(read, known)
     first, kept = findings.leading(found), set(findings.leading(found, findings.MOST + FOLDED))
     rest = [one for one in found if one in kept and one not in first]
@@ -102,7 +104,7 @@ def _page(path: Path, others: Helpers | None) -> str:
         failed=int((cells["status"] != Status.OK).sum()),
         missing=[
             *(f"no picture of {one.key[0]}: {one.reason}" for one in pictures.read(path) if one.reason),
-            *dict.fromkeys(undrawable),
+            *dict.fromkeys([*(line for one in extended.values() for line in one.faults), *undrawable]),
         ],
         grids=grids,
         stills=drawn,
@@ -166,31 +168,31 @@ def _facts(study: dict[str, Any], cells: pd.DataFrame) -> Iterator[tuple[str, st
     yield "seconds", "CPU seconds of one process; the offline time of a cell includes every stage it depends on"
 
 
-def _grids(read: Mapping[str, pd.DataFrame], cells: pd.DataFrame) -> Iterator[Grid]:
+def _grids(read: Mapping[str, Extended]) -> Iterator[Grid]:
     """The tables of the page, those of failures first; a table without rows is none."""
+    cells, thresholds = read["cells"].frame, read["thresholds"]
     keys = short_keys(cells["cell"])
     failed = cells[cells["status"] != Status.OK][["cell", *IDENTITY, "queries_ok", "queries", "reason"]]
-    queries = read["queries"]
+    queries = read["queries"].frame
     failed_queries = queries[queries["status"] != Status.OK][["cell", "query", *IDENTITY, "reason"]]
     found = [
         grid_of("failed", "Cells that are not ok", "", failed, IDENTITY, keys),
         grid_of("failed-queries", "Queries that are not ok", "", failed_queries, IDENTITY, keys),
-        grid_of_cells(cells, ERRORS),
+        grid_of_cells(read["cells"], ERRORS),
     ]
-    thresholds = read["thresholds"]
-    model = thresholds["cell_a"].isna()
+    model = thresholds.frame["cell_a"].isna()
     caption = (
         "When b is cheaper than a, offline and online together, by the number of queries, with its 95 % interval; "
         "undecided where the measured rounds do not tell the sign of a difference."
     )
     for name, title, rows in (
-        ("enrichments", "Break-even between enrichments", thresholds[~model]),
-        ("model", "Break-even against the high-fidelity model", thresholds[model]),
+        ("enrichments", "Break-even between enrichments", thresholds.frame[~model]),
+        ("model", "Break-even against the high-fidelity model", thresholds.frame[model]),
     ):
         if len(rows):
-            found.append(grid_of_thresholds(name, title, caption, rows, cells))
+            found.append(grid_of_thresholds(name, title, caption, thresholds.of(rows), cells))
     caption = "Any two solvers on one reduced model: relative differences of u in V, and the differences allowed."
-    disagreements = tables.in_order(read["disagreements"])
+    disagreements = tables.in_order(read["disagreements"].frame)
     disagreements = disagreements[["solver_a", *disagreements.columns.drop(["solver_a", "problem_options"])]]
     axes = ["problem", "dual", "primal", "primal_tol", "accuracy", "assembly", "solver_a", "solver_b"]
     found.append(grid_of("disagreements", "Agreement of the solvers", caption, disagreements, axes, keys))

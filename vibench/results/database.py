@@ -14,9 +14,9 @@ from typing import Any
 from vibench.errors import RequestError, StorageError
 from vibench.qp.status import Status
 from vibench.results.columns import HISTORY_KEYS, STORED, VERSION
-from vibench.results.digests import CREATE, DigestError, Digests
-from vibench.results.sqlite_files import BUSY_SECONDS, DAMAGE, DAMAGED, code_of, connected_read_only
-from vibench.results.values import UnstorableError, error_row, storable
+from vibench.results.sqlite.digests import CREATE, DigestError, Digests
+from vibench.results.sqlite.files import BUSY_SECONDS, DAMAGE, DAMAGED, code_of, connected_read_only
+from vibench.results.sqlite.values import UnstorableError, error_row, storable
 from vibench.text import one_line, printable
 
 FILE = "results.sqlite"

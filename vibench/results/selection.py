@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import re
 import sqlite3
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +13,9 @@ import pandas as pd
 
 from vibench.arrays import Array
 from vibench.errors import RequestError, unknown_name
+from vibench.results.columns import PARAMETER, STORED
 from vibench.results.database import open_read_only
+from vibench.results.plugin_columns import Extended
 from vibench.text import printable
 
 LONGEST = 1000
@@ -27,11 +29,23 @@ QUOTED = re.compile(r"'(?:[^']|'')*'")
 EXAMPLE = "solver = 'piqp' and beta_span_min < 1e-3"
 
 
-def matching(path: Path, table: str, expression: str, columns: Iterable[str]) -> Array:
+def matching(path: Path, table: str, expression: str, columns: Iterable[str], plugins: Extended | None = None) -> Array:
     """Which rows of a table satisfy an expression of SQLite over its columns, in the order they are read in.
 
     The expression may use columns, numbers, texts in single quotes and operators. It runs on a connection that cannot
-    write, under an authoriser that refuses functions, subqueries and other tables.
+    write, under an authoriser that refuses functions, subqueries and other tables. One that names a column of a plugin
+    runs on a copy in memory.
+
+    Parameters
+    ----------
+    path, table
+        The results file and the table.
+    expression
+        The expression.
+    columns
+        Columns that the table has, to suggest one.
+    plugins
+        The table with its columns of plugins, if it has any.
 
     Raises
     ------
@@ -55,7 +69,7 @@ def matching(path: Path, table: str, expression: str, columns: Iterable[str]) ->
 
     selects = iter(["the one around the expression"])
     query = f'SELECT ({expression}) IS TRUE FROM "{table}" NOT INDEXED ORDER BY rowid'
-    with open_read_only(path) as db:
+    with _opened(path, table, outside, plugins) as db:
         db.setlimit(sqlite3.SQLITE_LIMIT_EXPR_DEPTH, 100)
         db.set_authorizer(allowed)
         try:
@@ -65,6 +79,23 @@ def matching(path: Path, table: str, expression: str, columns: Iterable[str]) ->
             if unknown:
                 raise unknown_name(f"column of {table}", printable(unknown[1]), columns) from None
             raise _wrong(expression, _in_words(error)) from None
+
+
+@contextlib.contextmanager
+def _opened(path: Path, table: str, expression: str, plugins: Extended | None) -> Iterator[sqlite3.Connection]:
+    """Context with the results file, or with a table in memory for an expression that names a column of a plugin."""
+    if plugins is None or not any(re.search(rf"(?i)\b{name}\b", expression) for name in plugins.columns):
+        with open_read_only(path) as db:
+            yield db
+        return
+    frame, known = plugins.frame, {**STORED[table], **plugins.columns}
+    kinds = ", ".join(f'"{name}" {known.get(name, PARAMETER).kind.split()[0]}' for name in frame.columns)
+    values = frame.astype(object).where(frame.notna(), None)
+    with contextlib.closing(sqlite3.connect(":memory:")) as db:
+        db.execute(f'CREATE TABLE "{table}" ({kinds})')
+        marks = ", ".join("?" * len(frame.columns))
+        db.executemany(f'INSERT INTO "{table}" VALUES ({marks})', values.itertuples(index=False, name=None))
+        yield db
 
 
 def _refuse_unbalanced(expression: str, outside: str) -> None:

@@ -6,7 +6,9 @@ import json
 import math
 import re
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import pandas as pd
@@ -14,8 +16,10 @@ import pandas as pd
 from vibench.errors import RequestError
 from vibench.files import write_atomically
 from vibench.qp.status import Status
+from vibench.results import plugin_columns
 from vibench.results.columns import CELLS, INTEGER, KEYS, STORED, TABLES, THRESHOLDS, VERSION, Column, shown_columns
 from vibench.results.database import FILE, read_meta, read_rows
+from vibench.results.plugin_columns import Extended
 from vibench.text import printable_lines, unbroken
 
 ORDER = (
@@ -59,16 +63,33 @@ def read(path: Path, table: str) -> pd.DataFrame:
     return frame
 
 
+def extended(path: Path, table: str) -> Extended:
+    """One table of a results file with the columns that plugins add to it, in the order in which it was written.
+
+    Raises
+    ------
+    RequestError
+        If it is damaged; what is wrong with a plugin is among the faults instead.
+    """
+    return plugin_columns.extended(table, partial(read, path))
+
+
 SUMMARY = "summary.md"
 EXPORTED = (*(f"{table}.csv" for table in TABLES), SUMMARY)
 """Names of the files that `export` writes."""
 
 
-def export(path: Path, folder: Path) -> list[Path]:
-    """Write every table as CSV and the summary as Markdown into a folder; returns the files."""
+def export(path: Path, folder: Path, note: Callable[[str], None] = lambda _: None) -> list[Path]:
+    """Write every table as CSV and the summary as Markdown into a folder; returns the files.
+
+    `note` is called with a line for every column of a plugin that could not be written.
+    """
     folder.mkdir(parents=True, exist_ok=True)
-    texts = {f"{table}.csv": to_csv(whole_numbers(in_order(read(path, table)))) for table in TABLES}
-    texts[SUMMARY] = to_markdown(summary(read(path, "cells")))
+    found = {table: extended(path, table) for table in TABLES}
+    for line in dict.fromkeys(line for one in found.values() for line in one.faults):
+        note(line)
+    texts = {f"{table}.csv": to_csv(whole_numbers(in_order(one.frame))) for table, one in found.items()}
+    texts[SUMMARY] = to_markdown(summary(found["cells"].frame, found["cells"].columns))
     for name, text in texts.items():
         write_atomically(folder / name, text.encode("utf-8"))
     return [folder / name for name in texts]
@@ -81,14 +102,14 @@ def in_order(frame: pd.DataFrame) -> pd.DataFrame:
     return frame.sort_values(by, ascending=ascending, kind="stable", na_position="first", ignore_index=True)
 
 
-def summary(cells: pd.DataFrame) -> pd.DataFrame:
-    """The summary of a run: one row per cell, the columns with a heading in `CELLS`."""
-    return _for_reading(in_order(cells), CELLS)
+def summary(cells: pd.DataFrame, plugins: Mapping[str, Column] = MappingProxyType({})) -> pd.DataFrame:
+    """The summary of a run: one row per cell, the columns with a heading in `CELLS`, and those of plugins with one."""
+    return _for_reading(in_order(cells), {**CELLS, **plugins})
 
 
-def benefits(thresholds: pd.DataFrame) -> pd.DataFrame:
+def benefits(thresholds: pd.DataFrame, plugins: Mapping[str, Column] = MappingProxyType({})) -> pd.DataFrame:
     """The break-even table: the number of queries from which, or until which, b is cheaper than a."""
-    return _for_reading(in_order(thresholds), THRESHOLDS)
+    return _for_reading(in_order(thresholds), {**THRESHOLDS, **plugins})
 
 
 def _for_reading(frame: pd.DataFrame, table: Mapping[str, Column]) -> pd.DataFrame:
@@ -132,7 +153,7 @@ def _shown(frame: pd.DataFrame, name: str, column: Column) -> pd.Series | list[s
         return [interval(*ends) for ends in zip(frame["threshold_low"], frame[name], strict=True)]
     if column.kind == INTEGER:
         return frame[name].astype("Int64")
-    return 1e3 * frame[name] if column.heading.endswith("[ms]") else frame[name]
+    return 1e3 * frame[name] if column.unit == "s" and column.heading.endswith("[ms]") else frame[name]
 
 
 def whole_numbers(frame: pd.DataFrame) -> pd.DataFrame:

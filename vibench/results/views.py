@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import NoReturn
 
 import pandas as pd
 
-from vibench.errors import unknown_name
+from vibench.errors import RequestError, unknown_name
 from vibench.results import best, selection, tables
 from vibench.results.columns import CELLS, THRESHOLDS, Column
 
@@ -100,6 +101,8 @@ class Table:
     view: View
     chosen: bool
     key_length: int
+    faults: tuple[str, ...] = ()
+    """A line for every column of a plugin that is missing, or every plugin that cannot be loaded."""
 
     @property
     def exact(self) -> pd.DataFrame:
@@ -151,11 +154,11 @@ def look_up(
     """
     if name not in VIEWS:
         raise unknown_name("table", name, VIEWS)
-    view = VIEWS[name]
-    found = tables.read(path, view.source)
+    extended = tables.extended(path, VIEWS[name].source)
+    view, found = _with_columns(VIEWS[name], extended.columns), extended.frame
     keys = found.get("cell", [])
     if where:
-        found = found[selection.matching(path, view.source, where, found.columns)]
+        found = found[selection.matching(path, view.source, where, found.columns, extended)]
     rows = view.rows(found)
     by_heading = {column.heading: key for key, column in (view.headings or {}).items() if column.heading}
     if sort:
@@ -166,7 +169,23 @@ def look_up(
         asked = list(rows.columns)
     for column in asked:
         if column not in rows:
-            raise unknown_name(f"column of {name}", column, rows.columns)
+            _refuse(name, column, rows, extended.faults)
     default = [column for column in dict.fromkeys(view.columns) if column in rows]
     shown = rows.head(limit) if limit else rows
-    return Table(shown, tuple(dict.fromkeys(asked or default)), view, bool(asked), selection.short_keys(keys))
+    listed, length = tuple(dict.fromkeys(asked or default)), selection.short_keys(keys)
+    return Table(shown, listed, view, bool(asked), length, extended.faults)
+
+
+def _with_columns(view: View, columns: Mapping[str, Column]) -> View:
+    """A table for reading with columns of plugins as the least important ones: all, or those with a heading."""
+    shown = [name for name, column in columns.items() if column.heading or view.headings is None]
+    headings = None if view.headings is None else {**view.headings, **columns}
+    return replace(view, columns=(*view.columns, *shown), headings=headings)
+
+
+def _refuse(table: str, column: str, rows: pd.DataFrame, faults: Sequence[str]) -> NoReturn:
+    """Refuse a column that the table does not have: a plugin may have failed to give it."""
+    for line in faults:
+        if line.startswith(f"column '{column}' of "):
+            raise RequestError(line)
+    raise unknown_name(f"column of {table}", column, rows.columns)

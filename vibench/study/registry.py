@@ -47,6 +47,7 @@ READERS = ("problem", "sampling strategy")
 
 WORDS: Mapping[str, str] = {
     "problem": "problem", "primal": "primal strategy", "dual": "dual strategy", "solver": "QP solver",
+    "sampling": "sampling strategy", "figure": "figure plugin",
 }  # fmt: skip
 """Kinds of plugins by their names on the command line."""
 
@@ -195,9 +196,14 @@ def requirements(kind: str, name: str) -> tuple[str, ...]:
 
 def options(kind: str, name: str) -> list[Option]:
     """The options of a plugin, read from its constructor."""
+    return options_of(load(kind, name))
+
+
+def options_of(plugin: type) -> list[Option]:
+    """The options of a class."""
     return [
         Option(option, _expected(annotation), "" if default is inspect.Parameter.empty else repr(default))
-        for option, (default, annotation) in _parameters(load(kind, name)).items()
+        for option, (default, annotation) in _parameters(plugin).items()
     ]
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shlex
+import sys
 from pathlib import Path
 
 import typer
@@ -14,6 +15,12 @@ def echo(*lines: str) -> None:
     """Print lines; what is not printable in them, such as an escape sequence or a line break, is shown as an escape."""
     if lines:
         typer.echo("\n".join(map(printable, lines)))
+
+
+def warn(*lines: str) -> None:
+    """Print lines on standard error, each as those of errors begin: what is printed may go into a file."""
+    for line in lines:
+        sys.stderr.write(f"vibench: {printable(line)}\n")
 
 
 def run_argument(folder: Path) -> str:

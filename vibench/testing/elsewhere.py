@@ -9,7 +9,7 @@ import pickle
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cache, partial
 from operator import attrgetter
 from typing import Any
@@ -40,6 +40,8 @@ class Examination(PiecewiseStage):
         Arguments of its constructor; `None` for one that is a function.
     seconds
         Wall time [s] of all checks.
+    given
+        Further arguments of `case_of`.
     """
 
     label = "checks"
@@ -48,6 +50,7 @@ class Examination(PiecewiseStage):
     plugin: str
     options: Mapping[str, Any] | None
     seconds: float
+    given: Mapping[str, Any] = field(default_factory=dict)
 
     def all_checks(self) -> tuple[Check[Any], ...]:
         """The checks in their order."""
@@ -64,7 +67,7 @@ class Examination(PiecewiseStage):
         module, _, name = self.plugin.partition(":")
         plugin = attrgetter(name)(importlib.import_module(module))
         create = plugin if self.options is None else partial(plugin, **self.options)
-        return _Checking(self, self._module().case_of(create, self.seconds))
+        return _Checking(self, self._module().case_of(create, self.seconds, **self.given))
 
     def _module(self) -> Any:
         return importlib.import_module(f"vibench.testing.{self.checks}")

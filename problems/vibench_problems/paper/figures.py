@@ -4,14 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from functools import partial
-from typing import ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
-from vibench import CaptionedFigure, FigurePlugin, ProblemTables
-from vibench_problems.paper import constants, discs, membrane, offline
-from vibench_problems.paper.curves import Curves
+from vibench import FigurePlugin, ProblemTables
 from vibench_problems.paper.published import PROBLEMS, PUBLICATION
 
-Twin = Callable[[], CaptionedFigure | None]
+if TYPE_CHECKING:  # tables ask every plugin for columns: this module loads no matplotlib
+    from vibench import CaptionedFigure
+
+Twin = Callable[[], "CaptionedFigure | None"]
 
 RADIUS = "radius µ [m]"
 NOT_IN_THE_PAPER = {"bulge": True, "approach": "parameter"}
@@ -31,6 +32,9 @@ class PaperFigures(FigurePlugin):
         paper = PROBLEMS.get(tables.problem_name)
         if paper is None or any(tables.problem_options.get(name) == value for name, value in NOT_IN_THE_PAPER.items()):
             return {}
+        from vibench_problems.paper import constants, discs, membrane, offline  # noqa: PLC0415
+        from vibench_problems.paper.curves import Curves  # noqa: PLC0415
+
         curves, parameter = Curves(tables), RADIUS if tables.problem_name == "hertz" else ""
         errors, angles, greedy, comparison = paper.figures
         found: dict[int, Twin] = {

@@ -145,9 +145,9 @@ def test_a_run_without_any_query_has_a_report(changed: Changed) -> None:
 
 def test_a_strategy_that_is_labelled_high_fidelity_is_no_high_fidelity_model(changed: Changed) -> None:
     path = changed("UPDATE thresholds SET primal_a = 'high-fidelity'")
-    read = {name: tables.read(path, name) for name in html.SHARED}
-    thresholds = read["thresholds"]
-    found = {grid.name: len(grid.frame) for grid in html._grids(read, read["cells"])}
+    read = {name: tables.extended(path, name) for name in html.SHARED}
+    thresholds = read["thresholds"].frame
+    found = {grid.name: len(grid.frame) for grid in html._grids(read)}
     assert found["enrichments"] == thresholds["cell_a"].notna().sum() > 0
     assert found["model"] == thresholds["cell_a"].isna().sum() > 0
 

@@ -184,15 +184,31 @@ def unlisted(folder: Path) -> Path:
 
 @pytest.mark.parametrize(("word", "name"), BUILT_IN)
 def test_a_built_in_plugin_passes_every_check(word: str, name: str, tmp_path: Path) -> None:
-    examine = {
-        "problem": testing.examine_problem,
-        "dual": testing.examine_dual,
-        "primal": testing.examine_primal,
-    }[word]
-    given = {"path": str(unlisted(tmp_path / "cable"))} if name == "pack" else {"resolution": "coarse"}
-    options = registry.check_options(registry.WORDS[word], name, given if word == "problem" else {})
-    findings = examine(partial(registry.load(registry.WORDS[word], name), **options))
-    assert [str(finding) for finding in findings if finding.verdict is not Verdict.PASSED] == []
+    given: dict[str, object] = {}
+    if word == "problem":
+        given = {"path": str(unlisted(tmp_path / "cable"))} if name == "pack" else {"resolution": "coarse"}
+    if word == "sampling":
+        given = sampling_options(name, tmp_path)
+    options = registry.check_options(registry.WORDS[word], name, given)
+    findings = getattr(testing, f"examine_{word}")(partial(registry.load(registry.WORDS[word], name), **options))
+    shown = [str(finding) for finding in findings if finding.verdict is not Verdict.PASSED]
+    assert shown == ([NOTHING_TO_DRAW] if word == "figure" else [])  # it draws the problems of a publication
+
+
+NOTHING_TO_DRAW = (
+    "warning  something to show: neither figures nor columns of the made-up run, whose problems are membrane and "
+    "plate: `--run RUN` checks on a run of yours"
+)
+
+
+def sampling_options(name: str, folder: Path) -> dict[str, object]:
+    (folder / "points.csv").write_text("height,position\n0.5,-1\n900,2\n")
+    return {
+        "grid": {"counts": [3]},
+        "list": {"points": [0.5, 2.0]},
+        "file": {"path": str(folder / "points.csv")},
+        "greedy": {"candidates": 64, "tolerance": 0.2},
+    }.get(name, {"size": 7, "seed": 3, "log": []})
 
 
 def test_the_command_takes_a_coarse_mesh_and_says_so(main: Main) -> None:
@@ -235,7 +251,7 @@ def test_one_error_lists_all_failures() -> None:
     assert [line.split(":")[0] for line in lines[1:]] == ["training set", "pickling"]
 
 
-@pytest.mark.parametrize("kind", ["problem", "dual", "primal", "solver"])
+@pytest.mark.parametrize("kind", ["problem", "dual", "primal", "solver", "sampling", "figure"])
 def test_check_and_examine_have_the_same_parameters(kind: str) -> None:
     check, examination = getattr(testing, f"check_{kind}"), getattr(testing, f"examine_{kind}")
     assert inspect.signature(check).parameters == inspect.signature(examination).parameters
@@ -338,7 +354,10 @@ class TestRequests:
             (["dual:obstacle"], ["no dual strategy is called 'obstacle'", "known:", "mcpg"]),
             (["no_module:Rope"], ["'no_module:Rope'", "cannot be imported", "no_module"]),
             (["broken_problems:Jmups"], ["no plugin of the module broken_problems", "did you mean 'Jumps'"]),
-            (["running:Path"], ["'running:Path'", "no subclass of Problem, PrimalStrategy or DualStrategy"]),
+            (
+                ["running:Path"],
+                ["'running:Path'", "no subclass of Problem, DualStrategy, PrimalStrategy, Sampling, Fig"],
+            ),
             (["some thing:Rope"], ["neither KIND:NAME", "solver", "MODULE:NAME"]),
             (["broken_variants:UnknownAnnotation"], ["annotations that fail: NameError", "'Depth'"]),
             (["solver:piqq"], ["no QP solver is called 'piqq'", "did you mean 'piqp'"]),

@@ -20,6 +20,7 @@ from vibench.report.comparison.differences import (
     Difference,
     Verdict,
     of_numbers,
+    of_plugins,
     of_seconds,
 )
 from vibench.report.comparison.runs import AXES, ComparedRun, compared_runs
@@ -138,8 +139,9 @@ class Comparison:
         RequestError
             If there is no such column.
         """
-        if column not in CELLS:
-            raise unknown_name("column of cells", column, CELLS)
+        known = {**CELLS, **{name: one for run in self.runs for name, one in run.extended.columns.items()}}
+        if column not in known:
+            raise unknown_name("column of cells", column, known)
         keys = dict.fromkeys(key for run in self.runs for key in run.cells)
         shared = [key for key in keys if sum(key in run.cells for run in self.runs) > 1]
         rows = [
@@ -191,6 +193,7 @@ def compare(paths: Sequence[Path], limit: float) -> Comparison:
         for key in shared:
             one, two = first.cells[key] | means[0].get(key, {}), run.cells[key] | means[1].get(key, {})
             differences += of_numbers(one, two, limit)
+            differences += of_plugins(one, two, first.extended.better, limit)
         notes.append(f"{of_run}{len(shared)} cells are in both runs")
         if means[0]:
             notes.append(f"{of_run}errors of {len(means[0])} of them are compared on the queries that are ok in both")
@@ -202,6 +205,7 @@ def compare(paths: Sequence[Path], limit: float) -> Comparison:
                 found.setdefault((run.name, earlier.name), []).extend(of_seconds(earlier, run, same, limit))
         if compared < len([key for key in run.cells if any(key in earlier.cells for earlier in runs[:k])]):
             notes.append(f"{of_run}times and break-even of different machines are not compared")
+    notes += dict.fromkeys(line for run in runs for line in run.extended.faults)
     pairs = tuple(Pair(*names, differences) for names, differences in found.items())
     return Comparison(tuple(runs), pairs, tuple(notes))
 

@@ -15,6 +15,7 @@ from vibench.errors import RequestError
 from vibench.qp.status import Status
 from vibench.results import tables
 from vibench.results.database import FILE, read_meta, study_of
+from vibench.results.plugin_columns import Extended
 
 AXES = ("problem", "dual", "primal", "asked", "solver", "accuracy", "assembly")
 """Columns that tell cells apart in a comparison; "asked" has all tolerances, or sizes."""
@@ -30,8 +31,13 @@ class ComparedRun:
     @cached_property
     def cells(self) -> dict[str, dict[str, Any]]:
         """Rows of the table of cells in the order of the axes, by key."""
-        rows = tables.in_order(tables.read(self.path, "cells")).to_dict("records")
+        rows = tables.in_order(self.extended.frame).to_dict("records")
         return {str(row["cell"]): {str(name): value for name, value in row.items()} for row in rows}
+
+    @cached_property
+    def extended(self) -> Extended:
+        """The table of cells with the columns that plugins add to it."""
+        return tables.extended(self.path, "cells")
 
     @cached_property
     def identity(self) -> dict[str, Any]:

@@ -96,7 +96,9 @@ def problems(path: Path, known: Mapping[str, pd.DataFrame] = MappingProxyType({}
 
     The training set is named where a problem has several. Tables that are `known` are not read again.
     """
-    read = {name: tables.in_order(known[name] if name in known else tables.read(path, name)) for name in TABLES}
+    read = {
+        name: tables.in_order(known[name] if name in known else tables.extended(path, name).frame) for name in TABLES
+    }
     if read["queries"].empty:
         return
     for axis in ("training", "dual", "primal"):

@@ -8,13 +8,12 @@ from functools import partial
 
 from matplotlib.figure import Figure
 
-from vibench.errors import RequestError, VibenchError, in_a_line
+from vibench.errors import VibenchError, in_a_line
 from vibench.interfaces.figures import Drawing, FigurePlugin
 from vibench.report.figures.data import Data, file_names
 from vibench.report.figures.style import set_caption
+from vibench.results.plugin_columns import KIND, loaded
 from vibench.study import registry
-
-KIND = "figure plugin"
 
 
 class FigureError(VibenchError):
@@ -57,26 +56,6 @@ def publications() -> Iterator[tuple[str, FigurePlugin]]:
         plugin = loaded(name)
         if plugin.publication:
             yield name, plugin
-
-
-def loaded(name: str) -> FigurePlugin:
-    """A figure plugin.
-
-    Raises
-    ------
-    RequestError
-        If it cannot be loaded or created.
-    """
-    missing = registry.missing(KIND, name)
-    if missing:
-        raise RequestError(f"{KIND} '{name}' needs {', '.join(missing)}, which is not installed")
-    try:
-        plugin: FigurePlugin = registry.create(KIND, name)
-    except RequestError:
-        raise
-    except (Exception, SystemExit) as error:  # noqa: BLE001  third-party code
-        raise RequestError(f"{KIND} '{name}' cannot be created: {in_a_line(error)}") from None
-    return plugin
 
 
 def named(name: str, plugin: FigurePlugin, data: Data) -> Iterator[tuple[str, Drawing]]:

@@ -12,6 +12,7 @@ import pandas as pd
 
 from vibench.results import tables, views
 from vibench.results.columns import CELLS, THRESHOLDS, Column
+from vibench.results.plugin_columns import Extended
 from vibench.results.selection import short_keys
 from vibench.text import printable
 
@@ -62,23 +63,25 @@ class Grid:
     disturbed: tuple[int, ...] = ()
 
 
-def grid_of_cells(cells: pd.DataFrame, caption: str) -> Grid:
-    """The table of all cells, in the order of the rows."""
-    names = [name for name in (*OF_CELLS, *MORE_OF_CELLS) if name in ("cell", *views.AXES) or cells[name].notna().any()]
-    says_nothing = [name for name in names if CELLS[name].heading and not tables.says_something(cells, name)]
+def grid_of_cells(extended: Extended, caption: str) -> Grid:
+    """The table of all cells, in the order of the rows; columns of plugins without a heading are offered besides."""
+    cells, known, own = extended.frame, {**CELLS, **extended.columns}, tuple(extended.columns)
+    names = [n for n in (*OF_CELLS, *MORE_OF_CELLS, *own) if n in ("cell", *views.AXES) or cells[n].notna().any()]
+    says_nothing = [name for name in names if known[name].heading and not tables.says_something(cells, name)]
     length = short_keys(cells["cell"])
-    frame = tables.under_headings(cells.assign(cell=cells["cell"].str[:length]), names, CELLS)
-    hidden = [_heading(CELLS, name) for name in (*says_nothing, *MORE_OF_CELLS) if name in names]
+    frame = tables.under_headings(cells.assign(cell=cells["cell"].str[:length]), names, known)
+    offered = (*MORE_OF_CELLS, *(name for name in own if not known[name].heading))
+    hidden = [_heading(known, name) for name in (*says_nothing, *offered) if name in names]
     axes = tuple(_heading(CELLS, name) for name in (*views.AXES, "status"))
     return Grid(
         "summary", "All cells", caption, frame, axes, (*hidden, *_constant(frame)), _disturbed(cells["cell"], cells)
     )
 
 
-def grid_of_thresholds(name: str, title: str, caption: str, rows: pd.DataFrame, cells: pd.DataFrame) -> Grid:
+def grid_of_thresholds(name: str, title: str, caption: str, rows: Extended, cells: pd.DataFrame) -> Grid:
     """A table of break-even points; a row is disturbed if one of its cells is."""
-    ordered = tables.in_order(rows)
-    frame = tables.benefits(rows)
+    ordered = tables.in_order(rows.frame)
+    frame = tables.benefits(rows.frame, rows.columns)
     first = _heading(THRESHOLDS, "primal_b")
     frame = frame[[first, *frame.columns.drop(first)]]
     axes = tuple(heading for heading in frame.columns if not pd.api.types.is_numeric_dtype(frame[heading]))

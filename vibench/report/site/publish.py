@@ -97,7 +97,7 @@ def _write_run(own: Path, run: PublishedRun, pages: _Pages) -> None:
 
 
 def _csv(path: Path, table: str) -> str:
-    return tables.to_csv(tables.whole_numbers(tables.in_order(tables.read(path, table))))
+    return tables.to_csv(tables.whole_numbers(tables.in_order(tables.extended(path, table).frame)))
 
 
 def _comparable(runs: Sequence[PublishedRun]) -> Iterator[tuple[str, list[PublishedRun]]]:

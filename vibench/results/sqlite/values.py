@@ -49,7 +49,7 @@ def storable(table: str, row: Mapping[str, Any]) -> dict[str, Any]:
     found: dict[str, Any] = {}
     for name, value in row.items():
         try:
-            found[name] = _stored(columns.get(name, PARAMETER), value)
+            found[name] = stored(columns.get(name, PARAMETER), value)
         except (TypeError, OverflowError) as error:
             raise UnstorableError(f"column '{name}' of the table '{table}': {error}") from None
     return found
@@ -62,7 +62,7 @@ def error_row(cell: Mapping[str, Any], reason: str) -> dict[str, Any]:
     return kept | {"status": Status.ERROR.value, "reason": reason, "queries_ok": 0}
 
 
-def _stored(column: Column, value: Any) -> Any:
+def stored(column: Column, value: Any) -> Any:
     """A value in the type of its column; a `TypeError` or an `OverflowError` where there is none."""
     kind = column.kind.split()[0]
     if isinstance(value, np.generic):

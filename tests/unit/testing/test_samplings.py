@@ -1,0 +1,211 @@
+"""Sampling strategies that are wrong, each in one way: the check made for it finds it, and no other does."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pytest
+from running import Main, refused
+
+from vibench import AdaptiveSampling, Array, ParameterBox, RequestError, Sampling, Trainer, testing
+from vibench.testing.checks import Finding, Verdict
+
+
+class Uniform(Sampling):
+    """Independent points; nothing is wrong with it."""
+
+    def __init__(self, size: int, seed: int = 0) -> None:
+        self.size, self.seed = size, seed
+
+    def parameters(self, box: ParameterBox) -> Array:
+        return box.sample(self.size, self.seed)
+
+
+class Transposed(Uniform):
+    def parameters(self, box: ParameterBox) -> Array:
+        return super().parameters(box).T
+
+
+class Outside(Uniform):
+    def parameters(self, box: ParameterBox) -> Array:
+        return super().parameters(box) + (box.upper - box.lower)
+
+
+class Twice(Uniform):
+    def parameters(self, box: ParameterBox) -> Array:
+        return np.repeat(super().parameters(box)[: -(-self.size // 2)], 2, axis=0)[: self.size]
+
+
+class PerAxis(Uniform):
+    """Takes its size for that of an axis."""
+
+    def parameters(self, box: ParameterBox) -> Array:
+        return box.grid(*[self.size] * box.dim)
+
+
+class Unseeded(Uniform):
+    def parameters(self, box: ParameterBox) -> Array:
+        return box.sample(self.size, int(np.random.default_rng().integers(2**32)))
+
+
+class Deaf(Uniform):
+    def parameters(self, box: ParameterBox) -> Array:
+        return box.sample(self.size, 1)
+
+
+class OfHashes(Uniform):
+    """Its points follow from the order of a set of texts."""
+
+    def parameters(self, box: ParameterBox) -> Array:
+        order = list({"a", "b", "c", "d", "e", "f", "g"})
+        return box.sample(self.size, self.seed + int("".join(str("abcdefg".index(one)) for one in order)))
+
+
+class Reseeds(Uniform):
+    def parameters(self, box: ParameterBox) -> Array:
+        np.random.seed(self.seed)  # noqa: NPY002
+        return box.lower + np.random.rand(self.size, box.dim) * (box.upper - box.lower)  # noqa: NPY002
+
+
+class Narrows(Uniform):
+    def parameters(self, box: ParameterBox) -> Array:
+        found = super().parameters(box)
+        box.lower[:] = 0.0
+        return found
+
+
+class Raises(Uniform):
+    def parameters(self, box: ParameterBox) -> Array:
+        raise ArithmeticError("no points today")
+
+
+class Picky(Uniform):
+    def parameters(self, box: ParameterBox) -> Array:
+        raise RequestError("only on Sundays")
+
+
+class Unpicklable(Uniform):
+    def __init__(self, size: int, seed: int = 0) -> None:
+        super().__init__(size, seed)
+        self.rule = lambda: None
+
+
+class Farthest(AdaptiveSampling):
+    """The candidate farthest from the solutions; nothing is wrong with it."""
+
+    def parameters(self, box: ParameterBox) -> Array:
+        return box.grid(*[4] * box.dim)
+
+    def train(self, box: ParameterBox, trainer: Trainer) -> None:
+        trainer.solve(box.lower)
+        for mu in self.parameters(box):
+            if trainer.bound(mu) > 0.5:
+                trainer.solve(mu, trainer.bound(mu))
+
+
+class Idle(Farthest):
+    def train(self, box: ParameterBox, trainer: Trainer) -> None:
+        pass
+
+
+class Endless(Farthest):
+    def train(self, box: ParameterBox, trainer: Trainer) -> None:
+        while True:
+            trainer.solve(box.lower)
+
+
+class Beyond(Farthest):
+    def train(self, box: ParameterBox, trainer: Trainer) -> None:
+        trainer.solve(2.0 * box.upper)
+
+
+class Wanders(Farthest):
+    def train(self, box: ParameterBox, trainer: Trainer) -> None:
+        trainer.solve(box.sample(1, int(np.random.default_rng().integers(2**32)))[0])
+
+
+WRONG: Mapping[type[Sampling], tuple[str, str]] = {
+    Transposed: ("parameters", "1 parameter: parameters of shape (1, 5); expected (P, 1), a row for each, with P > 0"),
+    Outside: ("parameters", "1 parameter: parameter 0 has 'position' = 3.91"),
+    Twice: ("parameters", "1 parameter: parameter 1, ["),
+    PerAxis: ("size", "2 parameters: size = 5 was asked for; there are 25 points"),
+    Unseeded: ("determinism", "3 parameters: a second call gives different values of the points: entry ("),
+    OfHashes: ("another process", "1 parameter: another process gives different points: entry ("),
+    Reseeds: ("no mutation", "1 parameter: parameters changes NumPy's global random numbers"),
+    Narrows: ("no mutation", "1 parameter: parameters changes box.lower; work on copies"),
+    Raises: ("parameters", "ArithmeticError: no points today (test_samplings.py, line "),
+    Picky: (
+        "parameters",
+        "(position, height, stiffness) is accepted: only on Sundays",
+    ),
+    Unpicklable: ("pickling", "the Unpicklable cannot be pickled"),
+    Idle: ("training", "1 parameter: train solves nowhere; expected a training parameter at least"),
+    Endless: ("training", "train does not end after 5000 solutions"),
+    Beyond: ("training", "1 parameter: train: parameter 0 has 'position' = 4, outside the box [-1, 2]"),
+    Wanders: ("training", "1 parameter: a second call solves at other parameters"),
+}
+
+
+def made(plugin: type[Sampling]) -> partial[Sampling]:
+    return partial(plugin) if issubclass(plugin, Farthest) else partial(plugin, size=5)
+
+
+def failures(findings: list[Finding]) -> dict[str, str]:
+    return {finding.check: finding.message for finding in findings if finding.verdict is Verdict.FAILED}
+
+
+@pytest.mark.parametrize("plugin", WRONG)
+def test_a_fault_is_found_by_its_check_alone(plugin: type[Sampling]) -> None:
+    check, words = WRONG[plugin]
+    found = failures(testing.examine_sampling(made(plugin)))
+    assert list(found) == [check]
+    assert words in found[check]
+
+
+@pytest.mark.parametrize("plugin", [Uniform, Farthest])
+def test_what_is_right_passes(plugin: type[Sampling]) -> None:
+    testing.check_sampling(made(plugin))
+
+
+def test_a_seed_that_changes_nothing_is_doubtful() -> None:
+    (doubt,) = [one for one in testing.examine_sampling(made(Deaf)) if one.verdict is Verdict.WARNING]
+    assert doubt.check == "seed"
+    assert "seeds 0 to 3 give the same points" in doubt.message
+
+
+def test_the_command_chooses_a_size_and_a_seed_and_says_so(main: Main) -> None:
+    code, out, err = main("check", "sampling:latin-hypercube")
+    assert (code, err) == (0, ""), out
+    assert out.startswith(
+        "sampling strategy 'latin-hypercube', with size = 16 and seed = 0 (--option size=… for another)\n"
+    )
+    assert "passed   parameters: 1 parameter: P = 16; 2 parameters: P = 16; 3 parameters: P = 16\n" in out
+    refused(main("check", "sampling:grid"), "needs the option 'counts'")
+    code, out, _ = main("check", "sampling:list", "--option", "points=[[0.5, 1, 5.2], [1, 2, 5.3]]")
+    assert code == 0
+    assert "1 parameter: refused, point 0 has 3 values" in out
+
+
+HANGING = """
+import time
+from vibench import Sampling
+
+class Hangs(Sampling):
+    '''Never answers.'''
+    def parameters(self, box):
+        time.sleep(60.0)
+"""
+
+
+def test_the_command_names_what_hangs(main: Main) -> None:
+    Path("hanging_points.py").write_text(HANGING)
+    code, out, _ = main("check", "hanging_points:Hangs", "--seconds", "3")
+    assert code == 1
+    assert "failed   parameters: stopped: the checks take longer than 3 s" in out
+
+
+def test_a_run_is_for_figures(main: Main) -> None:
+    refused(main("check", "sampling:grid", "--run", "quick"), "--run is for figure plugins", "'grid' is none")

@@ -1,0 +1,260 @@
+"""Columns that plugins add to the tables of the results: computed when a table is read, and stored nowhere.
+
+A results file holds what was measured, and stays readable where a plugin is not installed. Whatever is wrong with a
+plugin is a line beside the table, which has all other columns.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import pandas as pd
+
+from vibench.errors import RequestError, VibenchError, in_a_line
+from vibench.interfaces.figures import EXTENSIBLE, DerivedColumn, FigurePlugin
+from vibench.results.columns import CELLS, INTEGER, REAL, STORED, TEXT, THRESHOLDS, Column
+from vibench.results.sqlite.values import stored
+from vibench.study import registry
+from vibench.text import brief
+
+KIND = "figure plugin"
+
+TYPES: Mapping[type, str] = {float: REAL, int: INTEGER, str: TEXT}
+
+AFTER = 100
+"""Places of columns of plugins in a table for reading: after all others."""
+
+RESERVED = {"pair", "error_below", *(name.lower() for table in STORED.values() for name in table)}
+"""Names of columns of results files, for which SQLite knows no case, and of those that figures and summaries add."""
+
+_SHOWN = {**CELLS, **THRESHOLDS}
+
+HEADINGS = {"error ≤", *_SHOWN, *(column.heading for column in _SHOWN.values() if column.heading)}
+"""What stands above the columns of the tables for reading."""
+
+PARAMETERS = re.compile(r"mu_\d+")
+
+Read = Callable[[str], pd.DataFrame]
+"""Reads a recorded table, by its name."""
+
+
+class ColumnError(VibenchError):
+    """A column of a plugin that cannot be used, in one line."""
+
+
+@dataclass(frozen=True)
+class Extended:
+    """A table with the columns that plugins add to it.
+
+    Attributes
+    ----------
+    frame
+        Its rows.
+    columns
+        Those of plugins, by their names.
+    better
+        Whether a smaller or a larger value is better, by the names of those of which one is.
+    faults
+        A line for every plugin or column that could not be used.
+    """
+
+    frame: pd.DataFrame
+    columns: Mapping[str, Column] = field(default_factory=dict)
+    better: Mapping[str, str] = field(default_factory=dict)
+    faults: tuple[str, ...] = ()
+
+    def of(self, frame: pd.DataFrame) -> Extended:
+        """The same with other rows."""
+        return replace(self, frame=frame)
+
+
+def extended(table: str, read: Read) -> Extended:
+    """A recorded table with the columns of plugins, in the order of its rows."""
+    frame = read(table)
+    if table not in EXTENSIBLE:
+        return Extended(frame)
+    columns: dict[str, Column] = {}
+    better: dict[str, str] = {}
+    faults: list[str] = []
+    tables = Copies(read)
+    for plugin, found in _declared(faults):
+        if found.table != table:
+            continue
+        try:
+            values = column_values(plugin, found, tables, frame)
+        except ColumnError as error:
+            faults.append(str(error))
+            continue
+        frame = frame.assign(**{found.name: values})
+        place = AFTER + len(columns)
+        columns[found.name] = Column(TYPES[found.kind], found.unit, found.meaning, found.heading, place)
+        better |= {found.name: found.better} if found.better else {}
+    return Extended(frame, columns, better, tuple(faults))
+
+
+def _declared(faults: list[str]) -> Iterator[tuple[str, DerivedColumn]]:
+    """The columns of all plugins, with the names of the plugins; what cannot be used is added to the faults."""
+    owners: dict[str, str] = {}
+    for name in registry.names(KIND):
+        try:
+            found = declared(name, loaded(name))
+        except VibenchError as error:
+            faults.append(str(error))
+            continue
+        for column in found:
+            if fault := _taken(name, column, owners):
+                faults.append(fault)
+            else:
+                owners |= _names(name, column)
+                yield name, column
+
+
+def name_faults(plugin: str, columns: Sequence[DerivedColumn]) -> Iterator[str]:
+    """A line for each column of a plugin whose name or heading vibench or an earlier column of it has."""
+    owners: dict[str, str] = {}
+    for column in columns:
+        if fault := _taken(plugin, column, owners):
+            yield fault
+        owners |= _names(plugin, column)
+
+
+def _names(plugin: str, column: DerivedColumn) -> dict[str, str]:
+    """The plugin by the name and the heading of its column, which no other one may have."""
+    return {text: plugin for text in (column.name.lower(), column.heading) if text}
+
+
+def _taken(plugin: str, column: DerivedColumn, owners: Mapping[str, str]) -> str:
+    """Why a column cannot have its name or heading; "" if it can. `owners` are the plugins of those before it."""
+    name, title = column.name.lower(), _title(plugin, column)
+    if name in RESERVED or PARAMETERS.fullmatch(name):
+        return f"{title} has the name of a column of vibench, and needs another"
+    if column.heading in HEADINGS:
+        return f"{title} has the heading '{column.heading}' of a column of vibench, and needs another"
+    for what, text in (("name", name), ("heading", column.heading)):
+        if text in owners:
+            return f"{title} has the {what} of a column of {KIND} '{owners[text]}', and needs another"
+    return ""
+
+
+def loaded(name: str) -> FigurePlugin:
+    """A figure plugin.
+
+    Raises
+    ------
+    RequestError
+        If it cannot be loaded or created.
+    """
+    missing = registry.missing(KIND, name)
+    if missing:
+        raise RequestError(f"{KIND} '{name}' needs {', '.join(missing)}, which is not installed")
+    try:
+        plugin: FigurePlugin = registry.create(KIND, name)
+    except RequestError:
+        raise
+    except (Exception, SystemExit) as error:  # noqa: BLE001  third-party code
+        raise RequestError(f"{KIND} '{name}' cannot be created: {in_a_line(error)}") from None
+    return plugin
+
+
+def declared(name: str, plugin: FigurePlugin) -> Sequence[DerivedColumn]:
+    """The columns that a plugin declares.
+
+    Raises
+    ------
+    ColumnError
+        If it raises, or returns something else.
+    """
+    try:
+        found = tuple(plugin.columns())
+    except (Exception, SystemExit) as error:  # noqa: BLE001  third-party code
+        raise ColumnError(f"{KIND} '{name}' has no columns: {in_a_line(error)}") from None
+    for column in found:
+        if not isinstance(column, DerivedColumn):
+            raise ColumnError(f"{KIND} '{name}' declares a {type(column).__name__}, expected a vibench.DerivedColumn")
+    return found
+
+
+def column_values(plugin: str, column: DerivedColumn, tables: Copies, frame: pd.DataFrame) -> pd.Series:
+    """The values of a column for the rows of its table.
+
+    Raises
+    ------
+    ColumnError
+        If the function raises, returns another number of values, or values of another type.
+    """
+    title = _title(plugin, column)
+    try:
+        found = column.values(tables)
+        values = list(found)
+    except (Exception, SystemExit) as error:  # noqa: BLE001  third-party code
+        raise ColumnError(f"{title} cannot be computed: {in_a_line(error)}") from None
+    if isinstance(found, str | bytes | Mapping | pd.DataFrame):
+        raise ColumnError(f"{title} is a {type(found).__name__}, expected a value for each row")
+    if len(values) != len(frame):
+        raise ColumnError(f"{title} has {len(values)} values for the {len(frame)} rows of '{column.table}'")
+    if isinstance(found, pd.Series) and not found.index.equals(frame.index):
+        raise ColumnError(f"{title} is a Series with another index than the table '{column.table}' has")
+    kept = [_stored(title, column, k, value) for k, value in enumerate(values)]
+    kind = {float: "float64", int: "Int64" if None in kept else "int64", str: "object"}[column.kind]
+    return pd.Series(kept, index=frame.index, dtype=kind)
+
+
+def _stored(title: str, column: DerivedColumn, row: int, value: Any) -> Any:
+    """A value as a results file would hold it."""
+    if value is pd.NA or value is pd.NaT:
+        return None
+    if isinstance(value, bool) or type(value).__name__ == "bool":  # NumPy's is no subclass
+        raise ColumnError(f"{title} has the value {value} in row {row}, expected {column.kind.__name__}")
+    try:
+        return stored(Column(TYPES[column.kind], "", ""), value)
+    except (TypeError, ValueError, OverflowError) as error:
+        raise ColumnError(f"{title} has {brief(repr(value), 40)} in row {row}: {error}") from None
+
+
+def _title(plugin: str, column: DerivedColumn) -> str:
+    return f"column '{column.name}' of {KIND} '{plugin}'"
+
+
+class Copies:
+    """The recorded tables of a run (`vibench.RunTables`), read when asked for; each access gives a copy."""
+
+    def __init__(self, read: Read) -> None:
+        self._read, self._known = read, dict[str, pd.DataFrame]()
+
+    def _copy(self, table: str) -> pd.DataFrame:
+        if table not in self._known:
+            self._known[table] = self._read(table)
+        return self._known[table].copy()
+
+    @property
+    def cells(self) -> pd.DataFrame:
+        """A row per cell."""
+        return self._copy("cells")
+
+    @property
+    def queries(self) -> pd.DataFrame:
+        """A row per query of a cell."""
+        return self._copy("queries")
+
+    @property
+    def histories(self) -> pd.DataFrame:
+        """A row per step of POD, cones and enrichments."""
+        return self._copy("histories")
+
+    @property
+    def timings(self) -> pd.DataFrame:
+        """A row per timing round of a cell."""
+        return self._copy("timings")
+
+    @property
+    def thresholds(self) -> pd.DataFrame:
+        """A row per pair of cells that break-even compares."""
+        return self._copy("thresholds")
+
+    @property
+    def outputs(self) -> pd.DataFrame:
+        """A row per cell and quantity of interest."""
+        return self._copy("outputs")

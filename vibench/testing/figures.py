@@ -1,0 +1,219 @@
+"""The conformance checks of figure plugins: figures that are drawn and have captions, columns with a value per row."""
+
+from __future__ import annotations
+
+import inspect
+import shutil
+import tempfile
+import time
+import weakref
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import cached_property, partial
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import pandas as pd
+
+from vibench.interfaces.figures import DerivedColumn, FigurePlugin
+from vibench.results import tables
+from vibench.results.plugin_columns import Copies, column_values, declared, name_faults
+from vibench.testing.checks import SECONDS, Check, Doubt, Finding, Note, examine, raising
+from vibench.testing.samples.run import write_sample_run
+
+if TYPE_CHECKING:
+    from vibench.report.figures.data import Data
+
+NAME = "examined"
+"""What the plugin is called in messages of the functions that draw."""
+
+
+@dataclass(eq=False)
+class FigureCase:
+    """A figure plugin and the results file that its figures and columns are made from; `limit` is in wall seconds."""
+
+    create: Callable[[], FigurePlugin]
+    limit: float
+    run: Path | None = None
+
+    def __post_init__(self) -> None:
+        if not callable(self.create):
+            raise TypeError(f"pass the class {type(self.create).__name__}, not an instance: two instances are compared")
+        self._slowest = dict[str, float]()
+
+    @cached_property
+    def plugin(self) -> FigurePlugin:
+        """The instance that most checks use."""
+        return self.create()
+
+    @cached_property
+    def folder(self) -> Path:
+        """Folder of the made-up runs, which goes with the case."""
+        folder = tempfile.mkdtemp(prefix="vibench-check-")
+        weakref.finalize(self, shutil.rmtree, folder, ignore_errors=True)
+        return Path(folder)
+
+    @cached_property
+    def path(self) -> Path:
+        """The results file: of the run that is given, or of the made-up one."""
+        return self.run or write_sample_run(self.folder / "run")
+
+    @cached_property
+    def empty(self) -> Path:
+        """Results of a run without cells."""
+        return write_sample_run(self.folder / "empty", empty=True)
+
+    @cached_property
+    def problems(self) -> list[Data]:
+        """The tables of every problem of the run."""
+        from vibench.report.figures.data import problems  # noqa: PLC0415  loads matplotlib
+
+        return [data for _, data in problems(self.path)]
+
+    @cached_property
+    def columns(self) -> tuple[DerivedColumn, ...]:
+        """The columns that it declares."""
+        return tuple(declared(NAME, self.plugin))
+
+    def construction(self) -> Iterator[str]:
+        """It is made without arguments."""
+        plugin: object = self.plugin
+        if not isinstance(plugin, FigurePlugin):
+            yield f"a {type(plugin).__name__} was made; expected a subclass of vibench.FigurePlugin"
+        constructor = getattr(self.create, "func", self.create)
+        options = list(inspect.signature(constructor).parameters)
+        if options:
+            yield Doubt(f"it is created without arguments: nobody sets {', '.join(options)}")
+
+    def drawings(self) -> Iterator[str]:
+        """Every problem has figures, as functions by the ends of their names."""
+        from vibench.report.figures.plugins import named  # noqa: PLC0415  loads matplotlib
+
+        for data in self.problems:
+            found = [kind for kind, _ in named(NAME, self.plugin, data)]
+            yield Note(f"{data.problem}: {len(found)} figures")
+
+    def figures(self) -> Iterator[str]:
+        """Every figure is drawn or has nothing to show, has a caption, and changes no table."""
+        from vibench.report.figures.plugins import draw_guarded, named  # noqa: PLC0415  loads matplotlib
+        from vibench.report.figures.style import caption_of, styled  # noqa: PLC0415  likewise
+
+        drawn = 0
+        for data in self.problems:
+            before = _frames(data)
+            for kind, draw in list(named(NAME, self.plugin, data)):
+                began = time.perf_counter()
+                with styled():
+                    figure = draw_guarded(NAME, kind, draw)
+                self._note(f"figure '{kind}'", time.perf_counter() - began)
+                drawn += figure is not None
+                if figure is not None and not caption_of(figure):
+                    yield Doubt(f"{data.problem}: figure '{kind}' has no caption: use vibench.Sheet, or a docstring")
+            for name, frame in _frames(data).items():
+                if not frame.equals(before[name]):
+                    yield f"{data.problem}: drawing changes tables.{name}; work on a copy"
+        yield Note(f"{drawn} figures drawn")
+
+    def declarations(self) -> Iterator[str]:
+        """Columns have names and headings that nothing else has."""
+        yield from name_faults(NAME, self.columns)
+        yield Note(", ".join(f"{one.name} of {one.table}" for one in self.columns) or "no columns")
+
+    def values(self) -> Iterator[str]:
+        """Columns have a value of their type for every row, also where there is none."""
+        for what, path in (("", self.path), (" of a run without cells", self.empty)):
+            for column in self.columns:
+                began = time.perf_counter()
+                found = self._values(column, path)
+                self._note(f"column '{column.name}'", time.perf_counter() - began)
+                if not what and len(found) and found.isna().all():
+                    yield Doubt(f"column '{column.name}' is empty in all {len(found)} rows")
+
+    def determinism(self) -> Iterator[str]:
+        """A second call and another instance give the same figures and columns."""
+        from vibench.report.figures.plugins import named  # noqa: PLC0415  loads matplotlib
+
+        other = self.create()
+        for data in self.problems:
+            here, there = ([kind for kind, _ in named(NAME, plugin, data)] for plugin in (self.plugin, other))
+            if here != there:
+                yield f"{data.problem}: another instance has the figures {', '.join(there)}, not {', '.join(here)}"
+        again = {column.name: column for column in declared(NAME, other)}
+        if list(again) != [column.name for column in self.columns]:
+            yield f"another instance has the columns {', '.join(again)}"
+            return
+        for column in self.columns:
+            first = self._values(column, self.path)
+            for source, same in (("a second call", column), ("another instance", again[column.name])):
+                found = self._values(same, self.path)
+                if not found.equals(first):
+                    row = int((~(found.eq(first) | (found.isna() & first.isna()))).to_numpy().argmax())
+                    yield (
+                        f"{source} gives column '{column.name}' other values: {found.iloc[row]} against "
+                        f"{first.iloc[row]} in row {row}"
+                    )
+                    break
+
+    def something(self) -> Iterator[str]:
+        """There is a figure or a column of this run."""
+        if not self.columns and not any(self.plugin.drawings(data) for data in self.problems):
+            where = "this run" if self.run else "the made-up run, whose problems are membrane and plate"
+            yield Doubt(f"neither figures nor columns of {where}: `--run RUN` checks on a run of yours")
+
+    def duration(self) -> Iterator[str]:
+        """Every figure and column stays below the limit."""
+        for what, seconds in self._slowest.items():
+            if seconds > self.limit:
+                yield f"{what} takes {seconds:.3g} s, above the limit of {self.limit:g} s"
+        slowest = max(self._slowest.values(), default=0.0)
+        yield Note(f"at most {slowest:.2g} s each")
+
+    def _values(self, column: DerivedColumn, path: Path) -> pd.Series:
+        read = partial(tables.read, path)
+        return column_values(NAME, column, Copies(read), read(column.table))
+
+    def _note(self, what: str, seconds: float) -> None:
+        self._slowest[what] = max(seconds, self._slowest.get(what, 0.0))
+
+
+def _frames(data: Data) -> dict[str, pd.DataFrame]:
+    """Copies of the tables that figures are drawn from."""
+    return {name: getattr(data, name).copy() for name in ("cells", "queries", "histories", "thresholds")}
+
+
+CHECKS: tuple[Check[FigureCase], ...] = (
+    Check("construction", FigureCase.construction),
+    Check("drawings", FigureCase.drawings, ("construction",)),
+    Check("figures", FigureCase.figures, ("drawings",)),
+    Check("columns", FigureCase.declarations, ("construction",)),
+    Check("values", FigureCase.values, ("columns",)),
+    Check("determinism", FigureCase.determinism, ("figures", "values")),
+    Check("something to show", FigureCase.something, ("drawings", "columns")),
+    Check("time", FigureCase.duration, ("figures", "values")),
+)
+
+
+def case_of(create: Callable[[], FigurePlugin], seconds: float = SECONDS, run: str | Path | None = None) -> FigureCase:
+    """The case of a figure plugin; see `examine_figure`."""
+    return FigureCase(create, seconds, None if run is None else tables.results_file(str(run)))
+
+
+def examine_figure(
+    create: Callable[[], FigurePlugin], run: str | Path | None = None, *, seconds: float = SECONDS
+) -> list[Finding]:
+    """Make all checks of a figure plugin.
+
+    Parameters
+    ----------
+    create
+        Its class; an instance is refused with a `TypeError`.
+    run
+        A run: its folder, its results file, or its name under `runs/`. By default a made-up one of two problems,
+        membrane and plate, each with two dual strategies and three enrichments, in which a cell failed.
+    seconds
+        Longest wall time [s] of a figure or a column.
+    """
+    return examine(CHECKS, case_of(create, seconds, run))
+
+
+check_figure = raising(examine_figure)
