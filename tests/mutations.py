@@ -270,14 +270,14 @@ FAULTS = (
     ),
     Fault(
         "online-residual-in-the-norm-of-V",
-        "vibench/model/certificates/bounds.py",
+        "vibench/model/certificates/preparation.py",
         "residual, U = residual_basis(base.X, blocks,",
         "residual, U = residual_basis(problem.V, blocks,",
         ("tests/unit/model/certificates/test_bounds.py",),
     ),
     Fault(
         "residual-basis-of-the-space-before",
-        "vibench/model/certificates/bounds.py",
+        "vibench/model/certificates/preparation.py",
         "problem, Phi, chi, B = model.problem, model.basis, model.generators,",
         "problem, Phi, chi, B = model.problem, np.roll(model.basis, 1, axis=1), model.generators,",
         ("tests/unit/model/certificates/test_bounds.py",),
@@ -306,14 +306,14 @@ FAULTS = (
     Fault(
         "terms-left-out-and-forgotten",
         "vibench/model/certificates/residual.py",
-        "return beside, float(self.norms @ np.abs(z))",
-        "return beside, 0.0",
+        "return self.factor @ represented, beside, float(self.norms @ np.abs(z))",
+        "return self.factor @ represented, beside, 0.0",
         ("tests/unit/model/certificates/test_residual.py",),
     ),
     Fault(
         "coercivity-between-anchors",
         "vibench/model/certificates/spectral.py",
-        "lacking = float(np.abs(theta - self.theta[:, where] @ c) @ self.norms) + 2.0 * self.error",
+        "lacking = float(np.abs(theta - at_anchors) @ self.norms) + 2.0 * self.error",
         "lacking = 2.0 * self.error",
         ("tests/unit/model/certificates/test_spectral.py",),
     ),
@@ -431,9 +431,9 @@ FAULTS = (
     ),
     Fault(
         "declared-terms-in-another-order",
-        "vibench/model/hyperreduced.py",
-        "self.problem.affine[name].coefficients(mu) for name",
-        "self.problem.affine[name].coefficients(mu)[::-1] for name",
+        "vibench/model/affine.py",
+        "problem.affine[name].coefficients(mu) for name",
+        "problem.affine[name].coefficients(mu)[::-1] for name",
         ("tests/unit/model/test_hyperreduced.py",),
     ),
     Fault(

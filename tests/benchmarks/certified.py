@@ -27,7 +27,8 @@ from vibench.highfidelity.active_set import HighFidelitySolver
 from vibench.interfaces.strategies import Enrichment, Kind
 from vibench.model.affine import affine_decomposition
 from vibench.model.certificates.base import Guarantee, certificate_base
-from vibench.model.certificates.bounds import OnlineCertificate, prepare
+from vibench.model.certificates.bounds import OnlineCertificate
+from vibench.model.certificates.preparation import prepare
 from vibench.model.galerkin import ReducedModel
 from vibench.model.hyperreduced import HyperReducedModel, hyper_reduce
 from vibench.qp.solve import solve_qp

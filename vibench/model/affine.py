@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Any
@@ -12,7 +12,7 @@ import scipy.sparse as sp
 
 from vibench.arrays import Array, Indices, SparseMatrix
 from vibench.errors import NumericalError
-from vibench.interfaces.problem import MEMBERS, Problem
+from vibench.interfaces.problem import MEMBERS, Problem, Sampler
 from vibench.interfaces.validation import checked_assembly
 from vibench.model.deim import interpolate
 
@@ -90,6 +90,26 @@ def affine_decomposition(problem: Problem, training: Array, tolerance: float) ->
         else:
             found[name] = _member(name, assembled[name], problem, tolerance)
     return found
+
+
+def evaluated_members(
+    members: Mapping[str, AffineMember],
+) -> tuple[dict[str, tuple[Indices, Indices]], tuple[str, ...]]:
+    """Rows and columns of the entries that are evaluated at a parameter, by member, and the members declared affine."""
+    sampled = {name: (m.rows, m.columns) for name, m in members.items() if m.way is Evaluation.INTERPOLATED}
+    return sampled, tuple(name for name, m in members.items() if m.way is Evaluation.AFFINE)
+
+
+def coefficients(
+    problem: Problem, sampled: Mapping[str, tuple[Indices, Indices]], declared: Sequence[str]
+) -> Callable[[Array], Mapping[str, Array]]:
+    """The function that evaluates θ (Q,) at mu (d,) of members with sampled entries and of those declared affine."""
+    sampler: Sampler = problem.sampler(sampled) if sampled else lambda _: {}
+
+    def evaluate(mu: Array) -> Mapping[str, Array]:
+        return {name: problem.affine[name].coefficients(mu) for name in declared} | dict(sampler(mu))
+
+    return evaluate
 
 
 def _check_affine(problem: Problem, training: Array) -> None:

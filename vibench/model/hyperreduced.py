@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property, partial
 
@@ -11,10 +11,10 @@ import scipy.linalg
 
 from vibench.arrays import Array, Indices
 from vibench.errors import NumericalError
-from vibench.interfaces.problem import MEMBERS, Contact, Sampler, VariationalInequality
+from vibench.interfaces.problem import MEMBERS, Contact, VariationalInequality
 from vibench.interfaces.strategies import Kind
 from vibench.linalg.dense import orthonormal_range
-from vibench.model.affine import AffineMember, Evaluation
+from vibench.model.affine import AffineMember, Evaluation, coefficients, evaluated_members
 from vibench.model.galerkin import Evaluated, ReducedModel, ReducedProblem
 from vibench.reduction.supremizers import ContactCoordinates, Coordinates, SpannedCoordinates, supremizers
 
@@ -136,10 +136,11 @@ def hyper_reduce(model: ReducedModel, members: Mapping[str, AffineMember]) -> Op
     A = ProjectedMember.symmetric([Z.T @ np.asarray(term @ Z) for term in members["A"].terms], members["A"])
     contact = members["B"].way is Evaluation.CONTACT
     count, rank = model.generators.shape[1], model.span.shape[1]
+    sampled, affine = evaluated_members(members)
     dual_is_regular = A.constant and coordinates is None and A.shape[0] >= count == rank > 0
     return Operators(
-        sampled_entries={name: (m.rows, m.columns) for name, m in members.items() if m.way is Evaluation.INTERPOLATED},
-        affine=tuple(name for name, m in members.items() if m.way is Evaluation.AFFINE),
+        sampled_entries=sampled,
+        affine=affine,
         A=A,
         f=ProjectedMember.of([Z.T @ term for term in members["f"].terms], members["f"]),
         g=None
@@ -188,14 +189,9 @@ class HyperReducedModel:
         self.kind = Kind.FIXED if operators.supremizer_coordinates is None else Kind.PER_PARAMETER
 
     @cached_property
-    def _sampler(self) -> Sampler:
-        entries = self._operators.sampled_entries
-        return self.problem.sampler(entries) if entries else lambda _: {}
-
-    def coefficients(self, mu: Array) -> Samples:
-        """The values θ (Q,) at mu (d,) of all members that are sums of terms: declared ones and sampled entries."""
-        declared = {name: self.problem.affine[name].coefficients(mu) for name in self._operators.affine}
-        return {**declared, **self._sampler(mu)}
+    def coefficients(self) -> Callable[[Array], Samples]:
+        """The function of mu (d,) that evaluates θ (Q,) of all members that are sums of terms."""
+        return coefficients(self.problem, self._operators.sampled_entries, self._operators.affine)
 
     def assemble(self, mu: Array) -> ReducedProblem:
         """The reduced problem at mu (d,).

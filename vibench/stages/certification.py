@@ -8,8 +8,10 @@ from dataclasses import dataclass
 from vibench.errors import UnsupportedError
 from vibench.model.affine import AffineMember
 from vibench.model.certificates.base import CertificateBase, certificate_base
-from vibench.model.certificates.bounds import OnlineCertificate, prepare
+from vibench.model.certificates.bounds import OnlineCertificate
 from vibench.model.certificates.lifting import ContactCompliance
+from vibench.model.certificates.preparation import prepare
+from vibench.model.certificates.prepared_lifting import PreparedLiftings
 from vibench.model.certificates.residual import ResidualBasis
 from vibench.model.certificates.spectral import SpectralBounds
 from vibench.model.hyperreduced import HyperReducedModel
@@ -19,7 +21,7 @@ from vibench.storage.artefacts import Store
 from vibench.storage.serialisation import storable
 from vibench.timing import timed
 
-for _kind in (CertificateBase, ContactCompliance, OnlineCertificate, ResidualBasis, SpectralBounds):
+for _kind in (CertificateBase, ContactCompliance, OnlineCertificate, PreparedLiftings, ResidualBasis, SpectralBounds):
     storable(_kind)
 
 

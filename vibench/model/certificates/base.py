@@ -10,10 +10,10 @@ import numpy as np
 
 from vibench.arrays import Array, Indices, SparseMatrix
 from vibench.errors import UnsupportedError
-from vibench.interfaces.problem import Problem
+from vibench.interfaces.problem import Contact, Problem
 from vibench.interfaces.validation import checked_assembly
 from vibench.linalg.inner_product import InnerProduct
-from vibench.model.affine import AffineMember, Evaluation
+from vibench.model.affine import AffineMember, Evaluation, coefficients, evaluated_members
 from vibench.model.certificates.spectral import SpectralBounds, rotated, spectral_bounds
 from vibench.stability.coercivity import operator_norm
 
@@ -25,6 +25,9 @@ SEED = 21
 
 SAFETY = 2.0
 """Factor on the largest error measured."""
+
+ONE = np.ones(1)
+"""θ of a constant member."""
 
 
 class Guarantee(StrEnum):
@@ -68,6 +71,13 @@ class CertificateBase:
         exact = self.load_error == self.stiffness_error == 0.0
         return Guarantee.CERTIFIED if proved and exact else Guarantee.VERIFIED
 
+    def coefficients(self, samples: Mapping[str, Array]) -> dict[str, Array]:
+        """θ of f, A and B from those that a query evaluated; those of A rotated, one for what is constant."""
+        theta = {name: samples.get(name, ONE) for name in ("f", "A", "B")}
+        if self.rotation is not None:
+            theta["A"] = self.rotation @ theta["A"]
+        return theta
+
 
 def unsupported(problem: Problem, members: Mapping[str, AffineMember]) -> str:
     """Why reduced models of a problem cannot be certified at online cost; "" if they can."""
@@ -99,10 +109,10 @@ def certificate_base(problem: Problem, members: Mapping[str, AffineMember], trai
     load, stiffness = _interpolation_errors(problem, X, A, f)
     terms, rotation, spectral = list(A.terms), None, None
     if not constant:
-        coefficients = _Coefficients(problem, "A", A)
-        samples = np.column_stack([coefficients.at(mu) for mu in training])
+        evaluate = coefficients(problem, *evaluated_members({"A": A}))
+        samples = np.column_stack([evaluate(mu).get("A", ONE) for mu in training])
         rotation, terms = T, _ = rotated(A.terms, samples)
-        spectral = spectral_bounds(problem, X, terms, lambda mu: T @ coefficients.at(mu), stiffness)
+        spectral = spectral_bounds(problem, X, terms, lambda mu: T @ evaluate(mu).get("A", ONE), stiffness)
     return CertificateBase(X, 0.5 * (compliance + compliance.T), tuple(terms), rotation, spectral, load, stiffness)
 
 
@@ -120,18 +130,11 @@ def contact_unknowns(problem: Problem) -> Indices:
     return problem.contact_dofs
 
 
-class _Coefficients:
-    """The coefficients θ (Q,) of one member as a function of mu."""
-
-    def __init__(self, problem: Problem, name: str, member: AffineMember) -> None:
-        self._name, sampled = name, member.way is Evaluation.INTERPOLATED
-        self._sampler = problem.sampler({name: (member.rows, member.columns)}) if sampled else None
-        self._declared = problem.affine[name] if member.way is Evaluation.AFFINE else None
-
-    def at(self, mu: Array) -> Array:
-        if self._declared is not None:
-            return self._declared.coefficients(mu)
-        return np.ones(1) if self._sampler is None else np.asarray(self._sampler(mu)[self._name])
+def contact_at(problem: Problem, mu: Array) -> Contact:
+    """B and g at mu (d,) on the contact unknowns."""
+    contact = problem.contact(mu)
+    assert contact is not None  # `unsupported` refuses problems without
+    return contact
 
 
 def _interpolation_errors(problem: Problem, X: InnerProduct, A: AffineMember, f: AffineMember) -> tuple[float, float]:
@@ -139,21 +142,14 @@ def _interpolation_errors(problem: Problem, X: InnerProduct, A: AffineMember, f:
     exact = {name: is_exact(problem, name, member) for name, member in (("A", A), ("f", f))}
     if all(exact.values()):
         return 0.0, 0.0
-    theta = {name: _Coefficients(problem, name, member) for name, member in (("A", A), ("f", f))}
+    evaluate = coefficients(problem, *evaluated_members({"A": A, "f": f}))
     load = stiffness = 0.0
     for mu in problem.parameters.sample(VERIFICATION, SEED):
-        vi = checked_assembly(problem, mu)
+        vi, theta = checked_assembly(problem, mu), evaluate(mu)
         if not exact["f"]:
-            interpolated = sum(t * term for t, term in zip(theta["f"].at(mu), f.terms, strict=True))
+            interpolated = sum(t * term for t, term in zip(theta.get("f", ONE), f.terms, strict=True))
             load = max(load, float(np.linalg.norm(X.whiten_functional(vi.f - interpolated))))
         if not exact["A"]:
-            difference = vi.A - sum(t * term for t, term in zip(theta["A"].at(mu), A.terms, strict=True))
+            difference = vi.A - sum(t * term for t, term in zip(theta.get("A", ONE), A.terms, strict=True))
             stiffness = max(stiffness, operator_norm(difference, X).value)
     return SAFETY * load, SAFETY * stiffness
-
-
-def coefficients(base: CertificateBase, samples: Mapping[str, Array]) -> dict[str, Array]:
-    """θ of f, A and B; those of A rotated, one for what does not depend on the parameter."""
-    one = np.ones(1)
-    theta = {name: samples.get(name, one) for name in ("f", "A", "B")}
-    return theta if base.rotation is None else theta | {"A": base.rotation @ theta["A"]}

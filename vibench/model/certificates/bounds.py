@@ -24,39 +24,24 @@ whether w is feasible, and nowhere else.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
+from math import sqrt
 
 import numpy as np
-import scipy.sparse as sp
 
-from vibench.arrays import Array, Indices
-from vibench.errors import UnsupportedError
-from vibench.highfidelity.active_set import FALLBACK_SOLVER
-from vibench.interfaces.problem import Contact, Problem
-from vibench.model.affine import AffineMember
-from vibench.model.certificates.base import (
-    CertificateBase,
-    Guarantee,
-    coefficients,
-    contact_unknowns,
-    injected,
-    is_exact,
-)
+from vibench.arrays import Array, SparseMatrix
+from vibench.interfaces.problem import Problem
+from vibench.model.certificates.base import ONE, CertificateBase, Guarantee, contact_at
 from vibench.model.certificates.lifting import ContactCompliance, lift
-from vibench.model.certificates.residual import ResidualBasis, residual_basis
+from vibench.model.certificates.prepared_lifting import PreparedLiftings
+from vibench.model.certificates.residual import ResidualBasis
 from vibench.model.error_bounds import NO_LIFTING, NOT_IN_CONE
 from vibench.model.galerkin import Evaluated, ReducedProblem
-from vibench.model.hyperreduced import HyperReducedModel
-from vibench.qp.solve import solve_qp
 
-SAMPLES = 200
-"""Training parameters at most whose reduced solutions tell what terms of the residual contribute."""
+TINY = float(np.finfo(float).tiny)
 
-RINGS = 1
-"""Rings of rows around the support of the generators whose contact unknowns liftings usually involve."""
-
-SAMPLE_ACCURACY = 1e-8
+NOT_PREPARED = "no prepared lifting satisfies B w ≥ s: the best w was computed at the parameter"
 
 NOT_COERCIVE = "no positive lower bound of the coercivity of A was found at this parameter"
 
@@ -76,7 +61,7 @@ class OnlineBound:
     coercivity
         α.
     guarantee, note
-        What they are worth, and why there are none or "".
+        What they are worth, and why there are none, what took more time than usual, or "".
     """
 
     u_energy: float
@@ -98,7 +83,7 @@ class OnlineBound:
 
 @dataclass(frozen=True)
 class OnlineCertificate:
-    """What bounds the errors of one reduced model at online cost; from `prepare`.
+    """What bounds the errors of one reduced model at online cost; from `vibench.model.certificates.preparation`.
 
     Attributes
     ----------
@@ -116,6 +101,10 @@ class OnlineCertificate:
         χ (m×R).
     on_contact
         Whether the coefficients of Bᵀλ_N are its values on the contact unknowns, not multiples of Bᵀχ.
+    prepared
+        Liftings that take no factorisation at the parameter, where there are any.
+    bound_terms
+        The terms of g (m×Q), where these liftings need no matrix B.
     """
 
     base: CertificateBase
@@ -125,11 +114,14 @@ class OnlineCertificate:
     contact_basis: Array
     generators: Array
     on_contact: bool
+    prepared: PreparedLiftings | None = None
+    bound_terms: Array | None = None
 
     @cached_property
-    def _near_directions(self) -> Array:
-        """Rows of `contact_directions` for the unknowns of most liftings."""
-        return np.ascontiguousarray(self.contact_directions[self.compliance.near])
+    def _bound_sizes(self) -> Array:
+        """|g_q| (m×Q)."""
+        assert self.bound_terms is not None  # where this is called
+        return np.abs(self.bound_terms)
 
     @cached_property
     def _round_off(self) -> Array:
@@ -140,110 +132,75 @@ class OnlineCertificate:
     def evaluate(self, problem: Problem, mu: Array, reduced: ReducedProblem, x: Array, alpha: Array) -> OnlineBound:
         """Bounds of a solution x (N',), α (R,) of a reduced program that a `HyperReducedModel` assembled at mu (d,)."""
         lam, base = self.generators @ alpha, self.base
-        if np.min(lam, initial=0.0) < 0.0:
+        if lam.min(initial=0.0) < 0.0:
             return OnlineBound.none(NOT_IN_CONE)
-        evaluated = _evaluated(reduced)
-        contact, y = _contact(problem, mu, evaluated), _coordinates(evaluated, x)
-        theta = coefficients(base, evaluated.samples)
+        evaluated = evaluated_by(reduced)
+        if self.on_contact and evaluated.contact is None:
+            evaluated = replace(evaluated, contact=contact_at(problem, mu))
+        y, theta = coordinates_of(x, evaluated), base.coefficients(evaluated.samples)
         lower, upper = (1.0, 1.0) if base.spectral is None else base.spectral.at(mu, theta["A"])
         if not lower > 0.0:
             return OnlineBound.none(NOT_COERCIVE)
-        on_contact, uncertain = self.contact_basis @ y, float(np.linalg.norm(y)) * self._round_off
-        lifting = lift(self.compliance, contact, on_contact, uncertain, lam, upper)
-        if lifting is None:
-            return OnlineBound.none(NO_LIFTING)
-        of_lam = contact.B.T @ lam if self.on_contact else np.outer(theta["B"], alpha).ravel()
-        z = residual_coefficients(theta, y, of_lam)
-        energy = float(np.sqrt(max(0.0, float(x @ (reduced.program.A @ x)))))
-        u_norm = energy / float(np.sqrt(max(lower - base.stiffness_error, np.finfo(float).tiny)))  # of u_N in X
+        lifted, note = self._lifted(problem, mu, evaluated, y, lam, upper)
+        if lifted is None:
+            return OnlineBound.none(note)
+        along, norm, kappa = lifted
+        of_lam = np.outer(theta["B"], alpha).ravel()
+        if self.on_contact and evaluated.contact is not None:
+            of_lam = evaluated.contact.B.T @ lam
+        coordinates, beside, missing = self.residual.parts(residual_coefficients(theta, y, of_lam))
+        square_of_u = float(x @ (reduced.program.A @ x))
+        u_norm = sqrt(max(0.0, square_of_u) / max(lower - base.stiffness_error, TINY))  # of u_N in X
         lacking = base.load_error + base.stiffness_error * u_norm
-        coordinates, (beside, missing) = self.residual.coordinates(z), self.residual.left_out(z)
-        rho = float(np.hypot(np.linalg.norm(coordinates), beside)) + missing + lacking
-        omega, kappa = lifting.norm * float(np.sqrt(upper)), lifting.kappa
+        rho = sqrt(float(coordinates @ coordinates) + beside**2) + missing + lacking
+        omega = norm * sqrt(upper)
         square = rho**2 / lower + omega**2 + 2.0 * kappa
-        bound = float(np.sqrt(square))
-        near = len(lifting.unknowns) == len(self.compliance.near)
-        along = lifting.load @ (self._near_directions if near else self.contact_directions)
-        work = float(along @ coordinates) + (beside + missing + lacking) * lifting.norm  # at least rᵀw
-        natural = min(float(np.sqrt(max(0.0, square + 2.0 * work))), omega + bound)
-        least = float(np.sqrt(max(0.0, energy**2 - base.stiffness_error * u_norm**2))) - bound  # of ‖u‖
+        bound = sqrt(square)
+        work = float(along @ coordinates) + (beside + missing + lacking) * norm  # at least rᵀw
+        natural = min(sqrt(max(0.0, square + 2.0 * work)), omega + bound)
+        least = sqrt(max(0.0, square_of_u - base.stiffness_error * u_norm**2)) - bound  # of ‖u‖
         relative = bound / least if least > 0.0 else float("inf")
-        terms = rho / float(np.sqrt(lower)), omega, kappa
-        return OnlineBound(bound, natural, relative, *terms, lower, base.guarantee)
+        return OnlineBound(bound, natural, relative, rho / sqrt(lower), omega, kappa, lower, base.guarantee, note)
+
+    def _lifted(
+        self, problem: Problem, mu: Array, evaluated: Evaluated, y: Array, lam: Array, gamma: float
+    ) -> tuple[tuple[Array, float, float] | None, str]:
+        """Coordinates of X w in the basis of residuals, ‖w‖ and κ; and why it is no prepared w, or there is none."""
+        prepared = self.prepared
+        if prepared is not None:
+            B, g, g_size = self._constraint(problem, mu, evaluated)
+            found = prepared.lift(B, g, g_size, y, lam, gamma)
+            if found is not None:
+                return found, ""
+        on_contact, uncertain = self.contact_basis @ y, float(np.linalg.norm(y)) * self._round_off
+        lifting = lift(self.compliance, evaluated.contact or contact_at(problem, mu), on_contact, uncertain, lam, gamma)
+        if lifting is None:
+            return None, NO_LIFTING
+        along = lifting.load @ self.contact_directions[lifting.unknowns]
+        return (along, lifting.norm, lifting.kappa), "" if prepared is None else NOT_PREPARED
+
+    def _constraint(
+        self, problem: Problem, mu: Array, evaluated: Evaluated
+    ) -> tuple[float | SparseMatrix, Array, Array]:
+        """B and g as prepared liftings take them, and a bound of the terms of g."""
+        if self.bound_terms is None:
+            contact = evaluated.contact or contact_at(problem, mu)
+            return contact.B, contact.g, np.abs(contact.g)
+        theta, of_g = evaluated.samples.get("B", ONE), evaluated.samples.get("g", ONE)
+        return float(theta[0]), self.bound_terms @ of_g, self._bound_sizes @ np.abs(of_g)
 
 
 def residual_coefficients(theta: Mapping[str, Array], y: Array, of_lam: Array) -> Array:
     """Coefficients (Z,) of a residual: those of f, of A for every vector of Φ, and of Bᵀλ_N."""
-    return np.concatenate([theta["f"], -np.outer(theta["A"], y).ravel(), -of_lam])
+    return np.concatenate([theta["f"], np.outer(-theta["A"], y).ravel(), -of_lam])
 
 
-def prepare(
-    model: HyperReducedModel, members: Mapping[str, AffineMember], base: CertificateBase, training: Array
-) -> OnlineCertificate:
-    """Prepare what bounds the errors of a reduced model, from the members it was made of and `certificate_base`.
-
-    Sharpness alone depends on `training` (P×d), parameters that show which terms of residuals contribute.
-    """
-    problem, Phi, chi, B = model.problem, model.basis, model.generators, members["B"]
-    functionals, on_contact = injected(problem), not is_exact(problem, "B", B)
-    blocks = [np.column_stack(members["f"].terms), *(np.asarray(term @ Phi) for term in base.terms)]
-    blocks += [functionals] if on_contact else [np.asarray(term.T @ chi) for term in B.terms]
-    compliance = ContactCompliance(base.compliance, _near(problem, chi, training))
-    residual, U = residual_basis(base.X, blocks, *_sampled(model, base, compliance, on_contact, training))
-    directions = base.X.whiten_functional(functionals).T @ U
-    contact_basis = np.ascontiguousarray(Phi[contact_unknowns(problem)])
-    return OnlineCertificate(base, residual, directions, compliance, contact_basis, chi, on_contact)
-
-
-def _near(problem: Problem, chi: Array, training: Array) -> Indices:
-    """Contact unknowns that rows in the support of a generator, or next to it, touch at some training parameter."""
-    found = np.zeros(len(contact_unknowns(problem)), bool)
-    for mu in training:
-        contact = problem.contact(mu)
-        assert contact is not None  # `unsupported` refuses problems without
-        touches, rows = abs(sp.csr_array(contact.B)) > 0.0, np.any(chi > 0.0, axis=1)
-        for _ in range(RINGS):
-            rows = touches @ (touches.T @ rows)
-        found |= touches.T @ rows
-    return np.flatnonzero(found)
-
-
-def _sampled(
-    model: HyperReducedModel, base: CertificateBase, compliance: ContactCompliance, on_contact: bool, training: Array
-) -> tuple[Array, float]:
-    """Coefficients of residuals (Z×S) of reduced solutions at training parameters, and the median norm of liftings."""
-    problem, found, norms = model.problem, [], [0.0]
-    rows = model.basis[contact_unknowns(problem)]
-    for number, mu in enumerate(training[:: -(-len(training) // SAMPLES)]):
-        reduced = model.assemble(mu)
-        answer = solve_qp(reduced.program, FALLBACK_SOLVER, SAMPLE_ACCURACY, factor=reduced.factor)
-        if answer.x is None or answer.alpha is None or not np.all(np.isfinite(answer.x)):
-            continue
-        evaluated, lam = _evaluated(reduced), model.generators @ np.maximum(answer.alpha, 0.0)
-        contact, y = _contact(problem, mu, evaluated), _coordinates(evaluated, answer.x)
-        theta = coefficients(base, evaluated.samples)
-        of_lam = contact.B.T @ lam if on_contact else np.outer(theta["B"], answer.alpha).ravel()
-        found.append(residual_coefficients(theta, y, of_lam))
-        if number % 8 == 0:
-            lifting = lift(compliance, contact, rows @ y, np.zeros(len(rows)), lam, 1.0)
-            norms += [] if lifting is None else [lifting.norm]
-    if not found:
-        raise UnsupportedError("no reduced program at a training parameter has a solution")
-    return np.column_stack(found), float(np.median(norms))
-
-
-def _evaluated(reduced: ReducedProblem) -> Evaluated:
+def evaluated_by(reduced: ReducedProblem) -> Evaluated:
+    """What the assembly of a reduced program evaluated."""
     assert reduced.evaluated is not None  # assembled by a `HyperReducedModel`
     return reduced.evaluated
 
 
-def _contact(problem: Problem, mu: Array, evaluated: Evaluated) -> Contact:
-    """B and g at mu on the contact unknowns."""
-    contact = evaluated.contact or problem.contact(mu)
-    assert contact is not None  # `unsupported` refuses problems without
-    return contact
-
-
-def _coordinates(evaluated: Evaluated, x: Array) -> Array:
-    """Coordinates (d,) of u_N in Φ."""
+def coordinates_of(x: Array, evaluated: Evaluated) -> Array:
+    """Coordinates (d,) of u_N in Φ from those (N',) in the primal basis at the parameter."""
     return x if evaluated.coordinates is None else np.asarray(evaluated.coordinates @ x)

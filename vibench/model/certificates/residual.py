@@ -61,19 +61,20 @@ class ResidualBasis:
     remainder: float
     norms: Array
 
-    def coordinates(self, z: Array) -> Array:
-        """Coordinates (K,) in U of the residual with coefficients z (Z,)."""
-        return np.asarray(self.factor @ z[self.kept])
+    def parts(self, z: Array) -> tuple[Array, float, float]:
+        """The residual with coefficients z (Z,): its coordinates (K,) in U, and bounds of what is left out of them.
 
-    def left_out(self, z: Array) -> tuple[float, float]:
-        """Bounds of the part of the residual that is orthogonal to U, and of the terms that are left out."""
-        beside = self.remainder * float(np.linalg.norm(self.inverse_scale * z[self.kept])) if self.remainder else 0.0
-        return beside, float(self.norms @ np.abs(z))
+        These are of the part that is orthogonal to U, and of the terms that are left out.
+        """
+        represented = z[self.kept]
+        scaled = self.inverse_scale * represented
+        beside = self.remainder * float(scaled @ scaled) ** 0.5
+        return self.factor @ represented, beside, float(self.norms @ np.abs(z))
 
     def norm(self, z: Array) -> float:
         """Upper bound of the dual norm of the residual."""
-        beside, missing = self.left_out(z)
-        return float(np.hypot(np.linalg.norm(self.coordinates(z)), beside)) + missing
+        coordinates, beside, missing = self.parts(z)
+        return float(np.hypot(np.linalg.norm(coordinates), beside)) + missing
 
 
 def residual_basis(

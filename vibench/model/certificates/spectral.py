@@ -19,11 +19,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import scipy.sparse as sp
 
-from vibench.arrays import Array, Indices, SparseMatrix
+from vibench.arrays import Array, Indices, Mask, SparseMatrix
 from vibench.interfaces.problem import ParameterBox, Problem
 from vibench.interfaces.validation import checked_assembly
 from vibench.linalg.inner_product import InnerProduct
@@ -70,25 +71,30 @@ class SpectralBounds:
     def at(self, mu: Array, theta: Array) -> tuple[float, float]:
         """α(µ) and γ(µ) at mu (d,) with the rotated θ(µ) (Q,); α(µ) ≤ 0 says nothing."""
         where, c = self._weights(mu)
-        lacking = float(np.abs(theta - self.theta[:, where] @ c) @ self.norms) + 2.0 * self.error
-        return float(c @ self.alpha[where]) - lacking, float(c @ self.gamma[where]) + lacking
+        alpha, gamma, *at_anchors = c @ self._known[where]
+        lacking = float(np.abs(theta - at_anchors) @ self.norms) + 2.0 * self.error
+        return float(alpha) - lacking, float(gamma) + lacking
+
+    @cached_property
+    def _known(self) -> Array:
+        """α_i, γ_i and θ(µ_i), one row per anchor."""
+        return np.column_stack([self.alpha, self.gamma, self.theta.T])
+
+    @cached_property
+    def _corners(self) -> Mask:
+        """The corners of a cell of the grid (2^d×d): whether they are at its upper end."""
+        d = len(self.lower)
+        return np.asarray((np.arange(2**d)[:, None] >> np.arange(d)) % 2 == 1)
 
     def _weights(self, mu: Array) -> tuple[Indices, Array]:
         """The anchors around mu and their weights, which sum to 1; outside the box those of the nearest point in it."""
-        d = len(self.lower)
         if self.count == 1:
             return np.zeros(1, np.intp), np.ones(1)
         width = np.maximum(self.upper - self.lower, np.finfo(float).tiny)
         place = np.clip((mu - self.lower) / width, 0.0, 1.0) * (self.count - 1)
         first = np.minimum(place.astype(np.intp), self.count - 2)
-        share, strides = place - first, self.count ** np.arange(d - 1, -1, -1)
-        where: Indices = np.zeros(1, np.intp)
-        c = np.ones(1)
-        for axis in range(d):
-            start = first[axis] * strides[axis]
-            where = np.concatenate([where + start, where + start + strides[axis]])
-            c = np.concatenate([c * (1.0 - share[axis]), c * share[axis]])
-        return where, c
+        share, strides = place - first, self.count ** np.arange(len(mu) - 1, -1, -1)
+        return (first + self._corners) @ strides, np.where(self._corners, share, 1.0 - share).prod(axis=1)
 
 
 def anchors(box: ParameterBox) -> tuple[Array, int]:

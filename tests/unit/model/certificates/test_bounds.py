@@ -20,7 +20,8 @@ from vibench.linalg.inner_product import InnerProduct
 from vibench.model.affine import affine_decomposition
 from vibench.model.certificates import base as base_module
 from vibench.model.certificates.base import CertificateBase, Guarantee, certificate_base, unsupported
-from vibench.model.certificates.bounds import OnlineBound, OnlineCertificate, prepare
+from vibench.model.certificates.bounds import OnlineBound, OnlineCertificate
+from vibench.model.certificates.preparation import prepare
 from vibench.model.error_bounds import NOT_IN_CONE
 from vibench.model.galerkin import ReducedModel
 from vibench.model.hyperreduced import HyperReducedModel, hyper_reduce

@@ -1,0 +1,178 @@
+"""Liftings by a matrix that is inverted offline, where the constraint of some bodies is one matrix times a factor.
+
+Let the loads c of w = X⁻¹ E c act on bodies, blocks of C, on which B(µ) is θ(µ) B₀, and be multiples of the rows J of
+it that generators touch. The program of `vibench.model.certificates.lifting` has the minimiser c = θ B₀ᵀ(ν − λ)/γ with
+
+    ν = λ + (γ/θ²) M (s + v) ≥ 0,    v = B w − s ≥ 0,    νᵀv = 0,    M = S₀⁻¹,    S₀ = B₀ C B₀ᵀ,    on J,
+
+where M does not depend on the parameter. The primal-dual active set method starts from v = 0 where λ > 0 costs nothing,
+as there, and its systems have the size of the rows with v > 0, which are few.
+
+Where B(µ) is θ(µ) B₀ everywhere, w is the minimiser unless rows beyond J are violated. Where it is so on some bodies
+alone, w is the best of those that deform no other body: of two equal ones in contact the lifting of one has √2 times
+the norm of that of both. In either case it must satisfy B w ≥ s in all rows, with the B of the parameter and bounds of
+round-off; C is taken as it is stored, and |C_ij| ≤ √C_ii √C_jj. Where it does not, there is no prepared lifting.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+import scipy.linalg
+import scipy.sparse as sp
+from scipy.linalg.lapack import dposv
+
+from vibench.arrays import Array, Indices, Mask, SparseMatrix
+from vibench.model.certificates.lifting import ATTEMPTS, MARGIN, STEPS, UNIT, BlockDiagonal
+
+LARGEST_CONDITION = 1e9
+"""Rows of a B₀ whose S₀ has a larger condition number are treated as dependent: S₀ is not inverted."""
+
+
+@dataclass(frozen=True)
+class PreparedLiftings:
+    """What depends on no parameter; see above.
+
+    Attributes
+    ----------
+    scaled
+        Whether B(µ) is θ(µ) B₀ everywhere; arrays called (p×·) are then multiplied by B₀ (p = m), or else |B₀|, and
+        have one row per contact unknown (p = k) otherwise.
+    rows
+        J (j,), rising.
+    inverse, compliance
+        M and S₀ (j×j).
+    reach
+        |B₀| √C_ii (j,) on the rows J.
+    basis
+        Φ at the contact unknowns (p×d).
+    responses
+        C B₀ᵀ (p×j): w for unit multiples of the rows J.
+    sizes
+        Norms of the rows of Φ, and √C_ii (p×2).
+    directions
+        Coordinates (j×K) of the rows J of B₀ as functionals, in the basis of residuals.
+    terms
+        Bound of the number of round-off errors, of size `UNIT`, in an entry of s and of B w; but for those of B.
+    """
+
+    scaled: bool
+    rows: Indices
+    inverse: Array
+    compliance: Array
+    reach: Array
+    basis: Array
+    responses: Array
+    sizes: Array
+    directions: Array
+    terms: int
+
+    def lift(
+        self, B: float | SparseMatrix, g: Array, g_size: Array, y: Array, lam: Array, gamma: float
+    ) -> tuple[Array, float, float] | None:
+        """Coordinates (K,) of X w in the basis of residuals, ‖w‖, and κ; `None` if no w was found.
+
+        Parameters
+        ----------
+        B
+            θ if B is `scaled`, else B (m×k).
+        g, g_size
+            g (m,), and a bound (m,) of the terms that it is the sum of.
+        y, lam, gamma
+            Coordinates (d,) of u_N, λ ≥ 0 (m,), zero beyond the rows J, and γ.
+        """
+        B = B if isinstance(B, float | sp.csr_array) else sp.csr_array(B)
+        theta, terms = (B, self.terms) if isinstance(B, float) else (1.0, self.terms + int(np.diff(B.indptr).max()))
+        if theta == 0.0:
+            return None
+        excess, size, unit = _product(B, self.basis @ y) - g, _product(abs(B), self.sizes), 1.01 * terms * UNIT
+        round_off = unit * (float(y @ y) ** 0.5 * size[:, 0] + g_size)
+        margin, here = MARGIN * round_off, lam[self.rows]
+        for _ in range(ATTEMPTS):
+            nu = self._complementary(gamma / theta**2, (excess + margin)[self.rows], here)
+            if nu is None:
+                return None
+            a = (theta / gamma) * (nu - here)  # c = B₀ᵀ a
+            slack = _product(B, self.responses @ a) - excess
+            lacking = round_off + (unit * float(self.reach @ np.abs(a))) * size[:, 1] - slack
+            if lacking.max() <= 0.0:  # NaN is not
+                norm = max(0.0, float(a @ (self.compliance @ a))) ** 0.5
+                return a @ self.directions, norm, max(0.0, float(lam @ slack))
+            if lacking[self.rows].max() <= 0.0:  # rows beyond J are violated
+                return None
+            margin = np.maximum(margin, 2.0 * lacking)
+        return None
+
+    def _complementary(self, scale: float, excess: Array, lam: Array) -> Array | None:
+        """ν (j,) from s and λ on the rows J, and γ/θ²; `None` if the method cycles."""
+        fixed = lam + scale * (self.inverse @ excess)  # ν for v = 0
+        released: Mask = lam * self.compliance.diagonal() <= -scale * excess
+        for _ in range(STEPS):
+            rows = released.nonzero()[0]
+            among, nu, v = self.inverse[rows], fixed, np.zeros(0)
+            if len(rows):
+                _, v, singular = dposv(among[:, rows], -fixed[rows])
+                if singular:
+                    return None
+                nu = fixed + v @ among
+                nu[rows] = 0.0
+            wanted = nu < 0.0
+            wanted[rows] = v >= 0.0
+            if not (wanted != released).any():
+                return nu
+            released = wanted
+        return None
+
+
+def _product(B: float | SparseMatrix, x: Array) -> Array:
+    return np.asarray(B * x if isinstance(B, float) else B @ x)
+
+
+def carriers(compliance: Array, constraints: list[SparseMatrix]) -> Mask:
+    """Contact unknowns (k,) of the blocks of C on which all of the constraints (m×k) are the same matrix."""
+    first, same = sp.csc_array(constraints[0]), np.ones(len(compliance), bool)
+    for other in constraints[1:]:
+        difference = sp.csc_array(abs(sp.csc_array(other) - first))
+        same &= np.asarray(difference.max(axis=0).todense()).ravel() == 0.0
+    ends = BlockDiagonal.of(compliance).ends
+    for a, b in pairwise(ends):
+        same[a:b] = same[a:b].all()
+    return same
+
+
+def prepare_liftings(
+    B: SparseMatrix, scaled: bool, compliance: Array, rows: Mask, basis: Array, directions: Array
+) -> PreparedLiftings | None:
+    """Prepare liftings by loads that are multiples of some rows of B₀; `None` where these are dependent, or none.
+
+    Parameters
+    ----------
+    B
+        B₀ (m×k); zero on unknowns of bodies that liftings must not load.
+    scaled
+        Whether B(µ) is θ(µ) B₀ everywhere.
+    compliance
+        C (k×k).
+    rows
+        The rows (m,) of J.
+    basis
+        Φ (k×d) at the contact unknowns.
+    directions
+        Coordinates (k×K) of the contact unknowns as functionals.
+    """
+    J, B = np.flatnonzero(rows), sp.csr_array(B)
+    chosen, root = B[J], np.sqrt(np.diag(compliance))
+    responses = np.asarray((chosen @ compliance).T)
+    S = np.asarray(chosen @ responses)
+    S = 0.5 * (S + S.T)
+    if not len(J) or not np.linalg.cond(S) <= LARGEST_CONDITION:
+        return None
+    inverse = scipy.linalg.inv(S)
+    sizes = np.column_stack([np.linalg.norm(basis, axis=1), root])
+    if scaled:
+        basis, responses, sizes = B @ basis, np.asarray(B @ responses), abs(B) @ sizes
+    terms = max(basis.shape[1], len(J)) + 2 * int(np.diff(B.indptr).max()) + 8
+    reach, along = abs(chosen) @ root, np.asarray(chosen @ directions)
+    return PreparedLiftings(scaled, J, 0.5 * (inverse + inverse.T), S, reach, basis, responses, sizes, along, terms)
