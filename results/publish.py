@@ -19,7 +19,8 @@ import pandas as pd
 from vibench.report.site.citation import Citation
 from vibench.report.site.publish import publish
 from vibench.results.columns import STORED
-from vibench.results.database import FILE, ResultsDatabase
+from vibench.results.database import ResultsDatabase
+from vibench.results.reading import FILE
 from vibench.study.cells import expand
 from vibench.study.reader import read_study
 

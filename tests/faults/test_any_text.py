@@ -27,7 +27,8 @@ from vibench.report.figures import dimension, problems
 from vibench.report.figures.style import styled, write_figure
 from vibench.results import pictures, tables
 from vibench.results.columns import STORED, TABLES
-from vibench.results.database import FILE, ResultsDatabase
+from vibench.results.database import ResultsDatabase
+from vibench.results.reading import FILE
 from vibench.stages.query import Query, run_query
 from vibench.study import registry
 from vibench.terminal.console import print_frame

@@ -19,7 +19,8 @@ from vibench.execution import run  # noqa: F401  lists the classes of all stages
 from vibench.report.comparison.compare import compare
 from vibench.results import tables
 from vibench.results.columns import STORED
-from vibench.results.database import FILE, ResultsDatabase, read_meta, read_rows, study_of
+from vibench.results.database import ResultsDatabase
+from vibench.results.reading import FILE, read_meta, read_rows, study_of
 from vibench.storage.artefacts import CACHE_VARIABLE, SUFFIX, Store
 from vibench.storage.serialisation import dumps
 

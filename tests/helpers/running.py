@@ -14,7 +14,7 @@ from typing import Any
 import pandas as pd
 
 from vibench.results.columns import KEYS, STORED, TABLES
-from vibench.results.database import FILE, read_text
+from vibench.results.reading import FILE, read_text
 from vibench.results.sqlite.digests import Digests
 
 Vibench = Callable[..., "subprocess.CompletedProcess[str]"]

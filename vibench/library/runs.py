@@ -20,8 +20,8 @@ from vibench.execution.run_folder import REPORT
 from vibench.library.models import Model
 from vibench.results import tables
 from vibench.results.columns import TABLES
-from vibench.results.database import read_meta, study_of
 from vibench.results.plugin_columns import Extended
+from vibench.results.reading import read_meta, study_of
 from vibench.study.spec import Study
 
 if TYPE_CHECKING:

@@ -14,8 +14,8 @@ import pandas as pd
 from vibench.arrays import Array
 from vibench.errors import RequestError, unknown_name
 from vibench.results.columns import PARAMETER, STORED
-from vibench.results.database import open_read_only
 from vibench.results.plugin_columns import Extended
+from vibench.results.reading import open_read_only
 from vibench.text import printable
 
 LONGEST = 1000

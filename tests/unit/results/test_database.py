@@ -21,7 +21,8 @@ from samples import cell_row, query_rows
 from vibench.errors import RequestError, StorageError
 from vibench.results import database as module
 from vibench.results.columns import CELLS, TABLES, VERSION
-from vibench.results.database import FILE, ResultsDatabase, open_read_only, read_meta, read_rows
+from vibench.results.database import ResultsDatabase
+from vibench.results.reading import FILE, open_read_only, read_meta, read_rows
 from vibench.results.sqlite.values import LONGEST_TEXT
 
 STUDY = {"name": "sample", "seed": 1, "validation": 4, "accuracy": 1e-7}

@@ -14,8 +14,9 @@ from vibench.arrays import Array
 from vibench.errors import NumericalError
 from vibench.interfaces.problem import Picture
 from vibench.results import pictures
-from vibench.results.database import FILE, ResultsDatabase
+from vibench.results.database import ResultsDatabase
 from vibench.results.pictures import Shown
+from vibench.results.reading import FILE
 from vibench.stages import base
 from vibench.stages.pictures import PictureStage
 from vibench.study.cells import Plugin

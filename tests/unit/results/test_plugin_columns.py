@@ -19,7 +19,8 @@ from vibench import DerivedColumn, FigurePlugin, RunTables
 from vibench.report.comparison.compare import compare
 from vibench.report.page.embedded import grid_of_cells
 from vibench.results import tables
-from vibench.results.database import FILE, ResultsDatabase
+from vibench.results.database import ResultsDatabase
+from vibench.results.reading import FILE
 
 GROUP, HERE = "vibench.figures", __name__
 

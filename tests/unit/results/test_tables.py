@@ -23,7 +23,8 @@ from vibench.errors import RequestError
 from vibench.results import tables
 from vibench.results.break_even import break_even_rows
 from vibench.results.columns import CELLS, HISTORIES, KEYS, QUERIES, TABLES, THRESHOLDS, VERSION
-from vibench.results.database import FILE, ResultsDatabase
+from vibench.results.database import ResultsDatabase
+from vibench.results.reading import FILE
 from vibench.results.tables import (
     benefits,
     cell_text,

@@ -11,7 +11,7 @@ from running import Changed, Main, refused
 from vibench.errors import RequestError
 from vibench.execution.recorded_cell import recorded_study
 from vibench.results import tables
-from vibench.results.database import FILE
+from vibench.results.reading import FILE
 from vibench.study.cells import Cell, expand
 from vibench.study.reader import read_study
 from vibench.study.single_cell import only_cell, study_of_cell

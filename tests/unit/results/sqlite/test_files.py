@@ -16,7 +16,8 @@ from samples import cell_row
 from vibench.errors import RequestError, StorageError
 from vibench.execution.run_folder import claimed
 from vibench.results import tables
-from vibench.results.database import FILE, DamagedError, ResultsDatabase, open_read_only, read_meta
+from vibench.results.database import ResultsDatabase
+from vibench.results.reading import FILE, DamagedError, open_read_only, read_meta
 from vibench.results.sqlite.files import DAMAGED, set_aside
 
 STUDY = {"name": "sample", "seed": 1, "validation": 4}
