@@ -15,14 +15,13 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from running import execute
 from samples import cell_row, query_rows
 
 from vibench.errors import RequestError, StorageError
 from vibench.results import database as module
 from vibench.results.columns import CELLS, TABLES, VERSION
 from vibench.results.database import ResultsDatabase
-from vibench.results.reading import FILE, open_read_only, read_meta, read_rows
+from vibench.results.reading import FILE, read_meta, read_rows
 from vibench.results.sqlite.values import LONGEST_TEXT
 
 STUDY = {"name": "sample", "seed": 1, "validation": 4, "accuracy": 1e-7}
@@ -172,23 +171,6 @@ def test_a_long_text_is_cut_and_json_is_not(journal: ResultsDatabase) -> None:
     assert len(row["reason"]) == LONGEST_TEXT
 
 
-def test_what_others_have_written_is_printable_when_it_is_read(journal: ResultsDatabase, tmp_path: Path) -> None:
-    journal.write_cell(cell_row(), [])
-    execute(tmp_path / "run", "UPDATE cells SET reason = CAST(x'411b5b324aff' AS TEXT), problem = 'a' || char(10)")
-    with open_read_only(tmp_path / "run" / FILE) as db:
-        assert db.execute("SELECT problem, reason FROM cells").fetchall() == [("a\\n", "A\\u001b[2J\ufffd")]
-
-
-def test_a_text_of_many_rows_is_kept_once(journal: ResultsDatabase, tmp_path: Path) -> None:
-    """The histories of a large study have tens of millions of texts, and hundreds that differ."""
-    for key in ("one", "other"):
-        journal.write_cell(cell_row(cell=key, reason="neither a letter nor a name"), [])
-    names, (one, other) = read_rows(tmp_path / "run" / FILE, "cells")
-    reason = names.index("reason")
-    assert one[reason] == "neither a letter nor a name"
-    assert one[reason] is other[reason]
-
-
 def test_a_name_that_looks_like_a_uri_is_a_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     for name in ("file:run", "file:run?mode=memory", "a%20b#c", ":memory:", "\udcff"):
@@ -198,10 +180,6 @@ def test_a_name_that_looks_like_a_uri_is_a_name(tmp_path: Path, monkeypatch: pyt
         assert read_meta(Path(name) / FILE)["schema"] == str(VERSION)
         assert (tmp_path / name / FILE).is_file()
     assert len(list(tmp_path.iterdir())) == 5
-
-
-def test_two_slashes_are_no_authority(journal: ResultsDatabase, tmp_path: Path) -> None:
-    assert read_meta(Path(f"/{tmp_path}") / "run" / FILE)["schema"] == str(VERSION)
 
 
 def test_a_rewritten_cell_has_only_its_new_queries(journal: ResultsDatabase) -> None:
