@@ -21,7 +21,7 @@ from vibench.report.site.publish import publish
 from vibench.results.columns import STORED
 from vibench.results.database import ResultsDatabase
 from vibench.results.reading import FILE
-from vibench.study.cells import expand
+from vibench.study.matrix import expand
 from vibench.study.reader import read_study
 
 RESULTS = Path(__file__).parent

@@ -28,7 +28,7 @@ from vibench.interfaces.validation import checked_assembly
 from vibench.results import tables
 from vibench.stages.base import build_problem
 from vibench.stages.snapshots import CHUNKS, SnapshotStage
-from vibench.study.cells import Plugin
+from vibench.study.plugin import Plugin
 from vibench.timing import median_interval, timed
 
 SEED = 2022

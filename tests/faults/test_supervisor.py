@@ -23,7 +23,7 @@ from vibench.qp.status import Status
 from vibench.stages.base import Done, Failed, Stage, Unstored
 from vibench.storage.artefacts import Store
 from vibench.study import registry
-from vibench.study.cells import Plugin
+from vibench.study.plugin import Plugin
 
 Run = Callable[..., "Done | Failed | Unstored"]
 

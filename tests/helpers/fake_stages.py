@@ -17,7 +17,7 @@ import numpy as np
 
 from vibench.stages.base import Failed, Pieces, PiecewiseStage, Result, Stage
 from vibench.storage.artefacts import Store
-from vibench.study.cells import Plugin
+from vibench.study.plugin import Plugin
 from vibench.timing import Seconds
 
 

@@ -30,8 +30,8 @@ import vibench
 from vibench.cli.main import app
 from vibench.errors import RequestError
 from vibench.results import columns, tables
-from vibench.study.cells import expand
 from vibench.study.entries import Entry, ProblemEntry, SamplingEntry
+from vibench.study.matrix import expand
 from vibench.study.reader import read_study
 from vibench.study.registry import GROUPS
 from vibench.study.spec import Limits, Study, ToleranceTable

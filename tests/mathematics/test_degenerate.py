@@ -17,7 +17,7 @@ from vibench.stages.cell_queries import CellQueries, CellRows
 from vibench.stages.enrichment import SingleEnrichment
 from vibench.stages.offline import ConeStage, PODStage
 from vibench.study import registry
-from vibench.study.cells import Plugin
+from vibench.study.plugin import Plugin
 
 
 class NoContact(Wire):

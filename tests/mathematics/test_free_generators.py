@@ -27,7 +27,7 @@ from vibench.stages.cell_queries import CellQueries, CellRows
 from vibench.stages.enrichment import SingleEnrichment
 from vibench.stages.offline import ConeStage, PODStage
 from vibench.study import registry
-from vibench.study.cells import Plugin
+from vibench.study.plugin import Plugin
 
 seeds = st.integers(0, 10_000)
 

@@ -15,7 +15,7 @@ from vibench.execution.recorded_cell import recorded_study
 from vibench.report import html
 from vibench.results import tables
 from vibench.results.reading import FILE
-from vibench.study.cells import expand
+from vibench.study.matrix import expand
 
 ROOT = Path(__file__).parents[2]
 RESULTS = ROOT / "results"

@@ -110,7 +110,7 @@ def run(
     """Run a study. An interrupted run resumes where it stopped."""
     with interrupted_at_once():  # the libraries and plugins of a study take a second to import
         from vibench.execution.run import Options, run_study
-        from vibench.study.cells import expand
+        from vibench.study.matrix import expand
         from vibench.terminal.console import new_console
         from vibench.terminal.progress import ProgressDisplay
 
@@ -177,7 +177,7 @@ def _warn_of_open_scheduler(scheduler: str, executor: str) -> None:
 def _study(request: str, key: str, overrides: dict[str, list[Any]]) -> Study:
     """The study that is asked for, or what it has, or a results file, of one cell."""
     from vibench.execution.recorded_cell import recorded_study
-    from vibench.study.cells import expand
+    from vibench.study.matrix import expand
     from vibench.study.reader import read_study
     from vibench.study.single_cell import only_cell, study_of_cell
 

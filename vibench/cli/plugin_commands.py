@@ -176,7 +176,7 @@ def new_plugin(
 def _plugin_rows(kind: str) -> list[tuple[str, str, str, str]]:
     """Name, origin, description and options of every plugin of a kind; of one that does not load, the error."""
     from vibench.study import registry
-    from vibench.study.cells import expand
+    from vibench.study.matrix import expand
     from vibench.study.reader import read_study
 
     rows = []

@@ -13,8 +13,10 @@ from vibench.stages.base import Row, Stage, value_of
 from vibench.stages.cell_queries import CellRows
 from vibench.stages.timing_rounds import TimedCell, round_rows, seconds_of_cell, seconds_of_queries
 from vibench.storage.artefacts import History, Store
-from vibench.study.cells import OWN, Axes, Cell, Plugin, digest
+from vibench.study.cells import Axes, Cell, digest
+from vibench.study.plugin import Plugin
 from vibench.study.spec import Study
+from vibench.study.values import OWN
 
 
 @dataclass(frozen=True)

@@ -30,7 +30,9 @@ from vibench.stages.cell_queries import CellRows, cell_queries
 from vibench.stages.pictures import PictureStage
 from vibench.storage.artefacts import Store, usable_store
 from vibench.study import registry
-from vibench.study.cells import Cell, Plugin, expand
+from vibench.study.cells import Cell
+from vibench.study.matrix import expand
+from vibench.study.plugin import Plugin
 from vibench.study.spec import Study
 
 CHECK_INTERVAL = 5.0

@@ -28,7 +28,8 @@ from vibench.stages.enrichment import EnrichmentStage, GrowthStage, enrichment_s
 from vibench.stages.snapshots import is_adaptive, training_of, validation_of
 from vibench.storage.artefacts import Store
 from vibench.storage.serialisation import storable
-from vibench.study.cells import Cell, Plugin
+from vibench.study.cells import Cell
+from vibench.study.plugin import Plugin
 from vibench.timing import timed
 
 for _kind in (

@@ -16,7 +16,8 @@ from vibench.provenance import core_code, libraries
 from vibench.qp.status import Status
 from vibench.storage.artefacts import History, Store
 from vibench.study import registry
-from vibench.study.cells import Axes, Plugin, digest
+from vibench.study.cells import Axes, digest
+from vibench.study.plugin import Plugin
 from vibench.timing import NO_TIME, Seconds
 
 Row = dict[str, Any]

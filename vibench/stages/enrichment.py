@@ -23,7 +23,8 @@ from vibench.stages.offline import ConeStage, PODStage, ReducedCone, TrainingCon
 from vibench.stages.snapshots import training_of
 from vibench.storage.artefacts import History, Store
 from vibench.storage.serialisation import storable
-from vibench.study.cells import Axes, Cell, Plugin
+from vibench.study.cells import Axes, Cell
+from vibench.study.plugin import Plugin
 from vibench.timing import timed
 
 for _kind in (Kind, Grown, Milestone):

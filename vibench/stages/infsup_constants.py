@@ -21,7 +21,7 @@ from vibench.stages.offline import ConeStage, PODStage
 from vibench.stages.snapshots import validation_of
 from vibench.storage.artefacts import Store
 from vibench.storage.serialisation import storable
-from vibench.study.cells import Plugin
+from vibench.study.plugin import Plugin
 
 for _kind in (ConstraintClasses, Stability, Constant, InfSup):
     storable(_kind)

@@ -14,7 +14,8 @@ from vibench.stages.base import Result, Stage, build_problem, faults_of, value_o
 from vibench.stages.snapshots import chosen_by, gather, training_of, training_stages
 from vibench.storage.artefacts import History, Store
 from vibench.storage.serialisation import storable
-from vibench.study.cells import Axes, Plugin
+from vibench.study.cells import Axes
+from vibench.study.plugin import Plugin
 from vibench.timing import timed
 
 for _kind in (POD, Cone, Multipliers, ConstraintClasses):

@@ -16,7 +16,8 @@ from vibench.stages.base import Result, Row, Stage, build_problem
 from vibench.stages.snapshots import gather, training_stages
 from vibench.storage.artefacts import Store
 from vibench.storage.serialisation import storable
-from vibench.study.cells import Axes, Plugin
+from vibench.study.cells import Axes
+from vibench.study.plugin import Plugin
 from vibench.text import one_line
 
 storable(Picture)

@@ -23,7 +23,8 @@ from vibench.stages.base import Result, Stage, build_problem, faults_of, value_o
 from vibench.storage.artefacts import History, Store
 from vibench.storage.serialisation import storable
 from vibench.study import registry
-from vibench.study.cells import Axes, Plugin
+from vibench.study.cells import Axes
+from vibench.study.plugin import Plugin
 from vibench.timing import NO_TIME, Seconds, median_seconds, timed
 
 T = TypeVar("T")

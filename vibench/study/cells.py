@@ -1,26 +1,18 @@
-"""The matrix of a study: its cells, each identified by what determines its numbers."""
+"""The cells of a matrix, each identified by what determines its numbers."""
 
 from __future__ import annotations
 
 import hashlib
 import json
-import shlex
-from collections.abc import Iterator
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from functools import cached_property
-from itertools import product
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from vibench.errors import RequestError
 from vibench.interfaces.strategies import Stop
 from vibench.provenance import NUMERICAL, core_code, solver_version
-from vibench.reduction.nested import NestedStrategy
 from vibench.study import registry
-from vibench.study.parameter_sets import size_of_set
-
-if TYPE_CHECKING:  # worker processes have no use for the schema of study files
-    from vibench.study.entries import Entry, ProblemEntry
-    from vibench.study.spec import Study, ToleranceTable
+from vibench.study.plugin import Plugin
+from vibench.study.values import OWN
 
 
 def digest(content: Any) -> str:
@@ -29,48 +21,8 @@ def digest(content: Any) -> str:
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
-@dataclass(frozen=True)
-class Plugin:
-    """A plugin with its options as canonical JSON, and the version of its code and data (`registry.code_and_data`)."""
-
-    kind: str
-    name: str
-    options: str
-    code: str
-
-    @classmethod
-    def from_entry(cls, kind: str, entry: Entry) -> Plugin:
-        """Plugin of an entry of an axis."""
-        options = registry.canonical_options(kind, entry.name, entry.options)
-        return cls(kind, entry.name, options, "").as_installed()
-
-    def as_installed(self) -> Plugin:
-        """The same with the version of the code that is installed, and of the files its options name, now.
-
-        Raises
-        ------
-        RequestError
-            If it is not installed, or one of its files cannot be read.
-        """
-        return replace(self, code=registry.code_and_data(self.kind, self.name, json.loads(self.options)))
-
-    def create(self) -> Any:
-        """A new instance."""
-        return registry.create(self.kind, self.name, json.loads(self.options))
-
-    @property
-    def check(self) -> str:
-        """The command that checks the plugin with these options."""
-        word = next(word for word, kind in registry.WORDS.items() if kind == self.kind)
-        options = (f"{k}={v if isinstance(v, str) else json.dumps(v)}" for k, v in json.loads(self.options).items())
-        return shlex.join(["vibench", "check", f"{word}:{self.name}", *(f"--option={text}" for text in options)])
-
-
 PLUGINS = ("problem", "dual", "primal", "training", "validation_sampling")
 """Fields of a `Cell` that are plugins; the last two are `None` for sets of the problem itself."""
-
-OWN = "own"
-"""Name of the training and the validation set that a problem itself has."""
 
 
 @dataclass(frozen=True)
@@ -182,86 +134,3 @@ class Cell:
         )
         assembly = "" if self.assembly == "full" else f" · {self.assembly}"
         return f"{problem} · {dual} · {primal}{tolerance} · {pod}, {cone} · {self.solver} {self.accuracy:g}{assembly}"
-
-
-def expand(study: Study) -> list[Cell]:
-    """All cells of a study without duplicates, in the order of its axes.
-
-    Raises
-    ------
-    RequestError
-        If the matrix is empty, or a strategy that takes a tolerance has none.
-    """
-    cells: dict[str, Cell] = {}
-    for problem, table in product(study.problem, study.tolerances):
-        nested = {entry.title: _nested_tolerances(entry, table) for entry in study.primal}
-        sets = _sets(study, problem)
-        for trained, (dual, pod, cone, primal, tolerance) in product(sets, _combinations(study, table)):
-            for assembly, solver, accuracy in product(study.assembly, study.solver_names(), study.accuracy):
-                cell = Cell(
-                    problem=Plugin.from_entry("problem", problem),
-                    dual=Plugin.from_entry("dual strategy", dual),
-                    primal=Plugin.from_entry("primal strategy", primal),
-                    pod=pod,
-                    cone=cone,
-                    primal_tol=tolerance,
-                    solver=solver,
-                    assembly=assembly,
-                    interpolation=None if assembly == "full" else study.interpolation,
-                    warm_start=study.warm_start,
-                    seed=study.seed,
-                    accuracy=accuracy,
-                    labels=(problem.title, dual.title, primal.title),
-                    nested_tolerances=nested[primal.title],
-                    validation=trained.validation,
-                    training=trained.training,
-                    validation_sampling=trained.validation_sampling,
-                    set_labels=trained.labels,
-                )
-                cells.setdefault(cell.key, cell)
-    if not cells:
-        raise RequestError(f"study '{study.name}': the matrix is empty")
-    return list(cells.values())
-
-
-@dataclass(frozen=True)
-class _Sets:
-    """A training set and the validation set of a problem, as in the fields of a `Cell`."""
-
-    training: Plugin | None
-    validation: int
-    validation_sampling: Plugin | None
-    labels: tuple[str, str]
-
-
-def _sets(study: Study, problem: ProblemEntry) -> list[_Sets]:
-    """The training sets of a problem in a study, each with the validation set."""
-    built, asked = Plugin.from_entry("problem", problem), study.validation_of(problem)
-    if isinstance(asked, int):
-        count, checked, label = asked, None, OWN
-    else:
-        checked, label = Plugin.from_entry("sampling strategy", asked), asked.title
-        count = size_of_set(built, checked)
-    return [
-        _Sets(
-            None if entry.name == OWN else Plugin.from_entry("sampling strategy", entry),
-            count,
-            checked,
-            (entry.title, label),
-        )
-        for entry in study.training_of(problem)
-    ]
-
-
-def _nested_tolerances(primal: Entry, table: ToleranceTable) -> tuple[float, ...]:
-    kind = "primal strategy"
-    if registry.conflict(kind, primal.name) or not issubclass(registry.load(kind, primal.name), NestedStrategy):
-        return ()
-    return tuple(sorted({value for value in table.of_primal(primal) if value is not None}, reverse=True))
-
-
-def _combinations(study: Study, table: ToleranceTable) -> Iterator[tuple[Entry, Stop, Stop, Entry, float | None]]:
-    pods = [Stop(tolerance=value) for value in table.pod or []] + [Stop(size=value) for value in table.N or []]
-    for pod, dual, primal in product(pods, study.dual, study.primal):
-        for cone, tolerance in product(table.of_dual(dual), table.of_primal(primal)):
-            yield dual, pod, cone, primal, tolerance

@@ -16,7 +16,7 @@ from pydantic import (
     model_validator,
 )
 
-from vibench.study.cells import OWN
+from vibench.study.values import OWN
 
 Size: TypeAlias = Annotated[int, Ge(1), Le(100_000)]
 Name: TypeAlias = Annotated[str, MinLen(1)]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from functools import lru_cache
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -13,9 +12,7 @@ from vibench.interfaces.problem import ParameterBox, Problem
 from vibench.interfaces.sampling import AdaptiveSampling, Sampling
 from vibench.interfaces.validation import training_parameters, validation_parameters
 from vibench.study import registry
-
-if TYPE_CHECKING:
-    from vibench.study.cells import Plugin
+from vibench.study.plugin import Plugin
 
 
 def is_available(*plugins: Plugin) -> bool:

@@ -8,8 +8,10 @@ from typing import Any
 
 from vibench.errors import RequestError
 from vibench.interfaces.strategies import Stop
-from vibench.study.cells import OWN, Cell, Plugin
+from vibench.study.cells import Cell
+from vibench.study.plugin import Plugin
 from vibench.study.spec import Study
+from vibench.study.values import OWN
 
 
 def study_of_cell(cell: Cell, name: str, **settings: Any) -> Study:

@@ -24,7 +24,6 @@ from vibench.interfaces.strategies import Stop
 from vibench.qp.settings import SETTINGS
 from vibench.qp.solve import installed_solvers
 from vibench.study import registry
-from vibench.study.cells import OWN, Plugin
 from vibench.study.entries import (
     STRICT,
     Entry,
@@ -37,6 +36,8 @@ from vibench.study.entries import (
     as_list,
 )
 from vibench.study.parameter_sets import check_no_training, check_own_validation, check_unseen, is_available
+from vibench.study.plugin import Plugin
+from vibench.study.values import OWN
 
 Tolerance: TypeAlias = Annotated[float, Gt(0.0), Lt(1.0), AllowInfNan(False)]
 Seconds: TypeAlias = Annotated[float, Gt(0.0), Le(1e7), AllowInfNan(False)]

@@ -13,7 +13,7 @@ from vibench.stages.assembly import AffineDecomposition
 from vibench.stages.base import value_of
 from vibench.stages.offline import PODStage, TrainingConstraints
 from vibench.stages.snapshots import gather, training_of, training_stages
-from vibench.study.cells import Plugin
+from vibench.study.plugin import Plugin
 
 BOX = ParameterBox(("x", "y"), np.zeros(2), np.array([2.0, 1.0]), ("1", "1"))
 

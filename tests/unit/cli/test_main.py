@@ -21,7 +21,7 @@ from vibench.results.columns import TABLES
 from vibench.results.reading import FILE
 from vibench.results.tables import read
 from vibench.study import registry
-from vibench.study.cells import expand
+from vibench.study.matrix import expand
 from vibench.study.reader import read_study
 from vibench.text import printable
 
@@ -245,7 +245,7 @@ def test_options_replace_axes(axis: str, main: Main, monkeypatch: pytest.MonkeyP
         listed.extend(expand(study))
         return listed
 
-    monkeypatch.setattr("vibench.study.cells.expand", recorded)
+    monkeypatch.setattr("vibench.study.matrix.expand", recorded)
     options, look, value = REPLACED[axis]
     assert main("run", "quick", "--dry-run", *options)[0] == 0
     assert {look(cell) for cell in listed} == {value}

@@ -15,7 +15,7 @@ from vibench.stages.cell_queries import cell_queries
 from vibench.stages.pictures import PictureStage
 from vibench.storage.artefacts import Store
 from vibench.study import registry
-from vibench.study.cells import expand
+from vibench.study.matrix import expand
 from vibench.study.reader import read_study
 
 

@@ -18,7 +18,8 @@ from vibench.stages.enrichment import NestedEnrichment
 from vibench.stages.infsup_constants import ReferenceConstants
 from vibench.stages.offline import ConeStage, PODStage
 from vibench.stages.snapshots import SnapshotStage
-from vibench.study.cells import Cell, expand
+from vibench.study.cells import Cell
+from vibench.study.matrix import expand
 from vibench.study.reader import read_study
 from vibench.study.spec import Study
 

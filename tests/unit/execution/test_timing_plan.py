@@ -14,7 +14,8 @@ from vibench.results.database import ResultsDatabase
 from vibench.stages.base import Failed
 from vibench.stages.cell_queries import cell_queries
 from vibench.stages.timing_rounds import TimedCell, TimedRound, TimingRounds
-from vibench.study.cells import Cell, expand
+from vibench.study.cells import Cell
+from vibench.study.matrix import expand
 from vibench.study.reader import read_study
 from vibench.timing import Seconds
 

@@ -22,7 +22,7 @@ from vibench.packs.checks import read_model_pack
 from vibench.packs.dual_half import reduce_multipliers
 from vibench.packs.pack import ModelPack
 from vibench.study import registry
-from vibench.study.cells import Plugin
+from vibench.study.plugin import Plugin
 from vibench.testing import check_problem
 
 MU = np.array([5.0, 0.2])

@@ -31,7 +31,7 @@ from vibench.stages.snapshots import SnapshotStage
 from vibench.stages.timing_rounds import TimingRounds
 from vibench.storage.artefacts import Store
 from vibench.study import registry
-from vibench.study.cells import Plugin
+from vibench.study.plugin import Plugin
 
 PROBLEM = Plugin("problem", "obstacle", '{"resolution": 150}', "repeats")
 EVERY = tuple(range(3))

@@ -9,7 +9,7 @@ from fake_plugins import Wire
 from vibench.errors import NumericalError
 from vibench.interfaces.strategies import Cone, Offline, no_free
 from vibench.reduction.nested import NestedStrategy, Step, grow_through
-from vibench.study.cells import expand
+from vibench.study.matrix import expand
 from vibench.study.spec import Study
 
 

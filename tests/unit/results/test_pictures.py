@@ -19,7 +19,7 @@ from vibench.results.pictures import Shown
 from vibench.results.reading import FILE
 from vibench.stages import base
 from vibench.stages.pictures import PictureStage
-from vibench.study.cells import Plugin
+from vibench.study.plugin import Plugin
 
 OBSTACLE = Plugin("problem", "obstacle", '{"resolution": 200}', "test")
 KEYS = {"problem": "membrane", "problem_options": OBSTACLE.options}

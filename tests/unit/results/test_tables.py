@@ -39,7 +39,7 @@ from vibench.results.tables import (
     to_markdown,
 )
 from vibench.results.views import look_up
-from vibench.study.cells import expand
+from vibench.study.matrix import expand
 from vibench.study.reader import read_study
 from vibench.text import printable_lines
 

@@ -19,7 +19,7 @@ from vibench.stages.base import value_of
 from vibench.stages.cell_queries import CellQueries
 from vibench.stages.enrichment import SingleEnrichment
 from vibench.stages.offline import ConeStage, PODStage
-from vibench.study.cells import Plugin
+from vibench.study.plugin import Plugin
 
 OBSTACLE = Plugin("problem", "obstacle", '{"resolution": 200}', "test")
 RADIAL = Plugin("problem", "radial-obstacle", '{"resolution": 300}', "test")

@@ -22,7 +22,7 @@ from vibench.stages.enrichment import SingleEnrichment
 from vibench.stages.offline import ConeStage, PODStage
 from vibench.stages.pictures import PictureStage
 from vibench.study import registry
-from vibench.study.cells import Plugin
+from vibench.study.plugin import Plugin
 
 OBSTACLE = registry.load("problem", "obstacle")
 PROBLEMS: Mapping[str, Callable[[], Problem]] = {

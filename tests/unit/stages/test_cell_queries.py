@@ -23,7 +23,7 @@ from vibench.stages.cell_queries import CellQueries
 from vibench.stages.enrichment import SingleEnrichment
 from vibench.stages.offline import ConeStage, PODStage
 from vibench.stages.query import error_columns, path_before
-from vibench.study.cells import Plugin
+from vibench.study.plugin import Plugin
 
 BOX = ParameterBox(("a", "b"), np.array([0.0, 0.0]), np.array([1.0, 100.0]), ("1", "1"))
 PROBLEM = Plugin("problem", "radial-obstacle", '{"resolution": 200}', "test")

@@ -11,7 +11,7 @@ from vibench.stages.base import value_of
 from vibench.stages.cell_queries import CellQueries
 from vibench.stages.enrichment import SingleEnrichment
 from vibench.stages.offline import ConeStage, PODStage
-from vibench.study.cells import Plugin
+from vibench.study.plugin import Plugin
 
 PROBLEMS = {
     "obstacle": Plugin("problem", "obstacle", '{"resolution": 200}', "test"),

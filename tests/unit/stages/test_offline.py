@@ -29,7 +29,7 @@ from vibench.stages.enrichment import NestedEnrichment, SingleEnrichment
 from vibench.stages.infsup_constants import ReferenceConstants, ValidationConstraints
 from vibench.stages.offline import ConeStage, PODStage
 from vibench.stages.snapshots import CHUNKS, SnapshotStage, gather, training_stages, validation_stages
-from vibench.study.cells import Plugin
+from vibench.study.plugin import Plugin
 from vibench.timing import NO_TIME, Seconds
 
 PROBLEM = Plugin("problem", "obstacle", '{"resolution": 200}', "test")

@@ -20,7 +20,7 @@ from vibench.interfaces.fingerprint import AGREEMENT_RTOL, Fingerprint, Referenc
 from vibench.stages.base import build_problem
 from vibench.stages.snapshots import fingerprint_here, gather, training_stages
 from vibench.storage.artefacts import Store
-from vibench.study.cells import Plugin
+from vibench.study.plugin import Plugin
 from vibench.testing.elsewhere import call_elsewhere
 
 REASONS: Mapping[str, str] = {

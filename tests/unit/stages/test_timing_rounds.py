@@ -20,7 +20,7 @@ from vibench.stages.cell_queries import CellQueries
 from vibench.stages.enrichment import SingleEnrichment
 from vibench.stages.offline import ConeStage, PODStage
 from vibench.stages.timing_rounds import TimedRound, TimingRounds, round_rows, seconds_of_cell, seconds_of_queries
-from vibench.study.cells import Plugin
+from vibench.study.plugin import Plugin
 from vibench.timing import Seconds
 
 PROBLEM = Plugin("problem", "obstacle", '{"resolution": 200}', "test")

@@ -16,7 +16,9 @@ from samples import REMOVE, STUDY, changed, write_study
 from vibench.errors import RequestError
 from vibench.interfaces.strategies import Stop
 from vibench.study import cells as module
-from vibench.study.cells import Cell, Plugin, digest, expand
+from vibench.study.cells import Cell, digest
+from vibench.study.matrix import expand
+from vibench.study.plugin import Plugin
 from vibench.study.reader import read_study
 
 Expand = Callable[[Mapping[str, Any]], list[Cell]]

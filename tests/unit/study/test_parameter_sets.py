@@ -12,8 +12,10 @@ from packs import Cable, manifest, write_cable, write_manifest
 from samples import STUDY, changed, write_study
 
 from vibench.errors import RequestError
-from vibench.study.cells import Cell, Plugin, expand
+from vibench.study.cells import Cell
+from vibench.study.matrix import expand
 from vibench.study.parameter_sets import sampled
+from vibench.study.plugin import Plugin
 from vibench.study.reader import read_study
 from vibench.study.single_cell import study_of_cell
 

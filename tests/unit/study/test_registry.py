@@ -22,7 +22,7 @@ from vibench.errors import RequestError
 from vibench.interfaces.problem import Problem
 from vibench.interfaces.strategies import DualStrategy, PrimalStrategy
 from vibench.study import registry
-from vibench.study.cells import Plugin
+from vibench.study.plugin import Plugin
 from vibench.study.reader import read_study
 from vibench.study.spec import Entry
 

@@ -12,7 +12,8 @@ from vibench.errors import RequestError
 from vibench.execution.recorded_cell import recorded_study
 from vibench.results import tables
 from vibench.results.reading import FILE
-from vibench.study.cells import Cell, expand
+from vibench.study.cells import Cell
+from vibench.study.matrix import expand
 from vibench.study.reader import read_study
 from vibench.study.single_cell import only_cell, study_of_cell
 from vibench.study.spec import Study

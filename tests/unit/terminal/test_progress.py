@@ -19,7 +19,9 @@ from vibench.stages.base import Stage
 from vibench.stages.cell_queries import CellQueries, cell_queries
 from vibench.stages.offline import PODStage
 from vibench.stages.snapshots import CHUNKS, SnapshotStage
-from vibench.study.cells import Cell, Plugin, expand
+from vibench.study.cells import Cell
+from vibench.study.matrix import expand
+from vibench.study.plugin import Plugin
 from vibench.study.reader import read_study
 from vibench.terminal.progress import ALIKE, DrawingDisplay, ProgressDisplay, TimeLeft, duration
 

@@ -1,0 +1,101 @@
+"""The matrix of a study: the cells that its axes and tolerances make."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import product
+
+from vibench.errors import RequestError
+from vibench.interfaces.strategies import Stop
+from vibench.reduction.nested import NestedStrategy
+from vibench.study import registry
+from vibench.study.cells import Cell
+from vibench.study.entries import Entry, ProblemEntry
+from vibench.study.parameter_sets import size_of_set
+from vibench.study.plugin import Plugin
+from vibench.study.spec import Study, ToleranceTable
+from vibench.study.values import OWN
+
+
+def expand(study: Study) -> list[Cell]:
+    """All cells of a study without duplicates, in the order of its axes.
+
+    Raises
+    ------
+    RequestError
+        If the matrix is empty, or a strategy that takes a tolerance has none.
+    """
+    cells: dict[str, Cell] = {}
+    for problem, table in product(study.problem, study.tolerances):
+        nested = {entry.title: _nested_tolerances(entry, table) for entry in study.primal}
+        sets = _sets(study, problem)
+        for trained, (dual, pod, cone, primal, tolerance) in product(sets, _combinations(study, table)):
+            for assembly, solver, accuracy in product(study.assembly, study.solver_names(), study.accuracy):
+                cell = Cell(
+                    problem=Plugin.from_entry("problem", problem),
+                    dual=Plugin.from_entry("dual strategy", dual),
+                    primal=Plugin.from_entry("primal strategy", primal),
+                    pod=pod,
+                    cone=cone,
+                    primal_tol=tolerance,
+                    solver=solver,
+                    assembly=assembly,
+                    interpolation=None if assembly == "full" else study.interpolation,
+                    warm_start=study.warm_start,
+                    seed=study.seed,
+                    accuracy=accuracy,
+                    labels=(problem.title, dual.title, primal.title),
+                    nested_tolerances=nested[primal.title],
+                    validation=trained.validation,
+                    training=trained.training,
+                    validation_sampling=trained.validation_sampling,
+                    set_labels=trained.labels,
+                )
+                cells.setdefault(cell.key, cell)
+    if not cells:
+        raise RequestError(f"study '{study.name}': the matrix is empty")
+    return list(cells.values())
+
+
+@dataclass(frozen=True)
+class _Sets:
+    """A training set and the validation set of a problem, as in the fields of a `Cell`."""
+
+    training: Plugin | None
+    validation: int
+    validation_sampling: Plugin | None
+    labels: tuple[str, str]
+
+
+def _sets(study: Study, problem: ProblemEntry) -> list[_Sets]:
+    """The training sets of a problem in a study, each with the validation set."""
+    built, asked = Plugin.from_entry("problem", problem), study.validation_of(problem)
+    if isinstance(asked, int):
+        count, checked, label = asked, None, OWN
+    else:
+        checked, label = Plugin.from_entry("sampling strategy", asked), asked.title
+        count = size_of_set(built, checked)
+    return [
+        _Sets(
+            None if entry.name == OWN else Plugin.from_entry("sampling strategy", entry),
+            count,
+            checked,
+            (entry.title, label),
+        )
+        for entry in study.training_of(problem)
+    ]
+
+
+def _nested_tolerances(primal: Entry, table: ToleranceTable) -> tuple[float, ...]:
+    kind = "primal strategy"
+    if registry.conflict(kind, primal.name) or not issubclass(registry.load(kind, primal.name), NestedStrategy):
+        return ()
+    return tuple(sorted({value for value in table.of_primal(primal) if value is not None}, reverse=True))
+
+
+def _combinations(study: Study, table: ToleranceTable) -> Iterator[tuple[Entry, Stop, Stop, Entry, float | None]]:
+    pods = [Stop(tolerance=value) for value in table.pod or []] + [Stop(size=value) for value in table.N or []]
+    for pod, dual, primal in product(pods, study.dual, study.primal):
+        for cone, tolerance in product(table.of_dual(dual), table.of_primal(primal)):
+            yield dual, pod, cone, primal, tolerance
