@@ -342,4 +342,8 @@ def test_a_page_of_many_cells_shows_some_rows_at_a_time(
     browser.find_element(By.CSS_SELECTOR, '[data-table="summary"] [aria-label="next rows"]').click()
     assert browser.find_element(By.CSS_SELECTOR, count).text == "rows 51–100 of 120"
     assert {row["cell"] for row in first}.isdisjoint(row["cell"] for row in shown_rows(browser))
+    # a value that all rows have is in the page once
+    look(browser, page, fragment="#summary?show=solver&show=accuracy&page=2")
+    accuracy = tables.cell_text(tables.read(tmp_path / "many" / FILE, "cells")["accuracy"].iloc[0])
+    assert [(row["solver"], row["accuracy"]) for row in shown_rows(browser)] == [("piqp", accuracy)] * 50
     assert complaints(browser) == []

@@ -167,3 +167,22 @@ def test_labels_of_points_cover_neither_each_other_nor_leave_the_panel(points: l
         assert not any(box.overlaps(other) for other in boxes[:k])
     missing = len(points) - len(boxes)
     assert caption_of(figure) == (f"{missing} points have no label for want of room." if missing else "")
+
+
+def test_a_point_without_a_text_is_kept_clear() -> None:
+    """The label stands on another side than it would otherwise, and the empty one is not missed."""
+    sides = []
+    for others in ((), ((0.6, 0.5),)):
+        made = Sheet(1, 1)
+        (panel,) = made.panels
+        panel.set(xlim=(0.0, 1.0), ylim=(0.0, 1.0))
+        made.label(panel, 0.5, 0.5, "(8, 43)")
+        for x, y in others:
+            made.label(panel, x, y, "")
+        figure = made.finish()
+        (label,) = panel.texts
+        box = label.get_window_extent(RendererAgg(10, 10, figure.dpi))
+        sides.append(box.x0 > panel.transData.transform((0.5, 0.5))[0])
+        assert not any(box.contains(*panel.transData.transform(other)) for other in others)
+        assert not caption_of(figure)
+    assert sides == [True, False]

@@ -185,6 +185,7 @@ def shares(data: Data) -> CaptionedFigure | None:
             panel.plot(mine["share_guaranteed"], mine["share_validation"], "|", color=look.colour)
             for k, text in point_names(mine).items():
                 sheet.label(panel, mine.at[k, "share_training"], mine.at[k, "share_validation"], text)
+                sheet.label(panel, mine.at[k, "share_guaranteed"], mine.at[k, "share_validation"], "")
         panel.set(title=title, xlabel="smallest share, training set", ylabel="smallest share, validation set")
     return sheet.finish(
         f"Smallest share of β over the span in that of the whole of V for {data.problem}: over the validation set "

@@ -26,7 +26,7 @@ SIDES = ((1, 0), (-1, 0), (0, 1), (0, -1), (1, 1), (-1, 1), (1, -1), (-1, -1))
 def label_points(axes: Axes, points: list[tuple[float, float, str]]) -> int:
     """Write a label at every point (x, y, text) where there is room; returns the number of those without room.
 
-    The axes must have their final size and limits.
+    A point without a text is only kept clear. The axes must have their final size and limits.
     """
     drawn = [(x, y, text) for x, y, text in points if np.isfinite([x, y]).all()]
     if not drawn:
@@ -37,6 +37,8 @@ def label_points(axes: Axes, points: list[tuple[float, float, str]]) -> int:
     taken: list[Box] = [(x - MARKER, y - MARKER, x + MARKER, y + MARKER) for x, y in places]
     missing = 0
     for (x, y, text), place in zip(drawn, places, strict=True):
+        if not text:
+            continue
         box = _free(place, text, taken, (left, bottom, right, top))
         if box is None:
             missing += 1

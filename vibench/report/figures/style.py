@@ -166,7 +166,7 @@ class Sheet:
         return self.panels[row * self._columns + column]
 
     def label(self, panel: Axes, x: float, y: float, text: str) -> None:
-        """Write a text at a point, where there is room for it in the finished figure."""
+        """Write a text at a point, where there is room for it in the finished figure; without one keep it clear."""
         self._labels.setdefault(self.panels.index(panel), []).append((x, y, text))
 
     def finish(self, caption: str = "") -> CaptionedFigure:
