@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from importlib.metadata import PackageNotFoundError, metadata
@@ -19,11 +19,13 @@ from vibench.errors import NumericalError, RequestError, in_a_line
 from vibench.files import write_atomically
 from vibench.interfaces.problem import MEMBERS, VariationalInequality
 from vibench.interfaces.strategies import Kind
+from vibench.interfaces.validation import training_parameters
 from vibench.library import c_source
 from vibench.library.models import Model
 from vibench.library.reduced_model import FORMAT, SOLVERS
+from vibench.model.affine import affine_decomposition, check_affine
 from vibench.model.chebyshev import AffinePolynomial, interpolate_on_box
-from vibench.model.hyperreduced import HyperReducedModel
+from vibench.model.hyperreduced import HyperReducedModel, hyper_reduce
 from vibench.provenance import distribution_version
 from vibench.qp.settings import SETTINGS
 from vibench.qp.solve import MARGIN
@@ -118,9 +120,7 @@ def export_model(
             raise RequestError(f"'{path}' exists; remove it, or choose another name")
     if script.exists() and (not script.is_file() or script.read_bytes() != runtime):
         raise RequestError(f"'{script}' exists and is not the runtime of this version; choose another folder")
-    if c and isinstance(model.reduced, HyperReducedModel) and model.reduced.space is not None:
-        raise RequestError("the enrichment changes the basis at every parameter; C sources are for fixed bases")
-    found = exported(model, tolerance, evaluations, bases)
+    found = exported(model, tolerance, evaluations, bases, c)
     contents = {file: _npz(found), script: runtime}
     if c:
         contents[source] = c_source.source(found.members, found.arrays, found.about, file.stem).encode()
@@ -131,15 +131,18 @@ def export_model(
 
 
 def exported(
-    model: Model, tolerance: float = TOLERANCE, evaluations: int = EVALUATIONS, bases: bool = True
+    model: Model, tolerance: float = TOLERANCE, evaluations: int = EVALUATIONS, bases: bool = True, c: bool = False
 ) -> ExportedModel:
     """The model as `export_model` writes it."""
-    queried, box = model.reduced, model.parameters
+    box = model.parameters
     try:
+        queried = declared_model(model.reduced)
+        if c and isinstance(queried, HyperReducedModel) and queried.space is not None:
+            raise RequestError("the enrichment changes the basis at every parameter; C sources are for fixed bases")
         first = members_of(queried, box.lower)
         if not len(first.f) or not len(first.g):
             raise RequestError("the model has no unknowns or no constraints")
-        terms = queried.declared_terms() if isinstance(queried, HyperReducedModel) else {}
+        terms = declared_terms(queried)
         evaluate = partial(_evaluated, queried, len(first.f), frozenset(terms))
         members = interpolate_on_box(evaluate, box.lower, box.upper, tolerance, evaluations, terms=terms)
     except NumericalError as error:
@@ -156,6 +159,43 @@ def exported(
     return ExportedModel(members, arrays, _about(model, members))
 
 
+def declared_model(queried: Queried) -> Queried:
+    """The model without high-fidelity assembly where its problem declares all members constant or affine sums.
+
+    Their terms are projected, whatever the assembly of the cell was; any other model is returned as it is.
+
+    Raises
+    ------
+    NumericalError
+        If a declared sum differs from the assembled member.
+    """
+    if isinstance(queried, HyperReducedModel):
+        return queried
+    problem = queried.problem
+    training = training_parameters(problem)
+    if queried.enrichment.supply is not None or not set(MEMBERS) <= {*problem.constant, *problem.affine}:
+        check_affine(problem, training)
+        return queried
+    members = affine_decomposition(problem, training, tolerance=TOLERANCE)  # nothing is left to interpolate
+    return HyperReducedModel(queried, hyper_reduce(queried, members))
+
+
+def declared_terms(queried: Queried) -> dict[str, Array]:
+    """Flat terms (Q×size) of the members declared affine, of A packed upper triangles, on a fixed space."""
+    if isinstance(queried, HyperReducedModel):
+        return queried.declared_terms()
+    Z, chi, problem = queried.fixed_basis, queried.generators, queried.problem
+    upper = np.triu_indices(Z.shape[1])
+    projected: Mapping[str, Callable[[Any], Array]] = {
+        "A": lambda term: (0.5 * (Z.T @ (term @ Z) + (Z.T @ (term @ Z)).T))[upper],
+        "f": lambda term: Z.T @ term,
+        "B": lambda term: chi.T @ (term @ Z),
+        "g": lambda term: chi.T @ term,
+    }
+    declared = {name: sums for name, sums in problem.affine.items() if name not in problem.constant}
+    return {name: np.stack([np.ravel(projected[name](t)) for t in sums.terms]) for name, sums in declared.items()}
+
+
 def members_of(queried: Queried, mu: Array) -> VariationalInequality:
     """A, f, B, g at a parameter, on a space that does not depend on it.
 
@@ -168,8 +208,8 @@ def members_of(queried: Queried, mu: Array) -> VariationalInequality:
         return queried.members(mu)
     if queried.kind is Kind.PER_PARAMETER:
         raise RequestError(
-            "the enrichment changes the basis at every parameter, and the cell assembles in full; export the same cell "
-            'with assembly = "reduced"'
+            "the enrichment changes the basis at every parameter, the cell assembles in full, and its problem does not "
+            'declare all members constant or affine; export the same cell with assembly = "reduced"'
         )
     return queried.assemble(mu).program
 
@@ -177,8 +217,7 @@ def members_of(queried: Queried, mu: Array) -> VariationalInequality:
 def _evaluated(queried: Queried, size: int, declared: frozenset[str], mu: Array) -> dict[str, Array]:
     """The members as flat arrays; of declared affine ones θ."""
     found = _packed(queried, size, mu)
-    theta = queried.coefficients(mu) if isinstance(queried, HyperReducedModel) else {}
-    return found | {name: theta[name] for name in declared}
+    return found | {name: queried.problem.affine[name].coefficients(mu) for name in declared}
 
 
 def _packed(queried: Queried, size: int, mu: Array) -> dict[str, Array]:

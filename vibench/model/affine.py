@@ -78,7 +78,7 @@ def affine_decomposition(problem: Problem, training: Array, tolerance: float) ->
         If an assembly is invalid, or a declared affine sum differs from it.
     """
     first = checked_assembly(problem, training[0]).copy()
-    _check_affine(problem, training)
+    check_affine(problem, training)
     varying = [name for name in MEMBERS if name not in problem.constant and name not in problem.affine]
     assembled = _assembled(problem, training, varying) if varying else {}
     found: dict[str, AffineMember] = {}
@@ -112,8 +112,14 @@ def coefficients(
     return evaluate
 
 
-def _check_affine(problem: Problem, training: Array) -> None:
-    """Refuse affine sums that are not the assembled members."""
+def check_affine(problem: Problem, training: Array) -> None:
+    """Refuse affine sums that are not the assembled members, at the first, the middle and the last parameter (P×d).
+
+    Raises
+    ------
+    NumericalError
+        For the first member that differs.
+    """
     for mu in training[[0, len(training) // 2, -1]] if problem.affine else ():
         vi = checked_assembly(problem, mu)
         for name, declared in problem.affine.items():

@@ -7,6 +7,7 @@ import json
 import subprocess
 import sys
 import warnings
+from collections.abc import Mapping
 from importlib.metadata import distribution
 from pathlib import Path
 from types import SimpleNamespace
@@ -78,6 +79,95 @@ class Rotating(Varying):
             return {name: dense[name][places] for name, places in wanted.items()}
 
         return sample
+
+
+class Declared(Rotating):
+    """The same with its sums declared; assemblies are counted."""
+
+    constant = frozenset({"f"})
+    entrywise = frozenset()
+    most: int | None = None
+    """Assemblies after which it refuses another one."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._first = super().assemble(np.zeros(1))
+
+    def assemble(self, mu: vibench.Array) -> vibench.VariationalInequality:
+        if self.most is not None:
+            assert self.most > 0
+            self.most -= 1
+        return super().assemble(mu)
+
+    @property
+    def affine(self) -> Mapping[str, vibench.AffineSum]:
+        first, (one, other) = self._first, self._two
+        return {
+            "A": vibench.AffineSum.of([("1 + angle", first.A)], self.parameters.names),
+            "B": vibench.AffineSum.of([(1.0, one), ("sin(3 * angle)", other)], self.parameters.names),
+            "g": vibench.AffineSum.of([("exp(-angle)", first.g)], self.parameters.names),
+        }
+
+
+class PartlyDeclared(Declared):
+    """Its bound is not declared."""
+
+    @property
+    def affine(self) -> Mapping[str, vibench.AffineSum]:
+        return {name: found for name, found in super().affine.items() if name != "g"}
+
+
+class FalselyDeclared(PartlyDeclared):
+    """Its stiffness grows twice as fast as it says."""
+
+    def assemble(self, mu: vibench.Array) -> vibench.VariationalInequality:
+        found = super().assemble(mu)
+        return vibench.VariationalInequality(found.A * (1.0 + 2.0 * mu[0]) / (1.0 + mu[0]), found.f, found.B, found.g)
+
+
+def assembled_in_full(template: vibench.Model, problem: vibench.Problem, kind: vibench.Kind) -> vibench.Model:
+    """A model of a problem whose queries assemble high-fidelity matrices, with the row of a real cell."""
+    solver, training = HighFidelitySolver(problem), problem.training_set()
+    found = [solver.solve(mu) for mu in training]
+    basis = vibench.pod(np.column_stack([s.u for s in found]), problem.V, vibench.Stop(size=4)).basis
+    cone = vibench.greedy_cone(np.column_stack([s.lam for s in found]), problem.W, vibench.Stop(size=3))
+    span = multipliers(cone.generators, problem.W).span
+    enrichment = vibench.Enrichment(kind, eta=span if kind is vibench.Kind.PER_PARAMETER else None)
+    reduced = ReducedModel(problem, basis, enrichment, cone.generators, span)
+    cell: Any = SimpleNamespace(
+        row=template.row, model=reduced, certificate=None, cell=SimpleNamespace(solver="piqp", accuracy=1e-10)
+    )
+    return vibench.Model(cell)
+
+
+@pytest.mark.parametrize("kind", [vibench.Kind.NONE, vibench.Kind.PER_PARAMETER])
+def test_declared_sums_are_exported_whatever_the_assembly_of_the_cell(
+    run: vibench.Run, kind: vibench.Kind, tmp_path: Path
+) -> None:
+    """Without an assembly beyond those that check the declarations, and with the θ of these terms alone."""
+    problem = Declared()
+    model = assembled_in_full(model_of(run, "radial-obstacle"), problem, kind)
+    problem.most = 4
+    found = export_model(model, tmp_path / "model.npz")
+    problem.most = None
+    assert {name: len(member.terms) for name, member in found.members.items()} == {"A": 1, "f": 1, "B": 2, "g": 1}
+    assert found.members["A"].degrees == (1,)
+    exported = Exported(tmp_path / "model.npz")
+    assert max(largest_errors(model, lambda mu: (exported.solve(mu).u, exported.solve(mu).lam), 100)) <= 1e-9
+
+
+def test_sums_that_are_declared_keep_their_terms_beside_members_that_are_not(run: vibench.Run, tmp_path: Path) -> None:
+    template = model_of(run, "radial-obstacle")
+    model = assembled_in_full(template, PartlyDeclared(), vibench.Kind.NONE)
+    found = export_model(model, tmp_path / "model.npz")
+    assert {name: len(found.members[name].terms) for name in "AB"} == {"A": 1, "B": 2}
+    exported = Exported(tmp_path / "model.npz")
+    assert max(largest_errors(model, lambda mu: (exported.solve(mu).u, exported.solve(mu).lam), 100)) <= 1e-9
+    with pytest.raises(vibench.RequestError, match="does not declare all members constant or affine; export the same"):
+        export_model(assembled_in_full(template, PartlyDeclared(), vibench.Kind.PER_PARAMETER), tmp_path / "other.npz")
+    with pytest.raises(vibench.RequestError, match="the affine sum declared for A differs from the assembled A"):
+        export_model(assembled_in_full(template, FalselyDeclared(), vibench.Kind.NONE), tmp_path / "other.npz")
+    assert {file.name for file in tmp_path.iterdir()} == FILES
 
 
 def per_parameter(template: vibench.Model) -> vibench.Model:
