@@ -102,7 +102,7 @@ class PreparedLiftings:
                 return a @ self.directions, norm, max(0.0, float(lam @ slack))
             if lacking[self.rows].max() <= 0.0:  # rows beyond J are violated
                 return None
-            margin = np.maximum(margin, 2.0 * lacking)
+            margin = margin + 2.0 * np.maximum(lacking, 0.0)
         return None
 
     def _complementary(self, scale: float, excess: Array, lam: Array) -> Array | None:

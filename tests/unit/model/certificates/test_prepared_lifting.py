@@ -1,0 +1,146 @@
+from __future__ import annotations
+
+from fractions import Fraction
+
+import numpy as np
+import pytest
+import scipy.sparse as sp
+from hypothesis import given
+from hypothesis import strategies as st
+from numerics import exact, spd
+
+from vibench.interfaces.problem import VariationalInequality
+from vibench.model.certificates.prepared_lifting import PreparedLiftings, carriers, prepare_liftings
+
+K, M, D = 9, 6, 3
+ALL = np.ones(M, bool)
+BODIES = np.equal.outer(np.arange(K) < 7, np.arange(K) < 7)
+"""Two bodies: the first seven unknowns, and the others."""
+
+
+def compliance(rng: np.random.Generator, two: bool) -> np.ndarray:
+    C = np.linalg.inv(spd(K, rng, 100.0) * (BODIES if two else 1.0))
+    return 0.5 * (C + C.T)
+
+
+def prepared(
+    B: np.ndarray, C: np.ndarray, basis: np.ndarray, scaled: bool, rows: np.ndarray = ALL
+) -> PreparedLiftings | None:
+    """The directions are the functionals themselves."""
+    return prepare_liftings(sp.csr_array(B), scaled, C, rows, basis, np.eye(K))
+
+
+@given(
+    st.integers(0, 10_000), st.booleans(), st.sampled_from([0.0, 0.1, 3.0]), st.sampled_from([1e-6, 1.0]),
+    st.sampled_from([1.0, 2.5]),
+)  # fmt: skip
+def test_liftings_are_feasible_also_in_exact_arithmetic_and_the_best_ones(
+    seed: int, scaled: bool, pressure: float, violation: float, gamma: float
+) -> None:
+    """Where B is scaled, the best of all; where one body moves, the best of those that load the other one alone."""
+    rng = np.random.default_rng(seed)
+    C, B0 = compliance(rng, two=not scaled), rng.standard_normal((M, K))
+    factor = float(rng.choice([-0.7, 1.3])) if scaled else 1.0
+    B0[:, 7:] *= scaled
+    B = factor * B0 if scaled else B0 + np.where(np.arange(K) < 7, 0.0, rng.standard_normal((M, K)))
+    basis, y = rng.standard_normal((K, D)), rng.standard_normal(D)
+    lam = np.maximum(rng.standard_normal(M), 0.0) * pressure
+    g = B @ (basis @ y) - violation * rng.uniform(-1.0, 0.5, M)
+    liftings = prepared(B0, C, basis, scaled)
+    assert liftings is not None
+    found = liftings.lift(factor if scaled else sp.csr_array(B), g, np.abs(g), y, lam, gamma)
+    assert found is not None
+    load, norm, kappa = found
+    w, u = fractions(C) @ fractions(load), fractions(basis) @ fractions(y)
+    slack = fractions(B) @ (w - u) + fractions(g)
+    unit = Fraction(1e-14 * float((np.abs(B) @ np.abs(C) @ np.abs(load)).max()))  # `load` itself is rounded
+    assert min(slack) >= -unit
+    values, s = C @ load, B @ (basis @ y) - g
+    assert norm == pytest.approx(float(np.sqrt(load @ values)), rel=1e-6, abs=1e-12)
+    assert kappa == pytest.approx(float(lam @ (B @ values - s)), abs=1e-9 * (1.0 + lam.sum()))
+    part = slice(0, K if scaled else 7)
+    A, rows = gamma * np.linalg.inv(C[part, part]), B[:, part]
+    if np.linalg.cond(rows @ rows.T) > 1e5:
+        return
+    best, _ = exact(VariationalInequality(0.5 * (A + A.T), -rows.T @ lam, -rows, -s))
+    least = 0.5 * best @ A @ best + lam @ (rows @ best - s)
+    assert 0.5 * gamma * norm**2 + kappa <= least + 1e-5 * (gamma * norm**2 + lam @ np.abs(s)) + 1e-12 * (
+        1.0 + lam.sum()
+    )
+
+
+def fractions(array: np.ndarray) -> np.ndarray:
+    return np.vectorize(Fraction, otypes=[object])(array)
+
+
+def membrane() -> tuple[np.ndarray, np.ndarray]:
+    """A chain of K unknowns, and the constraints −w ≥ s of the first M."""
+    chain = 2.0 * np.eye(K) - np.eye(K, k=1) - np.eye(K, k=-1)
+    return np.linalg.inv(chain), -np.eye(M, K)
+
+
+def test_there_is_no_prepared_lifting_where_rows_beyond_those_that_are_prepared_stay_violated() -> None:
+    C, B = membrane()
+    few, zero = ALL.copy(), np.zeros(D)
+    few[4:] = False
+    liftings = prepared(B, C, np.zeros((K, D)), True, few)
+    assert liftings is not None
+    lam, violated = np.where(few, 1.0, 0.0), np.full(M, -1.0)
+    assert liftings.lift(1.0, violated, np.ones(M), zero, lam, 1.0) is None
+    violated[4:] = 0.0  # w of the first rows lifts these, too
+    found = liftings.lift(1.0, violated, np.ones(M), zero, lam, 1.0)
+    assert found is not None
+    assert np.all(B @ (C @ found[0]) >= -violated)
+
+
+def test_rows_without_pressure_are_not_held_where_they_are() -> None:
+    """Their multiplier is zero and w leaves s behind: one row pushes, the others follow."""
+    C, B = membrane()
+    liftings = prepared(B, C, np.zeros((K, D)), True)
+    assert liftings is not None
+    g = np.full(M, 1.0)
+    g[2] = -1.0
+    load, _, kappa = liftings.lift(1.0, g, np.abs(g), np.zeros(D), np.eye(M)[2], 1.0) or (np.zeros(K), 0.0, 0.0)
+    assert load == pytest.approx(np.eye(K)[2] * load[2])
+    assert (C @ load)[2] == pytest.approx(-1.0)
+    assert kappa == pytest.approx(0.0, abs=1e-12)
+
+
+def test_more_round_off_in_g_asks_for_more() -> None:
+    C, B = membrane()
+    liftings = prepared(B, C, np.zeros((K, D)), True)
+    assert liftings is not None
+    raised = []
+    for size in (1.0, 1e12):
+        found = liftings.lift(1.0, np.full(M, -1.0), np.full(M, size), np.zeros(D), np.ones(M), 1.0)
+        assert found is not None
+        raised.append(B @ (C @ found[0]))
+    assert np.all(raised[1] >= raised[0] + 1e12 * np.finfo(float).eps)
+
+
+def test_dependent_rows_have_no_prepared_liftings() -> None:
+    C, B = membrane()
+    B[3] = 2.0 * B[0]
+    assert prepared(B, C, np.zeros((K, D)), True) is None
+    assert prepared(B, C, np.zeros((K, D)), True, np.zeros(M, bool)) is None
+    kept = ALL.copy()
+    kept[3] = False
+    assert prepared(B, C, np.zeros((K, D)), True, kept) is not None
+
+
+def test_a_factor_of_zero_has_no_lifting() -> None:
+    C, B = membrane()
+    liftings = prepared(B, C, np.zeros((K, D)), True)
+    assert liftings is not None
+    assert liftings.lift(0.0, np.ones(M), np.ones(M), np.zeros(D), np.zeros(M), 1.0) is None
+
+
+def test_bodies_carry_liftings_where_the_constraint_is_the_same_everywhere() -> None:
+    rng = np.random.default_rng(0)
+    C, B = compliance(rng, two=True), rng.standard_normal((M, K))
+    other = B.copy()
+    other[2, 8] += 1e-14
+    assert carriers(C, [sp.csr_array(B), sp.csr_array(B)]).all()
+    assert list(np.flatnonzero(carriers(C, [sp.csr_array(B), sp.csr_array(other)]))) == list(range(7))
+    coupled = compliance(rng, two=False)
+    assert not carriers(coupled, [sp.csr_array(B), sp.csr_array(other)]).any()
