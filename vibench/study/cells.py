@@ -72,6 +72,9 @@ PLUGINS = ("problem", "dual", "primal", "training", "validation_sampling")
 OWN = "own"
 """Name of the training and the validation set that a problem itself has."""
 
+CERTIFIED = "certified"
+"""Assembly of queries that are assembled as reduced ones, and have certificates."""
+
 
 @dataclass(frozen=True)
 class Axes:
