@@ -17,6 +17,7 @@ from palette import use_palette
 from vibench.report.figures.looks import look_of
 from vibench.report.figures.style import Sheet, save, scatter, styled
 from vibench.results import tables
+from vibench.study.values import CERTIFIED
 
 BOUNDS = {"HSW": ("hsw_u", "hsw_lambda"), "(ii)": ("u_energy", "lambda_natural")} | {
     "(ii) online": ("online_u_energy", "online_lambda_natural")
@@ -36,7 +37,7 @@ MODEL = ["problem", "training", "primal", "primal_tol"]
 def effectivities(cells: pd.DataFrame, queries: pd.DataFrame) -> pd.DataFrame:
     """Median effectivities over the ok queries of every certified model, and the number of violations."""
     rows = []
-    for cell in cells[cells["assembly"] == "certified"].to_dict("records"):
+    for cell in cells[cells["assembly"] == CERTIFIED].to_dict("records"):
         mine = queries[(queries["cell"] == cell["cell"]) & (queries["status"] == "ok")]
         row = {name: cell[name] for name in [*MODEL, "certificate"]} | {"queries": len(mine)}
         for name, (u, lam) in BOUNDS.items():
@@ -47,7 +48,7 @@ def effectivities(cells: pd.DataFrame, queries: pd.DataFrame) -> pd.DataFrame:
 
 def costs(cells: pd.DataFrame) -> pd.DataFrame:
     """Seconds of a query with and without its certificate, and of what is prepared offline."""
-    without, with_one = (cells[cells["assembly"] == assembly].set_index(MODEL) for assembly in ("reduced", "certified"))
+    without, with_one = (cells[cells["assembly"] == assembly].set_index(MODEL) for assembly in ("reduced", CERTIFIED))
     found = pd.DataFrame(
         {
             "query without [ms]": 1e3 * without["online_s"],
@@ -74,7 +75,7 @@ def trainings(cells: pd.DataFrame) -> pd.DataFrame:
 
 def figure(cells: pd.DataFrame, queries: pd.DataFrame) -> Figure:
     """Bounds against errors of all certified queries; on the grey line they are equal."""
-    certified = cells[cells["assembly"] == "certified"]
+    certified = cells[cells["assembly"] == CERTIFIED]
     problems = list(certified["problem"].unique())
     sheet = Sheet(2, len(problems), "bounds against errors, all queries of certified models")
     for column, problem in enumerate(problems):

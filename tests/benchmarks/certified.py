@@ -2,8 +2,8 @@
 
 Usage: python tests/benchmarks/certified.py RUN [COUNT]
 
-For every certified cell of a run: bounds of COUNT random parameters (10000 by default) that the model has not seen,
-compared with high-fidelity solutions.
+For every certified cell of a run: bounds at COUNT random parameters (10000 by default) that the model has not seen,
+compared with high-fidelity solutions, which the models of a problem share.
 
 Usage: python tests/benchmarks/certified.py --meshes [COUNT]
 
@@ -16,15 +16,19 @@ from __future__ import annotations
 
 import sys
 import time
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
 
 import vibench
-from vibench import AffineProblem, InnerProduct, ParameterBox
+from vibench import AffineProblem, Array, InnerProduct, ParameterBox
 from vibench.execution.recorded_cell import recorded_cells
-from vibench.highfidelity.active_set import HighFidelitySolver
+from vibench.highfidelity.active_set import HighFidelitySolution, HighFidelitySolver
 from vibench.interfaces.strategies import Enrichment, Kind
+from vibench.library.models import Model
 from vibench.model.affine import affine_decomposition
 from vibench.model.certificates.base import Guarantee, certificate_base
 from vibench.model.certificates.bounds import OnlineCertificate
@@ -32,57 +36,97 @@ from vibench.model.certificates.preparation import prepare
 from vibench.model.galerkin import ReducedModel
 from vibench.model.hyperreduced import HyperReducedModel, hyper_reduce
 from vibench.qp.solve import solve_qp
-from vibench.stages.assemblies import assemblies
-
-VIOLATION = 1e-10
-"""An error above its bound by more than this share of the solution violates it."""
+from vibench.stages.assemblies import Assemblies
+from vibench.stages.query import VIOLATION
+from vibench.study.cells import Plugin
 
 SEED = 2027
 
+REPORTED = 1000
+"""Parameters between two reports."""
+
+
+@dataclass
+class Tally:
+    """What the queries of one certified model gave so far.
+
+    Attributes
+    ----------
+    row, model, certificate
+        Of the cell.
+    violations, without
+        Parameters with an error above its bound, and without a bound.
+    effectivities, seconds
+        Of u and λ, and of the query and its certificate, by parameter.
+    """
+
+    row: Mapping[str, Any]
+    model: Model
+    certificate: OnlineCertificate
+    violations: int = 0
+    without: int = 0
+    effectivities: list[tuple[float, float]] = field(default_factory=list)
+    seconds: list[tuple[float, float]] = field(default_factory=list)
+
+    def query(self, kept: Assemblies, mu: Array, exact: HighFidelitySolution) -> None:
+        """Compare the bounds at mu (d,) with the errors."""
+        start = time.process_time_ns()
+        reduced = self.model.reduced.assemble(mu)
+        middle = time.process_time_ns()
+        solution = self.model.solve(mu)
+        if solution.bound is None or solution.x is None or solution.alpha is None:
+            self.without += 1
+            return
+        solved = 1e-9 * (middle - start) + solution.solution.cpu
+        start = time.process_time_ns()
+        bound = self.certificate.evaluate(self.model.problem, mu, reduced, solution.x, solution.alpha)
+        self.seconds.append((solved, 1e-9 * (time.process_time_ns() - start)))
+        if bound.guarantee is Guarantee.NONE:
+            self.without += 1
+            return
+        vi, energy = kept.at(mu), kept.energy_at(mu)
+        errors = energy.norm(exact.u - solution.u), energy.dual_norm(vi.B.T @ (exact.lam - solution.lam))
+        sizes = energy.norm(exact.u), energy.dual_norm(vi.B.T @ exact.lam)
+        bounds = bound.u_energy, bound.lambda_natural
+        pairs = zip(errors, bounds, sizes, strict=True)
+        self.violations += any(not error <= limit + VIOLATION * size for error, limit, size in pairs)
+        self.effectivities.append((bounds[0] / errors[0], bounds[1] / errors[1]))
+
+    def __str__(self) -> str:
+        """One line."""
+        (of_u, of_lam), (query, certify) = np.median(self.effectivities, axis=0), 1e3 * np.median(self.seconds, axis=0)
+        least = np.min(self.effectivities, axis=0)
+        training, primal, size = (self.row[name] for name in ("training", "primal", "snapshots"))
+        return (
+            f"{self.row['problem']}, {size} solutions ({training}), {primal}, {self.row['cell']}, "
+            f"{self.certificate.base.guarantee.value}: {len(self.seconds) + self.without} parameters, "
+            f"{self.violations} violations, {self.without} without a bound; effectivity of u {of_u:.2f} (least "
+            f"{least[0]:.4f}), of λ {of_lam:.2f} (least {least[1]:.4f}); query {query:.2f} ms, certificate "
+            f"{certify:.2f} ms"
+        )
+
 
 def main(run: str, count: int) -> int:
-    """Print one line per cell; the number of cells with a violation."""
-    failed = 0
+    """Print one line per certified cell, every thousand parameters; the number of cells with a violation.
+
+    Models of one problem are compared with the same high-fidelity solutions.
+    """
+    models: dict[Plugin, list[Tally]] = {}
+    opened = vibench.open_run(run)
     for recorded in recorded_cells(run):
-        certificate = recorded.certificate
-        if certificate is None:
-            continue
-        model = vibench.open_run(run).model(recorded.row["cell"])
-        problem, violations, without = model.problem, 0, 0
-        effectivities, seconds = [], []
-        for mu in problem.parameters.sample(count, SEED):
-            start = time.process_time_ns()
-            reduced = model.reduced.assemble(mu)
-            middle = time.process_time_ns()
-            solution = model.solve(mu)
-            if solution.bound is None or solution.x is None or solution.alpha is None:
-                without += 1
-                continue
-            solved = 1e-9 * (middle - start) + solution.solution.cpu
-            start = time.process_time_ns()
-            bound = certificate.evaluate(problem, mu, reduced, solution.x, solution.alpha)
-            seconds.append((solved, 1e-9 * (time.process_time_ns() - start)))
-            if bound.guarantee is Guarantee.NONE:
-                without += 1
-                continue
-            exact, vi = model.high_fidelity(mu), problem.assemble(mu)
-            energy = assemblies(problem).energy_at(mu)
-            errors = energy.norm(exact.u - solution.u), energy.dual_norm(vi.B.T @ (exact.lam - solution.lam))
-            sizes = energy.norm(exact.u), energy.dual_norm(vi.B.T @ exact.lam)
-            bounds = bound.u_energy, bound.lambda_natural
-            pairs = zip(errors, bounds, sizes, strict=True)
-            violations += any(not error <= limit + VIOLATION * size for error, limit, size in pairs)
-            effectivities.append((bounds[0] / errors[0], bounds[1] / errors[1]))
-        failed += violations > 0
-        (of_u, of_lam), (query, certify) = np.median(effectivities, axis=0), 1e3 * np.median(seconds, axis=0)
-        least = np.min(effectivities, axis=0)
-        print(
-            f"{recorded.row['problem']} {recorded.row['cell']} {certificate.base.guarantee.value}: {count} parameters, "
-            f"{violations} violations, {without} without a bound; effectivity of u {of_u:.2f} (least {least[0]:.4f}), "
-            f"of λ {of_lam:.2f} (least {least[1]:.4f}); query {query:.2f} ms, certificate {certify:.2f} ms",
-            flush=True,
-        )
-    return failed
+        if (certificate := recorded.certificate) is not None:
+            tally = Tally(recorded.row, opened.model(recorded.row["cell"]), certificate)
+            models.setdefault(recorded.cell.problem, []).append(tally)
+    for tallies in models.values():
+        problem = tallies[0].model.problem
+        solver, kept = HighFidelitySolver(problem), Assemblies(problem)
+        for k, mu in enumerate(problem.parameters.sample(count, SEED), 1):
+            exact = solver.solve(mu)
+            for tally in tallies:
+                tally.query(kept, mu, exact)
+            if k % REPORTED == 0 or k == count:
+                print(*tallies, sep="\n", flush=True)
+    return sum(tally.violations > 0 for tallies in models.values() for tally in tallies)
 
 
 class Membrane(AffineProblem):

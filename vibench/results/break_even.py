@@ -12,6 +12,7 @@ import numpy as np
 from vibench.arrays import Array, Indices
 from vibench.interfaces.strategies import Kind
 from vibench.results.columns import KEYS, THRESHOLDS
+from vibench.study.values import CERTIFIED
 
 DRAWS = 2000
 """Resamples of the rounds that an interval is taken from."""
@@ -98,9 +99,6 @@ def resampled_break_even(a: Costs, b: Costs) -> BreakEven:
 
 
 UNDECIDED = BreakEven(None, Meaning.UNDECIDED)
-
-CERTIFIED = "certified"
-"""Value of `assembly` of queries that are assembled as reduced ones, and have certificates."""
 
 STRATEGY = ("primal", "primal_options", "primal_tol")
 

@@ -41,6 +41,7 @@ from vibench.stages.snapshots import gather, validation_stages
 from vibench.storage.artefacts import Artefact, Store
 from vibench.study import registry
 from vibench.study.cells import Cell
+from vibench.study.values import CERTIFIED
 from vibench.timing import median_interval, median_of
 
 CLEAR_GAP = 10.0
@@ -157,7 +158,7 @@ class CellQueries(PiecewiseStage):
 def cell_queries(cell: Cell, query_seconds: float) -> CellQueries:
     """The last stage of a cell; all its other stages are inputs of it, directly or indirectly."""
     assembly = assembly_stage(cell)
-    certificate = CertificateStage(assembly) if cell.assembly == "certified" else None
+    certificate = CertificateStage(assembly) if cell.assembly == CERTIFIED else None
     return CellQueries(assembly, cell.solver, cell.accuracy, query_seconds, cell.warm_start, certificate)
 
 

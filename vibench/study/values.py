@@ -2,3 +2,6 @@
 
 OWN = "own"
 """Name of the training and the validation set that a problem itself has."""
+
+CERTIFIED = "certified"
+"""Assembly of queries that are assembled as reduced ones, and have certificates."""
