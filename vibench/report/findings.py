@@ -140,8 +140,8 @@ def _whole_run(read: Mapping[str, pd.DataFrame]) -> Said:
         yield (
             Weight.WHOLE_RUN,
             f"{_number(len(loose), 'cell')} {_are(loose)} not compared with others: the QP solver makes "
-            f"{100.0 * SOLVER_SHARE:.0f} % or more of an error there (column `solver_share_mean`). A smaller "
-            "`accuracy` would help.",
+            f"{100.0 * SOLVER_SHARE:.0f} % or more of an error there (column solver_share_mean). A smaller "
+            "accuracy would help.",
         )
     few = cells[cells["queries_ok"] < FEWEST * cells["queries"]]
     if len(few):
@@ -155,7 +155,7 @@ def _whole_run(read: Mapping[str, pd.DataFrame]) -> Said:
         yield (
             Weight.WHOLE_RUN,
             f"{_number(len(disturbed), 'cell')} {'was' if len(disturbed) == 1 else 'were'} timed while other processes "
-            "slowed the machine down (column `disturbed`).",
+            "slowed the machine down (column disturbed).",
         )
 
 

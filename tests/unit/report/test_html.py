@@ -76,6 +76,10 @@ def test_findings_tables_and_facts_are_in_it(made: Path, quick_run: Path) -> Non
     assert cells["machine"].iloc[0] in page
     embedded = data(page, "table-data")["summary"]
     assert embedded["rows"] == len(cells)
+    break_even = data(page, "table-data")["model"]
+    assert {"break-even", "interval"} <= {column["name"] for column in break_even["columns"]}
+    assert {"problem", "solver"} <= {*break_even["axes"]}
+    assert {"break-even", "interval"}.isdisjoint(break_even["axes"]), "results, not axes of the study"
     whole = {column["name"]: column for column in embedded["columns"]}
     assert whole["error λ"]["numbers"] == [
         pytest.approx(error, rel=1e-5) for error in tables.in_order(cells)["error_lambda_mean"]

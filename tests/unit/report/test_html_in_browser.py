@@ -167,6 +167,13 @@ def test_columns_that_matter_are_seen_at_once(browser: Chrome, made: Path) -> No
     assert seen[0] == "cell"
     assert set(seen) >= MATTERS
     assert "accuracy" not in seen, "a column with one value in all rows is hidden at first"
+    sides = """
+        const side = one => getComputedStyle(one).textAlign;
+        const { tHead, tBodies } = document.querySelector('[data-table="summary"] table');
+        return [...tHead.rows[0].cells].map((head, k) => [side(head), side(tBodies[0].rows[0].cells[k])]);
+        """
+    found = browser.execute_script(sides)
+    assert {tuple(one) for one in found} == {("left", "left"), ("right", "right")}
 
 
 def test_the_switch_changes_the_theme_and_back(browser: Chrome, made: Path) -> None:

@@ -84,7 +84,9 @@ def grid_of_thresholds(name: str, title: str, caption: str, rows: Extended, cell
     frame = tables.benefits(rows.frame, rows.columns)
     first = _heading(THRESHOLDS, "primal_b")
     frame = frame[[first, *frame.columns.drop(first)]]
-    axes = tuple(heading for heading in frame.columns if not pd.api.types.is_numeric_dtype(frame[heading]))
+    results = {_heading(THRESHOLDS, name) for name in ("benefit_threshold", "threshold_high")}
+    texts = [heading for heading in frame.columns if not pd.api.types.is_numeric_dtype(frame[heading])]
+    axes = tuple(heading for heading in texts if heading not in results)
     disturbed = {*_disturbed(ordered["cell_a"], cells), *_disturbed(ordered["cell_b"], cells)}
     return Grid(name, title, caption, frame, axes, tuple(_constant(frame)), tuple(sorted(disturbed)))
 

@@ -144,9 +144,9 @@ class Grid {
     this.before.disabled = this.page === 0;
     this.after.disabled = this.page === pages - 1;
     const shown = this.shown();
-    const head = element("tr", {}, ...shown.map(({ name }) => {
+    const head = element("tr", {}, ...shown.map(({ name, number }) => {
       const sorted = this.sort === name && (this.falling ? "descending" : "ascending");
-      return element("th", { scope: "col", "aria-sort": sorted }, element("button", { type: "button", onclick: () => this.order(name) }, name));
+      return element("th", { scope: "col", class: number && "number", "aria-sort": sorted }, element("button", { type: "button", onclick: () => this.order(name) }, name));
     }));
     const body = rows.map(row => element("tr", { "data-row": row }, ...shown.map((column, k) => {
       const text = column.text(row), kind = column.number ? "number" : text.length > 48 ? "long" : text.length > 16 ? "text" : "";
