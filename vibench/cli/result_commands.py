@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from enum import StrEnum
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -41,6 +42,12 @@ def show(
         Option(metavar="NAME,…", help="Columns to sort by; -NAME for the largest first.", autocompletion=column_names),
     ] = "",
     limit: Annotated[int, Option(min=0, metavar="N", help="Print the first N rows; 0 for all.")] = 0,
+    error: Annotated[
+        str, Option(metavar="MEASURE", help="Compare models by the error of solution, u, lambda or output:NAME.")
+    ] = "",
+    within: Annotated[
+        float | None, Option(metavar="ERROR", help="Break-even of models with this error at most; 0.01 is 1 %.")
+    ] = None,
     form: FormOption = "terminal",
 ) -> None:
     """Print a table of a run.
@@ -52,7 +59,8 @@ def show(
     from vibench.terminal.console import print_frame
 
     path = tables.results_file(run)
-    found = views.look_up(path, table, columns=parts(columns), where=where, sort=parts(sort), limit=limit)
+    measured = partial(views.look_up, path, table, error=error, largest=within)
+    found = measured(columns=parts(columns), where=where, sort=parts(sort), limit=limit)
     warn(*found.faults)
     if form == "terminal":
         print_frame(found.readable, f"{path.parent.name}: {table}", found.priority, axes=found.axes, every=found.chosen)

@@ -18,7 +18,7 @@ from vibench.execution.recorded_cell import recorded_cell
 from vibench.execution.run import Observer, Options, run_study
 from vibench.execution.run_folder import REPORT
 from vibench.library.models import Model
-from vibench.results import tables
+from vibench.results import error_measures, tables
 from vibench.results.columns import TABLES
 from vibench.results.plugin_columns import Extended
 from vibench.results.reading import read_meta, study_of
@@ -88,6 +88,27 @@ class Run:
     def thresholds(self) -> pd.DataFrame:
         """A row per pair of cells, or of the high-fidelity model and a cell: the break-even and its interval."""
         return self.table("thresholds")
+
+    def break_even(self, error: str = error_measures.SOLUTION, within: float | None = None) -> pd.DataFrame:
+        """The thresholds with the errors of both models, `error_a` and `error_b`; 0 of the high-fidelity model.
+
+        Parameters
+        ----------
+        error
+            What errors are of: "u", "lambda", "solution" for the larger one of these, or "output:NAME" for a quantity
+            of interest. They are mean relative errors.
+        within
+            Largest error that both models may have; by default all rows are kept.
+
+        Raises
+        ------
+        RequestError
+            If there is no such measure, or the largest error is not positive.
+        """
+        cells, outputs = tables.read(self.path, "cells"), tables.read(self.path, "outputs")
+        errors = error_measures.errors_of(cells, outputs, error)
+        found = error_measures.with_errors(self.thresholds, cells, errors)
+        return found if within is None else error_measures.within(found, within).reset_index(drop=True)
 
     @property
     def summary(self) -> pd.DataFrame:

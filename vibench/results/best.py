@@ -9,6 +9,7 @@ import pandas as pd
 
 from vibench.qp.status import Status
 from vibench.results.columns import CELLS, REAL, Column
+from vibench.results.error_measures import OF_SOLUTION, SOLUTION
 from vibench.stability.infsup import VANISHES
 
 LARGEST_BAND = 0.1
@@ -24,29 +25,34 @@ NOBODY = (
 )
 """Why a run may have no best cell."""
 
-ERRORS = ("error_u_mean", "error_lambda_mean")
-
 BAND = "error_below"
 """Column of the accuracy: a power of ten that the mean errors of u and λ do not exceed."""
 
 HEADINGS: Mapping[str, Column] = {
     **CELLS,
-    BAND: Column(REAL, "1", "Power of ten that the mean errors of u and λ do not exceed.", "error ≤", 1),
+    BAND: Column(
+        REAL,
+        "1",
+        "Power of ten that the mean errors, of u and λ unless told, do not exceed.",
+        "error ≤",
+        1,
+    ),
 }
 
 
-def excluded(cells: pd.DataFrame) -> pd.DataFrame:
+def excluded(cells: pd.DataFrame, errors: pd.Series | None = None) -> pd.DataFrame:
     """Whether a row of the cells table takes no part, for each reason; a row has the first reason that holds.
 
     A query is not ok (`incomplete`); the inf-sup constant β over the span vanishes at a parameter, so that the
     multiplier is not unique there (`unstable`); the QP solver makes too large a share of the error (`loose`); a mean
-    error is above `LARGEST_BAND`, or none is known (`inexact`).
+    error is above `LARGEST_BAND`, or none is known (`inexact`). `errors` are those of the cells by another measure than
+    the larger one of u and λ.
     """
     reasons = {
         "incomplete": cells["status"] != Status.OK,
         "unstable": cells["beta_span_min"].astype(float) < VANISHES,
         "loose": solved_too_loosely(cells),
-        "inexact": ~(largest_error(cells) <= LARGEST_BAND),
+        "inexact": ~((largest_error(cells) if errors is None else errors) <= LARGEST_BAND),
     }
     found = pd.DataFrame(reasons, index=cells.index).astype(bool)
     earlier = found.astype(int).cumsum(axis=1).shift(1, axis=1, fill_value=0) > 0
@@ -65,16 +71,18 @@ def solved_too_loosely(cells: pd.DataFrame) -> pd.Series:
 
 def largest_error(cells: pd.DataFrame) -> pd.Series:
     """The larger of the mean relative errors of u and λ; the other one where one is missing."""
-    return cells[list(ERRORS)].astype(float).max(axis=1, skipna=True)
+    return cells[list(OF_SOLUTION[SOLUTION])].astype(float).max(axis=1, skipna=True)
 
 
-def fastest(cells: pd.DataFrame) -> pd.DataFrame:
+def fastest(cells: pd.DataFrame, errors: pd.Series | None = None) -> pd.DataFrame:
     """For every problem and power of ten, the timed cell with the fastest query whose mean errors do not exceed it.
 
     Cells that are not `eligible` take no part, as in the leaderboard of a report. A band whose cell is that of the next
-    smaller one is left out.
+    smaller one is left out. `errors` are those of the cells by another measure, in their rows or in more.
     """
-    known = cells.assign(error=largest_error(cells))[eligible(cells) & cells["online_s"].notna()]
+    measured = largest_error(cells) if errors is None else errors.reindex(cells.index)
+    fine = ~excluded(cells, measured).any(axis=1) & cells["online_s"].notna()
+    known = cells.assign(error=measured)[fine]
     rows = [row for _, mine in known.groupby(["problem", "problem_options"], dropna=False) for row in _bands(mine)]
     columns = ["problem", BAND, *cells.columns.drop("problem")]
     return pd.DataFrame(rows, columns=columns).astype({**cells.dtypes, BAND: float}).reset_index(drop=True)

@@ -27,12 +27,12 @@ TYPES: Mapping[type, str] = {float: REAL, int: INTEGER, str: TEXT}
 AFTER = 100
 """Places of columns of plugins in a table for reading: after all others."""
 
-RESERVED = {"pair", "error_below", *(name.lower() for table in STORED.values() for name in table)}
+RESERVED = {"pair", "error_below", "error_a", "error_b", *(name.lower() for table in STORED.values() for name in table)}
 """Names of columns of results files, for which SQLite knows no case, and of those that figures and summaries add."""
 
 _SHOWN = {**CELLS, **THRESHOLDS}
 
-HEADINGS = {"error ≤", *_SHOWN, *(column.heading for column in _SHOWN.values() if column.heading)}
+HEADINGS = {"error ≤", "error a", "error b", *_SHOWN, *(column.heading for column in _SHOWN.values() if column.heading)}
 """What stands above the columns of the tables for reading."""
 
 PARAMETERS = re.compile(r"mu_\d+")

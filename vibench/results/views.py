@@ -4,14 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import NoReturn
 
 import pandas as pd
 
 from vibench.errors import RequestError, unknown_name
-from vibench.results import best, selection, tables
+from vibench.results import best, error_measures, selection, tables
 from vibench.results.columns import CELLS, THRESHOLDS, Column
+from vibench.results.plugin_columns import Extended
 
 AXES = ("problem", "training", "dual", "primal", "primal_tol", "solver", "pod_tol", "dual_tol", "accuracy", "assembly")
 """Columns that tell rows apart; where all rows have one value, it stands in the title and takes no room."""
@@ -143,23 +145,34 @@ class Table:
 
 
 def look_up(
-    path: Path, name: str, *, columns: Sequence[str] = (), where: str = "", sort: Sequence[str] = (), limit: int = 0
+    path: Path,
+    name: str,
+    *,
+    columns: Sequence[str] = (),
+    where: str = "",
+    sort: Sequence[str] = (),
+    limit: int = 0,
+    error: str = "",
+    largest: float | None = None,
 ) -> Table:
     """A table of a results file: the rows that satisfy a condition, sorted, the first `limit` of them.
+
+    With an error measure (`error_measures`) models are compared by it: `best` has its bands, tables of break-even have
+    the errors of both models, of which neither is above `largest`.
 
     Raises
     ------
     RequestError
-        If there is no such table or column, or the condition is none.
+        If there is no such table, column or measure, the table does not depend on one, or the condition is none.
     """
     if name not in VIEWS:
         raise unknown_name("table", name, VIEWS)
-    extended = tables.extended(path, VIEWS[name].source)
-    view, found = _with_columns(VIEWS[name], extended.columns), extended.frame
+    view, extended = _measured(path, name, error, largest is not None)
+    view, found = _with_columns(view, extended.columns), extended.frame
     keys = found.get("cell", [])
     if where:
         found = found[selection.matching(path, view.source, where, found.columns, extended)]
-    rows = view.rows(found)
+    rows = view.rows(found if largest is None else error_measures.within(found, largest))
     by_heading = {column.heading: key for key, column in (view.headings or {}).items() if column.heading}
     if sort:
         resolved = [f"{'-' * key.startswith('-')}{by_heading.get(k, k)}" for key in sort for k in [key.lstrip("-")]]
@@ -176,11 +189,36 @@ def look_up(
     return Table(shown, listed, view, bool(asked), length, extended.faults)
 
 
+def _measured(path: Path, name: str, error: str, limited: bool) -> tuple[View, Extended]:
+    """A table for reading and its rows, with errors by the measure that is asked for."""
+    view, extended = VIEWS[name], tables.extended(path, VIEWS[name].source)
+    if not error and not limited:
+        return view, extended
+    if name != "best" and view.source != "thresholds":
+        raise RequestError(f"the table {name} compares no models by an error; expected {', '.join(COMPARING)}")
+    if limited and name == "best":
+        raise RequestError("--within is for tables of break-even points; the table best has all levels of error")
+    cells, outputs = tables.read(path, "cells"), tables.read(path, "outputs")
+    errors = error_measures.errors_of(cells, outputs, error or error_measures.SOLUTION)
+    if name == "best":
+        return replace(view, rows=partial(best.fastest, errors=errors)), extended
+    frame = error_measures.with_errors(extended.frame, cells, errors)
+    first = ("problem", "dual", "primal_a", "primal_b", "benefit_threshold", "error_b", "error_a")
+    columns = {**extended.columns, **error_measures.COLUMNS}
+    return replace(view, columns=tuple(dict.fromkeys((*first, *view.columns)))), replace(
+        extended, frame=frame, columns=columns
+    )
+
+
+COMPARING = ("best", *(name for name, view in VIEWS.items() if view.source == "thresholds"))
+"""Tables that compare models, for which an error measure can be asked."""
+
+
 def _with_columns(view: View, columns: Mapping[str, Column]) -> View:
     """A table for reading with columns of plugins as the least important ones: all, or those with a heading."""
     shown = [name for name, column in columns.items() if column.heading or view.headings is None]
     headings = None if view.headings is None else {**view.headings, **columns}
-    return replace(view, columns=(*view.columns, *shown), headings=headings)
+    return replace(view, columns=tuple(dict.fromkeys((*view.columns, *shown))), headings=headings)
 
 
 def _refuse(table: str, column: str, rows: pd.DataFrame, faults: Sequence[str]) -> NoReturn:

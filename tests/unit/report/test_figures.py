@@ -97,8 +97,8 @@ def line_called(axes: Axes, label: str) -> Line2D:
     return line
 
 
-SOMETIMES = ("diagnostics", "precision")
-"""Figures that need a problem with diagnostics, and a study of several accuracies."""
+SOMETIMES = ("diagnostics", "precision", "break-even")
+"""Figures that need a problem with diagnostics, a study of several accuracies, and seconds that decide something."""
 
 
 def problems() -> list[str]:

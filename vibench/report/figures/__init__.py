@@ -21,7 +21,7 @@ from vibench.files import write_atomically
 from vibench.report.figures import constants, convergence, costs
 from vibench.report.figures.constants import inf_sup, shares
 from vibench.report.figures.convergence import diagnostics, enrichment, orthogonality, projection_errors
-from vibench.report.figures.costs import dimension, outputs, total_cost, work_precision
+from vibench.report.figures.costs import break_even, dimension, outputs, total_cost, work_precision
 from vibench.report.figures.data import Data, file_names, problems
 from vibench.report.figures.plugins import FigureError, of_plugins
 from vibench.report.figures.solutions import solutions
@@ -42,6 +42,7 @@ OF_PROBLEM: dict[str, Drawing] = {
     "precision": precision,
     "total-cost": total_cost,
     "outputs": outputs,
+    "break-even": break_even,
 }
 """Figures of every problem, by the end of their file names."""
 
@@ -57,6 +58,7 @@ LONG: dict[str, tuple[Callable[[Data], int], int]] = {
     "work-precision": (costs.timed, DEEP),
     "total-cost": (costs.pairs, ABREAST * DEEP),
     "outputs": (costs.reported, ABREAST * DEEP),
+    "break-even": (costs.decided, ABREAST * DEEP),
     "enrichment": (convergence.enriched, DEEP),
     "inf-sup": (constants.pairs, constants.MOST_PAIRS),
 }

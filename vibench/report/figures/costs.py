@@ -21,7 +21,9 @@ from vibench.report.figures.data import (
 )
 from vibench.report.figures.looks import HIGH_FIDELITY_LOOK, Looks, Series
 from vibench.report.figures.style import ABREAST, DEEP, SERIES, CaptionedFigure, Layout, Sheet, plot, positive, scatter
+from vibench.results import error_measures
 from vibench.results.break_even import HIGH_FIDELITY, Meaning
+from vibench.results.error_measures import OUTPUT
 
 ERRORS = {"error_u_mean": "mean relative error of u", "error_lambda_mean": "mean relative error of λ"}
 
@@ -120,7 +122,7 @@ def outputs(data: Data) -> CaptionedFigure | None:
     solver = data.cells.loc[data.cells["cell"] == panels[0][1]["cell"].iloc[0], "solver"].iloc[0]
     sheet = Sheet.of(len(panels), f"{data.problem}, {solver}: quantities of interest")
     looks = Looks(Series(name) for _, _, names in panels for name in names)
-    for panel, (title, mine, names) in zip(sheet.panels, panels, strict=True):
+    for panel, (title, mine, names) in zip(sheet.panels, panels, strict=False):  # the last ones may be empty
         for name in names:
             one = mine[mine["primal"] == name]
             scatter(panel, 1e3 * one["online_s"], positive(one["error_scaled_mean"]), looks[Series(name)], name)
@@ -134,6 +136,52 @@ def outputs(data: Data) -> CaptionedFigure | None:
         "point for every model, with its (N, R) and the tolerance δ of its primal strategy; a number alone is another "
         f"δ.{data.part}"
     )
+
+
+def break_even(data: Data) -> CaptionedFigure | None:
+    """Queries from which a reduced model is cheaper than the high-fidelity one, against its errors, also of outputs."""
+    panels, without = _decided(data)
+    shown = data.on_page(panels, ABREAST * DEEP)
+    if not shown:
+        return None
+    solver = data.cells.loc[data.cells["cell"] == shown[0][1]["cell"].iloc[0], "solver"].iloc[0]
+    sheet = Sheet.of(len(shown), f"{data.problem}, {solver}: break-even and accuracy")
+    looks = Looks(Series(str(name)) for _, mine in shown for name in mine["primal"].unique())
+    for panel, (measure, mine) in zip(sheet.panels, shown, strict=False):
+        for name, rows in mine.groupby("primal", sort=False):
+            scatter(panel, positive(rows["error"]), rows["benefit_threshold"], looks[Series(str(name))], str(name))
+        for row in mine.itertuples():
+            panel.plot([row.error] * 2, [row.threshold_low, row.threshold_high], c="0.6", lw=0.8, zorder=0)
+        for index, text in point_names(mine).items():
+            sheet.label(panel, mine.at[index, "error"], mine.at[index, "benefit_threshold"], text)
+        title = measure.removeprefix(OUTPUT).replace("lambda", "λ")
+        panel.set(xlabel="mean relative error", ylabel="break-even [queries]", title=title, xscale="log", yscale="log")
+    left_out = f" Models without such a number, or with an undecided one, have no point: {without}." * bool(without)
+    return sheet.finish(
+        f"Number of queries from which a reduced model of {data.problem} is cheaper than the high-fidelity one, over "
+        f"its mean relative error of u, of λ and of every quantity of interest; solver {solver}. Lines are 95 % "
+        f"intervals. A point for every model, with its (N, R) and the tolerance δ of its primal strategy.{left_out}"
+        f"{data.part}"
+    )
+
+
+def decided(data: Data) -> int:
+    """Number of panels of `break_even`."""
+    return len(_decided(data)[0])
+
+
+def _decided(data: Data) -> tuple[list[tuple[str, pd.DataFrame]], int]:
+    """Measure and models of every panel of `break_even`, and the number of models that have no break-even."""
+    cells, numbers = best_solver(data.cells), ["benefit_threshold", "threshold_low", "threshold_high", "meaning"]
+    against = data.thresholds[data.thresholds["cell_a"].isna()].set_index("cell_b")[numbers]
+    mine = cells.merge(against, "inner", left_on="cell", right_index=True)
+    found = mine[mine["meaning"] == Meaning.FROM]
+    panels = [
+        (measure, found.assign(error=error_measures.errors_of(found, data.outputs, measure)).dropna(subset=["error"]))
+        for measure in error_measures.measures(data.outputs)
+        if measure != error_measures.SOLUTION
+    ]
+    return [(measure, rows) for measure, rows in panels if len(rows)], len(mine) - len(found)
 
 
 def reported(data: Data) -> int:

@@ -1,0 +1,203 @@
+"""Models compared by the error of a quantity of interest: break-even, the fastest cells and the figure of both."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+from running import Main, refused
+from samples import cell_row
+
+import vibench
+from vibench.errors import RequestError
+from vibench.interfaces.strategies import Kind
+from vibench.report.figures import caption_of
+from vibench.report.figures.costs import break_even, decided
+from vibench.report.figures.costs import outputs as figure_of_outputs
+from vibench.report.figures.data import problems
+from vibench.results.best import BAND, fastest
+from vibench.results.break_even import break_even_rows
+from vibench.results.columns import CELLS, KEYS, OUTPUTS
+from vibench.results.database import FILE, ResultsDatabase
+from vibench.results.error_measures import errors_of, measures, with_errors, within
+from vibench.testing.samples.run import write_sample_run
+
+MODELS = {
+    # offline seconds, seconds of a query, errors of u, of λ, of the force, and of the area
+    "a": (Kind.PER_PARAMETER, 4.0, 3.0, 0.001, 0.03, 0.004, None),
+    "b": (Kind.FIXED, 10.0, 1.0, 0.002, 0.02, 0.008, 0.05),
+    "c": (Kind.FIXED, 20.0, 0.5, 0.0005, 0.05, 0.0002, 0.2),
+}
+HIGH_FIDELITY = (1.0, 6.0)
+"""Seconds of the set-up, and of a solution."""
+
+
+def cell(name: str) -> dict[str, Any]:
+    kind, offline, online, error_u, error_lam, _, _ = MODELS[name]
+    axes = {key: "x" for key in KEYS if key not in {"primal", "primal_tol", "pod_size", "dual_size", "accuracy"}}
+    seconds = {"offline_s": offline, "online_s": online, "hf_setup_s": HIGH_FIDELITY[0], "hf_s": HIGH_FIDELITY[1]}
+    phases = {f"offline_{phase}_s": 0.0 for phase in ("snapshots", "pod", "cone", "enrichment", "assembly")}
+    row = cell_row(name, **axes | seconds | phases) | {"pod_tol": 0.1, "dual_tol": 0.1, "accuracy": 1e-8}
+    row |= {"hf_low_s": 5.999, "hf_high_s": 6.001, "assembly": "full", "solver": "piqp", "machine": "m"}
+    row |= {"error_u_mean": error_u, "error_lambda_mean": error_lam, "enrichment_kind": kind.value, "primal": name}
+    row |= {"primal_tol": None, "beta_span_min": 0.1, "solver_share_mean": 1e-6, "definition": "{}", "disturbed": 0}
+    return row | {f"{name}_options": "{}" for name in ("problem", "training", "dual", "primal")}
+
+
+def outputs_of(name: str) -> list[dict[str, Any]]:
+    keys = {key: value for key, value in cell(name).items() if key in KEYS}
+    return [
+        dict.fromkeys(OUTPUTS) | keys | {"cell": name, "output": output, "unit": "N", "error_mean": error}
+        for output, error in zip(("contact force", "area"), MODELS[name][-2:], strict=True)
+    ]
+
+
+TIMINGS = [
+    {"cell": name, "round": k, "total_s": model[2], "slowdown": 1.0} for name, model in MODELS.items() for k in range(8)
+]
+"""The same seconds in every round: nothing is undecided."""
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    database = ResultsDatabase(tmp_path / "run", {"name": "sample", "seed": 1, "validation": 1})
+    for name in MODELS:
+        database.write_cell(cell(name), [], (), outputs_of(name))
+    database.replace("thresholds", break_even_rows(map(cell, MODELS), TIMINGS))
+    database.close()
+    return tmp_path / "run" / FILE
+
+
+BY_HAND = {
+    # (T_b − T_a) / (t_a − t_b), with the errors of the force of a and of b
+    (None, "a"): ((4.0 - 1.0) / (6.0 - 3.0), 0.0, 0.004),
+    (None, "b"): ((10.0 - 1.0) / (6.0 - 1.0), 0.0, 0.008),
+    (None, "c"): ((20.0 - 1.0) / (6.0 - 0.5), 0.0, 0.0002),
+    ("a", "b"): ((10.0 - 4.0) / (3.0 - 1.0), 0.004, 0.008),
+    ("a", "c"): ((20.0 - 4.0) / (3.0 - 0.5), 0.004, 0.0002),
+}
+
+
+def test_break_even_is_beside_the_errors_of_an_output(path: Path) -> None:
+    found = vibench.open_run(path).break_even("output:contact force")
+    numbers = found[["benefit_threshold", "error_a", "error_b"]].itertuples(index=False, name=None)
+    rows = dict(zip(pairs_of(found), numbers, strict=True))
+    assert rows.keys() == BY_HAND.keys()
+    for pair, expected in BY_HAND.items():
+        np.testing.assert_allclose(rows[pair], expected, rtol=1e-12)
+
+
+def pairs_of(found: pd.DataFrame) -> list[tuple[str | None, str]]:
+    """The cells that are compared; `None` for the high-fidelity model."""
+    first = [cell if isinstance(cell, str) else None for cell in found["cell_a"]]
+    return list(zip(first, found["cell_b"], strict=True))
+
+
+@pytest.mark.parametrize(
+    ("measure", "largest", "pairs"),
+    [
+        ("output:contact force", 0.005, {(None, "a"), (None, "c"), ("a", "c")}),
+        ("output:contact force", 0.008, set(BY_HAND)),  # the limit itself is within
+        ("output:area", 0.1, {(None, "b")}),  # the area of a is zero at all queries: nobody knows its relative error
+        ("lambda", 0.03, {(None, "a"), (None, "b"), ("a", "b")}),
+        ("u", 0.001, {(None, "a"), (None, "c"), ("a", "c")}),
+        ("solution", 0.025, {(None, "b")}),
+    ],
+)
+def test_only_models_that_are_accurate_enough_are_compared(
+    measure: str, largest: float, pairs: set[tuple[str | None, str]], path: Path, main: Main
+) -> None:
+    found = vibench.open_run(path).break_even(measure, within=largest)
+    assert set(pairs_of(found)) == pairs
+    chosen = ("--error", measure, "--within", str(largest), "--format", "csv", "--columns", "primal_a,primal_b")
+    code, out, err = main("show", str(path.parent), "--table", "benefits", *chosen)
+    assert (code, err) == (0, "")
+    assert {tuple(line.split(",")) for line in out.splitlines()[1:]} == {(a or "high-fidelity", b) for a, b in pairs}
+
+
+def test_the_table_shows_selects_and_sorts_by_these_errors(path: Path, main: Main) -> None:
+    asked = ("show", str(path.parent), "--table", "benefits", "--error", "output:contact force")
+    _, out, _ = main(*asked, "--format", "markdown")
+    assert "error a" in out
+    assert "error b" in out
+    chosen = ("--where", "error_b < 0.001", "--sort", "-error_a", "--columns", "primal_a,error_b", "--format", "csv")
+    assert main(*asked, *chosen) == (0, "primal_a,error_b\na,0.0002\nhigh-fidelity,0.0002\n", "")
+    _, out, _ = main("show", str(path.parent), "--table", "benefits", "--format", "csv")
+    assert "error_b" not in out
+
+
+def test_the_fastest_cells_are_those_of_the_measure(path: Path, main: Main) -> None:
+    cells = pd.DataFrame([cell(name) for name in MODELS], columns=list(CELLS))
+    outputs = pd.DataFrame([row for name in MODELS for row in outputs_of(name)])
+    found = fastest(cells, errors_of(cells, outputs, "output:contact force"))
+    assert list(zip(found["cell"], found[BAND], strict=True)) == [("c", 1e-3)]
+    found = fastest(cells, errors_of(cells, outputs, "output:area"))
+    assert list(zip(found["cell"], found[BAND], strict=True)) == [("b", 0.1)]  # 20 % are no answer
+    code, out, _ = main("show", str(path.parent), "--table", "best", "--error", "output:area", "--columns", "cell",
+                        "--format", "csv")  # fmt: skip
+    assert (code, out) == (0, "cell\nb\n")
+
+
+def test_what_is_no_measure_is_refused(path: Path, main: Main) -> None:
+    run = str(path.parent)
+    assert measures(pd.DataFrame({"output": ["force"]})) == ["solution", "u", "lambda", "output:force"]
+    refused(main("show", run, "--table", "benefits", "--error", "output:contact forse"), "did you mean 'output:contact")
+    refused(main("show", run, "--error", "u"), "the table summary compares no models by an error", "best, benefits")
+    refused(main("show", run, "--table", "best", "--within", "0.1"), "--within is for tables of break-even points")
+    refused(main("show", run, "--table", "benefits", "--within", "0"), "the largest error is 0, expected a positive")
+    with pytest.raises(RequestError, match="expected a positive number"):
+        within(pd.DataFrame({"error_a": [], "error_b": []}), float("nan"))
+
+
+def test_a_pair_without_an_error_has_none() -> None:
+    thresholds = pd.DataFrame({"cell_a": [None, "a"], "cell_b": ["b", "b"]})
+    cells = pd.DataFrame({"cell": ["a", "b"]})
+    found = with_errors(thresholds, cells, pd.Series([np.nan, 0.5]))
+    np.testing.assert_array_equal(found[["error_a", "error_b"]], [[0.0, 0.5], [np.nan, 0.5]])
+    assert list(within(found, 0.5).index) == [0]
+
+
+@pytest.mark.parametrize("count", [1, 2, 4, 5])
+def test_figures_of_any_number_of_outputs_are_drawn(count: int, tmp_path: Path) -> None:
+    """Their panels need not fill a row."""
+    data = next(data for _, data in problems(write_sample_run(tmp_path / "run")))
+    outputs = pd.concat([data.outputs.assign(output=f"force {k}") for k in range(count)], ignore_index=True)
+    thresholds = data.thresholds.assign(benefit_threshold=9.0, threshold_low=8.0, threshold_high=10.0, meaning="from")
+    known = type(data)(**{**vars(data), "outputs": outputs, "thresholds": thresholds})
+    names = [f"force {k}" for k in range(count)]
+    for draw, expected in (
+        (break_even, ["u", "λ", *names]),
+        (figure_of_outputs, [f"{n}, {d}" for n in names for d in DUALS]),
+    ):
+        figure = draw(known)
+        assert figure is not None
+        assert [axes.get_title() for axes in figure.axes if axes.get_title()] == expected
+
+
+DUALS = ("narrow", "wide")
+
+
+def test_the_figure_has_a_panel_for_every_measure_and_says_what_has_no_point(tmp_path: Path) -> None:
+    data = next(data for _, data in problems(write_sample_run(tmp_path / "run")))
+    thresholds = data.thresholds.copy()
+    mine = thresholds["cell_a"].isna()
+    numbers = {"benefit_threshold": 50.0, "threshold_low": 40.0, "threshold_high": 60.0, "meaning": "from"}
+    thresholds.loc[mine, list(numbers)] = list(numbers.values())
+    thresholds.loc[thresholds.index[mine][0], "meaning"] = "never"
+    known = type(data)(**{**vars(data), "thresholds": thresholds})
+    figure = break_even(known)
+    assert figure is not None
+    assert decided(known) == 3
+    drawn = [axes for axes in figure.axes if axes.get_title()]
+    assert [axes.get_title() for axes in drawn] == ["u", "λ", "force"]
+    count = int(mine.sum()) - 1
+    for axes in drawn:
+        lines = [line.get_data() for line in axes.lines if line.get_marker() != "None"]
+        points = np.concatenate([np.column_stack(line) for line in lines])
+        assert len(points) == count
+        assert set(points[:, 1]) == {50.0}
+    assert "Models without such a number, or with an undecided one, have no point: 1." in caption_of(figure)
+    assert break_even(type(data)(**{**vars(data), "thresholds": thresholds.assign(meaning="undecided")})) is None
