@@ -271,8 +271,8 @@ FAULTS = (
     Fault(
         "online-residual-in-the-norm-of-V",
         "vibench/model/certificates/preparation.py",
-        "residual, U = residual_basis(base.X, blocks,",
-        "residual, U = residual_basis(problem.V, blocks,",
+        "residual, U = residual_basis(base.X, blocks +",
+        "residual, U = residual_basis(problem.V, blocks +",
         ("tests/unit/model/certificates/test_bounds.py",),
     ),
     Fault(
@@ -288,6 +288,20 @@ FAULTS = (
         "if np.all(lacking <= 0.0):",
         "if np.all(np.isfinite(lacking)):",
         ("tests/unit/model/certificates/test_lifting.py",),
+    ),
+    Fault(
+        "prepared-lifting-not-feasible",
+        "vibench/model/certificates/prepared_lifting.py",
+        "if lacking.max() <= 0.0:",
+        "if np.isfinite(lacking.max()):",
+        ("tests/unit/model/certificates/test_prepared_lifting.py",),
+    ),
+    Fault(
+        "prepared-lifting-in-the-wrong-unit",
+        "vibench/model/certificates/prepared_lifting.py",
+        "a = (theta / gamma) * (nu - here)",
+        "a = theta * (nu - here)",
+        ("tests/unit/model/certificates/test_prepared_lifting.py",),
     ),
     Fault(
         "rows-far-from-the-contact-ignored",
@@ -313,7 +327,7 @@ FAULTS = (
     Fault(
         "coercivity-between-anchors",
         "vibench/model/certificates/spectral.py",
-        "lacking = float(np.abs(theta - at_anchors) @ self.norms) + 2.0 * self.error",
+        "lacking = float(np.abs(theta - found[2:]) @ self.norms) + 2.0 * self.error",
         "lacking = 2.0 * self.error",
         ("tests/unit/model/certificates/test_spectral.py",),
     ),

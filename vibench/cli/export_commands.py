@@ -30,7 +30,7 @@ def export_reduced_model(
     c: Annotated[bool, Option("--c", help="Also write a C99 source, under the same name.")] = False,
 ) -> None:
     """Export a reduced model for use without vibench."""
-    from vibench.library.export import RUNTIME, TOLERANCE, export_model
+    from vibench.library.export import BOUNDS, RUNTIME, TOLERANCE, export_model
     from vibench.library.runs import open_run
     from vibench.model.chebyshev import MEASURED
 
@@ -41,8 +41,15 @@ def export_reduced_model(
     echo(f"relative errors are those at {MEASURED} random parameters and at the corners of the box")
     if found.about["solver"] != model.row["solver"]:
         echo(f"the cell's solver is {model.row['solver']}, the script solves by {found.about['solver']}")
-    written = f"{file}, {file.with_name(RUNTIME)}" + (f", {file.with_suffix('.c')}" if c else "")
-    echo(f"{written}: `from {Path(RUNTIME).stem} import Model`, then `Model({str(file)!r}).solve(mu)`")
+    worth = found.about["certificate"]
+    has_bounds = worth in {"certified", "verified"}
+    echo(f"error bounds: {worth}" if has_bounds else f"no error bounds: {worth}")
+    if c and has_bounds:
+        echo("the C source has no error bounds")
+    beside = [file.with_name(BOUNDS)] if has_bounds else []
+    written = ", ".join(map(str, [file, file.with_name(RUNTIME), *beside, *([file.with_suffix(".c")] if c else [])]))
+    script = Path(BOUNDS if has_bounds else RUNTIME).stem
+    echo(f"{written}: `from {script} import Model`, then `Model({str(file)!r}).solve(mu)`")
 
 
 def _in_words(member: AffinePolynomial) -> str:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import json
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from importlib.metadata import PackageNotFoundError, metadata
 from importlib.resources import files
@@ -20,10 +20,11 @@ from vibench.files import write_atomically
 from vibench.interfaces.problem import MEMBERS, VariationalInequality
 from vibench.interfaces.strategies import Kind
 from vibench.interfaces.validation import training_parameters
-from vibench.library import c_source
+from vibench.library import c_source, exported_certificate
 from vibench.library.models import Model
 from vibench.library.reduced_model import FORMAT, SOLVERS
 from vibench.model.affine import affine_decomposition, check_affine
+from vibench.model.certificates.bounds import OnlineCertificate
 from vibench.model.chebyshev import AffinePolynomial, interpolate_on_box
 from vibench.model.hyperreduced import HyperReducedModel, hyper_reduce
 from vibench.provenance import distribution_version
@@ -35,6 +36,9 @@ from vibench.study.registry import version
 
 RUNTIME = "reduced_model.py"
 """The runtime, written beside the exported files."""
+
+BOUNDS = "reduced_model_certificate.py"
+"""The same with error bounds, written where there are some."""
 
 TOLERANCE = 1e-11
 """Largest relative error of a polynomial where nothing else is asked for; solutions then agree to 1e-9 and better."""
@@ -64,16 +68,19 @@ class ExportedModel:
         The other arrays of the file.
     about
         Everything else in it.
+    thetas
+        What the certificate evaluates at a parameter, if there is one.
     """
 
     members: Mapping[str, AffinePolynomial]
     arrays: Mapping[str, Array]
     about: Mapping[str, Any]
+    thetas: Mapping[str, AffinePolynomial] = field(default_factory=dict)
 
     @property
     def error(self) -> float:
         """Largest relative error of a member at random parameters."""
-        return max(member.error for member in self.members.values())
+        return max(found.error for found in (*self.members.values(), *self.thetas.values()))
 
 
 def export_model(
@@ -113,15 +120,12 @@ def export_model(
         raise RequestError(f"the tolerance of the interpolation is {tolerance:g}, expected a number between 0 and 1")
     if file.parent.exists() and not file.parent.is_dir():
         raise RequestError(f"'{file.parent}' is no folder")
-    runtime = (files("vibench.library") / RUNTIME).read_bytes()
-    source, script = file.with_suffix(".c"), file.with_name(RUNTIME)
-    for path in [file, *([source] if c else [])]:
-        if path.exists():
-            raise RequestError(f"'{path}' exists; remove it, or choose another name")
-    if script.exists() and (not script.is_file() or script.read_bytes() != runtime):
-        raise RequestError(f"'{script}' exists and is not the runtime of this version; choose another folder")
+    scripts = [RUNTIME] if exported_certificate.reason_for_none(model.certificate) else [RUNTIME, BOUNDS]
+    runtime = {file.with_name(name): (files("vibench.library") / name).read_bytes() for name in scripts}
+    source = file.with_suffix(".c")
+    _refuse_to_overwrite([file, *([source] if c else [])], runtime)
     found = exported(model, tolerance, evaluations, bases, c)
-    contents = {file: _npz(found), script: runtime}
+    contents = {file: _npz(found), **runtime}
     if c:
         contents[source] = c_source.source(found.members, found.arrays, found.about, file.stem).encode()
     file.parent.mkdir(parents=True, exist_ok=True)
@@ -130,11 +134,23 @@ def export_model(
     return found
 
 
+def _refuse_to_overwrite(new: list[Path], scripts: Mapping[Path, bytes]) -> None:
+    """Refuse files that exist, but for scripts with the same content."""
+    for path in new:
+        if path.exists():
+            raise RequestError(f"'{path}' exists; remove it, or choose another name")
+    for script, content in scripts.items():
+        if script.exists() and (not script.is_file() or script.read_bytes() != content):
+            raise RequestError(f"'{script}' exists and is not the runtime of this version; choose another folder")
+
+
 def exported(
     model: Model, tolerance: float = TOLERANCE, evaluations: int = EVALUATIONS, bases: bool = True, c: bool = False
 ) -> ExportedModel:
     """The model as `export_model` writes it."""
     box = model.parameters
+    why = exported_certificate.reason_for_none(model.certificate)
+    certificate = None if why else model.certificate
     try:
         queried = declared_model(model.reduced)
         if c and isinstance(queried, HyperReducedModel) and queried.space is not None:
@@ -143,20 +159,25 @@ def exported(
         if not len(first.f) or not len(first.g):
             raise RequestError("the model has no unknowns or no constraints")
         terms = declared_terms(queried)
-        evaluate = partial(_evaluated, queried, len(first.f), frozenset(terms))
-        members = interpolate_on_box(evaluate, box.lower, box.upper, tolerance, evaluations, terms=terms)
+        evaluate = partial(_evaluated, queried, len(first.f), frozenset(terms), certificate)
+        polynomials = interpolate_on_box(evaluate, box.lower, box.upper, tolerance, evaluations, terms=terms)
     except NumericalError as error:
         raise RequestError(f"the model cannot be evaluated in the whole parameter box: {error}") from None
     except (ArithmeticError, ValueError, LookupError) as error:  # what the code of a problem raises
         raise RequestError(f"the model cannot be evaluated in the whole parameter box: {in_a_line(error)}") from None
-    _refuse_inaccurate(members, tolerance, evaluations)
+    _refuse_inaccurate(polynomials, tolerance, evaluations)
+    members = {name: polynomials.pop(name) for name in MEMBERS}
+    about = _about(model, members) | {"certificate": why}
     arrays = {"lower": box.lower, "upper": box.upper}
     if isinstance(queried, HyperReducedModel) and queried.space is not None:
         arrays["plain"] = queried.space.plain
     if bases:
         basis = queried.basis if isinstance(queried, HyperReducedModel) else queried.fixed_basis
         arrays |= {"basis": basis, "generators": queried.generators}
-    return ExportedModel(members, arrays, _about(model, members))
+    if certificate is not None:
+        arrays |= exported_certificate.arrays(certificate)
+        about["certificate"] = exported_certificate.guarantee(certificate, polynomials | members).value
+    return ExportedModel(members, arrays, about, polynomials)
 
 
 def declared_model(queried: Queried) -> Queried:
@@ -214,10 +235,19 @@ def members_of(queried: Queried, mu: Array) -> VariationalInequality:
     return queried.assemble(mu).program
 
 
-def _evaluated(queried: Queried, size: int, declared: frozenset[str], mu: Array) -> dict[str, Array]:
-    """The members as flat arrays; of declared affine ones θ."""
+def _evaluated(
+    queried: Queried, size: int, declared: frozenset[str], certificate: OnlineCertificate | None, mu: Array
+) -> dict[str, Array]:
+    """The members as flat arrays, of declared affine ones θ; and what the certificate evaluates."""
     found = _packed(queried, size, mu)
-    return found | {name: queried.problem.affine[name].coefficients(mu) for name in declared}
+    declares = queried.problem.affine
+    theta = (
+        queried.coefficients(mu)
+        if isinstance(queried, HyperReducedModel)
+        else {name: declares[name].coefficients(mu) for name in declared}
+    )
+    beside = {} if certificate is None else exported_certificate.thetas(certificate, theta)
+    return found | {name: theta[name] for name in declared} | beside
 
 
 def _packed(queried: Queried, size: int, mu: Array) -> dict[str, Array]:
@@ -283,7 +313,7 @@ def _licence(distribution: str) -> str:
 def _npz(model: ExportedModel) -> bytes:
     arrays: dict[str, Any] = {"format": np.array(FORMAT), "about": np.array(json.dumps(dict(model.about)))}
     arrays |= model.arrays
-    for name, member in model.members.items():
+    for name, member in (*model.members.items(), *model.thetas.items()):
         arrays |= {f"{name}_indices": member.indices, f"{name}_coefficients": member.coefficients}
         arrays |= {f"{name}_terms": member.terms}
     content = io.BytesIO()

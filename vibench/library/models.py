@@ -14,7 +14,7 @@ from vibench.errors import RequestError, unknown_name
 from vibench.execution.recorded_cell import RecordedCell
 from vibench.highfidelity.active_set import HighFidelitySolution, HighFidelitySolver
 from vibench.interfaces.problem import ParameterBox, Problem
-from vibench.model.certificates.bounds import OnlineBound
+from vibench.model.certificates.bounds import OnlineBound, OnlineCertificate
 from vibench.model.error_bounds import Certificate, certificate
 from vibench.model.galerkin import ReducedProblem
 from vibench.qp.settings import SETTINGS
@@ -116,13 +116,15 @@ class Model:
         The high-fidelity problem.
     reduced
         What assembles the reduced programs: `reduced.assemble(mu)` has `program` and `lift`.
+    certificate
+        What bounds errors at online cost; `None` where the cell is not certified.
     """
 
     def __init__(self, recorded: RecordedCell) -> None:
         self.row = recorded.row
         self.reduced: Queried = recorded.model
         self.problem: Problem = self.reduced.problem
-        self._certificate = recorded.certificate
+        self.certificate: OnlineCertificate | None = recorded.certificate
         self._solver, self._accuracy = recorded.cell.solver, recorded.cell.accuracy
 
     @property
@@ -160,7 +162,7 @@ class Model:
         """
         if tolerance is not None and not tolerance > 0.0:
             raise RequestError(f"the tolerance is {tolerance:g}, expected a positive number")
-        if tolerance is not None and self._certificate is None:
+        if tolerance is not None and self.certificate is None:
             raise RequestError(
                 f'cell {self.row["cell"]} has no error bounds: a tolerance needs a cell with assembly = "certified"'
             )
@@ -176,10 +178,10 @@ class Model:
         found, solution = timed(solve)
         status, reason, residuals = verify(reduced.program, found, accuracy)
         bound = None
-        if self._certificate is not None:
+        if self.certificate is not None:
             bound = OnlineBound.none(f"the program has no solution: {reason}")
             if residuals is not None and found.x is not None and found.alpha is not None:
-                bound = self._certificate.evaluate(self.problem, at, reduced, found.x, found.alpha)
+                bound = self.certificate.evaluate(self.problem, at, reduced, found.x, found.alpha)
         answer = at, status, reason, found.x, found.alpha, residuals
         return Solution(*answer, assembly, solution, self, reduced, bound, tolerance)
 

@@ -20,7 +20,7 @@ FORMAT = "vibench reduced model 1"
 
 
 class Solution(NamedTuple):
-    """Status ("ok" up to the accuracy in the file, or "inaccurate"), x, α, u and λ if the file has bases, residuals."""
+    """Status ("ok" up to the accuracy in the file, or "inaccurate"), x, α, u and λ with bases, residuals, and uᵀA u."""
 
     status: str
     x: Array
@@ -28,6 +28,7 @@ class Solution(NamedTuple):
     u: Array | None
     lam: Array | None
     residuals: tuple[float, float, float]
+    energy: float
 
 
 class Model:
@@ -37,9 +38,9 @@ class Model:
         with np.load(file, allow_pickle=False) as data:
             if "format" not in data or str(data["format"]) != FORMAT:
                 raise ValueError(f"'{file}' is no {FORMAT}")
-            self._data = {name: data[name] for name in data.files}
-        self.about: dict[str, Any] = json.loads(str(self._data["about"]))
-        self.lower, self.upper = self._data["lower"], self._data["upper"]
+            self.data = {name: data[name] for name in data.files}
+        self.about: dict[str, Any] = json.loads(str(self.data["about"]))
+        self.lower, self.upper = self.data["lower"], self.data["upper"]
         self.solver = solver or self.about["solver"]
         if self.solver not in SOLVERS:
             raise ValueError(f"the solver is '{self.solver}', expected one of {', '.join(SOLVERS)}")
@@ -51,21 +52,22 @@ class Model:
             raise ValueError(f"mu is {at.tolist()}, expected {', '.join(self.about['parameters']['names'])}")
         if np.any(at < self.lower) or np.any(at > self.upper):
             warnings.warn(f"mu = {at.tolist()} is outside the box, where the model was not trained", stacklevel=3)
-        packed, f, B, g = (self._member(name, at) for name in "AfBg")
+        packed, f, B, g = (self.member(name, at) for name in "AfBg")
         A, Y, B = np.zeros((len(f), len(f))), np.eye(len(f)), B.reshape(-1, len(f))
         A[np.triu_indices(len(f))] = packed
         A += np.triu(A, 1).T
-        if "plain" in self._data:  # V_N in a larger space; the supremizers that enrich it are the first rows of B
-            Y = _enriched(self._data["plain"], B[: len(B) - len(g)].T)
+        if "plain" in self.data:  # V_N in a larger space; the supremizers that enrich it are the first rows of B
+            Y = _enriched(self.data["plain"], B[: len(B) - len(g)].T)
             A, f, B = Y.T @ A @ Y, Y.T @ f, B[len(B) - len(g) :] @ Y
         return A, f, B, g, Y
 
-    def _member(self, name: str, mu: Array) -> Array:
-        indices = self._data[f"{name}_indices"]
+    def member(self, name: str, mu: Array) -> Array:
+        """The sum of terms of this name at a parameter."""
+        indices = self.data[f"{name}_indices"]
         unit = (2.0 * mu - self.lower - self.upper) / (self.upper - self.lower)
         values = np.cos(np.arccos(unit[:, None] + 0j) * np.arange(indices.max() + 1)).real  # inside the box and outside
         products = np.prod(values[np.arange(len(mu)), indices], axis=1)
-        return np.asarray(products @ self._data[f"{name}_coefficients"] @ self._data[f"{name}_terms"])
+        return np.asarray(products @ self.data[f"{name}_coefficients"] @ self.data[f"{name}_terms"])
 
     def solve(self, mu: Sequence[float] | Array) -> Solution:
         """The solution at a parameter, verified; look at its status."""
@@ -78,11 +80,9 @@ class Model:
         y, z = (np.nan_to_num(vector, nan=0.0, posinf=0.0, neginf=0.0) for vector in answer)
         answers = [(length * y, force * np.maximum(z, 0.0)), _polished(A, f, N, b, z > b / length - N @ y)]
         x, forces = min(answers, key=lambda answer: max(residuals(A, f, N, b, *answer)))
-        found = residuals(A, f, N, b, x, forces)
-        x, alpha = Y @ x, forces / rows
-        parts = (("basis", x), ("generators", alpha))
-        u, lam = (self._data[name] @ part if name in self._data else None for name, part in parts)
-        return Solution("ok" if max(found) <= self.about["accuracy"] else "inaccurate", x, alpha, u, lam, found)
+        found, energy, x, alpha = residuals(A, f, N, b, x, forces), float(x @ A @ x), Y @ x, forces / rows
+        u, lam = (self.data[n] @ v if n in self.data else None for n, v in (("basis", x), ("generators", alpha)))
+        return Solution("ok" if max(found) <= self.about["accuracy"] else "inaccurate", x, alpha, u, lam, found, energy)
 
 
 def residuals(A: Array, f: Array, B: Array, g: Array, x: Array, alpha: Array) -> tuple[float, float, float]:

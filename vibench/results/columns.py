@@ -359,7 +359,11 @@ QUERIES: Mapping[str, Column] = {
     "bound_online_violated": Column(
         INTEGER, "", "1 where an error is above its bound by more than 1e-10 of the solution, else 0; empty without."
     ),
-    "bound_online_note": Column(TEXT, "", "Why there are no bounds at online cost."),
+    "bound_online_note": Column(
+        TEXT,
+        "",
+        "Why there are no bounds at online cost, or no prepared lifting was feasible and the best one was computed.",
+    ),
     "bound_hsw_u": Column(
         REAL,
         "V",

@@ -21,9 +21,11 @@ from running import Main, refused
 
 import vibench
 from vibench.highfidelity.active_set import HighFidelitySolver
-from vibench.library import reduced_model
-from vibench.library.export import RUNTIME, export_model
+from vibench.library import exported_certificate, reduced_model
+from vibench.library.export import BOUNDS, RUNTIME, export_model
+from vibench.library.export import exported as exported_model
 from vibench.library.reduced_model import Model as Exported
+from vibench.library.reduced_model_certificate import Model as WithBounds
 from vibench.model.affine import affine_decomposition
 from vibench.model.galerkin import ReducedModel
 from vibench.model.hyperreduced import HyperReducedModel, hyper_reduce
@@ -448,3 +450,59 @@ def test_the_command(run: vibench.Run, main: Main, tmp_path: Path) -> None:
     assert {file.name for file in (tmp_path / "out").iterdir()} == FILES | {"model.c"}
     refused(main(*asked), "model.npz' exists; remove it")
     refused(main(*asked[:-1], str(tmp_path / "b.npz"), "--interpolate", "1e-14"), "A depends on mu", "--evaluations")
+
+
+@pytest.fixture(scope="module")
+def certified(tmp_path_factory: pytest.TempPathFactory) -> vibench.Run:
+    study = vibench.Study(
+        name="certified",
+        problem=[{"name": "radial-obstacle", "options": {"resolution": 200}}],
+        dual=["mcpg"],
+        primal=["decorrelated"],
+        assembly=["certified"],
+        tolerances=[{"pod": [1e-2], "dual": [1e-1]}],
+        solvers=["piqp"],
+        accuracy=1e-10,
+        validation=1,
+        timing_rounds=1,
+    )
+    return vibench.run(study, tmp_path_factory.mktemp("bounds") / "run", progress=False)
+
+
+def test_an_exported_certificate_gives_the_bounds_of_vibench(certified: vibench.Run, tmp_path: Path) -> None:
+    model = certified.model(str(certified.cells["cell"].iloc[0]))
+    assert model.certificate is not None
+    found = export_model(model, tmp_path / "model.npz")
+    assert {file.name for file in tmp_path.iterdir()} == FILES | {BOUNDS}
+    assert found.about["certificate"] == "certified"
+    exported = WithBounds(tmp_path / "model.npz")
+    for mu in model.parameters.sample(20, seed=5):
+        answer = exported.solve(mu)
+        solution, bound = answer.solution, answer.bound
+        reduced = model.reduced.assemble(mu)
+        expected = model.certificate.evaluate(model.problem, mu, reduced, solution.x, solution.alpha)
+        assert (bound.guarantee, expected.note) == ("certified", "")
+        for name in ("u_energy", "lambda_natural", "relative"):
+            assert getattr(bound, name) == pytest.approx(getattr(expected, name), rel=1e-9)
+        exact, vi = model.high_fidelity(mu), model.problem.assemble(mu)
+        away = exact.u - solution.u
+        assert float(away @ (vi.A @ away)) <= bound.u_energy**2
+        assert exported.solve(mu, tolerance=1.01 * bound.relative).verdict == "certified"
+        assert exported.solve(mu, tolerance=0.99 * bound.relative).verdict == "not certified"
+        assert answer.verdict == ""
+
+
+def test_a_model_without_a_certificate_has_no_bounds_and_says_why(run: vibench.Run, tmp_path: Path) -> None:
+    file = tmp_path / "model.npz"
+    found = export_model(model_of(run, "radial-obstacle"), file)
+    assert 'assembly = "certified"' in found.about["certificate"]
+    with pytest.raises(ValueError, match="has no error bounds: its cell has no bounds"):
+        WithBounds(file)
+
+
+def test_polynomials_that_are_not_the_functions_they_replace_are_not_called_certified(
+    certified: vibench.Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    model = certified.model(str(certified.cells["cell"].iloc[0]))
+    monkeypatch.setattr(exported_certificate, "EXACT", 0.0)
+    assert exported_model(model).about["certificate"] == "verified"

@@ -31,7 +31,7 @@ from math import sqrt
 import numpy as np
 
 from vibench.arrays import Array, SparseMatrix
-from vibench.interfaces.problem import Problem
+from vibench.interfaces.problem import Contact, Problem
 from vibench.model.certificates.base import ONE, CertificateBase, Guarantee, contact_at
 from vibench.model.certificates.lifting import ContactCompliance, lift
 from vibench.model.certificates.prepared_lifting import PreparedLiftings
@@ -100,7 +100,9 @@ class OnlineCertificate:
     generators
         χ (m×R).
     on_contact
-        Whether the coefficients of Bᵀλ_N are its values on the contact unknowns, not multiples of Bᵀχ.
+        Whether the coefficients of Bᵀλ_N are those of `coefficients_on_contact`, not θ_q α_i for all Bᵀ_q χ_i.
+    forces
+        B₀ᵀχ (k×R) with the part B₀ of B that does not depend on the parameter.
     prepared
         Liftings that take no factorisation at the parameter, where there are any.
     bound_terms
@@ -114,6 +116,7 @@ class OnlineCertificate:
     contact_basis: Array
     generators: Array
     on_contact: bool
+    forces: Array
     prepared: PreparedLiftings | None = None
     bound_terms: Array | None = None
 
@@ -145,9 +148,10 @@ class OnlineCertificate:
         if lifted is None:
             return OnlineBound.none(note)
         along, norm, kappa = lifted
-        of_lam = np.outer(theta["B"], alpha).ravel()
-        if self.on_contact and evaluated.contact is not None:
-            of_lam = evaluated.contact.B.T @ lam
+        of_lam: Array = (theta["B"][:, None] * alpha).ravel()
+        if self.on_contact:
+            assert evaluated.contact is not None  # see above
+            of_lam = coefficients_on_contact(evaluated.contact, self.forces, alpha, lam)
         coordinates, beside, missing = self.residual.parts(residual_coefficients(theta, y, of_lam))
         square_of_u = float(x @ (reduced.program.A @ x))
         u_norm = sqrt(max(0.0, square_of_u) / max(lower - base.stiffness_error, TINY))  # of u_N in X
@@ -192,7 +196,12 @@ class OnlineCertificate:
 
 def residual_coefficients(theta: Mapping[str, Array], y: Array, of_lam: Array) -> Array:
     """Coefficients (Z,) of a residual: those of f, of A for every vector of Φ, and of Bᵀλ_N."""
-    return np.concatenate([theta["f"], np.outer(-theta["A"], y).ravel(), -of_lam])
+    return np.concatenate([theta["f"], (-theta["A"][:, None] * y).ravel(), -of_lam])
+
+
+def coefficients_on_contact(contact: Contact, forces: Array, alpha: Array, lam: Array) -> Array:
+    """Coefficients (k+R,) of Bᵀλ_N: what B₀ᵀλ_N lacks, on the contact unknowns, and α for the vectors B₀ᵀχ."""
+    return np.concatenate([contact.B.T @ lam - forces @ alpha, alpha])
 
 
 def evaluated_by(reduced: ReducedProblem) -> Evaluated:

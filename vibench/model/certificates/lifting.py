@@ -158,6 +158,13 @@ class ContactCompliance:
         return chosen, position, BlockDiagonal.of(self.matrix[np.ix_(chosen, chosen)])
 
 
+def held_rows(compliance: ContactCompliance, contact: Contact, on_contact: Array, lam: Array) -> Mask:
+    """Rows (m,) that are violated, or in which the best lifting of u_N (k,) and λ (m,) may hold B w = s for γ = 1."""
+    B = sp.csr_array(contact.B)
+    excess, reach = B @ on_contact - contact.g, abs(B) @ compliance.root
+    return np.asarray((excess > 0.0) | (lam * reach**2 > np.abs(excess)))
+
+
 def lift(
     compliance: ContactCompliance, contact: Contact, on_contact: Array, uncertain: Array, lam: Array, gamma: float
 ) -> Lifting | None:

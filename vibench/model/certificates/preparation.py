@@ -3,19 +3,26 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 
 import numpy as np
 import scipy.sparse as sp
 
-from vibench.arrays import Array, Indices
+from vibench.arrays import Array, Indices, Mask, SparseMatrix
 from vibench.errors import UnsupportedError
 from vibench.highfidelity.active_set import FALLBACK_SOLVER
 from vibench.interfaces.problem import Problem
 from vibench.model.affine import AffineMember
 from vibench.model.certificates.base import CertificateBase, contact_at, contact_unknowns, injected, is_exact
-from vibench.model.certificates.bounds import OnlineCertificate, coordinates_of, evaluated_by, residual_coefficients
-from vibench.model.certificates.lifting import ContactCompliance, lift
-from vibench.model.certificates.prepared_lifting import PreparedLiftings, carriers, prepare_liftings
+from vibench.model.certificates.bounds import (
+    OnlineCertificate,
+    coefficients_on_contact,
+    coordinates_of,
+    evaluated_by,
+    residual_coefficients,
+)
+from vibench.model.certificates.lifting import ContactCompliance, held_rows, lift
+from vibench.model.certificates.prepared_lifting import carriers, prepare_liftings
 from vibench.model.certificates.residual import residual_basis
 from vibench.model.hyperreduced import HyperReducedModel
 from vibench.qp.solve import solve_qp
@@ -39,33 +46,32 @@ def prepare(
     problem, Phi, chi, B = model.problem, model.basis, model.generators, members["B"]
     functionals, on_contact = injected(problem), not is_exact(problem, "B", B)
     blocks = [np.column_stack(members["f"].terms), *(np.asarray(term @ Phi) for term in base.terms)]
-    blocks += [functionals] if on_contact else [np.asarray(term.T @ chi) for term in B.terms]
+    constant, scaled = _constant_part(problem, members, base, training)
+    forces = np.asarray(constant.T @ chi)
+    of_multiplier = [functionals, functionals @ forces] if on_contact else [np.asarray(B_q.T @ chi) for B_q in B.terms]
     compliance = ContactCompliance(base.compliance, _near(problem, chi, training))
-    residual, U = residual_basis(base.X, blocks, *_sampled(model, base, compliance, on_contact, training))
+    z, typical, held = _sampled(model, base, compliance, forces if on_contact else None, training)
+    residual, U = residual_basis(base.X, blocks + of_multiplier, z, typical)
     directions = base.X.whiten_functional(functionals).T @ U
     contact_basis = np.ascontiguousarray(Phi[contact_unknowns(problem)])
-    liftings = _prepared_liftings(problem, members, base, training, chi, contact_basis, directions)
-    return OnlineCertificate(base, residual, directions, compliance, contact_basis, chi, on_contact, *liftings)
+    liftings = prepare_liftings(constant, scaled, base.compliance, held, contact_basis, directions)
+    found = OnlineCertificate(base, residual, directions, compliance, contact_basis, chi, on_contact, forces, liftings)
+    return replace(found, bound_terms=np.column_stack(members["g"].terms)) if scaled else found
 
 
-def _prepared_liftings(
-    problem: Problem,
-    members: Mapping[str, AffineMember],
-    base: CertificateBase,
-    training: Array,
-    chi: Array,
-    contact_basis: Array,
-    directions: Array,
-) -> tuple[PreparedLiftings | None, Array | None]:
-    """Liftings of constraints that are one matrix times a factor, on some bodies at least, and the terms of g."""
-    rows, B, g = np.any(chi > 0.0, axis=1), members["B"], members["g"]
-    common = base.compliance, rows, contact_basis, directions
+def _constant_part(
+    problem: Problem, members: Mapping[str, AffineMember], base: CertificateBase, training: Array
+) -> tuple[SparseMatrix, bool]:
+    """B₀ (m×k) on the contact unknowns, and whether B is a multiple of it and g an exact sum.
+
+    Elsewhere it is B on the bodies where that is the same at all training parameters, and zero on the others.
+    """
+    B, g = members["B"], members["g"]
     if len(B.terms) == 1 and is_exact(problem, "B", B) and is_exact(problem, "g", g):
-        term = sp.csr_array(B.terms[0])[:, contact_unknowns(problem)]
-        return prepare_liftings(term, True, *common), np.column_stack(g.terms)
-    constraints = [contact_at(problem, mu).B for mu in training]
+        return sp.csr_array(B.terms[0])[:, contact_unknowns(problem)], True
+    constraints = [contact_at(problem, mu).B.copy() for mu in training]
     kept = carriers(base.compliance, constraints)
-    return prepare_liftings(sp.csr_array(constraints[0]) @ sp.diags_array(kept.astype(float)), False, *common), None
+    return sp.csr_array(sp.csr_array(constraints[0]) @ sp.diags_array(kept.astype(float))), False
 
 
 def _near(problem: Problem, chi: Array, training: Array) -> Indices:
@@ -81,24 +87,36 @@ def _near(problem: Problem, chi: Array, training: Array) -> Indices:
 
 
 def _sampled(
-    model: HyperReducedModel, base: CertificateBase, compliance: ContactCompliance, on_contact: bool, training: Array
-) -> tuple[Array, float]:
-    """Coefficients of residuals (Z×S) of reduced solutions at training parameters, and the median norm of liftings."""
+    model: HyperReducedModel,
+    base: CertificateBase,
+    compliance: ContactCompliance,
+    forces: Array | None,
+    training: Array,
+) -> tuple[Array, float, Mask]:
+    """What reduced solutions at training parameters have.
+
+    Coefficients (Z×S) of their residuals, the median norm of liftings, and the rows (m,) that some of these hold.
+    `forces` are needed where the coefficients are those of `coefficients_on_contact`.
+    """
     problem, found, norms = model.problem, [], [0.0]
-    rows = model.basis[contact_unknowns(problem)]
+    rows, held = model.basis[contact_unknowns(problem)], np.zeros(len(model.generators), bool)
     for number, mu in enumerate(training[:: -(-len(training) // SAMPLES)]):
         reduced = model.assemble(mu)
         answer = solve_qp(reduced.program, FALLBACK_SOLVER, SAMPLE_ACCURACY, factor=reduced.factor)
         if answer.x is None or answer.alpha is None or not np.all(np.isfinite(answer.x)):
             continue
-        evaluated, lam = evaluated_by(reduced), model.generators @ np.maximum(answer.alpha, 0.0)
+        evaluated, alpha = evaluated_by(reduced), np.maximum(answer.alpha, 0.0)
+        lam = model.generators @ alpha
         contact, y = evaluated.contact or contact_at(problem, mu), coordinates_of(answer.x, evaluated)
         theta = base.coefficients(evaluated.samples)
-        of_lam = contact.B.T @ lam if on_contact else np.outer(theta["B"], answer.alpha).ravel()
+        of_lam = np.outer(theta["B"], alpha).ravel()
+        if forces is not None:
+            of_lam = coefficients_on_contact(contact, forces, alpha, lam)
         found.append(residual_coefficients(theta, y, of_lam))
+        held |= held_rows(compliance, contact, rows @ y, lam)
         if number % 8 == 0:
             lifting = lift(compliance, contact, rows @ y, np.zeros(len(rows)), lam, 1.0)
             norms += [] if lifting is None else [lifting.norm]
     if not found:
         raise UnsupportedError("no reduced program at a training parameter has a solution")
-    return np.column_stack(found), float(np.median(norms))
+    return np.column_stack(found), float(np.median(norms)), held

@@ -1,22 +1,24 @@
 """Liftings by a matrix that is inverted offline, where the constraint of some bodies is one matrix times a factor.
 
-Let the loads c of w = X⁻¹ E c act on bodies, blocks of C, on which B(µ) is θ(µ) B₀, and be multiples of the rows J of
-it that generators touch. The program of `vibench.model.certificates.lifting` has the minimiser c = θ B₀ᵀ(ν − λ)/γ with
+Let the loads c of w = X⁻¹ E c act on bodies, blocks of C, on which B(µ) is θ(µ) B₀, and be multiples of some rows J of
+it: those that the best w holds at a training parameter. The minimiser of the program of
+`vibench.model.certificates.lifting` over such w is c = θ B₀ᵀ(ν − λ)/γ with
 
     ν = λ + (γ/θ²) M (s + v) ≥ 0,    v = B w − s ≥ 0,    νᵀv = 0,    M = S₀⁻¹,    S₀ = B₀ C B₀ᵀ,    on J,
 
 where M does not depend on the parameter. The primal-dual active set method starts from v = 0 where λ > 0 costs nothing,
 as there, and its systems have the size of the rows with v > 0, which are few.
 
-Where B(µ) is θ(µ) B₀ everywhere, w is the minimiser unless rows beyond J are violated. Where it is so on some bodies
-alone, w is the best of those that deform no other body: of two equal ones in contact the lifting of one has √2 times
-the norm of that of both. In either case it must satisfy B w ≥ s in all rows, with the B of the parameter and bounds of
-round-off; C is taken as it is stored, and |C_ij| ≤ √C_ii √C_jj. Where it does not, there is no prepared lifting.
+Where B(µ) is θ(µ) B₀ everywhere, w is the best one, but for λ beyond J, in rows that do not touch. Where it is so on
+some bodies alone, w is the best of those that deform no other body: of two equal ones in contact the lifting of one has
+√2 times the norm of that of both. In either case it must satisfy B w ≥ s in all rows, with the B of the parameter and
+bounds of round-off; C is taken as it is stored, and |C_ij| ≤ √C_ii √C_jj. Otherwise there is no prepared lifting.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import pairwise
 
 import numpy as np
@@ -38,8 +40,10 @@ class PreparedLiftings:
     Attributes
     ----------
     scaled
-        Whether B(µ) is θ(µ) B₀ everywhere; arrays called (p×·) are then multiplied by B₀ (p = m), or else |B₀|, and
-        have one row per contact unknown (p = k) otherwise.
+        Whether B(µ) is θ(µ) B₀ everywhere; arrays called (p×·) are then multiplied by B₀, or by |B₀| (p = m), and have
+        one row per contact unknown (p = k) otherwise.
+    moved
+        Where C B₀ᵀ is not zero: contact unknowns, or rows of B₀ where that is multiplied by it.
     rows
         J (j,), rising.
     inverse, compliance
@@ -49,7 +53,7 @@ class PreparedLiftings:
     basis
         Φ at the contact unknowns (p×d).
     responses
-        C B₀ᵀ (p×j): w for unit multiples of the rows J.
+        Rows `moved` of C B₀ᵀ (p×j): w for unit multiples of the rows J.
     sizes
         Norms of the rows of Φ, and √C_ii (p×2).
     directions
@@ -59,6 +63,7 @@ class PreparedLiftings:
     """
 
     scaled: bool
+    moved: Indices
     rows: Indices
     inverse: Array
     compliance: Array
@@ -81,9 +86,9 @@ class PreparedLiftings:
         g, g_size
             g (m,), and a bound (m,) of the terms that it is the sum of.
         y, lam, gamma
-            Coordinates (d,) of u_N, λ ≥ 0 (m,), zero beyond the rows J, and γ.
+            Coordinates (d,) of u_N, λ ≥ 0 (m,), and γ.
         """
-        B = B if isinstance(B, float | sp.csr_array) else sp.csr_array(B)
+        B = B if isinstance(B, (float, sp.csr_array)) else sp.csr_array(B)
         theta, terms = (B, self.terms) if isinstance(B, float) else (1.0, self.terms + int(np.diff(B.indptr).max()))
         if theta == 0.0:
             return None
@@ -95,20 +100,26 @@ class PreparedLiftings:
             if nu is None:
                 return None
             a = (theta / gamma) * (nu - here)  # c = B₀ᵀ a
-            slack = _product(B, self.responses @ a) - excess
+            values = np.zeros(len(self.basis))
+            values[self.moved] = self.responses @ a
+            slack = _product(B, values) - excess
             lacking = round_off + (unit * float(self.reach @ np.abs(a))) * size[:, 1] - slack
             if lacking.max() <= 0.0:  # NaN is not
-                norm = max(0.0, float(a @ (self.compliance @ a))) ** 0.5
-                return a @ self.directions, norm, max(0.0, float(lam @ slack))
+                square = float(a @ (values[self.rows] if self.scaled else self.compliance @ a))
+                return a @ self.directions, max(0.0, square) ** 0.5, max(0.0, float(lam @ slack))
             if lacking[self.rows].max() <= 0.0:  # rows beyond J are violated
                 return None
             margin = margin + 2.0 * np.maximum(lacking, 0.0)
         return None
 
+    @cached_property
+    def _diagonal(self) -> Array:
+        return self.compliance.diagonal().copy()
+
     def _complementary(self, scale: float, excess: Array, lam: Array) -> Array | None:
         """ν (j,) from s and λ on the rows J, and γ/θ²; `None` if the method cycles."""
         fixed = lam + scale * (self.inverse @ excess)  # ν for v = 0
-        released: Mask = lam * self.compliance.diagonal() <= -scale * excess
+        released: Mask = lam * self._diagonal <= -scale * excess
         for _ in range(STEPS):
             rows = released.nonzero()[0]
             among, nu, v = self.inverse[rows], fixed, np.zeros(0)
@@ -173,6 +184,10 @@ def prepare_liftings(
     sizes = np.column_stack([np.linalg.norm(basis, axis=1), root])
     if scaled:
         basis, responses, sizes = B @ basis, np.asarray(B @ responses), abs(B) @ sizes
+    moved = np.flatnonzero(responses.any(axis=1))
     terms = max(basis.shape[1], len(J)) + 2 * int(np.diff(B.indptr).max()) + 8
     reach, along = abs(chosen) @ root, np.asarray(chosen @ directions)
-    return PreparedLiftings(scaled, J, 0.5 * (inverse + inverse.T), S, reach, basis, responses, sizes, along, terms)
+    symmetric = 0.5 * (inverse + inverse.T)
+    return PreparedLiftings(
+        scaled, moved, J, symmetric, S, reach, basis, np.ascontiguousarray(responses[moved]), sizes, along, terms
+    )

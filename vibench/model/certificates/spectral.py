@@ -24,7 +24,7 @@ from functools import cached_property
 import numpy as np
 import scipy.sparse as sp
 
-from vibench.arrays import Array, Indices, Mask, SparseMatrix
+from vibench.arrays import Array, SparseMatrix
 from vibench.interfaces.problem import ParameterBox, Problem
 from vibench.interfaces.validation import checked_assembly
 from vibench.linalg.inner_product import InnerProduct
@@ -34,6 +34,8 @@ ANCHORS = 81
 """Largest number of anchors; a grid has from 2 to 9 points per direction, or one point alone where 2^d are too many."""
 
 MOST_PER_DIRECTION = 9
+
+TINY = float(np.finfo(float).tiny)
 
 
 @dataclass(frozen=True)
@@ -71,30 +73,27 @@ class SpectralBounds:
     def at(self, mu: Array, theta: Array) -> tuple[float, float]:
         """α(µ) and γ(µ) at mu (d,) with the rotated θ(µ) (Q,); α(µ) ≤ 0 says nothing."""
         where, c = self._weights(mu)
-        alpha, gamma, *at_anchors = c @ self._known[where]
-        lacking = float(np.abs(theta - at_anchors) @ self.norms) + 2.0 * self.error
-        return float(alpha) - lacking, float(gamma) + lacking
+        found = np.array(c) @ self._known[where]
+        lacking = float(np.abs(theta - found[2:]) @ self.norms) + 2.0 * self.error
+        return float(found[0]) - lacking, float(found[1]) + lacking
 
     @cached_property
     def _known(self) -> Array:
         """α_i, γ_i and θ(µ_i), one row per anchor."""
         return np.column_stack([self.alpha, self.gamma, self.theta.T])
 
-    @cached_property
-    def _corners(self) -> Mask:
-        """The corners of a cell of the grid (2^d×d): whether they are at its upper end."""
-        d = len(self.lower)
-        return np.asarray((np.arange(2**d)[:, None] >> np.arange(d)) % 2 == 1)
-
-    def _weights(self, mu: Array) -> tuple[Indices, Array]:
+    def _weights(self, mu: Array) -> tuple[list[int], list[float]]:
         """The anchors around mu and their weights, which sum to 1; outside the box those of the nearest point in it."""
+        where, c = [0], [1.0]
         if self.count == 1:
-            return np.zeros(1, np.intp), np.ones(1)
-        width = np.maximum(self.upper - self.lower, np.finfo(float).tiny)
-        place = np.clip((mu - self.lower) / width, 0.0, 1.0) * (self.count - 1)
-        first = np.minimum(place.astype(np.intp), self.count - 2)
-        share, strides = place - first, self.count ** np.arange(len(mu) - 1, -1, -1)
-        return (first + self._corners) @ strides, np.where(self._corners, share, 1.0 - share).prod(axis=1)
+            return where, c
+        # Few numbers: loops over them take less time than calls of NumPy.
+        for at, low, high in zip(mu.tolist(), self.lower.tolist(), self.upper.tolist(), strict=True):
+            place = min(max((at - low) / max(high - low, TINY), 0.0), 1.0) * (self.count - 1)
+            first = min(int(place), self.count - 2)
+            where = [k * self.count + first + end for k in where for end in (0, 1)]
+            c = [weight * share for weight in c for share in (first + 1.0 - place, place - first)]
+        return where, c
 
 
 def anchors(box: ParameterBox) -> tuple[Array, int]:

@@ -22,6 +22,7 @@ from vibench.model.certificates import base as base_module
 from vibench.model.certificates.base import CertificateBase, Guarantee, certificate_base, injected, unsupported
 from vibench.model.certificates.bounds import NOT_PREPARED, OnlineBound, OnlineCertificate
 from vibench.model.certificates.preparation import prepare
+from vibench.model.certificates.prepared_lifting import prepare_liftings
 from vibench.model.certificates.residual import residual_basis
 from vibench.model.error_bounds import NOT_IN_CONE
 from vibench.model.galerkin import ReducedModel
@@ -116,15 +117,13 @@ Prepared = tuple[Family, HyperReducedModel, OnlineCertificate]
 
 @lru_cache
 def prepared(
-    stiffness: str, per_parameter: bool = False, constraint: str = "moving", tolerance: float = 1e-3, rows: int = M
+    stiffness: str, per_parameter: bool = False, constraint: str = "moving", tolerance: float = 1e-3
 ) -> Prepared:
-    """Generators touch the first `rows` rows."""
     problem = Family(stiffness, constraint)
     rng, training = np.random.default_rng(5), problem.training_set()
     members = affine_decomposition(problem, training, tolerance)
     basis = problem.V.orthonormalise(rng.standard_normal((N, 4)))
     generators = np.maximum(rng.standard_normal((M, 3)), 0.0) + 0.05
-    generators[rows:] = 0.0
     enrichment = Enrichment(Kind.PER_PARAMETER, eta=generators[:, :2]) if per_parameter else Enrichment(Kind.NONE)
     span = np.linalg.qr(generators)[0]
     model = ReducedModel(problem, basis, enrichment, generators, span)
@@ -204,16 +203,18 @@ def test_prepared_liftings_are_the_best_ones_or_close_to_them(constraint: str, l
         assert quick.lambda_natural <= loss * best.lambda_natural * (1.0 + 1e-6)
 
 
-def test_rows_that_no_generator_touches_are_lifted_by_the_best_lifting_and_it_is_recorded() -> None:
-    given = prepared("affine", constraint="scaled", rows=3)
-    problem, model, certificate = given
-    assert certificate.prepared is not None
-    assert list(certificate.prepared.rows) == [0, 1, 2]
+def test_where_no_prepared_lifting_is_feasible_the_best_one_is_computed_and_it_is_recorded() -> None:
+    """Liftings of the first two rows alone leave the others violated."""
+    problem, model, certificate = prepared("affine", constraint="scaled")
+    term, rows = problem.affine["B"].terms[0][:, CONTACT], np.arange(M) < 2
+    base, at_contact = certificate.base, (certificate.contact_basis, certificate.contact_directions)
+    few = replace(certificate, prepared=prepare_liftings(term, True, base.compliance, rows, *at_contact))
     without = replace(certificate, prepared=None)
+    assert few.prepared is not None
     for mu in BOX.sample(20, 6):
         reduced = model.assemble(mu)
         solution = exact(reduced.program)
-        bound, error, natural, _ = found(given, mu, *solution)
+        bound, error, natural, _ = found((problem, model, few), mu, *solution)
         assert bound == replace(without.evaluate(problem, mu, reduced, *solution), note=NOT_PREPARED)
         assert error <= bound.u_energy
         assert natural <= bound.lambda_natural
@@ -236,7 +237,9 @@ def test_small_residuals_keep_their_digits(constraint: str) -> None:
         blocks = [load[:, None], *others, injected(problem)]
         if not certificate.on_contact:
             blocks[-1] = np.asarray(problem.affine["B"].terms[0].T @ model.generators)
-        of_lam = force[CONTACT] if certificate.on_contact else scale(mu) * alpha
+        of_lam = scale(mu) * alpha
+        if certificate.on_contact:
+            of_lam = force[CONTACT]
         z = np.concatenate([np.ones(1), -x, -of_lam])
         basis, _ = residual_basis(certificate.base.X, blocks, z[:, None], 0.0)
         exact_norm = size * float(np.sqrt(away @ np.linalg.solve(A, away)))

@@ -1,0 +1,65 @@
+"""What an exported model needs to bound its errors: arrays of a certificate, and θ of the members at a parameter."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from vibench.arrays import Array
+from vibench.model.certificates.base import ONE, Guarantee
+from vibench.model.certificates.bounds import OnlineCertificate
+from vibench.model.chebyshev import AffinePolynomial
+
+EXACT = 1e-14
+"""A polynomial whose measured error is smaller is the function that it replaces, up to round-off."""
+
+
+def reason_for_none(certificate: OnlineCertificate | None) -> str:
+    """Why an exported model cannot bound its errors; "" if it can."""
+    if certificate is None:
+        return 'its cell has no bounds, they need assembly = "certified"'
+    if certificate.prepared is None or not certificate.prepared.scaled:
+        return (
+            "they need B(mu) and g(mu) on all contact unknowns, which the code of the problem evaluates unless B is "
+            "declared to be one matrix times a function of mu and g an affine sum"
+        )
+    return ""
+
+
+def thetas(certificate: OnlineCertificate, samples: Mapping[str, Array]) -> dict[str, Array]:
+    """θ (Q,) of A, f, B and g in the terms of the certificate, from what a query evaluates."""
+    found = certificate.base.coefficients(samples) | {"g": samples.get("g", ONE)}
+    return {f"theta_{name}": value for name, value in found.items()}
+
+
+def arrays(certificate: OnlineCertificate) -> dict[str, Array]:
+    """The arrays of a certificate for which there is no `reason_for_none`."""
+    base, residual, liftings, terms = (
+        certificate.base, certificate.residual, certificate.prepared, certificate.bound_terms
+    )  # fmt: skip
+    assert liftings is not None  # there is no reason for none
+    assert terms is not None
+    responses = np.zeros((len(liftings.basis), len(liftings.rows)))
+    responses[liftings.moved] = liftings.responses
+    found = {
+        "generators": certificate.generators, "bounds": terms, "rows": liftings.rows, "inverse": liftings.inverse,
+        "diagonal": liftings.compliance.diagonal(), "reach": liftings.reach, "basis": liftings.basis,
+        "responses": responses, "sizes": liftings.sizes, "directions": liftings.directions,
+        "terms": np.array(liftings.terms), "kept": residual.kept, "factor": residual.factor,
+        "inverse_scale": residual.inverse_scale, "remainder": np.array(residual.remainder), "norms": residual.norms,
+        "load_error": np.array(base.load_error), "stiffness_error": np.array(base.stiffness_error),
+    }  # fmt: skip
+    if (spectral := base.spectral) is not None:
+        found |= {
+            "anchors": np.column_stack([spectral.alpha, spectral.gamma, spectral.theta.T]),
+            "lower": spectral.lower, "upper": spectral.upper, "count": np.array(spectral.count),
+            "term_norms": spectral.norms, "spectral_error": np.array(spectral.error),
+        }  # fmt: skip
+    return {f"certificate_{name}": array for name, array in found.items()}
+
+
+def guarantee(certificate: OnlineCertificate, polynomials: Mapping[str, AffinePolynomial]) -> Guarantee:
+    """What the bounds are worth: verified at most where a polynomial is not the function that it replaces."""
+    exact = all(polynomial.error <= EXACT for polynomial in polynomials.values())
+    return certificate.base.guarantee if exact else Guarantee.VERIFIED

@@ -1,0 +1,143 @@
+"""Error bounds of a reduced model exported by vibench: `Model(file).solve(mu, tolerance=1e-2)`, by `reduced_model.py`.
+
+u_N and λ_N ≥ 0 are compared with u and λ of the high-fidelity problem whose θ_q are the polynomials of the file. With
+X that does not depend on mu, α X ≼ A(mu) ≼ γ X, the residual r, and w such that B w ≥ s = B u_N − g,
+
+    ‖u − u_N‖²_A ≤ Δ² = ρ²/α + γ ω² + 2κ,    ρ = ‖r‖_{X⁻¹},    ω = ‖w‖_X,    κ = λ_Nᵀ(B w − s),
+    ‖Bᵀ(λ − λ_N)‖_{A⁻¹} ≤ min(√(Δ² + 2 rᵀw), ω √γ + Δ);    see "Bounds at online cost" in the documentation of vibench.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from importlib import import_module
+from math import inf, sqrt
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+UNIT, TINY = float(np.finfo(float).eps), float(np.finfo(float).tiny)
+STEPS, ATTEMPTS, MARGIN = 30, 4, 4.0
+
+
+class Bound(NamedTuple):
+    """Bounds of ‖u − u_N‖_A, ‖Bᵀ(λ − λ_N)‖_{A⁻¹}, ‖u − u_N‖_A / ‖u‖_A; "certified", "verified", or "none" and why."""
+
+    u_energy: float
+    lambda_natural: float
+    relative: float
+    guarantee: str
+    note: str = ""
+
+
+class Certified(NamedTuple):
+    """A `Solution` of `reduced_model.py`, its bounds, and whether `relative` keeps the tolerance, or "" without one."""
+
+    solution: Any
+    bound: Bound
+    verdict: str
+
+
+class Model:
+    """A reduced model from a file with error bounds; `plain` is that of `reduced_model.py`."""
+
+    def __init__(self, file: str | Path, solver: str = "") -> None:
+        self.plain = import_module(__name__.removesuffix("_certificate")).Model(file, solver)
+        self.guarantee, start, data = str(self.plain.about["certificate"]), "certificate_", self.plain.data
+        if self.guarantee not in {"certified", "verified"}:
+            raise ValueError(f"'{file}' has no error bounds: {self.guarantee}")
+        self._data = {name.removeprefix(start): data[name] for name in data if name.startswith(start)}
+
+    def solve(self, mu: Sequence[float] | Array, tolerance: float | None = None) -> Certified:
+        """The solution at a parameter and its bounds; the tolerance is of the relative error of u in the norm of A."""
+        solution = self.plain.solve(mu)
+        bound = self._bound(np.asarray(mu, dtype=float), solution.x, solution.alpha, solution.energy)
+        kept = tolerance is None or (solution.status == "ok" and bound.relative <= tolerance)
+        return Certified(solution, bound, "not certified" if not kept else "" if tolerance is None else bound.guarantee)
+
+    def _bound(self, mu: Array, y: Array, alpha: Array, energy: float) -> Bound:
+        """Bounds of a solution: u_N has the coordinates y in the basis, λ_N is generators · α, `energy` is ‖u_N‖²_A."""
+        data, lam = self._data, self._data["generators"] @ alpha
+        if np.min(lam, initial=0.0) < 0.0:
+            return Bound(inf, inf, inf, "none", "λ_N has negative coefficients")
+        A, f, B, g = (self.plain.member(f"theta_{name}", mu) for name in "AfBg")
+        lower, upper = self._spectrum(mu, A)
+        lifted = self._lifted(float(B[0]), g, y, lam, upper) if lower > 0.0 else None
+        if lifted is None:
+            which = "α > 0" if lower <= 0.0 else "w with B w ≥ s"
+            return Bound(inf, inf, inf, "none", f"no {which} was found at this parameter")
+        along, norm, kappa = lifted
+        z = np.concatenate([f, np.outer(-A, y).ravel(), np.outer(-B, alpha).ravel()])
+        coordinates = data["factor"] @ z[data["kept"]]
+        beside = float(data["remainder"] * np.linalg.norm(data["inverse_scale"] * z[data["kept"]]))
+        error = float(data["stiffness_error"])
+        of_u = sqrt(max(0.0, energy) / max(lower - error, TINY))
+        lacking = float(data["norms"] @ abs(z)) + float(data["load_error"]) + error * of_u
+        rho = float(np.hypot(np.linalg.norm(coordinates), beside)) + lacking
+        omega = norm * sqrt(upper)
+        square = rho**2 / lower + omega**2 + 2.0 * kappa
+        found = sqrt(square)
+        work = float(along @ coordinates) + (beside + lacking) * norm
+        least = sqrt(max(0.0, energy - error * of_u**2)) - found
+        natural = min(sqrt(max(0.0, square + 2.0 * work)), omega + found)
+        return Bound(found, natural, found / least if least > 0.0 else inf, self.guarantee)
+
+    def _spectrum(self, mu: Array, theta: Array) -> tuple[float, float]:
+        """α and γ from the values at the anchors around mu, a grid of the parameter box."""
+        data = self._data
+        if "anchors" not in data:
+            return 1.0, 1.0
+        count, where, weights = int(data["count"]), [0], [1.0]
+        for at, low, high in zip(mu, data["lower"], data["upper"], strict=True) if count > 1 else ():
+            place = min(max((at - low) / max(high - low, TINY), 0.0), 1.0) * (count - 1)
+            first = min(int(place), count - 2)
+            where = [k * count + first + end for k in where for end in (0, 1)]
+            weights = [weight * share for weight in weights for share in (first + 1.0 - place, place - first)]
+        found = np.array(weights) @ data["anchors"][where]
+        lacking = float(abs(theta - found[2:]) @ data["term_norms"]) + 2.0 * float(data["spectral_error"])
+        return float(found[0]) - lacking, float(found[1]) + lacking
+
+    def _lifted(
+        self, theta: float, of_g: Array, y: Array, lam: Array, gamma: float
+    ) -> tuple[Array, float, float] | None:
+        """Coordinates of X w in the basis of residuals, ‖w‖, and κ, for a w with B w ≥ s also in exact arithmetic."""
+        data, unit = self._data, 1.01 * float(self._data["terms"]) * UNIT
+        if theta == 0.0:
+            return None
+        rows, size = data["rows"], abs(theta) * data["sizes"]
+        excess = theta * (data["basis"] @ y) - data["bounds"] @ of_g
+        round_off = unit * (float(np.linalg.norm(y)) * size[:, 0] + abs(data["bounds"]) @ abs(of_g))
+        margin = MARGIN * round_off
+        for _ in range(ATTEMPTS):
+            nu = self._complementary(gamma / theta**2, (excess + margin)[rows], lam[rows])
+            if nu is None:
+                return None
+            a = (theta / gamma) * (nu - lam[rows])
+            values = data["responses"] @ a
+            slack = theta * values - excess
+            lacking = round_off + unit * float(data["reach"] @ abs(a)) * size[:, 1] - slack
+            if lacking.max() <= 0.0:
+                norm = sqrt(max(0.0, float(a @ values[rows])))
+                return a @ data["directions"], norm, max(0.0, float(lam @ slack))
+            margin = margin + 2.0 * np.maximum(lacking, 0.0)
+        return None
+
+    def _complementary(self, scale: float, excess: Array, lam: Array) -> Array | None:
+        """ν = λ + scale · M (s + v) with ν, v ≥ 0 and νᵀv = 0, by the primal-dual active set method."""
+        inverse = self._data["inverse"]
+        fixed = lam + scale * (inverse @ excess)
+        released = lam * self._data["diagonal"] <= -scale * excess
+        for _ in range(STEPS):
+            K = released.nonzero()[0]
+            v = np.linalg.solve(inverse[np.ix_(K, K)], -fixed[K])
+            nu: Array = fixed + v @ inverse[K]
+            nu[K] = 0.0
+            wanted = nu < 0.0
+            wanted[K] = v >= 0.0
+            if np.array_equal(wanted, released):
+                return nu
+            released = wanted
+        return None
