@@ -20,7 +20,7 @@ from vibench.report.site.citation import Citation
 from vibench.report.site.publish import publish
 from vibench.results.columns import STORED
 from vibench.results.database import ResultsDatabase
-from vibench.results.reading import FILE
+from vibench.results.sqlite.reading import FILE
 from vibench.study.matrix import expand
 from vibench.study.reader import read_study
 

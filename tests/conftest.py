@@ -22,7 +22,7 @@ from samples import install_fakes
 from threadpoolctl import threadpool_limits
 
 from vibench.cli import start
-from vibench.results.reading import FILE
+from vibench.results.sqlite.reading import FILE
 from vibench.storage.artefacts import CACHE_VARIABLE
 from vibench.study import entry_points, registry
 

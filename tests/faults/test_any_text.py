@@ -28,7 +28,7 @@ from vibench.report.figures.style import styled, write_figure
 from vibench.results import pictures, tables
 from vibench.results.columns import STORED, TABLES
 from vibench.results.database import ResultsDatabase
-from vibench.results.reading import FILE
+from vibench.results.sqlite.reading import FILE
 from vibench.stages.query import Query, run_query
 from vibench.study import registry
 from vibench.terminal.console import print_frame

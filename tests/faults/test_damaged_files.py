@@ -20,7 +20,7 @@ from vibench.report.comparison.compare import compare
 from vibench.results import tables
 from vibench.results.columns import STORED
 from vibench.results.database import ResultsDatabase
-from vibench.results.reading import FILE, read_meta, read_rows, study_of
+from vibench.results.sqlite.reading import FILE, read_meta, read_rows, study_of
 from vibench.storage.artefacts import CACHE_VARIABLE, SUFFIX, Store
 from vibench.storage.serialisation import dumps
 

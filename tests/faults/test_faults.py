@@ -17,7 +17,7 @@ import pytest
 from running import Vibench, assert_same_numbers, rows, started, without_seconds
 from samples import wire_study, write_study
 
-from vibench.results.reading import FILE
+from vibench.results.sqlite.reading import FILE
 from vibench.storage.artefacts import CACHE_VARIABLE
 
 STUDY = wire_study(

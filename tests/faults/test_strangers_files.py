@@ -20,7 +20,7 @@ from vibench.files import write_atomically
 from vibench.locking import locked
 from vibench.report import figures
 from vibench.results import tables
-from vibench.results.reading import FILE
+from vibench.results.sqlite.reading import FILE
 from vibench.storage import artefacts
 from vibench.storage.artefacts import CACHE_VARIABLE, SUFFIX, Artefact, Store, usable_store
 from vibench.timing import NO_TIME

@@ -16,7 +16,7 @@ from samples import install, wire_study, write_study
 
 from vibench.results import pictures, tables
 from vibench.results.columns import TABLES
-from vibench.results.reading import FILE
+from vibench.results.sqlite.reading import FILE
 from vibench.results.sqlite.values import LONGEST_TEXT
 from vibench.text import printable
 

@@ -14,8 +14,8 @@ from typing import Any
 import pandas as pd
 
 from vibench.results.columns import KEYS, STORED, TABLES
-from vibench.results.reading import FILE, read_text
 from vibench.results.sqlite.digests import Digests
+from vibench.results.sqlite.reading import FILE, read_text
 
 Vibench = Callable[..., "subprocess.CompletedProcess[str]"]
 """Runs the installed command in a folder."""

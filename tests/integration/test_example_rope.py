@@ -19,7 +19,7 @@ from samples import write_study
 from sources import SOURCES, mentions
 
 from vibench.interfaces.problem import MEMBERS
-from vibench.results.reading import FILE
+from vibench.results.sqlite.reading import FILE
 from vibench.results.tables import read
 from vibench.storage.artefacts import CACHE_VARIABLE
 

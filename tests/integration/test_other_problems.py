@@ -17,7 +17,7 @@ from samples import install, write_study
 
 from vibench.model.errors import UNMEASURABLE
 from vibench.report.findings import findings
-from vibench.results.reading import FILE
+from vibench.results.sqlite.reading import FILE
 from vibench.results.tables import read
 
 REGISTERED = {"vibench.problems": {"torsion": "Torsion", "put": "Put", "block": "Block"}}

@@ -14,7 +14,7 @@ import pytest
 from vibench.execution.recorded_cell import recorded_study
 from vibench.report import html
 from vibench.results import tables
-from vibench.results.reading import FILE
+from vibench.results.sqlite.reading import FILE
 from vibench.study.matrix import expand
 
 ROOT = Path(__file__).parents[2]

@@ -180,7 +180,7 @@ def solvers(incomplete: str) -> list[str]:
 
 def runs(incomplete: str) -> list[str]:
     """Completes names of the runs under `runs/`."""
-    from vibench.results.reading import FILE
+    from vibench.results.sqlite.reading import FILE
 
     return _beginning(incomplete, (path.parent.name for path in Path("runs").glob(f"*/{FILE}")))
 

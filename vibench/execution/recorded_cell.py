@@ -19,7 +19,7 @@ from vibench.execution.supervisor import Job, Supervisor
 from vibench.interfaces.problem import VariationalInequality
 from vibench.model.certificates.bounds import OnlineCertificate
 from vibench.results import tables
-from vibench.results.reading import read_meta, read_rows, study_of
+from vibench.results.sqlite.reading import read_meta, read_rows, study_of
 from vibench.results.tables import results_file
 from vibench.stages.assembly import Model, assembly_stage
 from vibench.stages.base import Done, Stage, value_of

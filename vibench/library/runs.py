@@ -21,7 +21,7 @@ from vibench.library.models import Model
 from vibench.results import error_measures, tables
 from vibench.results.columns import TABLES
 from vibench.results.plugin_columns import Extended
-from vibench.results.reading import read_meta, study_of
+from vibench.results.sqlite.reading import read_meta, study_of
 from vibench.study.spec import Study
 
 if TYPE_CHECKING:

@@ -26,8 +26,8 @@ from vibench.report.page.stills import Helpers, helpers, stills
 from vibench.results import pictures, tables
 from vibench.results.best import LARGEST_BAND
 from vibench.results.plugin_columns import Extended
-from vibench.results.reading import read_meta, study_of
 from vibench.results.selection import short_keys
+from vibench.results.sqlite.reading import read_meta, study_of
 from vibench.text import printable
 
 ERRORS = (

@@ -15,7 +15,7 @@ from vibench.arrays import Array
 from vibench.errors import RequestError, unknown_name
 from vibench.results.columns import PARAMETER, STORED
 from vibench.results.plugin_columns import Extended
-from vibench.results.reading import open_read_only
+from vibench.results.sqlite.reading import open_read_only
 from vibench.text import printable
 
 LONGEST = 1000

@@ -19,7 +19,7 @@ from vibench.qp.status import Status
 from vibench.results import plugin_columns
 from vibench.results.columns import CELLS, INTEGER, KEYS, STORED, TABLES, THRESHOLDS, VERSION, Column, shown_columns
 from vibench.results.plugin_columns import Extended
-from vibench.results.reading import FILE, read_meta, read_rows
+from vibench.results.sqlite.reading import FILE, read_meta, read_rows
 from vibench.text import printable_lines, unbroken
 
 ORDER = (

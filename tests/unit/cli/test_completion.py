@@ -19,7 +19,7 @@ from vibench.cli.plugin_commands import LISTS
 from vibench.qp.settings import SETTINGS
 from vibench.results import tables
 from vibench.results.columns import TABLES
-from vibench.results.reading import FILE
+from vibench.results.sqlite.reading import FILE
 from vibench.results.views import VIEWS
 from vibench.study import registry
 

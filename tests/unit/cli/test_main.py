@@ -18,7 +18,7 @@ from samples import STUDY, changed, write_study
 from vibench.cli.plugin_commands import LISTS
 from vibench.qp.settings import SETTINGS
 from vibench.results.columns import TABLES
-from vibench.results.reading import FILE
+from vibench.results.sqlite.reading import FILE
 from vibench.results.tables import read
 from vibench.study import registry
 from vibench.study.matrix import expand

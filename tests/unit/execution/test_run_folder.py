@@ -10,7 +10,7 @@ import pytest
 from vibench.errors import RequestError
 from vibench.execution.run_folder import LOG, REPORT, claimed, clear
 from vibench.results.database import ResultsDatabase
-from vibench.results.reading import FILE
+from vibench.results.sqlite.reading import FILE
 
 STUDY = {"name": "sample", "seed": 1, "validation": 4}
 

@@ -14,7 +14,7 @@ from vibench.errors import RequestError
 from vibench.report.comparison.compare import compare
 from vibench.report.comparison.differences import Verdict
 from vibench.report.comparison.runs import run_names
-from vibench.results.reading import FILE
+from vibench.results.sqlite.reading import FILE
 
 STEADY = (
     "UPDATE cells SET offline_low_s = offline_s, offline_high_s = offline_s, disturbed = 0",

@@ -26,7 +26,7 @@ from vibench.report.figures import problems as of_file
 from vibench.report.figures.data import _per_combination
 from vibench.report.figures.style import save, styled
 from vibench.results import tables
-from vibench.results.reading import FILE
+from vibench.results.sqlite.reading import FILE
 from vibench.study.reader import read_study
 
 Drawn = dict[str, Figure]

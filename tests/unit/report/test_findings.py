@@ -11,7 +11,7 @@ from running import DECIDED, Changed
 from vibench.report.figures.data import problems
 from vibench.report.findings import MOST, READ, Finding, Weight, all_findings, findings, leading
 from vibench.results import tables
-from vibench.results.reading import FILE
+from vibench.results.sqlite.reading import FILE
 
 
 @pytest.fixture

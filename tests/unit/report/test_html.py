@@ -18,7 +18,7 @@ from vibench.report.findings import MOST, findings
 from vibench.report.leaderboard import leaderboard
 from vibench.results import tables
 from vibench.results.columns import TABLES
-from vibench.results.reading import FILE
+from vibench.results.sqlite.reading import FILE
 from vibench.text import brief
 
 

@@ -21,7 +21,7 @@ from selenium.webdriver.support.ui import WebDriverWait
 
 from vibench.report import html
 from vibench.results import tables
-from vibench.results.reading import FILE
+from vibench.results.sqlite.reading import FILE
 
 MATTERS = {"cell", "problem", "dual", "primal", "δ", "solver", "error λ", "error u", "online [ms]", "offline [s]"}
 """Columns that are seen at 1280 pixels without scrolling."""

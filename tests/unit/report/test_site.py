@@ -24,7 +24,7 @@ from vibench.report.site.citation import Citation, requirements
 from vibench.report.site.publish import publish
 from vibench.report.site.published_run import folder_names
 from vibench.results import tables
-from vibench.results.reading import FILE
+from vibench.results.sqlite.reading import FILE
 
 CITATION = Citation("Tests & <trials>", ("Doe, Jane", "The {team}"), "10.5281/zenodo.1234567")
 

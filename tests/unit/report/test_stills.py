@@ -7,7 +7,7 @@ from pathlib import Path
 from vibench.report.figures import for_report
 from vibench.report.figures.data import problems
 from vibench.report.page.stills import helpers, stills
-from vibench.results.reading import FILE
+from vibench.results.sqlite.reading import FILE
 
 
 def test_several_processes_draw_the_same_pictures_in_the_same_order(quick_run: Path) -> None:

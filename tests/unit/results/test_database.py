@@ -21,7 +21,7 @@ from vibench.errors import RequestError, StorageError
 from vibench.results import database as module
 from vibench.results.columns import CELLS, TABLES, VERSION
 from vibench.results.database import ResultsDatabase
-from vibench.results.reading import FILE, read_meta, read_rows
+from vibench.results.sqlite.reading import FILE, read_meta, read_rows
 from vibench.results.sqlite.values import LONGEST_TEXT
 
 STUDY = {"name": "sample", "seed": 1, "validation": 4, "accuracy": 1e-7}

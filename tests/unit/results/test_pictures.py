@@ -16,7 +16,7 @@ from vibench.interfaces.problem import Picture
 from vibench.results import pictures
 from vibench.results.database import ResultsDatabase
 from vibench.results.pictures import Shown
-from vibench.results.reading import FILE
+from vibench.results.sqlite.reading import FILE
 from vibench.stages import base
 from vibench.stages.pictures import PictureStage
 from vibench.study.plugin import Plugin

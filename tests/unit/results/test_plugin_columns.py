@@ -20,7 +20,7 @@ from vibench.report.comparison.compare import compare
 from vibench.report.page.embedded import grid_of_cells
 from vibench.results import tables
 from vibench.results.database import ResultsDatabase
-from vibench.results.reading import FILE
+from vibench.results.sqlite.reading import FILE
 
 GROUP, HERE = "vibench.figures", __name__
 

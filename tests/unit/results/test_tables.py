@@ -24,7 +24,7 @@ from vibench.results import tables
 from vibench.results.break_even import break_even_rows
 from vibench.results.columns import CELLS, HISTORIES, KEYS, QUERIES, TABLES, THRESHOLDS, VERSION
 from vibench.results.database import ResultsDatabase
-from vibench.results.reading import FILE
+from vibench.results.sqlite.reading import FILE
 from vibench.results.tables import (
     benefits,
     cell_text,

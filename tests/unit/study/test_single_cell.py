@@ -11,7 +11,7 @@ from running import Changed, Main, refused
 from vibench.errors import RequestError
 from vibench.execution.recorded_cell import recorded_study
 from vibench.results import tables
-from vibench.results.reading import FILE
+from vibench.results.sqlite.reading import FILE
 from vibench.study.cells import Cell
 from vibench.study.matrix import expand
 from vibench.study.reader import read_study

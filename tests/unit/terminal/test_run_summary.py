@@ -14,7 +14,7 @@ from samples import cell_row
 from vibench.cli.main import app
 from vibench.results.best import NOBODY
 from vibench.results.database import ResultsDatabase
-from vibench.results.reading import FILE
+from vibench.results.sqlite.reading import FILE
 from vibench.terminal.output import run_argument
 from vibench.terminal.run_summary import REASONS, WHOLE, failures, next_steps, print_summary
 

@@ -15,7 +15,7 @@ from vibench.errors import RequestError
 from vibench.qp.status import Status
 from vibench.results import tables
 from vibench.results.plugin_columns import Extended
-from vibench.results.reading import FILE, read_meta, study_of
+from vibench.results.sqlite.reading import FILE, read_meta, study_of
 
 AXES = ("problem", "dual", "primal", "asked", "solver", "accuracy", "assembly")
 """Columns that tell cells apart in a comparison; "asked" has all tolerances, or sizes."""

@@ -16,7 +16,7 @@ from vibench.interfaces.figures import Drawing
 from vibench.report.figures.data import Data, file_names, problems
 from vibench.report.figures.plugins import FigureError, draw_guarded, named, publications
 from vibench.report.figures.style import FORMATS, caption_of, save, styled
-from vibench.results.reading import read_meta, study_of
+from vibench.results.sqlite.reading import read_meta, study_of
 from vibench.text import unbroken
 
 PAGE = "paper-figures.md"

@@ -20,7 +20,7 @@ from vibench.report.site import folder
 from vibench.report.site.citation import Citation, requirements
 from vibench.report.site.published_run import FILTERED, SHOWN_CELLS, PublishedRun, folder_names
 from vibench.results import tables
-from vibench.results.reading import FILE, open_read_only
+from vibench.results.sqlite.reading import FILE, open_read_only
 from vibench.text import printable
 
 TABLES = ("cells", "thresholds", "disagreements")

@@ -13,7 +13,7 @@ import pandas as pd
 
 from vibench.report.comparison.runs import ComparedRun
 from vibench.results import tables
-from vibench.results.reading import FILE
+from vibench.results.sqlite.reading import FILE
 from vibench.study import registry
 
 FILTERED = ("study", "problem", "dual", "primal", "solver", "machine", "vibench")

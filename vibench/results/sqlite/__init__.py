@@ -1,1 +1,1 @@
-"""The SQLite file under the results: how it is opened, what its columns can hold, and digests of what was written."""
+"""The SQLite file under the results: how it is opened and read, what its columns hold, digests of what was written."""

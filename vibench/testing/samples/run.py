@@ -14,7 +14,7 @@ from vibench.interfaces.strategies import Kind
 from vibench.results.break_even import break_even_rows
 from vibench.results.columns import CELLS, INTEGER, OUTPUTS, QUERIES, REAL, TEXT, TIMINGS, Column
 from vibench.results.database import ResultsDatabase
-from vibench.results.reading import FILE
+from vibench.results.sqlite.reading import FILE
 
 QUERIES_PER_CELL, ROUNDS, STEPS = 5, 8, 6
 """Sizes of the run."""

@@ -17,8 +17,8 @@ from vibench.errors import RequestError, StorageError
 from vibench.execution.run_folder import claimed
 from vibench.results import tables
 from vibench.results.database import ResultsDatabase
-from vibench.results.reading import FILE, DamagedError, open_read_only, read_meta
 from vibench.results.sqlite.files import DAMAGED, set_aside
+from vibench.results.sqlite.reading import FILE, DamagedError, open_read_only, read_meta
 
 STUDY = {"name": "sample", "seed": 1, "validation": 4}
 NOBODY = 65534

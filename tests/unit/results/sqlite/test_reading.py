@@ -11,7 +11,7 @@ from samples import cell_row
 
 from vibench.results.columns import VERSION
 from vibench.results.database import ResultsDatabase
-from vibench.results.reading import FILE, open_read_only, read_meta, read_rows
+from vibench.results.sqlite.reading import FILE, open_read_only, read_meta, read_rows
 
 
 @pytest.fixture
