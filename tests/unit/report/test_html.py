@@ -87,6 +87,18 @@ def test_findings_tables_and_facts_are_in_it(made: Path, quick_run: Path) -> Non
     assert "None: every query of every cell is ok." in page
 
 
+def test_of_thousands_of_findings_those_that_say_most_are_in_it(
+    quick_run: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(html, "stills", lambda *_: ([], []))
+    monkeypatch.setattr(html, "FOLDED", 5)
+    count = sum(map(len, findings(quick_run / FILE).values()))
+    section = html.page(quick_run / FILE).split('<section id="findings">')[1].split("</section>")[0]
+    assert section.count("<li>") == MOST + 5 < count
+    assert "<summary>5 more</summary>" in section
+    assert f"{count - MOST - 5} findings on single cells and pairs are left out" in section
+
+
 def test_every_failure_has_its_reason_and_nothing_is_markup(changed: Changed, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(html, "stills", lambda *_: ([], []))
     reason = "<script>alert(''the solver said & did nothing'')</script>"
