@@ -105,19 +105,19 @@ def _scales(A: Array, f: Array, g: Array) -> tuple[float, float, float, float, f
 
 
 def _polished(A: Array, f: Array, B: Array, g: Array, active: NDArray[np.bool_]) -> tuple[Array, Array]:
-    """The solution up to round-off: equations on the active set, which changes until all signs are right."""
+    """The solution up to round-off: equations on an active set, which changes until all signs are right."""
     k = np.sqrt(A.trace() / len(A))
-    for _ in range(20):
-        N = B[active]
-        system = np.block([[A / k, k * N.T], [k * N, np.zeros((len(N), len(N)))]])
+    for step in range(20 + 4 * len(g)):
+        system = np.block([[A / k, k * B[active].T], [k * B[active], np.zeros([active.sum()] * 2)]])
         found = np.linalg.lstsq(system, np.append(f / k, k * g[active]), rcond=None)[0]
         x, alpha = found[: len(f)], np.zeros(len(g))
         alpha[active] = k**2 * found[len(f) :]
         violated = B @ x - g > 1e-12 * (abs(B) @ abs(x) + abs(g))
         pulling = alpha < -1e-12 * abs(alpha).max(initial=0.0)
-        active = violated | (active & ~pulling)
         if not np.any(violated | pulling):
             break
+        one = np.arange(len(g)) == (np.argmin(alpha) if pulling.any() else np.argmax(B @ x - g))
+        active = violated | (active & ~pulling) if step < 20 else active ^ one  # all at once may cycle
     return x, np.maximum(alpha, 0.0)
 
 

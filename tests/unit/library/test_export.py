@@ -322,6 +322,21 @@ def test_solvers_give_the_same_answer(run: vibench.Run, tmp_path: Path) -> None:
         Exported(tmp_path / "model.npz", "osqp")
 
 
+def test_polishing_ends_where_changes_of_all_rows_at_once_cycle() -> None:
+    """Rows that are dependent up to 1e-8 have huge multipliers of both signs while all of them are active."""
+    for seed in range(20):
+        rng = np.random.default_rng(seed)
+        rows = rng.random((8, 12))
+        mixed = rng.random((3, 8)) @ rows
+        B = np.vstack([rows, mixed + 1e-8 * rng.standard_normal(mixed.shape)])
+        g = np.append(0.2 * rng.random(8) - 0.1, np.zeros(3))
+        B /= np.linalg.norm(B, axis=1)[:, None]
+        g[8:] = B[8:] @ np.linalg.lstsq(B[:8], g[:8], rcond=None)[0]
+        A, f = np.eye(12), 3.0 * rng.random(12)
+        x, alpha = reduced_model._polished(A, f, B, g, np.ones(11, bool))
+        assert max(reduced_model.residuals(A, f, B, g, x, alpha)) <= 1e-12
+
+
 def test_a_solver_that_gives_up_is_not_believed(
     run: vibench.Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
