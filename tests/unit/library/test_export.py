@@ -461,7 +461,8 @@ def test_the_command(run: vibench.Run, main: Main, tmp_path: Path) -> None:
     code, out, err = main(*asked, "--interpolate", "1e-4", "--c")
     assert (code, err) == (0, "")
     assert "B: 1 term, polynomials of degree (2, 0, 0)" in out
-    assert f"Model('{tmp_path / 'out' / 'model.npz'}').solve(mu)" in out
+    assert f"`from reduced_model import Model`, then `Model('{tmp_path / 'out' / 'model.npz'}').solve(mu)" in out
+    assert "no error bounds: its cell has no bounds" in out
     assert {file.name for file in (tmp_path / "out").iterdir()} == FILES | {"model.c"}
     refused(main(*asked), "model.npz' exists; remove it")
     refused(main(*asked[:-1], str(tmp_path / "b.npz"), "--interpolate", "1e-14"), "A depends on mu", "--evaluations")
@@ -521,3 +522,15 @@ def test_polynomials_that_are_not_the_functions_they_replace_are_not_called_cert
     model = certified.model(str(certified.cells["cell"].iloc[0]))
     monkeypatch.setattr(exported_certificate, "EXACT", 0.0)
     assert exported_model(model).about["certificate"] == "verified"
+
+
+def test_the_command_says_what_has_bounds(certified: vibench.Run, main: Main, tmp_path: Path) -> None:
+    cell, file = str(certified.cells["cell"].iloc[0]), tmp_path / "out" / "model.npz"
+    code, out, err = main("export-model", str(certified.path.parent), cell, str(file), "--c")
+    assert (code, err) == (0, "")
+    assert "\nerror bounds: certified\n" in out
+    assert "the C source has no error bounds" in out
+    assert "`from reduced_model_certificate import Model`" in out
+    assert {file.name for file in (tmp_path / "out").iterdir()} == FILES | {BOUNDS, "model.c"}
+    assert "There are no bounds of the errors" in file.with_suffix(".c").read_text()
+    assert len(file.with_name(BOUNDS).read_text().splitlines()) < 150

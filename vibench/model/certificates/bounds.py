@@ -9,9 +9,11 @@ A, α = γ = 1, and nothing is lost. Elsewhere X is A at the centre of the param
 
 - ρ comes from coordinates of the residual in an orthonormal basis (`vibench.model.certificates.residual`). Its terms
   are those of f, of A times the basis of the reduced space, and of Bᵀ times the generators. Where B is assembled on
-  the contact the last ones are the functionals on the contact unknowns, with the values of Bᵀλ_N at the parameter.
+  the contact the last ones are B₀ᵀ times the generators, with the part B₀ of B that is the same at all training
+  parameters, and the functionals on the contact unknowns, with the values of (B − B₀)ᵀλ_N at the parameter.
 - s = B u_N − g is evaluated on all rows with the B and g of the parameter, which involve the contact unknowns alone.
-- w is the lifting of `vibench.model.certificates.lifting` with the compliance C = Eᵀ X⁻¹ E of the contact unknowns E.
+- w is a lifting of `vibench.model.certificates.prepared_lifting`, or that of `vibench.model.certificates.lifting`, with
+  the compliance C = Eᵀ X⁻¹ E of the contact unknowns E.
 - α and γ are those of `vibench.model.certificates.spectral`.
 
 Members that the problem declares to be constant or affine sums are exact, those that are interpolated are not. With
