@@ -101,7 +101,7 @@ FAULTS = (
     ),
     Fault(
         "coefficientwise-constraint-dropped",
-        "strategies/vibench_strategies/mcpg.py",
+        "vibench/reduction/cone_parts.py",
         "B=np.vstack([-np.eye(count), generators[support]]),\n"
         "        g=np.concatenate([np.zeros(count), theta[support]]),",
         "B=-np.eye(count),\n        g=np.zeros(count),",

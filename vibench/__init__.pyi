@@ -61,6 +61,7 @@ from .qp.solve import solve_qp as solve_qp
 from .qp.status import Status as Status
 from .qp.verification import kkt_residuals as kkt_residuals
 from .qp.verification import verify as verify
+from .reduction.cone_parts import part_in_cone as part_in_cone
 from .reduction.cones import REPRODUCED as REPRODUCED
 from .reduction.cones import GrowingCone as GrowingCone
 from .reduction.cones import LazyDistances as LazyDistances

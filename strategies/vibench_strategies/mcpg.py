@@ -2,32 +2,7 @@
 
 from __future__ import annotations
 
-import numpy as np
-
-from vibench import (
-    Array,
-    Cone,
-    DualStrategy,
-    GrowingCone,
-    InnerProduct,
-    Mask,
-    Stop,
-    VariationalInequality,
-    kkt_residuals,
-    solve_qp,
-)
-
-SOLVERS = ("piqp", "proxqp")
-"""QP solvers tried for line 9, in this order."""
-
-ACCURACY = 1e-12
-"""Accuracy requested for line 9."""
-
-ACCEPTED = 1e-9
-"""A solution of line 9 with a larger residual is recorded as a fallback; Remark 4.1 holds for any feasible one."""
-
-ZERO = 1e-12
-"""Entries of θ − Υ below this share of max θ are round-off; left there, they would exclude generators later on."""
+from vibench import Array, Cone, DualStrategy, GrowingCone, InnerProduct, Stop, part_in_cone
 
 
 class ModifiedCPG(DualStrategy):
@@ -44,66 +19,3 @@ class ModifiedCPG(DualStrategy):
             if not cone.add(theta - upsilon, note):
                 break
         return cone.result()
-
-
-def part_in_cone(theta: Array, generators: Array, W: InnerProduct) -> tuple[Array, str]:
-    """Line 9 of Algorithm 2: the Υ of the cone closest to θ with θ − Υ ≥ 0 coefficientwise.
-
-    Parameters
-    ----------
-    theta
-        Snapshot θ ≥ 0 (m,).
-    generators
-        Generators ν ≥ 0 of the cone (m×r).
-    W
-        Inner product of the multiplier space.
-
-    Returns
-    -------
-    tuple
-        Υ (m,) such that θ − Υ has no negative entry, and exact zeros where round-off would leave less than `ZERO` of
-        its maximum; and a note, empty where Υ is optimal to `ACCEPTED`.
-    """
-    # A generator that is positive where θ is zero must have the coefficient 0. Without such generators, and restricted
-    # to the support of θ, the problem has strictly feasible points; otherwise it has none, and QP solvers break down.
-    support = theta > 0.0
-    usable = generators[:, ~np.any(generators[~support] > 0.0, axis=0)]
-    if not usable.shape[1]:
-        return np.zeros_like(theta), ""
-    coefficients, residual = _least_squares(theta, usable, support, W)
-    part = usable @ coefficients
-    over = part > theta
-    # The solver may violate Υ ≤ θ. Scaling Υ down restores feasibility and stays in the cone; a violation of the size
-    # of round-off is left to the clamp below.
-    if np.any(over):
-        shrink = float(np.min(theta[over] / part[over]))
-        part *= shrink if shrink < 1.0 - ACCEPTED else 1.0
-    rest = np.maximum(theta - part, 0.0)
-    rest[rest < ZERO * theta.max()] = 0.0
-    note = "" if residual <= ACCEPTED else f"line 9 solved only to {residual:.0e}, made feasible"
-    return theta - rest, note
-
-
-def _least_squares(theta: Array, generators: Array, support: Mask, W: InnerProduct) -> tuple[Array, float]:
-    """Coefficients α ≥ 0 (r,) that minimise ‖θ − Σ α_i ν_i‖_W with Σ α_i ν_i ≤ θ, and the largest KKT residual."""
-    whitened, target = W.whiten(generators), W.whiten(theta)
-    count = generators.shape[1]
-    program = VariationalInequality(
-        A=whitened.T @ whitened,
-        f=whitened.T @ target,
-        B=np.vstack([-np.eye(count), generators[support]]),
-        g=np.concatenate([np.zeros(count), theta[support]]),
-    )
-    best, smallest = np.zeros(count), np.inf
-    for solver in SOLVERS:
-        solution = solve_qp(program, solver, ACCURACY)
-        if solution.x is None or solution.alpha is None:
-            continue
-        if not np.all(np.isfinite(np.append(solution.x, solution.alpha))):
-            continue
-        residual = kkt_residuals(program, solution.x, solution.alpha).worst
-        if residual < smallest:
-            best, smallest = np.maximum(solution.x, 0.0), residual
-        if smallest <= ACCEPTED:
-            break
-    return best, smallest

@@ -38,7 +38,7 @@ from vibench.model.hyperreduced import HyperReducedModel, hyper_reduce
 from vibench.qp.solve import solve_qp
 from vibench.stages.assemblies import Assemblies
 from vibench.stages.query import VIOLATION
-from vibench.study.cells import Plugin
+from vibench.study.plugin import Plugin
 
 SEED = 2027
 

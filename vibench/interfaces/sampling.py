@@ -52,7 +52,10 @@ class Trainer(ABC):
 
     @abstractmethod
     def bound(self, mu: Array) -> float:
-        """Relative error bound of the model of all solutions so far at mu (d,); infinite where there is none."""
+        """Relative error of the model of all solutions so far at mu (d,): at least its bounds; infinite without them.
+
+        An estimate of the error of λ in W is taken where it is larger than the bounds of u and λ.
+        """
 
 
 class AdaptiveSampling(Sampling):

@@ -119,9 +119,16 @@ def certificate(
     """Bounds (ii) of one reduced u (n,) and λ (m,), from lower bounds of α and of β_A."""
     if np.min(lam, initial=0.0) < 0.0:
         return Certificate(None, NOT_IN_CONE)
-    w = lifting(vi, energy, u, lam)
-    if w is None:
+    lifted = lifting(vi, energy, u, lam)
+    if lifted is None:
         return Certificate(None, NO_LIFTING)
+    return Certificate(bounds_with(lifted.w, vi, energy, alpha, beta, u, lam), "" if alpha.proved else ESTIMATED)
+
+
+def bounds_with(
+    w: Array, vi: VariationalInequality, energy: Energy, alpha: Constant, beta: Constant, u: Array, lam: Array
+) -> Bounds:
+    """Bounds (ii) with a lifting w (n,), B w ≥ B u − g, for λ ≥ 0."""
     residual = vi.f - vi.A @ u - vi.B.T @ lam
     rho, omega = energy.dual_norm(residual), energy.norm(w)
     kappa = max(0.0, float(lam @ _slack(vi, u, w)))
@@ -131,12 +138,23 @@ def certificate(
     natural = min(float(np.sqrt(gap)), omega + bound)
     in_V = bound / float(np.sqrt(alpha.value))
     in_W = natural / beta.value if beta.value > 0.0 else float("inf")
-    found = Bounds(bound, in_V, natural, in_W, rho, omega, kappa)
-    return Certificate(found, "" if alpha.proved else ESTIMATED)
+    return Bounds(bound, in_V, natural, in_W, rho, omega, kappa)
 
 
-def lifting(vi: VariationalInequality, energy: Energy, u: Array, lam: Array) -> Array | None:
-    """A w (n,) with B w ≥ B u − g also in exact arithmetic, close to the best one; `None` if none was found.
+@dataclass(frozen=True)
+class Lifting:
+    """A w (n,) with B w ≥ s also in exact arithmetic, and ν ≥ 0 (m,) with A w = Bᵀ(ν − λ_N).
+
+    As A(u_N − w) + Bᵀν = f − r and ν is complementary to B(u_N − w) ≤ g, u_N − w and ν solve (7) with the load f − r:
+    up to the residual of (u_N, λ_N), ν is the high-fidelity multiplier. It is approximate where w is.
+    """
+
+    w: Array
+    nu: Array
+
+
+def lifting(vi: VariationalInequality, energy: Energy, u: Array, lam: Array) -> Lifting | None:
+    """A lifting of s = B u − g that is close to the best one; `None` if none was found.
 
     Parameters
     ----------
@@ -148,26 +166,26 @@ def lifting(vi: VariationalInequality, energy: Energy, u: Array, lam: Array) -> 
     excess, margin = vi.B @ u - vi.g, MARGIN * _round_off(vi, u, np.zeros_like(u))
     for _ in range(ATTEMPTS):
         raised = VariationalInequality(vi.A, -(vi.B.T @ lam), -vi.B, -(excess + margin))
-        for w in _minimisers(raised, energy, lam > 0.0):
+        for w, nu in _minimisers(raised, energy, lam > 0.0):
             lacking = _round_off(vi, u, w) - _slack(vi, u, w)
             if np.all(lacking <= 0.0):  # NaN is not
-                return w
+                return Lifting(w, nu)
             margin = np.maximum(margin, 2.0 * np.nan_to_num(lacking, nan=0.0, posinf=0.0))
         margin = 10.0 * margin
     return None
 
 
-def _minimisers(program: VariationalInequality, energy: Energy, start: Mask) -> Iterator[Array]:
-    """Approximate solutions of the program: by the active set method, then by an interior-point method."""
+def _minimisers(program: VariationalInequality, energy: Energy, start: Mask) -> Iterator[tuple[Array, Array]]:
+    """Approximate solutions and multipliers of the program: by active sets, then by an interior-point method."""
     system = energy.stiffness.active_set_system(program)
     for active in (start, np.zeros_like(start)):
         found = active_set_iterations(system, active)
         if found is not None:
-            yield system.recover(found[0])
+            yield system.recover(found[0]), found[1]
             return
     answer = solve_qp(program, FALLBACK_SOLVER, ACCURACY)
-    if answer.x is not None:
-        yield answer.x
+    if answer.x is not None and answer.alpha is not None:
+        yield answer.x, np.maximum(answer.alpha, 0.0)
 
 
 def _slack(vi: VariationalInequality, u: Array, w: Array) -> Array:

@@ -15,18 +15,22 @@ from vibench.interfaces.validation import checked_assembly
 from vibench.linalg.cholesky import SparseCholesky
 from vibench.linalg.dense import orthonormal_range
 from vibench.model.energy import Energy
-from vibench.model.error_bounds import certificate
+from vibench.model.error_bounds import bounds_with, lifting
 from vibench.model.galerkin import project
 from vibench.qp.exact import ExactSolution, exact_solution
 from vibench.qp.scaling import ratio
 from vibench.qp.solution import QPSolution
 from vibench.qp.solve import solve_qp
+from vibench.reduction.cone_parts import part_in_cone
 from vibench.reduction.supremizers import supremizers
 from vibench.stability.coercivity import Constant
 from vibench.timing import NO_TIME, Seconds, timed
 
 UNIT_CONSTANT = Constant(1.0, proved=False)
 """Bounds in the energy norm need no constants; those in the norms of V and W are not used."""
+
+IN_CONE = 1e-6
+"""A multiplier is in the cone where less than this share of it is outside: it may be what a solver left."""
 
 SOLVER, ACCURACY = "piqp", 1e-9
 """Solver of the programs that cannot be solved to round-off."""
@@ -35,24 +39,32 @@ SOLVER, ACCURACY = "piqp", 1e-9
 class GrowingModel:
     """A reduced model of all high-fidelity solutions that were added to it, without compression.
 
-    Its space is spanned by the u(µ_i) and the supremizers T(µ_i)λ(µ_i), its cone by the λ(µ_i) (Haasdonk, Salomon and
-    Wohlmuth 2012, §5). The bound is (ii) of `vibench.model.error_bounds`, at the cost of the mesh.
+    Its space is spanned by the u(µ_i) and supremizers T(µ_i)ν_i (Haasdonk, Salomon and Wohlmuth 2012, §5), its cone by
+    the ν_i: every λ(µ_i) without its part in the cone before it (line 9 of Algorithm 2 of Niakh et al. 2022), which
+    makes the cone larger than that of the λ(µ_i). Bounds are (ii) of `vibench.model.error_bounds`, at the cost of the
+    mesh.
+
+    Attributes
+    ----------
+    generators
+        The ν_i (m×R), unit norm in W.
     """
 
     def __init__(self, problem: Problem, solver: HighFidelitySolver) -> None:
         self._problem, self._solver = problem, solver
         self._whitened = np.zeros((problem.V.dim, 0))
         self._basis = np.zeros((problem.V.dim, 0))
-        self._generators = np.zeros((problem.W.dim, 0))
+        self.generators = np.zeros((problem.W.dim, 0))
         self._factor: SparseCholesky | None = None
 
     def add(self, vi: VariationalInequality, found: HighFidelitySolution) -> None:
         """Add the solution of `vi`."""
-        V, norm = self._problem.V, float(self._problem.W.norm(found.lam))
-        new = [found.u[:, None]]
-        if norm > 0.0:
-            new.append(supremizers(V, vi.B, found.lam[:, None]))
-            self._generators = np.hstack([self._generators, found.lam[:, None] / norm])
+        V, W = self._problem.V, self._problem.W
+        new, rest = [found.u[:, None]], found.lam - part_in_cone(found.lam, self.generators, W)[0]
+        norm = float(W.norm(rest))
+        if norm > IN_CONE * float(W.norm(found.lam)):
+            new.append(supremizers(V, vi.B, rest[:, None]))
+            self.generators = np.hstack([self.generators, rest[:, None] / norm])
         for column in new:  # one after the other: u must not lose to its supremizer
             more = orthonormal_range(V.whiten(column), self._whitened)
             self._whitened = np.hstack([self._whitened, more])
@@ -60,18 +72,21 @@ class GrowingModel:
 
     def solution(self, vi: VariationalInequality) -> tuple[Array, Array] | None:
         """The reduced solution u_N (n,) and λ_N ≥ 0 (m,) of `vi`; `None` if its program cannot be solved."""
-        program = project(vi, self._basis, self._generators)
+        program = project(vi, self._basis, self.generators)
         found: ExactSolution | QPSolution | None = exact_solution(program)
         if found is None:
             found = solve_qp(program, SOLVER, ACCURACY)
         if found.x is None or found.alpha is None:
             return None
-        return self._basis @ found.x, self._generators @ np.maximum(found.alpha, 0.0)
+        return self._basis @ found.x, self.generators @ np.maximum(found.alpha, 0.0)
 
     def bound(self, mu: Array) -> float:
-        """The larger of the bounds of u and λ at mu (d,), relative to the reduced solution; infinite without one.
+        """The largest of two bounds and an estimate at mu (d,), relative to the reduced solution; infinite without one.
 
-        That of u is in the energy norm over that of u_N, that of λ in the norm of A⁻¹ over that of Bᵀλ_N.
+        The bound of u is in the energy norm over that of u_N, that of λ in the norm of A⁻¹ over that of Bᵀλ_N. Neither
+        follows the error of λ in W, in which contact pressures are compared: the same λ − λ_N is smaller in the norm of
+        A⁻¹ the faster it oscillates. Its estimate is ‖ν − λ_N‖_W / ‖λ_N‖_W, ν the multiplier of the lifting that the
+        bounds need anyway.
         """
         vi = checked_assembly(self._problem, mu)
         solved = self.solution(vi)
@@ -79,12 +94,16 @@ class GrowingModel:
             return float("inf")
         u, lam = solved
         energy = self._energy(vi)
-        found = certificate(vi, energy, UNIT_CONSTANT, UNIT_CONSTANT, u, lam).bounds
-        if found is None:
+        lifted = lifting(vi, energy, u, lam)
+        if lifted is None:
             return float("inf")
+        found = bounds_with(lifted.w, vi, energy, UNIT_CONSTANT, UNIT_CONSTANT, u, lam)
         of_u = ratio(found.u_energy, energy.norm(u))
-        pressed = energy.dual_norm(vi.B.T @ lam)
-        return max(of_u, ratio(found.lambda_natural, pressed)) if pressed > 0.0 else of_u
+        pressed, W = energy.dual_norm(vi.B.T @ lam), self._problem.W
+        if not pressed > 0.0:
+            return of_u
+        in_W = ratio(float(W.norm(lifted.nu - lam)), float(W.norm(lam)))
+        return max(of_u, ratio(found.lambda_natural, pressed), in_W)
 
     def _energy(self, vi: VariationalInequality) -> Energy:
         if self._factor is None or "A" not in self._problem.constant:

@@ -11,6 +11,7 @@ from families import W, families
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from vibench import part_in_cone
 from vibench.arrays import Array
 from vibench.errors import NumericalError
 from vibench.interfaces.strategies import Cone, DualStrategy, Stop, rays
@@ -23,7 +24,6 @@ from vibench_strategies.angle_greedy import AngleGreedy
 from vibench_strategies.cpg import CPG
 from vibench_strategies.dictionary import Dictionary
 from vibench_strategies.enlarged_cpg import EnlargedCPG
-from vibench_strategies.mcpg import part_in_cone
 from vibench_strategies.nmf import NonnegativeFactors
 from vibench_strategies.orthant import Orthant
 from vibench_strategies.pod_dual import PODDual

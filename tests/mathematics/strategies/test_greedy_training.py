@@ -51,6 +51,7 @@ def test_all_candidates_meet_the_tolerance_where_all_are_checked() -> None:
     assert apart.max() <= 0.2
     assert trainer.solved[0].tolist() == [1.0, 0.5]  # the middle of the box
     assert {(x, y) for x in (0.0, 2.0) for y in (0.0, 1.0)} <= {tuple(mu) for mu in candidates}
+    assert {(x, y) for x in 0.5 * np.arange(5) for y in 0.25 * np.arange(5)} <= {tuple(mu) for mu in candidates}
     assert len(candidates) == 400
     assert len(trainer.solved) < 40  # 2 / (0.2² · π / 2) discs cannot do with fewer than 16
     assert len(trainer.asked) < 400 + 10 * len(trainer.solved)  # lazy: not all candidates in all steps
@@ -77,6 +78,24 @@ def test_it_ends_after_so_many_candidates_in_a_row_or_solutions() -> None:
     assert np.array_equal(bounded.solved, again.solved)
     other = trained(candidates=500, tolerance=1e-6, most=7, seed=1)[1]
     assert not np.array_equal(bounded.solved, other.solved)
+
+
+def test_the_coarse_grid_comes_first_and_the_finer_one_before_random_candidates() -> None:
+    _, trainer = trained(candidates=1000, tolerance=0.01, drawn=4, most=12)
+    new, seen = [], {tuple(trainer.solved[0])}
+    for mu, _ in trainer.asked:
+        if tuple(mu) not in seen:
+            seen.add(tuple(mu))
+            new.append(mu)
+    fine = np.array([np.all(mu * [2.0, 4.0] % 1.0 == 0.0) for mu in new])
+    coarse = np.array([np.all(mu * [1.0, 2.0] % 1.0 == 0.0) for mu in new])
+    assert coarse[:8].all()  # with the middle, which is solved without a bound, the 3×3 grid
+    assert fine[:24].all()
+    assert not fine[24:].any()
+    assert len(new) > 24
+    _, loose = trained(candidates=1000, tolerance=0.9, checked=30)
+    asked = np.unique([mu for mu, _ in loose.asked], axis=0)
+    assert np.sum(np.any(asked * [2.0, 4.0] % 1.0 != 0.0, axis=1)) >= 30  # those of the grids are not random
 
 
 @pytest.mark.parametrize("candidates", [2, 3, 8])

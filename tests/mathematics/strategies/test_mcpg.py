@@ -7,14 +7,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numerics import space
 
+from vibench import part_in_cone
 from vibench.interfaces.problem import VariationalInequality
 from vibench.interfaces.strategies import Stop
 from vibench.linalg.inner_product import InnerProduct
 from vibench.qp.solution import QPSolution
+from vibench.reduction import cone_parts
 from vibench.reduction.cones import project_on_cone
-from vibench_strategies import mcpg
 from vibench_strategies.cpg import CPG
-from vibench_strategies.mcpg import ModifiedCPG, part_in_cone
+from vibench_strategies.mcpg import ModifiedCPG
 
 seeds = st.integers(0, 10_000)
 EUCLID = InnerProduct(sp.eye_array(3))
@@ -100,7 +101,7 @@ def test_a_solver_that_fails_leaves_a_feasible_generator_and_a_note(monkeypatch,
         return QPSolution(np.full(count, value), np.zeros(rows), "solved")
 
     theta, W = bumps()
-    monkeypatch.setattr(mcpg, "solve_qp", fails)
+    monkeypatch.setattr(cone_parts, "solve_qp", fails)
     part, note = part_in_cone(theta[:, 3], theta[:, 2:3] * (theta[:, 3:4] > 0.0), W)
     assert "line 9" in note
     assert np.all(theta[:, 3] - part >= 0.0)

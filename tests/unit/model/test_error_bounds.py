@@ -110,13 +110,30 @@ def test_the_identity_the_bounds_follow_from(
 
 
 @given(approximations())
+def test_the_multiplier_of_a_lifting_is_the_high_fidelity_one_where_there_is_no_residual(
+    given: tuple[VariationalInequality, np.ndarray, np.ndarray, np.ndarray, np.ndarray],
+) -> None:
+    vi, u, lam, _, lam_N = given
+    A = vi.A.toarray()
+    without = np.linalg.solve(A, vi.f - vi.B.T @ lam_N)
+    lifted = lifting(vi, energy(vi), without, lam_N)
+    assert lifted is not None
+    assert lifted.nu.min(initial=0.0) >= 0.0
+    size = np.abs(vi.f).max() + np.abs(A).max() * np.abs(u).max() + np.abs(vi.B.T @ lam_N).max()
+    # With dependent rows the interior-point method solves the program, and λ is not unique.
+    np.testing.assert_allclose(A @ lifted.w, vi.B.T @ (lifted.nu - lam_N), rtol=0.0, atol=1e-3 * size)
+    np.testing.assert_allclose(vi.B.T @ lifted.nu, vi.B.T @ lam, rtol=0.0, atol=1e-3 * size)
+
+
+@given(approximations())
 def test_the_terms_are_those_of_a_lifting_that_is_feasible_in_exact_arithmetic(
     given: tuple[VariationalInequality, np.ndarray, np.ndarray, np.ndarray, np.ndarray],
 ) -> None:
     vi, _, _, u_N, lam_N = given
-    w, norm = lifting(vi, energy(vi), u_N, lam_N), energy(vi)
+    lifted, norm = lifting(vi, energy(vi), u_N, lam_N), energy(vi)
     scale = norm.norm(u_N) + norm.dual_norm(vi.f) + norm.dual_norm(vi.B.T @ lam_N)
-    assert w is not None
+    assert lifted is not None
+    w = lifted.w
     for row, g in zip(vi.B.toarray(), vi.g, strict=True):
         slack = sum(Fraction(b) * (Fraction(x) - Fraction(v)) for b, x, v in zip(row, w, u_N, strict=True))
         assert slack + Fraction(g) >= 0

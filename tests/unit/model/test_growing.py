@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numerics import Varying
 
-from vibench import create
+from vibench import create, part_in_cone, project_on_cone
 from vibench.highfidelity.active_set import HighFidelitySolver
 from vibench.interfaces.fingerprint import ReferenceAssembly
 from vibench.interfaces.problem import Problem
@@ -38,6 +38,43 @@ def test_bounds_hold_everywhere_and_vanish_at_the_solutions(case: str) -> None:
         assert np.sqrt(e @ (vi.A @ e)) <= bound * np.sqrt(u @ (vi.A @ u)) * (1.0 + 1e-6)
         assert np.sqrt(r @ inverse.solve(r)) <= bound * np.sqrt(pressed @ inverse.solve(pressed)) * (1.0 + 1e-6)
     assert max(model.bound(mu) for mu in unseen) > 1e-4  # there is something to bound
+
+
+@pytest.mark.parametrize("case", PROBLEMS)
+def test_the_cone_has_every_multiplier_and_grows_by_what_it_lacks(case: str) -> None:
+    problem: Problem = PROBLEMS[case]()
+    solver, W = HighFidelitySolver(problem), problem.W
+    model, found = GrowingModel(problem, solver), []
+    for mu in problem.parameters.sample(5, 1):
+        vi = problem.assemble(mu).copy()
+        found.append(solver.solve_assembled(mu, vi))
+        model.add(vi, found[-1])
+    chi, snapshots = model.generators, np.column_stack([one.lam for one in found])
+    assert chi.min() >= 0.0
+    np.testing.assert_allclose(W.norm(chi), 1.0)
+    for k, lam in enumerate(snapshots.T):
+        assert project_on_cone(chi, lam, W).distance <= 1e-7 * W.norm(lam)
+        part, _ = part_in_cone(lam, chi[:, :k], W)
+        np.testing.assert_allclose(chi[:, k], (lam - part) / W.norm(lam - part), atol=1e-6 * chi.max())
+    size = chi.shape[1]
+    model.add(vi, found[-1])  # it has that one
+    assert model.generators.shape[1] == size
+
+
+def test_what_chooses_follows_large_errors_of_the_multiplier() -> None:
+    """In the norm of A⁻¹ they are eight times smaller here."""
+    problem = Varying()
+    solver, W = HighFidelitySolver(problem), problem.W
+    model = GrowingModel(problem, solver)
+    for mu in problem.parameters.sample(5, 1):
+        vi = problem.assemble(mu).copy()
+        model.add(vi, solver.solve_assembled(mu, vi))
+    mus = problem.parameters.sample(10, 2)
+    found = [(model.solution(problem.assemble(mu).copy()), solver.solve(mu)) for mu in mus]
+    errors = np.array([W.norm(exact.lam - one[1]) / W.norm(one[1]) for one, exact in found if one is not None])
+    assert len(errors) == len(mus)
+    large = errors > 0.5 * errors.max()
+    assert all(model.bound(mu) > 0.8 * error for mu, error in zip(mus[large], errors[large], strict=True))
 
 
 def test_a_model_without_contact_has_bounds_of_u_alone() -> None:

@@ -8,6 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numerics import space
 
+from vibench import part_in_cone
 from vibench.errors import NumericalError
 from vibench.highfidelity.active_set import HighFidelitySolver
 from vibench.interfaces.strategies import DualStrategy, Stop
@@ -16,7 +17,7 @@ from vibench.reduction import cones as cone_module
 from vibench.reduction.cones import greedy_cone, orthogonality, project_on_cone
 from vibench_problems.obstacle import Obstacle
 from vibench_strategies.cpg import CPG
-from vibench_strategies.mcpg import ModifiedCPG, part_in_cone
+from vibench_strategies.mcpg import ModifiedCPG
 
 seeds = st.integers(0, 10_000)
 
