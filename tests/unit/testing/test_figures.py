@@ -151,4 +151,4 @@ def test_the_made_up_run_is_one_that_vibench_reads_and_draws(tmp_path: Path) -> 
         pd.testing.assert_frame_equal(tables.read(path, name), tables.read(again, name))
     drawn = {draw for _, draw, data in drawings(path) if draw(data) is not None}
     missing = {kind for kind, draw in (OF_PROBLEM | OF_DUAL).items() if draw not in drawn}
-    assert missing <= {"solutions", "diagnostics", "shares", "solvers", "precision"}
+    assert missing <= {"solutions", "diagnostics", "shares", "solvers", "precision", "break-even"}
