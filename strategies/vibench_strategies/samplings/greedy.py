@@ -2,20 +2,15 @@
 
 from __future__ import annotations
 
-from itertools import pairwise
 from typing import Annotated
 
-import numpy as np
 from annotated_types import Ge, Gt, Le, Lt
 
 from vibench import AdaptiveSampling, Array, ParameterBox, Trainer
-from vibench_strategies.samplings.sobol import Sobol
+from vibench_strategies.samplings.candidates import nested_candidates
 
 WEAK = 0.8
 """The worst bound is at least this share of all known ones, most of which are those of earlier models."""
-
-LEVELS = 3, 5
-"""Points per parameter of the grids among the candidates: the second one refines the first one."""
 
 
 class Greedy(AdaptiveSampling):
@@ -41,28 +36,17 @@ class Greedy(AdaptiveSampling):
 
     def parameters(self, box: ParameterBox) -> Array:
         """The candidates: the middle of the box, grids, each in at most half of them, then the sequence."""
-        return self._candidates(box)[0]
-
-    def _candidates(self, box: ParameterBox) -> tuple[Array, list[int]]:
-        """The candidates, and how many there are up to the end of each of their parts."""
-        grids = [box.grid(*[n] * box.dim) for n in LEVELS if n**box.dim <= self.candidates // 2]
-        parts = [(box.lower + box.upper)[None] / 2.0, *grids, Sobol(self.candidates, self.seed).parameters(box)]
-        mus = np.vstack(parts)
-        kept = np.sort(np.unique(mus, axis=0, return_index=True)[1])[: self.candidates]
-        return mus[kept], [int(np.count_nonzero(kept < end)) for end in np.cumsum([len(part) for part in parts])]
+        return nested_candidates(box, self.candidates, self.seed)[0]
 
     def train(self, box: ParameterBox, trainer: Trainer) -> None:
         """Solve in the middle of the box, then where the bound is worst."""
-        mus, ends = self._candidates(box)
-        rng, unseen = np.random.default_rng(self.seed), list[int]()
-        for begin, end in pairwise(ends):  # they are taken from the end, the coarse grid first
-            unseen = [*(begin + rng.permutation(end - begin)), *unseen]
+        mus, (coarse, fixed), unseen = nested_candidates(box, self.candidates, self.seed)
         trainer.solve(mus[0])
-        known, solved, passed, draws = dict[int, float](), 1, 0, (ends[1] if len(ends) > 2 else 1) + self.drawn
+        known, solved, passed, draws = dict[int, float](), 1, 0, coarse + self.drawn
         while solved < self.most and (known or unseen):
             for k in [unseen.pop() for _ in range(min(draws, len(unseen)))]:
                 known[k] = trainer.bound(mus[k])
-                passed = 0 if known[k] > self.tolerance else passed + int(k >= ends[-2])
+                passed = 0 if known[k] > self.tolerance else passed + int(k >= fixed)
             k, draws = max(known, key=known.__getitem__), 0
             known[k] = trainer.bound(mus[k])  # of the present model
             if known[k] > self.tolerance and known[k] >= WEAK * max(known.values()):
