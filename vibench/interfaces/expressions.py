@@ -25,7 +25,7 @@ ARGUMENTS: Mapping[str, range] = {"min": range(2, 100), "max": range(2, 100), "a
 
 BINARY: Mapping[type[ast.operator], Callable[[float, float], float]] = {
     ast.Add: operator.add, ast.Sub: operator.sub, ast.Mult: operator.mul, ast.Div: operator.truediv,
-    ast.Pow: operator.pow,
+    ast.Pow: math.pow,  # not Python's own, which leaves the real numbers where the base is negative
 }  # fmt: skip
 
 UNARY: Mapping[type[ast.unaryop], Callable[[float], float]] = {ast.UAdd: operator.pos, ast.USub: operator.neg}
@@ -78,9 +78,9 @@ class Expression:
             found = _value(_tree(self.text), {**values, **CONSTANTS})
         except (ArithmeticError, ValueError) as error:
             raise NumericalError(f"{where}: {error}") from None
-        if isinstance(found, complex) or not math.isfinite(found):
-            raise NumericalError(f"{where} is {found}, which is not a finite real number")
-        return float(found)
+        if not math.isfinite(found):
+            raise NumericalError(f"{where} is {found}, which is not finite")
+        return found
 
 
 @lru_cache(maxsize=1000)
