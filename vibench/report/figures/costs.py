@@ -76,8 +76,8 @@ def _scatter(
             for index, text in point_names(drawn[drawn["primal"].isin(names)]).items():
                 sheet.label(panel, x[index], drawn.at[index, column], text)
             if front:
-                line = _front(x[drawn.index].to_numpy(float), drawn[column].to_numpy(float))
-                panel.plot(*line, color="0.6", linewidth=0.8, drawstyle="steps-post", zorder=0)
+                best = drawn.iloc[_front(x[drawn.index].to_numpy(float), drawn[column].to_numpy(float))]
+                panel.plot(x[best.index], best[column], color="0.6", linewidth=0.8, drawstyle="steps-post", zorder=0)
             panel.set(xlabel=xlabel, ylabel=ylabel, title=name, xscale="log", yscale="log")
     over = compared.over or f" over all {compared.asked} queries"
     beyond = "The thin line is the Pareto front: no model is both faster and more accurate." if front else ""
@@ -150,17 +150,19 @@ def break_even(data: Data) -> CaptionedFigure | None:
     for panel, (measure, mine) in zip(sheet.panels, shown, strict=False):
         for name, rows in mine.groupby("primal", sort=False):
             scatter(panel, positive(rows["error"]), rows["benefit_threshold"], looks[Series(str(name))], str(name))
-        for row in mine.itertuples():
-            panel.plot([row.error] * 2, [row.threshold_low, row.threshold_high], c="0.6", lw=0.8, zorder=0)
-        for index, text in point_names(mine).items():
-            sheet.label(panel, mine.at[index, "error"], mine.at[index, "benefit_threshold"], text)
+        low, high = (mine[f"threshold_{end}"].replace(np.inf, np.nan) for end in ("low", "high"))
+        panel.vlines(mine["error"], low, high, color="0.6", lw=0.8, zorder=0)
+        best = mine.iloc[_front(mine["error"].to_numpy(float), mine["benefit_threshold"].to_numpy(float))]
+        for index, text in point_names(best).items():
+            sheet.label(panel, best.at[index, "error"], best.at[index, "benefit_threshold"], text)
         title = measure.removeprefix(OUTPUT).replace("lambda", "λ")
         panel.set(xlabel="mean relative error", ylabel="break-even [queries]", title=title, xscale="log", yscale="log")
     left_out = f" Models without such a number, or with an undecided one, have no point: {without}." * bool(without)
     return sheet.finish(
         f"Number of queries from which a reduced model of {data.problem} is cheaper than the high-fidelity one, over "
         f"its mean relative error of u, of λ and of every quantity of interest; solver {solver}. Lines are 95 % "
-        f"intervals. A point for every model, with its (N, R) and the tolerance δ of its primal strategy.{left_out}"
+        f"intervals. A point for every model; those on the Pareto front, which no model beats in both, "
+        f"have their (N, R) and the tolerance δ of their primal strategy.{left_out}"
         f"{data.part}"
     )
 
@@ -201,12 +203,12 @@ def _reported(data: Data) -> list[tuple[str, pd.DataFrame, list[str]]]:
     ]
 
 
-def _front(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The Pareto front of points to be small in x and y, from left to right."""
+def _front(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Places of the points on the Pareto front, of those that are small in x and y, from left to right."""
     order = np.lexsort((y, x))
     best = np.minimum.accumulate(y[order])
-    kept = np.concatenate([np.ones(min(len(best), 1), dtype=bool), best[1:] < best[:-1]])
-    return x[order][kept], y[order][kept]
+    kept: np.ndarray = order[np.concatenate([np.ones(min(len(best), 1), dtype=bool), best[1:] < best[:-1]])]
+    return kept
 
 
 def total_cost(data: Data) -> CaptionedFigure | None:
