@@ -58,17 +58,17 @@ def fitted_rate(widths: Sequence[float], errors: Sequence[float]) -> float:
 
 
 def exact(vi: VariationalInequality) -> tuple[np.ndarray, np.ndarray]:
-    """Solution by trying every active set."""
-    m = len(vi.g)
+    """Solution by trying every active set, in coordinates in which A is the identity and rows of B have length one."""
+    m, half = len(vi.g), np.linalg.cholesky(np.asarray(vi.A))
+    whitened, load = np.linalg.solve(half, vi.B.T), np.linalg.solve(half, vi.f)
+    lengths = np.linalg.norm(whitened, axis=0)
+    rows, g = (whitened / lengths).T, vi.g / lengths
     for bits in range(2**m):
         active = [i for i in range(m) if bits >> i & 1]
-        C = vi.B[active]
-        kkt = np.block([[vi.A, C.T], [C, np.zeros((len(active), len(active)))]])
-        solution = np.linalg.lstsq(kkt, np.concatenate([vi.f, vi.g[active]]), rcond=None)[0]
-        x, lam = solution[: len(vi.f)], solution[len(vi.f) :]
-        excess, scale = vi.B @ x - vi.g, np.abs(vi.B).sum(axis=1) * (1.0 + np.abs(x).max())
-        if np.all(lam >= -1e-9 * (1.0 + np.abs(lam).max(initial=0.0))) and np.all(excess <= 1e-10 * scale):
-            alpha = np.zeros(m)
-            alpha[active] = lam
-            return x, alpha
+        C, lam = rows[active], np.zeros(m)
+        y = load + np.linalg.lstsq(C, g[active] - C @ load, rcond=1e-10)[0]  # the nearest point
+        lam[active] = np.linalg.lstsq(C.T, load - y, rcond=1e-10)[0]
+        size = np.linalg.norm(load) + np.abs(g).max()
+        if np.all(lam >= -1e-10 * size) and np.all(rows @ y - g <= 1e-10 * size):
+            return np.linalg.solve(half.T, y), lam / lengths
     raise AssertionError("no active set")

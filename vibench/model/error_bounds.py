@@ -20,15 +20,25 @@ As λ ≥ 0, λᵀs ≤ λᵀB w = λ_NᵀB w + (Bᵀε)ᵀw, and (i) becomes �
 
 Completing the square instead, ‖e‖²_A + (‖Bᵀε‖_{A⁻¹} − ω)² ≤ Δ_A², the last one. The second is twice the duality gap
 of λ_N and the feasible v = u_N − w, which bounds ‖u − v‖²_A + ‖Bᵀε‖²_{A⁻¹}: (i) at v has the residual r + A w and the
-excess B v − g = s − B w ≤ 0, for which λᵀ(B v − g) ≤ 0. Constants enter in the norms of V and W alone:
+excess B v − g = s − B w ≤ 0, for which λᵀ(B v − g) ≤ 0.
+
+Only the part of r in the range of Bᵀ concerns λ. In the inner product of A⁻¹ the rest is A d with B d = 0, hence
+
+    r = r_B + A d,    r_B = Bᵀξ,    ρ_B := ‖r_B‖_{A⁻¹} ≤ ρ,
+
+and u_N + d has the same violation s as u_N, and the residual r_B beside λ_N. (ii) for this pair bounds the same ε with
+ρ_B in the place of ρ. It leaves the bound of e as it is: e − d = A⁻¹(r_B − Bᵀε) is orthogonal to d in A, so that
+‖e‖²_A = ‖d‖²_A + ‖e − d‖²_A and ρ² = ‖d‖²_A + ρ_B². Constants enter in the norms of V and W alone:
 
     ‖e‖_V ≤ Δ_A / √α,        ‖ε‖_W ≤ ‖Bᵀε‖_{A⁻¹} / β_A.
 
 Δ_A is smallest for w = argmin ½‖w‖²_A + λ_NᵀB w subject to B w ≥ s, which has the structure of (7): stiffness A, load
 −Bᵀλ_N, constraints −B w ≤ −s. The active set method starts from supp λ_N, where B w = s makes κ = 0. Any w with B w ≥ s
 is valid, however it was found: optimality is not verified, feasibility is. s is raised by a margin above the round-off
-of B u_N − g and of B w, and the w that is used satisfies the constraints by more than the bound of that round-off. The
-norms ρ and ω and the product κ are evaluated in floating-point arithmetic without such a bound.
+of B u_N − g and of B w, and the w that is used satisfies the constraints by more than the bound of that round-off. So is
+any d, if w is feasible for u_N + d, too: d = 0 is used where w is not, or where constraints are dependent and d is
+lost in round-off. The norms ρ, ρ_B and ω and the product κ are evaluated in floating-point arithmetic without such a
+bound.
 """
 
 from __future__ import annotations
@@ -67,8 +77,8 @@ class Bounds:
         Of ‖u − u_N‖ in the norms of A and of V.
     lambda_natural, lam
         Of ‖Bᵀ(λ − λ_N)‖ in the norm of A⁻¹ and of ‖λ − λ_N‖ in the norm of W.
-    rho, omega, kappa
-        ρ and ω, in the unit of `u_energy`, and κ in that of its square.
+    rho, rho_range, omega, kappa
+        ρ, ρ_B and ω, in the unit of `u_energy`, and κ in that of its square.
     """
 
     u_energy: float
@@ -76,6 +86,7 @@ class Bounds:
     lambda_natural: float
     lam: float
     rho: float
+    rho_range: float
     omega: float
     kappa: float
 
@@ -129,16 +140,52 @@ def bounds_with(
     w: Array, vi: VariationalInequality, energy: Energy, alpha: Constant, beta: Constant, u: Array, lam: Array
 ) -> Bounds:
     """Bounds (ii) with a lifting w (n,), B w ≥ B u − g, for λ ≥ 0."""
+    of_u = _terms(w, vi, energy, u, lam)
+    of_lam = min((of_u, *_projected(of_u.residual, w, vi, energy, u, lam)), key=lambda terms: terms.rho)
+    in_V = of_u.primal / float(np.sqrt(alpha.value))
+    in_W = of_lam.dual / beta.value if beta.value > 0.0 else float("inf")
+    return Bounds(of_u.primal, in_V, of_lam.dual, in_W, of_u.rho, of_lam.rho, of_u.omega, of_u.kappa)
+
+
+@dataclass(frozen=True)
+class _Terms:
+    """The terms of (ii), with the residual r (n,) and rᵀw."""
+
+    residual: Array
+    rho: float
+    omega: float
+    kappa: float
+    work: float
+
+    @property
+    def primal(self) -> float:
+        """Δ_A."""
+        return float(np.sqrt(self.rho**2 + self.omega**2 + 2.0 * self.kappa))
+
+    @property
+    def dual(self) -> float:
+        """The bound of ‖Bᵀε‖ in the norm of A⁻¹."""
+        gap = max(0.0, self.primal**2 + 2.0 * self.work)  # twice the duality gap
+        return min(float(np.sqrt(gap)), self.omega + self.primal)
+
+
+def _terms(w: Array, vi: VariationalInequality, energy: Energy, u: Array, lam: Array) -> _Terms:
     residual = vi.f - vi.A @ u - vi.B.T @ lam
-    rho, omega = energy.dual_norm(residual), energy.norm(w)
     kappa = max(0.0, float(lam @ _slack(vi, u, w)))
-    square = rho**2 + omega**2 + 2.0 * kappa
-    bound = float(np.sqrt(square))
-    gap = max(0.0, square + 2.0 * float(residual @ w))  # twice the duality gap
-    natural = min(float(np.sqrt(gap)), omega + bound)
-    in_V = bound / float(np.sqrt(alpha.value))
-    in_W = natural / beta.value if beta.value > 0.0 else float("inf")
-    return Bounds(bound, in_V, natural, in_W, rho, omega, kappa)
+    return _Terms(residual, energy.dual_norm(residual), energy.norm(w), kappa, float(residual @ w))
+
+
+def _projected(
+    residual: Array, w: Array, vi: VariationalInequality, energy: Energy, u: Array, lam: Array
+) -> Iterator[_Terms]:
+    """The terms for u + d, whose residual is the part of r in the range of Bᵀ, if w is feasible for it and d exists."""
+    system = energy.stiffness.active_set_system(VariationalInequality(vi.A, residual, vi.B, np.zeros_like(vi.g)))
+    try:
+        d = system.recover(system.solve_active(np.arange(len(vi.g)))[0])
+    except (RuntimeError, np.linalg.LinAlgError):  # an exactly singular system
+        return
+    if np.all(_lacking(vi, u + d, w) <= 0.0):
+        yield _terms(w, vi, energy, u + d, lam)
 
 
 @dataclass(frozen=True)
@@ -167,7 +214,7 @@ def lifting(vi: VariationalInequality, energy: Energy, u: Array, lam: Array) -> 
     for _ in range(ATTEMPTS):
         raised = VariationalInequality(vi.A, -(vi.B.T @ lam), -vi.B, -(excess + margin))
         for w, nu in _minimisers(raised, energy, lam > 0.0):
-            lacking = _round_off(vi, u, w) - _slack(vi, u, w)
+            lacking = _lacking(vi, u, w)
             if np.all(lacking <= 0.0):  # NaN is not
                 return Lifting(w, nu)
             margin = np.maximum(margin, 2.0 * np.nan_to_num(lacking, nan=0.0, posinf=0.0))
@@ -186,6 +233,11 @@ def _minimisers(program: VariationalInequality, energy: Energy, start: Mask) -> 
     answer = solve_qp(program, FALLBACK_SOLVER, ACCURACY)
     if answer.x is not None and answer.alpha is not None:
         yield answer.x, np.maximum(answer.alpha, 0.0)
+
+
+def _lacking(vi: VariationalInequality, u: Array, w: Array) -> Array:
+    """By how much the constraints B w ≥ s may be violated in exact arithmetic (m,); negative where they hold."""
+    return _round_off(vi, u, w) - _slack(vi, u, w)
 
 
 def _slack(vi: VariationalInequality, u: Array, w: Array) -> Array:

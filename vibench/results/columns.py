@@ -339,6 +339,9 @@ QUERIES: Mapping[str, Column] = {
     ),
     **_effectivities("u_energy", "u", "lambda_natural", "lambda"),
     "bound_rho": Column(REAL, "A", "ρ, the residual in the norm of A(µ)⁻¹."),
+    "bound_rho_range": Column(
+        REAL, "A", "ρ_B, the part of ρ in the range of Bᵀ, which bounds λ; ρ itself where constraints are dependent."
+    ),
     "bound_omega": Column(REAL, "A", "ω, the norm of the lifting w of the constraint violation."),
     "bound_kappa": Column(REAL, "A²", "κ = λ_Nᵀ(B w − s), the complementarity of w and λ_N."),
     "bound_note": Column(

@@ -249,7 +249,7 @@ def _columns(error: Errors, certificate: Certificate, hsw: HSWBounds | None) -> 
     of_lam = _measured(error.error_lambda, error.error_lambda_scaled) > UNMEASURABLE
     found: dict[str, tuple[float, bool, float]] = {}  # a bound, the error, and whether that is measurable
     if (bounds := certificate.bounds) is not None:
-        row |= {"bound_rho": bounds.rho, "bound_omega": bounds.omega, "bound_kappa": bounds.kappa}
+        row |= {f"bound_{name}": getattr(bounds, name) for name in ("rho", "rho_range", "omega", "kappa")}
         found |= {
             "u_energy": (bounds.u_energy, of_u, error.error_u_energy_absolute),
             "u": (bounds.u, of_u, error.error_u_absolute),
