@@ -16,8 +16,31 @@ Drawing = Callable[[], "Figure | None"]
 """Draws one figure; `None` where there is nothing to draw."""
 
 
-class ProblemTables(Protocol):
-    """What figures are drawn from: the tables of one problem of a run."""
+class RecordedTables(Protocol):
+    """The tables of the cells of a run, or of one problem of it."""
+
+    @property
+    def cells(self) -> pd.DataFrame:
+        """A row per cell; the documentation lists the columns of all tables."""
+
+    @property
+    def queries(self) -> pd.DataFrame:
+        """A row per query of a cell."""
+
+    @property
+    def histories(self) -> pd.DataFrame:
+        """A row per step of POD, cones and enrichments, and per diagnostic of a problem."""
+
+    @property
+    def thresholds(self) -> pd.DataFrame:
+        """A row per pair of cells that break-even compares."""
+
+
+class ProblemTables(RecordedTables, Protocol):
+    """What figures are drawn from: the tables of one problem of a run.
+
+    Rows of `queries` have `N`, `R` and `enrichment_kind` of their cell, too.
+    """
 
     @property
     def problem(self) -> str:
@@ -35,48 +58,16 @@ class ProblemTables(Protocol):
     def machine(self) -> str:
         """Machines that measured the seconds."""
 
-    @property
-    def cells(self) -> pd.DataFrame:
-        """A row per cell; the documentation lists the columns of all tables."""
 
-    @property
-    def queries(self) -> pd.DataFrame:
-        """A row per query of a cell, with `N`, `R` and `enrichment_kind` of its cell."""
-
-    @property
-    def histories(self) -> pd.DataFrame:
-        """A row per step of POD, cones and enrichments, and per diagnostic of the problem."""
-
-    @property
-    def thresholds(self) -> pd.DataFrame:
-        """A row per pair of cells that break-even compares."""
-
-
-class RunTables(Protocol):
+class RunTables(RecordedTables, Protocol):
     """What derived columns are computed from: the recorded tables of a whole run, without columns of plugins.
 
     Each access gives a copy, whose rows have the order in which values are expected.
     """
 
     @property
-    def cells(self) -> pd.DataFrame:
-        """A row per cell; the documentation lists the columns of all tables."""
-
-    @property
-    def queries(self) -> pd.DataFrame:
-        """A row per query of a cell."""
-
-    @property
-    def histories(self) -> pd.DataFrame:
-        """A row per step of POD, cones and enrichments, and per diagnostic of a problem."""
-
-    @property
     def timings(self) -> pd.DataFrame:
         """A row per timing round of a cell."""
-
-    @property
-    def thresholds(self) -> pd.DataFrame:
-        """A row per pair of cells that break-even compares."""
 
     @property
     def outputs(self) -> pd.DataFrame:

@@ -35,10 +35,10 @@ and u_N + d has the same violation s as u_N, and the residual r_B beside λ_N. (
 Δ_A is smallest for w = argmin ½‖w‖²_A + λ_NᵀB w subject to B w ≥ s, which has the structure of (7): stiffness A, load
 −Bᵀλ_N, constraints −B w ≤ −s. The active set method starts from supp λ_N, where B w = s makes κ = 0. Any w with B w ≥ s
 is valid, however it was found: optimality is not verified, feasibility is. s is raised by a margin above the round-off
-of B u_N − g and of B w, and the w that is used satisfies the constraints by more than the bound of that round-off. So is
-any d, if w is feasible for u_N + d, too: d = 0 is used where w is not, or where constraints are dependent and d is
-lost in round-off. The norms ρ, ρ_B and ω and the product κ are evaluated in floating-point arithmetic without such a
-bound.
+of B u_N − g and of B w, and the w that is used satisfies the constraints by more than the bound of that round-off. Any
+d for which w is feasible at u_N + d, too, gives a bound of ε; d = 0 where w is not feasible, or where constraints are
+dependent and d is lost in round-off. The norms ρ, ρ_B and ω and the product κ are evaluated in floating-point
+arithmetic without such a bound.
 """
 
 from __future__ import annotations

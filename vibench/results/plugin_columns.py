@@ -218,43 +218,25 @@ def _title(plugin: str, column: DerivedColumn) -> str:
     return f"column '{column.name}' of {KIND} '{plugin}'"
 
 
+def _copied(table: str) -> property:
+    return property(lambda copies: copies.of(table))
+
+
 class Copies:
     """The recorded tables of a run (`vibench.RunTables`), read when asked for; each access gives a copy."""
 
     def __init__(self, read: Read) -> None:
         self._read, self._known = read, dict[str, pd.DataFrame]()
 
-    def _copy(self, table: str) -> pd.DataFrame:
+    def of(self, table: str) -> pd.DataFrame:
+        """A copy of a table, by its name."""
         if table not in self._known:
             self._known[table] = self._read(table)
         return self._known[table].copy()
 
-    @property
-    def cells(self) -> pd.DataFrame:
-        """A row per cell."""
-        return self._copy("cells")
-
-    @property
-    def queries(self) -> pd.DataFrame:
-        """A row per query of a cell."""
-        return self._copy("queries")
-
-    @property
-    def histories(self) -> pd.DataFrame:
-        """A row per step of POD, cones and enrichments."""
-        return self._copy("histories")
-
-    @property
-    def timings(self) -> pd.DataFrame:
-        """A row per timing round of a cell."""
-        return self._copy("timings")
-
-    @property
-    def thresholds(self) -> pd.DataFrame:
-        """A row per pair of cells that break-even compares."""
-        return self._copy("thresholds")
-
-    @property
-    def outputs(self) -> pd.DataFrame:
-        """A row per cell and quantity of interest."""
-        return self._copy("outputs")
+    cells = _copied("cells")
+    queries = _copied("queries")
+    histories = _copied("histories")
+    timings = _copied("timings")
+    thresholds = _copied("thresholds")
+    outputs = _copied("outputs")
