@@ -1,8 +1,9 @@
-"""Results of the study `certified`: effectivities, the cost of a certificate, greedy against fixed training.
+"""Results of the studies `certified` and `training`: effectivities, cost of a certificate, greedy and fixed training.
 
-vibench run certified --no-figures && python results/certified.py runs/certified results/certified
+vibench run certified --no-figures && vibench run training --no-figures
+python results/certified.py runs/certified runs/training results/certified
 
-Everything comes from the results file.
+Everything comes from the results files.
 """
 
 from __future__ import annotations
@@ -19,19 +20,27 @@ from vibench.report.figures.style import Sheet, save, scatter, styled
 from vibench.results import tables
 from vibench.study.values import CERTIFIED, OWN
 
-BOUNDS = {"HSW": ("hsw_u", "hsw_lambda"), "(ii)": ("u_energy", "lambda_natural")} | {
-    "(ii) online": ("online_u_energy", "online_lambda_natural")
-}
+BOUNDS = {
+    "HSW": ("hsw_u", "hsw_lambda"), "(ii)": ("u_energy", "lambda_natural"), "(ii) V, W": ("u", "lambda"),
+    "(ii) online": ("online_u_energy", "online_lambda_natural"),
+}  # fmt: skip
 """Bounds of u and λ: those of Haasdonk, Salomon and Wohlmuth (2012) in V and W, the others in the energy norm and in
-the natural norm of the multiplier."""
+the natural norm of the multiplier unless named."""
+
+PAPER = {
+    "obstacle": ((1e-3, 1e-2), (1e-4, 1e-3), (1e-6, 1e-2)),
+    "hertz": ((1e-3, 1e-2), (1e-3, 1e-3), (1e-2, 1e-2)),
+}
+"""Tolerances (δ_POD, δ_mCPG) of Niakh et al. (2022), §5.1 and §5.2."""
 
 ERRORS = {
     "HSW": ("error_u_absolute", "error_lambda_absolute"),
     "(ii)": ("error_u_energy_absolute", "error_lambda_natural_absolute"),
+    "(ii) V, W": ("error_u_absolute", "error_lambda_absolute"),
     "(ii) online": ("error_u_energy_absolute", "error_lambda_natural_absolute"),
 }
 
-MODEL = ["problem", "training", "primal", "primal_tol", "pod_tol", "dual_tol"]
+MODEL = ["problem", "training", "dual", "primal", "primal_tol", "pod_tol", "dual_tol"]
 
 MEASURED = ["error_u_mean", "error_u_max", "error_lambda_mean", "error_lambda_max"]
 
@@ -70,29 +79,29 @@ def trainings(cells: pd.DataFrame) -> pd.DataFrame:
     columns = {
         "snapshots": "high-fidelity solutions", "N": "N", "R": "R", "error_u_mean": "error u",
         "error_u_max": "largest error u", "error_lambda_mean": "error λ", "error_lambda_max": "largest error λ",
-        "offline_s": "offline [s]",
+        "offline_s": "offline [s]", "query [ms]": "query [ms]",
     }  # fmt: skip
-    return cells.loc[cells["assembly"] == "reduced", [*MODEL, *columns]].rename(columns=columns)
+    return cells[[*MODEL, *columns]].rename(columns=columns)
 
 
 def equal_errors(cells: pd.DataFrame) -> pd.DataFrame:
-    """Every model of a fixed set beside the smallest greedy one whose four errors are at most its own.
+    """Every mCPG model of a fixed set beside the smallest greedy one whose four errors are at most its own.
 
     Where there is none, the greedy one is that with the smallest of the largest ratios, which is above one.
     """
-    models = cells[(cells["assembly"] == "reduced") & (cells["status"] == "ok")]
-    sizes, rows = ["snapshots", "N", "R", "offline_s"], []
-    for fixed in models[models["training"] == OWN].to_dict("records"):
+    models, rows = cells[cells["status"] == "ok"], []
+    compared = ["dual", "snapshots", "N", "R", "offline_s", "query [ms]"]
+    for fixed in models[(models["training"] == OWN) & (models["dual"] == "mcpg")].to_dict("records"):
         others = models[(models["problem"] == fixed["problem"]) & (models["primal"] == fixed["primal"])]
         others = others[others["training"] != OWN]
         ratios = others[MEASURED].div([fixed[name] for name in MEASURED]).max(axis=1).rename("largest ratio of errors")
         ranked = others.join(ratios).assign(size=others["N"] + others["R"], above=ratios.clip(lower=1.0))
-        chosen = ranked.sort_values(["above", "size"]).head(1).to_dict("records")
+        greedy = ranked.sort_values(["above", "size"]).iloc[0]
+        pair = fixed["pod_tol"], fixed["dual_tol"]
         row = {name: fixed[name] for name in ("problem", "primal", "pod_tol", "dual_tol")}
-        row |= {f"fixed {name}": fixed[name] for name in sizes}
-        rows += [
-            row | {f"greedy {name}": one[name] for name in sizes} | {ratios.name: one[ratios.name]} for one in chosen
-        ]
+        row |= {"paper": "yes" if pair in PAPER[fixed["problem"]] else "no"}
+        row |= {f"fixed {name}": fixed[name] for name in compared[1:]}
+        rows.append(row | {f"greedy {name}": greedy[name] for name in compared} | {ratios.name: greedy[ratios.name]})
     return pd.DataFrame(rows)
 
 
@@ -123,22 +132,32 @@ def table(frame: pd.DataFrame) -> str:
     return str(text.replace("nan", "").to_markdown(index=False, disable_numparse=True))
 
 
-def page(folder: Path, target: Path) -> None:
+def read(run: Path, name: str) -> pd.DataFrame:
+    """A table of a run."""
+    return tables.in_order(tables.read(tables.results_file(str(run)), name))
+
+
+def machines(cells: pd.DataFrame) -> str:
+    """Which machine measured a run, and how undisturbed."""
+    disturbed = int((cells["disturbed"] == 1).sum())
+    return f"{'; '.join(cells['machine'].dropna().unique())}; {disturbed} of {len(cells)} cells disturbed"
+
+
+def page(certified: Path, training: Path, target: Path) -> None:
     """Write the page and its figure."""
-    path = tables.results_file(str(folder))
-    cells, queries = (tables.in_order(tables.read(path, name)) for name in ("cells", "queries"))
+    cells, queries, trained = read(certified, "cells"), read(certified, "queries"), read(training, "cells")
+    trained["query [ms]"] = 1e3 * trained["online_s"]
     target.mkdir(parents=True, exist_ok=True)
     with styled():
         save(figure(cells, queries), target, "bounds", ("png",))
     use_palette(target / "bounds.png")
-    failed = cells[cells["status"] != "ok"]
+    failed = pd.concat(frame[frame["status"] != "ok"] for frame in (cells, trained))
     lines = [
         "# certified",
         "",
-        "Generated by `vibench run certified --no-figures && python results/certified.py runs/certified "
-        f"results/certified` on one machine: {'; '.join(cells['machine'].dropna().unique())}. Seconds are CPU seconds "
-        f"on one thread; {int((cells['disturbed'] == 1).sum())} of {len(cells)} cells were timed on a disturbed "
-        "machine.",
+        "Generated by `vibench run certified --no-figures && vibench run training --no-figures && python "
+        "results/certified.py runs/certified runs/training results/certified`. Seconds are CPU seconds on one thread. "
+        f"Machine of the study `certified`: {machines(cells)}; of `training`: {machines(trained)}.",
         "",
         "## Effectivities",
         "",
@@ -154,18 +173,19 @@ def page(folder: Path, target: Path) -> None:
         "",
         "## Greedy against fixed training",
         "",
-        "Relative errors over the validation set, reduced assembly.",
+        "The study `training`: relative errors over the validation set, reduced assembly.",
         "",
-        table(trainings(cells)),
+        table(trainings(trained)),
         "",
-        "At equal error: every model of a fixed set beside the smallest greedy one whose four errors are at most its "
-        "own, or, with a ratio above one, the one that comes closest.",
+        "At equal error: every mCPG model of a fixed set beside the smallest greedy model, of either cone, whose four "
+        "errors are at most its own, or, with a ratio above one, the one that comes closest. The column `paper` says "
+        "whether Niakh et al. (2022) use these tolerances for the problem.",
         "",
-        table(equal_errors(cells)),
+        table(equal_errors(trained)),
         *(f"\n- {row.cell}: {row.status}, {row.reason}" for row in failed.itertuples()),
     ]
     (target / "README.md").write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
 if __name__ == "__main__":
-    page(Path(sys.argv[1]), Path(sys.argv[2]))
+    page(*map(Path, sys.argv[1:4]))
