@@ -150,7 +150,7 @@ def plugin_options(context: typer.Context, incomplete: str) -> list[str]:
     kind, colon, name = (context.params.get("plugin") or "".join(context.args[:1])).rpartition(":")
     groups = [KINDS[kind]] if kind in KINDS else [] if colon else KINDS.values()
     entries = (entry for group in groups for entry in entry_points(group=f"vibench.{group}") if entry.name == name)
-    found = {option for entry in entries for option in overview.options(overview.plugin_class(entry))}
+    found = {option for entry in entries for option in overview.options(entry)}
     return _beginning(incomplete, (f"{option}=" for option in found))
 
 

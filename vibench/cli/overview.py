@@ -40,7 +40,7 @@ def rows(kind: str) -> Iterator[Row]:
         else:
             found = plugin_class(entry)
             text = ast.get_docstring(found) or "" if found is not None else ""
-            yield name, origin, text.split("\n")[0], ", ".join(options(found))
+            yield name, origin, text.split("\n")[0], ", ".join(options(entry))
 
 
 def _origin(entry: EntryPoint) -> str:
@@ -49,18 +49,44 @@ def _origin(entry: EntryPoint) -> str:
 
 def plugin_class(entry: EntryPoint) -> ast.ClassDef | None:
     """The class that an entry point names, if its module defines it."""
-    tree = _parsed(_source(entry.module))
-    classes = (node for node in tree.body if isinstance(node, ast.ClassDef))
-    return next((node for node in classes if node.name == entry.attr), None)
+    return _class(_parsed(_source(entry.module)), entry.attr)
 
 
-def options(found: ast.ClassDef | None) -> Sequence[str]:
+def options(entry: EntryPoint) -> Sequence[str]:
     """Names of the options of a plugin, the arguments of its constructor."""
-    methods = (node for node in found.body if isinstance(node, ast.FunctionDef)) if found is not None else ()
-    constructor = next((node for node in methods if node.name == "__init__"), None)
+    constructor = _constructor(entry.module, entry.attr)
     if constructor is None:
         return []
     return [argument.arg for argument in (*constructor.args.args[1:], *constructor.args.kwonlyargs)]
+
+
+def _constructor(module: str, name: str, below: tuple[tuple[str, str], ...] = ()) -> ast.FunctionDef | None:
+    """The constructor of a class or the one it inherits; `below` are the classes that inherit it.
+
+    Only modules of the package of the first class are read: to find others, packages that hold them are imported.
+    """
+    if (module, name) in below or (below and module.split(".", maxsplit=1)[0] != below[0][0].split(".")[0]):
+        return None
+    tree, below = _parsed(_source(module)), (*below, (module, name))
+    found = _class(tree, name)
+    if found is None:
+        imports = (node for node in tree.body if isinstance(node, ast.ImportFrom) and node.module and not node.level)
+        origins = [(str(node.module), part.name) for node in imports for part in node.names if name == _local(part)]
+    else:
+        methods = (node for node in found.body if isinstance(node, ast.FunctionDef))
+        if own := next((node for node in methods if node.name == "__init__"), None):
+            return own
+        origins = [(module, base.id) for base in found.bases if isinstance(base, ast.Name)]
+    return next(filter(None, (_constructor(*origin, below) for origin in origins)), None)
+
+
+def _local(imported: ast.alias) -> str:
+    return imported.asname or imported.name
+
+
+def _class(tree: ast.Module, name: str) -> ast.ClassDef | None:
+    classes = (node for node in tree.body if isinstance(node, ast.ClassDef))
+    return next((node for node in classes if node.name == name), None)
 
 
 def _comment(entry: EntryPoint) -> str:

@@ -141,7 +141,7 @@ def test_words_that_bash_breaks_are_completed_after_the_break(
     assert (done.stdout.split()[: len(completed)], done.stderr) == (completed, "")
 
 
-@pytest.mark.parametrize("kind", ["problems", "primal", "dual"])
+@pytest.mark.parametrize("kind", ["problems", "primal", "dual", "sampling"])
 def test_the_overview_reads_the_options_that_the_registry_knows(kind: str) -> None:
     """Without importing any plugin."""
     for name, _, what, options in overview.rows(kind):
