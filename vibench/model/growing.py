@@ -57,10 +57,11 @@ class GrowingModel:
         self.generators = np.zeros((problem.W.dim, 0))
         self._factor: SparseCholesky | None = None
 
-    def add(self, vi: VariationalInequality, found: HighFidelitySolution) -> None:
-        """Add the solution of `vi`."""
+    def add(self, vi: VariationalInequality, found: HighFidelitySolution) -> str:
+        """Add the solution of `vi`; returns what was less accurate than usual, "" if nothing."""
         V, W = self._problem.V, self._problem.W
-        new, rest = [found.u[:, None]], found.lam - part_in_cone(found.lam, self.generators, W)[0]
+        part, note = part_in_cone(found.lam, self.generators, W)
+        new, rest = [found.u[:, None]], found.lam - part
         norm = float(W.norm(rest))
         if norm > IN_CONE * float(W.norm(found.lam)):
             new.append(supremizers(V, vi.B, rest[:, None]))
@@ -69,6 +70,7 @@ class GrowingModel:
             more = orthonormal_range(V.whiten(column), self._whitened)
             self._whitened = np.hstack([self._whitened, more])
             self._basis = np.hstack([self._basis, V.unwhiten(more)])
+        return note
 
     def solution(self, vi: VariationalInequality) -> tuple[Array, Array] | None:
         """The reduced solution u_N (n,) and λ_N ≥ 0 (m,) of `vi`; `None` if its program cannot be solved."""
@@ -113,13 +115,17 @@ class GrowingModel:
 
 @dataclass(frozen=True)
 class Solved:
-    """One solution of an adaptive training, the bound that led to it, and the number of bounds evaluated before it."""
+    """One solution of an adaptive training, the bound that led to it, and the number of bounds evaluated before it.
+
+    `fallback` says what was used besides the active set method, and what was less accurate in the growth of the model.
+    """
 
     mu: Array
     solution: HighFidelitySolution
     seconds: Seconds
     bound: float
     evaluated: int
+    fallback: str
 
 
 class GrowingTrainer(Trainer):
@@ -156,8 +162,10 @@ class GrowingTrainer(Trainer):
         self._solver.check_coercive(mu, vi)  # verification, which is not timed
         self._reference.refuse_false_constants(mu, vi)
         self._solver.remember(mu, solution)
-        self.solved.append(Solved(mu, solution, seconds, bound, self._evaluated))
-        self.selecting += timed(lambda: self._model.add(vi, solution))[1]
+        note, growing = timed(lambda: self._model.add(vi, solution))
+        fallback = "; ".join(filter(None, (solution.fallback, note)))
+        self.solved.append(Solved(mu, solution, seconds, bound, self._evaluated, fallback))
+        self.selecting += growing
 
     def bound(self, mu: Array) -> float:
         """That of the model of all solutions."""

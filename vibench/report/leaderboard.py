@@ -9,7 +9,8 @@ from typing import Any
 
 import pandas as pd
 
-from vibench.results.best import digits_of, excluded, largest_error
+from vibench.results.best import digits_of, excluded
+from vibench.results.error_measures import errors_of_solution
 
 
 class Criterion(StrEnum):
@@ -108,7 +109,7 @@ def leaderboard(cells: pd.DataFrame) -> tuple[Standings, ...]:
 
 def _standings(problem: str, options: str, cells: pd.DataFrame) -> Standings:
     without = excluded(cells)
-    known = cells.assign(**{COLUMNS[Criterion.ERROR]: largest_error(cells)})[~without.any(axis=1)]
+    known = cells.assign(**{COLUMNS[Criterion.ERROR]: errors_of_solution(cells)})[~without.any(axis=1)]
     counts = {str(reason): int(count) for reason, count in without.sum().items()}
     return Standings(problem, options, tuple(_distinct(_bands(known))), len(cells), **counts)
 

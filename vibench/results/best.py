@@ -9,7 +9,7 @@ import pandas as pd
 
 from vibench.qp.status import Status
 from vibench.results.columns import CELLS, REAL, Column
-from vibench.results.error_measures import OF_SOLUTION, SOLUTION
+from vibench.results.error_measures import errors_of_solution
 from vibench.stability.infsup import VANISHES
 
 LARGEST_BAND = 0.1
@@ -18,7 +18,7 @@ LARGEST_BAND = 0.1
 SOLVER_SHARE = 0.1
 """Cells whose QP solver makes a larger share of an error are not compared: the solver, not the strategy, decides."""
 
-NOBODY = (
+NO_BEST_CELL = (
     "no cell takes part in the comparison: one that does has every query ok, β over the span above zero at every "
     f"parameter, mean errors of at most {100.0 * LARGEST_BAND:g} %, and less than {100.0 * SOLVER_SHARE:g} % of an "
     "error made by the QP solver"
@@ -52,7 +52,7 @@ def excluded(cells: pd.DataFrame, errors: pd.Series | None = None) -> pd.DataFra
         "incomplete": cells["status"] != Status.OK,
         "unstable": cells["beta_span_min"].astype(float) < VANISHES,
         "loose": solved_too_loosely(cells),
-        "inexact": ~((largest_error(cells) if errors is None else errors) <= LARGEST_BAND),
+        "inexact": ~((errors_of_solution(cells) if errors is None else errors) <= LARGEST_BAND),
     }
     found = pd.DataFrame(reasons, index=cells.index).astype(bool)
     earlier = found.astype(int).cumsum(axis=1).shift(1, axis=1, fill_value=0) > 0
@@ -69,21 +69,16 @@ def solved_too_loosely(cells: pd.DataFrame) -> pd.Series:
     return cells["solver_share_mean"].astype(float) >= SOLVER_SHARE
 
 
-def largest_error(cells: pd.DataFrame) -> pd.Series:
-    """The larger of the mean relative errors of u and λ; the other one where one is missing."""
-    return cells[list(OF_SOLUTION[SOLUTION])].astype(float).max(axis=1, skipna=True)
-
-
 def fastest(cells: pd.DataFrame, errors: pd.Series | None = None) -> pd.DataFrame:
     """For every problem and power of ten, the timed cell with the fastest query whose mean errors do not exceed it.
 
     Cells that are not `eligible` take no part, as in the leaderboard of a report. A band whose cell is that of the next
     smaller one is left out. `errors` are those of the cells by another measure, in their rows or in more.
     """
-    measured = largest_error(cells) if errors is None else errors.reindex(cells.index)
+    measured = errors_of_solution(cells) if errors is None else errors.reindex(cells.index)
     fine = ~excluded(cells, measured).any(axis=1) & cells["online_s"].notna()
-    known = cells.assign(error=measured)[fine]
-    rows = [row for _, mine in known.groupby(["problem", "problem_options"], dropna=False) for row in _bands(mine)]
+    groups = cells[fine].groupby(["problem", "problem_options"], dropna=False)
+    rows = [row for _, mine in groups for row in _bands(mine, measured[mine.index])]
     columns = ["problem", BAND, *cells.columns.drop("problem")]
     return pd.DataFrame(rows, columns=columns).astype({**cells.dtypes, BAND: float}).reset_index(drop=True)
 
@@ -94,10 +89,10 @@ def digits_of(errors: pd.Series) -> pd.Series:
     return np.ceil(exponents - 1e-12)  # by round-off the logarithm of 1e-3 may be above -3
 
 
-def _bands(cells: pd.DataFrame) -> Iterator[pd.Series]:
+def _bands(cells: pd.DataFrame, errors: pd.Series) -> Iterator[pd.Series]:
     """The fastest cells of one problem, from the largest error to the smallest."""
-    digits = digits_of(cells["error"])
+    digits = digits_of(errors)
     found = [(band, cells.loc[cells.loc[digits <= band, "online_s"].idxmin()]) for band in sorted(set(digits))[::-1]]
     for k, (band, cell) in enumerate(found):
         if k + 1 == len(found) or found[k + 1][1]["cell"] != cell["cell"]:
-            yield pd.concat([cell.drop("error"), pd.Series({BAND: 10.0**band})])
+            yield pd.concat([cell, pd.Series({BAND: 10.0**band})])

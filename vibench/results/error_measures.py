@@ -46,9 +46,14 @@ def errors_of(cells: pd.DataFrame, outputs: pd.DataFrame, measure: str = SOLUTIO
     if measure not in known:
         raise unknown_name("error measure", measure, known)
     if measure in OF_SOLUTION:
-        return cells[list(OF_SOLUTION[measure])].astype(float).max(axis=1, skipna=True)
+        return errors_of_solution(cells, measure)
     of_output = outputs[outputs["output"] == measure.removeprefix(OUTPUT)]
     return cells["cell"].map(of_output.set_index("cell")["error_mean"]).astype(float)
+
+
+def errors_of_solution(cells: pd.DataFrame, measure: str = SOLUTION) -> pd.Series:
+    """Mean relative errors of u, of λ, or the larger one of these; the other one where one is missing."""
+    return cells[list(OF_SOLUTION[measure])].astype(float).max(axis=1, skipna=True)
 
 
 def with_errors(thresholds: pd.DataFrame, cells: pd.DataFrame, errors: pd.Series) -> pd.DataFrame:

@@ -57,7 +57,7 @@ class View:
 
 VIEWS: Mapping[str, View] = {
     "summary": View("cells", (*OF_CELLS, *(name for name in CELLS if CELLS[name].heading)), CELLS),
-    "best": View("cells", ("problem", best.BAND, *OF_CELLS), best.HEADINGS, best.fastest, best.NOBODY),
+    "best": View("cells", ("problem", best.BAND, *OF_CELLS), best.HEADINGS, best.fastest, best.NO_BEST_CELL),
     "benefits": View("thresholds", (*OF_BENEFITS, *(n for n in THRESHOLDS if THRESHOLDS[n].heading)), THRESHOLDS),
     "cells": View("cells", (*OF_CELLS, "reason")),
     "queries": View(

@@ -187,7 +187,7 @@ class AdaptiveTraining(Stage):
             raise NumericalError(f"the sampling strategy '{self.sampling.name}' has solved at no parameter")
         seconds, mus = tuple(one.seconds for one in solved), np.array([one.mu for one in solved])
         u, lam = (np.column_stack([getattr(one.solution, name) for one in solved]) for name in ("u", "lam"))
-        fallbacks, setups = tuple(one.solution.fallback for one in solved), (trainer.setup,)
+        fallbacks, setups = tuple(one.fallback for one in solved), (trainer.setup,)
         found = Snapshots(mus, u, lam, seconds, setups, fallbacks, reference.fingerprint, trainer.selecting)
         histories = (
             History.of("selection", "bound", [one.bound for one in solved]),

@@ -19,6 +19,7 @@ from vibench import DerivedColumn, FigurePlugin, RunTables
 from vibench.report.comparison.compare import compare
 from vibench.report.page.embedded import grid_of_cells
 from vibench.results import tables
+from vibench.results.best import fastest
 from vibench.results.database import ResultsDatabase
 from vibench.results.sqlite.reading import FILE
 
@@ -252,3 +253,33 @@ def test_runs_are_compared_by_them_in_the_direction_that_is_better(
     verdicts = {d.cell["cell"]: d.verdict.value for p in found.pairs for d in p.differences if d.what == "speedup"}
     assert verdicts == {"b": "worse", "c": "better", "a": "undecided"}
     assert list(found.values("unknowns").iloc[:, -1]) == [8, 2, 5]
+
+
+def test_a_column_that_fails_for_one_of_two_runs_is_no_difference(
+    register: Register, path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    later = ResultsDatabase(tmp_path / "later", {"name": "sample", "seed": 1, "validation": 2})
+    for cell in "bca":
+        later.write_cell(cell_row(cell, problem=cell, machine="m", disturbed=0), query_rows(cell))
+    later.close()
+    counts = [iter([1.0]) for _ in range(3)]
+    given = staticmethod(lambda: column(values=lambda found: list(map(next, counts)), better="smaller"))
+    monkeypatch.setattr(One, "made", given)
+    register((GROUP, "one", f"{HERE}:One"))
+    found = compare([path, tmp_path / "later" / FILE], 1.25)
+    assert [d for p in found.pairs for d in p.differences if d.what == "mine"] == []
+    assert found.notes[-1] == "column 'mine' of figure plugin 'one' has 0 values for the 3 rows of 'cells'"
+
+
+def test_a_column_may_be_called_error(
+    register: Register, path: Path, main: Main, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Which is no column of vibench: the table of the best cells keeps it, by problem."""
+    given = staticmethod(lambda: column(name="error", kind=int, unit="", values=lambda found: [3, 4, 5]))
+    monkeypatch.setattr(One, "made", given)
+    register((GROUP, "one", f"{HERE}:One"))
+    found = tables.extended(path, "cells").frame.assign(
+        error_u_mean=1e-3, error_lambda_mean=[1e-3, 2e-3, 0.01], beta_span_min=0.5, solver_share_mean=0.0
+    )
+    assert list(fastest(found)["error"]) == [5, 3, 4]
+    assert main("show", str(path), "--table", "best")[0] == 0

@@ -12,7 +12,7 @@ from running import Main
 from samples import cell_row
 
 from vibench.cli.main import app
-from vibench.results.best import NOBODY
+from vibench.results.best import NO_BEST_CELL
 from vibench.results.database import ResultsDatabase
 from vibench.results.sqlite.reading import FILE
 from vibench.terminal.output import run_argument
@@ -61,10 +61,10 @@ def test_a_run_of_which_no_cell_is_the_best_says_why(
         made.write_cell(one, [])
     made.close()
     print_summary("sample", tmp_path / "run" / FILE, rows)
-    assert NOBODY in capsys.readouterr().out.splitlines()
+    assert NO_BEST_CELL in capsys.readouterr().out.splitlines()
     code, out, _ = main("show", str(tmp_path / "run"), "--table", "best")
     assert code == 0
-    assert out.splitlines() == ["run: best: no rows", NOBODY]
+    assert out.splitlines() == ["run: best: no rows", NO_BEST_CELL]
     _, out, _ = main("show", str(tmp_path / "run"), "--where", "problem = 'none'")
     assert out.splitlines() == ["run: summary: no rows"]
 

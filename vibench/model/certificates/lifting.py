@@ -18,6 +18,7 @@ the inequality of Cauchy and Schwarz, suffices.
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
@@ -296,5 +297,7 @@ def _complementary(factor: Array, excess: Array, lam: Array) -> Array:
         nu[rows] = 0.0
     else:  # it cycles, which it may where S is no M-matrix: the same minimiser, at more cost
         L = np.tril(factor)
-        nu = nnls(L.T, L.T @ lam + solve_triangular(L, excess, lower=True, check_finite=False))[0]
+        target = L.T @ lam + solve_triangular(L, excess, lower=True, check_finite=False)
+        with suppress(RuntimeError):  # no convergence either: whether the w of the last ν is feasible is verified
+            nu = nnls(L.T, target, maxiter=30 * len(lam))[0]
     return np.maximum(nu, 0.0)

@@ -190,10 +190,12 @@ def compare(paths: Sequence[Path], limit: float) -> Comparison:
         differences += [Difference(cell, "cell", "present", "gone", Verdict.WORSE) for cell in gone]
         differences += [Difference(cell, "cell", "", "new", Verdict.CHANGED) for cell in new]
         means = _on_common_queries(first, run, shared)
+        # a column that fails for one of the runs is no difference between their cells
+        judged = {name: better for name, better in first.extended.better.items() if name in run.extended.columns}
         for key in shared:
             one, two = first.cells[key] | means[0].get(key, {}), run.cells[key] | means[1].get(key, {})
             differences += of_numbers(one, two, limit)
-            differences += of_plugins(one, two, first.extended.better, limit)
+            differences += of_plugins(one, two, judged, limit)
         notes.append(f"{of_run}{len(shared)} cells are in both runs")
         if means[0]:
             notes.append(f"{of_run}errors of {len(means[0])} of them are compared on the queries that are ok in both")

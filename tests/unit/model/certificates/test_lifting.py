@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from numerics import exact, spd
 
 from vibench.interfaces.problem import Contact, VariationalInequality
+from vibench.model.certificates import lifting
 from vibench.model.certificates.lifting import BlockDiagonal, ContactCompliance, Lifting, lift
 
 K, M = 7, 6
@@ -132,3 +133,20 @@ def test_multipliers_of_rows_with_much_slack_take_part() -> None:
     load = np.zeros(K)
     load[found.unknowns] = found.load
     assert load == pytest.approx(B.T @ np.array([load[0] / B[0, 0], -0.01]), abs=1e-12)
+
+
+def test_where_no_method_ends_the_feasibility_of_the_last_lifting_decides(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Neither the active sets nor the least squares that replace them."""
+
+    def unfinished(*given: object, **options: object) -> None:
+        raise RuntimeError("Maximum number of iterations reached.")
+
+    monkeypatch.setattr(lifting, "STEPS", 0)
+    monkeypatch.setattr(lifting, "nnls", unfinished)
+    rng = np.random.default_rng(3)
+    B = rng.standard_normal((M, K))
+    u = rng.standard_normal(K)
+    contact = Contact(sp.csr_array(B), B @ u - rng.uniform(-1.0, 0.5, M))
+    given = np.linalg.inv(spd(K, rng, 100.0)), contact, u, np.zeros(M), 1.0
+    found = lifted(given)
+    assert found is None or np.all(B @ values(given[0], found) >= B @ u - contact.g)
