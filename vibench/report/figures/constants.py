@@ -48,6 +48,11 @@ class _Panel(NamedTuple):
     title: str
     strategies: list[tuple[Series, str, pd.DataFrame]]
     reference: pd.DataFrame
+    order: pd.Series
+
+    def along(self, rows: pd.DataFrame) -> pd.DataFrame:
+        """The rows of a strategy in the order of the abscissae."""
+        return rows.set_index("query").reindex(self.order)
 
 
 def inf_sup(data: Data) -> CaptionedFigure:
@@ -64,9 +69,11 @@ def inf_sup(data: Data) -> CaptionedFigure:
     looks = Looks(one for panel in panels for one, _, _ in panel.strategies)
     zeros: list[list[str]] = []
     for panel, span, cone in zip(panels, over, below, strict=True):
-        x = _abscissae(panel, axis)
-        _draw((span, cone), x, panel.reference, "beta_hf_", HIGH_FIDELITY_LOOK, "high-fidelity")
-        drawn = {name: _draw((span, cone), x, rows, "beta_", looks[one], name) for one, name, rows in panel.strategies}
+        reference, both = panel.along(panel.reference), (span, cone)
+        x = reference["mu_1"].to_numpy(float) if axis else np.arange(1, len(reference) + 1)  # or places in the order
+        _draw(both, x, reference, "beta_hf_", HIGH_FIDELITY_LOOK, "high-fidelity")
+        named = [(name, panel.along(rows), looks[one]) for one, name, rows in panel.strategies]
+        drawn = {name: _draw(both, x, rows, "beta_", look, name) for name, rows, look in named}
         zeros.append([name for name, zero in drawn.items() if zero])
         span.set_title(panel.title)
         for axes, generated in ((span, "span"), (cone, "cone")):
@@ -107,21 +114,14 @@ def _panels(data: Data, shown: pd.DataFrame) -> list[_Panel]:
         first = sorting[sorting["cell"] == sorting["cell"].iloc[0]]
         order = first.sort_values("mu_1" if data.parameter else "beta_span", kind="stable")["query"]
         strategies = [
-            (series(one["primal"].iloc[0], one["primal_tol"].iloc[0]), name, one.set_index("query").reindex(order))
-            for name, one in by_strategy(rows)
+            (series(one["primal"].iloc[0], one["primal_tol"].iloc[0]), name, one) for name, one in by_strategy(rows)
         ]
         reference = strategies[0][2]
         groups = parts(strategies, SERIES - 1)
         for k, group in enumerate(groups, 1):
             more = f", strategies {k} of {len(groups)}" if len(groups) > 1 else ""
-            found.append(_Panel(f"{dimensions(of_pair)}{more}", group, reference))
+            found.append(_Panel(f"{dimensions(of_pair)}{more}", group, reference, order))
     return found
-
-
-def _abscissae(panel: _Panel, axis: str) -> Any:
-    """The only parameter, or the places of the parameters in their order."""
-    known = panel.reference
-    return known["mu_1"].to_numpy(float) if axis else np.arange(1, len(known) + 1)
 
 
 def _draw(axes: tuple[Axes, Axes], x: Any, rows: pd.DataFrame, prefix: str, look: Look, name: str) -> bool:
