@@ -1,9 +1,10 @@
 """Certificates at online cost: violations at random parameters, effectivities, and seconds beside those of a query.
 
-Usage: python tests/benchmarks/certified.py RUN [COUNT]
+Usage: python tests/benchmarks/certified.py RUN [COUNT [PROBLEM]]
 
-For every certified cell of a run: bounds at COUNT random parameters (10000 by default) that the model has not seen,
-compared with high-fidelity solutions, which the models of a problem share.
+For every certified cell of a run, or of one problem of it: bounds at COUNT random parameters (10000 by default) that
+the model has not seen, compared with high-fidelity solutions, which the models of a problem share. Every tenth query is
+timed.
 
 Usage: python tests/benchmarks/certified.py --meshes [COUNT]
 
@@ -45,6 +46,9 @@ SEED = 2027
 REPORTED = 1000
 """Parameters between two reports."""
 
+TIMED = 10
+"""Parameters between two that are timed: what a query does is done again for that."""
+
 
 @dataclass
 class Tally:
@@ -54,15 +58,16 @@ class Tally:
     ----------
     row, model, certificate
         Of the cell.
-    violations, without
-        Parameters with an error above its bound, and without a bound.
+    parameters, violations, without
+        All parameters, those with an error above its bound, and those without a bound.
     effectivities, seconds
-        Of u and λ, and of the query and its certificate, by parameter.
+        Of u and λ by parameter, and of the query and its certificate by timed parameter.
     """
 
     row: Mapping[str, Any]
     model: Model
     certificate: OnlineCertificate
+    parameters: int = 0
     violations: int = 0
     without: int = 0
     effectivities: list[tuple[float, float]] = field(default_factory=list)
@@ -70,20 +75,13 @@ class Tally:
 
     def query(self, kept: Assemblies, mu: Array, exact: HighFidelitySolution) -> None:
         """Compare the bounds at mu (d,) with the errors."""
-        start = time.process_time_ns()
-        reduced = self.model.reduced.assemble(mu)
-        middle = time.process_time_ns()
-        solution = self.model.solve(mu)
-        if solution.bound is None or solution.x is None or solution.alpha is None:
+        solution, self.parameters = self.model.solve(mu), self.parameters + 1
+        bound = solution.bound
+        if bound is None or bound.guarantee is Guarantee.NONE or solution.x is None or solution.alpha is None:
             self.without += 1
             return
-        solved = 1e-9 * (middle - start) + solution.solution.cpu
-        start = time.process_time_ns()
-        bound = self.certificate.evaluate(self.model.problem, mu, reduced, solution.x, solution.alpha)
-        self.seconds.append((solved, 1e-9 * (time.process_time_ns() - start)))
-        if bound.guarantee is Guarantee.NONE:
-            self.without += 1
-            return
+        if self.parameters % TIMED == 1:
+            self.time(mu, solution.x, solution.alpha, solution.solution.cpu)
         vi, energy = kept.at(mu), kept.energy_at(mu)
         errors = energy.norm(exact.u - solution.u), energy.dual_norm(vi.B.T @ (exact.lam - solution.lam))
         sizes = energy.norm(exact.u), energy.dual_norm(vi.B.T @ exact.lam)
@@ -92,6 +90,15 @@ class Tally:
         self.violations += any(not error <= limit + VIOLATION * size for error, limit, size in pairs)
         self.effectivities.append((bounds[0] / errors[0], bounds[1] / errors[1]))
 
+    def time(self, mu: Array, x: Array, alpha: Array, solved: float) -> None:
+        """Seconds of the assembly and the solution, of which `solved` are known, and of the certificate, at mu (d,)."""
+        start = time.process_time_ns()
+        reduced = self.model.reduced.assemble(mu)
+        middle = time.process_time_ns()
+        self.certificate.evaluate(self.model.problem, mu, reduced, x, alpha)
+        end = time.process_time_ns()
+        self.seconds.append((1e-9 * (middle - start) + solved, 1e-9 * (end - middle)))
+
     def __str__(self) -> str:
         """One line."""
         (of_u, of_lam), (query, certify) = np.median(self.effectivities, axis=0), 1e3 * np.median(self.seconds, axis=0)
@@ -99,14 +106,14 @@ class Tally:
         training, primal, size = (self.row[name] for name in ("training", "primal", "snapshots"))
         return (
             f"{self.row['problem']}, {size} solutions ({training}), {primal}, {self.row['cell']}, "
-            f"{self.certificate.base.guarantee.value}: {len(self.seconds) + self.without} parameters, "
+            f"{self.certificate.base.guarantee.value}: {self.parameters} parameters, "
             f"{self.violations} violations, {self.without} without a bound; effectivity of u {of_u:.2f} (least "
             f"{least[0]:.4f}), of λ {of_lam:.2f} (least {least[1]:.4f}); query {query:.2f} ms, certificate "
             f"{certify:.2f} ms"
         )
 
 
-def main(run: str, count: int) -> int:
+def main(run: str, count: int, only: str = "") -> int:
     """Print one line per certified cell, every thousand parameters; the number of cells with a violation.
 
     Models of one problem are compared with the same high-fidelity solutions.
@@ -114,6 +121,8 @@ def main(run: str, count: int) -> int:
     models: dict[Plugin, list[Tally]] = {}
     opened = vibench.open_run(run)
     for recorded in recorded_cells(run):
+        if only not in ("", recorded.row["problem"]):
+            continue
         if (certificate := recorded.certificate) is not None:
             tally = Tally(recorded.row, opened.model(recorded.row["cell"]), certificate)
             models.setdefault(recorded.cell.problem, []).append(tally)
@@ -239,4 +248,4 @@ def meshes(count: int) -> int:
 if __name__ == "__main__":
     if sys.argv[1] == "--meshes":
         sys.exit(meshes(int(sys.argv[2]) if len(sys.argv) > 2 else 200))
-    sys.exit(main(sys.argv[1], int(sys.argv[2]) if len(sys.argv) > 2 else 10_000))
+    sys.exit(main(sys.argv[1], int(sys.argv[2]) if len(sys.argv) > 2 else 10_000, *sys.argv[3:]))
