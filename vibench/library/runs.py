@@ -105,9 +105,7 @@ class Run:
         RequestError
             If there is no such measure, or the largest error is not positive.
         """
-        cells, outputs = tables.read(self.path, "cells"), tables.read(self.path, "outputs")
-        errors = error_measures.errors_of(cells, outputs, error)
-        found = error_measures.with_errors(self.thresholds, cells, errors)
+        found = error_measures.with_errors(self.thresholds, *tables.measured(self.path, error))
         return found if within is None else error_measures.within(found, within).reset_index(drop=True)
 
     @property

@@ -16,7 +16,7 @@ import pandas as pd
 from vibench.errors import RequestError
 from vibench.files import write_atomically
 from vibench.qp.status import Status
-from vibench.results import plugin_columns
+from vibench.results import error_measures, plugin_columns
 from vibench.results.columns import CELLS, INTEGER, KEYS, STORED, TABLES, THRESHOLDS, VERSION, Column, shown_columns
 from vibench.results.plugin_columns import Extended
 from vibench.results.sqlite.reading import FILE, read_meta, read_rows
@@ -77,6 +77,18 @@ def extended(path: Path, table: str) -> Extended:
 SUMMARY = "summary.md"
 EXPORTED = (*(f"{table}.csv" for table in TABLES), SUMMARY)
 """Names of the files that `export` writes."""
+
+
+def measured(path: Path, measure: str = error_measures.SOLUTION) -> tuple[pd.DataFrame, pd.Series]:
+    """The recorded cells of a results file, and the error of each by a measure.
+
+    Raises
+    ------
+    RequestError
+        If there is no such measure, or the file cannot be read.
+    """
+    cells = read(path, "cells")
+    return cells, error_measures.errors_of(cells, read(path, "outputs"), measure)
 
 
 def export(path: Path, folder: Path, note: Callable[[str], None] = lambda _: None) -> list[Path]:

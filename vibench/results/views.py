@@ -198,8 +198,7 @@ def _measured(path: Path, name: str, error: str, limited: bool) -> tuple[View, E
         raise RequestError(f"the table {name} compares no models by an error; expected {', '.join(COMPARING)}")
     if limited and name == "best":
         raise RequestError("--within is for tables of break-even points; the table best has all levels of error")
-    cells, outputs = tables.read(path, "cells"), tables.read(path, "outputs")
-    errors = error_measures.errors_of(cells, outputs, error or error_measures.SOLUTION)
+    cells, errors = tables.measured(path, error or error_measures.SOLUTION)
     if name == "best":
         return replace(view, rows=partial(best.fastest, errors=errors)), extended
     frame = error_measures.with_errors(extended.frame, cells, errors)

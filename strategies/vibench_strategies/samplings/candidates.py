@@ -20,7 +20,7 @@ def nested_candidates(box: ParameterBox, count: int, seed: int) -> tuple[Array, 
     grids; and with the order in which all but the middle are taken, from its end: of each part at random, grids first.
     """
     grids = [box.grid(*[n] * box.dim) for n in LEVELS if n**box.dim <= count // 2]
-    parts = [(box.lower + box.upper)[None] / 2.0, *grids, Sobol(count, seed).parameters(box)]
+    parts = [(box.lower + (box.upper - box.lower) / 2.0)[None], *grids, Sobol(count, seed).parameters(box)]
     mus = np.vstack(parts)
     kept = np.sort(np.unique(mus, axis=0, return_index=True)[1])[:count]
     ends = [int(np.count_nonzero(kept < end)) for end in np.cumsum([len(part) for part in parts])]

@@ -55,7 +55,7 @@ class Data:
     """Whether pages have half as many panels as those of files."""
 
     def on_page(self, panels: list[Panel], most: int) -> list[Panel]:
-        """The panels of the page, of which each has at most `most`."""
+        """The panels of the page; each page has at most `most`, or half of them where it is `halved`."""
         most = most // 2 if self.halved else most
         return panels if self.page is None else panels[self.page[0] * most : (self.page[0] + 1) * most]
 
