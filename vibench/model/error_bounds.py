@@ -133,23 +133,18 @@ def certificate(
     lifted = lifting(vi, energy, u, lam)
     if lifted is None:
         return Certificate(None, NO_LIFTING)
-    return Certificate(bounds_with(lifted.w, vi, energy, alpha, beta, u, lam), "" if alpha.proved else ESTIMATED)
-
-
-def bounds_with(
-    w: Array, vi: VariationalInequality, energy: Energy, alpha: Constant, beta: Constant, u: Array, lam: Array
-) -> Bounds:
-    """Bounds (ii) with a lifting w (n,), B w ≥ B u − g, for λ ≥ 0."""
-    of_u = _terms(w, vi, energy, u, lam)
+    w = lifted.w
+    of_u = terms(w, vi, energy, u, lam)
     of_lam = min((of_u, *_projected(of_u.residual, w, vi, energy, u, lam)), key=lambda terms: terms.rho)
     in_V = of_u.primal / float(np.sqrt(alpha.value))
     in_W = of_lam.dual / beta.value if beta.value > 0.0 else float("inf")
-    return Bounds(of_u.primal, in_V, of_lam.dual, in_W, of_u.rho, of_lam.rho, of_u.omega, of_u.kappa)
+    bounds = Bounds(of_u.primal, in_V, of_lam.dual, in_W, of_u.rho, of_lam.rho, of_u.omega, of_u.kappa)
+    return Certificate(bounds, "" if alpha.proved else ESTIMATED)
 
 
 @dataclass(frozen=True)
-class _Terms:
-    """The terms of (ii), with the residual r (n,) and rᵀw."""
+class Terms:
+    """The terms of (ii), with the residual r (n,) and rᵀw, and the bounds that need no constants."""
 
     residual: Array
     rho: float
@@ -169,15 +164,16 @@ class _Terms:
         return min(float(np.sqrt(gap)), self.omega + self.primal)
 
 
-def _terms(w: Array, vi: VariationalInequality, energy: Energy, u: Array, lam: Array) -> _Terms:
+def terms(w: Array, vi: VariationalInequality, energy: Energy, u: Array, lam: Array) -> Terms:
+    """The terms with a lifting w (n,), B w ≥ B u − g, of u (n,) and λ ≥ 0 (m,)."""
     residual = vi.f - vi.A @ u - vi.B.T @ lam
     kappa = max(0.0, float(lam @ _slack(vi, u, w)))
-    return _Terms(residual, energy.dual_norm(residual), energy.norm(w), kappa, float(residual @ w))
+    return Terms(residual, energy.dual_norm(residual), energy.norm(w), kappa, float(residual @ w))
 
 
 def _projected(
     residual: Array, w: Array, vi: VariationalInequality, energy: Energy, u: Array, lam: Array
-) -> Iterator[_Terms]:
+) -> Iterator[Terms]:
     """The terms for u + d, whose residual is the part of r in the range of Bᵀ, if w is feasible for it and d exists."""
     system = energy.stiffness.active_set_system(VariationalInequality(vi.A, residual, vi.B, np.zeros_like(vi.g)))
     try:
@@ -185,7 +181,7 @@ def _projected(
     except (RuntimeError, np.linalg.LinAlgError):  # an exactly singular system
         return
     if np.all(_lacking(vi, u + d, w) <= 0.0):
-        yield _terms(w, vi, energy, u + d, lam)
+        yield terms(w, vi, energy, u + d, lam)
 
 
 @dataclass(frozen=True)

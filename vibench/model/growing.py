@@ -15,7 +15,7 @@ from vibench.interfaces.validation import checked_assembly
 from vibench.linalg.cholesky import SparseCholesky
 from vibench.linalg.dense import orthonormal_range
 from vibench.model.energy import Energy
-from vibench.model.error_bounds import bounds_with, lifting
+from vibench.model.error_bounds import lifting, terms
 from vibench.model.galerkin import project
 from vibench.qp.exact import ExactSolution, exact_solution
 from vibench.qp.scaling import ratio
@@ -23,11 +23,7 @@ from vibench.qp.solution import QPSolution
 from vibench.qp.solve import solve_qp
 from vibench.reduction.cone_parts import part_in_cone
 from vibench.reduction.supremizers import supremizers
-from vibench.stability.coercivity import Constant
 from vibench.timing import NO_TIME, Seconds, timed
-
-UNIT_CONSTANT = Constant(1.0, proved=False)
-"""Bounds in the energy norm need no constants; those in the norms of V and W are not used."""
 
 IN_CONE = 1e-6
 """A multiplier is in the cone where less than this share of it is outside: it may be what a solver left."""
@@ -99,13 +95,13 @@ class GrowingModel:
         lifted = lifting(vi, energy, u, lam)
         if lifted is None:
             return float("inf")
-        found = bounds_with(lifted.w, vi, energy, UNIT_CONSTANT, UNIT_CONSTANT, u, lam)
-        of_u = ratio(found.u_energy, energy.norm(u))
+        found = terms(lifted.w, vi, energy, u, lam)
+        of_u = ratio(found.primal, energy.norm(u))
         pressed, W = energy.dual_norm(vi.B.T @ lam), self._problem.W
         if not pressed > 0.0:
             return of_u
         in_W = ratio(float(W.norm(lifted.nu - lam)), float(W.norm(lam)))
-        return max(of_u, ratio(found.lambda_natural, pressed), in_W)
+        return max(of_u, ratio(found.dual, pressed), in_W)
 
     def _energy(self, vi: VariationalInequality) -> Energy:
         if self._factor is None or "A" not in self._problem.constant:
