@@ -68,12 +68,13 @@ CAPTIONS = "captions.json"
 """File beside the figures: the caption of every figure, by the name of its files."""
 
 
-def drawings(path: Path) -> Iterator[tuple[str, Drawing, Data]]:
+def drawings(path: Path, note: Callable[[str], None] = lambda _: None) -> Iterator[tuple[str, Drawing, Data]]:
     """Every figure a results file may have: its name, the function that draws it, and the data.
 
-    The functions of plugins raise `FigureError`; those of this package do not.
+    The functions of plugins raise `FigureError`; those of this package do not. `note` is called with a line for every
+    column of a plugin that the data do not have.
     """
-    return drawings_of(problems(path))
+    return drawings_of(problems(path, note=note))
 
 
 def drawings_of(known: Iterable[tuple[str, Data]]) -> Iterator[tuple[str, Drawing, Data]]:
@@ -120,7 +121,13 @@ def _beginning(name: str, kind: str, draw: Drawing, data: Data) -> tuple[str, Dr
     return name, draw, replace(data, page=(0, -(-panels // (most // 2))), halved=True)
 
 
-def draw(path: Path, kind: str, problem: str | None = None, dual: str | None = None) -> Figure:
+def draw(
+    path: Path,
+    kind: str,
+    problem: str | None = None,
+    dual: str | None = None,
+    note: Callable[[str], None] = lambda _: None,
+) -> Figure:
     """One figure of a results file.
 
     Parameters
@@ -130,6 +137,8 @@ def draw(path: Path, kind: str, problem: str | None = None, dual: str | None = N
     problem, dual
         Label of the problem ("LABEL, TRAINING" where it has several training sets), and of the dual strategy for a kind
         of `OF_DUAL`; `None` where there is only one.
+    note
+        Called with a line for every column of a plugin that the data do not have.
 
     Raises
     ------
@@ -138,7 +147,10 @@ def draw(path: Path, kind: str, problem: str | None = None, dual: str | None = N
     FigureError
         If it is a plugin's figure, which cannot be drawn.
     """
-    known = {one.problem: one for _, one in problems(path)}
+    faults: list[str] = []
+    known = {one.problem: one for _, one in problems(path, note=faults.append)}
+    for line in faults:  # called here, so that a warning can name the line of the caller
+        note(line)
     others = {name for one in known.values() for name in of_plugins(one, {*OF_PROBLEM, *OF_DUAL})}
     if kind not in {*OF_PROBLEM, *OF_DUAL, *others}:
         raise unknown_name("figure", kind, (*OF_PROBLEM, *OF_DUAL, *sorted(others)))
@@ -218,9 +230,10 @@ def draw_all(
     progress
         Called before a figure is drawn here, with its name, the number of those done, and that of all there may be.
     note
-        Called with a line for every figure of a plugin that could not be drawn.
+        Called with a line for every column of a plugin that the data do not have, and for every figure of a plugin
+        that could not be drawn.
     """
-    known = _drawings(path)
+    known, faults = _drawings(path)
     written: dict[int, Written] = {}
     with contextlib.ExitStack() as stack:
         others: dict[int, Future[Written]] = {}
@@ -239,7 +252,8 @@ def draw_all(
             progress(known[k][0], len(written), len(known))
             written[k] = other.result()
     _drawings.cache_clear()
-    for line in dict.fromkeys(written[k].failure for k in sorted(written) if written[k].failure):
+    failures = [written[k].failure for k in sorted(written) if written[k].failure]
+    for line in dict.fromkeys([*faults, *failures]):
         note(line)
     captions = {known[k][0]: written[k].caption for k in sorted(written) if written[k].files}
     if captions:
@@ -249,14 +263,15 @@ def draw_all(
 
 
 @cache
-def _drawings(path: Path) -> list[tuple[str, Drawing, Data]]:
-    """The drawings of a results file, read once in a process that draws."""
-    return list(drawings(path))
+def _drawings(path: Path) -> tuple[list[tuple[str, Drawing, Data]], list[str]]:
+    """The drawings of a results file, read once in a process that draws, and what they lack of plugins."""
+    faults: list[str] = []
+    return list(drawings(path, faults.append)), faults
 
 
 def _draw(path: Path, folder: Path, formats: tuple[str, ...], number: int) -> Written:
     """Draw one figure of `drawings`."""
-    name, draw, data = _drawings(path)[number]
+    name, draw, data = _drawings(path)[0][number]
     folder.mkdir(parents=True, exist_ok=True)
     with styled():
         try:
