@@ -56,9 +56,11 @@ def solver_version(solver: str) -> str:
     return distribution_version(solver_distribution(solver))
 
 
+SHARED = ("arrays.py", "errors.py", "fem.py", "timing.py")
+"""Modules outside of rooms whose code determines numbers: it enters the key of every stage."""
+
 NUMERICAL = (
-    "arrays.py", "errors.py", "fem.py", "timing.py", "linalg", "interfaces", "qp", "reduction", "stability",
-    "highfidelity", "model", "storage", "stages",
+    *SHARED, "linalg", "interfaces", "qp", "reduction", "stability", "highfidelity", "model", "storage", "stages",
 )  # fmt: skip
 """Rooms and modules whose code determines numbers; the others carry requests and records, and show them."""
 

@@ -18,6 +18,7 @@ import typer
 
 from vibench.errors import VibenchError
 from vibench.results.columns import TABLES
+from vibench.study.kinds import CHECKED, KINDS
 
 SHOWN = ("summary", "best", "benefits", *TABLES)
 """Tables that `vibench show` prints."""
@@ -137,8 +138,8 @@ def plugins(incomplete: str) -> list[str]:
     """Completes names of plugins, alone or with their kind before them: "primal:NAME", "solver:NAME"."""
     kind, colon, name = incomplete.partition(":")
     if not colon:
-        return _beginning(incomplete, [*_registered(*KINDS.values()), *(f"{kind}:" for kind in KINDS)])
-    known = solvers(name) if kind == "solver" else _registered(KINDS[kind]) if kind in KINDS else ()
+        return _beginning(incomplete, [*_registered(*GROUPS.values()), *(f"{kind}:" for kind in GROUPS)])
+    known = solvers(name) if kind == "solver" else _registered(GROUPS[kind]) if kind in GROUPS else ()
     return _beginning(incomplete, (f"{kind}:{found}" for found in known))
 
 
@@ -148,19 +149,16 @@ def plugin_options(context: typer.Context, incomplete: str) -> list[str]:
     from vibench.study.entry_points import entry_points
 
     kind, colon, name = (context.params.get("plugin") or "".join(context.args[:1])).rpartition(":")
-    groups = [KINDS[kind]] if kind in KINDS else [] if colon else KINDS.values()
+    groups = [GROUPS[kind]] if kind in GROUPS else [] if colon else GROUPS.values()
     entries = (entry for group in groups for entry in entry_points(group=f"vibench.{group}") if entry.name == name)
     found = {option for entry in entries for option in overview.options(entry)}
     return _beginning(incomplete, (f"{option}=" for option in found))
 
 
-KINDS = {
-    "problem": "problems", "primal": "primal_strategies", "dual": "dual_strategies", "solver": "qp_solvers",
-    "sampling": "sampling", "figure": "figures",
-}  # fmt: skip
+GROUPS = {kind.word: kind.group for kind in CHECKED}
 """Groups of entry points by the word that `vibench check` knows them by."""
 
-lists = words(lambda: ("problems", "sampling", "dual", "primal", "solvers", "figures", "studies"))
+lists = words(lambda: (kind.listed for kind in KINDS))
 table_names = words(lambda: SHOWN)
 
 

@@ -41,9 +41,9 @@ def export_reduced_model(
     echo(f"relative errors are those at {MEASURED} random parameters and at the corners of the box")
     if found.about["solver"] != model.row["solver"]:
         echo(f"the cell's solver is {model.row['solver']}, the script solves by {found.about['solver']}")
-    worth = found.about["certificate"]
-    has_bounds = worth in {"certified", "verified"}
-    echo(f"error bounds: {worth}" if has_bounds else f"no error bounds: {worth}")
+    why = found.about["no_bounds"]
+    has_bounds = not why
+    echo(f"error bounds: {found.about['certificate']}" if has_bounds else f"no error bounds: {why}")
     if c and has_bounds:
         echo("the C source has no error bounds")
     beside = [file.with_name(BOUNDS)] if has_bounds else []

@@ -13,12 +13,10 @@ from importlib.metadata import EntryPoint
 from pathlib import Path
 
 from vibench.study.entry_points import entry_points
+from vibench.study.kinds import KINDS
 
-KINDS = {
-    "problems": "problems", "sampling": "sampling", "primal": "primal_strategies", "dual": "dual_strategies",
-    "figures": "figures", "studies": "studies", "solvers": "qp_solvers",
-}  # fmt: skip
-"""Group of entry points of every list, without `vibench.`."""
+LISTS = {kind.listed: kind.entry_points for kind in KINDS}
+"""Group of entry points of every list."""
 
 Row = tuple[str, str, str, str]
 
@@ -28,7 +26,7 @@ def rows(kind: str) -> Iterator[Row]:
     from vibench.qp.settings import SETTINGS
 
     registered: dict[str, dict[str, EntryPoint]] = {}
-    for entry in entry_points(group=f"vibench.{KINDS[kind]}"):
+    for entry in entry_points(group=LISTS[kind]):
         registered.setdefault(entry.name, {}).setdefault(entry.value, entry)
     for name, entries in sorted(registered.items()):
         origins = [*(["qpsolvers"] if kind == "solvers" and name in SETTINGS else []), *map(_origin, entries.values())]

@@ -6,21 +6,24 @@ import sys
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from typer import Argument, Exit, Option
 
 from vibench.cli.completion import lists, plugin_options, plugins, runs
 from vibench.errors import RequestError, VibenchError, in_a_line, unknown_name
+from vibench.study.kinds import CHECKED, FIGURE, KINDS, SOLVER, STUDY
 from vibench.terminal.output import echo
 
-LISTS = {
-    "problems": "problem", "sampling": "sampling strategy", "primal": "primal strategy", "dual": "dual strategy",
-    "figures": "figure plugin", "studies": "study",
-}  # fmt: skip
+LISTS = {kind.listed: kind.title for kind in KINDS if kind is not SOLVER}
 """Kind of plugin that each list shows; QP solvers are listed whether they are plugins or not."""
 
 HEADINGS = ("name", "from", "what", "options")
+
+if TYPE_CHECKING:
+    Word = str
+else:
+    Word = Literal[tuple(kind.word for kind in CHECKED)]
 
 SECONDS = 120.0
 """Default of `--seconds`: that of `vibench.testing`, which is too slow to import for a help text."""
@@ -40,7 +43,7 @@ def list_plugins(
     what: Annotated[
         str | None,
         Argument(
-            help="problems, sampling, primal, dual, figures, solvers or studies; all of them by default.",
+            help=f"{', '.join([*LISTS][:-1])}, {[*LISTS][-1]} or {SOLVER.listed}; all of them by default.",
             autocompletion=lists,
         ),
     ] = None,
@@ -54,14 +57,14 @@ def list_plugins(
     from vibench.terminal.console import print_rows
 
     if what is None:
-        for title in overview.KINDS:
+        for title in overview.LISTS:
             rows = _solvers_by_version() if title == "solvers" else list(overview.rows(title))
             print_rows(rows, HEADINGS, title)
-        echo("", f"vibench list {'|'.join(overview.KINDS)} shows what options are, and whether it can be loaded")
-    elif what in overview.KINDS:
+        echo("", f"vibench list {'|'.join(overview.LISTS)} shows what options are, and whether it can be loaded")
+    elif what in overview.LISTS:
         print_rows(_solver_rows() if what == "solvers" else _plugin_rows(LISTS[what]), HEADINGS, what)
     else:
-        raise unknown_name("list", what, overview.KINDS)
+        raise unknown_name("list", what, overview.LISTS)
     for distribution, reason in unreadable().items():
         echo(f"{distribution}: {reason}")
 
@@ -71,7 +74,7 @@ def check_plugin(
         str,
         Argument(
             metavar="PLUGIN",
-            help="A name, problem|primal|dual|solver|sampling|figure:NAME, or MODULE:NAME.",
+            help=f"A name, {'|'.join(kind.word for kind in CHECKED)}:NAME, or MODULE:NAME.",
             autocompletion=plugins,
         ),
     ],
@@ -150,10 +153,7 @@ SAMPLE = {"size": 16, "seed": 0}
 
 
 def new_plugin(
-    kind: Annotated[
-        Literal["problem", "primal", "dual", "solver", "sampling", "figure"],
-        Argument(metavar="KIND", help="Kind of plugin."),
-    ],
+    kind: Annotated[Word, Argument(metavar="KIND", help="Kind of plugin.")],
     name: Annotated[str, Argument(metavar="NAME", help="Name of the plugin: a-z, 0-9 and hyphens.")],
     out: Annotated[Path, Option(metavar="DIR", help="Folder in which the package is created.")] = Path(),
 ) -> None:
@@ -183,12 +183,12 @@ def _plugin_rows(kind: str) -> list[tuple[str, str, str, str]]:
     for name in registry.names(kind):
         options, columns = [], []
         try:
-            if kind == "study":
+            if kind == STUDY.title:
                 description = f"{len(expand(read_study(name)))} cells"
             else:
                 description = (registry.load(kind, name).__doc__ or "").strip().split("\n")[0]
                 options = registry.options(kind, name)
-            columns = _columns(name) if kind == LISTS["figures"] else []
+            columns = _columns(name) if kind == FIGURE.title else []
         except VibenchError as error:
             description = str(error)
         except Exception as error:  # noqa: BLE001  annotations of plugins are evaluated

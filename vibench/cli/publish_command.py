@@ -9,7 +9,7 @@ from typer import Argument, Option
 
 from vibench.cli.completion import runs
 from vibench.errors import RequestError
-from vibench.terminal.output import echo
+from vibench.terminal.output import echo, warn
 
 
 def publish_runs(
@@ -35,5 +35,5 @@ def publish_runs(
     if not title.strip():
         raise RequestError("--title is empty; a site needs one to be cited")
     citation = Citation(title, tuple(author or ()), doi, url)
-    page = publish([tables.results_file(one) for one in run], site, citation)
+    page = publish([tables.results_file(one) for one in run], site, citation, warn=warn)
     echo(f"site of {len(run)} run{'s' * (len(run) > 1)}: {page}")

@@ -123,7 +123,7 @@ def draw_paper(paths: list[Path], folder: Path, formats: tuple[str, ...]) -> Non
     notes: list[str] = []
     with DrawingDisplay(new_console()) as display:
         drawn = draw_published(paths, folder, formats, display.show, notes.append)
-    echo(*notes, f"{len(drawn)} figures: {folder}", f"page: {folder / PAGE}")
+    echo(*dict.fromkeys(notes), f"{len(drawn)} figures: {folder}", f"page: {folder / PAGE}")
 
 
 def draw(path: Path, folder: Path, jobs: int, formats: tuple[str, ...] = ("png", "svg")) -> None:

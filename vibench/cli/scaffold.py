@@ -11,12 +11,10 @@ from string import Template
 from vibench.errors import RequestError, StorageError
 from vibench.provenance import distribution_version
 from vibench.qp.settings import SETTINGS
+from vibench.study.kinds import CHECKED
 from vibench.study.registry import GROUPS, WORDS, names, version
 
-MODULES = {
-    "problem": "problem", "primal": "strategy", "dual": "strategy", "solver": "solver", "sampling": "sampling",
-    "figure": "figures",
-}  # fmt: skip
+MODULES = {kind.word: kind.module for kind in CHECKED}
 """Module of the plugin by kind."""
 
 NAME = re.compile(r"[a-z][a-z0-9]*(-[a-z0-9]+)*")

@@ -24,6 +24,7 @@ from vibench.library import c_source, exported_certificate
 from vibench.library.models import Model
 from vibench.library.reduced_model import FORMAT, SOLVERS
 from vibench.model.affine import affine_decomposition, check_affine
+from vibench.model.certificates.base import Guarantee
 from vibench.model.certificates.bounds import OnlineCertificate
 from vibench.model.chebyshev import AffinePolynomial, interpolate_on_box
 from vibench.model.hyperreduced import HyperReducedModel, hyper_reduce
@@ -155,7 +156,7 @@ def exported(
         queried = declared_model(model.reduced)
         if c and isinstance(queried, HyperReducedModel) and queried.space is not None:
             raise RequestError("the enrichment changes the basis at every parameter; C sources are for fixed bases")
-        first = members_of(queried, box.lower)
+        first = members_of(queried, box.lower, coefficients_of(queried, box.lower))
         if not len(first.f) or not len(first.g):
             raise RequestError("the model has no unknowns or no constraints")
         terms = declared_terms(queried)
@@ -167,7 +168,7 @@ def exported(
         raise RequestError(f"the model cannot be evaluated in the whole parameter box: {in_a_line(error)}") from None
     _refuse_inaccurate(polynomials, tolerance, evaluations)
     members = {name: polynomials.pop(name) for name in MEMBERS}
-    about = _about(model, members) | {"certificate": why}
+    about = _about(model, members) | {"certificate": Guarantee.NONE.value, "no_bounds": why}
     arrays = {"lower": box.lower, "upper": box.upper}
     if isinstance(queried, HyperReducedModel) and queried.space is not None:
         arrays["plain"] = queried.space.plain
@@ -217,8 +218,16 @@ def declared_terms(queried: Queried) -> dict[str, Array]:
     return {name: np.stack([np.ravel(projected[name](t)) for t in sums.terms]) for name, sums in declared.items()}
 
 
-def members_of(queried: Queried, mu: Array) -> VariationalInequality:
-    """A, f, B, g at a parameter, on a space that does not depend on it.
+def coefficients_of(queried: Queried, mu: Array) -> Mapping[str, Array]:
+    """θ (Q,) at a parameter of the members that are sums of terms, as far as the model evaluates them."""
+    if isinstance(queried, HyperReducedModel):
+        return queried.coefficients(mu)
+    problem = queried.problem
+    return {name: sums.coefficients(mu) for name, sums in problem.affine.items() if name not in problem.constant}
+
+
+def members_of(queried: Queried, mu: Array, theta: Mapping[str, Array]) -> VariationalInequality:
+    """A, f, B, g at a parameter with these coefficients, on a space that does not depend on it.
 
     Raises
     ------
@@ -226,7 +235,7 @@ def members_of(queried: Queried, mu: Array) -> VariationalInequality:
         If the model has no such space.
     """
     if isinstance(queried, HyperReducedModel):
-        return queried.members(mu)
+        return queried.members(mu, theta)
     if queried.kind is Kind.PER_PARAMETER:
         raise RequestError(
             "the enrichment changes the basis at every parameter, the cell assembles in full, and its problem does not "
@@ -239,20 +248,15 @@ def _evaluated(
     queried: Queried, size: int, declared: frozenset[str], certificate: OnlineCertificate | None, mu: Array
 ) -> dict[str, Array]:
     """The members as flat arrays, of declared affine ones θ; and what the certificate evaluates."""
-    found = _packed(queried, size, mu)
-    declares = queried.problem.affine
-    theta = (
-        queried.coefficients(mu)
-        if isinstance(queried, HyperReducedModel)
-        else {name: declares[name].coefficients(mu) for name in declared}
-    )
+    theta = coefficients_of(queried, mu)
+    found = _packed(queried, size, mu, theta)
     beside = {} if certificate is None else exported_certificate.thetas(certificate, theta)
     return found | {name: theta[name] for name in declared} | beside
 
 
-def _packed(queried: Queried, size: int, mu: Array) -> dict[str, Array]:
+def _packed(queried: Queried, size: int, mu: Array, theta: Mapping[str, Array]) -> dict[str, Array]:
     """The members as flat arrays; of A the upper triangle."""
-    found = members_of(queried, mu)
+    found = members_of(queried, mu, theta)
     if len(found.f) != size:
         raise RequestError(f"the reduced program has {len(found.f)} unknowns at mu = {mu.tolist()}, {size} elsewhere")
     arrays = {name: np.asarray(getattr(found, name)) for name in MEMBERS}

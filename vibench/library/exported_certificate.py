@@ -19,7 +19,7 @@ def reason_for_none(certificate: OnlineCertificate | None) -> str:
     """Why an exported model cannot bound its errors; "" if it can."""
     if certificate is None:
         return 'its cell has no bounds, they need assembly = "certified"'
-    if certificate.prepared is None or not certificate.prepared.scaled:
+    if certificate.prepared is None or certificate.base.bound_terms is None:
         return (
             "they need B(mu) and g(mu) on all contact unknowns, which the code of the problem evaluates unless B is "
             "declared to be one matrix times a function of mu and g an affine sum"
@@ -36,7 +36,7 @@ def thetas(certificate: OnlineCertificate, samples: Mapping[str, Array]) -> dict
 def arrays(certificate: OnlineCertificate) -> dict[str, Array]:
     """The arrays of a certificate for which there is no `reason_for_none`."""
     base, residual, liftings, terms = (
-        certificate.base, certificate.residual, certificate.prepared, certificate.bound_terms
+        certificate.base, certificate.residual, certificate.prepared, certificate.base.bound_terms
     )  # fmt: skip
     assert liftings is not None  # there is no reason for none
     assert terms is not None

@@ -47,8 +47,8 @@ class Model:
     def __init__(self, file: str | Path, solver: str = "") -> None:
         self.plain = import_module(__name__.removesuffix("_certificate")).Model(file, solver)
         self.guarantee, start, data = str(self.plain.about["certificate"]), "certificate_", self.plain.data
-        if self.guarantee not in {"certified", "verified"}:
-            raise ValueError(f"'{file}' has no error bounds: {self.guarantee}")
+        if why := self.plain.about["no_bounds"]:
+            raise ValueError(f"'{file}' has no error bounds: {why}")
         self._data = {name.removeprefix(start): data[name] for name in data if name.startswith(start)}
 
     def solve(self, mu: Sequence[float] | Array, tolerance: float | None = None) -> Certified:

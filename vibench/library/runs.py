@@ -122,7 +122,7 @@ class Run:
         return findings(self.path)
 
     def figure(self, kind: str, problem: str | None = None, dual: str | None = None) -> Figure:
-        """One figure of the run, to be shown or saved.
+        """One figure of the run, to be shown or saved; a column of a plugin that cannot be computed is a warning.
 
         Parameters
         ----------
@@ -138,7 +138,7 @@ class Run:
         """
         from vibench.report.figures import draw  # noqa: PLC0415  loads matplotlib
 
-        return draw(self.path, kind, problem, dual)
+        return draw(self.path, kind, problem, dual, partial(warnings.warn, stacklevel=3))
 
     def write_tables(self, folder: Path | str | None = None) -> list[Path]:
         """Write every table as CSV, and the summary as Markdown; into `tables` beside the results file by default."""
@@ -150,7 +150,7 @@ class Run:
     ) -> list[Path]:
         """Write every figure, and their captions; into `figures` beside the results file by default.
 
-        A figure of a plugin that cannot be drawn is a warning.
+        A figure of a plugin that cannot be drawn, and a column of one that cannot be computed, is a warning.
         """
         from vibench.report.figures import draw_all  # noqa: PLC0415  loads matplotlib
 

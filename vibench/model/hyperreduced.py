@@ -201,7 +201,7 @@ class HyperReducedModel:
         NumericalError
             If the reduced problem has entries that are not finite.
         """
-        samples, contact = self._evaluate(mu)
+        samples, contact = self.coefficients(mu), self._contact(mu)
         members, space = self._members(samples, contact), self.space
         A, f, B, g = members.A, members.f, members.B, members.g
         Y = None
@@ -225,14 +225,16 @@ class HyperReducedModel:
         """Flat terms (Q×size) of the members declared affine, of A packed upper triangles, on Φ."""
         return {name: getattr(self._operators, name).terms for name in self._operators.affine}
 
-    def members(self, mu: Array) -> VariationalInequality:
-        """A, f, B, g at mu (d,) on Φ, a space that does not depend on mu; B on (η, χ) where Φ has `space`."""
-        return self._members(*self._evaluate(mu))
+    def members(self, mu: Array, samples: Samples) -> VariationalInequality:
+        """A, f, B, g at mu (d,) on Φ, a space that does not depend on mu; B on (η, χ) where Φ has `space`.
 
-    def _evaluate(self, mu: Array) -> tuple[Samples, Contact | None]:
-        operators = self._operators
-        of_contact = operators.B is None or operators.g is None
-        return self.coefficients(mu), self.problem.contact(mu) if of_contact else None
+        `samples` are the `coefficients` at mu, which whoever needs members on Φ evaluates for other purposes, too.
+        """
+        return self._members(samples, self._contact(mu))
+
+    def _contact(self, mu: Array) -> Contact | None:
+        """B and g at mu (d,) on the contact unknowns, where a member is projected from there."""
+        return self.problem.contact(mu) if self._operators.B is None or self._operators.g is None else None
 
     def _members(self, samples: Samples, contact: Contact | None) -> VariationalInequality:
         operators = self._operators

@@ -107,7 +107,8 @@ def _spaces(problem: Problem, part: Path) -> list[str]:
 def _operators(problem: Problem, listed: Array, part: Path) -> list[str]:
     """The table of the members, whose arrays are written."""
     found: dict[str, dict[str, Any]] = {name: {} for name in MEMBERS}
-    for k, mu in enumerate(listed):
+    varies = not set(MEMBERS) <= {*problem.constant, *problem.affine}
+    for k, mu in enumerate(listed if varies else listed[:1]):
         vi = checked_assembly(problem, mu)
         for name in MEMBERS:
             if name not in problem.affine and (k == 0 or name not in problem.constant):

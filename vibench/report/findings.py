@@ -18,6 +18,7 @@ from vibench.qp.status import Status
 from vibench.report.common_queries import FEWEST, MEANS, WAY, Comparable, common_programs, on_common_queries
 from vibench.report.figures.data import (
     PRIMAL,
+    TABLES,
     Data,
     best_solver,
     by_dimensions,
@@ -59,7 +60,8 @@ Said = Iterator[tuple[Weight, str]]
 def findings(path: Path) -> dict[str, list[str]]:
     """Sentences on completeness, stability, errors, costs and solvers by subject, "" for the whole run."""
     found = defaultdict[str, list[str]](list)
-    read = {name: tables.read(path, name) for name in READ}
+    # as recorded: no finding is on a column of a plugin
+    read = {name: tables.read(path, name) for name in dict.fromkeys((*READ, *TABLES))}
     for one in all_findings(read, problems(path, read)):
         found[one.subject].append(one.text)
     return dict(found)

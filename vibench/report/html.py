@@ -18,14 +18,14 @@ from vibench.files import write_atomically
 from vibench.qp.status import Status
 from vibench.report import findings
 from vibench.report.figures import for_report
-from vibench.report.figures.data import Data, label, problems
+from vibench.report.figures.data import TABLES, Data, label, problems
 from vibench.report.leaderboard import Criterion, Winner, leaderboard
 from vibench.report.page import plots
 from vibench.report.page.embedded import Grid, grid_of, grid_of_cells, grid_of_thresholds, script_safe, to_json
 from vibench.report.page.stills import Helpers, helpers, stills
 from vibench.results import pictures, tables
 from vibench.results.best import LARGEST_BAND
-from vibench.results.plugin_columns import Extended
+from vibench.results.plugin_columns import Extended, faults_of
 from vibench.results.selection import short_keys
 from vibench.results.sqlite.reading import read_meta, study_of
 from vibench.text import printable
@@ -36,7 +36,7 @@ ERRORS = (
     "over other queries are not comparable: findings and figures take those over queries that all solved."
 )
 
-SHARED = ("cells", "queries", "thresholds", "disagreements")
+READ = tuple(dict.fromkeys((*TABLES, *findings.READ)))
 """Tables from which findings, tables and figures are all made: they are read once."""
 
 FOLDED = 300
@@ -76,9 +76,10 @@ def page(path: Path, jobs: int = 1) -> str:
 
 
 def _page(path: Path, others: Helpers | None) -> str:
-    study, extended = study_of(path, read_meta(path)), {name: tables.extended(path, name) for name in SHARED}
-    read = {name: one.frame for name, one in extended.items()}
+    study, extended = study_of(path, read_meta(path)), tables.extended_tables(path, READ)
+    faults, read = faults_of(extended.values()), {name: one.frame for name, one in extended.items()}
     cells, known = tables.in_order(read["cells"]), list(problems(path, read))
+    del extended["histories"], read["histories"]  # of a large study millions of rows, which `known` has in order
     grids = list(_grids({**extended, "cells": extended["cells"].of(cells)}))
     found = findings.all_findings(read, known)
     first, kept = findings.leading(found), set(findings.leading(found, findings.MOST + FOLDED))
@@ -104,7 +105,7 @@ def _page(path: Path, others: Helpers | None) -> str:
         failed=int((cells["status"] != Status.OK).sum()),
         missing=[
             *(f"no picture of {one.key[0]}: {one.reason}" for one in pictures.read(path) if one.reason),
-            *dict.fromkeys([*(line for one in extended.values() for line in one.faults), *undrawable]),
+            *dict.fromkeys([*faults, *undrawable]),
         ],
         grids=grids,
         stills=drawn,

@@ -7,7 +7,7 @@ plugin is a line beside the table, which has all other columns.
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -70,43 +70,59 @@ class Extended:
         """The same with other rows."""
         return replace(self, frame=frame)
 
+    def with_fault(self, line: str) -> Extended:
+        """The same with one more line on what could not be used."""
+        return replace(self, faults=(*self.faults, line))
 
-def extended(table: str, read: Read) -> Extended:
-    """A recorded table with the columns of plugins, in the order of its rows."""
-    frame = read(table)
-    if table not in EXTENSIBLE:
-        return Extended(frame)
-    columns: dict[str, Column] = {}
-    better: dict[str, str] = {}
-    faults: list[str] = []
+
+def extended_tables(names: Collection[str], read: Read) -> dict[str, Extended]:
+    """Recorded tables with the columns of plugins, in the order of their rows.
+
+    Every table is read once, and every plugin created once, whatever the number of tables.
+    """
     tables = Copies(read)
-    for plugin, found in _declared(faults):
-        if found.table != table:
-            continue
-        try:
-            values = column_values(plugin, found, tables, frame)
-        except ColumnError as error:
-            faults.append(str(error))
-            continue
-        frame = frame.assign(**{found.name: values})
-        place = AFTER + len(columns)
-        columns[found.name] = Column(TYPES[found.kind], found.unit, found.meaning, found.heading, place)
-        better |= {found.name: found.better} if found.better else {}
-    return Extended(frame, columns, better, tuple(faults))
+    found = {name: Extended(tables.of(name)) for name in names}
+    extensible = [name for name in found if name in EXTENSIBLE]
+    for one in _declared() if extensible else ():
+        if isinstance(one, str):
+            found |= {name: found[name].with_fault(one) for name in extensible}
+        elif one[1].table in found:
+            found[one[1].table] = _with_column(found[one[1].table], *one, tables)
+    return found
 
 
-def _declared(faults: list[str]) -> Iterator[tuple[str, DerivedColumn]]:
-    """The columns of all plugins, with the names of the plugins; what cannot be used is added to the faults."""
+def faults_of(found: Iterable[Extended]) -> list[str]:
+    """The lines on what could not be used of some tables, each once."""
+    return list(dict.fromkeys(line for one in found for line in one.faults))
+
+
+def _with_column(table: Extended, plugin: str, column: DerivedColumn, tables: Copies) -> Extended:
+    """A table with one more column, or with a line on why it cannot have it."""
+    try:
+        values = column_values(plugin, column, tables, table.frame)
+    except ColumnError as error:
+        return table.with_fault(str(error))
+    made = Column(TYPES[column.kind], column.unit, column.meaning, column.heading, AFTER + len(table.columns))
+    return replace(
+        table,
+        frame=table.frame.assign(**{column.name: values}),
+        columns={**table.columns, column.name: made},
+        better={**table.better, column.name: column.better} if column.better else table.better,
+    )
+
+
+def _declared() -> Iterator[tuple[str, DerivedColumn] | str]:
+    """The columns of all plugins, with the names of the plugins, and lines on what cannot be used."""
     owners: dict[str, str] = {}
     for name in registry.names(KIND):
         try:
             found = declared(name, loaded(name))
         except VibenchError as error:
-            faults.append(str(error))
+            yield str(error)
             continue
         for column in found:
             if fault := _taken(name, column, owners):
-                faults.append(fault)
+                yield fault
             else:
                 owners |= _names(name, column)
                 yield name, column

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from types import MappingProxyType
@@ -71,7 +71,18 @@ def extended(path: Path, table: str) -> Extended:
     RequestError
         If it is damaged; what is wrong with a plugin is among the faults instead.
     """
-    return plugin_columns.extended(table, partial(read, path))
+    return extended_tables(path, (table,))[table]
+
+
+def extended_tables(path: Path, names: Collection[str]) -> dict[str, Extended]:
+    """Several tables of a results file, as `extended` reads one; plugins are loaded once for all of them.
+
+    Raises
+    ------
+    RequestError
+        If one is damaged.
+    """
+    return plugin_columns.extended_tables(names, partial(read, path))
 
 
 SUMMARY = "summary.md"
@@ -97,8 +108,8 @@ def export(path: Path, folder: Path, note: Callable[[str], None] = lambda _: Non
     `note` is called with a line for every column of a plugin that could not be written.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    found = {table: extended(path, table) for table in TABLES}
-    for line in dict.fromkeys(line for one in found.values() for line in one.faults):
+    found = extended_tables(path, TABLES)
+    for line in plugin_columns.faults_of(found.values()):
         note(line)
     texts = {f"{table}.csv": to_csv(whole_numbers(in_order(one.frame))) for table, one in found.items()}
     texts[SUMMARY] = to_markdown(summary(found["cells"].frame, found["cells"].columns))

@@ -12,7 +12,7 @@ from typing import Any, ClassVar
 
 from vibench.errors import NumericalError
 from vibench.interfaces.problem import Problem
-from vibench.provenance import core_code, libraries
+from vibench.provenance import SHARED, core_code, libraries
 from vibench.qp.status import Status
 from vibench.storage.artefacts import History, Store
 from vibench.study import registry
@@ -98,15 +98,7 @@ class Stage(ABC):
         enters through `Plugin.code`. Of vibench, only the module that defines the stage and `rooms` enter: an edited
         figure or help text invalidates no artefact.
         """
-        parts = (
-            "arrays.py",
-            "errors.py",
-            "fem.py",
-            "timing.py",
-            *self.rooms,
-            __file__,
-            str(sys.modules[type(self).__module__].__file__),
-        )
+        parts = (*SHARED, *self.rooms, __file__, str(sys.modules[type(self).__module__].__file__))
         own = {name: _described(value) for name, value in self._fields().items()}
         content = [type(self).__name__, core_code(*parts), libraries(), own, [stage.key for stage in self.inputs()]]
         return f"{self.label.lower().replace(' ', '-')}-{digest(content)}"

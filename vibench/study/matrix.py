@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import product
+from typing import TypeAlias, TypeVar
 
 from vibench.errors import RequestError
 from vibench.interfaces.strategies import Stop
@@ -27,15 +28,16 @@ def expand(study: Study) -> list[Cell]:
         If the matrix is empty, or a strategy that takes a tolerance has none.
     """
     cells: dict[str, Cell] = {}
-    for problem, table in product(study.problem, study.tolerances):
+    problems = [(entry, plugin, _sets(study, entry, plugin)) for entry, plugin in _made("problem", study.problem)]
+    duals, primals = _made("dual strategy", study.dual), _made("primal strategy", study.primal)
+    for (problem, plugin, sets), table in product(problems, study.tolerances):
         nested = {entry.title: _nested_tolerances(entry, table) for entry in study.primal}
-        sets = _sets(study, problem)
-        for trained, (dual, pod, cone, primal, tolerance) in product(sets, _combinations(study, table)):
+        for trained, (dual, pod, cone, primal, tolerance) in product(sets, _combinations(duals, primals, table)):
             for assembly, solver, accuracy in product(study.assembly, study.solver_names(), study.accuracy):
                 cell = Cell(
-                    problem=Plugin.from_entry("problem", problem),
-                    dual=Plugin.from_entry("dual strategy", dual),
-                    primal=Plugin.from_entry("primal strategy", primal),
+                    problem=plugin,
+                    dual=dual[1],
+                    primal=primal[1],
                     pod=pod,
                     cone=cone,
                     primal_tol=tolerance,
@@ -45,8 +47,8 @@ def expand(study: Study) -> list[Cell]:
                     warm_start=study.warm_start,
                     seed=study.seed,
                     accuracy=accuracy,
-                    labels=(problem.title, dual.title, primal.title),
-                    nested_tolerances=nested[primal.title],
+                    labels=(problem.title, dual[0].title, primal[0].title),
+                    nested_tolerances=nested[primal[0].title],
                     validation=trained.validation,
                     training=trained.training,
                     validation_sampling=trained.validation_sampling,
@@ -56,6 +58,15 @@ def expand(study: Study) -> list[Cell]:
     if not cells:
         raise RequestError(f"study '{study.name}': the matrix is empty")
     return list(cells.values())
+
+
+EntryT = TypeVar("EntryT", bound=Entry)
+_Made: TypeAlias = tuple[EntryT, Plugin]
+
+
+def _made(kind: str, entries: Sequence[EntryT]) -> list[_Made[EntryT]]:
+    """The entries of an axis, each with its plugin: titles need not tell them apart."""
+    return [(entry, Plugin.from_entry(kind, entry)) for entry in entries]
 
 
 @dataclass(frozen=True)
@@ -68,14 +79,14 @@ class _Sets:
     labels: tuple[str, str]
 
 
-def _sets(study: Study, problem: ProblemEntry) -> list[_Sets]:
+def _sets(study: Study, problem: ProblemEntry, plugin: Plugin) -> list[_Sets]:
     """The training sets of a problem in a study, each with the validation set."""
-    built, asked = Plugin.from_entry("problem", problem), study.validation_of(problem)
+    asked = study.validation_of(problem)
     if isinstance(asked, int):
         count, checked, label = asked, None, OWN
     else:
         checked, label = Plugin.from_entry("sampling strategy", asked), asked.title
-        count = size_of_set(built, checked)
+        count = size_of_set(plugin, checked)
     return [
         _Sets(
             None if entry.name == OWN else Plugin.from_entry("sampling strategy", entry),
@@ -94,8 +105,10 @@ def _nested_tolerances(primal: Entry, table: ToleranceTable) -> tuple[float, ...
     return tuple(sorted({value for value in table.of_primal(primal) if value is not None}, reverse=True))
 
 
-def _combinations(study: Study, table: ToleranceTable) -> Iterator[tuple[Entry, Stop, Stop, Entry, float | None]]:
+def _combinations(
+    duals: Sequence[_Made[Entry]], primals: Sequence[_Made[Entry]], table: ToleranceTable
+) -> Iterator[tuple[_Made[Entry], Stop, Stop, _Made[Entry], float | None]]:
     pods = [Stop(tolerance=value) for value in table.pod or []] + [Stop(size=value) for value in table.N or []]
-    for pod, dual, primal in product(pods, study.dual, study.primal):
-        for cone, tolerance in product(table.of_dual(dual), table.of_primal(primal)):
+    for pod, dual, primal in product(pods, duals, primals):
+        for cone, tolerance in product(table.of_dual(dual[0]), table.of_primal(primal[0])):
             yield dual, pod, cone, primal, tolerance

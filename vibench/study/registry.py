@@ -10,45 +10,31 @@ from dataclasses import dataclass
 from functools import cache, cached_property
 from importlib.metadata import EntryPoint
 from pathlib import Path
+from pkgutil import resolve_name
 from typing import Any, get_type_hints
 
 from pydantic import ConfigDict, PydanticUserError, TypeAdapter, ValidationError
 
 from vibench.errors import RequestError, in_a_line, unknown_name
-from vibench.interfaces.figures import FigurePlugin
-from vibench.interfaces.problem import Problem
-from vibench.interfaces.sampling import Sampling
-from vibench.interfaces.strategies import DualStrategy, PrimalStrategy
 from vibench.provenance import distribution_version, source_hash
 from vibench.qp.settings import SETTINGS
 from vibench.qp.solution import QPSolver
 from vibench.study.entry_points import entry_points
+from vibench.study.kinds import CHECKED, KINDS
 
-GROUPS: Mapping[str, str] = {
-    "problem": "vibench.problems",
-    "dual strategy": "vibench.dual_strategies",
-    "primal strategy": "vibench.primal_strategies",
-    "QP solver": "vibench.qp_solvers",
-    "sampling strategy": "vibench.sampling",
-    "study": "vibench.studies",
-    "figure plugin": "vibench.figures",
-}
+GROUPS: Mapping[str, str] = {kind.title: kind.entry_points for kind in KINDS}
+"""Groups of entry points by kind of plugin."""
+
 FINITE = ConfigDict(allow_inf_nan=False)
 """Options of plugins are finite."""
 
-BASES: Mapping[str, type] = {
-    "problem": Problem, "dual strategy": DualStrategy, "primal strategy": PrimalStrategy,
-    "sampling strategy": Sampling, "figure plugin": FigurePlugin,
-}  # fmt: skip
+BASES: Mapping[str, type] = {kind.title: resolve_name(kind.base) for kind in KINDS if kind.base}
 """Abstract base classes of the kinds of plugins that are classes."""
 
 READERS = ("problem", "sampling strategy")
 """Kinds of plugins that may read files, of which they have a `data_digest`."""
 
-WORDS: Mapping[str, str] = {
-    "problem": "problem", "primal": "primal strategy", "dual": "dual strategy", "solver": "QP solver",
-    "sampling": "sampling strategy", "figure": "figure plugin",
-}  # fmt: skip
+WORDS: Mapping[str, str] = {kind.word: kind.title for kind in CHECKED}
 """Kinds of plugins by their names on the command line."""
 
 

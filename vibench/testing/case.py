@@ -1,4 +1,4 @@
-"""A plugin under examination, and the checks that problems and strategies have in common."""
+"""A plugin under examination, and the checks that plugins of several kinds have in common."""
 
 from __future__ import annotations
 
@@ -38,11 +38,8 @@ T = TypeVar("T")
 
 
 @dataclass(eq=False)
-class Case(ABC, Generic[PluginT, ArgumentT, ResultT]):
-    """A plugin, the arguments it is called with, and the results; `limit` bounds the wall time [s] of the checks.
-
-    Every call receives copies, so that a plugin that writes to its input fails the check "no mutation" alone.
-    """
+class Examined(Generic[PluginT]):
+    """A plugin of any kind; `limit` bounds the wall time [s] of the checks."""
 
     base: ClassVar[type]
     """Class that the plugin derives from."""
@@ -52,12 +49,52 @@ class Case(ABC, Generic[PluginT, ArgumentT, ResultT]):
 
     def __post_init__(self) -> None:
         self._times: defaultdict[str, list[float]] = defaultdict(list)
-        self._began = time.monotonic()
         if not callable(self.create):
             raise TypeError(
                 f"pass the class {type(self.create).__name__}, or a function that makes an instance, not an instance: "
                 "two instances are compared"
             )
+
+    @cached_property
+    def plugin(self) -> PluginT:
+        """The instance that most checks use."""
+        return self.clocked("the construction", self.create)
+
+    def clocked(self, what: str, work: Callable[[], T]) -> T:
+        """Result of some work; the check "time" reports its wall time."""
+        result, seconds = timed(work)
+        self._times[what].append(seconds.wall)
+        return result
+
+    def construction(self) -> Iterator[str]:
+        """An instance of the right class can be made."""
+        plugin: object = self.plugin
+        if not isinstance(plugin, self.base):
+            yield f"a {type(plugin).__name__} was made; expected a subclass of vibench.{self.base.__name__}"
+
+    def duration(self) -> Iterator[str]:
+        """The constructor and every call stay below the limit."""
+        for what, seconds in self._times.items():
+            if max(seconds) > self.limit:
+                excess = f"{what} takes {max(seconds):.3g} s, above the limit of {self.limit:g} s"
+                yield f"{excess}; is something recomputed that could be stored?"
+        yield from self._spent()
+
+    def _spent(self) -> Iterator[Note]:
+        """What all calls took."""
+        yield from (Note(f"{what} takes {np.median(seconds):.2g} s") for what, seconds in self._times.items())
+
+
+@dataclass(eq=False)
+class Case(Examined[PluginT], ABC, Generic[PluginT, ArgumentT, ResultT]):
+    """A plugin, the arguments it is called with, and the results.
+
+    Every call receives copies, so that a plugin that writes to its input fails the check "no mutation" alone.
+    """
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self._began = time.monotonic()
 
     @property
     @abstractmethod
@@ -73,20 +110,9 @@ class Case(ABC, Generic[PluginT, ArgumentT, ResultT]):
         """Arrays of a result that a repeated call has to reproduce to the last bit."""
 
     @cached_property
-    def plugin(self) -> PluginT:
-        """The instance that most checks use."""
-        return self.clocked("the construction", self.create)
-
-    @cached_property
     def results(self) -> dict[str, ResultT]:
         """Results by the names of their arguments."""
         return {name: self.evaluate(argument) for name, argument in self.arguments.items()}
-
-    def clocked(self, what: str, work: Callable[[], T]) -> T:
-        """Result of some work; the check "time" reports its wall time."""
-        result, seconds = timed(work)
-        self._times[what].append(seconds.wall)
-        return result
 
     @property
     def late(self) -> bool:
@@ -97,12 +123,6 @@ class Case(ABC, Generic[PluginT, ArgumentT, ResultT]):
         """Every option has an annotation that its default conforms to."""
         constructor = getattr(self.create, "func", self.create)
         yield from option_doubts(constructor) if isinstance(constructor, type) else ()
-
-    def construction(self) -> Iterator[str]:
-        """An instance of the right class can be made."""
-        plugin: object = self.plugin
-        if not isinstance(plugin, self.base):
-            yield f"a {type(plugin).__name__} was made; expected a subclass of vibench.{self.base.__name__}"
 
     def determinism(self) -> Iterator[str]:
         """A second call and another instance give the same results to the last bit."""
@@ -128,14 +148,6 @@ class Case(ABC, Generic[PluginT, ArgumentT, ResultT]):
         """A result as a stage finds it in its artefact."""
         found: ResultT = loads(dumps(result))
         return found
-
-    def duration(self) -> Iterator[str]:
-        """The constructor and every call stay below the limit."""
-        for what, seconds in self._times.items():
-            if max(seconds) > self.limit:
-                excess = f"{what} takes {max(seconds):.3g} s, above the limit of {self.limit:g} s"
-                yield f"{excess}; is something recomputed that could be stored?"
-            yield Note(f"{what} takes {np.median(seconds):.2g} s")
 
     def _deviations(self, source: str, plugin: PluginT) -> Iterator[str]:
         """Arrays that differ when all calls are repeated, each named once."""

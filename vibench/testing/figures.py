@@ -5,7 +5,6 @@ from __future__ import annotations
 import inspect
 import shutil
 import tempfile
-import time
 import weakref
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -15,9 +14,10 @@ from typing import TYPE_CHECKING
 
 import pandas as pd
 
-from vibench.interfaces.figures import DerivedColumn, FigurePlugin
+from vibench.interfaces.figures import EXTENSIBLE, DerivedColumn, FigurePlugin
 from vibench.results import tables
 from vibench.results.plugin_columns import Copies, column_values, declared, name_faults
+from vibench.testing.case import Examined
 from vibench.testing.checks import SECONDS, Check, Doubt, Finding, Note, examine, raising
 from vibench.testing.samples.run import write_sample_run
 
@@ -29,22 +29,11 @@ NAME = "examined"
 
 
 @dataclass(eq=False)
-class FigureCase:
-    """A figure plugin and the results file that its figures and columns are made from; `limit` is in wall seconds."""
+class FigureCase(Examined[FigurePlugin]):
+    """A figure plugin and the results file that its figures and columns are made from."""
 
-    create: Callable[[], FigurePlugin]
-    limit: float
+    base = FigurePlugin
     run: Path | None = None
-
-    def __post_init__(self) -> None:
-        if not callable(self.create):
-            raise TypeError(f"pass the class {type(self.create).__name__}, not an instance: two instances are compared")
-        self._slowest = dict[str, float]()
-
-    @cached_property
-    def plugin(self) -> FigurePlugin:
-        """The instance that most checks use."""
-        return self.create()
 
     @cached_property
     def folder(self) -> Path:
@@ -59,9 +48,14 @@ class FigureCase:
         return self.run or write_sample_run(self.folder / "run")
 
     @cached_property
-    def empty(self) -> Path:
-        """Results of a run without cells."""
-        return write_sample_run(self.folder / "empty", empty=True)
+    def recorded(self) -> Copies:
+        """The recorded tables, read before any column is timed."""
+        return _read(self.path)
+
+    @cached_property
+    def empty(self) -> Copies:
+        """Those of a run without cells."""
+        return _read(write_sample_run(self.folder / "empty", empty=True))
 
     @cached_property
     def problems(self) -> list[Data]:
@@ -77,9 +71,7 @@ class FigureCase:
 
     def construction(self) -> Iterator[str]:
         """It is made without arguments."""
-        plugin: object = self.plugin
-        if not isinstance(plugin, FigurePlugin):
-            yield f"a {type(plugin).__name__} was made; expected a subclass of vibench.FigurePlugin"
+        yield from super().construction()
         constructor = getattr(self.create, "func", self.create)
         options = list(inspect.signature(constructor).parameters)
         if options:
@@ -102,10 +94,8 @@ class FigureCase:
         for data in self.problems:
             before = _frames(data)
             for kind, draw in list(named(NAME, self.plugin, data)):
-                began = time.perf_counter()
                 with styled():
-                    figure = draw_guarded(NAME, kind, draw)
-                self._note(f"figure '{kind}'", time.perf_counter() - began)
+                    figure = self.clocked(f"figure '{kind}'", partial(draw_guarded, NAME, kind, draw))
                 drawn += figure is not None
                 if figure is not None and not caption_of(figure):
                     yield Doubt(f"{data.problem}: figure '{kind}' has no caption: use vibench.Sheet, or a docstring")
@@ -121,12 +111,10 @@ class FigureCase:
 
     def values(self) -> Iterator[str]:
         """Columns have a value of their type for every row, also where there is none."""
-        for what, path in (("", self.path), (" of a run without cells", self.empty)):
+        for recorded in (self.recorded, self.empty):
             for column in self.columns:
-                began = time.perf_counter()
-                found = self._values(column, path)
-                self._note(f"column '{column.name}'", time.perf_counter() - began)
-                if not what and len(found) and found.isna().all():
+                found = self.clocked(f"column '{column.name}'", partial(_values, column, recorded))
+                if recorded is self.recorded and len(found) and found.isna().all():
                     yield Doubt(f"column '{column.name}' is empty in all {len(found)} rows")
 
     def determinism(self) -> Iterator[str]:
@@ -143,9 +131,9 @@ class FigureCase:
             yield f"another instance has the columns {', '.join(again)}"
             return
         for column in self.columns:
-            first = self._values(column, self.path)
+            first = _values(column, self.recorded)
             for source, same in (("a second call", column), ("another instance", again[column.name])):
-                found = self._values(same, self.path)
+                found = _values(same, self.recorded)
                 if not found.equals(first):
                     row = int((~(found.eq(first) | (found.isna() & first.isna()))).to_numpy().argmax())
                     yield (
@@ -160,20 +148,22 @@ class FigureCase:
             where = "this run" if self.run else "the made-up run, whose problems are membrane and plate"
             yield Doubt(f"neither figures nor columns of {where}: `--run RUN` checks on a run of yours")
 
-    def duration(self) -> Iterator[str]:
-        """Every figure and column stays below the limit."""
-        for what, seconds in self._slowest.items():
-            if seconds > self.limit:
-                yield f"{what} takes {seconds:.3g} s, above the limit of {self.limit:g} s"
-        slowest = max(self._slowest.values(), default=0.0)
+    def _spent(self) -> Iterator[Note]:
+        """What the slowest call took: there are many figures."""
+        slowest = max((max(seconds) for seconds in self._times.values()), default=0.0)
         yield Note(f"at most {slowest:.2g} s each")
 
-    def _values(self, column: DerivedColumn, path: Path) -> pd.Series:
-        read = partial(tables.read, path)
-        return column_values(NAME, column, Copies(read), read(column.table))
 
-    def _note(self, what: str, seconds: float) -> None:
-        self._slowest[what] = max(seconds, self._slowest.get(what, 0.0))
+def _read(path: Path) -> Copies:
+    """The tables of a results file that columns are made from."""
+    found = Copies(partial(tables.read, path))
+    for table in EXTENSIBLE:
+        found.of(table)
+    return found
+
+
+def _values(column: DerivedColumn, recorded: Copies) -> pd.Series:
+    return column_values(NAME, column, recorded, recorded.of(column.table))
 
 
 def _frames(data: Data) -> dict[str, pd.DataFrame]:

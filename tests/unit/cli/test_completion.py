@@ -66,7 +66,7 @@ def test_values_are_completed_with_what_there_is(line: str, words: list[str]) ->
 
 
 def test_the_lists_and_tables_offered_are_all_there_are() -> None:
-    assert set(completion.lists("")) == {*LISTS, "solvers"} == set(overview.KINDS)
+    assert set(completion.lists("")) == {*LISTS, "solvers"} == set(overview.LISTS)
     assert set(completion.table_names("")) == set(completion.SHOWN) == set(VIEWS) > set(TABLES)
 
 

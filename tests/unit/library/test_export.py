@@ -21,7 +21,7 @@ from running import Main, refused
 
 import vibench
 from vibench.highfidelity.active_set import HighFidelitySolver
-from vibench.library import exported_certificate, reduced_model
+from vibench.library import export, exported_certificate, reduced_model
 from vibench.library.export import BOUNDS, RUNTIME, export_model
 from vibench.library.export import exported as exported_model
 from vibench.library.reduced_model import Model as Exported
@@ -450,9 +450,23 @@ def test_a_problem_that_fails_in_the_box_is_named(
     def only_once(_: np.ndarray) -> Any:
         raise KeyError("mu is not in the list")
 
-    monkeypatch.setattr(type(model.reduced), "members", lambda self, mu: only_once(mu))
+    monkeypatch.setattr(type(model.reduced), "members", lambda self, mu, samples: only_once(mu))
     with pytest.raises(vibench.RequestError, match="cannot be evaluated in the whole parameter box: KeyError"):
         export_model(model, tmp_path / "model.npz")
+
+
+def test_coefficients_are_evaluated_once_per_parameter(run: vibench.Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    model = model_of(run, "radial-obstacle")
+    (mu,), points = model.parameters.sample(1, seed=0), []
+    evaluate, size = model.reduced.coefficients, len(model.reduced.assemble(mu).program.f)
+
+    def count(at: np.ndarray) -> Mapping[str, np.ndarray]:
+        points.append(at)
+        return evaluate(at)
+
+    monkeypatch.setattr(model.reduced, "coefficients", count)
+    assert export._evaluated(model.reduced, size, frozenset(), None, mu).keys() == {"A", "f", "B", "g"}
+    assert len(points) == 1
 
 
 def test_the_command(run: vibench.Run, main: Main, tmp_path: Path) -> None:
@@ -511,7 +525,8 @@ def test_an_exported_certificate_gives_the_bounds_of_vibench(certified: vibench.
 def test_a_model_without_a_certificate_has_no_bounds_and_says_why(run: vibench.Run, tmp_path: Path) -> None:
     file = tmp_path / "model.npz"
     found = export_model(model_of(run, "radial-obstacle"), file)
-    assert 'assembly = "certified"' in found.about["certificate"]
+    assert found.about["certificate"] == "none"
+    assert 'assembly = "certified"' in found.about["no_bounds"]
     with pytest.raises(ValueError, match="has no error bounds: its cell has no bounds"):
         WithBounds(file)
 

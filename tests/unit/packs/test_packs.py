@@ -17,7 +17,9 @@ from running import Main
 
 from vibench.errors import NumericalError, RequestError
 from vibench.highfidelity.active_set import HighFidelitySolver
-from vibench.interfaces.problem import MEMBERS
+from vibench.interfaces.problem import MEMBERS, Problem, VariationalInequality
+from vibench.interfaces.validation import checked_assembly
+from vibench.packs import writer
 from vibench.packs.checks import read_model_pack
 from vibench.packs.dual_half import reduce_multipliers
 from vibench.packs.pack import ModelPack
@@ -192,6 +194,21 @@ def test_a_pack_is_written_whole_or_not_at_all(tmp_path: Path, main: Main, monke
     assert code == 0
     assert_cable(read_model_pack("new"))
     assert [path.name for path in Path().iterdir()] == ["new"]
+
+
+def test_a_problem_of_constants_and_declared_sums_is_assembled_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    problem, assembled = registry.create("problem", "pack", {"path": str(write_cable(tmp_path / "pack"))}), []
+
+    def count(problem: Problem, mu: np.ndarray) -> VariationalInequality:
+        assembled.append(mu)
+        return checked_assembly(problem, mu)
+
+    monkeypatch.setattr(writer, "checked_assembly", count)
+    writer.write_pack(problem, tmp_path / "new", name="cable", source="", validation=2, seed=0)
+    assert len(assembled) == 1
+    assert_cable(read_model_pack(tmp_path / "new"))
 
 
 def test_the_python_example_of_the_page_exports_a_pack(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

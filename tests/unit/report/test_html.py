@@ -161,7 +161,7 @@ def test_a_run_without_any_query_has_a_report(changed: Changed) -> None:
 
 def test_a_strategy_that_is_labelled_high_fidelity_is_no_high_fidelity_model(changed: Changed) -> None:
     path = changed("UPDATE thresholds SET primal_a = 'high-fidelity'")
-    read = {name: tables.extended(path, name) for name in html.SHARED}
+    read = tables.extended_tables(path, html.READ)
     thresholds = read["thresholds"].frame
     found = {grid.name: len(grid.frame) for grid in html._grids(read)}
     assert found["enrichments"] == thresholds["cell_a"].notna().sum() > 0

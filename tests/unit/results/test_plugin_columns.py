@@ -16,12 +16,15 @@ from samples import cell_row, query_rows
 
 import vibench
 from vibench import DerivedColumn, FigurePlugin, RunTables
+from vibench.report import figures, html
 from vibench.report.comparison.compare import compare
 from vibench.report.page.embedded import grid_of_cells
 from vibench.results import tables
 from vibench.results.best import fastest
 from vibench.results.database import ResultsDatabase
+from vibench.results.plugin_columns import extended_tables
 from vibench.results.sqlite.reading import FILE
+from vibench.testing.samples.run import write_sample_run
 
 GROUP, HERE = "vibench.figures", __name__
 
@@ -94,6 +97,29 @@ def test_columns_are_derived_from_all_tables_in_the_order_of_the_rows(register: 
     assert list(found.frame["size"]) == ["small", "small", "large"]
     assert list(tables.extended(path, "queries").frame["odd"]) == [0, 1] * 3
     assert list(found.frame["N"]) == [0, 1, 2]
+
+
+def test_tables_are_read_and_plugins_created_once_for_all_tables(
+    register: Register, path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    register((GROUP, "savings", f"{HERE}:Savings"))
+    created: list[Savings] = []
+    read: list[str] = []
+    names = ["queries", "cells", "disagreements"]
+
+    def create(self: Savings) -> None:
+        created.append(self)
+
+    def recorded(name: str) -> pd.DataFrame:
+        read.append(name)
+        return tables.read(path, name)
+
+    monkeypatch.setattr(Savings, "__init__", create)
+    found = extended_tables(names, recorded)
+    assert (read, len(created), list(found)) == (names, 1, names)
+    assert list(found["cells"].columns) == ["speedup", "slowest_s", "unknowns", "size"]
+    assert list(found["queries"].columns) == ["odd"]
+    assert not found["disagreements"].columns
 
 
 def test_the_library_and_the_exports_have_them(register: Register, path: Path) -> None:
@@ -215,6 +241,49 @@ def test_a_column_that_failed_is_refused_with_its_reason_and_the_table_is_shown(
     code, out, err = main("show", str(path.parent), "--columns", "cell", "--format", "csv")
     assert (code, out, err) == (0, "cell\na\nb\nc\n", f"vibench: {reason}\n")
     refused(main("show", str(path.parent), "--columns", "cell,mine"), reason)
+
+
+class Two(FigurePlugin):
+    """Columns of two tables, of which neither can be computed."""
+
+    def columns(self) -> Sequence[DerivedColumn]:
+        return (
+            DerivedColumn("mine", "Mine.", lambda found: 1 / 0),
+            DerivedColumn("later", "Mine.", lambda found: 1 / 0, table="histories"),
+        )
+
+
+TWO = [
+    "column 'mine' of figure plugin 'two' cannot be computed: ZeroDivisionError: division by zero",
+    "column 'later' of figure plugin 'two' cannot be computed: ZeroDivisionError: division by zero",
+]
+
+
+def test_figures_say_once_which_columns_their_data_do_not_have(register: Register, main: Main, tmp_path: Path) -> None:
+    register((GROUP, "two", f"{HERE}:Two"))
+    path = write_sample_run(tmp_path / "run")
+    lines: list[str] = []
+    drawn = figures.draw_all(path, tmp_path / "figures", ("svg",), note=lines.append)
+    assert drawn
+    assert lines == TWO
+    code, out, _ = main("figures", str(path.parent), "--out", str(tmp_path / "drawn"), "--format", "svg", "--jobs", "1")
+    assert code == 0
+    assert [line for line in out.splitlines() if line.startswith("column")] == TWO
+    with pytest.warns(UserWarning, match="'two'") as caught:
+        vibench.open_run(path).figure("errors", problem="plate")
+    assert [str(one.message) for one in caught] == TWO
+    assert {one.filename for one in caught} == {__file__}
+
+
+def test_a_report_and_a_site_say_once_which_columns_they_do_not_have(
+    register: Register, main: Main, tmp_path: Path
+) -> None:
+    register((GROUP, "two", f"{HERE}:Two"))
+    path = write_sample_run(tmp_path / "run")
+    text = html.page(path)
+    assert [text.count(line.replace("'", "&#39;")) for line in TWO] == [1, 1]
+    code, _, err = main("publish", str(path.parent), str(tmp_path / "site"))
+    assert (code, err) == (0, f"vibench: {TWO[0]}\n")  # no table of histories is published
 
 
 @pytest.mark.parametrize(

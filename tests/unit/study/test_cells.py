@@ -241,6 +241,12 @@ def test_equal_options_give_one_cell(cells_of: Expand) -> None:
     assert len(cells_of(changed(STUDY, "problem", to=entries))) == len(cells_of(STUDY))
 
 
+def test_entries_of_the_same_title_are_told_apart_by_their_options(cells_of: Expand) -> None:
+    cells = cells_of(changed(STUDY, "problem", to=["obstacle", {"name": "obstacle", "options": {"length": 2.0}}]))
+    assert {cell.problem.options for cell in cells} == {"{}", '{"length": 2.0}'}
+    assert {cell.labels[0] for cell in cells} == {"obstacle"}
+
+
 def test_defaults_written_out_give_the_same_cells(cells_of: Expand) -> None:
     short, long = (
         cells_of(changed(STUDY, "problem", 0, "options", to={"resolution": "coarse"} | options))

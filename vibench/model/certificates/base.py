@@ -1,4 +1,4 @@
-"""What certificates of all reduced models of a problem have in common: the inner product, and A against it."""
+"""What certificates of all reduced models of a problem have in common: the inner product, A against it, and B₀."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 
 import numpy as np
+import scipy.sparse as sp
 
 from vibench.arrays import Array, Indices, SparseMatrix
 from vibench.errors import UnsupportedError
@@ -14,6 +15,7 @@ from vibench.interfaces.problem import Contact, Problem
 from vibench.interfaces.validation import checked_assembly
 from vibench.linalg.inner_product import InnerProduct
 from vibench.model.affine import AffineMember, Evaluation, coefficients, evaluated_members
+from vibench.model.certificates.prepared_lifting import constant_unknowns
 from vibench.model.certificates.spectral import SpectralBounds, rotated, spectral_bounds
 from vibench.stability.coercivity import operator_norm
 
@@ -54,6 +56,11 @@ class CertificateBase:
         Bounds of A against X; `None` where A is X.
     load_error, stiffness_error
         Bounds of ‖f − f̃‖ in the dual norm of X and of the operator norm of A − Ã; zero where they are exact.
+    constraint
+        B₀ (m×k) on the contact unknowns: what B is a multiple of where there are `bound_terms`; elsewhere B on the
+        bodies where that is the same at all training parameters, and zero on the others.
+    bound_terms
+        The terms of g (m×Q) where B is a multiple of one matrix and g an exact sum; `None` elsewhere.
     """
 
     X: InnerProduct
@@ -63,6 +70,8 @@ class CertificateBase:
     spectral: SpectralBounds | None
     load_error: float
     stiffness_error: float
+    constraint: SparseMatrix
+    bound_terms: Array | None
 
     @property
     def guarantee(self) -> Guarantee:
@@ -113,7 +122,21 @@ def certificate_base(problem: Problem, members: Mapping[str, AffineMember], trai
         samples = np.column_stack([evaluate(mu).get("A", ONE) for mu in training])
         rotation, terms = T, _ = rotated(A.terms, samples)
         spectral = spectral_bounds(problem, X, terms, lambda mu: T @ evaluate(mu).get("A", ONE), stiffness)
-    return CertificateBase(X, 0.5 * (compliance + compliance.T), tuple(terms), rotation, spectral, load, stiffness)
+    C = 0.5 * (compliance + compliance.T)
+    constraint, bound = _constant_constraint(problem, members, C, training)
+    return CertificateBase(X, C, tuple(terms), rotation, spectral, load, stiffness, constraint, bound)
+
+
+def _constant_constraint(
+    problem: Problem, members: Mapping[str, AffineMember], compliance: Array, training: Array
+) -> tuple[SparseMatrix, Array | None]:
+    """B₀ and the terms of g of a `CertificateBase`."""
+    B, g = members["B"], members["g"]
+    if len(B.terms) == 1 and is_exact(problem, "B", B) and is_exact(problem, "g", g):
+        return sp.csr_array(B.terms[0])[:, contact_unknowns(problem)], np.column_stack(g.terms)
+    constraints = [contact_at(problem, mu).B.copy() for mu in training]
+    kept = constant_unknowns(compliance, constraints)
+    return sp.csr_array(sp.csr_array(constraints[0]) @ sp.diags_array(kept.astype(float))), None
 
 
 def injected(problem: Problem) -> Array:

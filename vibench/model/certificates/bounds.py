@@ -63,7 +63,7 @@ class OnlineBound:
     coercivity
         α.
     guarantee, note
-        What they are worth, and why there are none, what took more time than usual, or "".
+        What they are worth; and why there are none, that no prepared lifting was feasible, or "".
     """
 
     u_energy: float
@@ -101,14 +101,10 @@ class OnlineCertificate:
         Rows (k×d) of Φ at the contact unknowns.
     generators
         χ (m×R).
-    on_contact
-        Whether the coefficients of Bᵀλ_N are those of `coefficients_on_contact`, not θ_q α_i for all Bᵀ_q χ_i.
     forces
-        B₀ᵀχ (k×R) with the part B₀ of B that does not depend on the parameter.
+        B₀ᵀχ (k×R) where B is assembled on the contact; `None` where it is exactly the sum of its terms.
     prepared
         Liftings that take no factorisation at the parameter, where there are any.
-    bound_terms
-        The terms of g (m×Q), where these liftings need no matrix B.
     """
 
     base: CertificateBase
@@ -117,16 +113,14 @@ class OnlineCertificate:
     compliance: ContactCompliance
     contact_basis: Array
     generators: Array
-    on_contact: bool
-    forces: Array
+    forces: Array | None
     prepared: PreparedLiftings | None = None
-    bound_terms: Array | None = None
 
     @cached_property
     def _bound_sizes(self) -> Array:
         """|g_q| (m×Q)."""
-        assert self.bound_terms is not None  # where this is called
-        return np.abs(self.bound_terms)
+        assert self.base.bound_terms is not None  # where this is called
+        return np.abs(self.base.bound_terms)
 
     @cached_property
     def _round_off(self) -> Array:
@@ -140,7 +134,7 @@ class OnlineCertificate:
         if lam.min(initial=0.0) < 0.0:
             return OnlineBound.none(NOT_IN_CONE)
         evaluated = evaluated_by(reduced)
-        if self.on_contact and evaluated.contact is None:
+        if self.forces is not None and evaluated.contact is None:
             evaluated = replace(evaluated, contact=contact_at(problem, mu))
         y, theta = coordinates_of(x, evaluated), base.coefficients(evaluated.samples)
         lower, upper = (1.0, 1.0) if base.spectral is None else base.spectral.at(mu, theta["A"])
@@ -150,10 +144,7 @@ class OnlineCertificate:
         if lifted is None:
             return OnlineBound.none(note)
         along, norm, kappa = lifted
-        of_lam: Array = (theta["B"][:, None] * alpha).ravel()
-        if self.on_contact:
-            assert evaluated.contact is not None  # see above
-            of_lam = coefficients_on_contact(evaluated.contact, self.forces, alpha, lam)
+        of_lam = coefficients_of_multiplier(theta["B"], self.forces, evaluated.contact, alpha, lam)
         coordinates, beside, missing = self.residual.parts(residual_coefficients(theta, y, of_lam))
         square_of_u = float(x @ (reduced.program.A @ x))
         u_norm = sqrt(max(0.0, square_of_u) / max(lower - base.stiffness_error, TINY))  # of u_N in X
@@ -189,11 +180,11 @@ class OnlineCertificate:
         self, problem: Problem, mu: Array, evaluated: Evaluated
     ) -> tuple[float | SparseMatrix, Array, Array]:
         """B and g as prepared liftings take them, and a bound of the terms of g."""
-        if self.bound_terms is None:
+        if self.base.bound_terms is None:
             contact = evaluated.contact or contact_at(problem, mu)
             return contact.B, contact.g, np.abs(contact.g)
         theta, of_g = evaluated.samples.get("B", ONE), evaluated.samples.get("g", ONE)
-        return float(theta[0]), self.bound_terms @ of_g, self._bound_sizes @ np.abs(of_g)
+        return float(theta[0]), self.base.bound_terms @ of_g, self._bound_sizes @ np.abs(of_g)
 
 
 def residual_coefficients(theta: Mapping[str, Array], y: Array, of_lam: Array) -> Array:
@@ -201,8 +192,17 @@ def residual_coefficients(theta: Mapping[str, Array], y: Array, of_lam: Array) -
     return np.concatenate([theta["f"], (-theta["A"][:, None] * y).ravel(), -of_lam])
 
 
-def coefficients_on_contact(contact: Contact, forces: Array, alpha: Array, lam: Array) -> Array:
-    """Coefficients (k+R,) of Bᵀλ_N: what B₀ᵀλ_N lacks, on the contact unknowns, and α for the vectors B₀ᵀχ."""
+def coefficients_of_multiplier(
+    theta: Array, forces: Array | None, contact: Contact | None, alpha: Array, lam: Array
+) -> Array:
+    """Coefficients of Bᵀλ_N: θ_q α_i of all Bᵀ_q χ_i (Q R,) where B is exactly the sum of its terms.
+
+    Where it is assembled on the contact, and there are `forces`, they are what B₀ᵀλ_N lacks, on the contact unknowns,
+    and α for the vectors B₀ᵀχ (k+R,).
+    """
+    if forces is None:
+        return np.asarray((theta[:, None] * alpha).ravel())
+    assert contact is not None  # evaluated where B is assembled on the contact
     return np.concatenate([contact.B.T @ lam - forces @ alpha, alpha])
 
 

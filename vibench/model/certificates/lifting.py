@@ -5,10 +5,11 @@ norm ‖w‖² = cᵀ C c. As B w depends on w_E alone, the minimiser of
 
     ½ γ ‖w‖² + λᵀ B w    subject to    B w ≥ s
 
-is of this form with γ c = Bᵀ(ν − λ), multipliers ν ≥ 0 and complementarity. Let I be the rows with λ > 0 and those that
-other w violate, S = (B C Bᵀ)_II / γ, and v = (B w − s)_I. Then ν = λ + S⁻¹(s + v) on I: a linear complementarity
-problem for v ≥ 0 and ν ≥ 0, solved by a primal-dual active set method from v = 0, where λ > 0 costs nothing
-(Hintermüller, Ito and Kunisch, 2002). Few rows leave v = 0, so that one factorisation of S serves all steps.
+is of this form with γ c = Bᵀ(ν − λ), multipliers ν ≥ 0 and complementarity. Let S = B C Bᵀ / γ and v = B w − s. Let I
+be the rows with λ_i > 0 in which releasing λ_i alone violates the constraint, λ_i S_ii > −s_i, and those that other w
+violate; on the other rows, J, ν = 0. Then ν = λ + S_II⁻¹(s + v + S_IJ λ_J) on I: a linear complementarity problem for
+v ≥ 0 and ν ≥ 0, solved by a primal-dual active set method from v = 0, where λ > 0 costs nothing (Hintermüller, Ito and
+Kunisch, 2002). Few rows leave v = 0, so that one factorisation of S_II serves all steps.
 
 Any w with B w ≥ s is as good as another for a bound to hold. Optimality is not verified, feasibility is: s is raised by
 a margin above its round-off. Rows far from the contact are not evaluated where |B w| ≤ Σ_j |B_ij| √C_jj ‖w‖, which is
@@ -39,7 +40,7 @@ EXTENSIONS = 10
 """How often rows are added to I."""
 
 ATTEMPTS = 4
-"""Margins that are tried, each at least ten times the one before."""
+"""Margins that are tried; each is larger than the one before in the rows that lacked something."""
 
 MARGIN = 4.0
 """The first margin of s, as a multiple of the round-off in s."""
@@ -51,7 +52,7 @@ MOST_BLOCKS = 8
 """Largest number of blocks of C that are treated one by one."""
 
 REGULAR = 1e-13
-"""Share of the largest diagonal entry of S that is added to all, so that dependent rows have a factorisation."""
+"""Share of the largest diagonal entry of S_II that is added to all, so that dependent rows have a factorisation."""
 
 UNIT = float(np.finfo(float).eps)
 
@@ -251,7 +252,7 @@ class _Program:
             chosen |= violated
 
     def _difference(self, chosen: Mask, excess: Array, size: Array) -> Array:
-        """ν − λ (m,) with ν = 0 on rows that are not chosen."""
+        """ν − λ (m,) with ν = 0 on rows that are not chosen, but for those where λ is negligible: there ν = λ."""
         lam, rows = self._lam, np.flatnonzero(chosen)
         found = np.where(chosen | (lam * size <= NEGLIGIBLE * np.abs(excess)), 0.0, -lam)
         if not len(rows):

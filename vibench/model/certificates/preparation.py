@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
 
 import numpy as np
 import scipy.sparse as sp
 
-from vibench.arrays import Array, Indices, Mask, SparseMatrix
+from vibench.arrays import Array, Indices, Mask
 from vibench.errors import UnsupportedError
 from vibench.highfidelity.active_set import FALLBACK_SOLVER
 from vibench.interfaces.problem import Problem
@@ -16,13 +15,13 @@ from vibench.model.affine import AffineMember
 from vibench.model.certificates.base import CertificateBase, contact_at, contact_unknowns, injected, is_exact
 from vibench.model.certificates.bounds import (
     OnlineCertificate,
-    coefficients_on_contact,
+    coefficients_of_multiplier,
     coordinates_of,
     evaluated_by,
     residual_coefficients,
 )
 from vibench.model.certificates.lifting import ContactCompliance, held_rows, lift
-from vibench.model.certificates.prepared_lifting import carriers, prepare_liftings
+from vibench.model.certificates.prepared_lifting import prepare_liftings
 from vibench.model.certificates.residual import residual_basis
 from vibench.model.hyperreduced import HyperReducedModel
 from vibench.qp.solve import solve_qp
@@ -44,34 +43,21 @@ def prepare(
     Sharpness alone depends on `training` (P×d), parameters that show which terms of residuals contribute.
     """
     problem, Phi, chi, B = model.problem, model.basis, model.generators, members["B"]
-    functionals, on_contact = injected(problem), not is_exact(problem, "B", B)
-    blocks = [np.column_stack(members["f"].terms), *(np.asarray(term @ Phi) for term in base.terms)]
-    constant, scaled = _constant_part(problem, members, base, training)
-    forces = np.asarray(constant.T @ chi)
-    of_multiplier = [functionals, functionals @ forces] if on_contact else [np.asarray(B_q.T @ chi) for B_q in B.terms]
+    whiten, scaled = base.X.whiten_functional, base.bound_terms is not None
+    forces = None if is_exact(problem, "B", B) else np.asarray(base.constraint.T @ chi)
+    blocks = [whiten(np.column_stack(members["f"].terms)), *(whiten(np.asarray(term @ Phi)) for term in base.terms)]
+    functionals = whiten(injected(problem))
+    if forces is None:
+        blocks += [whiten(np.asarray(B_q.T @ chi)) for B_q in B.terms]
+    else:
+        blocks += [functionals, functionals @ forces]
     compliance = ContactCompliance(base.compliance, _near(problem, chi, training))
-    z, typical, held = _sampled(model, base, compliance, forces if on_contact else None, training)
-    residual, U = residual_basis(base.X, blocks + of_multiplier, z, typical)
-    directions = base.X.whiten_functional(functionals).T @ U
+    z, typical, held = _sampled(model, base, compliance, forces, training)
+    residual, U = residual_basis(blocks, z, typical)
+    directions = functionals.T @ U
     contact_basis = np.ascontiguousarray(Phi[contact_unknowns(problem)])
-    liftings = prepare_liftings(constant, scaled, base.compliance, held, contact_basis, directions)
-    found = OnlineCertificate(base, residual, directions, compliance, contact_basis, chi, on_contact, forces, liftings)
-    return replace(found, bound_terms=np.column_stack(members["g"].terms)) if scaled else found
-
-
-def _constant_part(
-    problem: Problem, members: Mapping[str, AffineMember], base: CertificateBase, training: Array
-) -> tuple[SparseMatrix, bool]:
-    """B₀ (m×k) on the contact unknowns, and whether B is a multiple of it and g an exact sum.
-
-    Elsewhere it is B on the bodies where that is the same at all training parameters, and zero on the others.
-    """
-    B, g = members["B"], members["g"]
-    if len(B.terms) == 1 and is_exact(problem, "B", B) and is_exact(problem, "g", g):
-        return sp.csr_array(B.terms[0])[:, contact_unknowns(problem)], True
-    constraints = [contact_at(problem, mu).B.copy() for mu in training]
-    kept = carriers(base.compliance, constraints)
-    return sp.csr_array(sp.csr_array(constraints[0]) @ sp.diags_array(kept.astype(float))), False
+    liftings = prepare_liftings(base.constraint, scaled, base.compliance, held, contact_basis, directions)
+    return OnlineCertificate(base, residual, directions, compliance, contact_basis, chi, forces, liftings)
 
 
 def _near(problem: Problem, chi: Array, training: Array) -> Indices:
@@ -96,7 +82,7 @@ def _sampled(
     """What reduced solutions at training parameters have.
 
     Coefficients (Z×S) of their residuals, the median norm of liftings, and the rows (m,) that some of these hold.
-    `forces` are needed where the coefficients are those of `coefficients_on_contact`.
+    `forces` are those of `coefficients_of_multiplier`.
     """
     problem, found, norms = model.problem, [], [0.0]
     rows, held = model.basis[contact_unknowns(problem)], np.zeros(len(model.generators), bool)
@@ -109,9 +95,7 @@ def _sampled(
         lam = model.generators @ alpha
         contact, y = evaluated.contact or contact_at(problem, mu), coordinates_of(answer.x, evaluated)
         theta = base.coefficients(evaluated.samples)
-        of_lam = np.outer(theta["B"], alpha).ravel()
-        if forces is not None:
-            of_lam = coefficients_on_contact(contact, forces, alpha, lam)
+        of_lam = coefficients_of_multiplier(theta["B"], forces, contact, alpha, lam)
         found.append(residual_coefficients(theta, y, of_lam))
         held |= held_rows(compliance, contact, rows @ y, lam)
         if number % 8 == 0:

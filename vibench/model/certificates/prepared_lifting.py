@@ -37,11 +37,11 @@ LARGEST_CONDITION = 1e9
 class PreparedLiftings:
     """What depends on no parameter; see above.
 
+    Where B(µ) is θ(µ) B₀ everywhere arrays called (p×·) are multiplied by B₀, or by |B₀| (p = m), and have one row per
+    contact unknown (p = k) otherwise.
+
     Attributes
     ----------
-    scaled
-        Whether B(µ) is θ(µ) B₀ everywhere; arrays called (p×·) are then multiplied by B₀, or by |B₀| (p = m), and have
-        one row per contact unknown (p = k) otherwise.
     moved
         Where C B₀ᵀ is not zero: contact unknowns, or rows of B₀ where that is multiplied by it.
     rows
@@ -62,7 +62,6 @@ class PreparedLiftings:
         Bound of the number of round-off errors, of size `UNIT`, in an entry of s and of B w; but for those of B.
     """
 
-    scaled: bool
     moved: Indices
     rows: Indices
     inverse: Array
@@ -82,7 +81,7 @@ class PreparedLiftings:
         Parameters
         ----------
         B
-            θ if B is `scaled`, else B (m×k).
+            θ where B(µ) is θ(µ) B₀ everywhere, else B (m×k).
         g, g_size
             g (m,), and a bound (m,) of the terms that it is the sum of.
         y, lam, gamma
@@ -105,7 +104,7 @@ class PreparedLiftings:
             slack = _product(B, values) - excess
             lacking = round_off + (unit * float(self.reach @ np.abs(a))) * size[:, 1] - slack
             if lacking.max() <= 0.0:  # NaN is not
-                square = float(a @ (values[self.rows] if self.scaled else self.compliance @ a))
+                square = float(a @ (values[self.rows] if isinstance(B, float) else self.compliance @ a))
                 return a @ self.directions, max(0.0, square) ** 0.5, max(0.0, float(lam @ slack))
             if lacking[self.rows].max() <= 0.0:  # rows beyond J are violated
                 return None
@@ -141,7 +140,7 @@ def _product(B: float | SparseMatrix, x: Array) -> Array:
     return np.asarray(B * x if isinstance(B, float) else B @ x)
 
 
-def carriers(compliance: Array, constraints: list[SparseMatrix]) -> Mask:
+def constant_unknowns(compliance: Array, constraints: list[SparseMatrix]) -> Mask:
     """Contact unknowns (k,) of the blocks of C on which all of the constraints (m×k) are the same matrix."""
     first, same = sp.csc_array(constraints[0]), np.ones(len(compliance), bool)
     for other in constraints[1:]:
@@ -189,5 +188,5 @@ def prepare_liftings(
     reach, along = abs(chosen) @ root, np.asarray(chosen @ directions)
     symmetric = 0.5 * (inverse + inverse.T)
     return PreparedLiftings(
-        scaled, moved, J, symmetric, S, reach, basis, np.ascontiguousarray(responses[moved]), sizes, along, terms
+        moved, J, symmetric, S, reach, basis, np.ascontiguousarray(responses[moved]), sizes, along, terms
     )

@@ -21,7 +21,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from vibench.arrays import Array, Indices
-from vibench.linalg.inner_product import InnerProduct
 
 TERMS, DIRECTIONS = 0.05, 0.4
 """Bounds of what is left out are these shares of the typical norm: of terms, and of directions, which are orthogonal to
@@ -77,20 +76,17 @@ class ResidualBasis:
         return float(np.hypot(np.linalg.norm(coordinates), beside)) + missing
 
 
-def residual_basis(
-    X: InnerProduct, blocks: Sequence[Array], samples: Array, beside: float
-) -> tuple[ResidualBasis, Array]:
-    """Basis of the terms t_j, given as blocks (n×·), from samples of their coefficients (Z×S), and U itself (n×K).
+def residual_basis(blocks: Sequence[Array], samples: Array, beside: float) -> tuple[ResidualBasis, Array]:
+    """Basis of the F⁻ᵀt_j, given as blocks (n×·), from samples of their coefficients (Z×S), and U itself (n×K).
 
     What is left out is compared with the sampled norms and `beside`, what else enters the same bound in quadrature.
     """
     sizes, ends = np.abs(samples), np.cumsum([0, *(block.shape[1] for block in blocks)])
     scale = sizes.max(axis=1, initial=0.0)
-    whitened = [X.whiten_functional(block) for block in blocks]
-    norms = np.concatenate([np.linalg.norm(block, axis=0) for block in whitened])
-    typical = float(np.hypot(_typical_norm(whitened, ends, samples), beside))
+    norms = np.concatenate([np.linalg.norm(block, axis=0) for block in blocks])
+    typical = float(np.hypot(_typical_norm(blocks, ends, samples), beside))
     kept = _worth_keeping(norms * scale, norms * sizes.mean(axis=1), TERMS * typical)
-    pairs = zip(whitened, ends, ends[1:], strict=False)
+    pairs = zip(blocks, ends, ends[1:], strict=False)
     R = np.hstack([block[:, kept[(kept >= a) & (kept < b)] - a] for block, a, b in pairs])
     inverse = 1.0 / scale[kept]
     reach = float(np.linalg.norm(inverse[:, None] * samples[kept], axis=0).mean())
@@ -99,9 +95,9 @@ def residual_basis(
     return ResidualBasis(kept, U.T @ R, inverse, remainder, norms), U
 
 
-def _typical_norm(whitened: Sequence[Array], ends: Array, samples: Array) -> float:
+def _typical_norm(blocks: Sequence[Array], ends: Array, samples: Array) -> float:
     """Median norm of the sampled residuals."""
-    pairs = zip(whitened, ends, ends[1:], strict=False)
+    pairs = zip(blocks, ends, ends[1:], strict=False)
     return float(np.median(np.linalg.norm(sum(block @ samples[a:b] for block, a, b in pairs), axis=0)))
 
 

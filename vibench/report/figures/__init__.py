@@ -7,7 +7,7 @@ import json
 import re
 import signal
 import threading
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from concurrent.futures import Future, ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cache
@@ -30,6 +30,9 @@ from vibench.report.figures.style import ABREAST, DEEP, FORMATS, WRITTEN, captio
 
 Drawing = Callable[[Data], Figure | None]
 
+Drawn = tuple[str, Drawing, Data]
+"""A figure to be drawn: its name, the function that draws it, and the data."""
+
 OF_PROBLEM: dict[str, Drawing] = {
     "solutions": solutions,
     "diagnostics": diagnostics,
@@ -50,7 +53,7 @@ OF_DUAL: dict[str, Drawing] = {"enrichment": enrichment, "inf-sup": inf_sup}
 """Figures of every problem and dual strategy."""
 
 OF_HISTORIES: frozenset[Drawing] = frozenset({diagnostics, projection_errors, orthogonality, enrichment})
-"""Those that read the histories."""
+"""Those that read the histories; no other one does."""
 
 LONG: dict[str, tuple[Callable[[Data], int], int]] = {
     "shares": (constants.compared, ABREAST * DEEP),
@@ -68,31 +71,50 @@ CAPTIONS = "captions.json"
 """File beside the figures: the caption of every figure, by the name of its files."""
 
 
-def drawings(path: Path) -> Iterator[tuple[str, Drawing, Data]]:
+def drawings(path: Path, note: Callable[[str], None] = lambda _: None) -> Iterator[Drawn]:
     """Every figure a results file may have: its name, the function that draws it, and the data.
 
-    The functions of plugins raise `FigureError`; those of this package do not.
+    The functions of plugins raise `FigureError`; those of this package do not. `note` is called with a line for every
+    column of a plugin that the data do not have.
     """
-    return drawings_of(problems(path))
+    for name, data in problems(path, note=note):
+        yield from _drawings_of(name, data, data.duals, _pages)
 
 
-def drawings_of(known: Iterable[tuple[str, Data]]) -> Iterator[tuple[str, Drawing, Data]]:
-    """Every figure of some problems, from their data and what the names of their files begin with."""
-    for name, data in known:
-        for kind, draw in OF_PROBLEM.items():
-            yield from _pages(f"{name}-{kind}", kind, draw, data)
-        for dual, file in zip(data.duals, file_names(data.duals), strict=True):
+def for_report(name: str, data: Data, duals: Collection[str]) -> Iterator[Drawn]:
+    """The figures of a problem that a report shows: of these dual strategies, and of a long figure half a page."""
+    return _drawings_of(name, data, duals, _beginning)
+
+
+def _drawings_of(
+    name: str, data: Data, duals: Collection[str], paged: Callable[[str, str, Drawing, Data], Iterator[Drawn]]
+) -> Iterator[Drawn]:
+    """The figures of a problem and of some of its dual strategies; `paged` gives what is drawn of each of vibench."""
+    for kind, draw in OF_PROBLEM.items():
+        yield from paged(f"{name}-{kind}", kind, draw, data)
+    for dual, file in zip(data.duals, file_names(data.duals), strict=True):
+        if dual in duals:
+            of_dual = data.of_dual(dual)
             for kind, draw in OF_DUAL.items():
-                yield from _pages(f"{name}-{file}-{kind}", kind, draw, data.of_dual(dual))
-        yield from ((f"{name}-{kind}", draw, data) for kind, draw in of_plugins(data, {*OF_PROBLEM, *OF_DUAL}).items())
+                yield from paged(f"{name}-{file}-{kind}", kind, draw, of_dual)
+    yield from ((f"{name}-{kind}", draw, data) for kind, draw in of_plugins(data, {*OF_PROBLEM, *OF_DUAL}).items())
 
 
-def _pages(name: str, kind: str, draw: Drawing, data: Data) -> Iterator[tuple[str, Drawing, Data]]:
+def _pages(name: str, kind: str, draw: Drawing, data: Data) -> Iterator[Drawn]:
     """A drawing, or several of a figure that is too long for one."""
     panels, most = _length(kind, data)
     pages = max(1, -(-panels // most))
     for page in range(pages):
         yield name + f"-{page + 1}" * (page > 0), draw, replace(data, page=(page, pages))
+
+
+def _beginning(name: str, kind: str, draw: Drawing, data: Data) -> Iterator[Drawn]:
+    """The drawing of a figure, or of its first panels where it is too long for one file."""
+    panels, most = _length(kind, data)
+    if panels <= most:
+        yield name, draw, replace(data, page=(0, 1))
+    else:
+        yield name, draw, replace(data, page=(0, -(-panels // (most // 2))), halved=True)
 
 
 def _length(kind: str, data: Data) -> tuple[int, int]:
@@ -101,26 +123,13 @@ def _length(kind: str, data: Data) -> tuple[int, int]:
     return count(data), most
 
 
-def for_report(name: str, data: Data, duals: Collection[str]) -> Iterator[tuple[str, Drawing, Data]]:
-    """The figures of a problem that a report shows: of these dual strategies, and of a long figure half a page."""
-    for kind, draw in OF_PROBLEM.items():
-        yield _beginning(f"{name}-{kind}", kind, draw, data)
-    for dual, file in zip(data.duals, file_names(data.duals), strict=True):
-        if dual in duals:
-            of_dual = data.of_dual(dual)
-            yield from (_beginning(f"{name}-{file}-{kind}", kind, draw, of_dual) for kind, draw in OF_DUAL.items())
-    yield from ((f"{name}-{kind}", draw, data) for kind, draw in of_plugins(data, {*OF_PROBLEM, *OF_DUAL}).items())
-
-
-def _beginning(name: str, kind: str, draw: Drawing, data: Data) -> tuple[str, Drawing, Data]:
-    """The drawing of a figure, or of its first panels where it is too long for one file."""
-    panels, most = _length(kind, data)
-    if panels <= most:
-        return name, draw, replace(data, page=(0, 1))
-    return name, draw, replace(data, page=(0, -(-panels // (most // 2))), halved=True)
-
-
-def draw(path: Path, kind: str, problem: str | None = None, dual: str | None = None) -> Figure:
+def draw(
+    path: Path,
+    kind: str,
+    problem: str | None = None,
+    dual: str | None = None,
+    note: Callable[[str], None] = lambda _: None,
+) -> Figure:
     """One figure of a results file.
 
     Parameters
@@ -130,6 +139,8 @@ def draw(path: Path, kind: str, problem: str | None = None, dual: str | None = N
     problem, dual
         Label of the problem ("LABEL, TRAINING" where it has several training sets), and of the dual strategy for a kind
         of `OF_DUAL`; `None` where there is only one.
+    note
+        Called with a line for every column of a plugin that the data do not have.
 
     Raises
     ------
@@ -138,7 +149,10 @@ def draw(path: Path, kind: str, problem: str | None = None, dual: str | None = N
     FigureError
         If it is a plugin's figure, which cannot be drawn.
     """
-    known = {one.problem: one for _, one in problems(path)}
+    faults: list[str] = []
+    known = {one.problem: one for _, one in problems(path, note=faults.append)}
+    for line in faults:  # called here, so that a warning can name the line of the caller
+        note(line)
     others = {name for one in known.values() for name in of_plugins(one, {*OF_PROBLEM, *OF_DUAL})}
     if kind not in {*OF_PROBLEM, *OF_DUAL, *others}:
         raise unknown_name("figure", kind, (*OF_PROBLEM, *OF_DUAL, *sorted(others)))
@@ -218,9 +232,10 @@ def draw_all(
     progress
         Called before a figure is drawn here, with its name, the number of those done, and that of all there may be.
     note
-        Called with a line for every figure of a plugin that could not be drawn.
+        Called with a line for every column of a plugin that the data do not have, and for every figure of a plugin
+        that could not be drawn.
     """
-    known = _drawings(path)
+    known, faults = _drawings(path)
     written: dict[int, Written] = {}
     with contextlib.ExitStack() as stack:
         others: dict[int, Future[Written]] = {}
@@ -239,7 +254,8 @@ def draw_all(
             progress(known[k][0], len(written), len(known))
             written[k] = other.result()
     _drawings.cache_clear()
-    for line in dict.fromkeys(written[k].failure for k in sorted(written) if written[k].failure):
+    failures = [written[k].failure for k in sorted(written) if written[k].failure]
+    for line in dict.fromkeys([*faults, *failures]):
         note(line)
     captions = {known[k][0]: written[k].caption for k in sorted(written) if written[k].files}
     if captions:
@@ -249,14 +265,15 @@ def draw_all(
 
 
 @cache
-def _drawings(path: Path) -> list[tuple[str, Drawing, Data]]:
-    """The drawings of a results file, read once in a process that draws."""
-    return list(drawings(path))
+def _drawings(path: Path) -> tuple[list[Drawn], list[str]]:
+    """The drawings of a results file, read once in a process that draws, and what they lack of plugins."""
+    faults: list[str] = []
+    return list(drawings(path, faults.append)), faults
 
 
 def _draw(path: Path, folder: Path, formats: tuple[str, ...], number: int) -> Written:
     """Draw one figure of `drawings`."""
-    name, draw, data = _drawings(path)[number]
+    name, draw, data = _drawings(path)[0][number]
     folder.mkdir(parents=True, exist_ok=True)
     with styled():
         try:

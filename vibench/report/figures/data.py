@@ -17,6 +17,7 @@ import pandas as pd
 from vibench.report.figures.looks import Series
 from vibench.results import pictures, tables
 from vibench.results.best import solved_too_loosely
+from vibench.results.plugin_columns import faults_of
 
 TABLES = ("cells", "queries", "histories", "thresholds", "outputs")
 
@@ -91,14 +92,20 @@ class Data:
         return [str(dual) for dual in self.queries["dual"].unique()]
 
 
-def problems(path: Path, known: Mapping[str, pd.DataFrame] = MappingProxyType({})) -> Iterator[tuple[str, Data]]:
+def problems(
+    path: Path,
+    known: Mapping[str, pd.DataFrame] = MappingProxyType({}),
+    note: Callable[[str], None] = lambda _: None,
+) -> Iterator[tuple[str, Data]]:
     """Every problem and training set of a results file that has queries, with the name its files begin with.
 
-    The training set is named where a problem has several. Tables that are `known` are not read again.
+    The training set is named where a problem has several. Tables that are `known` are not read again; `note` is called
+    with a line for every column of a plugin that those read here do not have.
     """
-    read = {
-        name: tables.in_order(known[name] if name in known else tables.extended(path, name).frame) for name in TABLES
-    }
+    extended = tables.extended_tables(path, [name for name in TABLES if name not in known])
+    for line in faults_of(extended.values()):
+        note(line)
+    read = {name: tables.in_order(known[name] if name in known else extended.pop(name).frame) for name in TABLES}
     if read["queries"].empty:
         return
     for axis in ("training", "dual", "primal"):

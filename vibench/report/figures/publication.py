@@ -100,7 +100,7 @@ def _twins(paths: Sequence[Path], note: Callable[[str], None]) -> Iterator[Twin]
     seen: dict[str, int] = {}
     plugins = list(publications())
     for path in paths:
-        for _, data in problems(path):
+        for _, data in problems(path, note=note):
             for plugin_name, plugin in plugins:
                 try:
                     kinds = list(named(plugin_name, plugin, data))

@@ -9,9 +9,10 @@ from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from multiprocessing import get_context
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
+import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
@@ -19,7 +20,7 @@ from matplotlib.lines import Line2D
 from PIL import Image
 
 from vibench.arrays import Array
-from vibench.report.figures import OF_DUAL, OF_HISTORIES, OF_PROBLEM, Drawing, interrupts_ignored
+from vibench.report.figures import OF_DUAL, OF_HISTORIES, OF_PROBLEM, Drawing, Drawn, interrupts_ignored
 from vibench.report.figures.data import Data
 from vibench.report.figures.plugins import FigureError
 from vibench.report.figures.style import caption_of, styled
@@ -47,10 +48,6 @@ class Still:
     height: int
 
 
-Known = Sequence[tuple[str, Drawing, Data]]
-"""Figures: their names, the functions that draw them, and the data."""
-
-
 @dataclass(frozen=True)
 class Helpers:
     """Processes that draw beside this one."""
@@ -72,13 +69,13 @@ def helpers(jobs: int) -> Iterator[Helpers | None]:
         yield Helpers(pool, jobs - 1)
 
 
-def stills(known: Known, others: Helpers | None = None) -> tuple[list[Still], list[str]]:
+def stills(known: Sequence[Drawn], others: Helpers | None = None) -> tuple[list[Still], list[str]]:
     """The pictures that there are data for, drawn here and by others, and why figures of plugins have none."""
     found = _draw_all(known) if others is None else _in_parallel(known, others)
     return [one for one in found if isinstance(one, Still)], [one for one in found if isinstance(one, str)]
 
 
-def _in_parallel(known: Known, others: Helpers) -> list[Still | str | None]:
+def _in_parallel(known: Sequence[Drawn], others: Helpers) -> list[Still | str | None]:
     """All pictures in their order.
 
     Those of plugins are drawn here, since their functions need not go to other processes, and so are those of
@@ -89,14 +86,15 @@ def _in_parallel(known: Known, others: Helpers) -> list[Still | str | None]:
     own = [k for k in range(len(known)) if k not in set(shared)]
     jobs = 1 + others.count
     shares = [[*shared[0::jobs], *own], *(shared[k::jobs] for k in range(1, jobs))]
-    sent = [(name, draw, replace(data, histories=data.histories.iloc[:0])) for name, draw, data in known]
+    # None, for a figure that reads histories without being one of OF_HISTORIES would be left out if they were empty
+    sent = [(name, draw, replace(data, histories=cast(pd.DataFrame, None))) for name, draw, data in known]
     awaited = [others.pool.submit(_draw_all, [sent[k] for k in share]) for share in shares[1:]]
     drawn = [_draw_all([known[k] for k in shares[0]]), *(other.result() for other in awaited)]
     placed = {k: one for share, found in zip(shares, drawn, strict=True) for k, one in zip(share, found, strict=True)}
     return [placed[k] for k in range(len(known))]
 
 
-def _draw_all(known: Known) -> list[Still | str | None]:
+def _draw_all(known: Sequence[Drawn]) -> list[Still | str | None]:
     return [_drawn(*one) for one in known]
 
 

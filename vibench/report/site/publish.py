@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +20,7 @@ from vibench.report.site import folder
 from vibench.report.site.citation import Citation, requirements
 from vibench.report.site.published_run import FILTERED, SHOWN_CELLS, PublishedRun, folder_names
 from vibench.results import tables
+from vibench.results.plugin_columns import faults_of
 from vibench.results.sqlite.reading import FILE, open_read_only
 from vibench.text import printable
 
@@ -33,7 +34,13 @@ MOST_CHANGES = 500
 """Changes that a page lists; the CSV beside it has all."""
 
 
-def publish(paths: Sequence[Path], site: Path, citation: Citation, notes: Mapping[Path, str] | None = None) -> Path:
+def publish(
+    paths: Sequence[Path],
+    site: Path,
+    citation: Citation,
+    notes: Mapping[Path, str] | None = None,
+    warn: Callable[[str], None] = lambda _: None,
+) -> Path:
     """Write the site of some results files; the same files give the same site.
 
     Parameters
@@ -46,6 +53,8 @@ def publish(paths: Sequence[Path], site: Path, citation: Citation, notes: Mappin
         How the site is cited.
     notes
         Remarks on results files, which stand on the pages of their runs.
+    warn
+        Called with a line for every column of a plugin that a published table does not have.
 
     Returns
     -------
@@ -63,16 +72,18 @@ def publish(paths: Sequence[Path], site: Path, citation: Citation, notes: Mappin
         PublishedRun(run, own, (notes or {}).get(run.path, ""))
         for run, own in zip(runs, folder_names([run.name for run in runs]), strict=True)
     ]
-    folder.write(site, lambda new: _fill(new, published, citation))
+    faults: list[str] = []
+    folder.write(site, lambda new: faults.extend(_fill(new, published, citation)))
+    for line in dict.fromkeys(faults):
+        warn(line)
     return site / folder.FIRST_PAGE
 
 
-def _fill(site: Path, runs: Sequence[PublishedRun], citation: Citation) -> None:
-    """Write all files of the site."""
+def _fill(site: Path, runs: Sequence[PublishedRun], citation: Citation) -> list[str]:
+    """Write all files of the site; returns lines on columns of plugins that tables do not have."""
     pages = _Pages(citation)
     comparisons = {study: compare([run.run.path for run in group], LIMIT) for study, group in _comparable(runs)}
-    for run in runs:
-        _write_run(site / "runs" / run.folder, run, pages)
+    faults = [line for run in runs for line in _write_run(site / "runs" / run.folder, run, pages)]
     links = {run.run.name: f"runs/{run.folder}/index.html" for run in runs}
     pages.write(site / "leaderboard.html", "leaderboard", "", boards=list(_boards(runs)), links=links)
     sections = [_section(site, number, *item) for number, item in enumerate(comparisons.items(), start=1)]
@@ -81,23 +92,25 @@ def _fill(site: Path, runs: Sequence[PublishedRun], citation: Citation) -> None:
     pages.write(site / folder.FIRST_PAGE, "index", "", runs=runs, filters=filters)
     _write(site / "CITATION.cff", citation.cff())
     _write(site / "citation.bib", citation.bibtex())
+    return faults
 
 
-def _write_run(own: Path, run: PublishedRun, pages: _Pages) -> None:
-    """Write the folder of one run: its page and report, its data, and what installs its versions."""
+def _write_run(own: Path, run: PublishedRun, pages: _Pages) -> list[str]:
+    """Write the folder of one run: its page and report, its data, and what installs its versions.
+
+    Returns lines on columns of plugins that its tables do not have.
+    """
     (own / "tables").mkdir(parents=True)
     with open_read_only(run.run.path) as db:
         db.execute("VACUUM INTO ?", (str((own / FILE).absolute()),))
     _write(own / "report.html", html.page(run.run.path))
-    for name in TABLES:
-        _write(own / "tables" / f"{name}.csv", _csv(run.run.path, name))
+    extended = tables.extended_tables(run.run.path, TABLES)
+    for name, one in extended.items():
+        _write(own / "tables" / f"{name}.csv", tables.to_csv(tables.whole_numbers(tables.in_order(one.frame))))
     _write(own / "requirements.txt", requirements(run.run.versions, run.code))
     _write(own / "provenance.json", json.dumps(run.provenance, indent=1, ensure_ascii=True, sort_keys=True) + "\n")
     pages.write(own / "index.html", "run", "../../", run=run, cells=run.cells(), columns=SHOWN_CELLS, tables=TABLES)
-
-
-def _csv(path: Path, table: str) -> str:
-    return tables.to_csv(tables.whole_numbers(tables.in_order(tables.extended(path, table).frame)))
+    return faults_of(extended.values())
 
 
 def _comparable(runs: Sequence[PublishedRun]) -> Iterator[tuple[str, list[PublishedRun]]]:

@@ -235,13 +235,14 @@ def test_small_residuals_keep_their_digits(constraint: str) -> None:
         load = A @ (Z @ x) + force + size * away  # f for which x and α have the residual size · away
         others = [np.asarray(term @ model.basis) for term in certificate.base.terms]
         blocks = [load[:, None], *others, injected(problem)]
-        if not certificate.on_contact:
+        if certificate.forces is None:
             blocks[-1] = np.asarray(problem.affine["B"].terms[0].T @ model.generators)
         of_lam = scale(mu) * alpha
-        if certificate.on_contact:
+        if certificate.forces is not None:
             of_lam = force[CONTACT]
         z = np.concatenate([np.ones(1), -x, -of_lam])
-        basis, _ = residual_basis(certificate.base.X, blocks, z[:, None], 0.0)
+        whitened = [certificate.base.X.whiten_functional(block) for block in blocks]
+        basis, _ = residual_basis(whitened, z[:, None], 0.0)
         exact_norm = size * float(np.sqrt(away @ np.linalg.solve(A, away)))
         assert basis.norm(z) == pytest.approx(exact_norm, rel=1e-5)
 

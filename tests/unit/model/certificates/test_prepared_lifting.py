@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from numerics import exact, spd
 
 from vibench.interfaces.problem import VariationalInequality
-from vibench.model.certificates.prepared_lifting import PreparedLiftings, carriers, prepare_liftings
+from vibench.model.certificates.prepared_lifting import PreparedLiftings, constant_unknowns, prepare_liftings
 
 K, M, D = 9, 6, 3
 ALL = np.ones(M, bool)
@@ -140,7 +140,7 @@ def test_bodies_carry_liftings_where_the_constraint_is_the_same_everywhere() -> 
     C, B = compliance(rng, two=True), rng.standard_normal((M, K))
     other = B.copy()
     other[2, 8] += 1e-14
-    assert carriers(C, [sp.csr_array(B), sp.csr_array(B)]).all()
-    assert list(np.flatnonzero(carriers(C, [sp.csr_array(B), sp.csr_array(other)]))) == list(range(7))
+    assert constant_unknowns(C, [sp.csr_array(B), sp.csr_array(B)]).all()
+    assert list(np.flatnonzero(constant_unknowns(C, [sp.csr_array(B), sp.csr_array(other)]))) == list(range(7))
     coupled = compliance(rng, two=False)
-    assert not carriers(coupled, [sp.csr_array(B), sp.csr_array(other)]).any()
+    assert not constant_unknowns(coupled, [sp.csr_array(B), sp.csr_array(other)]).any()
