@@ -11,11 +11,13 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, S
 from dataclasses import dataclass, field, replace
 from typing import Any
 
+import numpy as np
 import pandas as pd
 
 from vibench.errors import RequestError, VibenchError, in_a_line
 from vibench.interfaces.figures import EXTENSIBLE, DerivedColumn, FigurePlugin
-from vibench.results.columns import CELLS, INTEGER, REAL, STORED, TEXT, THRESHOLDS, Column
+from vibench.results import best, error_measures
+from vibench.results.columns import INTEGER, REAL, STORED, TEXT, THRESHOLDS, Column
 from vibench.results.sqlite.values import stored
 from vibench.study import registry
 from vibench.text import brief
@@ -27,12 +29,12 @@ TYPES: Mapping[type, str] = {float: REAL, int: INTEGER, str: TEXT}
 AFTER = 100
 """Places of columns of plugins in a table for reading: after all others."""
 
-RESERVED = {"pair", "error_below", "error_a", "error_b", *(name.lower() for table in STORED.values() for name in table)}
+_SHOWN = {**best.HEADINGS, **THRESHOLDS, **error_measures.COLUMNS}
+
+RESERVED = {"pair", *_SHOWN, *(name.lower() for table in STORED.values() for name in table)}
 """Names of columns of results files, for which SQLite knows no case, and of those that figures and summaries add."""
 
-_SHOWN = {**CELLS, **THRESHOLDS}
-
-HEADINGS = {"error ≤", "error a", "error b", *_SHOWN, *(column.heading for column in _SHOWN.values() if column.heading)}
+HEADINGS = {*_SHOWN, *(column.heading for column in _SHOWN.values() if column.heading)}
 """What stands above the columns of the tables for reading."""
 
 PARAMETERS = re.compile(r"mu_\d+")
@@ -222,7 +224,7 @@ def _stored(title: str, column: DerivedColumn, row: int, value: Any) -> Any:
     """A value as a results file would hold it."""
     if value is pd.NA or value is pd.NaT:
         return None
-    if isinstance(value, bool) or type(value).__name__ == "bool":  # NumPy's is no subclass
+    if isinstance(value, bool | np.bool_):
         raise ColumnError(f"{title} has the value {value} in row {row}, expected {column.kind.__name__}")
     try:
         return stored(Column(TYPES[column.kind], "", ""), value)
