@@ -10,5 +10,7 @@ WRITTEN = {12: "8d9c"}
 
 def test_other_columns_are_another_version() -> None:
     """A file with other columns under the same version would be refused as damaged."""
-    declared = [(table, *((name, column.kind) for name, column in columns.items())) for table, columns in STORED.items()]
-    assert WRITTEN == {VERSION: hashlib.sha256(repr(declared).encode()).hexdigest()[:4]}
+    declared = [
+        (table, *((name, column.kind) for name, column in columns.items())) for table, columns in STORED.items()
+    ]
+    assert {VERSION: hashlib.sha256(repr(declared).encode()).hexdigest()[:4]} == WRITTEN
