@@ -30,6 +30,7 @@ import vibench
 from vibench.cli.main import app
 from vibench.errors import RequestError
 from vibench.results import columns, tables
+from vibench.study import entry_points, registry
 from vibench.study.entries import Entry, ProblemEntry, SamplingEntry
 from vibench.study.matrix import expand
 from vibench.study.reader import read_study
@@ -94,6 +95,12 @@ def importable(package: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]
     yield
     for name in [name for name in sys.modules if name.split(".")[0] == "vibench_mine"]:
         del sys.modules[name]
+    for known in (
+        entry_points._readable,
+        registry._registered,
+        registry.code,
+    ):
+        known.cache_clear()
 
 
 SNIPPETS = [
