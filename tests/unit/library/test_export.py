@@ -48,6 +48,7 @@ STUDY = vibench.Study(
     timing_rounds=1,
 )
 FILES = {"model.npz", RUNTIME}
+FOUND = " was found at this parameter"
 
 
 @pytest.fixture(scope="module")
@@ -484,9 +485,12 @@ def test_the_command(run: vibench.Run, main: Main, tmp_path: Path) -> None:
 def certified(tmp_path_factory: pytest.TempPathFactory) -> vibench.Run:
     study = vibench.Study(
         name="certified",
-        problem=[{"name": "radial-obstacle", "options": {"resolution": 200}}],
+        problem=[
+            {"name": "radial-obstacle", "options": {"resolution": 200}},
+            {"name": "obstacle", "options": {"resolution": 150}},
+        ],
         dual=["mcpg"],
-        primal=["decorrelated"],
+        primal=["decorrelated", "online-supremizers"],
         assembly=["certified"],
         tolerances=[{"pod": [1e-2], "dual": [1e-1]}],
         solvers=["piqp"],
@@ -497,27 +501,59 @@ def certified(tmp_path_factory: pytest.TempPathFactory) -> vibench.Run:
     return vibench.run(study, tmp_path_factory.mktemp("bounds") / "run", progress=False)
 
 
-def test_an_exported_certificate_gives_the_bounds_of_vibench(certified: vibench.Run, tmp_path: Path) -> None:
-    model = certified.model(str(certified.cells["cell"].iloc[0]))
+def certified_model(run: vibench.Run, problem: str = "radial-obstacle", primal: str = "decorrelated") -> vibench.Model:
+    return model_of(run, problem, primal, "certified")
+
+
+@pytest.mark.parametrize(
+    ("problem", "primal", "guarantee"),
+    [
+        ("radial-obstacle", "decorrelated", "certified"),  # A and B are constant
+        ("obstacle", "decorrelated", "verified"),  # A varies, so that bounds of its spectrum are needed
+        ("obstacle", "online-supremizers", "verified"),
+    ],
+)
+def test_an_exported_certificate_gives_the_bounds_of_vibench(
+    problem: str, primal: str, guarantee: str, certified: vibench.Run, tmp_path: Path
+) -> None:
+    model = certified_model(certified, problem, primal)
     assert model.certificate is not None
     found = export_model(model, tmp_path / "model.npz")
     assert {file.name for file in tmp_path.iterdir()} == FILES | {BOUNDS}
-    assert found.about["certificate"] == "certified"
+    assert found.about["certificate"] == guarantee
     exported = WithBounds(tmp_path / "model.npz")
     for mu in model.parameters.sample(20, seed=5):
         answer = exported.solve(mu)
         solution, bound = answer.solution, answer.bound
         reduced = model.reduced.assemble(mu)
         expected = model.certificate.evaluate(model.problem, mu, reduced, solution.x, solution.alpha)
-        assert (bound.guarantee, expected.note) == ("certified", "")
+        assert (bound.guarantee, expected.note) == (guarantee, "")
         for name in ("u_energy", "lambda_natural", "relative"):
-            assert getattr(bound, name) == pytest.approx(getattr(expected, name), rel=1e-9)
+            assert getattr(bound, name) == pytest.approx(getattr(expected, name), rel=1e-7)
         exact, vi = model.high_fidelity(mu), model.problem.assemble(mu)
         away = exact.u - solution.u
         assert float(away @ (vi.A @ away)) <= bound.u_energy**2
-        assert exported.solve(mu, tolerance=1.01 * bound.relative).verdict == "certified"
+        assert exported.solve(mu, tolerance=1.01 * bound.relative).verdict == guarantee
         assert exported.solve(mu, tolerance=0.99 * bound.relative).verdict == "not certified"
         assert answer.verdict == ""
+
+
+def test_where_an_exported_certificate_has_no_bound_it_says_why(
+    certified: vibench.Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    model = certified_model(certified, "obstacle")
+    export_model(model, tmp_path / "model.npz")
+    exported, mu = WithBounds(tmp_path / "model.npz"), model.parameters.sample(1, seed=5)[0]
+    found = exported.solve(mu).solution
+    assert found.alpha.max() > 0.0
+    bound = exported._bound(mu, found.x, -found.alpha, found.energy)
+    assert bound == (np.inf, np.inf, np.inf, "none", "λ_N has negative coefficients")
+    with monkeypatch.context() as patch:
+        patch.setattr(exported, "_complementary", lambda *_: None)
+        assert exported.solve(mu).bound == (np.inf, np.inf, np.inf, "none", f"no w with B w ≥ s{FOUND}")
+        assert exported.solve(mu, tolerance=1e9).verdict == "not certified"
+    exported._data["spectral_error"] = np.array(1.0)  # as much as A itself
+    assert exported.solve(mu).bound == (np.inf, np.inf, np.inf, "none", f"no α > 0{FOUND}")
 
 
 def test_a_model_without_a_certificate_has_no_bounds_and_says_why(run: vibench.Run, tmp_path: Path) -> None:
@@ -531,13 +567,13 @@ def test_a_model_without_a_certificate_has_no_bounds_and_says_why(run: vibench.R
 def test_polynomials_that_are_not_the_functions_they_replace_are_not_called_certified(
     certified: vibench.Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    model = certified.model(str(certified.cells["cell"].iloc[0]))
+    model = certified_model(certified)
     monkeypatch.setattr(exported_certificate, "EXACT", 0.0)
     assert exported_model(model).about["certificate"] == "verified"
 
 
 def test_the_command_says_what_has_bounds(certified: vibench.Run, main: Main, tmp_path: Path) -> None:
-    cell, file = str(certified.cells["cell"].iloc[0]), tmp_path / "out" / "model.npz"
+    cell, file = str(certified_model(certified).row["cell"]), tmp_path / "out" / "model.npz"
     code, out, err = main("export-model", str(certified.path.parent), cell, str(file), "--c")
     assert (code, err) == (0, "")
     assert "\nerror bounds: certified\n" in out
