@@ -10,13 +10,12 @@ from typing import Any
 import pandas as pd
 import pytest
 from matplotlib.figure import Figure
-from running import Main, refused
+from running import Main, failures, refused
 
 from vibench import DerivedColumn, FigurePlugin, ProblemTables, testing
 from vibench.report.figures import OF_DUAL, OF_PROBLEM, drawings
 from vibench.results import tables
 from vibench.results.columns import TABLES
-from vibench.testing.checks import Finding, Verdict
 from vibench.testing.samples.run import write_sample_run
 
 counter = itertools.count()
@@ -97,10 +96,6 @@ WRONG: Mapping[type[FigurePlugin], tuple[str, str]] = {
     Restless: ("determinism", "membrane: another instance has the figures figure-"),
     Configured: ("construction", "TypeError: "),
 }
-
-
-def failures(findings: list[Finding]) -> dict[str, str]:
-    return {finding.check: finding.message for finding in findings if finding.verdict is Verdict.FAILED}
 
 
 @pytest.mark.parametrize("plugin", WRONG)
