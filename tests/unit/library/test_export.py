@@ -16,21 +16,19 @@ from typing import Any
 import numpy as np
 import pytest
 import scipy.sparse as sp
+from enriching import reduced_from
 from numerics import Varying
 from running import Main, refused
 
 import vibench
-from vibench.highfidelity.active_set import HighFidelitySolver
 from vibench.library import exported_certificate, reduced_model
 from vibench.library.export import BOUNDS, RUNTIME, export_model
 from vibench.library.export import exported as exported_model
 from vibench.library.reduced_model import Model as Exported
 from vibench.library.reduced_model_certificate import Model as WithBounds
 from vibench.model.affine import affine_decomposition
-from vibench.model.galerkin import ReducedModel
 from vibench.model.hyperreduced import HyperReducedModel, hyper_reduce
 from vibench.qp.exact import exact_solution
-from vibench.stability.infsup import multipliers
 
 STUDY = vibench.Study(
     name="small",
@@ -130,15 +128,13 @@ class FalselyDeclared(PartlyDeclared):
 
 def assembled_in_full(template: vibench.Model, problem: vibench.Problem, kind: vibench.Kind) -> vibench.Model:
     """A model of a problem whose queries assemble high-fidelity matrices, with the row of a real cell."""
-    solver, training = HighFidelitySolver(problem), problem.training_set()
-    found = [solver.solve(mu) for mu in training]
-    basis = vibench.pod(np.column_stack([s.u for s in found]), problem.V, vibench.Stop(size=4)).basis
-    cone = vibench.greedy_cone(np.column_stack([s.lam for s in found]), problem.W, vibench.Stop(size=3))
-    span = multipliers(cone.generators, problem.W).span
-    enrichment = vibench.Enrichment(kind, eta=span if kind is vibench.Kind.PER_PARAMETER else None)
-    reduced = ReducedModel(problem, basis, enrichment, cone.generators, span)
+    return with_row(template, reduced_from(problem, kind, 4, 3))
+
+
+def with_row(template: vibench.Model, queried: Any) -> vibench.Model:
+    """A model that answers queries, with the row of a real cell."""
     cell: Any = SimpleNamespace(
-        row=template.row, model=reduced, certificate=None, cell=SimpleNamespace(solver="piqp", accuracy=1e-10)
+        row=template.row, model=queried, certificate=None, cell=SimpleNamespace(solver="piqp", accuracy=1e-10)
     )
     return vibench.Model(cell)
 
@@ -176,19 +172,11 @@ def test_sums_that_are_declared_keep_their_terms_beside_members_that_are_not(run
 def per_parameter(template: vibench.Model) -> vibench.Model:
     """A model whose supremizers are added at every parameter, on another problem, with the row of a real cell."""
     problem = Rotating()
-    solver, training = HighFidelitySolver(problem), problem.training_set()
-    found = [solver.solve(mu) for mu in training]
-    basis = vibench.pod(np.column_stack([s.u for s in found]), problem.V, vibench.Stop(size=2)).basis
-    cone = vibench.greedy_cone(np.column_stack([s.lam for s in found]), problem.W, vibench.Stop(size=3))
-    span = multipliers(cone.generators, problem.W).span
-    enrichment = vibench.Enrichment(vibench.Kind.PER_PARAMETER, eta=span)
-    reduced = ReducedModel(problem, basis, enrichment, cone.generators, span)
-    queried = HyperReducedModel(reduced, hyper_reduce(reduced, affine_decomposition(problem, training, 1e-12)))
+    reduced = reduced_from(problem, vibench.Kind.PER_PARAMETER, 2, 3)
+    decomposed = affine_decomposition(problem, problem.training_set(), 1e-12)
+    queried = HyperReducedModel(reduced, hyper_reduce(reduced, decomposed))
     assert queried.kind is vibench.Kind.PER_PARAMETER
-    cell: Any = SimpleNamespace(
-        row=template.row, model=queried, certificate=None, cell=SimpleNamespace(solver="piqp", accuracy=1e-10)
-    )
-    return vibench.Model(cell)
+    return with_row(template, queried)
 
 
 def largest_errors(model: vibench.Model, answers: Any, count: int) -> tuple[float, float]:
