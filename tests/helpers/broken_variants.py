@@ -6,7 +6,6 @@ Where the docstring of a class says nothing else, `vibench check` names the mist
 from __future__ import annotations
 
 import os
-import time
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import cache
@@ -295,26 +294,6 @@ class ShiftsTheParameter(Bar):
     def assemble(self, mu: Array) -> VariationalInequality:
         mu -= 1.0
         return super().assemble(mu + 1.0)
-
-
-class Slow(Bar):
-    """3 s for an assembly."""
-
-    def assemble(self, mu: Array) -> VariationalInequality:
-        time.sleep(3.0)
-        return super().assemble(mu)
-
-
-class Hangs(Bar):
-    """Does not come back from its second assembly."""
-
-    calls = 0
-
-    def assemble(self, mu: Array) -> VariationalInequality:
-        self.calls += 1
-        if self.calls > 1:
-            time.sleep(3600.0)
-        return super().assemble(mu)
 
 
 class PaintsTheEnd(Bar):

@@ -19,6 +19,15 @@ def line_mass() -> InnerProduct:
 W = line_mass()
 
 
+def bumps(count: int = 12, m: int = 40) -> tuple[Array, InnerProduct]:
+    """Shifted and scaled bumps with exact zeros, and the mass matrix of their mesh."""
+    x = np.linspace(0.0, 1.0, m)
+    centres, widths = np.linspace(0.35, 0.65, count), 0.15 + 0.1 * np.sin(np.arange(count))
+    theta = np.maximum(0.0, 1.0 - ((x[:, None] - centres) / widths) ** 2)
+    mass = sp.diags_array([4.0 * np.ones(m), np.ones(m - 1), np.ones(m - 1)], offsets=[0, 1, -1]) / (6.0 * m)
+    return theta, InnerProduct(mass)
+
+
 @st.composite
 def families(draw: st.DrawFn) -> Array:
     """Nonnegative snapshots (12×Q) with exact zeros, some of them zero, copies, multiples or nearly parallel."""

@@ -1,4 +1,4 @@
-"""What an output may not hold, whoever says it: control characters, and elements of HTML that are not its own."""
+"""What an output may not hold, control characters and HTML that is not its own; and where it leads."""
 
 from __future__ import annotations
 
@@ -24,3 +24,23 @@ def elements(page: str) -> set[str]:
     parser = _Elements()
     parser.feed(page)
     return parser.found
+
+
+class Links(HTMLParser):
+    """What a page fetches (`sources`), what it leads to (`targets`), and the anchors that it has."""
+
+    def __init__(self, page: str) -> None:
+        super().__init__()
+        self.sources: list[str] = []
+        self.targets: list[str] = []
+        self.ids: set[str] = set()
+        self.feed(page)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        for name, value in attrs:
+            if name == "src" or (name == "href" and tag == "link"):
+                self.sources.append(str(value))
+            elif name == "href":
+                self.targets.append(str(value))
+            elif name == "id":
+                self.ids.add(str(value))

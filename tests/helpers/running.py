@@ -7,7 +7,7 @@ import os
 import signal
 import sqlite3
 import subprocess
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +16,7 @@ import pandas as pd
 from vibench.results.columns import KEYS, STORED, TABLES
 from vibench.results.sqlite.digests import Digests
 from vibench.results.sqlite.reading import FILE, read_text
+from vibench.testing.checks import Finding, Verdict
 
 Vibench = Callable[..., "subprocess.CompletedProcess[str]"]
 """Runs the installed command in a folder."""
@@ -58,6 +59,11 @@ def rows(folder: Path, table: str = "cells") -> list[dict[str, Any]]:
         return [dict(row) for row in db.execute(f"SELECT rowid, * FROM {table} ORDER BY rowid")]
     finally:
         db.close()
+
+
+def failures(findings: Sequence[Finding]) -> dict[str, str]:
+    """The messages of the checks of a plugin that fail, by the names of the checks."""
+    return {finding.check: finding.message for finding in findings if finding.verdict is Verdict.FAILED}
 
 
 def execute(folder: Path, *statements: str) -> None:

@@ -11,6 +11,7 @@ from types import ModuleType
 from typing import Any
 
 import fake_plugins
+import pandas as pd
 
 from vibench.results.columns import CELLS, QUERIES
 from vibench.stages.base import Stage
@@ -28,6 +29,9 @@ STUDY: Mapping[str, Any] = {
     "tolerances": [{"pod": [1e-2, 1e-3], "dual": [1e-1], "primal": {"offline-pga": [0.5, 0.3, 0.1]}}],
 }
 """A study that uses every axis."""
+
+RECORDED: Mapping[str, Any] = {"name": "sample", "seed": 1, "validation": 4, "accuracy": 1e-7}
+"""What a results file records of a study."""
 
 REMOVE = object()
 """Stands for a key that is taken away."""
@@ -81,6 +85,20 @@ def cell_row(cell: str = "c1", **columns: Any) -> dict[str, Any]:
     samples = {"TEXT": "text", "REAL": 0.5, "INTEGER": 3}
     row = {name: samples[column.kind.split()[0]] for name, column in CELLS.items()}
     return row | {"cell": cell, "status": "ok", "enrichment_kind": "fixed"} | columns
+
+
+def row_of(cell: str, error: float | None, online: float | None, **more: Any) -> dict[str, Any]:
+    """What `cells_of` needs of a cell: its error of λ and its seconds of a query."""
+    return {"cell": cell, "error_lambda_mean": error, "online_s": online, **more}
+
+
+def cells_of(*rows: dict[str, Any]) -> pd.DataFrame:
+    """Cells that differ in what is given alone, and are stable, exact in u and ok otherwise."""
+    common = {
+        "problem": "box", "problem_options": "{}", "status": "ok", "error_u_mean": 1e-9, "solver_share_mean": 1e-6,
+        "beta_span_min": 0.1, "offline_s": 1.0,
+    }  # fmt: skip
+    return pd.DataFrame([cell_row(**common | row) for row in rows], columns=list(CELLS))
 
 
 def query_rows(cell: str = "c1", count: int = 2, **columns: Any) -> list[dict[str, Any]]:

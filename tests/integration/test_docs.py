@@ -30,6 +30,7 @@ import vibench
 from vibench.cli.main import app
 from vibench.errors import RequestError
 from vibench.results import columns, tables
+from vibench.study import entry_points, registry
 from vibench.study.entries import Entry, ProblemEntry, SamplingEntry
 from vibench.study.matrix import expand
 from vibench.study.reader import read_study
@@ -94,6 +95,12 @@ def importable(package: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]
     yield
     for name in [name for name in sys.modules if name.split(".")[0] == "vibench_mine"]:
         del sys.modules[name]
+    for known in (
+        entry_points._readable,
+        registry._registered,
+        registry.code,
+    ):
+        known.cache_clear()
 
 
 SNIPPETS = [
@@ -327,21 +334,41 @@ def test_every_module_and_name_on_a_page_exists(page: Path) -> None:
         assert pkgutil.resolve_name(f"vibench.{name}") is not None
 
 
-COMMAND = re.compile(r"^\s*(?:\.venv/bin/)?vibench ([a-z-]+)(.*)$", re.MULTILINE)
+FENCED = re.compile(r"^```\w*[^\n]*\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+INDENTED = re.compile(r"^(?: {4}|\t)(.*)$", re.MULTILINE)
+INLINE = re.compile(r"`([^`]+)`")
+COMMAND = re.compile(r"^\s*(?:\.venv/bin/)?vibench (-{0,2}[a-z-]+)(.*)$")
+SCRIPT = re.compile(r"\bpython ([\w-]+/[\w/.-]+\.py)\b")
+WRITTEN = [ROOT / "CONTRIBUTING.md", *PAGES, *RESULTS]
+
+
+def commands(page: Path) -> Iterator[tuple[str, str]]:
+    """Name and arguments of every command of vibench on a page: in blocks, indented lines and inline code."""
+    text = page.read_text(encoding="utf-8")
+    prose = FENCED.sub("", text)
+    lines = "\n".join([*FENCED.findall(text), *INDENTED.findall(prose)]).splitlines()
+    for line in [*lines, *(" ".join(code.split()) for code in INLINE.findall(prose))]:
+        for part in re.split(r" && |; |(?<=\S)  +|#", line):  # what stands apart is a comment
+            if found := COMMAND.match(part):
+                yield found[1], found[2]
 
 
 def test_every_command_of_the_pages_exists_with_its_options(main: Main) -> None:
     known = {command.name or command.callback.__name__.replace("_", "-") for command in app.registered_commands}
-    asked = {
-        (name, option)
-        for page in PAGES
-        for language, _, text in blocks(page)
-        if language == "sh"
-        for name, rest in COMMAND.findall(text)
-        for option in ["", *re.findall(r"--[a-z-]+", rest)]
-    }
+    found = [command for page in WRITTEN for command in commands(page)]
+    assert len(found) > 100
+    asked = {(name, option) for name, rest in found for option in ["", *re.findall(r"--[a-z-]+", rest)]}
+    general = {name for name, _ in asked if name.startswith("-")}
+    assert [option for option in general if option not in main("--help")[1]] == []
+    asked = {(name, option) for name, option in asked if name not in general}
     assert {name for name, _ in asked} <= known
     for name in sorted({name for name, _ in asked}):
         code, printed, _ = main(name, "--help")
         assert code == 0
         assert [option for command, option in asked if command == name and option not in printed] == []
+
+
+def test_every_script_of_the_pages_exists() -> None:
+    found = {script for page in WRITTEN for script in SCRIPT.findall(page.read_text(encoding="utf-8"))}
+    assert len(found) > 10
+    assert [script for script in sorted(found) if not (ROOT / script).is_file()] == []

@@ -61,10 +61,13 @@ def test_a_second_run_does_nothing_new(vibench: Vibench, again: Path) -> None:
 
 def test_retry_redoes_what_was_not_ok(vibench: Vibench, again: Path) -> None:
     before = by_solver(again / "runs" / "wire")
+    execute(again / "runs" / "wire", "UPDATE cells SET reason = 'old'")
     printed, after = run_again(vibench, again, "--retry")
     assert "3 cells, 1 to run, 1 stages" in printed
-    # Its row is the same again where even the peak of the memory is.
-    assert {row["solver"] for row in after if row != before[row["solver"]]} <= {"gives-up"}
+    reasons = {row["solver"]: row["reason"] for row in after}
+    assert reasons == {"piqp": "old", "careful": "old", "gives-up": before["gives-up"]["reason"]}
+    redone = {row["solver"] for row in after if row | {"reason": ""} != before[row["solver"]] | {"reason": ""}}
+    assert redone <= {"gives-up"}  # its row is the same again where even the peak of the memory is
     assert len(rows(again / "runs" / "wire", "queries")) == 9
 
 

@@ -154,7 +154,13 @@ CELLS: Mapping[str, Column] = {
     "offline_enrichment_s": Column(REAL, "s", "Primal strategy."),
     "offline_assembly_s": Column(REAL, "s", "Preparation of reduced assembly; 0 with full assembly."),
     "offline_certificate_s": Column(REAL, "s", "Preparation of certificates at online cost; 0 without."),
-    "offline_s": Column(REAL, "s", "Sum of the six above: the offline time of this cell alone.", "offline [s]", 22),
+    "offline_s": Column(
+        REAL,
+        "s",
+        "Offline time of this cell alone: the sum of these without `offline_selection_s`, a part of the first.",
+        "offline [s]",
+        22,
+    ),
     "offline_low_s": Column(
         REAL,
         "s",
@@ -432,7 +438,11 @@ HISTORY_KEYS = _without("solver", "accuracy", "assembly")
 
 HISTORIES: Mapping[str, Column] = {
     "artefact": Column(TEXT, "", "Hash of the stage it comes from."),
-    "stage": Column(TEXT, "", "pod, cone or enrichment; training or validation for diagnostics of the problem."),
+    "stage": Column(
+        TEXT,
+        "",
+        "pod, cone, enrichment or selection; training or validation for diagnostics of the problem.",
+    ),
     **HISTORY_KEYS,
     "quantity": Column(TEXT, "", "Name of the quantity."),
     "step": Column(INTEGER, "", "Step of the algorithm, or number of the parameter."),

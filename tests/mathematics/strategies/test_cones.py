@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 import scipy.sparse as sp
-from families import W, families
+from families import W, bumps, families
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -38,15 +38,6 @@ STRATEGIES: dict[str, DualStrategy] = {
 }
 
 ALL = pytest.mark.parametrize("strategy", STRATEGIES.values(), ids=STRATEGIES.keys())
-
-
-def bumps(count: int = 12, m: int = 40) -> tuple[Array, InnerProduct]:
-    """Shifted and scaled bumps with exact zeros, and the mass matrix of their mesh."""
-    x = np.linspace(0.0, 1.0, m)
-    centres, widths = np.linspace(0.35, 0.65, count), 0.15 + 0.1 * np.sin(np.arange(count))
-    theta = np.maximum(0.0, 1.0 - ((x[:, None] - centres) / widths) ** 2)
-    mass = sp.diags_array([4.0 * np.ones(m), np.ones(m - 1), np.ones(m - 1)], offsets=[0, 1, -1]) / (6.0 * m)
-    return theta, InnerProduct(mass)
 
 
 def errors_one_by_one(cone: Cone, theta: Array, X: InnerProduct) -> Array:

@@ -3,6 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import scipy.sparse as sp
+from families import bumps
 from hypothesis import given
 from hypothesis import strategies as st
 from numerics import space
@@ -19,15 +20,6 @@ from vibench_strategies.mcpg import ModifiedCPG
 
 seeds = st.integers(0, 10_000)
 EUCLID = InnerProduct(sp.eye_array(3))
-
-
-def bumps(count: int = 12, m: int = 40) -> tuple[np.ndarray, InnerProduct]:
-    """Shifted and scaled bumps with exact zeros, and the mass matrix of their mesh."""
-    x = np.linspace(0.0, 1.0, m)
-    centres, widths = np.linspace(0.35, 0.65, count), 0.15 + 0.1 * np.sin(np.arange(count))
-    theta = np.maximum(0.0, 1.0 - ((x[:, None] - centres) / widths) ** 2)
-    mass = sp.diags_array([4.0 * np.ones(m), np.ones(m - 1), np.ones(m - 1)], offsets=[0, 1, -1]) / (6.0 * m)
-    return theta, InnerProduct(mass)
 
 
 def test_the_second_generator_of_the_example_that_corrects_remark_4_3() -> None:

@@ -16,21 +16,24 @@ from typing import Any
 import numpy as np
 import pytest
 import scipy.sparse as sp
+from enriching import reduced_from
 from numerics import Varying
 from running import Main, refused
 
 import vibench
+<<<<<<< HEAD
 from vibench.highfidelity.active_set import HighFidelitySolver
 from vibench.library import export, exported_certificate, reduced_model
+=======
+from vibench.library import exported_certificate, reduced_model
+>>>>>>> tests5
 from vibench.library.export import BOUNDS, RUNTIME, export_model
 from vibench.library.export import exported as exported_model
 from vibench.library.reduced_model import Model as Exported
 from vibench.library.reduced_model_certificate import Model as WithBounds
 from vibench.model.affine import affine_decomposition
-from vibench.model.galerkin import ReducedModel
 from vibench.model.hyperreduced import HyperReducedModel, hyper_reduce
 from vibench.qp.exact import exact_solution
-from vibench.stability.infsup import multipliers
 
 STUDY = vibench.Study(
     name="small",
@@ -48,6 +51,7 @@ STUDY = vibench.Study(
     timing_rounds=1,
 )
 FILES = {"model.npz", RUNTIME}
+FOUND = " was found at this parameter"
 
 
 @pytest.fixture(scope="module")
@@ -129,15 +133,13 @@ class FalselyDeclared(PartlyDeclared):
 
 def assembled_in_full(template: vibench.Model, problem: vibench.Problem, kind: vibench.Kind) -> vibench.Model:
     """A model of a problem whose queries assemble high-fidelity matrices, with the row of a real cell."""
-    solver, training = HighFidelitySolver(problem), problem.training_set()
-    found = [solver.solve(mu) for mu in training]
-    basis = vibench.pod(np.column_stack([s.u for s in found]), problem.V, vibench.Stop(size=4)).basis
-    cone = vibench.greedy_cone(np.column_stack([s.lam for s in found]), problem.W, vibench.Stop(size=3))
-    span = multipliers(cone.generators, problem.W).span
-    enrichment = vibench.Enrichment(kind, eta=span if kind is vibench.Kind.PER_PARAMETER else None)
-    reduced = ReducedModel(problem, basis, enrichment, cone.generators, span)
+    return with_row(template, reduced_from(problem, kind, 4, 3))
+
+
+def with_row(template: vibench.Model, queried: Any) -> vibench.Model:
+    """A model that answers queries, with the row of a real cell."""
     cell: Any = SimpleNamespace(
-        row=template.row, model=reduced, certificate=None, cell=SimpleNamespace(solver="piqp", accuracy=1e-10)
+        row=template.row, model=queried, certificate=None, cell=SimpleNamespace(solver="piqp", accuracy=1e-10)
     )
     return vibench.Model(cell)
 
@@ -175,19 +177,11 @@ def test_sums_that_are_declared_keep_their_terms_beside_members_that_are_not(run
 def per_parameter(template: vibench.Model) -> vibench.Model:
     """A model whose supremizers are added at every parameter, on another problem, with the row of a real cell."""
     problem = Rotating()
-    solver, training = HighFidelitySolver(problem), problem.training_set()
-    found = [solver.solve(mu) for mu in training]
-    basis = vibench.pod(np.column_stack([s.u for s in found]), problem.V, vibench.Stop(size=2)).basis
-    cone = vibench.greedy_cone(np.column_stack([s.lam for s in found]), problem.W, vibench.Stop(size=3))
-    span = multipliers(cone.generators, problem.W).span
-    enrichment = vibench.Enrichment(vibench.Kind.PER_PARAMETER, eta=span)
-    reduced = ReducedModel(problem, basis, enrichment, cone.generators, span)
-    queried = HyperReducedModel(reduced, hyper_reduce(reduced, affine_decomposition(problem, training, 1e-12)))
+    reduced = reduced_from(problem, vibench.Kind.PER_PARAMETER, 2, 3)
+    decomposed = affine_decomposition(problem, problem.training_set(), 1e-12)
+    queried = HyperReducedModel(reduced, hyper_reduce(reduced, decomposed))
     assert queried.kind is vibench.Kind.PER_PARAMETER
-    cell: Any = SimpleNamespace(
-        row=template.row, model=queried, certificate=None, cell=SimpleNamespace(solver="piqp", accuracy=1e-10)
-    )
-    return vibench.Model(cell)
+    return with_row(template, queried)
 
 
 def largest_errors(model: vibench.Model, answers: Any, count: int) -> tuple[float, float]:
@@ -313,11 +307,23 @@ def test_the_runtime_is_one_short_file_that_imports_no_vibench() -> None:
     assert given == {"numpy", "numpy.typing", "piqp", "proxsuite"}
 
 
-def test_solvers_give_the_same_answer(run: vibench.Run, tmp_path: Path) -> None:
-    model = model_of(run, "obstacle")
+def test_solvers_give_the_same_answer(run: vibench.Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each of them is the one that is asked for, which its answer, polished to round-off, does not show."""
+    model, called = model_of(run, "obstacle"), list[str]()
     one, other = per_file(model, tmp_path, "piqp"), per_file(model, tmp_path, "proxqp")
+
+    def counted(name: str, solve: Any) -> Any:
+        def asked(*given: Any) -> Any:
+            called.append(name)
+            return solve(*given)
+
+        return asked
+
+    for name, solve in list(reduced_model.SOLVERS.items()):
+        monkeypatch.setitem(reduced_model.SOLVERS, name, counted(name, solve))
     for mu in model.parameters.sample(10, seed=2):
         assert np.allclose(one.solve(mu).x, other.solve(mu).x, rtol=0.0, atol=1e-12)
+    assert called == ["piqp", "proxqp"] * 10
     with pytest.raises(ValueError, match="the solver is 'osqp', expected one of piqp, proxqp"):
         Exported(tmp_path / "model.npz", "osqp")
 
@@ -486,9 +492,12 @@ def test_the_command(run: vibench.Run, main: Main, tmp_path: Path) -> None:
 def certified(tmp_path_factory: pytest.TempPathFactory) -> vibench.Run:
     study = vibench.Study(
         name="certified",
-        problem=[{"name": "radial-obstacle", "options": {"resolution": 200}}],
+        problem=[
+            {"name": "radial-obstacle", "options": {"resolution": 200}},
+            {"name": "obstacle", "options": {"resolution": 150}},
+        ],
         dual=["mcpg"],
-        primal=["decorrelated"],
+        primal=["decorrelated", "online-supremizers"],
         assembly=["certified"],
         tolerances=[{"pod": [1e-2], "dual": [1e-1]}],
         solvers=["piqp"],
@@ -499,27 +508,59 @@ def certified(tmp_path_factory: pytest.TempPathFactory) -> vibench.Run:
     return vibench.run(study, tmp_path_factory.mktemp("bounds") / "run", progress=False)
 
 
-def test_an_exported_certificate_gives_the_bounds_of_vibench(certified: vibench.Run, tmp_path: Path) -> None:
-    model = certified.model(str(certified.cells["cell"].iloc[0]))
+def certified_model(run: vibench.Run, problem: str = "radial-obstacle", primal: str = "decorrelated") -> vibench.Model:
+    return model_of(run, problem, primal, "certified")
+
+
+@pytest.mark.parametrize(
+    ("problem", "primal", "guarantee"),
+    [
+        ("radial-obstacle", "decorrelated", "certified"),  # A and B are constant
+        ("obstacle", "decorrelated", "verified"),  # A varies, so that bounds of its spectrum are needed
+        ("obstacle", "online-supremizers", "verified"),
+    ],
+)
+def test_an_exported_certificate_gives_the_bounds_of_vibench(
+    problem: str, primal: str, guarantee: str, certified: vibench.Run, tmp_path: Path
+) -> None:
+    model = certified_model(certified, problem, primal)
     assert model.certificate is not None
     found = export_model(model, tmp_path / "model.npz")
     assert {file.name for file in tmp_path.iterdir()} == FILES | {BOUNDS}
-    assert found.about["certificate"] == "certified"
+    assert found.about["certificate"] == guarantee
     exported = WithBounds(tmp_path / "model.npz")
     for mu in model.parameters.sample(20, seed=5):
         answer = exported.solve(mu)
         solution, bound = answer.solution, answer.bound
         reduced = model.reduced.assemble(mu)
         expected = model.certificate.evaluate(model.problem, mu, reduced, solution.x, solution.alpha)
-        assert (bound.guarantee, expected.note) == ("certified", "")
+        assert (bound.guarantee, expected.note) == (guarantee, "")
         for name in ("u_energy", "lambda_natural", "relative"):
-            assert getattr(bound, name) == pytest.approx(getattr(expected, name), rel=1e-9)
+            assert getattr(bound, name) == pytest.approx(getattr(expected, name), rel=1e-7)
         exact, vi = model.high_fidelity(mu), model.problem.assemble(mu)
         away = exact.u - solution.u
         assert float(away @ (vi.A @ away)) <= bound.u_energy**2
-        assert exported.solve(mu, tolerance=1.01 * bound.relative).verdict == "certified"
+        assert exported.solve(mu, tolerance=1.01 * bound.relative).verdict == guarantee
         assert exported.solve(mu, tolerance=0.99 * bound.relative).verdict == "not certified"
         assert answer.verdict == ""
+
+
+def test_where_an_exported_certificate_has_no_bound_it_says_why(
+    certified: vibench.Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    model = certified_model(certified, "obstacle")
+    export_model(model, tmp_path / "model.npz")
+    exported, mu = WithBounds(tmp_path / "model.npz"), model.parameters.sample(1, seed=5)[0]
+    found = exported.solve(mu).solution
+    assert found.alpha.max() > 0.0
+    bound = exported._bound(mu, found.x, -found.alpha, found.energy)
+    assert bound == (np.inf, np.inf, np.inf, "none", "λ_N has negative coefficients")
+    with monkeypatch.context() as patch:
+        patch.setattr(exported, "_complementary", lambda *_: None)
+        assert exported.solve(mu).bound == (np.inf, np.inf, np.inf, "none", f"no w with B w ≥ s{FOUND}")
+        assert exported.solve(mu, tolerance=1e9).verdict == "not certified"
+    exported._data["spectral_error"] = np.array(1.0)  # as much as A itself
+    assert exported.solve(mu).bound == (np.inf, np.inf, np.inf, "none", f"no α > 0{FOUND}")
 
 
 def test_a_model_without_a_certificate_has_no_bounds_and_says_why(run: vibench.Run, tmp_path: Path) -> None:
@@ -534,13 +575,13 @@ def test_a_model_without_a_certificate_has_no_bounds_and_says_why(run: vibench.R
 def test_polynomials_that_are_not_the_functions_they_replace_are_not_called_certified(
     certified: vibench.Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    model = certified.model(str(certified.cells["cell"].iloc[0]))
+    model = certified_model(certified)
     monkeypatch.setattr(exported_certificate, "EXACT", 0.0)
     assert exported_model(model).about["certificate"] == "verified"
 
 
 def test_the_command_says_what_has_bounds(certified: vibench.Run, main: Main, tmp_path: Path) -> None:
-    cell, file = str(certified.cells["cell"].iloc[0]), tmp_path / "out" / "model.npz"
+    cell, file = str(certified_model(certified).row["cell"]), tmp_path / "out" / "model.npz"
     code, out, err = main("export-model", str(certified.path.parent), cell, str(file), "--c")
     assert (code, err) == (0, "")
     assert "\nerror bounds: certified\n" in out

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import json
-from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
 
 import pytest
 from markupsafe import escape
-from outputs import clean, elements
+from outputs import Links, clean, elements
 from running import Changed
 
 from vibench.report import html
@@ -28,29 +27,9 @@ def made(quick_run: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return html.write(quick_run / FILE, tmp_path_factory.mktemp("report") / "report.html")
 
 
-class Links(HTMLParser):
-    """Everything that a page would fetch."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.sources: list[str] = []
-        self.targets: list[str] = []
-        self.ids: list[str] = []
-
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        for name, value in attrs:
-            if name == "src" or (name == "href" and tag == "link"):
-                self.sources.append(str(value))
-            elif name == "href":
-                self.targets.append(str(value))
-            elif name == "id":
-                self.ids.append(str(value))
-
-
 def test_it_needs_nothing_but_itself(made: Path) -> None:
     page = made.read_text(encoding="utf-8")
-    links = Links()
-    links.feed(page)
+    links = Links(page)
     tables_of_cells = [target for target in links.targets if target.startswith("#summary?q=")]
     assert len(tables_of_cells) >= len({*tables_of_cells}) > 2
     assert links.sources

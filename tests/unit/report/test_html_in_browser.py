@@ -6,13 +6,13 @@ import csv
 import io
 import shutil
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pandas as pd
 import pytest
-from browsing import chromium, complaints, look
+from browsing import complaints, look
 from many_cells import write_many
 from running import execute
 from selenium.webdriver import ActionChains, Chrome
@@ -93,17 +93,6 @@ def made(results: Path) -> Path:
 @pytest.fixture(scope="module")
 def cells(results: Path) -> pd.DataFrame:
     return tables.in_order(tables.read(results, "cells"))
-
-
-@pytest.fixture(scope="module")
-def downloads(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return tmp_path_factory.mktemp("downloads")
-
-
-@pytest.fixture(scope="module")
-def browser(downloads: Path) -> Iterator[Chrome]:
-    with chromium(downloads) as found:
-        yield found
 
 
 def awaited(browser: Chrome, condition: Callable[[Chrome], Any]) -> Any:

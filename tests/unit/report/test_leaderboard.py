@@ -2,29 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Any
-
-import pandas as pd
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from samples import cell_row
+from samples import cells_of, row_of
 
 from vibench.report.leaderboard import COLUMNS, Criterion, Standings, leaderboard
 from vibench.results.best import LARGEST_BAND
-from vibench.results.columns import CELLS
-
-
-def cells(*rows: dict[str, Any]) -> pd.DataFrame:
-    common = {
-        "problem": "box", "problem_options": "{}", "status": "ok", "error_u_mean": 1e-9, "solver_share_mean": 1e-6,
-        "beta_span_min": 0.1, "offline_s": 1.0,
-    }  # fmt: skip
-    return pd.DataFrame([cell_row(**common | row) for row in rows], columns=list(CELLS))
-
-
-def row(cell: str, error: float | None, online: float | None, **more: Any) -> dict[str, Any]:
-    return {"cell": cell, "error_lambda_mean": error, "online_s": online, **more}
 
 
 def won(standings: Standings, criterion: Criterion) -> list[tuple[float, str]]:
@@ -33,7 +17,14 @@ def won(standings: Standings, criterion: Criterion) -> list[tuple[float, str]]:
 
 
 def test_the_fastest_query_is_named_for_every_band() -> None:
-    (found,) = leaderboard(cells(row("a", 0.05, 1.0), row("b", 0.06, 2.0), row("c", 4e-3, 3.0), row("d", 3e-3, 2.5)))
+    (found,) = leaderboard(
+        cells_of(
+            row_of("a", 0.05, 1.0),
+            row_of("b", 0.06, 2.0),
+            row_of("c", 4e-3, 3.0),
+            row_of("d", 3e-3, 2.5),
+        )
+    )
     assert won(found, Criterion.QUERY) == [(0.1, "a"), (0.01, "d")]
     assert [band.cells for band in found.bands] == [4, 2]
     assert won(found, Criterion.ERROR) == [(0.1, "d"), (0.01, "d")]
@@ -41,21 +32,21 @@ def test_the_fastest_query_is_named_for_every_band() -> None:
 
 def test_a_model_that_is_unstable_and_ten_per_cent_off_wins_nothing() -> None:
     """However fast it is; nor does one that is only unstable, or only above the largest band."""
-    wrong = row("wrong", 0.1, 1e-6, beta_span_min=0.0, offline_s=1e-3)
-    unstable = row("unstable", 1e-8, 1e-6, beta_span_min=1e-17, offline_s=1e-3)
-    inexact = row("inexact", 0.11, 1e-6, offline_s=1e-3)
-    (found,) = leaderboard(cells(wrong, row("right", 0.1, 1.0), unstable, inexact))
+    wrong = row_of("wrong", 0.1, 1e-6, beta_span_min=0.0, offline_s=1e-3)
+    unstable = row_of("unstable", 1e-8, 1e-6, beta_span_min=1e-17, offline_s=1e-3)
+    inexact = row_of("inexact", 0.11, 1e-6, offline_s=1e-3)
+    (found,) = leaderboard(cells_of(wrong, row_of("right", 0.1, 1.0), unstable, inexact))
     assert {name for criterion in Criterion for _, name in won(found, criterion)} == {"right"}
     assert (found.cells, found.unstable, found.inexact, found.incomplete) == (4, 2, 1, 0)
 
 
 def test_what_is_not_ok_or_solved_too_loosely_takes_no_part() -> None:
     (found,) = leaderboard(
-        cells(
-            row("failed", 1e-9, 1e-9, status="inaccurate"),
-            row("loose", 1e-3, 1e-9, solver_share_mean=0.5),
-            row("unknown", None, 1e-9, error_u_mean=None),
-            row("untimed", 1e-4, None),
+        cells_of(
+            row_of("failed", 1e-9, 1e-9, status="inaccurate"),
+            row_of("loose", 1e-3, 1e-9, solver_share_mean=0.5),
+            row_of("unknown", None, 1e-9, error_u_mean=None),
+            row_of("untimed", 1e-4, None),
         )
     )
     assert won(found, Criterion.QUERY) == []
@@ -64,18 +55,24 @@ def test_what_is_not_ok_or_solved_too_loosely_takes_no_part() -> None:
 
 
 def test_constants_that_were_not_computed_exclude_nobody() -> None:
-    (found,) = leaderboard(cells(row("a", 1e-3, 1.0, beta_span_min=None)))
+    (found,) = leaderboard(cells_of(row_of("a", 1e-3, 1.0, beta_span_min=None)))
     assert won(found, Criterion.QUERY) == [(1e-3, "a")]
 
 
 def test_problems_are_apart_and_an_empty_table_has_none() -> None:
-    found = leaderboard(cells(row("a", 0.05, 2.0), row("b", 0.05, 1.0, problem="bar"), row("c", 0.5, 1.0, problem="c")))
+    found = leaderboard(
+        cells_of(
+            row_of("a", 0.05, 2.0),
+            row_of("b", 0.05, 1.0, problem="bar"),
+            row_of("c", 0.5, 1.0, problem="c"),
+        )
+    )
     assert [(one.problem, won(one, Criterion.QUERY)) for one in found] == [
         ("box", [(0.1, "a")]),
         ("bar", [(0.1, "b")]),
         ("c", []),
     ]
-    assert leaderboard(cells()) == ()
+    assert leaderboard(cells_of()) == ()
 
 
 some = st.floats(1e-6, 1.0)
@@ -85,10 +82,10 @@ some = st.floats(1e-6, 1.0)
 @given(st.lists(st.tuples(some, some, some, st.sampled_from([0.0, 0.3])), min_size=1, max_size=8))
 def test_nobody_in_a_band_is_better_than_its_winner(found: list[tuple[float, float, float, float]]) -> None:
     rows = [
-        row(str(k), error, online, offline_s=offline, beta_span_min=beta)
+        row_of(str(k), error, online, offline_s=offline, beta_span_min=beta)
         for k, (error, online, offline, beta) in enumerate(found)
     ]
-    (standings,) = leaderboard(cells(*rows))
+    (standings,) = leaderboard(cells_of(*rows))
     for band in standings.bands:
         mine = [one for one in found if one[0] <= band.error * (1 + 1e-12) and one[3] > 0.0]
         assert len(mine) == band.cells

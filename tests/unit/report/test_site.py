@@ -5,15 +5,13 @@ from __future__ import annotations
 import json
 import re
 import shutil
-from collections.abc import Iterator
-from html.parser import HTMLParser
 from pathlib import Path
 from urllib.parse import unquote
 
 import pandas as pd
 import pytest
-from browsing import chromium, observed
-from outputs import clean, elements
+from browsing import observed
+from outputs import Links, clean, elements
 from running import Changed, Main, execute, refused
 from selenium.webdriver import Chrome
 
@@ -64,34 +62,12 @@ def site(three: list[Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
     return made
 
 
-class Links(HTMLParser):
-    """What a page links to, and the anchors that it has."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.targets: list[str] = []
-        self.ids: set[str] = set()
-
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        for name, value in attrs:
-            if name in ("href", "src"):
-                self.targets.append(str(value))
-            elif name == "id":
-                self.ids.add(str(value))
-
-
-def links(page: Path) -> Links:
-    found = Links()
-    found.feed(page.read_text(encoding="utf-8"))
-    return found
-
-
 def test_every_link_of_every_page_leads_to_a_file_of_the_site_and_to_its_anchor(site: Path) -> None:
-    pages = {page: links(page) for page in site.rglob("*.html")}
+    pages = {page: Links(page.read_text(encoding="utf-8")) for page in site.rglob("*.html")}
     assert len(pages) == 3 + 2 * 3
     reached = {site / "index.html"}
     for page, found in pages.items():
-        for target in found.targets:
+        for target in found.sources + found.targets:
             if target.startswith(("data:", "https://doi.org/10.5281/")):
                 continue
             assert not target.startswith("/"), target
@@ -102,12 +78,6 @@ def test_every_link_of_every_page_leads_to_a_file_of_the_site_and_to_its_anchor(
             assert not anchor or anchor in pages[linked].ids, (page, target)
             reached.add(linked)
     assert {path for path in site.rglob("*") if path.is_file()} - reached == {site / folder.CATALOGUE}
-
-
-@pytest.fixture(scope="module")
-def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Chrome]:
-    with chromium(tmp_path_factory.mktemp("downloads")) as found:
-        yield found
 
 
 OBSERVE = """

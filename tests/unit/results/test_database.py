@@ -7,7 +7,7 @@ import json
 import shutil
 import sqlite3
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from samples import cell_row, query_rows
+from samples import RECORDED, cell_row, query_rows
 
 from vibench.errors import RequestError, StorageError
 from vibench.results import database as module
@@ -23,16 +23,6 @@ from vibench.results.columns import CELLS, TABLES, VERSION
 from vibench.results.database import ResultsDatabase
 from vibench.results.sqlite.reading import FILE, read_meta, read_rows
 from vibench.results.sqlite.values import LONGEST_TEXT
-
-STUDY = {"name": "sample", "seed": 1, "validation": 4, "accuracy": 1e-7}
-
-
-@pytest.fixture
-def journal(tmp_path: Path) -> Iterator[ResultsDatabase]:
-    """The results of a new study."""
-    made = ResultsDatabase(tmp_path / "run", STUDY)
-    yield made
-    made.close()
 
 
 def seen(folder: Path, table: str) -> list[tuple[Any, ...]]:
@@ -82,7 +72,7 @@ def test_columns_are_added_for_every_parameter(journal: ResultsDatabase) -> None
 
 def test_columns_of_parameters_are_found_again(journal: ResultsDatabase, tmp_path: Path) -> None:
     journal.write_cell(cell_row("c1"), query_rows("c1"))
-    again = ResultsDatabase(tmp_path / "run", STUDY)
+    again = ResultsDatabase(tmp_path / "run", RECORDED)
     again.write_cell(cell_row("c2"), query_rows("c2"))
     assert len(again.rows("queries")) == 4
     again.close()
@@ -147,7 +137,10 @@ def test_a_disk_that_fails_is_no_fault_of_the_values(journal: ResultsDatabase) -
 
 @given(st.text(st.characters()), st.integers(-(10**300), 10**300) | st.floats() | st.none())
 def test_any_text_and_any_number_can_be_written_and_read(text: str, number: Any) -> None:
-    with tempfile.TemporaryDirectory() as folder, contextlib.closing(ResultsDatabase(Path(folder), STUDY)) as journal:
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        contextlib.closing(ResultsDatabase(Path(folder), RECORDED)) as journal,
+    ):
         columns = {"problem": text, "dual": text, "primal": text, "reason": text, "solver": text}
         content = {text.encode("utf-8", "replace").decode(): number}
         options = json.dumps(content, ensure_ascii=False)
@@ -174,7 +167,7 @@ def test_a_long_text_is_cut_and_json_is_not(journal: ResultsDatabase) -> None:
 def test_a_name_that_looks_like_a_uri_is_a_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     for name in ("file:run", "file:run?mode=memory", "a%20b#c", ":memory:", "\udcff"):
-        made = ResultsDatabase(Path(name), STUDY)
+        made = ResultsDatabase(Path(name), RECORDED)
         made.write_cell(cell_row(), [])
         made.close()
         assert read_meta(Path(name) / FILE)["schema"] == str(VERSION)
@@ -200,7 +193,7 @@ def test_finished_tells_status_and_code(journal: ResultsDatabase) -> None:
 def test_what_was_written_is_there_for_the_next_run(journal: ResultsDatabase, tmp_path: Path) -> None:
     journal.write_cell(cell_row(), query_rows())
     journal.close()
-    again = ResultsDatabase(tmp_path / "run", STUDY)
+    again = ResultsDatabase(tmp_path / "run", RECORDED)
     assert len(again.finished()) == 1
     assert len(again.rows("queries")) == 2
     again.close()
@@ -210,7 +203,7 @@ def test_a_run_that_dies_loses_no_written_cell(journal: ResultsDatabase, tmp_pat
     """What a copy of the folder holds while the journal is open is what a crash would leave."""
     journal.write_cell(cell_row(), query_rows())
     shutil.copytree(tmp_path / "run", tmp_path / "copy")
-    again = ResultsDatabase(tmp_path / "copy", STUDY)
+    again = ResultsDatabase(tmp_path / "copy", RECORDED)
     assert len(again.rows("cells")) == 1
     assert len(again.rows("queries")) == 2
     again.close()
@@ -252,17 +245,17 @@ def test_numbers_of_numpy_are_stored_as_numbers(journal: ResultsDatabase) -> Non
 
 @pytest.mark.parametrize(("key", "value"), [("name", "other"), ("seed", 2), ("validation", 5), ("accuracy", 1e-8)])
 def test_results_of_another_study_are_refused(key: str, value: Any, journal: ResultsDatabase, tmp_path: Path) -> None:
-    line = refusal(lambda: ResultsDatabase(tmp_path / "run", STUDY | {key: value}))
+    line = refusal(lambda: ResultsDatabase(tmp_path / "run", RECORDED | {key: value}))
     assert str(tmp_path / "run") in line
     assert "another study" in line
-    assert f"{key} {STUDY[key]!r} instead of {value!r}" in line
+    assert f"{key} {RECORDED[key]!r} instead of {value!r}" in line
 
 
 def test_results_of_another_schema_are_refused(
     journal: ResultsDatabase, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(module, "VERSION", VERSION + 1)
-    line = refusal(lambda: ResultsDatabase(tmp_path / "run", STUDY))
+    line = refusal(lambda: ResultsDatabase(tmp_path / "run", RECORDED))
     assert f"schema {VERSION}" in line
     assert str(VERSION + 1) in line
 
@@ -271,25 +264,25 @@ def test_a_refused_folder_is_left_as_it_was(journal: ResultsDatabase, tmp_path: 
     journal.write_cell(cell_row(), query_rows())
     journal.close()
     before = (tmp_path / "run" / FILE).read_bytes()
-    refusal(lambda: ResultsDatabase(tmp_path / "run", STUDY | {"seed": 2}))
+    refusal(lambda: ResultsDatabase(tmp_path / "run", RECORDED | {"seed": 2}))
     assert (tmp_path / "run" / FILE).read_bytes() == before
 
 
 def test_a_file_in_place_of_the_folder_is_refused(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
-    assert "cannot be written" in refusal(lambda: ResultsDatabase(tmp_path / "file" / "below", STUDY))
+    assert "cannot be written" in refusal(lambda: ResultsDatabase(tmp_path / "file" / "below", RECORDED))
 
 
 def test_a_name_of_a_column_that_is_no_text_is_damage(tmp_path: Path) -> None:
-    ResultsDatabase(tmp_path, STUDY).close()
+    ResultsDatabase(tmp_path, RECORDED).close()
     path = tmp_path / FILE
     path.write_bytes(path.read_bytes().replace(b'"peak_memory_mib"', b'"\xa0eak_memory_mib"'))
     assert "the columns of the table 'cells' are not those" in refusal(lambda: read_rows(path, "cells"))
-    assert "the columns of the table 'cells' are not those" in refusal(lambda: ResultsDatabase(tmp_path, STUDY))
+    assert "the columns of the table 'cells' are not those" in refusal(lambda: ResultsDatabase(tmp_path, RECORDED))
 
 
 def test_an_empty_folder_will_do(tmp_path: Path) -> None:
-    made = ResultsDatabase(tmp_path, STUDY)
+    made = ResultsDatabase(tmp_path, RECORDED)
     made.write_cell(cell_row(), [])
     assert len(made.rows("cells")) == 1
     made.close()
@@ -298,7 +291,7 @@ def test_an_empty_folder_will_do(tmp_path: Path) -> None:
 @pytest.mark.parametrize("content", [b"hello", b"SQLite format 3\x00 and then nothing"], ids=["text", "cut off"])
 def test_a_file_that_is_no_database_is_refused(content: bytes, tmp_path: Path) -> None:
     (tmp_path / FILE).write_bytes(content)
-    line = refusal(lambda: ResultsDatabase(tmp_path, STUDY))
+    line = refusal(lambda: ResultsDatabase(tmp_path, RECORDED))
     assert FILE in line
     assert "not a results file" in line
     assert (tmp_path / FILE).read_bytes() == content
@@ -308,7 +301,7 @@ def test_a_database_of_something_else_is_refused(tmp_path: Path) -> None:
     db = sqlite3.connect(tmp_path / FILE)
     db.execute("CREATE TABLE notes (text TEXT)")
     db.close()
-    assert "not a results file" in refusal(lambda: ResultsDatabase(tmp_path, STUDY))
+    assert "not a results file" in refusal(lambda: ResultsDatabase(tmp_path, RECORDED))
 
 
 def test_a_results_file_with_a_broken_study_is_refused(journal: ResultsDatabase, tmp_path: Path) -> None:
@@ -316,23 +309,23 @@ def test_a_results_file_with_a_broken_study_is_refused(journal: ResultsDatabase,
     db.execute("UPDATE meta SET value = 'nonsense' WHERE key = 'study'")
     db.commit()
     db.close()
-    assert FILE in refusal(lambda: ResultsDatabase(tmp_path / "run", STUDY))
+    assert FILE in refusal(lambda: ResultsDatabase(tmp_path / "run", RECORDED))
 
 
 def test_a_file_left_empty_by_a_killed_run_is_taken_over(tmp_path: Path) -> None:
     (tmp_path / FILE).touch()
-    made = ResultsDatabase(tmp_path, STUDY)
+    made = ResultsDatabase(tmp_path, RECORDED)
     assert made.finished() == {}
     made.close()
 
 
 def test_a_name_no_folder_can_have_is_refused(tmp_path: Path) -> None:
-    assert "output folder" in refusal(lambda: ResultsDatabase(tmp_path / ("a" * 300), STUDY))
+    assert "output folder" in refusal(lambda: ResultsDatabase(tmp_path / ("a" * 300), RECORDED))
 
 
 @pytest.mark.skipif(not Path("/proc").is_dir(), reason="needs a folder nobody can write to")
 def test_a_folder_that_cannot_be_made_is_refused() -> None:
-    assert "cannot be written" in refusal(lambda: ResultsDatabase(Path("/proc/vibench"), STUDY))
+    assert "cannot be written" in refusal(lambda: ResultsDatabase(Path("/proc/vibench"), RECORDED))
 
 
 def test_a_database_that_cannot_be_opened_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -340,7 +333,7 @@ def test_a_database_that_cannot_be_opened_is_refused(tmp_path: Path, monkeypatch
         raise sqlite3.OperationalError("database is locked")
 
     monkeypatch.setattr(module.sqlite3, "connect", locked)
-    line = refusal(lambda: ResultsDatabase(tmp_path / "run", STUDY))
+    line = refusal(lambda: ResultsDatabase(tmp_path / "run", RECORDED))
     assert "cannot be written" in line
     assert "locked" in line
 

@@ -201,3 +201,21 @@ def test_the_figure_has_a_panel_for_every_measure_and_says_what_has_no_point(tmp
         assert set(points[:, 1]) == {50.0}
     assert "Models without such a number, or with an undecided one, have no point: 1." in caption_of(figure)
     assert break_even(type(data)(**{**vars(data), "thresholds": thresholds.assign(meaning="undecided")})) is None
+
+
+def test_the_figure_names_the_models_that_no_other_beats_in_both(tmp_path: Path) -> None:
+    data = next(data for _, data in problems(write_sample_run(tmp_path / "run")))
+    rng, mine = np.random.default_rng(3), data.thresholds["cell_a"].isna()
+    queries = pd.Series(rng.permutation(int(mine.sum())) * 10.0 + 10.0, index=data.thresholds.index[mine])
+    thresholds = data.thresholds.assign(meaning="from", benefit_threshold=queries, threshold_low=9.0, threshold_high=70)
+    figure = break_even(type(data)(**{**vars(data), "thresholds": thresholds}))
+    assert figure is not None
+    cells = data.cells.set_index("cell").join(thresholds[mine].set_index("cell_b")["benefit_threshold"], how="inner")
+    shown = {axes.get_title(): [text.get_text() for text in axes.texts] for axes in figure.axes if axes.get_title()}
+    for title, column in {"u": "error_u_mean", "λ": "error_lambda_mean"}.items():
+        both = cells[[column, "benefit_threshold"]].to_numpy(float)
+        beaten = [any((other <= one).all() and (other < one).any() for other in both) for one in both]
+        front = cells[~np.array(beaten)]
+        assert len(shown[title]) == len(front) < len(cells)
+        pairs = [f"({N:.0f}, {R:.0f})" for N, R in zip(front["N"], front["R"], strict=True)]
+        assert sorted(pairs) == sorted(text.split(", δ")[0] for text in shown[title])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from functools import partial
+from pathlib import Path
 
 import broken_variants
 import pytest
@@ -78,6 +79,16 @@ def test_a_mistake_in_a_solver_is_named(name: str) -> None:
     check, words = SOLVERS[name]
     found = messages(testing.examine_solver(getattr(broken_variants, name)))
     assert words in found.get(check, ""), found
+
+
+def test_every_broken_variant_is_tried() -> None:
+    sound = {"Bar", "Option", "Cube", "exact"}
+    elsewhere = {"PaintsTheEnd": "test_elsewhere.py", "UnknownAnnotation": "test_conformance.py"}
+    for name, file in elsewhere.items():
+        assert f"broken_variants:{name}" in Path(__file__).with_name(file).read_text(encoding="utf-8")
+    module = broken_variants.__name__
+    own = {name for name, value in vars(broken_variants).items() if getattr(value, "__module__", "") == module}
+    assert {name for name in own if not name.startswith("_")} - sound == {*PROBLEMS, *SOLVERS, *elsewhere}
 
 
 @pytest.mark.parametrize(

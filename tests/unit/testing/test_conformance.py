@@ -17,13 +17,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numerics import Varying
 from packs import manifest, write_cable, write_manifest
-from running import Main, refused
+from running import Main, failures, refused
 
 from vibench import testing
 from vibench.interfaces.strategies import DualStrategy
 from vibench.study import registry
 from vibench.testing.assembly import JUMP, WIDTH, find_jump
-from vibench.testing.checks import Check, Finding, Note, Verdict, examine
+from vibench.testing.checks import Check, Note, Verdict, examine
 from vibench.testing.comparisons import difference
 
 Case = tuple[str, list[str]]
@@ -123,10 +123,6 @@ MORE_STRATEGIES: Mapping[str, Case] = {
     "SuppliesAVector": ("enrichment", ["the supply at mu = [-0.1, 0.0] has shape (40,); expected (40, 40)"]),
     "Restarts": ("nested growth", ["the vectors of tolerance 0.5 are not the first ones of tolerance 0.1"]),
 }  # fmt: skip
-
-
-def failures(findings: list[Finding]) -> dict[str, str]:
-    return {finding.check: finding.message for finding in findings if finding.verdict is Verdict.FAILED}
 
 
 def assert_found(found: Mapping[str, str], case: Case) -> None:

@@ -10,13 +10,12 @@ from typing import Any
 import pandas as pd
 import pytest
 from matplotlib.figure import Figure
-from running import Main, refused
+from running import Main, failures, refused
 
 from vibench import DerivedColumn, FigurePlugin, ProblemTables, testing
 from vibench.report.figures import OF_DUAL, OF_PROBLEM, drawings
 from vibench.results import tables
 from vibench.results.columns import TABLES
-from vibench.testing.checks import Finding, Verdict
 from vibench.testing.samples.run import write_sample_run
 
 counter = itertools.count()
@@ -99,10 +98,6 @@ WRONG: Mapping[type[FigurePlugin], tuple[str, str]] = {
 }
 
 
-def failures(findings: list[Finding]) -> dict[str, str]:
-    return {finding.check: finding.message for finding in findings if finding.verdict is Verdict.FAILED}
-
-
 @pytest.mark.parametrize("plugin", WRONG)
 def test_a_fault_is_found_by_its_check_alone(plugin: type[FigurePlugin]) -> None:
     check, words = WRONG[plugin]
@@ -149,6 +144,9 @@ def test_the_made_up_run_is_one_that_vibench_reads_and_draws(tmp_path: Path) -> 
     again = write_sample_run(tmp_path / "again")
     for name in TABLES:
         pd.testing.assert_frame_equal(tables.read(path, name), tables.read(again, name))
-    drawn = {draw for _, draw, data in drawings(path) if draw(data) is not None}
+    figures = [(name, draw, draw(data)) for name, draw, data in drawings(path)]
+    drawn = {draw for _, draw, figure in figures if figure is not None}
     missing = {kind for kind, draw in (OF_PROBLEM | OF_DUAL).items() if draw not in drawn}
     assert missing <= {"solutions", "diagnostics", "shares", "solvers", "precision", "break-even"}
+    shown = [(name, axes) for name, _, figure in figures if figure is not None for axes in figure.axes if axes.axison]
+    assert [name for name, axes in shown if not axes.has_data()] == []

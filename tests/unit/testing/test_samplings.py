@@ -8,10 +8,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from running import Main, refused
+from running import Main, failures, refused
 
 from vibench import AdaptiveSampling, Array, ParameterBox, RequestError, Sampling, Trainer, testing
-from vibench.testing.checks import Finding, Verdict
+from vibench.testing.checks import Verdict
 
 
 class Uniform(Sampling):
@@ -151,10 +151,6 @@ WRONG: Mapping[type[Sampling], tuple[str, str]] = {
 
 def made(plugin: type[Sampling]) -> partial[Sampling]:
     return partial(plugin) if issubclass(plugin, Farthest) else partial(plugin, size=5)
-
-
-def failures(findings: list[Finding]) -> dict[str, str]:
-    return {finding.check: finding.message for finding in findings if finding.verdict is Verdict.FAILED}
 
 
 @pytest.mark.parametrize("plugin", WRONG)

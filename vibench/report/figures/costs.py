@@ -55,7 +55,7 @@ def work_precision(data: Data) -> CaptionedFigure | None:
 def _scatter(
     data: Data, cells: pd.DataFrame, x: pd.Series, xlabel: str, title: str, *, front: bool = False
 ) -> CaptionedFigure | None:
-    """One point per cell with its (N, R) and δ; a row of panels for every dual strategy and assembly."""
+    """One point per cell with its (N, R) and δ; a row of panels for every dual strategy and assembly among them."""
     compared = on_common_queries(cells[x.notna()], data.queries)
     cells = compared.cells[compared.cells[list(ERRORS)].notna().any(axis=1)]
     if cells.empty:
@@ -80,10 +80,11 @@ def _scatter(
                 panel.plot(x[best.index], best[column], color="0.6", linewidth=0.8, drawstyle="steps-post", zorder=0)
             panel.set(xlabel=xlabel, ylabel=ylabel, title=name, xscale="log", yscale="log")
     over = compared.over or f" over all {compared.asked} queries"
+    rows_of = "dual strategy" + " and assembly" * (cells["assembly"].nunique() > 1)
     beyond = "The thin line is the Pareto front: no model is both faster and more accurate." if front else ""
     return sheet.finish(
         f"Relative errors of u (left) and of λ (right) of the reduced models of {data.problem}, means{over}, against "
-        f"the {xlabel}; solver {cells['solver'].iloc[0]}. A row for every dual strategy and assembly, a point for "
+        f"the {xlabel}; solver {cells['solver'].iloc[0]}. A row for every {rows_of}, a point for "
         "every model, with its (N, R) and the tolerance δ of its primal strategy; a number alone is another δ. "
         f"{beyond}"
         f"{data.part}"

@@ -59,7 +59,13 @@ def _fill(database: ResultsDatabase) -> None:
     database.replace("thresholds", break_even_rows(cells, timings))
 
 
-HISTORIES = (("pod", "e_pod"), ("cone", "e_proj"), ("cone", "e_orth"), ("enrichment", "sigma"))
+HISTORIES = (
+    ("pod", "error"),
+    ("cone", "error"),
+    ("cone", "e_orth"),
+    ("enrichment", "sigma"),
+    ("enrichment", "beta_span_min"),
+)
 """Stage and quantity of the histories."""
 
 

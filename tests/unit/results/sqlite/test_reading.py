@@ -2,24 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 
-import pytest
 from running import execute
 from samples import cell_row
 
 from vibench.results.columns import VERSION
 from vibench.results.database import ResultsDatabase
 from vibench.results.sqlite.reading import FILE, open_read_only, read_meta, read_rows
-
-
-@pytest.fixture
-def journal(tmp_path: Path) -> Iterator[ResultsDatabase]:
-    """The results of a new study."""
-    made = ResultsDatabase(tmp_path / "run", {"name": "sample"})
-    yield made
-    made.close()
 
 
 def test_what_others_have_written_is_printable_when_it_is_read(journal: ResultsDatabase, tmp_path: Path) -> None:

@@ -1,0 +1,17 @@
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from samples import RECORDED
+
+from vibench.results.database import ResultsDatabase
+
+
+@pytest.fixture
+def journal(tmp_path: Path) -> Iterator[ResultsDatabase]:
+    """The results of a new study."""
+    made = ResultsDatabase(tmp_path / "run", RECORDED)
+    yield made
+    made.close()
