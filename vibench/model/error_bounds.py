@@ -49,7 +49,7 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.sparse as sp
 
-from vibench.arrays import Array, Mask
+from vibench.arrays import Array
 from vibench.highfidelity.active_set import FALLBACK_SOLVER, active_set_iterations
 from vibench.interfaces.problem import VariationalInequality
 from vibench.linalg.inertia import UNIT
@@ -62,6 +62,9 @@ ACCURACY = 1e-10
 
 MARGIN = 4.0
 """The first margin of s, as a multiple of the round-off in s."""
+
+IMPLAUSIBLE = 1e8
+"""Multipliers this many times those that rows alone would have are of dependent constraints, solved in round-off."""
 
 ATTEMPTS = 4
 """Margins that are tried, each at least ten times the one before."""
@@ -209,7 +212,7 @@ def lifting(vi: VariationalInequality, energy: Energy, u: Array, lam: Array) -> 
     excess, margin = vi.B @ u - vi.g, MARGIN * _round_off(vi, u, np.zeros_like(u))
     for _ in range(ATTEMPTS):
         raised = VariationalInequality(vi.A, -(vi.B.T @ lam), -vi.B, -(excess + margin))
-        for w, nu in _minimisers(raised, energy, lam > 0.0):
+        for w, nu in _minimisers(raised, energy, lam):
             lacking = _lacking(vi, u, w)
             if np.all(lacking <= 0.0):  # NaN is not
                 return Lifting(w, nu)
@@ -218,17 +221,38 @@ def lifting(vi: VariationalInequality, energy: Energy, u: Array, lam: Array) -> 
     return None
 
 
-def _minimisers(program: VariationalInequality, energy: Energy, start: Mask) -> Iterator[tuple[Array, Array]]:
-    """Approximate solutions and multipliers of the program: by active sets, then by an interior-point method."""
-    system = energy.stiffness.active_set_system(program)
-    for active in (start, np.zeros_like(start)):
+def _minimisers(program: VariationalInequality, energy: Energy, lam: Array) -> Iterator[tuple[Array, Array]]:
+    """Approximate solutions and multipliers of the program: by active sets, then by an interior-point method.
+
+    Active sets of constraints that are dependent but for round-off may have a w that is feasible and huge: it comes
+    last.
+    """
+    system, doubtful = energy.stiffness.active_set_system(program), list[tuple[Array, Array]]()
+    largest = IMPLAUSIBLE * max(np.max(lam, initial=0.0), _largest_multiplier(program))
+    for active in (lam > 0.0, np.zeros(len(lam), bool)):
         found = active_set_iterations(system, active)
-        if found is not None:
-            yield system.recover(found[0]), found[1]
+        if found is None:
+            continue
+        minimiser = system.recover(found[0]), found[1]
+        if np.max(found[1], initial=0.0) <= largest:
+            yield minimiser
             return
+        doubtful.append(minimiser)
     answer = solve_qp(program, FALLBACK_SOLVER, ACCURACY)
     if answer.x is not None and answer.alpha is not None:
         yield answer.x, np.maximum(answer.alpha, 0.0)
+    yield from doubtful
+
+
+def _largest_multiplier(program: VariationalInequality) -> float:
+    """At least the largest multiplier that a constraint b x ≤ g would have alone and without load, −g / b A⁻¹ bᵀ.
+
+    It is at most −g b A bᵀ / |b|⁴, by the inequality of Cauchy and Schwarz.
+    """
+    B = sp.csr_array(program.B)
+    squares, energies = (np.asarray((B * other).sum(axis=1)) for other in (B, B @ program.A))
+    shares = np.divide(energies, squares**2, out=np.zeros_like(squares), where=squares > 0.0)
+    return float(np.max(-program.g * shares, initial=0.0))
 
 
 def _lacking(vi: VariationalInequality, u: Array, w: Array) -> Array:

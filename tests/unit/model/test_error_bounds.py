@@ -15,6 +15,7 @@ from vibench.linalg.cholesky import SparseCholesky
 from vibench.model import error_bounds
 from vibench.model.energy import Energy
 from vibench.model.error_bounds import ESTIMATED, NO_LIFTING, NOT_IN_CONE, Bounds, Certificate, certify, lifting
+from vibench.qp.solution import QPSolution
 from vibench.stability.coercivity import Constant, Stability, coercivity_and_continuity, energy_inf_sup
 from vibench.stability.infsup import InfSup
 
@@ -237,3 +238,20 @@ def test_an_active_set_method_that_fails_is_replaced(monkeypatch: pytest.MonkeyP
     assert found is not None
     assert sharp is not None
     assert sharp.u_energy == pytest.approx(found.u_energy, rel=1e-4)
+
+
+def test_an_active_set_of_dependent_constraints_comes_last(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its w is feasible and may be huge: a multiplier that no row alone would have tells."""
+    vi, u, lam = scalar(lam=0.8, u=0.6)
+    known = Stability(InfSup(0.0, 0.0, 0.0, ""), Constant(0.25, True), Constant(9.0, True), Constant(0.5, True))
+    sharp = certificate(vi, u, lam, known).bounds
+    assert sharp is not None
+    huge = np.array([1e13]), np.array([1e15]), 3
+    monkeypatch.setattr(error_bounds, "active_set_iterations", lambda system, active: huge)
+    found = certificate(vi, u, lam, known).bounds
+    assert found is not None
+    assert found.u_energy == pytest.approx(sharp.u_energy, rel=1e-4)
+    monkeypatch.setattr(error_bounds, "solve_qp", lambda *given: QPSolution(None, None, "none"))
+    found = certificate(vi, u, lam, known).bounds
+    assert found is not None
+    assert found.u_energy > 1e13  # it holds all the same
