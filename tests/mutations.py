@@ -229,8 +229,8 @@ FAULTS = (
     Fault(
         "lifting-not-feasible",
         "vibench/model/error_bounds.py",
-        "if np.all(lacking <= 0.0):",
-        "if np.all(np.isfinite(w)):",
+        "if not np.all(lacking <= 0.0):",
+        "if not np.all(np.isfinite(w)):",
         ("tests/unit/model/test_error_bounds.py",),
     ),
     Fault(

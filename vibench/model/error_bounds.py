@@ -49,7 +49,7 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.sparse as sp
 
-from vibench.arrays import Array
+from vibench.arrays import Array, Mask
 from vibench.highfidelity.active_set import FALLBACK_SOLVER, active_set_iterations
 from vibench.interfaces.problem import VariationalInequality
 from vibench.linalg.inertia import UNIT
@@ -210,49 +210,51 @@ def lifting(vi: VariationalInequality, energy: Energy, u: Array, lam: Array) -> 
         u_N (n,) and λ_N ≥ 0 (m,).
     """
     excess, margin = vi.B @ u - vi.g, MARGIN * _round_off(vi, u, np.zeros_like(u))
+    largest = IMPLAUSIBLE * max(np.max(lam, initial=0.0), _largest_multiplier(vi, excess))
+    doubtful = None
     for _ in range(ATTEMPTS):
         raised = VariationalInequality(vi.A, -(vi.B.T @ lam), -vi.B, -(excess + margin))
-        for w, nu in _minimisers(raised, energy, lam):
+        for w, nu in _minimisers(raised, energy, lam > 0.0, largest):
             lacking = _lacking(vi, u, w)
-            if np.all(lacking <= 0.0):  # NaN is not
+            if not np.all(lacking <= 0.0):  # NaN is not
+                margin = np.maximum(margin, 2.0 * np.nan_to_num(lacking, nan=0.0, posinf=0.0))
+            elif np.max(nu, initial=0.0) <= largest:
                 return Lifting(w, nu)
-            margin = np.maximum(margin, 2.0 * np.nan_to_num(lacking, nan=0.0, posinf=0.0))
+            else:
+                doubtful = Lifting(w, nu)
         margin = 10.0 * margin
-    return None
+    return doubtful
 
 
-def _minimisers(program: VariationalInequality, energy: Energy, lam: Array) -> Iterator[tuple[Array, Array]]:
+def _minimisers(
+    program: VariationalInequality, energy: Energy, start: Mask, largest: float
+) -> Iterator[tuple[Array, Array]]:
     """Approximate solutions and multipliers of the program: by active sets, then by an interior-point method.
 
-    Active sets of constraints that are dependent but for round-off may have a w that is feasible and huge: it comes
-    last.
+    Active sets of constraints that are dependent but for round-off may have a w that is feasible and huge, with a
+    multiplier above `largest`: others follow it.
     """
-    system, doubtful = energy.stiffness.active_set_system(program), list[tuple[Array, Array]]()
-    largest = IMPLAUSIBLE * max(np.max(lam, initial=0.0), _largest_multiplier(program))
-    for active in (lam > 0.0, np.zeros(len(lam), bool)):
+    system = energy.stiffness.active_set_system(program)
+    for active in (start, np.zeros_like(start)):
         found = active_set_iterations(system, active)
-        if found is None:
-            continue
-        minimiser = system.recover(found[0]), found[1]
-        if np.max(found[1], initial=0.0) <= largest:
-            yield minimiser
-            return
-        doubtful.append(minimiser)
+        if found is not None:
+            yield system.recover(found[0]), found[1]
+            if np.max(found[1], initial=0.0) <= largest:
+                return
     answer = solve_qp(program, FALLBACK_SOLVER, ACCURACY)
     if answer.x is not None and answer.alpha is not None:
         yield answer.x, np.maximum(answer.alpha, 0.0)
-    yield from doubtful
 
 
-def _largest_multiplier(program: VariationalInequality) -> float:
-    """At least the largest multiplier that a constraint b x ≤ g would have alone and without load, −g / b A⁻¹ bᵀ.
+def _largest_multiplier(vi: VariationalInequality, excess: Array) -> float:
+    """At least the largest multiplier s / b A⁻¹ bᵀ that a row b w ≥ s of the excess s (m,) would have alone.
 
-    It is at most −g b A bᵀ / |b|⁴, by the inequality of Cauchy and Schwarz.
+    It is at most s b A bᵀ / |b|⁴, by the inequality of Cauchy and Schwarz.
     """
-    B = sp.csr_array(program.B)
-    squares, energies = (np.asarray((B * other).sum(axis=1)) for other in (B, B @ program.A))
+    B = sp.csr_array(vi.B)
+    squares, energies = (np.asarray((B * other).sum(axis=1)) for other in (B, B @ vi.A))
     shares = np.divide(energies, squares**2, out=np.zeros_like(squares), where=squares > 0.0)
-    return float(np.max(-program.g * shares, initial=0.0))
+    return float(np.max(excess * shares, initial=0.0))
 
 
 def _lacking(vi: VariationalInequality, u: Array, w: Array) -> Array:

@@ -21,12 +21,7 @@ from numerics import Varying
 from running import Main, refused
 
 import vibench
-<<<<<<< HEAD
-from vibench.highfidelity.active_set import HighFidelitySolver
 from vibench.library import export, exported_certificate, reduced_model
-=======
-from vibench.library import exported_certificate, reduced_model
->>>>>>> tests5
 from vibench.library.export import BOUNDS, RUNTIME, export_model
 from vibench.library.export import exported as exported_model
 from vibench.library.reduced_model import Model as Exported
