@@ -23,6 +23,9 @@ from vibench.stages.base import Failed
 OPEN_FILES, OPEN_FILES_OF_A_WORKER = 64, 16
 """Files and sockets that a cluster keeps open, and for each worker; about 30 and 11 were counted in /proc."""
 
+ASKED_AGAIN = 5.0
+"""Seconds after which a result that has not come is asked for again, if the client is still there."""
+
 
 class Dask(Executor):
     """The workers of a dask cluster, one job at a time on each.
@@ -163,7 +166,7 @@ def _interrupts_held() -> Iterator[None]:
 def _hand_over(theirs: Any, ours: Future[Outcome]) -> None:
     """Pass the result of a dask future to a standard one, because `concurrent.futures.wait` works only on these."""
     try:
-        ours.set_result(theirs.result())
+        ours.set_result(_result(theirs))
     except BaseException as error:  # noqa: BLE001  in a thread of dask: passed to the waiting thread
         line = in_a_line(error)
         if type(error).__name__ == "KilledWorker":
@@ -172,6 +175,21 @@ def _hand_over(theirs: Any, ours: Future[Outcome]) -> None:
             ours.set_exception(
                 ExecutorError(f"the dask cluster was lost: {line}; run the same command again to continue")
             )
+
+
+def _result(theirs: Any) -> Outcome:
+    """The result of a dask future that is done, for as long as its client can fetch it.
+
+    A client that closes meanwhile never answers, and the thread that asks is that of the callbacks of all clients.
+    """
+    while True:
+        try:
+            outcome: Outcome = theirs.result(timeout=ASKED_AGAIN)
+        except TimeoutError:
+            if theirs.status == "error" or theirs.client.status != "running":  # the error may be the job's own
+                raise
+        else:
+            return outcome
 
 
 _supervisors: dict[tuple[str, int], Supervisor] = {}

@@ -8,8 +8,10 @@ import ssl
 import subprocess
 import time
 from collections.abc import Iterator
-from concurrent.futures import wait
+from concurrent.futures import Future, wait
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 from urllib.parse import urlsplit
 
 import pytest
@@ -80,7 +82,7 @@ def test_a_cluster_somebody_has_is_used_and_left_alone(cluster: LocalCluster, tm
         with pytest.raises(ProcessLookupError):  # nothing of ours goes on there
             os.kill(worker, 0)
         with pytest.raises(ExecutorError):
-            endless.result(timeout=10)
+            endless.result(timeout=60)
     assert list(tmp_path.glob("*.part")) == []
 
 
@@ -94,6 +96,32 @@ def test_a_dask_worker_that_dies_is_survived(cluster: LocalCluster, tmp_path: Pa
             assert len((tmp_path / f"diary {k}").read_text().splitlines()) >= 2  # it was begun again
     finally:
         workers.close()
+
+
+@pytest.mark.parametrize(
+    ("client", "job_status"), [("closed", "finished"), ("running", "finished"), ("running", "error")]
+)
+def test_a_client_that_closes_while_it_is_asked_holds_up_nobody(
+    client: str, job_status: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The callbacks of all clients share one thread: a result that never comes would be the end of all later runs."""
+    monkeypatch.setattr(dask, "ASKED_AGAIN", 0.0)
+    asked: list[float] = []
+
+    def result(timeout: float) -> str:
+        asked.append(timeout)
+        if len(asked) < 3:
+            raise TimeoutError
+        return "outcome"
+
+    ours: Future[Any] = Future()
+    dask._hand_over(SimpleNamespace(client=SimpleNamespace(status=client), status=job_status, result=result), ours)
+    if (client, job_status) != ("running", "finished"):
+        with pytest.raises(ExecutorError, match="the dask cluster was lost"):
+            ours.result(timeout=0)
+    else:
+        assert ours.result(timeout=0) == "outcome"
+        assert len(asked) == 3
 
 
 def test_workers_with_another_vibench_are_refused(
