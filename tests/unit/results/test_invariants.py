@@ -22,6 +22,7 @@ def test_constants_in_order_are_fine_and_so_is_round_off() -> None:
     assert violations(rows(), KINDS) == []
     assert violations(rows(beta_plain_span=0.1 * (1.0 + 5e-9)), KINDS) == []
     assert violations(rows(effectivity_u=np.nan, effectivity_lambda=40.0), KINDS) == []
+    assert violations(rows(effectivity_lambda_natural=1.0 - 1e-11), KINDS) == []
     assert violations(rows(beta_span=np.inf, beta_full_span=np.inf, beta_cone_upper=np.inf), KINDS) == []
 
 
@@ -34,6 +35,7 @@ def test_constants_in_order_are_fine_and_so_is_round_off() -> None:
         ({"beta_cone_lower": 0.11}, "beta_cone_upper ≥ beta_cone_lower"),
         ({"beta_span": np.nan}, "beta_span ≥ beta_plain_span"),
         ({"effectivity_u": 0.999}, "effectivity_u ≥ 1"),
+        ({"effectivity_lambda_natural": 1.0 - 1e-9}, "effectivity_lambda_natural ≥ 1"),
         ({"effectivity_lambda": 0.5}, "effectivity_lambda ≥ 1"),
     ],
 )
