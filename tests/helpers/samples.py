@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import json
 import shutil
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -13,6 +13,7 @@ from typing import Any
 import fake_plugins
 import pandas as pd
 
+import vibench
 from vibench.results.columns import CELLS, QUERIES
 from vibench.stages.base import Stage
 from vibench.storage.artefacts import Artefact, Store
@@ -216,3 +217,12 @@ def carry_out(stage: Stage, store: SampleStore) -> None:
         store.put(stage.key, result.value, result.seconds, result.histories)
     else:
         store.kept[stage.key] = Artefact(result.value, result.seconds, result.histories, "here")
+
+
+def small_study(name: str, problem: Sequence[Mapping[str, Any]], **axes: Any) -> vibench.Study:
+    """A study of few modes and generators, solved to 1e-10 and timed once."""
+    given = {
+        "dual": ["mcpg"], "primal": ["decorrelated"], "assembly": ["reduced"], "solvers": ["piqp"], "accuracy": 1e-10,
+        "tolerances": [{"pod": [1e-2], "dual": [1e-1]}], "validation": 1, "timing_rounds": 1,
+    }  # fmt: skip
+    return vibench.Study(name=name, problem=problem, **given | axes)

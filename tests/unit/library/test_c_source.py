@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from samples import small_study
 
 import vibench
 from vibench.library import c_source
@@ -47,18 +48,8 @@ def compiled(file: Path, unknowns: int, constraints: int) -> Solve:
 
 @pytest.fixture(scope="module", params=["radial-obstacle", "obstacle"])
 def model(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> vibench.Model:
-    study = vibench.Study(
-        name="small",
-        problem=[{"name": request.param, "options": {"resolution": 150}}],
-        dual=["mcpg"],
-        primal=["decorrelated"],
-        assembly=["reduced"],
-        tolerances=[{"pod": [5e-2], "dual": [2e-1]}],
-        solvers=["piqp"],
-        accuracy=1e-10,
-        validation=1,
-        timing_rounds=1,
-    )
+    problem = {"name": request.param, "options": {"resolution": 150}}
+    study = small_study("small", [problem], tolerances=[{"pod": [5e-2], "dual": [2e-1]}])
     run = vibench.run(study, tmp_path_factory.mktemp("c") / "run", progress=False)
     return run.model(run.cells["cell"].iloc[0])
 

@@ -19,6 +19,7 @@ import scipy.sparse as sp
 from enriching import reduced_from
 from numerics import Varying
 from running import Main, refused
+from samples import small_study
 
 import vibench
 from vibench.library import export, exported_certificate, reduced_model
@@ -30,20 +31,17 @@ from vibench.model.affine import affine_decomposition
 from vibench.model.hyperreduced import HyperReducedModel, hyper_reduce
 from vibench.qp.exact import exact_solution
 
-STUDY = vibench.Study(
-    name="small",
-    problem=[
-        {"name": "radial-obstacle", "options": {"resolution": 200}},
-        {"name": "obstacle", "options": {"resolution": 150}},
-    ],
-    dual=["mcpg"],
+PROBLEMS = [
+    {"name": "radial-obstacle", "options": {"resolution": 200}},
+    {"name": "obstacle", "options": {"resolution": 150}},
+]
+STUDY = small_study(
+    "small",
+    PROBLEMS,
     primal=["online-supremizers", "offline-pga"],
     assembly=["full", "reduced"],
     tolerances=[{"pod": [1e-2], "dual": [1e-1], "primal": {"offline-pga": [0.5]}}],
-    solvers=["piqp"],
-    accuracy=1e-10,
     validation=2,
-    timing_rounds=1,
 )
 FILES = {"model.npz", RUNTIME}
 FOUND = " was found at this parameter"
@@ -485,21 +483,8 @@ def test_the_command(run: vibench.Run, main: Main, tmp_path: Path) -> None:
 
 @pytest.fixture(scope="module")
 def certified(tmp_path_factory: pytest.TempPathFactory) -> vibench.Run:
-    study = vibench.Study(
-        name="certified",
-        problem=[
-            {"name": "radial-obstacle", "options": {"resolution": 200}},
-            {"name": "obstacle", "options": {"resolution": 150}},
-        ],
-        dual=["mcpg"],
-        primal=["decorrelated", "online-supremizers"],
-        assembly=["certified"],
-        tolerances=[{"pod": [1e-2], "dual": [1e-1]}],
-        solvers=["piqp"],
-        accuracy=1e-10,
-        validation=1,
-        timing_rounds=1,
-    )
+    primal = ["decorrelated", "online-supremizers"]
+    study = small_study("certified", PROBLEMS, primal=primal, assembly=["certified"])
     return vibench.run(study, tmp_path_factory.mktemp("bounds") / "run", progress=False)
 
 

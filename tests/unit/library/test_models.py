@@ -6,21 +6,18 @@ import warnings
 
 import numpy as np
 import pytest
+from samples import small_study
 
 import vibench
 from vibench.interfaces.validation import validation_parameters
 
-STUDY = vibench.Study(
-    name="small",
-    problem=[{"name": "radial-obstacle", "options": {"resolution": 200}}],
-    dual=["mcpg"],
+STUDY = small_study(
+    "small",
+    [{"name": "radial-obstacle", "options": {"resolution": 200}}],
     primal=["online-supremizers", "offline-pga"],
     assembly=["full", "reduced"],
     tolerances=[{"pod": [1e-2], "dual": [1e-1], "primal": {"offline-pga": [0.5]}}],
-    solvers=["piqp"],
-    accuracy=1e-10,
     validation=3,
-    timing_rounds=1,
 )
 
 
@@ -124,18 +121,8 @@ def test_a_cell_is_named_by_its_beginning(run: vibench.Run) -> None:
 
 @pytest.fixture(scope="module")
 def certified(tmp_path_factory: pytest.TempPathFactory) -> vibench.Run:
-    study = vibench.Study(
-        name="certified",
-        problem=[{"name": "hertz", "options": {"resolution": 300}}],
-        dual=["mcpg"],
-        primal=["decorrelated"],
-        assembly=["reduced", "certified"],
-        tolerances=[{"pod": [1e-2], "dual": [1e-1]}],
-        solvers=["piqp"],
-        accuracy=1e-10,
-        validation=3,
-        timing_rounds=1,
-    )
+    problem = {"name": "hertz", "options": {"resolution": 300}}
+    study = small_study("certified", [problem], assembly=["reduced", "certified"], validation=3)
     return vibench.run(study, tmp_path_factory.mktemp("certified") / "run", progress=False)
 
 
