@@ -190,9 +190,11 @@ def test_a_run_of_which_nothing_can_run_here_is_an_error(vibench: Vibench, tmp_p
     study = write_study(tmp_path, wire_study(primal=["decorrelated", "online-supremizers"], solvers=["ecos"]))
     done = vibench(tmp_path, "run", study, "--jobs", "1")
     assert done.returncode == 1
-    assert "no cell could run here" in done.stderr
-    assert done.stdout.count("the QP solver 'ecos' is not installed: `pip install ecos`") == 2
-    assert "2 cells unavailable: " in done.stdout
+    reason = "the QP solver 'ecos' is not installed: `pip install ecos`"
+    assert done.stderr == f"vibench: no cell could run here: {reason}\n"
+    first, results = done.stdout.splitlines()
+    assert (first, results.split()[0]) == ("2 cells, 0 to run, 0 stages", "results:")
+    assert {row["reason"] for row in rows(tmp_path / "runs" / "wire")} == {reason}
 
 
 def test_clean_deletes_nothing_unasked(vibench: Vibench, again: Path, artefacts: Path) -> None:

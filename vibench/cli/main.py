@@ -147,21 +147,23 @@ def _conclude(name: str, outcome: Outcome, folder: Path, *, draw: int | None, fr
         again = "the same command without --fresh" if fresh else "the same command"
         echo(f"interrupted: {missing}; {again} resumes the run")
         raise typer.Exit(INTERRUPTED)
-    run_summary.print_summary(name, path, outcome.rows)
+    statuses = [row["status"] for row in outcome.rows]
+    nothing_ran = set(statuses) == {Status.UNAVAILABLE}
+    if not nothing_ran:
+        run_summary.print_summary(name, path, outcome.rows)
     echo(f"results: {path}, tables: {folder / 'tables'}")
     if fresh or draw is not None:
         from vibench.report import figures
 
         figures.remove(folder / "figures")
+    if nothing_ran:
+        raise VibenchError(f"no cell could run here: {run_summary.reasons(outcome.rows)}")
     if draw is not None:
         result_commands.draw(path, folder / "figures", draw)
-    statuses = [row["status"] for row in outcome.rows]
     fine = statuses.count(Status.OK)
     run_summary.next_steps(folder, len(statuses), len(statuses) - fine, figures=draw is not None)
     if strict and any(status not in (Status.OK, Status.UNAVAILABLE) for status in statuses):
         raise typer.Exit(1)
-    if set(statuses) == {Status.UNAVAILABLE}:
-        raise VibenchError("no cell could run here: what all of them need is not installed")
 
 
 def _warn_of_open_scheduler(scheduler: str, executor: str) -> None:

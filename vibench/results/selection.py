@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import re
 import sqlite3
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -29,7 +29,14 @@ QUOTED = re.compile(r"'(?:[^']|'')*'")
 EXAMPLE = "solver = 'piqp' and beta_span_min < 1e-3"
 
 
-def matching(path: Path, table: str, expression: str, columns: Iterable[str], plugins: Extended | None = None) -> Array:
+def matching(
+    path: Path,
+    table: str,
+    expression: str,
+    columns: Iterable[str],
+    plugins: Extended | None = None,
+    made: Collection[str] = (),
+) -> Array:
     """Which rows of a table satisfy an expression of SQLite over its columns, in the order they are read in.
 
     The expression may use columns, numbers, texts in single quotes and operators. It runs on a connection that cannot
@@ -46,6 +53,8 @@ def matching(path: Path, table: str, expression: str, columns: Iterable[str], pl
         Columns that the table has, to suggest one.
     plugins
         The table with its columns of plugins, if it has any.
+    made
+        Columns of what is made of the rows that are selected, which they do not have themselves.
 
     Raises
     ------
@@ -76,6 +85,9 @@ def matching(path: Path, table: str, expression: str, columns: Iterable[str], pl
             return np.array([found for (found,) in db.execute(query)], dtype=bool)
         except sqlite3.Error as error:
             unknown = re.fullmatch(r"no such column: (.+)", str(error))
+            if unknown and unknown[1] in made:
+                about = f"'{unknown[1]}' is a column of the table alone, for --columns and --sort"
+                raise RequestError(f"--where selects rows of {table}, of which the table is made; {about}") from None
             if unknown:
                 raise unknown_name(f"column of {table}", printable(unknown[1]), columns) from None
             raise _wrong(expression, _in_words(error)) from None

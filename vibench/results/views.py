@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -103,6 +104,8 @@ class Table:
     view: View
     chosen: bool
     key_length: int
+    varying: Mapping[tuple[str, str], tuple[str, ...]]
+    """Options that tell plugins of one name apart, by the column of the name and the name."""
     faults: tuple[str, ...] = ()
     """A line for every column of a plugin that is missing, or every plugin that cannot be loaded."""
 
@@ -116,9 +119,14 @@ class Table:
 
     @property
     def readable(self) -> pd.DataFrame:
-        """The values as people read them, under headings; keys of cells are shortened."""
-        names = [name for name in self._placed if self.chosen or tables.says_something(self.rows, name)]
+        """The values as people read them, under headings; keys of cells are shortened, and names have their options."""
+        told = {axis for axis, _ in self.varying}
+        names = [n for n in self._placed if self.chosen or n in told or tables.says_something(self.rows, n)]
         rows = self.rows.assign(cell=self.rows["cell"].str[: self.key_length]) if "cell" in self.rows else self.rows
+        for axis in told:
+            pairs = zip(rows[axis], rows[f"{axis}_options"], strict=True)
+            texts = [_with_options(name, text, self.varying.get((axis, name), ())) for name, text in pairs]
+            rows = rows.assign(**{axis: texts})
         return tables.under_headings(rows, names, self.view.headings or {})
 
     @property
@@ -171,7 +179,10 @@ def look_up(
     view, found = _with_columns(view, extended.columns), extended.frame
     keys = found.get("cell", [])
     if where:
-        found = found[selection.matching(path, view.source, where, found.columns, extended)]
+        made = set(view.headings or {}) - set(found.columns)
+        found = found[selection.matching(path, view.source, where, found.columns, extended, made)]
+        if found.empty:  # what keeps rows out of the table is not why there are none
+            view = replace(view, empty="")
     rows = view.rows(found if largest is None else error_measures.within(found, largest))
     by_heading = {column.heading: key for key, column in (view.headings or {}).items() if column.heading}
     if sort:
@@ -186,7 +197,47 @@ def look_up(
     default = [column for column in dict.fromkeys(view.columns) if column in rows]
     shown = rows.head(limit) if limit else rows
     listed, length = tuple(dict.fromkeys(asked or default)), selection.short_keys(keys)
-    return Table(shown, listed, view, bool(asked), length, extended.faults)
+    return Table(shown, listed, view, bool(asked), length, _varying_options(extended.frame), extended.faults)
+
+
+def _varying_options(frame: pd.DataFrame) -> dict[tuple[str, str], tuple[str, ...]]:
+    """Options that differ between plugins of one name, by the column of the name and the name."""
+    found = {}
+    for axis in PLUGINS:
+        if f"{axis}_options" not in frame:
+            continue
+        for name, texts in frame.groupby(axis)[f"{axis}_options"]:
+            given = [_options(text) for text in texts.unique()]
+            keys = dict.fromkeys(key for options in given for key in options)
+            differing = tuple(key for key in keys if len({options.get(key) for options in given}) > 1)
+            if differing:
+                found[axis, str(name)] = differing
+    return found
+
+
+PLUGINS = ("problem", "training", "dual", "primal")
+"""Columns of names of plugins, whose options are in columns of their own."""
+
+
+def _options(text: str | None) -> dict[str, str]:
+    """Options as they are recorded, their values as texts; a text that is no JSON object is one of them."""
+    if not isinstance(text, str):
+        return {}
+    try:
+        found = json.loads(text)
+    except (ValueError, RecursionError):
+        found = None
+    if not isinstance(found, dict):
+        return {"options": text}
+    return {key: value if isinstance(value, str) else json.dumps(value) for key, value in found.items()}
+
+
+def _with_options(name: str, text: str | None, keys: Sequence[str]) -> str:
+    """A name and those of its options that tell it apart; an option at its default is not recorded."""
+    if not keys:
+        return name
+    given = _options(text)
+    return " ".join([name, *(f"{key} {given[key]}" for key in keys if key in given)])
 
 
 def _measured(path: Path, name: str, error: str, limited: bool) -> tuple[View, Extended]:

@@ -105,6 +105,7 @@ class ProgressDisplay(Observer):
         self._done: Counter[str] = Counter()
         self._failures: Counter[tuple[str, str]] = Counter()
         self._begun: set[str] = set()
+        self._none_can_run = False
         self._bar: Progress | None = None
 
     def __enter__(self) -> ProgressDisplay:
@@ -123,6 +124,7 @@ class ProgressDisplay(Observer):
         self._left = TimeLeft(agenda.stages, max(agenda.workers, 1))
         self._parts = Counter(stage.label for stage in agenda.stages if stage.partial)
         self._total = agenda.to_run
+        self._none_can_run = agenda.unavailable == agenda.cells  # the command ends with the reason
         workers = f" on {agenda.workers} worker{'s' * (agenda.workers != 1)}" * (agenda.workers > 0)
         to_run = agenda.to_run - agenda.unavailable
         print_line(self._console, f"{agenda.cells} cells, {to_run} to run, {len(agenda.stages)} stages{workers}")
@@ -164,7 +166,7 @@ class ProgressDisplay(Observer):
             kind = kind_of_failure(row)
             self._failures[kind] += 1
             if row["status"] == Status.UNAVAILABLE:
-                if self._failures[kind] == 1:
+                if self._failures[kind] == 1 and not self._none_can_run:
                     print_line(self._console, f"{row['status']}: {row['reason']}")
             elif self._failures[kind] <= ALIKE and len(self._failures) <= REASONS:
                 print_line(self._console, f"{count} {row['status']}: {cell} ({row['reason']})")

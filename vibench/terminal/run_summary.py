@@ -74,6 +74,13 @@ def failures(not_ok: Rows) -> Iterator[str]:
         yield f"{others} cells not ok for {len(ranked) - REASONS} other reasons"
 
 
+def reasons(rows: Rows) -> str:
+    """The reasons of cells, each once."""
+    found = list(dict.fromkeys(str(row["reason"]) for row in rows))
+    more = [f"{len(found) - REASONS} other reasons"] if len(found) > REASONS else []
+    return "; ".join([*found[:REASONS], *more])
+
+
 def kind_of_failure(row: Mapping[str, Any]) -> tuple[str, str]:
     """Status and reason of a cell without the numbers in it."""
     return row["status"], re.sub(r"[-+]?\d[\d.]*(e[-+]?\d+)?", "#", row["reason"] or "")

@@ -146,6 +146,14 @@ class TestShow:
             if source[name].dtype.kind in "if" and found[name].notna().any():
                 assert found[name].dtype.kind in "if", name
 
+    def test_a_condition_on_what_is_made_of_the_rows_it_selects_is_refused(self, main: Main, quick_run: Path) -> None:
+        code, out, err = main("show", str(quick_run), "--table", "best", "--where", "error_below < 0.1")
+        assert (code, out) == (2, "")
+        assert err == (
+            "vibench: --where selects rows of cells, of which the table is made; "
+            "'error_below' is a column of the table alone, for --columns and --sort\n"
+        )
+
     def test_a_wrong_column_is_refused(self, main: Main, quick_run: Path) -> None:
         for option in ("--columns", "--sort"):
             code, out, err = main("show", str(quick_run), option, "solvr")

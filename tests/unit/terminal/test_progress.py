@@ -264,11 +264,13 @@ def test_a_thousand_cells_are_not_a_thousand_lines(report: Make, cells: list[Cel
 
 
 def test_what_is_not_installed_is_one_line(report: Make, cells: list[Cell]) -> None:
-    made, printed = report()
-    made.start(Agenda(24, 24, 24, [], 0))
-    for _ in range(24):
-        made.cell(cells[0], {"status": "unavailable", "reason": "no solver: `pip install it`"})
-    assert printed.getvalue().splitlines()[1:] == ["unavailable: no solver: `pip install it`"]
+    """None where no cell can run here, which the command ends with."""
+    for count, lines in ((48, ["unavailable: no solver: `pip install it`"]), (24, [])):
+        made, printed = report()
+        made.start(Agenda(count, 24, 24, [], 0))
+        for _ in range(24):
+            made.cell(cells[0], {"status": "unavailable", "reason": "no solver: `pip install it`"})
+        assert printed.getvalue().splitlines()[1:] == lines
 
 
 @pytest.mark.parametrize("terminal", [False, True])

@@ -65,8 +65,36 @@ def test_a_run_of_which_no_cell_is_the_best_says_why(
     code, out, _ = main("show", str(tmp_path / "run"), "--table", "best")
     assert code == 0
     assert out.splitlines() == ["run: best: no rows", NO_BEST_CELL]
-    _, out, _ = main("show", str(tmp_path / "run"), "--where", "problem = 'none'")
-    assert out.splitlines() == ["run: summary: no rows"]
+    for table in ("summary", "best"):
+        _, out, _ = main("show", str(tmp_path / "run"), "--table", table, "--where", "problem = 'none'")
+        assert out.splitlines() == [f"run: {table}: no rows"]
+
+
+def test_rows_that_differ_in_options_alone_say_which(
+    tmp_path: Path, main: Main, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Options that have one value for a name are not said, nor are those of a name that tells its rows apart."""
+    options = ('{"tolerance": 0.1, "size": 9}', '{"tolerance": 0.01, "size": 9}', '{"size": 9}')
+    fine = {"status": "ok", "queries_ok": 16, "training": "greedy", "dual": "cpg", "dual_options": '{"k": 2}'}
+    rows = [row(f"c{k}", "", training_options=text, **fine) for k, text in enumerate(options)]
+    rows.append(row("c4", "", **fine | {"training": "random", "training_options": '{"size": 3}'}))
+    rows.append(row("c5", "", **fine | {"problem": "rope", "problem_options": "{}", "training": "y"}))
+    rows.append(row("c6", "", **fine | {"problem": "rope", "problem_options": '{"mesh": "fine"}', "training": "x"}))
+    made = ResultsDatabase(tmp_path / "run", {"name": "sample"})
+    for one in rows:
+        made.write_cell(one, [])
+    made.close()
+    print_summary("sample", tmp_path / "run" / FILE, rows)
+    ended = capsys.readouterr().out
+    _, shown, _ = main("show", str(tmp_path / "run"))
+    for printed in (ended, shown):
+        assert all(f"greedy{more}" in printed for more in (" tolerance 0.1 ", " tolerance 0.01 ", "   "))
+        assert "rope mesh fine" in printed
+        assert not {"size", "k"} & set(printed.split())
+    _, out, _ = main("show", str(tmp_path / "run"), "--limit", "1", "--where", "training_options like '%0.01%'")
+    assert "training greedy tolerance 0.01" in out
+    _, out, _ = main("show", str(tmp_path / "run"), "--format", "csv", "--columns", "training")
+    assert set(out.split()) == {"training", "greedy", "random", "x", "y"}
 
 
 def test_what_to_do_next_are_commands(capsys: pytest.CaptureFixture[str]) -> None:
