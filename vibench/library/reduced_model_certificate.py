@@ -91,8 +91,7 @@ class Model:
         found = sqrt(square)
         work = float(along @ coordinates) + (beside + lacking) * norm
         least = sqrt(max(0.0, energy - of_energy - error * of_u**2)) - found
-        gap = square + 2.0 * work + 4.0 * UNIT * (len(along) + len(lam)) * square  # with its round-off
-        natural = min(sqrt(max(0.0, gap)), omega + found)
+        natural = min(sqrt(max(0.0, square + 2.0 * work)), omega + found)
         return Bound(found, natural, found / least if least > 0.0 else inf, self.guarantee)
 
     def _spectrum(self, mu: Array, theta: Array) -> tuple[float, float]:

@@ -22,8 +22,8 @@ are measured at random parameters and doubled, which proves nothing: the bounds 
 certified. They are certified where α, γ and the norms in them are proved, too. Outside the parameter box, where nothing
 was measured, there are none with interpolated members.
 
-Round-off is bounded where it decides whether w is feasible, in the coordinates of the residual, and in Δ² + 2 rᵀw,
-where it may be all that is left.
+Round-off is bounded where it decides whether w is feasible, and in the coordinates of the residual: it may be all that
+is left of Δ² + 2 rᵀw, in which these are multiplied with those of X w.
 """
 
 from __future__ import annotations
@@ -43,8 +43,6 @@ from vibench.model.certificates.prepared_lifting import PreparedLiftings
 from vibench.model.certificates.residual import ResidualBasis
 from vibench.model.error_bounds import NO_LIFTING, NOT_IN_CONE
 from vibench.model.galerkin import Evaluated, ReducedProblem
-
-UNIT = float(np.finfo(float).eps)
 
 NOT_PREPARED = "no prepared lifting satisfies B w ≥ s: the best w was computed at the parameter"
 
@@ -161,8 +159,7 @@ class OnlineCertificate:
         square = rho**2 / lower + omega**2 + 2.0 * kappa
         bound = sqrt(square)
         work = float(along @ coordinates) + (beside + missing + lacking) * norm  # at least rᵀw
-        gap = square + 2.0 * work + (4.0 * UNIT * (len(along) + len(lam))) * square  # with its round-off
-        natural = min(sqrt(max(0.0, gap)), omega + bound)
+        natural = min(sqrt(max(0.0, square + 2.0 * work)), omega + bound)
         least = sqrt(max(0.0, square_of_u - base.stiffness_error * u_norm**2)) - bound  # of ‖u‖
         relative = bound / least if least > 0.0 else float("inf")
         return OnlineBound(bound, natural, relative, rho / sqrt(lower), omega, kappa, lower, base.guarantee, note)
