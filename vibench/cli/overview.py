@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import ast
 import importlib.util
+import re
 from collections.abc import Iterator, Sequence
 from importlib.metadata import EntryPoint
 from pathlib import Path
@@ -94,7 +95,12 @@ def _comment(entry: EntryPoint) -> str:
         return ""
     lines = file.read_text(encoding="utf-8").split("\n")
     top = lines[: next((k for k, line in enumerate(lines) if not line.startswith("#")), len(lines))]
-    return " ".join(line.removeprefix("#").strip() for line in top).split(". ")[0].removesuffix(".")
+    return first_sentence(" ".join(line.removeprefix("#").strip() for line in top))
+
+
+def first_sentence(text: str) -> str:
+    """The first sentence of a text, without its point; one before no capital letter is that of an abbreviation."""
+    return re.split(r"\.\s+(?=[A-Z])", text, maxsplit=1)[0].removesuffix(".")
 
 
 def _study_file(entry: EntryPoint) -> Path | None:

@@ -60,7 +60,8 @@ def list_plugins(
         for title in overview.LISTS:
             rows = _solvers_by_version() if title == "solvers" else list(overview.rows(title))
             print_rows(rows, HEADINGS, title)
-        echo("", f"vibench list {'|'.join(overview.LISTS)} shows what options are, and whether it can be loaded")
+        echo("", "what the options of one kind are, and whether its plugins can be loaded:")
+        echo(f"  vibench list {'|'.join(overview.LISTS)}")
     elif what in overview.LISTS:
         print_rows(_solver_rows() if what == "solvers" else _plugin_rows(LISTS[what]), HEADINGS, what)
     else:

@@ -198,7 +198,6 @@ def compare_runs(
     from vibench.report.comparison.compare import compare
     from vibench.results import tables
     from vibench.terminal import comparison
-    from vibench.terminal.console import print_frame
 
     found = compare([tables.results_file(one) for one in run], limit)
     if column:
@@ -209,7 +208,7 @@ def compare_runs(
     else:
         title, frame = table or "changes", found.table(table or "changes")
     if form == "terminal":
-        print_frame(frame, title, comparison.PRIORITY, rest=comparison.REST)
+        comparison.print_table(found, frame, title)
     else:
         sys.stdout.write(tables.FORMS[form](tables.whole_numbers(frame)))
 

@@ -17,8 +17,8 @@ REST = "--format csv"
 """Option that prints the columns for which a terminal is too narrow."""
 
 PRIORITY = (
-    "run", "what", "verdict", "ratio", "cells", "equal", "worse", "better", "changed", "problem", "dual", "primal",
-    "solver", "asked", "before", "after", "interval", "within accuracy", "within limit", "undecided", "farthest ratio",
+    "run", "what", "verdict", "before", "after", "ratio", "cells", "equal", "worse", "better", "changed", "problem",
+    "dual", "primal", "solver", "asked", "interval", "within accuracy", "within limit", "undecided", "farthest ratio",
     "against", "accuracy", "assembly", "cell", "study", "ok", "only here", "same code", "in all runs", "machine",
     "seed", "validation",
 )  # fmt: skip
@@ -47,6 +47,11 @@ def print_comparison(found: Comparison, limit: float) -> None:
     print_frame(columns.drop(columns=_pair_columns(found)), f"cells by column, {title}", PRIORITY, rest=REST)
     echo("")
     print_changes(found, limit)
+
+
+def print_table(found: Comparison, frame: pd.DataFrame, title: str) -> None:
+    """Print one table of a comparison; what it says of each run, in a column of its own, matters most."""
+    print_frame(frame, title, [*(run.name for run in found.runs), *PRIORITY], rest=REST)
 
 
 def readable(frame: pd.DataFrame) -> pd.DataFrame:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -20,7 +21,10 @@ if TYPE_CHECKING:  # lists of plugins are printed without it
     import pandas as pd
 
 WIDTH = 10_000
-"""Columns where the output is no terminal and `COLUMNS` is not set: whoever reads it can scroll."""
+"""Columns where the output is no terminal and `COLUMNS` is no positive integer: whoever reads it can scroll."""
+
+POSITIVE = re.compile("0*[1-9][0-9]{0,5}")
+"""Values of `COLUMNS` that are a width; Rich would take 0 for one, and fail on some others."""
 
 SHORT = 24
 """A text of more characters may be wrapped, between words if it can."""
@@ -31,8 +35,11 @@ LONG = 60
 
 def new_console() -> Console:
     """A console for the standard output, which takes no text for markup."""
-    console = Console(highlight=False, markup=False, emoji=False)
-    if not console.is_terminal and not os.environ.get("COLUMNS"):
+    columns = os.environ.get("COLUMNS", "")
+    known = POSITIVE.fullmatch(columns) is not None
+    environment = {name: value for name, value in os.environ.items() if known or name != "COLUMNS"}
+    console = Console(highlight=False, markup=False, emoji=False, _environ=environment)
+    if not console.is_terminal and not known:
         console.width = WIDTH
     return console
 
@@ -65,7 +72,8 @@ def print_frame(
     priority
         Columns, those that matter most first; the order of the table by default.
     axes
-        Columns of numbers that go into the title, too, where they are the same in every row.
+        Columns that tell rows apart: those of numbers go into the title, too, where they are the same in every row, and
+        of a single row they alone do.
     every
         Print columns with the same value in every row, too, as columns.
     rest
@@ -98,7 +106,8 @@ def print_columns(
     """Print columns as `print_frame` prints a table."""
     console = new_console()
     count = len(columns[0].cells) if columns else 0
-    alike = [column for column in columns if not every and count > 1 and len(set(column.cells)) == 1]
+    titled = [column for column in columns if not every and (count > 1 or column.heading in axes)]
+    alike = [column for column in titled if len(set(column.cells)) == 1]
     shared = [column for column in alike if not column.numeric or column.heading in axes or not column.cells[0]]
     values = [f"{column.heading} {column.cells[0]}" for column in shared if column.cells[0]]
     title = ", ".join([title, *values])

@@ -94,9 +94,13 @@ def next_steps(folder: Path, cells: int, not_ok: int, *, figures: bool) -> None:
 def aligned(steps: Iterable[tuple[str, str]]) -> list[str]:
     """Commands and what they do, in two columns; a command that is too long for the first has a line of its own."""
     steps = list(steps)
-    width = max([len(command) for command, _ in steps if len(command) < SHORT_COMMAND], default=0)
-    return [f"  {command:<{width}}  {what}" for command, what in steps]
+    width = max([len(command) for command, _ in steps if len(command) <= SHORT_COMMAND], default=SHORT_COMMAND)
+    lines = []
+    for command, what in steps:
+        alone = len(command) > SHORT_COMMAND
+        lines += [f"  {command}", f"  {'':<{width}}  {what}"] if alone else [f"  {command:<{width}}  {what}"]
+    return lines
 
 
-SHORT_COMMAND = 40
-"""Characters of a command that others are aligned with."""
+SHORT_COMMAND = 36
+"""Characters of a command that others are aligned with: 80 columns have room for what it does beside it."""

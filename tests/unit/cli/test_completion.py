@@ -168,6 +168,20 @@ def test_help_ends_with_examples_that_are_commands(name: str, main: Main, monkey
         GROUP.get_command(None, name).make_context(name, arguments)
 
 
+def test_the_overview_of_studies_has_whole_sentences() -> None:
+    """A point of an abbreviation ends none."""
+    said = {name: what for name, _, what, _ in overview.rows("studies")}
+    assert said["benefit"].endswith("of Niakh et al. (2022)")
+    assert overview.first_sentence("A. of B et al. (2022), i.e. this. More. And") == "A. of B et al. (2022), i.e. this"
+    assert overview.first_sentence("All of it.") == "All of it"
+
+
+def test_the_overview_ends_within_80_columns(main: Main, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
+    _, out, _ = main("list")
+    assert max(map(len, out.splitlines())) <= 80
+
+
 def test_the_overview_cuts_no_command_short(main: Main, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("COLUMNS", "80")
     _, out, _ = main("--help")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 
 import pandas as pd
@@ -305,6 +306,24 @@ def test_a_comparison_fits_the_terminal(
     assert max(map(len, tables)) <= width
     assert {"server", "later", "online_s"} <= set(shown.split())
     assert len(shown.splitlines()) < 120
+
+
+def test_what_a_narrow_comparison_is_about_is_shown(
+    quick_run: Path, changed: Changed, main: Main, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The values of the runs, what changed to what, and which cells only one has; axes make room for them."""
+    monkeypatch.setenv("COLUMNS", "80")
+    other = changed(f"UPDATE cells SET status = 'error', queries_ok = 0 WHERE {ONE}", "DELETE FROM cells WHERE N = 13")
+    _, shown, _ = main("compare", *[str(quick_run)] * 3, "--column", "online_s")
+    below = shown.split("─\n")[1].split("not shown")[0].splitlines()
+    assert all(re.search(r"( [0-9][0-9.e-]*){3}$", re.sub(" +", " ", line)) for line in below)
+    for command in (["compare", "--table", "changes"], ["diff"], ["compare"]):
+        _, shown, _ = main(command[0], str(quick_run), str(other), *command[1:])
+        assert re.search(r"before +after", shown)
+        assert re.search(r"present +gone", shown)
+        assert re.search(r"ok +error", shown)
+    _, shown, _ = main("compare", str(quick_run), str(other), "--table", "cells")
+    assert re.search(r"yes +no|quick yes, .* no", shown)
 
 
 def test_every_table_of_a_comparison_has_every_format(three: list[Path], main: Main) -> None:

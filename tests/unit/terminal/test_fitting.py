@@ -16,7 +16,7 @@ from running import Main
 
 from vibench.cli.completion import SHOWN
 from vibench.results import tables, views
-from vibench.terminal.console import print_frame
+from vibench.terminal.console import WIDTH, new_console, print_frame
 
 WIDTHS = (80, 120, 200)
 
@@ -80,6 +80,33 @@ def test_values_that_all_rows_share_stand_in_the_title_unless_asked_for() -> Non
     with contextlib.redirect_stdout(io.StringIO()) as out:
         print_frame(frame, "table", every=True)
     assert out.getvalue().splitlines()[1].split() == ["solver", "N", "k", "none"]
+
+
+def test_the_axes_of_a_single_row_stand_in_the_title_and_its_other_values_do_not() -> None:
+    frame = pd.DataFrame({"cell": ["be21"], "solver": ["piqp"], "δ": [None], "N": [8], "ok": ["4/4"]})
+    with contextlib.redirect_stdout(io.StringIO()) as out:
+        print_frame(frame, "table", axes=["solver", "δ"])
+    title, headings, _, row = out.getvalue().splitlines()
+    assert (title, headings.split(), row.split()) == ("table, solver piqp", ["cell", "N", "ok"], ["be21", "8", "4/4"])
+    title, headings, *_ = printed(frame.drop(columns="δ"), 80)
+    assert (title, headings.split()) == ("table", ["cell", "solver", "N", "ok"])
+
+
+@pytest.mark.parametrize("asked", [("--limit", "1"), ("--table", "best", "--where", "problem = 'obstacle'")])
+def test_a_single_row_has_its_errors_and_seconds(
+    asked: tuple[str, ...], main: Main, quick_run: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
+    _, out, _ = main("show", str(quick_run), *asked)
+    table = out.split("not shown")[0]
+    assert table.count("error") >= 2
+    assert all(f"[{unit}]" in table for unit in ("s", "ms"))
+
+
+@pytest.mark.parametrize("columns", ["0", "-5", "none", "", "²", "9" * 5000])
+def test_a_width_that_is_none_is_no_width(columns: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("COLUMNS", columns)
+    assert new_console().width == WIDTH
 
 
 def test_a_table_without_rows_says_so() -> None:

@@ -72,13 +72,22 @@ def test_a_run_of_which_no_cell_is_the_best_says_why(
 def test_what_to_do_next_are_commands(capsys: pytest.CaptureFixture[str]) -> None:
     group: Any = typer.main.get_command(app)
     next_steps(Path("a folder's"), 36, 3, figures=False)
-    lines = [line for line in capsys.readouterr().out.splitlines() if line.startswith("  ")]
+    lines = [line for line in capsys.readouterr().out.splitlines() if line.startswith("  vibench ")]
     assert len(lines) == 4
     for line in lines:
-        program, command, *arguments = shlex.split(line.rsplit("  ", 1)[0])
+        program, command, *arguments = shlex.split(line.strip().split("  ")[0])
         assert program == "vibench"
         context = group.get_command(None, command).make_context(command, arguments)
         assert "a folder's" in (context.params.get("run"), *context.params.get("names", ()))
+
+
+@pytest.mark.parametrize("length", range(1, 27))
+def test_what_to_do_next_fits_80_columns(length: int, capsys: pytest.CaptureFixture[str]) -> None:
+    """A command alone may be longer: it stays one line to copy."""
+    next_steps(Path("r" * length), 36, 3, figures=False)
+    lines = capsys.readouterr().out.splitlines()
+    assert max(len(line) for line in lines if not line.endswith("\"status != 'ok'\"")) <= 80
+    assert [line.strip() for line in lines].count("what is not ok") == 1
 
 
 def test_a_run_is_named_as_briefly_as_it_can_be() -> None:
