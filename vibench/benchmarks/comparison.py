@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import statistics
 from collections.abc import Callable, Mapping, Sequence
@@ -13,7 +12,7 @@ from typing import Any
 import pandas as pd
 
 from vibench.errors import RequestError
-from vibench.text import unbroken
+from vibench.text import parsed_json, unbroken
 
 LIMIT = 1.25
 """Ratio of medians above which something is slower."""
@@ -90,7 +89,7 @@ def parsed(content: bytes) -> Timed:
     """What the content of a file of pytest-benchmark says."""
     if not content:  # of no benchmark at all
         return Timed({}, {})
-    known = json.loads(content)
+    known = parsed_json(content)
     found = {_name(entry["fullname"]): _measured(entry) for entry in known["benchmarks"]}
     return Timed(found, _machine(known["machine_info"], known["benchmarks"]))
 
