@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import statistics
 from collections.abc import Callable, Mapping, Sequence
@@ -13,7 +12,7 @@ from typing import Any
 import pandas as pd
 
 from vibench.errors import RequestError
-from vibench.text import unbroken
+from vibench.text import parsed_json, unbroken
 
 LIMIT = 1.25
 """Ratio of medians above which something is slower."""
@@ -95,7 +94,7 @@ def parsed(content: bytes) -> Timed:
         If it is no JSON, has a benchmark twice, or seconds that no clock gives; like other exceptions of Python where
         the structure is another.
     """
-    known = json.loads(content)
+    known = parsed_json(content)
     found: dict[str, Measured] = {}
     for entry in known["benchmarks"]:
         name = _name(entry["fullname"])
