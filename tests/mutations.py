@@ -250,8 +250,8 @@ FAULTS = (
     Fault(
         "duality-gap-without-the-residual",
         "vibench/model/error_bounds.py",
-        "self.primal**2 + 2.0 * self.work",
-        "self.primal**2",
+        "energy.dual_norm(residual + vi.A @ w)",
+        "energy.dual_norm(vi.A @ w)",
         ("tests/unit/model/test_error_bounds.py",),
     ),
     Fault(
@@ -260,6 +260,27 @@ FAULTS = (
         "if np.all(_lacking(vi, u + d, w) <= 0.0):",
         "if False:",
         ("tests/unit/model/test_error_bounds.py",),
+    ),
+    Fault(
+        "coordinates-without-their-round-off",
+        "vibench/model/certificates/residual.py",
+        "remainder + round_off",
+        "remainder",
+        ("tests/unit/model/certificates/test_bounds.py",),
+    ),
+    Fault(
+        "interpolation-errors-outside-the-box",
+        "vibench/model/certificates/bounds.py",
+        "if not base.is_exact and problem.parameters.outside(mu).any():",
+        "if False:",
+        ("tests/unit/model/certificates/test_bounds.py",),
+    ),
+    Fault(
+        "exported-bounds-without-errors-of-polynomials",
+        "vibench/library/exported_certificate.py",
+        "SAFETY * polynomial.error * polynomial.scale",
+        "0.0",
+        ("tests/unit/library/test_export.py",),
     ),
     Fault(
         "online-bound-without-kappa",
@@ -341,8 +362,8 @@ FAULTS = (
     Fault(
         "verified-called-certified",
         "vibench/model/certificates/base.py",
-        "exact = self.load_error == self.stiffness_error == 0.0",
-        "exact = True",
+        "return self.load_error == self.stiffness_error == 0.0",
+        "return True",
         ("tests/unit/model/certificates/test_bounds.py",),
     ),
     Fault(

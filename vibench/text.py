@@ -3,9 +3,24 @@
 from __future__ import annotations
 
 import json
+from typing import Any
 
 LONGEST = 2000
 """Characters that are kept of a message or a status."""
+
+
+def parsed_json(text: str | bytes) -> Any:
+    """The value of a JSON text that others wrote.
+
+    Raises
+    ------
+    ValueError
+        If it is no JSON, or nested too deeply to be read.
+    """
+    try:
+        return json.loads(text)
+    except RecursionError:
+        raise ValueError("it is nested too deeply") from None
 
 
 def printable(text: str) -> str:

@@ -234,6 +234,18 @@ def test_a_status_that_does_not_exist_is_refused(table: str, results: Path, main
     assert f"has the status 'fine' in '{table}', expected one of ok, inaccurate" in errors
 
 
+@pytest.mark.parametrize("value", ["'fast'", "x'00ff'"])
+@pytest.mark.parametrize("command", ["show", "report", "figures", "diff"])
+def test_text_in_a_column_of_numbers_is_refused(command: str, value: str, results: Path, main: Main) -> None:
+    """Written by a stranger, with the right digest."""
+    execute(results.parent, f"UPDATE cells SET online_s = {value} WHERE rowid = 1")
+    folder = str(results.parent)
+    code, _, errors = main(command, folder, *([folder] if command == "diff" else []))
+    assert code == 2
+    assert "in the column 'online_s' of 'cells', expected a number" in errors
+    assert errors.count("\n") == 1
+
+
 @pytest.mark.parametrize("damages", [flips(3, 90), truncations(4, 40)], ids=["flips", "truncations"])
 def test_damage_of_an_artefact_is_found(damages: Iterator[Damage], made: Path, tmp_path: Path) -> None:
     """Every kind of artefact; the digest covers all of it."""

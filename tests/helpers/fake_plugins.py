@@ -188,6 +188,16 @@ class RaisingCone(DualStrategy):
         raise LookupError("no generator found")
 
 
+class ExitingCone(DualStrategy):
+    def reduce(self, snapshots: Array, W: InnerProduct, stop: Stop) -> Cone:
+        os._exit(3)
+
+
+class InterruptingCone(DualStrategy):
+    def reduce(self, snapshots: Array, W: InnerProduct, stop: Stop) -> Cone:
+        raise KeyboardInterrupt
+
+
 class WaitingCone(DualStrategy):
     """Reduces as CPG does, once a file exists."""
 

@@ -18,7 +18,7 @@ from outputs import clean
 from running import Main, Register, refused
 from samples import install_fakes
 
-from vibench.benchmarks import cases
+from vibench.benchmarks import cases, elsewhere
 from vibench.benchmarks.measure import PASSES, _how_often, plain
 from vibench.errors import RequestError
 
@@ -28,6 +28,8 @@ wire = fake_plugins:Wire
 wire-broken = fake_plugins:Broken
 [vibench.dual_strategies]
 cone-raises = fake_plugins:RaisingCone
+cone-exits = fake_plugins:ExitingCone
+cone-interrupts = fake_plugins:InterruptingCone
 [vibench.primal_strategies]
 enrichment-counts = fake_plugins:CountingEnrichment
 [vibench.qp_solvers]
@@ -57,7 +59,17 @@ def third_party(command: str, tmp_path_factory: pytest.TempPathFactory) -> Timed
     folder = tmp_path_factory.mktemp("third-party")
     site = install_fakes(folder / "site")
     (site / "fake_plugins-1.0.dist-info" / "entry_points.txt").write_text(REGISTERED)
-    plugins = ["wire", "wire-broken", "careful", "lost", "cone-raises", "mcpg", *PRIMALS]
+    plugins = [
+        "wire",
+        "wire-broken",
+        "careful",
+        "lost",
+        "cone-raises",
+        "cone-exits",
+        "cone-interrupts",
+        "mcpg",
+        *PRIMALS,
+    ]
     paths = os.pathsep.join(filter(None, [str(site), os.environ.get("PYTHONPATH")]))
     done = subprocess.run(
         [command, "bench", *plugins, "--seconds", "0.001", "--out", str(folder / "file.json")],
@@ -111,11 +123,23 @@ def test_what_cannot_be_made_fails_with_its_reason_and_is_not_timed(third_party:
         ("pod[wire-broken]", "no wire in stock"),
         ("query[wire-broken-decorrelated]", "no wire in stock"),
         ("cone[wire-cone-raises]", "no generator found"),
+        ("cone[wire-cone-exits]", "its process died with exit code 3"),
+        ("cone[wire-cone-interrupts]", "KeyboardInterrupt"),
         ("solver[wire-N5-R5-lost-1e-06]", "no_such_module"),
     ):
         failed = (line for line in third_party.err.splitlines() if f" failed: {name}: " in line)
         assert any(reason in line for line in failed), name
         assert name not in third_party.benchmarks
+
+
+def test_where_all_fail_there_is_a_file_of_none(main: Main, register: Register, tmp_path: Path) -> None:
+    register(("vibench.dual_strategies", "gone", "no_such_module:Cone"))
+    request, told = elsewhere.Request({"dual": ["gone"]}, seconds=0.001), list[str]()
+    outcome = elsewhere.run(request, told.append)
+    assert len(outcome.failed) == len(told) > 0
+    path = tmp_path / "file.json"
+    path.write_bytes(outcome.content)
+    assert main("bench", "--read", str(path))[:2] == (0, "0 benchmarks; times are CPU times of a call on one thread\n")
 
 
 def test_the_file_says_where_it_was_measured(third_party: Timed) -> None:
@@ -139,7 +163,8 @@ def test_the_tables_fit_eighty_columns_and_have_every_benchmark(third_party: Tim
     lines = third_party.out.splitlines()
     assert max(map(len, lines)) <= 80
     assert "POD" in lines
-    assert f"{len(third_party.benchmarks)} benchmarks; times are CPU times" in lines[-1]
+    failed = sum(" failed: " in line for line in third_party.err.splitlines())
+    assert f"{len(third_party.benchmarks)} benchmarks, {failed} failed; times are CPU times" in lines[-1]
     assert sum(line.startswith(("decorrelated", "offline-pga")) for line in lines) == 3 * 3
 
 
@@ -309,3 +334,23 @@ def test_a_file_of_something_else_is_refused_in_a_line(content: str, tmp_path: P
     other.write_text(content)
     for before, after in ((good, str(other)), (str(other), good), (good, str(tmp_path / "missing.json"))):
         refused(main("bench", "--read", after, "--against", before), "cannot be read as a file of pytest-benchmark")
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [("rounds", math.inf), ("median", 10**400), ("median", -1.0), ("q1", math.nan), ("q3", math.inf)],
+    ids=["rounds", "digits", "negative", "nan", "infinite"],
+)
+def test_numbers_that_no_clock_gives_are_refused_in_a_line(
+    field: str, value: float, tmp_path: Path, main: Main
+) -> None:
+    odd = entry("a", 1.0, SAME)
+    odd["stats"][field] = value
+    good, bad = written(tmp_path / "good.json", entry("a", 1.0, SAME)), written(tmp_path / "bad.json", odd)
+    refused(main("bench", "--read", bad), "cannot be read as a file of pytest-benchmark")
+    refused(main("bench", "--read", good, "--against", bad), "cannot be read as a file of pytest-benchmark")
+
+
+def test_a_benchmark_that_is_there_twice_is_refused(tmp_path: Path, main: Main) -> None:
+    twice = written(tmp_path / "twice.json", entry("a", 1.0, SAME), entry("a", 2.0, SAME))
+    refused(main("bench", "--read", twice), "it has 'a' twice")

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import json
+from pathlib import Path
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from vibench.errors import in_a_line
-from vibench.text import LONGEST, above, brief, one_line, printable, printable_lines, unbroken
+from vibench.benchmarks import comparison
+from vibench.errors import RequestError, in_a_line
+from vibench.results.sqlite.reading import study_of
+from vibench.text import LONGEST, above, brief, one_line, parsed_json, printable, printable_lines, unbroken
 
 ANYTHING = st.text(st.characters())
 """All of Unicode: `st.text()` alone draws no surrogates."""
@@ -91,3 +94,19 @@ def test_a_residual_just_above_the_accuracy_is_told_from_it() -> None:
     assert above(1.0234e-7, 1e-7) == "1.02e-07 above 1e-07"
     assert above(3.14e-7, 1e-7) == "3.1e-07 above 1e-07"
     assert above(1.0000001e-7, 1e-7) == "1.0000001e-07 above 1e-07"
+
+
+@pytest.mark.parametrize("opening", ["[", '{"a": '])
+def test_json_nested_beyond_the_stack_is_no_json(opening: str) -> None:
+    assert parsed_json(b'{"a": [1.5]}') == {"a": [1.5]}
+    with pytest.raises(ValueError, match="nested too deeply"):
+        parsed_json(opening * 100_000)
+
+
+def test_files_with_such_json_are_refused_in_a_line(tmp_path: Path) -> None:
+    deep = tmp_path / "deep.json"
+    deep.write_text("[" * 100_000)
+    with pytest.raises(RequestError, match="cannot be read as a file of pytest-benchmark"):
+        comparison.read(deep)
+    with pytest.raises(RequestError, match="does not say which study"):
+        study_of(deep, {"study": "[" * 100_000})

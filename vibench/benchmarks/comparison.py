@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import statistics
 from collections.abc import Callable, Mapping, Sequence
@@ -13,7 +12,7 @@ from typing import Any
 import pandas as pd
 
 from vibench.errors import RequestError
-from vibench.text import unbroken
+from vibench.text import parsed_json, unbroken
 
 LIMIT = 1.25
 """Ratio of medians above which something is slower."""
@@ -80,18 +79,28 @@ def read(path: Path) -> Timed:
         If it is none.
     """
     try:
-        return parsed(path.read_bytes() or b"null")
-    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        return parsed(path.read_bytes())
+    except (OSError, ValueError, OverflowError, KeyError, TypeError, AttributeError) as error:
         reason = unbroken(f"{type(error).__name__}: {error}")
         raise RequestError(f"'{path}' cannot be read as a file of pytest-benchmark ({reason})") from None
 
 
 def parsed(content: bytes) -> Timed:
-    """What the content of a file of pytest-benchmark says."""
-    if not content:  # of no benchmark at all
-        return Timed({}, {})
-    known = json.loads(content)
-    found = {_name(entry["fullname"]): _measured(entry) for entry in known["benchmarks"]}
+    """What the content of a file of pytest-benchmark says.
+
+    Raises
+    ------
+    ValueError
+        If it is no JSON, has a benchmark twice, or seconds that no clock gives; like other exceptions of Python where
+        the structure is another.
+    """
+    known = parsed_json(content)
+    found: dict[str, Measured] = {}
+    for entry in known["benchmarks"]:
+        name = _name(entry["fullname"])
+        if name in found:
+            raise ValueError(f"it has '{name}' twice")
+        found[name] = _measured(entry)
     return Timed(found, _machine(known["machine_info"], known["benchmarks"]))
 
 
@@ -105,15 +114,15 @@ def _measured(entry: Mapping[str, Any]) -> Measured:
     axes = {str(name): unbroken(str(value)) for name, value in extra.get("axes", {}).items()}
     known = {"problem": axes.get("case", "")} | axes
     passes = [stats, *extra.get("passes", [])]
-    calibrations = [float(one["calibration_s"]) for one in passes if "calibration_s" in one]
+    calibrations = [_seconds(one, "calibration_s") for one in passes if "calibration_s" in one]
     return Measured(
         group=unbroken(str(entry.get("group") or _name(entry["fullname"]).partition("[")[0])),
         axes={name: known[name] for name in AXES if known.get(name)},
-        seconds=float(stats["median"]),
-        q1=float(stats["q1"]),
-        q3=float(stats["q3"]),
-        low=min(float(one["q1"]) for one in passes),
-        high=max(float(one["q3"]) for one in passes),
+        seconds=_seconds(stats, "median"),
+        q1=_seconds(stats, "q1"),
+        q3=_seconds(stats, "q3"),
+        low=min(_seconds(one, "q1") for one in passes),
+        high=max(_seconds(one, "q3") for one in passes),
         rounds=int(stats["rounds"]),
         accuracy={
             unbroken(str(name)): None if value is None else float(value)
@@ -122,6 +131,14 @@ def _measured(entry: Mapping[str, Any]) -> Measured:
         status=unbroken(str(extra.get("status", ""))),
         calibration=statistics.median(calibrations) if calibrations else math.nan,
     )
+
+
+def _seconds(stats: Mapping[str, Any], name: str) -> float:
+    """Seconds of a file, which others may have written."""
+    seconds = float(stats[name])
+    if not (math.isfinite(seconds) and seconds >= 0.0):
+        raise ValueError(f"{name} is {seconds:g} s, expected a finite number that is not negative")
+    return seconds
 
 
 def _machine(info: Mapping[str, Any], benchmarks: Sequence[Mapping[str, Any]]) -> dict[str, str]:

@@ -1,4 +1,4 @@
-"""Running the benchmarks in a pytest process of their own, on one thread, followed line by line."""
+"""Running the benchmarks in pytest processes of their own, on one thread, followed line by line."""
 
 from __future__ import annotations
 
@@ -10,11 +10,13 @@ import sys
 import tempfile
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from vibench.benchmarks.passes import Entry, is_slow, together
 from vibench.errors import VibenchError
+from vibench.execution.supervisor import manner_of_death
 from vibench.text import one_line
 from vibench.timing import ONE_THREAD
 
@@ -48,9 +50,9 @@ class Request:
 class Outcome:
     """What came of the benchmarks: the file of pytest-benchmark, and why some failed or were left out."""
 
-    content: bytes = b""
-    failed: dict[str, str] = field(default_factory=dict)
-    skipped: dict[str, str] = field(default_factory=dict)
+    content: bytes
+    failed: Mapping[str, str]
+    skipped: Mapping[str, str]
 
 
 def check_installed() -> None:
@@ -70,65 +72,129 @@ def check_installed() -> None:
 def run(request: Request, show: Callable[[str], None]) -> Outcome:
     """Run the benchmarks, each told to `show` in a line when it ends.
 
+    One that ends its process has failed; those after it are run in another process.
+
     Raises
     ------
     VibenchError
-        If pytest-benchmark is not installed, or the process ends otherwise than at the end of the benchmarks.
+        If pytest-benchmark is not installed, or a process ends before any benchmark begins.
     """
     check_installed()
+    followed = _Followed(show)
     with tempfile.TemporaryDirectory(prefix="vibench-") as scratch:
-        file, log = Path(scratch) / "benchmarks.json", Path(scratch) / "log.txt"
-        reading, writing = os.pipe()
-        with log.open("wb") as printed, os.fdopen(reading, encoding="utf-8") as lines:
-            command = _command(request, file, Path(scratch), writing)
-            environment = {name: value for name, value in os.environ.items() if not name.startswith("PYTEST_")}
-            process = subprocess.Popen(
-                command, stdout=printed, stderr=printed, stdin=subprocess.DEVNULL, pass_fds=(writing,),
-                env=environment | ONE_THREAD,
-            )  # fmt: skip
-            os.close(writing)
-            try:
-                outcome = _followed(map(json.loads, lines), show)
-                code = process.wait()
-            finally:
-                process.kill()
-                process.wait()
-        if code not in (0, 1, 5) or not (code == 5 or file.is_file()):
-            last = log.read_text(encoding="utf-8", errors="replace").strip().splitlines()[-1:]
-            raise VibenchError(f"the benchmarks ended with exit code {code}: {one_line(' '.join(last))}")
-        outcome.content = file.read_bytes() if file.is_file() else b""
-        return outcome
+        while not followed.finished:
+            code = _one_process(request, Path(scratch), followed)
+            if not (followed.finished or followed.running):
+                last = (Path(scratch) / LOG).read_text(encoding="utf-8", errors="replace").strip().splitlines()[-1:]
+                why = one_line(": ".join(["", *last]))
+                raise VibenchError(f"the process of the benchmarks died with {manner_of_death(code)}{why}")
+            if not followed.finished:
+                followed.lose(f"its process died with {manner_of_death(code)}")
+    return followed.outcome()
 
 
-def _command(request: Request, file: Path, scratch: Path, progress: int) -> list[str]:
+LOG = "log.txt"
+"""File for what benchmarks print."""
+
+
+def _one_process(request: Request, scratch: Path, followed: _Followed) -> int:
+    """Run the benchmarks that are left in a process; returns its exit code."""
+    reading, writing = os.pipe()
+    with (scratch / LOG).open("wb") as printed, os.fdopen(reading, encoding="utf-8") as lines:
+        command = _command(request, followed.had, scratch, writing)
+        environment = {name: value for name, value in os.environ.items() if not name.startswith("PYTEST_")}
+        process = subprocess.Popen(
+            command, stdout=printed, stderr=printed, stdin=subprocess.DEVNULL, pass_fds=(writing,),
+            env=environment | ONE_THREAD,
+        )  # fmt: skip
+        os.close(writing)
+        try:
+            followed.begin()
+            for line in lines:
+                if line.endswith("\n"):  # a process that dies may leave half a line
+                    followed.take(json.loads(line))
+            return process.wait()
+        finally:
+            process.kill()
+            process.wait()
+
+
+def _command(request: Request, had: Mapping[str, int], scratch: Path, progress: int) -> list[str]:
     """Pytest without any configuration but ours, and without its own output."""
     return [
         sys.executable, "-m", "pytest", str(Path(__file__).parent), "-p", "vibench.benchmarks.plugin", "--noconftest",
         "-c", os.devnull, f"--rootdir={scratch}", f"--basetemp={scratch / 'temp'}", "-o", "python_files=bench_*.py",
         "-p", "no:cacheprovider", "-p", "no:terminal", "-p", "no:xdist", "-p", "no:randomly",
-        f"--benchmark-json={file}", f"--benchmark-max-time={request.seconds:g}",
+        f"--benchmark-max-time={request.seconds:g}", f"--had={json.dumps(had)}",
         f"--chosen={json.dumps({kind: list(names) for kind, names in request.chosen.items()})}",
         f"--resolutions={','.join(request.resolutions)}", f"--study={request.study}", f"--progress={progress}",
     ]  # fmt: skip
 
 
-def _followed(reports: Any, show: Callable[[str], None]) -> Outcome:
-    """What the process reports: every benchmark by name in the first pass, then how far the others are."""
-    outcome, count, passes, ended = Outcome(), 0, 1, Counter[str]()
-    for report in reports:
+class _Followed:
+    """What the processes report: every benchmark by name in the first pass, then how far the others are.
+
+    Attributes
+    ----------
+    had
+        Passes that every benchmark has had, by name; all of them for one that needs no other.
+    running
+        The benchmark that the process began last.
+    finished
+        Whether all had their turn.
+    """
+
+    def __init__(self, show: Callable[[str], None]) -> None:
+        self.had = Counter[str]()
+        self.running, self.finished = "", False
+        self._show = show
+        self._stopped = ""
+        self._count, self._passes, self._shown = 0, 1, 1
+        self._file: dict[str, Any] = {}
+        self._timed: list[Entry] = []
+        self._failed: dict[str, str] = {}
+        self._skipped: dict[str, str] = {}
+
+    def begin(self) -> None:
+        """A process begins."""
+        self.running, self._stopped = "", ""
+
+    def take(self, report: Mapping[str, Any]) -> None:
+        """Note a line of the process."""
         if "count" in report:
-            count, passes = report["count"], report["passes"]
-            continue
-        name, reason = report["name"], one_line(report["reason"])
-        number = ended[name]
-        ended[name] += 1
-        if report["outcome"] == "skipped":
-            outcome.skipped[name] = reason
-        elif report["outcome"] == "failed":
-            outcome.failed[name] = reason
-            show(f"[{len(ended)}/{count}] failed: {name}: {reason}")
-        elif number == 0:
-            show(f"[{len(ended)}/{count}] {name}")
-        elif max(ended.values()) == ended[name] and sum(times > number for times in ended.values()) == 1:
-            show(f"pass {number + 1} of {passes}")
-    return outcome
+            self._count, self._passes, self._file = report["count"], report["passes"], report["file"]
+        elif "begun" in report:
+            self.running = report["begun"]
+        elif "timed" in report:
+            self._timed.append(report["timed"])
+            if is_slow(report["timed"]):
+                self.had[self.running] = self._passes
+        elif "stopped" in report:
+            self._stopped = report["stopped"]
+        elif "finished" in report:
+            self.finished = True
+        else:
+            self._ended(report["name"], report["outcome"], one_line(report["reason"]))
+
+    def lose(self, reason: str) -> None:
+        """The process ended while a benchmark was running: it failed, for a reason unless the process has told one."""
+        self._ended(self.running, "failed", self._stopped or reason)
+
+    def _ended(self, name: str, outcome: str, reason: str) -> None:
+        new = name not in self.had
+        self.had[name] = self.had[name] + 1 if outcome == "passed" else self._passes
+        if outcome == "skipped":
+            self._skipped[name] = reason
+        elif outcome == "failed":
+            self._failed[name] = reason
+            self._show(f"[{len(self.had)}/{self._count}] failed: {name}: {reason}")
+        elif new:
+            self._show(f"[{len(self.had)}/{self._count}] {name}")
+        elif self.had[name] > self._shown:
+            self._shown = self.had[name]
+            self._show(f"pass {self._shown} of {self._passes}")
+
+    def outcome(self) -> Outcome:
+        """What came of the benchmarks."""
+        content = {**self._file, "benchmarks": together(self._timed)}
+        return Outcome(json.dumps(content, indent=4).encode(), self._failed, self._skipped)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cache
 from typing import Any, ClassVar
@@ -27,6 +26,8 @@ from vibench.benchmarks.cases import (
 )
 from vibench.benchmarks.material import Material
 from vibench.benchmarks.measure import PASSES
+from vibench.benchmarks.passes import plain_name
+from vibench.errors import in_a_line
 from vibench.qp.solve import installed_solvers
 from vibench.study import registry
 
@@ -34,9 +35,6 @@ KINDS: Mapping[str, str] = {
     "case": "problem", "size": "problem", "dual": "dual", "primal": "primal", "solver": "solver",
 }  # fmt: skip
 """The word for the kind of plugin (`registry.WORDS`) that an argument of a benchmark is about."""
-
-PASS = re.compile(r"-@\d+(?=[-\]])")
-"""The pass in the name of a benchmark."""
 
 Chosen = Mapping[str, Sequence[str]]
 """Names of the plugins to time, by the word for their kind; all that are registered where there is none of any kind."""
@@ -48,7 +46,8 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     group.addoption("--chosen", type=json.loads, default={}, help="plugins by the word for their kind, as JSON")
     group.addoption("--resolutions", default="coarse", help="names or numbers of nodes, separated by commas")
     group.addoption("--study", default="quick", help="study whose strategies complete what is timed")
-    group.addoption("--progress", type=int, default=None, help="descriptor to write a line to for every benchmark")
+    group.addoption("--progress", type=int, default=None, help="descriptor to write a line to for every event")
+    group.addoption("--had", type=json.loads, default={}, help="passes of benchmarks that need no other, as JSON")
 
 
 def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
@@ -83,10 +82,19 @@ def _sizes(problems: Sequence[str], resolutions: Sequence[Resolution]) -> list[S
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Leave out benchmarks in which no chosen plugin takes part; all others once, then all once more, and so on."""
+    """Leave out benchmarks in which no chosen plugin takes part; all others once, then all once more, and so on.
+
+    What processes before this one have timed is left out, too.
+    """
     chosen: Chosen = config.getoption("chosen")
+    had = config.getoption("had")
     kept = [item for item in items if not chosen or _kinds(item) & chosen.keys()]
-    items[:] = sorted(kept, key=lambda item: int(_parameters(item)["number"]))
+    left = [item for item in kept if _pass(item) >= had.get(plain_name(item.nodeid), 0)]
+    items[:] = sorted(left, key=_pass)
+
+
+def _pass(item: pytest.Item) -> int:
+    return int(_parameters(item)["number"])
 
 
 def _kinds(item: pytest.Item) -> set[str]:
@@ -114,15 +122,48 @@ class _Session:
 
 
 def pytest_collection_finish(session: pytest.Session) -> None:
-    """Tell how many benchmarks there are in a pass."""
-    _Session.progress = session.config.getoption("progress")
-    _tell({"count": len(session.items) // PASSES, "passes": PASSES})
+    """Tell how many benchmarks there are in a pass, and what the file says of the machine."""
+    config = session.config
+    _Session.progress = config.getoption("progress")
+    if not config.getoption("had"):
+        _tell({"count": len(session.items) // PASSES, "passes": PASSES, "file": _empty_file(config)})
 
 
+def _empty_file(config: pytest.Config) -> dict[str, Any]:
+    """The file of pytest-benchmark, without any benchmark."""
+    hook = config.hook
+    machine = hook.pytest_benchmark_generate_machine_info(config=config)
+    hook.pytest_benchmark_update_machine_info(config=config, machine_info=machine)
+    commit = hook.pytest_benchmark_generate_commit_info(config=config)
+    found: dict[str, Any] = hook.pytest_benchmark_generate_json(
+        config=config, benchmarks=[], include_data=True, machine_info=machine, commit_info=commit
+    )
+    return found
+
+
+@pytest.hookimpl(tryfirst=True)
 def pytest_runtest_setup(item: pytest.Item) -> None:
-    """Leave out what failed, was left out, or is slow in a pass before."""
-    if plain_name(item.nodeid) in _Session.done:
+    """Leave out what failed, was left out, or is slow in a pass before; tell what begins."""
+    name = plain_name(item.nodeid)
+    if name in _Session.done:
         pytest.skip("one pass is enough")
+    _tell({"begun": name})
+
+
+def pytest_keyboard_interrupt(excinfo: pytest.ExceptionInfo[BaseException]) -> None:
+    """Tell what ends this process: a plugin may raise what only Ctrl-C should."""
+    _tell({"stopped": in_a_line(excinfo.value)})
+
+
+def pytest_internalerror(excinfo: pytest.ExceptionInfo[BaseException]) -> None:
+    """Tell what ends this process."""
+    _tell({"stopped": in_a_line(excinfo.value)})
+
+
+def pytest_sessionfinish(exitstatus: int) -> None:
+    """Tell that every benchmark had its turn."""
+    if exitstatus in (pytest.ExitCode.OK, pytest.ExitCode.TESTS_FAILED, pytest.ExitCode.NO_TESTS_COLLECTED):
+        _tell({"finished": True})
 
 
 def pytest_runtest_logreport(report: pytest.TestReport) -> None:
@@ -138,7 +179,7 @@ def pytest_runtest_logreport(report: pytest.TestReport) -> None:
 
 def _tell(line: Mapping[str, Any]) -> None:
     if _Session.progress is not None:
-        os.write(_Session.progress, json.dumps(line).encode() + b"\n")
+        os.write(_Session.progress, json.dumps(line, default=str).encode() + b"\n")
 
 
 def _reason(report: pytest.TestReport) -> str:
@@ -148,11 +189,6 @@ def _reason(report: pytest.TestReport) -> str:
         return str(told[2]).removeprefix("Skipped: ")
     crash = getattr(told, "reprcrash", None)
     return str(crash.message if crash is not None else told or "").strip().removeprefix("Failed: ")
-
-
-def plain_name(fullname: str) -> str:
-    """Name of a benchmark without the file, what every function begins with, and the pass."""
-    return PASS.sub("", fullname.rsplit("::", 1)[-1].removeprefix("test_"))
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -183,44 +219,14 @@ def material(case: Case, materials: Callable[[Case], Material]) -> Material:
 
 @pytest.fixture(autouse=True)
 def about(request: pytest.FixtureRequest, benchmark: Any, number: int) -> Iterator[None]:
-    """Keep what a benchmark is about beside its seconds; what is slow is timed in one pass."""
+    """Keep what a benchmark is about beside its seconds, and tell both; what is slow is timed in one pass."""
     parameters = {name: str(value) for name, value in _parameters(request.node).items() if name != "number"}
     benchmark.extra_info.update({"axes": parameters, "pass": number})
     yield
     if benchmark.extra_info.get("slow"):
         _Session.done.add(plain_name(request.node.nodeid))
-
-
-@pytest.hookimpl(optionalhook=True)
-def pytest_benchmark_update_json(output_json: dict[str, Any]) -> None:
-    """Make one entry of the passes of a benchmark: its statistics are over all rounds."""
-    entries: dict[str, list[dict[str, Any]]] = {}
-    for entry in output_json["benchmarks"]:
-        entries.setdefault(plain_name(entry["fullname"]), []).append(entry)
-    output_json["benchmarks"] = [_merged(name, passes) for name, passes in entries.items()]
-
-
-def _merged(name: str, passes: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    from pytest_benchmark.stats import Stats  # noqa: PLC0415  it is not installed wherever this module is read
-
-    first, together = passes[0], Stats()  # type: ignore[no-untyped-call]
-    for one in passes:
-        for seconds in one["stats"]["data"]:
-            together.update(seconds)  # type: ignore[no-untyped-call]
-    statistics = {field: getattr(together, field) for field in Stats.fields}
-    kept = ("q1", "median", "q3", "rounds")
-    several = [
-        {key: one["stats"][key] for key in kept} | {"calibration_s": one["extra_info"]["calibration_s"]}
-        for one in passes
-    ]
-    extra = {key: value for key, value in first["extra_info"].items() if key not in ("pass", "slow", "calibration_s")}
-    stats = first["stats"] | statistics | {"data": together.data}
-    return first | {
-        "name": f"test_{name}",
-        "fullname": PASS.sub("", first["fullname"]),
-        "stats": stats,
-        "extra_info": extra | {"passes": several},
-    }
+    if "calibration_s" in benchmark.extra_info:  # the last that is measured
+        _tell({"timed": benchmark.stats.as_dict(include_data=True)})
 
 
 @pytest.hookimpl(optionalhook=True)

@@ -20,8 +20,8 @@ PRIORITY = (
 """Columns, those that matter most first."""
 
 
-def print_benchmarks(found: Timed, earlier: Timed | None, limit: float) -> None:
-    """Print a table for everything that was timed, beside an earlier file if there is one."""
+def print_benchmarks(found: Timed, earlier: Timed | None, limit: float, failed: int = 0) -> None:
+    """Print a table for everything that was timed, beside an earlier file if there is one, and how many failed."""
     frame = comparison.table(found) if earlier is None else comparison.compared(earlier, found, limit)
     if len(frame):
         for group, rows in frame.groupby("group", sort=False):
@@ -30,7 +30,8 @@ def print_benchmarks(found: Timed, earlier: Timed | None, limit: float) -> None:
             print_frame(pd.concat([rows[named], shown], axis=1), str(group), PRIORITY, rest=REST)
             echo("")
     if earlier is None:
-        echo(f"{len(frame)} benchmarks; times are CPU times of a call on one thread")
+        counts = f"{len(frame)} benchmarks" + (f", {failed} failed" if failed else "")
+        echo(f"{counts}; times are CPU times of a call on one thread")
     else:
         echo(*comparison.remarks(earlier, found, limit))
 

@@ -54,7 +54,7 @@ def bench_plugins(
     else:
         found, failed = _timed(plugin or [], out, resolution or ["coarse"], study, seconds)
     if form == "terminal":
-        print_benchmarks(found, earlier, limit)
+        print_benchmarks(found, earlier, limit, failed)
     else:
         frame = comparison.table(found) if earlier is None else comparison.compared(earlier, found, limit)
         sys.stdout.write(tables.FORMS[form](frame))

@@ -201,8 +201,25 @@ def column_names(context: typer.Context, incomplete: str) -> list[str]:
     source = {"summary": "cells", "best": "cells", "benefits": "thresholds"}.get(table, table)
     before, comma, last = incomplete.rpartition(",")
     sign = "-" * last.startswith("-")
-    found = _beginning(last.removeprefix("-"), TABLES.get(source, ()))
+    found = _beginning(last.removeprefix("-"), [*TABLES.get(source, ()), *_added(table)])
     return [f"{before}{comma}{sign}{name}" for name in found]
+
+
+def _added(table: str) -> Iterable[str]:
+    """Columns that a table for reading has beside those of the results file."""
+    from vibench.results import best, error_measures
+
+    return {"best": [best.BAND], "benefits": error_measures.COLUMNS}.get(table, ())
+
+
+def error_measures(incomplete: str) -> list[str]:
+    """Completes measures of errors; names of outputs are those of a run."""
+    from vibench.results.error_measures import OF_SOLUTION, OUTPUT
+
+    return _beginning(incomplete, [*OF_SOLUTION, OUTPUT])
+
+
+cell_columns = words(lambda: TABLES["cells"])
 
 
 def _registered(*groups: str) -> set[str]:

@@ -14,6 +14,7 @@ from vibench.cli.completion import lists, plugin_options, plugins, runs
 from vibench.errors import RequestError, VibenchError, in_a_line, unknown_name
 from vibench.study.kinds import CHECKED, FIGURE, KINDS, SOLVER, STUDY
 from vibench.terminal.output import echo
+from vibench.text import parsed_json
 
 LISTS = {kind.listed: kind.title for kind in KINDS if kind is not SOLVER}
 """Kind of plugin that each list shows; QP solvers are listed whether they are plugins or not."""
@@ -314,12 +315,10 @@ def _find_object(module: str, name: str) -> Found:
 
 def key_value(text: str) -> tuple[str, Any]:
     """Key and value of "key=value"; the value is read as JSON if it is valid JSON, as text otherwise."""
-    import json
-
     key, equals, value = text.partition("=")
     if not equals or not key:
         raise RequestError(f"--option '{text}' is not of the form KEY=VALUE")
     try:
-        return key, json.loads(value)
-    except json.JSONDecodeError:
+        return key, parsed_json(value)
+    except ValueError:
         return key, value

@@ -10,7 +10,7 @@ from typing import Annotated, Literal
 
 from typer import Argument, Exit, Option
 
-from vibench.cli.completion import SHOWN, cells, column_names, runs, table_names
+from vibench.cli.completion import SHOWN, cell_columns, cells, column_names, error_measures, runs, table_names
 from vibench.terminal.output import echo, run_argument, warn
 
 
@@ -43,7 +43,12 @@ def show(
     ] = "",
     limit: Annotated[int, Option(min=0, metavar="N", help="Print the first N rows; 0 for all.")] = 0,
     error: Annotated[
-        str, Option(metavar="MEASURE", help="Compare models by the error of solution, u, lambda or output:NAME.")
+        str,
+        Option(
+            metavar="MEASURE",
+            help="Compare models by the error of solution, u, lambda or output:NAME.",
+            autocompletion=error_measures,
+        ),
     ] = "",
     within: Annotated[
         float | None, Option(metavar="ERROR", help="Break-even of models with this error at most; 0.01 is 1 %.")
@@ -181,7 +186,9 @@ def compare_runs(
         Literal["changes", "columns", "runs", "cells"] | None,
         Option(help="Print one table: changes, what moved by column, the runs, or cells that only some runs have."),
     ] = None,
-    column: Annotated[str, Option(metavar="NAME", help="Print a column of the cells in every run.")] = "",
+    column: Annotated[
+        str, Option(metavar="NAME", help="Print a column of the cells in every run.", autocompletion=cell_columns)
+    ] = "",
     form: FormOption = "terminal",
 ) -> None:
     """Compare runs: what is equal, what moved, and by how much.

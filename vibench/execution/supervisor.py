@@ -308,10 +308,15 @@ def _cause_of_death(process: subprocess.Popen[bytes]) -> str:
         code = process.wait(timeout=5.0)
     except subprocess.TimeoutExpired:
         return "the worker process closed its connection"
+    return f"the worker process died with {manner_of_death(code)}"
+
+
+def manner_of_death(code: int) -> str:
+    """What an exit code of `subprocess` says: an exit code, or the name of a signal."""
     if code >= 0:
-        return f"the worker process died with exit code {code}"
+        return f"exit code {code}"
     known = {number.value: number.name for number in signal.Signals}
-    return f"the worker process died with signal {known.get(-code, -code)}"
+    return f"signal {known.get(-code, -code)}"
 
 
 def _environment(parent: Mapping[str, str]) -> dict[str, str]:

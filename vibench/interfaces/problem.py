@@ -11,11 +11,14 @@ from typing import Any, ClassVar
 import numpy as np
 import scipy.sparse as sp
 
-from vibench.arrays import Array, Indices, SparseMatrix
+from vibench.arrays import Array, Indices, Mask, SparseMatrix
 from vibench.errors import RequestError, unknown_name
 from vibench.interfaces.affine import AffineSum
 from vibench.interfaces.outputs import Output
 from vibench.linalg.inner_product import InnerProduct
+
+OUTSIDE_RTOL = 1e-12
+"""Largest distance of a parameter from the box, relative to its bounds."""
 
 
 @dataclass(frozen=True)
@@ -54,6 +57,11 @@ class ParameterBox:
         """`count` uniform random points (count×d), the same for the same seed."""
         uniform = np.random.default_rng(seed).random((count, self.dim))
         return np.asarray(self.lower + uniform * (self.upper - self.lower))
+
+    def outside(self, mus: Array) -> Mask:
+        """Which components of points (…×d) lie outside the box, by more than round-off."""
+        slack = OUTSIDE_RTOL * np.maximum(np.abs(self.lower), np.abs(self.upper))
+        return np.asarray((mus < self.lower - slack) | (mus > self.upper + slack))
 
     def from_unit(self, unit: Array, log: Sequence[str] = ()) -> Array:
         """The points (P×d) of the box at the places `unit` (P×d) of the unit cube, some parameters on a log scale.

@@ -11,9 +11,6 @@ from vibench.arrays import Array
 from vibench.errors import RequestError
 from vibench.interfaces.problem import ParameterBox
 
-OUTSIDE_RTOL = 1e-12
-"""Largest distance of a parameter from the box, relative to its bounds."""
-
 LISTED_RTOL = 1e-9
 """Largest distance of a parameter from a listed one, relative to the widths of the box."""
 
@@ -83,8 +80,7 @@ def check_sample(box: ParameterBox, found: object) -> Array:
         raise RequestError(f"parameters of shape {mus.shape}; expected (P, {box.dim}), a row for each, with P > 0")
     for k, i in np.argwhere(~np.isfinite(mus))[:1]:
         raise RequestError(f"parameter {k} has '{box.names[i]}' = {mus[k, i]}, which is not finite")
-    slack = OUTSIDE_RTOL * np.maximum(np.abs(box.lower), np.abs(box.upper))
-    for k, i in np.argwhere((mus < box.lower - slack) | (mus > box.upper + slack))[:1]:
+    for k, i in np.argwhere(box.outside(mus))[:1]:
         bounds = f"[{box.lower[i]:g}, {box.upper[i]:g}]"
         raise RequestError(f"parameter {k} has '{box.names[i]}' = {mus[k, i]:g}, outside the box {bounds}")
     if box.listed is not None:

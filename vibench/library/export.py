@@ -176,8 +176,9 @@ def exported(
         basis = queried.basis if isinstance(queried, HyperReducedModel) else queried.fixed_basis
         arrays |= {"basis": basis, "generators": queried.generators}
     if certificate is not None:
-        arrays |= exported_certificate.arrays(certificate)
-        about["certificate"] = exported_certificate.guarantee(certificate, polynomials | members).value
+        interpolated = polynomials | members
+        arrays |= exported_certificate.arrays(certificate, interpolated)
+        about["certificate"] = exported_certificate.guarantee(certificate, interpolated).value
     return ExportedModel(members, arrays, about, polynomials)
 
 

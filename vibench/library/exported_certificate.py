@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from vibench.arrays import Array
-from vibench.model.certificates.base import ONE, Guarantee
+from vibench.model.certificates.base import ONE, SAFETY, Guarantee
 from vibench.model.certificates.bounds import OnlineCertificate
 from vibench.model.chebyshev import AffinePolynomial
 
@@ -33,8 +33,11 @@ def thetas(certificate: OnlineCertificate, samples: Mapping[str, Array]) -> dict
     return {f"theta_{name}": value for name, value in found.items()}
 
 
-def arrays(certificate: OnlineCertificate) -> dict[str, Array]:
-    """The arrays of a certificate for which there is no `reason_for_none`."""
+def arrays(certificate: OnlineCertificate, polynomials: Mapping[str, AffinePolynomial]) -> dict[str, Array]:
+    """The arrays of a certificate for which there is no `reason_for_none`.
+
+    Bounds grow by what the measured errors of the polynomials, of A and of all θ, may add, with the factor `SAFETY`.
+    """
     base, residual, liftings, terms = (
         certificate.base, certificate.residual, certificate.prepared, certificate.base.bound_terms
     )  # fmt: skip
@@ -48,15 +51,33 @@ def arrays(certificate: OnlineCertificate) -> dict[str, Array]:
         "responses": responses, "sizes": liftings.sizes, "directions": liftings.directions,
         "terms": np.array(liftings.terms), "kept": residual.kept, "factor": residual.factor,
         "inverse_scale": residual.inverse_scale, "remainder": np.array(residual.remainder), "norms": residual.norms,
-        "load_error": np.array(base.load_error), "stiffness_error": np.array(base.stiffness_error),
+    }  # fmt: skip
+    error = {name: _error(polynomial) for name, polynomial in polynomials.items()}
+    sizes = residual.norms.copy()  # of all terms of residuals
+    sizes[residual.kept] = np.hypot(
+        np.linalg.norm(residual.factor, axis=0), residual.remainder * residual.inverse_scale
+    )
+    of_f, of_lam = sizes[: polynomials["theta_f"].terms.shape[1]], sizes[-certificate.generators.shape[1] :]
+    stiffness = 0.0 if base.spectral is None else error["theta_A"] * float(np.linalg.norm(base.spectral.norms))
+    found |= {
+        "load_error": np.array(base.load_error + error["theta_f"] * np.linalg.norm(of_f)),
+        "stiffness_error": np.array(base.stiffness_error + stiffness),
+        "energy_error": np.array(np.sqrt(2.0) * error["A"]),  # off the diagonal every entry counts twice
+        "constraint_error": np.array(error["theta_B"]), "multiplier_norms": of_lam,
+        "bound_errors": error["theta_g"] * np.linalg.norm(terms, axis=1),
     }  # fmt: skip
     if (spectral := base.spectral) is not None:
         found |= {
             "anchors": np.column_stack([spectral.alpha, spectral.gamma, spectral.theta.T]),
             "lower": spectral.lower, "upper": spectral.upper, "count": np.array(spectral.count),
-            "term_norms": spectral.norms, "spectral_error": np.array(spectral.error),
+            "term_norms": spectral.norms, "spectral_error": np.array(spectral.error + stiffness),
         }  # fmt: skip
     return {f"certificate_{name}": array for name, array in found.items()}
+
+
+def _error(polynomial: AffinePolynomial) -> float:
+    """Absolute error to expect of a polynomial; none where it is the function that it replaces."""
+    return 0.0 if polynomial.error <= EXACT else SAFETY * polynomial.error * polynomial.scale
 
 
 def guarantee(certificate: OnlineCertificate, polynomials: Mapping[str, AffinePolynomial]) -> Guarantee:

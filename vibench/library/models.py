@@ -6,6 +6,7 @@ import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, partial
+from math import inf
 
 import numpy as np
 
@@ -160,8 +161,8 @@ class Model:
             If mu is not a parameter of the problem, the solver is not installed, the tolerance is not positive, or
             there is one and the cell is not certified.
         """
-        if tolerance is not None and not tolerance > 0.0:
-            raise RequestError(f"the tolerance is {tolerance:g}, expected a positive number")
+        if tolerance is not None and not 0.0 < tolerance < inf:
+            raise RequestError(f"the tolerance is {tolerance:g}, expected a positive finite number")
         if tolerance is not None and self.certificate is None:
             raise RequestError(
                 f'cell {self.row["cell"]} has no error bounds: a tolerance needs a cell with assembly = "certified"'
@@ -208,8 +209,7 @@ class Model:
         at = np.asarray(mu, dtype=float)
         if at.shape != (box.dim,) or not np.all(np.isfinite(at)):
             raise RequestError(f"mu is {np.asarray(mu).tolist()}, expected finite numbers ({', '.join(box.names)})")
-        outside = [name for k, name in enumerate(box.names) if not box.lower[k] <= at[k] <= box.upper[k]]
-        if outside:
+        if outside := [name for name, out in zip(box.names, box.outside(at), strict=True) if out]:
             warnings.warn(
                 f"{', '.join(outside)}: outside the parameter domain, where the model was not trained", stacklevel=3
             )

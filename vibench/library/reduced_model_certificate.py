@@ -1,7 +1,8 @@
 """Error bounds of a reduced model exported by vibench: `Model(file).solve(mu, tolerance=1e-2)`, by `reduced_model.py`.
 
-u_N and λ_N ≥ 0 are compared with u and λ of the high-fidelity problem whose θ_q are the polynomials of the file. With
-X that does not depend on mu, α X ≼ A(mu) ≼ γ X, the residual r, and w such that B w ≥ s = B u_N − g,
+u_N and λ_N ≥ 0 are compared with u and λ of the high-fidelity problem. The errors of the polynomials that replace its
+θ_q, as measured in the parameter box, are in the bounds; outside the box there are none. With X that does not depend on
+mu, α X ≼ A(mu) ≼ γ X, the residual r, and w such that B w ≥ s = B u_N − g,
 
     ‖u − u_N‖²_A ≤ Δ² = ρ²/α + γ ω² + 2κ,    ρ = ‖r‖_{X⁻¹},    ω = ‖w‖_X,    κ = λ_Nᵀ(B w − s),
     ‖Bᵀ(λ − λ_N)‖_{A⁻¹} ≤ min(√(Δ² + 2 rᵀw), ω √γ + Δ);    see "Bounds at online cost" in the documentation of vibench.
@@ -49,10 +50,14 @@ class Model:
         self.guarantee, start, data = str(self.plain.about["certificate"]), "certificate_", self.plain.data
         if why := self.plain.about["no_bounds"]:
             raise ValueError(f"'{file}' has no error bounds: {why}")
+        slack = 1e-12 * np.maximum(abs(data["lower"]), abs(data["upper"]))
+        self._box = data["lower"] - slack, data["upper"] + slack
         self._data = {name.removeprefix(start): data[name] for name in data if name.startswith(start)}
 
     def solve(self, mu: Sequence[float] | Array, tolerance: float | None = None) -> Certified:
         """The solution at a parameter and its bounds; the tolerance is of the relative error of u in the norm of A."""
+        if tolerance is not None and not 0.0 < tolerance < inf:
+            raise ValueError(f"the tolerance is {tolerance}, expected a positive finite number")
         solution = self.plain.solve(mu)
         bound = self._bound(np.asarray(mu, dtype=float), solution.x, solution.alpha, solution.energy)
         kept = tolerance is None or (solution.status == "ok" and bound.relative <= tolerance)
@@ -63,25 +68,29 @@ class Model:
         data, lam = self._data, self._data["generators"] @ alpha
         if np.min(lam, initial=0.0) < 0.0:
             return Bound(inf, inf, inf, "none", "λ_N has negative coefficients")
+        if np.any((mu < self._box[0]) | (mu > self._box[1])):
+            return Bound(inf, inf, inf, "none", "mu is outside the parameter box")
         A, f, B, g = (self.plain.member(f"theta_{name}", mu) for name in "AfBg")
         lower, upper = self._spectrum(mu, A)
-        lifted = self._lifted(float(B[0]), g, y, lam, upper) if lower > 0.0 else None
+        error = float(data["stiffness_error"])
+        lifted = self._lifted(float(B[0]), g, y, lam, upper) if lower > error else None
         if lifted is None:
-            which = "α > 0" if lower <= 0.0 else "w with B w ≥ s"
+            which = "α > 0" if lower <= error else "w with B w ≥ s"
             return Bound(inf, inf, inf, "none", f"no {which} was found at this parameter")
         along, norm, kappa = lifted
         z = np.concatenate([f, np.outer(-A, y).ravel(), np.outer(-B, alpha).ravel()])
         coordinates = data["factor"] @ z[data["kept"]]
         beside = float(data["remainder"] * np.linalg.norm(data["inverse_scale"] * z[data["kept"]]))
-        error = float(data["stiffness_error"])
-        of_u = sqrt(max(0.0, energy) / max(lower - error, TINY))
+        of_energy = float(data["energy_error"] * (y @ y))
+        of_u = sqrt(max(0.0, energy + of_energy) / (lower - error))
         lacking = float(data["norms"] @ abs(z)) + float(data["load_error"]) + error * of_u
+        lacking += float(data["constraint_error"] * (data["multiplier_norms"] @ abs(alpha)))
         rho = float(np.hypot(np.linalg.norm(coordinates), beside)) + lacking
         omega = norm * sqrt(upper)
         square = rho**2 / lower + omega**2 + 2.0 * kappa
         found = sqrt(square)
         work = float(along @ coordinates) + (beside + lacking) * norm
-        least = sqrt(max(0.0, energy - error * of_u**2)) - found
+        least = sqrt(max(0.0, energy - of_energy - error * of_u**2)) - found
         natural = min(sqrt(max(0.0, square + 2.0 * work)), omega + found)
         return Bound(found, natural, found / least if least > 0.0 else inf, self.guarantee)
 
@@ -103,14 +112,16 @@ class Model:
     def _lifted(
         self, theta: float, of_g: Array, y: Array, lam: Array, gamma: float
     ) -> tuple[Array, float, float] | None:
-        """Coordinates of X w in the basis of residuals, ‖w‖, and κ, for a w with B w ≥ s also in exact arithmetic."""
+        """Coordinates of X w in the basis of residuals, ‖w‖, and κ, for a w with B w ≥ s in spite of all errors."""
         data, unit = self._data, 1.01 * float(self._data["terms"]) * UNIT
         if theta == 0.0:
             return None
         rows, size = data["rows"], abs(theta) * data["sizes"]
         excess = theta * (data["basis"] @ y) - data["bounds"] @ of_g
-        round_off = unit * (float(np.linalg.norm(y)) * size[:, 0] + abs(data["bounds"]) @ abs(of_g))
-        margin = MARGIN * round_off
+        share, of_y = float(data["constraint_error"]) / abs(theta), float(np.linalg.norm(y)) * size[:, 0]
+        error = share * of_y + data["bound_errors"]
+        uncertain = error + unit * (of_y + abs(data["bounds"]) @ abs(of_g))
+        margin = MARGIN * uncertain
         for _ in range(ATTEMPTS):
             nu = self._complementary(gamma / theta**2, (excess + margin)[rows], lam[rows])
             if nu is None:
@@ -118,10 +129,11 @@ class Model:
             a = (theta / gamma) * (nu - lam[rows])
             values = data["responses"] @ a
             slack = theta * values - excess
-            lacking = round_off + unit * float(data["reach"] @ abs(a)) * size[:, 1] - slack
+            of_w = float(data["reach"] @ abs(a)) * size[:, 1]
+            lacking = uncertain + (unit + share) * of_w - slack
             if lacking.max() <= 0.0:
                 norm = sqrt(max(0.0, float(a @ values[rows])))
-                return a @ data["directions"], norm, max(0.0, float(lam @ slack))
+                return a @ data["directions"], norm, max(0.0, float(lam @ (slack + error + share * of_w)))
             margin = margin + 2.0 * np.maximum(lacking, 0.0)
         return None
 

@@ -41,12 +41,15 @@ class AffinePolynomial:
         Flat terms (Q×size).
     error
         Largest Euclidean error at `MEASURED` random points of the box and at its corners, over the largest norm there.
+    scale
+        That norm.
     """
 
     indices: Indices
     coefficients: Array
     terms: Array
     error: float
+    scale: float = 1.0
 
     @property
     def degrees(self) -> tuple[int, ...]:
@@ -117,7 +120,10 @@ def interpolate_on_box(
         counts = _within(counts, budget)
         grid = along.coefficients(counts)
         found = {name: _compressed(c, units[name], 0.1 * tolerance, terms.get(name)) for name, c in grid.items()}
-        found = {name: replace(p, error=_error(p.at(unit), values[name], scale[name])) for name, p in found.items()}
+        found = {
+            name: replace(p, error=_error(p.at(unit), values[name], scale[name]), scale=scale[name])
+            for name, p in found.items()
+        }
         if max(p.error for p in found.values()) <= tolerance or prod(counts) >= 0.7 * budget:
             break
         counts = [count + max(1, count // 4) if count > 1 else count for count in counts]

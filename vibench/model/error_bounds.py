@@ -20,7 +20,8 @@ As λ ≥ 0, λᵀs ≤ λᵀB w = λ_NᵀB w + (Bᵀε)ᵀw, and (i) becomes �
 
 Completing the square instead, ‖e‖²_A + (‖Bᵀε‖_{A⁻¹} − ω)² ≤ Δ_A², the last one. The second is twice the duality gap
 of λ_N and the feasible v = u_N − w, which bounds ‖u − v‖²_A + ‖Bᵀε‖²_{A⁻¹}: (i) at v has the residual r + A w and the
-excess B v − g = s − B w ≤ 0, for which λᵀ(B v − g) ≤ 0.
+excess B v − g = s − B w ≤ 0, for which λᵀ(B v − g) ≤ 0. It is evaluated as ‖r + A w‖²_{A⁻¹} + 2κ: Δ_A² + 2 rᵀw loses
+half of the digits, and all of them where λ is small beside the error of u_N.
 
 Only the part of r in the range of Bᵀ concerns λ. In the inner product of A⁻¹ the rest is A d with B d = 0, hence
 
@@ -147,13 +148,13 @@ def certificate(
 
 @dataclass(frozen=True)
 class Terms:
-    """The terms of (ii), with the residual r (n,) and rᵀw, and the bounds that need no constants."""
+    """The terms of (ii), with the residual r (n,) and ‖r + A w‖_{A⁻¹}, and the bounds that need no constants."""
 
     residual: Array
     rho: float
     omega: float
     kappa: float
-    work: float
+    feasible_rho: float
 
     @property
     def primal(self) -> float:
@@ -163,7 +164,7 @@ class Terms:
     @property
     def dual(self) -> float:
         """The bound of ‖Bᵀε‖ in the norm of A⁻¹."""
-        gap = max(0.0, self.primal**2 + 2.0 * self.work)  # twice the duality gap
+        gap = self.feasible_rho**2 + 2.0 * self.kappa  # twice the duality gap
         return min(float(np.sqrt(gap)), self.omega + self.primal)
 
 
@@ -171,7 +172,8 @@ def terms(w: Array, vi: VariationalInequality, energy: Energy, u: Array, lam: Ar
     """The terms with a lifting w (n,), B w ≥ B u − g, of u (n,) and λ ≥ 0 (m,)."""
     residual = vi.f - vi.A @ u - vi.B.T @ lam
     kappa = max(0.0, float(lam @ _slack(vi, u, w)))
-    return Terms(residual, energy.dual_norm(residual), energy.norm(w), kappa, float(residual @ w))
+    of_feasible = energy.dual_norm(residual + vi.A @ w)
+    return Terms(residual, energy.dual_norm(residual), energy.norm(w), kappa, of_feasible)
 
 
 def _projected(

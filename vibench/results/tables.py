@@ -20,7 +20,7 @@ from vibench.results import error_measures, plugin_columns
 from vibench.results.columns import CELLS, INTEGER, KEYS, STORED, TABLES, THRESHOLDS, VERSION, Column, shown_columns
 from vibench.results.plugin_columns import Extended
 from vibench.results.sqlite.reading import FILE, read_meta, read_rows
-from vibench.text import printable_lines, unbroken
+from vibench.text import brief, printable_lines, unbroken
 
 ORDER = (
     *KEYS, "primal_a", "primal_b", "primal_tol_a", "primal_tol_b", "assembly_a", "assembly_b", "stage", "quantity",
@@ -53,12 +53,16 @@ def read(path: Path, table: str) -> pd.DataFrame:
     Raises
     ------
     RequestError
-        If they are damaged.
+        If they are damaged, or have text in a column of numbers.
     """
     names, rows = read_rows(path, table)
     frame = pd.DataFrame.from_records(rows, columns=names, coerce_float=True)
     for name, column in STORED.get(table, {}).items():
-        if column.kind.startswith(("REAL", "INTEGER")) and frame[name].dtype == object:  # every value is NULL
+        if column.kind.startswith(("REAL", "INTEGER")) and frame[name].dtype == object:  # every value is NULL, or wrong
+            wrong = [value for value in frame[name] if isinstance(value, str | bytes)]
+            if wrong:
+                found = brief(repr(wrong[0]))
+                raise RequestError(f"'{path}' has {found} in the column '{name}' of '{table}', expected a number")
             frame[name] = frame[name].astype(float)
     return frame
 

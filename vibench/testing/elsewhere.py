@@ -116,9 +116,10 @@ def examine_elsewhere(examination: Examination, observe: Callable[[Finding], Non
     """Make the checks in a supervised process; `observe` is called with every finding as soon as it is there."""
     seen: set[str] = set()
 
-    def note(found: Finding) -> None:
-        seen.add(found.check)
-        observe(found)
+    def note(found: Finding | Failed) -> None:
+        if isinstance(found, Finding):  # `finish` makes a finding of a failure
+            seen.add(found.check)
+            observe(found)
 
     with closing(Supervisor()) as supervisor:
         answer = supervisor.run(_job(examination, examination.seconds), note)

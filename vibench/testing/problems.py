@@ -90,8 +90,7 @@ def validation_set(case: ProblemCase) -> Iterator[str]:
 
 
 def _outside(name: str, mus: Array, box: ParameterBox) -> Iterator[str]:
-    slack = OUTSIDE_RTOL * np.maximum(np.abs(box.lower), np.abs(box.upper))
-    for k, i in np.argwhere((mus < box.lower - slack) | (mus > box.upper + slack))[:1]:
+    for k, i in np.argwhere(box.outside(mus))[:1]:
         interval = f"[{box.lower[i]:g}, {box.upper[i]:g}]"
         yield f"{name} leaves the box: parameter {k}, {at(mus[k])}, has '{box.names[i]}' outside {interval}"
 

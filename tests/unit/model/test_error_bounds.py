@@ -23,6 +23,9 @@ V, W = space(6, 1), space(4, 2)
 ROUND_OFF = 1e-7
 """Square root of the round-off in squares, relative."""
 
+EXACT = 1e-12
+"""Round-off in the solution of a small inequality, relative."""
+
 
 def energy(vi: VariationalInequality) -> Energy:
     return Energy(vi.A, SparseCholesky(vi.A), CondensedStiffness(vi.A))
@@ -86,7 +89,7 @@ def test_no_error_is_above_its_bound(
     vi, u, lam, u_N, lam_N = given
     found, norm = bounds(vi, u_N, lam_N), energy(vi)
     scale = norm.norm(u) + norm.norm(u_N) + norm.dual_norm(vi.f) + norm.dual_norm(vi.B.T @ lam_N)
-    allowed = ROUND_OFF * scale  # errors that are zero but for the round-off of the solution
+    allowed = EXACT * scale
     force = vi.B.T @ (lam - lam_N)
     assert norm.norm(u - u_N) <= found.u_energy + allowed
     assert norm.dual_norm(force) <= found.lambda_natural + allowed
@@ -95,6 +98,21 @@ def test_no_error_is_above_its_bound(
         assert float(W.norm(lam - lam_N)) <= found.lam + allowed / beta
     else:
         assert found.lam == np.inf  # of dependent rows the multiplier is not unique
+
+
+@given(st.integers(0, 10_000), st.sampled_from([1e-6, 1e-8, 1e-10]))
+def test_a_multiplier_that_is_small_beside_the_error_of_u_is_bounded(seed: int, size: float) -> None:
+    """Contact that begins: λ_N = 0, and A⁻¹r is −w but for 1e-10 of it, all that the bound of λ consists of."""
+    rng = np.random.default_rng(seed)
+    A, B, u = spd(6, rng, 30.0), rng.standard_normal((4, 6)), rng.standard_normal(6)
+    lam = size * rng.uniform(0.5, 1.5, 4)
+    vi = VariationalInequality(sp.csc_array(A), A @ u + B.T @ lam, sp.csr_array(B), B @ u)
+    u_N = u + np.linalg.solve(A, B.T @ rng.uniform(0.05, 0.15, 4))  # penetrates
+    error = energy(vi).dual_norm(B.T @ lam)
+    found = bounds(vi, u_N, np.zeros(4))
+    assert found.rho > 1e3 * error
+    assert found.lambda_natural >= error * (1.0 - 1e-4)
+    assert found.lambda_natural <= 10.0 * error + EXACT * found.rho
 
 
 @given(approximations())

@@ -61,6 +61,15 @@ def test_what_passed_in_a_process_that_died_later_is_remembered() -> None:
     assert findings["time"].verdict is Verdict.PASSED
 
 
+def test_a_plugin_that_raises_what_ctrl_c_does_fails_its_check() -> None:
+    told: list[Finding] = []
+    findings = examine_elsewhere(Examination("duals", "fake_plugins:InterruptingCone", {}, 60.0), told.append)
+    (failed,) = (each for each in findings if each.verdict is Verdict.FAILED)
+    assert failed.check == "cone"
+    assert failed.message.startswith("KeyboardInterrupt")
+    assert sorted(told, key=findings.index) == findings
+
+
 def test_a_plugin_that_is_not_there_is_one_finding() -> None:
     (failed,) = found("fake_plugins:Wier")
     assert failed.verdict is Verdict.FAILED

@@ -74,11 +74,15 @@ class CertificateBase:
     bound_terms: Array | None
 
     @property
+    def is_exact(self) -> bool:
+        """Whether bounds rest on no measured interpolation error."""
+        return self.load_error == self.stiffness_error == 0.0
+
+    @property
     def guarantee(self) -> Guarantee:
         """What bounds are worth."""
         proved = self.spectral is None or self.spectral.proved
-        exact = self.load_error == self.stiffness_error == 0.0
-        return Guarantee.CERTIFIED if proved and exact else Guarantee.VERIFIED
+        return Guarantee.CERTIFIED if proved and self.is_exact else Guarantee.VERIFIED
 
     def coefficients(self, samples: Mapping[str, Array]) -> dict[str, Array]:
         """θ of f, A and B from those that a query evaluated; those of A rotated, one for what is constant."""
@@ -92,7 +96,14 @@ def unsupported(problem: Problem, members: Mapping[str, AffineMember]) -> str:
     """Why reduced models of a problem cannot be certified at online cost; "" if they can."""
     if not problem.has_contact:
         return "the problem does not assemble its constraint on its contact unknowns (`contact_dofs` and `contact`)"
-    return "; ".join(members[name].reason for name in ("A", "f") if members[name].way is Evaluation.FULL)
+    if reason := "; ".join(members[name].reason for name in ("A", "f") if members[name].way is Evaluation.FULL):
+        return reason
+    if problem.parameters.listed is not None and not all(is_exact(problem, name, members[name]) for name in "Af"):
+        return (
+            "A or f is interpolated, and the problem has matrices at its listed parameters only: interpolation errors "
+            "are measured at others"
+        )
+    return ""
 
 
 def is_exact(problem: Problem, name: str, member: AffineMember) -> bool:

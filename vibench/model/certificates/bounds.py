@@ -19,8 +19,11 @@ A, α = γ = 1, and nothing is lost. Elsewhere X is A at the centre of the param
 Members that the problem declares to be constant or affine sums are exact, those that are interpolated are not. With
 A = Ã + D and f = f̃ + d, the residual of Ã and f̃ lacks d − D u_N, and ρ grows by the largest ‖d‖ and ‖D‖ ‖u_N‖_X. These
 are measured at random parameters and doubled, which proves nothing: the bounds are then called verified instead of
-certified. They are certified where α, γ and the norms in them are proved, too. Round-off is bounded where it decides
-whether w is feasible, and nowhere else.
+certified. They are certified where α, γ and the norms in them are proved, too. Outside the parameter box, where nothing
+was measured, there are none with interpolated members.
+
+Round-off is bounded where it decides whether w is feasible, and in the coordinates of the residual: it may be all that
+is left of Δ² + 2 rᵀw, in which these are multiplied with those of X w.
 """
 
 from __future__ import annotations
@@ -41,11 +44,11 @@ from vibench.model.certificates.residual import ResidualBasis
 from vibench.model.error_bounds import NO_LIFTING, NOT_IN_CONE
 from vibench.model.galerkin import Evaluated, ReducedProblem
 
-TINY = float(np.finfo(float).tiny)
-
 NOT_PREPARED = "no prepared lifting satisfies B w ≥ s: the best w was computed at the parameter"
 
 NOT_COERCIVE = "no positive lower bound of the coercivity of A was found at this parameter"
+
+OUTSIDE = "mu is outside the parameter box: interpolation errors are known inside it"
 
 
 @dataclass(frozen=True)
@@ -136,9 +139,11 @@ class OnlineCertificate:
         evaluated = evaluated_by(reduced)
         if self.forces is not None and evaluated.contact is None:
             evaluated = replace(evaluated, contact=contact_at(problem, mu))
+        if not base.is_exact and problem.parameters.outside(mu).any():
+            return OnlineBound.none(OUTSIDE)
         y, theta = coordinates_of(x, evaluated), base.coefficients(evaluated.samples)
         lower, upper = (1.0, 1.0) if base.spectral is None else base.spectral.at(mu, theta["A"])
-        if not lower > 0.0:
+        if not lower > base.stiffness_error:
             return OnlineBound.none(NOT_COERCIVE)
         lifted, note = self._lifted(problem, mu, evaluated, y, lam, upper)
         if lifted is None:
@@ -147,7 +152,7 @@ class OnlineCertificate:
         of_lam = coefficients_of_multiplier(theta["B"], self.forces, evaluated.contact, alpha, lam)
         coordinates, beside, missing = self.residual.parts(residual_coefficients(theta, y, of_lam))
         square_of_u = float(x @ (reduced.program.A @ x))
-        u_norm = sqrt(max(0.0, square_of_u) / max(lower - base.stiffness_error, TINY))  # of u_N in X
+        u_norm = sqrt(max(0.0, square_of_u) / (lower - base.stiffness_error))  # of u_N in X
         lacking = base.load_error + base.stiffness_error * u_norm
         rho = sqrt(float(coordinates @ coordinates) + beside**2) + missing + lacking
         omega = norm * sqrt(upper)

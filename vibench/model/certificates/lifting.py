@@ -94,8 +94,10 @@ class BlockDiagonal:
 
     @classmethod
     def of(cls, matrix: Array) -> BlockDiagonal:
-        """The smallest blocks that have all of the entries that are not zero."""
+        """The smallest blocks that have all of the entries that are not zero; one of an empty matrix."""
         nonzero, size = matrix != 0.0, len(matrix)
+        if not size:
+            return cls((0, 0), (matrix,))
         last = np.maximum(
             np.where(nonzero.any(axis=1), size - 1 - np.argmax(nonzero[:, ::-1], axis=1), 0), np.arange(size)
         )
@@ -190,6 +192,8 @@ def lift(
     round_off = 1.01 * (size @ uncertain) + terms * (size @ np.abs(on_contact) + np.abs(contact.g))
     reach = size @ compliance.root
     for unknowns, position, C in compliance.blocks:
+        if not len(C):
+            continue  # no generator, no unknown near one
         inside = position[B.indices] >= 0
         restricted = sp.csr_array((B.data * inside, np.maximum(position[B.indices], 0), B.indptr), (len(lam), len(C)))
         near = np.ones(len(lam), bool)

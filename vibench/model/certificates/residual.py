@@ -29,6 +29,8 @@ those that are kept."""
 NEGLIGIBLE = 1e-12
 """Contributions below this share of the largest one are not worth computing."""
 
+UNIT = float(np.finfo(float).eps)
+
 FEW, SHARE_OF_FEW = 1000, 0.25
 """Of up to so many terms all principal directions are computed, and this share of the above is left out."""
 
@@ -49,7 +51,7 @@ class ResidualBasis:
     inverse_scale
         1/d (p,).
     remainder
-        Bound of ‖P R D‖.
+        Bound of ‖P R D‖, and of the round-off in coordinates for ‖D⁻¹z‖ = 1.
     norms
         Norms (Z,) of the terms that are left out; zero for those that are kept.
     """
@@ -63,7 +65,7 @@ class ResidualBasis:
     def parts(self, z: Array) -> tuple[Array, float, float]:
         """The residual with coefficients z (Z,): its coordinates (K,) in U, and bounds of what is left out of them.
 
-        These are of the part that is orthogonal to U, and of the terms that are left out.
+        These are of the part that is orthogonal to U with the round-off, and of the terms that are left out.
         """
         represented = z[self.kept]
         scaled = self.inverse_scale * represented
@@ -91,8 +93,9 @@ def residual_basis(blocks: Sequence[Array], samples: Array, beside: float) -> tu
     inverse = 1.0 / scale[kept]
     reach = float(np.linalg.norm(inverse[:, None] * samples[kept], axis=0).mean())
     U, remainder = _directions(R * scale[kept], DIRECTIONS * typical / max(reach, np.finfo(float).tiny))
-    norms[kept] = 0.0
-    return ResidualBasis(kept, U.T @ R, inverse, remainder, norms), U
+    norms[kept], factor = 0.0, U.T @ R
+    round_off = 1.01 * UNIT * (len(kept) + 8.0) * float(np.linalg.norm(factor * scale[kept]))
+    return ResidualBasis(kept, factor, inverse, remainder + round_off, norms), U
 
 
 def _typical_norm(blocks: Sequence[Array], ends: Array, samples: Array) -> float:

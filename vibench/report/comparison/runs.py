@@ -16,6 +16,7 @@ from vibench.qp.status import Status
 from vibench.results import tables
 from vibench.results.plugin_columns import Extended
 from vibench.results.sqlite.reading import FILE, read_meta, study_of
+from vibench.text import parsed_json
 
 AXES = ("problem", "dual", "primal", "asked", "solver", "accuracy", "assembly")
 """Columns that tell cells apart in a comparison; "asked" has all tolerances, or sizes."""
@@ -108,7 +109,7 @@ class ComparedRun:
 
 def _json_object(path: Path, text: str) -> dict[str, Any]:
     try:
-        found = json.loads(text)
+        found = parsed_json(text)
     except ValueError:
         found = None
     if not isinstance(found, dict):

@@ -27,6 +27,7 @@ from vibench.report.figures.plugins import FigureError, of_plugins
 from vibench.report.figures.solutions import solutions
 from vibench.report.figures.solvers import precision, solvers
 from vibench.report.figures.style import ABREAST, DEEP, FORMATS, WRITTEN, caption_of, save, styled
+from vibench.text import parsed_json
 
 Drawing = Callable[[Data], Figure | None]
 
@@ -192,7 +193,7 @@ def remove(folder: Path) -> None:
 def read_captions(folder: Path) -> dict[str, str]:
     """The captions beside the figures of a folder, by the names of the figures; empty where there are none."""
     try:
-        found = json.loads((folder / CAPTIONS).read_text(encoding="utf-8"))
+        found = parsed_json((folder / CAPTIONS).read_text(encoding="utf-8"))
     except (OSError, ValueError):
         return {}
     return {str(name): str(text) for name, text in found.items()} if isinstance(found, dict) else {}

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
@@ -18,6 +17,7 @@ from vibench.report.figures.looks import Series
 from vibench.results import pictures, tables
 from vibench.results.best import solved_too_loosely
 from vibench.results.plugin_columns import faults_of
+from vibench.text import parsed_json
 
 TABLES = ("cells", "queries", "histories", "thresholds", "outputs")
 
@@ -168,7 +168,7 @@ def _plugin_name(cells: pd.DataFrame, axis: str) -> str:
 def _options(text: Any) -> dict[str, Any]:
     """A JSON object, such as the options of a plugin; empty where a strangers' file has something else."""
     try:
-        found = json.loads(text) if isinstance(text, str) else {}
+        found = parsed_json(text) if isinstance(text, str) else {}
     except ValueError:
         return {}
     return found if isinstance(found, dict) else {}

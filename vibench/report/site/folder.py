@@ -10,6 +10,7 @@ from pathlib import Path
 
 from vibench.errors import RequestError
 from vibench.files import PART, TEMPORARY
+from vibench.text import parsed_json
 
 CATALOGUE = "vibench-site.json"
 """File of a site that lists its files with their digests: what a later `vibench publish` may replace."""
@@ -122,7 +123,7 @@ def _known(site: Path) -> dict[str, list[str]]:
     if not catalogue.is_file():
         raise RequestError(f"'{site}' is not empty and was not written by `vibench publish`; choose another folder")
     try:
-        files = json.loads(catalogue.read_text(encoding="utf-8"))["files"]
+        files = parsed_json(catalogue.read_text(encoding="utf-8"))["files"]
         return {str(name): [str(digest) for digest in digests] for name, digests in dict(files).items()}
     except (OSError, ValueError, KeyError, TypeError):
         raise RequestError(f"'{catalogue}' cannot be read as the list of the files of a site") from None

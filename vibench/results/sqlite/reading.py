@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import json
 import sqlite3
 from collections.abc import Callable, Iterator, Mapping
 from functools import lru_cache
@@ -15,7 +14,7 @@ from vibench.qp.status import Status
 from vibench.results.columns import VERSION
 from vibench.results.sqlite.digests import DigestError, Digests
 from vibench.results.sqlite.files import DAMAGE, code_of, connected_read_only
-from vibench.text import one_line, printable
+from vibench.text import one_line, parsed_json, printable
 
 FILE = "results.sqlite"
 
@@ -116,7 +115,7 @@ def study_of(path: Path, meta: Mapping[str, str]) -> dict[str, Any]:
         If the meta table does not hold them.
     """
     try:
-        found = json.loads(meta.get("study", ""))
+        found = parsed_json(meta.get("study", ""))
     except ValueError:
         found = None
     if not isinstance(found, dict):

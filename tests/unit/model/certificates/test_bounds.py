@@ -20,7 +20,7 @@ from vibench.linalg.inner_product import InnerProduct
 from vibench.model.affine import affine_decomposition
 from vibench.model.certificates import base as base_module
 from vibench.model.certificates.base import CertificateBase, Guarantee, certificate_base, injected, unsupported
-from vibench.model.certificates.bounds import NOT_PREPARED, OnlineBound, OnlineCertificate
+from vibench.model.certificates.bounds import NOT_COERCIVE, NOT_PREPARED, OUTSIDE, OnlineBound, OnlineCertificate
 from vibench.model.certificates.preparation import prepare
 from vibench.model.certificates.prepared_lifting import prepare_liftings
 from vibench.model.certificates.residual import residual_basis
@@ -247,6 +247,83 @@ def test_small_residuals_keep_their_digits(constraint: str) -> None:
         assert basis.norm(z) == pytest.approx(exact_norm, rel=1e-5)
 
 
+def test_a_multiplier_that_is_small_beside_the_error_of_u_is_bounded() -> None:
+    """What is left of Δ² + 2 rᵀw may be round-off alone, and is then in the bound."""
+    problem = Family("constant", "scaled")
+    mu, rng = np.array([1.0, 0.0]), np.random.default_rng(3)
+    (B, g), A = problem.constraint(mu), problem.stiffness(mu).toarray()
+    u, lam = np.linalg.lstsq(B.toarray(), g)[0], 1e-9 * rng.uniform(0.5, 1.5, M)
+    problem._f = A @ u + B.T @ lam
+    training = problem.training_set()
+    members = affine_decomposition(problem, training, 1e-3)
+    model = ReducedModel(problem, problem.V.orthonormalise(np.eye(N)), Enrichment(Kind.NONE), np.eye(M), np.eye(M))
+    reduced = HyperReducedModel(model, hyper_reduce(model, members))
+    given = problem, reduced, prepare(reduced, members, certificate_base(problem, members, training), training)
+    for _ in range(10):
+        u_N = u + np.linalg.solve(A, B.T @ rng.uniform(0.05, 0.15, M))
+        x = np.linalg.lstsq(reduced.assemble(mu).basis, u_N)[0]
+        bound, _, natural, _ = found(given, mu, x, np.zeros(M))
+        assert natural <= bound.lambda_natural <= 1e-5 * bound.rho
+
+
+@pytest.mark.parametrize("kind", KINDS[2::2])
+def test_a_model_without_generators_is_certified(kind: tuple[str, bool, str]) -> None:
+    """No training parameter had contact: λ_N is zero everywhere."""
+    problem = Family(kind[0], kind[2])
+    training = problem.training_set()
+    members = affine_decomposition(problem, training, 1e-3)
+    basis = problem.V.orthonormalise(np.random.default_rng(5).standard_normal((N, 4)))
+    model = ReducedModel(problem, basis, Enrichment(Kind.NONE), np.zeros((M, 0)), np.zeros((M, 0)))
+    reduced = HyperReducedModel(model, hyper_reduce(model, members))
+    given = problem, reduced, prepare(reduced, members, certificate_base(problem, members, training), training)
+    for mu in BOX.sample(5, 3):
+        program = reduced.assemble(mu).program
+        bound, error, natural, _ = found(given, mu, np.linalg.solve(program.A, program.f), np.zeros(0))
+        assert error <= bound.u_energy < np.inf
+        assert natural <= bound.lambda_natural < np.inf
+
+
+class Rough(Family):
+    """A is interpolated with errors of its own size."""
+
+    def stiffness(self, mu: np.ndarray) -> sp.csr_array:
+        rough = 0.07 * np.cos(np.arange(N) * (mu[0] + mu[1]) ** 2)
+        return sp.csr_array((1.0 + 0.1 * mu[0]) * self._terms[0] + sp.diags_array(rough))
+
+
+def test_where_interpolation_errors_are_as_large_as_the_coercivity_there_is_no_bound() -> None:
+    """‖u_N‖_X follows from α − η: no bound is said to be worth anything where that is not positive."""
+    problem = Rough("interpolated", "scaled")
+    training = problem.training_set()
+    members = affine_decomposition(problem, training, 0.2)
+    basis = problem.V.orthonormalise(np.random.default_rng(5).standard_normal((N, 4)))
+    chi = np.maximum(np.random.default_rng(6).standard_normal((M, 3)), 0.0) + 0.05
+    model = ReducedModel(problem, basis, Enrichment(Kind.NONE), chi, np.linalg.qr(chi)[0])
+    reduced = HyperReducedModel(model, hyper_reduce(model, members))
+    base = certificate_base(problem, members, training)
+    given = problem, reduced, prepare(reduced, members, base, training)
+    refused = 0
+    for mu in BOX.sample(40, 3):
+        bound, error, *_ = found(given, mu, *exact(reduced.assemble(mu).program))
+        refused += bound.guarantee is Guarantee.NONE
+        assert (bound.note == NOT_COERCIVE) == (bound.guarantee is Guarantee.NONE) == np.isinf(bound.u_energy)
+        assert error <= bound.u_energy
+        assert bound.u_energy == np.inf or bound.coercivity > base.stiffness_error
+    assert refused
+
+
+def test_outside_the_box_only_exact_models_have_bounds() -> None:
+    """Interpolation errors are measured inside it."""
+    mu = np.array([2.3, 0.4])
+    for stiffness, has_bound in (("affine", True), ("interpolated", False)):
+        given = prepared(stiffness, constraint="scaled")
+        bound, error, natural, _ = found(given, mu, *exact(given[1].assemble(mu).program))
+        assert (bound.note == OUTSIDE) != has_bound
+        assert (bound.guarantee is Guarantee.CERTIFIED) == has_bound == np.isfinite(bound.u_energy)
+        assert error <= bound.u_energy
+        assert natural <= bound.lambda_natural
+
+
 def test_what_bounds_are_worth() -> None:
     assert prepared("constant")[2].base.guarantee is Guarantee.CERTIFIED
     assert prepared("affine")[2].base.guarantee is Guarantee.CERTIFIED
@@ -304,3 +381,14 @@ def test_what_is_stored_is_of_contact_and_reduced_size() -> None:
     reduced = model.assemble(mu)
     solution = exact(reduced.program)
     assert forgetful.evaluate(problem, mu, reduced, *solution) == certificate.evaluate(problem, mu, reduced, *solution)
+
+
+def test_what_is_interpolated_from_listed_parameters_alone_is_not_certified() -> None:
+    """Interpolation errors are measured at random parameters, where such a problem has no matrices."""
+    for stiffness, word in (("affine", ""), ("interpolated", "listed parameters only")):
+        problem = Family(stiffness)
+        training = problem.training_set()
+        members = affine_decomposition(problem, training, 1e-3)
+        problem.parameters = replace(BOX, listed=training)
+        assert word in unsupported(problem, members)
+        assert bool(unsupported(problem, members)) == bool(word)
