@@ -15,6 +15,7 @@ from vibench.errors import RequestError, unknown_name
 from vibench.results import best, error_measures, selection, tables
 from vibench.results.columns import CELLS, THRESHOLDS, Column
 from vibench.results.plugin_columns import Extended
+from vibench.text import parsed_json
 
 AXES = ("problem", "training", "dual", "primal", "primal_tol", "solver", "pod_tol", "dual_tol", "accuracy", "assembly")
 """Columns that tell rows apart; where all rows have one value, it stands in the title and takes no room."""
@@ -224,12 +225,14 @@ def _options(text: str | None) -> dict[str, str]:
     if not isinstance(text, str):
         return {}
     try:
-        found = json.loads(text)
-    except (ValueError, RecursionError):
+        found = parsed_json(text)
+    except ValueError:
         found = None
     if not isinstance(found, dict):
         return {"options": text}
-    return {key: value if isinstance(value, str) else json.dumps(value) for key, value in found.items()}
+    return {
+        key: value if isinstance(value, str) else json.dumps(value, ensure_ascii=False) for key, value in found.items()
+    }
 
 
 def _with_options(name: str, text: str | None, keys: Sequence[str]) -> str:
