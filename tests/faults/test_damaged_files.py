@@ -234,15 +234,27 @@ def test_a_status_that_does_not_exist_is_refused(table: str, results: Path, main
     assert f"has the status 'fine' in '{table}', expected one of ok, inaccurate" in errors
 
 
-@pytest.mark.parametrize("value", ["'fast'", "x'00ff'"])
+WRONG = {
+    ("cells", "online_s", "'fast'"): "a number",
+    ("cells", "online_s", "x'00ff'"): "a number",
+    ("cells", "reason", "x'00ff'"): "a text",
+    ("cells", "versions", "'[1, 2]'"): "a JSON object",
+    ("thresholds", "meaning", "'sometimes'"): "one of from, until, never, at once, undecided",
+}
+
+
+@pytest.mark.parametrize("wrong", WRONG, ids=str)
 @pytest.mark.parametrize("command", ["show", "report", "figures", "diff"])
-def test_text_in_a_column_of_numbers_is_refused(command: str, value: str, results: Path, main: Main) -> None:
+def test_a_value_that_is_none_of_its_column_is_refused(
+    command: str, wrong: tuple[str, str, str], results: Path, main: Main
+) -> None:
     """Written by a stranger, with the right digest."""
-    execute(results.parent, f"UPDATE cells SET online_s = {value} WHERE rowid = 1")
-    folder = str(results.parent)
-    code, _, errors = main(command, folder, *([folder] if command == "diff" else []))
+    table, column, value = wrong
+    execute(results.parent, f"UPDATE {table} SET {column} = {value} WHERE rowid = 1")
+    folder, beside = str(results.parent), {"show": ["--table", table], "diff": [str(results.parent)]}
+    code, _, errors = main(command, folder, *beside.get(command, []))
     assert code == 2
-    assert "in the column 'online_s' of 'cells', expected a number" in errors
+    assert f"in the column '{column}' of '{table}', expected {WRONG[wrong]}" in errors
     assert errors.count("\n") == 1
 
 

@@ -17,10 +17,23 @@ from vibench.errors import RequestError
 from vibench.files import write_atomically
 from vibench.qp.status import Status
 from vibench.results import error_measures, plugin_columns
-from vibench.results.columns import CELLS, INTEGER, KEYS, STORED, TABLES, THRESHOLDS, VERSION, Column, shown_columns
+from vibench.results.break_even import Meaning
+from vibench.results.columns import (
+    BLOB,
+    CELLS,
+    INTEGER,
+    KEYS,
+    REAL,
+    STORED,
+    TABLES,
+    THRESHOLDS,
+    VERSION,
+    Column,
+    shown_columns,
+)
 from vibench.results.plugin_columns import Extended
 from vibench.results.sqlite.reading import FILE, read_meta, read_rows
-from vibench.text import brief, printable_lines, unbroken
+from vibench.text import brief, parsed_json, printable_lines, unbroken
 
 ORDER = (
     *KEYS, "primal_a", "primal_b", "primal_tol_a", "primal_tol_b", "assembly_a", "assembly_b", "stage", "quantity",
@@ -53,18 +66,38 @@ def read(path: Path, table: str) -> pd.DataFrame:
     Raises
     ------
     RequestError
-        If they are damaged, or have text in a column of numbers.
+        If they are damaged, or have a value that is none of its column.
     """
     names, rows = read_rows(path, table)
     frame = pd.DataFrame.from_records(rows, columns=names, coerce_float=True)
     for name, column in STORED.get(table, {}).items():
-        if column.kind.startswith(("REAL", "INTEGER")) and frame[name].dtype == object:  # every value is NULL, or wrong
-            wrong = [value for value in frame[name] if isinstance(value, str | bytes)]
-            if wrong:
-                found = brief(repr(wrong[0]))
-                raise RequestError(f"'{path}' has {found} in the column '{name}' of '{table}', expected a number")
-            frame[name] = frame[name].astype(float)
+        if column.kind.startswith(BLOB) or pd.api.types.is_numeric_dtype(frame[name]):
+            continue
+        number = column.kind.startswith((REAL, INTEGER))
+        is_right, right = A_NUMBER if number else RIGHT.get(name, A_TEXT)
+        for value in frame[name].dropna().unique():
+            if not is_right(value):
+                found = f"{brief(repr(value), 60)} in the column '{name}' of '{table}'"
+                raise RequestError(f"'{path}' has {found}, expected {right}")
+        if number:
+            frame[name] = frame[name].astype(float)  # every value is NULL
     return frame
+
+
+def _is_json_object(value: object) -> bool:
+    try:
+        return isinstance(value, str) and isinstance(parsed_json(value), dict)
+    except ValueError:
+        return False
+
+
+A_NUMBER = (lambda value: isinstance(value, float | int)), "a number"
+A_TEXT = (lambda value: isinstance(value, str)), "a text"
+RIGHT: Mapping[str, tuple[Callable[[object], bool], str]] = {
+    "meaning": (set(Meaning).__contains__, f"one of {', '.join(Meaning)}"),
+    "versions": (_is_json_object, "a JSON object"),
+}
+"""What the values of some columns of texts have to be, and how it is said."""
 
 
 def extended(path: Path, table: str) -> Extended:

@@ -16,7 +16,6 @@ from vibench.qp.status import Status
 from vibench.results import tables
 from vibench.results.plugin_columns import Extended
 from vibench.results.sqlite.reading import FILE, read_meta, study_of
-from vibench.text import parsed_json
 
 AXES = ("problem", "dual", "primal", "asked", "solver", "accuracy", "assembly")
 """Columns that tell cells apart in a comparison; "asked" has all tolerances, or sizes."""
@@ -63,7 +62,7 @@ class ComparedRun:
         """Versions of Python, libraries and solvers; several, where its cells were run with several."""
         found: dict[str, set[str]] = {}
         for text in {row["versions"] for row in self.cells.values() if isinstance(row["versions"], str)}:
-            for name, version in _json_object(self.path, text).items():
+            for name, version in json.loads(text).items():
                 found.setdefault(name, set()).add(str(version))
         return {name: ", ".join(sorted(several)) for name, several in sorted(found.items())}
 
@@ -105,16 +104,6 @@ class ComparedRun:
     def has_seconds_of(self, cell: str, machine: str) -> bool:
         """Whether this run has the cell, measured by that machine."""
         return cell in self.cells and self.cells[cell]["machine"] == machine
-
-
-def _json_object(path: Path, text: str) -> dict[str, Any]:
-    try:
-        found = parsed_json(text)
-    except ValueError:
-        found = None
-    if not isinstance(found, dict):
-        raise RequestError(f"'{path}' has versions that are no JSON object: {text[:60]!a}")
-    return found
 
 
 def compared_runs(paths: Sequence[Path]) -> list[ComparedRun]:
