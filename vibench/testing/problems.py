@@ -19,9 +19,6 @@ from vibench.testing.checks import SECONDS, Check, ConformanceError, Doubt, Find
 from vibench.testing.comparisons import array_fault, at, difference, unmutated
 from vibench.testing.constants import constants
 
-OUTSIDE_RTOL = 1e-12
-"""Largest distance of a parameter from the box, relative to its bounds."""
-
 SOLVED = 5
 """Number of training parameters solved at; up to ten times as many while no constraint is active."""
 
