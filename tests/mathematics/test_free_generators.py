@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pandas as pd
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from numerics import Varying, space
 from samples import SampleStore, carry_out
@@ -87,6 +87,7 @@ def test_with_all_of_them_free_the_program_is_a_linear_system() -> None:
 
 
 @given(seeds)
+@example(535)  # the two are equal but for round-off
 @settings(max_examples=40)
 def test_the_constant_of_a_cone_with_free_generators_is_between_span_and_ordinary_cone(seed: int) -> None:
     rng = np.random.default_rng(seed)

@@ -128,7 +128,7 @@ def inf_sup(on_span: Array, on_generators: Array, cone: Multipliers) -> InfSup:
         return InfSup(span, span, span, f"{UNSIGNED}/{UNSIGNED}")
     lower, upper, sharp = cone_interval(_compressed(on_generators), cone.gram, span)
     if np.any(cone.free):  # α ≥ 0 is a subset of the cone: only upper bounds carry over
-        return InfSup(span, span, upper, f"{UNSIGNED}/{sharp.split('/')[1]}")
+        return InfSup(span, min(span, upper), upper, f"{UNSIGNED}/{sharp.split('/')[1]}")
     return InfSup(span, lower, upper, sharp)
 
 
