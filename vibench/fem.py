@@ -198,7 +198,7 @@ def _normal_mass(scalar: FacetBasis, k: int, direction: Array | None) -> SparseM
     return sp.csr_array(BilinearForm(lambda u, v, w: w.n[k] * u * v).assemble(scalar))
 
 
-def eliminate(vi: VariationalInequality, free: Indices, lift: Array | None = None) -> VariationalInequality:
+def eliminate(vi: VariationalInequality, free: Indices, dirichlet_lift: Array | None = None) -> VariationalInequality:
     """The variational inequality in the free unknowns, from that in all N.
 
     Parameters
@@ -207,14 +207,14 @@ def eliminate(vi: VariationalInequality, free: Indices, lift: Array | None = Non
         A (N×N), f (N,), B (m×N) and g (m,), without boundary conditions.
     free
         Unknowns (n,) that are not prescribed.
-    lift
+    dirichlet_lift
         Vector (N,) with the prescribed values, any values elsewhere; by default zero. The unknowns are those of
-        u − lift: f − A·lift and g − B·lift take the place of f and g.
+        u minus this lift: f − A·lift and g − B·lift take the place of f and g.
     """
     A, B, f, g = sp.csr_array(vi.A), sp.csr_array(vi.B), vi.f, vi.g
-    if lift is not None:
-        f, g = f - A @ lift, g - B @ lift
-    return VariationalInequality(sp.csr_array(A[free][:, free]), f[free], sp.csr_array(B[:, free]), g, lift)
+    if dirichlet_lift is not None:
+        f, g = f - A @ dirichlet_lift, g - B @ dirichlet_lift
+    return VariationalInequality(sp.csr_array(A[free][:, free]), f[free], sp.csr_array(B[:, free]), g, dirichlet_lift)
 
 
 @dataclass(frozen=True)

@@ -177,7 +177,9 @@ class Hertz(Problem):
             If mu_1 is so small that the arc of disc 2 does not cover the whole potential contact zone.
         """
         B, g = self.constraint(mu)
-        return VariationalInequality(A=self._stiffness, f=np.zeros(len(self.free)), B=B, g=g, lift=self._lift(mu))
+        return VariationalInequality(
+            A=self._stiffness, f=np.zeros(len(self.free)), B=B, g=g, dirichlet_lift=self._lift(mu)
+        )
 
     @property
     def contact_dofs(self) -> Indices:

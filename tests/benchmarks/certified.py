@@ -226,7 +226,7 @@ def meshes(count: int) -> int:
             vi = problem.assemble(mu)
             energy = InnerProduct(vi.A)
             errors = (
-                energy.norm(u - reduced.lift(answer.x[:, None])[:, 0]),
+                energy.norm(u - reduced.reconstruct(answer.x[:, None])[:, 0]),
                 float(np.linalg.norm(energy.whiten_functional(vi.B.T @ (lam - model.generators @ alpha)))),
             )
             limits = bounds[0].u_energy, bounds[0].lambda_natural

@@ -54,10 +54,10 @@ def main(run: str, cell: str, tolerance: float) -> None:
             exact = exact_solution(reduced.program)
             if exact is None:
                 continue
-            u, lam = reduced.lift(exact.x[:, None])[:, 0], chi @ exact.alpha
+            u, lam = reduced.reconstruct(exact.x[:, None])[:, 0], chi @ exact.alpha
             both = {"vibench": (solution.x, solution.alpha), "script": (answer.x, answer.alpha), "C": (x, alpha)}
             for name, (coordinates, forces) in both.items():
-                found = reduced.lift(coordinates[:, None])[:, 0]
+                found = reduced.reconstruct(coordinates[:, None])[:, 0]
                 of_lam = exact.unique * W.norm(chi @ forces - lam) / (W.norm(lam) or 1.0)
                 errors[name].append((V.norm(found - u) / (V.norm(u) or 1.0), of_lam))
     print(f"{QUERIES} queries; distance from the reduced program solved to round-off, and median CPU time")

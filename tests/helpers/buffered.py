@@ -32,7 +32,7 @@ def buffered(plain: type[Problem]) -> type[Problem]:
         def assemble(self, mu: Array) -> VariationalInequality:
             vi = super().assemble(mu)
             members = {name: self._own(name, getattr(vi, name)) for name in ("A", "f", "B", "g")}
-            return VariationalInequality(**members, lift=vi.lift)
+            return VariationalInequality(**members, dirichlet_lift=vi.dirichlet_lift)
 
         def contact(self, mu: Array) -> Contact | None:
             found = super().contact(mu)

@@ -137,7 +137,7 @@ class Patch(AffineProblem):
             B=B,
             g=g,
             free=self.free,
-            lift=[("slope", self.edge(MESH.p[0])), ("offset", self.edge(np.ones(self.basis.N)))],
+            dirichlet_lift=[("slope", self.edge(MESH.p[0])), ("offset", self.edge(np.ones(self.basis.N)))],
         )
 
     def edge(self, values: Array) -> Array:
@@ -155,11 +155,11 @@ def test_dirichlet_data_that_depend_on_the_parameter_are_lifted(mu: list[float],
     solution = HighFidelitySolver(problem).solve(at)
     whole = np.zeros(problem.basis.N)
     whole[problem.free] = solution.u
-    assert vi.lift is not None
-    assert np.allclose(whole + vi.lift, mu[0] * MESH.p[0] + mu[1], atol=1e-13)
+    assert vi.dirichlet_lift is not None
+    assert np.allclose(whole + vi.dirichlet_lift, mu[0] * MESH.p[0] + mu[1], atol=1e-13)
     stiffness, B, g = problem.full
     by_hand = fem.eliminate(
-        VariationalInequality(mu[2] * stiffness, np.zeros(problem.basis.N), B, g), problem.free, vi.lift
+        VariationalInequality(mu[2] * stiffness, np.zeros(problem.basis.N), B, g), problem.free, vi.dirichlet_lift
     )
     for name in ("f", "g"):
         assert np.allclose(getattr(vi, name), getattr(by_hand, name), rtol=1e-13, atol=1e-14)
@@ -174,7 +174,9 @@ def test_a_lifted_problem_passes_the_conformance_checks() -> None:
 def test_constants_stay_constant_when_they_are_lifted() -> None:
     problem = Patch()
     stiffness, B, g = problem.full
-    problem.declare(A=stiffness, f=np.ones(problem.basis.N), B=B, g=g, free=problem.free, lift=problem.edge(MESH.p[0]))
+    problem.declare(
+        A=stiffness, f=np.ones(problem.basis.N), B=B, g=g, free=problem.free, dirichlet_lift=problem.edge(MESH.p[0])
+    )
     assert problem.constant == {"A", "f", "B", "g"}
     assert np.allclose(
         problem.assemble(np.ones(3)).f, (np.ones(problem.basis.N) - stiffness @ problem.edge(MESH.p[0]))[problem.free]

@@ -23,7 +23,7 @@ from vibench.interfaces.validation import (
     validation_parameters,
 )
 from vibench.model.affine import AffineMember, affine_decomposition
-from vibench.model.errors import Reference
+from vibench.model.errors import ReferenceSolutions
 from vibench.model.galerkin import ReducedModel
 from vibench.model.hyperreduced import HyperReducedModel, Operators, hyper_reduce, reason_for_full_assembly
 from vibench.reduction.pod import POD, pod
@@ -48,7 +48,7 @@ class Query:
 
     mu: Array
     vi: VariationalInequality
-    exact: Reference
+    exact: ReferenceSolutions
 
 
 class Material:
@@ -171,7 +171,7 @@ class Material:
 
         def make() -> list[Query]:
             mus = validation_parameters(problem, QUERIES, SEED)
-            exact = [Reference(s.u[:, None], s.lam[:, None], *scales) for s in solve_all(problem, mus)]
+            exact = [ReferenceSolutions(s.u[:, None], s.lam[:, None], *scales) for s in solve_all(problem, mus)]
             return [Query(mu, checked_assembly(problem, mu), known) for mu, known in zip(mus, exact, strict=True)]
 
         return self._once("validation", make)

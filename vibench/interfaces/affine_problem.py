@@ -39,7 +39,7 @@ class AffineProblem(Problem):
         B: Declaration,
         g: Declaration,
         free: Indices | None = None,
-        lift: Declaration | None = None,
+        dirichlet_lift: Declaration | None = None,
     ) -> None:
         """Declare the members.
 
@@ -59,9 +59,9 @@ class AffineProblem(Problem):
         free
             Unknowns (n,) that are not prescribed, rising. The members are declared for all N unknowns and restricted to
             these. By default N = n.
-        lift
+        dirichlet_lift
             Prescribed values (N,) of the other unknowns, any values elsewhere; zero by default. The unknowns of the
-            model are those of u − lift: f − A·lift and g − B·lift take the place of f and g.
+            model are those of u minus this lift: f − A·lift and g − B·lift take the place of f and g.
 
         Raises
         ------
@@ -74,12 +74,14 @@ class AffineProblem(Problem):
         N = n if free is None else int(np.shape(_first(A))[0])
         if free is not None and (len(free) != n or np.max(free, initial=-1) >= N):
             raise NumericalError(f"there are {len(free)} free unknowns of {N}; V has the dimension {n}")
-        shapes = {"A": (N, N), "f": (N,), "B": (m, N), "g": (m,), "lift": (N,)}
-        given = {"A": A, "f": f, "B": B, "g": g} | ({} if lift is None else {"lift": lift})
+        shapes = {"A": (N, N), "f": (N,), "B": (m, N), "g": (m,), "dirichlet_lift": (N,)}
+        given = {"A": A, "f": f, "B": B, "g": g}
+        if dirichlet_lift is not None:
+            given["dirichlet_lift"] = dirichlet_lift
         sums = {name: self._declared(name, member, shapes[name]) for name, member in given.items()}
-        if lift is not None:
-            sums["f"] = _minus(sums["f"], sums["A"], sums["lift"])
-            sums["g"] = _minus(sums["g"], sums["B"], sums["lift"])
+        if dirichlet_lift is not None:
+            sums["f"] = _minus(sums["f"], sums["A"], sums["dirichlet_lift"])
+            sums["g"] = _minus(sums["g"], sums["B"], sums["dirichlet_lift"])
         if free is not None:
             sums["A"] = sums["A"].mapped(lambda term: sp.csr_array(term[free][:, free]))
             sums["f"] = sums["f"].mapped(lambda term: term[free])

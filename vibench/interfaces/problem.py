@@ -97,12 +97,12 @@ class VariationalInequality:
     A
         Stiffness, sparse SPD (n×n), on the free degrees of freedom.
     f
-        Load (n,), including the contribution of the lift.
+        Load (n,), including the contribution of the Dirichlet lift.
     B
         Constraint, sparse (m×n), sign such that A u + Bᵀλ = f with λ ≥ 0.
     g
-        Bound (m,), including the contribution of the lift.
-    lift
+        Bound (m,), including the contribution of the Dirichlet lift.
+    dirichlet_lift
         Lifting of inhomogeneous Dirichlet data, added to u in pictures only; `None` for homogeneous data.
     """
 
@@ -110,11 +110,11 @@ class VariationalInequality:
     f: Array
     B: SparseMatrix
     g: Array
-    lift: Array | None = None
+    dirichlet_lift: Array | None = None
 
     def copy(self) -> VariationalInequality:
         """The same in arrays of its own: a problem may write its next assembly into those of this one."""
-        lift = None if self.lift is None else self.lift.copy()
+        lift = None if self.dirichlet_lift is None else self.dirichlet_lift.copy()
         return VariationalInequality(self.A.copy(), self.f.copy(), self.B.copy(), self.g.copy(), lift)
 
 

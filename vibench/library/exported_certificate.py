@@ -38,18 +38,18 @@ def arrays(certificate: OnlineCertificate, polynomials: Mapping[str, AffinePolyn
 
     Bounds grow by what the measured errors of the polynomials, of A and of all θ, may add, with the factor `SAFETY`.
     """
-    base, residual, liftings, terms = (
+    base, residual, corrections, terms = (
         certificate.base, certificate.residual, certificate.prepared, certificate.base.bound_terms
     )  # fmt: skip
-    assert liftings is not None  # there is no reason for none
+    assert corrections is not None  # there is no reason for none
     assert terms is not None
-    responses = np.zeros((len(liftings.basis), len(liftings.rows)))
-    responses[liftings.moved] = liftings.responses
+    responses = np.zeros((len(corrections.basis), len(corrections.rows)))
+    responses[corrections.moved] = corrections.responses
     found = {
-        "generators": certificate.generators, "bounds": terms, "rows": liftings.rows, "inverse": liftings.inverse,
-        "diagonal": liftings.compliance.diagonal(), "reach": liftings.reach, "basis": liftings.basis,
-        "responses": responses, "sizes": liftings.sizes, "directions": liftings.directions,
-        "terms": np.array(liftings.terms), "kept": residual.kept, "factor": residual.factor,
+        "generators": certificate.generators, "bounds": terms, "rows": corrections.rows, "inverse": corrections.inverse,
+        "diagonal": corrections.compliance.diagonal(), "reach": corrections.reach, "basis": corrections.basis,
+        "responses": responses, "sizes": corrections.sizes, "directions": corrections.directions,
+        "terms": np.array(corrections.terms), "kept": residual.kept, "factor": residual.factor,
         "inverse_scale": residual.inverse_scale, "remainder": np.array(residual.remainder), "norms": residual.norms,
     }  # fmt: skip
     error = {name: _error(polynomial) for name, polynomial in polynomials.items()}

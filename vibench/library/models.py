@@ -16,7 +16,7 @@ from vibench.execution.recorded_cell import RecordedCell
 from vibench.highfidelity.active_set import HighFidelitySolution, HighFidelitySolver
 from vibench.interfaces.problem import ParameterBox, Problem
 from vibench.model.certificates.bounds import OnlineBound, OnlineCertificate
-from vibench.model.error_bounds import Certificate, certificate
+from vibench.model.error_bounds import ErrorBounds, bound_errors_at
 from vibench.model.galerkin import ReducedProblem
 from vibench.qp.settings import SETTINGS
 from vibench.qp.solve import installed_solvers, solve_qp
@@ -79,7 +79,7 @@ class Solution:
     @cached_property
     def u(self) -> Array:
         """The primal solution u (n,)."""
-        return np.asarray(self._reduced.lift(self._given(self.x)[:, None])[:, 0])
+        return np.asarray(self._reduced.reconstruct(self._given(self.x)[:, None])[:, 0])
 
     @cached_property
     def lam(self) -> Array:
@@ -87,13 +87,13 @@ class Solution:
         return np.asarray(self._model.reduced.generators @ self._given(self.alpha))
 
     @cached_property
-    def certificate(self) -> Certificate:
+    def error_bounds(self) -> ErrorBounds:
         """Proved bounds on the errors of u and λ in four norms, at the cost of high-fidelity factorisations at mu."""
         problem, kept = self._model.problem, assemblies(self._model.problem)
         vi = kept.at(self.mu)
         alpha, _ = coercivity_and_continuity(vi.A, problem.V)
         beta = energy_inf_sup(vi.A, vi.B, problem.W)
-        return certificate(vi, kept.energy_at(self.mu), alpha, beta, self.u, self.lam)
+        return bound_errors_at(vi, kept.energy_at(self.mu), alpha, beta, self.u, self.lam)
 
     def _given(self, vector: Array | None) -> Array:
         if vector is None:
@@ -116,7 +116,7 @@ class Model:
     problem
         The high-fidelity problem.
     reduced
-        What assembles the reduced programs: `reduced.assemble(mu)` has `program` and `lift`.
+        What assembles the reduced programs: `reduced.assemble(mu)` has `program` and `reconstruct`.
     certificate
         What bounds errors at online cost; `None` where the cell is not certified.
     """
@@ -188,7 +188,7 @@ class Model:
 
     def reconstruct(self, mu: Parameters, x: Array, alpha: Array) -> tuple[Array, Array]:
         """The solution u (n,), λ (m,) with coordinates x (N',) in the primal basis at mu and α (R,) on generators."""
-        u = self.reduced.assemble(self._parameter(mu)).lift(np.asarray(x)[:, None])[:, 0]
+        u = self.reduced.assemble(self._parameter(mu)).reconstruct(np.asarray(x)[:, None])[:, 0]
         return np.asarray(u), np.asarray(self.reduced.generators @ alpha)
 
     def high_fidelity(self, mu: Parameters) -> HighFidelitySolution:

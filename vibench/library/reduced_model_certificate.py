@@ -73,11 +73,11 @@ class Model:
         A, f, B, g = (self.plain.member(f"theta_{name}", mu) for name in "AfBg")
         lower, upper = self._spectrum(mu, A)
         error = float(data["stiffness_error"])
-        lifted = self._lifted(float(B[0]), g, y, lam, upper) if lower > error else None
-        if lifted is None:
+        corrected = self._corrected(float(B[0]), g, y, lam, upper) if lower > error else None
+        if corrected is None:
             which = "α > 0" if lower <= error else "w with B w ≥ s"
             return Bound(inf, inf, inf, "none", f"no {which} was found at this parameter")
-        along, norm, kappa = lifted
+        along, norm, kappa = corrected
         z = np.concatenate([f, np.outer(-A, y).ravel(), np.outer(-B, alpha).ravel()])
         coordinates = data["factor"] @ z[data["kept"]]
         beside = float(data["remainder"] * np.linalg.norm(data["inverse_scale"] * z[data["kept"]]))
@@ -109,7 +109,7 @@ class Model:
         lacking = float(abs(theta - found[2:]) @ data["term_norms"]) + 2.0 * float(data["spectral_error"])
         return float(found[0]) - lacking, float(found[1]) + lacking
 
-    def _lifted(
+    def _corrected(
         self, theta: float, of_g: Array, y: Array, lam: Array, gamma: float
     ) -> tuple[Array, float, float] | None:
         """Coordinates of X w in the basis of residuals, ‖w‖, and κ, for a w with B w ≥ s in spite of all errors."""

@@ -96,13 +96,13 @@ class Bounds:
 
 
 NOT_IN_CONE = "λ_N has negative coefficients"
-NO_LIFTING = "no w with B w ≥ s was found"
+NO_CORRECTION = "no w with B w ≥ s was found"
 ESTIMATED = "α is estimated"
 
 
 @dataclass(frozen=True)
-class Certificate:
-    """The bounds of one solution.
+class ErrorBounds:
+    """What bounds the errors of one solution, which may be nothing.
 
     Attributes
     ----------
@@ -116,34 +116,34 @@ class Certificate:
     note: str
 
 
-def certify(
+def error_bounds(
     vis: Sequence[VariationalInequality],
     energies: Sequence[Energy],
     constants: Sequence[Stability],
     u: Array,
     lam: Array,
-) -> list[Certificate]:
+) -> list[ErrorBounds]:
     """Bounds (ii) of reduced u (n×P) and λ (m×P), column by column at the parameters of `vis`."""
     given = zip(vis, energies, constants, u.T, lam.T, strict=True)
-    return [certificate(vi, energy, c.coercivity, c.energy_inf_sup, *one) for vi, energy, c, *one in given]
+    return [bound_errors_at(vi, energy, c.coercivity, c.energy_inf_sup, *one) for vi, energy, c, *one in given]
 
 
-def certificate(
+def bound_errors_at(
     vi: VariationalInequality, energy: Energy, alpha: Constant, beta: Constant, u: Array, lam: Array
-) -> Certificate:
+) -> ErrorBounds:
     """Bounds (ii) of one reduced u (n,) and λ (m,), from lower bounds of α and of β_A."""
     if np.min(lam, initial=0.0) < 0.0:
-        return Certificate(None, NOT_IN_CONE)
-    lifted = lifting(vi, energy, u, lam)
-    if lifted is None:
-        return Certificate(None, NO_LIFTING)
-    w = lifted.w
+        return ErrorBounds(None, NOT_IN_CONE)
+    corrected = find_correction(vi, energy, u, lam)
+    if corrected is None:
+        return ErrorBounds(None, NO_CORRECTION)
+    w = corrected.w
     of_u = terms(w, vi, energy, u, lam)
     of_lam = min((of_u, *_projected(of_u.residual, w, vi, energy, u, lam)), key=lambda terms: terms.rho)
     in_V = of_u.primal / float(np.sqrt(alpha.value))
     in_W = of_lam.dual / beta.value if beta.value > 0.0 else float("inf")
     bounds = Bounds(of_u.primal, in_V, of_lam.dual, in_W, of_u.rho, of_lam.rho, of_u.omega, of_u.kappa)
-    return Certificate(bounds, "" if alpha.proved else ESTIMATED)
+    return ErrorBounds(bounds, "" if alpha.proved else ESTIMATED)
 
 
 @dataclass(frozen=True)
@@ -169,7 +169,7 @@ class Terms:
 
 
 def terms(w: Array, vi: VariationalInequality, energy: Energy, u: Array, lam: Array) -> Terms:
-    """The terms with a lifting w (n,), B w ≥ B u − g, of u (n,) and λ ≥ 0 (m,)."""
+    """The terms with a correction w (n,), B w ≥ B u − g, of u (n,) and λ ≥ 0 (m,)."""
     residual = vi.f - vi.A @ u - vi.B.T @ lam
     kappa = max(0.0, float(lam @ _slack(vi, u, w)))
     of_feasible = energy.dual_norm(residual + vi.A @ w)
@@ -190,7 +190,7 @@ def _projected(
 
 
 @dataclass(frozen=True)
-class Lifting:
+class Correction:
     """A w (n,) with B w ≥ s also in exact arithmetic, and ν ≥ 0 (m,) with A w = Bᵀ(ν − λ_N).
 
     As A(u_N − w) + Bᵀν = f − r and ν is complementary to B(u_N − w) ≤ g, u_N − w and ν solve (7) with the load f − r:
@@ -201,8 +201,8 @@ class Lifting:
     nu: Array
 
 
-def lifting(vi: VariationalInequality, energy: Energy, u: Array, lam: Array) -> Lifting | None:
-    """A lifting of s = B u − g that is close to the best one; `None` if none was found.
+def find_correction(vi: VariationalInequality, energy: Energy, u: Array, lam: Array) -> Correction | None:
+    """A correction of s = B u − g that is close to the best one; `None` if none was found.
 
     Parameters
     ----------
@@ -221,9 +221,9 @@ def lifting(vi: VariationalInequality, energy: Energy, u: Array, lam: Array) -> 
             if not np.all(lacking <= 0.0):  # NaN is not
                 margin = np.maximum(margin, 2.0 * np.nan_to_num(lacking, nan=0.0, posinf=0.0))
             elif np.max(nu, initial=0.0) <= largest:
-                return Lifting(w, nu)
+                return Correction(w, nu)
             else:
-                doubtful = Lifting(w, nu)
+                doubtful = Correction(w, nu)
         margin = 10.0 * margin
     return doubtful
 

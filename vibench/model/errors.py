@@ -18,7 +18,7 @@ training solution. High-fidelity solutions have residuals up to 1e-10, so that e
 
 
 @dataclass(frozen=True)
-class Reference:
+class ReferenceSolutions:
     """High-fidelity solutions, columns of u (n×P) and λ (m×P), and what is largest over the training set.
 
     `scale_u` and `scale_lam` are norms in V and W, `scale_outputs` absolute values of the problem's outputs.
@@ -30,7 +30,7 @@ class Reference:
     scale_lam: float
     scale_outputs: tuple[float, ...] = ()
 
-    def at(self, numbers: Sequence[int]) -> Reference:
+    def at(self, numbers: Sequence[int]) -> ReferenceSolutions:
         """The solutions at some of the parameters."""
         return replace(self, u=self.u[:, numbers], lam=self.lam[:, numbers])
 
@@ -69,7 +69,7 @@ class Errors:
     complementarity: float
 
 
-def zeros(problem: Problem, reference: Reference) -> tuple[Mask, Mask]:
+def zeros(problem: Problem, reference: ReferenceSolutions) -> tuple[Mask, Mask]:
     """Which u (P,) and λ (P,) are zero on the scale of the training set: at most `UNMEASURABLE` of its largest norm.
 
     Without contact λ is zero, and u too where there is no load; a relative error would divide round-off by round-off.
@@ -82,7 +82,7 @@ def errors(
     problem: Problem,
     vis: Sequence[VariationalInequality],
     energies: Sequence[Energy],
-    reference: Reference,
+    reference: ReferenceSolutions,
     u: Array,
     lam: Array,
 ) -> list[Errors]:

@@ -44,7 +44,7 @@ class ReducedProblem:
     ----------
     program
         Dense A (N'×N'), f (N',), B (R×N'), g (R,) in coordinates of the primal basis and of the generators.
-    lift
+    reconstruct
         From coordinates (N'×k) in the V-orthonormal primal basis Z at this parameter to vectors (n×k): u = Z x.
     factor
         Cholesky factor (lower, N'×N') of A, where it was computed offline.
@@ -53,14 +53,14 @@ class ReducedProblem:
     """
 
     program: VariationalInequality
-    lift: Callable[[Array], Array]
+    reconstruct: Callable[[Array], Array]
     factor: Array | None = None
     evaluated: Evaluated | None = None
 
     @property
     def basis(self) -> Array:
         """Z (n×N')."""
-        return self.lift(np.eye(len(self.program.f)))
+        return self.reconstruct(np.eye(len(self.program.f)))
 
 
 class ReducedModel:
@@ -110,7 +110,7 @@ class ReducedModel:
             return self.fixed_basis
         return np.hstack([self.fixed_basis, V.unwhiten(orthonormal_range(whitened, self._whitened_basis))])
 
-    def lift(self, mu: Array, vi: VariationalInequality, x: Array) -> Array:  # noqa: ARG002
+    def reconstruct(self, mu: Array, vi: VariationalInequality, x: Array) -> Array:  # noqa: ARG002
         """Vectors u = Z x (n×k) with coordinates x (N'×k) at mu, with `vi` assembled there."""
         if not self._has_coordinates:
             return np.asarray(self.primal_basis(vi) @ x)

@@ -15,7 +15,7 @@ from vibench.interfaces.validation import checked_assembly
 from vibench.linalg.cholesky import SparseCholesky
 from vibench.linalg.dense import orthonormal_range
 from vibench.model.energy import Energy
-from vibench.model.error_bounds import lifting, terms
+from vibench.model.error_bounds import find_correction, terms
 from vibench.model.galerkin import project
 from vibench.qp.exact import ExactSolution, exact_solution
 from vibench.qp.scaling import ratio
@@ -83,7 +83,7 @@ class GrowingModel:
 
         The bound of u is in the energy norm over that of u_N, that of λ in the norm of A⁻¹ over that of Bᵀλ_N. Neither
         follows the error of λ in W, in which contact pressures are compared: the same λ − λ_N is smaller in the norm of
-        A⁻¹ the faster it oscillates. Its estimate is ‖ν − λ_N‖_W / ‖λ_N‖_W, ν the multiplier of the lifting that the
+        A⁻¹ the faster it oscillates. Its estimate is ‖ν − λ_N‖_W / ‖λ_N‖_W, ν the multiplier of the correction that the
         bounds need anyway.
         """
         vi = checked_assembly(self._problem, mu)
@@ -92,15 +92,15 @@ class GrowingModel:
             return float("inf")
         u, lam = solved
         energy = self._energy(vi)
-        lifted = lifting(vi, energy, u, lam)
-        if lifted is None:
+        corrected = find_correction(vi, energy, u, lam)
+        if corrected is None:
             return float("inf")
-        found = terms(lifted.w, vi, energy, u, lam)
+        found = terms(corrected.w, vi, energy, u, lam)
         of_u = ratio(found.primal, energy.norm(u))
         pressed, W = energy.dual_norm(vi.B.T @ lam), self._problem.W
         if not pressed > 0.0:
             return of_u
-        in_W = ratio(float(W.norm(lifted.nu - lam)), float(W.norm(lam)))
+        in_W = ratio(float(W.norm(corrected.nu - lam)), float(W.norm(lam)))
         return max(of_u, ratio(found.dual, pressed), in_W)
 
     def _energy(self, vi: VariationalInequality) -> Energy:

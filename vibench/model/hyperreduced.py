@@ -209,17 +209,17 @@ class HyperReducedModel:
             Y, B = self._enriched(space, B)
             A, f, B = Y.T @ (A @ Y), Y.T @ f, B @ Y
             A = 0.5 * (A + A.T)
-            lift = partial(_lift, space, Y)
+            reconstruct = partial(_reconstructed, space, Y)
         else:
-            lift = partial(np.matmul, self.basis)
+            reconstruct = partial(np.matmul, self.basis)
         if not all(np.isfinite(member.sum()) for member in (A, f, B, g)):
             raise NumericalError(f"the reduced problem has entries that are not finite at mu = {mu.tolist()}")
         evaluated = Evaluated(samples, contact, Y)
-        return ReducedProblem(VariationalInequality(A, f, B, g), lift, self._operators.factor, evaluated)
+        return ReducedProblem(VariationalInequality(A, f, B, g), reconstruct, self._operators.factor, evaluated)
 
-    def lift(self, mu: Array, vi: VariationalInequality, x: Array) -> Array:  # noqa: ARG002
+    def reconstruct(self, mu: Array, vi: VariationalInequality, x: Array) -> Array:  # noqa: ARG002
         """Vectors u = Z x (n×k) with coordinates x (N'×k) at mu, for reconstruction; it assembles again."""
-        return self.assemble(mu).lift(x)
+        return self.assemble(mu).reconstruct(x)
 
     def declared_terms(self) -> dict[str, Array]:
         """Flat terms (Q×size) of the members declared affine, of A packed upper triangles, on Φ."""
@@ -272,7 +272,7 @@ class HyperReducedModel:
         return np.hstack([space.plain, orthonormal_range(B[:count].T, space.plain)]), B[count:]
 
 
-def _lift(space: Coordinates, Y: Array, x: Array) -> Array:
+def _reconstructed(space: Coordinates, Y: Array, x: Array) -> Array:
     """Vectors (n×k) from coordinates (N'×k) in an orthonormal basis with coordinates Y (d×N')."""
     return space.vectors(Y @ x)
 

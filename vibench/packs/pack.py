@@ -20,7 +20,7 @@ from vibench.packs.members import Affine, Constant, Listed, PackMember
 
 
 @dataclass(frozen=True)
-class Reference:
+class PackSolutions:
     """Reference solutions: parameters (P×d), u (n×P) or `None`, λ (m×P), largest accepted relative KKT residual."""
 
     parameters: Array
@@ -79,7 +79,7 @@ class ModelPack:
     members: Mapping[str, PackMember]
     contact: Indices
     integrals: Array | None
-    reference: Reference | None
+    reference: PackSolutions | None
     mesh: PackMesh | None
     outputs: tuple[Output, ...] = ()
 

@@ -24,7 +24,7 @@ from vibench.packs import manifest as schema
 from vibench.packs.array_files import ArrayFiles, memory_limit, safe_path, size_of
 from vibench.packs.manifest import FILE, Manifest, read_manifest
 from vibench.packs.members import Affine, Constant, Listed, Listing, PackMember, Table, Theta
-from vibench.packs.pack import ModelPack, PackMesh, Reference
+from vibench.packs.pack import ModelPack, PackMesh, PackSolutions
 from vibench.provenance import core_code
 
 OUTSIDE_RTOL = 1e-12
@@ -270,7 +270,7 @@ class _Reader:
             touched[sp.csr_array(matrix).indices] = True
         return np.flatnonzero(touched)
 
-    def _reference(self, given: schema.Solutions, n: int, m: int) -> Reference:
+    def _reference(self, given: schema.Solutions, n: int, m: int) -> PackSolutions:
         lam = self._columns(given.lam, "solutions.lam", m, None)
         count = lam.shape[1]
         if given.parameters is not None:
@@ -284,7 +284,7 @@ class _Reader:
             full = n if self._free is None else self._all
             u = self._columns(given.u, "solutions.u", full, count)
             u = u if self._free is None else u[self._free]
-        return Reference(mus, u, lam, given.tolerance)
+        return PackSolutions(mus, u, lam, given.tolerance)
 
     def _output(self, number: int, given: schema.LinearOutput, n: int, m: int) -> Output:
         if not n:

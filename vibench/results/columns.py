@@ -348,7 +348,7 @@ QUERIES: Mapping[str, Column] = {
     "bound_rho_range": Column(
         REAL, "A", "ρ_B, the part of ρ in the range of Bᵀ, which bounds λ; ρ itself where constraints are dependent."
     ),
-    "bound_omega": Column(REAL, "A", "ω, the norm of the lifting w of the constraint violation."),
+    "bound_omega": Column(REAL, "A", "ω, the norm of the correction w of the constraint violation."),
     "bound_kappa": Column(REAL, "A²", "κ = λ_Nᵀ(B w − s), the complementarity of w and λ_N."),
     "bound_note": Column(
         TEXT, "", "Why there are no bounds, or which of their constants is estimated; empty if they are proved."
@@ -371,7 +371,7 @@ QUERIES: Mapping[str, Column] = {
     "bound_online_note": Column(
         TEXT,
         "",
-        "Why there are no bounds at online cost, or no prepared lifting was feasible and the best one was computed.",
+        "Why there are no bounds at online cost, or no prepared correction was feasible and the best one was computed.",
     ),
     "bound_hsw_u": Column(
         REAL,

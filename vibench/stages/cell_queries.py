@@ -15,7 +15,7 @@ from vibench.errors import in_a_line
 from vibench.interfaces.strategies import Kind
 from vibench.model.certificates.base import Guarantee
 from vibench.model.certificates.bounds import OnlineCertificate
-from vibench.model.errors import Reference, zeros
+from vibench.model.errors import ReferenceSolutions, zeros
 from vibench.model.output_errors import scales as output_scales
 from vibench.model.output_errors import summarise_outputs
 from vibench.provenance import machine
@@ -172,7 +172,7 @@ class _Queries(Pieces):
         self._training, self._reference = gather(store, stage.training), gather(store, stage.validation)
         problem = self._model.problem
         trained = self._training
-        self._compared = Reference(
+        self._compared = ReferenceSolutions(
             self._reference.u,
             self._reference.lam,
             float(np.max(problem.V.norm(trained.u), initial=0.0)),

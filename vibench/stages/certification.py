@@ -9,9 +9,9 @@ from vibench.errors import UnsupportedError
 from vibench.model.affine import AffineMember
 from vibench.model.certificates.base import CertificateBase, certificate_base
 from vibench.model.certificates.bounds import OnlineCertificate
-from vibench.model.certificates.lifting import ContactCompliance
+from vibench.model.certificates.contact_correction import ContactCompliance
 from vibench.model.certificates.preparation import prepare
-from vibench.model.certificates.prepared_lifting import PreparedLiftings
+from vibench.model.certificates.prepared_correction import PreparedCorrections
 from vibench.model.certificates.residual import ResidualBasis
 from vibench.model.certificates.spectral import SpectralBounds
 from vibench.model.hyperreduced import HyperReducedModel
@@ -21,7 +21,9 @@ from vibench.storage.artefacts import Store
 from vibench.storage.serialisation import storable
 from vibench.timing import timed
 
-for _kind in (CertificateBase, ContactCompliance, OnlineCertificate, PreparedLiftings, ResidualBasis, SpectralBounds):
+for _kind in (
+    CertificateBase, ContactCompliance, OnlineCertificate, PreparedCorrections, ResidualBasis, SpectralBounds,
+):  # fmt: skip
     storable(_kind)
 
 

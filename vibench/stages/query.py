@@ -14,8 +14,8 @@ from vibench.interfaces.problem import ParameterBox, VariationalInequality
 from vibench.interfaces.strategies import Kind
 from vibench.model.certificates.base import Guarantee
 from vibench.model.certificates.bounds import OnlineBound, OnlineCertificate
-from vibench.model.error_bounds import Certificate, certify
-from vibench.model.errors import UNMEASURABLE, Errors, Reference, errors
+from vibench.model.error_bounds import ErrorBounds, error_bounds
+from vibench.model.errors import UNMEASURABLE, Errors, ReferenceSolutions, errors
 from vibench.model.hsw_bounds import HSWBounds, hsw_bounds
 from vibench.model.hyperreduced import HyperReducedModel
 from vibench.model.output_errors import output_errors
@@ -195,7 +195,7 @@ def error_columns(
     model: Model,
     mus: Array,
     solutions: Sequence[tuple[Array, Array]],
-    reference: Reference,
+    reference: ReferenceSolutions,
     known: Sequence[Stability],
     exact: Sequence[ExactSolution | None],
     online: OnlineCertificate | None = None,
@@ -211,14 +211,14 @@ def error_columns(
     vis = [assemblies(problem).at(mu) for mu in mus]
     if model.kind is Kind.PER_PARAMETER:
         queries = zip(mus, vis, solutions, strict=True)
-        u = np.hstack([model.lift(mu, vi, x[:, None]) for mu, vi, (x, _) in queries])
+        u = np.hstack([model.reconstruct(mu, vi, x[:, None]) for mu, vi, (x, _) in queries])
     else:  # a fixed basis: all solutions are reconstructed at once
-        u = model.lift(mus[0], vis[0], np.column_stack([x for x, _ in solutions]))
+        u = model.reconstruct(mus[0], vis[0], np.column_stack([x for x, _ in solutions]))
     lam = model.generators @ np.column_stack([alpha for _, alpha in solutions])
     energies = [assemblies(problem).energy_at(mu) for mu in mus]
     found = zip(
         errors(problem, vis, energies, reference, u, lam),
-        certify(vis, energies, known, u, lam),
+        error_bounds(vis, energies, known, u, lam),
         hsw_bounds(problem, vis, known, u, lam),
         strict=True,
     )
@@ -243,12 +243,12 @@ def error_columns(
     return rows
 
 
-def _columns(error: Errors, certificate: Certificate, hsw: HSWBounds | None) -> Row:
-    row: Row = asdict(error) | {"bound_note": certificate.note}
+def _columns(error: Errors, proved: ErrorBounds, hsw: HSWBounds | None) -> Row:
+    row: Row = asdict(error) | {"bound_note": proved.note}
     of_u = _measured(error.error_u, error.error_u_scaled) > UNMEASURABLE
     of_lam = _measured(error.error_lambda, error.error_lambda_scaled) > UNMEASURABLE
     found: dict[str, tuple[float, bool, float]] = {}  # a bound, the error, and whether that is measurable
-    if (bounds := certificate.bounds) is not None:
+    if (bounds := proved.bounds) is not None:
         row |= {f"bound_{name}": getattr(bounds, name) for name in ("rho", "rho_range", "omega", "kappa")}
         found |= {
             "u_energy": (bounds.u_energy, of_u, error.error_u_energy_absolute),

@@ -59,7 +59,7 @@ def assembly(case: ProblemCase) -> Iterator[str]:
         if not isinstance(vi, VariationalInequality):
             yield f"assemble returns a {type(vi).__name__} {at(mu)}; expected a vibench.VariationalInequality"
             return
-        lift = {} if vi.lift is None else {"lift": np.shape(vi.lift)}
+        lift = {} if vi.dirichlet_lift is None else {"dirichlet_lift": np.shape(vi.dirichlet_lift)}
         found = [array_fault(name, getattr(vi, name), s, sparse=name in "AB") for name, s in (shapes | lift).items()]
         yield from (f"{fault} ({at(mu)})" for fault in found if fault)
         if any(found):

@@ -43,7 +43,7 @@ def test_the_approach_is_taken_from_the_gap_and_changes_nothing_else(radius: flo
         assert not np.any(vi.f)
         taken = 2.0 * (approach - 0.09) * LOADED.macro_lengths  # both flats move
         assert np.allclose(vi.g, before.g - taken, rtol=1e-13, atol=1e-15)
-        assert np.allclose(vi.lift, before.lift * approach / 0.09, rtol=1e-14)
+        assert np.allclose(vi.dirichlet_lift, before.dirichlet_lift * approach / 0.09, rtol=1e-14)
     assert LOADED.constant == {"A", "f"}
 
 

@@ -185,7 +185,7 @@ def largest_errors(model: vibench.Model, answers: Any, count: int) -> tuple[floa
         reduced = model.reduced.assemble(mu)
         exact = exact_solution(reduced.program)
         assert exact is not None
-        u, lam = reduced.lift(exact.x[:, None])[:, 0], model.reduced.generators @ exact.alpha
+        u, lam = reduced.reconstruct(exact.x[:, None])[:, 0], model.reduced.generators @ exact.alpha
         found_u, found_lam = answers(mu)
         unique += exact.unique
         errors.append((V.norm(found_u - u) / V.norm(u), exact.unique * W.norm(found_lam - lam) / W.norm(lam)))
@@ -279,7 +279,7 @@ def test_the_runtime_needs_numpy_and_one_solver_alone(run: vibench.Run, tmp_path
         reduced = model.reduced.assemble(mu)
         exact = exact_solution(reduced.program)
         assert exact is not None
-        solutions.append((reduced.lift(exact.x), model.reduced.generators @ exact.alpha))
+        solutions.append((reduced.reconstruct(exact.x), model.reduced.generators @ exact.alpha))
     u, lam = (np.stack(part) for part in zip(*solutions, strict=True))
     np.savez(tmp_path / "values.npz", mus=mus, u=u, lam=lam)
     script = ALONE.format(

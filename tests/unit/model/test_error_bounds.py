@@ -12,9 +12,17 @@ from numerics import exact, space, spd
 from vibench.highfidelity.kkt_systems import CondensedStiffness
 from vibench.interfaces.problem import VariationalInequality
 from vibench.linalg.cholesky import SparseCholesky
-from vibench.model import error_bounds
+from vibench.model import error_bounds as module
 from vibench.model.energy import Energy
-from vibench.model.error_bounds import ESTIMATED, NO_LIFTING, NOT_IN_CONE, Bounds, Certificate, certify, lifting
+from vibench.model.error_bounds import (
+    ESTIMATED,
+    NO_CORRECTION,
+    NOT_IN_CONE,
+    Bounds,
+    ErrorBounds,
+    error_bounds,
+    find_correction,
+)
 from vibench.qp.solution import QPSolution
 from vibench.stability.coercivity import Constant, Stability, coercivity_and_continuity, energy_inf_sup
 from vibench.stability.infsup import InfSup
@@ -38,15 +46,15 @@ def stability(vi: VariationalInequality) -> Stability:
     )
 
 
-def certificate(
+def bounds_or_note(
     vi: VariationalInequality, u: np.ndarray, lam: np.ndarray, known: Stability | None = None
-) -> Certificate:
-    (found,) = certify([vi], [energy(vi)], [known or stability(vi)], u[:, None], lam[:, None])
+) -> ErrorBounds:
+    (found,) = error_bounds([vi], [energy(vi)], [known or stability(vi)], u[:, None], lam[:, None])
     return found
 
 
 def bounds(vi: VariationalInequality, u: np.ndarray, lam: np.ndarray) -> Bounds:
-    found = certificate(vi, u, lam)
+    found = bounds_or_note(vi, u, lam)
     assert found.note == ""
     assert found.bounds is not None
     return found.bounds
@@ -135,13 +143,13 @@ def test_the_multiplier_of_a_lifting_is_the_high_fidelity_one_where_there_is_no_
     vi, u, lam, _, lam_N = given
     A = vi.A.toarray()
     without = np.linalg.solve(A, vi.f - vi.B.T @ lam_N)
-    lifted = lifting(vi, energy(vi), without, lam_N)
-    assert lifted is not None
-    assert lifted.nu.min(initial=0.0) >= 0.0
+    corrected = find_correction(vi, energy(vi), without, lam_N)
+    assert corrected is not None
+    assert corrected.nu.min(initial=0.0) >= 0.0
     size = np.abs(vi.f).max() + np.abs(A).max() * np.abs(u).max() + np.abs(vi.B.T @ lam_N).max()
     # With dependent rows the interior-point method solves the program, and λ is not unique.
-    np.testing.assert_allclose(A @ lifted.w, vi.B.T @ (lifted.nu - lam_N), rtol=0.0, atol=1e-3 * size)
-    np.testing.assert_allclose(vi.B.T @ lifted.nu, vi.B.T @ lam, rtol=0.0, atol=1e-3 * size)
+    np.testing.assert_allclose(A @ corrected.w, vi.B.T @ (corrected.nu - lam_N), rtol=0.0, atol=1e-3 * size)
+    np.testing.assert_allclose(vi.B.T @ corrected.nu, vi.B.T @ lam, rtol=0.0, atol=1e-3 * size)
 
 
 @given(approximations())
@@ -149,10 +157,10 @@ def test_the_terms_are_those_of_a_lifting_that_is_feasible_in_exact_arithmetic(
     given: tuple[VariationalInequality, np.ndarray, np.ndarray, np.ndarray, np.ndarray],
 ) -> None:
     vi, _, _, u_N, lam_N = given
-    lifted, norm = lifting(vi, energy(vi), u_N, lam_N), energy(vi)
+    corrected, norm = find_correction(vi, energy(vi), u_N, lam_N), energy(vi)
     scale = norm.norm(u_N) + norm.dual_norm(vi.f) + norm.dual_norm(vi.B.T @ lam_N)
-    assert lifted is not None
-    w = lifted.w
+    assert corrected is not None
+    w = corrected.w
     for row, g in zip(vi.B.toarray(), vi.g, strict=True):
         slack = sum(Fraction(b) * (Fraction(x) - Fraction(v)) for b, x, v in zip(row, w, u_N, strict=True))
         assert slack + Fraction(g) >= 0
@@ -202,12 +210,12 @@ def scalar(lam: float, u: float) -> tuple[VariationalInequality, np.ndarray, np.
 def test_each_term_enters_where_the_derivation_says() -> None:
     vi, u, lam = scalar(lam=0.8, u=0.6)  # r = 4 − 2.4 − 1.6 = 0, s = 0.2, w = 0.1 and κ = 0
     known = Stability(InfSup(0.0, 0.0, 0.0, ""), Constant(0.25, True), Constant(9.0, True), Constant(0.5, True))
-    (found,) = certify([vi], [energy(vi)], [known], u[:, None], lam[:, None])
+    (found,) = error_bounds([vi], [energy(vi)], [known], u[:, None], lam[:, None])
     expected = Bounds(u_energy=0.2, u=0.4, lambda_natural=0.2, lam=0.4, rho=0.0, rho_range=0.0, omega=0.2, kappa=0.0)
     assert found.bounds is not None
     assert vars(found.bounds) == pytest.approx(vars(expected), abs=1e-7)
     vi, u, lam = scalar(lam=0.2, u=0.3)  # r = 4 − 1.2 − 0.4 = 2.4, s = −0.4, w = −0.1 is best: κ = 0.2·(−0.2 + 0.4)
-    (found,) = certify([vi], [energy(vi)], [known], u[:, None], lam[:, None])
+    (found,) = error_bounds([vi], [energy(vi)], [known], u[:, None], lam[:, None])
     square = 1.2**2 + 0.2**2 + 2.0 * 0.04
     natural = np.sqrt(square - 2.0 * 2.4 * 0.1)
     expected = Bounds(np.sqrt(square), 2.0 * np.sqrt(square), natural, 2.0 * natural, 1.2, 1.2, 0.2, 0.04)
@@ -220,7 +228,7 @@ def test_of_the_residual_only_what_constraints_see_bounds_the_multiplier() -> No
     A, B = sp.eye_array(2, format="csc"), sp.csr_array([[1.0, 0.0]])
     vi = VariationalInequality(A, np.array([2.0, 1.0]), B, np.array([1.0]))
     known = Stability(InfSup(0.0, 0.0, 0.0, ""), Constant(1.0, True), Constant(1.0, True), Constant(1.0, True))
-    found = certificate(vi, np.array([1.0, 0.6]), np.array([0.7]), known).bounds
+    found = bounds_or_note(vi, np.array([1.0, 0.6]), np.array([0.7]), known).bounds
     assert found is not None
     assert found.rho == pytest.approx(0.5)
     assert found.rho_range == pytest.approx(0.3)
@@ -231,11 +239,11 @@ def test_of_the_residual_only_what_constraints_see_bounds_the_multiplier() -> No
 def test_what_is_not_proved_is_said() -> None:
     vi, u, lam = scalar(lam=0.8, u=0.6)
     known = Stability(InfSup(0.0, 0.0, 0.0, ""), Constant(0.25, False), Constant(9.0, False), Constant(0.0, True))
-    found = certificate(vi, u, lam, known)
+    found = bounds_or_note(vi, u, lam, known)
     assert found.note == ESTIMATED
     assert found.bounds is not None
     assert found.bounds.lam == np.inf
-    assert certificate(vi, u, -lam, known) == Certificate(None, NOT_IN_CONE)
+    assert bounds_or_note(vi, u, -lam, known) == ErrorBounds(None, NOT_IN_CONE)
 
 
 def test_where_no_lifting_is_strictly_feasible_nothing_is_bounded() -> None:
@@ -244,15 +252,15 @@ def test_where_no_lifting_is_strictly_feasible_nothing_is_bounded() -> None:
         sp.csc_array([[4.0]]), np.array([4.0]), sp.csr_array([[2.0], [-2.0]]), np.array([1.0, -1.0])
     )
     known = Stability(InfSup(0.0, 0.0, 0.0, ""), Constant(0.25, True), Constant(9.0, True), Constant(0.0, True))
-    assert certificate(vi, np.array([0.6]), np.array([0.8, 0.0]), known) == Certificate(None, NO_LIFTING)
+    assert bounds_or_note(vi, np.array([0.6]), np.array([0.8, 0.0]), known) == ErrorBounds(None, NO_CORRECTION)
 
 
 def test_an_active_set_method_that_fails_is_replaced(monkeypatch: pytest.MonkeyPatch) -> None:
     vi, u, lam = scalar(lam=0.8, u=0.6)
     known = Stability(InfSup(0.0, 0.0, 0.0, ""), Constant(0.25, True), Constant(9.0, True), Constant(0.5, True))
-    sharp = certificate(vi, u, lam, known).bounds
-    monkeypatch.setattr(error_bounds, "active_set_iterations", lambda system, active: None)
-    found = certificate(vi, u, lam, known).bounds
+    sharp = bounds_or_note(vi, u, lam, known).bounds
+    monkeypatch.setattr(module, "active_set_iterations", lambda system, active: None)
+    found = bounds_or_note(vi, u, lam, known).bounds
     assert found is not None
     assert sharp is not None
     assert sharp.u_energy == pytest.approx(found.u_energy, rel=1e-4)
@@ -262,14 +270,14 @@ def test_an_active_set_of_dependent_constraints_comes_last(monkeypatch: pytest.M
     """Its w is feasible and may be huge: a multiplier that no row alone would have tells."""
     vi, u, lam = scalar(lam=0.8, u=0.6)
     known = Stability(InfSup(0.0, 0.0, 0.0, ""), Constant(0.25, True), Constant(9.0, True), Constant(0.5, True))
-    sharp = certificate(vi, u, lam, known).bounds
+    sharp = bounds_or_note(vi, u, lam, known).bounds
     assert sharp is not None
     huge = np.array([1e13]), np.array([1e15]), 3
-    monkeypatch.setattr(error_bounds, "active_set_iterations", lambda system, active: huge)
-    found = certificate(vi, u, lam, known).bounds
+    monkeypatch.setattr(module, "active_set_iterations", lambda system, active: huge)
+    found = bounds_or_note(vi, u, lam, known).bounds
     assert found is not None
     assert found.u_energy == pytest.approx(sharp.u_energy, rel=1e-4)
-    monkeypatch.setattr(error_bounds, "solve_qp", lambda *given: QPSolution(None, None, "none"))
-    found = certificate(vi, u, lam, known).bounds
+    monkeypatch.setattr(module, "solve_qp", lambda *given: QPSolution(None, None, "none"))
+    found = bounds_or_note(vi, u, lam, known).bounds
     assert found is not None
     assert found.u_energy > 1e13  # it holds all the same

@@ -14,8 +14,8 @@ from vibench.highfidelity.kkt_systems import CondensedStiffness
 from vibench.interfaces.problem import VariationalInequality
 from vibench.linalg.cholesky import SparseCholesky
 from vibench.model.energy import Energy
-from vibench.model.error_bounds import certify
-from vibench.model.errors import UNMEASURABLE, Reference, errors
+from vibench.model.error_bounds import error_bounds
+from vibench.model.errors import UNMEASURABLE, ReferenceSolutions, errors
 from vibench.model.hsw_bounds import hsw_bounds
 from vibench.reduction.supremizers import constraint_classes
 from vibench.stability.coercivity import Stability, coercivity_and_continuity, energy_inf_sup
@@ -32,7 +32,7 @@ def test_errors_as_defined() -> None:
     mu = np.array([0.5])
     vi = problem.assemble(mu)
     exact = active_set.solve_high_fidelity(vi)
-    reference = Reference(exact.u[:, None], exact.lam[:, None], 0.0, 0.0)
+    reference = ReferenceSolutions(exact.u[:, None], exact.lam[:, None], 0.0, 0.0)
     rng = np.random.default_rng(0)
     du, dlam = 1e-3 * rng.standard_normal(30), 1e-2 * rng.standard_normal(8)
     (found,) = errors(problem, [vi], [energy(vi)], reference, (exact.u + du)[:, None], (exact.lam + dlam)[:, None])
@@ -61,7 +61,7 @@ def test_what_is_zero_beside_the_training_set_has_no_relative_error(
     vi = problem.assemble(np.array([0.5]))
     u, lam, du, dlam = (10.0**unit * rng.random((size, 1)) for size in (30, 8, 30, 8))
     scale_u, scale_lam = float(problem.V.norm(u)[0]), float(problem.W.norm(lam)[0])
-    reference = Reference(10.0**share_u * u, 10.0**share_lam * lam, scale_u, scale_lam)
+    reference = ReferenceSolutions(10.0**share_u * u, 10.0**share_lam * lam, scale_u, scale_lam)
     (found,) = errors(problem, [vi], [energy(vi)], reference, reference.u + du, reference.lam + dlam)
     for name, share, error, scale in (
         ("u", share_u, float(problem.V.norm(du)[0]), scale_u),
@@ -80,7 +80,7 @@ def test_without_a_training_solution_only_zero_is_zero() -> None:
     problem = Varying()
     vi = problem.assemble(np.array([0.5]))
     lam = np.column_stack([np.zeros(8), 1e-30 * np.ones(8)])
-    reference = Reference(np.zeros((30, 2)), lam, 0.0, 0.0)
+    reference = ReferenceSolutions(np.zeros((30, 2)), lam, 0.0, 0.0)
     found = errors(problem, [vi, vi], [energy(vi)] * 2, reference, np.zeros((30, 2)), np.zeros((8, 2)))
     assert [(one.error_u, one.error_lambda) for one in found] == [(None, None), (None, 1.0)]
 
@@ -90,7 +90,9 @@ def test_errors_and_bounds_of_many_queries_are_those_of_each() -> None:
     mus = [np.array([value]) for value in (0.1, 0.5, 0.9)]
     vis = [problem.assemble(mu) for mu in mus]
     exact = [active_set.solve_high_fidelity(vi) for vi in vis]
-    reference = Reference(np.column_stack([s.u for s in exact]), np.column_stack([s.lam for s in exact]), 0.0, 0.0)
+    reference = ReferenceSolutions(
+        np.column_stack([s.u for s in exact]), np.column_stack([s.lam for s in exact]), 0.0, 0.0
+    )
     u = reference.u + 1e-3 * rng.standard_normal(reference.u.shape)
     lam = reference.lam + 1e-2 * rng.random(reference.lam.shape)
     cone = nodal_multipliers(problem.W)
@@ -105,14 +107,14 @@ def test_errors_and_bounds_of_many_queries_are_those_of_each() -> None:
     energies = [energy(vi) for vi in vis]
     together = (
         errors(problem, vis, energies, reference, u, lam),
-        [found.bounds for found in certify(vis, energies, known, u, lam)],
+        [found.bounds for found in error_bounds(vis, energies, known, u, lam)],
         hsw_bounds(problem, vis, known, u, lam),
     )
     for k, vi in enumerate(vis):
         own = [energies[k]], u[:, [k]], lam[:, [k]]
         alone = (
             errors(problem, [vi], own[0], reference.at([k]), *own[1:])[0],
-            certify([vi], own[0], [known[k]], *own[1:])[0].bounds,
+            error_bounds([vi], own[0], [known[k]], *own[1:])[0].bounds,
             hsw_bounds(problem, [vi], [known[k]], *own[1:])[0],
         )
         for found, expected in zip(together, alone, strict=True):

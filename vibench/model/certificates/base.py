@@ -15,7 +15,7 @@ from vibench.interfaces.problem import Contact, Problem
 from vibench.interfaces.validation import checked_assembly
 from vibench.linalg.inner_product import InnerProduct
 from vibench.model.affine import AffineMember, Evaluation, coefficients, evaluated_members
-from vibench.model.certificates.prepared_lifting import constant_unknowns
+from vibench.model.certificates.prepared_correction import constant_unknowns
 from vibench.model.certificates.spectral import SpectralBounds, rotated, spectral_bounds
 from vibench.stability.coercivity import operator_norm
 

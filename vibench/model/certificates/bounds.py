@@ -12,8 +12,8 @@ A, α = γ = 1, and nothing is lost. Elsewhere X is A at the centre of the param
   the contact the last ones are B₀ᵀ times the generators, with the part B₀ of B that is the same at all training
   parameters, and the functionals on the contact unknowns, with the values of (B − B₀)ᵀλ_N at the parameter.
 - s = B u_N − g is evaluated on all rows with the B and g of the parameter, which involve the contact unknowns alone.
-- w is a lifting of `vibench.model.certificates.prepared_lifting`, or that of `vibench.model.certificates.lifting`, with
-  the compliance C = Eᵀ X⁻¹ E of the contact unknowns E.
+- w is one of `vibench.model.certificates.prepared_correction`, or that of
+  `vibench.model.certificates.contact_correction`, with the compliance C = Eᵀ X⁻¹ E of the contact unknowns E.
 - α and γ are those of `vibench.model.certificates.spectral`.
 
 Members that the problem declares to be constant or affine sums are exact, those that are interpolated are not. With
@@ -38,13 +38,13 @@ import numpy as np
 from vibench.arrays import Array, SparseMatrix
 from vibench.interfaces.problem import Contact, Problem
 from vibench.model.certificates.base import ONE, CertificateBase, Guarantee, contact_at
-from vibench.model.certificates.lifting import ContactCompliance, lift
-from vibench.model.certificates.prepared_lifting import PreparedLiftings
+from vibench.model.certificates.contact_correction import ContactCompliance, find_contact_correction
+from vibench.model.certificates.prepared_correction import PreparedCorrections
 from vibench.model.certificates.residual import ResidualBasis
-from vibench.model.error_bounds import NO_LIFTING, NOT_IN_CONE
+from vibench.model.error_bounds import NO_CORRECTION, NOT_IN_CONE
 from vibench.model.galerkin import Evaluated, ReducedProblem
 
-NOT_PREPARED = "no prepared lifting satisfies B w ≥ s: the best w was computed at the parameter"
+NOT_PREPARED = "no prepared correction satisfies B w ≥ s: the best w was computed at the parameter"
 
 NOT_COERCIVE = "no positive lower bound of the coercivity of A was found at this parameter"
 
@@ -66,7 +66,7 @@ class OnlineBound:
     coercivity
         α.
     guarantee, note
-        What they are worth; and why there are none, that no prepared lifting was feasible, or "".
+        What they are worth; and why there are none, that no prepared correction was feasible, or "".
     """
 
     u_energy: float
@@ -107,7 +107,7 @@ class OnlineCertificate:
     forces
         B₀ᵀχ (k×R) where B is assembled on the contact; `None` where it is exactly the sum of its terms.
     prepared
-        Liftings that take no factorisation at the parameter, where there are any.
+        Corrections that take no factorisation at the parameter, where there are any.
     """
 
     base: CertificateBase
@@ -117,7 +117,7 @@ class OnlineCertificate:
     contact_basis: Array
     generators: Array
     forces: Array | None
-    prepared: PreparedLiftings | None = None
+    prepared: PreparedCorrections | None = None
 
     @cached_property
     def _bound_sizes(self) -> Array:
@@ -145,10 +145,10 @@ class OnlineCertificate:
         lower, upper = (1.0, 1.0) if base.spectral is None else base.spectral.at(mu, theta["A"])
         if not lower > base.stiffness_error:
             return OnlineBound.none(NOT_COERCIVE)
-        lifted, note = self._lifted(problem, mu, evaluated, y, lam, upper)
-        if lifted is None:
+        corrected, note = self._corrected(problem, mu, evaluated, y, lam, upper)
+        if corrected is None:
             return OnlineBound.none(note)
-        along, norm, kappa = lifted
+        along, norm, kappa = corrected
         of_lam = coefficients_of_multiplier(theta["B"], self.forces, evaluated.contact, alpha, lam)
         coordinates, beside, missing = self.residual.parts(residual_coefficients(theta, y, of_lam))
         square_of_u = float(x @ (reduced.program.A @ x))
@@ -164,27 +164,29 @@ class OnlineCertificate:
         relative = bound / least if least > 0.0 else float("inf")
         return OnlineBound(bound, natural, relative, rho / sqrt(lower), omega, kappa, lower, base.guarantee, note)
 
-    def _lifted(
+    def _corrected(
         self, problem: Problem, mu: Array, evaluated: Evaluated, y: Array, lam: Array, gamma: float
     ) -> tuple[tuple[Array, float, float] | None, str]:
         """Coordinates of X w in the basis of residuals, ‖w‖ and κ; and why it is no prepared w, or there is none."""
         prepared = self.prepared
         if prepared is not None:
             B, g, g_size = self._constraint(problem, mu, evaluated)
-            found = prepared.lift(B, g, g_size, y, lam, gamma)
+            found = prepared.correction(B, g, g_size, y, lam, gamma)
             if found is not None:
                 return found, ""
         on_contact, uncertain = self.contact_basis @ y, float(np.linalg.norm(y)) * self._round_off
-        lifting = lift(self.compliance, evaluated.contact or contact_at(problem, mu), on_contact, uncertain, lam, gamma)
-        if lifting is None:
-            return None, NO_LIFTING
-        along = lifting.load @ self.contact_directions[lifting.unknowns]
-        return (along, lifting.norm, lifting.kappa), "" if prepared is None else NOT_PREPARED
+        correction = find_contact_correction(
+            self.compliance, evaluated.contact or contact_at(problem, mu), on_contact, uncertain, lam, gamma
+        )
+        if correction is None:
+            return None, NO_CORRECTION
+        along = correction.load @ self.contact_directions[correction.unknowns]
+        return (along, correction.norm, correction.kappa), "" if prepared is None else NOT_PREPARED
 
     def _constraint(
         self, problem: Problem, mu: Array, evaluated: Evaluated
     ) -> tuple[float | SparseMatrix, Array, Array]:
-        """B and g as prepared liftings take them, and a bound of the terms of g."""
+        """B and g as prepared corrections take them, and a bound of the terms of g."""
         if self.base.bound_terms is None:
             contact = evaluated.contact or contact_at(problem, mu)
             return contact.B, contact.g, np.abs(contact.g)

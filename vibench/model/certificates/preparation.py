@@ -20,8 +20,8 @@ from vibench.model.certificates.bounds import (
     evaluated_by,
     residual_coefficients,
 )
-from vibench.model.certificates.lifting import ContactCompliance, held_rows, lift
-from vibench.model.certificates.prepared_lifting import prepare_liftings
+from vibench.model.certificates.contact_correction import ContactCompliance, find_contact_correction, held_rows
+from vibench.model.certificates.prepared_correction import prepare_corrections
 from vibench.model.certificates.residual import residual_basis
 from vibench.model.hyperreduced import HyperReducedModel
 from vibench.qp.solve import solve_qp
@@ -30,7 +30,7 @@ SAMPLES = 200
 """Training parameters at most whose reduced solutions tell what terms of the residual contribute."""
 
 RINGS = 1
-"""Rings of rows around the support of the generators whose contact unknowns liftings usually involve."""
+"""Rings of rows around the support of the generators whose contact unknowns corrections usually involve."""
 
 SAMPLE_ACCURACY = 1e-8
 
@@ -56,8 +56,8 @@ def prepare(
     residual, U = residual_basis(blocks, z, typical)
     directions = functionals.T @ U
     contact_basis = np.ascontiguousarray(Phi[contact_unknowns(problem)])
-    liftings = prepare_liftings(base.constraint, scaled, base.compliance, held, contact_basis, directions)
-    return OnlineCertificate(base, residual, directions, compliance, contact_basis, chi, forces, liftings)
+    corrections = prepare_corrections(base.constraint, scaled, base.compliance, held, contact_basis, directions)
+    return OnlineCertificate(base, residual, directions, compliance, contact_basis, chi, forces, corrections)
 
 
 def _near(problem: Problem, chi: Array, training: Array) -> Indices:
@@ -81,7 +81,7 @@ def _sampled(
 ) -> tuple[Array, float, Mask]:
     """What reduced solutions at training parameters have.
 
-    Coefficients (Z×S) of their residuals, the median norm of liftings, and the rows (m,) that some of these hold.
+    Coefficients (Z×S) of their residuals, the median norm of corrections, and the rows (m,) that some of these hold.
     `forces` are those of `coefficients_of_multiplier`.
     """
     problem, found, norms = model.problem, [], [0.0]
@@ -99,8 +99,8 @@ def _sampled(
         found.append(residual_coefficients(theta, y, of_lam))
         held |= held_rows(compliance, contact, rows @ y, lam)
         if number % 8 == 0:
-            lifting = lift(compliance, contact, rows @ y, np.zeros(len(rows)), lam, 1.0)
-            norms += [] if lifting is None else [lifting.norm]
+            correction = find_contact_correction(compliance, contact, rows @ y, np.zeros(len(rows)), lam, 1.0)
+            norms += [] if correction is None else [correction.norm]
     if not found:
         raise UnsupportedError("no reduced program at a training parameter has a solution")
     return np.column_stack(found), float(np.median(norms)), held

@@ -22,7 +22,7 @@ from vibench.model.certificates import base as base_module
 from vibench.model.certificates.base import CertificateBase, Guarantee, certificate_base, injected, unsupported
 from vibench.model.certificates.bounds import NOT_COERCIVE, NOT_PREPARED, OUTSIDE, OnlineBound, OnlineCertificate
 from vibench.model.certificates.preparation import prepare
-from vibench.model.certificates.prepared_lifting import prepare_liftings
+from vibench.model.certificates.prepared_correction import prepare_corrections
 from vibench.model.certificates.residual import residual_basis
 from vibench.model.error_bounds import NOT_IN_CONE
 from vibench.model.galerkin import ReducedModel
@@ -152,7 +152,7 @@ def found(kind: Prepared, mu: np.ndarray, x: np.ndarray, alpha: np.ndarray) -> t
     reduced, vi = model.assemble(mu), problem.assemble(mu)
     u, lam = exact(VariationalInequality(vi.A.toarray(), vi.f, vi.B.toarray(), vi.g))
     bound = certificate.evaluate(problem, mu, reduced, x, alpha)
-    e, force = u - reduced.lift(x[:, None])[:, 0], vi.B.T @ (lam - model.generators @ alpha)
+    e, force = u - reduced.reconstruct(x[:, None])[:, 0], vi.B.T @ (lam - model.generators @ alpha)
     A = vi.A.toarray()
     energies = (e @ A @ e, force @ np.linalg.solve(A, force), u @ A @ u)
     error, natural, size = (float(np.sqrt(value)) for value in energies)
@@ -204,11 +204,11 @@ def test_prepared_liftings_are_the_best_ones_or_close_to_them(constraint: str, l
 
 
 def test_where_no_prepared_lifting_is_feasible_the_best_one_is_computed_and_it_is_recorded() -> None:
-    """Liftings of the first two rows alone leave the others violated."""
+    """Corrections of the first two rows alone leave the others violated."""
     problem, model, certificate = prepared("affine", constraint="scaled")
     term, rows = problem.affine["B"].terms[0][:, CONTACT], np.arange(M) < 2
     base, at_contact = certificate.base, (certificate.contact_basis, certificate.contact_directions)
-    few = replace(certificate, prepared=prepare_liftings(term, True, base.compliance, rows, *at_contact))
+    few = replace(certificate, prepared=prepare_corrections(term, True, base.compliance, rows, *at_contact))
     without = replace(certificate, prepared=None)
     assert few.prepared is not None
     for mu in BOX.sample(20, 6):

@@ -10,8 +10,13 @@ from hypothesis import strategies as st
 from numerics import exact, spd
 
 from vibench.interfaces.problem import Contact, VariationalInequality
-from vibench.model.certificates import lifting
-from vibench.model.certificates.lifting import BlockDiagonal, ContactCompliance, Lifting, lift
+from vibench.model.certificates import contact_correction
+from vibench.model.certificates.contact_correction import (
+    BlockDiagonal,
+    ContactCompliance,
+    ContactCorrection,
+    find_contact_correction,
+)
 
 K, M = 7, 6
 
@@ -29,14 +34,16 @@ def programs(draw: st.DrawFn) -> tuple[np.ndarray, Contact, np.ndarray, np.ndarr
     return np.linalg.inv(spd(K, rng, 100.0)), Contact(sp.csr_array(B), g), u, lam, draw(st.sampled_from([1.0, 2.5]))
 
 
-def lifted(
+def corrected(
     given: tuple[np.ndarray, Contact, np.ndarray, np.ndarray, float], near: np.ndarray | None = None
-) -> Lifting | None:
+) -> ContactCorrection | None:
     C, contact, u, lam, gamma = given
-    return lift(ContactCompliance(C, np.arange(K) if near is None else near), contact, u, np.zeros(K), lam, gamma)
+    return find_contact_correction(
+        ContactCompliance(C, np.arange(K) if near is None else near), contact, u, np.zeros(K), lam, gamma
+    )
 
 
-def values(C: np.ndarray, found: Lifting) -> np.ndarray:
+def values(C: np.ndarray, found: ContactCorrection) -> np.ndarray:
     load = np.zeros(K)
     load[found.unknowns] = found.load
     return np.asarray(C @ load)
@@ -47,7 +54,7 @@ def test_liftings_are_feasible_also_in_exact_arithmetic_and_close_to_the_best_on
     given: tuple[np.ndarray, Contact, np.ndarray, np.ndarray, float],
 ) -> None:
     C, contact, u, lam, gamma = given
-    found = lifted(given)
+    found = corrected(given)
     if found is None:  # opposite rows: round-off decides
         return
     w = values(C, found)
@@ -72,7 +79,7 @@ def test_no_random_program_is_without_a_lifting() -> None:
         B = rng.standard_normal((M, K))
         u, lam = rng.standard_normal(K), np.maximum(rng.standard_normal(M), 0.0)
         contact = Contact(sp.csr_array(B), B @ u - rng.uniform(-1.0, 0.5, M))
-        assert lifted((np.linalg.inv(spd(K, rng, 100.0)), contact, u, lam, 1.0)) is not None
+        assert corrected((np.linalg.inv(spd(K, rng, 100.0)), contact, u, lam, 1.0)) is not None
 
 
 def chain(far: float) -> tuple[np.ndarray, Contact, np.ndarray, np.ndarray, float]:
@@ -83,10 +90,10 @@ def chain(far: float) -> tuple[np.ndarray, Contact, np.ndarray, np.ndarray, floa
 
 
 def test_rows_far_from_the_contact_are_evaluated_where_the_inequality_of_cauchy_and_schwarz_is_not_enough() -> None:
-    away = lifted(chain(far=10.0), near=np.array([0, 1]))
+    away = corrected(chain(far=10.0), near=np.array([0, 1]))
     assert away is not None
     assert list(away.unknowns) == [0, 1]
-    close = lifted(chain(far=-0.5), near=np.array([0, 1]))
+    close = corrected(chain(far=-0.5), near=np.array([0, 1]))
     assert close is not None
     assert len(close.unknowns) == K
     C, contact, *_ = chain(far=-0.5)
@@ -95,7 +102,7 @@ def test_rows_far_from_the_contact_are_evaluated_where_the_inequality_of_cauchy_
 
 def test_nothing_is_lifted_where_nothing_is_violated() -> None:
     C, contact, u, _, gamma = chain(far=1.0)
-    found = lifted((C, Contact(contact.B, np.array([1.0, 1.0])), u, np.zeros(2), gamma))
+    found = corrected((C, Contact(contact.B, np.array([1.0, 1.0])), u, np.zeros(2), gamma))
     assert found is not None
     assert (found.norm, found.kappa) == (0.0, 0.0)
 
@@ -103,7 +110,8 @@ def test_nothing_is_lifted_where_nothing_is_violated() -> None:
 def test_a_larger_uncertainty_of_u_asks_for_more() -> None:
     C, contact, u, lam, gamma = chain(far=10.0)
     plain, careful = (
-        lift(ContactCompliance(C, np.arange(K)), contact, u, np.full(K, size), lam, gamma) for size in (0.0, 0.1)
+        find_contact_correction(ContactCompliance(C, np.arange(K)), contact, u, np.full(K, size), lam, gamma)
+        for size in (0.0, 0.1)
     )
     assert plain is not None
     assert careful is not None
@@ -127,7 +135,7 @@ def test_multipliers_of_rows_with_much_slack_take_part() -> None:
     """λ of 1e-2 on a row with a slack of 10 pulls w away from it: ν is zero there."""
     C, contact, u, lam, gamma = chain(far=10.0)
     lam = lam + np.array([0.0, 0.01])
-    found = lifted((C, contact, u, lam, gamma))
+    found = corrected((C, contact, u, lam, gamma))
     assert found is not None
     B = contact.B.toarray()
     load = np.zeros(K)
@@ -141,12 +149,12 @@ def test_where_no_method_ends_the_feasibility_of_the_last_lifting_decides(monkey
     def unfinished(*given: object, **options: object) -> None:
         raise RuntimeError("Maximum number of iterations reached.")
 
-    monkeypatch.setattr(lifting, "STEPS", 0)
-    monkeypatch.setattr(lifting, "nnls", unfinished)
+    monkeypatch.setattr(contact_correction, "STEPS", 0)
+    monkeypatch.setattr(contact_correction, "nnls", unfinished)
     rng = np.random.default_rng(3)
     B = rng.standard_normal((M, K))
     u = rng.standard_normal(K)
     contact = Contact(sp.csr_array(B), B @ u - rng.uniform(-1.0, 0.5, M))
     given = np.linalg.inv(spd(K, rng, 100.0)), contact, u, np.zeros(M), 1.0
-    found = lifted(given)
+    found = corrected(given)
     assert found is None or np.all(B @ values(given[0], found) >= B @ u - contact.g)

@@ -1,8 +1,8 @@
-"""Liftings by a matrix that is inverted offline, where the constraint of some bodies is one matrix times a factor.
+"""Corrections by a matrix that is inverted offline, where the constraint of some bodies is one matrix times a factor.
 
 Let the loads c of w = X⁻¹ E c act on bodies, blocks of C, on which B(µ) is θ(µ) B₀, and be multiples of some rows J of
 it: those that the best w holds at a training parameter. The minimiser of the program of
-`vibench.model.certificates.lifting` over such w is c = θ B₀ᵀ(ν − λ)/γ with
+`vibench.model.certificates.contact_correction` over such w is c = θ B₀ᵀ(ν − λ)/γ with
 
     ν = λ + (γ/θ²) M (s + v) ≥ 0,    v = B w − s ≥ 0,    νᵀv = 0,    M = S₀⁻¹,    S₀ = B₀ C B₀ᵀ,    on J,
 
@@ -10,9 +10,9 @@ where M does not depend on the parameter. The primal-dual active set method star
 as there, and its systems have the size of the rows with v > 0, which are few.
 
 Where B(µ) is θ(µ) B₀ everywhere, w is the best one, but for λ beyond J, in rows that do not touch. Where it is so on
-some bodies alone, w is the best of those that deform no other body: of two equal ones in contact the lifting of one has
-√2 times the norm of that of both. In either case it must satisfy B w ≥ s in all rows, with the B of the parameter and
-bounds of round-off; C is taken as it is stored, and |C_ij| ≤ √C_ii √C_jj. Otherwise there is no prepared lifting.
+some bodies alone, w is the best of those that deform no other body: of two equal ones in contact the correction of one
+has √2 times the norm of that of both. In either case it must satisfy B w ≥ s in all rows, with the B of the parameter
+and bounds of round-off; C is taken as it is stored, and |C_ij| ≤ √C_ii √C_jj. Otherwise there is no prepared one.
 """
 
 from __future__ import annotations
@@ -27,14 +27,14 @@ import scipy.sparse as sp
 from scipy.linalg.lapack import dposv
 
 from vibench.arrays import Array, Indices, Mask, SparseMatrix
-from vibench.model.certificates.lifting import ATTEMPTS, MARGIN, STEPS, UNIT, BlockDiagonal
+from vibench.model.certificates.contact_correction import ATTEMPTS, MARGIN, STEPS, UNIT, BlockDiagonal
 
 LARGEST_CONDITION = 1e9
 """Rows of a B₀ whose S₀ has a larger condition number are treated as dependent: S₀ is not inverted."""
 
 
 @dataclass(frozen=True)
-class PreparedLiftings:
+class PreparedCorrections:
     """What depends on no parameter; see above.
 
     Where B(µ) is θ(µ) B₀ everywhere arrays called (p×·) are multiplied by B₀, or by |B₀| (p = m), and have one row per
@@ -73,7 +73,7 @@ class PreparedLiftings:
     directions: Array
     terms: int
 
-    def lift(
+    def correction(
         self, B: float | SparseMatrix, g: Array, g_size: Array, y: Array, lam: Array, gamma: float
     ) -> tuple[Array, float, float] | None:
         """Coordinates (K,) of X w in the basis of residuals, ‖w‖, and κ; `None` if no w was found.
@@ -152,15 +152,15 @@ def constant_unknowns(compliance: Array, constraints: list[SparseMatrix]) -> Mas
     return same
 
 
-def prepare_liftings(
+def prepare_corrections(
     B: SparseMatrix, scaled: bool, compliance: Array, rows: Mask, basis: Array, directions: Array
-) -> PreparedLiftings | None:
-    """Prepare liftings by loads that are multiples of some rows of B₀; `None` where these are dependent, or none.
+) -> PreparedCorrections | None:
+    """Prepare corrections by loads that are multiples of some rows of B₀; `None` where these are dependent, or none.
 
     Parameters
     ----------
     B
-        B₀ (m×k); zero on unknowns of bodies that liftings must not load.
+        B₀ (m×k); zero on unknowns of bodies that corrections must not load.
     scaled
         Whether B(µ) is θ(µ) B₀ everywhere.
     compliance
@@ -187,6 +187,6 @@ def prepare_liftings(
     terms = max(basis.shape[1], len(J)) + 2 * int(np.diff(B.indptr).max()) + 8
     reach, along = abs(chosen) @ root, np.asarray(chosen @ directions)
     symmetric = 0.5 * (inverse + inverse.T)
-    return PreparedLiftings(
+    return PreparedCorrections(
         moved, J, symmetric, S, reach, basis, np.ascontiguousarray(responses[moved]), sizes, along, terms
     )

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from numerics import exact, spd
 
 from vibench.interfaces.problem import VariationalInequality
-from vibench.model.certificates.prepared_lifting import PreparedLiftings, constant_unknowns, prepare_liftings
+from vibench.model.certificates.prepared_correction import PreparedCorrections, constant_unknowns, prepare_corrections
 
 K, M, D = 9, 6, 3
 ALL = np.ones(M, bool)
@@ -25,9 +25,9 @@ def compliance(rng: np.random.Generator, two: bool) -> np.ndarray:
 
 def prepared(
     B: np.ndarray, C: np.ndarray, basis: np.ndarray, scaled: bool, rows: np.ndarray = ALL
-) -> PreparedLiftings | None:
+) -> PreparedCorrections | None:
     """The directions are the functionals themselves."""
-    return prepare_liftings(sp.csr_array(B), scaled, C, rows, basis, np.eye(K))
+    return prepare_corrections(sp.csr_array(B), scaled, C, rows, basis, np.eye(K))
 
 
 @given(
@@ -46,9 +46,9 @@ def test_liftings_are_feasible_also_in_exact_arithmetic_and_the_best_ones(
     basis, y = rng.standard_normal((K, D)), rng.standard_normal(D)
     lam = np.maximum(rng.standard_normal(M), 0.0) * pressure
     g = B @ (basis @ y) - violation * rng.uniform(-1.0, 0.5, M)
-    liftings = prepared(B0, C, basis, scaled)
-    assert liftings is not None
-    found = liftings.lift(factor if scaled else sp.csr_array(B), g, np.abs(g), y, lam, gamma)
+    corrections = prepared(B0, C, basis, scaled)
+    assert corrections is not None
+    found = corrections.correction(factor if scaled else sp.csr_array(B), g, np.abs(g), y, lam, gamma)
     assert found is not None
     load, norm, kappa = found
     w, u = fractions(C) @ fractions(load), fractions(basis) @ fractions(y)
@@ -83,12 +83,12 @@ def test_there_is_no_prepared_lifting_where_rows_beyond_those_that_are_prepared_
     C, B = membrane()
     few, zero = ALL.copy(), np.zeros(D)
     few[4:] = False
-    liftings = prepared(B, C, np.zeros((K, D)), True, few)
-    assert liftings is not None
+    corrections = prepared(B, C, np.zeros((K, D)), True, few)
+    assert corrections is not None
     lam, violated = np.where(few, 1.0, 0.0), np.full(M, -1.0)
-    assert liftings.lift(1.0, violated, np.ones(M), zero, lam, 1.0) is None
+    assert corrections.correction(1.0, violated, np.ones(M), zero, lam, 1.0) is None
     violated[4:] = 0.0  # w of the first rows lifts these, too
-    found = liftings.lift(1.0, violated, np.ones(M), zero, lam, 1.0)
+    found = corrections.correction(1.0, violated, np.ones(M), zero, lam, 1.0)
     assert found is not None
     assert np.all(B @ (C @ found[0]) >= -violated)
 
@@ -96,11 +96,15 @@ def test_there_is_no_prepared_lifting_where_rows_beyond_those_that_are_prepared_
 def test_rows_without_pressure_are_not_held_where_they_are() -> None:
     """Their multiplier is zero and w leaves s behind: one row pushes, the others follow."""
     C, B = membrane()
-    liftings = prepared(B, C, np.zeros((K, D)), True)
-    assert liftings is not None
+    corrections = prepared(B, C, np.zeros((K, D)), True)
+    assert corrections is not None
     g = np.full(M, 1.0)
     g[2] = -1.0
-    load, _, kappa = liftings.lift(1.0, g, np.abs(g), np.zeros(D), np.eye(M)[2], 1.0) or (np.zeros(K), 0.0, 0.0)
+    load, _, kappa = corrections.correction(1.0, g, np.abs(g), np.zeros(D), np.eye(M)[2], 1.0) or (
+        np.zeros(K),
+        0.0,
+        0.0,
+    )
     assert load == pytest.approx(np.eye(K)[2] * load[2])
     assert (C @ load)[2] == pytest.approx(-1.0)
     assert kappa == pytest.approx(0.0, abs=1e-12)
@@ -108,11 +112,11 @@ def test_rows_without_pressure_are_not_held_where_they_are() -> None:
 
 def test_more_round_off_in_g_asks_for_more() -> None:
     C, B = membrane()
-    liftings = prepared(B, C, np.zeros((K, D)), True)
-    assert liftings is not None
+    corrections = prepared(B, C, np.zeros((K, D)), True)
+    assert corrections is not None
     raised = []
     for size in (1.0, 1e12):
-        found = liftings.lift(1.0, np.full(M, -1.0), np.full(M, size), np.zeros(D), np.ones(M), 1.0)
+        found = corrections.correction(1.0, np.full(M, -1.0), np.full(M, size), np.zeros(D), np.ones(M), 1.0)
         assert found is not None
         raised.append(B @ (C @ found[0]))
     assert np.all(raised[1] >= raised[0] + 1e12 * np.finfo(float).eps)
@@ -130,9 +134,9 @@ def test_dependent_rows_have_no_prepared_liftings() -> None:
 
 def test_a_factor_of_zero_has_no_lifting() -> None:
     C, B = membrane()
-    liftings = prepared(B, C, np.zeros((K, D)), True)
-    assert liftings is not None
-    assert liftings.lift(0.0, np.ones(M), np.ones(M), np.zeros(D), np.zeros(M), 1.0) is None
+    corrections = prepared(B, C, np.zeros((K, D)), True)
+    assert corrections is not None
+    assert corrections.correction(0.0, np.ones(M), np.ones(M), np.zeros(D), np.zeros(M), 1.0) is None
 
 
 def test_bodies_carry_liftings_where_the_constraint_is_the_same_everywhere() -> None:

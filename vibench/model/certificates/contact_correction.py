@@ -1,4 +1,4 @@
-"""Liftings of constraint violations that are known by their values on the contact unknowns, at the cost of those.
+"""Corrections of constraint violations that are known by their values on the contact unknowns, at the cost of those.
 
 Of all w with given values w_E on the contact unknowns E, w = X⁻¹ E c with c = C⁻¹ w_E, C = Eᵀ X⁻¹ E, has the smallest
 norm ‖w‖² = cᵀ C c. As B w depends on w_E alone, the minimiser of
@@ -58,7 +58,7 @@ UNIT = float(np.finfo(float).eps)
 
 
 @dataclass(frozen=True)
-class Lifting:
+class ContactCorrection:
     """A w = X⁻¹ E c with B w ≥ s.
 
     Attributes
@@ -133,7 +133,7 @@ class BlockDiagonal:
 
 @dataclass(frozen=True)
 class ContactCompliance:
-    """C on all contact unknowns, and on those that liftings usually involve.
+    """C on all contact unknowns, and on those that corrections usually involve.
 
     Attributes
     ----------
@@ -163,15 +163,15 @@ class ContactCompliance:
 
 
 def held_rows(compliance: ContactCompliance, contact: Contact, on_contact: Array, lam: Array) -> Mask:
-    """Rows (m,) that are violated, or in which the best lifting of u_N (k,) and λ (m,) may hold B w = s for γ = 1."""
+    """Rows (m,) that are violated, or in which the best w for u_N (k,) and λ (m,) may hold B w = s for γ = 1."""
     B = sp.csr_array(contact.B)
     excess, reach = B @ on_contact - contact.g, abs(B) @ compliance.root
     return np.asarray((excess > 0.0) | (lam * reach**2 > np.abs(excess)))
 
 
-def lift(
+def find_contact_correction(
     compliance: ContactCompliance, contact: Contact, on_contact: Array, uncertain: Array, lam: Array, gamma: float
-) -> Lifting | None:
+) -> ContactCorrection | None:
     """A w with B w ≥ s = B u_N − g, close to the best one; `None` if none was found.
 
     Parameters
@@ -202,7 +202,7 @@ def lift(
             continue
         found = _Program(C, restricted, near, excess, round_off, reach, terms, lam, gamma).best()
         if found is not None:
-            return Lifting(unknowns, *found)
+            return ContactCorrection(unknowns, *found)
     return None
 
 
