@@ -137,7 +137,7 @@ def test_the_identity_the_bounds_follow_from(
 
 
 @given(approximations())
-def test_the_multiplier_of_a_lifting_is_the_high_fidelity_one_where_there_is_no_residual(
+def test_the_multiplier_of_a_correction_is_the_high_fidelity_one_where_there_is_no_residual(
     given: tuple[VariationalInequality, np.ndarray, np.ndarray, np.ndarray, np.ndarray],
 ) -> None:
     vi, u, lam, _, lam_N = given
@@ -153,7 +153,7 @@ def test_the_multiplier_of_a_lifting_is_the_high_fidelity_one_where_there_is_no_
 
 
 @given(approximations())
-def test_the_terms_are_those_of_a_lifting_that_is_feasible_in_exact_arithmetic(
+def test_the_terms_are_those_of_a_correction_that_is_feasible_in_exact_arithmetic(
     given: tuple[VariationalInequality, np.ndarray, np.ndarray, np.ndarray, np.ndarray],
 ) -> None:
     vi, _, _, u_N, lam_N = given
@@ -246,7 +246,7 @@ def test_what_is_not_proved_is_said() -> None:
     assert bounds_or_note(vi, u, -lam, known) == ErrorBounds(None, NOT_IN_CONE)
 
 
-def test_where_no_lifting_is_strictly_feasible_nothing_is_bounded() -> None:
+def test_where_no_correction_is_strictly_feasible_nothing_is_bounded() -> None:
     """Two opposite constraints ask for x = ½ exactly; round-off decides whether w is feasible."""
     vi = VariationalInequality(
         sp.csc_array([[4.0]]), np.array([4.0]), sp.csr_array([[2.0], [-2.0]]), np.array([1.0, -1.0])

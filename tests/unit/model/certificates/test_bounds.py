@@ -190,7 +190,7 @@ def test_bounds_of_reduced_solutions_are_sharp(kind: tuple[str, bool, str]) -> N
 
 
 @pytest.mark.parametrize(("constraint", "loss"), [("scaled", 1.0), ("half", 1.5)])
-def test_prepared_liftings_are_the_best_ones_or_close_to_them(constraint: str, loss: float) -> None:
+def test_prepared_corrections_are_the_best_ones_or_close_to_them(constraint: str, loss: float) -> None:
     """With them the bounds are the same as with the best w, or those of a w that moves one of two bodies."""
     problem, model, certificate = prepared("constant", constraint=constraint)
     without = replace(certificate, prepared=None)
@@ -203,7 +203,7 @@ def test_prepared_liftings_are_the_best_ones_or_close_to_them(constraint: str, l
         assert quick.lambda_natural <= loss * best.lambda_natural * (1.0 + 1e-6)
 
 
-def test_where_no_prepared_lifting_is_feasible_the_best_one_is_computed_and_it_is_recorded() -> None:
+def test_where_no_prepared_correction_is_feasible_the_best_one_is_computed_and_it_is_recorded() -> None:
     """Corrections of the first two rows alone leave the others violated."""
     problem, model, certificate = prepared("affine", constraint="scaled")
     term, rows = problem.affine["B"].terms[0][:, CONTACT], np.arange(M) < 2

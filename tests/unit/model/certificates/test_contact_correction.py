@@ -50,7 +50,7 @@ def values(C: np.ndarray, found: ContactCorrection) -> np.ndarray:
 
 
 @given(programs())
-def test_liftings_are_feasible_also_in_exact_arithmetic_and_close_to_the_best_one(
+def test_corrections_are_feasible_also_in_exact_arithmetic_and_close_to_the_best_one(
     given: tuple[np.ndarray, Contact, np.ndarray, np.ndarray, float],
 ) -> None:
     C, contact, u, lam, gamma = given
@@ -73,7 +73,7 @@ def test_liftings_are_feasible_also_in_exact_arithmetic_and_close_to_the_best_on
     assert 0.5 * gamma * found.norm**2 + found.kappa <= least + 1e-5 * scale
 
 
-def test_no_random_program_is_without_a_lifting() -> None:
+def test_no_random_program_is_without_a_correction() -> None:
     rng = np.random.default_rng(3)
     for _ in range(50):
         B = rng.standard_normal((M, K))
@@ -143,7 +143,7 @@ def test_multipliers_of_rows_with_much_slack_take_part() -> None:
     assert load == pytest.approx(B.T @ np.array([load[0] / B[0, 0], -0.01]), abs=1e-12)
 
 
-def test_where_no_method_ends_the_feasibility_of_the_last_lifting_decides(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_where_no_method_ends_the_feasibility_of_the_last_correction_decides(monkeypatch: pytest.MonkeyPatch) -> None:
     """Neither the active sets nor the least squares that replace them."""
 
     def unfinished(*given: object, **options: object) -> None:

@@ -34,7 +34,7 @@ def prepared(
     st.integers(0, 10_000), st.booleans(), st.sampled_from([0.0, 0.1, 3.0]), st.sampled_from([1e-6, 1.0]),
     st.sampled_from([1.0, 2.5]),
 )  # fmt: skip
-def test_liftings_are_feasible_also_in_exact_arithmetic_and_the_best_ones(
+def test_corrections_are_feasible_also_in_exact_arithmetic_and_the_best_ones(
     seed: int, scaled: bool, pressure: float, violation: float, gamma: float
 ) -> None:
     """Where B is scaled, the best of all; where one body moves, the best of those that load the other one alone."""
@@ -79,7 +79,7 @@ def membrane() -> tuple[np.ndarray, np.ndarray]:
     return np.linalg.inv(chain), -np.eye(M, K)
 
 
-def test_there_is_no_prepared_lifting_where_rows_beyond_those_that_are_prepared_stay_violated() -> None:
+def test_there_is_no_prepared_correction_where_rows_beyond_those_that_are_prepared_stay_violated() -> None:
     C, B = membrane()
     few, zero = ALL.copy(), np.zeros(D)
     few[4:] = False
@@ -122,7 +122,7 @@ def test_more_round_off_in_g_asks_for_more() -> None:
     assert np.all(raised[1] >= raised[0] + 1e12 * np.finfo(float).eps)
 
 
-def test_dependent_rows_have_no_prepared_liftings() -> None:
+def test_dependent_rows_have_no_prepared_corrections() -> None:
     C, B = membrane()
     B[3] = 2.0 * B[0]
     assert prepared(B, C, np.zeros((K, D)), True) is None
@@ -132,14 +132,14 @@ def test_dependent_rows_have_no_prepared_liftings() -> None:
     assert prepared(B, C, np.zeros((K, D)), True, kept) is not None
 
 
-def test_a_factor_of_zero_has_no_lifting() -> None:
+def test_a_factor_of_zero_has_no_correction() -> None:
     C, B = membrane()
     corrections = prepared(B, C, np.zeros((K, D)), True)
     assert corrections is not None
     assert corrections.correction(0.0, np.ones(M), np.ones(M), np.zeros(D), np.zeros(M), 1.0) is None
 
 
-def test_bodies_carry_liftings_where_the_constraint_is_the_same_everywhere() -> None:
+def test_bodies_carry_corrections_where_the_constraint_is_the_same_everywhere() -> None:
     rng = np.random.default_rng(0)
     C, B = compliance(rng, two=True), rng.standard_normal((M, K))
     other = B.copy()
