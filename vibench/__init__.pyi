@@ -41,8 +41,6 @@ from .interfaces.validation import check_enrichment as check_enrichment
 from .interfaces.validation import checked_assembly as checked_assembly
 from .library.export import ExportedModel as ExportedModel
 from .library.export import export_model as export_model
-from .library.models import Model as Model
-from .library.models import Solution as Solution
 from .library.runs import Run as Run
 from .library.runs import open_run as open_run
 from .library.runs import run as run
@@ -52,6 +50,10 @@ from .linalg.dense import project_out as project_out
 from .linalg.dense import singular_values as singular_values
 from .linalg.dense import svd as svd
 from .linalg.inner_product import InnerProduct as InnerProduct
+from .offline.models import Model as Model
+from .offline.models import Solution as Solution
+from .offline.reduction import Reduction as Reduction
+from .offline.reduction import Snapshots as Snapshots
 from .packs.checks import read_model_pack as read_model_pack
 from .packs.pack import ModelPack as ModelPack
 from .packs.reader import pack_digest as pack_digest

@@ -23,21 +23,21 @@ from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
+from vibench.library.models import Model
 
 import vibench
 from vibench import AffineProblem, Array, InnerProduct, ParameterBox
 from vibench.execution.recorded_cell import recorded_cells
 from vibench.highfidelity.active_set import HighFidelitySolution, HighFidelitySolver
 from vibench.interfaces.strategies import Enrichment, Kind
-from vibench.library.models import Model
 from vibench.model.affine import affine_decomposition
 from vibench.model.certificates.base import Guarantee, certificate_base
 from vibench.model.certificates.bounds import OnlineCertificate
 from vibench.model.certificates.preparation import prepare
 from vibench.model.galerkin import ReducedModel
 from vibench.model.hyperreduced import HyperReducedModel, hyper_reduce
+from vibench.offline.assemblies import Assemblies
 from vibench.qp.solve import solve_qp
-from vibench.stages.assemblies import Assemblies
 from vibench.stages.query import VIOLATION
 from vibench.study.plugin import Plugin
 

@@ -19,10 +19,10 @@ from vibench.interfaces.validation import check_cone, check_enrichment
 from vibench.model.affine import affine_decomposition
 from vibench.model.galerkin import ReducedProblem
 from vibench.model.hyperreduced import HyperReducedModel, Operators, hyper_reduce
+from vibench.offline.models import AnyReducedModel
 from vibench.qp.solution import QPSolution
 from vibench.qp.solve import solve_qp
 from vibench.reduction.pod import pod
-from vibench.stages.assembly import Model
 from vibench.study import registry
 
 pytestmark = MARKS
@@ -128,7 +128,7 @@ def test_assembly_reduced(benchmark: BenchmarkFixture, material: Material, prima
     _assembly(benchmark, "assembly, reduced", material, model)
 
 
-def _assembly(benchmark: BenchmarkFixture, group: str, material: Material, model: Model) -> None:
+def _assembly(benchmark: BenchmarkFixture, group: str, material: Material, model: AnyReducedModel) -> None:
     mus = _in_turn(material)
     measure(
         benchmark,

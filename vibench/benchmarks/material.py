@@ -26,9 +26,9 @@ from vibench.model.affine import AffineMember, affine_decomposition
 from vibench.model.errors import ReferenceSolutions
 from vibench.model.galerkin import ReducedModel
 from vibench.model.hyperreduced import HyperReducedModel, Operators, hyper_reduce, reason_for_full_assembly
+from vibench.offline.models import AnyReducedModel
 from vibench.reduction.pod import POD, pod
 from vibench.stability.infsup import multipliers
-from vibench.stages.assembly import Model
 from vibench.stages.offline import ReducedCone
 from vibench.study import registry
 
@@ -158,7 +158,7 @@ class Material:
             spaces,
         )
 
-    def online(self, primal: Primal, spaces: Spaces | None = None) -> tuple[Model, str]:
+    def online(self, primal: Primal, spaces: Spaces | None = None) -> tuple[AnyReducedModel, str]:
         """A new model that assembles in the quickest way there is, and why that is in full; "" where it is not."""
         model, operators = self.model(primal, spaces), self.operators(primal, spaces)
         return (model, operators) if isinstance(operators, str) else (HyperReducedModel(model, operators), "")

@@ -18,13 +18,13 @@ from vibench.linalg.inner_product import InnerProduct
 from vibench.model.affine import AffineMember, Evaluation
 from vibench.model.errors import errors
 from vibench.model.galerkin import ReducedModel, ReducedProblem, project
+from vibench.offline.assemblies import assemblies
+from vibench.offline.models import AnyReducedModel
 from vibench.qp import verification
 from vibench.qp.solution import QPSolution
 from vibench.reduction import cones
 from vibench.reduction.pod import POD
 from vibench.reduction.supremizers import supremizers
-from vibench.stages.assemblies import assemblies
-from vibench.stages.assembly import Model
 
 SOME = 9
 """Training parameters at which a figure is computed that takes long."""
@@ -120,7 +120,7 @@ def _norm(member: Array) -> float:
     return float(np.linalg.norm(member if isinstance(member, np.ndarray) else member.data))
 
 
-def of_programs(material: Material, model: Model) -> Info:
+def of_programs(material: Material, model: AnyReducedModel) -> Info:
     """Of the programs that a model assembles: difference from the projections on its basis, which is orthonormal."""
     accuracy, program = [], None
     for query in material.queries:
@@ -139,7 +139,7 @@ def _difference(found: Array, exact: Array) -> float:
 Solve = Callable[[ReducedProblem], QPSolution]
 
 
-def of_queries(material: Material, model: Model, solve: Solve, accuracy: float) -> Info:
+def of_queries(material: Material, model: AnyReducedModel, solve: Solve, accuracy: float) -> Info:
     """Of queries at all validation parameters: errors against high-fidelity solutions, residuals, the worst status."""
     figures, statuses, reduced = [], [], None
     for query in material.queries:

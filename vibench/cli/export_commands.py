@@ -39,8 +39,8 @@ def export_reduced_model(
     found = export_model(model, file, tolerance, evaluations=evaluations, bases=bases, c=c)
     echo(*(f"{name}: {_in_words(member)}" for name, member in found.members.items()))
     echo(f"relative errors are those at {MEASURED} random parameters and at the corners of the box")
-    if found.about["solver"] != model.row["solver"]:
-        echo(f"the cell's solver is {model.row['solver']}, the script solves by {found.about['solver']}")
+    if found.about["solver"] != model.solver:
+        echo(f"the cell's solver is {model.solver}, the script solves by {found.about['solver']}")
     why = found.about["no_bounds"]
     has_bounds = not why
     echo(f"error bounds: {found.about['certificate']}" if has_bounds else f"no error bounds: {why}")

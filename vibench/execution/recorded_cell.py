@@ -18,10 +18,11 @@ from vibench.execution.graph import Graph
 from vibench.execution.supervisor import Job, Supervisor
 from vibench.interfaces.problem import VariationalInequality
 from vibench.model.certificates.bounds import OnlineCertificate
+from vibench.offline.models import AnyReducedModel
 from vibench.results import tables
 from vibench.results.sqlite.reading import read_meta, read_rows, study_of
 from vibench.results.tables import results_file
-from vibench.stages.assembly import Model, assembly_stage
+from vibench.stages.assembly import assembly_stage
 from vibench.stages.base import Done, Stage, value_of
 from vibench.stages.cell_queries import cell_queries
 from vibench.storage.artefacts import Store, usable_store
@@ -54,7 +55,7 @@ class RecordedCell:
         return Cell.from_definition(self.row["definition"])
 
     @cached_property
-    def model(self) -> Model:
+    def model(self) -> AnyReducedModel:
         """The reduced model; stages whose artefacts are missing are run again.
 
         Raises

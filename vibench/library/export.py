@@ -21,17 +21,16 @@ from vibench.interfaces.problem import MEMBERS, VariationalInequality
 from vibench.interfaces.strategies import Kind
 from vibench.interfaces.validation import training_parameters
 from vibench.library import c_source, exported_certificate
-from vibench.library.models import Model
 from vibench.library.reduced_model import FORMAT, SOLVERS
 from vibench.model.affine import affine_decomposition, check_affine
 from vibench.model.certificates.base import Guarantee
 from vibench.model.certificates.bounds import OnlineCertificate
 from vibench.model.chebyshev import AffinePolynomial, interpolate_on_box
 from vibench.model.hyperreduced import HyperReducedModel, hyper_reduce
+from vibench.offline.models import AnyReducedModel, Model
 from vibench.provenance import distribution_version
 from vibench.qp.settings import SETTINGS
 from vibench.qp.solve import MARGIN
-from vibench.stages.assembly import Model as Queried
 from vibench.study.cells import Cell
 from vibench.study.registry import version
 
@@ -182,7 +181,7 @@ def exported(
     return ExportedModel(members, arrays, about, polynomials)
 
 
-def declared_model(queried: Queried) -> Queried:
+def declared_model(queried: AnyReducedModel) -> AnyReducedModel:
     """The model without high-fidelity assembly where its problem declares all members constant or affine sums.
 
     Their terms are projected, whatever the assembly of the cell was; any other model is returned as it is.
@@ -203,7 +202,7 @@ def declared_model(queried: Queried) -> Queried:
     return HyperReducedModel(queried, hyper_reduce(queried, members))
 
 
-def declared_terms(queried: Queried) -> dict[str, Array]:
+def declared_terms(queried: AnyReducedModel) -> dict[str, Array]:
     """Flat terms (Q×size) of the members declared affine, of A packed upper triangles, on a fixed space."""
     if isinstance(queried, HyperReducedModel):
         return queried.declared_terms()
@@ -219,7 +218,7 @@ def declared_terms(queried: Queried) -> dict[str, Array]:
     return {name: np.stack([np.ravel(projected[name](t)) for t in sums.terms]) for name, sums in declared.items()}
 
 
-def coefficients_of(queried: Queried, mu: Array) -> Mapping[str, Array]:
+def coefficients_of(queried: AnyReducedModel, mu: Array) -> Mapping[str, Array]:
     """θ (Q,) at a parameter of the members that are sums of terms, as far as the model evaluates them."""
     if isinstance(queried, HyperReducedModel):
         return queried.coefficients(mu)
@@ -227,7 +226,7 @@ def coefficients_of(queried: Queried, mu: Array) -> Mapping[str, Array]:
     return {name: sums.coefficients(mu) for name, sums in problem.affine.items() if name not in problem.constant}
 
 
-def members_of(queried: Queried, mu: Array, theta: Mapping[str, Array]) -> VariationalInequality:
+def members_of(queried: AnyReducedModel, mu: Array, theta: Mapping[str, Array]) -> VariationalInequality:
     """A, f, B, g at a parameter with these coefficients, on a space that does not depend on it.
 
     Raises
@@ -246,7 +245,7 @@ def members_of(queried: Queried, mu: Array, theta: Mapping[str, Array]) -> Varia
 
 
 def _evaluated(
-    queried: Queried, size: int, declared: frozenset[str], certificate: OnlineCertificate | None, mu: Array
+    queried: AnyReducedModel, size: int, declared: frozenset[str], certificate: OnlineCertificate | None, mu: Array
 ) -> dict[str, Array]:
     """The members as flat arrays, of declared affine ones θ; and what the certificate evaluates."""
     theta = coefficients_of(queried, mu)
@@ -255,7 +254,7 @@ def _evaluated(
     return found | {name: theta[name] for name in declared} | beside
 
 
-def _packed(queried: Queried, size: int, mu: Array, theta: Mapping[str, Array]) -> dict[str, Array]:
+def _packed(queried: AnyReducedModel, size: int, mu: Array, theta: Mapping[str, Array]) -> dict[str, Array]:
     """The members as flat arrays; of A the upper triangle."""
     found = members_of(queried, mu, theta)
     if len(found.f) != size:
@@ -282,9 +281,9 @@ def _refuse_inaccurate(members: Mapping[str, AffinePolynomial], tolerance: float
 
 def _about(model: Model, members: Mapping[str, AffinePolynomial]) -> dict[str, Any]:
     """What the file says in words: parameters, solver, errors, provenance."""
-    box, row = model.parameters, model.row
-    accuracy, solver = float(row["accuracy"]), str(row["solver"])
-    origin = version("problem", Cell.from_definition(str(row["definition"])).problem.name)
+    box, row, accuracy, solver = model.parameters, model.row, model.accuracy, model.solver
+    definition = row.get("definition")  # none of a model that is of no run
+    origin = version("problem", Cell.from_definition(str(definition)).problem.name) if definition else ""
     return {
         "parameters": {"names": list(box.names), "units": list(box.units)},
         "solver": solver if solver in SOLVERS else next(iter(SOLVERS)),
@@ -296,7 +295,7 @@ def _about(model: Model, members: Mapping[str, AffinePolynomial]) -> dict[str, A
         },
         "cell": {name: _plain(row[name]) for name in RECORDED if name in row},
         "exported_by": f"vibench {distribution_version('vibench')}",
-        "source": {"distribution": origin, "licence": _licence(origin.split()[0])},
+        "source": {"distribution": origin, "licence": _licence(origin.partition(" ")[0])},
     }
 
 

@@ -17,7 +17,7 @@ from vibench.errors import unknown_name
 from vibench.execution.recorded_cell import recorded_cell
 from vibench.execution.run import Observer, Options, run_study
 from vibench.execution.run_folder import REPORT
-from vibench.library.models import Model
+from vibench.offline.models import Model
 from vibench.results import error_measures, tables
 from vibench.results.columns import TABLES
 from vibench.results.plugin_columns import Extended
@@ -176,7 +176,9 @@ class Run:
         RequestError
             If there is no such cell, it failed before it had a model, or other code computed it.
         """
-        return Model(recorded_cell(str(self.path), cell))
+        recorded = recorded_cell(str(self.path), cell)
+        asked = recorded.cell
+        return Model(recorded.model, asked.solver, asked.accuracy, recorded.certificate, recorded.row)
 
 
 @contextmanager

@@ -13,16 +13,12 @@ from vibench.linalg.cholesky import SparseCholesky
 from vibench.linalg.inner_product import InnerProduct
 from vibench.model.affine import AffineMember, Evaluation, affine_decomposition
 from vibench.model.galerkin import ReducedModel, leading_part, project
-from vibench.model.hyperreduced import (
-    HyperReducedModel,
-    Operators,
-    ProjectedMember,
-    hyper_reduce,
-    reason_for_full_assembly,
-)
+from vibench.model.hyperreduced import HyperReducedModel, Operators, ProjectedMember
+from vibench.offline.assemblies import assemblies
+from vibench.offline.models import AnyReducedModel
+from vibench.offline.reduction import Reduction
 from vibench.qp.exact import ExactSolution, exact_solution
 from vibench.reduction.supremizers import ContactCoordinates, SpannedCoordinates
-from vibench.stages.assemblies import assemblies
 from vibench.stages.base import Result, Stage, build_problem, value_of
 from vibench.stages.enrichment import EnrichmentStage, GrowthStage, enrichment_stage
 from vibench.stages.snapshots import is_adaptive, training_of, validation_of
@@ -37,9 +33,6 @@ for _kind in (
     SparseCholesky, VariationalInequality, ExactSolution,
 ):  # fmt: skip
     storable(_kind)
-
-Model = ReducedModel | HyperReducedModel
-"""A model that assembles the reduced program at a parameter."""
 
 
 @dataclass(frozen=True)
@@ -85,10 +78,9 @@ class HyperReduction(Stage):
 
     def run(self, store: Store) -> Result:
         """The `Operators` of a reduced model, or why there are none and queries are assembled in full."""
-        model = self.enrichment.model(store)
-        members: Mapping[str, AffineMember] = value_of(store, self.decomposition)
-        why = reason_for_full_assembly(model, members)
-        return Result(why) if why else Result(*timed(lambda: hyper_reduce(model, members)))
+        reduction = self.enrichment.reduction(store).given(members=value_of(store, self.decomposition))
+        reduction.projection  # noqa: B018  the clock begins after it
+        return Result(*timed(lambda: reduction.operators))
 
 
 @dataclass(frozen=True)
@@ -109,7 +101,7 @@ class NestedPrograms(Stage):
 
     def run(self, store: Store) -> Result:
         """One program per validation parameter; not timed."""
-        model = self.growth.model(store)
+        model = self.growth.reduction(store).projection
         mus = validation_of(model.problem, self.count, self.seed, self.sampling)
         kept = assemblies(model.problem)
         return Result(tuple(model.reduce(kept.at(mu)).program for mu in mus))
@@ -187,15 +179,17 @@ class AssemblyStage(Stage):
         """The validation set (count×d)."""
         return validation_of(problem, self.count, self.seed, self.sampling)
 
-    def model(self, store: Store) -> tuple[Model, str]:
-        """The model that queries use, and why requested reduced assembly was replaced by full assembly, or ""."""
-        model = self.enrichment.model(store)
+    def offline(self, store: Store) -> Reduction:
+        """The offline phase of the model that queries use, with all its steps."""
         if self.reduction is None:
-            return model, ""
-        reduced: Operators | str = value_of(store, self.reduction)
-        if isinstance(reduced, str):
-            return model, f"assembled in full: {reduced}"
-        return HyperReducedModel(model, reduced), ""
+            return self.enrichment.reduction(store)
+        return self.enrichment.reduction(store, self.interpolation).given(operators=value_of(store, self.reduction))
+
+    def model(self, store: Store) -> tuple[AnyReducedModel, str]:
+        """The model that queries use, and why requested reduced assembly was replaced by full assembly, or ""."""
+        reduction = self.offline(store)
+        why = "" if self.reduction is None or not isinstance(reduction.operators, str) else reduction.operators
+        return reduction.assembled, f"assembled in full: {why}" if why else ""
 
     def columns(self, store: Store) -> dict[str, float | int | None]:
         """Columns of a cell: tolerance, training error and terms of every member; none for assembly in full."""

@@ -14,7 +14,7 @@ from vibench.arrays import Array
 from vibench.errors import NumericalError
 from vibench.interfaces.strategies import Enrichment, Kind, Offline, PrimalStrategy
 from vibench.interfaces.validation import check_enrichment
-from vibench.model.galerkin import ReducedModel
+from vibench.offline.reduction import Reduction
 from vibench.reduction.nested import Grown, Milestone, grow_through
 from vibench.reduction.supremizers import ConstraintClasses, projected_supremizers
 from vibench.stability.growth import ProjectedSupremizers
@@ -116,10 +116,11 @@ class GrowthStage(Stage):
         shares = projected.shares_over_steps(size, value_of(store, TrainingConstants(self.cone)))
         return Result(AssessedGrowth(grown, projected.over_steps(size), shares, training))
 
-    def model(self, store: Store) -> ReducedModel:
-        """The reduced model with all vectors."""
+    def reduction(self, store: Store) -> Reduction:
+        """The offline phase with all vectors."""
         growth: AssessedGrowth = value_of(store, self)
-        return _model(store, self.pod, self.cone, Enrichment(Kind.FIXED, vectors=growth.grown.vectors))
+        vectors = Enrichment(Kind.FIXED, vectors=growth.grown.vectors)
+        return _reduction(store, self.pod, self.cone).given(enrichment=vectors)
 
 
 @dataclass(frozen=True)
@@ -152,16 +153,16 @@ class EnrichmentStage(Stage):
 
     @property
     def model_inputs(self) -> tuple[Stage, ...]:
-        """The stages whose artefacts `model` reads."""
+        """The stages whose artefacts `reduction` reads."""
         return (self.pod, self.cone, self)
 
     @abstractmethod
     def enrichment(self, store: Store) -> Enrichment:
         """The enrichment, once the stage has been run."""
 
-    def model(self, store: Store) -> ReducedModel:
-        """The reduced model, once the stage has been run."""
-        return _model(store, self.pod, self.cone, self.enrichment(store))
+    def reduction(self, store: Store, interpolation: float | None = None) -> Reduction:
+        """The offline phase up to the enrichment, once the stage has been run; in full assembly without a tolerance."""
+        return _reduction(store, self.pod, self.cone, interpolation).given(enrichment=self.enrichment(store))
 
 
 @dataclass(frozen=True)
@@ -247,19 +248,29 @@ def _histories(known: Mapping[str, Array]) -> tuple[History, ...]:
     return tuple(History.of("enrichment", quantity, values) for quantity, values in known.items())
 
 
+def _reduction(store: Store, pod: PODStage, cone: ConeStage, interpolation: float | None = None) -> Reduction:
+    """The offline phase as far as V_N and the cone, which are stored."""
+    reduced: ReducedCone = value_of(store, cone)
+    reduction = Reduction(
+        build_problem(pod.problem),
+        cone.dual.create(),
+        None,
+        pod.stop,
+        cone.stop,
+        training=None if pod.training is None else pod.training.create(),
+        assembly="full" if interpolation is None else "reduced",
+        interpolation=interpolation or Reduction.interpolation,
+    )
+    return reduction.given(pod=value_of(store, pod), cone=reduced.cone, multipliers=reduced.prepared)
+
+
 def _offline(store: Store, pod: PODStage, cone: ConeStage) -> Offline:
     """The offline data that a primal strategy is built from."""
-    problem, basis = build_problem(pod.problem), value_of(store, pod).basis
-    reduced: ReducedCone = value_of(store, cone)
-    return Offline(problem, basis, reduced.cone, reduced.prepared.span, training_of(store, pod.problem, pod.training))
+    training = training_of(store, pod.problem, pod.training)
+    return _reduction(store, pod, cone).given(parameters=training).offline
 
 
 def _projected(offline: Offline, vectors: Array, classes: ConstraintClasses) -> ProjectedSupremizers:
     """ZᵀBᵀη of V_N and vectors (n×S) for every class of the training set, η orthonormal in span χ."""
     Z = np.hstack([offline.basis, vectors])
     return ProjectedSupremizers([projected_supremizers(Z, B, offline.span) for B in classes.representatives], classes)
-
-
-def _model(store: Store, pod: PODStage, cone: ConeStage, enrichment: Enrichment) -> ReducedModel:
-    basis, reduced = value_of(store, pod).basis, value_of(store, cone)
-    return ReducedModel(build_problem(pod.problem), basis, enrichment, reduced.cone.rays, reduced.prepared.span)

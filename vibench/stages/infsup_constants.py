@@ -10,11 +10,11 @@ from vibench.arrays import Array
 from vibench.interfaces.problem import Problem, VariationalInequality
 from vibench.interfaces.strategies import Kind
 from vibench.model.galerkin import ReducedModel
+from vibench.offline.assemblies import assemblies
 from vibench.reduction.supremizers import ConstraintClasses, constraint_classes
 from vibench.stability.coercivity import Constant, Stability, coercivity_and_continuity, energy_inf_sup
 from vibench.stability.infsup import InfSup, Multipliers, inf_sup, nodal_multipliers
 from vibench.stability.over_parameters import constants_full, constants_on, everywhere
-from vibench.stages.assemblies import assemblies
 from vibench.stages.base import Result, Stage, build_problem, value_of
 from vibench.stages.enrichment import EnrichmentStage
 from vibench.stages.offline import ConeStage, PODStage
@@ -122,7 +122,7 @@ class OwnConstants(Stage):
 
     def run(self, store: Store) -> Result:
         """Compute the constants."""
-        model, reduced = self.enrichment.model(store), value_of(store, self.enrichment.cone)
+        model, reduced = self.enrichment.reduction(store).projection, value_of(store, self.enrichment.cone)
         cone: Multipliers = reduced.prepared
         classes: ConstraintClasses = value_of(store, self.constraints)
         if model.kind is not Kind.PER_PARAMETER:

@@ -19,6 +19,8 @@ from vibench.model.errors import UNMEASURABLE, Errors, ReferenceSolutions, error
 from vibench.model.hsw_bounds import HSWBounds, hsw_bounds
 from vibench.model.hyperreduced import HyperReducedModel
 from vibench.model.output_errors import output_errors
+from vibench.offline.assemblies import assemblies
+from vibench.offline.models import AnyReducedModel
 from vibench.qp.accuracy_bounds import slack
 from vibench.qp.exact import ExactSolution
 from vibench.qp.repeats import in_units, nearby, units
@@ -29,8 +31,7 @@ from vibench.qp.status import Status
 from vibench.qp.verification import verify
 from vibench.results.solver_agreement import solution_row
 from vibench.stability.coercivity import Stability
-from vibench.stages.assemblies import assemblies
-from vibench.stages.assembly import AssemblyStage, Model, ReducedPrograms
+from vibench.stages.assembly import AssemblyStage, ReducedPrograms
 from vibench.stages.base import Row, value_of
 from vibench.storage.artefacts import Store
 from vibench.study import registry
@@ -192,7 +193,7 @@ def _identical(one: QPSolution, other: QPSolution) -> bool:
 
 
 def error_columns(
-    model: Model,
+    model: AnyReducedModel,
     mus: Array,
     solutions: Sequence[tuple[Array, Array]],
     reference: ReferenceSolutions,

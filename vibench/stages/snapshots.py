@@ -13,11 +13,12 @@ import numpy as np
 from vibench.arrays import Array
 from vibench.errors import NumericalError
 from vibench.highfidelity.active_set import HighFidelitySolution, HighFidelitySolver, check_stiffness
-from vibench.interfaces.fingerprint import Fingerprint, ReferenceAssembly
+from vibench.interfaces.fingerprint import Fingerprint
 from vibench.interfaces.problem import Problem, VariationalInequality
 from vibench.interfaces.sampling import AdaptiveSampling
 from vibench.interfaces.validation import checked_assembly, training_parameters, validation_parameters
 from vibench.model.growing import GrowingTrainer
+from vibench.offline.reduction import reference_assembly
 from vibench.qp.repeats import nearby
 from vibench.stages.base import Result, Stage, build_problem, faults_of, value_of
 from vibench.storage.artefacts import History, Store
@@ -232,11 +233,6 @@ def training_stages(problem: Plugin, sampling: Plugin | None = None) -> tuple[St
 def validation_stages(problem: Plugin, count: int, seed: int, sampling: Plugin | None = None) -> tuple[Stage, ...]:
     """The chunks of the validation set."""
     return tuple(SnapshotStage(problem, "validation", count, seed, chunk, sampling) for chunk in range(CHUNKS))
-
-
-def reference_assembly(problem: Problem) -> ReferenceAssembly:
-    """The assembly at the first training parameter, which those of all chunks and processes are compared with."""
-    return ReferenceAssembly(problem, checked_assembly(problem, training_parameters(problem)[0]))
 
 
 @lru_cache(maxsize=4)

@@ -10,7 +10,6 @@ import warnings
 from collections.abc import Mapping
 from importlib.metadata import distribution
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -132,10 +131,7 @@ def assembled_in_full(template: vibench.Model, problem: vibench.Problem, kind: v
 
 def with_row(template: vibench.Model, queried: Any) -> vibench.Model:
     """A model that answers queries, with the row of a real cell."""
-    cell: Any = SimpleNamespace(
-        row=template.row, model=queried, certificate=None, cell=SimpleNamespace(solver="piqp", accuracy=1e-10)
-    )
-    return vibench.Model(cell)
+    return vibench.Model(queried, "piqp", 1e-10, row=template.row)
 
 
 @pytest.mark.parametrize("kind", [vibench.Kind.NONE, vibench.Kind.PER_PARAMETER])

@@ -95,7 +95,7 @@ def test_what_is_no_parameter(model: vibench.Model, mu: object, line: str) -> No
 def test_solvers_that_are_not_there(model: vibench.Model, mus: np.ndarray, monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(vibench.RequestError, match="no QP solver is called 'piqpp'; did you mean 'piqp'"):
         model.solve(mus[0], solver="piqpp")
-    monkeypatch.setattr("vibench.library.models.installed_solvers", lambda _: ["piqp"])
+    monkeypatch.setattr("vibench.offline.models.installed_solvers", lambda _: ["piqp"])
     with pytest.raises(vibench.RequestError, match="the QP solver 'proxqp' is not installed"):
         model.solve(mus[0], solver="proxqp")
 
@@ -104,7 +104,7 @@ def test_a_solver_without_an_answer_has_no_solution(
     model: vibench.Model, mus: np.ndarray, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     nothing = vibench.QPSolution(None, None, "gave up")
-    monkeypatch.setattr("vibench.library.models.solve_qp", lambda *_: nothing)
+    monkeypatch.setattr("vibench.offline.models.solve_qp", lambda *_: nothing)
     solution = model.solve(mus[0])
     assert solution.status != "ok"
     for vector in ("u", "lam"):

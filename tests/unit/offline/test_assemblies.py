@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numerics import Varying
 
-from vibench.stages.assemblies import Assemblies
+from vibench.offline.assemblies import Assemblies
 
 
 def test_assemblies_are_kept_up_to_a_limit_and_those_of_longest_ago_go_first() -> None:

@@ -1,4 +1,4 @@
-"""A reduced model of a run, for queries at any parameter."""
+"""A reduced model, for queries at any parameter."""
 
 from __future__ import annotations
 
@@ -7,29 +7,33 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, partial
 from math import inf
+from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 
 from vibench.arrays import Array
 from vibench.errors import RequestError, unknown_name
-from vibench.execution.recorded_cell import RecordedCell
 from vibench.highfidelity.active_set import HighFidelitySolution, HighFidelitySolver
 from vibench.interfaces.problem import ParameterBox, Problem
 from vibench.model.certificates.bounds import OnlineBound, OnlineCertificate
 from vibench.model.error_bounds import ErrorBounds, bound_errors_at
-from vibench.model.galerkin import ReducedProblem
+from vibench.model.galerkin import ReducedModel, ReducedProblem
+from vibench.model.hyperreduced import HyperReducedModel
+from vibench.offline.assemblies import assemblies
 from vibench.qp.settings import SETTINGS
 from vibench.qp.solve import installed_solvers, solve_qp
 from vibench.qp.status import Status
 from vibench.qp.verification import Residuals, verify
 from vibench.stability.coercivity import coercivity_and_continuity, energy_inf_sup
-from vibench.stages.assemblies import assemblies
-from vibench.stages.assembly import Model as Queried
 from vibench.study import registry
 from vibench.timing import Seconds, timed
 
 Parameters = Sequence[float] | Array | Mapping[str, float]
 """A parameter mu: its components in the order of `ParameterBox.names`, or by these names."""
+
+AnyReducedModel = ReducedModel | HyperReducedModel
+"""A model that assembles the reduced program at a parameter."""
 
 
 @dataclass(frozen=True)
@@ -102,31 +106,33 @@ class Solution:
 
 
 class Model:
-    """A reduced model of a run, which answers queries at any parameter.
-
-    Parameters
-    ----------
-    recorded
-        The cell of the run.
+    """A reduced model of a run or of a `Reduction`, which answers queries at any parameter.
 
     Attributes
     ----------
-    row
-        Its row of the cells table.
-    problem
-        The high-fidelity problem.
     reduced
         What assembles the reduced programs: `reduced.assemble(mu)` has `program` and `reconstruct`.
+    problem
+        The high-fidelity problem.
+    solver, accuracy
+        QP solver of queries where no other is asked for, and the relative accuracy that it has to reach.
     certificate
-        What bounds errors at online cost; `None` where the cell is not certified.
+        What bounds errors at online cost; `None` where the model is not certified.
+    row
+        Its row of the cells table; empty for a model that is of no run.
     """
 
-    def __init__(self, recorded: RecordedCell) -> None:
-        self.row = recorded.row
-        self.reduced: Queried = recorded.model
-        self.problem: Problem = self.reduced.problem
-        self.certificate: OnlineCertificate | None = recorded.certificate
-        self._solver, self._accuracy = recorded.cell.solver, recorded.cell.accuracy
+    def __init__(
+        self,
+        reduced: AnyReducedModel,
+        solver: str,
+        accuracy: float,
+        certificate: OnlineCertificate | None = None,
+        row: Mapping[str, Any] = MappingProxyType({}),
+    ) -> None:
+        self.reduced, self.solver, self.accuracy = reduced, solver, accuracy
+        self.certificate, self.row = certificate, row
+        self.problem: Problem = reduced.problem
 
     @property
     def parameters(self) -> ParameterBox:
@@ -142,7 +148,7 @@ class Model:
     ) -> Solution:
         """Assemble and solve the reduced program at a parameter, verify the solution, and bound its errors.
 
-        Bounds need a cell with `assembly = "certified"`.
+        Bounds need a model with `assembly = "certified"`.
 
         The solver runs in this process, without the limits of a study.
 
@@ -151,7 +157,7 @@ class Model:
         mu
             The parameter; outside the domain there is a warning, since the model was not trained there.
         solver, accuracy
-            QP solver and the relative accuracy that it has to reach; those of the cell by default.
+            QP solver and the relative accuracy that it has to reach; those of the model by default.
         tolerance
             Largest relative error of u in the energy norm; `verdict` of the solution says whether the bound keeps it.
 
@@ -159,16 +165,14 @@ class Model:
         ------
         RequestError
             If mu is not a parameter of the problem, the solver is not installed, the tolerance is not positive, or
-            there is one and the cell is not certified.
+            there is one and the model is not certified.
         """
         if tolerance is not None and not 0.0 < tolerance < inf:
             raise RequestError(f"the tolerance is {tolerance:g}, expected a positive finite number")
         if tolerance is not None and self.certificate is None:
-            raise RequestError(
-                f'cell {self.row["cell"]} has no error bounds: a tolerance needs a cell with assembly = "certified"'
-            )
-        at, name = self._parameter(mu), solver or self._solver
-        accuracy = self._accuracy if accuracy is None else accuracy
+            raise RequestError('the model has no error bounds: a tolerance needs one with assembly = "certified"')
+        at, name = self._parameter(mu), solver or self.solver
+        accuracy = self.accuracy if accuracy is None else accuracy
         own = registry.names("QP solver")
         if name not in installed_solvers(own):
             if name in SETTINGS:

@@ -1,0 +1,162 @@
+"""The offline phase as an object."""
+
+from __future__ import annotations
+
+from functools import partial
+
+import numpy as np
+import pytest
+from samples import small_study
+
+import vibench
+from vibench.errors import UnsupportedError
+
+PROBLEM = {"name": "radial-obstacle", "options": {"resolution": 200}}
+STUDY = small_study(
+    "reduction",
+    [PROBLEM],
+    primal=["online-supremizers", "offline-pga"],
+    assembly=["full", "certified"],
+    tolerances=[{"pod": [1e-2], "dual": [1e-1], "primal": {"offline-pga": [0.5]}}],
+    validation=3,
+)
+
+
+@pytest.fixture(scope="module")
+def problem() -> vibench.Problem:
+    found: vibench.Problem = vibench.create("problem", PROBLEM["name"], PROBLEM["options"])
+    return found
+
+
+@pytest.fixture(scope="module")
+def reduce(problem: vibench.Problem) -> partial[vibench.Reduction]:
+    dual, primal = vibench.create("dual strategy", "mcpg"), vibench.create("primal strategy", "offline-pga")
+    stops = vibench.Stop(tolerance=1e-2), vibench.Stop(tolerance=1e-1)
+    return partial(vibench.Reduction, problem, dual, primal, *stops, tolerance=0.5)
+
+
+@pytest.fixture(scope="module")
+def snapshots(reduce: partial[vibench.Reduction]) -> vibench.Snapshots:
+    found: vibench.Snapshots = reduce().snapshots
+    return found
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> vibench.Run:
+    return vibench.run(STUDY, tmp_path_factory.mktemp("reduction") / "run", progress=False)
+
+
+@pytest.mark.parametrize("assembly", ["full", "certified"])
+@pytest.mark.parametrize("primal", ["online-supremizers", "offline-pga"])
+def test_a_reduction_answers_as_the_run_of_the_same_study(
+    run: vibench.Run, problem: vibench.Problem, snapshots: vibench.Snapshots, primal: str, assembly: str
+) -> None:
+    cells = run.cells.query("dual == 'mcpg' and primal == @primal and assembly == @assembly")
+    row = cells.iloc[0]
+    reduction = vibench.Reduction(
+        problem,
+        vibench.create("dual strategy", "mcpg"),
+        vibench.create("primal strategy", primal),
+        vibench.Stop(tolerance=1e-2),
+        vibench.Stop(tolerance=1e-1),
+        tolerance=0.5 if primal == "offline-pga" else None,
+        assembly=assembly,
+        interpolation=STUDY.interpolation,
+        accuracy=STUDY.accuracy[0],
+    ).given(snapshots=snapshots)
+    assert (reduction.pod.basis.shape[1], reduction.cone.size) == (row["N"], row["R"])
+    assert reduction.enrichment.kind == row["enrichment_kind"]
+    theirs = run.model(row["cell"])
+    for mu in problem.validation_set(3, 1):
+        one, other = reduction.model.solve(mu), theirs.solve(mu)
+        assert one.status == other.status == "ok"
+        assert np.allclose(one.u, other.u, rtol=0.0, atol=1e-8 * np.abs(other.u).max())
+        assert (one.bound is None) == (other.bound is None) == (assembly == "full")
+        if one.bound is not None and other.bound is not None:
+            assert one.bound.guarantee == other.bound.guarantee
+            # Snapshots of a run come from other starting points; small residuals agree in their first digits alone.
+            assert one.bound.u_energy == pytest.approx(other.bound.u_energy, rel=5e-2)
+
+
+def test_steps_are_computed_once_and_only_when_asked_for(reduce: partial[vibench.Reduction]) -> None:
+    calls: list[str] = []
+
+    class Counting(vibench.DualStrategy):
+        def reduce(self, snapshots: np.ndarray, W: vibench.InnerProduct, stop: vibench.Stop) -> vibench.Cone:
+            calls.append("cone")
+            return vibench.greedy_cone(snapshots, W, stop)
+
+    reduction = vibench.Reduction(
+        reduce().problem, Counting(), None, vibench.Stop(size=2), vibench.Stop(size=2), training=Few()
+    )
+    assert reduction.pod.basis.shape[1] == 2
+    assert not calls
+    assert reduction.cone is reduction.cone
+    assert reduction.model is reduction.model
+    assert calls == ["cone"]
+    assert reduction.enrichment.kind is vibench.Kind.NONE
+
+
+class Few(vibench.Sampling):
+    """The corners of the box."""
+
+    def parameters(self, box: vibench.ParameterBox) -> np.ndarray:
+        return box.grid(*(2,) * box.dim)
+
+
+class Centre(vibench.AdaptiveSampling):
+    """The corners, one of them only because of its bound."""
+
+    def parameters(self, box: vibench.ParameterBox) -> np.ndarray:
+        return Few().parameters(box)
+
+    def train(self, box: vibench.ParameterBox, trainer: vibench.Trainer) -> None:
+        first, *others = self.parameters(box)
+        trainer.solve(first)
+        trainer.solve(max(others, key=trainer.bound))
+
+
+def test_given_steps_are_kept_and_what_follows_is_computed_from_them(
+    reduce: partial[vibench.Reduction], snapshots: vibench.Snapshots
+) -> None:
+    first = reduce().given(snapshots=snapshots)
+    assert first.snapshots is snapshots
+    whole = first.cone.size
+    cone = vibench.greedy_cone(snapshots.lam, first.problem.W, vibench.Stop(size=1))
+    second = first.given(cone=cone)
+    assert second.snapshots is snapshots
+    assert second.model.reduced.generators.shape[1] == 1
+    assert first.model.reduced.generators.shape[1] == whole > 1
+
+
+def test_training_sets_of_sampling_strategies(reduce: partial[vibench.Reduction]) -> None:
+    drawn = vibench.Reduction(
+        reduce().problem, reduce().dual, None, vibench.Stop(size=2), vibench.Stop(size=2), training=Few()
+    )
+    assert np.array_equal(drawn.snapshots.mu, drawn.parameters)
+    assert len(drawn.parameters) == 2**drawn.problem.parameters.dim
+    adaptive = vibench.Reduction(
+        reduce().problem, reduce().dual, None, vibench.Stop(size=2), vibench.Stop(size=2), training=Centre()
+    )
+    assert len(adaptive.parameters) == 2
+    assert adaptive.snapshots.u.shape == (adaptive.problem.V.dim, 2)
+    assert len(adaptive.decomposed) == len(adaptive.problem.training_set())
+
+
+def test_what_is_asked_for_wrongly_is_one_line(reduce: partial[vibench.Reduction]) -> None:
+    problem, dual, primal = reduce().problem, reduce().dual, reduce().primal
+    stops = vibench.Stop(size=2), vibench.Stop(size=2)
+    with pytest.raises(vibench.RequestError, match=r"problem is the class \w+, expected an instance of a sub"):
+        vibench.Reduction(type(problem), dual, primal, *stops)  # type: ignore[arg-type]
+    with pytest.raises(vibench.RequestError, match="dual is 'mcpg', expected an instance of a subclass of Du"):
+        vibench.Reduction(problem, "mcpg", primal, *stops)  # type: ignore[arg-type]
+    with pytest.raises(vibench.RequestError, match=r"modes is 0\.001, expected a Stop"):
+        vibench.Reduction(problem, dual, primal, 1e-3, stops[1])  # type: ignore[arg-type]
+    with pytest.raises(vibench.RequestError, match="OfflinePGA needs a tolerance"):
+        vibench.Reduction(problem, dual, primal, *stops)
+    with pytest.raises(vibench.RequestError, match="without a primal strategy there is no tolerance"):
+        vibench.Reduction(problem, dual, None, *stops, tolerance=0.5)
+    with pytest.raises(vibench.RequestError, match="assembly is 'fulll', expected 'full', 'reduced' or 'certified'"):
+        vibench.Reduction(problem, dual, None, *stops, assembly="fulll")  # type: ignore[arg-type]
+    with pytest.raises(UnsupportedError, match="needs reduced assembly, and the model is assembled in full"):
+        _ = vibench.Reduction(problem, dual, None, *stops, training=Few()).certificate

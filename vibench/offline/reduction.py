@@ -1,0 +1,230 @@
+"""The offline phase as an object: snapshots ▸ POD, cone ▸ enrichment ▸ reduced model ▸ certificate."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any, Literal, TypeAlias, get_args
+
+import numpy as np
+
+from vibench.arrays import Array
+from vibench.errors import RequestError, UnsupportedError
+from vibench.highfidelity.active_set import HighFidelitySolver
+from vibench.interfaces.fingerprint import ReferenceAssembly
+from vibench.interfaces.problem import Problem
+from vibench.interfaces.sampling import AdaptiveSampling, Sampling
+from vibench.interfaces.strategies import Cone, DualStrategy, Enrichment, Kind, Offline, PrimalStrategy, Stop
+from vibench.interfaces.validation import check_cone, check_enrichment, checked_assembly, training_parameters
+from vibench.model.affine import AffineMember, affine_decomposition
+from vibench.model.certificates.base import CertificateBase, certificate_base
+from vibench.model.certificates.bounds import OnlineCertificate
+from vibench.model.certificates.preparation import prepare
+from vibench.model.galerkin import ReducedModel
+from vibench.model.growing import GrowingTrainer
+from vibench.model.hyperreduced import HyperReducedModel, Operators, hyper_reduce, reason_for_full_assembly
+from vibench.offline.models import AnyReducedModel, Model
+from vibench.reduction.pod import POD, pod
+from vibench.stability.infsup import Multipliers, multipliers
+
+Assembly: TypeAlias = Literal["full", "reduced", "certified"]
+"""How a model assembles its programs, as in a study."""
+
+
+@dataclass(frozen=True)
+class Snapshots:
+    """High-fidelity solutions at some parameters.
+
+    Attributes
+    ----------
+    mu
+        Parameters (P×d).
+    u, lam
+        Columns u(mu) (n×P) and λ(mu) (m×P).
+    """
+
+    mu: Array
+    u: Array
+    lam: Array
+
+
+def high_fidelity_sweep(problem: Problem, mus: Array) -> Snapshots:
+    """High-fidelity solutions of a problem at parameters (P×d), one after the other."""
+    solver = HighFidelitySolver(problem)
+    solutions = [solver.solve(mu) for mu in mus]
+    return Snapshots(mus, np.column_stack([s.u for s in solutions]), np.column_stack([s.lam for s in solutions]))
+
+
+def reference_assembly(problem: Problem) -> ReferenceAssembly:
+    """The assembly at the first training parameter, which those at others are compared with."""
+    return ReferenceAssembly(problem, checked_assembly(problem, training_parameters(problem)[0]))
+
+
+@dataclass(frozen=True, eq=False)
+class Reduction:
+    """The offline phase for one problem and one pair of strategies; every step is computed when it is first asked for.
+
+    The steps are the attributes `snapshots`, `pod`, `cone`, `enrichment`, `model` and, for certified models,
+    `certificate`; what a strategy returns is checked. `given` makes a reduction that takes some steps over.
+
+    Attributes
+    ----------
+    problem
+        The high-fidelity problem.
+    dual, primal
+        The strategies that make the cone and enrich V_N; with `None` for the latter nothing is added.
+    modes, generators
+        Where V_N and the cone stop, at a tolerance or at a size.
+    tolerance
+        Of the primal strategy, where it takes one.
+    training
+        A sampling strategy in place of the problem's own training set.
+    assembly, interpolation
+        "full", "reduced" or "certified" as in a study, and the tolerance of empirical interpolation of the latter two.
+    solver, accuracy
+        QP solver of the model's queries, and the relative accuracy that it has to reach.
+
+    Raises
+    ------
+    RequestError
+        If a class is given in place of an instance, or a primal strategy misses its tolerance or has none.
+    """
+
+    problem: Problem
+    dual: DualStrategy
+    primal: PrimalStrategy | None
+    modes: Stop
+    generators: Stop
+    tolerance: float | None = None
+    training: Sampling | None = None
+    assembly: Assembly = "full"
+    interpolation: float = 1e-6
+    solver: str = "piqp"
+    accuracy: float = 1e-9
+
+    def __post_init__(self) -> None:
+        for name, kind in (("problem", Problem), ("dual", DualStrategy), ("primal", PrimalStrategy)):
+            value = getattr(self, name)
+            if not isinstance(value, kind) and not (name == "primal" and value is None):
+                got = f"the class {value.__qualname__}" if isinstance(value, type) else repr(value)
+                raise RequestError(f"{name} is {got}, expected an instance of a subclass of {kind.__name__}")
+        for name in ("modes", "generators"):
+            if not isinstance(value := getattr(self, name), Stop):
+                raise RequestError(f"{name} is {value!r}, expected a Stop: Stop(tolerance=…) or Stop(size=…)")
+        if self.assembly not in get_args(Assembly):
+            raise RequestError(f"assembly is {self.assembly!r}, expected 'full', 'reduced' or 'certified'")
+        if self.primal is None and self.tolerance is not None:
+            raise RequestError("without a primal strategy there is no tolerance")
+        if self.primal is not None and self.primal.takes_tolerance == (self.tolerance is None):
+            needed = "needs a" if self.primal.takes_tolerance else "takes no"
+            raise RequestError(f"{type(self.primal).__qualname__} {needed} tolerance")
+
+    def given(self, **steps: Any) -> Reduction:
+        """A reduction with the same inputs for which these steps are known, by the names of the attributes.
+
+        Steps that were given before are kept, steps that were computed are computed again: they may depend on the new.
+        """
+        other, known = replace(self), self.__dict__.get("_given", {}) | steps
+        other.__dict__.update(known, _given=known)
+        return other
+
+    @cached_property
+    def snapshots(self) -> Snapshots:
+        """High-fidelity solutions at the training parameters; an adaptive sampling strategy chooses these itself."""
+        if not isinstance(self.training, AdaptiveSampling):
+            return high_fidelity_sweep(self.problem, training_parameters(self.problem, self.training))
+        trainer = GrowingTrainer(self.problem, reference_assembly(self.problem))
+        self.training.train(self.problem.parameters, trainer)
+        mus, solutions = np.array([s.mu for s in trainer.solved]), [s.solution for s in trainer.solved]
+        return Snapshots(mus, np.column_stack([s.u for s in solutions]), np.column_stack([s.lam for s in solutions]))
+
+    @cached_property
+    def parameters(self) -> Array:
+        """The training parameters (P×d)."""
+        if isinstance(self.training, AdaptiveSampling):
+            return self.snapshots.mu
+        return training_parameters(self.problem, self.training)
+
+    @cached_property
+    def pod(self) -> POD:
+        """V_N, and the error of the POD for every number of modes (paper, (10) and (11))."""
+        return pod(self.snapshots.u, self.problem.V, self.modes)
+
+    @cached_property
+    def cone(self) -> Cone:
+        """The reduced cone K_R (paper, (12))."""
+        W = self.problem.W
+        return check_cone(self.dual.reduce(self.snapshots.lam, W, self.generators), W)
+
+    @cached_property
+    def multipliers(self) -> Multipliers:
+        """The generators of the cone with their span and Gram matrix, for inf-sup constants."""
+        return multipliers(self.cone.generators, self.problem.W, self.cone.free)
+
+    @cached_property
+    def offline(self) -> Offline:
+        """What the primal strategy is given."""
+        return Offline(self.problem, self.pod.basis, self.cone, self.multipliers.span, self.parameters)
+
+    @cached_property
+    def enrichment(self) -> Enrichment:
+        """What the primal strategy adds to V_N."""
+        if self.primal is None:
+            return Enrichment(Kind.NONE)
+        return check_enrichment(self.primal.build(self.offline, self.tolerance), self.problem.V, self.pod.basis)
+
+    @cached_property
+    def projection(self) -> ReducedModel:
+        """The Galerkin projection on the reduced spaces, assembled in full."""
+        return ReducedModel(self.problem, self.pod.basis, self.enrichment, self.cone.rays, self.multipliers.span)
+
+    @cached_property
+    def members(self) -> Mapping[str, AffineMember]:
+        """A, f, B and g as sums of terms that do not depend on the parameter, or samples of them."""
+        return affine_decomposition(self.problem, self.decomposed, self.interpolation)
+
+    @cached_property
+    def decomposed(self) -> Array:
+        """Parameters (P×d) of the decomposition: the problem's own where training is adaptive, with few parameters."""
+        return training_parameters(self.problem) if isinstance(self.training, AdaptiveSampling) else self.parameters
+
+    @cached_property
+    def operators(self) -> Operators | str:
+        """The members projected on the reduced spaces, or why queries are assembled in full."""
+        why = reason_for_full_assembly(self.projection, self.members)
+        return why or hyper_reduce(self.projection, self.members)
+
+    @cached_property
+    def assembled(self) -> AnyReducedModel:
+        """The model that assembles the programs of queries, in full where that is asked for or nothing else works."""
+        if self.assembly == "full" or isinstance(self.operators, str):
+            return self.projection
+        return HyperReducedModel(self.projection, self.operators)
+
+    @cached_property
+    def certificate_base(self) -> CertificateBase:
+        """What the certificates of all reduced models of the problem have in common."""
+        return certificate_base(self.problem, self.members, self.decomposed)
+
+    @cached_property
+    def certificate(self) -> OnlineCertificate:
+        """What bounds the errors of queries at online cost (`docs/certified.md`).
+
+        Raises
+        ------
+        UnsupportedError
+            If the model is assembled in full, or the problem does not allow it.
+        """
+        if not isinstance(self.assembled, HyperReducedModel):
+            why = "as asked for" if self.assembly == "full" else self.operators
+            raise UnsupportedError(
+                f"a certificate at online cost needs reduced assembly, and the model is assembled in full: {why}"
+            )
+        return prepare(self.assembled, self.members, self.certificate_base, self.decomposed)
+
+    @cached_property
+    def model(self) -> Model:
+        """The reduced model, for queries at any parameter: `model.solve(mu)`."""
+        certificate = self.certificate if self.assembly == "certified" else None
+        return Model(self.assembled, self.solver, self.accuracy, certificate)
