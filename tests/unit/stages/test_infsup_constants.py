@@ -89,7 +89,7 @@ def test_the_kinds_of_enrichment_reach_what_they_are_for(store: SampleStore, pro
 @pytest.mark.parametrize("primal", list(PRIMALS))
 def test_constants_are_those_of_every_parameter_by_itself(store: SampleStore, problem: str, primal: str) -> None:
     stage = cell(problem, primal).assembly.enrichment
-    model, basis = stage.model(store), value_of(store, stage.pod).basis
+    model, basis = stage.reduction(store).projection, value_of(store, stage.pod).basis
     cone = value_of(store, stage.cone).prepared
     found = constants(store, problem, primal)
     mus = model.problem.validation_set(COUNT, 3)

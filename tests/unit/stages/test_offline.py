@@ -180,7 +180,7 @@ def test_a_cell_of_a_nested_strategy_is_the_cell_built_alone(store: SampleStore,
 
 def test_the_model_behind_a_cell_is_ready_for_queries(store: SampleStore) -> None:
     enrichment = cell("online-supremizers", None).assembly.enrichment
-    model, basis = enrichment.model(store), value_of(store, enrichment.pod).basis
+    model, basis = enrichment.reduction(store).projection, value_of(store, enrichment.pod).basis
     prepared = value_of(store, enrichment.cone).prepared
     assert model.kind is Kind.PER_PARAMETER
     query = model.assemble(np.array([1.05, 0.01, -0.03]))
