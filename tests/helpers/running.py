@@ -16,7 +16,7 @@ import pandas as pd
 from vibench.results.columns import KEYS, STORED, TABLES
 from vibench.results.sqlite.digests import Digests
 from vibench.results.sqlite.reading import FILE, read_text
-from vibench.testing.checks import Finding, Verdict
+from vibench.testing.checks import CheckResult, Verdict
 
 Vibench = Callable[..., "subprocess.CompletedProcess[str]"]
 """Runs the installed command in a folder."""
@@ -61,9 +61,9 @@ def rows(folder: Path, table: str = "cells") -> list[dict[str, Any]]:
         db.close()
 
 
-def failures(findings: Sequence[Finding]) -> dict[str, str]:
+def failures(results: Sequence[CheckResult]) -> dict[str, str]:
     """The messages of the checks of a plugin that fail, by the names of the checks."""
-    return {finding.check: finding.message for finding in findings if finding.verdict is Verdict.FAILED}
+    return {result.check: result.message for result in results if result.verdict is Verdict.FAILED}
 
 
 def execute(folder: Path, *statements: str) -> None:

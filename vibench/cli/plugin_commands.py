@@ -96,7 +96,7 @@ def check_plugin(
     """
     from vibench.results.tables import results_file
     from vibench.testing import Verdict
-    from vibench.testing.elsewhere import Examination, examine_elsewhere
+    from vibench.testing.processes import Examination, examine_in_process
 
     found = _find(plugin)
     if run is not None and found.kind != "figure":
@@ -104,9 +104,9 @@ def check_plugin(
     given = {} if run is None else {"run": str(results_file(run).resolve())}
     options, remark = _options(found, dict(map(key_value, option or [])))
     echo(f"{_title(found)}{remark}")
-    examination = Examination(f"{found.kind}s", found.reference, options, seconds, given)
-    findings = examine_elsewhere(examination, lambda finding: echo(str(finding)))
-    counts = {verdict: sum(finding.verdict is verdict for finding in findings) for verdict in Verdict}
+    examination = Examination(found.kind, found.reference, options, seconds, given)
+    results = examine_in_process(examination, lambda result: echo(str(result)))
+    counts = {verdict: sum(result.verdict is verdict for result in results) for verdict in Verdict}
     told = (f"{count} {verdict}" for verdict, count in counts.items() if count or verdict is not Verdict.WARNING)
     echo(", ".join(told))
     if counts[Verdict.FAILED]:

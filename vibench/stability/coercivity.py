@@ -78,7 +78,7 @@ def coercivity_and_continuity(A: SparseMatrix, V: InnerProduct) -> tuple[Constan
     NumericalError
         If A is not symmetric positive definite.
     """
-    low, high = _extreme_quotients(A, V)
+    low, high = extreme_quotients(A, V)
     X, root_A, root_X = V.matrix, np.sqrt(A.diagonal()), np.sqrt(V.matrix.diagonal())
 
     def coercive(a: float) -> bool:
@@ -117,8 +117,14 @@ def _moved(estimate: float, sign: float, proves: Callable[[float], bool]) -> Con
     return Constant(candidates[0], False)
 
 
-def _extreme_quotients(A: SparseMatrix, V: InnerProduct) -> tuple[float, float]:
-    """Estimates of α and γ_a."""
+def extreme_quotients(A: SparseMatrix, V: InnerProduct) -> tuple[float, float]:
+    """Estimates of α and γ_a for A (n×n): the extreme eigenvalues of A against X_V, by Lanczos iterations.
+
+    Raises
+    ------
+    NumericalError
+        If A is not symmetric positive definite.
+    """
     factor = SparseCholesky(A, "A")
     if V.dim <= FEW:
         values = scipy.linalg.eigvalsh(A.toarray(), V.matrix.toarray())

@@ -17,13 +17,9 @@ from vibench.errors import NumericalError
 from vibench.interfaces.problem import MEMBERS, Contact, Problem, VariationalInequality
 from vibench.linalg.inner_product import SYMMETRY_RTOL, InnerProduct
 from vibench.model.affine import CONSTANT_RTOL
-from vibench.testing.case import MOST_POINTS, ProblemCase, assembled
+from vibench.testing.case import MOST_POINTS, PARTIAL_RTOL, ProblemCase
 from vibench.testing.checks import ConformanceError, Doubt, Note, raised
 from vibench.testing.comparisons import Arrays, array_fault, at, copies, difference, differences, peak, unmutated
-from vibench.testing.elsewhere import NotImportableError, call_elsewhere
-
-PARTIAL_RTOL = 1e-10
-"""Largest difference of partial and full assembly, relative to the largest entry of the member."""
 
 ENTRIES = 40
 """Number of entries of every member that are sampled."""
@@ -121,23 +117,6 @@ def _without_effect(case: ProblemCase) -> Iterator[str]:
             differences(case.evaluate(moved), case.evaluate(centre), PARTIAL_RTOL)
         ):
             yield Doubt(f"nothing depends on the parameter '{name}'")
-
-
-def elsewhere(case: ProblemCase) -> Iterator[str]:
-    """Another process, whose sets have another order, assembles the same up to round-off."""
-    mus = case.mus[-2:]
-    try:
-        found = call_elsewhere(assembled, case.create, mus, seconds=case.limit)
-    except NotImportableError as error:
-        yield Note(f"not compared: {error}")
-        return
-    for mu, arrays in zip(mus, found, strict=True):
-        for name, what in differences(arrays, case.results[at(mu)], PARTIAL_RTOL):
-            yield (
-                f"{name} is another one in another process {at(mu)}: {what}; look for the order of sets, unseeded "
-                "random numbers, and what depends on time, folder or environment"
-            )
-            return
 
 
 def continuity(case: ProblemCase) -> Iterator[str]:

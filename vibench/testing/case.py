@@ -6,8 +6,8 @@ import pickle
 import time
 from abc import ABC, abstractmethod
 from collections import defaultdict
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import KW_ONLY, dataclass
 from functools import cached_property
 from typing import Any, ClassVar, Generic, TypeVar
 
@@ -18,8 +18,9 @@ from vibench.errors import NumericalError, in_a_line
 from vibench.interfaces.problem import MEMBERS, Problem
 from vibench.storage.serialisation import dumps, loads
 from vibench.study import registry
-from vibench.testing.checks import ConformanceError, Doubt, Note, plugin_line
+from vibench.testing.checks import SECONDS, ConformanceError, Doubt, Note, plugin_line
 from vibench.testing.comparisons import Arrays, at, copies, differences
+from vibench.testing.processes import NotImportableError, call_in_other_process
 from vibench.timing import timed
 
 MOST_POINTS, LEAST_POINTS = 7, 2
@@ -27,6 +28,12 @@ MOST_POINTS, LEAST_POINTS = 7, 2
 
 CALLS_PER_POINT = 10
 """Assemblies that all checks but the search for jumps make at each of them, about."""
+
+MOST_SENT = 3
+"""Number of arguments at which another process is compared."""
+
+PARTIAL_RTOL = 1e-10
+"""Largest difference of round-off between two ways to assemble, relative to the largest entry of the member."""
 
 LATE = 0.7
 """Share of the time limit after which no search for faults goes on."""
@@ -39,13 +46,14 @@ T = TypeVar("T")
 
 @dataclass(eq=False)
 class Examined(Generic[PluginT]):
-    """A plugin of any kind; `limit` bounds the wall time [s] of the checks."""
+    """A plugin of any kind under examination; `seconds` bounds the wall time [s] of the checks."""
 
     base: ClassVar[type]
     """Class that the plugin derives from."""
 
     create: Callable[[], PluginT]
-    limit: float
+    _: KW_ONLY
+    seconds: float = SECONDS
 
     def __post_init__(self) -> None:
         self._times: defaultdict[str, list[float]] = defaultdict(list)
@@ -75,8 +83,8 @@ class Examined(Generic[PluginT]):
     def duration(self) -> Iterator[str]:
         """The constructor and every call stay below the limit."""
         for what, seconds in self._times.items():
-            if max(seconds) > self.limit:
-                excess = f"{what} takes {max(seconds):.3g} s, above the limit of {self.limit:g} s"
+            if max(seconds) > self.seconds:
+                excess = f"{what} takes {max(seconds):.3g} s, above the limit of {self.seconds:g} s"
                 yield f"{excess}; is something recomputed that could be stored?"
         yield from self._spent()
 
@@ -91,6 +99,9 @@ class Case(Examined[PluginT], ABC, Generic[PluginT, ArgumentT, ResultT]):
 
     Every call receives copies, so that a plugin that writes to its input fails the check "no mutation" alone.
     """
+
+    round_off: ClassVar[float] = 0.0
+    """Largest relative difference that arrays of another process may have."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -117,17 +128,33 @@ class Case(Examined[PluginT], ABC, Generic[PluginT, ArgumentT, ResultT]):
     @property
     def late(self) -> bool:
         """Whether most of the time has passed, so that a search for faults has to end."""
-        return time.monotonic() - self._began > LATE * self.limit
+        return time.monotonic() - self._began > LATE * self.seconds
 
     def options(self) -> Iterator[str]:
-        """Every option has an annotation that its default conforms to."""
+        """Every option has an annotation that its default conforms to: study files may set no other to anything."""
         constructor = getattr(self.create, "func", self.create)
-        yield from option_doubts(constructor) if isinstance(constructor, type) else ()
+        if isinstance(constructor, type):
+            for option, problem in registry.doubtful_options(constructor).items():
+                yield Doubt(f"the option '{option}' {problem}")
 
     def determinism(self) -> Iterator[str]:
         """A second call and another instance give the same results to the last bit."""
-        again = list(self._deviations("a second call", self.plugin))
-        yield from again or self._deviations("another instance", self.create())
+        again = list(self._deviations("a second call", self._evaluation(self.plugin)))
+        yield from again or self._deviations("another instance", self._evaluation(self.create()))
+
+    def another_process(self) -> Iterator[str]:
+        """Another process, whose sets have another order, gives the same results up to `round_off`."""
+        some = dict([*self.arguments.items()][-MOST_SENT:])
+        try:
+            there = call_in_other_process(evaluated, type(self), self.create, some, seconds=self.seconds)
+        except NotImportableError as error:
+            yield Note(f"not compared: {error}")
+            return
+        for line in self._deviations("another process", there.__getitem__, some, self.round_off):
+            yield (
+                f"{line}; look for the order of sets, unseeded random numbers, and what depends on time, folder or "
+                "environment"
+            )
 
     def pickling(self) -> Iterator[str]:
         """The plugin can be sent to another process, and its result be stored."""
@@ -142,31 +169,59 @@ class Case(Examined[PluginT], ABC, Generic[PluginT, ArgumentT, ResultT]):
             raise ConformanceError(f"the {type(before).__name__} cannot be stored: {error}") from None
         for array, what in differences(self.arrays(after), self.arrays(before)):
             yield f"{name}: storing changes {array}: {what}"
-        yield from self._deviations("a pickled copy", pickle.loads(pickle.dumps(self.plugin)))
+        yield from self._deviations("a pickled copy", self._evaluation(pickle.loads(pickle.dumps(self.plugin))))
 
     def stored(self, result: ResultT) -> ResultT:
         """A result as a stage finds it in its artefact."""
-        found: ResultT = loads(dumps(result))
-        return found
+        again: ResultT = loads(dumps(result))
+        return again
 
-    def _deviations(self, source: str, plugin: PluginT) -> Iterator[str]:
-        """Arrays that differ when all calls are repeated, each named once."""
-        found: set[str] = set()
+    def _evaluation(self, plugin: PluginT) -> Callable[[str], Arrays]:
+        """What an instance gives for an argument, by its name."""
+        return lambda name: self.arrays(self.evaluate(self.arguments[name], plugin))
+
+    def _deviations(
+        self, source: str, again: Callable[[str], Arrays], names: Iterable[str] = (), rtol: float = 0.0
+    ) -> Iterator[str]:
+        """Arrays that differ from those of all results, or of some, each named once."""
+        named: set[str] = set()
         # The reverse order reveals results that depend on the previous call.
-        for name in reversed(self.arguments):
-            again = self.arrays(self.evaluate(self.arguments[name], plugin))
-            for array, what in differences(again, self.arrays(self.results[name])):
-                if array not in found:
-                    found.add(array)
+        for name in reversed([*(names or self.arguments)]):
+            for array, what in differences(again(name), self.arrays(self.results[name]), rtol):
+                if array not in named:
+                    named.add(array)
                     yield f"{name}: {source} gives different values of {array}: {what}"
+
+
+def evaluated(
+    case: Callable[[Callable[[], PluginT]], Case[PluginT, ArgumentT, Any]],
+    create: Callable[[], PluginT],
+    arguments: Mapping[str, ArgumentT],
+) -> dict[str, Arrays]:
+    """What another instance gives for some arguments."""
+    other = case(create)
+    return {name: other.arrays(other.evaluate(argument)) for name, argument in arguments.items()}
 
 
 @dataclass(eq=False)
 class ProblemCase(Case[Problem, Array, Arrays]):
-    """A problem, parameters, and the arrays it assembles; `seed` is that of random parameters and entries."""
+    """A problem, parameters, and the arrays it assembles.
+
+    Parameters
+    ----------
+    create
+        Class, or `partial` of it with options; an instance is refused with a `TypeError`. Choose a coarse mesh: some
+        hundred assemblies are made.
+    seconds
+        Wall time [s] that all checks may take, about: where an assembly is slow, they are made at fewer parameters.
+    seed
+        Of the random parameters and entries.
+    """
 
     base = Problem
-    seed: int
+    round_off = PARTIAL_RTOL
+    _: KW_ONLY
+    seed: int = 0
 
     @cached_property
     def one_assembly(self) -> float:
@@ -181,7 +236,7 @@ class ProblemCase(Case[Problem, Array, Arrays]):
             seconds = self.one_assembly
         except Exception:  # noqa: BLE001  the check "assembly" says what a plugin raises
             return MOST_POINTS
-        calls = 0.5 * self.limit / max(seconds, 1e-9)
+        calls = 0.5 * self.seconds / max(seconds, 1e-9)
         return int(min(max(calls / CALLS_PER_POINT, LEAST_POINTS), MOST_POINTS))
 
     @cached_property
@@ -215,18 +270,6 @@ class ProblemCase(Case[Problem, Array, Arrays]):
             place = plugin_line(error)
             names = [f"X_{name}: " for name in "VW" if f"self.{name} =" in place and f"X_{name}" not in str(error)]
             raise ConformanceError(f"{''.join(names)}{error} ({place})") from error
-
-
-def assembled(create: Callable[[], Problem], mus: Array) -> list[Arrays]:
-    """What another instance assembles, and its Gram matrices, at parameters (k×d)."""
-    case = ProblemCase(create, np.inf, 0)
-    return [case.evaluate(mu) for mu in mus]
-
-
-def option_doubts(constructor: type) -> Iterator[str]:
-    """Options that a study file may set to anything, and defaults that it could not set."""
-    for option, problem in registry.doubtful_options(constructor).items():
-        yield Doubt(f"the option '{option}' {problem}")
 
 
 def _pickling_error(thing: Any) -> str:

@@ -1,15 +1,16 @@
-"""Checks, their findings, and the error that lists the failures."""
+"""Checks of plugins, their results, and the error that lists the failures."""
 
 from __future__ import annotations
 
 import inspect
 import sysconfig
 import traceback
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from enum import StrEnum
+from functools import cached_property
 from pathlib import Path
-from typing import Generic, ParamSpec, TypeVar
+from typing import Any, Generic, ParamSpec, TypeVar
 
 import numpy as np
 import scipy
@@ -17,8 +18,9 @@ import scipy
 import vibench
 from vibench.errors import in_a_line
 
-CaseT = TypeVar("CaseT")
+CaseT_contra = TypeVar("CaseT_contra", contravariant=True)
 P = ParamSpec("P")
+T = TypeVar("T")
 
 MOST = 5
 """Largest number of faults that one check lists."""
@@ -37,7 +39,7 @@ class Verdict(StrEnum):
 
 
 @dataclass(frozen=True)
-class Finding:
+class CheckResult:
     """Result of one check: its name, its outcome, and a message.
 
     The message gives every fault and its place, the reason why a check was skipped, or the figures of a passed one and
@@ -69,62 +71,96 @@ class ConformanceError(AssertionError):
 
 
 @dataclass(frozen=True)
-class Check(Generic[CaseT]):
+class Check(Generic[CaseT_contra]):
     """A check: a name, a function from a case to its faults and notes, and the names of checks that must pass before.
 
     A function that reports its faults by a `ConformanceError` alone returns `None`.
     """
 
     name: str
-    faults: Callable[[CaseT], Iterable[str] | None]
+    faults: Callable[[CaseT_contra], Iterable[str] | None]
     needs: tuple[str, ...] = ()
 
-
-def examine(checks: Iterable[Check[CaseT]], case: CaseT) -> list[Finding]:
-    """Make checks in their order; skip a check if one that it needs did not pass."""
-    findings: dict[str, Finding] = {}
-    for check in checks:
-        findings[check.name] = examine_one(check, case, findings)
-    return list(findings.values())
-
-
-def examine_one(check: Check[CaseT], case: CaseT, findings: Mapping[str, Finding]) -> Finding:
-    """Make one check, unless one that it needs is not among the findings or did not pass."""
-    passed = {name for name, found in findings.items() if found.verdict in (Verdict.PASSED, Verdict.WARNING)}
-    missing = [name for name in check.needs if name not in passed]
-    if missing:
-        return Finding(check.name, Verdict.SKIPPED, f"it needs '{missing[0]}'")
-    lines: list[str] = []
-    try:
-        for line in check.faults(case) or ():
-            lines.append(line)  # noqa: PERF402  what precedes an exception is kept
-    except (Exception, SystemExit) as error:  # noqa: BLE001  a plugin may raise anything
-        lines.append(str(error) if isinstance(error, ConformanceError) else raised(error))
-    faults = [line for line in lines if not isinstance(line, Note | Doubt)]
-    if len(faults) > MOST:
-        faults[MOST:] = ["and more"]
-    doubtful = any(isinstance(line, Doubt) for line in lines)
-    verdict = Verdict.FAILED if faults else Verdict.WARNING if doubtful else Verdict.PASSED
-    return Finding(check.name, verdict, "; ".join(faults or lines))
+    def result(self, case: CaseT_contra, earlier: Iterable[CheckResult]) -> CheckResult:
+        """Make the check, unless one that it needs is not among the earlier ones or did not pass."""
+        passed = {one.check for one in earlier if one.verdict in (Verdict.PASSED, Verdict.WARNING)}
+        missing = [name for name in self.needs if name not in passed]
+        if missing:
+            return CheckResult(self.name, Verdict.SKIPPED, f"it needs '{missing[0]}'")
+        lines: list[str] = []
+        try:
+            for line in self.faults(case) or ():
+                lines.append(line)  # noqa: PERF402  what precedes an exception is kept
+        except (Exception, SystemExit) as error:  # noqa: BLE001  a plugin may raise anything
+            lines.append(str(error) if isinstance(error, ConformanceError) else raised(error))
+        faults = [line for line in lines if not isinstance(line, Note | Doubt)]
+        if len(faults) > MOST:
+            faults[MOST:] = ["and more"]
+        doubtful = any(isinstance(line, Doubt) for line in lines)
+        verdict = Verdict.FAILED if faults else Verdict.WARNING if doubtful else Verdict.PASSED
+        return CheckResult(self.name, verdict, "; ".join(faults or lines))
 
 
-def raising(examination: Callable[P, list[Finding]]) -> Callable[P, None]:
-    """Turn `examine_…` into `check_…`, which has the same parameters and raises if a check fails."""
-    signature = inspect.signature(examination)
+@dataclass(frozen=True)
+class Conformance(Generic[P, CaseT_contra]):
+    """The conformance checks of one kind of plugins.
 
-    def check(*args: P.args, **kwargs: P.kwargs) -> None:
-        findings = examination(*args, **kwargs)
-        failures = [f"{each.check}: {each.message}" for each in findings if each.verdict is Verdict.FAILED]
-        if failures:
-            create = signature.bind(*args, **kwargs).arguments["create"]
-            plugin = getattr(getattr(create, "func", create), "__name__", create)
-            raise ConformanceError("\n".join([f"{plugin} fails {len(failures)} of {len(findings)} checks", *failures]))
+    `examine` and `check` are the functions `vibench.testing.examine_KIND` and `check_KIND`. Their parameters are those
+    of the case, whose docstring explains them.
 
-    name, check.__module__ = examination.__name__, examination.__module__
-    check.__name__ = check.__qualname__ = name.replace("examine", "check")
-    check.__doc__ = f"Make the checks of `{name}`; raise a `ConformanceError` that lists all failures if there are any."
-    check.__signature__ = signature.replace(return_annotation=None)  # type: ignore[attr-defined]
-    return check
+    Attributes
+    ----------
+    kind
+        The kind, as `vibench check KIND:NAME` has it.
+    case
+        What makes a case of a plugin, or of a function that makes an instance, and of further arguments.
+    checks
+        The checks in their order.
+    """
+
+    kind: str
+    case: Callable[P, CaseT_contra]
+    checks: tuple[Check[CaseT_contra], ...]
+
+    @cached_property
+    def examine(self) -> Callable[P, list[CheckResult]]:
+        """The function that makes all checks and returns their results."""
+
+        def examine(*args: P.args, **kwargs: P.kwargs) -> list[CheckResult]:
+            case, results = self.case(*args, **kwargs), list[CheckResult]()
+            for check in self.checks:
+                results.append(check.result(case, results))
+            return results
+
+        return self._public(examine, f"Make all checks of a {self.kind} and return their results.", list[CheckResult])
+
+    @cached_property
+    def check(self) -> Callable[P, None]:
+        """The function that makes all checks and raises a `ConformanceError` that lists those that fail."""
+
+        def check(*args: P.args, **kwargs: P.kwargs) -> None:
+            results = self.examine(*args, **kwargs)
+            failures = [f"{each.check}: {each.message}" for each in results if each.verdict is Verdict.FAILED]
+            if failures:
+                create = inspect.signature(self.case).bind(*args, **kwargs).arguments["create"]
+                plugin = getattr(getattr(create, "func", create), "__name__", create)
+                raise ConformanceError(
+                    "\n".join([f"{plugin} fails {len(failures)} of {len(results)} checks", *failures])
+                )
+
+        return self._public(
+            check, f"Make all checks of a {self.kind}; raise a `ConformanceError` that lists the failures."
+        )
+
+    def _public(self, function: Callable[P, T], summary: str, returned: Any = None) -> Callable[P, T]:
+        """The function under its public name, with the parameters of the case and what is said of them."""
+        name = f"{function.__name__}_{self.kind}"
+        explained = "\n\n".join([summary, *str(inspect.getdoc(self.case)).split("\n\n")[1:]])
+        signature = inspect.signature(self.case).replace(return_annotation=returned)
+        vars(function).update(__signature__=signature)
+        function.__name__, function.__qualname__, function.__module__ = name, name, "vibench.testing"
+        function.__doc__ = explained
+        return function
 
 
 def raised(error: BaseException) -> str:

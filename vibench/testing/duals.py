@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import KW_ONLY, dataclass
 from functools import cached_property, partial
 
 import numpy as np
@@ -15,7 +15,7 @@ from vibench.interfaces.validation import check_cone
 from vibench.linalg.inner_product import InnerProduct
 from vibench.reduction.cones import project_on_cone
 from vibench.testing.case import Case
-from vibench.testing.checks import SECONDS, Check, Finding, Note, examine, raising
+from vibench.testing.checks import Check, Conformance, Note
 from vibench.testing.comparisons import Arrays, array_fault, unmutated
 from vibench.testing.samples.model import sample_snapshots
 
@@ -31,13 +31,39 @@ ERROR_RTOL = 1e-6
 
 @dataclass(eq=False)
 class DualCase(Case[DualStrategy, Stop, Cone]):
-    """A dual strategy, tolerances and sizes, and the cones it makes of snapshots (m×P)."""
+    """A dual strategy, tolerances and sizes, and the cones it makes of snapshots (m×P).
+
+    A cone with R + 1 errors claims that its generators are nested, and every error is computed again; a construction
+    that is not nested returns its last error alone.
+
+    Parameters
+    ----------
+    create
+        Class, or `partial` of it with options; an instance is refused with a `TypeError`.
+    snapshots, W
+        Multiplier snapshots (m×P), nonnegative coefficients, and their space; both or neither. By default those of a
+        sample problem.
+    seconds
+        Longest wall time [s] of one call.
+    tolerances, sizes
+        Stopping rules of the cones that are made.
+    """
 
     base = DualStrategy
-    snapshots: Array
-    W: InnerProduct
-    tolerances: Sequence[float]
-    sizes: Sequence[int]
+    snapshots: Array | None = None
+    W: InnerProduct | None = None
+    _: KW_ONLY
+    tolerances: Sequence[float] = TOLERANCES
+    sizes: Sequence[int] = SIZES
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.snapshots is not None and self.W is not None:
+            self.lam, self.space = self.snapshots, self.W
+        elif self.snapshots is None and self.W is None:
+            self.lam, self.space = sample_snapshots()
+        else:
+            raise TypeError("pass both snapshots and W, or neither")
 
     @cached_property
     def arguments(self) -> dict[str, Stop]:
@@ -47,8 +73,8 @@ class DualCase(Case[DualStrategy, Stop, Cone]):
 
     def evaluate(self, argument: Stop, plugin: DualStrategy | None = None, snapshots: Array | None = None) -> Cone:
         """Cone of all snapshots, or of others."""
-        given = (self.snapshots if snapshots is None else snapshots).copy()
-        return self.clocked("a cone", lambda: (plugin or self.plugin).reduce(given, self.W, argument))
+        given = (self.lam if snapshots is None else snapshots).copy()
+        return self.clocked("a cone", lambda: (plugin or self.plugin).reduce(given, self.space, argument))
 
     def arrays(self, result: Cone) -> Arrays:
         """Generators, errors and signs."""
@@ -57,14 +83,14 @@ class DualCase(Case[DualStrategy, Stop, Cone]):
     def cone(self) -> Iterator[str]:
         """Generators lie in W⁺ and have unit norm; errors have the right shape."""
         for stop, cone in self.results.items():
-            fault = _cone_fault(cone, self.W)
+            fault = _cone_fault(cone, self.space)
             yield f"{stop}: {fault}" if fault else Note(f"{stop}: R = {cone.size}")
 
     def tolerance(self) -> Iterator[str]:
         """The projection error of every snapshot is below the tolerance."""
         for name, stop in self.arguments.items():
             if stop.tolerance is not None:
-                yield from self._missed(stop.tolerance, self.results[name], self.snapshots)
+                yield from self._missed(stop.tolerance, self.results[name], self.lam)
 
     def _missed(self, tolerance: float, cone: Cone, snapshots: Array) -> Iterator[str]:
         errors = self._errors(cone, cone.size, snapshots)
@@ -81,7 +107,7 @@ class DualCase(Case[DualStrategy, Stop, Cone]):
             cone = self.results[name]
             if stop.size is None or cone.size == stop.size:
                 continue
-            error = self._errors(cone, cone.size, self.snapshots).max(initial=0.0)
+            error = self._errors(cone, cone.size, self.lam).max(initial=0.0)
             if cone.size > stop.size or error > ERROR_ATOL:
                 yield f"{name} was prescribed; the cone has {cone.size} generators and the projection error {error:.1e}"
 
@@ -90,7 +116,7 @@ class DualCase(Case[DualStrategy, Stop, Cone]):
         for stop, cone in self.results.items():
             first = 0 if len(cone.errors) == cone.size + 1 else cone.size
             for r, claimed in enumerate(cone.errors, first):
-                error = self._errors(cone, r, self.snapshots).max(initial=0.0)
+                error = self._errors(cone, r, self.lam).max(initial=0.0)
                 if abs(error - claimed) > ERROR_ATOL + ERROR_RTOL * error:
                     yield (
                         f"{stop}: the claimed error e({r}) is {claimed:.6g}; the projection error of the snapshots is "
@@ -101,14 +127,14 @@ class DualCase(Case[DualStrategy, Stop, Cone]):
     def no_mutation(self) -> None:
         """`reduce` changes neither the snapshots nor the space."""
         for name, stop in self.arguments.items():
-            given = self.snapshots.copy()
-            arrays = {"the snapshots": given, "X_W": self.W.matrix}
-            unmutated(f"{name}: reduce", arrays, partial(self.plugin.reduce, given, self.W, stop))
+            given = self.lam.copy()
+            arrays = {"the snapshots": given, "X_W": self.space.matrix}
+            unmutated(f"{name}: reduce", arrays, partial(self.plugin.reduce, given, self.space, stop))
 
     def without_contact(self) -> Iterator[str]:
         """Zero, repeated and single snapshots are reduced; snapshots that all vanish are reduced or refused."""
         tolerance = next(iter(self.tolerances), TOLERANCES[0])
-        some, stop = self.snapshots, Stop(tolerance=tolerance)
+        some, stop = self.lam, Stop(tolerance=tolerance)
         largest = some[:, [np.linalg.norm(some, axis=0).argmax()]]
         for name, snapshots in {
             "with a zero snapshot": np.hstack([np.zeros((len(some), 1)), some]),
@@ -116,23 +142,23 @@ class DualCase(Case[DualStrategy, Stop, Cone]):
             "with one snapshot": largest,
         }.items():
             cone = self.evaluate(stop, snapshots=snapshots)
-            if fault := _cone_fault(cone, self.W) or "".join(self._missed(tolerance, cone, snapshots)):
+            if fault := _cone_fault(cone, self.space) or "".join(self._missed(tolerance, cone, snapshots)):
                 yield f"{name}: {fault}"
         try:
             cone = self.evaluate(stop, snapshots=np.zeros_like(some))
         except VibenchError:  # a strategy may refuse them in one line
             return
-        if fault := _cone_fault(cone, self.W):
+        if fault := _cone_fault(cone, self.space):
             yield f"with zero snapshots alone: {fault}; expected a cone without generators"
 
     def _errors(self, cone: Cone, r: int, snapshots: Array) -> Array:
         """Projection errors (P,) on the cone of the first r generators, relative to the largest norm of a snapshot."""
-        largest = float(np.max(self.W.norm(snapshots), initial=0.0)) or 1.0
+        largest = float(np.max(self.space.norm(snapshots), initial=0.0)) or 1.0
         chi = rays(cone.generators[:, :r], cone.free[:r])
-        return np.array([project_on_cone(chi, theta, self.W).distance for theta in snapshots.T]) / largest
+        return np.array([project_on_cone(chi, theta, self.space).distance for theta in snapshots.T]) / largest
 
 
-CHECKS: tuple[Check[DualCase], ...] = (
+DUAL = Conformance("dual", DualCase, (
     Check("construction", DualCase.construction),
     Check("options", DualCase.options, ("construction",)),
     Check("cone", DualCase.cone, ("construction",)),
@@ -144,53 +170,7 @@ CHECKS: tuple[Check[DualCase], ...] = (
     Check("snapshots without contact", DualCase.without_contact, ("cone", "tolerance")),
     Check("pickling", DualCase.pickling, ("determinism",)),
     Check("time", DualCase.duration, ("cone",)),
-)
-
-
-def case_of(
-    create: Callable[[], DualStrategy],
-    seconds: float = SECONDS,
-    given: tuple[Array, InnerProduct] | None = None,
-    tolerances: Sequence[float] = TOLERANCES,
-    sizes: Sequence[int] = SIZES,
-) -> DualCase:
-    """The case of a dual strategy and snapshots `given` with their space; see `examine_dual`."""
-    return DualCase(create, seconds, *(given or sample_snapshots()), tolerances, sizes)
-
-
-def examine_dual(
-    create: Callable[[], DualStrategy],
-    snapshots: Array | None = None,
-    W: InnerProduct | None = None,
-    *,
-    tolerances: Sequence[float] = TOLERANCES,
-    sizes: Sequence[int] = SIZES,
-    seconds: float = SECONDS,
-) -> list[Finding]:
-    """Make all checks of a dual strategy.
-
-    A cone with R + 1 errors claims that its generators are nested, and every error is computed again; a construction
-    that is not nested returns its last error alone.
-
-    Parameters
-    ----------
-    create
-        Class, or `partial` of it with options; an instance is refused with a `TypeError`.
-    snapshots, W
-        Multiplier snapshots (m×P), nonnegative coefficients, and their space; both or neither. By default those of a
-        sample problem.
-    tolerances, sizes
-        Stopping rules of the cones that are made.
-    seconds
-        Longest wall time [s] of one call.
-    """
-    if (snapshots is None) != (W is None):
-        raise TypeError("pass both snapshots and W, or neither")
-    given = None if snapshots is None or W is None else (snapshots, W)
-    return examine(CHECKS, case_of(create, seconds, given, tolerances, sizes))
-
-
-check_dual = raising(examine_dual)
+))  # fmt: skip
 
 
 def _cone_fault(cone: object, W: InnerProduct) -> str:

@@ -6,7 +6,7 @@ import inspect
 import shutil
 import tempfile
 import weakref
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property, partial
 from pathlib import Path
@@ -18,7 +18,7 @@ from vibench.interfaces.figures import EXTENSIBLE, DerivedColumn, FigurePlugin
 from vibench.results import tables
 from vibench.results.plugin_columns import Copies, column_values, declared, name_faults
 from vibench.testing.case import Examined
-from vibench.testing.checks import SECONDS, Check, Doubt, Finding, Note, examine, raising
+from vibench.testing.checks import Check, Conformance, Doubt, Note
 from vibench.testing.samples.run import write_sample_run
 
 if TYPE_CHECKING:
@@ -30,10 +30,21 @@ NAME = "examined"
 
 @dataclass(eq=False)
 class FigureCase(Examined[FigurePlugin]):
-    """A figure plugin and the results file that its figures and columns are made from."""
+    """A figure plugin and the results file that its figures and columns are made from.
+
+    Parameters
+    ----------
+    create
+        Its class; an instance is refused with a `TypeError`.
+    run
+        A run: its folder, its results file, or its name under `runs/`. By default a made-up one of two problems,
+        membrane and plate, each with two dual strategies and three enrichments, in which a cell failed.
+    seconds
+        Longest wall time [s] of a figure or a column.
+    """
 
     base = FigurePlugin
-    run: Path | None = None
+    run: str | Path | None = None
 
     @cached_property
     def folder(self) -> Path:
@@ -45,7 +56,7 @@ class FigureCase(Examined[FigurePlugin]):
     @cached_property
     def path(self) -> Path:
         """The results file: of the run that is given, or of the made-up one."""
-        return self.run or write_sample_run(self.folder / "run")
+        return write_sample_run(self.folder / "run") if self.run is None else tables.results_file(str(self.run))
 
     @cached_property
     def recorded(self) -> Copies:
@@ -171,7 +182,7 @@ def _frames(data: Data) -> dict[str, pd.DataFrame]:
     return {name: getattr(data, name).copy() for name in ("cells", "queries", "histories", "thresholds")}
 
 
-CHECKS: tuple[Check[FigureCase], ...] = (
+FIGURE = Conformance("figure", FigureCase, (
     Check("construction", FigureCase.construction),
     Check("drawings", FigureCase.drawings, ("construction",)),
     Check("figures", FigureCase.figures, ("drawings",)),
@@ -180,30 +191,4 @@ CHECKS: tuple[Check[FigureCase], ...] = (
     Check("determinism", FigureCase.determinism, ("figures", "values")),
     Check("something to show", FigureCase.something, ("drawings", "columns")),
     Check("time", FigureCase.duration, ("figures", "values")),
-)
-
-
-def case_of(create: Callable[[], FigurePlugin], seconds: float = SECONDS, run: str | Path | None = None) -> FigureCase:
-    """The case of a figure plugin; see `examine_figure`."""
-    return FigureCase(create, seconds, None if run is None else tables.results_file(str(run)))
-
-
-def examine_figure(
-    create: Callable[[], FigurePlugin], run: str | Path | None = None, *, seconds: float = SECONDS
-) -> list[Finding]:
-    """Make all checks of a figure plugin.
-
-    Parameters
-    ----------
-    create
-        Its class; an instance is refused with a `TypeError`.
-    run
-        A run: its folder, its results file, or its name under `runs/`. By default a made-up one of two problems,
-        membrane and plate, each with two dual strategies and three enrichments, in which a cell failed.
-    seconds
-        Longest wall time [s] of a figure or a column.
-    """
-    return examine(CHECKS, case_of(create, seconds, run))
-
-
-check_figure = raising(examine_figure)
+))  # fmt: skip

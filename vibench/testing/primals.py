@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import KW_ONLY, dataclass
 from functools import cached_property, partial
 from itertools import pairwise
 
@@ -18,7 +18,7 @@ from vibench.reduction.nested import NestedStrategy, grow_through
 from vibench.stages.enrichment import BuiltEnrichment
 from vibench.storage.serialisation import dumps, loads
 from vibench.testing.case import Case
-from vibench.testing.checks import SECONDS, Check, ConformanceError, Finding, Note, examine, raised, raising
+from vibench.testing.checks import Check, Conformance, ConformanceError, Note, raised
 from vibench.testing.comparisons import Arrays, array_fault, at, difference, unmutated
 from vibench.testing.samples.model import arrays_of, copy_of, offline_of, sample_offline
 
@@ -30,11 +30,29 @@ NESTED_ATOL = 1e-10
 
 @dataclass(eq=False)
 class PrimalCase(Case[PrimalStrategy, float | None, Enrichment]):
-    """A primal strategy, tolerances or `None`, and the enrichments it makes of a reduced model."""
+    """A primal strategy, tolerances or `None`, and the enrichments it makes of a reduced model.
+
+    Parameters
+    ----------
+    create
+        Class, or `partial` of it with options; an instance is refused with a `TypeError`.
+    offline
+        Reduced model to enrich; by default one of a sample problem.
+    seconds
+        Longest wall time [s] of one call.
+    tolerances
+        Tolerances for a strategy that takes one, in any order.
+    """
 
     base = PrimalStrategy
-    offline: Offline
-    tolerances: Sequence[float]
+    offline: Offline | None = None
+    _: KW_ONLY
+    tolerances: Sequence[float] = TOLERANCES
+
+    @cached_property
+    def model(self) -> Offline:
+        """The reduced model."""
+        return self.offline or sample_offline()
 
     @cached_property
     def arguments(self) -> dict[str, float | None]:
@@ -46,16 +64,16 @@ class PrimalCase(Case[PrimalStrategy, float | None, Enrichment]):
 
     def evaluate(self, argument: float | None, plugin: PrimalStrategy | None = None) -> Enrichment:
         """Enrichment for a tolerance."""
-        given = copy_of(self.offline)
+        given = copy_of(self.model)
         return self.clocked("an enrichment", lambda: (plugin or self.plugin).build(given, argument))
 
     def arrays(self, result: Enrichment, offline: Offline | None = None) -> Arrays:
         """Vectors (n×S), eta (m×k), or the vectors (n×k) supplied at the first training parameter."""
-        model = offline or self.offline
-        problem, mu = model.problem, model.training[0]
+        reduced = offline or self.model
+        problem, mu = reduced.problem, reduced.training[0]
         named = {"vectors": result.vectors, "eta": result.eta}
         if result.supply is not None:
-            named[f"the supply {at(mu)}"] = result.supply(problem.V, problem.assemble(mu.copy()), model.span.copy())
+            named[f"the supply {at(mu)}"] = result.supply(problem.V, problem.assemble(mu.copy()), reduced.span.copy())
         return {name: value for name, value in named.items() if value is not None}
 
     def stored(self, result: Enrichment) -> Enrichment:
@@ -83,7 +101,7 @@ class PrimalCase(Case[PrimalStrategy, float | None, Enrichment]):
     def enrichment(self) -> Iterator[str]:
         """Enrichments have the right types and shapes; fixed vectors are orthonormal and orthogonal to V_N."""
         for name, found in self.results.items():
-            if fault := self._fault(found, self.offline):
+            if fault := self._fault(found, self.model):
                 raise ConformanceError(f"{name}: {fault}")
             vectors = found.vectors if found.vectors is not None else found.eta
             yield Note(f"{name}: {found.kind}" + ("" if vectors is None else f", {vectors.shape[1]} vectors"))
@@ -123,7 +141,7 @@ class PrimalCase(Case[PrimalStrategy, float | None, Enrichment]):
             yield Note("not declared")
             return
         tolerances = {name: tolerance for name, tolerance in self.arguments.items() if tolerance is not None}
-        grown = grow_through(self.plugin, copy_of(self.offline), tolerances.values())
+        grown = grow_through(self.plugin, copy_of(self.model), tolerances.values())
         fixed = self._fixed()
         tightest, longest = list(fixed.items())[-1]
         limit = NESTED_ATOL * float(np.max(np.abs(longest), initial=0.0))
@@ -140,14 +158,14 @@ class PrimalCase(Case[PrimalStrategy, float | None, Enrichment]):
     def no_mutation(self) -> None:
         """`build` changes nothing of the reduced model."""
         for name, tolerance in self.arguments.items():
-            given = copy_of(self.offline)
+            given = copy_of(self.model)
             unmutated(f"{name}: build", arrays_of(given), partial(self.plugin.build, given, tolerance))
 
     def without_contact(self) -> Iterator[str]:
         """A cone without generators, as of snapshots without contact, is accepted or refused."""
-        problem = self.offline.problem
+        problem = self.model.problem
         empty = Cone(np.zeros((problem.W.dim, 0)), np.zeros(1), no_free(0))
-        offline = offline_of(problem, self.offline.basis.copy(), empty)
+        offline = offline_of(problem, self.model.basis.copy(), empty)
         try:
             found = self.plugin.build(offline, next(iter(self.arguments.values())))
         except VibenchError:  # a strategy may refuse it in one line
@@ -156,7 +174,7 @@ class PrimalCase(Case[PrimalStrategy, float | None, Enrichment]):
             yield f"with a cone without generators: {fault}"
 
 
-CHECKS: tuple[Check[PrimalCase], ...] = (
+PRIMAL = Conformance("primal", PrimalCase, (
     Check("construction", PrimalCase.construction),
     Check("options", PrimalCase.options, ("construction",)),
     Check("tolerance", PrimalCase.tolerance, ("construction",)),
@@ -169,40 +187,4 @@ CHECKS: tuple[Check[PrimalCase], ...] = (
     Check("model without contact", PrimalCase.without_contact, ("enrichment",)),
     Check("pickling", PrimalCase.pickling, ("determinism",)),
     Check("time", PrimalCase.duration, ("enrichment",)),
-)
-
-
-def case_of(
-    create: Callable[[], PrimalStrategy],
-    seconds: float = SECONDS,
-    offline: Offline | None = None,
-    tolerances: Sequence[float] = TOLERANCES,
-) -> PrimalCase:
-    """The case of a primal strategy; see `examine_primal`."""
-    return PrimalCase(create, seconds, offline or sample_offline(), tolerances)
-
-
-def examine_primal(
-    create: Callable[[], PrimalStrategy],
-    offline: Offline | None = None,
-    *,
-    tolerances: Sequence[float] = TOLERANCES,
-    seconds: float = SECONDS,
-) -> list[Finding]:
-    """Make all checks of a primal strategy.
-
-    Parameters
-    ----------
-    create
-        Class, or `partial` of it with options; an instance is refused with a `TypeError`.
-    offline
-        Reduced model to enrich; by default one of a sample problem.
-    tolerances
-        Tolerances for a strategy that takes one, in any order.
-    seconds
-        Longest wall time [s] of one call.
-    """
-    return examine(CHECKS, case_of(create, seconds, offline, tolerances))
-
-
-check_primal = raising(examine_primal)
+))  # fmt: skip

@@ -2,25 +2,39 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 
 import numpy as np
+import scipy.sparse as sp
 
 from vibench.arrays import Array
 from vibench.errors import NumericalError
 from vibench.highfidelity import active_set
 from vibench.interfaces.outputs import Output
-from vibench.interfaces.problem import ParameterBox, Picture, Problem
+from vibench.interfaces.problem import ParameterBox, Picture
 from vibench.interfaces.validation import training_parameters, validation_parameters
+from vibench.linalg.dense import singular_values
 from vibench.linalg.inner_product import InnerProduct
+from vibench.stability.coercivity import extreme_quotients
 from vibench.testing import assembly
 from vibench.testing.case import ProblemCase
-from vibench.testing.checks import SECONDS, Check, ConformanceError, Doubt, Finding, Note, examine, raising
+from vibench.testing.checks import Check, Conformance, ConformanceError, Doubt, Note
 from vibench.testing.comparisons import array_fault, at, difference, unmutated
-from vibench.testing.constants import constants
 
 SOLVED = 5
 """Number of training parameters solved at; up to ten times as many while no constraint is active."""
+
+MOST_CONSTRAINTS = 1000
+"""With more constraints β_HF is not computed."""
+
+EXTREME = 10.0
+"""Up to this γ_a/α a norm is not doubted."""
+
+DIAGONAL_SHARE = 0.8
+"""Share of the condition number of A with its own diagonal that a good norm stays below, already on coarse meshes."""
+
+DEPENDENT = 1e-10
+"""β_HF / γ_b below which rows of B are linearly dependent up to round-off."""
 
 
 def spaces(case: ProblemCase) -> Iterator[str]:
@@ -90,6 +104,35 @@ def _outside(name: str, mus: Array, box: ParameterBox) -> Iterator[str]:
     for k, i in np.argwhere(box.outside(mus))[:1]:
         interval = f"[{box.lower[i]:g}, {box.upper[i]:g}]"
         yield f"{name} leaves the box: parameter {k}, {at(mus[k])}, has '{box.names[i]}' outside {interval}"
+
+
+def constants(case: ProblemCase) -> Iterator[str]:
+    """α and γ_a of A, β_HF and γ_b of B are of a moderate ratio.
+
+    Norms of V that bound A from both sides, such as energy and H¹ norms, have a ratio γ_a/α that does not depend on the
+    mesh. Diagonal matrices in their place have one of O(h⁻²), and so have a mass matrix and any norm without gradients;
+    one in another order of the unknowns has a larger one. The ratio is compared with that of the diagonal of A.
+    """
+    where, found = next(iter(case.results.items()))
+    A, V, W = found["A"], case.plugin.V, case.plugin.W
+    lowest, highest = extreme_quotients(A, V)
+    yield Note(f"{where}: α = {lowest:.3g}, γ_a = {highest:.3g}")
+    low, high = extreme_quotients(A, InnerProduct(sp.diags_array(A.diagonal(), format="csc")))
+    ratio, diagonal = highest / lowest, high / low
+    if ratio > max(EXTREME, DIAGONAL_SHARE * diagonal):
+        yield Doubt(
+            f"γ_a/α = {ratio:.2g}, as large as with the diagonal of A in place of X_V ({diagonal:.2g}): probably X_V "
+            "has the unknowns in another order than A, or is a norm without gradients, such as a mass matrix"
+        )
+    if W.dim > MOST_CONSTRAINTS:
+        yield Note(f"β_HF is not computed for more than {MOST_CONSTRAINTS} constraints")
+        return
+    values = singular_values(V.whiten_functional(np.asarray(found["B"].T @ W.unwhiten(np.eye(W.dim)))))
+    beta = float(values[-1]) if len(values) == W.dim else 0.0
+    yield Note(f"β_HF = {beta:.3g}, γ_b = {values[0]:.3g}")
+    if beta <= DEPENDENT * values[0]:
+        dependent = W.dim - int(np.sum(values > DEPENDENT * values[0]))
+        yield Doubt(f"β_HF/γ_b = {beta / values[0]:.1g}: {dependent} rows of B depend linearly on the others")
 
 
 def solution(case: ProblemCase) -> Iterator[str]:
@@ -179,7 +222,7 @@ def outputs(case: ProblemCase) -> Iterator[str]:
     yield Note(f"{', '.join(names)}" if names else "no outputs")
 
 
-CHECKS: tuple[Check[ProblemCase], ...] = (
+PROBLEM = Conformance("problem", ProblemCase, (
     Check("construction", ProblemCase.construction),
     Check("options", ProblemCase.options, ("construction",)),
     Check("spaces", spaces, ("construction",)),
@@ -192,7 +235,7 @@ CHECKS: tuple[Check[ProblemCase], ...] = (
     Check("symmetry of A", assembly.symmetry, ("assembly",)),
     Check("definiteness of A", assembly.definiteness, ("symmetry of A",)),
     Check("determinism", ProblemCase.determinism, ("assembly",)),
-    Check("another process", assembly.elsewhere, ("determinism",)),
+    Check("another process", ProblemCase.another_process, ("determinism",)),
     Check("coercivity and inf-sup", constants, ("definiteness of A", "determinism")),
     Check("independence of mu", assembly.independence, ("determinism",)),
     Check("continuity in mu", assembly.continuity, ("independence of mu",)),
@@ -200,36 +243,9 @@ CHECKS: tuple[Check[ProblemCase], ...] = (
     Check("affine sums", assembly.affine, ("determinism",)),
     Check("assembly by entries", assembly.by_entries, ("determinism",)),
     Check("pickling", ProblemCase.pickling, ("determinism",)),
-    Check(
-        "high-fidelity solution",
-        solution,
-        ("training set", "definiteness of A", "independence of mu", "assembly on the contact"),
-    ),
+    Check("high-fidelity solution", solution,
+          ("training set", "definiteness of A", "independence of mu", "assembly on the contact")),
     Check("picture and diagnostics", pictures, ("high-fidelity solution",)),
     Check("outputs", outputs, ("high-fidelity solution",)),
     Check("time", ProblemCase.duration, ("assembly",)),
-)
-
-
-def case_of(create: Callable[[], Problem], seconds: float = SECONDS, seed: int = 0) -> ProblemCase:
-    """The case of a problem; see `examine_problem`."""
-    return ProblemCase(create, seconds, seed)
-
-
-def examine_problem(create: Callable[[], Problem], *, seed: int = 0, seconds: float = SECONDS) -> list[Finding]:
-    """Make all checks of a problem.
-
-    Parameters
-    ----------
-    create
-        Class, or `partial` of it with options; an instance is refused with a `TypeError`. Choose a coarse mesh: some
-        hundred assemblies are made.
-    seed
-        Of the random parameters and entries.
-    seconds
-        Wall time [s] that all checks may take, about: where an assembly is slow, they are made at fewer parameters.
-    """
-    return examine(CHECKS, case_of(create, seconds, seed))
-
-
-check_problem = raising(examine_problem)
+))  # fmt: skip

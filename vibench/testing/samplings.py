@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from typing import Any
 
@@ -15,9 +15,8 @@ from vibench.errors import RequestError
 from vibench.interfaces.problem import ParameterBox
 from vibench.interfaces.sampling import AdaptiveSampling, Sampling, Trainer, check_sample
 from vibench.testing.case import Case
-from vibench.testing.checks import SECONDS, Check, ConformanceError, Doubt, Finding, Note, examine, raised, raising
-from vibench.testing.comparisons import Arrays, differences
-from vibench.testing.elsewhere import NotImportableError, call_elsewhere
+from vibench.testing.checks import Check, Conformance, ConformanceError, Doubt, Note, raised
+from vibench.testing.comparisons import Arrays
 
 SIZES = (1, 5, 16)
 """Values of an option `size` that are tried."""
@@ -40,10 +39,24 @@ BOXES: Mapping[str, ParameterBox] = {
 
 @dataclass(eq=False)
 class SamplingCase(Case[Sampling, ParameterBox, Array]):
-    """A sampling strategy, boxes, and its points (P×d) in those that its options fit."""
+    """A sampling strategy, boxes, and its points (P×d) in those that its options fit.
+
+    An option called `size` is the number of points, one called `seed` determines whatever is random; both are tried
+    with other values.
+
+    Parameters
+    ----------
+    create
+        Class, or `partial` of it with options; an instance is refused with a `TypeError`.
+    boxes
+        Boxes by what they are called in messages; by default three, of one to three parameters called position, height
+        and stiffness. A strategy may refuse some of them by a `RequestError`, where its options do not fit.
+    seconds
+        Longest wall time [s] of one call.
+    """
 
     base = Sampling
-    boxes: Mapping[str, ParameterBox]
+    boxes: Mapping[str, ParameterBox] = field(default_factory=lambda: BOXES)
 
     @cached_property
     def tried(self) -> dict[str, Array | RequestError]:
@@ -114,17 +127,6 @@ class SamplingCase(Case[Sampling, ParameterBox, Array]):
             if len(samples[0]) > 1 and all(np.array_equal(samples[0], other) for other in samples[1:]):
                 yield Doubt(f"{name}: seeds 0 to 3 give the same points, so that the option 'seed' changes nothing")
 
-    def elsewhere(self) -> Iterator[str]:
-        """Another process draws the same points."""
-        try:
-            there = call_elsewhere(samples_of, self.create, dict(self.arguments), seconds=self.limit)
-        except NotImportableError as error:
-            yield Note(f"another process cannot import the strategy: {error}")
-            return
-        for name, found in self.results.items():
-            for _, what in differences({"": there[name]}, {"": found}):
-                yield f"{name}: another process gives different points: {what}"
-
     def no_mutation(self) -> Iterator[str]:
         """Neither the box nor NumPy's global random numbers are changed."""
         for name, box in self.arguments.items():
@@ -189,12 +191,6 @@ class DistanceTrainer(Trainer):
         return float(min(gaps, default=np.inf))
 
 
-def samples_of(create: Callable[[], Sampling], boxes: Mapping[str, ParameterBox]) -> dict[str, Array]:
-    """What another instance draws in some boxes."""
-    plugin = create()
-    return {name: _points(plugin, box) for name, box in boxes.items()}
-
-
 def _points(plugin: Sampling, box: ParameterBox) -> Array:
     return np.array(plugin.parameters(_copy(box)), float)
 
@@ -220,47 +216,16 @@ def _same_state(one: Any, other: Any) -> bool:
     return all(np.array_equal(a, b) for a, b in zip(one, other, strict=True))
 
 
-CHECKS: tuple[Check[SamplingCase], ...] = (
+SAMPLING = Conformance("sampling", SamplingCase, (
     Check("construction", SamplingCase.construction),
     Check("options", SamplingCase.options, ("construction",)),
     Check("parameters", SamplingCase.parameters, ("construction",)),
     Check("size", SamplingCase.size, ("parameters",)),
     Check("determinism", SamplingCase.determinism, ("parameters",)),
     Check("seed", SamplingCase.seed, ("determinism",)),
-    Check("another process", SamplingCase.elsewhere, ("determinism",)),
+    Check("another process", SamplingCase.another_process, ("determinism",)),
     Check("no mutation", SamplingCase.no_mutation, ("parameters",)),
     Check("training", SamplingCase.training, ("determinism",)),
     Check("pickling", SamplingCase.pickling, ("determinism",)),
     Check("time", SamplingCase.duration, ("parameters",)),
-)
-
-
-def case_of(
-    create: Callable[[], Sampling], seconds: float = SECONDS, boxes: Mapping[str, ParameterBox] = BOXES
-) -> SamplingCase:
-    """The case of a sampling strategy; see `examine_sampling`."""
-    return SamplingCase(create, seconds, boxes)
-
-
-def examine_sampling(
-    create: Callable[[], Sampling], boxes: Mapping[str, ParameterBox] = BOXES, *, seconds: float = SECONDS
-) -> list[Finding]:
-    """Make all checks of a sampling strategy.
-
-    An option called `size` is the number of points, one called `seed` determines whatever is random; both are tried
-    with other values.
-
-    Parameters
-    ----------
-    create
-        Class, or `partial` of it with options; an instance is refused with a `TypeError`.
-    boxes
-        Boxes by what they are called in messages; by default three, of one to three parameters called position, height
-        and stiffness. A strategy may refuse some of them by a `RequestError`, where its options do not fit.
-    seconds
-        Longest wall time [s] of one call.
-    """
-    return examine(CHECKS, case_of(create, seconds, boxes))
-
-
-check_sampling = raising(examine_sampling)
+))  # fmt: skip

@@ -6,7 +6,7 @@ import copy
 import statistics
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import KW_ONLY, dataclass, replace
 from functools import cached_property, partial
 
 import numpy as np
@@ -19,7 +19,7 @@ from vibench.qp.solution import QPSolution, QPSolver
 from vibench.qp.solve import solve_qp
 from vibench.qp.status import Status
 from vibench.qp.verification import kkt_residuals, verify
-from vibench.testing.checks import SECONDS, Check, ConformanceError, Doubt, Finding, Note, examine, raised, raising
+from vibench.testing.checks import SECONDS, Check, Conformance, ConformanceError, Doubt, Note, raised
 from vibench.testing.comparisons import copies, differences, unmutated
 from vibench.timing import timed
 
@@ -96,10 +96,19 @@ IMPOSSIBLE = VariationalInequality(np.eye(1), np.ones(1), np.array([[1.0], [-1.0
 
 @dataclass(eq=False)
 class SolverCase:
-    """A QP solver, and the programs it solves; `limit` bounds the wall time [s] of the checks."""
+    """A QP solver, and the programs it solves.
+
+    Parameters
+    ----------
+    create
+        The function that is registered under `vibench.qp_solvers`.
+    seconds
+        Longest wall time [s] of one solution.
+    """
 
     create: QPSolver
-    limit: float
+    _: KW_ONLY
+    seconds: float = SECONDS
 
     @cached_property
     def programs(self) -> dict[str, KnownProgram]:
@@ -231,8 +240,8 @@ class SolverCase:
         begin = time.perf_counter()
         self.create(self.typical, ACCURACY)
         seconds = time.perf_counter() - begin
-        if seconds > self.limit:
-            yield f"a solution takes {seconds:.3g} s, above the limit of {self.limit:g} s"
+        if seconds > self.seconds:
+            yield f"a solution takes {seconds:.3g} s, above the limit of {self.seconds:g} s"
         elif seconds > 1.0:
             yield Doubt(f"a solution of a program of 6 unknowns takes {seconds:.3g} s")
         yield Note(f"a solution takes {seconds:.2g} s")
@@ -255,7 +264,7 @@ def of_qpsolvers(program: VariationalInequality, accuracy: float, *, solver: str
     return solve_qp(program, solver, accuracy)
 
 
-CHECKS: tuple[Check[SolverCase], ...] = (
+SOLVER = Conformance("solver", SolverCase, (
     Check("answer", SolverCase.answer),
     Check("signs of multipliers", SolverCase.signs, ("answer",)),
     Check("known solutions", SolverCase.solutions, ("signs of multipliers",)),
@@ -266,25 +275,4 @@ CHECKS: tuple[Check[SolverCase], ...] = (
     Check("independent calls", SolverCase.independence, ("known solutions", "no mutation")),
     Check("repeated programs", SolverCase.repetition, ("answer",)),
     Check("time", SolverCase.duration, ("answer",)),
-)
-
-
-def case_of(create: QPSolver, seconds: float = SECONDS) -> SolverCase:
-    """The case of a solver; see `examine_solver`."""
-    return SolverCase(create, seconds)
-
-
-def examine_solver(create: QPSolver, *, seconds: float = SECONDS) -> list[Finding]:
-    """Make all checks of a QP solver.
-
-    Parameters
-    ----------
-    create
-        The function that is registered under `vibench.qp_solvers`.
-    seconds
-        Longest wall time [s] of one solution.
-    """
-    return examine(CHECKS, case_of(create, seconds))
-
-
-check_solver = raising(examine_solver)
+))  # fmt: skip

@@ -21,7 +21,7 @@ from vibench.stages.base import build_problem
 from vibench.stages.snapshots import fingerprint_here, gather, training_stages
 from vibench.storage.artefacts import Store
 from vibench.study.plugin import Plugin
-from vibench.testing.elsewhere import call_elsewhere
+from vibench.testing.processes import call_in_other_process
 
 REASONS: Mapping[str, str] = {
     "SkewStiffness": "A at mu = [0.25, 0.05] is not symmetric",
@@ -73,7 +73,7 @@ def fingerprint_of(create: type[Problem]) -> Fingerprint:
 
 def test_a_numbering_that_differs_between_processes_shows_in_the_fingerprint() -> None:
     for create, same in ((broken_variants.Bar, True), (broken_variants.NamesOfNodes, False)):
-        there = call_elsewhere(fingerprint_of, create, seconds=60.0)
+        there = call_in_other_process(fingerprint_of, create, seconds=60.0)
         assert (not list(there.deviations(fingerprint_of(create)))) == same
 
 

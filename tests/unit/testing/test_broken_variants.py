@@ -63,7 +63,7 @@ SOLVERS: Mapping[str, tuple[str, str]] = {
 }
 
 
-def messages(findings: list[testing.Finding]) -> dict[str, str]:
+def messages(findings: list[testing.CheckResult]) -> dict[str, str]:
     return {found.check: found.message for found in findings if found.verdict in (Verdict.FAILED, Verdict.WARNING)}
 
 
@@ -83,7 +83,7 @@ def test_a_mistake_in_a_solver_is_named(name: str) -> None:
 
 def test_every_broken_variant_is_tried() -> None:
     sound = {"Bar", "Option", "Cube", "exact"}
-    elsewhere = {"PaintsTheEnd": "test_elsewhere.py", "UnknownAnnotation": "test_conformance.py"}
+    elsewhere = {"PaintsTheEnd": "test_processes.py", "UnknownAnnotation": "test_conformance.py"}
     for name, file in elsewhere.items():
         assert f"broken_variants:{name}" in Path(__file__).with_name(file).read_text(encoding="utf-8")
     module = broken_variants.__name__

@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.metadata
 import inspect
 from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
@@ -23,7 +24,7 @@ from vibench import testing
 from vibench.interfaces.strategies import DualStrategy
 from vibench.study import registry
 from vibench.testing.assembly import JUMP, WIDTH, find_jump
-from vibench.testing.checks import Check, Note, Verdict, examine
+from vibench.testing.checks import Check, Conformance, Note, Verdict
 from vibench.testing.comparisons import difference
 
 Case = tuple[str, list[str]]
@@ -287,21 +288,28 @@ def test_a_call_that_takes_longer_than_the_limit_fails(check, monkeypatch: pytes
     assert "above the limit of 0 s" in failures(check(plugin, seconds=0.0))["time"]
 
 
+@dataclass
+class Anything:
+    """A case of a text."""
+
+    create: str
+
+
 def violation(case: object) -> Iterator[str]:
     yield "one"
     raise testing.ConformanceError("two")
 
 
 def test_a_check_is_skipped_when_one_that_it_needs_did_not_pass() -> None:
-    findings = examine([
+    findings = Conformance("made up", Anything, (
         Check("first", lambda case: ["wrong"]),
         Check("second", lambda case: [Note("fine")], ("first",)),
         Check("third", lambda case: ["wrong", "too"], ("second",)),
-        Check("fourth", lambda case: [Note(case)]),
+        Check("fourth", lambda case: [Note(case.create)]),
         Check("fifth", lambda case: 1 / 0, ("fourth",)),
         Check("sixth", violation),
         Check("seventh", lambda case: list("abcdefg")),
-    ], "fine")  # fmt: skip
+    )).examine("fine")  # fmt: skip
     verdicts = ["failed", "skipped", "skipped", "passed", "failed", "failed", "failed"]
     assert [finding.verdict.value for finding in findings] == verdicts
     assert [finding.message for finding in findings[:4]] == ["wrong", "it needs 'first'", "it needs 'second'", "fine"]

@@ -133,7 +133,7 @@ WRONG: Mapping[type[Sampling], tuple[str, str]] = {
     Twice: ("parameters", "1 parameter: parameter 1, ["),
     PerAxis: ("size", "2 parameters: size = 5 was asked for; there are 25 points"),
     Unseeded: ("determinism", "3 parameters: a second call gives different values of the points: entry ("),
-    OfHashes: ("another process", "1 parameter: another process gives different points: entry ("),
+    OfHashes: ("another process", "3 parameters: another process gives different values of the points: entry ("),
     Reseeds: ("no mutation", "1 parameter: parameters changes NumPy's global random numbers"),
     Narrows: ("no mutation", "1 parameter: parameters changes box.lower; work on copies"),
     Raises: ("parameters", "ArithmeticError: no points today (test_samplings.py, line "),

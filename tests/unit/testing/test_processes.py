@@ -13,15 +13,15 @@ from running import Main
 
 from vibench import testing
 from vibench.testing.case import LEAST_POINTS, MOST_POINTS, ProblemCase
-from vibench.testing.checks import ConformanceError, Finding, Verdict
-from vibench.testing.elsewhere import Examination, NotImportableError, call_elsewhere, examine_elsewhere
-from vibench.testing.problems import CHECKS
+from vibench.testing.checks import CheckResult, ConformanceError, Verdict
+from vibench.testing.problems import PROBLEM
+from vibench.testing.processes import Examination, NotImportableError, call_in_other_process, examine_in_process
 
 
-def found(plugin: str, seconds: float = 60.0) -> list[Finding]:
+def found(plugin: str, seconds: float = 60.0) -> list[CheckResult]:
     """Findings of a problem; every one is told, once."""
-    told: list[Finding] = []
-    findings = examine_elsewhere(Examination("problems", plugin, {}, seconds), told.append)
+    told: list[CheckResult] = []
+    findings = examine_in_process(Examination("problem", plugin, {}, seconds), told.append)
     assert sorted(told, key=findings.index) == findings
     return findings
 
@@ -48,8 +48,8 @@ def test_a_check_that_ends_its_process_costs_those_that_need_it(plugin: str, cau
     assert failed.check == "one assembly"
     assert cause in failed.message
     assert findings["training set"].verdict is Verdict.PASSED
-    assert findings["assembly"] == Finding("assembly", Verdict.SKIPPED, "it needs 'one assembly'")
-    assert len(findings) == len(CHECKS)
+    assert findings["assembly"] == CheckResult("assembly", Verdict.SKIPPED, "it needs 'one assembly'")
+    assert len(findings) == len(PROBLEM.checks)
 
 
 def test_what_passed_in_a_process_that_died_later_is_remembered() -> None:
@@ -62,8 +62,8 @@ def test_what_passed_in_a_process_that_died_later_is_remembered() -> None:
 
 
 def test_a_plugin_that_raises_what_ctrl_c_does_fails_its_check() -> None:
-    told: list[Finding] = []
-    findings = examine_elsewhere(Examination("duals", "fake_plugins:InterruptingCone", {}, 60.0), told.append)
+    told: list[CheckResult] = []
+    findings = examine_in_process(Examination("dual", "fake_plugins:InterruptingCone", {}, 60.0), told.append)
     (failed,) = (each for each in findings if each.verdict is Verdict.FAILED)
     assert failed.check == "cone"
     assert failed.message.startswith("KeyboardInterrupt")
@@ -80,10 +80,11 @@ def test_a_plugin_that_is_not_there_is_one_finding() -> None:
     ("seconds", "points"), [(1e-3, MOST_POINTS), (0.8, MOST_POINTS), (1.5, 4), (3.0, LEAST_POINTS)]
 )
 def test_a_slow_assembly_is_made_at_fewer_parameters(seconds: float, points: int) -> None:
-    case = ProblemCase(Bar, 120.0, 0)
+    case = ProblemCase(Bar)
     case.__dict__["one_assembly"] = seconds
     assert len(case.mus) == points
-    findings = {check.name: list(check.faults(case) or ()) for check in CHECKS if check.name != "another process"}
+    here = [check for check in PROBLEM.checks if check.name != "another process"]
+    findings = {check.name: list(check.faults(case) or ()) for check in here}
     assert findings["one assembly"][0] == f"takes {seconds:.2g} s"
     fewer = f"checks at {points} parameters instead of 7, and none for jumps, for lack of time"
     assert findings["one assembly"][1:] == ([fewer] if points < MOST_POINTS else [])
@@ -99,17 +100,17 @@ def fails() -> None:
 
 
 def test_another_process_has_other_hashes() -> None:
-    there = call_elsewhere(process, seconds=60.0)
+    there = call_in_other_process(process, seconds=60.0)
     assert there[0] != os.getpid()
     assert there[1] != hash("a text")
-    assert call_elsewhere(process, seconds=60.0) == there
+    assert call_in_other_process(process, seconds=60.0) == there
 
 
 def test_what_fails_there_is_told_from_what_cannot_be_sent() -> None:
     with pytest.raises(ConformanceError, match="in another process it fails: ArithmeticError: the wire snapped"):
-        call_elsewhere(fails, seconds=60.0)
+        call_in_other_process(fails, seconds=60.0)
     with pytest.raises(NotImportableError):
-        call_elsewhere(lambda: None, seconds=60.0)
+        call_in_other_process(lambda: None, seconds=60.0)
 
     class Local(Wire):
         pass
@@ -123,4 +124,4 @@ def test_a_plugin_in_a_module_that_only_this_process_has_is_not_compared() -> No
     code: dict[str, Any] = {"__name__": "made_up", "Wire": Wire}
     exec("class Mine(Wire):\n    pass", code)
     with pytest.raises(NotImportableError):
-        call_elsewhere(code["Mine"], seconds=60.0)
+        call_in_other_process(code["Mine"], seconds=60.0)

@@ -1,0 +1,97 @@
+"""Work of plugins outside studies, item by item in a watched process; what ends the process costs itself alone."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import closing
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+from vibench.execution.supervisor import Job, Supervisor
+from vibench.qp.status import Status
+from vibench.stages.base import Done, Failed, Pieces, PiecewiseStage
+from vibench.storage.artefacts import Store
+from vibench.study.spec import Limits
+
+
+@dataclass(frozen=True)
+class WatchedWork(PiecewiseStage, Pieces):
+    """Items of work; a subclass says how many `pieces` there are, and how one is done.
+
+    It is sent to the process that does the items; what they share is a cached property there. The value of an item that
+    raises an exception, exceeds its time limit or ends the process is `lost`, by default the `Failed` that says why.
+    """
+
+    label = "work"
+
+    @abstractmethod
+    def do(self, number: int, done: Mapping[int, Any]) -> Any:
+        """The value of an item; `done` has those of the items before it, also where another process did them."""
+
+    @cached_property
+    def _done(self) -> dict[int, Any]:
+        return {}
+
+    def begin(self, store: Store) -> Pieces:  # noqa: ARG002
+        """Nothing to prepare."""
+        return self
+
+    def resume(self, done: Mapping[int, Any]) -> None:
+        """Keep the values of the items that another process did."""
+        self._done.update(done)
+
+    def piece(self, number: int, watch: Callable[[bool], None]) -> Any:
+        """Do an item under its time limit."""
+        watch(True)
+        self._done[number] = self.do(number, self._done)
+        return self._done[number]
+
+    def lost(self, number: int, failed: Failed) -> Any:  # noqa: ARG002
+        """Why there is no value."""
+        return failed
+
+    def finish(self, pieces: Sequence[Any]) -> list[Any]:
+        """The values of all items."""
+        return list(pieces)
+
+
+def watched(
+    work: WatchedWork,
+    seconds: float,
+    observe: Callable[[Any], None] = lambda _: None,
+    *,
+    in_all: float | None = None,
+    supervisor: Supervisor | None = None,
+) -> list[Any] | Failed:
+    """Do work in a watched process.
+
+    Parameters
+    ----------
+    work
+        The work.
+    seconds
+        Time limit of an item; wall seconds.
+    observe
+        Gets the values of items as soon as they are there, but for those of items that ended the process.
+    in_all
+        Time limit of all items together; by default that of an item.
+    supervisor
+        Whose process to use; by default one that ends with the work.
+
+    Returns
+    -------
+    list or Failed
+        The values of all items, or why none could be done.
+    """
+    job = Job("", work, seconds, max(in_all or seconds, 1.0), Limits().memory_gib)
+    if supervisor is None:
+        with closing(Supervisor()) as own:
+            answer = own.run(job, observe)
+    else:
+        answer = supervisor.run(job, observe)
+    if isinstance(answer, Done):
+        values: list[Any] = answer.value
+        return values
+    return Failed(answer.status if isinstance(answer, Failed) else Status.ERROR, answer.reason)
