@@ -1,9 +1,30 @@
 """vibench: a benchmark framework for reduced-order models of parametrised variational inequalities.
 
-What authors of plugins and users of the library need is importable from here; `__init__.pyi` lists it. A name is
-imported when it is first used, so that `import vibench` alone costs next to nothing.
+What authors of plugins and users of the library need is importable from here; `__init__.pyi` lists it. Tools of
+algorithms and figures are in the submodules of `GROUPS`. A name is imported when it is first used, so that
+`import vibench` alone costs next to nothing.
 """
+
+from importlib import import_module
 
 import lazy_loader
 
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+GROUPS = ("linalg", "packs", "qp", "reduction", "report", "stability")
+"""Submodules with public names of their own."""
+
+_attached, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+
+
+def __getattr__(name: str) -> object:
+    """A public name; of one that a submodule has, the error says which.
+
+    Raises
+    ------
+    ImportError
+        If a submodule has the name. `from vibench import NAME` would not show the message of an `AttributeError`.
+    """
+    if name not in __all__ and not name.startswith("_"):
+        for group in GROUPS:
+            if name in import_module(f"vibench.{group}").__all__:
+                raise ImportError(f"'{name}' is in vibench.{group}: from vibench.{group} import {name}")
+    return _attached(name)

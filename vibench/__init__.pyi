@@ -1,6 +1,15 @@
-"""The public surface: what authors of plugins and users of the library import from `vibench` itself."""
+"""The public surface: what authors of plugins and users of the library import from `vibench` itself.
+
+Tools of algorithms and figures are in the submodules named first, whose `__init__.pyi` lists them.
+"""
 
 from . import fem as fem
+from . import linalg as linalg
+from . import packs as packs
+from . import qp as qp
+from . import reduction as reduction
+from . import report as report
+from . import stability as stability
 from .arrays import Array as Array
 from .arrays import Indices as Indices
 from .arrays import Mask as Mask
@@ -44,60 +53,24 @@ from .library.export import export_model as export_model
 from .library.runs import Run as Run
 from .library.runs import open_run as open_run
 from .library.runs import run as run
-from .linalg.dense import RANK_RTOL as RANK_RTOL
-from .linalg.dense import orthonormal_range as orthonormal_range
-from .linalg.dense import project_out as project_out
-from .linalg.dense import singular_values as singular_values
-from .linalg.dense import svd as svd
 from .linalg.inner_product import InnerProduct as InnerProduct
 from .offline.models import Model as Model
 from .offline.models import Solution as Solution
 from .offline.reduction import Reduction as Reduction
 from .offline.reduction import Snapshots as Snapshots
-from .packs.checks import read_model_pack as read_model_pack
-from .packs.pack import ModelPack as ModelPack
-from .packs.reader import pack_digest as pack_digest
 from .qp.solution import QPSolution as QPSolution
 from .qp.solution import QPSolver as QPSolver
 from .qp.solve import solve_qp as solve_qp
 from .qp.status import Status as Status
-from .qp.verification import kkt_residuals as kkt_residuals
-from .qp.verification import verify as verify
-from .reduction.cone_parts import part_in_cone as part_in_cone
-from .reduction.cones import REPRODUCED as REPRODUCED
-from .reduction.cones import GrowingCone as GrowingCone
-from .reduction.cones import LazyDistances as LazyDistances
 from .reduction.cones import greedy_cone as greedy_cone
 from .reduction.cones import project_on_cone as project_on_cone
-from .reduction.cones import refuse_negative as refuse_negative
-from .reduction.lazy_greedy import TIE as TIE
-from .reduction.lazy_greedy import LazyMaximum as LazyMaximum
 from .reduction.nested import NestedStrategy as NestedStrategy
 from .reduction.nested import Step as Step
 from .reduction.pod import POD as POD
 from .reduction.pod import pod as pod
-from .reduction.supremizers import constraint_classes as constraint_classes
-from .reduction.supremizers import projected_supremizers as projected_supremizers
-from .reduction.supremizers import supremizer_coordinates as supremizer_coordinates
 from .reduction.supremizers import supremizers as supremizers
-from .report.figures.looks import HIGH_FIDELITY_LOOK as HIGH_FIDELITY_LOOK
-from .report.figures.looks import Look as Look
-from .report.figures.looks import Looks as Looks
-from .report.figures.looks import Series as Series
-from .report.figures.solutions import draw_field as draw_field
-from .report.figures.solutions import draw_multiplier as draw_multiplier
-from .report.figures.solutions import name_axes as name_axes
-from .report.figures.style import CaptionedFigure as CaptionedFigure
-from .report.figures.style import Layout as Layout
-from .report.figures.style import Sheet as Sheet
-from .report.figures.style import plot as plot
-from .report.figures.style import scatter as scatter
 from .results.break_even import BreakEven as BreakEven
 from .results.break_even import break_even as break_even
-from .stability.infsup import beta_span as beta_span
-from .stability.infsup import inf_sup_full as inf_sup_full
-from .stability.infsup import inf_sup_on as inf_sup_on
-from .stability.infsup import multipliers as multipliers
 from .study.reader import read_study as read_study
 from .study.registry import create as create
 from .study.spec import Study as Study

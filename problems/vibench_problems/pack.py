@@ -7,19 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from vibench import (
-    Array,
-    Contact,
-    Indices,
-    Output,
-    Picture,
-    Problem,
-    RequestError,
-    Sampler,
-    VariationalInequality,
-    pack_digest,
-    read_model_pack,
-)
+from vibench import Array, Contact, Indices, Output, Picture, Problem, RequestError, Sampler, VariationalInequality
+from vibench.packs import pack_digest, read_model_pack
 
 
 class Pack(Problem):

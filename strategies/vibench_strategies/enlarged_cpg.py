@@ -7,7 +7,8 @@ from typing import Annotated
 import numpy as np
 from annotated_types import Ge
 
-from vibench import Array, Cone, DualStrategy, InnerProduct, Stop, greedy_cone, no_free, part_in_cone, project_on_cone
+from vibench import Array, Cone, DualStrategy, InnerProduct, Stop, greedy_cone, no_free, project_on_cone
+from vibench.reduction import part_in_cone
 from vibench_strategies.snapshot_cones import projection_errors
 
 ROUND_OFF = 1e-9

@@ -6,7 +6,8 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from vibench import LazyMaximum, NestedStrategy, Offline, Step
+from vibench import NestedStrategy, Offline, Step
+from vibench.reduction import LazyMaximum
 from vibench_strategies.supremizer_greedy import Shares, SupremizerSpace
 
 

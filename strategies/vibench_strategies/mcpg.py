@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from vibench import Array, Cone, DualStrategy, GrowingCone, InnerProduct, Stop, part_in_cone
+from vibench import Array, Cone, DualStrategy, InnerProduct, Stop
+from vibench.reduction import GrowingCone, part_in_cone
 
 
 class ModifiedCPG(DualStrategy):

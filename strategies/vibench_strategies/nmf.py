@@ -8,17 +8,9 @@ from typing import Annotated
 import numpy as np
 from annotated_types import Ge, Lt
 
-from vibench import (
-    Array,
-    Cone,
-    DualStrategy,
-    InnerProduct,
-    NumericalError,
-    Stop,
-    no_free,
-    refuse_negative,
-    singular_values,
-)
+from vibench import Array, Cone, DualStrategy, InnerProduct, NumericalError, Stop, no_free
+from vibench.linalg import singular_values
+from vibench.reduction import refuse_negative
 from vibench_strategies.snapshot_cones import normalised, projection_errors
 
 

@@ -7,7 +7,9 @@ from typing import Literal
 
 import numpy as np
 
-from vibench import TIE, Array, LazyMaximum, NestedStrategy, Offline, Step, orthonormal_range, project_out, svd
+from vibench import Array, NestedStrategy, Offline, Step
+from vibench.linalg import orthonormal_range, project_out, svd
+from vibench.reduction import TIE, LazyMaximum
 from vibench_strategies.supremizer_greedy import Shares, SupremizerSpace, canonical
 
 SMALL = 1e-10

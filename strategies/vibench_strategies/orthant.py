@@ -4,18 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from vibench import (
-    REPRODUCED,
-    TIE,
-    Array,
-    Cone,
-    DualStrategy,
-    InnerProduct,
-    LazyDistances,
-    Stop,
-    no_free,
-    refuse_negative,
-)
+from vibench import Array, Cone, DualStrategy, InnerProduct, Stop, no_free
+from vibench.reduction import REPRODUCED, TIE, LazyDistances, refuse_negative
 
 
 class Orthant(DualStrategy):

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from vibench import RANK_RTOL, Array, Cone, DualStrategy, InnerProduct, Stop, svd
+from vibench import Array, Cone, DualStrategy, InnerProduct, Stop
+from vibench.linalg import RANK_RTOL, svd
 
 
 class PODDual(DualStrategy):

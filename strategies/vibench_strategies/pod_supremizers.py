@@ -6,7 +6,8 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from vibench import RANK_RTOL, NestedStrategy, Offline, Step, orthonormal_range, project_out, svd
+from vibench import NestedStrategy, Offline, Step
+from vibench.linalg import RANK_RTOL, orthonormal_range, project_out, svd
 from vibench_strategies.supremizer_greedy import SupremizerSpace
 
 

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from vibench import Array, InnerProduct, LazyDistances, refuse_negative
+from vibench import Array, InnerProduct
+from vibench.reduction import LazyDistances, refuse_negative
 
 
 def normalised(snapshots: Array, W: InnerProduct) -> Array:

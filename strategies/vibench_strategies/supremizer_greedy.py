@@ -6,20 +6,10 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from vibench import (
-    RANK_RTOL,
-    TIE,
-    Array,
-    NumericalError,
-    Offline,
-    Step,
-    beta_span,
-    constraint_classes,
-    project_out,
-    singular_values,
-    supremizer_coordinates,
-    svd,
-)
+from vibench import Array, NumericalError, Offline, Step
+from vibench.linalg import RANK_RTOL, project_out, singular_values, svd
+from vibench.reduction import TIE, constraint_classes, supremizer_coordinates
+from vibench.stability import beta_span
 
 
 class SupremizerSpace:

@@ -6,9 +6,10 @@ from collections.abc import Callable
 
 import numpy as np
 
-from vibench import Cone, Enrichment, Kind, LazyMaximum, Offline, Problem, Stop, greedy_cone, no_free, pod
+from vibench import Cone, Enrichment, Kind, Offline, Problem, Stop, greedy_cone, no_free, pod
 from vibench.highfidelity.active_set import HighFidelitySolver
 from vibench.model.galerkin import ReducedModel
+from vibench.reduction import LazyMaximum
 from vibench.stability.infsup import multipliers
 
 

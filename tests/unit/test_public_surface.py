@@ -1,4 +1,4 @@
-"""What authors of plugins and users of the library import: from `vibench` itself, and lazily."""
+"""What authors of plugins and users of the library import: from `vibench` or a named submodule of it, and lazily."""
 
 from __future__ import annotations
 
@@ -29,7 +29,8 @@ AUTHORS = sorted(
     for path in ROOT.glob(pattern)
 )
 IMPORTED = re.compile(r"^[ ]*(?:from|import) (vibench(?:\.[a-z_]+)*)\b", re.MULTILINE)
-NAMES = re.compile(r"^[ ]*from vibench import (\([^)]*\)|[^\n]+)", re.MULTILINE)
+NAMES = re.compile(r"^[ ]*from (vibench(?:\.[a-z]+)?) import (\([^)]*\)|[^\n]+)", re.MULTILINE)
+PUBLIC = {"vibench": vibench, **{f"vibench.{group}": getattr(vibench, group) for group in vibench.GROUPS}}
 
 
 def test_there_are_sources_of_every_sort() -> None:
@@ -40,17 +41,33 @@ def test_there_are_sources_of_every_sort() -> None:
 @pytest.mark.parametrize("path", AUTHORS, ids=lambda path: path.name)
 def test_plugins_templates_and_pages_import_nothing_but_the_public_surface(path: Path) -> None:
     text = path.read_text(encoding="utf-8")
-    assert set(IMPORTED.findall(text)) <= {"vibench", "vibench.testing"}
-    for names in NAMES.findall(text):
+    assert set(IMPORTED.findall(text)) <= {*PUBLIC, "vibench.testing"}
+    for module, names in NAMES.findall(text):
         for name in names.strip("()").replace("\n", " ").split(","):
-            if name.strip():
-                assert name.strip() in vibench.__all__
+            if name.strip() and module != "vibench.testing":
+                assert name.strip() in PUBLIC[module].__all__
 
 
-@pytest.mark.parametrize("name", sorted(vibench.__all__))
-def test_every_public_name_is_there_and_documented(name: str) -> None:
-    found = getattr(vibench, name)
+@pytest.mark.parametrize(
+    ("module", "name"), sorted((module, name) for module, found in PUBLIC.items() for name in found.__all__)
+)
+def test_every_public_name_is_there_and_documented(module: str, name: str) -> None:
+    found = getattr(PUBLIC[module], name)
     assert found.__doc__ or not (inspect.isclass(found) or inspect.isfunction(found))
+
+
+def test_every_public_name_is_in_one_place() -> None:
+    names = [name for module in PUBLIC.values() for name in module.__all__]
+    assert len(names) == len(set(names))
+
+
+@pytest.mark.parametrize("group", vibench.GROUPS)
+def test_a_name_of_a_submodule_is_refused_with_its_place(group: str) -> None:
+    for name in getattr(vibench, group).__all__:
+        with pytest.raises(ImportError, match=f"^'{name}' is in vibench.{group}: from vibench.{group} import {name}$"):
+            getattr(vibench, name)
+    with pytest.raises(AttributeError, match="nothing_called_so"):
+        vibench.nothing_called_so  # noqa: B018
 
 
 def loaded(code: str) -> set[str]:

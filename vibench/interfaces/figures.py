@@ -145,7 +145,7 @@ class FigurePlugin(ABC):  # noqa: B024  a plugin has figures, columns, or both
         """Functions that draw the figures of one problem, by the end of their file names; empty if there are none.
 
         Called again in every process that draws: it should do no work itself. A figure that is a
-        `vibench.CaptionedFigure` brings its caption; of any other the caption is the docstring of its function.
+        `vibench.report.CaptionedFigure` brings its caption; of any other the caption is the docstring of its function.
         """
         return {}
 

@@ -1,1 +1,5 @@
 """Inf-sup constants over the span and the cone of reduced multipliers."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -109,7 +109,9 @@ class FigureCase(Examined[FigurePlugin]):
                     figure = self.clocked(f"figure '{kind}'", partial(draw_guarded, NAME, kind, draw))
                 drawn += figure is not None
                 if figure is not None and not caption_of(figure):
-                    yield Doubt(f"{data.problem}: figure '{kind}' has no caption: use vibench.Sheet, or a docstring")
+                    yield Doubt(
+                        f"{data.problem}: figure '{kind}' has no caption: use Sheet of vibench.report, or a docstring"
+                    )
             for name, frame in _frames(data).items():
                 if not frame.equals(before[name]):
                     yield f"{data.problem}: drawing changes tables.{name}; work on a copy"

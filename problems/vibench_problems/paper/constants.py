@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 import pandas as pd
 
-from vibench import HIGH_FIDELITY_LOOK, CaptionedFigure, Look, Looks, Series, Sheet, plot
+from vibench.report import HIGH_FIDELITY_LOOK, CaptionedFigure, Look, Looks, Series, Sheet, plot
 from vibench_problems.paper.curves import ZERO, Curves, Fact, below, compared, positive, span
 from vibench_problems.paper.published import Pair, Published
 

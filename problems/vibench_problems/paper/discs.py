@@ -6,17 +6,8 @@ import numpy as np
 from matplotlib import colormaps
 from matplotlib.axes import Axes
 
-from vibench import (
-    Array,
-    CaptionedFigure,
-    HighFidelitySolver,
-    Layout,
-    ProblemTables,
-    Sheet,
-    create,
-    draw_field,
-    name_axes,
-)
+from vibench import Array, HighFidelitySolver, ProblemTables, create
+from vibench.report import CaptionedFigure, Layout, Sheet, draw_field, name_axes
 from vibench_problems.hertz import Hertz
 from vibench_problems.line_contact import LineContact, measured, theory
 from vibench_problems.paper.curves import compared, span

@@ -10,7 +10,7 @@ from vibench import FigurePlugin, ProblemTables
 from vibench_problems.paper.published import PROBLEMS, PUBLICATION
 
 if TYPE_CHECKING:  # tables ask every plugin for columns: this module loads no matplotlib
-    from vibench import CaptionedFigure
+    from vibench.report import CaptionedFigure
 
 Twin = Callable[[], "CaptionedFigure | None"]
 

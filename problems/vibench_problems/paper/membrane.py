@@ -4,15 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from vibench import (
+from vibench import HighFidelitySolver, ProblemTables, create
+from vibench.report import (
     CaptionedFigure,
-    HighFidelitySolver,
     Layout,
     Looks,
-    ProblemTables,
     Series,
     Sheet,
-    create,
     draw_field,
     draw_multiplier,
     name_axes,

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from vibench import CaptionedFigure, Looks, Series, Sheet, plot
+from vibench.report import CaptionedFigure, Looks, Series, Sheet, plot
 from vibench_problems.paper.curves import (
     MODIFIED,
     PLAIN,

@@ -11,12 +11,12 @@ from families import W, bumps, families
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from vibench import part_in_cone
 from vibench.arrays import Array
 from vibench.errors import NumericalError
 from vibench.interfaces.strategies import Cone, DualStrategy, Stop, rays
 from vibench.interfaces.validation import check_cone
 from vibench.linalg.inner_product import InnerProduct
+from vibench.reduction import part_in_cone
 from vibench.reduction.cones import project_on_cone
 from vibench.testing import check_dual
 from vibench_strategies import enlarged_cpg

@@ -227,7 +227,7 @@ def test_residuals_are_those_of_vibench(run: vibench.Run, tmp_path: Path) -> Non
     for load in (f, np.zeros(len(f))):  # without a load other scales count
         x, alpha = random.standard_normal(len(f)), random.random(len(g))
         program = vibench.VariationalInequality(A, load, B, g)
-        expected = vibench.kkt_residuals(program, x, alpha)
+        expected = vibench.qp.kkt_residuals(program, x, alpha)
         found = reduced_model.residuals(A, load, B / rows[:, None], g / rows, x, rows * alpha)
         assert found == pytest.approx((expected.primal, expected.dual, expected.gap), rel=1e-12)
 

@@ -6,12 +6,13 @@ import numpy as np
 import pytest
 from numerics import Varying
 
-from vibench import create, part_in_cone, project_on_cone
+from vibench import create, project_on_cone
 from vibench.highfidelity.active_set import HighFidelitySolver
 from vibench.interfaces.fingerprint import ReferenceAssembly
 from vibench.interfaces.problem import Problem
 from vibench.linalg.cholesky import SparseCholesky
 from vibench.model.growing import GrowingModel, GrowingTrainer
+from vibench.reduction import part_in_cone
 
 PROBLEMS = {"B and A vary": Varying, "A is constant": lambda: create("problem", "hertz", {"resolution": 300})}
 

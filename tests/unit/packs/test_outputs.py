@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 from packs import SIZE, manifest, write_cable, write_manifest
 
-from vibench import create, read_model_pack
+from vibench import create
 from vibench.errors import RequestError
+from vibench.packs import read_model_pack
 from vibench.packs.writer import write_pack
 
 FORCE = {"name": "force", "unit": "N", "lam": "outputs.npz:lam"}

@@ -8,12 +8,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numerics import space
 
-from vibench import part_in_cone
 from vibench.errors import NumericalError
 from vibench.highfidelity.active_set import HighFidelitySolver
 from vibench.interfaces.strategies import DualStrategy, Stop
 from vibench.linalg.inner_product import InnerProduct
 from vibench.reduction import cones as cone_module
+from vibench.reduction import part_in_cone
 from vibench.reduction.cones import greedy_cone, orthogonality, project_on_cone
 from vibench_problems.obstacle import Obstacle
 from vibench_strategies.cpg import CPG

@@ -15,7 +15,7 @@ from running import Changed, Main, Register
 import vibench
 from vibench.errors import RequestError
 from vibench.interfaces.figures import FigurePlugin, ProblemTables
-from vibench.report import figures, html
+from vibench.report import CaptionedFigure, Looks, Series, Sheet, figures, html, scatter
 from vibench.report.figures import publication
 from vibench.report.figures.plugins import FigureError
 from vibench.study import registry
@@ -37,9 +37,9 @@ class Sizes(FigurePlugin):
             return figure
 
         def captioned() -> Figure:
-            sheet = vibench.Sheet(1, 1, "sizes")
+            sheet = Sheet(1, 1, "sizes")
             name = str(tables.cells["primal"].iloc[0])
-            vibench.scatter(sheet.panels[0], [1.0], [2.0], vibench.Looks([vibench.Series(name)])[vibench.Series(name)])
+            scatter(sheet.panels[0], [1.0], [2.0], Looks([Series(name)])[Series(name)])
             return sheet.finish("A caption of its own.")
 
         return {"": partial(sizes), "captioned": captioned, "none": lambda: None}
@@ -54,7 +54,7 @@ class Twins(Sizes):
         found = super().drawings(tables)
 
         def twin() -> Figure:
-            figure = vibench.CaptionedFigure()
+            figure = CaptionedFigure()
             figure.subplots().plot([0.0, 1.0], [0.0, 1.0])
             figure.caption, figure.published = "What is [shown].", "N = 19."
             figure.compared = f"Differs: N = {tables.cells['N'].iloc[0]:.0f}."

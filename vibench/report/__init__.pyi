@@ -1,0 +1,14 @@
+"""The public names of `vibench.report`: drawing of figures."""
+
+from .figures.looks import HIGH_FIDELITY_LOOK as HIGH_FIDELITY_LOOK
+from .figures.looks import Look as Look
+from .figures.looks import Looks as Looks
+from .figures.looks import Series as Series
+from .figures.solutions import draw_field as draw_field
+from .figures.solutions import draw_multiplier as draw_multiplier
+from .figures.solutions import name_axes as name_axes
+from .figures.style import CaptionedFigure as CaptionedFigure
+from .figures.style import Layout as Layout
+from .figures.style import Sheet as Sheet
+from .figures.style import plot as plot
+from .figures.style import scatter as scatter
