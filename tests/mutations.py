@@ -389,8 +389,8 @@ FAULTS = (
     ),
     Fault(
         "validated-on-the-training-set",
-        "vibench/stages/snapshots.py",
-        "return validation_of(problem, self.count, self.seed, self.sampling)",
+        "vibench/study/parameter_sets.py",
+        "return validation_parameters(problem, self.count, self.seed, self.strategy())",
         "return training_parameters(problem)",
         ("tests/unit/stages/test_offline.py",),
     ),

@@ -28,6 +28,7 @@ from vibench.interfaces.validation import checked_assembly
 from vibench.results import tables
 from vibench.stages.base import build_problem
 from vibench.stages.snapshots import CHUNKS, SnapshotStage
+from vibench.study.parameter_sets import ParameterSet
 from vibench.study.plugin import Plugin
 from vibench.timing import median_interval, timed
 
@@ -51,7 +52,7 @@ def measure(name: str, count: int) -> dict[str, float]:
     problem = build_problem(Plugin("problem", name, "{}", ""))
     seconds, setups, totals, sums = [], [], 0.0, 0.0
     for chunk in range(CHUNKS):
-        stage = SnapshotStage(Plugin("problem", name, "{}", ""), "validation", count, SEED, chunk)
+        stage = SnapshotStage(Plugin("problem", name, "{}", ""), ParameterSet("validation", count, SEED), chunk)
         mus = stage.part(stage.parameters(problem))[1]
         before = sweep(problem, mus)
         found = stage.run(None).value  # type: ignore[arg-type]  # reads no artefact

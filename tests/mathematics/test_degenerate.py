@@ -17,6 +17,7 @@ from vibench.stages.cell_queries import CellQueries, CellRows
 from vibench.stages.enrichment import SingleEnrichment
 from vibench.stages.offline import ConeStage, PODStage
 from vibench.study import registry
+from vibench.study.parameter_sets import ParameterSet
 from vibench.study.plugin import Plugin
 
 
@@ -117,7 +118,7 @@ def rows(register, store):
         tolerance = None if primal in {"decorrelated", "online-supremizers"} else 0.5
         strategy = Plugin("primal strategy", primal, "{}", "test")
         enrichment = SingleEnrichment(PODStage(problem, Stop(tolerance=1e-6)), cone, strategy, tolerance)
-        stage = CellQueries(AssemblyStage(enrichment, None, 3, 1), "piqp", 1e-8, 20.0)
+        stage = CellQueries(AssemblyStage(enrichment, None, ParameterSet("validation", 3, 1)), "piqp", 1e-8, 20.0)
         carry_out(stage, store)
         found: CellRows = value_of(store, stage)
         return found

@@ -27,6 +27,7 @@ from vibench.stages.cell_queries import CellQueries, CellRows
 from vibench.stages.enrichment import SingleEnrichment
 from vibench.stages.offline import ConeStage, PODStage
 from vibench.study import registry
+from vibench.study.parameter_sets import ParameterSet
 from vibench.study.plugin import Plugin
 
 seeds = st.integers(0, 10_000)
@@ -133,7 +134,10 @@ def test_rows_of_a_negative_control_are_ok_and_keep_the_invariants(
     cone = ConeStage(problem, plugin("dual strategy", "pod-dual"), Stop(tolerance=1e-2))
     pod, primal = PODStage(problem, Stop(tolerance=1e-3)), plugin("primal strategy", "infsup-greedy")
     stage = CellQueries(
-        AssemblyStage(SingleEnrichment(pod, cone, primal, 0.7), interpolation, 3, 1), "piqp", 1e-7, 20.0
+        AssemblyStage(SingleEnrichment(pod, cone, primal, 0.7), interpolation, ParameterSet("validation", 3, 1)),
+        "piqp",
+        1e-7,
+        20.0,
     )
     carry_out(stage, store)
     found: CellRows = value_of(store, stage)

@@ -93,7 +93,7 @@ class RecordedCell:
     @cached_property
     def parameters(self) -> Array:
         """The validation parameters (queries×d)."""
-        return assembly_stage(self.cell).parameters(self.model.problem)
+        return self.cell.validation.of(self.model.problem)
 
     def program(self, query: int) -> VariationalInequality:
         """The reduced quadratic program of one query, exactly as it was solved."""

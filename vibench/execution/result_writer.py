@@ -14,9 +14,9 @@ from vibench.stages.cell_queries import CellRows
 from vibench.stages.timing_rounds import TimedCell, round_rows, seconds_of_cell, seconds_of_queries
 from vibench.storage.artefacts import History, Store
 from vibench.study.cells import Axes, Cell, digest
+from vibench.study.parameter_sets import ParameterSet
 from vibench.study.plugin import Plugin
 from vibench.study.spec import Study
-from vibench.study.values import OWN
 
 
 @dataclass(frozen=True)
@@ -32,8 +32,8 @@ class ResultWriter:
         keys = cell_columns(cell)
         row = {"cell": cell.key, **keys, "machine": provenance.machine(), **found.cell}
         row |= {
-            "seed": cell.seed,
-            **_set_columns("validation", cell.validation_sampling, cell.set_labels[1]),
+            "seed": cell.validation.seed,
+            **_set_columns(cell.validation),
             "study_hash": digest(self.study.model_dump(mode="json")),
             "code": cell.code,
             "threads": 1,
@@ -89,14 +89,12 @@ def labels_of(cells: Iterable[Cell]) -> dict[Plugin, str]:
     for cell in cells:
         for plugin, label in zip((cell.problem, cell.dual, cell.primal), cell.labels, strict=True):
             found.setdefault(plugin, label)
-        if cell.training is not None:
-            found.setdefault(cell.training, cell.set_labels[0])
     return found
 
 
-def _set_columns(name: str, sampling: Plugin | None, label: str) -> dict[str, Any]:
+def _set_columns(parameters: ParameterSet) -> dict[str, Any]:
     """Label and options of a parameter set."""
-    return {name: label, f"{name}_options": "{}" if sampling is None else sampling.options}
+    return {parameters.role: parameters.label, f"{parameters.role}_options": parameters.options}
 
 
 def axis_columns(axes: Axes, labels: Mapping[Plugin, str]) -> dict[str, Any]:
@@ -104,8 +102,8 @@ def axis_columns(axes: Axes, labels: Mapping[Plugin, str]) -> dict[str, Any]:
     columns: dict[str, Any] = {}
     if axes.problem is not None:
         columns |= {"problem": labels[axes.problem], "problem_options": axes.problem.options}
-    for training in axes.training:
-        columns |= _set_columns("training", training, OWN if training is None else labels[training])
+    if axes.training is not None:
+        columns |= _set_columns(axes.training)
     for name, plugin in (("dual", axes.dual), ("primal", axes.primal)):
         if plugin is not None:
             columns |= {name: labels[plugin], f"{name}_options": plugin.options}

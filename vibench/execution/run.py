@@ -305,7 +305,8 @@ class _Run:
             self.observer.plan(group)
 
     def _fail_cell(self, cell: Cell, failed: Failed) -> None:
-        row = {"status": failed.status.value, "reason": failed.reason, "queries": cell.validation, "queries_ok": 0}
+        queries = {"queries": cell.validation.count, "queries_ok": 0}
+        row = {"status": failed.status.value, "reason": failed.reason, **queries}
         self.observer.cell(cell, self.writer.cell(cell, CellRows(row, ())))
 
 

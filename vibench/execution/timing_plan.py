@@ -86,4 +86,4 @@ class TimingPlan:
 
 
 def _group(cell: Cell) -> tuple[object, ...]:
-    return cell.problem, cell.training, cell.validation, cell.validation_sampling, cell.dual, cell.pod, cell.cone
+    return cell.problem, cell.training, cell.validation, cell.dual, cell.pod, cell.cone

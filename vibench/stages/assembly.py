@@ -21,10 +21,10 @@ from vibench.qp.exact import ExactSolution, exact_solution
 from vibench.reduction.supremizers import ContactCoordinates, SpannedCoordinates
 from vibench.stages.base import Result, Stage, build_problem, value_of
 from vibench.stages.enrichment import EnrichmentStage, GrowthStage, enrichment_stage
-from vibench.stages.snapshots import is_adaptive, training_of, validation_of
 from vibench.storage.artefacts import Store
 from vibench.storage.serialisation import storable
 from vibench.study.cells import Cell
+from vibench.study.parameter_sets import OWN_TRAINING, ParameterSet
 from vibench.study.plugin import Plugin
 from vibench.timing import timed
 
@@ -47,19 +47,20 @@ class AffineDecomposition(Stage):
 
     problem: Plugin
     tolerance: float
-    training: Plugin | None = None
+    training: ParameterSet = OWN_TRAINING
 
-    def run(self, store: Store) -> Result:
+    def run(self, store: Store) -> Result:  # noqa: ARG002
         """An `AffineMember` by name."""
-        problem, mus = build_problem(self.problem), self.parameters(store)
+        problem = build_problem(self.problem)
+        mus = self.parameters(problem)
         return Result(*timed(lambda: affine_decomposition(problem, mus, self.tolerance)))
 
-    def parameters(self, store: Store) -> Array:
+    def parameters(self, problem: Problem) -> Array:
         """Parameters (P×d) at which members are assembled: the training set, or the problem's own.
 
         That needs no solutions, and an adaptive training has too few parameters for it.
         """
-        return training_of(store, self.problem, None if is_adaptive(self.training) else self.training)
+        return (OWN_TRAINING if self.training.is_adaptive else self.training).of(problem)
 
 
 @dataclass(frozen=True)
@@ -91,9 +92,7 @@ class NestedPrograms(Stage):
     rooms = ("linalg", "interfaces", "model")
 
     growth: GrowthStage
-    count: int
-    seed: int
-    sampling: Plugin | None = None
+    validation: ParameterSet
 
     def inputs(self) -> tuple[Stage, ...]:
         """The growth, and the POD and the cone of its model."""
@@ -102,8 +101,7 @@ class NestedPrograms(Stage):
     def run(self, store: Store) -> Result:
         """One program per validation parameter; not timed."""
         model = self.growth.reduction(store).projection
-        mus = validation_of(model.problem, self.count, self.seed, self.sampling)
-        kept = assemblies(model.problem)
+        mus, kept = self.validation.of(model.problem), assemblies(model.problem)
         return Result(tuple(model.reduce(kept.at(mu)).program for mu in mus))
 
 
@@ -137,9 +135,7 @@ class AssemblyStage(Stage):
 
     enrichment: EnrichmentStage
     interpolation: float | None
-    count: int
-    seed: int
-    sampling: Plugin | None = None
+    validation: ParameterSet
 
     @property
     def reduction(self) -> HyperReduction | None:
@@ -153,7 +149,7 @@ class AssemblyStage(Stage):
     def nested(self) -> NestedPrograms | None:
         """The stage of the fully assembled programs of a nested strategy; `None` for any other."""
         growth = self.enrichment.growth
-        return None if growth is None else NestedPrograms(growth, self.count, self.seed, self.sampling)
+        return None if growth is None else NestedPrograms(growth, self.validation)
 
     @property
     def model_inputs(self) -> tuple[Stage, ...]:
@@ -169,15 +165,11 @@ class AssemblyStage(Stage):
     def run(self, store: Store) -> Result:
         """Assemble at every parameter; compare reduced programs with full ones."""
         model, _ = self.model(store)
-        mus = self.parameters(model.problem)
+        mus = self.validation.of(model.problem)
         known = None if self.nested is None else value_of(store, self.nested)
         if isinstance(model, HyperReducedModel):
             return Result(_reduced(model, mus, known))
         return Result(_in_full(model, mus, known))
-
-    def parameters(self, problem: Problem) -> Array:
-        """The validation set (count×d)."""
-        return validation_of(problem, self.count, self.seed, self.sampling)
 
     def offline(self, store: Store) -> Reduction:
         """The offline phase of the model that queries use, with all its steps."""
@@ -253,5 +245,4 @@ class ExactSolutions(Stage):
 
 def assembly_stage(cell: Cell) -> AssemblyStage:
     """The stage that assembles the reduced programs of a cell."""
-    sampling = cell.validation_sampling
-    return AssemblyStage(enrichment_stage(cell), cell.interpolation, cell.validation, cell.seed, sampling)
+    return AssemblyStage(enrichment_stage(cell), cell.interpolation, cell.validation)

@@ -6,7 +6,7 @@ import sys
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, fields, is_dataclass
+from dataclasses import dataclass, fields, is_dataclass
 from functools import cached_property, lru_cache
 from typing import Any, ClassVar
 
@@ -17,6 +17,7 @@ from vibench.qp.status import Status
 from vibench.storage.artefacts import History, Store
 from vibench.study import registry
 from vibench.study.cells import Axes, digest
+from vibench.study.parameter_sets import ParameterSet
 from vibench.study.plugin import Plugin
 from vibench.timing import NO_TIME, Seconds
 
@@ -123,7 +124,10 @@ class Stage(ABC):
 
     def plugins(self) -> Iterator[Plugin]:
         """The plugins that the stage and its inputs depend on."""
-        yield from (value for value in self._fields().values() if isinstance(value, Plugin))
+        for value in self._fields().values():
+            plugin = value.sampling if isinstance(value, ParameterSet) else value
+            if isinstance(plugin, Plugin):
+                yield plugin
         for stage in self.inputs():
             yield from stage.plugins()
 
@@ -150,14 +154,16 @@ class Stage(ABC):
 
 
 def _described(value: Any) -> Any:
-    """A field of a stage as JSON can hold it; another stage is described by its key."""
+    """A field of a stage as JSON can hold it: a stage by its key, of other objects what they are compared by."""
     if isinstance(value, Stage):
         return value.key
     if isinstance(value, bytes):
         return value.hex()
     if isinstance(value, tuple):
         return [_described(part) for part in value]
-    return asdict(value) if is_dataclass(value) and not isinstance(value, type) else value
+    if is_dataclass(value):
+        return {part.name: _described(getattr(value, part.name)) for part in fields(value) if part.compare}
+    return value
 
 
 class Pieces(ABC):

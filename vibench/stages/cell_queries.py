@@ -33,11 +33,10 @@ from vibench.stages.infsup_constants import (
     OwnConstants,
     PlainConstants,
     ReferenceConstants,
-    ValidationConstraints,
 )
-from vibench.stages.offline import ReducedCone
+from vibench.stages.offline import ConstraintMatrices, ReducedCone
 from vibench.stages.query import Queries, Query, error_columns, run_query
-from vibench.stages.snapshots import gather, validation_stages
+from vibench.stages.snapshots import gather, solution_stages
 from vibench.storage.artefacts import Artefact, Store
 from vibench.study import registry
 from vibench.study.cells import Cell
@@ -88,7 +87,7 @@ class CellQueries(PiecewiseStage):
     @property
     def pieces(self) -> int:
         """One query per validation parameter."""
-        return self.assembly.count
+        return self.assembly.validation.count
 
     def query(self, queries: Queries, number: int) -> Query:
         """One query of the cell's reduced model, for its solver."""
@@ -110,9 +109,8 @@ class CellQueries(PiecewiseStage):
         )
 
     @property
-    def _constraints(self) -> ValidationConstraints:
-        assembly = self.assembly
-        return ValidationConstraints(assembly.enrichment.pod.problem, assembly.count, assembly.seed, assembly.sampling)
+    def _constraints(self) -> ConstraintMatrices:
+        return ConstraintMatrices(self.assembly.enrichment.pod.problem, self.assembly.validation)
 
     @property
     def exact(self) -> ExactSolutions:
@@ -127,8 +125,7 @@ class CellQueries(PiecewiseStage):
     @property
     def validation(self) -> tuple[Stage, ...]:
         """The stages of the reference solutions."""
-        assembly = self.assembly
-        return validation_stages(assembly.enrichment.pod.problem, assembly.count, assembly.seed, assembly.sampling)
+        return solution_stages(self.assembly.enrichment.pod.problem, self.assembly.validation)
 
     @property
     def offline(self) -> Mapping[str, tuple[Stage, ...]]:

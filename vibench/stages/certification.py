@@ -37,7 +37,7 @@ class CertificateBaseStage(Stage):
         """Factorise, bound the spectrum, measure interpolation errors."""
         problem = build_problem(self.decomposition.problem)
         members: Mapping[str, AffineMember] = value_of(store, self.decomposition)
-        training = self.decomposition.parameters(store)
+        training = self.decomposition.parameters(problem)
         return Result(*timed(lambda: certificate_base(problem, members, training)))
 
 
@@ -68,10 +68,11 @@ class CertificateStage(Stage):
         UnsupportedError
             If the model is assembled in full.
         """
+        problem = build_problem(self.base.decomposition.problem)
         reduction = self.assembly.offline(store).given(
             members=value_of(store, self.base.decomposition),
             certificate_base=value_of(store, self.base),
-            decomposed=self.base.decomposition.parameters(store),
+            decomposed=self.base.decomposition.parameters(problem),
         )
         reduction.assembled  # noqa: B018  the clock begins after it
         return Result(*timed(lambda: reduction.certificate))

@@ -20,7 +20,7 @@ from vibench.reduction.supremizers import ConstraintClasses, projected_supremize
 from vibench.stability.growth import ProjectedSupremizers
 from vibench.stages.base import Result, Stage, build_problem, faults_of, value_of
 from vibench.stages.offline import ConeStage, PODStage, ReducedCone, TrainingConstants
-from vibench.stages.snapshots import training_of
+from vibench.stages.snapshots import parameters_in
 from vibench.storage.artefacts import History, Store
 from vibench.storage.serialisation import storable
 from vibench.study.cells import Axes, Cell
@@ -139,7 +139,7 @@ class EnrichmentStage(Stage):
     def axes(self) -> Axes:
         """The axes of POD and cone, the primal strategy and its tolerance."""
         stops = self.pod.stop, self.cone.stop
-        return Axes(self.pod.problem, self.cone.dual, self.primal, *stops, self.tolerance, (self.pod.training,))
+        return Axes(self.pod.problem, self.cone.dual, self.primal, *stops, self.tolerance, self.pod.training)
 
     @property
     def growth(self) -> GrowthStage | None:
@@ -257,7 +257,7 @@ def _reduction(store: Store, pod: PODStage, cone: ConeStage, interpolation: floa
         None,
         pod.stop,
         cone.stop,
-        training=None if pod.training is None else pod.training.create(),
+        training=pod.training.strategy(),
         assembly="full" if interpolation is None else "reduced",
         interpolation=interpolation or Reduction.interpolation,
     )
@@ -266,7 +266,7 @@ def _reduction(store: Store, pod: PODStage, cone: ConeStage, interpolation: floa
 
 def _offline(store: Store, pod: PODStage, cone: ConeStage) -> Offline:
     """The offline data that a primal strategy is built from."""
-    training = training_of(store, pod.problem, pod.training)
+    training = parameters_in(store, pod.problem, pod.training)
     return _reduction(store, pod, cone).given(parameters=training).offline
 
 

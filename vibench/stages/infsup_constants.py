@@ -6,47 +6,22 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from vibench.arrays import Array
-from vibench.interfaces.problem import Problem, VariationalInequality
+from vibench.interfaces.problem import VariationalInequality
 from vibench.interfaces.strategies import Kind
 from vibench.model.galerkin import ReducedModel
 from vibench.offline.assemblies import assemblies
-from vibench.reduction.supremizers import ConstraintClasses, constraint_classes
+from vibench.reduction.supremizers import ConstraintClasses
 from vibench.stability.coercivity import Constant, Stability, coercivity_and_continuity, energy_inf_sup
 from vibench.stability.infsup import InfSup, Multipliers, inf_sup, nodal_multipliers
 from vibench.stability.over_parameters import constants_full, constants_on, everywhere
 from vibench.stages.base import Result, Stage, build_problem, value_of
 from vibench.stages.enrichment import EnrichmentStage
-from vibench.stages.offline import ConeStage, PODStage
-from vibench.stages.snapshots import validation_of
+from vibench.stages.offline import ConeStage, ConstraintMatrices, PODStage
 from vibench.storage.artefacts import Store
 from vibench.storage.serialisation import storable
-from vibench.study.plugin import Plugin
 
 for _kind in (ConstraintClasses, Stability, Constant, InfSup):
     storable(_kind)
-
-
-@dataclass(frozen=True)
-class ValidationConstraints(Stage):
-    """The constraint matrices of the validation set, sorted into classes of proportional ones."""
-
-    label = "validation constraints"
-    rooms = ("linalg", "interfaces", "reduction")
-
-    problem: Plugin
-    count: int
-    seed: int
-    sampling: Plugin | None = None
-
-    def run(self, store: Store) -> Result:  # noqa: ARG002
-        """The `ConstraintClasses`."""
-        problem = build_problem(self.problem)
-        return Result(constraint_classes(assemblies(problem).at(mu).B for mu in self.parameters(problem)))
-
-    def parameters(self, problem: Problem) -> Array:
-        """The validation set (count×d)."""
-        return validation_of(problem, self.count, self.seed, self.sampling)
 
 
 @dataclass(frozen=True)
@@ -56,13 +31,13 @@ class ReferenceConstants(Stage):
     label = "high-fidelity constants"
     rooms = ("linalg", "interfaces", "reduction", "stability")
 
-    constraints: ValidationConstraints
+    constraints: ConstraintMatrices
 
     def run(self, store: Store) -> Result:
         """Compute the constants."""
-        problem, known = build_problem(self.constraints.problem), self.constraints
-        inf_sup = constants_full(problem.V, value_of(store, known), nodal_multipliers(problem.W))
-        mus = known.parameters(problem)
+        problem = build_problem(self.constraints.problem)
+        inf_sup = constants_full(problem.V, value_of(store, self.constraints), nodal_multipliers(problem.W))
+        mus = self.constraints.parameters.of(problem)
         different = mus[:1] if "A" in problem.constant else mus  # the eigenvalue problems are the expensive part
         quotients = [coercivity_and_continuity(assemblies(problem).at(mu).A, problem.V) for mu in different]
         quotients *= len(mus) // len(different)
@@ -81,7 +56,7 @@ class FullConstants(Stage):
     rooms = ("linalg", "interfaces", "reduction", "stability")
 
     cone: ConeStage
-    constraints: ValidationConstraints
+    constraints: ConstraintMatrices
 
     def run(self, store: Store) -> Result:
         """Compute the constants."""
@@ -98,7 +73,7 @@ class PlainConstants(Stage):
 
     pod: PODStage
     cone: ConeStage
-    constraints: ValidationConstraints
+    constraints: ConstraintMatrices
 
     def run(self, store: Store) -> Result:
         """Compute the constants."""
@@ -114,7 +89,7 @@ class OwnConstants(Stage):
     rooms = ("linalg", "interfaces", "reduction", "stability", "model")
 
     enrichment: EnrichmentStage
-    constraints: ValidationConstraints
+    constraints: ConstraintMatrices
 
     def inputs(self) -> tuple[Stage, ...]:
         """The reduced model and the constraint matrices."""
@@ -127,7 +102,7 @@ class OwnConstants(Stage):
         classes: ConstraintClasses = value_of(store, self.constraints)
         if model.kind is not Kind.PER_PARAMETER:
             return Result(constants_on(model.fixed_basis, classes, cone))
-        mus = self.constraints.parameters(model.problem)
+        mus = self.constraints.parameters.of(model.problem)
         if model.enrichment.eta is None:
             return Result([_constants_at(model, assemblies(model.problem).at(mu), cone) for mu in mus])
         at_firsts = (assemblies(model.problem).at(mu) for mu in mus[classes.firsts])  # a class shares one space

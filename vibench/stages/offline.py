@@ -11,10 +11,11 @@ from vibench.reduction.pod import POD, pod
 from vibench.reduction.supremizers import ConstraintClasses, constraint_classes, isometric_supremizers
 from vibench.stability.infsup import Multipliers, beta_span, multipliers
 from vibench.stages.base import Result, Stage, build_problem, faults_of, value_of
-from vibench.stages.snapshots import chosen_by, gather, training_of, training_stages
+from vibench.stages.snapshots import choosing_stages, gather, parameters_in, solution_stages
 from vibench.storage.artefacts import History, Store
 from vibench.storage.serialisation import storable
 from vibench.study.cells import Axes
+from vibench.study.parameter_sets import OWN_TRAINING, ParameterSet
 from vibench.study.plugin import Plugin
 from vibench.timing import timed
 
@@ -31,16 +32,16 @@ class PODStage(Stage):
 
     problem: Plugin
     stop: Stop
-    training: Plugin | None = None
+    training: ParameterSet = OWN_TRAINING
 
     @property
     def axes(self) -> Axes:
         """The problem, the training set and the tolerance of the POD."""
-        return Axes(problem=self.problem, pod=self.stop, training=(self.training,))
+        return Axes(problem=self.problem, pod=self.stop, training=self.training)
 
     def inputs(self) -> tuple[Stage, ...]:
         """The training snapshots."""
-        return training_stages(self.problem, self.training)
+        return solution_stages(self.problem, self.training)
 
     def run(self, store: Store) -> Result:
         """Compute the modes; the history is the relative tail over the number of modes."""
@@ -68,21 +69,21 @@ class ConeStage(Stage):
     problem: Plugin
     dual: Plugin
     stop: Stop
-    training: Plugin | None = None
+    training: ParameterSet = OWN_TRAINING
 
     @property
     def axes(self) -> Axes:
         """The problem, the training set, the dual strategy and its tolerance."""
-        return Axes(problem=self.problem, dual=self.dual, cone=self.stop, training=(self.training,))
+        return Axes(problem=self.problem, dual=self.dual, cone=self.stop, training=self.training)
 
     @property
-    def constraints(self) -> TrainingConstraints:
+    def constraints(self) -> ConstraintMatrices:
         """The stage of the training constraint matrices, used to assess the cone."""
-        return TrainingConstraints(self.problem, self.training)
+        return ConstraintMatrices(self.problem, self.training)
 
     def inputs(self) -> tuple[Stage, ...]:
         """The training snapshots."""
-        return training_stages(self.problem, self.training)
+        return solution_stages(self.problem, self.training)
 
     def run(self, store: Store) -> Result:
         """Reduce; histories are the projection error and e_orth over the number of generators."""
@@ -98,22 +99,22 @@ class ConeStage(Stage):
 
 
 @dataclass(frozen=True)
-class TrainingConstraints(Stage):
-    """The constraint matrices of the training set, sorted into classes of proportional ones; not timed."""
+class ConstraintMatrices(Stage):
+    """The constraint matrices at the parameters of a set, sorted into classes of proportional ones; not timed."""
 
-    label = "training constraints"
+    label = "constraint matrices"
     rooms = ("linalg", "interfaces", "reduction")
 
     problem: Plugin
-    training: Plugin | None = None
+    parameters: ParameterSet
 
     def inputs(self) -> tuple[Stage, ...]:
-        """The training set, where it is known only when it is solved."""
-        return chosen_by(self.problem, self.training)
+        """The solutions, where the parameters are known only with them."""
+        return choosing_stages(self.problem, self.parameters)
 
     def run(self, store: Store) -> Result:
         """The `ConstraintClasses`."""
-        problem, mus = build_problem(self.problem), training_of(store, self.problem, self.training)
+        problem, mus = build_problem(self.problem), parameters_in(store, self.problem, self.parameters)
         return Result(constraint_classes(problem.constraint(mu)[0] for mu in mus))
 
 

@@ -13,10 +13,11 @@ from vibench.errors import NumericalError
 from vibench.interfaces.problem import ParameterBox, Picture
 from vibench.results.pictures import ARRAYS, TEXTS, failure_rows, picture_rows
 from vibench.stages.base import Result, Row, Stage, build_problem
-from vibench.stages.snapshots import gather, training_stages
+from vibench.stages.snapshots import gather, solution_stages
 from vibench.storage.artefacts import Store
 from vibench.storage.serialisation import storable
 from vibench.study.cells import Axes
+from vibench.study.parameter_sets import OWN_TRAINING, ParameterSet
 from vibench.study.plugin import Plugin
 from vibench.text import one_line
 
@@ -34,7 +35,7 @@ class PictureStage(Stage):
     rooms = ("interfaces",)
 
     problem: Plugin
-    training: Plugin | None = None
+    training: ParameterSet = OWN_TRAINING
 
     @property
     def axes(self) -> Axes:
@@ -43,7 +44,7 @@ class PictureStage(Stage):
 
     def inputs(self) -> tuple[Stage, ...]:
         """The training snapshots."""
-        return training_stages(self.problem, self.training)
+        return solution_stages(self.problem, self.training)
 
     def run(self, store: Store) -> Result:
         """Titles and pictures, in the order of `CORNERS`; empty for a problem without pictures."""

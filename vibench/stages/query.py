@@ -115,7 +115,7 @@ class Queries:
 
     def __init__(self, store: Store, assembly: AssemblyStage) -> None:
         self.model, self.note = assembly.model(store)
-        self.mus, self._seed = assembly.parameters(self.model.problem), assembly.seed
+        self.mus, self._seed = assembly.validation.of(self.model.problem), assembly.validation.seed
         self.reduced: ReducedPrograms = value_of(store, assembly)
 
     @cached_property

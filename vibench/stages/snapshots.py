@@ -6,7 +6,7 @@ import itertools
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import lru_cache, partial
-from typing import Literal, TypeVar
+from typing import TypeVar
 
 import numpy as np
 
@@ -15,16 +15,15 @@ from vibench.errors import NumericalError
 from vibench.highfidelity.active_set import HighFidelitySolution, HighFidelitySolver, check_stiffness
 from vibench.interfaces.fingerprint import Fingerprint
 from vibench.interfaces.problem import Problem, VariationalInequality
-from vibench.interfaces.sampling import AdaptiveSampling
-from vibench.interfaces.validation import checked_assembly, training_parameters, validation_parameters
+from vibench.interfaces.validation import checked_assembly
 from vibench.model.growing import GrowingTrainer
 from vibench.offline.reduction import reference_assembly
 from vibench.qp.repeats import nearby
 from vibench.stages.base import Result, Stage, build_problem, faults_of, value_of
 from vibench.storage.artefacts import History, Store
 from vibench.storage.serialisation import storable
-from vibench.study import registry
 from vibench.study.cells import Axes
+from vibench.study.parameter_sets import ParameterSet
 from vibench.study.plugin import Plugin
 from vibench.timing import NO_TIME, Seconds, median_seconds, timed
 
@@ -72,23 +71,20 @@ class Snapshots:
 
 @dataclass(frozen=True)
 class SnapshotStage(Stage):
-    """High-fidelity solutions of one chunk of the training or the validation parameters."""
+    """High-fidelity solutions at one chunk of a parameter set."""
 
     label = "high-fidelity solutions"
     rooms = ("linalg", "interfaces", "qp", "highfidelity")
     partial = True
 
     problem: Plugin
-    purpose: Literal["training", "validation"]
-    count: int
-    seed: int
+    parameters: ParameterSet
     chunk: int
-    sampling: Plugin | None = None
 
     @property
     def axes(self) -> Axes:
         """The problem, and the training set if it is a part of that."""
-        return Axes(problem=self.problem, training=(self.sampling,) if self.purpose == "training" else ())
+        return Axes(self.problem, training=self.parameters if self.parameters.role == "training" else None)
 
     def run(self, store: Store) -> Result:  # noqa: ARG002
         """Assemble and solve at every parameter of the chunk."""
@@ -96,7 +92,7 @@ class SnapshotStage(Stage):
             return self._sweep(build_problem(self.problem))
 
     def _sweep(self, problem: Problem) -> Result:
-        first, mus = self.part(self.parameters(problem))
+        first, mus = self.part(self.parameters.of(problem))
         given, reference = mus.copy(), reference_assembly(problem)
         u, lam = np.zeros((problem.V.dim, len(mus))), np.zeros((problem.W.dim, len(mus)))
         seconds, setups, fallbacks, solver = [], [], [], HighFidelitySolver(problem)
@@ -111,7 +107,7 @@ class SnapshotStage(Stage):
                 raise
 
         for k, mu in enumerate(mus):
-            near = (nearby(problem.parameters, mu, self.seed, k, repeat) for repeat in itertools.count())
+            near = (nearby(problem.parameters, mu, self.parameters.seed, k, repeat) for repeat in itertools.count())
             if k == 0:  # with the set-up; what it costs without is measured next to it
                 (vi, solution), beginning = timed(partial(solve, mu))
                 _, marginal = self._measure(solve, near)
@@ -136,13 +132,7 @@ class SnapshotStage(Stage):
 
         The result is the one at the first parameter.
         """
-        return timed(partial(work, next(mus))) if self.purpose == "training" else median_seconds(work, mus)
-
-    def parameters(self, problem: Problem) -> Array:
-        """Training or validation parameters (P×d), of which the stage solves a part."""
-        if self.purpose == "training":
-            return training_parameters(problem, None if self.sampling is None else self.sampling.create())
-        return validation_of(problem, self.count, self.seed, self.sampling)
+        return timed(partial(work, next(mus))) if self.parameters.role == "training" else median_seconds(work, mus)
 
     def part(self, everything: Array) -> tuple[int, Array]:
         """Number of the first parameter of the chunk, and its parameters."""
@@ -154,7 +144,7 @@ class SnapshotStage(Stage):
         for mu in mus:
             for quantity, value in problem.diagnostics(mu).items():
                 found.setdefault(quantity, []).append(float(value))
-        return tuple(History.of(self.purpose, quantity, values, first) for quantity, values in found.items())
+        return tuple(History.of(self.parameters.role, quantity, values, first) for quantity, values in found.items())
 
 
 @dataclass(frozen=True)
@@ -168,24 +158,25 @@ class AdaptiveTraining(Stage):
     rooms = ("linalg", "interfaces", "qp", "highfidelity", "reduction", "stability", "model")
 
     problem: Plugin
-    sampling: Plugin
+    training: ParameterSet
 
     @property
     def axes(self) -> Axes:
         """The problem and the training set."""
-        return Axes(problem=self.problem, training=(self.sampling,))
+        return Axes(self.problem, training=self.training)
 
     def run(self, store: Store) -> Result:  # noqa: ARG002
         """Train; histories are the bounds that led to solutions, the parameters, and the number of bounds so far."""
+        assert self.training.sampling is not None  # a problem's own set is not adaptive
         with faults_of(self.problem):
-            problem, strategy = build_problem(self.problem), self.sampling.create()
+            problem, strategy = build_problem(self.problem), self.training.sampling.create()
             reference = reference_assembly(problem)
             trainer = GrowingTrainer(problem, reference)
             strategy.train(problem.parameters, trainer)
             reference.refuse_rewritten_constants()
         solved = trainer.solved
         if not solved:
-            raise NumericalError(f"the sampling strategy '{self.sampling.name}' has solved at no parameter")
+            raise NumericalError(f"the sampling strategy '{self.training.sampling.name}' has solved at no parameter")
         seconds, mus = tuple(one.seconds for one in solved), np.array([one.mu for one in solved])
         u, lam = (np.column_stack([getattr(one.solution, name) for one in solved]) for name in ("u", "lam"))
         fallbacks, setups = tuple(one.fallback for one in solved), (trainer.setup,)
@@ -201,38 +192,23 @@ class AdaptiveTraining(Stage):
         return Result(found, sum(seconds, trainer.selecting), histories)
 
 
-def is_adaptive(sampling: Plugin | None) -> bool:
-    """Whether a training set is chosen as its solutions are known."""
-    return sampling is not None and issubclass(registry.load(sampling.kind, sampling.name), AdaptiveSampling)
+def solution_stages(problem: Plugin, parameters: ParameterSet) -> tuple[Stage, ...]:
+    """The stages that solve at the parameters of a set: its chunks, or one stage if the set is adaptive."""
+    if parameters.is_adaptive:
+        return (AdaptiveTraining(problem, parameters),)
+    return tuple(SnapshotStage(problem, parameters, chunk) for chunk in range(CHUNKS))
 
 
-def training_of(store: Store, problem: Plugin, sampling: Plugin | None) -> Array:
-    """The training set (P×d) of a sampling strategy, or of the problem itself."""
-    if is_adaptive(sampling):
-        return gather(store, training_stages(problem, sampling)).mu
-    return training_parameters(build_problem(problem), None if sampling is None else sampling.create())
+def choosing_stages(problem: Plugin, parameters: ParameterSet) -> tuple[Stage, ...]:
+    """The stages that `parameters_in` reads."""
+    return solution_stages(problem, parameters) if parameters.is_adaptive else ()
 
 
-def chosen_by(problem: Plugin, sampling: Plugin | None) -> tuple[Stage, ...]:
-    """The stages that `training_of` reads."""
-    return training_stages(problem, sampling) if is_adaptive(sampling) else ()
-
-
-def validation_of(problem: Problem, count: int, seed: int, sampling: Plugin | None) -> Array:
-    """The validation set (count×d), likewise; the seed is for that of the problem itself."""
-    return validation_parameters(problem, count, seed, None if sampling is None else sampling.create())
-
-
-def training_stages(problem: Plugin, sampling: Plugin | None = None) -> tuple[Stage, ...]:
-    """The chunks of the training set of a sampling strategy, or of the problem itself; one stage if it is adaptive."""
-    if sampling is not None and is_adaptive(sampling):
-        return (AdaptiveTraining(problem, sampling),)
-    return tuple(SnapshotStage(problem, "training", 0, 0, chunk, sampling) for chunk in range(CHUNKS))
-
-
-def validation_stages(problem: Plugin, count: int, seed: int, sampling: Plugin | None = None) -> tuple[Stage, ...]:
-    """The chunks of the validation set."""
-    return tuple(SnapshotStage(problem, "validation", count, seed, chunk, sampling) for chunk in range(CHUNKS))
+def parameters_in(store: Store, problem: Plugin, parameters: ParameterSet) -> Array:
+    """The parameters (P×d) of a set; those of an adaptive one are known once it is solved."""
+    if parameters.is_adaptive:
+        return gather(store, solution_stages(problem, parameters)).mu
+    return parameters.of(build_problem(problem))
 
 
 @lru_cache(maxsize=4)

@@ -152,7 +152,7 @@ class _Rounds(Pieces):
         solve: dict[int, Seconds] = {}
         certify: dict[int, Seconds] = {}
         for k in order:
-            seed = (stage.assembly.seed, k, at, cell, int(warm_up))
+            seed = (stage.assembly.validation.seed, k, at, cell, int(warm_up))
             query = stage.query(queries, k).repeated(*seed)
             answer, solve[k] = query.prepare(watch)()
             check_answer(query.program, answer, query.accuracy)

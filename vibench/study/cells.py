@@ -11,6 +11,7 @@ from typing import Any
 from vibench.interfaces.strategies import Stop
 from vibench.provenance import NUMERICAL, core_code, solver_version
 from vibench.study import registry
+from vibench.study.parameter_sets import OWN_TRAINING, ParameterSet
 from vibench.study.plugin import Plugin
 from vibench.study.values import OWN
 
@@ -22,16 +23,12 @@ def digest(content: Any) -> str:
 
 
 PLUGINS = ("problem", "dual", "primal", "training", "validation_sampling")
-"""Fields of a `Cell` that are plugins; the last two are `None` for sets of the problem itself."""
+"""Names of plugins in the definition of a cell; the last two, of sampling strategies, may be `None`."""
 
 
 @dataclass(frozen=True)
 class Axes:
-    """Values on the axes of a study; `None` on an axis that does not matter.
-
-    `training` holds the sampling strategy of the training set, which is `None` for the problem's own set, and nothing
-    where that axis does not matter.
-    """
+    """Values on the axes of a study; `None` on an axis that does not matter."""
 
     problem: Plugin | None = None
     dual: Plugin | None = None
@@ -39,18 +36,17 @@ class Axes:
     pod: Stop | None = None
     cone: Stop | None = None
     primal_tol: float | None = None
-    training: tuple[Plugin | None, ...] = ()
+    training: ParameterSet | None = None
 
 
 @dataclass(frozen=True)
 class Cell:
     """One cell: problem × training set × dual × primal strategy × tolerances × QP solver × accuracy × assembly.
 
-    `training` and `validation_sampling` are the sampling strategies of its sets, `None` for the problem's own ones;
-    `validation` is the number of validation parameters. `interpolation` is the tolerance of reduced assembly, `None`
-    for full assembly; certified queries are assembled as reduced ones. `labels` of problem, dual and primal strategy
-    and `set_labels` of training and validation are no part of the identity; nor are `nested_tolerances`, all tolerances
-    of a nested primal strategy in the study, whose enrichments are stages of one.
+    `interpolation` is the tolerance of reduced assembly, `None` for full assembly; certified queries are assembled as
+    reduced ones. `labels` of problem, dual and primal strategy are no part of the identity, nor are those of the
+    parameter sets; nor are `nested_tolerances`, all tolerances of a nested primal strategy in the study, whose
+    enrichments are stages of one.
     """
 
     problem: Plugin
@@ -63,19 +59,16 @@ class Cell:
     assembly: str
     interpolation: float | None
     warm_start: bool
-    seed: int
-    validation: int
     accuracy: float
+    validation: ParameterSet
     labels: tuple[str, str, str]
     nested_tolerances: tuple[float, ...] = ()
-    training: Plugin | None = None
-    validation_sampling: Plugin | None = None
-    set_labels: tuple[str, str] = (OWN, OWN)
+    training: ParameterSet = OWN_TRAINING
 
     @cached_property
     def key(self) -> str:
         """Hash of everything but the code that determines the cell's numbers."""
-        content = asdict(self)
+        content = self._content()
         del content["labels"], content["nested_tolerances"], content["set_labels"]
         for name in PLUGINS:
             if content[name] is None:
@@ -87,7 +80,19 @@ class Cell:
     @property
     def definition(self) -> str:
         """The cell as JSON, which `from_definition` reads."""
-        return json.dumps(asdict(self), sort_keys=True, ensure_ascii=False)
+        return json.dumps(self._content(), sort_keys=True, ensure_ascii=False)
+
+    def _content(self) -> dict[str, Any]:
+        """The cell as results files hold it: its parameter sets lie in five entries beside the others."""
+        content = asdict(self)
+        training, validation = content.pop("training"), content.pop("validation")
+        return content | {
+            "seed": validation["seed"],
+            "validation": validation["count"],
+            "training": training["sampling"],
+            "validation_sampling": validation["sampling"],
+            "set_labels": (training["label"], validation["label"]),
+        }
 
     @classmethod
     def from_definition(cls, text: str) -> Cell:
@@ -103,18 +108,25 @@ class Cell:
             content[name] = Plugin(**content[name]).as_installed() if content.get(name) else None
         for axis in ("pod", "cone"):
             content[axis] = Stop(**content[axis])
-        labels = ("labels", "nested_tolerances", "set_labels")
-        return cls(**content | {name: tuple(content[name]) for name in labels if name in content})
+        for name in ("labels", "nested_tolerances"):
+            content[name] = tuple(content.get(name, ()))
+        trained, validated = content.pop("set_labels", (OWN, OWN))
+        content["training"] = ParameterSet("training", sampling=content["training"], label=trained)
+        content["validation"] = ParameterSet(
+            "validation", content["validation"], content.pop("seed"), content.pop("validation_sampling"), validated
+        )
+        return cls(**content)
 
     @property
     def axes(self) -> Axes:
         """The axes of the cell, without solver and assembly."""
-        return Axes(self.problem, self.dual, self.primal, self.pod, self.cone, self.primal_tol, (self.training,))
+        return Axes(self.problem, self.dual, self.primal, self.pod, self.cone, self.primal_tol, self.training)
 
     @property
     def plugins(self) -> tuple[Plugin, ...]:
         """Its plugins, the solver aside."""
-        return tuple(found for name in PLUGINS if (found := getattr(self, name)) is not None)
+        samplings = (one.sampling for one in (self.training, self.validation) if one.sampling is not None)
+        return (self.problem, self.dual, self.primal, *samplings)
 
     @property
     def code(self) -> str:
@@ -126,7 +138,7 @@ class Cell:
 
     def __str__(self) -> str:
         problem, dual, primal = self.labels
-        problem += f" ({self.set_labels[0]})" if self.training is not None else ""
+        problem += f" ({self.training.label})" if self.training.sampling is not None else ""
         tolerance = "" if self.primal_tol is None else f" {self.primal_tol:g}"
         pod, cone = (
             f"{size}={stop.size}" if stop.tolerance is None else f"{stop.tolerance:g}"

@@ -1,18 +1,89 @@
-"""The parameter sets that sampling strategies make for the problems of a study, checked before anything is run."""
+"""The training and validation sets of a study, found and checked before anything is run."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
+from typing import Literal
 
 import numpy as np
 
 from vibench.arrays import Array
 from vibench.errors import NumericalError, RequestError
-from vibench.interfaces.problem import ParameterBox, Problem
+from vibench.interfaces.problem import Problem
 from vibench.interfaces.sampling import AdaptiveSampling, Sampling
 from vibench.interfaces.validation import training_parameters, validation_parameters
 from vibench.study import registry
 from vibench.study.plugin import Plugin
+from vibench.study.values import OWN
+
+
+@dataclass(frozen=True)
+class ParameterSet:
+    """The training or the validation set of a problem: its own, or that of a sampling strategy.
+
+    Attributes
+    ----------
+    role
+        What the solutions at its parameters are for.
+    count
+        Number of parameters of a validation set; 0 for training sets, whose size the problem or the strategy chooses.
+    seed
+        Seed of the validation set of a problem itself, and of what is drawn to time solutions; 0 for training sets.
+    sampling
+        The sampling strategy; `None` for the set of the problem itself.
+    label
+        Its name in results. Sets that differ in their labels alone are the same set.
+    """
+
+    role: Literal["training", "validation"]
+    count: int = 0
+    seed: int = 0
+    sampling: Plugin | None = None
+    label: str = field(default=OWN, compare=False)
+
+    @property
+    def is_adaptive(self) -> bool:
+        """Whether its parameters are chosen as solutions are known; `of` gives candidates then."""
+        sampling = self.sampling
+        return sampling is not None and issubclass(registry.load(sampling.kind, sampling.name), AdaptiveSampling)
+
+    @property
+    def options(self) -> str:
+        """The options of the sampling strategy as canonical JSON."""
+        return "{}" if self.sampling is None else self.sampling.options
+
+    def strategy(self) -> Sampling | None:
+        """A new instance of the sampling strategy; `None` for the set of the problem itself."""
+        if self.sampling is None:
+            return None
+        strategy = self.sampling.create()
+        assert isinstance(strategy, Sampling)  # `registry.load` refuses anything else
+        return strategy
+
+    def of(self, problem: Problem) -> Array:
+        """The parameters (P×d) of a problem.
+
+        Raises
+        ------
+        NumericalError
+            If the set of the problem itself has the wrong shape, or values that are not finite.
+        RequestError
+            If the sampling strategy makes no set in the box of the problem.
+        """
+        if self.role == "training":
+            return training_parameters(problem, self.strategy())
+        return validation_parameters(problem, self.count, self.seed, self.strategy())
+
+    def sized(self, problem: Plugin) -> ParameterSet:
+        """The same set with the number of parameters that its strategy makes for a problem, if both are installed."""
+        if self.sampling is None or not is_available(problem, self.sampling):
+            return self
+        return replace(self, count=len(parameters_of(problem, self)))
+
+
+OWN_TRAINING = ParameterSet("training")
+"""The training set of a problem itself."""
 
 
 def is_available(*plugins: Plugin) -> bool:
@@ -26,78 +97,47 @@ def _problem(plugin: Plugin) -> Problem:
         problem = plugin.create()
     except NumericalError as error:
         raise RequestError(f"problem '{plugin.name}': {error}") from None
-    assert isinstance(problem, Problem)  # `registry.load` refuses anything else
+    assert isinstance(problem, Problem)  # as above
     return problem
 
 
-def box_of(problem: Plugin) -> ParameterBox:
-    """The parameter box of a problem; the problem is built.
-
-    Raises
-    ------
-    RequestError
-        If it cannot be built.
-    """
-    return _problem(problem).parameters
-
-
 @lru_cache(maxsize=64)
-def sampled(problem: Plugin, sampling: Plugin) -> Array:
-    """The parameters (P×d) of a sampling strategy in the box of a problem, for reading only.
+def parameters_of(problem: Plugin, parameters: ParameterSet) -> Array:
+    """The parameters (P×d) of a set for a problem, which is built; for reading only.
 
     Raises
     ------
     RequestError
-        If there is no such set; the message names the strategy and the problem.
+        If there is no such set; the message names the problem, and the strategy if there is one.
     """
-    strategy = sampling.create()
-    assert isinstance(strategy, Sampling)  # as above
+    built, sampling = _problem(problem), parameters.sampling
     try:
-        return training_parameters(_problem(problem), strategy)
+        return parameters.of(built)
     except (RequestError, NumericalError) as error:
-        raise RequestError(f"sampling strategy '{sampling.name}' for problem '{problem.name}': {error}") from None
+        strategy = "" if sampling is None else f"sampling strategy '{sampling.name}' for "
+        raise RequestError(f"{strategy}problem '{problem.name}': {error}") from None
 
 
-def size_of_set(problem: Plugin, sampling: Plugin) -> int:
-    """Number of parameters of a set; 0 if the problem or the strategy is not available, and nothing can be run."""
-    return len(sampled(problem, sampling)) if is_available(problem, sampling) else 0
+def check_sets(problem: Plugin, training: ParameterSet, validation: ParameterSet) -> None:
+    """Refuse sets that a problem does not have, and a validation set all of whose parameters are training parameters.
 
-
-def check_no_training(validation: Plugin) -> None:
-    """Refuse a sampling strategy that makes training sets alone as one of a validation set."""
-    if isinstance(validation.create(), AdaptiveSampling):
-        raise RequestError(
-            f"sampling strategy '{validation.name}' chooses training parameters by what solutions know; it makes no "
-            "validation set"
-        )
-
-
-def check_own_validation(problem: Plugin, count: int, seed: int) -> None:
-    """Refuse a number of validation parameters that the problem does not have."""
-    try:
-        validation_parameters(_problem(problem), count, seed)
-    except NumericalError as error:
-        raise RequestError(f"problem '{problem.name}': {error}") from None
-
-
-def check_unseen(problem: Plugin, training: Plugin | None, validation: Plugin | int, seed: int) -> None:
-    """Refuse a validation set all of whose parameters are training parameters, if a strategy has made one of the two.
-
-    Errors there would say nothing of other parameters; two strategies with the same seed draw the same points.
+    Errors there would say nothing of other parameters; two strategies with the same seed draw the same points. The sets
+    of a problem itself are its own business.
 
     Raises
     ------
     RequestError
         If it is so.
     """
-    if training is None and isinstance(validation, int):
+    if validation.is_adaptive and validation.sampling is not None:
+        raise RequestError(
+            f"sampling strategy '{validation.sampling.name}' chooses training parameters by what solutions know; it "
+            "makes no validation set"
+        )
+    asked = parameters_of(problem, validation)
+    if training.sampling is None and validation.sampling is None:
         return
-    built = _problem(problem)
-    known = training_parameters(built) if training is None else sampled(problem, training)
-    asked = (
-        validation_parameters(built, validation, seed) if isinstance(validation, int) else sampled(problem, validation)
-    )
-    if np.isin(_rows(asked), _rows(known)).all():
+    if np.isin(_rows(asked), _rows(parameters_of(problem, training))).all():
         raise RequestError(
             f"all validation parameters of problem '{problem.name}' are training parameters, so that errors would say "
             "nothing of others: give one of the two sets another seed, or other parameters"

@@ -9,6 +9,7 @@ from typing import Any
 from vibench.errors import RequestError
 from vibench.interfaces.strategies import Stop
 from vibench.study.cells import Cell
+from vibench.study.parameter_sets import ParameterSet
 from vibench.study.plugin import Plugin
 from vibench.study.spec import Study
 from vibench.study.values import OWN
@@ -38,12 +39,10 @@ def study_of_cell(cell: Cell, name: str, **settings: Any) -> Study:
     if cell.primal_tol is not None:
         tolerances["primal"] = {cell.labels[2]: [cell.primal_tol]}
     content: dict[str, Any] = {
-        "training": OWN if cell.training is None else _entry(cell.training, cell.set_labels[0]),
+        "training": _entry_of_set(cell.training) or OWN,
         "name": name,
-        "seed": cell.seed,
-        "validation": cell.validation
-        if cell.validation_sampling is None
-        else _entry(cell.validation_sampling, cell.set_labels[1]),
+        "seed": cell.validation.seed,
+        "validation": _entry_of_set(cell.validation) or cell.validation.count,
         "accuracy": [cell.accuracy],
         "solvers": [cell.solver],
         "problem": [problem],
@@ -60,6 +59,11 @@ def study_of_cell(cell: Cell, name: str, **settings: Any) -> Study:
 
 def _entry(plugin: Plugin, label: str) -> Any:
     return {"name": plugin.name, "label": label, "options": json.loads(plugin.options)}
+
+
+def _entry_of_set(parameters: ParameterSet) -> Any:
+    """The entry of a sampling strategy; `None` of a set of the problem itself."""
+    return None if parameters.sampling is None else _entry(parameters.sampling, parameters.label)
 
 
 def _stop(tolerance: str, size: str, stop: Stop) -> tuple[str, list[float] | list[int]]:

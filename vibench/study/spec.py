@@ -35,7 +35,7 @@ from vibench.study.entries import (
     Validation,
     as_list,
 )
-from vibench.study.parameter_sets import check_no_training, check_own_validation, check_unseen, is_available
+from vibench.study.parameter_sets import ParameterSet, check_sets, is_available
 from vibench.study.plugin import Plugin
 from vibench.study.values import OWN
 
@@ -193,17 +193,25 @@ class Study(_Model):
         _check_names(study)
         return study
 
-    def training_of(self, problem: ProblemEntry) -> list[SamplingEntry]:
+    def training_sets(self, problem: ProblemEntry) -> list[ParameterSet]:
         """The training sets of a problem."""
-        return problem.training or self.training
+        entries = problem.training or self.training
+        return [ParameterSet("training", sampling=_sampling(entry), label=entry.title) for entry in entries]
 
-    def validation_of(self, problem: ProblemEntry) -> int | SamplingEntry:
-        """The validation set of a problem; a number means its own."""
-        return self.validation if problem.validation is None else problem.validation
+    def validation_set(self, problem: ProblemEntry) -> ParameterSet:
+        """The validation set of a problem; the size of one of a sampling strategy is not known yet."""
+        asked = self.validation if problem.validation is None else problem.validation
+        if isinstance(asked, int):
+            return ParameterSet("validation", asked, self.seed)
+        return ParameterSet("validation", 0, self.seed, _sampling(asked), asked.title)
 
     def solver_names(self) -> list[str]:
         """Solvers to run: those named, or all that are installed."""
         return installed_solvers(registry.names("QP solver")) if self.solvers == "available" else list(self.solvers)
+
+
+def _sampling(entry: SamplingEntry) -> Plugin | None:
+    return None if entry.name == OWN else Plugin.from_entry("sampling strategy", entry)
 
 
 MODELS: Mapping[str, type[BaseModel]] = {"tolerances": ToleranceTable, "limits": Limits, "problem": ProblemEntry}
@@ -258,23 +266,17 @@ def _check_sets(study: Study, entry: ProblemEntry) -> None:
 
     What is wrong with them is found before a run, and not in all of its cells.
     """
-    validation, trained = study.validation_of(entry), study.training_of(entry)
-    named = [found for found in (*trained, validation) if isinstance(found, SamplingEntry) and found.name != OWN]
-    for found in named:
-        registry.check_options("sampling strategy", found.name, found.options)
-    if not named and not registry.data_digest("problem", entry.name, entry.options):
-        return
-    problem = Plugin.from_entry("problem", entry)
-    by = validation if isinstance(validation, int) else Plugin.from_entry("sampling strategy", validation)
-    samplings = [None if one.name == OWN else Plugin.from_entry("sampling strategy", one) for one in trained]
-    if not is_available(*(found for found in (problem, by, *samplings) if isinstance(found, Plugin))):
-        return
-    if isinstance(by, int):
-        check_own_validation(problem, by, study.seed)
-    else:
-        check_no_training(by)
+    asked = [*(entry.training or study.training), entry.validation or study.validation]
+    samplings = [one for one in asked if isinstance(one, SamplingEntry) and one.name != OWN]
     for sampling in samplings:
-        check_unseen(problem, sampling, by, study.seed)
+        registry.check_options("sampling strategy", sampling.name, sampling.options)
+    if not samplings and not registry.data_digest("problem", entry.name, entry.options):
+        return
+    problem, validation = Plugin.from_entry("problem", entry), study.validation_set(entry)
+    training = study.training_sets(entry)
+    if is_available(problem, *(one.sampling for one in (validation, *training) if one.sampling is not None)):
+        for trained in training:
+            check_sets(problem, trained, validation)
 
 
 def _check_tolerances(study: Study, table: ToleranceTable) -> None:

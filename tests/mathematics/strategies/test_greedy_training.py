@@ -11,8 +11,9 @@ from samples import SampleStore, carry_out
 from vibench import AdaptiveSampling, Array, HighFidelitySolver, ParameterBox, Stop, Trainer, create
 from vibench.stages.assembly import AffineDecomposition
 from vibench.stages.base import value_of
-from vibench.stages.offline import PODStage, TrainingConstraints
-from vibench.stages.snapshots import gather, training_of, training_stages
+from vibench.stages.offline import ConstraintMatrices, PODStage
+from vibench.stages.snapshots import gather, parameters_in, solution_stages
+from vibench.study.parameter_sets import ParameterSet
 from vibench.study.plugin import Plugin
 
 BOX = ParameterBox(("x", "y"), np.zeros(2), np.array([2.0, 1.0]), ("1", "1"))
@@ -105,19 +106,20 @@ def test_it_ends_where_every_candidate_is_solved(candidates: int) -> None:
 
 
 PROBLEM = Plugin("problem", "obstacle", '{"resolution": 160}', "test")
-GREEDY = Plugin("sampling strategy", "greedy", '{"candidates": 200, "tolerance": 0.1, "checked": 20}', "test")
+SAMPLING = Plugin("sampling strategy", "greedy", '{"candidates": 200, "tolerance": 0.1, "checked": 20}', "test")
+GREEDY = ParameterSet("training", sampling=SAMPLING)
 
 
 @pytest.fixture(scope="module")
 def store(tmp_path_factory: pytest.TempPathFactory) -> SampleStore:
     store = SampleStore(tmp_path_factory.mktemp("greedy"))
     carry_out(PODStage(PROBLEM, Stop(tolerance=1e-6), GREEDY), store)
-    carry_out(TrainingConstraints(PROBLEM, GREEDY), store)
+    carry_out(ConstraintMatrices(PROBLEM, GREEDY), store)
     return store
 
 
 def test_the_solutions_of_the_training_are_the_snapshots(store: SampleStore) -> None:
-    (stage,) = training_stages(PROBLEM, GREEDY)
+    (stage,) = solution_stages(PROBLEM, GREEDY)
     found = gather(store, (stage,))
     solver = HighFidelitySolver(create("problem", "obstacle", {"resolution": 160}))
     for k, mu in enumerate(found.mu):
@@ -125,12 +127,12 @@ def test_the_solutions_of_the_training_are_the_snapshots(store: SampleStore) -> 
         np.testing.assert_allclose(found.u[:, k], exact.u, atol=1e-9 * np.abs(exact.u).max())
         np.testing.assert_allclose(found.lam[:, k], exact.lam, atol=1e-8 * np.abs(exact.lam).max())
     assert 3 <= len(found.mu) < 60
-    assert np.array_equal(training_of(store, PROBLEM, GREEDY), found.mu)
-    assert len(value_of(store, TrainingConstraints(PROBLEM, GREEDY)).members) == len(found.mu)
+    assert np.array_equal(parameters_in(store, PROBLEM, GREEDY), found.mu)
+    assert len(value_of(store, ConstraintMatrices(PROBLEM, GREEDY)).members) == len(found.mu)
 
 
 def test_history_and_seconds_are_recorded(store: SampleStore) -> None:
-    (stage,) = training_stages(PROBLEM, GREEDY)
+    (stage,) = solution_stages(PROBLEM, GREEDY)
     artefact = store.get(stage.key)
     assert artefact is not None
     histories = {history.quantity: history for history in artefact.histories}

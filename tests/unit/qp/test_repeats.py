@@ -31,6 +31,7 @@ from vibench.stages.snapshots import SnapshotStage
 from vibench.stages.timing_rounds import TimingRounds
 from vibench.storage.artefacts import Store
 from vibench.study import registry
+from vibench.study.parameter_sets import ParameterSet
 from vibench.study.plugin import Plugin
 
 PROBLEM = Plugin("problem", "obstacle", '{"resolution": 150}', "repeats")
@@ -41,7 +42,13 @@ def cell(interpolation: float | None, solver: str = "remembers", warm_start: boo
     cone = ConeStage(PROBLEM, Plugin("dual strategy", "cpg", "{}", "repeats"), Stop(size=3))
     primal = Plugin("primal strategy", "decorrelated", "{}", "repeats")
     enrichment = SingleEnrichment(PODStage(PROBLEM, Stop(size=3)), cone, primal, None)
-    return CellQueries(AssemblyStage(enrichment, interpolation, len(EVERY), 1), solver, 1e-8, 20.0, warm_start)
+    return CellQueries(
+        AssemblyStage(enrichment, interpolation, ParameterSet("validation", len(EVERY), 1)),
+        solver,
+        1e-8,
+        20.0,
+        warm_start,
+    )
 
 
 CELLS = (cell(None), cell(None, "other"), cell(1e-6), cell(1e-6, "other"))
@@ -102,12 +109,12 @@ def test_reduced_programs_are_assembled_nowhere_twice(store: Store, monkeypatch:
     assert len({tuple(np.round(mu, 6)) for mu in visited}) == len(EVERY)
 
 
-@pytest.mark.parametrize("purpose", ["training", "validation"])
+@pytest.mark.parametrize("role", ["training", "validation"])
 def test_a_high_fidelity_solution_is_repeated_next_to_its_parameter(
-    purpose: Literal["training", "validation"], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+    role: Literal["training", "validation"], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     visited = visits(monkeypatch, snapshots, "checked_assembly")
-    found = SnapshotStage(PROBLEM, purpose, 6, 3, 0).run(Store(tmp_path)).value
+    found = SnapshotStage(PROBLEM, ParameterSet(role, 6, 3), 0).run(Store(tmp_path)).value
     repeated = {mu for mu in visited if visited.count(mu) > 1}
     assert repeated <= {visited[0], tuple(PROBLEM.create().training_set()[0])}  # where the fingerprint is taken
     assert len(set(visited)) > len(found.mu)

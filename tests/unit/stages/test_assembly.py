@@ -19,6 +19,7 @@ from vibench.stages.base import value_of
 from vibench.stages.cell_queries import CellQueries
 from vibench.stages.enrichment import SingleEnrichment
 from vibench.stages.offline import ConeStage, PODStage
+from vibench.study.parameter_sets import ParameterSet
 from vibench.study.plugin import Plugin
 
 OBSTACLE = Plugin("problem", "obstacle", '{"resolution": 200}', "test")
@@ -38,7 +39,9 @@ def cell(
         Plugin("primal strategy", primal, "{}", "test"),
         tolerance,
     )
-    return CellQueries(AssemblyStage(enrichment, interpolation, QUERIES, 3), "piqp", 1e-8, 20.0)
+    return CellQueries(
+        AssemblyStage(enrichment, interpolation, ParameterSet("validation", QUERIES, 3)), "piqp", 1e-8, 20.0
+    )
 
 
 CELLS = {

@@ -22,6 +22,7 @@ from vibench.stages.enrichment import SingleEnrichment
 from vibench.stages.offline import ConeStage, PODStage
 from vibench.stages.pictures import PictureStage
 from vibench.study import registry
+from vibench.study.parameter_sets import ParameterSet
 from vibench.study.plugin import Plugin
 
 OBSTACLE = registry.load("problem", "obstacle")
@@ -51,7 +52,7 @@ def cell(name: str, primal: str, interpolation: float | None) -> CellQueries:
     problem = plugin("problem", name)
     cone = ConeStage(problem, plugin("dual strategy", "cpg"), Stop(size=2))
     enrichment = SingleEnrichment(PODStage(problem, Stop(size=2)), cone, plugin("primal strategy", primal), None)
-    return CellQueries(AssemblyStage(enrichment, interpolation, 4, 1), "piqp", 1e-8, 20.0)
+    return CellQueries(AssemblyStage(enrichment, interpolation, ParameterSet("validation", 4, 1)), "piqp", 1e-8, 20.0)
 
 
 def rows(stage: CellQueries, store: SampleStore) -> list[Row]:

@@ -23,6 +23,7 @@ from vibench.stages.cell_queries import CellQueries
 from vibench.stages.enrichment import SingleEnrichment
 from vibench.stages.offline import ConeStage, PODStage
 from vibench.stages.query import error_columns, path_before
+from vibench.study.parameter_sets import ParameterSet
 from vibench.study.plugin import Plugin
 
 BOX = ParameterBox(("a", "b"), np.array([0.0, 0.0]), np.array([1.0, 100.0]), ("1", "1"))
@@ -65,7 +66,10 @@ def test_a_query_whose_assessment_fails_costs_itself(tmp_path: Path, monkeypatch
     cone = ConeStage(PROBLEM, Plugin("dual strategy", "cpg", "{}", "test"), Stop(size=3))
     primal = Plugin("primal strategy", "decorrelated", "{}", "test")
     enrichment = SingleEnrichment(PODStage(PROBLEM, Stop(size=4)), cone, primal, None)
-    stage, store = CellQueries(AssemblyStage(enrichment, None, 4, 1), "piqp", 1e-6, 20.0), SampleStore(tmp_path)
+    stage, store = (
+        CellQueries(AssemblyStage(enrichment, None, ParameterSet("validation", 4, 1)), "piqp", 1e-6, 20.0),
+        SampleStore(tmp_path),
+    )
     carry_out(stage, store)
     whole, bad = value_of(store, stage), float(PROBLEM.create().validation_set(4, 1)[2, 0])
 
@@ -87,7 +91,7 @@ def test_rows_say_which_query_they_started_from(tmp_path: Path) -> None:
     cone = ConeStage(PROBLEM, Plugin("dual strategy", "cpg", "{}", "test"), Stop(size=3))
     primal = Plugin("primal strategy", "decorrelated", "{}", "test")
     enrichment = SingleEnrichment(PODStage(PROBLEM, Stop(size=4)), cone, primal, None)
-    assembly = AssemblyStage(enrichment, None, 4, 1)
+    assembly = AssemblyStage(enrichment, None, ParameterSet("validation", 4, 1))
     stage, store, started = CellQueries(assembly, "osqp", 1e-6, 20.0), SampleStore(tmp_path), {}
     for warm, solver in ((False, "osqp"), (True, "osqp"), (True, "piqp")):
         asked = replace(stage, warm_start=warm, solver=solver)

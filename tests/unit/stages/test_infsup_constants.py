@@ -11,6 +11,7 @@ from vibench.stages.base import value_of
 from vibench.stages.cell_queries import CellQueries
 from vibench.stages.enrichment import SingleEnrichment
 from vibench.stages.offline import ConeStage, PODStage
+from vibench.study.parameter_sets import ParameterSet
 from vibench.study.plugin import Plugin
 
 PROBLEMS = {
@@ -30,7 +31,7 @@ def cell(problem: str, primal: str) -> CellQueries:
         Plugin("primal strategy", primal, "{}", "test"),
         PRIMALS[primal],
     )
-    return CellQueries(AssemblyStage(enrichment, None, COUNT, 3), "piqp", 1e-8, 20.0)
+    return CellQueries(AssemblyStage(enrichment, None, ParameterSet("validation", COUNT, 3)), "piqp", 1e-8, 20.0)
 
 
 @pytest.fixture(scope="module")

@@ -26,13 +26,15 @@ from vibench.stages.base import Stage, value_of
 from vibench.stages.cell_queries import CellQueries
 from vibench.stages.cell_summary import summarise
 from vibench.stages.enrichment import NestedEnrichment, SingleEnrichment
-from vibench.stages.infsup_constants import ReferenceConstants, ValidationConstraints
-from vibench.stages.offline import ConeStage, PODStage
-from vibench.stages.snapshots import CHUNKS, SnapshotStage, gather, training_stages, validation_stages
+from vibench.stages.infsup_constants import ReferenceConstants
+from vibench.stages.offline import ConeStage, ConstraintMatrices, PODStage
+from vibench.stages.snapshots import CHUNKS, SnapshotStage, gather, solution_stages
+from vibench.study.parameter_sets import OWN_TRAINING, ParameterSet
 from vibench.study.plugin import Plugin
 from vibench.timing import NO_TIME, Seconds
 
 PROBLEM = Plugin("problem", "obstacle", '{"resolution": 200}', "test")
+VALIDATION = ParameterSet("validation", 9, 3)
 
 
 def cell(primal: str, tolerance: float | None, solver: str = "piqp") -> CellQueries:
@@ -42,7 +44,7 @@ def cell(primal: str, tolerance: float | None, solver: str = "piqp") -> CellQuer
         Plugin("primal strategy", primal, "{}", "test"),
         tolerance,
     )
-    return CellQueries(AssemblyStage(enrichment, None, 9, 3), solver, 1e-8, 20.0)
+    return CellQueries(AssemblyStage(enrichment, None, VALIDATION), solver, 1e-8, 20.0)
 
 
 @pytest.fixture(scope="module")
@@ -68,7 +70,7 @@ def test_keys_say_what_determines_a_stage_and_nothing_else() -> None:
     keys = {
         PODStage(PROBLEM, Stop(size=3)).key,
         PODStage(PROBLEM, Stop(size=4)).key,
-        *(c.key for c in training_stages(PROBLEM)),
+        *(c.key for c in solution_stages(PROBLEM, OWN_TRAINING)),
     }
     assert len(keys) == 2 + CHUNKS
 
@@ -82,7 +84,7 @@ def stages_below(stage: Stage) -> Iterator[Stage]:
 @pytest.mark.parametrize(
     ("room", "changed", "kept"),
     [
-        ("highfidelity", {"high-fidelity solutions", "POD", "cone", "enrichment", "queries"}, {"training constraints"}),
+        ("highfidelity", {"high-fidelity solutions", "POD", "cone", "enrichment", "queries"}, {"constraint matrices"}),
         ("reduction", {"POD", "cone", "enrichment", "queries"}, {"high-fidelity solutions", "full assembly times"}),
         ("stability", {"cone", "enrichment", "constants of V", "queries"}, {"high-fidelity solutions", "POD"}),
         ("model", {"assembly", "queries"}, {"high-fidelity solutions", "POD", "cone", "enrichment"}),
@@ -106,19 +108,19 @@ def test_a_key_changes_with_the_rooms_that_compute_the_value_and_what_it_is_made
 
 
 def test_chunks_make_up_the_whole_sweep_in_order(store: SampleStore) -> None:
-    found = gather(store, training_stages(PROBLEM))
+    found = gather(store, solution_stages(PROBLEM, OWN_TRAINING))
     problem = PROBLEM.create()
     assert np.array_equal(found.mu, problem.training_set())
     assert found.u.shape == (problem.V.dim, 125)
     assert len(found.seconds) == len(found.fallbacks) == 125
     assert all(s.cpu > 0.0 for s in found.seconds)
-    validation = gather(store, validation_stages(PROBLEM, 9, 3))
+    validation = gather(store, solution_stages(PROBLEM, VALIDATION))
     assert np.array_equal(validation.mu, problem.validation_set(9, 3))
 
 
 def test_few_parameters_leave_empty_chunks(tmp_path: Path) -> None:
     store = SampleStore(tmp_path)
-    chunks = validation_stages(PROBLEM, 3, 1)
+    chunks = solution_stages(PROBLEM, ParameterSet("validation", 3, 1))
     for chunk in chunks:
         carry_out(chunk, store)
     assert gather(store, chunks).mu.shape == (3, 3)
@@ -126,7 +128,7 @@ def test_few_parameters_leave_empty_chunks(tmp_path: Path) -> None:
 
 def test_diagnostics_are_kept_beside_the_solutions(store: SampleStore) -> None:
     steps = {}
-    for chunk in training_stages(PROBLEM):
+    for chunk in solution_stages(PROBLEM, OWN_TRAINING):
         for history in store.get(chunk.key).histories:
             assert history.quantity == "aspect_ratio"
             steps |= {history.first_step + k: v for k, v in enumerate(history.values)}
@@ -199,8 +201,11 @@ def test_rows_of_a_cell(store: SampleStore, primal: str, tolerance: float | None
     assert rows.cell["queries"] == rows.cell["queries_ok"] == len(rows.queries) == 9
     parts = ("snapshots", "pod", "cone", "enrichment", "assembly")
     assert rows.cell["offline_s"] == pytest.approx(sum(rows.cell[f"offline_{part}_s"] for part in parts))
-    snapshots = sum((store.get(chunk.key).seconds for chunk in training_stages(PROBLEM)), NO_TIME)
-    training, validation = gather(store, training_stages(PROBLEM)), gather(store, validation_stages(PROBLEM, 9, 3))
+    snapshots = sum((store.get(chunk.key).seconds for chunk in solution_stages(PROBLEM, OWN_TRAINING)), NO_TIME)
+    training, validation = (
+        gather(store, solution_stages(PROBLEM, OWN_TRAINING)),
+        gather(store, solution_stages(PROBLEM, VALIDATION)),
+    )
     assert snapshots.cpu == pytest.approx(sum(seconds.cpu for seconds in training.seconds))
     setup = median(seconds.cpu for seconds in (*training.setups, *validation.setups))
     assert rows.cell["offline_snapshots_s"] == pytest.approx(snapshots.cpu + setup)
@@ -249,15 +254,15 @@ class Factorising(HighFidelitySolver):
         return super().solve_assembled(mu, vi)
 
 
-@pytest.mark.parametrize(("purpose", "count"), [("training", 0), ("validation", 9), ("validation", 18)])
+@pytest.mark.parametrize(("role", "count"), [("training", 0), ("validation", 9), ("validation", 18)])
 def test_the_set_up_is_no_part_of_the_seconds_of_a_solution(
-    purpose: Literal["training", "validation"], count: int, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+    role: Literal["training", "validation"], count: int, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     """Whatever the number of parameters that share it: break-even would depend on the number of queries otherwise."""
     monkeypatch.setattr(snapshots, "HighFidelitySolver", Factorising)
     for clock in ("process_time", "perf_counter"):
         monkeypatch.setattr(timing, clock, lambda: Factorising.now)
-    found = SnapshotStage(PROBLEM, purpose, count, 3, 1).run(SampleStore(tmp_path))
+    found = SnapshotStage(PROBLEM, ParameterSet(role, count, 3), 1).run(SampleStore(tmp_path))
     assert found.value.setups == (Seconds(10.0, 10.0),)
     assert set(found.value.seconds) == {Seconds(1.0, 1.0)}
     assert found.seconds == Seconds(float(len(found.value.mu)), float(len(found.value.mu)))
@@ -272,7 +277,7 @@ def test_a_slow_query_is_a_timeout(store: SampleStore) -> None:
 
 
 def test_the_reference_constants_are_those_of_every_parameter(store: SampleStore) -> None:
-    constants = value_of(store, ReferenceConstants(ValidationConstraints(PROBLEM, 9, 3)))
+    constants = value_of(store, ReferenceConstants(ConstraintMatrices(PROBLEM, VALIDATION)))
     mus = PROBLEM.create().validation_set(9, 3)
     scaled = [c.inf_sup.span / mu[0] ** 2 for c, mu in zip(constants, mus, strict=True)]  # B = mu_1² times one matrix
     assert np.allclose(scaled, scaled[0], rtol=1e-9)
@@ -317,7 +322,7 @@ def test_a_problem_without_diagnostics_has_no_such_history(monkeypatch: pytest.M
     problem = PROBLEM.create()
     monkeypatch.setattr(problem, "diagnostics", lambda mu: {})
     monkeypatch.setattr(snapshots, "build_problem", lambda plugin: problem)
-    assert SnapshotStage(PROBLEM, "validation", 2, 0, 0).run(None).histories == ()
+    assert SnapshotStage(PROBLEM, ParameterSet("validation", 2, 0), 0).run(None).histories == ()
 
 
 def query(status: str, error: float | None = 1.0, **columns) -> dict:

@@ -18,8 +18,9 @@ from running import Register
 from vibench import NumericalError, Problem, VariationalInequality
 from vibench.interfaces.fingerprint import AGREEMENT_RTOL, Fingerprint, ReferenceAssembly, fingerprint
 from vibench.stages.base import build_problem
-from vibench.stages.snapshots import fingerprint_here, gather, training_stages
+from vibench.stages.snapshots import fingerprint_here, gather, solution_stages
 from vibench.storage.artefacts import Store
+from vibench.study.parameter_sets import OWN_TRAINING
 from vibench.study.plugin import Plugin
 from vibench.testing.processes import call_in_other_process
 
@@ -44,7 +45,7 @@ def swept(name: str, folder: Path) -> None:
     build_problem.cache_clear()
     fingerprint_here.cache_clear()
     store = Store(folder / "artefacts")
-    chunks = training_stages(Plugin("problem", name, "{}", ""))
+    chunks = solution_stages(Plugin("problem", name, "{}", ""), OWN_TRAINING)
     for chunk in chunks:
         found = chunk.run(store)
         store.put(chunk.key, found.value, found.seconds, found.histories)

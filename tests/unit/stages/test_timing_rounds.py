@@ -20,6 +20,7 @@ from vibench.stages.cell_queries import CellQueries
 from vibench.stages.enrichment import SingleEnrichment
 from vibench.stages.offline import ConeStage, PODStage
 from vibench.stages.timing_rounds import TimedRound, TimingRounds, round_rows, seconds_of_cell, seconds_of_queries
+from vibench.study.parameter_sets import ParameterSet
 from vibench.study.plugin import Plugin
 from vibench.timing import Seconds
 
@@ -31,7 +32,9 @@ def cell(primal: str = "decorrelated", solver: str = "piqp", interpolation: floa
     cone = ConeStage(PROBLEM, Plugin("dual strategy", "cpg", "{}", "test"), Stop(size=4))
     strategy = Plugin("primal strategy", primal, "{}", "test")
     enrichment = SingleEnrichment(PODStage(PROBLEM, Stop(size=4)), cone, strategy, None)
-    return CellQueries(AssemblyStage(enrichment, interpolation, VALIDATION, 1), solver, 1e-7, 20.0)
+    return CellQueries(
+        AssemblyStage(enrichment, interpolation, ParameterSet("validation", VALIDATION, 1)), solver, 1e-7, 20.0
+    )
 
 
 CELLS = (cell(), cell(solver="osqp"), cell("online-supremizers"), cell(interpolation=1e-6))

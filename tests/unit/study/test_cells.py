@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, fields, replace
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +18,7 @@ from vibench.interfaces.strategies import Stop
 from vibench.study import cells as module
 from vibench.study.cells import Cell, digest
 from vibench.study.matrix import expand
+from vibench.study.parameter_sets import ParameterSet
 from vibench.study.plugin import Plugin
 from vibench.study.reader import read_study
 
@@ -145,11 +146,12 @@ SAMPLE = Cell(
     assembly="full",
     interpolation=None,
     warm_start=False,
-    seed=1,
-    validation=8,
     accuracy=1e-7,
+    validation=ParameterSet("validation", 8, 1),
     labels=("P", "D", "Q"),
 )
+
+SAMPLING = Plugin("sampling strategy", "s", "{}", "package 1")
 
 OTHER: Mapping[str, Mapping[str, Any]] = {
     "problem": {"problem": replace(SAMPLE.problem, name="other")},
@@ -168,18 +170,18 @@ OTHER: Mapping[str, Mapping[str, Any]] = {
     "assembly": {"assembly": "reduced"},
     "interpolation": {"interpolation": 1e-6},
     "warm start": {"warm_start": True},
-    "seed": {"seed": 2},
-    "validation": {"validation": 9},
+    "seed": {"validation": ParameterSet("validation", 8, 2)},
+    "validation": {"validation": ParameterSet("validation", 9, 1)},
     "accuracy": {"accuracy": 1e-8},
-    "training": {"training": Plugin("sampling strategy", "s", "{}", "package 1")},
-    "training options": {"training": Plugin("sampling strategy", "s", '{"a": 1}', "package 1")},
-    "validation sampling": {"validation_sampling": Plugin("sampling strategy", "s", "{}", "package 1")},
+    "training": {"training": ParameterSet("training", sampling=SAMPLING)},
+    "training options": {"training": ParameterSet("training", sampling=replace(SAMPLING, options='{"a": 1}'))},
+    "validation sampling": {"validation": ParameterSet("validation", 8, 1, SAMPLING)},
 }
 
 
 def test_the_cases_cover_every_member_of_a_cell() -> None:
     covered = {name for change in OTHER.values() for name in change}
-    assert covered | {"labels", "set_labels", "nested_tolerances"} == {field.name for field in fields(Cell)}
+    assert covered | {"labels", "nested_tolerances"} == {field.name for field in fields(Cell)}
 
 
 @pytest.mark.parametrize("case", OTHER)
@@ -192,25 +194,32 @@ def test_no_two_changes_give_the_same_key() -> None:
 
 
 def test_the_key_does_not_depend_on_labels_or_code() -> None:
-    assert replace(SAMPLE, labels=("x", "y", "z"), set_labels=("x", "y")).key == SAMPLE.key
+    named = {name: replace(getattr(SAMPLE, name), label="x") for name in ("training", "validation")}
+    assert replace(SAMPLE, labels=("x", "y", "z"), **named).key == SAMPLE.key
     newer = {axis: replace(getattr(SAMPLE, axis), code="package 2") for axis in ("problem", "dual", "primal")}
     assert replace(SAMPLE, **newer).key == SAMPLE.key
 
 
 def test_the_key_of_a_cell_with_the_sets_of_its_problem_is_what_it_was_before_there_were_others() -> None:
-    content = asdict(SAMPLE)
-    for name in ("labels", "nested_tolerances", "training", "validation_sampling", "set_labels"):
-        del content[name]
-    for plugin in ("problem", "dual", "primal"):
-        del content[plugin]["code"]
-    assert SAMPLE.key == digest(content)
+    assert SAMPLE.key == digest({
+        "problem": {"kind": "problem", "name": "p", "options": '{"a": 1}'},
+        "dual": {"kind": "dual strategy", "name": "d", "options": "{}"},
+        "primal": {"kind": "primal strategy", "name": "q", "options": "{}"},
+        "pod": {"tolerance": 1e-3, "size": None}, "cone": {"tolerance": None, "size": 4}, "primal_tol": 0.5,
+        "solver": "piqp", "assembly": "full", "interpolation": None, "warm_start": False, "seed": 1, "validation": 8,
+        "accuracy": 1e-7,
+    })  # fmt: skip
 
 
-@pytest.mark.parametrize("axis", ["problem", "dual", "primal", "training", "validation_sampling"])
+@pytest.mark.parametrize("axis", ["problem", "dual", "primal", "training", "validation"])
 def test_the_code_changes_with_every_plugin(axis: str) -> None:
-    given = getattr(SAMPLE, axis) or Plugin("sampling strategy", "s", "{}", "package 1")
-    one, other = (replace(SAMPLE, **{axis: replace(given, code=f"package {k}")}).code for k in (1, 2))
-    assert one != other
+    def code(version: str) -> str:
+        part = getattr(SAMPLE, axis)
+        if isinstance(part, ParameterSet):
+            return replace(SAMPLE, **{axis: replace(part, sampling=replace(SAMPLING, code=version))}).code
+        return replace(SAMPLE, **{axis: replace(part, code=version)}).code
+
+    assert code("package 1") != code("package 2")
 
 
 @pytest.mark.parametrize("what", ["core_code", "solver_version"])

@@ -14,7 +14,7 @@ from samples import STUDY, changed, write_study
 from vibench.errors import RequestError
 from vibench.study.cells import Cell
 from vibench.study.matrix import expand
-from vibench.study.parameter_sets import sampled
+from vibench.study.parameter_sets import OWN_TRAINING, ParameterSet, parameters_of
 from vibench.study.plugin import Plugin
 from vibench.study.reader import read_study
 from vibench.study.single_cell import study_of_cell
@@ -32,7 +32,7 @@ def plugin(name: str, options: str) -> Plugin:
 
 def test_a_study_that_names_no_set_has_those_of_its_problems(tmp_path: Path) -> None:
     plain = cells_of(STUDY, tmp_path)
-    assert {(cell.training, cell.validation, cell.validation_sampling) for cell in plain} == {(None, 3, None)}
+    assert {(cell.training, cell.validation) for cell in plain} == {(OWN_TRAINING, ParameterSet("validation", 3, 7))}
     named = cells_of(changed(STUDY, "training", to="own"), tmp_path)
     assert [cell.key for cell in named] == [cell.key for cell in plain]
 
@@ -41,8 +41,8 @@ def test_training_sets_are_an_axis_with_a_label_each(tmp_path: Path) -> None:
     sets = ["own", SOBOL, {**SOBOL, "seed": 2, "label": "other"}]
     cells = cells_of(changed(STUDY, "training", to=sets), tmp_path)
     assert len(cells) == 3 * len(cells_of(STUDY, tmp_path))
-    assert {cell.set_labels[0]: cell.training and cell.training.options for cell in cells} == {
-        "own": None, "sobol": '{"seed": 1, "size": 8}', "other": '{"seed": 2, "size": 8}',
+    assert {cell.training.label: cell.training.options for cell in cells} == {
+        "own": "{}", "sobol": '{"seed": 1, "size": 8}', "other": '{"seed": 2, "size": 8}',
     }  # fmt: skip
     assert len({cell.key for cell in cells}) == len(cells)
     assert {str(cell).split(" · ")[0] for cell in cells} == {"obstacle", "obstacle (sobol)", "obstacle (other)"}
@@ -53,12 +53,9 @@ def test_a_problem_may_have_sets_of_its_own(tmp_path: Path) -> None:
     validation = {"name": "random", "options": {"size": 7, "seed": 4}}
     content = changed(changed(STUDY, "problem", to=problems), "validation", to=validation)
     found = {
-        (c.problem.name, c.training and c.training.name, c.validation, c.set_labels)
-        for c in cells_of(content, tmp_path)
+        (c.problem.name, c.training.label, c.validation.count, c.validation.label) for c in cells_of(content, tmp_path)
     }
-    assert found == {
-        ("obstacle", "sobol", 5, ("sobol", "own")), ("radial-obstacle", None, 7, ("own", "random")),
-    }  # fmt: skip
+    assert found == {("obstacle", "sobol", 5, "own"), ("radial-obstacle", "own", 7, "random")}
 
 
 def test_a_cell_is_restored_with_its_sets(tmp_path: Path) -> None:
@@ -66,7 +63,8 @@ def test_a_cell_is_restored_with_its_sets(tmp_path: Path) -> None:
     cell = cells_of(content, tmp_path)[0]
     assert Cell.from_definition(cell.definition) == cell
     (alone,) = expand(study_of_cell(cell, "sample"))
-    assert (alone.key, str(alone), alone.set_labels) == (cell.key, str(cell), ("sobol", "random"))
+    assert (alone.key, str(alone)) == (cell.key, str(cell))
+    assert (alone.training.label, alone.validation.label) == ("sobol", "random")
 
 
 def test_a_file_is_beside_the_study_and_its_content_is_part_of_the_code(
@@ -78,8 +76,7 @@ def test_a_file_is_beside_the_study_and_its_content_is_part_of_the_code(
     file.write_text("centre_x,scale,centre_y\n0.01, 0.9, -0.02\n0.02,1.0,0\n")
     content = changed(STUDY, "training", to={"name": "file", "path": "sets/points.csv"})
     (cell, *_) = cells_of(content, tmp_path)
-    assert cell.training is not None
-    assert sampled(cell.problem, cell.training).tolist() == [[0.9, 0.01, -0.02], [1.0, 0.02, 0.0]]
+    assert parameters_of(cell.problem, cell.training).tolist() == [[0.9, 0.01, -0.02], [1.0, 0.02, 0.0]]
     file.write_text("centre_x,scale,centre_y\n0.01,0.9,-0.02\n")
     (again, *_) = cells_of(content, tmp_path)
     assert again.key == cell.key

@@ -36,7 +36,7 @@ def test_a_study_of_one_cell_has_its_parameter_sets() -> None:
     )
     for cell in expand(sampled):
         (again,) = expand(study_of_cell(cell, "quick"))
-        assert (again.key, str(again), again.validation) == (cell.key, str(cell), 9)
+        assert (again.key, str(again), again.validation.count) == (cell.key, str(cell), 9)
 
 
 def test_a_definition_without_parameter_sets_is_one_with_those_of_the_problem() -> None:

@@ -21,13 +21,14 @@ from vibench.stages.offline import PODStage
 from vibench.stages.snapshots import CHUNKS, SnapshotStage
 from vibench.study.cells import Cell
 from vibench.study.matrix import expand
+from vibench.study.parameter_sets import OWN_TRAINING
 from vibench.study.plugin import Plugin
 from vibench.study.reader import read_study
 from vibench.terminal.progress import ALIKE, DrawingDisplay, ProgressDisplay, TimeLeft, duration
 
 PROBLEM = Plugin("problem", "p", "{}", "")
 PODS: list[Stage] = [PODStage(PROBLEM, Stop(size=k)) for k in range(1, 5)]
-CHUNK: list[Stage] = [SnapshotStage(PROBLEM, "training", 0, 0, chunk) for chunk in range(CHUNKS)]
+CHUNK: list[Stage] = [SnapshotStage(PROBLEM, OWN_TRAINING, chunk) for chunk in range(CHUNKS)]
 
 
 @pytest.fixture
