@@ -31,10 +31,10 @@ LINES = (
 
 @pytest.fixture(scope="module")
 def results() -> object:
-    """The scripts of the folder `results`, importable."""
-    sys.path.insert(0, str(ROOT / "results"))
+    """The scripts of the folder `results/scripts`, importable."""
+    sys.path.insert(0, str(ROOT / "results" / "scripts"))
     yield
-    sys.path.remove(str(ROOT / "results"))
+    sys.path.remove(str(ROOT / "results" / "scripts"))
 
 
 @pytest.fixture(scope="module")

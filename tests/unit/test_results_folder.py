@@ -19,6 +19,7 @@ from vibench.study.matrix import expand
 
 ROOT = Path(__file__).parents[2]
 RESULTS = ROOT / "results"
+SCRIPTS = RESULTS / "scripts"
 FILES = sorted(path for path in RESULTS.rglob("*") if path.is_file() and "__pycache__" not in path.parts)
 PAGES = [path for path in FILES if path.suffix == ".md"]
 LARGEST = 8_000_000
@@ -37,6 +38,10 @@ def linked(page: Path) -> set[Path]:
 
 def test_the_folder_is_light() -> None:
     assert sum(path.stat().st_size for path in FILES) <= LARGEST
+
+
+def test_scripts_lie_apart_from_what_they_wrote() -> None:
+    assert {path for path in FILES if path.suffix == ".py"} == {path for path in FILES if SCRIPTS in path.parents}
 
 
 def test_every_file_is_a_page_or_a_script_or_on_a_page() -> None:
@@ -63,7 +68,7 @@ def test_the_page_of_a_study_names_the_command_that_makes_the_tables_of_all_quer
 
 def test_a_page_made_anew_is_as_light(quick_run: Path, tmp_path: Path) -> None:
     folder = tmp_path / "benefit"
-    make = [sys.executable, str(RESULTS / "make.py"), str(quick_run), str(folder)]
+    make = [sys.executable, str(SCRIPTS / "study.py"), str(quick_run), str(folder)]
     done = subprocess.run(make, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     written, page = set(folder.iterdir()), folder / "README.md"
@@ -84,11 +89,10 @@ def test_a_page_made_anew_is_as_light(quick_run: Path, tmp_path: Path) -> None:
 
 
 def test_the_results_are_published_by_one_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.syspath_prepend(str(RESULTS))
+    monkeypatch.syspath_prepend(str(SCRIPTS))
     script = importlib.import_module("publish")
     monkeypatch.setattr(html, "page", lambda _: "<!doctype html>")
-    monkeypatch.setattr(sys, "argv", ["publish.py", str(tmp_path / "site")])
-    script.main()
+    script.main(str(tmp_path / "site"))
     index = (tmp_path / "site" / "index.html").read_text(encoding="utf-8")
     for name in NAMES:
         own = tmp_path / "site" / "runs" / name

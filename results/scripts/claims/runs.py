@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import pandas as pd
-from make import DUAL, PAPER, SOLVER, Published
+from study import DUAL, PAPER, SOLVER, Published
 
 from vibench.arrays import Array
 from vibench.results import tables

@@ -1,6 +1,6 @@
 """Publish the results of this folder as a static site.
 
-python results/publish.py SITE
+python results/scripts/publish.py SITE
 
 The tables that the pages show are put into results files again: cells, break-even and disagreements, with the six
 digits that are committed. Tables of all queries are not committed, so that reports have no figures of queries; on the
@@ -9,12 +9,12 @@ page of every run stands the command that makes them.
 
 from __future__ import annotations
 
-import sys
 import tempfile
 from pathlib import Path
 from typing import Any
 
 import pandas as pd
+from page import start
 
 from vibench.report.site.citation import Citation
 from vibench.report.site.publish import publish
@@ -24,7 +24,7 @@ from vibench.results.sqlite.reading import FILE
 from vibench.study.matrix import expand
 from vibench.study.reader import read_study
 
-RESULTS = Path(__file__).parent
+RESULTS = Path(__file__).parents[1]
 
 CITATION = Citation(
     "vibench: results of the reduced-order models of the paper and of the field",
@@ -32,9 +32,7 @@ CITATION = Citation(
 )
 
 
-def main() -> None:
-    if len(sys.argv) != 2:
-        sys.exit("usage: python results/publish.py SITE")
+def main(site: str) -> None:
     with tempfile.TemporaryDirectory() as scratch:
         files = {
             restore(table.parent, Path(scratch)): table.parent.name for table in sorted(RESULTS.glob("*/cells.csv"))
@@ -44,7 +42,7 @@ def main() -> None:
             "makes all of it"
             for file, name in files.items()
         }
-        print(publish(list(files), Path(sys.argv[1]), CITATION, notes))
+        print(publish(list(files), Path(site), CITATION, notes))
 
 
 def restore(tables: Path, folder: Path) -> Path:
@@ -57,10 +55,10 @@ def restore(tables: Path, folder: Path) -> Path:
     database = ResultsDatabase(folder / tables.name, identity)
     try:
         for row in cells:
-            database.write_cell(known("cells", row), ())
+            database.write_cell(stored("cells", row), ())
         for name in ("thresholds", "disagreements"):
             if (tables / f"{name}.csv").exists():
-                database.replace(name, [known(name, row) for row in rows(tables / f"{name}.csv")])
+                database.replace(name, [stored(name, row) for row in rows(tables / f"{name}.csv")])
     finally:
         database.close()
     return folder / tables.name / FILE
@@ -75,10 +73,10 @@ def rows(table: Path) -> list[dict[str, Any]]:
     ]
 
 
-def known(table: str, row: dict[str, Any]) -> dict[str, Any]:
+def stored(table: str, row: dict[str, Any]) -> dict[str, Any]:
     """The columns of a row that the results file has."""
     return {name: value for name, value in row.items() if name in STORED[table]}
 
 
 if __name__ == "__main__":
-    main()
+    start(main)

@@ -1,28 +1,30 @@
 """Which conclusions depend on the triangulation: the page of the study `meshes`.
 
-vibench run meshes --no-figures && python results/meshes.py runs/meshes results/meshes
+vibench run meshes --no-figures && python results/scripts/meshes.py runs/meshes results/meshes
 """
 
 from __future__ import annotations
 
 import json
-import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 import pandas as pd
+from page import Page, machines, made_by, read, start
 
 from vibench.highfidelity.active_set import HighFidelitySolver
 from vibench.interfaces.strategies import Stop
 from vibench.reduction.cones import greedy_cone, project_on_cone
 from vibench.reduction.lazy_greedy import TIE
-from vibench.results import tables
 from vibench.study import registry
 
 LOOSE, TIGHT = 1e-2, 1e-3
 """δ_dual."""
+
+
+Entry = tuple[str, str, float, str]
+"""A column of a cell: dual strategy, primal strategy, δ_dual, column."""
 
 
 @dataclass(frozen=True)
@@ -32,95 +34,80 @@ class Mesh:
     name: str
     cells: pd.DataFrame
 
-    def value(self, dual: str, primal: str, tolerance: float, column: str) -> float:
+    def value(self, entry: Entry) -> float:
         """One column of one cell."""
-        return float(self.cells.loc[(dual, primal, tolerance), column])
+        *cell, column = entry
+        return float(self.cells.loc[tuple(cell), column])
 
 
 @dataclass(frozen=True)
 class Conclusion:
-    """A statement on one mesh: a figure to judge it by, and whether it holds."""
+    """A statement on one mesh, and what confirms it: an entry, divided by another one if it is given."""
 
     statement: str
-    figure: Callable[[Mesh], float]
     holds: Callable[[float], bool]
+    entry: Entry
+    over: Entry | None = None
 
-
-def _ratio(dual: str, tolerance: float, column: str, one: str, other: str) -> Callable[[Mesh], float]:
-    return lambda mesh: mesh.value(dual, one, tolerance, column) / mesh.value(dual, other, tolerance, column)
+    def figure(self, mesh: Mesh) -> float:
+        """The figure to judge the statement by."""
+        return mesh.value(self.entry) / (mesh.value(self.over) if self.over else 1.0)
 
 
 def conclusions() -> list[Conclusion]:
     """What the pages of this repository and the paper conclude."""
-    found = [
+    of_cones = [
         Conclusion(
             f"mCPG needs fewer generators than CPG at δ = {tolerance:g} (ratio)",
-            lambda mesh, tolerance=tolerance: (
-                mesh.value("mcpg", "decorrelated", tolerance, "R") / mesh.value("cpg", "decorrelated", tolerance, "R")
-            ),
             lambda ratio: ratio < 1.0,
+            ("mcpg", "decorrelated", tolerance, "R"),
+            ("cpg", "decorrelated", tolerance, "R"),
         )
         for tolerance in (LOOSE, TIGHT)
     ]
-    found.append(
-        Conclusion(
-            f"without enrichment β over the cone is smaller for mCPG than for CPG at δ = {TIGHT:g} (ratio)",
-            lambda mesh: (
-                mesh.value("mcpg", "decorrelated", TIGHT, "beta_cone_lower_min")
-                / mesh.value("cpg", "decorrelated", TIGHT, "beta_cone_upper_min")
-            ),
-            lambda ratio: ratio < 1.0,
-        )
+    beta = Conclusion(
+        f"without enrichment β over the cone is smaller for mCPG than for CPG at δ = {TIGHT:g} (ratio)",
+        lambda ratio: ratio < 1.0,
+        ("mcpg", "decorrelated", TIGHT, "beta_cone_lower_min"),
+        ("cpg", "decorrelated", TIGHT, "beta_cone_upper_min"),
     )
-    for dual, tolerance in (("cpg", TIGHT), ("mcpg", LOOSE), ("mcpg", TIGHT)):
-        case = f"{dual}, δ = {tolerance:g}"
-
-        def of(primal: str, column: str, dual: str = dual, tolerance: float = tolerance) -> Callable[[Mesh], float]:
-            return lambda mesh: mesh.value(dual, primal, tolerance, column)
-
-        def guaranteed(mesh: Mesh, dual: str = dual, tolerance: float = tolerance) -> float:
-            pair = [
-                mesh.value(dual, "offline-pga", tolerance, f"share_{what}") for what in ("validation", "guaranteed")
-            ]
-            return pair[0] / pair[1]
-
-        found += [
+    of_enrichments = [
+        conclusion
+        for dual, tolerance in (("cpg", TIGHT), ("mcpg", LOOSE), ("mcpg", TIGHT))
+        for conclusion in (
             Conclusion(
-                f"{case}: without enrichment β over the span is less than a tenth of that of V (share)",
-                of("decorrelated", "share_validation"),
+                f"{dual}, δ = {tolerance:g}: without enrichment β over the span is less than a tenth of that of V "
+                "(share)",
                 lambda share: share < 0.1,
+                (dual, "decorrelated", tolerance, "share_validation"),
             ),
             Conclusion(
-                f"{case}: enrichment halves the error of λ at least (ratio online / none)",
-                _ratio(dual, tolerance, "error_lambda_mean", "online-supremizers", "decorrelated"),
+                f"{dual}, δ = {tolerance:g}: enrichment halves the error of λ at least (ratio online / none)",
                 lambda ratio: ratio < 0.5,
+                (dual, "online-supremizers", tolerance, "error_lambda_mean"),
+                (dual, "decorrelated", tolerance, "error_lambda_mean"),
             ),
             Conclusion(
-                f"{case}: the offline enrichment has the error of λ of the online one within 10 % (ratio)",
-                _ratio(dual, tolerance, "error_lambda_mean", "offline-pga", "online-supremizers"),
+                f"{dual}, δ = {tolerance:g}: the offline enrichment has the error of λ of the online one within 10 % "
+                "(ratio)",
                 lambda ratio: ratio < 1.1,
+                (dual, "offline-pga", tolerance, "error_lambda_mean"),
+                (dual, "online-supremizers", tolerance, "error_lambda_mean"),
             ),
             Conclusion(
-                f"{case}: √(1 − σ²) bounds the share of β off the training set, too (share over bound)",
-                guaranteed,
+                f"{dual}, δ = {tolerance:g}: √(1 − σ²) bounds the share of β off the training set, too (share over "
+                "bound)",
                 lambda ratio: ratio >= 1.0 - 1e-6,
+                (dual, "offline-pga", tolerance, "share_validation"),
+                (dual, "offline-pga", tolerance, "share_guaranteed"),
             ),
-        ]
-    return found
+        )
+    ]
+    return [*of_cones, beta, *of_enrichments]
 
 
-def main() -> None:
-    if len(sys.argv) != 3:
-        sys.exit("usage: python results/meshes.py RUN_FOLDER TARGET_FOLDER")
-    path, target = tables.results_file(sys.argv[1]), Path(sys.argv[2])
-    cells = tables.in_order(tables.read(path, "cells"))
-    target.mkdir(parents=True, exist_ok=True)
-    tables.in_order(cells).to_csv(target / "cells.csv", index=False, float_format="%.6g")
-    (target / "README.md").write_text(page(cells), encoding="utf-8")
-
-
-def page(cells: pd.DataFrame) -> str:
-    """The whole page."""
+def main(run: str, target: str) -> None:
+    cells = read(run, "cells")
     meshes = [
         Mesh(str(name), rows.set_index(["dual", "primal", "dual_tol"])) for name, rows in cells.groupby("problem")
     ]
@@ -128,31 +115,34 @@ def page(cells: pd.DataFrame) -> str:
         sorted((mesh for mesh in meshes if mesh.name.startswith(kind)), key=lambda mesh: mesh.name != first)
         for kind, first in (("obstacle", "obstacle, symmetric"), ("hertz", "hertz, staggered"))
     )
-    found = [(kind, judged(of)) for kind, of in (("the obstacle", obstacle), ("Hertz contact", hertz))]
-    lines = []
-    for kind, table in found:
-        depends = table[table["on all meshes"] == "no"]["conclusion"]
-        lines.append(f"- For {kind}: {'; '.join(depends) or 'nothing; every conclusion is the same on all meshes'}.")
-    parts = [
-        "# Conclusions and meshes",
-        "Generated by `vibench run meshes --no-figures && python results/meshes.py runs/meshes results/meshes` on one "
-        f"machine: {cells['machine'].iloc[0]}. The problems of the paper on meshes of one size that differ in their "
-        "triangulation alone. For the obstacle: ours, symmetric as the training grid is, and the same one with nodes "
-        "displaced at random (`asymmetric`). For Hertz contact: layers of nodes shifted by half a spacing (ours), not "
-        "shifted and cut by diagonals that all point one way, and displaced at random (`triangulation`).",
-        "## Dimensions",
-        tables.to_markdown(dimensions([*obstacle, *hertz])),
-        "## Ties",
+    page = Page(
+        target,
+        "Conclusions and meshes",
+        made_by("meshes", "meshes", "meshes", options=" --no-figures"),
+        "The problems of the paper on meshes of one size that differ in their triangulation alone. For the obstacle: "
+        "ours, symmetric as the training grid is, and the same one with nodes displaced at random (`asymmetric`). For "
+        "Hertz contact: layers of nodes shifted by half a spacing (ours), not shifted and cut by diagonals that all "
+        "point one way, and displaced at random (`triangulation`).",
+        machine=machines(cells),
+    )
+    page.section("Dimensions", dimensions([*obstacle, *hertz]))
+    page.section(
+        "Ties",
         f"Steps of CPG (δ = {TIGHT:g}) at which another snapshot is as far from the cone as the farthest one, to "
         f"{TIE:g} of the first distance; the smallest index decides.",
-        tables.to_markdown(pd.DataFrame([ties(mesh) for mesh in [*obstacle, *hertz]])),
-        *(f"## Conclusions for {kind}\n\n{tables.to_markdown(table)}" for kind, table in found),
-        "## What depends on the mesh",
-        "\n".join(lines),
+        pd.DataFrame([ties(mesh) for mesh in [*obstacle, *hertz]]),
+    )
+    lines = []
+    for kind, verdicts in (("the obstacle", judged(obstacle)), ("Hertz contact", judged(hertz))):
+        page.section(f"Conclusions for {kind}", verdicts)
+        depends = "; ".join(verdicts[verdicts["on all meshes"] == "no"]["conclusion"])
+        lines.append(f"- For {kind}: {depends or 'nothing; every conclusion is the same on all meshes'}.")
+    page.section("What depends on the mesh", "\n".join(lines))
+    page.add(
         "`vibench run meshes` leaves the tables of all queries and histories under `runs/meshes/tables`. Full table of "
-        "the cells: [cells.csv](cells.csv).",
-    ]
-    return "\n\n".join(part.strip() for part in parts) + "\n"
+        f"the cells: {page.link('cells', cells)}."
+    )
+    page.write()
 
 
 def dimensions(meshes: Sequence[Mesh]) -> pd.DataFrame:
@@ -200,4 +190,4 @@ def judged(meshes: Sequence[Mesh]) -> pd.DataFrame:
 
 
 if __name__ == "__main__":
-    main()
+    start(main)

@@ -1,14 +1,14 @@
 """The tables of the README: reduced models of the obstacle at two tolerances, and queries against the best alternative.
 
-python results/headline.py runs/paper-obstacle runs/benefit
+python results/scripts/headline.py runs/paper-obstacle runs/benefit
 """
 
 from __future__ import annotations
 
-import sys
 from typing import Any
 
 import pandas as pd
+from page import start
 
 from vibench.report.figures.data import label
 from vibench.results import tables
@@ -17,12 +17,9 @@ LOOSE, TIGHT = 1e-3, 1e-6
 """δ_POD of the two pairs that are shown."""
 
 
-def main() -> None:
-    if len(sys.argv) != 3:
-        sys.exit("usage: python results/headline.py RUN_OF_PAPER_OBSTACLE RUN_OF_BENEFIT")
-    paper, benefit = (tables.read(tables.results_file(run), "cells") for run in sys.argv[1:])
-    print(tables.to_markdown(models(paper)))
-    print(tables.to_markdown(gains(benefit)))
+def main(paper_obstacle: str, benefit: str) -> None:
+    for run, table in ((paper_obstacle, models), (benefit, gains)):
+        print(tables.to_markdown(table(tables.read(tables.results_file(run), "cells"))))
 
 
 def models(cells: pd.DataFrame) -> pd.DataFrame:
@@ -67,4 +64,4 @@ def gains(cells: pd.DataFrame) -> pd.DataFrame:
 
 
 if __name__ == "__main__":
-    main()
+    start(main)

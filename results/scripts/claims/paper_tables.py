@@ -24,7 +24,7 @@ from claims.verdicts import (
 )
 from vibench.results.break_even import Meaning, break_even
 
-SPEED = Path(__file__).parents[1] / "speed"
+SPEED = Path(__file__).parents[2] / "speed"
 """Seconds of the published algorithms in our transcription."""
 
 SPREAD = 1.25

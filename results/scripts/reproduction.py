@@ -1,6 +1,6 @@
 """The page docs/reproduction.md: the paper claim by claim, against the runs of its two studies.
 
-python results/reproduction.py runs/paper-obstacle runs/paper-hertz > docs/reproduction.md
+python results/scripts/reproduction.py runs/paper-obstacle runs/paper-hertz > docs/reproduction.md
 
 Every number of ours comes from the results files of the two runs, or is computed from the problem classes; the seconds
 of the published algorithms in our transcription come from `results/speed`.
@@ -9,7 +9,6 @@ of the published algorithms in our transcription come from `results/speed`.
 from __future__ import annotations
 
 import re
-import sys
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 
@@ -18,6 +17,7 @@ from claims.hertz import Discs
 from claims.obstacle import Membrane
 from claims.runs import Run
 from claims.verdicts import DIMENSION, MESH, ORDER, RATIO, WIDEST, Claim, Verdict
+from page import start
 
 INTRODUCTION = """# Reproduction of the paper
 
@@ -25,7 +25,7 @@ Niakh, Drouet, Ehrlacher and Ern, *Stable model reduction for linear variational
 
 ```
 vibench run paper-obstacle && vibench run paper-hertz
-python results/reproduction.py runs/paper-obstacle runs/paper-hertz > docs/reproduction.md
+python results/scripts/reproduction.py runs/paper-obstacle runs/paper-hertz > docs/reproduction.md
 ```
 
 Seconds were measured on {machine}.{disturbed} Equations, sections and figures are those of the paper. *On* and *off* are its online and offline enrichment; our numbers are those of the cone of mCPG, PIQP and assembly in full, unless a row says otherwise. Curves are not read off the figures: of a figure, the page compares what the text and the caption say.
@@ -52,10 +52,8 @@ DEVIATIONS = """## What is not done as published
 """  # noqa: E501
 
 
-def main() -> None:
-    if len(sys.argv) != 3:
-        sys.exit("usage: python results/reproduction.py RUN_OF_PAPER_OBSTACLE RUN_OF_PAPER_HERTZ > PAGE")
-    runs = {run.study: run for run in map(Run.read, sys.argv[1:])}
+def main(paper_obstacle: str, paper_hertz: str) -> None:
+    runs = {run.study: run for run in map(Run.read, (paper_obstacle, paper_hertz))}
     membrane, discs = runs["paper-obstacle"], runs["paper-hertz"]
     print(page(sections(membrane, discs), (membrane, discs)))
 
@@ -118,4 +116,4 @@ def _escaped(cell: str) -> str:
 
 
 if __name__ == "__main__":
-    main()
+    start(main)

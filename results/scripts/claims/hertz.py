@@ -152,7 +152,7 @@ def pressure(discs: Discs) -> Iterator[Claim]:
         "in the figure only",
         f"half-width {text([p.half_width for p in shown])} m; peak {text([p.peak for p in shown])} Pa",
         f"Against the theory of line contact: half-width {span(100 * p.width_difference for p in shown)} %, peak "
-        f"{span(100 * p.peak_difference for p in shown)} %; see `results/hertz-theory.md`.",
+        f"{span(100 * p.peak_difference for p in shown)} %; see `results/hertz-theory`.",
     )
     gap = max(p.violation for p in discs.pressures)
     yield holds(

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from make import DUAL
+from study import DUAL
 
 from vibench.arrays import Array
 from vibench.highfidelity.active_set import HighFidelitySolution, HighFidelitySolver

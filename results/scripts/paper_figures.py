@@ -1,0 +1,25 @@
+"""Figures 3 to 15 of the paper, drawn again, with a page that compares: `vibench figures --paper`, in smaller files.
+
+python results/scripts/paper_figures.py runs/paper-obstacle runs/paper-hertz runs/hertz-direct results/paper-figures
+"""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+from page import start, use_palette
+
+from vibench.report.figures.publication import draw_published
+from vibench.results import tables
+
+
+def main(obstacle: str, hertz: str, direct: str, target: str) -> None:
+    paths = [tables.results_file(run) for run in (obstacle, hertz, direct)]
+    shutil.rmtree(target, ignore_errors=True)
+    for file in draw_published(paths, Path(target), ("png",), note=print):
+        use_palette(file)
+
+
+if __name__ == "__main__":
+    start(main)
