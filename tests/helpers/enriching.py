@@ -6,34 +6,29 @@ from collections.abc import Callable
 
 import numpy as np
 
-from vibench import Cone, Enrichment, Kind, Offline, Problem, Stop, greedy_cone, no_free, pod
-from vibench.highfidelity.active_set import HighFidelitySolver
+from vibench import Cone, Kind, Offline, Problem, Reduction, Stop, no_free
 from vibench.model.galerkin import ReducedModel
+from vibench.offline.reduction import high_fidelity_sweep
 from vibench.reduction import LazyMaximum
 from vibench.stability.infsup import multipliers
+from vibench_strategies.cpg import CPG
+from vibench_strategies.online_supremizers import OnlineSupremizers
 
 
-def offline(problem, count: int, modes: int, generators: int) -> Offline:
+def offline(problem: Problem, count: int, modes: int, generators: int) -> Offline:
     """A reduced setting from some training solutions."""
     training = problem.training_set()
-    solver = HighFidelitySolver(problem)
-    solved = [solver.solve(mu) for mu in training[:: max(1, len(training) // count)]]
-    u, lam = np.column_stack([s.u for s in solved]), np.column_stack([s.lam for s in solved])
-    basis = problem.V.orthonormalise(u)[:, :modes]
-    chi = lam[:, :generators] / problem.W.norm(lam[:, :generators])
+    solved = high_fidelity_sweep(problem, training[:: max(1, len(training) // count)])
+    basis = problem.V.orthonormalise(solved.u)[:, :modes]
+    chi = solved.lam[:, :generators] / problem.W.norm(solved.lam[:, :generators])
     cone = Cone(chi, np.ones(1), no_free(generators))
     return Offline(problem, basis, cone, multipliers(chi, problem.W).span, training)
 
 
 def reduced_from(problem: Problem, kind: Kind, modes: int, generators: int) -> ReducedModel:
     """A reduced model from all training solutions, without enrichment or with supremizers at every parameter."""
-    solver = HighFidelitySolver(problem)
-    solved = [solver.solve(mu) for mu in problem.training_set()]
-    basis = pod(np.column_stack([s.u for s in solved]), problem.V, Stop(size=modes)).basis
-    cone = greedy_cone(np.column_stack([s.lam for s in solved]), problem.W, Stop(size=generators))
-    span = multipliers(cone.generators, problem.W).span
-    enrichment = Enrichment(kind, eta=span if kind is Kind.PER_PARAMETER else None)
-    return ReducedModel(problem, basis, enrichment, cone.generators, span)
+    primal = OnlineSupremizers() if kind is Kind.PER_PARAMETER else None
+    return Reduction(problem, CPG(), primal, Stop(size=modes), Stop(size=generators)).projection
 
 
 class Plain(LazyMaximum):

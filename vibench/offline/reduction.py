@@ -141,8 +141,8 @@ class Reduction:
 
     @cached_property
     def parameters(self) -> Array:
-        """The training parameters (P×d)."""
-        if isinstance(self.training, AdaptiveSampling):
+        """The training parameters (P×d): those of the snapshots, where these are known or chosen one by one."""
+        if "snapshots" in self.__dict__ or isinstance(self.training, AdaptiveSampling):
             return self.snapshots.mu
         return training_parameters(self.problem, self.training)
 

@@ -12,11 +12,10 @@ from skfem import Basis, BilinearForm, ElementTriP1, LinearForm, MeshTri, conden
 from skfem.helpers import dot, grad
 
 from vibench.highfidelity.active_set import HighFidelitySolver
-from vibench.interfaces.strategies import Offline, Stop
+from vibench.interfaces.strategies import Stop
 from vibench.model.affine import Evaluation, affine_decomposition
-from vibench.reduction.pod import pod
+from vibench.offline.reduction import Reduction, high_fidelity_sweep
 from vibench.reduction.supremizers import constraint_classes, supremizers
-from vibench.stability.infsup import multipliers
 from vibench_problems.disc_mesh import aspect_ratios
 from vibench_problems.obstacle import RADIUS, Obstacle
 from vibench_strategies.mcpg import ModifiedCPG
@@ -148,14 +147,10 @@ def test_supremizers_of_all_parameters_span_more_than_those_of_one() -> None:
 def test_online_and_offline_enrichment_differ() -> None:
     added = {}
     for problem in (EGG, ROUND):
-        training = problem.training_set()[::3]
-        solver = HighFidelitySolver(problem)
-        solved = [solver.solve(mu) for mu in training]
-        basis = pod(np.column_stack([s.u for s in solved]), problem.V, Stop(size=8)).basis
-        cone = ModifiedCPG().reduce(np.column_stack([s.lam for s in solved]), problem.W, Stop(size=8))
-        prepared = multipliers(cone.generators, problem.W)
-        assert prepared.rank == 8
-        added[problem] = OfflinePGA().build(Offline(problem, basis, cone, prepared.span, training), 1e-3).vectors
+        reduction = Reduction(problem, ModifiedCPG(), OfflinePGA(), Stop(size=8), Stop(size=8), tolerance=1e-3)
+        reduction = reduction.given(snapshots=high_fidelity_sweep(problem, problem.training_set()[::3]))
+        assert reduction.multipliers.rank == 8
+        added[problem] = reduction.enrichment.vectors
     assert added[EGG].shape[1] > 8 >= added[ROUND].shape[1]  # online supremizers are 8 at every parameter
 
 

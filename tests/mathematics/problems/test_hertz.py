@@ -5,10 +5,10 @@ import pytest
 
 from vibench.errors import NumericalError
 from vibench.highfidelity.active_set import HighFidelitySolver, solve_high_fidelity
-from vibench.interfaces.strategies import Offline, Stop
-from vibench.reduction.pod import pod
+from vibench.interfaces.strategies import Stop
+from vibench.offline.reduction import Reduction, high_fidelity_sweep
 from vibench.reduction.supremizers import proportionality
-from vibench.stability.infsup import inf_sup_full, inf_sup_on, multipliers
+from vibench.stability.infsup import inf_sup_full, inf_sup_on
 from vibench_problems.hertz import Hertz
 from vibench_problems.line_contact import measured, theory
 from vibench_strategies.mcpg import ModifiedCPG
@@ -133,14 +133,10 @@ def test_contact_beyond_the_zone_and_pairing_beyond_the_disc_are_refused(coarse:
 
 def test_online_and_offline_enrichment_differ_where_b_varies(coarse: Hertz) -> None:
     training = coarse.training_set()[::8]
-    solver = HighFidelitySolver(coarse)
-    solved = [solver.solve(mu) for mu in training]
-    basis = pod(np.column_stack([s.u for s in solved]), coarse.V, Stop(size=3)).basis
-    cone = ModifiedCPG().reduce(np.column_stack([s.lam for s in solved]), coarse.W, Stop(size=5))
-    prepared = multipliers(cone.generators, coarse.W)
-    added = OfflinePGA().build(Offline(coarse, basis, cone, prepared.span, training), 0.6).vectors
-    assert added.shape[1] > prepared.rank  # one parameter's supremizers are not enough
-    Z = np.hstack([basis, added])
+    reduction = Reduction(coarse, ModifiedCPG(), OfflinePGA(), Stop(size=3), Stop(size=5), tolerance=0.6)
+    reduction = reduction.given(snapshots=high_fidelity_sweep(coarse, training))
+    prepared, Z = reduction.multipliers, reduction.projection.fixed_basis
+    assert Z.shape[1] - 3 > prepared.rank  # one parameter's supremizers are not enough
     for mu in training:
         B = coarse.assemble(mu).B
         own, full = inf_sup_on(Z, B, prepared), inf_sup_full(coarse.V, B, prepared)
