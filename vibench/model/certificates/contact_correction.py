@@ -18,7 +18,7 @@ the inequality of Cauchy and Schwarz, suffices.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
@@ -27,7 +27,7 @@ from itertools import pairwise
 import numpy as np
 import scipy.sparse as sp
 from scipy.linalg import solve_triangular
-from scipy.linalg.lapack import dpotrf, dpotrs
+from scipy.linalg.lapack import dposv, dpotrf, dpotrs
 from scipy.optimize import nnls
 
 from vibench.arrays import Array, Indices, Mask, SparseMatrix
@@ -284,25 +284,43 @@ def _rows(B: SparseMatrix, chosen: Mask) -> SparseMatrix:
 def _complementary(factor: Array, excess: Array, lam: Array) -> Array:
     """ν ≥ 0 (i,) with ν = λ + S⁻¹(s + v), v ≥ 0 and νᵀv = 0, from the Cholesky factor (lower) of S."""
     fixed: Array = lam + dpotrs(factor, excess, lower=1)[0]
-    nu, v, released = fixed, np.zeros(len(lam)), np.zeros(len(lam), bool)
-    inverse, known = np.zeros((len(lam), len(lam)), order="F"), np.zeros(len(lam), bool)  # some columns of S⁻¹
-    for _ in range(STEPS):
-        wanted = np.where(released, v >= 0.0, nu < 0.0)
-        if np.array_equal(wanted, released):
-            break
-        released, new = wanted, np.flatnonzero(wanted & ~known)
+    inverse, computed = np.zeros((len(lam), len(lam))), np.zeros(len(lam), bool)
+
+    def rows_of_inverse(rows: Indices) -> Array:
+        new = rows[~computed[rows]]
         if len(new):
             units = np.zeros((len(lam), len(new)), order="F")
             units[new, np.arange(len(new))] = 1.0
-            inverse[:, new], known[new] = dpotrs(factor, units, lower=1, overwrite_b=1)[0], True
-        rows, v = np.flatnonzero(released), np.zeros(len(lam))
-        among = inverse[:, rows]
-        v[rows] = np.linalg.solve(among[rows], -fixed[rows])
-        nu = fixed + among @ v[rows]
-        nu[rows] = 0.0
-    else:  # it cycles, which it may where S is no M-matrix: the same minimiser, at more cost
-        L = np.tril(factor)
+            inverse[new], computed[new] = dpotrs(factor, units, lower=1, overwrite_b=1)[0].T, True
+        return inverse[rows]
+
+    nu = complementary(fixed, rows_of_inverse, np.zeros(len(lam), bool))
+    if nu is None:  # it may cycle where S is no M-matrix: the same minimiser, at more cost
+        L, nu = np.tril(factor), fixed
         target = L.T @ lam + solve_triangular(L, excess, lower=True, check_finite=False)
-        with suppress(RuntimeError):  # no convergence either: whether the w of the last ν is feasible is verified
+        with suppress(RuntimeError):  # no convergence either: whether the w of `fixed` is feasible is verified
             nu = nnls(L.T, target, maxiter=30 * len(lam))[0]
     return np.maximum(nu, 0.0)
+
+
+def complementary(fixed: Array, rows_of: Callable[[Indices], Array], released: Mask) -> Array | None:
+    """ν ≥ 0 (i,) with ν = fixed + M v, v ≥ 0 and νᵀv = 0, by a primal-dual active set method; `None` where it cycles.
+
+    `rows_of` gives rows of M, symmetric positive definite (i×i). `released` (i,) is where v is not zero in the first
+    step. The systems that are solved have the size of this set.
+    """
+    for _ in range(STEPS):
+        rows = released.nonzero()[0]
+        among, nu, v = rows_of(rows), fixed, np.zeros(0)
+        if len(rows):
+            _, v, singular = dposv(among[:, rows], -fixed[rows])
+            if singular:
+                return None
+            nu = fixed + v @ among
+            nu[rows] = 0.0
+        wanted = nu < 0.0
+        wanted[rows] = v >= 0.0
+        if not (wanted != released).any():
+            return nu
+        released = wanted
+    return None

@@ -24,10 +24,9 @@ from itertools import pairwise
 import numpy as np
 import scipy.linalg
 import scipy.sparse as sp
-from scipy.linalg.lapack import dposv
 
 from vibench.arrays import Array, Indices, Mask, SparseMatrix
-from vibench.model.certificates.contact_correction import ATTEMPTS, MARGIN, STEPS, UNIT, BlockDiagonal
+from vibench.model.certificates.contact_correction import ATTEMPTS, MARGIN, UNIT, BlockDiagonal, complementary
 
 LARGEST_CONDITION = 1e9
 """Rows of a B₀ whose S₀ has a larger condition number are treated as dependent: S₀ is not inverted."""
@@ -95,7 +94,9 @@ class PreparedCorrections:
         round_off = unit * (float(y @ y) ** 0.5 * size[:, 0] + g_size)
         margin, here = MARGIN * round_off, lam[self.rows]
         for _ in range(ATTEMPTS):
-            nu = self._complementary(gamma / theta**2, (excess + margin)[self.rows], here)
+            wanted, scale = (excess + margin)[self.rows], gamma / theta**2
+            released = here * self._diagonal <= -scale * wanted
+            nu = complementary(here + scale * (self.inverse @ wanted), self.inverse.__getitem__, released)
             if nu is None:
                 return None
             a = (theta / gamma) * (nu - here)  # c = B₀ᵀ a
@@ -114,26 +115,6 @@ class PreparedCorrections:
     @cached_property
     def _diagonal(self) -> Array:
         return self.compliance.diagonal().copy()
-
-    def _complementary(self, scale: float, excess: Array, lam: Array) -> Array | None:
-        """ν (j,) from s and λ on the rows J, and γ/θ²; `None` if the method cycles."""
-        fixed = lam + scale * (self.inverse @ excess)  # ν for v = 0
-        released: Mask = lam * self._diagonal <= -scale * excess
-        for _ in range(STEPS):
-            rows = released.nonzero()[0]
-            among, nu, v = self.inverse[rows], fixed, np.zeros(0)
-            if len(rows):
-                _, v, singular = dposv(among[:, rows], -fixed[rows])
-                if singular:
-                    return None
-                nu = fixed + v @ among
-                nu[rows] = 0.0
-            wanted = nu < 0.0
-            wanted[rows] = v >= 0.0
-            if not (wanted != released).any():
-                return nu
-            released = wanted
-        return None
 
 
 def _product(B: float | SparseMatrix, x: Array) -> Array:
