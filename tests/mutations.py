@@ -207,7 +207,7 @@ FAULTS = (
     ),
     Fault(
         "cone-interval-too-narrow",
-        "vibench/stability/copositive.py",
+        "vibench/stability/conic_infsup.py",
         "return max(0.0, float(np.min(M[positive] / G[positive])) - len(G) * negative)",
         "return max(0.0, float(np.min(M[positive] / G[positive])))",
         ("tests/unit/stability/test_conic_infsup.py",),
@@ -382,7 +382,7 @@ FAULTS = (
     ),
     Fault(
         "agreement-too-generous",
-        "vibench/qp/accuracy_bounds.py",
+        "vibench/qp/verification.py",
         "half = 0.5 * (first.linear + second.linear)",
         "half = 500.0 * (first.linear + second.linear)",
         ("tests/unit/results/test_solver_agreement.py",),
@@ -431,7 +431,7 @@ FAULTS = (
     ),
     Fault(
         "folder-not-locked",
-        "vibench/locking.py",
+        "vibench/files.py",
         "fcntl.flock(file, (fcntl.LOCK_SH if shared else fcntl.LOCK_EX) | fcntl.LOCK_NB)",
         "pass",
         ("tests/unit/results/test_database.py",),
@@ -459,7 +459,7 @@ FAULTS = (
     ),
     Fault(
         "interpolation-point-off-by-one",
-        "vibench/model/deim.py",
+        "vibench/model/affine.py",
         "return Interpolation(points, cardinal,",
         "return Interpolation(points - 1, cardinal,",
         ("tests/unit/model/test_deim.py",),

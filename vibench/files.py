@@ -1,10 +1,17 @@
-"""Writing files: whole or not at all, and never through what somebody else has put in their place."""
+"""Files written whole or not at all, never through what others put in their place, and locks that name a holder."""
 
 from __future__ import annotations
 
+import contextlib
+import fcntl
 import os
+import platform
 import tempfile
+from collections.abc import Iterator
 from pathlib import Path
+from typing import TextIO
+
+from vibench.errors import RequestError
 
 TEMPORARY = "vibench-"
 """How the names of temporary files begin; the rest is random."""
@@ -45,3 +52,46 @@ def open_unlinked(path: Path) -> int:
         If it is a symbolic link, or cannot be opened.
     """
     return os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o666)
+
+
+@contextlib.contextmanager
+def locked(path: Path, *, busy: str, shared: bool = False) -> Iterator[None]:
+    """Hold a lock file; the system releases it when the process ends.
+
+    The file is created in an existing folder and never deleted. Several processes may hold a `shared` lock.
+
+    Raises
+    ------
+    RequestError
+        With the text `busy` and the holder if another process holds the lock; if the file cannot be written.
+    """
+    try:
+        file = os.fdopen(open_unlinked(path), "r+", encoding="utf-8")
+    except OSError as error:
+        if path.is_symlink():
+            raise RequestError(f"'{path}' is a symbolic link, expected a lock file of vibench") from None
+        raise RequestError(f"'{path}' cannot be written: {error.strerror}") from None
+    with file:
+        try:
+            fcntl.flock(file, (fcntl.LOCK_SH if shared else fcntl.LOCK_EX) | fcntl.LOCK_NB)
+        except BlockingIOError:
+            file.seek(0)
+            holder = file.read()
+            raise RequestError(f"{busy} ({holder})" if holder else busy) from None
+        except OSError as error:
+            raise RequestError(f"'{path}' cannot be locked: {error.strerror}") from None
+        _note(file, "" if shared else f"process {os.getpid()} on {platform.node()}")
+        try:
+            yield
+        finally:
+            if not shared:
+                _note(file, "")
+
+
+def _note(file: TextIO, holder: str) -> None:
+    """Write the holder into the lock file; on a full disk the lock is valid without it."""
+    with contextlib.suppress(OSError):
+        file.seek(0)
+        file.truncate()
+        file.write(holder)
+        file.flush()

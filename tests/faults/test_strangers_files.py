@@ -16,8 +16,7 @@ from running import seal
 from vibench.cli.result_commands import export_qps, replay_query, show, write_report
 from vibench.errors import NumericalError, RequestError
 from vibench.execution.run_folder import LOCK, REPORT, claimed
-from vibench.files import write_atomically
-from vibench.locking import locked
+from vibench.files import locked, write_atomically
 from vibench.report import figures
 from vibench.results import tables
 from vibench.results.sqlite.reading import FILE

@@ -128,7 +128,7 @@ def test_numbers_depend_on_the_rooms_that_compute_them_and_on_no_other(edited: C
     rooms = {path.name for path in PACKAGE.iterdir() if path.suffix == ".py" or (path / "__init__.py").is_file()}
     others = rooms - set(NUMERICAL)
     assert others == {
-        "__init__.py", "provenance.py", "locking.py", "text.py", "files.py", "study", "results", "execution", "report",
+        "__init__.py", "provenance.py", "text.py", "files.py", "study", "results", "execution", "report",
         "benchmarks", "testing", "terminal", "library", "cli", "packs",  # which enters the digest of every pack
     }  # fmt: skip
     for room in others:

@@ -24,8 +24,8 @@ from threadpoolctl import threadpool_info, threadpool_limits
 from vibench import provenance
 from vibench.errors import RequestError, in_a_line
 from vibench.execution.solver_trials import solver_trials
+from vibench.files import locked
 from vibench.interfaces.problem import VariationalInequality
-from vibench.locking import locked
 from vibench.qp.settings import SETTINGS
 from vibench.qp.solve import installed_solvers
 from vibench.qp.status import Status

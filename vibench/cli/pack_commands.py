@@ -75,7 +75,7 @@ def reduce_cones(
     import pandas as pd
 
     from vibench.packs.checks import read_model_pack
-    from vibench.packs.dual_half import multipliers, reduce_multipliers
+    from vibench.packs.pack import pack_multipliers, reduce_multipliers
     from vibench.packs.reader import naming
     from vibench.report.figures.convergence import cone_errors
     from vibench.report.figures.style import save, styled
@@ -85,7 +85,7 @@ def reduce_cones(
 
     pack = read_model_pack(folder)
     with naming(folder):
-        multipliers(pack)
+        pack_multipliers(pack)
     wanted = dual or [name for name in registry.names("dual strategy") if not registry.missing("dual strategy", name)]
     rows, errors = [], {}
     for name in wanted:

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from vibench.errors import RequestError
-from vibench.locking import locked
+from vibench.files import locked
 from vibench.results.sqlite import files as sqlite_files
 from vibench.results.sqlite.files import DAMAGED, set_aside
 from vibench.results.sqlite.reading import FILE, DamagedError, read_meta, study_of

@@ -54,7 +54,7 @@ from vibench.arrays import Array, Mask
 from vibench.highfidelity.active_set import FALLBACK_SOLVER, active_set_iterations
 from vibench.interfaces.problem import VariationalInequality
 from vibench.linalg.inertia import UNIT
-from vibench.model.energy import Energy
+from vibench.model.errors import Energy
 from vibench.qp.solve import solve_qp
 from vibench.stability.coercivity import Constant, Stability
 

@@ -1,20 +1,55 @@
-"""Errors of reduced solutions against high-fidelity ones."""
+"""Errors of reduced solutions and of their quantities of interest against high-fidelity ones, and the energy norm."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
-from vibench.arrays import Array, Mask
+from vibench.arrays import Array, Mask, SparseMatrix
+from vibench.highfidelity.kkt_systems import CondensedStiffness
+from vibench.interfaces.outputs import Output
 from vibench.interfaces.problem import Problem, VariationalInequality
-from vibench.model.energy import Energy
+from vibench.linalg.cholesky import SparseCholesky
 from vibench.qp.scaling import ratio
 
 UNMEASURABLE = 1e-8
 """Nothing is measured below this: not by an error relative to its solution, nor by a solution relative to the largest
 training solution. High-fidelity solutions have residuals up to 1e-10, so that either may be an error of theirs."""
+
+
+@dataclass(frozen=True)
+class Energy:
+    """The energy norm at one parameter and its dual norm, from factorisations of A(µ).
+
+    Attributes
+    ----------
+    A
+        Sparse SPD (n×n).
+    factor
+        Its Cholesky factor.
+    stiffness
+        A condensed on the unknowns that constraints involve, for programs with this A and these constraints.
+    """
+
+    A: SparseMatrix
+    factor: SparseCholesky
+    stiffness: CondensedStiffness
+
+    @property
+    def nbytes(self) -> int:
+        """Memory, about: that of the condensed matrix is as large, and SuperLU allocates twice what it fills."""
+        return 4 * self.factor.nbytes
+
+    def norm(self, v: Array) -> float:
+        """‖v‖_A of v (n,)."""
+        return float(np.sqrt(max(float(v @ (self.A @ v)), 0.0)))
+
+    def dual_norm(self, functional: Array) -> float:
+        """‖ℓ‖_{A⁻¹} of a functional (n,)."""
+        return float(np.sqrt(max(float(functional @ self.factor.solve(functional)), 0.0)))
 
 
 @dataclass(frozen=True)
@@ -113,3 +148,55 @@ def errors(
             )
         )
     return found
+
+
+OutputErrors = dict[str, Any]
+"""An output of one query: name and unit, `value`, `reference`, `error` (relative, `None` for a zero) and `scaled`."""
+
+
+def output_scales(outputs: Sequence[Output], mus: Array, u: Array, lam: Array) -> tuple[float, ...]:
+    """The largest absolute value of every output over solutions, those of the training set."""
+    return tuple(float(np.max(np.abs(output.values(mus, u, lam)), initial=0.0)) for output in outputs)
+
+
+def output_errors(
+    outputs: Sequence[Output],
+    mus: Array,
+    reduced: tuple[Array, Array],
+    reference: tuple[Array, Array],
+    scale: Sequence[float],
+) -> list[list[OutputErrors]]:
+    """Every output at parameters (P×d), from solutions (u, λ) as columns, reduced ones and high-fidelity ones.
+
+    An output that is at most `UNMEASURABLE` of its scale is zero: there is no contact, for instance. A relative error
+    would divide round-off by round-off, and is `None`; the error over the scale is not.
+    """
+    found: list[list[OutputErrors]] = [[] for _ in mus]
+    for output, largest in zip(outputs, scale, strict=True):
+        pairs = zip(output.values(mus, *reduced), output.values(mus, *reference), strict=True)
+        for row, (value, exact) in zip(found, pairs, strict=True):
+            error = abs(float(value - exact))
+            relative = None if abs(exact) <= UNMEASURABLE * largest else error / abs(float(exact))
+            own = {"value": float(value), "reference": float(exact), "error": relative}
+            row.append({"output": output.name, "unit": output.unit} | own | {"scaled": ratio(error, largest)})
+    return found
+
+
+def summarise_outputs(
+    outputs: Sequence[Output], scale: Sequence[float], queries: Sequence[Sequence[OutputErrors]]
+) -> list[Mapping[str, Any]]:
+    """Rows of the outputs table of a cell: means and maxima over its ok queries, zeros counted apart."""
+    rows: list[Mapping[str, Any]] = []
+    for k, (output, largest) in enumerate(zip(outputs, scale, strict=True)):
+        mine = [query[k] for query in queries]
+        relative = [one["error"] for one in mine if one["error"] is not None]
+        zero, scaled = [one["scaled"] for one in mine if one["error"] is None], [one["scaled"] for one in mine]
+        rows.append({
+            "output": output.name, "unit": output.unit, "linear": int(output.linear), "scale": largest,
+            "queries_ok": len(mine), "error_mean": float(np.mean(relative)) if relative else None,
+            "error_max": max(relative, default=None), "queries_zero": len(zero),
+            "error_zero_max": max(zero, default=None),
+            "error_scaled_mean": float(np.mean(scaled)) if scaled else None,
+            "error_scaled_max": max(scaled, default=None),
+        })  # fmt: skip
+    return rows

@@ -8,14 +8,13 @@ import numpy as np
 
 from vibench.arrays import Array
 from vibench.highfidelity.active_set import HighFidelitySolution, HighFidelitySolver
-from vibench.interfaces.fingerprint import ReferenceAssembly
 from vibench.interfaces.problem import Problem, VariationalInequality
 from vibench.interfaces.sampling import Trainer
-from vibench.interfaces.validation import checked_assembly
+from vibench.interfaces.validation import ReferenceAssembly, checked_assembly
 from vibench.linalg.cholesky import SparseCholesky
 from vibench.linalg.dense import orthonormal_range
-from vibench.model.energy import Energy
 from vibench.model.error_bounds import find_correction, terms
+from vibench.model.errors import Energy
 from vibench.model.galerkin import project
 from vibench.qp.exact import ExactSolution, exact_solution
 from vibench.qp.scaling import ratio

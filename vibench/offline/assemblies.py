@@ -12,7 +12,7 @@ from vibench.highfidelity.active_set import HighFidelitySolver
 from vibench.interfaces.problem import Problem, VariationalInequality
 from vibench.interfaces.validation import checked_assembly
 from vibench.linalg.cholesky import SparseCholesky
-from vibench.model.energy import Energy
+from vibench.model.errors import Energy
 
 LIMIT = 2**28
 """Size limit of the assemblies in bytes; the least recently used one is dropped first."""

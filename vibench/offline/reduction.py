@@ -12,11 +12,16 @@ import numpy as np
 from vibench.arrays import Array
 from vibench.errors import RequestError, UnsupportedError
 from vibench.highfidelity.active_set import HighFidelitySolver
-from vibench.interfaces.fingerprint import ReferenceAssembly
 from vibench.interfaces.problem import Problem
 from vibench.interfaces.sampling import AdaptiveSampling, Sampling
 from vibench.interfaces.strategies import Cone, DualStrategy, Enrichment, Kind, Offline, PrimalStrategy, Stop
-from vibench.interfaces.validation import check_cone, check_enrichment, checked_assembly, training_parameters
+from vibench.interfaces.validation import (
+    ReferenceAssembly,
+    check_cone,
+    check_enrichment,
+    checked_assembly,
+    training_parameters,
+)
 from vibench.model.affine import AffineMember, affine_decomposition
 from vibench.model.certificates.base import CertificateBase, certificate_base
 from vibench.model.certificates.bounds import OnlineCertificate

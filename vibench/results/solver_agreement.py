@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from vibench.arrays import Array
-from vibench.qp.accuracy_bounds import Slack, allowed
 from vibench.qp.status import Status
+from vibench.qp.verification import Slack, allowed
 from vibench.results.columns import DISAGREEMENTS, KEYS
 
 if TYPE_CHECKING:  # worker processes, which start often, have no use for pandas

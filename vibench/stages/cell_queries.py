@@ -15,9 +15,7 @@ from vibench.errors import in_a_line
 from vibench.interfaces.strategies import Kind
 from vibench.model.certificates.base import Guarantee
 from vibench.model.certificates.bounds import OnlineCertificate
-from vibench.model.errors import ReferenceSolutions, zeros
-from vibench.model.output_errors import scales as output_scales
-from vibench.model.output_errors import summarise_outputs
+from vibench.model.errors import ReferenceSolutions, output_scales, summarise_outputs, zeros
 from vibench.provenance import machine
 from vibench.qp.exact import ExactSolution
 from vibench.qp.status import Status

@@ -15,20 +15,18 @@ from vibench.interfaces.strategies import Kind
 from vibench.model.certificates.base import Guarantee
 from vibench.model.certificates.bounds import OnlineBound, OnlineCertificate
 from vibench.model.error_bounds import ErrorBounds, error_bounds
-from vibench.model.errors import UNMEASURABLE, Errors, ReferenceSolutions, errors
+from vibench.model.errors import UNMEASURABLE, Errors, ReferenceSolutions, errors, output_errors
 from vibench.model.hsw_bounds import HSWBounds, hsw_bounds
 from vibench.model.hyperreduced import HyperReducedModel
-from vibench.model.output_errors import output_errors
 from vibench.offline.assemblies import assemblies
 from vibench.offline.models import AnyReducedModel
-from vibench.qp.accuracy_bounds import slack
 from vibench.qp.exact import ExactSolution
 from vibench.qp.repeats import in_units, nearby, units
 from vibench.qp.scaling import ratio
 from vibench.qp.solution import QPSolution
 from vibench.qp.solve import solve_qp, takes_start
 from vibench.qp.status import Status
-from vibench.qp.verification import verify
+from vibench.qp.verification import slack, verify
 from vibench.results.solver_agreement import solution_row
 from vibench.stability.coercivity import Stability
 from vibench.stages.assembly import AssemblyStage, ReducedPrograms

@@ -13,9 +13,8 @@ import numpy as np
 from vibench.arrays import Array
 from vibench.errors import NumericalError
 from vibench.highfidelity.active_set import HighFidelitySolution, HighFidelitySolver, check_stiffness
-from vibench.interfaces.fingerprint import Fingerprint
 from vibench.interfaces.problem import Problem, VariationalInequality
-from vibench.interfaces.validation import checked_assembly
+from vibench.interfaces.validation import Fingerprint, checked_assembly
 from vibench.model.growing import GrowingTrainer
 from vibench.offline.reduction import reference_assembly
 from vibench.qp.repeats import nearby

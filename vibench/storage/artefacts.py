@@ -15,8 +15,7 @@ import platformdirs
 from cachetools import LRUCache
 
 from vibench.errors import RequestError, StorageError
-from vibench.files import PART, TEMPORARY, write_atomically
-from vibench.locking import locked
+from vibench.files import PART, TEMPORARY, locked, write_atomically
 from vibench.provenance import machine
 from vibench.storage.serialisation import DamagedError, dumps, loads, storable
 from vibench.text import one_line

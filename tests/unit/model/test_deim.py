@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from vibench.model.deim import interpolate
+from vibench.model.affine import interpolate
 
 seeds = st.integers(0, 10_000)
 TOLERANCES = (1e-1, 1e-2, 1e-3, 1e-4)

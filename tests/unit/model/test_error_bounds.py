@@ -13,7 +13,6 @@ from vibench.highfidelity.kkt_systems import CondensedStiffness
 from vibench.interfaces.problem import VariationalInequality
 from vibench.linalg.cholesky import SparseCholesky
 from vibench.model import error_bounds as module
-from vibench.model.energy import Energy
 from vibench.model.error_bounds import (
     ESTIMATED,
     NO_CORRECTION,
@@ -23,6 +22,7 @@ from vibench.model.error_bounds import (
     error_bounds,
     find_correction,
 )
+from vibench.model.errors import Energy
 from vibench.qp.solution import QPSolution
 from vibench.stability.coercivity import Constant, Stability, coercivity_and_continuity, energy_inf_sup
 from vibench.stability.infsup import InfSup

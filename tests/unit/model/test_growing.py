@@ -8,8 +8,8 @@ from numerics import Varying
 
 from vibench import create, project_on_cone
 from vibench.highfidelity.active_set import HighFidelitySolver
-from vibench.interfaces.fingerprint import ReferenceAssembly
 from vibench.interfaces.problem import Problem
+from vibench.interfaces.validation import ReferenceAssembly
 from vibench.linalg.cholesky import SparseCholesky
 from vibench.model.growing import GrowingModel, GrowingTrainer
 from vibench.reduction import part_in_cone

@@ -10,7 +10,7 @@ from hypothesis.extra.numpy import arrays
 
 from vibench.errors import NumericalError
 from vibench.interfaces.outputs import Output
-from vibench.model.output_errors import output_errors, scales, summarise_outputs
+from vibench.model.errors import output_errors, output_scales, summarise_outputs
 
 MUS = np.array([[1.0], [2.0], [3.0]])
 U, LAM = np.array([[1.0, 2.0, 0.0], [1.0, 1.0, 0.0]]), np.array([[0.0, 4.0, 0.0]])
@@ -23,7 +23,7 @@ def test_values_are_what_the_coefficients_or_the_function_give() -> None:
     assert TOTAL.values(MUS, U, LAM).tolist() == [2.0, 5.0, 0.0]
     assert LARGEST.values(MUS, U, LAM).tolist() == [1.0, 8.0, 0.0]
     assert (TOTAL.linear, LARGEST.linear) == (True, False)
-    assert scales((TOTAL, LARGEST), MUS, U, LAM) == (5.0, 8.0)
+    assert output_scales((TOTAL, LARGEST), MUS, U, LAM) == (5.0, 8.0)
 
 
 @given(u=arrays(float, (2, 3), elements=FLOATS), v=arrays(float, (2, 3), elements=FLOATS), t=FLOATS)
@@ -35,7 +35,7 @@ def test_a_linear_output_is_linear(u: np.ndarray, v: np.ndarray, t: float) -> No
 
 def test_errors_are_relative_but_for_zeros_which_are_counted_apart() -> None:
     reduced = U + np.array([[0.2, 0.0, 0.1], [0.0, -0.5, 0.0]]), LAM
-    found = output_errors((TOTAL,), MUS, reduced, (U, LAM), scales((TOTAL,), MUS, U, LAM))
+    found = output_errors((TOTAL,), MUS, reduced, (U, LAM), output_scales((TOTAL,), MUS, U, LAM))
     rows = [row for (row,) in found]
     assert [row["error"] for row in rows] == [pytest.approx(0.1), pytest.approx(0.1), None]
     assert [row["scaled"] for row in rows] == [pytest.approx(x) for x in (0.04, 0.1, 0.02)]

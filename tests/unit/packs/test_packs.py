@@ -21,8 +21,7 @@ from vibench.interfaces.problem import MEMBERS, Problem, VariationalInequality
 from vibench.interfaces.validation import checked_assembly
 from vibench.packs import writer
 from vibench.packs.checks import read_model_pack
-from vibench.packs.dual_half import reduce_multipliers
-from vibench.packs.pack import ModelPack
+from vibench.packs.pack import ModelPack, reduce_multipliers
 from vibench.study import registry
 from vibench.study.plugin import Plugin
 from vibench.testing import check_problem

@@ -9,8 +9,8 @@ from numerics import spd
 
 from vibench.interfaces.problem import VariationalInequality
 from vibench.qp import verification
-from vibench.qp.accuracy_bounds import Slack, allowed, slack
 from vibench.qp.solve import solve_qp
+from vibench.qp.verification import Slack, allowed, slack
 from vibench.results.columns import KEYS
 from vibench.results.solver_agreement import Recorded, compare, disagreement_rows, sentence, solution_row
 

@@ -8,8 +8,7 @@ import scipy.linalg
 from hypothesis import given
 from hypothesis import strategies as st
 
-from vibench.stability.conic_infsup import GAP, cone_interval, simplex_minimiser
-from vibench.stability.copositive import entrywise_bound, semidefinite_bounds
+from vibench.stability.conic_infsup import GAP, cone_interval, entrywise_bound, semidefinite_bounds, simplex_minimiser
 
 seeds = st.integers(0, 10_000)
 

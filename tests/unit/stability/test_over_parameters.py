@@ -13,9 +13,8 @@ from vibench.highfidelity import active_set
 from vibench.highfidelity.kkt_systems import CondensedStiffness
 from vibench.interfaces.problem import VariationalInequality
 from vibench.linalg.cholesky import SparseCholesky
-from vibench.model.energy import Energy
 from vibench.model.error_bounds import error_bounds
-from vibench.model.errors import UNMEASURABLE, ReferenceSolutions, errors
+from vibench.model.errors import UNMEASURABLE, Energy, ReferenceSolutions, errors
 from vibench.model.hsw_bounds import hsw_bounds
 from vibench.reduction.supremizers import constraint_classes
 from vibench.stability.coercivity import Stability, coercivity_and_continuity, energy_inf_sup
