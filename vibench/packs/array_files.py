@@ -98,7 +98,7 @@ class ArrayFiles:
             if isinstance(found, Mapping) or sp.issparse(found):
                 matrix = self._matrix(found)
                 if 1 not in matrix.shape:
-                    raise RequestError(f"a sparse matrix {_size(matrix.shape)}; expected a dense array")
+                    raise RequestError(f"a sparse matrix {size_of(matrix.shape)}; expected a dense array")
                 self._take(8 * max(matrix.shape))
                 found = matrix.toarray()
             return self._real(found)
@@ -109,7 +109,7 @@ class ArrayFiles:
         if found.ndim == 2 and 1 in found.shape:
             return found.ravel()
         if found.ndim != 1:
-            raise RequestError(f"{what}: an array {size_of(found)}; expected a vector")
+            raise RequestError(f"{what}: an array {size_of(found.shape)}; expected a vector")
         return found
 
     def sparse(self, reference: str, what: str) -> SparseMatrix:
@@ -118,7 +118,7 @@ class ArrayFiles:
             found = self._read(reference)
             if not isinstance(found, Mapping) and not sp.issparse(found):
                 if found.ndim != 2:
-                    raise RequestError(f"an array {_size(found.shape)}; expected a matrix")
+                    raise RequestError(f"an array {size_of(found.shape)}; expected a matrix")
                 found = sp.csr_array(self._real(found))
             matrix = self._matrix(found)
             matrix.data = self._real(matrix.data)
@@ -187,7 +187,7 @@ class ArrayFiles:
             raise RequestError(f"it holds values of type {dtype}; expected numbers")
         count = int(np.prod([int(length) for length in shape], dtype=object)) if shape else 1
         if count * dtype.itemsize > size:
-            raise RequestError(f"the array {_size(shape)} is larger than its file: it is damaged or cut off")
+            raise RequestError(f"the array {size_of(shape)} is larger than its file: it is damaged or cut off")
         self._take(count * dtype.itemsize)
         flat = np.frombuffer(file.read(count * dtype.itemsize), dtype, count)
         return flat.reshape(shape, order="F" if fortran else "C")
@@ -256,7 +256,7 @@ class ArrayFiles:
         column_wise = "csc" in str(np.ravel(found.get("format", "csr"))[0])
         kind, long, short = (sp.csc_array, columns, rows) if column_wise else (sp.csr_array, rows, columns)
         indices, pointers = np.ravel(found["indices"]), np.ravel(found["indptr"])
-        fits = f"the shape {_size((rows, columns))} and the {len(data)} values"
+        fits = f"the shape {size_of((rows, columns))} and the {len(data)} values"
         if len(pointers) != long + 1 or pointers[0] != 0 or pointers[-1] > len(data) or np.any(np.diff(pointers) < 0):
             raise RequestError(f"indptr does not fit {fits}")
         used = int(pointers[-1])  # SciPy may have allocated more
@@ -304,10 +304,6 @@ class ArrayFiles:
             )
 
 
-def size_of(array: Any) -> str:
-    """The shape of an array in words, "3×4"."""
-    return _size(array.shape)
-
-
-def _size(shape: Any) -> str:
+def size_of(shape: Any) -> str:
+    """A shape in words, "3×4"."""
     return "×".join(map(str, shape)) or "of no dimension"

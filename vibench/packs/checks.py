@@ -15,8 +15,7 @@ from vibench.errors import NumericalError, RequestError
 from vibench.interfaces.problem import MEMBERS, VariationalInequality
 from vibench.linalg.cholesky import SparseCholesky
 from vibench.linalg.inner_product import InnerProduct, asymmetry
-from vibench.packs.members import Affine
-from vibench.packs.pack import ModelPack
+from vibench.packs.pack import ModelPack, PackSolutions
 from vibench.packs.reader import naming, one_triangle, read_pack
 from vibench.qp.verification import kkt_residuals
 
@@ -57,21 +56,31 @@ def check_pack(pack: ModelPack) -> float | None:
     RequestError
         Naming the property that is violated and what was probably meant.
     """
-    if pack.members:
+    if pack.V is not None:
         try:
-            _check_operators(pack)
+            _check_operators(pack, pack.V.matrix)
         except NumericalError as error:
             raise RequestError(f"operators: {error}") from None
-    if pack.reference is None:
+    reference = pack.reference
+    if reference is None:
         return None
-    if not np.any(pack.reference.lam):
+    if not np.any(reference.lam):
         raise RequestError("solutions.lam is zero everywhere: no constraint is active, there is nothing to reduce")
-    _check_signs(pack)
-    return _check_solutions(pack) if pack.members and pack.reference.u is not None else None
+    solved = pack.V is not None and reference.u is not None
+    residuals = [_Solution.of(pack, reference, k).residual for k in range(len(reference.parameters))] if solved else []
+    if reference.lam.min() < -NEGATIVE_RTOL * np.abs(reference.lam).max():
+        if solved:
+            raise _explained(pack, reference, int(np.argmin(reference.lam.min(axis=0))))
+        raise _of_signs(reference.lam)
+    for k, residual in enumerate(residuals):
+        if not residual <= reference.tolerance:
+            raise _explained(pack, reference, k)
+    return max(residuals, default=None)
 
 
-def _check_operators(pack: ModelPack) -> None:
-    A, B, listed = pack.members["A"], pack.members["B"], _listed(pack)
+def _check_operators(pack: ModelPack, X_V: Any) -> None:
+    A, B = pack.members["A"], pack.members["B"]
+    listed = pack.training if pack.validation is None else np.vstack([pack.training, pack.validation])
     for k, matrix in enumerate(A.arrays):
         what = "operators.A" if len(A.arrays) == 1 else f"operators.A, array {k}"
         one_triangle(matrix, what)
@@ -82,31 +91,24 @@ def _check_operators(pack: ModelPack) -> None:
         raise RequestError("operators.B is zero: no constraint acts on any unknown")
     for name in MEMBERS:
         member = pack.members[name]
-        if isinstance(member, Affine):
+        if member.thetas:
             try:
                 for mu in listed:
                     member.sum.coefficients(mu)
             except NumericalError as error:
                 raise RequestError(f"operators.{name}: {error}") from None
     for mu in listed[np.linspace(0, len(listed) - 1, FACTORISED).round().astype(int)]:
-        vi = pack.at(mu)
-        _check_dirichlet(pack, vi.A)
+        matrix = A.at(mu)
+        _check_dirichlet(matrix, X_V)
         try:
-            SparseCholesky(sp.csc_array(vi.A), f"A at mu = {mu.tolist()}")
+            SparseCholesky(sp.csc_array(matrix), f"A at mu = {mu.tolist()}")
         except NumericalError as error:
-            raise RequestError(f"operators: {error}; {_why_indefinite(vi.A)}") from None
-
-
-def _listed(pack: ModelPack) -> Array:
-    return pack.training if pack.validation is None else np.vstack([pack.training, pack.validation])
+            raise RequestError(f"operators: {error}; {_why_indefinite(matrix)}") from None
 
 
 def _replaced_rows(matrix: Any) -> bool:
     """Whether some rows have a diagonal entry alone while their columns have more."""
-    off = sp.csr_array(matrix - sp.diags_array(matrix.diagonal()))
-    off.eliminate_zeros()
-    rows, columns = np.diff(off.indptr), np.diff(sp.csc_array(off).indptr)
-    return bool(np.any((rows == 0) & (columns > 0)))
+    return bool(np.any((_couplings(matrix) == 0) & (_couplings(matrix.T) > 0)))
 
 
 def _why_indefinite(A: Any) -> str:
@@ -117,7 +119,7 @@ def _why_indefinite(A: Any) -> str:
     return "a coercive problem has a positive definite one on its free unknowns"
 
 
-def _check_dirichlet(pack: ModelPack, A: Any) -> None:
+def _check_dirichlet(A: Any, X_V: Any) -> None:
     diagonal = A.diagonal()
     if diagonal.max(initial=0.0) > PENALTY * max(float(np.median(diagonal)), 0.0) > 0.0:
         k = np.flatnonzero(diagonal > PENALTY * np.median(diagonal))
@@ -125,8 +127,7 @@ def _check_dirichlet(pack: ModelPack, A: Any) -> None:
             f"operators.A has diagonal entries of {diagonal.max():.0e} at {len(k)} unknowns, the first is {k[0]}: a "
             "penalty for Dirichlet conditions was left in; remove these unknowns, or name the free ones in spaces.free"
         )
-    assert pack.V is not None
-    coupled_V, coupled_A = (_couplings(matrix) > 0 for matrix in (pack.V.matrix, A))
+    coupled_V, coupled_A = (_couplings(matrix) > 0 for matrix in (X_V, A))
     alone = np.flatnonzero(coupled_V & ~coupled_A)
     if len(alone) and np.any(coupled_A):
         raise RequestError(
@@ -142,31 +143,15 @@ def _couplings(matrix: Any) -> Array:
     return np.diff(off.indptr)
 
 
-def _check_signs(pack: ModelPack) -> None:
-    assert pack.reference is not None
-    lam = pack.reference.lam
-    if lam.min() >= -NEGATIVE_RTOL * np.abs(lam).max():
-        return
-    if pack.members and pack.reference.u is not None:
-        _explain(pack, int(np.argmin(lam.min(axis=0))))
+def _of_signs(lam: Array) -> RequestError:
+    """The error for λ that has negative entries, without a solution u that would explain them."""
     if lam.max() <= NEGATIVE_RTOL * np.abs(lam).max():
-        raise RequestError("solutions.lam is negative: λ has the other sign, it is −λ that is nonnegative")
+        return RequestError("solutions.lam is negative: λ has the other sign, it is −λ that is nonnegative")
     i, k = np.unravel_index(lam.argmin(), lam.shape)
-    raise RequestError(
+    return RequestError(
         f"solutions.lam has both signs, {lam[i, k]:.1e} at entry {i} of column {k}: λ needs coefficients that are "
         "nonnegative, in a basis in which W⁺ is the cone of nonnegative coefficients"
     )
-
-
-def _check_solutions(pack: ModelPack) -> float:
-    assert pack.reference is not None
-    worst = 0.0
-    for k in range(pack.reference.lam.shape[1]):
-        residual = _Solution.of(pack, k).residual
-        if not residual <= pack.reference.tolerance:
-            _explain(pack, k)
-        worst = max(worst, residual)
-    return worst
 
 
 @dataclass(frozen=True)
@@ -178,14 +163,13 @@ class _Solution:
     lam: Array
 
     @classmethod
-    def of(cls, pack: ModelPack, k: int) -> _Solution:
-        assert pack.reference is not None
-        assert pack.reference.u is not None
+    def of(cls, pack: ModelPack, given: PackSolutions, k: int) -> _Solution:
+        assert given.u is not None  # where solutions are compared with operators
         try:
-            vi = pack.at(pack.reference.parameters[k])
+            vi = pack.at(given.parameters[k])
         except NumericalError as error:
             raise RequestError(f"solutions: {error}") from None
-        return cls(vi, pack.reference.u[:, k], pack.reference.lam[:, k])
+        return cls(vi, given.u[:, k], given.lam[:, k])
 
     @property
     def residual(self) -> float:
@@ -221,24 +205,17 @@ MISTAKES: Mapping[str, Change] = {
 """What may be wrong with a solution that solves nothing, and the change that mends it."""
 
 
-def _explain(pack: ModelPack, k: int) -> None:
-    """Refuse a reference solution, with the single change that would make it right if there is one.
-
-    Raises
-    ------
-    RequestError
-        Always.
-    """
-    assert pack.reference is not None
-    found, tolerance = _Solution.of(pack, k), pack.reference.tolerance
-    title = f"solutions: column {k}, mu = {pack.reference.parameters[k].tolist()}, does not solve the problem"
+def _explained(pack: ModelPack, given: PackSolutions, k: int) -> RequestError:
+    """The error for a reference solution, with the single change that would make it right if there is one."""
+    solution, tolerance = _Solution.of(pack, given, k), given.tolerance
+    title = f"solutions: column {k}, mu = {given.parameters[k].tolist()}, does not solve the problem"
     for meant, change in MISTAKES.items():
-        if change(found, pack.W).residual <= tolerance:
-            raise RequestError(f"{title}; probably {meant}")
-    for other, mu in enumerate(pack.reference.parameters):
-        if other != k and replace(found, vi=pack.at(mu)).residual <= tolerance:
-            raise RequestError(f"{title}, but that of parameter {other}: the columns are in another order")
-    residuals = kkt_residuals(found.vi, found.u, np.maximum(found.lam, 0.0))
+        if change(solution, pack.W).residual <= tolerance:
+            return RequestError(f"{title}; probably {meant}")
+    for other, mu in enumerate(given.parameters):
+        if other != k and replace(solution, vi=pack.at(mu)).residual <= tolerance:
+            return RequestError(f"{title}, but that of parameter {other}: the columns are in another order")
+    residuals = kkt_residuals(solution.vi, solution.u, np.maximum(solution.lam, 0.0))
     parts = {"B u ≤ g": residuals.primal, "A u + Bᵀλ = f": residuals.dual, "λᵀ(B u − g) = 0": residuals.gap}
     worst = max(parts, key=lambda name: parts[name])
-    raise RequestError(f"{title}: {worst} is violated by {parts[worst]:.1e} relatively; accepted: {tolerance:g}")
+    return RequestError(f"{title}: {worst} is violated by {parts[worst]:.1e} relatively; accepted: {tolerance:g}")

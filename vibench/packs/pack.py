@@ -6,7 +6,7 @@ Its dual half needs λ and X_W alone: `reduce_multipliers` builds cones of the m
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -15,15 +15,111 @@ import scipy.sparse as sp
 
 from vibench.arrays import Array, Indices
 from vibench.errors import NumericalError, RequestError
-from vibench.interfaces.affine import AffineSum
+from vibench.interfaces.affine import AffineSum, Thetas, entries_of
+from vibench.interfaces.expressions import Expression
 from vibench.interfaces.outputs import Output
 from vibench.interfaces.problem import MEMBERS, ParameterBox, VariationalInequality
 from vibench.interfaces.strategies import Cone, DualStrategy, Stop
 from vibench.interfaces.validation import check_cone
 from vibench.linalg.inner_product import InnerProduct
 from vibench.packs.manifest import Manifest
-from vibench.packs.members import Affine, Constant, Listed, PackMember
 from vibench.reduction.cones import project_on_cone
+
+SAME_RTOL = 1e-8
+"""Largest distance between a parameter and a listed one that count as the same, relative to the widths of the box.
+
+Far above round-off, since assemblies are timed next to a parameter, far below the distances of listed ones.
+"""
+
+
+@dataclass(frozen=True)
+class Listing:
+    """The listed parameters (P×d) of a pack, and the widths (d,) of its box."""
+
+    parameters: Array
+    widths: Array
+
+    def number(self, mu: Array) -> int:
+        """Number of the listed parameter that equals mu (d,).
+
+        Raises
+        ------
+        NumericalError
+            If there is none.
+        """
+        away = np.abs((self.parameters - mu) / self.widths).max(axis=1)
+        nearest = int(away.argmin())
+        if not away[nearest] <= SAME_RTOL:
+            raise NumericalError(f"the pack has arrays at its listed parameters only; mu = {mu.tolist()} is not listed")
+        return nearest
+
+
+@dataclass(frozen=True)
+class TabulatedTheta:
+    """A coefficient tabulated (P,) at the listed parameters."""
+
+    listing: Listing
+    values: Array
+
+    def __call__(self, mu: Array) -> float:
+        """The value at mu (d,), one of the listed parameters."""
+        return float(self.values[self.listing.number(mu)])
+
+
+@dataclass(frozen=True)
+class PackMember:
+    """A matrix or vector: one array that is constant, the terms of an affine sum, or an array per listed parameter.
+
+    Attributes
+    ----------
+    arrays
+        These arrays.
+    thetas
+        Coefficients of the terms of an affine sum; of no other member.
+    listing
+        The listed parameters of a member with an array for each of them; of no other member.
+    """
+
+    arrays: tuple[Any, ...]
+    thetas: tuple[Expression | TabulatedTheta, ...] = ()
+    listing: Listing | None = None
+
+    @property
+    def constant(self) -> bool:
+        """Whether it does not depend on the parameter."""
+        return not self.thetas and self.listing is None
+
+    @property
+    def everywhere(self) -> bool:
+        """Whether it can be evaluated at every mu of the box, and not only at listed ones."""
+        return self.listing is None and not any(isinstance(theta, TabulatedTheta) for theta in self.thetas)
+
+    @cached_property
+    def sum(self) -> AffineSum:
+        """An affine sum as problems declare it; its matrices have the same sparsity pattern at every mu."""
+        return AffineSum(self.arrays, Thetas(self.thetas))
+
+    def at(self, mu: Array) -> Any:
+        """The matrix or vector at mu (d,)."""
+        if self.thetas:
+            return self.sum.at(mu)
+        return self.arrays[0 if self.listing is None else self.listing.number(mu)]
+
+    def entries(self, rows: Indices, columns: Indices) -> Callable[[Array], Array]:
+        """Function that evaluates these entries (k,) at mu; `columns` is not used for vectors."""
+        if self.thetas:
+            return self.sum.entries(rows, columns)
+        values, listing = [entries_of(array, rows, columns) for array in self.arrays], self.listing
+        return lambda mu: values[0 if listing is None else listing.number(mu)]
+
+    def mapped(self, change: Callable[[Any], Any]) -> PackMember:
+        """The member with all its arrays changed."""
+        return replace(self, arrays=tuple(map(change, self.arrays)))
+
+    def __str__(self) -> str:
+        if self.listing is not None:
+            return f"one array for each of {len(self.arrays)} listed parameters"
+        return f"affine, {len(self.arrays)} term{'s' * (len(self.arrays) > 1)}" if self.thetas else "constant"
 
 
 @dataclass(frozen=True)
@@ -93,7 +189,7 @@ class ModelPack:
     @property
     def constant(self) -> frozenset[str]:
         """Members that do not depend on the parameter."""
-        return frozenset(name for name, member in self.members.items() if isinstance(member, Constant))
+        return frozenset(name for name, member in self.members.items() if member.constant)
 
     @property
     def entrywise(self) -> frozenset[str]:
@@ -106,7 +202,7 @@ class ModelPack:
     def affine(self) -> Mapping[str, AffineSum]:
         """Affine members that reduced assembly may use."""
         members = {name: self.members[name] for name in MEMBERS if name in self.entrywise}
-        return {name: member.sum for name, member in members.items() if isinstance(member, Affine)}
+        return {name: member.sum for name, member in members.items() if member.thetas}
 
     @property
     def everywhere(self) -> bool:
@@ -116,7 +212,7 @@ class ModelPack:
     @cached_property
     def contact_members(self) -> Mapping[str, PackMember]:
         """B on the columns `contact` and g."""
-        return {"B": _mapped(self.members["B"], lambda B: sp.csr_array(B)[:, self.contact]), "g": self.members["g"]}
+        return {"B": self.members["B"].mapped(lambda B: sp.csr_array(B)[:, self.contact]), "g": self.members["g"]}
 
     def at(self, mu: Array) -> VariationalInequality:
         """The variational inequality at mu (d,).
@@ -144,18 +240,6 @@ class ModelPack:
                 f"set validation = {len(self.validation)}"
             )
         return self.validation[:count]
-
-
-def _mapped(member: PackMember, change: Callable[[Any], Any]) -> PackMember:
-    """A member with all its arrays changed."""
-    match member:
-        case Constant(array):
-            return Constant(change(array))
-        case Affine(thetas, terms):
-            return Affine(thetas, tuple(map(change, terms)))
-        case Listed(listing, values):
-            return Listed(listing, tuple(map(change, values)))
-    raise NotImplementedError(type(member).__name__)
 
 
 @dataclass(frozen=True)

@@ -23,12 +23,8 @@ from vibench.linalg.inner_product import InnerProduct
 from vibench.packs import manifest as schema
 from vibench.packs.array_files import ArrayFiles, memory_limit, safe_path, size_of
 from vibench.packs.manifest import FILE, Manifest, read_manifest
-from vibench.packs.members import Affine, Constant, Listed, Listing, PackMember, Table, Theta
-from vibench.packs.pack import ModelPack, PackMesh, PackSolutions
+from vibench.packs.pack import Listing, ModelPack, PackMember, PackMesh, PackSolutions, TabulatedTheta
 from vibench.provenance import core_code
-
-OUTSIDE_RTOL = 1e-12
-"""Largest distance of a listed parameter from the box, relative to its bounds."""
 
 
 def read_pack(path: str | Path) -> ModelPack:
@@ -109,7 +105,7 @@ class _Reader:
         self._folder, self._manifest = folder, manifest
         self._files = ArrayFiles(folder, manifest.index_base, memory_limit())
         self._names = tuple(manifest.parameters.names)
-        self._bounds: tuple[Array, Array] | None = None
+        self._box: ParameterBox | None = None  # where its bounds are given
         self._free: Indices | None = None
 
     def pack(self) -> ModelPack:
@@ -120,7 +116,7 @@ class _Reader:
         if operators is not None and spaces.X_V is None:
             raise RequestError("spaces.X_V: required with [operators], but not given")
         training, validation, box = self._domain(given)
-        W = self._space(spaces.X_W, "X_W")
+        W = self._inner_product(self._files.sparse(spaces.X_W, "spaces.X_W"), "X_W")
         V = None if operators is None or spaces.X_V is None else self._primal_space(spaces.X_V)
         n, m = 0 if V is None else V.dim, W.dim
         members = {} if operators is None else self._members(operators, n, m)
@@ -128,14 +124,11 @@ class _Reader:
             raise RequestError(
                 "parameters.validation: required, since arrays or tables are given at listed parameters only"
             )
-        integrals = None
-        if spaces.integrals is not None:
-            integrals = self._files.vector(spaces.integrals, "spaces.integrals")
-            self._expect("spaces.integrals", integrals, (m,))
         if not all(member.everywhere for member in members.values()):
             box = replace(box, listed=self._listed)
         return ModelPack(
-            self._manifest, box, training, validation, V, W, members, self._contact(members, n), integrals,
+            self._manifest, box, training, validation, V, W, members, self._contact(members, n),
+            None if spaces.integrals is None else self._vector(spaces.integrals, "spaces.integrals", m),
             None if solutions is None else self._reference(solutions, n, m),
             None if mesh is None else self._mesh(mesh, n, m),
             tuple(self._output(k, output, n, m) for k, output in enumerate(self._manifest.outputs)),
@@ -143,25 +136,25 @@ class _Reader:
 
     def _domain(self, given: schema.Parameters) -> tuple[Array, Array | None, ParameterBox]:
         """The training and the validation set, and the box."""
+        units = tuple(given.units or ["1"] * len(self._names))
         if given.lower is not None:
-            self._bounds = (np.array(given.lower), np.array(given.upper))
+            self._box = ParameterBox(self._names, np.array(given.lower), np.array(given.upper), units)
         training, validation = self._parameters(given.training, "parameters.training"), None
         self._listed = training
         if given.validation is not None:
             validation = self._parameters(given.validation, "parameters.validation")
             self._listed = np.vstack([training, validation])
-        lower, upper = self._bounds or (self._listed.min(axis=0), self._listed.max(axis=0))
-        widths = np.where(upper > lower, upper - lower, np.maximum(np.abs(lower), 1.0))
+        box = self._box or ParameterBox(self._names, self._listed.min(axis=0), self._listed.max(axis=0), units)
+        widths = np.where(box.upper > box.lower, box.upper - box.lower, np.maximum(np.abs(box.lower), 1.0))
         self._listing, self._training = Listing(self._listed, widths), len(training)
-        return training, validation, ParameterBox(self._names, lower, upper, tuple(given.units or ["1"] * len(lower)))
+        return training, validation, box
 
     def _parameters(self, given: schema.ParameterSet, what: str) -> Array:
-        bounds = self._bounds
-        d = len(self._names)
-        if given.grid is not None and bounds is not None:
+        box, d = self._box, len(self._names)
+        if given.grid is not None and box is not None:
             if len(given.grid) != d:
                 raise RequestError(f"{what}.grid has {len(given.grid)} counts for {d} parameters")
-            return ParameterBox(self._names, *bounds, units=()).grid(*given.grid)
+            return box.grid(*given.grid)
         if given.array is not None:
             found = self._files.dense(given.array, what)
             found = found[:, None] if found.ndim == 1 and d == 1 else found
@@ -171,16 +164,12 @@ class _Reader:
             found = np.array(given.points, dtype=float)
         if found.ndim != 2 or found.shape[1] != d:
             transposed = "; it is transposed" if found.ndim == 2 and found.shape[0] == d else ""
-            raise RequestError(f"{what}: an array {size_of(found)}; expected P×{d}, a row per parameter{transposed}")
-        if bounds is not None:
-            slack = OUTSIDE_RTOL * np.maximum(np.abs(bounds[0]), np.abs(bounds[1]))
-            for k, i in np.argwhere((found < bounds[0] - slack) | (found > bounds[1] + slack))[:1]:
-                box = f"[{bounds[0][i]:g}, {bounds[1][i]:g}]"
-                raise RequestError(f"{what}: point {k} has '{self._names[i]}' = {found[k, i]:g}, outside the box {box}")
+            raise RequestError(f"{what}: an array {size_of(found.shape)}; expected P×{d}, a row per parameter{transposed}")
+        if box is not None:
+            for k, i in np.argwhere(box.outside(found))[:1]:
+                sides, name = f"[{box.lower[i]:g}, {box.upper[i]:g}]", self._names[i]
+                raise RequestError(f"{what}: point {k} has '{name}' = {found[k, i]:g}, outside the box {sides}")
         return found
-
-    def _space(self, reference: str, name: str) -> InnerProduct:
-        return self._inner_product(self._files.sparse(reference, f"spaces.{name}"), name)
 
     def _primal_space(self, reference: str) -> InnerProduct:
         X = self._files.sparse(reference, "spaces.X_V")
@@ -206,9 +195,9 @@ class _Reader:
             raise RequestError(f"{error}{hint}") from None
 
     def _members(self, operators: schema.Operators, n: int, m: int) -> dict[str, PackMember]:
-        full = self._all if self._free is not None else n
         shapes: dict[str, tuple[tuple[int, ...], tuple[int, ...]]] = {
-            "A": ((full, full), (n, n)), "f": ((full,), (n,)), "B": ((m, full), (m, n)), "g": ((m,), (m,)),
+            "A": ((self._all, self._all), (n, n)), "f": ((self._all,), (n,)), "B": ((m, self._all), (m, n)),
+            "g": ((m,), (m,)),
         }  # fmt: skip
         return {name: self._member(name, getattr(operators, name), *shapes[name]) for name in MEMBERS}
 
@@ -221,10 +210,11 @@ class _Reader:
             return found if stored == kept else self._restricted(name, found)
 
         if given.constant is not None:
-            return Constant(read(given.constant, what))
+            return PackMember((read(given.constant, what),))
         if given.affine is not None:
             terms = tuple(read(term.array, f"{what}.affine.{q}") for q, term in enumerate(given.affine))
-            return Affine(tuple(self._theta(term, f"{what}.affine.{q}") for q, term in enumerate(given.affine)), terms)
+            thetas = tuple(self._theta(term, f"{what}.affine.{q}") for q, term in enumerate(given.affine))
+            return PackMember(terms, thetas)
         assert given.each is not None  # the manifest has exactly one of the three
         if "{}" in given.each:
             base = self._manifest.index_base
@@ -235,7 +225,7 @@ class _Reader:
         else:
             columns = self._columns(given.each, f"{what}.each", stored[0], len(self._listed))
             values = [column if stored == kept else self._restricted(name, column) for column in columns.T]
-        return Listed(self._listing, tuple(values))
+        return PackMember(tuple(values), listing=self._listing)
 
     def _restricted(self, name: str, found: Any) -> Any:
         """A member of all unknowns on the free ones."""
@@ -243,22 +233,20 @@ class _Reader:
             return sp.csr_array(found)[:, self._free]
         return found[self._free] if name == "f" else sp.csr_array(found)[self._free][:, self._free]
 
-    def _theta(self, term: schema.Term, what: str) -> Theta:
+    def _theta(self, term: schema.Term, what: str) -> Expression | TabulatedTheta:
         if term.table is None:
             try:
                 return Expression.parse(str(term.theta), self._names)
             except RequestError as error:
                 raise RequestError(f"{what}.theta: {error}") from None
-        values = self._files.vector(term.table, f"{what}.table")
-        self._expect(f"{what}.table", values, (len(self._listed),))
-        return Table(self._listing, values)
+        return TabulatedTheta(self._listing, self._vector(term.table, f"{what}.table", len(self._listed)))
 
     def _columns(self, reference: str, what: str, rows: int, count: int | None) -> Array:
         found = self._files.dense(reference, what)
         if found.ndim != 2 or found.shape[0] != rows or count not in (None, found.shape[1]):
             transposed = "; it is transposed" if found.ndim == 2 and found.shape[1] == rows else ""
             expected = f"{rows}×{'P' if count is None else count}, a column per parameter"
-            raise RequestError(f"{what}: an array {size_of(found)}; expected {expected}{transposed}")
+            raise RequestError(f"{what}: an array {size_of(found.shape)}; expected {expected}{transposed}")
         return found
 
     def _contact(self, members: Mapping[str, PackMember], n: int) -> Indices:
@@ -281,22 +269,14 @@ class _Reader:
             raise RequestError(f"solutions.lam has {count} columns for {len(mus)} parameters")
         u = None
         if given.u is not None and n:
-            full = n if self._free is None else self._all
-            u = self._columns(given.u, "solutions.u", full, count)
-            u = u if self._free is None else u[self._free]
+            u = self._kept(self._columns(given.u, "solutions.u", self._all, count))
         return PackSolutions(mus, u, lam, given.tolerance)
 
     def _output(self, number: int, given: schema.LinearOutput, n: int, m: int) -> Output:
         if not n:
             raise RequestError("outputs need the table [operators]")
-        u = lam = None
-        if given.u is not None:
-            u = self._files.vector(given.u, f"outputs.{number}.u")
-            self._expect(f"outputs.{number}.u", u, (n if self._free is None else self._all,))
-            u = u if self._free is None else u[self._free]
-        if given.lam is not None:
-            lam = self._files.vector(given.lam, f"outputs.{number}.lam")
-            self._expect(f"outputs.{number}.lam", lam, (m,))
+        u = None if given.u is None else self._kept(self._vector(given.u, f"outputs.{number}.u", self._all))
+        lam = None if given.lam is None else self._vector(given.lam, f"outputs.{number}.lam", m)
         return Output(given.name, given.unit, u, lam)
 
     def _mesh(self, given: schema.Mesh, n: int, m: int) -> PackMesh:
@@ -317,7 +297,7 @@ class _Reader:
         positions = self._files.dense(given.positions, "mesh.positions")
         positions = positions[:, None] if positions.ndim == 1 else positions
         if positions.shape not in ((m, 1), (m, 2)):
-            raise RequestError(f"mesh.positions: an array {size_of(positions)}; expected {m}×1 or {m}×2")
+            raise RequestError(f"mesh.positions: an array {size_of(positions.shape)}; expected {m}×1 or {m}×2")
         return PackMesh(points, triangles, drawn, unknowns, positions.T, given.value, given.multiplier)
 
     def _unknowns(self, reference: str) -> Indices:
@@ -331,6 +311,15 @@ class _Reader:
             raise RequestError("mesh.unknowns names an unknown that is not free")
         return number[found]
 
+    def _kept(self, values: Array) -> Array:
+        """Values (N, …) of all unknowns of the files at the free ones (n, …)."""
+        return values if self._free is None else values[self._free]
+
+    def _vector(self, reference: str, what: str, length: int) -> Array:
+        found = self._files.vector(reference, what)
+        self._expect(what, found, (length,))
+        return found
+
     def _expect(self, what: str, found: Any, shape: tuple[int, ...]) -> None:
         if found.shape == shape:
             return
@@ -339,7 +328,7 @@ class _Reader:
             hint = "; it is transposed"
         elif self._free is None and self._manifest.operators is not None and max(found.shape) > max(shape):
             hint = "; if it has the Dirichlet unknowns, too, leave them out, or name the free ones in spaces.free"
-        raise RequestError(f"{what}: {size_of(found)}; expected {'×'.join(map(str, shape))}{hint}")
+        raise RequestError(f"{what}: {size_of(found.shape)}; expected {'×'.join(map(str, shape))}{hint}")
 
 
 def one_triangle(matrix: Any, what: str) -> None:
