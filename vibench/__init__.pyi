@@ -58,10 +58,10 @@ from .offline.models import Model as Model
 from .offline.models import Solution as Solution
 from .offline.reduction import Reduction as Reduction
 from .offline.reduction import Snapshots as Snapshots
-from .qp.solution import QPSolution as QPSolution
-from .qp.solution import QPSolver as QPSolver
 from .qp.solve import solve_qp as solve_qp
 from .qp.status import Status as Status
+from .qp.verification import QPSolution as QPSolution
+from .qp.verification import QPSolver as QPSolver
 from .reduction.cones import greedy_cone as greedy_cone
 from .reduction.cones import project_on_cone as project_on_cone
 from .reduction.nested import NestedStrategy as NestedStrategy

@@ -21,7 +21,7 @@ from outputs import clean, elements
 from samples import cell_row, query_rows
 
 from vibench.interfaces.problem import VariationalInequality
-from vibench.qp.solution import QPSolution
+from vibench.qp.verification import QPSolution
 from vibench.report import html
 from vibench.report.figures import dimension, problems
 from vibench.report.figures.style import styled, write_figure

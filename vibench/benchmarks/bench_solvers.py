@@ -13,8 +13,8 @@ from vibench.benchmarks.material import Material
 from vibench.benchmarks.measure import MARKS, Info, measure
 from vibench.interfaces.strategies import Stop
 from vibench.model.galerkin import ReducedProblem
-from vibench.qp.solution import QPSolution
 from vibench.qp.solve import solve_qp
+from vibench.qp.verification import QPSolution
 from vibench.study import registry
 
 pytestmark = MARKS

@@ -20,8 +20,8 @@ from vibench.model.affine import affine_decomposition
 from vibench.model.galerkin import ReducedProblem
 from vibench.model.hyperreduced import HyperReducedModel, Operators, hyper_reduce
 from vibench.offline.models import AnyReducedModel
-from vibench.qp.solution import QPSolution
 from vibench.qp.solve import solve_qp
+from vibench.qp.verification import QPSolution
 from vibench.reduction.pod import pod
 from vibench.study import registry
 

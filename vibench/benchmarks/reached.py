@@ -13,15 +13,14 @@ from vibench.highfidelity.active_set import HighFidelitySolution
 from vibench.interfaces.problem import MEMBERS, VariationalInequality
 from vibench.interfaces.strategies import Cone, Enrichment
 from vibench.interfaces.validation import checked_assembly
-from vibench.linalg.dense import project_out, singular_values
-from vibench.linalg.inner_product import InnerProduct
+from vibench.linalg.inner_product import InnerProduct, project_out, singular_values
 from vibench.model.affine import AffineMember, Evaluation
 from vibench.model.errors import errors
 from vibench.model.galerkin import ReducedModel, ReducedProblem, project
 from vibench.offline.assemblies import assemblies
 from vibench.offline.models import AnyReducedModel
 from vibench.qp import verification
-from vibench.qp.solution import QPSolution
+from vibench.qp.verification import QPSolution
 from vibench.reduction import cones
 from vibench.reduction.pod import POD
 from vibench.reduction.supremizers import supremizers

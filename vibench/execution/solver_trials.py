@@ -11,10 +11,9 @@ from itertools import chain, count
 from vibench.execution.supervisor import Job, Supervisor
 from vibench.interfaces.problem import VariationalInequality
 from vibench.qp.repeats import in_units, units
-from vibench.qp.solution import QPSolution
 from vibench.qp.solve import solve_qp
 from vibench.qp.status import Status
-from vibench.qp.verification import Residuals, verify
+from vibench.qp.verification import QPSolution, Residuals, verify
 from vibench.stages.base import Done, Failed, Pieces, PiecewiseStage, Stage
 from vibench.storage.artefacts import Store
 from vibench.storage.serialisation import dumps, loads, storable

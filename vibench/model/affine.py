@@ -15,7 +15,7 @@ from vibench.arrays import Array, Indices, SparseMatrix
 from vibench.errors import NumericalError
 from vibench.interfaces.problem import MEMBERS, Problem, Sampler
 from vibench.interfaces.validation import checked_assembly
-from vibench.linalg.dense import svd
+from vibench.linalg.inner_product import svd
 
 CONSTANT_RTOL = 1e-13
 """A member whose entries vary by less over the training set, relative to the largest one, is constant."""

@@ -12,7 +12,7 @@ import numpy as np
 import scipy.fft
 
 from vibench.arrays import Array, Indices
-from vibench.linalg.dense import svd
+from vibench.linalg.inner_product import svd
 
 Evaluate = Callable[[Array], Mapping[str, Array]]
 """From a parameter mu (d,) to flat arrays (size,) by name, of the same sizes everywhere."""

@@ -13,7 +13,7 @@ from vibench.errors import NumericalError
 from vibench.interfaces.problem import Contact, Problem, VariationalInequality
 from vibench.interfaces.strategies import Enrichment
 from vibench.interfaces.validation import checked_assembly
-from vibench.linalg.dense import orthonormal_range
+from vibench.linalg.inner_product import orthonormal_range
 from vibench.reduction.supremizers import ContactCoordinates, projected_supremizers
 
 

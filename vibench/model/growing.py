@@ -12,14 +12,14 @@ from vibench.interfaces.problem import Problem, VariationalInequality
 from vibench.interfaces.sampling import Trainer
 from vibench.interfaces.validation import ReferenceAssembly, checked_assembly
 from vibench.linalg.cholesky import SparseCholesky
-from vibench.linalg.dense import orthonormal_range
+from vibench.linalg.inner_product import orthonormal_range
 from vibench.model.error_bounds import find_correction, terms
 from vibench.model.errors import Energy
 from vibench.model.galerkin import project
 from vibench.qp.exact import ExactSolution, exact_solution
 from vibench.qp.scaling import ratio
-from vibench.qp.solution import QPSolution
 from vibench.qp.solve import solve_qp
+from vibench.qp.verification import QPSolution
 from vibench.reduction.cone_parts import part_in_cone
 from vibench.reduction.supremizers import supremizers
 from vibench.timing import NO_TIME, Seconds, timed

@@ -13,7 +13,7 @@ from vibench.arrays import Array, Indices
 from vibench.errors import NumericalError
 from vibench.interfaces.problem import MEMBERS, Contact, VariationalInequality
 from vibench.interfaces.strategies import Kind
-from vibench.linalg.dense import orthonormal_range
+from vibench.linalg.inner_product import orthonormal_range
 from vibench.model.affine import AffineMember, Evaluation, coefficients, evaluated_members
 from vibench.model.galerkin import Evaluated, ReducedModel, ReducedProblem
 from vibench.reduction.supremizers import ContactCoordinates, Coordinates, SpannedCoordinates, supremizers

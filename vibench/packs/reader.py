@@ -164,7 +164,9 @@ class _Reader:
             found = np.array(given.points, dtype=float)
         if found.ndim != 2 or found.shape[1] != d:
             transposed = "; it is transposed" if found.ndim == 2 and found.shape[0] == d else ""
-            raise RequestError(f"{what}: an array {size_of(found.shape)}; expected P×{d}, a row per parameter{transposed}")
+            raise RequestError(
+                f"{what}: an array {size_of(found.shape)}; expected P×{d}, a row per parameter{transposed}"
+            )
         if box is not None:
             for k, i in np.argwhere(box.outside(found))[:1]:
                 sides, name = f"[{box.lower[i]:g}, {box.upper[i]:g}]", self._names[i]

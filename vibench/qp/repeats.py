@@ -12,9 +12,8 @@ import numpy as np
 from vibench.arrays import Array
 from vibench.errors import NumericalError
 from vibench.interfaces.problem import ParameterBox, VariationalInequality
-from vibench.qp.solution import QPSolution
 from vibench.qp.status import Status
-from vibench.qp.verification import verify
+from vibench.qp.verification import QPSolution, verify
 
 APART = 1e3
 """Units of the unknowns vary by this many times the accuracy, so that the answer in other units is not the answer."""

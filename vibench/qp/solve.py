@@ -22,7 +22,7 @@ from vibench.interfaces.problem import VariationalInequality
 from vibench.provenance import solver_version
 from vibench.qp.scaling import Units, prescribed, row_norms, units_of, units_of_dual
 from vibench.qp.settings import SETTINGS
-from vibench.qp.solution import QPSolution, QPSolver
+from vibench.qp.verification import QPSolution, QPSolver
 from vibench.text import one_line
 
 MARGIN = 0.5

@@ -1,4 +1,4 @@
-"""KKT verification: residuals recomputed from the solution, and a status from them alone, not from the solver.
+"""Solutions of QP solvers, and their verification: residuals recomputed, and a status from them alone.
 
 How far apart can two solutions of one program be when the KKT residuals of both meet an accuracy? For two solutions
 k = 1, 2 of min ½xᵀAx − fᵀx, Bx ≤ g, with α_k ≥ 0, residuals r_k = Ax_k − f + Bᵀα_k, excesses p_k = (Bx_k − g)₊ and
@@ -14,6 +14,7 @@ displacements in V. Solvers that are `ok` on the same reduced problem and farthe
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 from scipy.optimize import nnls
@@ -21,7 +22,6 @@ from scipy.optimize import nnls
 from vibench.arrays import Array
 from vibench.interfaces.problem import VariationalInequality
 from vibench.qp.scaling import peak, prescribed, ratio, row_norms, size
-from vibench.qp.solution import QPSolution
 from vibench.qp.status import Status
 from vibench.text import above
 
@@ -30,6 +30,28 @@ ENERGY_FLOOR = 1e-4
 
 FORCE_FLOOR = 1e-4
 """The same of the prescribed force and the dual residual; small, since nodal forces decrease with the mesh width."""
+
+
+@dataclass(frozen=True)
+class QPSolution:
+    """Unverified result of a solver: x (n,), multipliers α (m,) with A x + Bᵀα = f, its status and iteration count.
+
+    `solve_qp` sets negative multipliers to zero; `negative` is the largest absolute value among them. It makes the
+    status one printable line, and leaves out iterations that are no number of them.
+    """
+
+    x: Array | None
+    alpha: Array | None
+    solver_status: str
+    iterations: int | None = None
+    negative: float = 0.0
+
+
+class QPSolver(Protocol):
+    """A solver registered through the entry point group `vibench.qp_solvers`."""
+
+    def __call__(self, program: VariationalInequality, accuracy: float) -> QPSolution:
+        """Solve to a relative accuracy."""
 
 
 @dataclass(frozen=True)

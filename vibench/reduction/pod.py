@@ -9,8 +9,7 @@ import numpy as np
 from vibench.arrays import Array
 from vibench.errors import NumericalError
 from vibench.interfaces.strategies import Stop
-from vibench.linalg.dense import RANK_RTOL, svd
-from vibench.linalg.inner_product import InnerProduct
+from vibench.linalg.inner_product import RANK_RTOL, InnerProduct, svd
 
 
 @dataclass(frozen=True)

@@ -22,10 +22,9 @@ from vibench.execution.recorded_cell import RecordedCell, recorded_cells
 from vibench.execution.solver_trials import Trial, solver_trials
 from vibench.files import PART, TEMPORARY, write_atomically
 from vibench.interfaces.problem import VariationalInequality
-from vibench.qp.solution import QPSolution
 from vibench.qp.solve import installed_solvers
 from vibench.qp.status import Status
-from vibench.qp.verification import verify
+from vibench.qp.verification import QPSolution, verify
 from vibench.results.solver_agreement import vectors
 from vibench.results.tables import to_csv
 from vibench.study import registry

@@ -17,7 +17,7 @@ from vibench.interfaces.validation import check_enrichment
 from vibench.offline.reduction import Reduction
 from vibench.reduction.nested import Grown, Milestone, grow_through
 from vibench.reduction.supremizers import ConstraintClasses, projected_supremizers
-from vibench.stability.over_parameters import ProjectedSupremizers
+from vibench.stability.infsup import ProjectedSupremizers
 from vibench.stages.base import Result, Stage, build_problem, faults_of, value_of
 from vibench.stages.offline import ConeStage, PODStage, ReducedCone, TrainingConstants
 from vibench.stages.snapshots import parameters_in

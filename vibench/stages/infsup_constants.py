@@ -12,8 +12,15 @@ from vibench.model.galerkin import ReducedModel
 from vibench.offline.assemblies import assemblies
 from vibench.reduction.supremizers import ConstraintClasses
 from vibench.stability.coercivity import Constant, Stability, coercivity_and_continuity, energy_inf_sup
-from vibench.stability.infsup import InfSup, Multipliers, inf_sup, nodal_multipliers
-from vibench.stability.over_parameters import constants_full, constants_on, everywhere
+from vibench.stability.infsup import (
+    InfSup,
+    Multipliers,
+    constants_full,
+    constants_on,
+    everywhere,
+    inf_sup,
+    nodal_multipliers,
+)
 from vibench.stages.base import Result, Stage, build_problem, value_of
 from vibench.stages.enrichment import EnrichmentStage
 from vibench.stages.offline import ConeStage, ConstraintMatrices, PODStage

@@ -23,10 +23,9 @@ from vibench.offline.models import AnyReducedModel
 from vibench.qp.exact import ExactSolution
 from vibench.qp.repeats import in_units, nearby, units
 from vibench.qp.scaling import ratio
-from vibench.qp.solution import QPSolution
 from vibench.qp.solve import solve_qp, takes_start
 from vibench.qp.status import Status
-from vibench.qp.verification import slack, verify
+from vibench.qp.verification import QPSolution, slack, verify
 from vibench.results.solver_agreement import solution_row
 from vibench.stability.coercivity import Stability
 from vibench.stages.assembly import AssemblyStage, ReducedPrograms

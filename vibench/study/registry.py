@@ -18,7 +18,7 @@ from pydantic import ConfigDict, PydanticUserError, TypeAdapter, ValidationError
 from vibench.errors import RequestError, in_a_line, unknown_name
 from vibench.provenance import distribution_version, source_hash
 from vibench.qp.settings import SETTINGS
-from vibench.qp.solution import QPSolver
+from vibench.qp.verification import QPSolver
 from vibench.study.entry_points import entry_points
 from vibench.study.kinds import CHECKED, KINDS
 

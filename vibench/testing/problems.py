@@ -13,8 +13,7 @@ from vibench.highfidelity import active_set
 from vibench.interfaces.outputs import Output
 from vibench.interfaces.problem import ParameterBox, Picture
 from vibench.interfaces.validation import training_parameters, validation_parameters
-from vibench.linalg.dense import singular_values
-from vibench.linalg.inner_product import InnerProduct
+from vibench.linalg.inner_product import InnerProduct, singular_values
 from vibench.stability.coercivity import extreme_quotients
 from vibench.testing import assembly
 from vibench.testing.case import ProblemCase

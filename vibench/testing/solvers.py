@@ -15,10 +15,9 @@ from vibench.arrays import Array
 from vibench.errors import NumericalError
 from vibench.interfaces.problem import MEMBERS, VariationalInequality
 from vibench.qp.scaling import units_of
-from vibench.qp.solution import QPSolution, QPSolver
 from vibench.qp.solve import solve_qp
 from vibench.qp.status import Status
-from vibench.qp.verification import kkt_residuals, verify
+from vibench.qp.verification import QPSolution, QPSolver, kkt_residuals, verify
 from vibench.testing.checks import SECONDS, Check, Conformance, ConformanceError, Doubt, Note, raised
 from vibench.testing.comparisons import copies, differences, unmutated
 from vibench.timing import timed

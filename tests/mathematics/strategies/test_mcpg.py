@@ -11,7 +11,7 @@ from numerics import space
 from vibench.interfaces.problem import VariationalInequality
 from vibench.interfaces.strategies import Stop
 from vibench.linalg.inner_product import InnerProduct
-from vibench.qp.solution import QPSolution
+from vibench.qp.verification import QPSolution
 from vibench.reduction import cone_parts, part_in_cone
 from vibench.reduction.cones import project_on_cone
 from vibench_strategies.cpg import CPG

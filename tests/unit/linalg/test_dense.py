@@ -4,7 +4,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from vibench.linalg.dense import orthonormal_range, project_out, singular_values, svd
+from vibench.linalg.inner_product import orthonormal_range, project_out, singular_values, svd
 
 seeds = st.integers(0, 10_000)
 

@@ -23,7 +23,7 @@ from vibench.model.error_bounds import (
     find_correction,
 )
 from vibench.model.errors import Energy
-from vibench.qp.solution import QPSolution
+from vibench.qp.verification import QPSolution
 from vibench.stability.coercivity import Constant, Stability, coercivity_and_continuity, energy_inf_sup
 from vibench.stability.infsup import InfSup
 

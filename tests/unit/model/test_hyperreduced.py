@@ -23,7 +23,7 @@ from vibench.interfaces.affine import AffineSum
 from vibench.interfaces.problem import MEMBERS, Contact, Problem, VariationalInequality
 from vibench.interfaces.strategies import Enrichment, Kind
 from vibench.interfaces.validation import checked_assembly
-from vibench.linalg.dense import singular_values
+from vibench.linalg.inner_product import singular_values
 from vibench.model.affine import Evaluation, affine_decomposition
 from vibench.model.galerkin import ReducedModel, project
 from vibench.model.hyperreduced import HyperReducedModel, hyper_reduce, reason_for_full_assembly

@@ -19,8 +19,8 @@ from vibench.interfaces.problem import MEMBERS, ParameterBox, VariationalInequal
 from vibench.interfaces.strategies import Stop
 from vibench.model.hyperreduced import HyperReducedModel
 from vibench.qp.repeats import APART, in_units, nearby, units
-from vibench.qp.solution import QPSolution
 from vibench.qp.solve import solve_qp
+from vibench.qp.verification import QPSolution
 from vibench.stages import snapshots, timing_rounds
 from vibench.stages.assembly import AssemblyStage
 from vibench.stages.cell_queries import CellQueries

@@ -13,9 +13,9 @@ from vibench.highfidelity.active_set import solve_high_fidelity
 from vibench.interfaces.problem import MEMBERS, VariationalInequality
 from vibench.qp import verification
 from vibench.qp.scaling import prescribed, row_norms, stiffness, units_of, units_of_dual
-from vibench.qp.solution import QPSolution
 from vibench.qp.solve import installed_solvers, solve_qp
 from vibench.qp.status import Status
+from vibench.qp.verification import QPSolution
 
 seeds = st.integers(0, 10_000)
 exponents = st.integers(-12, 12)

@@ -12,9 +12,9 @@ from numerics import exact, spd
 from vibench.errors import NumericalError
 from vibench.interfaces.problem import VariationalInequality
 from vibench.qp import verification
-from vibench.qp.solution import QPSolution
 from vibench.qp.solve import solve_qp
 from vibench.qp.status import Status
+from vibench.qp.verification import QPSolution
 from vibench.text import LONGEST
 
 seeds = st.integers(0, 10_000)

@@ -7,8 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from vibench.reduction.supremizers import constraint_classes
-from vibench.stability.infsup import beta_span
-from vibench.stability.over_parameters import ProjectedSupremizers
+from vibench.stability.infsup import ProjectedSupremizers, beta_span
 
 
 @given(st.integers(0, 10_000), st.integers(0, 3), st.integers(1, 4), st.sampled_from([0.0, 1e-7, 1e-3, 1.0]))

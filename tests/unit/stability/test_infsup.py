@@ -8,8 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numerics import Varying, space
 
-from vibench.linalg.dense import RANK_RTOL
-from vibench.linalg.inner_product import InnerProduct
+from vibench.linalg.inner_product import RANK_RTOL, InnerProduct
 from vibench.reduction.supremizers import supremizers
 from vibench.stability.infsup import beta_span, inf_sup_full, inf_sup_on, multipliers, nodal_multipliers
 

@@ -18,8 +18,14 @@ from vibench.model.errors import UNMEASURABLE, Energy, ReferenceSolutions, error
 from vibench.model.hsw_bounds import hsw_bounds
 from vibench.reduction.supremizers import constraint_classes
 from vibench.stability.coercivity import Stability, coercivity_and_continuity, energy_inf_sup
-from vibench.stability.infsup import inf_sup_full, inf_sup_on, multipliers, nodal_multipliers
-from vibench.stability.over_parameters import constants_full, constants_on
+from vibench.stability.infsup import (
+    constants_full,
+    constants_on,
+    inf_sup_full,
+    inf_sup_on,
+    multipliers,
+    nodal_multipliers,
+)
 
 
 def energy(vi: VariationalInequality) -> Energy:
