@@ -18,7 +18,7 @@ from outputs import clean
 from running import Main, Register, refused
 from samples import install_fakes
 
-from vibench.benchmarks import cases, elsewhere
+from vibench.benchmarks import cases, running
 from vibench.benchmarks.measure import PASSES, _how_often, plain
 from vibench.errors import RequestError
 
@@ -123,7 +123,7 @@ def test_what_cannot_be_made_fails_with_its_reason_and_is_not_timed(third_party:
         ("pod[wire-broken]", "no wire in stock"),
         ("query[wire-broken-decorrelated]", "no wire in stock"),
         ("cone[wire-cone-raises]", "no generator found"),
-        ("cone[wire-cone-exits]", "its process died with exit code 3"),
+        ("cone[wire-cone-exits]", "the worker process died with exit code 3"),
         ("cone[wire-cone-interrupts]", "KeyboardInterrupt"),
         ("solver[wire-N5-R5-lost-1e-06]", "no_such_module"),
     ):
@@ -132,10 +132,10 @@ def test_what_cannot_be_made_fails_with_its_reason_and_is_not_timed(third_party:
         assert name not in third_party.benchmarks
 
 
-def test_where_all_fail_there_is_a_file_of_none(main: Main, register: Register, tmp_path: Path) -> None:
-    register(("vibench.dual_strategies", "gone", "no_such_module:Cone"))
-    request, told = elsewhere.Request({"dual": ["gone"]}, seconds=0.001), list[str]()
-    outcome = elsewhere.run(request, told.append)
+def test_where_all_fail_there_is_a_file_of_none(main: Main, tmp_path: Path) -> None:
+    setting, told = cases.setting("quick"), list[str]()
+    benchmarks = running.planned({"dual": ["gone"]}, ["coarse"], setting)
+    outcome = running.run_benchmarks(benchmarks, setting, 0.001, told.append)
     assert len(outcome.failed) == len(told) > 0
     path = tmp_path / "file.json"
     path.write_bytes(outcome.content)
@@ -176,7 +176,7 @@ def test_only_benchmarks_with_a_chosen_plugin_are_timed(third_party: Timed) -> N
 
 
 def test_plugins_are_chosen_by_the_names_of_lists(register: Register) -> None:
-    assert cases.chosen(["obstacle", "piqp", "dual:mcpg"]) == {
+    assert cases.chosen_plugins(["obstacle", "piqp", "dual:mcpg"]) == {
         "problem": ["obstacle"], "solver": ["piqp"], "dual": ["mcpg"],
     }  # fmt: skip
     for name, words in (
@@ -184,13 +184,13 @@ def test_plugins_are_chosen_by_the_names_of_lists(register: Register) -> None:
         ("pack", "needs options"), ("thing:x", "no plugin is called 'x'"),
     ):  # fmt: skip
         with pytest.raises(RequestError, match=words):
-            cases.chosen([name])
+            cases.chosen_plugins([name])
     register(
         ("vibench.problems", "same", "fake_plugins:Wire"),
         ("vibench.dual_strategies", "same", "vibench_strategies.cpg:CPG"),
     )
     with pytest.raises(RequestError, match="say problem:same or dual:same"):
-        cases.chosen(["same"])
+        cases.chosen_plugins(["same"])
 
 
 def test_a_wrong_request_is_refused_before_anything_is_timed(main: Main, tmp_path: Path) -> None:

@@ -1,1 +1,1 @@
-"""Benchmarks of plugins with pytest-benchmark: what is timed, what it reached, and files of benchmarks compared."""
+"""Benchmarks of plugins: what is timed, what it reached, and files of pytest-benchmark written and compared."""

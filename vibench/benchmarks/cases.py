@@ -1,8 +1,8 @@
-"""What is timed: registered problems at resolutions, registered strategies, sizes of reduced programs."""
+"""What benchmarks are made of: registered problems at resolutions, registered strategies, sizes of reduced programs."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 from vibench.errors import RequestError, unknown_name
@@ -19,7 +19,7 @@ TOLERANCES = (0.5, 0.1)
 
 
 @dataclass(frozen=True)
-class Case:
+class TimedProblem:
     """A registered problem at a resolution; `None` where it has no such option and is timed as it is."""
 
     problem: str
@@ -35,7 +35,7 @@ class Case:
 
 
 @dataclass(frozen=True)
-class Primal:
+class PrimalChoice:
     """A registered primal strategy and its tolerance, `None` where it takes none."""
 
     name: str
@@ -49,8 +49,8 @@ class Primal:
 class Spaces:
     """Where V_N and the reduced cone of a registered dual strategy stop."""
 
-    pod: Stop
-    cone: Stop
+    modes: Stop
+    generators: Stop
     dual: str
 
 
@@ -66,11 +66,14 @@ class Setting:
         Where V_N and the cone stop, and the dual strategy.
     primal
         The primal strategy.
+    seconds
+        Wall seconds that the study allows for a stage.
     """
 
     problems: tuple[str, ...]
     spaces: Spaces
-    primal: Primal
+    primal: PrimalChoice
+    seconds: float
 
 
 def setting(study: str) -> Setting:
@@ -81,40 +84,37 @@ def setting(study: str) -> Setting:
     RequestError
         If there is no such study.
     """
-    found = read_study(study)
-    table, dual, primal = found.tolerances[0], found.dual[-1], found.primal[-1]
-    pod = Stop(tolerance=table.pod[0]) if table.pod else Stop(size=(table.N or [0])[0])
-    spaces = Spaces(pod, table.of_dual(dual)[0], dual.name)
-    problems = tuple(dict.fromkeys(entry.name for entry in found.problem))
-    return Setting(problems, spaces, Primal(primal.name, table.of_primal(primal)[0]))
+    spec = read_study(study)
+    table, dual, primal = spec.tolerances[0], spec.dual[-1], spec.primal[-1]
+    modes = Stop(tolerance=table.pod[0]) if table.pod else Stop(size=(table.N or [0])[0])
+    spaces = Spaces(modes, table.of_dual(dual)[0], dual.name)
+    problems = tuple(dict.fromkeys(entry.name for entry in spec.problem))
+    chosen = PrimalChoice(primal.name, table.of_primal(primal)[0])
+    return Setting(problems, spaces, chosen, spec.limits.cell_seconds)
 
 
 @dataclass(frozen=True)
 class Size:
     """A reduced program by what is prescribed of it; the enrichment adds to N."""
 
-    case: Case
     N: int
     R: int
 
     def __str__(self) -> str:
-        return f"{self.case}-N{self.N}-R{self.R}"
+        return f"N{self.N}-R{self.R}"
 
 
-DIMENSIONS = ((5, 5), (10, 12), (20, 30), (46, 60), (80, 70))
-"""N and R of the reduced programs that QP solvers are timed on, as far as the snapshots of a problem give them."""
+SIZES = (Size(5, 5), Size(10, 12), Size(20, 30), Size(46, 60), Size(80, 70))
+"""The reduced programs that QP solvers are timed on, as far as the snapshots of a problem give them."""
 
 ACCURACIES = (1e-6, 1e-10)
 """What the QP solvers are asked for."""
 
 
-def problem_cases(problems: Sequence[str], wanted: Sequence[Resolution]) -> list[Case]:
-    """Every problem at those of the resolutions that it knows; once, as it is, where it knows none of them."""
-    found: list[Case] = []
-    for name in problems:
-        known = [Case(name, resolution) for resolution in wanted if knows(name, resolution)]
-        found += known or [Case(name, None)]
-    return found
+def at_resolutions(problem: str, wanted: Sequence[Resolution]) -> list[TimedProblem]:
+    """A problem at those of the resolutions that it knows; once, as it is, where it knows none of them."""
+    known = [TimedProblem(problem, resolution) for resolution in wanted if knows(problem, resolution)]
+    return known or [TimedProblem(problem, None)]
 
 
 def knows(problem: str, resolution: Resolution) -> bool:
@@ -134,9 +134,9 @@ def takes_no_option(problem: str) -> bool:
         return True
 
 
-def primal_cases() -> list[Primal]:
-    """Every registered primal strategy, at all `TOLERANCES` if it takes one."""
-    return [Primal(name, tolerance) for name in registry.names("primal strategy") for tolerance in _tolerances(name)]
+def at_tolerances(names: Iterable[str]) -> list[PrimalChoice]:
+    """Primal strategies, at all `TOLERANCES` if they take one."""
+    return [PrimalChoice(name, tolerance) for name in names for tolerance in _tolerances(name)]
 
 
 def _tolerances(primal: str) -> tuple[float | None, ...]:
@@ -150,7 +150,7 @@ TIMED = ("problem", "primal", "dual", "solver")
 """Kinds of plugins that benchmarks time, by the word for each."""
 
 
-def chosen(plugins: Sequence[str]) -> dict[str, list[str]]:
+def chosen_plugins(plugins: Sequence[str]) -> dict[str, list[str]]:
     """Names of plugins by the word for their kind, from names as `vibench list` shows them, or KIND:NAME.
 
     Raises
@@ -160,7 +160,7 @@ def chosen(plugins: Sequence[str]) -> dict[str, list[str]]:
     """
     known = {word: registry.names(registry.WORDS[word]) for word in TIMED}
     known["solver"] = installed_solvers(known["solver"])
-    found: dict[str, list[str]] = {}
+    chosen: dict[str, list[str]] = {}
     for plugin in plugins:
         prefix, colon, rest = plugin.partition(":")
         name = rest if colon else plugin
@@ -174,19 +174,20 @@ def chosen(plugins: Sequence[str]) -> dict[str, list[str]]:
             raise unknown_name(kind, name, choices_of or known)
         if words[0] == "problem" and not takes_no_option(name):
             raise RequestError(f"the problem '{name}' needs options, which `vibench bench` has no place for")
-        found.setdefault(words[0], []).append(name)
-    return found
+        chosen.setdefault(words[0], []).append(name)
+    return chosen
 
 
-def check_resolutions(resolutions: Sequence[str]) -> None:
-    """Refuse resolutions that no problem has.
+def resolutions(texts: Sequence[str]) -> list[Resolution]:
+    """Resolutions from texts.
 
     Raises
     ------
     RequestError
-        For the first one.
+        For the first one that no problem has.
     """
-    for text in resolutions:
-        resolution: Resolution = int(text) if text.isdigit() else text
+    wanted: list[Resolution] = [int(text) if text.isdigit() else text for text in texts]
+    for resolution in wanted:
         if not any(knows(problem, resolution) for problem in registry.names("problem")):
-            raise RequestError(f"no problem has the resolution {text!r}")
+            raise RequestError(f"no problem has the resolution {str(resolution)!r}")
+    return wanted

@@ -1,4 +1,4 @@
-"""Timing by pytest-benchmark of work that is judged beforehand: what it reached is kept beside its seconds."""
+"""Timing of work that is judged beforehand: what it reached is kept beside its seconds."""
 
 from __future__ import annotations
 
@@ -6,14 +6,10 @@ import math
 import time
 import tracemalloc
 from collections.abc import Callable, Mapping
-from typing import Any, TypeVar
-
-import pytest
-from pytest_benchmark.fixture import BenchmarkFixture
+from dataclasses import dataclass, field
+from typing import Any
 
 from vibench.timing import calibration, timed
-
-T = TypeVar("T")
 
 PASSES = 5
 """Passes over all benchmarks, minutes apart: rounds in succession do not see how a machine changes meanwhile."""
@@ -27,32 +23,19 @@ SHORTEST = 2e-3
 TRACED = 0.2
 """Seconds up to which the peak of the memory is traced, in a run of its own: tracing slows down."""
 
+TIMER = time.process_time
+"""CPU seconds: whoever else uses the machine counts less."""
+
 Info = Mapping[str, Any]
 """What is kept of a benchmark: figures of its size; under "accuracy", those that should be small."""
 
-MARKS = [
-    pytest.mark.benchmark(timer=time.process_time),  # CPU seconds: whoever else uses the machine counts less
-    pytest.mark.filterwarnings("default", "ignore:Benchmark fixture was not used"),  # plugins may warn, or fail
-]
-"""For `pytestmark` of every file of benchmarks."""
 
+@dataclass(frozen=True)
+class Timing:
+    """Some work to be timed.
 
-def measure(
-    benchmark: BenchmarkFixture,
-    group: str,
-    work: Callable[..., T],
-    judge: Callable[[T], Info],
-    fresh: Callable[[], Any] | None = None,
-    together: int = 1,
-) -> None:
-    """Do some work once to judge it, then, timed, as often as fits into `--benchmark-max-time`, within limits.
-
-    That time is for all passes. The first one judges; later ones only time, and not what is slow.
-
-    Parameters
+    Attributes
     ----------
-    benchmark
-        The fixture.
     group
         The table to list it in.
     work
@@ -64,26 +47,76 @@ def measure(
     together
         How many calls in succession make a round, because each does something else.
     """
-    given = (lambda: (fresh(),)) if fresh else tuple
-    budget = float(benchmark._max_time)
-    result, first = timed(lambda: work(*given()))
-    seconds = first.wall
-    benchmark.group = group
-    if benchmark.extra_info["pass"] == 0:
-        benchmark.extra_info.update(plain(judge(result)))
+
+    group: str
+    work: Callable[..., Any]
+    judge: Callable[[Any], Info]
+    fresh: Callable[[], Any] | None = None
+    together: int = 1
+
+    def given(self) -> tuple[Any, ...]:
+        """The arguments of a call."""
+        return () if self.fresh is None else (self.fresh(),)
+
+
+@dataclass(frozen=True)
+class PassTimes:
+    """One pass of a benchmark.
+
+    Attributes
+    ----------
+    group
+        The table to list it in.
+    seconds
+        CPU seconds of a call, for every round.
+    calls
+        Calls in a round.
+    calibration
+        CPU seconds of fixed work beside it.
+    slow
+        Whether one pass is all that it takes.
+    info
+        What the first pass has reached.
+    """
+
+    group: str
+    seconds: tuple[float, ...]
+    calls: int
+    calibration: float
+    slow: bool = False
+    info: Info = field(default_factory=dict)
+
+
+def measure(timing: Timing, budget: float, *, first: bool) -> PassTimes:
+    """Do some work once, and time it as often as fits into its share of a budget of seconds for all passes.
+
+    The first pass judges; later ones only time, and not what is slow.
+    """
+    info: dict[str, Any] = {}
+    result, once = timed(lambda: timing.work(*timing.given()))
+    seconds, slow = once.wall, False
+    if first:
+        info.update(plain(timing.judge(result)))
         if seconds <= TRACED:
-            benchmark.extra_info["peak_memory_mib"] = peak_memory(work, given())
-        if first.cpu < SLOW * budget:
-            again = timed(lambda: work(*given()))[1]  # the first call may have imported something
-            first, seconds = again, min(seconds, again.wall)
-        benchmark.extra_info["slow"] = first.cpu >= SLOW * budget
-    rounds, calls = _how_often(seconds, budget / PASSES, together)
+            info["peak_memory_mib"] = peak_memory(timing.work, timing.given())
+        if once.cpu < SLOW * budget:
+            once = timed(lambda: timing.work(*timing.given()))[1]  # the first call may have imported something
+            seconds = min(seconds, once.wall)
+        slow = once.cpu >= SLOW * budget
+    rounds, calls = _how_often(seconds, budget / PASSES, timing.together)
+    calls = 1 if timing.fresh else calls
     before = calibration().seconds().cpu
-    if fresh:
-        benchmark.pedantic(work, setup=lambda: (given(), {}), rounds=rounds)  # type: ignore[no-untyped-call]
-    else:
-        benchmark.pedantic(work, rounds=rounds, iterations=calls)  # type: ignore[no-untyped-call]
-    benchmark.extra_info["calibration_s"] = (before + calibration().seconds().cpu) / 2.0
+    times = tuple(_round(timing, calls) for _ in range(rounds))
+    return PassTimes(timing.group, times, calls, (before + calibration().seconds().cpu) / 2.0, slow, info)
+
+
+def _round(timing: Timing, calls: int) -> float:
+    """CPU seconds of a call in one round."""
+    work, given = timing.work, timing.given()
+    begin = TIMER()
+    for _ in range(calls):
+        work(*given)
+    return (TIMER() - begin) / calls
 
 
 def _how_often(seconds: float, budget: float, together: int) -> tuple[int, int]:

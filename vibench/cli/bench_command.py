@@ -66,23 +66,21 @@ def _timed(
     plugins: list[str], out: Path | None, resolutions: list[str], study: str, seconds: float
 ) -> tuple[Timed, int]:
     """What was timed, kept in a file if asked to, and how many benchmarks failed."""
-    from vibench.benchmarks import cases, comparison, elsewhere
+    from vibench.benchmarks import cases, comparison, running
     from vibench.files import write_atomically
 
-    elsewhere.check_installed()
-    chosen = cases.chosen(plugins)
-    cases.check_resolutions(resolutions)
-    cases.setting(study)
+    running.check_installed()
+    setting, chosen = cases.setting(study), cases.chosen_plugins(plugins)
+    benchmarks = running.planned(chosen, cases.resolutions(resolutions), setting)
     if out is not None and not out.absolute().parent.is_dir():
         raise RequestError(f"'{out}' cannot be written: '{out.absolute().parent}' is not a folder")
-    request = elsewhere.Request(chosen, resolutions, study, seconds)
-    outcome = elsewhere.run(request, _tell)
+    outcome = running.run_benchmarks(benchmarks, setting, seconds, _tell)
     if out is not None:
         try:
             write_atomically(out, outcome.content)
         except OSError as error:
             raise RequestError(f"'{out}' cannot be written: {error.strerror}") from None
-    reasons = list(outcome.skipped.values())
+    reasons = list(outcome.left_out.values())
     for reason in dict.fromkeys(reasons):
         _tell(f"{reasons.count(reason)} benchmarks left out: {reason}")
     return comparison.parsed(outcome.content), len(outcome.failed)

@@ -20,8 +20,7 @@ from vibench.study.spec import Limits
 class WatchedWork(PiecewiseStage, Pieces):
     """Items of work; a subclass says how many `pieces` there are, and how one is done.
 
-    It is sent to the process that does the items; what they share is a cached property there. The value of an item that
-    raises an exception, exceeds its time limit or ends the process is `lost`, by default the `Failed` that says why.
+    It is sent to the process that does the items; what they share is a cached property there.
     """
 
     label = "work"
@@ -29,6 +28,10 @@ class WatchedWork(PiecewiseStage, Pieces):
     @abstractmethod
     def do(self, number: int, done: Mapping[int, Any]) -> Any:
         """The value of an item; `done` has those of the items before it, also where another process did them."""
+
+    def instead(self, number: int, failed: Failed) -> Any:  # noqa: ARG002
+        """The value of an item that raised an exception, exceeded its time limit or ended the process."""
+        return failed
 
     @cached_property
     def _done(self) -> dict[int, Any]:
@@ -48,9 +51,10 @@ class WatchedWork(PiecewiseStage, Pieces):
         self._done[number] = self.do(number, self._done)
         return self._done[number]
 
-    def lost(self, number: int, failed: Failed) -> Any:  # noqa: ARG002
-        """Why there is no value."""
-        return failed
+    def lost(self, number: int, failed: Failed) -> Any:
+        """Keep what stands for the value of an item that failed."""
+        self._done[number] = self.instead(number, failed)
+        return self._done[number]
 
     def finish(self, pieces: Sequence[Any]) -> list[Any]:
         """The values of all items."""

@@ -79,7 +79,7 @@ class Examination(WatchedWork):
         """Make one check."""
         return self.conformance.checks[number].result(self._case, done.values())
 
-    def lost(self, number: int, failed: Failed) -> CheckResult:
+    def instead(self, number: int, failed: Failed) -> CheckResult:
         """The check fails; one that was not begun for lack of time is skipped."""
         name, late = self.conformance.checks[number].name, failed.status is Status.TIMEOUT
         return CheckResult(name, Verdict.SKIPPED, LATE) if late else CheckResult(name, Verdict.FAILED, failed.reason)
