@@ -24,7 +24,7 @@ from threadpoolctl import threadpool_limits
 from vibench.cli import start
 from vibench.results.sqlite.reading import FILE
 from vibench.storage.artefacts import CACHE_VARIABLE
-from vibench.study import entry_points, registry
+from vibench.study import registry
 
 settings.register_profile("any machine", deadline=None)
 settings.load_profile("any machine")
@@ -93,9 +93,8 @@ def register(monkeypatch: pytest.MonkeyPatch) -> Iterator[Register]:
     """Function that makes entry points, given as (group, name, value), the only ones there are."""
 
     def forget() -> None:
-        entry_points._readable.cache_clear()
-        registry._registered.cache_clear()
-        registry.code.cache_clear()
+        registry._readable.cache_clear()
+        registry.registered.cache_clear()
 
     def replace(*entries: tuple[str, str, str]) -> None:
         found = [EntryPoint(name=name, group=group, value=value) for group, name, value in entries]

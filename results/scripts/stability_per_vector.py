@@ -19,6 +19,7 @@ from vibench.reduction.pod import pod
 from vibench.reduction.supremizers import constraint_classes, isometric_supremizers, projected_supremizers
 from vibench.stability.infsup import beta_span, multipliers
 from vibench.study import registry
+from vibench.study.kinds import PluginKind
 
 DIMENSIONS = {"hertz": (46, 12), "obstacle": (45, 50)}
 """Prescribed N and R: for Hertz those of the paper, for the obstacle about those of δ_POD = 1e-4 and δ = 1e-2."""
@@ -56,7 +57,7 @@ def conditions(name: str, size: int, lam: Array, W: InnerProduct) -> list[dict[s
     """One row for every dual strategy."""
     given = registry.create("dual strategy", "cpg", {}).reduce(lam, W, Stop(size=size)).generators
     rows: list[dict[str, object]] = []
-    for dual in registry.names("dual strategy"):
+    for dual in registry.registered(PluginKind.DUAL):
         cone = registry.create("dual strategy", dual, {}).reduce(lam, W, Stop(size=size))
         gram = W.gram(cone.generators, cone.generators)
         rows.append(

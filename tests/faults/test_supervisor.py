@@ -23,8 +23,9 @@ from vibench.execution.supervisor import Begun, Job, StoppedError, Supervisor
 from vibench.qp.status import Status
 from vibench.stages.base import Done, Failed, Stage, Unstored
 from vibench.storage.artefacts import Store
-from vibench.study import registry
+from vibench.study.kinds import PROBLEM
 from vibench.study.plugin import Plugin
+from vibench.study.registry import find
 
 Run = Callable[..., "Done | Failed | Unstored"]
 
@@ -175,7 +176,7 @@ def sleepers(seconds: int) -> list[str]:
 
 def test_a_plugin_that_is_not_the_one_planned_with_is_refused(run: Run) -> None:
     """Its result would be stored under the hash of the other."""
-    known = Plugin("problem", "obstacle", "{}", registry.code("problem", "obstacle"))
+    known = Plugin("problem", "obstacle", "{}", find(PROBLEM, "obstacle").code)
     assert isinstance(run(OfAPlugin(OfAPlugin(problem=known))), Done)
     other = replace(known, code="older")
     found = run(OfAPlugin(OfAPlugin(problem=other)))

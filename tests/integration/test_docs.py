@@ -30,11 +30,11 @@ import vibench
 from vibench.cli.main import app
 from vibench.errors import RequestError
 from vibench.results import columns, tables
-from vibench.study import entry_points, registry
+from vibench.study import registry
 from vibench.study.entries import Entry, ProblemEntry, SamplingEntry
+from vibench.study.kinds import STUDY, PluginKind
 from vibench.study.matrix import expand
 from vibench.study.reader import read_study
-from vibench.study.registry import GROUPS
 from vibench.study.spec import Limits, Study, ToleranceTable
 from vibench.testing import check_figure, check_problem
 
@@ -96,9 +96,8 @@ def importable(package: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]
     for name in [name for name in sys.modules if name.split(".")[0] == "vibench_mine"]:
         del sys.modules[name]
     for known in (
-        entry_points._readable,
-        registry._registered,
-        registry.code,
+        registry._readable,
+        registry.registered,
     ):
         known.cache_clear()
 
@@ -130,7 +129,7 @@ def test_the_torsion_problem_of_the_pages_takes_some_thirty_lines(package: Path)
 
 def test_the_package_of_the_pages_has_a_plugin_of_every_kind(package: Path) -> None:
     project = tomllib.loads((package / "pyproject.toml").read_text())["project"]
-    assert {*project["entry-points"], GROUPS["study"]} == set(GROUPS.values())
+    assert {*project["entry-points"], STUDY.entry_points} == {kind.entry_points for kind in PluginKind}
 
 
 @pytest.mark.usefixtures("importable")
@@ -330,7 +329,7 @@ NAME = re.compile(r"`vibench\.(\w+(?:\.\w+)*)`")
 def test_every_module_and_name_on_a_page_exists(page: Path) -> None:
     text = page.read_text(encoding="utf-8")
     assert [path for path in MODULE.findall(text) if not (ROOT / path).is_file()] == []
-    groups = {group.removeprefix("vibench.") for group in GROUPS.values()}
+    groups = {kind.entry_points.removeprefix("vibench.") for kind in PluginKind}
     for name in set(NAME.findall(text)) - groups:
         assert pkgutil.resolve_name(f"vibench.{name}") is not None
 

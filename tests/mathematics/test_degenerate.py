@@ -16,9 +16,10 @@ from vibench.stages.base import value_of
 from vibench.stages.cell_queries import CellQueries, CellRows
 from vibench.stages.enrichment import SingleEnrichment
 from vibench.stages.offline import ConeStage, PODStage
-from vibench.study import registry
+from vibench.study.kinds import PROBLEM
 from vibench.study.parameter_sets import ParameterSet
 from vibench.study.plugin import Plugin
+from vibench.study.registry import find
 
 
 class NoContact(Wire):
@@ -112,7 +113,7 @@ def rows(register, store):
     register(*EVERYTHING)
 
     def run(case: type[Wire], dual: str, primal: str) -> CellRows:
-        problem = Plugin("problem", case.__name__, "{}", registry.code("problem", case.__name__))
+        problem = Plugin("problem", case.__name__, "{}", find(PROBLEM, case.__name__).code)
         stop = Stop(tolerance=1e-3 if dual == "nmf" else 1e-6)  # an iteration, which ends long before round-off
         cone = ConeStage(problem, Plugin("dual strategy", dual, "{}", "test"), stop)
         tolerance = None if primal in {"decorrelated", "online-supremizers"} else 0.5

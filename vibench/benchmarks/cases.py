@@ -8,8 +8,9 @@ from dataclasses import dataclass
 from vibench.errors import RequestError, unknown_name
 from vibench.interfaces.strategies import Stop
 from vibench.qp.solve import installed_solvers
-from vibench.study import registry
+from vibench.study.kinds import CHECKED, PRIMAL, PROBLEM
 from vibench.study.reader import read_study
+from vibench.study.registry import find, registered
 
 Resolution = str | int
 """A name that a problem knows, or a number of nodes."""
@@ -120,7 +121,7 @@ def at_resolutions(problem: str, wanted: Sequence[Resolution]) -> list[TimedProb
 def knows(problem: str, resolution: Resolution) -> bool:
     """Whether a problem has such a resolution; one that cannot be loaded has none."""
     try:
-        registry.check_options("problem", problem, {"resolution": resolution})
+        find(PROBLEM, problem).check_options({"resolution": resolution})
     except RequestError:
         return False
     return True
@@ -129,7 +130,7 @@ def knows(problem: str, resolution: Resolution) -> bool:
 def takes_no_option(problem: str) -> bool:
     """Whether a problem needs no option, as a folder; one that cannot be loaded counts, its case then fails."""
     try:
-        return all(option.default for option in registry.options("problem", problem))
+        return all(option.default for option in find(PROBLEM, problem).options)
     except RequestError:
         return True
 
@@ -141,7 +142,7 @@ def at_tolerances(names: Iterable[str]) -> list[PrimalChoice]:
 
 def _tolerances(primal: str) -> tuple[float | None, ...]:
     try:
-        return TOLERANCES if registry.load("primal strategy", primal).takes_tolerance else (None,)
+        return TOLERANCES if find(PRIMAL, primal).load().takes_tolerance else (None,)
     except RequestError:  # its benchmarks fail, and say why
         return (None,)
 
@@ -158,7 +159,7 @@ def chosen_plugins(plugins: Sequence[str]) -> dict[str, list[str]]:
     RequestError
         If there is no such plugin, several have the name, or a solver is not installed.
     """
-    known = {word: registry.names(registry.WORDS[word]) for word in TIMED}
+    known = {word: list(registered(CHECKED[word])) for word in TIMED}
     known["solver"] = installed_solvers(known["solver"])
     chosen: dict[str, list[str]] = {}
     for plugin in plugins:
@@ -169,7 +170,7 @@ def chosen_plugins(plugins: Sequence[str]) -> dict[str, list[str]]:
             choices = " or ".join(f"{word}:{plugin}" for word in words)
             raise RequestError(f"several plugins are called '{plugin}': say {choices}")
         if not words or words[0] not in known or name not in known[words[0]]:
-            kind = registry.WORDS.get(words[0], "plugin") if words else "plugin"
+            kind = CHECKED.get(words[0], "plugin") if words else "plugin"
             choices_of = known.get(words[0], []) if words else [one for names in known.values() for one in names]
             raise unknown_name(kind, name, choices_of or known)
         if words[0] == "problem" and not takes_no_option(name):
@@ -188,6 +189,6 @@ def resolutions(texts: Sequence[str]) -> list[Resolution]:
     """
     wanted: list[Resolution] = [int(text) if text.isdigit() else text for text in texts]
     for resolution in wanted:
-        if not any(knows(problem, resolution) for problem in registry.names("problem")):
+        if not any(knows(problem, resolution) for problem in registered(PROBLEM)):
             raise RequestError(f"no problem has the resolution {str(resolution)!r}")
     return wanted

@@ -20,7 +20,8 @@ from vibench.model.affine import AffineMember, affine_decomposition
 from vibench.model.errors import ReferenceSolutions
 from vibench.offline.reduction import Reduction, Snapshots, high_fidelity_sweep
 from vibench.reduction.pod import pod
-from vibench.study import registry
+from vibench.study.kinds import DUAL, PRIMAL, PROBLEM
+from vibench.study.registry import find
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -83,7 +84,7 @@ class StageInputs:
     @_once
     def problem(self) -> Problem:
         """The problem."""
-        created: Problem = registry.create("problem", self.case.problem, self.case.options)
+        created: Problem = find(PROBLEM, self.case.problem).create(self.case.options)
         return created
 
     @property
@@ -120,8 +121,8 @@ class StageInputs:
 
         `given()` makes the same reduction anew, whose models have nothing in store from earlier queries.
         """
-        dual = registry.create("dual strategy", spaces.dual, {})
-        strategy = None if primal is None else registry.create("primal strategy", primal.name, {})
+        dual = find(DUAL, spaces.dual).create({})
+        strategy = None if primal is None else find(PRIMAL, primal.name).create({})
         reduction = Reduction(
             self.problem,
             dual,

@@ -32,7 +32,8 @@ from vibench.errors import VibenchError
 from vibench.execution.watched import WatchedWork, watched
 from vibench.qp.solve import installed_solvers
 from vibench.stages.base import Failed
-from vibench.study import registry
+from vibench.study.kinds import DUAL, PRIMAL, PROBLEM, SOLVER
+from vibench.study.registry import registered
 
 
 @dataclass(frozen=True)
@@ -63,20 +64,20 @@ def planned(
     Parameters
     ----------
     chosen
-        Names of plugins by the word for their kind (`registry.WORDS`). Problems that are needed and not named are those
+        Names of plugins by the word for their kind (`kinds.CHECKED`). Problems that are needed and not named are those
         of the setting.
     resolutions
         Resolutions at which problems are timed that know them; QP solvers at the first of these alone.
     setting
         What completes what is timed.
     """
-    every = setting.problems if chosen else filter(takes_no_option, registry.names("problem"))
+    every = setting.problems if chosen else filter(takes_no_option, registered(PROBLEM))
     cases = [at_resolutions(name, resolutions) for name in chosen.get("problem", every)]
     choices: dict[str, Sequence[Any]] = {
         "size": SIZES,
-        "dual": chosen.get("dual", registry.names("dual strategy")),
-        "primal": at_tolerances(chosen.get("primal", registry.names("primal strategy"))),
-        "solver": chosen.get("solver", installed_solvers(registry.names("QP solver"))),
+        "dual": chosen.get("dual", [*registered(DUAL)]),
+        "primal": at_tolerances(chosen.get("primal", [*registered(PRIMAL)])),
+        "solver": chosen.get("solver", installed_solvers(registered(SOLVER))),
         "accuracy": ACCURACIES,
     }
     benchmarks = []

@@ -23,7 +23,8 @@ from vibench.offline.models import AnyReducedModel
 from vibench.qp.solve import solve_qp
 from vibench.qp.verification import QPSolution
 from vibench.reduction.pod import pod
-from vibench.study import registry
+from vibench.study.kinds import DUAL, PRIMAL
+from vibench.study.registry import find, qp_solver
 
 SOLVER, ACCURACY = "piqp", 1e-10
 """Of complete queries."""
@@ -66,7 +67,7 @@ def time_pod(inputs: StageInputs) -> Timing:
 def time_cone(inputs: StageInputs, dual: str) -> Timing:
     """A cone by one dual strategy."""
     W, lam, stop = inputs.problem.W, inputs.snapshots.lam, inputs.usual.generators
-    strategy = registry.create("dual strategy", dual, {})
+    strategy = find(DUAL, dual).create({})
 
     def judge(cone: Cone) -> Info:
         return reached.of_cone(inputs, check_cone(cone, W))
@@ -76,7 +77,7 @@ def time_cone(inputs: StageInputs, dual: str) -> Timing:
 
 def time_enrichment(inputs: StageInputs, primal: PrimalChoice) -> Timing:
     """An enrichment by one primal strategy."""
-    reduction, strategy = inputs.reduction(inputs.usual), registry.create("primal strategy", primal.name, {})
+    reduction, strategy = inputs.reduction(inputs.usual), find(PRIMAL, primal.name).create({})
     offline = reduction.offline
 
     def judge(enrichment: Enrichment) -> Info:
@@ -162,7 +163,7 @@ def _in_turn(inputs: StageInputs) -> Iterator[Array]:
 
 def time_solver(inputs: StageInputs, size: Size, solver: str, accuracy: float) -> Timing:
     """One reduced program, solved to an accuracy."""
-    registered = registry.qp_solver(solver)
+    registered = qp_solver(solver)
     spaces = _spaces(inputs, size)
     N, R = inputs.dimensions(spaces)
     smaller = SIZES[: SIZES.index(size)]

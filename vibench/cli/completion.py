@@ -18,7 +18,7 @@ import typer
 
 from vibench.errors import VibenchError
 from vibench.results.columns import TABLES
-from vibench.study.kinds import CHECKED, KINDS
+from vibench.study.kinds import CHECKED, SOLVER, STUDY, PluginKind
 
 SHOWN = ("summary", "best", "benefits", *TABLES)
 """Tables that `vibench show` prints."""
@@ -129,36 +129,31 @@ def words(known: Callable[[], Iterable[str]]) -> Callable[[str], list[str]]:
     return complete
 
 
-def names(*groups: str) -> Callable[[str], list[str]]:
-    """Completes names of plugins in groups of entry points: "problems" stands for `vibench.problems`."""
-    return words(lambda: _registered(*groups))
+def names(*kinds: PluginKind) -> Callable[[str], list[str]]:
+    """Completes names of plugins of some kinds."""
+    return words(lambda: _registered(*kinds))
 
 
 def plugins(incomplete: str) -> list[str]:
     """Completes names of plugins, alone or with their kind before them: "primal:NAME", "solver:NAME"."""
     kind, colon, name = incomplete.partition(":")
     if not colon:
-        return _beginning(incomplete, [*_registered(*GROUPS.values()), *(f"{kind}:" for kind in GROUPS)])
-    known = solvers(name) if kind == "solver" else _registered(GROUPS[kind]) if kind in GROUPS else ()
-    return _beginning(incomplete, (f"{kind}:{found}" for found in known))
+        return _beginning(incomplete, [*_registered(*CHECKED.values()), *(f"{kind}:" for kind in CHECKED)])
+    offered = solvers(name) if kind == "solver" else _registered(CHECKED[kind]) if kind in CHECKED else ()
+    return _beginning(incomplete, (f"{kind}:{one}" for one in offered))
 
 
 def plugin_options(context: typer.Context, incomplete: str) -> list[str]:
     """Completes the options of the plugin named before, as "resolution=", without importing it."""
-    from vibench.cli import overview
-    from vibench.study.entry_points import entry_points
+    from vibench.study.registry import find
 
-    kind, colon, name = (context.params.get("plugin") or "".join(context.args[:1])).rpartition(":")
-    groups = [GROUPS[kind]] if kind in GROUPS else [] if colon else GROUPS.values()
-    entries = (entry for group in groups for entry in entry_points(group=f"vibench.{group}") if entry.name == name)
-    found = {option for entry in entries for option in overview.options(entry)}
-    return _beginning(incomplete, (f"{option}=" for option in found))
+    word, colon, name = (context.params.get("plugin") or "".join(context.args[:1])).rpartition(":")
+    kinds = [CHECKED[word]] if word in CHECKED else [] if colon else CHECKED.values()
+    options = {option for kind in kinds for option in find(kind, name).names_of_options}
+    return _beginning(incomplete, (f"{option}=" for option in options))
 
 
-GROUPS = {kind.word: kind.group for kind in CHECKED}
-"""Groups of entry points by the word that `vibench check` knows them by."""
-
-lists = words(lambda: (kind.listed for kind in KINDS))
+lists = words(lambda: (kind.plural for kind in PluginKind))
 table_names = words(lambda: SHOWN)
 
 
@@ -166,14 +161,14 @@ def studies(incomplete: str) -> list[str]:
     """Completes registered studies, and study files in the current folder or in the folder of the word."""
     folder, slash, _ = incomplete.rpartition("/")
     files = (f"{folder}{slash}{path.name}" for path in Path(folder + slash).glob("*.toml"))
-    return sorted([*_beginning(incomplete, _registered("studies")), *_beginning(incomplete, files)])
+    return sorted([*_beginning(incomplete, _registered(STUDY)), *_beginning(incomplete, files)])
 
 
 def solvers(incomplete: str) -> list[str]:
     """Completes QP solvers, installed or not."""
     from vibench.qp.settings import SETTINGS
 
-    return _beginning(incomplete, {*SETTINGS, *_registered("qp_solvers")})
+    return _beginning(incomplete, {*SETTINGS, *_registered(SOLVER)})
 
 
 def runs(incomplete: str) -> list[str]:
@@ -222,11 +217,10 @@ def error_measures(incomplete: str) -> list[str]:
 cell_columns = words(lambda: TABLES["cells"])
 
 
-def _registered(*groups: str) -> set[str]:
-    """Names in the entry points themselves: `vibench.study.registry` would import SciPy and pydantic."""
-    from vibench.study.entry_points import entry_points
+def _registered(*kinds: PluginKind) -> set[str]:
+    from vibench.study.registry import registered
 
-    return {entry.name for group in groups for entry in entry_points(group=f"vibench.{group}")}
+    return {name for kind in kinds for name in registered(kind)}
 
 
 def _beginning(word: str, known: Iterable[str]) -> list[str]:

@@ -30,9 +30,9 @@ from vibench.qp.settings import SETTINGS
 from vibench.qp.solve import installed_solvers
 from vibench.qp.status import Status
 from vibench.storage.artefacts import CACHE_VARIABLE, LOCK, Store, default_folder
-from vibench.study import registry
-from vibench.study.entry_points import unreadable
+from vibench.study.kinds import SOLVER, STUDY, PluginKind
 from vibench.study.reader import read_study
+from vibench.study.registry import RegisteredPlugin, find, registered, unreadable
 from vibench.terminal.console import new_console, shown
 from vibench.terminal.output import echo
 from vibench.timing import DISTURBED, WAITED, Calibration, Stopwatch
@@ -115,10 +115,9 @@ def requirements() -> dict[str, list[str]]:
 
 def solvers() -> Iterator[Finding]:
     """All known QP solvers; the installed ones solve a small program each."""
-    extra = registry.names("QP solver")
-    trials = solver_trials(wire(), ACCURACY, installed_solvers(extra))
-    for name in sorted({*SETTINGS, *extra}):
-        version = provenance.solver_version(name) if name in SETTINGS else registry.version("QP solver", name)
+    trials = solver_trials(wire(), ACCURACY, installed_solvers(registered(SOLVER)))
+    for name in sorted({*SETTINGS, *registered(SOLVER)}):
+        version = provenance.solver_version(name) if name in SETTINGS else find(SOLVER, name).origin
         if name not in trials:
             yield _unavailable(name, version)
         elif (trial := trials[name]).status is Status.OK and trial.residuals is not None:
@@ -154,24 +153,24 @@ def _unavailable(solver: str, version: str) -> Finding:
 
 def plugins() -> Iterator[Finding]:
     """The plugins of each kind that load, and the errors of those that do not."""
-    for kind in registry.GROUPS:
-        names = registry.names(kind)
-        errors = {name: error for name in names if (error := _load_error(kind, name))}
-        yield Finding(kind, ", ".join(name for name in names if name not in errors) or "none")
+    for kind in PluginKind:
+        errors = {name: error for name, plugin in registered(kind).items() if (error := _load_error(plugin))}
+        yield Finding(kind, ", ".join(name for name in registered(kind) if name not in errors) or "none")
         for name, error in errors.items():
-            yield Finding(f"{kind} '{name}'", f"{error} (from {registry.version(kind, name)})", Health.BROKEN)
+            plugin = find(kind, name)
+            yield Finding(str(plugin), f"{error} (from {plugin.origin})", Health.BROKEN)
     yield from (Finding(name, reason, Health.BROKEN) for name, reason in unreadable().items())
 
 
-def _load_error(kind: str, name: str) -> str:
+def _load_error(plugin: RegisteredPlugin) -> str:
     """The error that loading a plugin ends with; "" if it loads."""
     try:
-        if kind == "study":
-            read_study(name)
+        if plugin.kind is STUDY:
+            read_study(plugin.name)
+        elif plugin.kind is SOLVER:
+            plugin.load()
         else:
-            registry.load(kind, name)
-            if kind != "QP solver":
-                registry.options(kind, name)
+            plugin.options  # noqa: B018  loads it and evaluates its annotations
     except RequestError as error:
         return str(error)
     except Exception as error:  # noqa: BLE001  annotations of plugins are evaluated

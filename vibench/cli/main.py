@@ -33,6 +33,7 @@ from vibench.cli.result_commands import (
     write_report,
 )
 from vibench.errors import RequestError, VibenchError
+from vibench.study.kinds import DUAL, PRIMAL, PROBLEM
 from vibench.terminal.output import echo, warn
 from vibench.text import unbroken
 
@@ -83,12 +84,10 @@ def run(
     ] = "quick",
     cell: Annotated[str, Option(metavar="KEY", help="Run one cell alone, by its key or the beginning of that.")] = "",
     problem: Annotated[
-        Names, Option(help="Replace the problems of the study (repeatable).", autocompletion=names("problems"))
+        Names, Option(help="Replace the problems of the study (repeatable).", autocompletion=names(PROBLEM))
     ] = None,
-    dual: Annotated[Names, Option(help="Replace the dual strategies.", autocompletion=names("dual_strategies"))] = None,
-    primal: Annotated[
-        Names, Option(help="Replace the primal strategies.", autocompletion=names("primal_strategies"))
-    ] = None,
+    dual: Annotated[Names, Option(help="Replace the dual strategies.", autocompletion=names(DUAL))] = None,
+    primal: Annotated[Names, Option(help="Replace the primal strategies.", autocompletion=names(PRIMAL))] = None,
     solver: Annotated[Names, Option(help="Replace the QP solvers.", autocompletion=solvers)] = None,
     pod_tol: Annotated[Tolerances, Option(help="Replace the tolerances (or sizes) of the POD.")] = None,
     dual_tol: Annotated[Tolerances, Option(help="Replace the tolerances (or sizes) of the dual strategies.")] = None,

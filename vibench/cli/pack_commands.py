@@ -13,6 +13,7 @@ from vibench.cli.completion import names
 from vibench.cli.plugin_commands import key_value
 from vibench.errors import NumericalError
 from vibench.files import write_atomically
+from vibench.study.kinds import DUAL, PROBLEM
 from vibench.terminal.output import echo
 
 if TYPE_CHECKING:
@@ -36,7 +37,7 @@ def import_pack(folder: Folder) -> None:
 
 
 def write_pack(
-    problem: Annotated[str, Argument(help="A registered problem.", autocompletion=names("problems"))],
+    problem: Annotated[str, Argument(help="A registered problem.", autocompletion=names(PROBLEM))],
     folder: Annotated[Path, Argument(metavar="FOLDER", help="Folder to be made.")],
     option: Annotated[list[str] | None, Option(metavar="KEY=VALUE", help="Option of the problem (repeatable).")] = None,
     validation: Annotated[int, Option(min=1, help="Number of validation parameters.")] = 64,
@@ -48,12 +49,12 @@ def write_pack(
     Members that the problem declares constant are written once, the others at every training and validation parameter.
     """
     from vibench.packs import writer
-    from vibench.study import registry
+    from vibench.study.registry import find
 
-    created = registry.create("problem", problem, dict(map(key_value, option or [])))
-    origin = f"problem '{problem}' of {registry.version('problem', problem)}"
+    plugin = find(PROBLEM, problem)
+    created, source = plugin.create(dict(map(key_value, option or []))), f"{plugin} of {plugin.origin}"
     writer.write_pack(
-        created, folder, name=problem, source=origin, validation=validation, seed=seed, solutions=solutions
+        created, folder, name=problem, source=source, validation=validation, seed=seed, solutions=solutions
     )
     echo(f"{folder}: the problem '{problem}' at {len(created.training_set())} training and {validation} validation "
          f"parameters (seed {seed})", f"  vibench import {folder}")  # fmt: skip
@@ -62,7 +63,7 @@ def write_pack(
 def reduce_cones(
     folder: Folder,
     dual: Annotated[
-        list[str] | None, Option(help="Dual strategies; all by default.", autocompletion=names("dual_strategies"))
+        list[str] | None, Option(help="Dual strategies; all by default.", autocompletion=names(DUAL))
     ] = None,
     dual_tol: Annotated[float, Option(min=1e-12, max=1.0, help="Tolerance of the cones.")] = 1e-2,
     out: Annotated[Path, Option(metavar="DIR", help="Folder of the table and the figure.")] = Path("cones"),
@@ -80,17 +81,17 @@ def reduce_cones(
     from vibench.report.figures.convergence import cone_errors
     from vibench.report.figures.style import save, styled
     from vibench.results.tables import to_csv
-    from vibench.study import registry
+    from vibench.study.registry import find, registered
     from vibench.terminal.console import print_frame
 
     pack = read_model_pack(folder)
     with naming(folder):
         pack_multipliers(pack)
-    wanted = dual or [name for name in registry.names("dual strategy") if not registry.missing("dual strategy", name)]
+    wanted = dual or [name for name, plugin in registered(DUAL).items() if not plugin.missing]
     rows, errors = [], {}
     for name in wanted:
         try:
-            found = reduce_multipliers(pack, registry.create("dual strategy", name, {}), dual_tol)
+            found = reduce_multipliers(pack, find(DUAL, name).create({}), dual_tol)
         except NumericalError as error:
             echo(f"failed: {name}: {error}")
             continue

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,39 +13,44 @@ from typer import Argument, Exit, Option
 
 from vibench.cli.completion import lists, plugin_options, plugins, runs
 from vibench.errors import RequestError, VibenchError, in_a_line, unknown_name
-from vibench.study.kinds import CHECKED, FIGURE, KINDS, SOLVER, STUDY
+from vibench.study.kinds import CHECKED, FIGURE, PROBLEM, SAMPLING, SOLVER, STUDY, PluginKind
 from vibench.terminal.output import echo
 from vibench.text import parsed_json
 
-LISTS = {kind.listed: kind.title for kind in KINDS if kind is not SOLVER}
+LISTS = {kind.plural: kind for kind in PluginKind}
 """Kind of plugin that each list shows; QP solvers are listed whether they are plugins or not."""
 
 HEADINGS = ("name", "from", "what", "options")
 
+Row = tuple[str, str, str, str]
+
 if TYPE_CHECKING:
-    Word = str
+    CliName = str
 else:
-    Word = Literal[tuple(kind.word for kind in CHECKED)]
+    CliName = Literal[tuple(CHECKED)]
 
 SECONDS = 120.0
 """Default of `--seconds`: that of `vibench.testing`, which is too slow to import for a help text."""
 
 
 @dataclass(frozen=True)
-class Found:
-    """A plugin: its kind (a key of `registry.WORDS`), its name, itself, and where it is, "module:attribute"."""
+class Checked:
+    """What is to be checked: its kind, its name, the plugin itself, and where it is, "module:attribute"."""
 
-    kind: str
+    kind: PluginKind
     name: str
     plugin: Any
     reference: str
+
+    def __str__(self) -> str:
+        return f"{self.kind} '{self.name}'"
 
 
 def list_plugins(
     what: Annotated[
         str | None,
         Argument(
-            help=f"{', '.join([*LISTS][:-1])}, {[*LISTS][-1]} or {SOLVER.listed}; all of them by default.",
+            help=f"{', '.join([*LISTS][:-1])} or {[*LISTS][-1]}; all of them by default.",
             autocompletion=lists,
         ),
     ] = None,
@@ -53,20 +59,18 @@ def list_plugins(
 
     Plugins are listed with their options; a list of one kind has the values of the options, too.
     """
-    from vibench.cli import overview
-    from vibench.study.entry_points import unreadable
+    from vibench.study.registry import unreadable
     from vibench.terminal.console import print_rows
 
     if what is None:
-        for title in overview.LISTS:
-            rows = _solvers_by_version() if title == "solvers" else list(overview.rows(title))
-            print_rows(rows, HEADINGS, title)
+        for kind in PluginKind:
+            print_rows(_solvers_by_version() if kind is SOLVER else _read_rows(kind), HEADINGS, kind.plural)
         echo("", "what the options of one kind are, and whether its plugins can be loaded:")
-        echo(f"  vibench list {'|'.join(overview.LISTS)}")
-    elif what in overview.LISTS:
-        print_rows(_solver_rows() if what == "solvers" else _plugin_rows(LISTS[what]), HEADINGS, what)
+        echo(f"  vibench list {'|'.join(LISTS)}")
+    elif what in LISTS:
+        print_rows(_solver_rows() if LISTS[what] is SOLVER else _loaded_rows(LISTS[what]), HEADINGS, what)
     else:
-        raise unknown_name("list", what, overview.LISTS)
+        raise unknown_name("list", what, LISTS)
     for distribution, reason in unreadable().items():
         echo(f"{distribution}: {reason}")
 
@@ -76,7 +80,7 @@ def check_plugin(
         str,
         Argument(
             metavar="PLUGIN",
-            help=f"A name, {'|'.join(kind.word for kind in CHECKED)}:NAME, or MODULE:NAME.",
+            help=f"A name, {'|'.join(CHECKED)}:NAME, or MODULE:NAME.",
             autocompletion=plugins,
         ),
     ],
@@ -98,13 +102,13 @@ def check_plugin(
     from vibench.testing import Verdict
     from vibench.testing.processes import Examination, examine_in_process
 
-    found = _find(plugin)
-    if run is not None and found.kind != "figure":
-        raise RequestError(f"--run is for figure plugins; {_title(found)} is none")
+    checked = _find(plugin)
+    if run is not None and checked.kind is not FIGURE:
+        raise RequestError(f"--run is for figure plugins; {checked} is none")
     given = {} if run is None else {"run": str(results_file(run).resolve())}
-    options, remark = _options(found, dict(map(key_value, option or [])))
-    echo(f"{_title(found)}{remark}")
-    examination = Examination(found.kind, found.reference, options, seconds, given)
+    options, remark = _options(checked, dict(map(key_value, option or [])))
+    echo(f"{checked}{remark}")
+    examination = Examination(checked.kind.cli_name, checked.reference, options, seconds, given)
     results = examine_in_process(examination, lambda result: echo(str(result)))
     counts = {verdict: sum(result.verdict is verdict for result in results) for verdict in Verdict}
     told = (f"{count} {verdict}" for verdict, count in counts.items() if count or verdict is not Verdict.WARNING)
@@ -113,41 +117,26 @@ def check_plugin(
         raise Exit(1)
 
 
-def _title(found: Found) -> str:
-    from vibench.study.registry import WORDS
-
-    return f"{WORDS[found.kind]} '{found.name}'"
-
-
-def _options(found: Found, given: dict[str, Any]) -> tuple[dict[str, Any] | None, str]:
-    """Options of a plugin, and what its title says of them; a problem is as coarse as it can be, if not told."""
-    from vibench.study import registry
+def _options(checked: Checked, given: dict[str, Any]) -> tuple[dict[str, Any] | None, str]:
+    """Options of a plugin, and what its title says of them: those that `vibench check` chooses where none are given."""
+    from vibench.study.options import checked_arguments, options_of
     from vibench.testing.solvers import of_qpsolvers
 
-    title = _title(found)
-    if found.kind == "solver":
+    if checked.kind is SOLVER:
         if given:
-            raise RequestError(f"{title} has no options")
-        return ({"solver": found.name} if found.plugin is of_qpsolvers else None), ""
-    if found.kind == "sampling":
-        return _sampling_options(found, given)
-    options = registry.checked_arguments(found.plugin, title, given)
-    if found.kind == "problem" and "resolution" not in given:
+            raise RequestError(f"{checked} has no options")
+        return ({"solver": checked.name} if checked.plugin is of_qpsolvers else None), ""
+    if checked.kind is PROBLEM and "resolution" not in given:
         with suppress(RequestError):  # the problem has no resolution of that name
-            options = registry.checked_arguments(found.plugin, title, {"resolution": "coarse", **given})
+            options = checked_arguments(checked.plugin, str(checked), {"resolution": "coarse", **given})
             return options, ", at resolution coarse (--option resolution=… for another)"
-    return options, ""
-
-
-def _sampling_options(found: Found, given: dict[str, Any]) -> tuple[dict[str, Any], str]:
-    """Options of a sampling strategy; a size and a seed that it needs are chosen, if not told."""
-    from vibench.study import registry
-
-    needed = {option.name for option in registry.options_of(found.plugin) if not option.default}
-    chosen = {name: value for name, value in SAMPLE.items() if name in needed and name not in given}
-    options = registry.checked_arguments(found.plugin, _title(found), chosen | given)
+    chosen = {}
+    if checked.kind is SAMPLING:
+        needed = {option.name for option in options_of(checked.plugin) if not option.default}
+        chosen = {name: value for name, value in SAMPLE.items() if name in needed and name not in given}
     told = " and ".join(f"{name} = {value}" for name, value in chosen.items())
-    return options, f", with {told} (--option {next(iter(chosen))}=… for another)" if chosen else ""
+    remark = f", with {told} (--option {next(iter(chosen))}=… for another)" if chosen else ""
+    return checked_arguments(checked.plugin, str(checked), chosen | given), remark
 
 
 SAMPLE = {"size": 16, "seed": 0}
@@ -155,7 +144,7 @@ SAMPLE = {"size": 16, "seed": 0}
 
 
 def new_plugin(
-    kind: Annotated[Word, Argument(metavar="KIND", help="Kind of plugin.")],
+    kind: Annotated[CliName, Argument(metavar="KIND", help="Kind of plugin.")],
     name: Annotated[str, Argument(metavar="NAME", help="Name of the plugin: a-z, 0-9 and hyphens.")],
     out: Annotated[Path, Option(metavar="DIR", help="Folder in which the package is created.")] = Path(),
 ) -> None:
@@ -164,40 +153,49 @@ def new_plugin(
     The package passes its tests as generated. Existing files are never overwritten.
     """
     from vibench.cli import scaffold
-    from vibench.study.registry import WORDS
 
-    folder = scaffold.write_package(kind, name, out)
+    folder = scaffold.write_package(CHECKED[kind], name, out)
+    module = scaffold.module_file(folder, CHECKED[kind], name)
     echo(
-        f"{folder}: a {WORDS[kind]} called '{name}' that works as it is",
+        f"{folder}: a {CHECKED[kind]} called '{name}' that works as it is",
         f"  pip install -e {folder}",
         f"  vibench check {kind}:{name}",
-        f"the code to edit: {scaffold.module_file(folder, kind, name)}; what to do next: {folder / 'README.md'}",
+        f"the code to edit: {module}; what to do next: {folder / 'README.md'}",
     )
 
 
-def _plugin_rows(kind: str) -> list[tuple[str, str, str, str]]:
+def _read_rows(kind: PluginKind) -> Iterator[Row]:
+    """Name, origin, description and names of the options of every plugin of a kind, none of which is imported."""
+    from vibench.study.registry import registered
+
+    for name, plugin in registered(kind).items():
+        if plugin.conflict:
+            yield name, plugin.origin, f"several packages provide '{name}', so that none is used", ""
+        else:
+            yield name, plugin.origin, plugin.summary, ", ".join(plugin.names_of_options)
+
+
+def _loaded_rows(kind: PluginKind) -> Iterator[Row]:
     """Name, origin, description and options of every plugin of a kind; of one that does not load, the error."""
-    from vibench.study import registry
     from vibench.study.matrix import expand
     from vibench.study.reader import read_study
+    from vibench.study.registry import registered
 
-    rows = []
-    for name in registry.names(kind):
+    for name, plugin in registered(kind).items():
         options, columns = [], []
         try:
-            if kind == STUDY.title:
+            if kind is STUDY:
                 description = f"{len(expand(read_study(name)))} cells"
             else:
-                description = (registry.load(kind, name).__doc__ or "").strip().split("\n")[0]
-                options = registry.options(kind, name)
-            columns = _columns(name) if kind == FIGURE.title else []
+                description = (plugin.load().__doc__ or "").strip().split("\n")[0]
+                options = plugin.options
+            columns = _columns(name) if kind is FIGURE else []
         except VibenchError as error:
             description = str(error)
         except Exception as error:  # noqa: BLE001  annotations of plugins are evaluated
-            description = f"{kind} '{name}' cannot be read: {in_a_line(error)}"
+            description = f"{plugin} cannot be read: {in_a_line(error)}"
         lines = [f"{o.name}: {o.expected}" + f" = {o.default}" * bool(o.default) for o in options]
-        rows.append((name, registry.version(kind, name), description, "\n".join([*lines, *columns])))
-    return rows
+        yield name, plugin.origin, description, "\n".join([*lines, *columns])
 
 
 def _columns(name: str) -> list[str]:
@@ -210,10 +208,9 @@ def _columns(name: str) -> list[str]:
     ]
 
 
-def _solvers_by_version() -> list[tuple[str, str, str, str]]:
+def _solvers_by_version() -> list[Row]:
     """QP solvers and their versions, without loading them."""
     from vibench import provenance
-    from vibench.cli import overview
     from vibench.qp.settings import SETTINGS
 
     ours = []
@@ -221,25 +218,23 @@ def _solvers_by_version() -> list[tuple[str, str, str, str]]:
         version = provenance.solver_version(name)
         package = provenance.solver_distribution(name)
         ours.append((name, version, "" if version else f"not installed: `pip install {package}`", ""))
-    return sorted([*ours, *overview.rows("solvers")])
+    return sorted([*ours, *_read_rows(SOLVER)])
 
 
-def _solver_rows() -> list[tuple[str, str, str, str]]:
+def _solver_rows() -> Iterator[Row]:
+    """QP solvers, their versions, and whether they can be loaded."""
     from vibench import provenance
     from vibench.qp.settings import SETTINGS
     from vibench.qp.solve import installed_solvers
-    from vibench.study import registry
+    from vibench.study.registry import find, registered
 
-    plugins = registry.names("QP solver")
-    installed = installed_solvers(plugins)
-    rows = []
-    for name in sorted({*SETTINGS, *plugins}):
-        state = registry.conflict("QP solver", name) or ("installed" if name in installed else "not installed")
-        rows.append((name, provenance.solver_version(name), state, ""))
-    return rows
+    installed = installed_solvers(registered(SOLVER))
+    for name in sorted({*SETTINGS, *registered(SOLVER)}):
+        state = find(SOLVER, name).conflict or ("installed" if name in installed else "not installed")
+        yield name, provenance.solver_version(name), state, ""
 
 
-def _find(text: str) -> Found:
+def _find(text: str) -> Checked:
     """The plugin that NAME, KIND:NAME or MODULE:NAME refers to.
 
     Raises
@@ -247,69 +242,57 @@ def _find(text: str) -> Found:
     RequestError
         If there is no such plugin, or several.
     """
-    from vibench.study.registry import WORDS, load, reference
+    from vibench.qp.solve import installed_solvers
+    from vibench.study.registry import find, registered
+    from vibench.testing.solvers import of_qpsolvers
 
     prefix, colon, rest = text.partition(":")
-    if colon and prefix not in WORDS:
+    if colon and prefix not in CHECKED:
         return _find_object(prefix, rest)
-    name = rest if colon else text
-    kinds = [prefix] if colon else [word for word in WORDS if text in _names(word)]
-    if not kinds:
-        raise unknown_name("plugin", text, (known for word in WORDS for known in _names(word)))
-    if len(kinds) > 1:
-        raise RequestError(f"several plugins are called '{text}': say {' or '.join(f'{k}:{text}' for k in kinds)}")
-    kind = WORDS[kinds[0]]
-    if name not in _names(kinds[0]):
-        raise unknown_name(kind, name, _names(kinds[0]))
-    if kinds[0] == "solver" and name in _of_qpsolvers():
-        from vibench.testing.solvers import of_qpsolvers
-
-        return Found("solver", name, of_qpsolvers, f"{of_qpsolvers.__module__}:{of_qpsolvers.__name__}")
-    return Found(kinds[0], name, load(kind, name), reference(kind, name))
-
-
-def _names(word: str) -> list[str]:
-    """Names of the plugins of a kind, a key of `registry.WORDS`; of solvers those that are installed."""
-    from vibench.study.registry import WORDS, names
-
-    return names(WORDS[word]) + (_of_qpsolvers() if word == "solver" else [])
+    name, kinds = (rest, {prefix: CHECKED[prefix]}) if colon else (text, CHECKED)
+    names = {word: [*registered(kind)] for word, kind in kinds.items()}
+    ours = [solver for solver in installed_solvers() if solver not in registered(SOLVER)]
+    if "solver" in names:
+        names["solver"] += ours
+    having = [word for word, those in names.items() if name in those]
+    if not having:
+        raise unknown_name(
+            kinds[prefix] if colon else "plugin", name, (one for those in names.values() for one in those)
+        )
+    if len(having) > 1:
+        raise RequestError(f"several plugins are called '{text}': say {' or '.join(f'{k}:{text}' for k in having)}")
+    plugin = find(kinds[having[0]], name)
+    if plugin.kind is SOLVER and name in ours:
+        return Checked(SOLVER, name, of_qpsolvers, f"{of_qpsolvers.__module__}:{of_qpsolvers.__name__}")
+    return Checked(plugin.kind, name, plugin.load(), plugin.reference)
 
 
-def _of_qpsolvers() -> list[str]:
-    """The installed solvers that no plugin registers."""
-    from vibench.qp.solve import installed_solvers
-    from vibench.study.registry import names
-
-    return [solver for solver in installed_solvers() if solver not in names("QP solver")]
-
-
-def _find_object(module: str, name: str) -> Found:
+def _find_object(module: str, name: str) -> Checked:
     """A plugin in an importable module; modules in the current folder count. A function is a QP solver."""
     import importlib
-
-    from vibench.study.registry import BASES, WORDS
 
     where = f"{module}:{name}"
     title = f"'{where}'"
     if not module or not all(part.isidentifier() for part in [*module.split("."), name]):
-        raise RequestError(f"{title} is neither KIND:NAME ({', '.join(WORDS)}) nor MODULE:NAME")
+        raise RequestError(f"{title} is neither KIND:NAME ({', '.join(CHECKED)}) nor MODULE:NAME")
     if str(Path.cwd()) not in sys.path:
         sys.path.insert(0, str(Path.cwd()))
     try:
         contents = vars(importlib.import_module(module))
     except (Exception, SystemExit) as error:  # noqa: BLE001  the module may raise anything
         raise RequestError(f"{title}: the module cannot be imported: {in_a_line(error)}") from None
-    found, bases = contents.get(name), tuple(BASES.values())
-    if isinstance(found, type):
-        for word, kind in WORDS.items():
-            if kind in BASES and issubclass(found, BASES[kind]):
-                return Found(word, where, found, where)
-        names = ", ".join(base.__name__ for base in bases)
+    plugin = contents.get(name)
+    bases = {kind: kind.base for kind in CHECKED.values() if kind.base is not None}
+    if isinstance(plugin, type):
+        for kind, base in bases.items():
+            if issubclass(plugin, base):
+                return Checked(kind, where, plugin, where)
+        names = ", ".join(base.__name__ for base in bases.values())
         raise RequestError(f"{title} is no subclass of {names}, and no QP solver")
-    if callable(found):
-        return Found("solver", where, found, where)
+    if callable(plugin):
+        return Checked(SOLVER, where, plugin, where)
     classes = [value for value in contents.values() if isinstance(value, type)]
-    own = [value.__name__ for value in classes if issubclass(value, bases) and value.__module__ == module]
+    own = [one.__name__ for one in classes if issubclass(one, tuple(bases.values())) and one.__module__ == module]
     raise unknown_name(f"plugin of the module {module}", name, own)
 
 

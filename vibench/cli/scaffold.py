@@ -10,12 +10,8 @@ from string import Template
 
 from vibench.errors import RequestError, StorageError
 from vibench.provenance import distribution_version
-from vibench.qp.settings import SETTINGS
-from vibench.study.kinds import CHECKED
-from vibench.study.registry import GROUPS, WORDS, names, version
-
-MODULES = {kind.word: kind.module for kind in CHECKED}
-"""Module of the plugin by kind."""
+from vibench.study.kinds import SOLVER, PluginKind
+from vibench.study.registry import find
 
 NAME = re.compile(r"[a-z][a-z0-9]*(-[a-z0-9]+)*")
 MAX_LENGTH = 40
@@ -24,10 +20,10 @@ RESERVED = ("problems", "strategies")
 """Names whose packages would have the names of those that come with vibench."""
 
 
-def write_package(kind: str, name: str, parent: Path) -> Path:
+def write_package(kind: PluginKind, name: str, parent: Path) -> Path:
     """Write a package with one plugin, completely or not at all; returns its folder `parent/vibench-NAME`.
 
-    The kind is a key of `MODULES`. The parent folder is created if necessary.
+    The parent folder is created if necessary.
 
     Raises
     ------
@@ -59,53 +55,50 @@ def write_package(kind: str, name: str, parent: Path) -> Path:
     return target
 
 
-def check_name(kind: str, name: str) -> None:
+def check_name(kind: PluginKind, name: str) -> None:
     """Raise a `RequestError` for a name that no package can have, or that another plugin of the kind has."""
     if not NAME.fullmatch(name) or len(name) > MAX_LENGTH:
         raise RequestError(
             f"'{name}' cannot be the name of a plugin: expected lower case letters and digits, in words joined by '-', "
-            f"a letter first, {MAX_LENGTH} characters at most, such as 'my-{kind}'"
+            f"a letter first, {MAX_LENGTH} characters at most, such as 'my-{kind.cli_name}'"
         )
     if name in RESERVED:
         raise RequestError(f"'{name}' cannot be the name of a plugin: vibench itself has a package of that name")
-    title = WORDS[kind]
-    if kind == "solver" and name in SETTINGS:
-        raise RequestError(f"there is a {title} '{name}' already, in qpsolvers; choose another name")
-    if name in names(title):
-        raise RequestError(f"there is a {title} '{name}' already, in {version(title, name)}; choose another name")
+    if origin := find(kind, name).origin:
+        raise RequestError(f"there is a {kind} '{name}' already, in {origin}; choose another name")
 
 
-def module_file(folder: Path, kind: str, name: str) -> Path:
+def module_file(folder: Path, kind: PluginKind, name: str) -> Path:
     """The module of a package that contains the plugin."""
-    return folder / "src" / _package(name) / f"{MODULES[kind]}.py"
+    return folder / "src" / _package(name) / f"{kind.module}.py"
 
 
 def _package(name: str) -> str:
     return f"vibench_{name.replace('-', '_')}"
 
 
-def _contents(kind: str, name: str) -> dict[str, str]:
+def _contents(kind: PluginKind, name: str) -> dict[str, str]:
     """Texts of the files of a package by path."""
-    package, module = _package(name), MODULES[kind]
+    package, word = _package(name), kind.cli_name
     camel, snake = "".join(word.capitalize() for word in name.split("-")), name.replace("-", "_")
     words = {
         "name": name,
         "package": package,
-        "module": module,
-        "cls": f"solve_{snake}" if kind == "solver" else camel + kind.capitalize(),
-        "kind": kind,
-        "title": WORDS[kind],
-        "group": GROUPS[WORDS[kind]],
+        "module": kind.module,
+        "cls": f"solve_{snake}" if kind is SOLVER else camel + word.capitalize(),
+        "kind": word,
+        "title": str(kind),
+        "group": kind.entry_points,
         "test": snake,
         "column": f"{snake}_speed_up",
         "version": distribution_version("vibench"),
     }
     sources = {
         "pyproject.toml": "pyproject.toml",
-        "README.md": f"README-{kind}.md",
+        "README.md": f"README-{word}.md",
         f"src/{package}/__init__.py": "__init__.py",
-        f"src/{package}/{module}.py": f"{kind}.py",
-        f"tests/test_{words['test']}.py": f"test_{kind}.py",
+        f"src/{package}/{kind.module}.py": f"{word}.py",
+        f"tests/test_{words['test']}.py": f"test_{word}.py",
     }
     folder = files("vibench.cli") / "templates"
     return {

@@ -29,10 +29,11 @@ from vibench.stages.base import Done, Failed, Stage, Unstored
 from vibench.stages.cell_queries import CellRows, cell_queries
 from vibench.stages.pictures import PictureStage
 from vibench.storage.artefacts import Store, usable_store
-from vibench.study import registry
 from vibench.study.cells import Cell
+from vibench.study.kinds import SOLVER
 from vibench.study.matrix import expand
 from vibench.study.plugin import Plugin
+from vibench.study.registry import find, registered
 from vibench.study.spec import Study
 
 CHECK_INTERVAL = 5.0
@@ -315,15 +316,15 @@ def unavailable(cell: Cell) -> str:
 
     A name that several packages use is as good as none.
     """
-    for kind, name in (*((plugin.kind, plugin.name) for plugin in cell.plugins), ("QP solver", cell.solver)):
-        if reason := registry.conflict(kind, name):
-            return reason
-    for plugin in cell.plugins:
-        missing = registry.missing(plugin.kind, plugin.name)
-        if missing:
-            what = f"the {plugin.kind} '{plugin.name}' needs {', '.join(missing)}, which is not installed"
+    plugins = [plugin.registered for plugin in cell.plugins]
+    for plugin in (*plugins, find(SOLVER, cell.solver)):
+        if plugin.conflict:
+            return plugin.conflict
+    for plugin in plugins:
+        if missing := plugin.missing:
+            what = f"the {plugin} needs {', '.join(missing)}, which is not installed"
             return f"{what}: `pip install {' '.join(missing)}`"
-    if cell.solver in installed_solvers(registry.names("QP solver")):
+    if cell.solver in installed_solvers(registered(SOLVER)):
         return ""
     return f"the QP solver '{cell.solver}' is not installed: `pip install {solver_distribution(cell.solver)}`"
 

@@ -18,6 +18,7 @@ from vibench.stages.base import Done, Failed, Pieces, PiecewiseStage, Stage
 from vibench.storage.artefacts import Store
 from vibench.storage.serialisation import dumps, loads, storable
 from vibench.study import registry
+from vibench.study.kinds import SOLVER
 from vibench.study.spec import Limits
 from vibench.timing import NO_TIME, Seconds, median_seconds
 
@@ -56,7 +57,7 @@ class SolverTrials(PiecewiseStage, Pieces):
     @cached_property
     def packages(self) -> frozenset[str]:
         """Those of the solvers."""
-        return frozenset(registry.package("QP solver", solver) for solver in self.solvers) - {""}
+        return frozenset(registry.find(SOLVER, solver).package for solver in self.solvers) - {""}
 
     def stage_of(self, number: int) -> Stage:
         """The trial of one solver."""

@@ -116,7 +116,7 @@ def _check_code(job: Job, part: Part) -> None:
     stage = job.stage
     parts = (stage.stage_of(number) for number in part.numbers) if isinstance(stage, PiecewiseStage) else (stage,)
     used = (plugin for one in {part.key: part for part in parts}.values() for plugin in one.plugins())
-    changed = [f"the {p.kind} '{p.name}'" for p in used if p.as_installed() != p]
+    changed = [f"the {p}" for p in used if p.as_installed() != p]
     if job.code != code_here():
         changed.insert(0, "vibench or one of the libraries")
     if changed:

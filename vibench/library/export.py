@@ -32,7 +32,6 @@ from vibench.provenance import distribution_version
 from vibench.qp.settings import SETTINGS
 from vibench.qp.solve import MARGIN
 from vibench.study.cells import Cell
-from vibench.study.registry import version
 
 RUNTIME = "reduced_model.py"
 """The runtime, written beside the exported files."""
@@ -283,7 +282,7 @@ def _about(model: Model, members: Mapping[str, AffinePolynomial]) -> dict[str, A
     """What the file says in words: parameters, solver, errors, provenance."""
     box, row, accuracy, solver = model.parameters, model.row, model.accuracy, model.solver
     definition = row.get("definition")  # none of a model that is of no run
-    origin = version("problem", Cell.from_definition(str(definition)).problem.name) if definition else ""
+    origin = Cell.from_definition(str(definition)).problem.registered.origin if definition else ""
     return {
         "parameters": {"names": list(box.names), "units": list(box.units)},
         "solver": solver if solver in SOLVERS else next(iter(SOLVERS)),

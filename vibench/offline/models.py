@@ -27,6 +27,7 @@ from vibench.qp.status import Status
 from vibench.qp.verification import Residuals, verify
 from vibench.stability.coercivity import coercivity_and_continuity, energy_inf_sup
 from vibench.study import registry
+from vibench.study.kinds import SOLVER
 from vibench.timing import Seconds, timed
 
 Parameters = Sequence[float] | Array | Mapping[str, float]
@@ -173,11 +174,11 @@ class Model:
             raise RequestError('the model has no error bounds: a tolerance needs one with assembly = "certified"')
         at, name = self._parameter(mu), solver or self.solver
         accuracy = self.accuracy if accuracy is None else accuracy
-        own = registry.names("QP solver")
+        own = registry.registered(SOLVER)
         if name not in installed_solvers(own):
             if name in SETTINGS:
                 raise RequestError(f"the QP solver '{name}' is not installed")
-            raise unknown_name("QP solver", name, {*SETTINGS, *own})
+            raise unknown_name(SOLVER, name, {*SETTINGS, *own})
         reduced, assembly = timed(lambda: self.reduced.assemble(at))
         solve = partial(solve_qp, reduced.program, name, accuracy, registry.qp_solver(name), reduced.factor)
         found, solution = timed(solve)

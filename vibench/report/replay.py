@@ -27,7 +27,8 @@ from vibench.qp.status import Status
 from vibench.qp.verification import QPSolution, verify
 from vibench.results.solver_agreement import vectors
 from vibench.results.tables import to_csv
-from vibench.study import registry
+from vibench.study.kinds import SOLVER
+from vibench.study.registry import registered
 
 CHECKER = "check.py"
 """Script in an exported test set that recomputes its residuals; it needs only NumPy."""
@@ -72,7 +73,7 @@ def replay(recorded: RecordedCell, query: int, file: Path) -> pd.DataFrame:
         status, reason, residuals = verify(program, solution, accuracy)
         line = _line(Trial(status, reason, solution, residuals), None) | {"seconds": rows[query]["solve_s"]}
         table.append({"solver": f"{recorded.cell.solver} (recorded)"} | line)
-    solvers = installed_solvers(registry.names("QP solver"))
+    solvers = installed_solvers(registered(SOLVER))
     for solver, trial in solver_trials(program, accuracy, solvers).items():
         table.append({"solver": solver} | _line(trial, known))
     return pd.DataFrame(table)

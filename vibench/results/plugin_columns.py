@@ -19,10 +19,9 @@ from vibench.interfaces.figures import EXTENSIBLE, DerivedColumn, FigurePlugin
 from vibench.results import best, error_measures
 from vibench.results.columns import INTEGER, REAL, STORED, TEXT, THRESHOLDS, Column
 from vibench.results.sqlite.values import stored
-from vibench.study import registry
+from vibench.study.kinds import FIGURE
+from vibench.study.registry import find, registered
 from vibench.text import brief
-
-KIND = "figure plugin"
 
 TYPES: Mapping[type, str] = {float: REAL, int: INTEGER, str: TEXT}
 
@@ -116,7 +115,7 @@ def _with_column(table: Extended, plugin: str, column: DerivedColumn, tables: Co
 def _declared() -> Iterator[tuple[str, DerivedColumn] | str]:
     """The columns of all plugins, with the names of the plugins, and lines on what cannot be used."""
     owners: dict[str, str] = {}
-    for name in registry.names(KIND):
+    for name in registered(FIGURE):
         try:
             found = declared(name, loaded(name))
         except VibenchError as error:
@@ -153,7 +152,7 @@ def _taken(plugin: str, column: DerivedColumn, owners: Mapping[str, str]) -> str
         return f"{title} has the heading '{column.heading}' of a column of vibench, and needs another"
     for what, text in (("name", name), ("heading", column.heading)):
         if text in owners:
-            return f"{title} has the {what} of a column of {KIND} '{owners[text]}', and needs another"
+            return f"{title} has the {what} of a column of {FIGURE} '{owners[text]}', and needs another"
     return ""
 
 
@@ -165,15 +164,15 @@ def loaded(name: str) -> FigurePlugin:
     RequestError
         If it cannot be loaded or created.
     """
-    missing = registry.missing(KIND, name)
-    if missing:
-        raise RequestError(f"{KIND} '{name}' needs {', '.join(missing)}, which is not installed")
+    registered_plugin = find(FIGURE, name)
+    if missing := registered_plugin.missing:
+        raise RequestError(f"{registered_plugin} needs {', '.join(missing)}, which is not installed")
     try:
-        plugin: FigurePlugin = registry.create(KIND, name)
+        plugin: FigurePlugin = registered_plugin.create({})
     except RequestError:
         raise
     except (Exception, SystemExit) as error:  # noqa: BLE001  third-party code
-        raise RequestError(f"{KIND} '{name}' cannot be created: {in_a_line(error)}") from None
+        raise RequestError(f"{FIGURE} '{name}' cannot be created: {in_a_line(error)}") from None
     return plugin
 
 
@@ -188,10 +187,10 @@ def declared(name: str, plugin: FigurePlugin) -> Sequence[DerivedColumn]:
     try:
         found = tuple(plugin.columns())
     except (Exception, SystemExit) as error:  # noqa: BLE001  third-party code
-        raise ColumnError(f"{KIND} '{name}' has no columns: {in_a_line(error)}") from None
+        raise ColumnError(f"{FIGURE} '{name}' has no columns: {in_a_line(error)}") from None
     for column in found:
         if not isinstance(column, DerivedColumn):
-            raise ColumnError(f"{KIND} '{name}' declares a {type(column).__name__}, expected a vibench.DerivedColumn")
+            raise ColumnError(f"{FIGURE} '{name}' declares a {type(column).__name__}, expected a vibench.DerivedColumn")
     return found
 
 
@@ -233,7 +232,7 @@ def _stored(title: str, column: DerivedColumn, row: int, value: Any) -> Any:
 
 
 def _title(plugin: str, column: DerivedColumn) -> str:
-    return f"column '{column.name}' of {KIND} '{plugin}'"
+    return f"column '{column.name}' of {FIGURE} '{plugin}'"
 
 
 def _copied(table: str) -> property:

@@ -15,7 +15,6 @@ from vibench.interfaces.problem import Problem
 from vibench.provenance import SHARED, core_code, libraries
 from vibench.qp.status import Status
 from vibench.storage.artefacts import History, Store
-from vibench.study import registry
 from vibench.study.cells import Axes, digest
 from vibench.study.parameter_sets import ParameterSet
 from vibench.study.plugin import Plugin
@@ -29,7 +28,7 @@ Row = dict[str, Any]
 def build_problem(plugin: Plugin) -> Problem:
     """The problem of a stage; one instance per process."""
     problem = plugin.create()
-    assert isinstance(problem, Problem)  # `registry.load` refuses anything else
+    assert isinstance(problem, Problem)  # `RegisteredPlugin.load` refuses anything else
     return problem
 
 
@@ -134,7 +133,7 @@ class Stage(ABC):
     @cached_property
     def packages(self) -> frozenset[str]:
         """Distributions of third parties whose code the stage runs; it shares no process with that of others."""
-        return frozenset(registry.package(plugin.kind, plugin.name) for plugin in self.plugins()) - {""}
+        return frozenset(plugin.registered.package for plugin in self.plugins()) - {""}
 
     def inputs(self) -> tuple[Stage, ...]:
         """Stages whose artefacts `run` reads itself, by default those among the fields; theirs are not repeated."""

@@ -36,8 +36,9 @@ from vibench.stages.offline import ConstraintMatrices, ReducedCone
 from vibench.stages.query import Queries, Query, error_columns, run_query
 from vibench.stages.snapshots import gather, solution_stages
 from vibench.storage.artefacts import Artefact, Store
-from vibench.study import registry
 from vibench.study.cells import Cell
+from vibench.study.kinds import SOLVER
+from vibench.study.registry import find
 from vibench.study.values import CERTIFIED
 from vibench.timing import median_interval, median_of
 
@@ -80,7 +81,7 @@ class CellQueries(PiecewiseStage):
     @cached_property
     def packages(self) -> frozenset[str]:
         """Those of the strategies and the problem, and that of the solver."""
-        return super().packages | {registry.package("QP solver", self.solver)} - {""}
+        return super().packages | {find(SOLVER, self.solver).package} - {""}
 
     @property
     def pieces(self) -> int:

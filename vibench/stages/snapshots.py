@@ -22,6 +22,7 @@ from vibench.stages.base import Result, Stage, build_problem, faults_of, value_o
 from vibench.storage.artefacts import History, Store
 from vibench.storage.serialisation import storable
 from vibench.study.cells import Axes
+from vibench.study.kinds import PROBLEM
 from vibench.study.parameter_sets import ParameterSet
 from vibench.study.plugin import Plugin
 from vibench.timing import NO_TIME, Seconds, median_seconds, timed
@@ -225,7 +226,7 @@ def gather(store: Store, chunks: tuple[Stage, ...]) -> Snapshots:
         If the problem was assembled otherwise for a chunk than it is in this process.
     """
     parts = [value_of(store, chunk) for chunk in chunks]
-    (problem,) = {plugin for chunk in chunks for plugin in chunk.plugins() if plugin.kind == "problem"}
+    (problem,) = {plugin for chunk in chunks for plugin in chunk.plugins() if plugin.kind is PROBLEM}
     with faults_of(problem):
         here = fingerprint_here(problem)
         for deviation in (text for part in parts for text in part.fingerprint.deviations(here)):

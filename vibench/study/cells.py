@@ -9,10 +9,11 @@ from functools import cached_property
 from typing import Any
 
 from vibench.interfaces.strategies import Stop
-from vibench.provenance import NUMERICAL, core_code, solver_version
-from vibench.study import registry
+from vibench.provenance import NUMERICAL, core_code
+from vibench.study.kinds import SOLVER
 from vibench.study.parameter_sets import OWN_TRAINING, ParameterSet
 from vibench.study.plugin import Plugin
+from vibench.study.registry import find
 from vibench.study.values import OWN
 
 
@@ -131,10 +132,9 @@ class Cell:
     @property
     def code(self) -> str:
         """Hash of the code that computes the cell: the numerical rooms of the core, its plugins and its solver."""
-        plugins_used = [plugin.code for plugin in self.plugins]
-        registered = self.solver in registry.names("QP solver")
-        solver = registry.code("QP solver", self.solver) if registered else solver_version(self.solver)
-        return digest([core_code(*NUMERICAL), *plugins_used, solver])
+        return digest(
+            [core_code(*NUMERICAL), *(plugin.code for plugin in self.plugins), find(SOLVER, self.solver).code]
+        )
 
     def __str__(self) -> str:
         problem, dual, primal = self.labels

@@ -2,61 +2,62 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from enum import StrEnum
+from functools import cached_property
+from pkgutil import resolve_name
 
 
-@dataclass(frozen=True)
-class Kind:
-    """A kind of plugin.
+class PluginKind(StrEnum):
+    """A kind of plugin; as a text it is what messages and records call it: "dual strategy".
 
     Attributes
     ----------
-    title
-        What messages, records and the registry call it.
-    listed
+    plural
         The list of `vibench list` that shows it.
-    group
-        Its group of entry points, without `vibench.`.
-    word
-        What stands for it on the command line, in `vibench check WORD:NAME`; "" where no plugin of it is checked.
+    entry_points
+        Its group of entry points.
+    cli_name
+        What stands for it on the command line, in `vibench check NAME:…`; "" where no plugin of it is checked.
     module
         The module that `vibench new` writes it to.
-    base
-        The abstract base class of its plugins, "module:class"; "" where they are no classes.
     """
 
-    title: str
-    listed: str
-    group: str
-    word: str = ""
-    module: str = ""
-    base: str = ""
+    plural: str
+    entry_points: str
+    cli_name: str
+    module: str
+    _base: str
 
-    @property
-    def entry_points(self) -> str:
-        """Its group of entry points."""
-        return f"vibench.{self.group}"
+    def __new__(  # noqa: D102
+        cls, title: str, plural: str = "", group: str = "", cli_name: str = "", module: str = "", base: str = ""
+    ) -> PluginKind:
+        kind = str.__new__(cls, title)
+        kind._value_, kind.plural, kind.entry_points = title, plural, f"vibench.{group}"
+        kind.cli_name, kind.module, kind._base = cli_name, module, base
+        return kind
 
-
-SOLVER = Kind("QP solver", "solvers", "qp_solvers", "solver", "solver")
-STUDY = Kind("study", "studies", "studies")
-FIGURE = Kind("figure plugin", "figures", "figures", "figure", "figures", "vibench.interfaces.figures:FigurePlugin")
-
-KINDS = (
-    Kind("problem", "problems", "problems", "problem", "problem", "vibench.interfaces.problem:Problem"),
-    Kind("sampling strategy", "sampling", "sampling", "sampling", "sampling", "vibench.interfaces.sampling:Sampling"),
-    Kind(
+    PROBLEM = "problem", "problems", "problems", "problem", "problem", "vibench.interfaces.problem:Problem"
+    SAMPLING = (
+        "sampling strategy", "sampling", "sampling", "sampling", "sampling", "vibench.interfaces.sampling:Sampling",
+    )  # fmt: skip
+    PRIMAL = (
         "primal strategy", "primal", "primal_strategies", "primal", "strategy",
         "vibench.interfaces.strategies:PrimalStrategy",
-    ),
-    Kind(
+    )  # fmt: skip
+    DUAL = (
         "dual strategy", "dual", "dual_strategies", "dual", "strategy", "vibench.interfaces.strategies:DualStrategy",
-    ),
-    FIGURE,
-    STUDY,
-    SOLVER,
-)  # fmt: skip
-"""All of them, in the order of `vibench list`."""
+    )  # fmt: skip
+    FIGURE = "figure plugin", "figures", "figures", "figure", "figures", "vibench.interfaces.figures:FigurePlugin"
+    STUDY = "study", "studies", "studies"
+    SOLVER = "QP solver", "solvers", "qp_solvers", "solver", "solver"
 
-CHECKED = tuple(kind for kind in KINDS if kind.word)
-"""Those whose plugins `vibench check` examines and `vibench new` writes."""
+    @cached_property
+    def base(self) -> type | None:
+        """The abstract base class of its plugins; `None` where they are no classes."""
+        return resolve_name(self._base) if self._base else None
+
+
+PROBLEM, SAMPLING, PRIMAL, DUAL, FIGURE, STUDY, SOLVER = PluginKind
+
+CHECKED = {kind.cli_name: kind for kind in PluginKind if kind.cli_name}
+"""Those whose plugins `vibench check` examines and `vibench new` writes, by their names on the command line."""

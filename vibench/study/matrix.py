@@ -9,10 +9,11 @@ from typing import TypeAlias, TypeVar
 from vibench.errors import RequestError
 from vibench.interfaces.strategies import Stop
 from vibench.reduction.nested import NestedStrategy
-from vibench.study import registry
 from vibench.study.cells import Cell
 from vibench.study.entries import Entry
+from vibench.study.kinds import DUAL, PRIMAL, PROBLEM, PluginKind
 from vibench.study.plugin import Plugin
+from vibench.study.registry import find
 from vibench.study.spec import Study, ToleranceTable
 
 
@@ -27,9 +28,9 @@ def expand(study: Study) -> list[Cell]:
     cells: dict[str, Cell] = {}
     problems = [
         (entry, plugin, study.training_sets(entry), study.validation_set(entry).sized(plugin))
-        for entry, plugin in _made("problem", study.problem)
+        for entry, plugin in _made(PROBLEM, study.problem)
     ]
-    duals, primals = _made("dual strategy", study.dual), _made("primal strategy", study.primal)
+    duals, primals = _made(DUAL, study.dual), _made(PRIMAL, study.primal)
     for (problem, plugin, sets, validation), table in product(problems, study.tolerances):
         nested = {entry.title: _nested_tolerances(entry, table) for entry in study.primal}
         for training, (dual, pod, cone, primal, tolerance) in product(sets, _combinations(duals, primals, table)):
@@ -61,14 +62,14 @@ EntryT = TypeVar("EntryT", bound=Entry)
 _Made: TypeAlias = tuple[EntryT, Plugin]
 
 
-def _made(kind: str, entries: Sequence[EntryT]) -> list[_Made[EntryT]]:
+def _made(kind: PluginKind, entries: Sequence[EntryT]) -> list[_Made[EntryT]]:
     """The entries of an axis, each with its plugin: titles need not tell them apart."""
     return [(entry, Plugin.from_entry(kind, entry)) for entry in entries]
 
 
 def _nested_tolerances(primal: Entry, table: ToleranceTable) -> tuple[float, ...]:
-    kind = "primal strategy"
-    if registry.conflict(kind, primal.name) or not issubclass(registry.load(kind, primal.name), NestedStrategy):
+    plugin = find(PRIMAL, primal.name)
+    if plugin.conflict or not issubclass(plugin.load(), NestedStrategy):
         return ()
     return tuple(sorted({value for value in table.of_primal(primal) if value is not None}, reverse=True))
 

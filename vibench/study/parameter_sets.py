@@ -13,7 +13,6 @@ from vibench.errors import NumericalError, RequestError
 from vibench.interfaces.problem import Problem
 from vibench.interfaces.sampling import AdaptiveSampling, Sampling
 from vibench.interfaces.validation import training_parameters, validation_parameters
-from vibench.study import registry
 from vibench.study.plugin import Plugin
 from vibench.study.values import OWN
 
@@ -45,8 +44,7 @@ class ParameterSet:
     @property
     def is_adaptive(self) -> bool:
         """Whether its parameters are chosen as solutions are known; `of` gives candidates then."""
-        sampling = self.sampling
-        return sampling is not None and issubclass(registry.load(sampling.kind, sampling.name), AdaptiveSampling)
+        return self.sampling is not None and issubclass(self.sampling.registered.load(), AdaptiveSampling)
 
     @property
     def options(self) -> str:
@@ -58,7 +56,7 @@ class ParameterSet:
         if self.sampling is None:
             return None
         strategy = self.sampling.create()
-        assert isinstance(strategy, Sampling)  # `registry.load` refuses anything else
+        assert isinstance(strategy, Sampling)  # `RegisteredPlugin.load` refuses anything else
         return strategy
 
     def of(self, problem: Problem) -> Array:
@@ -88,7 +86,7 @@ OWN_TRAINING = ParameterSet("training")
 
 def is_available(*plugins: Plugin) -> bool:
     """Whether plugins can be made here: their names are unambiguous, and what they require is installed."""
-    return not any(registry.conflict(p.kind, p.name) or registry.missing(p.kind, p.name) for p in plugins)
+    return not any(plugin.registered.conflict or plugin.registered.missing for plugin in plugins)
 
 
 @lru_cache(maxsize=4)

@@ -9,6 +9,8 @@ from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
 from vibench.study import registry
+from vibench.study.kinds import PluginKind
+from vibench.study.registry import RegisteredPlugin
 
 
 class Named(Protocol):
@@ -27,18 +29,29 @@ class Named(Protocol):
 
 @dataclass(frozen=True)
 class Plugin:
-    """A plugin with its options as canonical JSON, and the version of its code and data (`registry.code_and_data`)."""
+    """A plugin with its options as canonical JSON, and the version of its code and of the files that these name."""
 
-    kind: str
+    kind: PluginKind
     name: str
     options: str
     code: str
 
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "kind", PluginKind(self.kind))  # a text, where it is read from a results file
+
+    def __str__(self) -> str:
+        return str(self.registered)
+
     @classmethod
-    def from_entry(cls, kind: str, entry: Named) -> Plugin:
+    def from_entry(cls, kind: PluginKind, entry: Named) -> Plugin:
         """Plugin of an entry of an axis."""
-        options = registry.canonical_options(kind, entry.name, entry.options)
+        options = registry.find(kind, entry.name).canonical_options(entry.options)
         return cls(kind, entry.name, options, "").as_installed()
+
+    @property
+    def registered(self) -> RegisteredPlugin:
+        """What is registered under its name."""
+        return registry.find(self.kind, self.name)
 
     def as_installed(self) -> Plugin:
         """The same with the version of the code that is installed, and of the files its options name, now.
@@ -48,15 +61,17 @@ class Plugin:
         RequestError
             If it is not installed, or one of its files cannot be read.
         """
-        return replace(self, code=registry.code_and_data(self.kind, self.name, json.loads(self.options)))
+        data = self.registered.data_digest(json.loads(self.options))
+        return replace(self, code=f"{self.registered.code} data {data}" if data else self.registered.code)
 
     def create(self) -> Any:
         """A new instance."""
-        return registry.create(self.kind, self.name, json.loads(self.options))
+        return self.registered.create(json.loads(self.options))
 
     @property
     def check(self) -> str:
         """The command that checks the plugin with these options."""
-        word = next(word for word, kind in registry.WORDS.items() if kind == self.kind)
         options = (f"{k}={v if isinstance(v, str) else json.dumps(v)}" for k, v in json.loads(self.options).items())
-        return shlex.join(["vibench", "check", f"{word}:{self.name}", *(f"--option={text}" for text in options)])
+        return shlex.join(
+            ["vibench", "check", f"{self.kind.cli_name}:{self.name}", *(f"--option={text}" for text in options)]
+        )

@@ -9,7 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from vibench.errors import RequestError
-from vibench.study import registry
+from vibench.study.kinds import PRIMAL, SAMPLING, STUDY
+from vibench.study.registry import find, registered
 from vibench.study.spec import Study
 
 
@@ -25,9 +26,9 @@ def find_study(request: str) -> Path:
     # os.path, since methods of Path raise OSError for names too long for a file.
     is_file, exists = os.path.isfile(path), os.path.exists(path)  # noqa: PTH110, PTH113
     if path.suffix != ".toml" and not is_file:
-        if exists and request not in registry.names("study"):
+        if exists and request not in registered(STUDY):
             raise RequestError(f"study '{request}' is not a file")
-        return registry.study_path(request)
+        return Path(find(STUDY, request).load())
     if not is_file:
         raise RequestError(f"study file '{request}' {'is not a file' if exists else 'does not exist'}")
     return path
@@ -87,7 +88,7 @@ def _anchor(content: dict[str, Any], folder: Path) -> None:
 def _anchor_options(entry: dict[str, Any], folder: Path) -> None:
     given = entry.get("options")
     for options in (entry, given if isinstance(given, dict) else {}):
-        for name in registry.path_options("sampling strategy", str(entry.get("name"))):
+        for name in find(SAMPLING, str(entry.get("name"))).path_options:
             if isinstance(options.get(name), str):
                 options[name] = str(folder / options[name])
 
@@ -117,9 +118,8 @@ def _title(entry: Any) -> str:
 
 def _takes_tolerance(entry: Any) -> bool:
     """Whether an unchecked entry of the primal axis names a strategy that takes a tolerance."""
-    name = str(entry.get("name") if isinstance(entry, dict) else entry)
-    known = name in registry.names("primal strategy") and not registry.conflict("primal strategy", name)
-    return known and bool(registry.load("primal strategy", name).takes_tolerance)
+    plugin = find(PRIMAL, str(entry.get("name") if isinstance(entry, dict) else entry))
+    return bool(plugin.entries and not plugin.conflict and plugin.load().takes_tolerance)
 
 
 def _entries_in(axis: Any, name: str) -> list[Any]:

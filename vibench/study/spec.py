@@ -23,7 +23,6 @@ from vibench.errors import RequestError, unknown_name
 from vibench.interfaces.strategies import Stop
 from vibench.qp.settings import SETTINGS
 from vibench.qp.solve import installed_solvers
-from vibench.study import registry
 from vibench.study.entries import (
     STRICT,
     Entry,
@@ -35,8 +34,10 @@ from vibench.study.entries import (
     Validation,
     as_list,
 )
+from vibench.study.kinds import DUAL, PRIMAL, PROBLEM, SAMPLING, SOLVER, PluginKind
 from vibench.study.parameter_sets import ParameterSet, check_sets, is_available
 from vibench.study.plugin import Plugin
+from vibench.study.registry import find, registered
 from vibench.study.values import OWN
 
 Tolerance: TypeAlias = Annotated[float, Gt(0.0), Lt(1.0), AllowInfNan(False)]
@@ -111,9 +112,10 @@ class ToleranceTable(_Model):
 
     def of_primal(self, entry: Entry) -> list[float | None]:
         """Tolerances of one primal strategy; [`None`] for a strategy that takes none."""
-        if registry.conflict("primal strategy", entry.name):  # whether it takes one or not, its cells cannot be run
+        plugin = find(PRIMAL, entry.name)
+        if plugin.conflict:  # whether it takes one or not, its cells cannot be run
             return list(self.primal.get(entry.title, self.primal.get(entry.name, [None])))
-        if not registry.load("primal strategy", entry.name).takes_tolerance:
+        if not plugin.load().takes_tolerance:
             return [None]
         return list(_meant_for(self.primal, entry, "tolerances.primal"))
 
@@ -207,11 +209,11 @@ class Study(_Model):
 
     def solver_names(self) -> list[str]:
         """Solvers to run: those named, or all that are installed."""
-        return installed_solvers(registry.names("QP solver")) if self.solvers == "available" else list(self.solvers)
+        return installed_solvers(registered(SOLVER)) if self.solvers == "available" else list(self.solvers)
 
 
 def _sampling(entry: SamplingEntry) -> Plugin | None:
-    return None if entry.name == OWN else Plugin.from_entry("sampling strategy", entry)
+    return None if entry.name == OWN else Plugin.from_entry(SAMPLING, entry)
 
 
 MODELS: Mapping[str, type[BaseModel]] = {"tolerances": ToleranceTable, "limits": Limits, "problem": ProblemEntry}
@@ -241,22 +243,21 @@ def _message(error: Any) -> str:
 
 def _check_names(study: Study) -> None:
     """Check names and options of plugins, and that exactly the strategies which take a tolerance have one."""
-    axes: dict[str, Sequence[Entry]] = {
-        "problem": study.problem,
-        "dual strategy": study.dual,
-        "primal strategy": study.primal,
-    }
-    for kind, axis in axes.items():
+    axes: tuple[tuple[PluginKind, Sequence[Entry]], ...] = (
+        (PROBLEM, study.problem), (DUAL, study.dual), (PRIMAL, study.primal),
+    )  # fmt: skip
+    for kind, axis in axes:
         for entry in axis:
-            registry.check_options(kind, entry.name, entry.options)
+            find(kind, entry.name).check_options(entry.options)
     for problem in study.problem:
         _check_sets(study, problem)
-    known = {*SETTINGS, *registry.names("QP solver")}
+    solvers = {*SETTINGS, *registered(SOLVER)}
     for solver in study.solver_names():
-        if solver not in known:  # installed or not
-            raise unknown_name("QP solver", solver, known)
-        if not registry.conflict("QP solver", solver):
-            registry.qp_solver(solver)
+        if solver not in solvers:  # installed or not
+            raise unknown_name(SOLVER, solver, solvers)
+        plugin = find(SOLVER, solver)
+        if plugin.entries and not plugin.conflict:
+            plugin.load()
     for table in study.tolerances:
         _check_tolerances(study, table)
 
@@ -269,10 +270,10 @@ def _check_sets(study: Study, entry: ProblemEntry) -> None:
     asked = [*(entry.training or study.training), entry.validation or study.validation]
     samplings = [one for one in asked if isinstance(one, SamplingEntry) and one.name != OWN]
     for sampling in samplings:
-        registry.check_options("sampling strategy", sampling.name, sampling.options)
-    if not samplings and not registry.data_digest("problem", entry.name, entry.options):
+        find(SAMPLING, sampling.name).check_options(sampling.options)
+    if not samplings and not find(PROBLEM, entry.name).data_digest(entry.options):
         return
-    problem, validation = Plugin.from_entry("problem", entry), study.validation_set(entry)
+    problem, validation = Plugin.from_entry(PROBLEM, entry), study.validation_set(entry)
     training = study.training_sets(entry)
     if is_available(problem, *(one.sampling for one in (validation, *training) if one.sampling is not None)):
         for trained in training:
@@ -281,14 +282,14 @@ def _check_sets(study: Study, entry: ProblemEntry) -> None:
 
 def _check_tolerances(study: Study, table: ToleranceTable) -> None:
     for kind, axis, tolerances in (
-        ("dual strategy", study.dual, table.dual),
-        ("dual strategy", study.dual, table.R),
-        ("primal strategy", study.primal, table.primal),
+        (DUAL, study.dual, table.dual),
+        (DUAL, study.dual, table.R),
+        (PRIMAL, study.primal, table.primal),
     ):
         # A tolerance may name a plugin that an option of the command line removed from the axis.
         known = {name for entry in axis for name in (entry.name, entry.title)}
         for name in tolerances if isinstance(tolerances, dict) else ():
-            if name not in known and name not in registry.names(kind):
+            if name not in known and name not in registered(kind):
                 raise unknown_name(f"{kind} of this study", name, known)
     for entry in study.dual:
         table.of_dual(entry)

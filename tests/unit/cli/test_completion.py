@@ -5,15 +5,14 @@ from __future__ import annotations
 import os
 import shlex
 import subprocess
-from importlib.metadata import EntryPoint
 from pathlib import Path
 from typing import Any
 
 import pytest
 import typer
-from running import Main
+from running import Main, Register
 
-from vibench.cli import completion, overview
+from vibench.cli import completion
 from vibench.cli.main import app
 from vibench.cli.plugin_commands import LISTS
 from vibench.qp.settings import SETTINGS
@@ -21,7 +20,9 @@ from vibench.results import tables
 from vibench.results.columns import TABLES
 from vibench.results.sqlite.reading import FILE
 from vibench.results.views import VIEWS
-from vibench.study import registry
+from vibench.study.kinds import DUAL, STUDY
+from vibench.study.registry import find, registered
+from vibench.study.source import first_sentence
 
 GROUP: Any = typer.main.get_command(app)
 
@@ -43,7 +44,7 @@ def completed(line: str) -> list[str]:
     ("line", "words"),
     [
         ("vibench run quick --problem ob", ["obstacle"]),
-        ("vibench run quick --dual ", registry.names("dual strategy")),
+        ("vibench run quick --dual ", list(registered(DUAL))),
         ("vibench run quick --primal o", ["offline-pga", "online-supremizers"]),
         ("vibench run quick --solver ", sorted(SETTINGS)),
         ("vibench check o", ["obstacle", "offline-pga", "online-supremizers", "orthant"]),
@@ -70,7 +71,7 @@ def test_values_are_completed_with_what_there_is(line: str, words: list[str]) ->
 
 
 def test_the_lists_and_tables_offered_are_all_there_are() -> None:
-    assert set(completion.lists("")) == {*LISTS, "solvers"} == set(overview.LISTS)
+    assert set(completion.lists("")) == set(LISTS)
     assert set(completion.table_names("")) == set(completion.SHOWN) == set(VIEWS) > set(TABLES)
 
 
@@ -112,12 +113,9 @@ class TestFiles:
         assert completed("vibench replay broken ") == []
 
 
-def test_a_name_that_two_packages_register_is_completed_once(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_name_that_two_packages_register_is_completed_once(register: Register) -> None:
     """The command then refuses it and names both packages; a prompt is no place for that."""
-    both = [EntryPoint("mine", f"{module}:Problem", "vibench.problems") for module in ("one", "other")]
-    monkeypatch.setattr(
-        "vibench.study.entry_points.entry_points", lambda *, group: both if group == both[0].group else []
-    )
+    register(*(("vibench.problems", "mine", f"{module}:Problem") for module in ("one", "other")))
     assert completed("vibench run quick --problem ") == ["mine"]
 
 
@@ -148,10 +146,9 @@ def test_words_that_bash_breaks_are_completed_after_the_break(
 @pytest.mark.parametrize("kind", ["problems", "primal", "dual", "sampling"])
 def test_the_overview_reads_the_options_that_the_registry_knows(kind: str) -> None:
     """Without importing any plugin."""
-    for name, _, what, options in overview.rows(kind):
-        known = [option.name for option in registry.options(LISTS[kind], name)]
-        assert options == ", ".join(known)
-        assert what == (registry.load(LISTS[kind], name).__doc__ or "").split("\n")[0]
+    for plugin in registered(LISTS[kind]).values():
+        assert plugin.names_of_options == [option.name for option in plugin.options]
+        assert plugin.summary == (plugin.load().__doc__ or "").split("\n")[0]
 
 
 @pytest.mark.parametrize("name", completion.EXAMPLES)
@@ -170,10 +167,9 @@ def test_help_ends_with_examples_that_are_commands(name: str, main: Main, monkey
 
 def test_the_overview_of_studies_has_whole_sentences() -> None:
     """A point of an abbreviation ends none."""
-    said = {name: what for name, _, what, _ in overview.rows("studies")}
-    assert said["benefit"].endswith("of Niakh et al. (2022)")
-    assert overview.first_sentence("A. of B et al. (2022), i.e. this. More. And") == "A. of B et al. (2022), i.e. this"
-    assert overview.first_sentence("All of it.") == "All of it"
+    assert find(STUDY, "benefit").summary.endswith("of Niakh et al. (2022)")
+    assert first_sentence("A. of B et al. (2022), i.e. this. More. And") == "A. of B et al. (2022), i.e. this"
+    assert first_sentence("All of it.") == "All of it"
 
 
 def test_the_overview_ends_within_80_columns(main: Main, monkeypatch: pytest.MonkeyPatch) -> None:

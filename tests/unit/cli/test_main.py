@@ -20,9 +20,10 @@ from vibench.qp.settings import SETTINGS
 from vibench.results.columns import TABLES
 from vibench.results.sqlite.reading import FILE
 from vibench.results.tables import read
-from vibench.study import registry
+from vibench.study import kinds
 from vibench.study.matrix import expand
 from vibench.study.reader import read_study
+from vibench.study.registry import find, registered
 from vibench.text import printable
 
 
@@ -142,7 +143,7 @@ class TestOutputFolder:
 
     def test_another_seed_is_another_study(self, main: Main, quick_run: Path, tmp_path: Path) -> None:
         shutil.copytree(quick_run, "other")
-        text = registry.study_path("quick").read_text(encoding="utf-8")
+        text = Path(find(kinds.STUDY, "quick").load()).read_text(encoding="utf-8")
         path = tmp_path / "seeded.toml"
         path.write_text(text.replace("seed = 2022", "seed = 2023"), encoding="utf-8")
         refused(main("run", str(path), "--out", "other"), "seed 2022 instead of 2023")
@@ -260,9 +261,9 @@ def test_list_shows_every_plugin_and_its_options(main: Main) -> None:
     code, out, err = main("list")
     assert (code, err) == (0, "")
     for kind in LISTS.values():
-        for name in registry.names(kind):
+        for name in registered(kind):
             assert name in out
-    options = registry.options("problem", "obstacle")
+    options = find(kinds.PROBLEM, "obstacle").options
     assert ", ".join(option.name for option in options) in out
     _, out, _ = main("list", "problems")
     for option in options:
@@ -293,8 +294,8 @@ def test_one_list_shows_only_its_own(what: str, kind: str, main: Main) -> None:
     code, out, _ = main("list", what)
     assert code == 0
     assert out.startswith(what)
-    assert all(name in out for name in registry.names(kind))
-    others = [title for title in (*LISTS, "solvers") if title != what]
+    assert all(name in out for name in registered(kind))
+    others = [title for title in LISTS if title != what]
     assert [title for title in others if re.search(rf"^{title}(,|$)", out, re.MULTILINE)] == []
 
 

@@ -16,7 +16,8 @@ from running import Main, refused, rows
 
 from vibench.cli import scaffold
 from vibench.errors import RequestError
-from vibench.study import registry
+from vibench.study.kinds import CHECKED, DUAL, PROBLEM
+from vibench.study.registry import registered
 
 NAMES = {
     "problem": "my-rope", "primal": "tied", "dual": "cone", "solver": "for-rope", "sampling": "strata",
@@ -28,7 +29,7 @@ NAMES = {
 def written(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     """One new package of every kind."""
     parent = tmp_path_factory.mktemp("new")
-    return {kind: scaffold.write_package(kind, name, parent) for kind, name in NAMES.items()}
+    return {kind: scaffold.write_package(CHECKED[kind], name, parent) for kind, name in NAMES.items()}
 
 
 Run = Callable[..., "subprocess.CompletedProcess[str]"]
@@ -67,7 +68,7 @@ def test_new_plugins_pass_their_checks_as_they_are(installed: Run, tmp_path: Pat
     done = installed("-c", code, *NAMES.values(), folder=tmp_path)
     assert done.returncode == 0, done.stdout + done.stderr
     for kind, name in NAMES.items():
-        assert f"{registry.WORDS[kind]} '{name}'" in done.stdout
+        assert f"{CHECKED[kind]} '{name}'" in done.stdout
     assert done.stdout.count("passed, 0 failed, 0 skipped") == len(NAMES)
 
 
@@ -87,11 +88,11 @@ def test_a_new_package_registers_its_plugin_under_its_name(written: dict[str, Pa
         project = tomllib.loads((folder / "pyproject.toml").read_text())["project"]
         assert (folder.name, project["name"]) == (f"vibench-{NAMES[kind]}",) * 2
         ((group, entries),) = project["entry-points"].items()
-        assert group == registry.GROUPS[registry.WORDS[kind]]
+        assert group == CHECKED[kind].entry_points
         ((name, value),) = entries.items()
         assert name == NAMES[kind]
         module, cls = value.split(":")
-        source = scaffold.module_file(folder, kind, name)
+        source = scaffold.module_file(folder, CHECKED[kind], name)
         assert source == folder / "src" / f"{module.replace('.', '/')}.py"
         assert f"{'def' if kind == 'solver' else 'class'} {cls}(" in source.read_text()
 
@@ -126,7 +127,7 @@ def test_a_name_that_cannot_be_one_is_refused(name: str, main: Main) -> None:
 @given(st.from_regex(scaffold.NAME) | st.text(max_size=12))
 def test_a_name_that_is_accepted_is_good_everywhere(name: str) -> None:
     try:
-        scaffold.check_name("dual", name)
+        scaffold.check_name(DUAL, name)
     except RequestError:
         return
     assert f"vibench_{name.replace('-', '_')}".isidentifier()
@@ -135,7 +136,7 @@ def test_a_name_that_is_accepted_is_good_everywhere(name: str) -> None:
 
 
 def test_names_that_are_taken_are_refused(main: Main) -> None:
-    taken = registry.names("problem")[0]
+    taken = next(iter(registered(PROBLEM)))
     refused(main("new", "problem", taken), f"there is a problem '{taken}' already", "choose another name")
     refused(main("new", "solver", "piqp"), "there is a QP solver 'piqp' already", "choose another name")
     refused(main("new", "primal", "strategies"), "vibench itself has a package of that name")

@@ -14,9 +14,10 @@ from vibench.stages.base import Result, Stage
 from vibench.stages.cell_queries import cell_queries
 from vibench.stages.pictures import PictureStage
 from vibench.storage.artefacts import Store
-from vibench.study import registry
+from vibench.study.kinds import STUDY
 from vibench.study.matrix import expand
 from vibench.study.reader import read_study
+from vibench.study.registry import registered
 
 
 @dataclass(frozen=True)
@@ -104,7 +105,7 @@ def goals_of(study: str) -> Goals:
     return {goal.key: (goal, closure(goal)) for goal in goals}
 
 
-@pytest.mark.parametrize("study", registry.names("study"))
+@pytest.mark.parametrize("study", registered(STUDY))
 @settings(max_examples=5)
 @given(st.data())
 def test_whatever_fails_in_a_real_study_every_goal_ends_once(study: str, data: st.DataObject) -> None:

@@ -22,9 +22,9 @@ def attempts(solvers: Sequence[str], seconds: float = SECONDS) -> dict[str, Tria
 @pytest.fixture
 def _fakes(plugins_folder: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     monkeypatch.syspath_prepend(str(plugins_folder))
-    registry._registered.cache_clear()
+    registry.registered.cache_clear()
     yield
-    registry._registered.cache_clear()
+    registry.registered.cache_clear()
 
 
 def test_the_program_has_constraints_that_hold_and_constraints_that_do_not_matter() -> None:

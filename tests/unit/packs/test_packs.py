@@ -22,8 +22,9 @@ from vibench.interfaces.validation import checked_assembly
 from vibench.packs import writer
 from vibench.packs.checks import read_model_pack
 from vibench.packs.pack import ModelPack, reduce_multipliers
-from vibench.study import registry
+from vibench.study.kinds import PROBLEM
 from vibench.study.plugin import Plugin
+from vibench.study.registry import create, find
 from vibench.testing import check_problem
 
 MU = np.array([5.0, 0.2])
@@ -60,7 +61,7 @@ def test_the_problem_of_a_pack_conforms(tmp_path: Path) -> None:
     folder, content = write_cable(tmp_path / "pack"), manifest()
     del content["parameters"]["validation"]
     write_manifest(folder, content)
-    check_problem(partial(registry.load("problem", "pack"), str(folder)))
+    check_problem(partial(find(PROBLEM, "pack").load(), str(folder)))
 
 
 def test_triplets_count_from_the_index_base_and_matrix_market_from_one(tmp_path: Path) -> None:
@@ -153,7 +154,7 @@ def test_multipliers_alone_are_enough_for_cones(tmp_path: Path, main: Main) -> N
     content = manifest()
     del content["operators"], content["solutions"]["u"], content["spaces"]["X_V"]
     pack = pack_with(tmp_path / "pack", content)
-    found = reduce_multipliers(pack, registry.create("dual strategy", "mcpg", {}), 1e-3)
+    found = reduce_multipliers(pack, create("dual strategy", "mcpg", {}), 1e-3)
     assert found.cone.errors[-1] <= 1e-3
     code, out, _ = main("import", str(tmp_path / "pack"))
     assert (code, "it has no operators" in out) == (0, True)
@@ -198,7 +199,7 @@ def test_a_pack_is_written_whole_or_not_at_all(tmp_path: Path, main: Main, monke
 def test_a_problem_of_constants_and_declared_sums_is_assembled_once(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    problem, assembled = registry.create("problem", "pack", {"path": str(write_cable(tmp_path / "pack"))}), []
+    problem, assembled = create("problem", "pack", {"path": str(write_cable(tmp_path / "pack"))}), []
 
     def count(problem: Problem, mu: np.ndarray) -> VariationalInequality:
         assembled.append(mu)
@@ -252,7 +253,7 @@ def test_a_mesh_gives_pictures(tmp_path: Path) -> None:
     np.savez(folder / "more.npz", points=np.arange(1, SIZE + 1), positions=x[1:-1])
     content["mesh"] = {"file": "mesh.vtu", "points": "more.npz:points", "positions": "more.npz:positions"}
     write_manifest(folder, content)
-    problem = registry.create("problem", "pack", {"path": str(folder)})
+    problem = create("problem", "pack", {"path": str(folder)})
     cable = Cable()
     picture = problem.picture(MU, cable.u[:, 0], cable.lam[:, 0])
     assert picture.points.shape == (2, 2 * SIZE + 4)

@@ -19,6 +19,7 @@ from vibench.report import CaptionedFigure, Looks, Series, Sheet, figures, html,
 from vibench.report.figures import publication
 from vibench.report.figures.plugins import FigureError
 from vibench.study import registry
+from vibench.study.kinds import FIGURE
 
 GROUP, HERE = "vibench.figures", __name__
 
@@ -291,6 +292,6 @@ def test_the_command_draws_in_the_formats_that_are_asked_for(
 
 
 def test_the_plugins_that_are_shipped_load() -> None:
-    for name in registry.names("figure plugin"):
-        assert issubclass(registry.load("figure plugin", name), FigurePlugin)
-        assert (registry.load("figure plugin", name).__doc__ or "").strip()
+    for name in registry.registered(FIGURE):
+        assert issubclass(registry.find(FIGURE, name).load(), FigurePlugin)
+        assert (registry.find(FIGURE, name).load().__doc__ or "").strip()

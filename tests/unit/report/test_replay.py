@@ -96,10 +96,10 @@ def test_a_solver_that_ends_its_process_costs_its_own_line(
     run: Path, tmp_path: Path, plugins_folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.syspath_prepend(str(plugins_folder))
-    registry._registered.cache_clear()
+    registry.registered.cache_clear()
     monkeypatch.setattr(replay, "installed_solvers", lambda _: ["segfaults", "piqp"])
     frame = replay.replay(recorded_cell(str(run), key(run)), 0, tmp_path / "program.npz").set_index("solver")
-    registry._registered.cache_clear()
+    registry.registered.cache_clear()
     assert frame.loc["segfaults", "status"] == "crashed"
     assert "SIGSEGV" in frame.loc["segfaults", "claims"]
     assert frame.loc["piqp", "status"] == "ok"

@@ -15,7 +15,8 @@ from matplotlib.figure import Figure
 from vibench.report.figures.data import file_names
 from vibench.report.figures.looks import Looks, Series, look_of
 from vibench.report.figures.style import WRITTEN, Sheet, caption_of, plot, styled, write_figure
-from vibench.study import registry
+from vibench.study.kinds import DUAL, PRIMAL
+from vibench.study.registry import registered
 from vibench.text import printable
 
 SOLVERS = ("piqp", "proxqp", "osqp", "clarabel", "daqp", "quadprog", "highs", "scs", "cvxopt", "ecos")
@@ -113,7 +114,7 @@ def test_no_two_series_of_a_figure_look_the_same(names: list[str], tolerances: l
     ) == len(series)
 
 
-@pytest.mark.parametrize("names", [registry.names("primal strategy"), registry.names("dual strategy"), SOLVERS])
+@pytest.mark.parametrize("names", [registered(PRIMAL), registered(DUAL), SOLVERS])
 def test_what_is_shipped_has_colours_and_markers_of_its_own(names: list[str]) -> None:
     looks = [look_of(name) for name in names]
     assert len(set(looks)) == len(looks)

@@ -21,11 +21,12 @@ from vibench.stages.cell_queries import CellQueries
 from vibench.stages.enrichment import SingleEnrichment
 from vibench.stages.offline import ConeStage, PODStage
 from vibench.stages.pictures import PictureStage
-from vibench.study import registry
+from vibench.study.kinds import PROBLEM
 from vibench.study.parameter_sets import ParameterSet
 from vibench.study.plugin import Plugin
+from vibench.study.registry import find
 
-OBSTACLE = registry.load("problem", "obstacle")
+OBSTACLE = find(PROBLEM, "obstacle").load()
 PROBLEMS: Mapping[str, Callable[[], Problem]] = {
     "wire": Declared,
     "wire, buffered": buffered(Declared),

@@ -16,6 +16,7 @@ from samples import REMOVE, STUDY, changed, write_study
 from vibench.errors import RequestError
 from vibench.interfaces.strategies import Stop
 from vibench.study import cells as module
+from vibench.study import registry
 from vibench.study.cells import Cell, digest
 from vibench.study.matrix import expand
 from vibench.study.parameter_sets import ParameterSet
@@ -225,7 +226,8 @@ def test_the_code_changes_with_every_plugin(axis: str) -> None:
 @pytest.mark.parametrize("what", ["core_code", "solver_version"])
 def test_the_code_changes_with_the_core_and_the_solver(what: str, monkeypatch: pytest.MonkeyPatch) -> None:
     before = SAMPLE.code
-    monkeypatch.setattr(module, what, lambda *_: "another version")
+    monkeypatch.setattr(module if what == "core_code" else registry, what, lambda *_: "another version")
+    registry.registered.cache_clear()
     assert SAMPLE.code != before
 
 

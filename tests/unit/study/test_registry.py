@@ -22,8 +22,10 @@ from vibench.errors import RequestError
 from vibench.interfaces.problem import Problem
 from vibench.interfaces.strategies import DualStrategy, PrimalStrategy
 from vibench.study import registry
+from vibench.study.kinds import DUAL, PRIMAL, PROBLEM, SOLVER, STUDY, PluginKind
 from vibench.study.plugin import Plugin
 from vibench.study.reader import read_study
+from vibench.study.registry import find, registered
 from vibench.study.spec import Entry
 
 HERE = __name__
@@ -90,7 +92,7 @@ def no_strategy() -> None:
     """A function where a class is asked for."""
 
 
-DUAL, GROUP = "dual strategy", "vibench.dual_strategies"
+GROUP = DUAL.entry_points
 
 
 @pytest.fixture
@@ -107,56 +109,56 @@ def refusal(action: Callable[..., Any], *arguments: Any) -> str:
     return line
 
 
-BASES: Mapping[str, type] = {"problem": Problem, DUAL: DualStrategy, "primal strategy": PrimalStrategy}
+BASES: Mapping[PluginKind, type] = {PROBLEM: Problem, DUAL: DualStrategy, PRIMAL: PrimalStrategy}
 
 
 @pytest.mark.parametrize("kind", BASES)
 def test_the_built_in_plugins_are_found_through_their_entry_points(kind: str) -> None:
-    entries = importlib.metadata.distribution("vibench").entry_points.select(group=registry.GROUPS[kind])
+    entries = importlib.metadata.distribution("vibench").entry_points.select(group=kind.entry_points)
     assert entries
     for entry in entries:
-        assert entry.name in registry.names(kind)
-        assert issubclass(registry.load(kind, entry.name), BASES[kind])
-        assert registry.version(kind, entry.name) == f"vibench {importlib.metadata.version('vibench')}"
+        assert entry.name in registered(kind)
+        assert issubclass(find(kind, entry.name).load(), BASES[kind])
+        assert find(kind, entry.name).origin == f"vibench {importlib.metadata.version('vibench')}"
 
 
 def test_the_paper_s_strategies_and_problem_are_registered() -> None:
-    assert "obstacle" in registry.names("problem")
-    assert {"cpg", "mcpg"} <= set(registry.names(DUAL))
-    assert {"decorrelated", "online-supremizers", "offline-pga"} <= set(registry.names("primal strategy"))
+    assert "obstacle" in registered(PROBLEM)
+    assert {"cpg", "mcpg"} <= set(registered(DUAL))
+    assert {"decorrelated", "online-supremizers", "offline-pga"} <= set(registered(PRIMAL))
 
 
 def test_registered_studies_are_files_that_load() -> None:
-    assert "quick" in registry.names("study")
-    for name in registry.names("study"):
-        assert registry.study_path(name).is_file()
+    assert "quick" in registered(STUDY)
+    for name in registered(STUDY):
+        assert Path(find(STUDY, name).load()).is_file()
         assert read_study(name).name == name
 
 
 @pytest.mark.parametrize("kind", BASES)
 def test_every_built_in_plugin_has_a_summary_and_options_with_defaults(kind: str) -> None:
-    for name in registry.names(kind):
-        assert (registry.load(kind, name).__doc__ or "").strip()
-        assert all(option.expected for option in registry.options(kind, name))
-        required = [option.name for option in registry.options(kind, name) if not option.default]
+    for name in registered(kind):
+        assert (find(kind, name).load().__doc__ or "").strip()
+        assert all(option.expected for option in find(kind, name).options)
+        required = [option.name for option in find(kind, name).options if not option.default]
         assert required == (["path"] if name == "pack" else [])
-        assert registry.check_options(kind, name, dict.fromkeys(required, "text")) == dict.fromkeys(required, "text")
+        assert find(kind, name).check_options(dict.fromkeys(required, "text")) == dict.fromkeys(required, "text")
 
 
 def test_names_are_sorted(register: Register) -> None:
     register(*((GROUP, name, f"{HERE}:Plain") for name in ("b", "c", "a")))
-    assert registry.names(DUAL) == ["a", "b", "c"]
+    assert list(registered(DUAL)) == ["a", "b", "c"]
 
 
 def test_groups_are_kept_apart(register: Register) -> None:
     register((GROUP, "one", f"{HERE}:Plain"))
-    assert registry.names("problem") == []
-    assert "known: none" in refusal(registry.load, "problem", "one")
+    assert registered(PROBLEM) == {}
+    assert "known: none" in refusal(find(PROBLEM, "one").load)
 
 
 def test_an_unknown_name_is_refused_with_the_nearest(register: Register) -> None:
     register((GROUP, "plain", f"{HERE}:Plain"), (GROUP, "other", f"{HERE}:Plain"))
-    line = refusal(registry.load, DUAL, "plian")
+    line = refusal(find(DUAL, "plian").load)
     assert "no dual strategy is called 'plian'" in line
     assert "did you mean 'plain'" in line
     assert "known: other, plain" in line
@@ -164,19 +166,19 @@ def test_an_unknown_name_is_refused_with_the_nearest(register: Register) -> None
 
 def test_a_name_far_from_all_is_refused_without_a_guess(register: Register) -> None:
     register((GROUP, "plain", f"{HERE}:Plain"))
-    assert "did you mean" not in refusal(registry.load, DUAL, "xyzzy")
+    assert "did you mean" not in refusal(find(DUAL, "xyzzy").load)
 
 
 def test_a_name_that_two_packages_use_is_refused_and_no_other(register: Register) -> None:
     register((GROUP, "plain", f"{HERE}:Plain"), (GROUP, "plain", f"{HERE}:Choosy"), (GROUP, "heir", f"{HERE}:Heir"))
-    line = refusal(registry.load, DUAL, "plain")
+    line = refusal(find(DUAL, "plain").load)
     assert line.startswith("two packages provide the dual strategy 'plain'")
     assert f"{HERE}:Plain" in line
     assert f"{HERE}:Choosy" in line
-    assert registry.conflict(DUAL, "plain") == line
-    assert registry.load(DUAL, "heir") is Heir
-    assert registry.names(DUAL) == ["heir", "plain"]
-    assert "two packages" in refusal(registry.requirements, DUAL, "plain")
+    assert find(DUAL, "plain").conflict == line
+    assert find(DUAL, "heir").load() is Heir
+    assert list(registered(DUAL)) == ["heir", "plain"]
+    assert "two packages" in refusal(lambda: find(DUAL, "plain").missing)
     plugin = Plugin.from_entry(DUAL, Entry(name="plain", options={"mode": "slow"}))
     assert plugin.options == '{"mode": "slow"}'
     assert "two packages" in refusal(plugin.create)
@@ -190,7 +192,7 @@ def test_a_plugin_cannot_take_the_name_of_a_solver_of_qpsolvers(register: Regist
         assert line.startswith(f"two packages provide the QP solver '{name}'")
         assert f"qpsolvers, unknown ({HERE}:no_strategy)" in line
     assert registry.qp_solver("mine") == {"mine": no_strategy}
-    assert registry.conflict("QP solver", "osqp") == ""
+    assert find(SOLVER, "osqp").conflict == ""
 
 
 def test_a_distribution_that_is_found_in_two_folders_is_one(
@@ -198,13 +200,13 @@ def test_a_distribution_that_is_found_in_two_folders_is_one(
 ) -> None:
     for folder in ("one", "other"):
         monkeypatch.syspath_prepend(str(install(tmp_path / folder, fake_plugins, FAKES)))
-    assert registry.conflict("QP solver", "careful") == ""
-    assert registry.version("QP solver", "careful") == "fake-plugins 1.0"
+    assert find(SOLVER, "careful").conflict == ""
+    assert find(SOLVER, "careful").origin == "fake-plugins 1.0"
 
 
 def test_one_entry_point_seen_twice_is_no_conflict(register: Register) -> None:
     register((GROUP, "plain", f"{HERE}:Plain"), (GROUP, "plain", f"{HERE}:Plain"))
-    assert registry.load(DUAL, "plain") is Plain
+    assert find(DUAL, "plain").load() is Plain
 
 
 @pytest.mark.parametrize(
@@ -219,7 +221,7 @@ def test_one_entry_point_seen_twice_is_no_conflict(register: Register) -> None:
 )
 def test_what_cannot_be_loaded_is_refused_with_its_entry_point(value: str, words: str, register: Register) -> None:
     register((GROUP, "broken", value))
-    line = refusal(registry.load, DUAL, "broken")
+    line = refusal(find(DUAL, "broken").load)
     assert "'broken'" in line
     assert value in line
     assert words in line
@@ -233,14 +235,14 @@ def test_a_module_that_fails_when_imported_is_refused(
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.delitem(sys.modules, "failing_plugin", raising=False)
     register((GROUP, "failing", "failing_plugin:Plain"))
-    line = refusal(registry.load, DUAL, "failing")
+    line = refusal(find(DUAL, "failing").load)
     assert "'failing'" in line
     assert "failing_plugin:Plain" in line
 
 
 def test_a_solver_must_be_callable(register: Register) -> None:
     register(("vibench.qp_solvers", "broken", f"{HERE}:HERE"))
-    assert "'broken'" in refusal(registry.load, "QP solver", "broken")
+    assert "'broken'" in refusal(find(SOLVER, "broken").load)
 
 
 def built_in() -> list[tuple[str, str, str]]:
@@ -263,7 +265,7 @@ def test_a_study_may_name_a_registered_solver(register: Register) -> None:
 
 def test_a_study_must_be_a_path(register: Register) -> None:
     register(("vibench.studies", "broken", f"{HERE}:no_strategy"))
-    assert "'broken'" in refusal(registry.study_path, "broken")
+    assert "'broken'" in refusal(find(STUDY, "broken").load)
 
 
 def test_a_registered_study_without_file_is_refused(register: Register, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -293,13 +295,13 @@ ACCEPTED = [
 @pytest.mark.usefixtures("_own")
 @pytest.mark.parametrize("given", ACCEPTED, ids=str)
 def test_options_that_fit_reach_the_constructor(given: dict[str, Any]) -> None:
-    made = registry.create(DUAL, "choosy", given)
+    made = find(DUAL, "choosy").create(given)
     assert {name: made.given[name] for name in given} == given
 
 
 @pytest.mark.usefixtures("_own")
 def test_an_integer_will_do_where_a_float_is_asked_for() -> None:
-    assert isinstance(registry.check_options(DUAL, "record", {"width": 2})["width"], float)
+    assert isinstance(find(DUAL, "record").check_options({"width": 2})["width"], float)
 
 
 REFUSED = [
@@ -326,7 +328,7 @@ REFUSED = [
 def test_options_that_do_not_fit_are_refused_with_what_is_expected(
     given: dict[str, Any], words: tuple[str, ...]
 ) -> None:
-    line = refusal(registry.check_options, DUAL, "choosy", given)
+    line = refusal(find(DUAL, "choosy").check_options, given)
     assert "'choosy'" in line
     assert [word for word in words if word not in line] == [], line
 
@@ -336,42 +338,42 @@ def test_options_that_do_not_fit_are_refused_with_what_is_expected(
     ("option", "given", "made"), [("point", [1.0, 2.0], (1.0, 2.0)), ("colour", "blue", Colour.BLUE)]
 )
 def test_what_toml_can_only_say_as_a_list_or_a_text_is_taken(option: str, given: Any, made: Any) -> None:
-    assert registry.create(DUAL, "choosy", {"weight": 0.5, option: given}).given[option] == made
+    assert find(DUAL, "choosy").create({"weight": 0.5, option: given}).given[option] == made
 
 
 @pytest.mark.usefixtures("_own")
 @pytest.mark.parametrize(("option", "given"), [("point", [1.0]), ("point", [1.0, "x"]), ("colour", "green")])
 def test_lists_and_texts_of_the_wrong_kind_are_refused(option: str, given: Any) -> None:
-    assert f"'{option}'" in refusal(registry.check_options, DUAL, "choosy", {"weight": 0.5, option: given})
+    assert f"'{option}'" in refusal(find(DUAL, "choosy").check_options, {"weight": 0.5, option: given})
 
 
 @pytest.mark.usefixtures("_own")
 def test_a_plugin_without_constructor_takes_no_options() -> None:
-    assert registry.options(DUAL, "plain") == []
-    assert isinstance(registry.create(DUAL, "plain", {}), Plain)
-    assert "known: none" in refusal(registry.check_options, DUAL, "plain", {"x": 1})
+    assert find(DUAL, "plain").options == []
+    assert isinstance(find(DUAL, "plain").create({}), Plain)
+    assert "known: none" in refusal(find(DUAL, "plain").check_options, {"x": 1})
 
 
 @pytest.mark.usefixtures("_own")
 def test_an_inherited_constructor_counts() -> None:
-    assert registry.options(DUAL, "heir") == registry.options(DUAL, "choosy")
-    assert registry.create(DUAL, "heir", {"weight": 0.5}).given["weight"] == 0.5
+    assert find(DUAL, "heir").options == find(DUAL, "choosy").options
+    assert find(DUAL, "heir").create({"weight": 0.5}).given["weight"] == 0.5
 
 
 @pytest.mark.usefixtures("_own")
 def test_a_dataclass_is_a_plugin() -> None:
-    assert registry.create(DUAL, "record", {"width": 2.0}) == Record(2.0)
-    assert "float > 0" in refusal(registry.check_options, DUAL, "record", {"width": -1.0})
+    assert find(DUAL, "record").create({"width": 2.0}) == Record(2.0)
+    assert "float > 0" in refusal(find(DUAL, "record").check_options, {"width": -1.0})
 
 
 @pytest.mark.usefixtures("_own")
 def test_keyword_arguments_of_no_name_are_no_option_that_must_be_given() -> None:
-    assert registry.create(DUAL, "open", {"width": 2.0}).given == {"width": 2.0}
+    assert find(DUAL, "open").create({"width": 2.0}).given == {"width": 2.0}
 
 
 @pytest.mark.usefixtures("_own")
 def test_options_are_listed_in_words() -> None:
-    listed = {option.name: (option.expected, option.default) for option in registry.options(DUAL, "choosy")}
+    listed = {option.name: (option.expected, option.default) for option in find(DUAL, "choosy").options}
     assert listed["weight"] == ("float > 0 and < 1", "")
     assert listed["count"] == ("int ≥ 1 and ≤ 9", "3")
     assert listed["mode"] == ("'slow', 'fast'", "'slow'")
@@ -382,7 +384,7 @@ def test_options_are_listed_in_words() -> None:
 
 def test_the_version_of_an_unpackaged_plugin_is_unknown(register: Register) -> None:
     register((GROUP, "plain", f"{HERE}:Plain"))
-    assert registry.version(DUAL, "plain") == "unknown"
+    assert find(DUAL, "plain").origin == "unknown"
 
 
 def test_the_code_of_a_plugin_follows_its_sources(
@@ -390,15 +392,15 @@ def test_the_code_of_a_plugin_follows_its_sources(
 ) -> None:
     package = tmp_path / "edited_plugin"
     package.mkdir()
-    (package / "__init__.py").touch()
+    (package / "__init__.py").write_text("from vibench import DualStrategy\nclass Plain(DualStrategy): ...\n")
     (package / "helper.py").write_text("x = 1\n")
     monkeypatch.syspath_prepend(tmp_path)
     register((GROUP, "edited", "edited_plugin:Plain"), (GROUP, "plain", f"{HERE}:Plain"))
-    codes = [registry.code(DUAL, "edited"), registry.code(DUAL, "plain")]
+    codes = [find(DUAL, "edited").code, find(DUAL, "plain").code]
     (package / "helper.py").write_text("x = 2\n")
-    registry.code.cache_clear()
-    assert registry.code(DUAL, "edited") != codes[0]
-    assert registry.code(DUAL, "plain") == codes[1]
+    registry.registered.cache_clear()
+    assert find(DUAL, "edited").code != codes[0]
+    assert find(DUAL, "plain").code == codes[1]
 
 
 @pytest.mark.usefixtures("_own")

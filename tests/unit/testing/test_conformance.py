@@ -22,7 +22,8 @@ from running import Main, failures, refused
 
 from vibench import testing
 from vibench.interfaces.strategies import DualStrategy
-from vibench.study import registry
+from vibench.study.kinds import CHECKED
+from vibench.study.registry import create, find
 from vibench.testing.assembly import JUMP, WIDTH, find_jump
 from vibench.testing.checks import Check, Conformance, Note, Verdict
 from vibench.testing.comparisons import difference
@@ -166,8 +167,8 @@ def test_a_fault_of_a_strategy_is_found_by_its_check_alone(name: str) -> None:
 
 BUILT_IN = [
     (word, entry.name)
-    for word, kind in registry.WORDS.items()
-    for entry in importlib.metadata.distribution("vibench").entry_points.select(group=registry.GROUPS[kind])
+    for word, kind in CHECKED.items()
+    for entry in importlib.metadata.distribution("vibench").entry_points.select(group=kind.entry_points)
 ]
 
 
@@ -186,8 +187,8 @@ def test_a_built_in_plugin_passes_every_check(word: str, name: str, tmp_path: Pa
         given = {"path": str(unlisted(tmp_path / "cable"))} if name == "pack" else {"resolution": "coarse"}
     if word == "sampling":
         given = sampling_options(name, tmp_path)
-    options = registry.check_options(registry.WORDS[word], name, given)
-    findings = getattr(testing, f"examine_{word}")(partial(registry.load(registry.WORDS[word], name), **options))
+    options = find(CHECKED[word], name).check_options(given)
+    findings = getattr(testing, f"examine_{word}")(partial(find(CHECKED[word], name).load(), **options))
     shown = [str(finding) for finding in findings if finding.verdict is not Verdict.PASSED]
     assert shown == ([NOTHING_TO_DRAW] if word == "figure" else [])  # it draws the problems of a publication
 
@@ -397,7 +398,7 @@ class TestRequests:
         code, out, _ = main("check", "obstacle", "--option", "resolution=200")
         assert code == 0
         assert out.splitlines()[0] == "problem 'obstacle'"
-        n = registry.create("problem", "obstacle", {"resolution": 200}).V.dim
+        n = create("problem", "obstacle", {"resolution": 200}).V.dim
         assert f"n = {n}, " in out
 
     def test_a_class_in_the_current_folder_is_found(self, main: Main, tmp_path) -> None:

@@ -12,8 +12,9 @@ from vibench.errors import VibenchError, in_a_line
 from vibench.interfaces.figures import Drawing, FigurePlugin
 from vibench.report.figures.data import Data, file_names
 from vibench.report.figures.style import set_caption
-from vibench.results.plugin_columns import KIND, loaded
-from vibench.study import registry
+from vibench.results.plugin_columns import loaded
+from vibench.study.kinds import FIGURE
+from vibench.study.registry import registered
 
 
 class FigureError(VibenchError):
@@ -27,8 +28,8 @@ def of_plugins(data: Data, taken: set[str]) -> dict[str, Callable[[Data], Figure
     raises `FigureError` with the reason.
     """
     found: dict[str, Callable[[Data], Figure | None]] = {}
-    for name in registry.names(KIND):
-        reason = f"{KIND} '{name}' has the name of a figure of vibench, and needs another" if name in taken else ""
+    for name in registered(FIGURE):
+        reason = f"{FIGURE} '{name}' has the name of a figure of vibench, and needs another" if name in taken else ""
         try:
             plugin = None if reason else loaded(name)
             if plugin is not None and not plugin.publication:
@@ -52,7 +53,7 @@ def publications() -> Iterator[tuple[str, FigurePlugin]]:
     RequestError
         If a figure plugin cannot be loaded: it may be the one that is asked for.
     """
-    for name in registry.names(KIND):
+    for name in registered(FIGURE):
         plugin = loaded(name)
         if plugin.publication:
             yield name, plugin
@@ -69,9 +70,9 @@ def named(name: str, plugin: FigurePlugin, data: Data) -> Iterator[tuple[str, Dr
     try:
         found = plugin.drawings(data)
     except (Exception, SystemExit) as error:  # noqa: BLE001  third-party code
-        raise FigureError(f"{KIND} '{name}' has no figures of {data.problem}: {in_a_line(error)}") from None
+        raise FigureError(f"{FIGURE} '{name}' has no figures of {data.problem}: {in_a_line(error)}") from None
     if not isinstance(found, Mapping) or not all(isinstance(k, str) and callable(f) for k, f in found.items()):
-        raise FigureError(f"{KIND} '{name}' returned {type(found).__name__}, expected functions by their names")
+        raise FigureError(f"{FIGURE} '{name}' returned {type(found).__name__}, expected functions by their names")
     files = file_names([kind or "unnamed" for kind in found])
     yield from ((file if kind else "", draw) for (kind, draw), file in zip(found.items(), files, strict=True))
 
@@ -89,10 +90,10 @@ def draw_guarded(name: str, kind: str, draw: Drawing) -> Figure | None:
         if isinstance(figure, Figure):
             figure.draw_without_rendering()
     except (Exception, SystemExit) as error:  # noqa: BLE001  third-party code
-        raise FigureError(f"figure '{kind}' of {KIND} '{name}' cannot be drawn: {in_a_line(error)}") from None
+        raise FigureError(f"figure '{kind}' of {FIGURE} '{name}' cannot be drawn: {in_a_line(error)}") from None
     if figure is not None and not isinstance(figure, Figure):
         returned = type(figure).__name__
-        raise FigureError(f"figure '{kind}' of {KIND} '{name}' is a {returned}, expected a matplotlib Figure or None")
+        raise FigureError(f"figure '{kind}' of {FIGURE} '{name}' is a {returned}, expected a matplotlib Figure or None")
     if figure is not None:
         described = draw.func if isinstance(draw, partial) else draw
         set_caption(figure, inspect.getdoc(described) or "")

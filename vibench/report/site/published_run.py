@@ -14,7 +14,8 @@ import pandas as pd
 from vibench.report.comparison.runs import ComparedRun
 from vibench.results import tables
 from vibench.results.sqlite.reading import FILE
-from vibench.study import registry
+from vibench.study.kinds import STUDY
+from vibench.study.registry import registered
 
 FILTERED = ("study", "problem", "dual", "primal", "solver", "machine", "vibench")
 """What the list of runs is filtered by."""
@@ -97,7 +98,7 @@ class PublishedRun:
         """Commands on the run as a whole, and what they do; they are meant for the folder of the results file."""
         study = str(self.run.identity["study"])
         found = [("pip install -r requirements.txt", "the versions that computed it")]
-        if study in registry.names("study"):
+        if study in registered(STUDY):
             found.append((f"vibench run {shlex.quote(study)}", "the whole study, on your machine"))
         found.append((f"vibench compare {FILE} YOUR-RUN", "your run beside this one"))
         return found
