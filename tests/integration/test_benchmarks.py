@@ -18,7 +18,7 @@ from outputs import clean
 from running import Main, Register, refused
 from samples import install_fakes
 
-from vibench.benchmarks import cases, running
+from vibench.benchmarks import cases, files, running
 from vibench.benchmarks.measure import PASSES, _how_often, plain
 from vibench.errors import RequestError
 
@@ -135,10 +135,10 @@ def test_what_cannot_be_made_fails_with_its_reason_and_is_not_timed(third_party:
 def test_where_all_fail_there_is_a_file_of_none(main: Main, tmp_path: Path) -> None:
     setting, told = cases.setting("quick"), list[str]()
     benchmarks = running.planned({"dual": ["gone"]}, ["coarse"], setting)
-    outcome = running.run_benchmarks(benchmarks, setting, 0.001, told.append)
-    assert len(outcome.failed) == len(told) > 0
+    results = running.run_benchmarks(benchmarks, setting, 0.001, told.append)
+    assert len(results.failed) == len(told) > 0
     path = tmp_path / "file.json"
-    path.write_bytes(outcome.content)
+    path.write_bytes(files.written(benchmarks, results.passes))
     assert main("bench", "--read", str(path))[:2] == (0, "0 benchmarks; times are CPU times of a call on one thread\n")
 
 

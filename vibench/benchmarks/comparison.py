@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 import math
-import statistics
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
-from pathlib import Path
-from typing import Any
 
 import pandas as pd
 
-from vibench.errors import RequestError
-from vibench.text import parsed_json, unbroken
+from vibench.benchmarks.files import AXES, Measured, Timed
+from vibench.results.tables import cell_text
+from vibench.terminal.console import print_frame
+from vibench.terminal.output import echo
 
 LIMIT = 1.25
 """Ratio of medians above which something is slower."""
@@ -23,132 +20,14 @@ SHORTEST = 10e-6
 FACTOR, NEGLIGIBLE = 10.0, 1e-9
 """A figure of accuracy is worse if it is more than this many times what it was; below this size none is."""
 
-AXES = ("problem", "dual", "primal", "size", "solver", "accuracy")
-"""What a benchmark is about: its columns, as far as it has them."""
+REST = "--format csv"
+"""Option that prints the columns for which a terminal is too narrow."""
 
-
-@dataclass(frozen=True)
-class Measured:
-    """One benchmark of a file.
-
-    Attributes
-    ----------
-    group, axes
-        What is timed, and with which plugins.
-    seconds, q1, q3
-        Median and quartiles over the rounds, in CPU seconds of one call.
-    low, high
-        The smallest lower and the largest upper quartile of a pass; the quartiles, where there was one.
-    rounds
-        Their number.
-    accuracy
-        Figures that should be small; `None` where one was not finite.
-    status
-        Of what a QP solver answered, "" where none was asked.
-    calibration
-        CPU seconds of fixed work beside it, median over the passes: how fast the machine was then; NaN where unknown.
-    """
-
-    group: str
-    axes: Mapping[str, str]
-    seconds: float
-    q1: float
-    q3: float
-    low: float
-    high: float
-    rounds: int
-    accuracy: Mapping[str, float | None]
-    status: str
-    calibration: float
-
-
-@dataclass(frozen=True)
-class Timed:
-    """What a file holds: benchmarks by name, and what they were timed on: machine, libraries, timer, code."""
-
-    benchmarks: Mapping[str, Measured]
-    machine: Mapping[str, str]
-
-
-def read(path: Path) -> Timed:
-    """What a file of pytest-benchmark holds.
-
-    Raises
-    ------
-    RequestError
-        If it is none.
-    """
-    try:
-        return parsed(path.read_bytes())
-    except (OSError, ValueError, OverflowError, KeyError, TypeError, AttributeError) as error:
-        reason = unbroken(f"{type(error).__name__}: {error}")
-        raise RequestError(f"'{path}' cannot be read as a file of pytest-benchmark ({reason})") from None
-
-
-def parsed(content: bytes) -> Timed:
-    """What the content of a file of pytest-benchmark says.
-
-    Raises
-    ------
-    ValueError
-        If it is no JSON, has a benchmark twice, or seconds that no clock gives; like other exceptions of Python where
-        the structure is another.
-    """
-    known = parsed_json(content)
-    found: dict[str, Measured] = {}
-    for entry in known["benchmarks"]:
-        name = _name(entry["fullname"])
-        if name in found:
-            raise ValueError(f"it has '{name}' twice")
-        found[name] = _measured(entry)
-    return Timed(found, _machine(known["machine_info"], known["benchmarks"]))
-
-
-def _name(fullname: str) -> str:
-    """Name without the folder and what every file and function begins with."""
-    return unbroken(str(fullname).rsplit("/", 1)[-1].split("::", 1)[-1].removeprefix("test_"))
-
-
-def _measured(entry: Mapping[str, Any]) -> Measured:
-    extra, stats = entry.get("extra_info", {}), entry["stats"]
-    axes = {str(name): unbroken(str(value)) for name, value in extra.get("axes", {}).items()}
-    known = {"problem": axes.get("case", "")} | axes
-    passes = [stats, *extra.get("passes", [])]
-    calibrations = [_seconds(one, "calibration_s") for one in passes if "calibration_s" in one]
-    return Measured(
-        group=unbroken(str(entry.get("group") or _name(entry["fullname"]).partition("[")[0])),
-        axes={name: known[name] for name in AXES if known.get(name)},
-        seconds=_seconds(stats, "median"),
-        q1=_seconds(stats, "q1"),
-        q3=_seconds(stats, "q3"),
-        low=min(_seconds(one, "q1") for one in passes),
-        high=max(_seconds(one, "q3") for one in passes),
-        rounds=int(stats["rounds"]),
-        accuracy={
-            unbroken(str(name)): None if value is None else float(value)
-            for name, value in extra.get("accuracy", {}).items()
-        },
-        status=unbroken(str(extra.get("status", ""))),
-        calibration=statistics.median(calibrations) if calibrations else math.nan,
-    )
-
-
-def _seconds(stats: Mapping[str, Any], name: str) -> float:
-    """Seconds of a file, which others may have written."""
-    seconds = float(stats[name])
-    if not (math.isfinite(seconds) and seconds >= 0.0):
-        raise ValueError(f"{name} is {seconds:g} s, expected a finite number that is not negative")
-    return seconds
-
-
-def _machine(info: Mapping[str, Any], benchmarks: Sequence[Mapping[str, Any]]) -> dict[str, str]:
-    own = info.get("vibench", {})
-    timers = sorted({entry["options"]["timer"] for entry in benchmarks if "options" in entry})
-    machine = own.get("machine") or f"{info.get('cpu', {}).get('brand_raw', '')} {info.get('machine', '')}".strip()
-    libraries = own.get("libraries") or f"python {info.get('python_version', '')}"
-    found = {"machine": machine, "libraries": libraries, "timer": ", ".join(timers), "code": own.get("code", "")}
-    return {name: unbroken(str(text)) for name, text in found.items()}
-
+PRIORITY = (
+    "verdict", "problem", "dual", "primal", "size", "solver", "accuracy", "median [ms]", "before [ms]", "after [ms]",
+    "ratio", "quartiles [ms]", "reached", "status", "rounds", "apart",
+)  # fmt: skip
+"""Columns, those that matter most first."""
 
 Figures = tuple[str, float | None, float | None]
 """A figure of accuracy: its name, before and after; `None` where there is none or it is not finite."""
@@ -199,11 +78,6 @@ def verdict(before: Measured, after: Measured, limit: float) -> str:
     found += ["less accurate"] if any(map(is_worse, figures(before, after))) else []
     found += [f"{before.status}, now {after.status or 'nothing'}"] if before.status == "ok" != after.status else []
     return ", ".join(found)
-
-
-def is_regression(before: Measured, after: Measured, limit: float) -> bool:
-    """Whether anything got worse."""
-    return verdict(before, after, limit) not in ("", "faster")
 
 
 def table(found: Timed) -> pd.DataFrame:
@@ -260,15 +134,66 @@ def remarks(before: Timed, after: Timed, limit: float) -> list[str]:
     for what, said in before.machine.items():
         if said != after.machine.get(what, ""):
             lines += [f"{what} before: {said}", f"{what} after:  {after.machine.get(what, '')}"]
-    shared = [(one, after.benchmarks[name]) for name, one in before.benchmarks.items() if name in after.benchmarks]
-    ratios = [now.seconds / was.seconds for was, now in shared if was.seconds > 0.0]
-    middle = f", median of the ratios {pd.Series(ratios).median():.3g}" if ratios else ""
+    frame = compared(before, after, limit)
+    ratios = frame["ratio"].dropna() if len(frame) else frame
+    middle = f", median of the ratios {ratios.median():.3g}" if len(ratios) else ""
     worse = regressions(before, after, limit)
-    return [*lines, f"{len(shared)} benchmarks in both files{middle}; {len(worse)} worse (limit {limit:g})"]
+    return [*lines, f"{len(frame)} benchmarks in both files{middle}; {worse} worse (limit {limit:g})"]
 
 
-def regressions(before: Timed, after: Timed, limit: float) -> list[str]:
-    """Names of the benchmarks that got worse."""
-    both: Callable[[str], bool] = after.benchmarks.__contains__
-    shared = filter(both, before.benchmarks)
-    return [name for name in shared if is_regression(before.benchmarks[name], after.benchmarks[name], limit)]
+def regressions(before: Timed, after: Timed, limit: float) -> int:
+    """How many benchmarks got worse in any way."""
+    return sum(row["verdict"] not in ("", "faster") for row in compared(before, after, limit).to_dict("records"))
+
+
+def print_benchmarks(found: Timed, earlier: Timed | None, limit: float, failed: int = 0) -> None:
+    """Print a table for everything that was timed, beside an earlier file if there is one, and how many failed."""
+    frame = table(found) if earlier is None else compared(earlier, found, limit)
+    if len(frame):
+        for group, rows in frame.groupby("group", sort=False):
+            shown = _measured(rows) if earlier is None else _compared(rows)
+            named = [axis for axis in AXES if (rows[axis] != "").any()]
+            print_frame(pd.concat([rows[named], shown], axis=1), str(group), PRIORITY, rest=REST)
+            echo("")
+    if earlier is None:
+        counts = f"{len(frame)} benchmarks" + (f", {failed} failed" if failed else "")
+        echo(f"{counts}; times are CPU times of a call on one thread")
+    else:
+        echo(*remarks(earlier, found, limit))
+
+
+def _measured(rows: pd.DataFrame) -> pd.DataFrame:
+    quartiles = zip(1e3 * rows["q1_s"], 1e3 * rows["q3_s"], strict=True)
+    reached = [name for name in rows.columns if name.startswith("reached_")]
+    return pd.DataFrame(
+        {
+            "median [ms]": 1e3 * rows["median_s"],
+            "quartiles [ms]": [f"{cell_text(low)}–{cell_text(high)}" for low, high in quartiles],
+            "rounds": rows["rounds"],
+            "reached": [_largest(row) for row in rows[reached].to_dict("records")],
+            "status": rows["status"],
+        },
+        index=rows.index,
+    )
+
+
+def _largest(reached: dict[str, float | None]) -> str:
+    """The largest figure of accuracy of a benchmark; those of its table are of the same kind."""
+    known = {name.removeprefix("reached_"): value for name, value in reached.items() if pd.notna(value)}
+    name = max(known, key=lambda name: known[name] or 0.0, default="")
+    return f"{name} {cell_text(known[name])}" if name else ""
+
+
+def _compared(rows: pd.DataFrame) -> pd.DataFrame:
+    changes = rows[["figure", "before", "after"]].itertuples(index=False, name=None)
+    return pd.DataFrame(
+        {
+            "before [ms]": 1e3 * rows["before_s"],
+            "after [ms]": 1e3 * rows["after_s"],
+            "ratio": rows["ratio"],
+            "apart": rows["apart"],
+            "reached": [f"{name} {cell_text(was)} → {cell_text(now)}" if name else "" for name, was, now in changes],
+            "verdict": rows["verdict"],
+        },
+        index=rows.index,
+    )

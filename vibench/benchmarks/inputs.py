@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Mapping
 from dataclasses import dataclass
 from functools import wraps
 from typing import Any, Concatenate, ParamSpec, TypeVar
-
-import numpy as np
 
 from vibench.arrays import Array
 from vibench.benchmarks.cases import PrimalChoice, Setting, Spaces, TimedProblem
@@ -32,6 +30,9 @@ QUERIES = 8
 
 INTERPOLATION = 1e-6
 """Tolerance of the separation."""
+
+SOLVER, ACCURACY = "piqp", 1e-10
+"""Of complete queries."""
 
 
 @dataclass(frozen=True)
@@ -80,6 +81,11 @@ class StageInputs:
         self.case, self.usual, self.primal = case, setting.spaces, setting.primal
         self.made: dict[Hashable, Any] = {}
 
+    def about(self) -> dict[str, object]:
+        """Problem, resolution and dimensions of the spaces."""
+        case, problem = self.case, self.problem
+        return {"problem": case.problem, "resolution": case.resolution, "n": problem.V.dim, "m": problem.W.dim}
+
     @property
     @_once
     def problem(self) -> Problem:
@@ -123,16 +129,11 @@ class StageInputs:
         """
         dual = find(DUAL, spaces.dual).create({})
         strategy = None if primal is None else find(PRIMAL, primal.name).create({})
+        tolerance = None if primal is None else primal.tolerance
         reduction = Reduction(
-            self.problem,
-            dual,
-            strategy,
-            spaces.modes,
-            spaces.generators,
-            tolerance=None if primal is None else primal.tolerance,
-            assembly="reduced",
-            interpolation=INTERPOLATION,
-        ).given(snapshots=self.snapshots, parameters=self.training)
+            self.problem, dual, strategy, spaces.modes, spaces.generators, tolerance,
+            assembly="reduced", interpolation=INTERPOLATION, solver=SOLVER, accuracy=ACCURACY,
+        ).given(snapshots=self.snapshots, parameters=self.training)  # fmt: skip
         if primal is not None:
             before = self.reduction(spaces)
             reduction = reduction.given(pod=before.pod, cone=before.cone, multipliers=before.multipliers)
@@ -164,8 +165,3 @@ def solve_all(problem: Problem, mus: Array) -> list[HighFidelitySolution]:
     """High-fidelity solutions at parameters (P×d), one after the other."""
     solver = HighFidelitySolver(problem)
     return [solver.solve(mu) for mu in mus]
-
-
-def spread(parameters: Array, count: int) -> Sequence[Array]:
-    """At most `count` of the parameters (P×d), the first, the last and some between."""
-    return [parameters[k] for k in np.unique(np.linspace(0, len(parameters) - 1, count).round().astype(int))]

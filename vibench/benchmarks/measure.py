@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 import tracemalloc
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -146,3 +146,12 @@ def plain(value: Any) -> Any:
         return value
     number = value.item() if hasattr(value, "item") else value
     return number if math.isfinite(number) else None
+
+
+def largest_figures(several: Iterable[Mapping[str, float]]) -> dict[str, float]:
+    """The largest of every figure, NaN where one is."""
+    largest: dict[str, float] = {}
+    for figures in several:
+        for name, value in figures.items():
+            largest[name] = value if math.isnan(value) else max(largest.get(name, value), value)
+    return largest

@@ -1,18 +1,15 @@
-"""Running the benchmarks in a watched process on one thread, pass by pass; the file of pytest-benchmark they make."""
+"""Which benchmarks there are, and running them in a watched process on one thread, pass by pass."""
 
 from __future__ import annotations
 
 import importlib.util
 import inspect
-import json
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
-from datetime import UTC, datetime
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import product
 from typing import Any
 
-from vibench import provenance
 from vibench.benchmarks.cases import (
     ACCURACIES,
     SIZES,
@@ -26,14 +23,20 @@ from vibench.benchmarks.cases import (
     takes_no_option,
 )
 from vibench.benchmarks.inputs import StageInputs
-from vibench.benchmarks.measure import PASSES, TIMER, PassTimes, measure
-from vibench.benchmarks.stages import BENCHMARKS, LeftOutError
+from vibench.benchmarks.measure import PASSES, PassTimes, Timing, measure
+from vibench.benchmarks.offline import OFFLINE
+from vibench.benchmarks.online import ONLINE, LeftOutError
 from vibench.errors import VibenchError
 from vibench.execution.watched import WatchedWork, watched
 from vibench.qp.solve import installed_solvers
 from vibench.stages.base import Failed
 from vibench.study.kinds import DUAL, PRIMAL, PROBLEM, SOLVER
 from vibench.study.registry import registered
+
+BENCHMARKS: Mapping[str, Callable[..., Timing]] = {
+    function.__name__.removeprefix("time_"): function for function in OFFLINE + ONLINE
+}
+"""What is timed, by the names of the benchmarks."""
 
 
 @dataclass(frozen=True)
@@ -52,7 +55,7 @@ class Benchmark:
 
     @property
     def name(self) -> str:
-        """The name in the file."""
+        """Its name in files and on the terminal."""
         return f"{self.what}[{self.parameters}]"
 
 
@@ -123,51 +126,61 @@ class TimedBenchmarks(WatchedWork):
 
     def do(self, number: int, done: Mapping[int, Turn]) -> Turn:
         """One pass of a benchmark, unless an earlier one failed, was left out or is enough."""
-        count = len(self.benchmarks)
-        benchmark, turn = self.benchmarks[number % count], number // count
-        earlier = [done[k].times for k in range(number % count, number, count)]
+        turn, which = divmod(number, len(self.benchmarks))
+        benchmark = self.benchmarks[which]
+        earlier = [done[k].times for k in range(which, number, len(self.benchmarks))]
         if any(times is None or times.slow for times in earlier):
             return Turn(benchmark.name, turn)
+        inputs = self._inputs[benchmark.case]
         try:
-            timing = BENCHMARKS[benchmark.what](self._inputs[benchmark.case], *(value for _, value in benchmark.axes))
-            return Turn(benchmark.name, turn, measure(timing, self.seconds, first=not turn))
+            timing = BENCHMARKS[benchmark.what](inputs, *(value for _, value in benchmark.axes))
         except LeftOutError as error:
             return Turn(benchmark.name, turn, left_out=str(error))
+        times = measure(timing, self.seconds, first=not turn)
+        return Turn(benchmark.name, turn, times if turn else replace(times, info={**inputs.about(), **times.info}))
 
     def instead(self, number: int, failed: Failed) -> Turn:
-        """Why the benchmark failed."""
-        count = len(self.benchmarks)
-        return Turn(self.benchmarks[number % count].name, number // count, failed=failed.reason)
+        """Why a benchmark failed."""
+        turn, which = divmod(number, len(self.benchmarks))
+        return Turn(self.benchmarks[which].name, turn, failed=failed.reason)
 
 
-class Followed:
-    """Tells in a line when a benchmark ends, and when a pass begins."""
+class BenchmarkResults:
+    """What comes of benchmarks, each told to `show` in a line when it ends.
+
+    Attributes
+    ----------
+    passes
+        The passes of every benchmark that was timed, by name.
+    failed, left_out
+        Why others failed or were left out.
+    """
 
     def __init__(self, count: int, show: Callable[[str], None]) -> None:
+        self.passes: dict[str, list[PassTimes]] = {}
+        self.failed, self.left_out = dict[str, str](), dict[str, str]()
         self._count, self._show = count, show
+        self._told: set[tuple[str, int]] = set()
         self._pass = 0
-        self.told: set[tuple[str, int]] = set()
 
     def take(self, turn: Turn) -> None:
-        """Note how a benchmark ended in its pass."""
-        self.told.add((turn.name, turn.number))
-        ended = f"[{len({name for name, _ in self.told})}/{self._count}]"
+        """Note how a benchmark ended in its pass, unless that was told before."""
+        if (turn.name, turn.number) in self._told:
+            return
+        self._told.add((turn.name, turn.number))
+        ended = f"[{len({name for name, _ in self._told})}/{self._count}]"
         if turn.failed:
+            self.failed[turn.name] = turn.failed
             self._show(f"{ended} failed: {turn.name}: {turn.failed}")
-        elif turn.times and not turn.number:
-            self._show(f"{ended} {turn.name}")
-        elif turn.times and turn.number > self._pass:
-            self._pass = turn.number
-            self._show(f"pass {self._pass + 1} of {PASSES}")
-
-
-@dataclass(frozen=True)
-class BenchmarkOutcome:
-    """What came of the benchmarks: the file of pytest-benchmark, and why some failed or were left out."""
-
-    content: bytes
-    failed: Mapping[str, str]
-    left_out: Mapping[str, str]
+        elif turn.left_out:
+            self.left_out[turn.name] = turn.left_out
+        elif turn.times:
+            self.passes.setdefault(turn.name, []).append(turn.times)
+            if not turn.number:
+                self._show(f"{ended} {turn.name}")
+            elif turn.number > self._pass:
+                self._pass = turn.number
+                self._show(f"pass {self._pass + 1} of {PASSES}")
 
 
 def check_installed() -> None:
@@ -184,82 +197,18 @@ def check_installed() -> None:
 
 def run_benchmarks(
     benchmarks: Sequence[Benchmark], setting: Setting, seconds: float, show: Callable[[str], None]
-) -> BenchmarkOutcome:
-    """Run benchmarks, each told to `show` in a line when it ends.
-
-    One that ends its process, or takes longer than a stage of the study may, has failed.
+) -> BenchmarkResults:
+    """Run benchmarks; one that ends its process, or takes longer than a stage of the study may, has failed.
 
     Raises
     ------
     VibenchError
-        If pytest-benchmark is not installed, or no benchmark can be begun.
+        If no benchmark can be begun.
     """
-    check_installed()
-    work, followed = TimedBenchmarks(tuple(benchmarks), setting, seconds), Followed(len(benchmarks), show)
-    turns = watched(work, setting.seconds, followed.take, in_all=setting.seconds * work.pieces)
+    work, results = TimedBenchmarks(tuple(benchmarks), setting, seconds), BenchmarkResults(len(benchmarks), show)
+    turns = watched(work, setting.seconds, results.take, in_all=setting.seconds * work.pieces)
     if isinstance(turns, Failed):
         raise VibenchError(f"the process of the benchmarks failed: {turns.reason}")
     for turn in turns:
-        if (turn.name, turn.number) not in followed.told:
-            followed.take(turn)
-    passes: dict[str, list[PassTimes]] = {}
-    for turn in turns:
-        if turn.times is not None:
-            passes.setdefault(turn.name, []).append(turn.times)
-    entries = [_entry(one, passes[one.name]) for one in benchmarks if one.name in passes]
-    failed = {turn.name: turn.failed for turn in turns if turn.failed}
-    content = json.dumps(_described_machine() | {"benchmarks": entries}, indent=4, default=str)
-    return BenchmarkOutcome(content.encode(), failed, {turn.name: turn.left_out for turn in turns if turn.left_out})
-
-
-def _entry(benchmark: Benchmark, passes: Sequence[PassTimes]) -> dict[str, Any]:
-    """The entry of a benchmark: its statistics are over the rounds of all passes."""
-    axes = {"case": benchmark.case, **dict(benchmark.axes)}
-    kept = ("q1", "median", "q3", "rounds")
-    several = []
-    for one in passes:
-        statistics = _statistics(one.seconds)
-        several.append({key: statistics[key] for key in kept} | {"calibration_s": one.calibration})
-    every = [seconds for one in passes for seconds in one.seconds]
-    return {
-        "group": passes[0].group,
-        "name": f"test_{benchmark.name}",
-        "fullname": f"vibench/benchmarks/stages.py::test_{benchmark.name}",
-        "params": None,
-        "param": benchmark.parameters,
-        "extra_info": {
-            **passes[0].info,
-            "axes": {axis: str(value) for axis, value in axes.items()},
-            "passes": several,
-        },
-        "options": {"timer": TIMER.__name__},
-        "stats": {**_statistics(every), "data": every, "iterations": passes[0].calls},
-    }
-
-
-def _statistics(seconds: Sequence[float]) -> dict[str, Any]:
-    from pytest_benchmark.stats import Stats  # noqa: PLC0415  it is not installed wherever this module is read
-
-    statistics = Stats()  # type: ignore[no-untyped-call]
-    statistics.data.extend(seconds)
-    fields: dict[str, Any] = statistics.as_dict()  # type: ignore[no-untyped-call]
-    return fields
-
-
-def _described_machine() -> dict[str, Any]:
-    """What a file of pytest-benchmark says beside its benchmarks: where and when they were timed, and what."""
-    import pytest_benchmark  # noqa: PLC0415  it is not installed wherever this module is read
-    from pytest_benchmark.plugin import pytest_benchmark_generate_machine_info  # noqa: PLC0415  likewise
-    from pytest_benchmark.utils import get_commit_info  # noqa: PLC0415  likewise
-
-    own = {
-        "machine": provenance.machine(),
-        "libraries": provenance.libraries(),
-        "code": provenance.core_code(),
-    }
-    return {
-        "machine_info": pytest_benchmark_generate_machine_info() | {"vibench": own},  # type: ignore[no-untyped-call]
-        "commit_info": get_commit_info(),  # type: ignore[no-untyped-call]
-        "datetime": datetime.now(UTC).isoformat(),
-        "version": pytest_benchmark.__version__,
-    }
+        results.take(turn)
+    return results

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from collections import Counter
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -13,7 +14,7 @@ from vibench.cli.result_commands import FormOption
 from vibench.errors import RequestError
 
 if TYPE_CHECKING:
-    from vibench.benchmarks.comparison import Timed
+    from vibench.benchmarks.files import Timed
 
 
 def bench_plugins(
@@ -41,24 +42,23 @@ def bench_plugins(
     Each benchmark in which one of the plugins takes part is timed. Exit code 1 if one fails, or something is slower or
     less accurate than in the file of --against.
     """
-    from vibench.benchmarks import comparison
-    from vibench.benchmarks.tables import print_benchmarks
+    from vibench.benchmarks import comparison, files
     from vibench.results import tables
 
-    earlier = comparison.read(against) if against is not None else None
+    earlier = files.read(against) if against is not None else None
     failed = 0
     if read is not None:
         if plugin or out is not None:
             raise RequestError("--read times nothing: leave out the plugins and --out")
-        found = comparison.read(read)
+        timed = files.read(read)
     else:
-        found, failed = _timed(plugin or [], out, resolution or ["coarse"], study, seconds)
+        timed, failed = _timed(plugin or [], out, resolution or ["coarse"], study, seconds)
     if form == "terminal":
-        print_benchmarks(found, earlier, limit, failed)
+        comparison.print_benchmarks(timed, earlier, limit, failed)
     else:
-        frame = comparison.table(found) if earlier is None else comparison.compared(earlier, found, limit)
+        frame = comparison.table(timed) if earlier is None else comparison.compared(earlier, timed, limit)
         sys.stdout.write(tables.FORMS[form](frame))
-    if failed or (earlier is not None and comparison.regressions(earlier, found, limit)):
+    if failed or (earlier is not None and comparison.regressions(earlier, timed, limit)):
         raise Exit(1)
 
 
@@ -66,7 +66,7 @@ def _timed(
     plugins: list[str], out: Path | None, resolutions: list[str], study: str, seconds: float
 ) -> tuple[Timed, int]:
     """What was timed, kept in a file if asked to, and how many benchmarks failed."""
-    from vibench.benchmarks import cases, comparison, running
+    from vibench.benchmarks import cases, files, running
     from vibench.files import write_atomically
 
     running.check_installed()
@@ -74,16 +74,16 @@ def _timed(
     benchmarks = running.planned(chosen, cases.resolutions(resolutions), setting)
     if out is not None and not out.absolute().parent.is_dir():
         raise RequestError(f"'{out}' cannot be written: '{out.absolute().parent}' is not a folder")
-    outcome = running.run_benchmarks(benchmarks, setting, seconds, _tell)
+    results = running.run_benchmarks(benchmarks, setting, seconds, _tell)
+    content = files.written(benchmarks, results.passes)
     if out is not None:
         try:
-            write_atomically(out, outcome.content)
+            write_atomically(out, content)
         except OSError as error:
             raise RequestError(f"'{out}' cannot be written: {error.strerror}") from None
-    reasons = list(outcome.left_out.values())
-    for reason in dict.fromkeys(reasons):
-        _tell(f"{reasons.count(reason)} benchmarks left out: {reason}")
-    return comparison.parsed(outcome.content), len(outcome.failed)
+    for reason, count in Counter(results.left_out.values()).items():
+        _tell(f"{count} benchmarks left out: {reason}")
+    return files.parsed(content), len(results.failed)
 
 
 def _tell(line: str) -> None:
