@@ -19,7 +19,7 @@ from vibench.results import tables
 from vibench.results.plugin_columns import Copies, column_values, declared, name_faults
 from vibench.testing.case import Examined
 from vibench.testing.checks import Check, Conformance, Doubt, Note
-from vibench.testing.samples.run import write_sample_run
+from vibench.testing.sample_run import write_sample_run
 
 if TYPE_CHECKING:
     from vibench.report.figures.data import Data

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
-from dataclasses import KW_ONLY, dataclass
+from dataclasses import KW_ONLY, dataclass, replace
 from functools import cached_property, partial
 from itertools import pairwise
 
@@ -20,7 +20,7 @@ from vibench.storage.serialisation import dumps, loads
 from vibench.testing.case import Case
 from vibench.testing.checks import Check, Conformance, ConformanceError, Note, raised
 from vibench.testing.comparisons import Arrays, array_fault, at, difference, unmutated
-from vibench.testing.samples.model import arrays_of, copy_of, offline_of, sample_offline
+from vibench.testing.sample_problem import arrays_of, copy_of, sample_offline
 
 TOLERANCES = (0.9, 0.5, 0.1)
 
@@ -163,9 +163,8 @@ class PrimalCase(Case[PrimalStrategy, float | None, Enrichment]):
 
     def without_contact(self) -> Iterator[str]:
         """A cone without generators, as of snapshots without contact, is accepted or refused."""
-        problem = self.model.problem
-        empty = Cone(np.zeros((problem.W.dim, 0)), np.zeros(1), no_free(0))
-        offline = offline_of(problem, self.model.basis.copy(), empty)
+        none = np.zeros((self.model.problem.W.dim, 0))
+        offline = replace(copy_of(self.model), cone=Cone(none, np.zeros(1), no_free(0)), span=none)
         try:
             found = self.plugin.build(offline, next(iter(self.arguments.values())))
         except VibenchError:  # a strategy may refuse it in one line

@@ -23,7 +23,7 @@ from vibench.results.break_even import break_even_rows
 from vibench.results.columns import CELLS, KEYS, OUTPUTS
 from vibench.results.database import FILE, ResultsDatabase
 from vibench.results.error_measures import errors_of, measures, with_errors, within
-from vibench.testing.samples.run import write_sample_run
+from vibench.testing.sample_run import write_sample_run
 
 MODELS = {
     # offline seconds, seconds of a query, errors of u, of λ, of the force, and of the area

@@ -10,13 +10,11 @@ import numpy as np
 import scipy.sparse as sp
 
 from vibench.arrays import Array, SparseMatrix
-from vibench.highfidelity import active_set
 from vibench.interfaces.problem import ParameterBox, Problem, VariationalInequality
-from vibench.interfaces.strategies import Cone, Offline, Stop
+from vibench.interfaces.strategies import Cone, DualStrategy, Offline, Stop
 from vibench.linalg.inner_product import InnerProduct
+from vibench.offline.reduction import Reduction, Snapshots, high_fidelity_sweep
 from vibench.reduction.cones import greedy_cone
-from vibench.reduction.pod import pod
-from vibench.stability.infsup import multipliers
 from vibench.testing.comparisons import Arrays
 
 NODES, CONSTRAINTS = 40, 14
@@ -58,22 +56,28 @@ def _tridiagonal(off: float, diagonal: float, n: int) -> SparseMatrix:
     return sp.csr_array(sp.diags_array([off, diagonal, off], offsets=[-1, 0, 1], shape=(n, n)))
 
 
+class _Greedy(DualStrategy):
+    def reduce(self, snapshots: Array, W: InnerProduct, stop: Stop) -> Cone:
+        """The greedy cone."""
+        return greedy_cone(snapshots, W, stop)
+
+
+@cache
+def _snapshots() -> Snapshots:
+    """High-fidelity solutions of the sample problem at its training parameters; for reading only."""
+    problem = MovingSupport()
+    return high_fidelity_sweep(problem, problem.training_set())
+
+
 def sample_snapshots() -> tuple[Array, InnerProduct]:
     """Multipliers λ(mu_p) (m×P) of the sample problem at its training parameters, and their space W."""
-    return _solutions()[1].copy(), MovingSupport().W
+    return _snapshots().lam.copy(), MovingSupport().W
 
 
 def sample_offline(modes: int = 4, generators: int = 6) -> Offline:
     """A reduced model of the sample problem to enrich: N POD modes and a greedy cone of R generators."""
-    problem = MovingSupport()
-    u, lam = _solutions()
-    basis = pod(u, problem.V, Stop(size=modes)).basis
-    return offline_of(problem, basis, greedy_cone(lam, problem.W, Stop(size=generators)))
-
-
-def offline_of(problem: Problem, basis: Array, cone: Cone) -> Offline:
-    """The reduced model of a basis of V_N (n×N) and a cone."""
-    return Offline(problem, basis, cone, multipliers(cone.generators, problem.W).span, problem.training_set())
+    reduction = Reduction(MovingSupport(), _Greedy(), None, Stop(size=modes), Stop(size=generators))
+    return reduction.given(snapshots=_snapshots()).offline
 
 
 def copy_of(offline: Offline) -> Offline:
@@ -85,12 +89,3 @@ def arrays_of(offline: Offline) -> Arrays:
     """All arrays that a strategy could change, by name."""
     names = ("basis", "span", "training", "cone.generators", "cone.errors", "problem.V.matrix", "problem.W.matrix")
     return {f"offline.{name}": attrgetter(name)(offline) for name in names}
-
-
-@cache
-def _solutions() -> tuple[Array, Array]:
-    """U (n×P) and λ (m×P) of the sample problem at its training parameters; for reading only."""
-    problem = MovingSupport()
-    solver = active_set.HighFidelitySolver(problem)
-    found = [solver.solve(mu) for mu in problem.training_set()]
-    return np.column_stack([each.u for each in found]), np.column_stack([each.lam for each in found])
