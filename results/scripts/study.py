@@ -121,12 +121,11 @@ def outcomes(cells: pd.DataFrame) -> tuple[str, str]:
 
 def drawn(path: Path, folder: Path) -> Iterator[Path]:
     """Draw the figures of the page."""
-    for name, drawing, data in figures.drawings(path):
-        if name.endswith(FIGURES.get(folder.name, "")):
-            with styled():
-                figure = drawing(data)
-                if figure is not None:
-                    yield write_figure(figure, folder, name)
+    kinds = FIGURES.get(folder.name, "")
+    with styled():
+        for task in figures.drawings(path):
+            pages = figures.pages_of(task) if task[0].endswith(kinds) else ()
+            yield from (write_figure(figure, folder, name) for name, figure in pages if name.endswith(kinds))
 
 
 def comparison(path: Path, name: str) -> pd.DataFrame:

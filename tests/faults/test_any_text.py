@@ -99,8 +99,7 @@ def outputs(path: Path) -> list[str]:
 
 
 def page(path: Path) -> str:
-    with mock.patch.object(html, "for_report", return_value=()):
-        return html.page(path)
+    return html.page(path, figures=False)
 
 
 def drawn(path: Path) -> str:
@@ -108,8 +107,7 @@ def drawn(path: Path) -> str:
     stream = io.BytesIO()
     (data,) = [data for _, data in problems(path)]
     with styled():
-        figure = dimension(data)
-        assert figure is not None
+        (figure,) = dimension(data)
         write_figure(figure, stream, "svg")
     return stream.getvalue().decode("utf-8")
 

@@ -39,7 +39,7 @@ EXAMPLES: Mapping[str, tuple[str, ...]] = {
         "vibench show quick --columns cell,solver,error_u_mean --sort -error_u_mean",
         "vibench show runs/quick --format csv",
     ),
-    "report": ("vibench report quick", "vibench report runs/quick --out quick.html"),
+    "report": ("vibench report quick", "vibench report runs/quick --no-figures --out quick.html"),
     "figures": ("vibench figures quick", "vibench figures runs/quick --out pictures -j 1"),
     "diff": ("vibench diff runs/before runs/after", "vibench diff runs/before runs/after --limit 1.1 --format json"),
     "compare": (

@@ -23,6 +23,7 @@ def publish_runs(
     ] = None,
     doi: Annotated[str, Option(help="DOI of the deposit, such as 10.5281/zenodo.1234567.")] = "",
     url: Annotated[str, Option(help="Address of the site.")] = "",
+    figures: Annotated[bool, Option("--figures/--no-figures", help="Add pictures to the reports.")] = True,
 ) -> None:
     """Write a static site of runs: reports, data, leaderboard.
 
@@ -35,5 +36,5 @@ def publish_runs(
     if not title.strip():
         raise RequestError("--title is empty; a site needs one to be cited")
     citation = Citation(title, tuple(author or ()), doi, url)
-    page = publish([tables.results_file(one) for one in run], site, citation, warn=warn)
+    page = publish([tables.results_file(one) for one in run], site, citation, warn=warn, figures=figures)
     echo(f"site of {len(run)} run{'s' * (len(run) > 1)}: {page}")

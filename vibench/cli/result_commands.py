@@ -76,7 +76,11 @@ def show(
 
 
 def write_report(
-    run: RunArgument, out: Annotated[Path | None, Option(help="HTML file; RUN/report.html by default.")] = None
+    run: RunArgument,
+    out: Annotated[Path | None, Option(help="HTML file; RUN/report.html by default.")] = None,
+    figures: Annotated[
+        bool, Option("--figures/--no-figures", help="Add pictures of the figures, which take most of the time.")
+    ] = True,
 ) -> None:
     """Write the report of a run as one HTML page."""
     from vibench import provenance
@@ -85,7 +89,8 @@ def write_report(
     from vibench.results import tables
 
     path = tables.results_file(run)
-    echo(f"report: {html.write(path, out or path.parent / REPORT, provenance.cores())}")
+    written = html.write(path, out or path.parent / REPORT, provenance.cores(), figures=figures)
+    echo(f"report: {written}")
 
 
 def draw_figures(

@@ -54,48 +54,45 @@ class Finding:
     weight: Weight
 
 
-Said = Iterator[tuple[Weight, str]]
-
-
 def findings(path: Path) -> dict[str, list[str]]:
     """Sentences on completeness, stability, errors, costs and solvers by subject, "" for the whole run."""
-    found = defaultdict[str, list[str]](list)
+    by_subject = defaultdict[str, list[str]](list)
     # as recorded: no finding is on a column of a plugin
     read = {name: tables.read(path, name) for name in dict.fromkeys((*READ, *TABLES))}
     for one in all_findings(read, problems(path, read)):
-        found[one.subject].append(one.text)
-    return dict(found)
+        by_subject[one.subject].append(one.text)
+    return dict(by_subject)
 
 
 READ = ("cells", "queries", "disagreements")
 """Tables that findings on the whole run are made from."""
 
 
-def all_findings(read: Mapping[str, pd.DataFrame], known: Iterable[tuple[str, Data]]) -> list[Finding]:
+def all_findings(read: Mapping[str, pd.DataFrame], by_problem: Iterable[tuple[str, Data]]) -> Iterator[Finding]:
     """Every finding of a run, by subject: the whole run, then problem by problem.
 
     Parameters
     ----------
     read
         The tables `READ` of the run.
-    known
+    by_problem
         What `problems` finds: the names of the problems, and their data.
     """
-    found = list(_about("", _whole_run(read)))
-    for name, data in known:
-        found += _about(name, _answer(data))
+    for weight, text in _whole_run(read):
+        yield Finding("", text, weight)
+    for name, data in by_problem:
+        yield from _about(name, Weight.ANSWER, _answer(data))
         for title, cells in by_dimensions(best_solver(data.cells)):
             compared = on_common_queries(cells, data.queries)
-            found += _about(f"{name}, {title}", _stability(cells, compared))
-            found += _about(f"{name}, {title}", _costs(cells, data.thresholds))
-        found += _about(f"{name}, enrichments", _off_training(data))
-        found += _about(f"{name}, zero solutions", _zero_solutions(data))
-        found += _about(f"{name}, solvers", _solvers(data))
-    return found
+            yield from _about(f"{name}, {title}", Weight.COMPARISON, _stability(cells, compared))
+            yield from _about(f"{name}, {title}", Weight.COMPARISON, _costs(cells, data.thresholds))
+        yield from _about(f"{name}, enrichments", Weight.DETAIL, _off_training(data))
+        yield from _about(f"{name}, zero solutions", Weight.DETAIL, _zero_solutions(data))
+        yield from _about(f"{name}, solvers", Weight.DETAIL, _solvers(data))
 
 
-def _about(subject: str, said: Said) -> Iterator[Finding]:
-    return (Finding(subject, text, weight) for weight, text in said)
+def _about(subject: str, weight: Weight, sentences: Iterable[str]) -> Iterator[Finding]:
+    return (Finding(subject, text, weight) for text in sentences)
 
 
 MOST = 10
@@ -112,7 +109,7 @@ def leading(found: Iterable[Finding], most: int = MOST) -> list[Finding]:
     return [one for *_, one in sorted(ranked, key=lambda entry: entry[:2])][:most]
 
 
-def _whole_run(read: Mapping[str, pd.DataFrame]) -> Said:
+def _whole_run(read: Mapping[str, pd.DataFrame]) -> Iterator[tuple[Weight, str]]:
     cells, queries = read["cells"], read["queries"]
     ok = int((cells["status"] == Status.OK).sum())
     count, accurate = (int(cells[name].fillna(0).sum()) for name in ("queries", "queries_ok"))
@@ -169,21 +166,20 @@ def _are(found: pd.DataFrame | list[Any]) -> str:
     return "is" if len(found) == 1 else "are"
 
 
-def _answer(data: Data) -> Said:
+def _answer(data: Data) -> Iterator[str]:
     """The fastest query of a problem in the widest and in the narrowest band of the leaderboard."""
     for standings in leaderboard(data.cells):
         if not standings.bands:
-            yield Weight.ANSWER, _no_winner(standings)
+            yield _no_winner(standings)
         for band in standings.bands[:1] + standings.bands[1:][-1:]:
             winner = band.winner(Criterion.QUERY)
             if winner is None:
                 continue
             cell = winner.cell
             yield (
-                Weight.ANSWER,
                 f"Of {_number(band.cells, 'cell')} with mean errors of at most {_share(band.error)}, the fastest query "
                 f"is that of {_way(cell)}, {_sizes(cell)}: {_milliseconds(winner.value)}, with mean errors of "
-                f"{_errors(cell)}; a high-fidelity solution takes {_milliseconds(cell['hf_s'])}.",
+                f"{_errors(cell)}; a high-fidelity solution takes {_milliseconds(cell['hf_s'])}."
             )
 
 
@@ -215,24 +211,22 @@ def _errors(cell: Any) -> str:
     return " and ".join(f"{value:.3g} in {name}" for name, value in known.items() if not pd.isna(value))
 
 
-def _stability(cells: pd.DataFrame, compared: Comparable) -> Said:
+def _stability(cells: pd.DataFrame, compared: Comparable) -> Iterator[str]:
     """Effect of the enrichments on the inf-sup constant over the span and on the error of the multiplier."""
     errors = dict(zip(compared.cells["cell"], compared.cells["error_lambda_mean"], strict=True))
     for row in cells[cells["enrichment_kind"] == Kind.NONE].head(1).itertuples():
         if np.isfinite(row.beta_span_min):
             value = "zero" if row.beta_span_min < VANISHES else f"{row.beta_span_min:.3g}"
             yield (
-                Weight.COMPARISON,
                 f"Without enrichment, min β over the span is {value} and min β over the cone at least "
-                f"{row.beta_cone_lower_min:.3g}{_mean_error(errors.get(row.cell), compared.over)}.",
+                f"{row.beta_cone_lower_min:.3g}{_mean_error(errors.get(row.cell), compared.over)}."
             )
     fixed = cells[(cells["enrichment_kind"] == Kind.FIXED) & np.isfinite(cells["beta_span_min"])]
     for row in fixed.drop_duplicates(PRIMAL).itertuples():
         yield (
-            Weight.COMPARISON,
             f"{label(row.primal, row.primal_tol)} adds {row.enrichment:.0f} vectors, with which min β over the span is "
             f"{row.beta_span_min:.3g}, at every validation parameter at least {100.0 * row.share_validation:.0f} % of "
-            f"the constant of the whole of V{_mean_error(errors.get(row.cell), compared.over)}.",
+            f"the constant of the whole of V{_mean_error(errors.get(row.cell), compared.over)}."
         )
 
 
@@ -241,54 +235,50 @@ def _mean_error(error: float | None, over: str) -> str:
     return "" if error is None or pd.isna(error) else f"; the mean error of λ is {error:.3g}{over}"
 
 
-def _off_training(data: Data) -> Said:
+def _off_training(data: Data) -> Iterator[str]:
     """Whether the share of the inf-sup constant that holds on the training set holds off it."""
     fixed = data.cells[data.cells["share_training"].notna()].drop_duplicates([*PRIMAL, "dual", "pair"])
     lost = fixed["share_training"] - fixed["share_validation"]
     if lost.max() > SHARE_ATOL:
         worst = fixed.loc[lost.idxmax()]
         yield (
-            Weight.DETAIL,
             f"The share of β over the span in that of the whole of V is smaller at validation parameters than at "
             f"training parameters in {(lost > SHARE_ATOL).sum()} of {len(fixed)} fixed enrichments, at worst "
             f"{worst['share_validation']:.3f} against {worst['share_training']:.3f} "
-            f"({label(worst['primal'], worst['primal_tol'])}, {worst['dual']}).",
+            f"({label(worst['primal'], worst['primal_tol'])}, {worst['dual']})."
         )
     bounded = fixed[fixed["share_guaranteed"].notna()]
     broken = bounded[bounded["share_validation"] < bounded["share_guaranteed"] - SHARE_ATOL]
     if len(bounded):
         yield (
-            Weight.DETAIL,
             f"√(1 − σ²), which bounds this share at training parameters, is not reached at a validation parameter in "
-            f"{len(broken)} of {len(bounded)} fixed enrichments that record σ.",
+            f"{len(broken)} of {len(bounded)} fixed enrichments that record σ."
         )
 
 
-def _zero_solutions(data: Data) -> Said:
+def _zero_solutions(data: Data) -> Iterator[str]:
     """Queries that have no relative error since the high-fidelity u or λ is zero, and how large the reduced one is."""
     for name, symbol in (("u", "u"), ("lambda", "λ")):
         zero = data.queries[data.queries[f"zero_{name}"] == 1]
         if zero.empty:
             continue
         yield (
-            Weight.DETAIL,
             f"{symbol} is zero, at most {UNMEASURABLE:g} of the largest of the training set, at "
             f"{zero['query'].nunique()} of {data.queries['query'].nunique()} validation parameters: it has no relative "
-            "error there, and means are over the other queries.",
+            "error there, and means are over the other queries."
         )
         answered = zero[zero["status"] == Status.OK]
         if len(answered):
             scaled = answered[f"error_{name}_scaled"]
             worst = answered.loc[scaled.idxmax()]
             yield (
-                Weight.DETAIL,
                 f"The reduced {symbol} is at most {scaled.max():.2g} of the largest of the training set there "
                 f"({label(worst['primal'], worst['primal_tol'], worst['assembly'])}, {worst['dual']}, "
-                f"{worst['solver']}), in the median {scaled.median():.2g}.",
+                f"{worst['solver']}), in the median {scaled.median():.2g}."
             )
 
 
-def _costs(cells: pd.DataFrame, thresholds: pd.DataFrame) -> Said:
+def _costs(cells: pd.DataFrame, thresholds: pd.DataFrame) -> Iterator[str]:
     """The fastest query among cells of one pair that can win on the leaderboard, and the break-even of its cell."""
     timed = cells[eligible(cells) & cells["online_s"].notna()]
     if timed.empty:
@@ -296,11 +286,10 @@ def _costs(cells: pd.DataFrame, thresholds: pd.DataFrame) -> Said:
     row = timed.loc[timed["online_s"].idxmin()]
     name = label(row["primal"], row["primal_tol"], row["assembly"])
     yield (
-        Weight.COMPARISON,
         f"The fastest query with mean errors of at most {_share(LARGEST_BAND)} is that of {name}: "
         f"{_milliseconds(row['online_s'])}, of which the QP solver takes {_milliseconds(row['online_solve_s'])}, with "
         f"mean errors of {_errors(row)}; a high-fidelity solution takes {_milliseconds(row['hf_s'])} after a set-up of "
-        f"{_milliseconds(row['hf_setup_s'])}.",
+        f"{_milliseconds(row['hf_setup_s'])}."
     )
     against = thresholds[(thresholds["cell_b"] == row["cell"]) & thresholds["cell_a"].isna()]
     for found in against.itertuples():
@@ -308,10 +297,10 @@ def _costs(cells: pd.DataFrame, thresholds: pd.DataFrame) -> Said:
         interval = tables.interval(found.threshold_low, found.threshold_high)
         within = f", 95 % interval {interval}" if interval else ""
         break_even = f"{tables.break_even(found.meaning, found.benefit_threshold)}{number}{within}"
-        yield Weight.COMPARISON, f"Break-even of {name} against high-fidelity solutions: {break_even}."
+        yield f"Break-even of {name} against high-fidelity solutions: {break_even}."
 
 
-def _solvers(data: Data) -> Said:
+def _solvers(data: Data) -> Iterator[str]:
     """Number of the programs that each solver solved, at each accuracy; median time and mean errors on common ones."""
     several = data.cells["accuracy"].nunique() > 1
     solved = data.queries[data.queries["status"] == Status.OK].groupby(WAY).size()
@@ -324,6 +313,6 @@ def _solvers(data: Data) -> Said:
             over = f" over the {common} programs that all solved" if common < asked else ""
             median = f", with a median of {1e3 * shared[way]['solve_s'].median():.3g} ms{over}"
             errors.append(f"{solver} {' and '.join(f'{shared[way][name].mean():.3g}' for name in MEANS.values())}")
-        yield Weight.DETAIL, f"{solver} solved {solved.get(way, 0)} of {asked} programs{median}."
+        yield f"{solver} solved {solved.get(way, 0)} of {asked} programs{median}."
     if len(errors) > 1 and common < solved.max():
-        yield Weight.DETAIL, f"Mean errors of u and λ over these {common} programs: {'; '.join(errors)}."
+        yield f"Mean errors of u and λ over these {common} programs: {'; '.join(errors)}."

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Mapping
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import replace
 from importlib.resources import files
 from itertools import groupby
 from pathlib import Path
@@ -17,12 +19,12 @@ from vibench.errors import RequestError
 from vibench.files import write_atomically
 from vibench.qp.status import Status
 from vibench.report import findings
-from vibench.report.figures import for_report
-from vibench.report.figures.data import TABLES, Data, label, problems
+from vibench.report.figures import FigureTask, figures_of, processes, render
+from vibench.report.figures.data import TABLES, Data, Extent, label, problems
 from vibench.report.leaderboard import Criterion, Winner, leaderboard
 from vibench.report.page import plots
-from vibench.report.page.embedded import Grid, grid_of, grid_of_cells, grid_of_thresholds, script_safe, to_json
-from vibench.report.page.stills import Helpers, helpers, stills
+from vibench.report.page.grids import Grid, grid_of, grid_of_cells, grid_of_thresholds, script_safe, to_json
+from vibench.report.page.images import image_of
 from vibench.results import pictures, tables
 from vibench.results.best import LARGEST_BAND
 from vibench.results.plugin_columns import Extended, faults_of
@@ -46,7 +48,7 @@ IDENTITY = ["problem", "dual", "primal", "primal_tol", "solver", "accuracy", "as
 """Columns that cells and queries share in the tables of failures."""
 
 
-def write(path: Path, target: Path, jobs: int = 1) -> Path:
+def write(path: Path, target: Path, jobs: int = 1, *, figures: bool = True) -> Path:
     """Write the page of a results file as `target`; an interrupted call leaves no incomplete file under its name.
 
     Parameters
@@ -54,6 +56,8 @@ def write(path: Path, target: Path, jobs: int = 1) -> Path:
     jobs
         Processes that draw its pictures, this one included. The others import the main module: with more than one, a
         script that calls this has to guard what it does by ``if __name__ == "__main__"``.
+    figures
+        Whether the page has pictures of the figures, which take most of the time.
 
     Raises
     ------
@@ -63,32 +67,33 @@ def write(path: Path, target: Path, jobs: int = 1) -> Path:
     if target.resolve() == path.resolve():
         raise RequestError(f"'{target}' is the results file itself; choose another file for the report")
     try:
-        write_atomically(target, page(path, jobs).encode("utf-8"))
+        write_atomically(target, page(path, jobs, figures=figures).encode("utf-8"))
     except OSError as error:
         raise RequestError(f"'{target}' cannot be written: {error.strerror}") from None
     return target
 
 
-def page(path: Path, jobs: int = 1) -> str:
-    """The page of a results file, its pictures drawn by so many processes."""
-    with helpers(jobs) as others:
-        return _page(path, others)
+def page(path: Path, jobs: int = 1, *, figures: bool = True) -> str:
+    """The page of a results file, its pictures drawn by so many processes, or without pictures."""
+    with processes(jobs if figures else 1) as pool:
+        return _page(path, pool, figures=figures)
 
 
-def _page(path: Path, others: Helpers | None) -> str:
+def _page(path: Path, pool: ProcessPoolExecutor | None, *, figures: bool) -> str:
     study, extended = study_of(path, read_meta(path)), tables.extended_tables(path, READ)
     faults, read = faults_of(extended.values()), {name: one.frame for name, one in extended.items()}
-    cells, known = tables.in_order(read["cells"]), list(problems(path, read))
-    del extended["histories"], read["histories"]  # of a large study millions of rows, which `known` has in order
+    cells, data_of = tables.in_order(read["cells"]), dict(problems(path, read))
+    del extended["histories"], read["histories"]  # of a large study millions of rows, which `data_of` has in order
     grids = list(_grids({**extended, "cells": extended["cells"].of(cells)}))
-    found = findings.all_findings(read, known)
-    first, kept = findings.leading(found), set(findings.leading(found, findings.MOST + FOLDED))
-    rest = [one for one in found if one in kept and one not in first]
+    everything = list(findings.all_findings(read, data_of.items()))
+    first, kept = findings.leading(everything), set(findings.leading(everything, findings.MOST + FOLDED))
+    rest = [one for one in everything if one in kept and one not in first]
     key_length = short_keys(cells["cell"])
     rows = {str(cell): k for k, cell in enumerate(cells["cell"])}
-    live = [plot for name, data in known for plot in plots.plots(name, data, rows)]
-    few = [one for name, data in known for one in for_report(name, data, _leading_duals(data))]
-    drawn, undrawable = stills(few, others)
+    live = [plot for name, data in data_of.items() for plot in plots.plots(name, data, rows)]
+    tasks = [task for name, data in data_of.items() for task in tasks_of(name, data)] if figures else []
+    rendered = render(tasks, image_of, pool)
+    images = [image for figure in rendered for image in figure.pages]
     template = _environment().get_template("report.html.j2")
     return template.render(
         study=study.get("name", path.parent.name),
@@ -99,19 +104,20 @@ def _page(path: Path, others: Helpers | None) -> str:
         way=_way,
         short=lambda cell: str(cell)[:key_length],
         findings=first,
-        findings_left_out=len(found) - len(first) - len(rest),
+        findings_left_out=len(everything) - len(first) - len(rest),
         more_findings=[(subject, list(group)) for subject, group in groupby(rest, key=lambda one: one.subject)],
         cells=len(cells),
         failed=int((cells["status"] != Status.OK).sum()),
         missing=[
             *(f"no picture of {one.key[0]}: {one.reason}" for one in pictures.read(path) if one.reason),
-            *dict.fromkeys([*faults, *undrawable]),
+            *dict.fromkeys([*faults, *(figure.failure for figure in rendered if figure.failure)]),
         ],
         grids=grids,
-        stills=drawn,
-        cut=any(data.halved for *_, data in few) or any(len(data.duals) > MOST_DUALS for _, data in known),
+        drawn=figures,
+        images=images,
+        cut=any(image.cut for image in images) or any(len(data.duals) > MOST_DUALS for data in data_of.values()),
         plots={plot.name: plot for plot in live},
-        plots_alone=[plot for plot in live if plot.name not in {still.name for still in drawn}],
+        plots_alone=[plot for plot in live if plot.name not in {image.name for image in images}],
         table_data=Markup(to_json(grids)),
         plot_data=Markup(script_safe({plot.name: plot.data for plot in live})),
         library=Markup(plots.library()) if live else "",
@@ -144,11 +150,11 @@ MOST_DUALS = 1
 """Dual strategies of a problem that have pictures of their own: those of the leaderboard first, then the others."""
 
 
-def _leading_duals(data: Data) -> list[str]:
-    """The dual strategies of a problem that have pictures of their own."""
+def tasks_of(name: str, data: Data) -> Iterator[FigureTask]:
+    """The figures of a problem of which the page has pictures: of long ones the beginning."""
     winners = (winner for one in leaderboard(data.cells) for band in one.bands for winner in band.winners)
     ranked = dict.fromkeys([*(str(winner.cell["dual"]) for winner in winners), *data.duals])
-    return list(ranked)[:MOST_DUALS]
+    return figures_of(name, replace(data, extent=Extent.BEGINNING), list(ranked)[:MOST_DUALS])
 
 
 def _way(winner: Winner) -> str:

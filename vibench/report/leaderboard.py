@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any
 
 import pandas as pd
 
-from vibench.results.best import digits_of, excluded
+from vibench.results.best import bands, excluded
 from vibench.results.error_measures import errors_of_solution
 
 
@@ -108,35 +108,17 @@ def leaderboard(cells: pd.DataFrame) -> tuple[Standings, ...]:
 
 
 def _standings(problem: str, options: str, cells: pd.DataFrame) -> Standings:
-    without = excluded(cells)
-    known = cells.assign(**{COLUMNS[Criterion.ERROR]: errors_of_solution(cells)})[~without.any(axis=1)]
+    without, errors = excluded(cells), errors_of_solution(cells)
+    rows = cells.assign(**{COLUMNS[Criterion.ERROR]: errors})[~without.any(axis=1)]
+    reached = tuple(
+        Band(error, len(mine), tuple(_winners(cells, rows, smallest)))
+        for error, mine, smallest in bands(rows, errors[rows.index], COLUMNS.values())
+    )
     counts = {str(reason): int(count) for reason, count in without.sum().items()}
-    return Standings(problem, options, tuple(_distinct(_bands(known))), len(cells), **counts)
+    return Standings(problem, options, reached, len(cells), **counts)
 
 
-def _bands(cells: pd.DataFrame) -> Iterator[Band]:
-    """The bands of one problem, from the largest error to the smallest."""
-    digits = digits_of(cells[COLUMNS[Criterion.ERROR]])
-    for digit in sorted(set(digits), reverse=True):
-        mine = cells[digits <= digit]
-        yield Band(10.0**digit, len(mine), tuple(_winners(mine)))
-
-
-def _winners(cells: pd.DataFrame) -> Iterator[Winner]:
+def _winners(cells: pd.DataFrame, rows: pd.DataFrame, smallest: Mapping[str, Any]) -> Iterator[Winner]:
     for criterion, column in COLUMNS.items():
-        values = cells[column].astype(float)
-        if values.notna().any():
-            best = values.idxmin()
-            yield Winner(criterion, float(values[best]), cells.drop(columns=COLUMNS[Criterion.ERROR]).loc[best])
-
-
-def _distinct(bands: Iterable[Band]) -> Iterator[Band]:
-    """Bands without those whose winners are also those of the next smaller one."""
-    found = list(bands)
-    for k, band in enumerate(found):
-        if k + 1 == len(found) or _keys(band) != _keys(found[k + 1]):
-            yield band
-
-
-def _keys(band: Band) -> list[tuple[Criterion, str]]:
-    return [(one.criterion, str(one.cell["cell"])) for one in band.winners]
+        if column in smallest:
+            yield Winner(criterion, float(rows.at[smallest[column], column]), cells.loc[smallest[column]])

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -77,22 +78,33 @@ def fastest(cells: pd.DataFrame, errors: pd.Series | None = None) -> pd.DataFram
     """
     measured = errors_of_solution(cells) if errors is None else errors.reindex(cells.index)
     fine = ~excluded(cells, measured).any(axis=1) & cells["online_s"].notna()
-    groups = cells[fine].groupby(["problem", "problem_options"], dropna=False)
-    rows = [row for _, mine in groups for row in _bands(mine, measured[mine.index])]
+    rows = [
+        pd.concat([mine.loc[fastest_of["online_s"]], pd.Series({BAND: error})])
+        for _, mine in cells[fine].groupby(["problem", "problem_options"], dropna=False)
+        for error, _, fastest_of in bands(mine, measured[mine.index], ["online_s"])
+    ]
     columns = ["problem", BAND, *cells.columns.drop("problem")]
     return pd.DataFrame(rows, columns=columns).astype({**cells.dtypes, BAND: float}).reset_index(drop=True)
 
 
-def digits_of(errors: pd.Series) -> pd.Series:
-    """The exponent of the smallest power of ten that an error does not exceed; that of an error of 1e-3 is -3."""
+def bands(
+    cells: pd.DataFrame, errors: pd.Series, columns: Collection[str]
+) -> Iterator[tuple[float, pd.DataFrame, dict[str, Any]]]:
+    """The bands of accuracy that the cells of one problem reach, from the largest error to the smallest.
+
+    Yields the power of ten that the errors in the band do not exceed, its cells, and by each of the columns of which it
+    has a value the index of the smallest one, of equal ones the first. A band in which the same cells have these as in
+    the next smaller one is left out.
+    """
     exponents = np.log10(errors.clip(lower=np.finfo(float).tiny))
-    return np.ceil(exponents - 1e-12)  # by round-off the logarithm of 1e-3 may be above -3
-
-
-def _bands(cells: pd.DataFrame, errors: pd.Series) -> Iterator[pd.Series]:
-    """The fastest cells of one problem, from the largest error to the smallest."""
-    digits = digits_of(errors)
-    found = [(band, cells.loc[cells.loc[digits <= band, "online_s"].idxmin()]) for band in sorted(set(digits))[::-1]]
-    for k, (band, cell) in enumerate(found):
-        if k + 1 == len(found) or found[k + 1][1]["cell"] != cell["cell"]:
-            yield pd.concat([cell, pd.Series({BAND: 10.0**band})])
+    digits = np.ceil(exponents - 1e-12)  # by round-off the logarithm of 1e-3 may be above -3
+    smaller: dict[str, Any] | None = None
+    reached = list[tuple[float, pd.DataFrame, dict[str, Any]]]()
+    for digit in sorted(set(digits)):
+        mine = cells[digits <= digit]
+        smallest = {name: mine[name].astype(float).idxmin() for name in columns if mine[name].notna().any()}
+        keys = {name: mine.at[index, "cell"] for name, index in smallest.items()}
+        if keys != smaller:
+            reached.append((10.0**digit, mine, smallest))
+        smaller = keys
+    yield from reversed(reached)

@@ -12,6 +12,7 @@ import pytest
 
 import vibench
 from vibench.execution.run import Agenda, Observer
+from vibench.report import figures
 from vibench.results import tables
 
 SETTINGS: dict[str, Any] = {
@@ -97,12 +98,16 @@ def test_a_figure_that_there_is_not(run: vibench.Run, kind: str, options: dict[s
         run.figure(kind, **options)
 
 
-def test_what_a_run_writes(run: vibench.Run, tmp_path: Path) -> None:
+def test_what_a_run_writes(run: vibench.Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(figures, "OF_PROBLEM", {"errors": figures.OF_PROBLEM["errors"]})
     assert {file.name for file in run.write_tables(tmp_path / "tables")} == set(tables.EXPORTED)
     drawn = run.write_figures(tmp_path / "figures")
     assert {file.suffix for file in drawn} == {".png", ".svg"}
     assert all(file.stat().st_size for file in drawn)
-    assert "radial-obstacle" in run.report(tmp_path / "page.html").read_text(encoding="utf-8")
+    for shown in (True, False):
+        page = run.report(tmp_path / "page.html", figures=shown).read_text(encoding="utf-8")
+        assert "radial-obstacle" in page
+        assert ("<img" in page) == shown
 
 
 @pytest.mark.parametrize(

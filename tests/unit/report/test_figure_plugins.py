@@ -148,7 +148,7 @@ def of_plugins(results: Path) -> dict[str, Any]:
     for name, draw, data in figures.drawings(results):
         if draw not in {*figures.OF_PROBLEM.values(), *figures.OF_DUAL.values()}:
             try:
-                found[name] = draw(data)
+                found[name] = next(iter(draw(data)), None)
             except FigureError as error:
                 found[name] = str(error)
     return found

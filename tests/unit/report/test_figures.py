@@ -23,7 +23,7 @@ from running import DECIDED, Changed, execute
 from vibench.report import figures
 from vibench.report.figures import FORMATS, OF_PROBLEM, constants, convergence, costs, draw_all
 from vibench.report.figures import problems as of_file
-from vibench.report.figures.data import _per_combination
+from vibench.report.figures.data import Extent, _per_combination
 from vibench.report.figures.style import save, styled
 from vibench.results import tables
 from vibench.results.sqlite.reading import FILE
@@ -63,7 +63,7 @@ def drawn_from(results: Path, folder: Path, *kinds: str) -> Drawn:
         files = draw_all(results, folder)
     assert [path.stem for path in files] == [name for name in kept for _ in FORMATS]
     captions = [figures.CAPTIONS] * bool(files)
-    assert sorted([path.name for path in files] + captions) == sorted(path.name for path in folder.iterdir())
+    assert sorted([path.name for path in files] + captions) == sorted(path.name for path in folder.glob("*"))
     return kept
 
 
@@ -349,13 +349,13 @@ def test_every_strategy_is_drawn_ten_to_a_panel(count: int, results: Path) -> No
 
     cones = replace(data, histories=pd.concat([data.histories[data.histories["stage"] == "pod"],
                                                many(data.histories, "dual", "mcpg")]))  # fmt: skip
-    assert in_tens(convergence.projection_errors(cones).axes[1:]) == count
-    assert in_tens(convergence.orthogonality(cones).axes) == count
+    assert in_tens(next(convergence.projection_errors(cones)).axes[1:]) == count
+    assert in_tens(next(convergence.orthogonality(cones)).axes) == count
     mine = data.of_dual("mcpg")
     fixed = replace(mine, queries=many(mine.queries, "primal", "offline-pga"),
                     histories=many(mine.histories, "primal", "offline-pga"))  # fmt: skip
-    assert in_tens(convergence.enrichment(fixed).axes[::3]) == count
-    spans = [axes for axes in constants.inf_sup(fixed).axes if axes.get_ylabel().endswith("span")]
+    assert in_tens(next(convergence.enrichment(fixed)).axes[::3]) == count
+    spans = [axes for axes in next(constants.inf_sup(fixed)).axes if axes.get_ylabel().endswith("span")]
     assert in_tens(spans) == count + len(spans)  # the high-fidelity pair is in each
 
 
@@ -363,7 +363,7 @@ def test_thresholds_are_marked_where_the_lines_cross(results: Path, change: Call
     """With their intervals; however many there are, a panel has one artist for each meaning and one for intervals."""
     change(*DECIDED)
     data = dict(of_file(results))["obstacle"]
-    figure, seen = costs.total_cost(data), 0
+    (figure,), seen = costs.total_cost(data), 0
     for axes in figure.axes:
         marks = [line for line in axes.get_lines() if line.get_marker() in "<>"]
         assert len({line.get_label() for line in marks}) == len(marks)
@@ -440,7 +440,7 @@ def test_the_same_results_give_the_same_files(results: Path, tmp_path: Path) -> 
         for folder in ("one", "two"):
             (tmp_path / folder).mkdir(exist_ok=True)
             with styled():
-                files.append(save(drawing(data), tmp_path / folder, name))
+                files.append(save(next(drawing(data)), tmp_path / folder, name))
         for first, second in zip(*files, strict=True):
             assert first.read_bytes() == second.read_bytes(), first.name
 
@@ -545,11 +545,15 @@ def test_a_caption_says_which_tolerances_are_left_out(change: Callable[..., None
 def test_a_long_figure_is_drawn_in_parts(results: Path) -> None:
     data = dict(of_file(results))["obstacle"].of_dual("mcpg")
     pairs = pd.concat([data.queries.assign(pair=f"pair {k}") for k in range(8)])
-    known = figures._pages("name", "inf-sup", figures.inf_sup, replace(data, queries=pairs))
-    drawn = {name: draw(part) for name, draw, part in known}
+    task = ("name", figures.inf_sup, replace(data, queries=pairs, extent=Extent.PAGES))
+    (rendered,) = figures.render([task], lambda name, figure: (name, figure))
+    drawn = dict(rendered.pages)
     assert list(drawn) == ["name", "name-2"]
     assert [len([axes for axes in figure.axes if axes.get_title()]) for figure in drawn.values()] == [6, 2]
     assert [figure.caption[-12:] for figure in drawn.values()] == ["Part 1 of 2.", "Part 2 of 2."]
+    (whole,) = figures.inf_sup(replace(data, queries=pairs))
+    assert len([axes for axes in whole.axes if axes.get_title()]) == 8
+    assert "Part" not in whole.caption
 
 
 def test_what_is_computed_once_per_combination_is_that_of_every_row() -> None:
@@ -578,15 +582,16 @@ def test_a_report_has_half_a_page_of_a_long_figure_and_the_whole_of_any_other(re
         return pd.concat(clones, ignore_index=True)
 
     many = replace(data, cells=long(mine.cells), queries=pd.concat([long(mine.queries), data.of_dual("cpg").queries]))
-    found = {one: (draw, part) for one, draw, part in figures.for_report(name, many, ["cpg"])}
-    assert {one.removeprefix("obstacle-") for one in found} >= {*OF_PROBLEM, "cpg-inf-sup"}
-    assert "obstacle-mcpg-inf-sup" not in found
-    cut = {one for one, (_, part) in found.items() if part.page is not None and part.page[1] > 1}
+    tasks = list(figures.figures_of(name, replace(many, extent=Extent.BEGINNING), ["cpg"]))
+    assert {one.removeprefix("obstacle-") for one, *_ in tasks} >= {*OF_PROBLEM, "cpg-inf-sup"}
+    assert "obstacle-mcpg-inf-sup" not in [one for one, *_ in tasks]
+    found = {one: list(draw(part)) for one, draw, part in tasks}
+    assert max(map(len, found.values())) == 1
+    cut = {one for one, pages in found.items() for page in pages if page.part}
     long_ones = {"shares": (6, 3), "dimension": (4, 7), "work-precision": (4, 7), "total-cost": (6, 3)}
     assert cut - {"obstacle-outputs"} == {f"obstacle-{kind}" for kind in long_ones}
     for kind, (titles, parts) in long_ones.items():
-        draw, part = found[f"obstacle-{kind}"]
-        figure = draw(part)
+        (figure,) = found[f"obstacle-{kind}"]
         assert len([axes for axes in figure.axes if axes.get_title()]) == titles
         assert f"Part 1 of {parts}." in figure.caption
 

@@ -227,7 +227,7 @@ def test_the_fastest_of_a_problem_is_named_with_its_errors(said: Said, quick_run
 
 def test_findings_that_say_most_come_first_and_every_subject_has_a_turn(quick_run: Path) -> None:
     read = {name: tables.read(quick_run / FILE, name) for name in READ}
-    found = all_findings(read, problems(quick_run / FILE, read))
+    found = list(all_findings(read, problems(quick_run / FILE, read)))
     first = leading(found)
     assert len(first) == MOST < len(found)
     assert [one.weight for one in first] == sorted(one.weight for one in first)

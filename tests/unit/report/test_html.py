@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 from markupsafe import escape
 from outputs import Links, clean, elements
-from running import Changed
+from running import Changed, Main
 
 from vibench.report import html
 from vibench.report.figures.data import problems
@@ -66,20 +66,32 @@ def test_findings_tables_and_facts_are_in_it(made: Path, quick_run: Path) -> Non
     assert "None: every query of every cell is ok." in page
 
 
+def test_without_pictures_all_else_is_in_it(made: Path, quick_run: Path, tmp_path: Path, main: Main) -> None:
+    target = tmp_path / "plain.html"
+    code, printed, _ = main("report", str(quick_run), "--no-figures", "--out", str(target))
+    assert (code, printed) == (0, f"report: {target}\n")
+    whole, page = (file.read_text(encoding="utf-8") for file in (made, target))
+    assert "<img" in whole
+    assert "<img" not in page
+    assert "The pictures were left out; <code>vibench figures</code> draws them as files." in page
+    for name in ("table-data", "plot-data"):
+        assert data(page, name) == data(whole, name)
+    assert page.count("data-plot=") == len(data(page, "plot-data")) > 4
+    assert page.split('<section id="figures">')[0] == whole.split('<section id="figures">')[0]
+
+
 def test_of_thousands_of_findings_those_that_say_most_are_in_it(
     quick_run: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(html, "stills", lambda *_: ([], []))
     monkeypatch.setattr(html, "FOLDED", 5)
     count = sum(map(len, findings(quick_run / FILE).values()))
-    section = html.page(quick_run / FILE).split('<section id="findings">')[1].split("</section>")[0]
+    section = html.page(quick_run / FILE, figures=False).split('<section id="findings">')[1].split("</section>")[0]
     assert section.count("<li>") == MOST + 5 < count
     assert "<summary>5 more</summary>" in section
     assert f"{count - MOST - 5} findings on single cells and pairs are left out" in section
 
 
-def test_every_failure_has_its_reason_and_nothing_is_markup(changed: Changed, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(html, "stills", lambda *_: ([], []))
+def test_every_failure_has_its_reason_and_nothing_is_markup(changed: Changed) -> None:
     reason = "<script>alert(''the solver said & did nothing'')</script>"
     results = changed(
         f"UPDATE cells SET status = 'failed', reason = '{reason}' WHERE solver = 'osqp'",
@@ -87,7 +99,7 @@ def test_every_failure_has_its_reason_and_nothing_is_markup(changed: Changed, mo
         "INSERT INTO pictures (problem, problem_options, number, reason) VALUES ('wire', '{}', 0, 'no <mesh>')",
     )
     failed = int((tables.read(results, "cells")["solver"] == "osqp").sum())
-    page = html.page(results)
+    page = html.page(results, figures=False)
     assert "<script>alert" not in page
     embedded = data(page, "table-data")
     (column,) = [column for column in embedded["failed"]["columns"] if column["name"] == "reason"]
@@ -103,10 +115,9 @@ def test_every_failure_has_its_reason_and_nothing_is_markup(changed: Changed, mo
 @pytest.mark.parametrize(
     "label", ["</script><script>alert(1)</script>", "<img src=x onerror=alert(1)>", '" onclick="x']
 )
-def test_a_label_is_no_markup_wherever_it_stands(label: str, changed: Changed, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_label_is_no_markup_wherever_it_stands(label: str, changed: Changed) -> None:
     """In tables, attributes, findings and facts, those that come from JSON included."""
-    monkeypatch.setattr(html, "stills", lambda *_: ([], []))
-    plain = elements(html.page(changed()))
+    plain = elements(html.page(changed(), figures=False))
     label += "\x1b[31m\n\ud800"
     known = json.dumps({"name": label, "seed": label})
     axes = [
@@ -120,7 +131,7 @@ def test_a_label_is_no_markup_wherever_it_stands(label: str, changed: Changed, m
         f"UPDATE meta SET value = '{known}' WHERE key = 'study'",
         f"UPDATE cells SET versions = '{known}', reason = 'a' || char(27) || char(7), status = 'failed'",
     )
-    page = html.page(results)
+    page = html.page(results, figures=False)
     assert elements(page) <= plain | {"td.class", "p.class", "h3", "h3.id"}
     assert page.count("<script") == page.count("</script") == 4
     assert clean(page)
@@ -153,21 +164,18 @@ def test_a_large_study_has_pictures_of_the_cones_that_win(changed: Changed, monk
     (hertz, _) = leaderboard(tables.in_order(tables.read(path, "cells")))
     (winner, *_) = hertz.bands[0].winners
     ((name, data), _) = problems(path)
-    names = [drawing[0] for drawing in html.for_report(name, data, html._leading_duals(data))]
+    names = [task[0] for task in html.tasks_of(name, data)]
     assert [one for one in names if one.endswith("inf-sup")] == [f"hertz-{winner.cell['dual']}-inf-sup"]
     assert {"hertz-errors", "hertz-total-cost"} <= {*names}
 
 
-def test_only_rows_of_a_disturbed_machine_are_said_to_be_marked(
-    changed: Changed, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(html, "stills", lambda *_: ([], []))
+def test_only_rows_of_a_disturbed_machine_are_said_to_be_marked(changed: Changed) -> None:
     calm = "UPDATE cells SET disturbed = 0"
-    page = html.page(changed(calm))
+    page = html.page(changed(calm), figures=False)
     assert "marks rows" not in page
     assert data(page, "table-data")["summary"]["disturbed"] == []
     path = changed(calm, "UPDATE cells SET disturbed = 1 WHERE rowid IN (3, 4)")
-    page = html.page(path)
+    page = html.page(path, figures=False)
     keys = tables.in_order(tables.read(path, "cells"))
     embedded = data(page, "table-data")
     assert embedded["summary"]["disturbed"] == list(keys.index[keys["disturbed"] == 1])

@@ -57,7 +57,7 @@ def site(three: list[Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Their site; reports have tests of their own, and take long to draw."""
     made = tmp_path_factory.mktemp("site") / "site"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(html, "page", lambda _: REPORT)
+        patch.setattr(html, "page", lambda *_, **__: REPORT)
         publish(three, made, CITATION, {three[1]: "measured on a <server>"})
     return made
 
@@ -201,7 +201,7 @@ def test_runs_of_one_study_are_compared(site: Path) -> None:
 def test_the_same_runs_give_the_same_site(
     site: Path, three: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(html, "page", lambda _: REPORT)
+    monkeypatch.setattr(html, "page", lambda *_, **__: REPORT)
     publish(three, tmp_path / "again", CITATION, {three[1]: "measured on a <server>"})
     names = sorted(path.relative_to(site) for path in site.rglob("*"))
     assert names == sorted(path.relative_to(tmp_path / "again") for path in (tmp_path / "again").rglob("*"))
@@ -240,7 +240,7 @@ def test_a_citation_is_valid_and_its_texts_are_data(site: Path) -> None:
 def test_a_label_is_no_markup_on_any_page(
     label: str, site: Path, changed: Changed, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(html, "page", lambda _: REPORT)
+    monkeypatch.setattr(html, "page", lambda *_, **__: REPORT)
     quoted = label.replace("'", "''") + "' || char(27) || '"
     axes = ("problem", "dual", "primal", "solver", "machine", "code", "study_hash")
     broken = changed(*(f"UPDATE cells SET {axis} = '{quoted}'" for axis in axes))
@@ -256,7 +256,7 @@ def test_a_label_is_no_markup_on_any_page(
 @pytest.fixture
 def small(three: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A site of one run whose report is empty."""
-    monkeypatch.setattr(html, "page", lambda _: REPORT)
+    monkeypatch.setattr(html, "page", lambda *_, **__: REPORT)
     publish(three[:1], tmp_path / "small", CITATION)
     return tmp_path / "small"
 
@@ -314,7 +314,7 @@ def test_a_folder_of_others_is_refused(three: list[Path], main: Main, tmp_path: 
 def test_the_command_writes_a_site(
     three: list[Path], main: Main, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(html, "page", lambda _: REPORT)
+    monkeypatch.setattr(html, "page", lambda *_, **__: REPORT)
     arguments = ("--title", "Ours", "--author", "Doe, Jane", "--url", "https://example.org/")
     code, out, err = main("publish", *map(str, three), str(tmp_path / "new" / "site"), *arguments)
     assert (code, err) == (0, "")

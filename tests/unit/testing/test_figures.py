@@ -144,9 +144,9 @@ def test_the_made_up_run_is_one_that_vibench_reads_and_draws(tmp_path: Path) -> 
     again = write_sample_run(tmp_path / "again")
     for name in TABLES:
         pd.testing.assert_frame_equal(tables.read(path, name), tables.read(again, name))
-    figures = [(name, draw, draw(data)) for name, draw, data in drawings(path)]
-    drawn = {draw for _, draw, figure in figures if figure is not None}
+    figures = [(name, draw, figure) for name, draw, data in drawings(path) for figure in draw(data)]
+    drawn = {draw for _, draw, _ in figures}
     missing = {kind for kind, draw in (OF_PROBLEM | OF_DUAL).items() if draw not in drawn}
     assert missing <= {"solutions", "diagnostics", "shares", "solvers", "precision", "break-even"}
-    shown = [(name, axes) for name, _, figure in figures if figure is not None for axes in figure.axes if axes.axison]
+    shown = [(name, axes) for name, _, figure in figures for axes in figure.axes if axes.axison]
     assert [name for name, axes in shown if not axes.has_data()] == []

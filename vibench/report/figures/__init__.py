@@ -4,37 +4,35 @@ from __future__ import annotations
 
 import contextlib
 import json
+import pickle
 import re
 import signal
+import tempfile
 import threading
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, partial
 from multiprocessing import get_context
 from pathlib import Path
+from typing import Generic, TypeVar, cast
 
+import pandas as pd
 from matplotlib.figure import Figure
 
 from vibench.errors import RequestError, unknown_name
-from vibench.files import write_atomically
-from vibench.report.figures import constants, convergence, costs
+from vibench.files import TEMPORARY, write_atomically
 from vibench.report.figures.constants import inf_sup, shares
 from vibench.report.figures.convergence import diagnostics, enrichment, orthogonality, projection_errors
 from vibench.report.figures.costs import break_even, dimension, outputs, total_cost, work_precision
-from vibench.report.figures.data import Data, file_names, problems
-from vibench.report.figures.plugins import FigureError, of_plugins
+from vibench.report.figures.data import Data, Extent, file_names, problems
+from vibench.report.figures.plugins import DrawPages, FigureError, of_plugins
 from vibench.report.figures.solutions import solutions
 from vibench.report.figures.solvers import precision, solvers
-from vibench.report.figures.style import ABREAST, DEEP, FORMATS, WRITTEN, caption_of, save, styled
+from vibench.report.figures.style import FORMATS, WRITTEN, caption_of, save, styled
 from vibench.text import parsed_json
 
-Drawing = Callable[[Data], Figure | None]
-
-Drawn = tuple[str, Drawing, Data]
-"""A figure to be drawn: its name, the function that draws it, and the data."""
-
-OF_PROBLEM: dict[str, Drawing] = {
+OF_PROBLEM: dict[str, DrawPages] = {
     "solutions": solutions,
     "diagnostics": diagnostics,
     "errors": projection_errors,
@@ -50,78 +48,41 @@ OF_PROBLEM: dict[str, Drawing] = {
 }
 """Figures of every problem, by the end of their file names."""
 
-OF_DUAL: dict[str, Drawing] = {"enrichment": enrichment, "inf-sup": inf_sup}
+OF_DUAL: dict[str, DrawPages] = {"enrichment": enrichment, "inf-sup": inf_sup}
 """Figures of every problem and dual strategy."""
 
-OF_HISTORIES: frozenset[Drawing] = frozenset({diagnostics, projection_errors, orthogonality, enrichment})
+OF_HISTORIES: frozenset[DrawPages] = frozenset({diagnostics, projection_errors, orthogonality, enrichment})
 """Those that read the histories; no other one does."""
-
-LONG: dict[str, tuple[Callable[[Data], int], int]] = {
-    "shares": (constants.compared, ABREAST * DEEP),
-    "dimension": (costs.sized, DEEP),
-    "work-precision": (costs.timed, DEEP),
-    "total-cost": (costs.pairs, ABREAST * DEEP),
-    "outputs": (costs.reported, ABREAST * DEEP),
-    "break-even": (costs.decided, ABREAST * DEEP),
-    "enrichment": (convergence.enriched, DEEP),
-    "inf-sup": (constants.pairs, constants.MOST_PAIRS),
-}
-"""Figures that grow with the study: how many panels or rows of panels they have, and how many go into one file."""
 
 CAPTIONS = "captions.json"
 """File beside the figures: the caption of every figure, by the name of its files."""
 
 
-def drawings(path: Path, note: Callable[[str], None] = lambda _: None) -> Iterator[Drawn]:
-    """Every figure a results file may have: its name, the function that draws it, and the data.
+FigureTask = tuple[str, DrawPages, Data]
+"""A figure to be drawn: the name of its file, or of the first one, the function that draws its pages, and the data."""
+
+Made = TypeVar("Made")
+"""What is made of a page."""
+
+
+def drawings(path: Path, note: Callable[[str], None] = lambda _: None) -> Iterator[FigureTask]:
+    """Every figure a results file may have, in files of a size that a page takes.
 
     The functions of plugins raise `FigureError`; those of this package do not. `note` is called with a line for every
     column of a plugin that the data do not have.
     """
     for name, data in problems(path, note=note):
-        yield from _drawings_of(name, data, data.duals, _pages)
+        yield from figures_of(name, replace(data, extent=Extent.PAGES), data.duals)
 
 
-def for_report(name: str, data: Data, duals: Collection[str]) -> Iterator[Drawn]:
-    """The figures of a problem that a report shows: of these dual strategies, and of a long figure half a page."""
-    return _drawings_of(name, data, duals, _beginning)
-
-
-def _drawings_of(
-    name: str, data: Data, duals: Collection[str], paged: Callable[[str, str, Drawing, Data], Iterator[Drawn]]
-) -> Iterator[Drawn]:
-    """The figures of a problem and of some of its dual strategies; `paged` gives what is drawn of each of vibench."""
-    for kind, draw in OF_PROBLEM.items():
-        yield from paged(f"{name}-{kind}", kind, draw, data)
+def figures_of(name: str, data: Data, duals: Collection[str]) -> Iterator[FigureTask]:
+    """The figures of a problem, whose names begin with its name, and of some of its dual strategies."""
+    yield from ((f"{name}-{kind}", draw, data) for kind, draw in OF_PROBLEM.items())
     for dual, file in zip(data.duals, file_names(data.duals), strict=True):
         if dual in duals:
             of_dual = data.of_dual(dual)
-            for kind, draw in OF_DUAL.items():
-                yield from paged(f"{name}-{file}-{kind}", kind, draw, of_dual)
+            yield from ((f"{name}-{file}-{kind}", draw, of_dual) for kind, draw in OF_DUAL.items())
     yield from ((f"{name}-{kind}", draw, data) for kind, draw in of_plugins(data, {*OF_PROBLEM, *OF_DUAL}).items())
-
-
-def _pages(name: str, kind: str, draw: Drawing, data: Data) -> Iterator[Drawn]:
-    """A drawing, or several of a figure that is too long for one."""
-    panels, most = _length(kind, data)
-    pages = max(1, -(-panels // most))
-    for page in range(pages):
-        yield name + f"-{page + 1}" * (page > 0), draw, replace(data, page=(page, pages))
-
-
-def _beginning(name: str, kind: str, draw: Drawing, data: Data) -> Iterator[Drawn]:
-    """The drawing of a figure, or of its first panels where it is too long for one file."""
-    panels, most = _length(kind, data)
-    if panels <= most:
-        yield name, draw, replace(data, page=(0, 1))
-    else:
-        yield name, draw, replace(data, page=(0, -(-panels // (most // 2))), halved=True)
-
-
-def _length(kind: str, data: Data) -> tuple[int, int]:
-    """Number of panels, or rows of panels, of a figure, and how many go into one file."""
-    count, most = LONG.get(kind, (lambda _: 1, 1))
-    return count(data), most
 
 
 def draw(
@@ -151,60 +112,59 @@ def draw(
         If it is a plugin's figure, which cannot be drawn.
     """
     faults: list[str] = []
-    known = {one.problem: one for _, one in problems(path, note=faults.append)}
+    by_problem = {data.problem: data for _, data in problems(path, note=faults.append)}
     for line in faults:  # called here, so that a warning can name the line of the caller
         note(line)
-    others = {name for one in known.values() for name in of_plugins(one, {*OF_PROBLEM, *OF_DUAL})}
+    others = {name for data in by_problem.values() for name in of_plugins(data, {*OF_PROBLEM, *OF_DUAL})}
     if kind not in {*OF_PROBLEM, *OF_DUAL, *others}:
         raise unknown_name("figure", kind, (*OF_PROBLEM, *OF_DUAL, *sorted(others)))
-    data = _only("problem", known, problem)
+    data = _only("problem", by_problem, problem)
     if kind in OF_DUAL:
         data = _only("dual strategy", {name: data.of_dual(name) for name in data.duals}, dual)
-    drawing = (OF_PROBLEM | OF_DUAL | of_plugins(data, {*OF_PROBLEM, *OF_DUAL})).get(kind)
+    draw_pages = (OF_PROBLEM | OF_DUAL | of_plugins(data, {*OF_PROBLEM, *OF_DUAL})).get(kind)
     with styled():
-        figure = None if drawing is None else drawing(data)
+        figure = None if draw_pages is None else next(iter(draw_pages(data)), None)
     if figure is None:
         raise RequestError(f"the run has no data for the figure '{kind}' of {data.problem}")
     return figure
 
 
-def _only(what: str, found: Mapping[str, Data], label: str | None) -> Data:
+def _only(noun: str, by_label: Mapping[str, Data], label: str | None) -> Data:
     """The data under a label, or the only ones."""
     if label is None:
-        if len(found) != 1:
-            known = f"name one of {', '.join(found)}" if found else "the run has none with queries"
-            raise RequestError(f"the figure is of one {what}: {known}")
-        return next(iter(found.values()))
-    if label not in found:
-        raise unknown_name(what, label, found)
-    return found[label]
+        if len(by_label) != 1:
+            hint = f"name one of {', '.join(by_label)}" if by_label else "the run has none with queries"
+            raise RequestError(f"the figure is of one {noun}: {hint}")
+        return next(iter(by_label.values()))
+    if label not in by_label:
+        raise unknown_name(noun, label, by_label)
+    return by_label[label]
 
 
 def remove(folder: Path) -> None:
     """Remove the figures that an earlier call of `draw_all` may have left in a folder; other files stay."""
     forms = f".({'|'.join(WRITTEN)})"
     own = re.compile(rf".*-({'|'.join(map(re.escape, (*OF_PROBLEM, *OF_DUAL)))})(-\d+)?\{forms}")
-    known = {f"{name}.{form}" for name in read_captions(folder) for form in WRITTEN}
+    captioned = {f"{name}.{form}" for name in read_captions(folder) for form in WRITTEN}
     for file in folder.glob("*"):
-        if file.is_file() and (file.name in known or file.name == CAPTIONS or own.fullmatch(file.name)):
+        if file.is_file() and (file.name in captioned or file.name == CAPTIONS or own.fullmatch(file.name)):
             file.unlink()
 
 
 def read_captions(folder: Path) -> dict[str, str]:
     """The captions beside the figures of a folder, by the names of the figures; empty where there are none."""
     try:
-        found = parsed_json((folder / CAPTIONS).read_text(encoding="utf-8"))
+        captions = parsed_json((folder / CAPTIONS).read_text(encoding="utf-8"))
     except (OSError, ValueError):
         return {}
-    return {str(name): str(text) for name, text in found.items()} if isinstance(found, dict) else {}
+    return {str(name): str(text) for name, text in captions.items()} if isinstance(captions, dict) else {}
 
 
 @dataclass(frozen=True)
-class Written:
-    """What became of one drawing: the files, their caption, and why a figure could not be drawn."""
+class Rendered(Generic[Made]):
+    """What became of a figure: what is made of its pages, and why a plugin could not draw it, "" if it could."""
 
-    files: tuple[Path, ...] = ()
-    caption: str = ""
+    pages: tuple[Made, ...]
     failure: str = ""
 
 
@@ -236,52 +196,110 @@ def draw_all(
         Called with a line for every column of a plugin that the data do not have, and for every figure of a plugin
         that could not be drawn.
     """
-    known, faults = _drawings(path)
-    written: dict[int, Written] = {}
-    with contextlib.ExitStack() as stack:
-        others: dict[int, Future[Written]] = {}
-        if jobs > 1:
-            pool = ProcessPoolExecutor(jobs - 1, get_context("spawn"))
-            stack.callback(pool.shutdown, cancel_futures=True)
-            with interrupts_ignored():  # the processes inherit it: Ctrl-C is for this one to handle
-                others = {k: pool.submit(_draw, path, folder, formats, k) for k in reversed(range(len(known)))}
-        # the others draw from the last figure on, this process from the first one on what they have not begun
-        for k in range(len(known)):
-            if k not in others or others[k].cancel():
-                others.pop(k, None)
-                progress(known[k][0], len(written) + sum(other.done() for other in others.values()), len(known))
-                written[k] = _draw(path, folder, formats, k)
-        for k, other in others.items():
-            progress(known[k][0], len(written), len(known))
-            written[k] = other.result()
-    _drawings.cache_clear()
-    failures = [written[k].failure for k in sorted(written) if written[k].failure]
-    for line in dict.fromkeys([*faults, *failures]):
+    faults: list[str] = []
+    with processes(jobs) as pool:
+        figures = render(list(drawings(path, faults.append)), partial(_save, folder, formats), pool, progress)
+    for line in dict.fromkeys([*faults, *(figure.failure for figure in figures if figure.failure)]):
         note(line)
-    captions = {known[k][0]: written[k].caption for k in sorted(written) if written[k].files}
-    if captions:
-        text = json.dumps(read_captions(folder) | captions, ensure_ascii=False, indent=1) + "\n"
+    pages = [page for figure in figures for page in figure.pages]
+    if pages:
+        captions = read_captions(folder) | {name: caption for name, caption, _ in pages}
+        text = json.dumps(captions, ensure_ascii=False, indent=1) + "\n"
         write_atomically(folder / CAPTIONS, text.encode("utf-8"))
-    return [file for k in sorted(written) for file in written[k].files]
+    return [file for *_, files in pages for file in files]
+
+
+def _save(folder: Path, formats: tuple[str, ...], name: str, figure: Figure) -> tuple[str, str, list[Path]]:
+    """Write a page; returns its name, its caption and its files."""
+    folder.mkdir(parents=True, exist_ok=True)
+    return name, caption_of(figure), save(figure, folder, name, formats)
+
+
+@contextlib.contextmanager
+def processes(jobs: int) -> Iterator[ProcessPoolExecutor | None]:
+    """Context with processes that draw: as many as `jobs`, this one included. They load Matplotlib in the meantime."""
+    if jobs < 2:
+        yield None
+        return
+    pool = ProcessPoolExecutor(jobs - 1, get_context("spawn"))
+    try:
+        with interrupts_ignored():  # the processes inherit it: Ctrl-C is for this one to handle
+            for _ in range(jobs - 1):
+                pool.submit(_tasks_in, None)
+        yield pool
+    finally:
+        pool.shutdown(cancel_futures=True)
+
+
+def render(
+    tasks: Sequence[FigureTask],
+    finish: Callable[[str, Figure], Made],
+    pool: ProcessPoolExecutor | None = None,
+    progress: Callable[[str, int, int], None] = lambda *_: None,
+) -> list[Rendered[Made]]:
+    """Draw figures here and in the processes of a pool; `finish` makes something of every page and its name."""
+    rendered: dict[int, Rendered[Made]] = {}
+    with contextlib.ExitStack() as stack:
+        awaited = {} if pool is None else stack.enter_context(_submitted(tasks, finish, pool))
+        # the others draw from the last figure on, this process what only it can and then what they have not begun
+        for k in sorted(range(len(tasks)), key=lambda k: k in awaited):
+            if k not in awaited or awaited[k].cancel():
+                awaited.pop(k, None)
+                progress(tasks[k][0], len(rendered) + sum(one.done() for one in awaited.values()), len(tasks))
+                rendered[k] = _render(tasks[k], finish)
+        for k, one in awaited.items():
+            progress(tasks[k][0], len(rendered), len(tasks))
+            rendered[k] = one.result()
+    return [rendered[k] for k in range(len(tasks))]
+
+
+@contextlib.contextmanager
+def _submitted(
+    tasks: Sequence[FigureTask], finish: Callable[[str, Figure], Made], pool: ProcessPoolExecutor
+) -> Iterator[dict[int, Future[Rendered[Made]]]]:
+    """Context with the figures that other processes may draw, by their places.
+
+    Those of plugins are not among them, since their functions need not go to other processes, and neither are those of
+    histories: of a large study these are millions of rows, which take longer to send than their few lines to draw.
+    """
+    shared = {*OF_PROBLEM.values(), *OF_DUAL.values()} - OF_HISTORIES
+    places = [k for k, (_, draw, _) in enumerate(tasks) if draw in shared]
+    # None, for a figure that reads histories without being one of OF_HISTORIES would not notice empty ones
+    none = cast("pd.DataFrame", None)
+    sent = [(name, draw, replace(data, histories=none)) for name, draw, data in (tasks[k] for k in places)]
+    with tempfile.TemporaryDirectory(prefix=TEMPORARY) as folder:
+        file = Path(folder) / "tasks"
+        file.write_bytes(pickle.dumps(sent))  # once for all of them: what they have in common is large
+        yield {
+            places[number]: pool.submit(_render_sent, file, number, finish) for number in reversed(range(len(places)))
+        }
+
+
+def pages_of(task: FigureTask) -> Iterator[tuple[str, Figure]]:
+    """The pages of a figure, one after the other, under the names of their files: after the first with its number."""
+    name, draw, data = task
+    for k, page in enumerate(draw(data), 1):
+        yield name + f"-{k}" * (k > 1), page
+
+
+def _render(task: FigureTask, finish: Callable[[str, Figure], Made]) -> Rendered[Made]:
+    """Draw a figure, and make something of its pages."""
+    with styled():
+        try:
+            return Rendered(tuple(finish(name, page) for name, page in pages_of(task)))
+        except FigureError as error:
+            return Rendered((), str(error))
+
+
+def _render_sent(file: Path, number: int, finish: Callable[[str, Figure], Made]) -> Rendered[Made]:
+    """Draw a figure of those that another process has written to a file."""
+    return _render(_tasks_in(file)[number], finish)
 
 
 @cache
-def _drawings(path: Path) -> tuple[list[Drawn], list[str]]:
-    """The drawings of a results file, read once in a process that draws, and what they lack of plugins."""
-    faults: list[str] = []
-    return list(drawings(path, faults.append)), faults
-
-
-def _draw(path: Path, folder: Path, formats: tuple[str, ...], number: int) -> Written:
-    """Draw one figure of `drawings`."""
-    name, draw, data = _drawings(path)[0][number]
-    folder.mkdir(parents=True, exist_ok=True)
-    with styled():
-        try:
-            figure = draw(data)
-        except FigureError as error:
-            return Written(failure=str(error))
-        return Written() if figure is None else Written(tuple(save(figure, folder, name, formats)), caption_of(figure))
+def _tasks_in(file: Path | None) -> Sequence[FigureTask]:
+    """The figures that another process has written to a file of its own; none without one."""
+    return () if file is None else pickle.loads(file.read_bytes())
 
 
 @contextlib.contextmanager

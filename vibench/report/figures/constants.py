@@ -17,18 +17,18 @@ from vibench.report.figures.data import (
     common_tolerances,
     dimensions,
     one_solver,
-    parts,
     point_names,
     series,
     some,
+    titled_parts,
 )
 from vibench.report.figures.looks import HIGH_FIDELITY_LOOK, Look, Looks, Series
 from vibench.report.figures.style import (
     ABREAST,
     DEEP,
     SERIES,
-    CaptionedFigure,
     Layout,
+    Pages,
     Sheet,
     counted,
     plot,
@@ -55,43 +55,33 @@ class _Panel(NamedTuple):
         return rows.set_index("query").reindex(self.order)
 
 
-def inf_sup(data: Data) -> CaptionedFigure:
+def inf_sup(data: Data) -> Pages:
     """Inf-sup constants β of every primal strategy and of the high-fidelity pair over the validation set.
 
     First row: over the span; second row: over the cone, with the certified interval as a band. Fixed enrichments are
     shown at the tolerance of the smallest mean, the same in every panel.
     """
-    constants = _constants(data)
-    shown = loosest(constants)
-    panels = data.on_page(_panels(data, shown), MOST_PAIRS)
-    axis = data.parameter
-    sheet, over, below = two_rows(len(panels), f"{data.problem}, {data.duals[0]}: inf-sup constants")
-    looks = Looks(one for panel in panels for one, _, _ in panel.strategies)
-    zeros: list[list[str]] = []
-    for panel, span, cone in zip(panels, over, below, strict=True):
-        reference, both = panel.along(panel.reference), (span, cone)
-        x = reference["mu_1"].to_numpy(float) if axis else np.arange(1, len(reference) + 1)  # or places in the order
-        _draw(both, x, reference, "beta_hf_", HIGH_FIDELITY_LOOK, "high-fidelity")
-        named = [(name, panel.along(rows), looks[one]) for one, name, rows in panel.strategies]
-        drawn = {name: _draw(both, x, rows, "beta_", look, name) for name, rows, look in named}
-        zeros.append([name for name, zero in drawn.items() if zero])
-        span.set_title(panel.title)
-        for axes, generated in ((span, "span"), (cone, "cone")):
-            axes.set(ylabel=f"β over {generated}", xlabel=axis or "validation parameters, sorted", yscale="log")
-            if not axis:
-                counted(axes)
-    _name_zeros(over, zeros)
-    return sheet.finish(_caption(data, constants, shown, bool(axis)))
-
-
-def pairs(data: Data) -> int:
-    """Number of panels of `inf_sup` over the span."""
-    shown = loosest(_constants(data)).groupby("pair", sort=False)
-    return sum(-(-len(rows.groupby(["primal", "primal_tol"], dropna=False)) // (SERIES - 1)) for _, rows in shown)
-
-
-def _constants(data: Data) -> pd.DataFrame:
-    return pd.concat([one_solver(rows) for _, rows in data.queries.groupby("pair", sort=False)])
+    constants = pd.concat([one_solver(rows) for _, rows in data.queries.groupby("pair", sort=False)])
+    shown, axis = loosest(constants), data.parameter
+    for panels, part in data.pages(_panels(data, shown), MOST_PAIRS):
+        sheet, over, below = two_rows(len(panels), f"{data.problem}, {data.duals[0]}: inf-sup constants")
+        looks = Looks(one for panel in panels for one, _, _ in panel.strategies)
+        zeros: list[list[str]] = []
+        for panel, span, cone in zip(panels, over, below, strict=True):
+            reference, both = panel.along(panel.reference), (span, cone)
+            # the parameter, or places in the order
+            x = reference["mu_1"].to_numpy(float) if axis else np.arange(1, len(reference) + 1)
+            _draw_constants(both, x, reference, "beta_hf_", HIGH_FIDELITY_LOOK, "high-fidelity")
+            named = [(name, panel.along(rows), looks[one]) for one, name, rows in panel.strategies]
+            drawn = {name: _draw_constants(both, x, rows, "beta_", look, name) for name, rows, look in named}
+            zeros.append([name for name, zero in drawn.items() if zero])
+            span.set_title(panel.title)
+            for axes, generated in ((span, "span"), (cone, "cone")):
+                axes.set(ylabel=f"β over {generated}", xlabel=axis or "validation parameters, sorted", yscale="log")
+                if not axis:
+                    counted(axes)
+        _name_zeros(over, zeros)
+        yield sheet.finish(_caption(data, constants, shown, bool(axis)), part)
 
 
 def loosest(constants: pd.DataFrame) -> pd.DataFrame:
@@ -106,7 +96,7 @@ def loosest(constants: pd.DataFrame) -> pd.DataFrame:
 
 def _panels(data: Data, shown: pd.DataFrame) -> list[_Panel]:
     """A panel for each pair, and several where there are more strategies than a panel takes."""
-    found = []
+    panels = []
     for pair, of_pair in data.queries.groupby("pair", sort=False):
         rows = shown[shown["pair"] == pair]
         fixed = rows[rows["enrichment_kind"] == Kind.FIXED]
@@ -116,24 +106,21 @@ def _panels(data: Data, shown: pd.DataFrame) -> list[_Panel]:
         strategies = [
             (series(one["primal"].iloc[0], one["primal_tol"].iloc[0]), name, one) for name, one in by_strategy(rows)
         ]
-        reference = strategies[0][2]
-        groups = parts(strategies, SERIES - 1)
-        for k, group in enumerate(groups, 1):
-            more = f", strategies {k} of {len(groups)}" if len(groups) > 1 else ""
-            found.append(_Panel(f"{dimensions(of_pair)}{more}", group, reference, order))
-    return found
+        groups = titled_parts(dimensions(of_pair), strategies, SERIES - 1)
+        panels += [_Panel(title, group, strategies[0][2], order) for title, group in groups]
+    return panels
 
 
-def _draw(axes: tuple[Axes, Axes], x: Any, rows: pd.DataFrame, prefix: str, look: Look, name: str) -> bool:
+def _draw_constants(axes: tuple[Axes, Axes], x: Any, rows: pd.DataFrame, prefix: str, look: Look, name: str) -> bool:
     """Constants over the span, and the interval over the cone as its upper end with a band; whether β is 0 there."""
     top, below = axes
     span = rows[f"{prefix}span"].to_numpy(float)
-    known = span[np.isfinite(span)]
+    finite = span[np.isfinite(span)]
     plot(top, x, positive(span, VANISHES), look, name)
     lower, upper = rows[f"{prefix}cone_lower"].to_numpy(float), rows[f"{prefix}cone_upper"].to_numpy(float)
     plot(below, x, positive(upper, VANISHES), look)
     below.fill_between(x, lower, upper, color=look.colour, alpha=0.2, linewidth=0.0)
-    return bool(known.size and known.max() < VANISHES)
+    return bool(finite.size and finite.max() < VANISHES)
 
 
 def _name_zeros(panels: list[Axes], zeros: list[list[str]]) -> None:
@@ -161,51 +148,39 @@ def _caption(data: Data, constants: pd.DataFrame, shown: pd.DataFrame, along: bo
         if len(given) > kept.nunique():
             left_out = [value for value in given if value not in set(kept)]
             text.append(f"{primal} is shown at δ = {some(kept)}, its loosest; left out: {some(left_out)}.")
-    return " ".join(text) + data.part
+    return " ".join(text)
 
 
-def shares(data: Data) -> CaptionedFigure | None:
+def shares(data: Data) -> Pages:
     """Smallest shares of β over the span in that of the whole of V: over the validation against the training set.
 
     One point per fixed enrichment. Below the diagonal, validation parameters are less stable than the training set; the
     tick on the left of a point is √(1 − σ²), which bounds the share on the training set.
     """
-    groups = data.on_page(_groups(data), ABREAST * DEEP)
-    if not groups:
-        return None
-    sheet = Sheet.of(
-        len(groups), f"{data.problem}: shares of the inf-sup constant", Layout(width=4.0, height=3.2), "all"
-    )
-    looks = Looks(Series(str(name)) for _, rows in groups for name in rows["primal"].unique())
-    for panel, (title, rows) in zip(sheet.panels, groups, strict=False):
-        panel.axline((1.0, 1.0), slope=1.0, color="0.6", linewidth=0.8, zorder=0)
-        for primal, mine in rows.groupby("primal", sort=False):
-            look = looks[Series(str(primal))]
-            scatter(panel, mine["share_training"], mine["share_validation"], look, str(primal))
-            panel.plot(mine["share_guaranteed"], mine["share_validation"], "|", color=look.colour)
-            for k, text in point_names(mine).items():
-                sheet.label(panel, mine.at[k, "share_training"], mine.at[k, "share_validation"], text)
-                sheet.label(panel, mine.at[k, "share_guaranteed"], mine.at[k, "share_validation"], "")
-        panel.set(title=title, xlabel="smallest share, training set", ylabel="smallest share, validation set")
-    return sheet.finish(
-        f"Smallest share of β over the span in that of the whole of V for {data.problem}: over the validation set "
-        "against over the training set, one point for each fixed enrichment with its (N, R) and tolerance δ; a number "
-        "alone is another δ. Below the diagonal, validation parameters are less stable than the training set. The tick "
-        f"left of a point is √(1 − σ²), which bounds the share on the training set.{data.part}"
-    )
-
-
-def compared(data: Data) -> int:
-    """Number of panels of `shares`."""
-    return len(_groups(data))
-
-
-def _groups(data: Data) -> list[tuple[str, pd.DataFrame]]:
-    """Title and fixed enrichments of every panel of `shares`."""
     cells = data.cells[data.cells["share_training"].notna()].drop_duplicates([*PRIMAL, "dual", "pair"])
-    return [
-        (str(dual) + f", strategies {k} of {len(groups)}" * (len(groups) > 1), rows[rows["primal"].isin(names)])
+    panels = [
+        (title, rows[rows["primal"].isin(names)])
         for dual, rows in cells.groupby("dual", sort=False)
-        for groups in [parts(list(rows["primal"].unique()), SERIES)]
-        for k, names in enumerate(groups, 1)
+        for title, names in titled_parts(str(dual), list(rows["primal"].unique()), SERIES)
     ]
+    for shown, part in data.pages(panels, ABREAST * DEEP):
+        title = f"{data.problem}: shares of the inf-sup constant"
+        sheet = Sheet.of(len(shown), title, Layout(width=4.0, height=3.2), "all")
+        looks = Looks(Series(str(name)) for _, rows in shown for name in rows["primal"].unique())
+        for panel, (dual, rows) in zip(sheet.panels, shown, strict=False):
+            panel.axline((1.0, 1.0), slope=1.0, color="0.6", linewidth=0.8, zorder=0)
+            for primal, mine in rows.groupby("primal", sort=False):
+                look = looks[Series(str(primal))]
+                scatter(panel, mine["share_training"], mine["share_validation"], look, str(primal))
+                panel.plot(mine["share_guaranteed"], mine["share_validation"], "|", color=look.colour)
+                for k, text in point_names(mine).items():
+                    sheet.label(panel, mine.at[k, "share_training"], mine.at[k, "share_validation"], text)
+                    sheet.label(panel, mine.at[k, "share_guaranteed"], mine.at[k, "share_validation"], "")
+            panel.set(title=dual, xlabel="smallest share, training set", ylabel="smallest share, validation set")
+        yield sheet.finish(
+            f"Smallest share of β over the span in that of the whole of V for {data.problem}: over the validation set "
+            "against over the training set, one point for each fixed enrichment with its (N, R) and tolerance δ; a "
+            "number alone is another δ. Below the diagonal, validation parameters are less stable than the training "
+            "set. The tick left of a point is √(1 − σ²), which bounds the share on the training set.",
+            part,
+        )

@@ -21,9 +21,10 @@ from vibench.report.figures.data import (
     parts,
     series,
     some,
+    titled_parts,
 )
 from vibench.report.figures.looks import Looks, Series
-from vibench.report.figures.style import DEEP, SERIES, CaptionedFigure, Sheet, counted, plot, positive, scatter
+from vibench.report.figures.style import DEEP, SERIES, CaptionedFigure, Pages, Sheet, counted, plot, positive, scatter
 
 ROUND_OFF = 1e-12
 """The tail of a POD below this is round-off."""
@@ -37,11 +38,11 @@ GROWTH = {"sigma": "largest σ, training set", "beta_span_min": "min β over spa
 POD = Series("POD")
 
 
-def diagnostics(data: Data) -> CaptionedFigure | None:
+def diagnostics(data: Data) -> Pages:
     """Quantities that the problem reports at every parameter, such as the largest aspect ratio (paper, Figure 3)."""
     found = data.histories[data.histories["stage"].isin(DIAGNOSED)]
     if found.empty:
-        return None
+        return
     quantities = list(found["quantity"].unique())
     sheet = Sheet.of(len(quantities), f"{data.problem}: diagnostics over the parameters")
     looks = Looks(map(Series, DIAGNOSED))
@@ -55,12 +56,12 @@ def diagnostics(data: Data) -> CaptionedFigure | None:
         panel.set(xlabel="parameter, training then validation", ylabel=str(quantity).replace("_", " "))
         counted(panel)
     named = ", ".join(str(quantity).replace("_", " ") for quantity in quantities)
-    return sheet.finish(
+    yield sheet.finish(
         f"What {data.problem} reports at every training parameter and every validation parameter: {named}."
     )
 
 
-def projection_errors(data: Data) -> CaptionedFigure:
+def projection_errors(data: Data) -> Pages:
     """Relative projection errors of the POD and of the cones against their size (paper, Figures 5 and 11)."""
     errors = data.histories[data.histories["quantity"] == "error"]
     cones = _in_panels(errors[errors["stage"] == "cone"])
@@ -74,23 +75,23 @@ def projection_errors(data: Data) -> CaptionedFigure:
     for panel, names in zip(others, cones, strict=False):
         panel.set(title="dual")
         _cones(panel, names, "number of generators R", "largest relative error of the cone")
-    return sheet.finish(
+    yield sheet.finish(
         f"Projection errors of {data.problem} over the training set: left, the relative tail of the POD against the "
         "number N of modes; right, the largest relative distance of a multiplier from the cone of the first R "
         "generators, for every dual strategy. Each curve is that of the tightest tolerance, which contains the others."
     )
 
 
-def orthogonality(data: Data) -> CaptionedFigure | None:
+def orthogonality(data: Data) -> Pages:
     """Relative distance of every generator from the cone of the preceding ones (paper, Figures 6 and 12)."""
     found = data.histories[(data.histories["stage"] == "cone") & (data.histories["quantity"] == "e_orth")]
     if found.empty:
-        return None
+        return
     cones = _in_panels(found)
     sheet = Sheet.of(len(cones), f"{data.problem}: angles between generators", share="all")
     for panel, names in zip(sheet.panels, cones, strict=False):
         _cones(panel, names, "number of preceding generators r", "e_orth(r)")
-    return sheet.finish(
+    yield sheet.finish(
         f"Distance e_orth(r) of generator r + 1 of {data.problem} from the cone of the r generators before it, for "
         "every dual strategy: 1 for a generator orthogonal to that cone, near 0 for one that is nearly in it."
     )
@@ -127,65 +128,55 @@ def _cones(axes: Axes, cones: Mapping[str, pd.DataFrame], xlabel: str, ylabel: s
     counted(axes)
 
 
-def enrichment(data: Data) -> CaptionedFigure | None:
+def enrichment(data: Data) -> Pages:
     """Fixed enrichments: σ and min β against the vectors added, β over the validation set (paper, Figures 7 and 14).
 
     One row of panels for every pair; the histories are those of the tolerance that went farthest, which contain the
     others.
     """
     fixed = data.queries[data.queries["enrichment_kind"] == Kind.FIXED]
-    if fixed.empty:
-        return None
-    rows = data.on_page(_rows(fixed), DEEP)
-    sheet = Sheet(len(rows), 3, f"{data.problem}, {data.duals[0]}: fixed enrichments", sharey="col")
-    known = fixed.drop_duplicates(["primal", "primal_tol"])
-    looks = Looks(starmap(series, zip(known["primal"], known["primal_tol"], strict=True)))
-    for row, (title, pair, names) in enumerate(rows):
-        histories = data.histories[(data.histories["stage"] == "enrichment") & (data.histories["pair"] == pair)]
-        steps = _tightest(histories[histories["primal"].isin({name for name, _ in names})])
-        for column, (quantity, ylabel) in enumerate(GROWTH.items()):
-            panel = sheet.at(row, column)
-            for name, one in by_strategy(steps[steps["quantity"] == quantity]):
-                look = looks[series(one["primal"].iloc[0], one["primal_tol"].iloc[0])]
-                plot(panel, one["step"], positive(one["value"], SINE_FLOOR), look, name)
-            panel.set(xlabel="vectors added", ylabel=ylabel, title=title, xlim=(0, None), yscale="log")
-            counted(panel)
-        _validation(sheet.at(row, 2), data, fixed[fixed["pair"] == pair], names, looks)
-        sheet.at(row, 2).set_title(title)
-    sheet.at(0, 2).set_ylim(0, None)  # of all rows: they share the axis
+    strategies = fixed.drop_duplicates(["primal", "primal_tol"])
+    looks = Looks(starmap(series, zip(strategies["primal"], strategies["primal_tol"], strict=True)))
+    for rows, part in data.pages(_enrichment_rows(fixed), DEEP):
+        sheet = Sheet(len(rows), 3, f"{data.problem}, {data.duals[0]}: fixed enrichments", sharey="col")
+        for row, (title, pair, names) in enumerate(rows):
+            histories = data.histories[(data.histories["stage"] == "enrichment") & (data.histories["pair"] == pair)]
+            steps = _tightest(histories[histories["primal"].isin({name for name, _ in names})])
+            for column, (quantity, ylabel) in enumerate(GROWTH.items()):
+                panel = sheet.at(row, column)
+                for name, one in by_strategy(steps[steps["quantity"] == quantity]):
+                    look = looks[series(one["primal"].iloc[0], one["primal_tol"].iloc[0])]
+                    plot(panel, one["step"], positive(one["value"], SINE_FLOOR), look, name)
+                panel.set(xlabel="vectors added", ylabel=ylabel, title=title, xlim=(0, None), yscale="log")
+                counted(panel)
+            _validation(sheet.at(row, 2), data, fixed[fixed["pair"] == pair], names, looks)
+            sheet.at(row, 2).set_title(title)
+        sheet.at(0, 2).set_ylim(0, None)  # of all rows: they share the axis
+        yield sheet.finish(_enrichment_caption(data, fixed), part)
+
+
+def _enrichment_caption(data: Data, fixed: pd.DataFrame) -> str:
     tolerances = ", ".join(
         f"{primal} at δ = {some(mine['primal_tol'].dropna())}"
         for primal, mine in fixed.groupby("primal", sort=False)
         if mine["primal_tol"].notna().any()
     )
-    return sheet.finish(
+    return (
         f"Fixed enrichments of {data.problem} with the cones of {data.duals[0]}, a row for every pair (N, R). Left, "
         "the largest σ over the training set against the number of vectors added, for strategies that report it; "
         "middle, the smallest β over the span on the training set; both for the tolerance that went farthest. Right, "
         f"β over the span at the validation parameters, for every tolerance{f' ({tolerances})' * bool(tolerances)}."
-        f"{data.part}"
     )
 
 
-def enriched(data: Data) -> int:
-    """Number of rows of panels of `enrichment`."""
-    return len(_rows(data.queries[data.queries["enrichment_kind"] == Kind.FIXED]))
-
-
-def _rows(fixed: pd.DataFrame) -> list[tuple[str, str, list[tuple[str, float]]]]:
+def _enrichment_rows(fixed: pd.DataFrame) -> list[tuple[str, str, list[tuple[str, float]]]]:
     """Title, pair, and strategies with their tolerances of every row of panels."""
-    return [
-        (f"{dimensions(group)}{f', strategies {k} of {len(groups)}' * (len(groups) > 1)}", str(pair), names)
-        for pair, group in fixed.groupby("pair", sort=False)
-        for groups in [_enrichments(group)]
-        for k, names in enumerate(groups, 1)
-    ]
-
-
-def _enrichments(group: pd.DataFrame) -> list[list[tuple[str, float]]]:
-    """Strategies and tolerances of fixed enrichments, in groups of as many as a panel takes."""
-    found = group.drop_duplicates(["primal", "primal_tol"]).sort_values(["primal", "primal_tol"])
-    return parts(list(zip(found["primal"], found["primal_tol"], strict=True)), SERIES)
+    rows = list[tuple[str, str, list[tuple[str, float]]]]()
+    for pair, group in fixed.groupby("pair", sort=False):
+        strategies = group.drop_duplicates(["primal", "primal_tol"]).sort_values(["primal", "primal_tol"])
+        names = list(zip(strategies["primal"], strategies["primal_tol"], strict=True))
+        rows += [(title, str(pair), some_names) for title, some_names in titled_parts(dimensions(group), names, SERIES)]
+    return rows
 
 
 def _validation(panel: Axes, data: Data, queries: pd.DataFrame, names: list[tuple[str, float]], looks: Looks) -> None:

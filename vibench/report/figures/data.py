@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from enum import Enum
 from itertools import count, pairwise
 from pathlib import Path
 from types import MappingProxyType
@@ -31,6 +32,14 @@ PRIMAL = ["primal", "primal_options", "primal_tol"]
 Panel = TypeVar("Panel")
 
 
+class Extent(Enum):
+    """How much is drawn of a figure that has too many panels for one page."""
+
+    WHOLE = "all panels in one figure"
+    PAGES = "all panels in several figures"
+    BEGINNING = "the first half of the first page"
+
+
 @dataclass(frozen=True)
 class Data:
     """The tables of one problem of a run, and of one training set where it has several.
@@ -50,20 +59,20 @@ class Data:
     thresholds: pd.DataFrame
     outputs: pd.DataFrame
     pictures: tuple[pictures.Shown, ...]
-    page: tuple[int, int] | None = None
-    """Which of how many pages of a long figure is drawn, from 0; `None` for all panels in one figure."""
-    halved: bool = False
-    """Whether pages have half as many panels as those of files."""
+    extent: Extent = Extent.WHOLE
 
-    def on_page(self, panels: list[Panel], most: int) -> list[Panel]:
-        """The panels of the page; each page has at most `most`, or half of them where it is `halved`."""
-        most = most // 2 if self.halved else most
-        return panels if self.page is None else panels[self.page[0] * most : (self.page[0] + 1) * most]
+    def pages(self, panels: Sequence[Panel], most: int) -> Iterator[tuple[Sequence[Panel], str]]:
+        """The panels of every page of a figure that is drawn, `most` to a page, and which part of the figure it is.
 
-    @property
-    def part(self) -> str:
-        """Which page it is, as a sentence; "" if there is one."""
-        return "" if self.page is None or self.page[1] < 2 else f" Part {self.page[0] + 1} of {self.page[1]}."
+        The part is a sentence, "" where there is one page. Without panels there is no page.
+        """
+        if self.extent is Extent.WHOLE:
+            most = len(panels)
+        elif self.extent is Extent.BEGINNING and len(panels) > most:
+            most //= 2
+        count = -(-len(panels) // most) if panels else 0
+        for k in range(count)[: 1 if self.extent is Extent.BEGINNING else count]:
+            yield panels[k * most : (k + 1) * most], f"Part {k + 1} of {count}." * (count > 1)
 
     def of_dual(self, dual: str) -> Data:
         """The rows of one dual strategy."""
@@ -212,6 +221,13 @@ def parts(items: list[Any], most: int) -> list[list[Any]]:
     count = -(-len(items) // most)
     ends = [round(k * len(items) / count) for k in range(count + 1)] if count else []
     return [items[a:b] for a, b in pairwise(ends)]
+
+
+def titled_parts(title: str, items: list[Any], most: int, noun: str = "strategies") -> Iterator[tuple[str, list[Any]]]:
+    """The parts of a list with the titles of their panels; of several parts, these have the number of theirs."""
+    groups = parts(items, most)
+    for k, group in enumerate(groups, 1):
+        yield title + f", {noun} {k} of {len(groups)}" * (len(groups) > 1), group
 
 
 def label(name: Any, tolerance: Any = None, assembly: str = "full") -> str:

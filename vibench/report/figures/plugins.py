@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from functools import partial
+from typing import NoReturn
 
 from matplotlib.figure import Figure
 
@@ -21,28 +22,32 @@ class FigureError(VibenchError):
     """A figure of a plugin that cannot be drawn."""
 
 
-def of_plugins(data: Data, taken: set[str]) -> dict[str, Callable[[Data], Figure | None]]:
+DrawPages = Callable[[Data], Iterable[Figure]]
+"""Draws the pages of a figure: none where there is nothing to draw."""
+
+
+def of_plugins(data: Data, taken: set[str]) -> dict[str, DrawPages]:
     """The figures that plugins have for a problem, by the end of their file names, publications left out.
 
     A plugin that cannot be loaded, or whose name is `taken` by a figure of vibench, has one figure, whose drawing
     raises `FigureError` with the reason.
     """
-    found: dict[str, Callable[[Data], Figure | None]] = {}
+    by_name: dict[str, DrawPages] = {}
     for name in registered(FIGURE):
         reason = f"{FIGURE} '{name}' has the name of a figure of vibench, and needs another" if name in taken else ""
         try:
             plugin = None if reason else loaded(name)
             if plugin is not None and not plugin.publication:
                 kinds = dict(named(name, plugin, data))
-                found |= {
-                    f"{name}-{kind}" if kind else name: partial(_drawn, name, kind, draw)
+                by_name |= {
+                    f"{name}-{kind}" if kind else name: partial(_page_of_plugin, name, kind, draw)
                     for kind, draw in kinds.items()
                 }
         except VibenchError as error:
             reason = str(error)
         if reason:
-            found[name] = partial(_refused, reason)
-    return found
+            by_name[name] = partial(_refused, reason)
+    return by_name
 
 
 def publications() -> Iterator[tuple[str, FigurePlugin]]:
@@ -100,9 +105,10 @@ def draw_guarded(name: str, kind: str, draw: Drawing) -> Figure | None:
     return figure
 
 
-def _drawn(name: str, kind: str, draw: Drawing, _: Data) -> Figure | None:
-    return draw_guarded(name, kind, draw)
+def _page_of_plugin(name: str, kind: str, draw: Drawing, _: Data) -> list[Figure]:
+    figure = draw_guarded(name, kind, draw)
+    return [] if figure is None else [figure]
 
 
-def _refused(reason: str, _: Data) -> Figure | None:
+def _refused(reason: str, _: Data) -> NoReturn:
     raise FigureError(reason)

@@ -14,7 +14,7 @@ from vibench.arrays import Array
 from vibench.interfaces.problem import Picture
 from vibench.report.figures.data import Data
 from vibench.report.figures.looks import BLACK, COLOURS
-from vibench.report.figures.style import ABREAST, CaptionedFigure, Layout, Sheet
+from vibench.report.figures.style import ABREAST, CaptionedFigure, Layout, Pages, Sheet
 
 Limits = tuple[float, float]
 """Range of the values of a field."""
@@ -26,10 +26,11 @@ EDGE = "#D55E00"
 """Colour of the boundary of the contact."""
 
 
-def solutions(data: Data) -> CaptionedFigure | None:
+def solutions(data: Data) -> Pages:
     """High-fidelity solution above and multiplier below, at some training parameters; one range of values for all."""
     shown = [(one.title, one.picture) for one in data.pictures if one.picture is not None][:ABREAST]
-    return draw_solutions(f"{data.problem}: high-fidelity solutions", shown) if shown else None
+    if shown:
+        yield draw_solutions(f"{data.problem}: high-fidelity solutions", shown)
 
 
 def draw_solutions(title: str, shown: Sequence[tuple[str, Picture]]) -> CaptionedFigure:

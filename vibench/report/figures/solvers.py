@@ -10,7 +10,7 @@ from vibench.qp.status import Status
 from vibench.report.common_queries import PROGRAM, WAY, common_programs
 from vibench.report.figures.data import Data, parts
 from vibench.report.figures.looks import Looks, Series
-from vibench.report.figures.style import SERIES, CaptionedFigure, Sheet, plot, scatter
+from vibench.report.figures.style import SERIES, Pages, Sheet, plot, scatter
 
 RESIDUALS = ["primal_residual", "dual_residual", "gap"]
 
@@ -18,7 +18,7 @@ EXACT = 1e-16
 """Residuals and errors are drawn no lower than this."""
 
 
-def solvers(data: Data) -> CaptionedFigure | None:
+def solvers(data: Data) -> Pages:
     """Time of every solver against the accuracy it achieves, and its performance profile (Dolan and Moré, 2002).
 
     A profile is the share of programs solved to the prescribed accuracy within a factor of the time of the fastest
@@ -27,7 +27,7 @@ def solvers(data: Data) -> CaptionedFigure | None:
     """
     queries = data.queries
     if not queries["solve_s"].notna().any():
-        return None
+        return
     names = [str(name) for name in queries["solver"].unique()]
     groups = parts(names, SERIES)
     compared = len(names) > 1
@@ -38,7 +38,7 @@ def solvers(data: Data) -> CaptionedFigure | None:
         sheet.at(row, 0).axhline(1.0, color="0.4", linewidth=0.8, linestyle=(0, (1, 2)), label="prescribed accuracy")
         if compared:
             _profile(sheet.at(row, 1), queries, group, looks)
-    return sheet.finish(
+    yield sheet.finish(
         f"QP solvers on the programs of {data.problem}. {'Left, the' if compared else 'The'} largest residual of a "
         "reduced model's programs, relative to the prescribed accuracy, against the median time of a program, one "
         "point for each model; points above the dotted line miss the accuracy. "
@@ -51,7 +51,7 @@ def solvers(data: Data) -> CaptionedFigure | None:
     )
 
 
-def precision(data: Data) -> CaptionedFigure | None:
+def precision(data: Data) -> Pages:
     """Median time of a program against the part of the error of u and of λ that the solver makes, over the accuracy.
 
     Each point is one accuracy of one solver: median over the programs that are ok in all of these ways. A solver that
@@ -59,7 +59,7 @@ def precision(data: Data) -> CaptionedFigure | None:
     """
     shared = common_programs(data.queries)
     if shared["accuracy"].nunique() < 2:
-        return None
+        return
     count = len(shared) // shared.groupby(WAY).ngroups
     groups = parts(sorted(map(str, shared["solver"].unique())), SERIES)
     title = f"{data.problem}: time and precision of the QP solvers, {count} programs"
@@ -78,7 +78,7 @@ def precision(data: Data) -> CaptionedFigure | None:
             panel.set(xlabel="median time of a program [ms]", ylabel=f"median error of {name} made by the solver")
             panel.set(xscale="log", yscale="log")
     accuracies = ", ".join(f"{value:g}" for value in sorted(shared["accuracy"].unique(), reverse=True))
-    return sheet.finish(
+    yield sheet.finish(
         f"The part of the relative error of u (left) and of λ (right) of {data.problem} that the QP solver makes, "
         f"against the time of a program: medians over the {count} programs that every solver shown solved at each of "
         f"its accuracies, of {accuracies}; a marker for each accuracy."

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import textwrap
 import warnings
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
@@ -98,13 +98,20 @@ class CaptionedFigure(Figure):
     ----------
     caption
         What it shows, in sentences for readers who do not see it, and what it leaves out.
+    part
+        Which part it is of a figure that has too many panels for one page, as a sentence; "" if it is the whole.
     published, compared
-        Of a figure of a publication that is drawn again: what is published, and what agrees and what differs.
+        What is published of a figure that is drawn again, and what agrees and what differs.
     """
 
     caption: str = ""
+    part: str = ""
     published: str = ""
     compared: str = ""
+
+
+Pages = Iterator[CaptionedFigure]
+"""A figure: one page, several where it has too many panels for one, none where there is nothing to draw."""
 
 
 def caption_of(figure: Figure) -> str:
@@ -169,10 +176,10 @@ class Sheet:
         """Write a text at a point, where there is room for it in the finished figure; without one keep it clear."""
         self._labels.setdefault(self.panels.index(panel), []).append((x, y, text))
 
-    def finish(self, caption: str = "") -> CaptionedFigure:
+    def finish(self, caption: str = "", part: str = "") -> CaptionedFigure:
         """Set ticks, sizes and a legend in which every label of the panels occurs once; returns the figure.
 
-        The caption says, too, how many labels of points have no room.
+        The caption says, too, which part of a figure it is, and how many labels of points have no room.
         """
         layout = self._layout
         column, row = layout.left + layout.width + layout.right, layout.above + layout.height + layout.below
@@ -189,7 +196,8 @@ class Sheet:
             _ticks(panel)
         missing = sum(label_points(self.panels[k], points) for k, points in self._labels.items())
         unlabelled = f"{missing} points have no label for want of room." if missing else ""
-        self.figure.caption = " ".join(part for part in (" ".join(caption.split()), unlabelled) if part)
+        self.figure.caption = " ".join(f"{caption} {part} {unlabelled}".split())
+        self.figure.part = part
         return self.figure
 
     def _legend(self, wide: float) -> float:

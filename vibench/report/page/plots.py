@@ -18,7 +18,7 @@ import pandas as pd
 from vibench.report.common_queries import on_common_queries
 from vibench.report.figures.data import Data, best_solver, label
 from vibench.report.figures.looks import Look, Looks, Series
-from vibench.report.page.embedded import short
+from vibench.report.page.grids import short
 from vibench.text import printable
 
 ERRORS = {"error_u_mean": "mean relative error of u", "error_lambda_mean": "mean relative error of λ"}

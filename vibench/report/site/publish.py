@@ -40,6 +40,8 @@ def publish(
     citation: Citation,
     notes: Mapping[Path, str] | None = None,
     warn: Callable[[str], None] = lambda _: None,
+    *,
+    figures: bool = True,
 ) -> Path:
     """Write the site of some results files; the same files give the same site.
 
@@ -55,6 +57,8 @@ def publish(
         Remarks on results files, which stand on the pages of their runs.
     warn
         Called with a line for every column of a plugin that a published table does not have.
+    figures
+        Whether the reports have pictures.
 
     Returns
     -------
@@ -73,17 +77,17 @@ def publish(
         for run, own in zip(runs, folder_names([run.name for run in runs]), strict=True)
     ]
     faults: list[str] = []
-    folder.write(site, lambda new: faults.extend(_fill(new, published, citation)))
+    folder.write(site, lambda new: faults.extend(_fill(new, published, citation, figures=figures)))
     for line in dict.fromkeys(faults):
         warn(line)
     return site / folder.FIRST_PAGE
 
 
-def _fill(site: Path, runs: Sequence[PublishedRun], citation: Citation) -> list[str]:
+def _fill(site: Path, runs: Sequence[PublishedRun], citation: Citation, *, figures: bool) -> list[str]:
     """Write all files of the site; returns lines on columns of plugins that tables do not have."""
     pages = _Pages(citation)
     comparisons = {study: compare([run.run.path for run in group], LIMIT) for study, group in _comparable(runs)}
-    faults = [line for run in runs for line in _write_run(site / "runs" / run.folder, run, pages)]
+    faults = [line for run in runs for line in _write_run(site / "runs" / run.folder, run, pages, figures)]
     links = {run.run.name: f"runs/{run.folder}/index.html" for run in runs}
     pages.write(site / "leaderboard.html", "leaderboard", "", boards=list(_boards(runs)), links=links)
     sections = [_section(site, number, *item) for number, item in enumerate(comparisons.items(), start=1)]
@@ -95,7 +99,7 @@ def _fill(site: Path, runs: Sequence[PublishedRun], citation: Citation) -> list[
     return faults
 
 
-def _write_run(own: Path, run: PublishedRun, pages: _Pages) -> list[str]:
+def _write_run(own: Path, run: PublishedRun, pages: _Pages, figures: bool) -> list[str]:
     """Write the folder of one run: its page and report, its data, and what installs its versions.
 
     Returns lines on columns of plugins that its tables do not have.
@@ -103,7 +107,7 @@ def _write_run(own: Path, run: PublishedRun, pages: _Pages) -> list[str]:
     (own / "tables").mkdir(parents=True)
     with open_read_only(run.run.path) as db:
         db.execute("VACUUM INTO ?", (str((own / FILE).absolute()),))
-    _write(own / "report.html", html.page(run.run.path))
+    _write(own / "report.html", html.page(run.run.path, figures=figures))
     extended = tables.extended_tables(run.run.path, TABLES)
     for name, one in extended.items():
         _write(own / "tables" / f"{name}.csv", tables.to_csv(tables.whole_numbers(tables.in_order(one.frame))))

@@ -1,23 +1,24 @@
-"""The pictures of a report."""
+"""The pictures of a report, and the processes that draw them."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
 
-from vibench.report.figures import OF_DUAL, OF_HISTORIES, OF_PROBLEM, drawings, for_report
+from vibench.report.figures import OF_DUAL, OF_HISTORIES, OF_PROBLEM, drawings, processes, render
 from vibench.report.figures.data import problems
-from vibench.report.page.stills import helpers, stills
+from vibench.report.html import tasks_of
+from vibench.report.page.images import image_of
 from vibench.results.sqlite.reading import FILE
 
 
 def test_several_processes_draw_the_same_pictures_in_the_same_order(quick_run: Path) -> None:
     """Also those that read tables which are not sent to other processes."""
-    known = [one for name, data in problems(quick_run / FILE) for one in for_report(name, data, data.duals[:1])][:14]
-    alone = stills(known)
-    with helpers(2) as others:
-        together = stills(known, others)
-    assert [one.name for one in alone[0]] == [one.name for one in together[0]]
+    tasks = [task for name, data in problems(quick_run / FILE) for task in tasks_of(name, data)][:14]
+    alone = render(tasks, image_of)
+    with processes(2) as pool:
+        together = render(tasks, image_of, pool)
+    assert sum(len(figure.pages) for figure in alone) > 10
     assert alone == together
 
 
@@ -27,7 +28,7 @@ def test_figures_read_histories_if_and_only_if_they_are_listed(quick_run: Path) 
     for _, draw, data in drawings(quick_run / FILE):
         if draw in {*OF_PROBLEM.values(), *OF_DUAL.values()}:
             try:
-                draw(replace(data, histories=None))
+                list(draw(replace(data, histories=None)))
             except TypeError:  # None has no rows
                 reading.add(draw)
     assert reading == OF_HISTORIES

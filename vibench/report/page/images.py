@@ -4,15 +4,11 @@ from __future__ import annotations
 
 import base64
 import io
-from collections.abc import Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
-from contextlib import contextmanager
-from dataclasses import dataclass, replace
-from multiprocessing import get_context
-from typing import Any, cast
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
-import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
@@ -20,10 +16,7 @@ from matplotlib.lines import Line2D
 from PIL import Image
 
 from vibench.arrays import Array
-from vibench.report.figures import OF_DUAL, OF_HISTORIES, OF_PROBLEM, Drawing, Drawn, interrupts_ignored
-from vibench.report.figures.data import Data
-from vibench.report.figures.plugins import FigureError
-from vibench.report.figures.style import caption_of, styled
+from vibench.report.figures.style import caption_of
 from vibench.text import unbroken
 
 DPI = 110
@@ -37,84 +30,39 @@ NAMED = 6
 
 
 @dataclass(frozen=True)
-class Still:
-    """A picture: its name, what its caption says, what is seen, its data URI, and its size in pixels."""
+class FigureImage:
+    """The picture of a figure.
+
+    Attributes
+    ----------
+    name, caption
+        Those of the figure.
+    cut
+        Whether it is only the beginning of the figure.
+    alternative
+        What is seen.
+    source, width, height
+        Its data URI, and its size in pixels.
+    """
 
     name: str
     caption: str
+    cut: bool
     alternative: str
     source: str
     width: int
     height: int
 
 
-@dataclass(frozen=True)
-class Helpers:
-    """Processes that draw beside this one."""
-
-    pool: ProcessPoolExecutor
-    count: int
-
-
-@contextmanager
-def helpers(jobs: int) -> Iterator[Helpers | None]:
-    """Context with processes that draw: as many as `jobs`, this one included. They load Matplotlib in the meantime."""
-    if jobs < 2:
-        yield None
-        return
-    with ProcessPoolExecutor(jobs - 1, get_context("spawn")) as pool:
-        with interrupts_ignored():  # the processes inherit it: Ctrl-C is for this one to handle
-            for _ in range(jobs - 1):
-                pool.submit(_draw_all, ())
-        yield Helpers(pool, jobs - 1)
-
-
-def stills(known: Sequence[Drawn], others: Helpers | None = None) -> tuple[list[Still], list[str]]:
-    """The pictures that there are data for, drawn here and by others, and why figures of plugins have none."""
-    found = _draw_all(known) if others is None else _in_parallel(known, others)
-    return [one for one in found if isinstance(one, Still)], [one for one in found if isinstance(one, str)]
-
-
-def _in_parallel(known: Sequence[Drawn], others: Helpers) -> list[Still | str | None]:
-    """All pictures in their order.
-
-    Those of plugins are drawn here, since their functions need not go to other processes, and so are those of
-    histories: of a large study these are millions of rows, which take longer to send than their few lines to draw.
-    """
-    elsewhere = {*OF_PROBLEM.values(), *OF_DUAL.values()} - OF_HISTORIES
-    shared = [k for k, (_, draw, _) in enumerate(known) if draw in elsewhere]
-    own = [k for k in range(len(known)) if k not in set(shared)]
-    jobs = 1 + others.count
-    shares = [[*shared[0::jobs], *own], *(shared[k::jobs] for k in range(1, jobs))]
-    # None, for a figure that reads histories without being one of OF_HISTORIES would be left out if they were empty
-    sent = [(name, draw, replace(data, histories=cast(pd.DataFrame, None))) for name, draw, data in known]
-    awaited = [others.pool.submit(_draw_all, [sent[k] for k in share]) for share in shares[1:]]
-    drawn = [_draw_all([known[k] for k in shares[0]]), *(other.result() for other in awaited)]
-    placed = {k: one for share, found in zip(shares, drawn, strict=True) for k, one in zip(share, found, strict=True)}
-    return [placed[k] for k in range(len(known))]
-
-
-def _draw_all(known: Sequence[Drawn]) -> list[Still | str | None]:
-    return [_drawn(*one) for one in known]
-
-
-def _drawn(name: str, draw: Drawing, data: Data) -> Still | str | None:
-    """A picture, `None` where there is nothing to draw, or why a plugin could not draw it."""
-    with styled():
-        try:
-            figure = draw(data)
-        except FigureError as error:
-            return str(error)
-        if figure is None:
-            return None
-        picture = _picture(figure)
-    stream = io.BytesIO()
-    picture.save(stream, "webp", lossless=True, **EFFORT)
+def image_of(name: str, figure: Figure) -> FigureImage:
+    """The picture of a figure."""
+    dots, stream = _dots(figure), io.BytesIO()
+    dots.save(stream, "webp", lossless=True, **EFFORT)
     source = "data:image/webp;base64," + base64.b64encode(stream.getvalue()).decode("ascii")
-    return Still(name, caption_of(figure), seen(figure), source, *picture.size)
+    return FigureImage(name, caption_of(figure), bool(getattr(figure, "part", "")), seen(figure), source, *dots.size)
 
 
-def _picture(figure: Figure) -> Image.Image:
+def _dots(figure: Figure) -> Image.Image:
     """The dots of a figure in a palette of 256 colours, of which line drawings need fewer."""
     figure.set_dpi(DPI)
     canvas: Any = FigureCanvasAgg(figure)
