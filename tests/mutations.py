@@ -334,8 +334,8 @@ FAULTS = (
     Fault(
         "rows-far-from-the-contact-ignored",
         "vibench/model/certificates/contact_correction.py",
-        "lacking = np.where(self._near, lacking, far)",
-        "lacking = np.where(self._near, lacking, 0.0)",
+        "lacking = np.where(self.near, lacking, far)",
+        "lacking = np.where(self.near, lacking, 0.0)",
         ("tests/unit/model/certificates/test_contact_correction.py",),
     ),
     Fault(

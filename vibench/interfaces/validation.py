@@ -15,8 +15,7 @@ import scipy.sparse as sp
 from vibench.arrays import Array
 from vibench.errors import NumericalError
 from vibench.interfaces.problem import MEMBERS, Problem, VariationalInequality
-from vibench.interfaces.sampling import Sampling, check_sample
-from vibench.interfaces.strategies import Cone, Enrichment
+from vibench.interfaces.strategies import Cone, Enrichment, Sampling, check_sample
 from vibench.linalg.inner_product import InnerProduct
 
 ROUND_OFF = 1e-8

@@ -72,8 +72,8 @@ ATTEMPTS = 4
 
 
 @dataclass(frozen=True)
-class Bounds:
-    """Absolute error bounds of one reduced solution.
+class ErrorBounds:
+    """Absolute error bounds of one reduced solution, infinite where there are none.
 
     Attributes
     ----------
@@ -83,6 +83,8 @@ class Bounds:
         Of ‖Bᵀ(λ − λ_N)‖ in the norm of A⁻¹ and of ‖λ − λ_N‖ in the norm of W.
     rho, rho_range, omega, kappa
         ρ, ρ_B and ω, in the unit of `u_energy`, and κ in that of its square.
+    note
+        Why there are none, or which constant in them is estimated; "" where they are proved.
     """
 
     u_energy: float
@@ -93,27 +95,18 @@ class Bounds:
     rho_range: float
     omega: float
     kappa: float
+    note: str = ""
+
+    @classmethod
+    def none(cls, note: str) -> ErrorBounds:
+        """No bounds, and why."""
+        inf = float("inf")
+        return cls(inf, inf, inf, inf, inf, inf, inf, inf, note)
 
 
 NOT_IN_CONE = "λ_N has negative coefficients"
 NO_CORRECTION = "no w with B w ≥ s was found"
 ESTIMATED = "α is estimated"
-
-
-@dataclass(frozen=True)
-class ErrorBounds:
-    """What bounds the errors of one solution, which may be nothing.
-
-    Attributes
-    ----------
-    bounds
-        `None` where there are none.
-    note
-        Why there are none, or which constant in them is estimated; "" where they are proved.
-    """
-
-    bounds: Bounds | None
-    note: str
 
 
 def error_bounds(
@@ -133,17 +126,17 @@ def bound_errors_at(
 ) -> ErrorBounds:
     """Bounds (ii) of one reduced u (n,) and λ (m,), from lower bounds of α and of β_A."""
     if np.min(lam, initial=0.0) < 0.0:
-        return ErrorBounds(None, NOT_IN_CONE)
+        return ErrorBounds.none(NOT_IN_CONE)
     corrected = find_correction(vi, energy, u, lam)
     if corrected is None:
-        return ErrorBounds(None, NO_CORRECTION)
+        return ErrorBounds.none(NO_CORRECTION)
     w = corrected.w
     of_u = terms(w, vi, energy, u, lam)
     of_lam = min((of_u, *_projected(of_u.residual, w, vi, energy, u, lam)), key=lambda terms: terms.rho)
     in_V = of_u.primal / float(np.sqrt(alpha.value))
     in_W = of_lam.dual / beta.value if beta.value > 0.0 else float("inf")
-    bounds = Bounds(of_u.primal, in_V, of_lam.dual, in_W, of_u.rho, of_lam.rho, of_u.omega, of_u.kappa)
-    return ErrorBounds(bounds, "" if alpha.proved else ESTIMATED)
+    terms_of_both = of_u.rho, of_lam.rho, of_u.omega, of_u.kappa
+    return ErrorBounds(of_u.primal, in_V, of_lam.dual, in_W, *terms_of_both, "" if alpha.proved else ESTIMATED)
 
 
 @dataclass(frozen=True)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property, partial
 
 import numpy as np
@@ -19,7 +19,7 @@ from vibench.reduction.supremizers import ContactCoordinates, projected_supremiz
 
 @dataclass(frozen=True)
 class Evaluated:
-    """What a hyper-reduced assembly evaluates at one parameter.
+    """What a hyper-reduced assembly evaluates at one parameter; nothing for an assembly in full.
 
     Attributes
     ----------
@@ -31,9 +31,13 @@ class Evaluated:
         Those (d×N') of the primal basis Z in the space Φ of the model; `None` where they are the same.
     """
 
-    samples: Mapping[str, Array]
-    contact: Contact | None
-    coordinates: Array | None
+    samples: Mapping[str, Array] = field(default_factory=dict)
+    contact: Contact | None = None
+    coordinates: Array | None = None
+
+    def in_space(self, x: Array) -> Array:
+        """Coordinates (d,) in Φ from those (N',) in Z."""
+        return x if self.coordinates is None else np.asarray(self.coordinates @ x)
 
 
 @dataclass(frozen=True)
@@ -55,7 +59,7 @@ class ReducedProblem:
     program: VariationalInequality
     reconstruct: Callable[[Array], Array]
     factor: Array | None = None
-    evaluated: Evaluated | None = None
+    evaluated: Evaluated = Evaluated()
 
     @property
     def basis(self) -> Array:

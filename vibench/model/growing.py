@@ -9,7 +9,7 @@ import numpy as np
 from vibench.arrays import Array
 from vibench.highfidelity.active_set import HighFidelitySolution, HighFidelitySolver
 from vibench.interfaces.problem import Problem, VariationalInequality
-from vibench.interfaces.sampling import Trainer
+from vibench.interfaces.strategies import Trainer
 from vibench.interfaces.validation import ReferenceAssembly, checked_assembly
 from vibench.linalg.cholesky import SparseCholesky
 from vibench.linalg.inner_product import orthonormal_range

@@ -13,8 +13,17 @@ from vibench.arrays import Array
 from vibench.errors import RequestError, UnsupportedError
 from vibench.highfidelity.active_set import HighFidelitySolver
 from vibench.interfaces.problem import Problem
-from vibench.interfaces.sampling import AdaptiveSampling, Sampling
-from vibench.interfaces.strategies import Cone, DualStrategy, Enrichment, Kind, Offline, PrimalStrategy, Stop
+from vibench.interfaces.strategies import (
+    AdaptiveSampling,
+    Cone,
+    DualStrategy,
+    Enrichment,
+    Kind,
+    Offline,
+    PrimalStrategy,
+    Sampling,
+    Stop,
+)
 from vibench.interfaces.validation import (
     ReferenceAssembly,
     check_cone,

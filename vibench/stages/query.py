@@ -241,12 +241,12 @@ def error_columns(
     return rows
 
 
-def _columns(error: Errors, proved: ErrorBounds, hsw: HSWBounds | None) -> Row:
-    row: Row = asdict(error) | {"bound_note": proved.note}
+def _columns(error: Errors, bounds: ErrorBounds, hsw: HSWBounds | None) -> Row:
+    row: Row = asdict(error) | {"bound_note": bounds.note}
     of_u = _measured(error.error_u, error.error_u_scaled) > UNMEASURABLE
     of_lam = _measured(error.error_lambda, error.error_lambda_scaled) > UNMEASURABLE
     found: dict[str, tuple[float, bool, float]] = {}  # a bound, the error, and whether that is measurable
-    if (bounds := proved.bounds) is not None:
+    if np.isfinite(bounds.u_energy):
         row |= {f"bound_{name}": getattr(bounds, name) for name in ("rho", "rho_range", "omega", "kappa")}
         found |= {
             "u_energy": (bounds.u_energy, of_u, error.error_u_energy_absolute),

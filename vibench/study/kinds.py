@@ -38,7 +38,7 @@ class PluginKind(StrEnum):
 
     PROBLEM = "problem", "problems", "problems", "problem", "problem", "vibench.interfaces.problem:Problem"
     SAMPLING = (
-        "sampling strategy", "sampling", "sampling", "sampling", "sampling", "vibench.interfaces.sampling:Sampling",
+        "sampling strategy", "sampling", "sampling", "sampling", "sampling", "vibench.interfaces.strategies:Sampling",
     )  # fmt: skip
     PRIMAL = (
         "primal strategy", "primal", "primal_strategies", "primal", "strategy",

@@ -11,7 +11,7 @@ import numpy as np
 from vibench.arrays import Array
 from vibench.errors import NumericalError, RequestError
 from vibench.interfaces.problem import Problem
-from vibench.interfaces.sampling import AdaptiveSampling, Sampling
+from vibench.interfaces.strategies import AdaptiveSampling, Sampling
 from vibench.interfaces.validation import training_parameters, validation_parameters
 from vibench.study.plugin import Plugin
 from vibench.study.values import OWN

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from vibench import Array, ParameterBox, Sampling, create
-from vibench.interfaces.sampling import check_sample
+from vibench.interfaces.strategies import check_sample
 
 BOX = ParameterBox(("a", "b", "c"), np.array([1e-3, -2.0, 5.0]), np.array([1e3, 3.0, 5.5]), ("m", "1", "N"))
 DRAWN = ("random", "sobol", "latin-hypercube")

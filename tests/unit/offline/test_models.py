@@ -47,8 +47,7 @@ def test_a_model_answers_as_the_run_did(run: vibench.Run, model: vibench.Model, 
         assert error_lambda == pytest.approx(rows.loc[query, "error_lambda"], rel=1e-6)
         assert solution.residuals is not None
         assert solution.residuals.worst <= 1e-10
-        bounds = solution.error_bounds.bounds
-        assert bounds is not None
+        bounds = solution.error_bounds
         assert bounds.u == pytest.approx(rows.loc[query, "bound_u"], rel=1e-3)
         assert bounds.u >= model.problem.V.norm(solution.u - exact.u)
         assert bounds.lam >= model.problem.W.norm(solution.lam - exact.lam)

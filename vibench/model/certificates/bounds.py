@@ -136,12 +136,12 @@ class OnlineCertificate:
         lam, base = self.generators @ alpha, self.base
         if lam.min(initial=0.0) < 0.0:
             return OnlineBound.none(NOT_IN_CONE)
-        evaluated = evaluated_by(reduced)
+        evaluated = reduced.evaluated
         if self.forces is not None and evaluated.contact is None:
             evaluated = replace(evaluated, contact=contact_at(problem, mu))
         if not base.is_exact and problem.parameters.outside(mu).any():
             return OnlineBound.none(OUTSIDE)
-        y, theta = coordinates_of(x, evaluated), base.coefficients(evaluated.samples)
+        y, theta = evaluated.in_space(x), base.coefficients(evaluated.samples)
         lower, upper = (1.0, 1.0) if base.spectral is None else base.spectral.at(mu, theta["A"])
         if not lower > base.stiffness_error:
             return OnlineBound.none(NOT_COERCIVE)
@@ -149,8 +149,8 @@ class OnlineCertificate:
         if corrected is None:
             return OnlineBound.none(note)
         along, norm, kappa = corrected
-        of_lam = coefficients_of_multiplier(theta["B"], self.forces, evaluated.contact, alpha, lam)
-        coordinates, beside, missing = self.residual.parts(residual_coefficients(theta, y, of_lam))
+        z = residual_coefficients(theta, y, self.forces, evaluated.contact, alpha, lam)
+        coordinates, beside, missing = self.residual.parts(z)
         square_of_u = float(x @ (reduced.program.A @ x))
         u_norm = sqrt(max(0.0, square_of_u) / (lower - base.stiffness_error))  # of u_N in X
         lacking = base.load_error + base.stiffness_error * u_norm
@@ -194,31 +194,18 @@ class OnlineCertificate:
         return float(theta[0]), self.base.bound_terms @ of_g, self._bound_sizes @ np.abs(of_g)
 
 
-def residual_coefficients(theta: Mapping[str, Array], y: Array, of_lam: Array) -> Array:
-    """Coefficients (Z,) of a residual: those of f, of A for every vector of Φ, and of Bᵀλ_N."""
-    return np.concatenate([theta["f"], (-theta["A"][:, None] * y).ravel(), -of_lam])
-
-
-def coefficients_of_multiplier(
-    theta: Array, forces: Array | None, contact: Contact | None, alpha: Array, lam: Array
+def residual_coefficients(
+    theta: Mapping[str, Array], y: Array, forces: Array | None, contact: Contact | None, alpha: Array, lam: Array
 ) -> Array:
-    """Coefficients of Bᵀλ_N: θ_q α_i of all Bᵀ_q χ_i (Q R,) where B is exactly the sum of its terms.
+    """Coefficients (Z,) of a residual: those of f, of A for every vector of Φ, and of Bᵀλ_N.
 
-    Where it is assembled on the contact, and there are `forces`, they are what B₀ᵀλ_N lacks, on the contact unknowns,
-    and α for the vectors B₀ᵀχ (k+R,).
+    The last ones are θ_q α_i of all Bᵀ_q χ_i (Q R,) where B is exactly the sum of its terms. Where it is assembled on
+    the contact, and there are `forces`, they are what B₀ᵀλ_N lacks, on the contact unknowns, and α for the vectors
+    B₀ᵀχ (k+R,).
     """
     if forces is None:
-        return np.asarray((theta[:, None] * alpha).ravel())
-    assert contact is not None  # evaluated where B is assembled on the contact
-    return np.concatenate([contact.B.T @ lam - forces @ alpha, alpha])
-
-
-def evaluated_by(reduced: ReducedProblem) -> Evaluated:
-    """What the assembly of a reduced program evaluated."""
-    assert reduced.evaluated is not None  # assembled by a `HyperReducedModel`
-    return reduced.evaluated
-
-
-def coordinates_of(x: Array, evaluated: Evaluated) -> Array:
-    """Coordinates (d,) of u_N in Φ from those (N',) in the primal basis at the parameter."""
-    return x if evaluated.coordinates is None else np.asarray(evaluated.coordinates @ x)
+        of_lam = (theta["B"][:, None] * alpha).ravel()
+    else:
+        assert contact is not None  # evaluated where B is assembled on the contact
+        of_lam = np.concatenate([contact.B.T @ lam - forces @ alpha, alpha])
+    return np.concatenate([theta["f"], (-theta["A"][:, None] * y).ravel(), -of_lam])

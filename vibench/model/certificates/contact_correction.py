@@ -206,37 +206,33 @@ def find_contact_correction(
     return None
 
 
+@dataclass(frozen=True)
 class _Program:
     """The program above in the unknowns of a block of C; rows that are not `near` involve others, too."""
 
-    def __init__(
-        self,
-        compliance: BlockDiagonal,
-        B: SparseMatrix,
-        near: Mask,
-        excess: Array,
-        round_off: Array,
-        reach: Array,
-        terms: Array,
-        lam: Array,
-        gamma: float,
-    ) -> None:
-        self._compliance, self._B, self._near, self._gamma, self._lam = compliance, B, near, gamma, lam
-        self._size = sp.csr_array((np.abs(B.data), B.indices, B.indptr), B.shape)
-        self._excess, self._round_off, self._reach, self._terms = excess, round_off, reach, terms
+    compliance: BlockDiagonal
+    B: SparseMatrix
+    near: Mask
+    excess: Array
+    round_off: Array
+    reach: Array
+    terms: Array
+    lam: Array
+    gamma: float
 
     def best(self) -> tuple[Array, float, float] | None:
         """C on the unknowns of the block, the norm of w, and κ."""
-        margin = MARGIN * self._round_off
+        B, margin = self.B, MARGIN * self.round_off
+        size = sp.csr_array((np.abs(B.data), B.indices, B.indptr), B.shape)
         for _ in range(ATTEMPTS):
-            for load, values, norm in self._minimisers(self._excess + margin):
-                slack = self._B @ values - self._excess
-                lacking = self._terms * (self._size @ np.abs(values)) + self._round_off - slack
-                far = self._reach * norm * (1.0 + 1e-10) + self._excess + self._round_off
-                lacking = np.where(self._near, lacking, far)
+            for load, values, norm in self._minimisers(self.excess + margin):
+                slack = self.B @ values - self.excess
+                lacking = self.terms * (size @ np.abs(values)) + self.round_off - slack
+                far = self.reach * norm * (1.0 + 1e-10) + self.excess + self.round_off
+                lacking = np.where(self.near, lacking, far)
                 if np.all(lacking <= 0.0):  # NaN is not
-                    return load, norm, max(0.0, float(self._lam @ slack))
-                if np.any(lacking[~self._near] > 0.0):
+                    return load, norm, max(0.0, float(self.lam @ slack))
+                if np.any(lacking[~self.near] > 0.0):
                     return None
                 margin = np.maximum(margin, 2.0 * np.nan_to_num(lacking, nan=0.0, posinf=0.0))
             margin = 10.0 * margin
@@ -244,12 +240,12 @@ class _Program:
 
     def _minimisers(self, excess: Array) -> Iterator[tuple[Array, Array, float]]:
         """The last w of the active set method: c, w on the unknowns of the block, and its norm."""
-        size = self._reach**2 / self._gamma  # at least the diagonal of S
-        chosen = (self._lam > 0.0) & (self._lam * size > -excess)
+        size = self.reach**2 / self.gamma  # at least the diagonal of S
+        chosen = (self.lam > 0.0) & (self.lam * size > -excess)
         for _ in range(EXTENSIONS):
-            load = (self._B.T @ self._difference(chosen, excess, size)) / self._gamma
-            values = self._compliance @ load
-            violated = self._near & ~chosen & (excess - self._B @ values > self._round_off)
+            load = (self.B.T @ self._difference(chosen, excess, size)) / self.gamma
+            values = self.compliance @ load
+            violated = self.near & ~chosen & (excess - self.B @ values > self.round_off)
             if not violated.any():
                 yield load, values, float(np.sqrt(max(0.0, float(load @ values))))
                 return
@@ -257,14 +253,14 @@ class _Program:
 
     def _difference(self, chosen: Mask, excess: Array, size: Array) -> Array:
         """ν − λ (m,) with ν = 0 on rows that are not chosen, but for those where λ is negligible: there ν = λ."""
-        lam, rows = self._lam, np.flatnonzero(chosen)
+        lam, rows = self.lam, np.flatnonzero(chosen)
         found = np.where(chosen | (lam * size <= NEGLIGIBLE * np.abs(excess)), 0.0, -lam)
         if not len(rows):
             return found
-        block, wanted = _rows(self._B, chosen), excess[rows]
+        block, wanted = _rows(self.B, chosen), excess[rows]
         if found.any():
-            wanted = wanted - block @ (self._compliance @ (self._B.T @ found)) / self._gamma
-        S = self._compliance.between(block) / self._gamma
+            wanted = wanted - block @ (self.compliance @ (self.B.T @ found)) / self.gamma
+        S = self.compliance.between(block) / self.gamma
         S[np.diag_indices_from(S)] += REGULAR * S.diagonal().max()
         factor, singular = dpotrf(S, lower=1, clean=0)
         found[rows] = (

@@ -13,13 +13,7 @@ from vibench.highfidelity.active_set import FALLBACK_SOLVER
 from vibench.interfaces.problem import Problem
 from vibench.model.affine import AffineMember
 from vibench.model.certificates.base import CertificateBase, contact_at, contact_unknowns, injected, is_exact
-from vibench.model.certificates.bounds import (
-    OnlineCertificate,
-    coefficients_of_multiplier,
-    coordinates_of,
-    evaluated_by,
-    residual_coefficients,
-)
+from vibench.model.certificates.bounds import OnlineCertificate, residual_coefficients
 from vibench.model.certificates.contact_correction import ContactCompliance, find_contact_correction, held_rows
 from vibench.model.certificates.prepared_correction import prepare_corrections
 from vibench.model.certificates.residual import residual_basis
@@ -82,7 +76,7 @@ def _sampled(
     """What reduced solutions at training parameters have.
 
     Coefficients (Z×S) of their residuals, the median norm of corrections, and the rows (m,) that some of these hold.
-    `forces` are those of `coefficients_of_multiplier`.
+    `forces` are those of `residual_coefficients`.
     """
     problem, found, norms = model.problem, [], [0.0]
     rows, held = model.basis[contact_unknowns(problem)], np.zeros(len(model.generators), bool)
@@ -91,12 +85,10 @@ def _sampled(
         answer = solve_qp(reduced.program, FALLBACK_SOLVER, SAMPLE_ACCURACY, factor=reduced.factor)
         if answer.x is None or answer.alpha is None or not np.all(np.isfinite(answer.x)):
             continue
-        evaluated, alpha = evaluated_by(reduced), np.maximum(answer.alpha, 0.0)
-        lam = model.generators @ alpha
-        contact, y = evaluated.contact or contact_at(problem, mu), coordinates_of(answer.x, evaluated)
-        theta = base.coefficients(evaluated.samples)
-        of_lam = coefficients_of_multiplier(theta["B"], forces, contact, alpha, lam)
-        found.append(residual_coefficients(theta, y, of_lam))
+        evaluated, alpha = reduced.evaluated, np.maximum(answer.alpha, 0.0)
+        lam, y = model.generators @ alpha, evaluated.in_space(answer.x)
+        contact, theta = evaluated.contact or contact_at(problem, mu), base.coefficients(evaluated.samples)
+        found.append(residual_coefficients(theta, y, forces, contact, alpha, lam))
         held |= held_rows(compliance, contact, rows @ y, lam)
         if number % 8 == 0:
             correction = find_contact_correction(compliance, contact, rows @ y, np.zeros(len(rows)), lam, 1.0)
