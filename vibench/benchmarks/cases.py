@@ -5,12 +5,11 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
-from vibench.errors import RequestError, unknown_name
+from vibench.errors import RequestError
 from vibench.interfaces.strategies import Stop
-from vibench.qp.solve import installed_solvers
-from vibench.study.kinds import CHECKED, PRIMAL, PROBLEM
+from vibench.study.kinds import DUAL, PRIMAL, PROBLEM, SOLVER
 from vibench.study.reader import read_study
-from vibench.study.registry import find, registered
+from vibench.study.registry import find, named, registered
 
 Resolution = str | int
 """A name that a problem knows, or a number of nodes."""
@@ -147,7 +146,7 @@ def _tolerances(primal: str) -> tuple[float | None, ...]:
         return (None,)
 
 
-TIMED = ("problem", "primal", "dual", "solver")
+TIMED = {kind.cli_name: kind for kind in (PROBLEM, PRIMAL, DUAL, SOLVER)}
 """Kinds of plugins that benchmarks time, by the word for each."""
 
 
@@ -159,23 +158,12 @@ def chosen_plugins(plugins: Sequence[str]) -> dict[str, list[str]]:
     RequestError
         If there is no such plugin, several have the name, or a solver is not installed.
     """
-    known = {word: list(registered(CHECKED[word])) for word in TIMED}
-    known["solver"] = installed_solvers(known["solver"])
     chosen: dict[str, list[str]] = {}
-    for plugin in plugins:
-        prefix, colon, rest = plugin.partition(":")
-        name = rest if colon else plugin
-        words = [prefix] if colon else [word for word, names in known.items() if plugin in names]
-        if len(words) > 1:
-            choices = " or ".join(f"{word}:{plugin}" for word in words)
-            raise RequestError(f"several plugins are called '{plugin}': say {choices}")
-        if not words or words[0] not in known or name not in known[words[0]]:
-            kind = CHECKED.get(words[0], "plugin") if words else "plugin"
-            choices_of = known.get(words[0], []) if words else [one for names in known.values() for one in names]
-            raise unknown_name(kind, name, choices_of or known)
-        if words[0] == "problem" and not takes_no_option(name):
-            raise RequestError(f"the problem '{name}' needs options, which `vibench bench` has no place for")
-        chosen.setdefault(words[0], []).append(name)
+    for text in plugins:
+        plugin = named(text, TIMED)
+        if plugin.kind is PROBLEM and not takes_no_option(plugin.name):
+            raise RequestError(f"the {plugin} needs options, which `vibench bench` has no place for")
+        chosen.setdefault(plugin.kind.cli_name, []).append(plugin.name)
     return chosen
 
 

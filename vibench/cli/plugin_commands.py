@@ -242,29 +242,16 @@ def _find(text: str) -> Checked:
     RequestError
         If there is no such plugin, or several.
     """
-    from vibench.qp.solve import installed_solvers
-    from vibench.study.registry import find, registered
+    from vibench.study.registry import named, registered
     from vibench.testing.solvers import of_qpsolvers
 
     prefix, colon, rest = text.partition(":")
     if colon and prefix not in CHECKED:
         return _find_object(prefix, rest)
-    name, kinds = (rest, {prefix: CHECKED[prefix]}) if colon else (text, CHECKED)
-    names = {word: [*registered(kind)] for word, kind in kinds.items()}
-    ours = [solver for solver in installed_solvers() if solver not in registered(SOLVER)]
-    if "solver" in names:
-        names["solver"] += ours
-    having = [word for word, those in names.items() if name in those]
-    if not having:
-        raise unknown_name(
-            kinds[prefix] if colon else "plugin", name, (one for those in names.values() for one in those)
-        )
-    if len(having) > 1:
-        raise RequestError(f"several plugins are called '{text}': say {' or '.join(f'{k}:{text}' for k in having)}")
-    plugin = find(kinds[having[0]], name)
-    if plugin.kind is SOLVER and name in ours:
-        return Checked(SOLVER, name, of_qpsolvers, f"{of_qpsolvers.__module__}:{of_qpsolvers.__name__}")
-    return Checked(plugin.kind, name, plugin.load(), plugin.reference)
+    plugin = named(text, CHECKED)
+    if plugin.kind is SOLVER and plugin.name not in registered(SOLVER):
+        return Checked(SOLVER, plugin.name, of_qpsolvers, f"{of_qpsolvers.__module__}:{of_qpsolvers.__name__}")
+    return Checked(plugin.kind, plugin.name, plugin.load(), plugin.reference)
 
 
 def _find_object(module: str, name: str) -> Checked:

@@ -244,6 +244,34 @@ def registered(kind: PluginKind) -> dict[str, RegisteredPlugin]:
     return {name: RegisteredPlugin(kind, name, tuple(entries.values())) for name, entries in sorted(named.items())}
 
 
+def named(text: str, kinds: Mapping[str, PluginKind]) -> RegisteredPlugin:
+    """The plugin that NAME or KIND:NAME refers to, of kinds by their names on the command line.
+
+    QP solvers are those that are installed, whether they are plugins or not.
+
+    Raises
+    ------
+    RequestError
+        If there is no such plugin, or several.
+    """
+    from vibench.qp.solve import installed_solvers
+
+    prefix, colon, rest = text.partition(":")
+    name = rest if colon else text
+    asked = {word: kind for word, kind in kinds.items() if not colon or word == prefix}
+    names = {
+        word: installed_solvers(registered(kind)) if kind is SOLVER else [*registered(kind)]
+        for word, kind in (asked or kinds).items()
+    }
+    having = [word for word in asked if name in names[word]]
+    if not having:
+        what = kinds.get(prefix, "plugin") if colon else "plugin"
+        raise unknown_name(what, name, (one for those in names.values() for one in those))
+    if len(having) > 1:
+        raise RequestError(f"several plugins are called '{name}': say {' or '.join(f'{k}:{name}' for k in having)}")
+    return find(kinds[having[0]], name)
+
+
 def create(kind: str, name: str, options: Mapping[str, Any] | None = None) -> Any:
     """Instance of a registered plugin, its options checked.
 
