@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 from vibench.errors import RequestError
 from vibench.interfaces.strategies import Stop
+from vibench.qp.solve import installed_solvers
 from vibench.study.kinds import DUAL, PRIMAL, PROBLEM, SOLVER
 from vibench.study.reader import read_study
 from vibench.study.registry import find, named, registered
@@ -158,9 +159,9 @@ def chosen_plugins(plugins: Sequence[str]) -> dict[str, list[str]]:
     RequestError
         If there is no such plugin, several have the name, or a solver is not installed.
     """
-    chosen: dict[str, list[str]] = {}
+    chosen, solvers = dict[str, list[str]](), installed_solvers(registered(SOLVER))
     for text in plugins:
-        plugin = named(text, TIMED)
+        plugin = named(text, TIMED, solvers)
         if plugin.kind is PROBLEM and not takes_no_option(plugin.name):
             raise RequestError(f"the {plugin} needs options, which `vibench bench` has no place for")
         chosen.setdefault(plugin.kind.cli_name, []).append(plugin.name)

@@ -242,13 +242,14 @@ def _find(text: str) -> Checked:
     RequestError
         If there is no such plugin, or several.
     """
+    from vibench.qp.solve import installed_solvers
     from vibench.study.registry import named, registered
     from vibench.testing.solvers import of_qpsolvers
 
     prefix, colon, rest = text.partition(":")
     if colon and prefix not in CHECKED:
         return _find_object(prefix, rest)
-    plugin = named(text, CHECKED)
+    plugin = named(text, CHECKED, installed_solvers(registered(SOLVER)))
     if plugin.kind is SOLVER and plugin.name not in registered(SOLVER):
         return Checked(SOLVER, plugin.name, of_qpsolvers, f"{of_qpsolvers.__module__}:{of_qpsolvers.__name__}")
     return Checked(plugin.kind, plugin.name, plugin.load(), plugin.reference)

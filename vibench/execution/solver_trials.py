@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from contextlib import closing
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
 from itertools import chain, count
 
-from vibench.execution.supervisor import Job, Supervisor
+from vibench.execution.watched import WatchedWork, watched
 from vibench.interfaces.problem import VariationalInequality
 from vibench.qp.repeats import in_units, units
 from vibench.qp.solve import solve_qp
 from vibench.qp.status import Status
 from vibench.qp.verification import QPSolution, Residuals, verify
-from vibench.stages.base import Done, Failed, Pieces, PiecewiseStage, Stage
-from vibench.storage.artefacts import Store
+from vibench.stages.base import Failed, Stage
 from vibench.storage.serialisation import dumps, loads, storable
 from vibench.study import registry
 from vibench.study.kinds import SOLVER
@@ -40,8 +38,8 @@ class Trial:
 
 
 @dataclass(frozen=True)
-class SolverTrials(PiecewiseStage, Pieces):
-    """A program solved by one solver after the other. A solver is a piece; the pieces share no preparation."""
+class SolverTrials(WatchedWork):
+    """A program solved by one solver after the other; the solvers of every package have a process of their own."""
 
     label = "QP solvers"
 
@@ -63,13 +61,8 @@ class SolverTrials(PiecewiseStage, Pieces):
         """The trial of one solver."""
         return SolverTrials(self.program, self.accuracy, self.solvers[number : number + 1])
 
-    def begin(self, store: Store) -> Pieces:  # noqa: ARG002
-        """Nothing to prepare."""
-        return self
-
-    def piece(self, number: int, watch: Callable[[bool], None]) -> Trial:
+    def do(self, number: int, done: Mapping[int, Trial]) -> Trial:  # noqa: ARG002
         """Solve the program with one solver and verify its solution; the time limit includes loading a plugin."""
-        watch(True)
         name, program, accuracy = self.solvers[number], loads(self.program), self.accuracy
         solve = partial(solve_qp, solver=name, accuracy=accuracy, extra=registry.qp_solver(name))
         repeats = (in_units(program, units(len(program.f), accuracy, repeat)) for repeat in count())
@@ -77,24 +70,16 @@ class SolverTrials(PiecewiseStage, Pieces):
         status, reason, residuals = verify(program, solution, accuracy)
         return Trial(status, reason, solution, residuals, seconds)
 
-    def lost(self, number: int, failed: Failed) -> Trial:  # noqa: ARG002
+    def instead(self, number: int, failed: Failed) -> Trial:  # noqa: ARG002
         """Outcome of a solver that raised an error, hung, or ended the process."""
         return Trial(failed.status, failed.reason)
-
-    def finish(self, pieces: Sequence[Trial]) -> list[Trial]:
-        """Outcomes in the order of the solvers."""
-        return list(pieces)
 
 
 def solver_trials(
     program: VariationalInequality, accuracy: float, solvers: Sequence[str], seconds: float = SECONDS
 ) -> dict[str, Trial]:
     """Outcomes of installed solvers on a dense program, by name; `seconds` is the time limit of each."""
-    limits = Limits()
-    with closing(Supervisor()) as supervisor:
-        stage = SolverTrials(dumps(program), accuracy, tuple(solvers))
-        answer = supervisor.run(Job("", stage, seconds, limits.cell_seconds, limits.memory_gib))
-    if isinstance(answer, Done):
-        return dict(zip(solvers, answer.value, strict=True))
-    status = answer.status if isinstance(answer, Failed) else Status.ERROR
-    return dict.fromkeys(solvers, Trial(status, answer.reason))
+    trials = watched(SolverTrials(dumps(program), accuracy, tuple(solvers)), seconds, in_all=Limits().cell_seconds)
+    if isinstance(trials, Failed):
+        return dict.fromkeys(solvers, Trial(trials.status, trials.reason))
+    return dict(zip(solvers, trials, strict=True))

@@ -9,7 +9,7 @@ from __future__ import annotations
 import importlib.metadata
 import json
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property
 from importlib.metadata import Distribution, EntryPoint
@@ -244,25 +244,20 @@ def registered(kind: PluginKind) -> dict[str, RegisteredPlugin]:
     return {name: RegisteredPlugin(kind, name, tuple(entries.values())) for name, entries in sorted(named.items())}
 
 
-def named(text: str, kinds: Mapping[str, PluginKind]) -> RegisteredPlugin:
+def named(text: str, kinds: Mapping[str, PluginKind], solvers: Sequence[str]) -> RegisteredPlugin:
     """The plugin that NAME or KIND:NAME refers to, of kinds by their names on the command line.
 
-    QP solvers are those that are installed, whether they are plugins or not.
+    QP solvers are those that are installed (`installed_solvers`), whether they are plugins or not.
 
     Raises
     ------
     RequestError
         If there is no such plugin, or several.
     """
-    from vibench.qp.solve import installed_solvers
-
     prefix, colon, rest = text.partition(":")
     name = rest if colon else text
     asked = {word: kind for word, kind in kinds.items() if not colon or word == prefix}
-    names = {
-        word: installed_solvers(registered(kind)) if kind is SOLVER else [*registered(kind)]
-        for word, kind in (asked or kinds).items()
-    }
+    names = {word: solvers if kind is SOLVER else [*registered(kind)] for word, kind in (asked or kinds).items()}
     having = [word for word in asked if name in names[word]]
     if not having:
         what = kinds.get(prefix, "plugin") if colon else "plugin"
