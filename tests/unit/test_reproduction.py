@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import html
 import importlib
 import math
 import re
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 from types import ModuleType
 
 import pytest
+
+from vibench_problems.paper import claims
+from vibench_problems.paper.claims import Verdict
 
 ROOT = Path(__file__).parents[2]
 PAGE = ROOT / "docs" / "reproduction.md"
@@ -30,21 +35,12 @@ LINES = (
 
 
 @pytest.fixture(scope="module")
-def results() -> object:
-    """The scripts of the folder `results/scripts`, importable."""
-    sys.path.insert(0, str(ROOT / "results" / "scripts"))
-    yield
-    sys.path.remove(str(ROOT / "results" / "scripts"))
-
-
-@pytest.fixture(scope="module")
-def verdicts(results: object) -> ModuleType:
-    return importlib.import_module("claims.verdicts")
-
-
-@pytest.fixture(scope="module")
-def reproduction(results: object) -> ModuleType:
-    return importlib.import_module("reproduction")
+def reproduction() -> Iterator[ModuleType]:
+    """The script that writes the page."""
+    scripts = str(ROOT / "results" / "scripts")
+    sys.path.insert(0, scripts)
+    yield importlib.import_module("reproduction")
+    sys.path.remove(scripts)
 
 
 @pytest.mark.parametrize(
@@ -61,10 +57,8 @@ def reproduction(results: object) -> ModuleType:
         (1.0, math.nan, 1.0, False),
     ],
 )
-def test_numbers_agree_within_a_relative_difference(
-    verdicts: ModuleType, paper: float, ours: float, within: float, expected: bool
-) -> None:
-    assert verdicts.close(paper, ours, within) is expected
+def test_numbers_agree_within_a_relative_difference(paper: float, ours: float, within: float, expected: bool) -> None:
+    assert claims.close(paper, ours, within) is expected
 
 
 @pytest.mark.parametrize(
@@ -84,15 +78,15 @@ def test_numbers_agree_within_a_relative_difference(
     ],
 )
 def test_a_break_even_agrees_where_the_interval_contains_it(
-    verdicts: ModuleType, meaning: str, low: float | None, high: float | None, expected: str
+    meaning: str, low: float | None, high: float | None, expected: str
 ) -> None:
-    assert verdicts.break_even_verdict(102.0, meaning, low, high).value == expected
+    assert claims.break_even_verdict(102.0, meaning, low, high).value == expected
 
 
-def test_a_break_even_is_written_with_its_interval(verdicts: ModuleType) -> None:
-    assert verdicts.break_even_text(28.3, "from", 18.8, 63.1) == "from 28 (19–63)"
-    assert verdicts.break_even_text(math.nan, "never", math.nan, math.nan) == "never"
-    assert verdicts.break_even_text(None, "undecided", 179.3, None) == "undecided (≥ 179)"
+def test_a_break_even_is_written_with_its_interval() -> None:
+    assert claims.break_even_text(28.3, "from", 18.8, 63.1) == "from 28 (19–63)"
+    assert claims.break_even_text(math.nan, "never", math.nan, math.nan) == "never"
+    assert claims.break_even_text(None, "undecided", 179.3, None) == "undecided (≥ 179)"
 
 
 @pytest.mark.parametrize(
@@ -104,29 +98,27 @@ def test_a_break_even_is_written_with_its_interval(verdicts: ModuleType) -> None
         (["until"], "differs"),
     ],
 )
-def test_queries_are_cheaper_only_where_every_break_even_says_so(
-    verdicts: ModuleType, meanings: list[str], expected: str
-) -> None:
-    assert verdicts.cheaper_from(meanings).value == expected
+def test_queries_are_cheaper_only_where_every_break_even_says_so(meanings: list[str], expected: str) -> None:
+    assert claims.cheaper_from(meanings).value == expected
 
 
-def test_an_order_of_magnitude_is_a_factor_of_the_root_of_ten(verdicts: ModuleType) -> None:
-    assert verdicts.same_order(8.0, [9.1, 12.6])
-    assert not verdicts.same_order(8.0, [9.1, 26.0])
-    assert not verdicts.same_order(1e-7, [2e-14])
+def test_an_order_of_magnitude_is_a_factor_of_the_root_of_ten() -> None:
+    assert claims.same_order(8.0, [9.1, 12.6])
+    assert not claims.same_order(8.0, [9.1, 26.0])
+    assert not claims.same_order(1e-7, [2e-14])
 
 
-def test_exceptions_of_an_inequality_are_the_steps_of_both_beyond_round_off(verdicts: ModuleType) -> None:
+def test_exceptions_of_an_inequality_are_the_steps_of_both_beyond_round_off() -> None:
     smaller = {0: 1.0, 1: 0.5, 2: 0.4, 3: 0.3, 5: 9.0}
     larger = {0: 1.0, 1: 0.5 * (1.0 - 1e-12), 2: 0.3, 3: 0.2, 4: 0.1}
-    assert verdicts.exceptions(smaller, larger) == [2, 3]
-    assert verdicts.ranges([9, 10, 11, 19, 22, 27, 28]) == "9–11, 19, 22, 27–28"
+    assert claims.exceptions(smaller, larger) == [2, 3]
+    assert claims.ranges([9, 10, 11, 19, 22, 27, 28]) == "9–11, 19, 22, 27–28"
 
 
-def test_the_cause_is_given_where_the_numbers_do_not_agree(verdicts: ModuleType) -> None:
-    agreed = verdicts.number("N", 50, 47, within=0.15, why="Counted.", cause="Another mesh.")
-    differing = verdicts.number("N", 50, 30, within=0.15, why="Counted.", cause="Another mesh.")
-    missing = verdicts.number("ratio", 2.0, math.nan, within=0.15)
+def test_the_cause_is_given_where_the_numbers_do_not_agree() -> None:
+    agreed = claims.number("Table 1", "N", 50, 47, within=0.15, why="Counted.", cause="Another mesh.")
+    differing = claims.number("Table 1", "N", 50, 30, within=0.15, why="Counted.", cause="Another mesh.")
+    missing = claims.number("Table 1", "ratio", 2.0, math.nan, within=0.15)
     assert (agreed.verdict.value, agreed.why) == ("agrees", "Counted.")
     assert (differing.verdict.value, differing.why) == ("differs", "Counted. Another mesh.")
     assert missing.verdict.value == "cannot be compared"
@@ -144,8 +136,8 @@ def page() -> str:
 
 @pytest.mark.parametrize(("table", "column"), [(table, column) for table in TABLES for column in TABLES[table]])
 def test_the_page_has_every_row_of_both_tables(page: str, table: str, column: str) -> None:
-    claims = [row["claim"] for row in ROW.finditer(page)]
-    assert [line for line in LINES if claims.count(f"{table}, {column}: {line}") != 1] == []
+    named = [row["claim"] for row in ROW.finditer(page)]
+    assert [line for line in LINES if named.count(f"{table}, {column}: {line}") != 1] == []
 
 
 def test_the_page_has_every_figure(page: str) -> None:
@@ -153,9 +145,9 @@ def test_the_page_has_every_figure(page: str) -> None:
     assert found == set(range(1, 16))
 
 
-def test_the_counts_of_the_page_are_those_of_its_rows(page: str, verdicts: ModuleType) -> None:
+def test_the_counts_of_the_page_are_those_of_its_rows(page: str) -> None:
     found = [row["verdict"] for row in ROW.finditer(page)]
-    counts = [found.count(verdict.value) for verdict in verdicts.Verdict]
+    counts = [found.count(verdict.value) for verdict in Verdict]
     assert f"| all | {' | '.join(map(str, counts))} |" in page
     assert sum(counts) > 150
 
@@ -163,3 +155,46 @@ def test_the_counts_of_the_page_are_those_of_its_rows(page: str, verdicts: Modul
 def test_what_differs_or_cannot_be_compared_has_a_reason(page: str) -> None:
     rows = [line for line in page.splitlines() if re.search(r"\| (differs|cannot be compared) \| ", line)]
     assert [row for row in rows if row.endswith(" |  |")] == []
+
+
+TWINS = ROOT / "results" / "paper-figures" / "paper-figures.md"
+SECTION = re.compile(
+    r"^## Figure (?P<number>\d+)(?P<direct> hertz direct)?\n.*?^\*\*Here\.\*\* (?P<said>.+?)$", re.M | re.S
+)
+DRAWN = re.compile(r"Fig\. ([3-8]|1\d)\b")
+GROUPS = "|".join(verdict.capitalize() for verdict in Verdict)
+
+
+def unescaped(markdown: str) -> str:
+    return html.unescape(re.sub(r"\\([\\`*_\[\]|#])", r"\1", markdown))
+
+
+def judged_under_figures() -> list[tuple[str, str, str]]:
+    """Statement, our value and verdict of everything that is said below the figures drawn again."""
+    result = []
+    for section in SECTION.finditer(TWINS.read_text(encoding="utf-8")):
+        suffix = ", direct projection" if section["direct"] else ""
+        groups = re.split(rf"(?:^|(?<=\.) )({GROUPS}): ", unescaped(section["said"]))[1:]
+        for verdict, said in zip(groups[::2], groups[1::2], strict=True):
+            for words in said.removesuffix(".").split("; "):
+                statement, _, ours = words.partition(": ")
+                result.append((statement + suffix, ours, verdict.lower()))
+    return result
+
+
+def test_both_pages_of_the_paper_agree_on_every_claim_that_they_share(page: str) -> None:
+    under_figures = judged_under_figures()
+    assert len(under_figures) > 100
+    rows = {
+        (unescaped(row["claim"]).partition(": ")[2], unescaped(row["ours"]), row["verdict"])
+        for row in ROW.finditer(page)
+    }
+    assert [claim for claim in under_figures if claim not in rows] == []
+
+
+def test_the_page_repeats_every_verdict_on_a_figure(page: str) -> None:
+    """The other way round: of a figure that is drawn again, the claims of the page stand below it."""
+    statements = {statement for statement, _, _ in judged_under_figures()}
+    of_figures = [unescaped(row["claim"]) for row in ROW.finditer(page) if DRAWN.search(row["claim"])]
+    missing = {claim for claim in of_figures if claim.partition(": ")[2] not in statements}
+    assert {claim for claim in missing if not claim.endswith(", without symmetry")} == set()

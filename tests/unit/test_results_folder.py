@@ -91,7 +91,7 @@ def test_a_page_made_anew_is_as_light(quick_run: Path, tmp_path: Path) -> None:
 def test_the_results_are_published_by_one_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.syspath_prepend(str(SCRIPTS))
     script = importlib.import_module("publish")
-    monkeypatch.setattr(html, "page", lambda _: "<!doctype html>")
+    monkeypatch.setattr(html, "page", lambda *_, **__: "<!doctype html>")
     script.main(str(tmp_path / "site"))
     index = (tmp_path / "site" / "index.html").read_text(encoding="utf-8")
     for name in NAMES:

@@ -14,7 +14,6 @@ if TYPE_CHECKING:  # tables ask every plugin for columns: this module loads no m
 
 Twin = Callable[[], "CaptionedFigure | None"]
 
-RADIUS = "radius µ [m]"
 NOT_IN_THE_PAPER = {"bulge": True, "approach": "parameter"}
 """Options that add a parameter which the problems of the paper do not have."""
 
@@ -33,22 +32,13 @@ class PaperFigures(FigurePlugin):
         if paper is None or any(tables.problem_options.get(name) == value for name, value in NOT_IN_THE_PAPER.items()):
             return {}
         from vibench_problems.paper import constants, discs, membrane, offline  # noqa: PLC0415
-        from vibench_problems.paper.curves import Curves  # noqa: PLC0415
+        from vibench_problems.paper.evidence import Evidence  # noqa: PLC0415
 
-        curves, parameter = Curves(tables), RADIUS if tables.problem_name == "hertz" else ""
-        errors, angles, greedy, comparison = paper.figures
-        found: dict[int, Twin] = {
-            errors: partial(offline.projection_errors, curves, paper),
-            angles: partial(offline.orthogonality, curves, paper),
-            greedy: partial(offline.greedy, curves, paper, parameter),
-            comparison: partial(constants.comparison, curves, paper, parameter),
-        }
+        drawn = (offline.projection_errors, offline.orthogonality, offline.greedy, constants.comparison)
+        twins: dict[int, Callable[[Evidence], CaptionedFigure | None]] = dict(zip(paper.figures, drawn, strict=True))
         if tables.problem_name == "obstacle":
-            found |= {3: partial(membrane.aspect_ratios, tables), 4: partial(membrane.solution, tables)}
+            twins |= {3: membrane.aspect_ratios, 4: membrane.solution}
         else:
-            found |= {
-                9: partial(discs.configuration, tables),
-                10: partial(discs.solution, tables),
-                13: partial(constants.without_enrichment, curves, paper, parameter),
-            }
-        return {f"figure-{number}": found[number] for number in sorted(found)}
+            twins |= {9: discs.configuration, 10: discs.solution, 13: constants.without_enrichment}
+        evidence = Evidence(tables)
+        return {f"figure-{number}": partial(twins[number], evidence) for number in sorted(twins)}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -12,14 +13,16 @@ from matplotlib.axes import Axes
 from running import Changed
 
 from vibench.highfidelity.active_set import HighFidelitySolver
-from vibench.report.figures import problems
+from vibench.report.figures.data import Data, problems
 from vibench.results import tables
 from vibench_problems.hertz import Hertz
 from vibench_problems.line_contact import theory
 from vibench_problems.obstacle import RADIUS, Obstacle
 from vibench_problems.paper import published
-from vibench_problems.paper.curves import compared, reached, violations
+from vibench_problems.paper.claims import Claim, Verdict, compared, exceptions, holds, typeset
+from vibench_problems.paper.evidence import Evidence, reached
 from vibench_problems.paper.figures import PaperFigures
+from vibench_problems.paper.sections import figure_claims
 
 FIXED = "primal = 'offline-pga'"
 TABLES = ("queries", "cells", "histories")
@@ -46,9 +49,18 @@ HERTZ = as_published("hertz", "pod_tol = NULL, pod_size = 46, dual_tol = NULL, d
 OBSTACLE = as_published("obstacle", "pod_tol = 0.001", 0.5, 0.001)
 
 
-def twins(path: Path, problem: str) -> dict[str, Callable[[], Any]]:
+def tables_of(path: Path, problem: str) -> Data:
     (data,) = [one for _, one in problems(path) if one.problem == problem]
-    return dict(PaperFigures().drawings(data))
+    return data
+
+
+def twins(path: Path, problem: str) -> dict[str, Callable[[], Any]]:
+    return dict(PaperFigures().drawings(tables_of(path, problem)))
+
+
+def the_claim(path: Path, problem: str, statement: str) -> Claim:
+    (claim,) = [one for one in figure_claims(Evidence(tables_of(path, problem))) if one.statement == statement]
+    return claim
 
 
 def line_called(axes: Axes, label: str) -> np.ndarray:
@@ -66,7 +78,7 @@ def test_every_figure_from_3_to_15_has_a_twin(changed: Changed) -> None:
         assert figure.get_suptitle().startswith(f"Figure {number}: "), name
         assert figure.caption, name
         assert figure.published, name
-        assert figure.compared.startswith(("Agrees: ", "Differs: ")), name
+        assert figure.compared.startswith(("Agrees: ", "Differs: ", "Cannot be compared: ")), name
 
 
 def test_a_run_without_the_pairs_of_the_paper_has_fewer(quick_run: Path) -> None:
@@ -97,17 +109,57 @@ def test_projection_errors_stand_beside_the_published_sizes(quick_run: Path) -> 
     np.testing.assert_array_equal(line_called(right, crosses), [(50, 1e-2), (70, 1e-3)])
     cells = tables.read(path, "cells")
     mine = cells[(cells["problem"] == "obstacle") & (cells["dual"] == "mcpg")].iloc[0]
-    assert f"N = {mine['N']} for δ_POD = 0.001, 19 published" in figure.compared
-    assert f"R = {mine['R']} for δ_mCPG = 0.01, 50 published" in figure.compared
-    assert "R = none for δ_mCPG = 0.001, 70 published" in figure.compared.partition("Differs: ")[2]
+    assert f"N for δ_POD = 0.001: {mine['N']}" in figure.compared
+    assert f"R for δ_mCPG = 0.01: {mine['R']}" in figure.compared
+    assert "R for δ_mCPG = 0.001: none" in figure.compared.partition("Cannot be compared: ")[2]
+    assert "N for δ_POD = 0.001: 19; " in figure.published
 
 
 def test_a_violated_inequality_differs(changed: Changed) -> None:
     path = changed(*OBSTACLE)
-    assert "the inequalities hold at all 16 points" in twins(path, "obstacle")["figure-8"]().compared
+    statement = "β_on ≥ β_off ≥ β_dec and β_on ≥ β_HF, (19, 50), δ_PGA = 0.5"
+    everywhere = f"{statement}: over the span at all 16, over the cone at all 16"
+    assert everywhere in twins(path, "obstacle")["figure-8"]().compared.partition("Differs: ")[0]
     path = changed(*OBSTACLE, "UPDATE queries SET beta_hf_span = 2.0 * beta_full_span WHERE query = 3")
     text = twins(path, "obstacle")["figure-8"]().compared
-    assert "the inequalities do not hold at all 16 points" in text.partition("Differs: ")[2]
+    assert f"{statement}: over the span not at all, over the cone at all 16" in text.partition("Differs: ")[2]
+
+
+@pytest.mark.parametrize(("factor", "verdict"), [(0.5, "differs"), (1.5, "differs"), (None, "agrees")])
+def test_there_is_no_order_only_where_the_panels_of_the_figure_have_none(
+    factor: float | None, verdict: str, changed: Changed
+) -> None:
+    """All tolerances of a run together say nothing of a figure that shows some of them."""
+    other = f"beta_hf_span = {factor or 0.5} * beta_span" + " * (1.0 + 2.0 * (query % 2))" * (factor is None)
+    path = changed(*OBSTACLE, f"UPDATE queries SET {other} WHERE primal_tol = 0.5")
+    assert the_claim(path, "obstacle", "no order between β_off and β_HF").verdict.value == verdict
+
+
+@pytest.mark.parametrize(
+    ("lower", "upper", "verdict"), [(0.01, 0.02, "differs"), (0.0, 0.02, "cannot be compared"), (0.0, 0.0, "agrees")]
+)
+def test_a_constant_vanishes_over_the_cone_where_an_upper_bound_says_so(
+    lower: float, upper: float, verdict: str, changed: Changed
+) -> None:
+    bounds = f"beta_plain_cone_lower = {lower}, beta_plain_cone_upper = {upper}"
+    path = changed(*OBSTACLE, f"UPDATE queries SET {bounds}")
+    statement = "N < R implies β_dec = 0, (19, 50), over the cone as in (14)"
+    assert the_claim(path, "obstacle", statement).verdict.value == verdict
+
+
+@pytest.mark.parametrize("problem", ["obstacle", "hertz"])
+def test_figures_and_the_page_of_claims_have_the_same_verdicts(problem: str, changed: Changed) -> None:
+    path = changed(*OBSTACLE, *HERTZ)
+    said = {name: draw().compared for name, draw in twins(path, problem).items()}
+    judged = list(figure_claims(Evidence(tables_of(path, problem))))
+    assert len(judged) > 15
+    for claim in judged:
+        (number,) = re.findall(r"Fig\. (\d+)", claim.place)
+        before, found, after = said[f"figure-{number}"].partition(f"{typeset(f'{claim.statement}: {claim.ours}')}")
+        assert found, claim.name
+        groups = re.findall("|".join(verdict.capitalize() for verdict in Verdict), before)
+        assert groups[-1].lower() == claim.verdict.value
+        assert after[0] in ";."
 
 
 def test_constants_of_the_third_pair_are_over_the_only_parameter(changed: Changed) -> None:
@@ -134,7 +186,7 @@ def test_the_greedy_algorithm_is_that_of_the_histories(changed: Changed) -> None
         steps = mine[mine["quantity"] == quantity].sort_values("step")[["step", "value"]].to_numpy(float)
         shown = line_called(panel, "offline-pga, δ = 0.3")
         np.testing.assert_array_equal(shown[np.isfinite(shown[:, 1])], steps[steps[:, 1] > 1e-12])
-    assert "σ stays above 0.3" in figure.compared.partition("Differs: ")[2]  # δ was 0.5
+    assert "PGA converges to δ_PGA = 0.3: σ = 0.4" in figure.compared.partition("Differs: ")[2]  # δ was 0.5
 
 
 def test_the_membrane_is_that_of_figure_4(quick_run: Path) -> None:
@@ -146,7 +198,7 @@ def test_the_membrane_is_that_of_figure_4(quick_run: Path) -> None:
     left, right = (axes.collections[0] for axes in figure.axes[:2])
     assert left.get_clim()[0] == pytest.approx(float(problem.picture(mu, found.u, found.lam).values.min()), rel=1e-6)
     assert right.get_clim() == (0.0, pytest.approx(float(found.lam.max()), rel=1e-6))
-    assert f"{np.count_nonzero(found.lam > 0.0)} of {problem.W.dim} multipliers are positive" in figure.compared
+    assert f"{np.count_nonzero(found.lam > 0.0)} of {problem.W.dim} multipliers positive" in figure.compared
 
 
 def test_five_pressures_lie_in_one_panel_with_hertz_s_theory(quick_run: Path) -> None:
@@ -163,9 +215,10 @@ def test_five_pressures_lie_in_one_panel_with_hertz_s_theory(quick_run: Path) ->
         np.testing.assert_allclose((x / exact.half_width) ** 2 + (pressure / exact.peak) ** 2, 1.0, rtol=1e-12)
 
 
-def test_facts_are_sorted_by_what_the_paper_says() -> None:
-    facts = ((True, "a"), (np.bool_(False), "b"), (None, "c"), (np.bool_(True), "d"))
-    assert compared(*facts) == "Agrees: a; d. Differs: b. Not published: c."
+def test_claims_are_sorted_by_their_verdicts() -> None:
+    conditions = {"a": True, "b": np.False_, "c": None, "d": np.True_}
+    claims = [holds("Fig. 1", name, "x", condition) for name, condition in conditions.items()]
+    assert compared(claims) == "Agrees: a: x; d: x. Differs: b: x. Cannot be compared: c: x."
     assert reached({0: 1.0, 3: 0.1, 4: 0.05}, 0.1) == 3
-    assert reached({0: 1.0}, 0.1) is None
-    assert violations({1: 1.0, 2: 3.0, 9: 1.0}, {1: 1.0, 2: 2.0}) == [2]
+    assert np.isnan(reached({0: 1.0}, 0.1))
+    assert exceptions({1: 1.0, 2: 3.0, 9: 1.0}, {1: 1.0, 2: 2.0}) == [2]

@@ -1,1 +1,0 @@
-"""The claims of Niakh, Drouet, Ehrlacher and Ern (2022), each compared with measured numbers."""
