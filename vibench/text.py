@@ -23,6 +23,15 @@ def parsed_json(text: str | bytes) -> Any:
         raise ValueError("it is nested too deeply") from None
 
 
+def json_object(text: object) -> dict[str, Any] | None:
+    """The object of a JSON text that others wrote; `None` where it is no such text."""
+    try:
+        value = parsed_json(text) if isinstance(text, str) else None
+    except ValueError:
+        return None
+    return value if isinstance(value, dict) else None
+
+
 def printable(text: str) -> str:
     r"""A text with its characters that are not printable as JSON escapes: ``\u001b``, ``\n``, ``\ud800``.
 

@@ -11,7 +11,7 @@ import pandas as pd
 from page import start
 
 from vibench.report.figures.data import label
-from vibench.results import tables
+from vibench.results import formats, tables
 
 LOOSE, TIGHT = 1e-3, 1e-6
 """δ_POD of the two pairs that are shown."""
@@ -19,7 +19,7 @@ LOOSE, TIGHT = 1e-3, 1e-6
 
 def main(paper_obstacle: str, benefit: str) -> None:
     for run, table in ((paper_obstacle, models), (benefit, gains)):
-        print(tables.to_markdown(table(tables.read(tables.results_file(run), "cells"))))
+        print(formats.to_markdown(table(tables.read(tables.results_file(run), "cells"))))
 
 
 def models(cells: pd.DataFrame) -> pd.DataFrame:

@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from vibench.report.figures.style import save
-from vibench.results import tables
+from vibench.results import formats, tables
 
 SECONDS = "Seconds are CPU seconds on one thread."
 
@@ -45,7 +45,7 @@ class Page:
         """Paragraphs and tables, in their order; empty paragraphs are left out, an empty table reads "None."."""
         for part in parts:
             if isinstance(part, pd.DataFrame):
-                self._parts.append(tables.to_markdown(part).strip() if len(part) else "None.")
+                self._parts.append(formats.to_markdown(part).strip() if len(part) else "None.")
             elif part:
                 self._parts.append(part.strip())
 

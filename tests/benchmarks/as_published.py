@@ -29,7 +29,7 @@ from sides import CASES, TOTAL, TOTAL_NAME, Ours, Published, Side
 from vibench import provenance
 from vibench.arrays import Array
 from vibench.qp import verification
-from vibench.results import tables
+from vibench.results import formats
 from vibench.timing import median_seconds, timed
 
 SEED = 2022
@@ -229,7 +229,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         "own reduced dimensions.\n"
     )
     text = "\n".join(
-        [title, about_columns, *map(tables.to_markdown, (times, ratio_table(seconds | of_queries), figures, held))]
+        [title, about_columns, *map(formats.to_markdown, (times, ratio_table(seconds | of_queries), figures, held))]
     )
     print(text)
     if asked.out:
@@ -237,7 +237,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         name = asked.out / f"as-published-{asked.problem}"
         name.with_suffix(".md").write_text(text, encoding="utf-8")
         about = {"problem": asked.problem, "resolution": resolution, "solver": asked.solver, "machine": where}
-        name.with_suffix(".csv").write_text(tables.to_csv(times.assign(**about)), encoding="utf-8")
+        name.with_suffix(".csv").write_text(formats.to_csv(times.assign(**about)), encoding="utf-8")
     return int(bool(broken(verdicts)))
 
 

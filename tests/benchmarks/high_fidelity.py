@@ -25,7 +25,7 @@ from vibench.arrays import Array
 from vibench.highfidelity.active_set import HighFidelitySolver
 from vibench.interfaces.problem import Problem
 from vibench.interfaces.validation import checked_assembly
-from vibench.results import tables
+from vibench.results import formats
 from vibench.stages.base import build_problem
 from vibench.stages.snapshots import CHUNKS, SnapshotStage
 from vibench.study.parameter_sets import ParameterSet
@@ -80,7 +80,7 @@ def main() -> int:
     parser.add_argument("--counts", type=int, nargs="+", default=[30, 60])
     asked = parser.parse_args()
     found = pd.DataFrame([measure(asked.problem, count) for count in asked.counts])
-    print(tables.to_markdown(found))
+    print(formats.to_markdown(found))
     overlap = found["from [ms]"].max() <= found["to [ms]"].min()
     return int(not overlap or bool((abs(found["ratio"] - 1.0) > TOLERATED).any()))
 

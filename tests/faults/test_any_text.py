@@ -25,7 +25,7 @@ from vibench.qp.verification import QPSolution
 from vibench.report import html
 from vibench.report.figures import dimension, problems
 from vibench.report.figures.style import styled, write_figure
-from vibench.results import pictures, tables
+from vibench.results import formats, pictures, tables
 from vibench.results.columns import STORED, TABLES
 from vibench.results.database import ResultsDatabase
 from vibench.results.sqlite.reading import FILE
@@ -90,12 +90,12 @@ def recorded(folder: Path, text: str, count: Any) -> Path:
 def outputs(path: Path) -> list[str]:
     """Every table of a results file in every format, and the summary as it is shown."""
     read = {table: tables.in_order(tables.read(path, table)) for table in TABLES}
-    found = [form(frame) for frame in read.values() for form in tables.FORMS.values()]
+    found = [form(frame) for frame in read.values() for form in formats.FORMS.values()]
     summary = tables.summary(read["cells"])
     with contextlib.redirect_stdout(io.StringIO()) as out:
         print_frame(summary, "summary")
         print_frame(read["disagreements"], "disagreements")
-    return [*found, tables.to_markdown(summary), out.getvalue()]
+    return [*found, formats.to_markdown(summary), out.getvalue()]
 
 
 def page(path: Path) -> str:

@@ -14,7 +14,7 @@ from outputs import clean, elements
 from running import Vibench, rows
 from samples import install, wire_study, write_study
 
-from vibench.results import pictures, tables
+from vibench.results import formats, pictures
 from vibench.results.columns import TABLES
 from vibench.results.sqlite.reading import FILE
 from vibench.results.sqlite.values import LONGEST_TEXT
@@ -134,7 +134,7 @@ def test_whatever_is_printed_and_written_is_printable(ended: tuple[Path, str], v
     cell = next(row["cell"] for row in rows(run) if (row["solver"], row["status"]) == ("odd-counts", "ok"))
     commands = [["report", "run"], ["diff", "run", "run"], ["replay", "run", cell], ["run", "study.toml", "--dry-run"]]
     commands += [["show", "run", "--table", table] for table in ("benefits", "queries")]
-    commands += [["show", "run", "--format", form] for form in tables.FORMS]
+    commands += [["show", "run", "--format", form] for form in formats.FORMS]
     for command in commands:
         done = vibench(folder, *command)
         assert (done.returncode, done.stderr) == (0, ""), command

@@ -7,7 +7,7 @@ import math
 import pandas as pd
 
 from vibench.benchmarks.files import AXES, Measured, Timed
-from vibench.results.tables import cell_text
+from vibench.results.formats import cell_text
 from vibench.terminal.console import print_frame
 from vibench.terminal.output import echo
 

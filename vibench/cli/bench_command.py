@@ -43,7 +43,7 @@ def bench_plugins(
     less accurate than in the file of --against.
     """
     from vibench.benchmarks import comparison, files
-    from vibench.results import tables
+    from vibench.results import formats
 
     earlier = files.read(against) if against is not None else None
     failed = 0
@@ -57,7 +57,7 @@ def bench_plugins(
         comparison.print_benchmarks(timed, earlier, limit, failed)
     else:
         frame = comparison.table(timed) if earlier is None else comparison.compared(earlier, timed, limit)
-        sys.stdout.write(tables.FORMS[form](frame))
+        sys.stdout.write(formats.FORMS[form](frame))
     if failed or (earlier is not None and comparison.regressions(earlier, timed, limit)):
         raise Exit(1)
 

@@ -80,7 +80,7 @@ def reduce_cones(
     from vibench.packs.reader import naming
     from vibench.report.figures.convergence import cone_errors
     from vibench.report.figures.style import save, styled
-    from vibench.results.tables import to_csv
+    from vibench.results.formats import to_csv
     from vibench.study.registry import find, registered
     from vibench.terminal.console import print_frame
 

@@ -59,7 +59,7 @@ def show(
 
     On a terminal, columns that do not fit are left out; csv and json have the values and names of the results file.
     """
-    from vibench.results import tables, views
+    from vibench.results import formats, tables, views
     from vibench.results.selection import parts
     from vibench.terminal.console import print_frame
 
@@ -72,7 +72,7 @@ def show(
         if found.rows.empty and found.view.empty:
             echo(found.view.empty)
     else:
-        sys.stdout.write(tables.FORMS[form](found.exact if form in {"csv", "json"} else found.readable))
+        sys.stdout.write(formats.FORMS[form](found.exact if form in {"csv", "json"} else found.readable))
 
 
 def write_report(
@@ -169,14 +169,14 @@ def diff_runs(
 ) -> None:
     """List changes between two runs; exit code 1 on a regression."""
     from vibench.report.comparison.compare import compare
-    from vibench.results import tables
+    from vibench.results import formats, tables
     from vibench.terminal import comparison
 
     found = compare([tables.results_file(a), tables.results_file(b)], limit)
     if form == "terminal":
         comparison.print_changes(found, limit)
     else:
-        sys.stdout.write(tables.FORMS[form](found.changes))
+        sys.stdout.write(formats.FORMS[form](found.changes))
     if found.regressions:
         raise Exit(1)
 
@@ -201,7 +201,7 @@ def compare_runs(
     Numbers are compared with the first run, seconds with the first run of the same machine.
     """
     from vibench.report.comparison.compare import compare
-    from vibench.results import tables
+    from vibench.results import formats, tables
     from vibench.terminal import comparison
 
     found = compare([tables.results_file(one) for one in run], limit)
@@ -215,7 +215,7 @@ def compare_runs(
     if form == "terminal":
         comparison.print_table(found, frame, title)
     else:
-        sys.stdout.write(tables.FORMS[form](tables.whole_numbers(frame)))
+        sys.stdout.write(formats.FORMS[form](tables.whole_numbers(frame)))
 
 
 def replay_query(

@@ -8,9 +8,7 @@ from pathlib import Path
 
 from vibench.errors import RequestError
 from vibench.files import locked
-from vibench.results.sqlite import files as sqlite_files
-from vibench.results.sqlite.files import DAMAGED, set_aside
-from vibench.results.sqlite.reading import FILE, DamagedError, read_meta, study_of
+from vibench.results.sqlite.reading import DAMAGED, FILE, WRITE_AHEAD_LOG, DamagedError, read_meta, set_aside, study_of
 from vibench.results.tables import EXPORTED
 
 LOCK = ".lock"
@@ -35,7 +33,7 @@ def claimed(folder: Path) -> Iterator[None]:
     try:
         if folder.exists() and not folder.is_dir():
             raise RequestError(f"output folder '{folder}' is a file")
-        known = {LOCK, FILE + DAMAGED, FILE + DAMAGED + sqlite_files.LOG}
+        known = {LOCK, FILE + DAMAGED, FILE + DAMAGED + WRITE_AHEAD_LOG}
         if folder.is_dir() and not (folder / FILE).exists() and {path.name for path in folder.iterdir()} - known:
             raise RequestError(f"output folder '{folder}' is not empty and holds no {FILE}; choose another with --out")
         folder.mkdir(parents=True, exist_ok=True)

@@ -26,7 +26,7 @@ from vibench.report.figures.data import (
     problems,
 )
 from vibench.report.leaderboard import Criterion, Standings, leaderboard
-from vibench.results import invariants, tables
+from vibench.results import formats, invariants, tables
 from vibench.results.best import LARGEST_BAND, SOLVER_SHARE, eligible, solved_too_loosely
 from vibench.results.solver_agreement import sentence
 from vibench.stability.infsup import VANISHES
@@ -294,9 +294,9 @@ def _costs(cells: pd.DataFrame, thresholds: pd.DataFrame) -> Iterator[str]:
     against = thresholds[(thresholds["cell_b"] == row["cell"]) & thresholds["cell_a"].isna()]
     for found in against.itertuples():
         number = "" if pd.isna(found.benefit_threshold) else " queries"
-        interval = tables.interval(found.threshold_low, found.threshold_high)
+        interval = formats.interval(found.threshold_low, found.threshold_high)
         within = f", 95 % interval {interval}" if interval else ""
-        break_even = f"{tables.break_even(found.meaning, found.benefit_threshold)}{number}{within}"
+        break_even = f"{formats.break_even(found.meaning, found.benefit_threshold)}{number}{within}"
         yield f"Break-even of {name} against high-fidelity solutions: {break_even}."
 
 

@@ -94,7 +94,7 @@ def _page(path: Path, pool: ProcessPoolExecutor | None, *, figures: bool) -> str
     tasks = [task for name, data in data_of.items() for task in tasks_of(name, data)] if figures else []
     rendered = render(tasks, image_of, pool)
     images = [image for figure in rendered for image in figure.pages]
-    template = _environment().get_template("report.html.j2")
+    template = environment("templates", trim_blocks=True, lstrip_blocks=True).get_template("report.html.j2")
     return template.render(
         study=study.get("name", path.parent.name),
         facts=list(_facts(study, cells)),
@@ -126,14 +126,14 @@ def _page(path: Path, pool: ProcessPoolExecutor | None, *, figures: bool) -> str
     )
 
 
-def _environment() -> Environment:
+def environment(folder: str, **options: Any) -> Environment:
+    """The templates of a folder, in which a text from others is printable and no markup."""
     return Environment(
-        loader=PackageLoader("vibench.report"),
+        loader=PackageLoader("vibench.report", folder),
         autoescape=True,
         undefined=StrictUndefined,
         finalize=_printable,
-        trim_blocks=True,
-        lstrip_blocks=True,
+        **options,
     )
 
 

@@ -25,8 +25,8 @@ from vibench.interfaces.problem import VariationalInequality
 from vibench.qp.solve import installed_solvers
 from vibench.qp.status import Status
 from vibench.qp.verification import QPSolution, verify
+from vibench.results.formats import to_csv
 from vibench.results.solver_agreement import vectors
-from vibench.results.tables import to_csv
 from vibench.study.kinds import SOLVER
 from vibench.study.registry import registered
 

@@ -13,8 +13,16 @@ from typing import Any
 from vibench.errors import RequestError, StorageError
 from vibench.results.columns import HISTORY_KEYS, STORED, VERSION
 from vibench.results.sqlite.digests import CREATE, DigestError, Digests
-from vibench.results.sqlite.files import BUSY_SECONDS, DAMAGED, code_of
-from vibench.results.sqlite.reading import FILE, DamagedError, read_meta, study_of, text_reader
+from vibench.results.sqlite.reading import (
+    BUSY_SECONDS,
+    DAMAGED,
+    FILE,
+    DamagedError,
+    code_of,
+    read_meta,
+    study_of,
+    text_reader,
+)
 from vibench.results.sqlite.values import UnstorableError, error_row, storable
 
 NAMED = ("stage", "quantity", *HISTORY_KEYS)

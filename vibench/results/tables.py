@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-import json
-import math
 import re
 from collections.abc import Callable, Collection, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
 
 import pandas as pd
 
@@ -31,9 +28,10 @@ from vibench.results.columns import (
     Column,
     shown_columns,
 )
+from vibench.results.formats import asked, break_even, interval, to_csv, to_markdown
 from vibench.results.plugin_columns import Extended
 from vibench.results.sqlite.reading import FILE, read_meta, read_rows
-from vibench.text import brief, parsed_json, printable_lines, unbroken
+from vibench.text import brief, json_object
 
 ORDER = (
     *KEYS, "primal_a", "primal_b", "primal_tol_a", "primal_tol_b", "assembly_a", "assembly_b", "stage", "quantity",
@@ -84,18 +82,11 @@ def read(path: Path, table: str) -> pd.DataFrame:
     return frame
 
 
-def _is_json_object(value: object) -> bool:
-    try:
-        return isinstance(value, str) and isinstance(parsed_json(value), dict)
-    except ValueError:
-        return False
-
-
 A_NUMBER = (lambda value: isinstance(value, float | int)), "a number"
 A_TEXT = (lambda value: isinstance(value, str)), "a text"
 RIGHT: Mapping[str, tuple[Callable[[object], bool], str]] = {
     "meaning": (set(Meaning).__contains__, f"one of {', '.join(Meaning)}"),
-    "versions": (_is_json_object, "a JSON object"),
+    "versions": (lambda value: json_object(value) is not None, "a JSON object"),
 }
 """What the values of some columns of texts have to be, and how it is said."""
 
@@ -224,133 +215,3 @@ def whole_numbers(frame: pd.DataFrame) -> pd.DataFrame:
 
 WHOLE = {name for table in TABLES.values() for name, column in table.items() if column.kind == INTEGER}
 """Columns of whole numbers; no name is a column of whole numbers in one table and of others in another."""
-
-
-def to_csv(frame: pd.DataFrame) -> str:
-    """CSV with full precision; a text that a spreadsheet would take for a formula has an apostrophe before it."""
-    shown = frame.rename(columns=lambda name: _no_formula(str(name)))
-    for k, kind in enumerate(frame.dtypes):
-        if not pd.api.types.is_numeric_dtype(kind):
-            shown.isetitem(k, pd.Series(map(_no_formula, frame.iloc[:, k]), index=frame.index, dtype=object))
-    return str(shown.to_csv(index=False))
-
-
-FORMULA = tuple("=+-@＝＋－＠\n")
-"""First characters of a text that spreadsheets may take for a formula (OWASP, CSV injection)."""
-
-NUMBER = re.compile(r"[+-]([0-9]+(\.[0-9]+)?(e[+-]?[0-9]+)?|inf)")
-
-
-def _no_formula(value: Any) -> Any:
-    if not isinstance(value, str):
-        return value
-    text = printable_lines(value)
-    return f"'{text}" if text.startswith(FORMULA) and not NUMBER.fullmatch(text) else text
-
-
-def to_markdown(frame: pd.DataFrame) -> str:
-    """A Markdown table, numbers with three significant digits."""
-    return f"{_as_text(frame, _markdown).to_markdown(index=False, disable_numparse=True)}\n"
-
-
-def to_latex(frame: pd.DataFrame) -> str:
-    """A LaTeX tabular (package booktabs), numbers with three significant digits.
-
-    What vibench itself writes compiles with every engine; labels in scripts other than Latin need LuaLaTeX or XeLaTeX.
-    """
-    columns = "".join("r" if pd.api.types.is_numeric_dtype(kind) else "l" for kind in frame.dtypes)
-    table = str(_as_text(frame, to_latex_text).to_latex(index=False, column_format=columns))
-    return f"% needs \\usepackage{{booktabs}}\n{table}"
-
-
-MARKUP = re.compile(r"[\\`*|]|\](?=[(\[])|(?<![^\W_])_|_(?![^\W_])")
-"""What Markdown acts on and a backslash makes text; an underscore inside a word, or a unit in brackets, is text."""
-
-ENTITIES = {
-    ord(sign): f"&{name};" for sign, name in {"&": "amp", "<": "lt", ">": "gt", "$": "#36", "~": "#126"}.items()
-}
-"""What HTML, or Markdown of some dialects, acts on and a backslash would not make text in all of them."""
-
-LATEX = str.maketrans({
-    **{sign: f"\\{sign}" for sign in "&%$#_{}"}, "\\": r"\textbackslash{}", "~": r"\textasciitilde{}",
-    "^": r"\textasciicircum{}", "<": r"\textless{}", ">": r"\textgreater{}", "|": r"\textbar{}",
-    "[": "{[}", "*": "{*}",  # arguments of the line break before them, at the beginning of a row
-    **{sign: f"${command}$" for sign, command in {
-        "≤": r"\leq", "≥": r"\geq", "→": r"\to", "−": "-", "√": r"\surd", "∞": r"\infty", "‖": r"\|", "Δ": r"\Delta",
-        "²": "^2", "·": r"\cdot", "×": r"\times", "γ": r"\gamma", "α": r"\alpha",
-    }.items()}, "–": "--", "…": r"\dots{}", "\u202f": r"\,",
-    "µ": r"$\mu$", "μ": r"$\mu$", "β": r"$\beta$", "δ": r"$\delta$", "λ": r"$\lambda$", "σ": r"$\sigma$",
-})  # fmt: skip
-
-
-def _markdown(text: str) -> str:
-    return MARKUP.sub(r"\\\g<0>", text).translate(ENTITIES)
-
-
-def to_latex_text(text: str) -> str:
-    """A text whose characters LaTeX shows, and acts on none of them."""
-    return text.translate(LATEX)
-
-
-def _as_text(frame: pd.DataFrame, escape: Callable[[str], str]) -> pd.DataFrame:
-    """The table as it is printed, special characters escaped and line breaks removed."""
-    rows = [[escape(unbroken(cell_text(value))) for value in row] for row in frame.itertuples(index=False)]
-    return pd.DataFrame(rows, columns=[escape(unbroken(str(name))) for name in frame.columns])
-
-
-def to_json(frame: pd.DataFrame) -> str:
-    """A JSON array of objects with full precision; missing values are null, infinite ones the numbers ±1e999.
-
-    JSON has no infinity; parsers read a number beyond the largest double as infinite.
-    """
-    # DataFrame.to_json keeps 15 digits at most and writes infinite values as null.
-    known = frame.astype(object).where(frame.notna(), None).to_dict("records")
-    rows = [",\n".join(f"  {_json(str(name))}: {_json(value)}" for name, value in row.items()) for row in known]
-    return printable_lines("[\n" + ",\n".join(f" {{\n{row}\n }}" for row in rows) + "\n]\n")
-
-
-def _json(value: Any) -> str:
-    if isinstance(value, float) and math.isinf(value):
-        return "1e999" if value > 0.0 else "-1e999"
-    return json.dumps(value, ensure_ascii=False)
-
-
-def cell_text(value: Any) -> str:
-    """A value as tables print it: integers whole, other numbers with three significant digits, "" if missing."""
-    if pd.isna(value):
-        return ""
-    if isinstance(value, float):
-        return f"{value:.0f}" if value.is_integer() and abs(value) < 1e6 else f"{value:.3g}"
-    return str(value)
-
-
-def asked(row: Mapping[str, Any] | pd.Series, axis: str) -> str:
-    """The tolerance of `axis`, "pod" or "dual", or the dimension where the study prescribes one."""
-    tolerance, count = row[f"{axis}_tol"], row[f"{axis}_size"]
-    return f"{'N' if axis == 'pod' else 'R'}={int(count)}" if pd.notna(count) else f"{tolerance:g}"
-
-
-def name_of_cell(row: Mapping[str, Any] | pd.Series) -> str:
-    """A cell by all its axes, as `Cell` prints itself."""
-    tolerance = "" if pd.isna(row["primal_tol"]) else f" {row['primal_tol']:g}"
-    sizes = ", ".join(asked(row, axis) for axis in ("pod", "dual"))
-    assembly = "" if row["assembly"] == "full" else f" · {row['assembly']}"
-    trained = "" if row["training"] == "own" else f" ({row['training']})"
-    way = f"{row['problem']}{trained} · {row['dual']} · {row['primal']}{tolerance}"
-    return f"{way} · {sizes} · {row['solver']} {row['accuracy']:g}{assembly}"
-
-
-def break_even(meaning: str, number: float | None) -> str:
-    """When one model is cheaper than another, such as "from 203": the one place where the number of it is rounded."""
-    return meaning if pd.isna(number) else f"{meaning} {number:.0f}"
-
-
-def interval(low: float | None, high: float | None) -> str:
-    """The interval of a break-even; without an upper end where none is known, "" where neither is."""
-    if pd.isna(low):
-        return ""
-    return f"≥ {low:.0f}" if pd.isna(high) else f"{low:.0f}–{high:.0f}"
-
-
-FORMS = {"markdown": to_markdown, "csv": to_csv, "latex": to_latex, "json": to_json}
-"""Formats in which a table is printed when the output is not a terminal."""

@@ -15,7 +15,7 @@ from vibench.errors import RequestError, unknown_name
 from vibench.results import best, error_measures, selection, tables
 from vibench.results.columns import CELLS, THRESHOLDS, Column
 from vibench.results.plugin_columns import Extended
-from vibench.text import parsed_json
+from vibench.text import json_object
 
 AXES = ("problem", "training", "dual", "primal", "primal_tol", "solver", "pod_tol", "dual_tol", "accuracy", "assembly")
 """Columns that tell rows apart; where all rows have one value, it stands in the title and takes no room."""
@@ -224,14 +224,12 @@ def _options(text: str | None) -> dict[str, str]:
     """Options as they are recorded, their values as texts; a text that is no JSON object is one of them."""
     if not isinstance(text, str):
         return {}
-    try:
-        found = parsed_json(text)
-    except ValueError:
-        found = None
-    if not isinstance(found, dict):
+    options = json_object(text)
+    if options is None:
         return {"options": text}
     return {
-        key: value if isinstance(value, str) else json.dumps(value, ensure_ascii=False) for key, value in found.items()
+        key: value if isinstance(value, str) else json.dumps(value, ensure_ascii=False)
+        for key, value in options.items()
     }
 
 

@@ -6,7 +6,7 @@ import pandas as pd
 
 from vibench.report.comparison.compare import Comparison
 from vibench.report.comparison.differences import MOVED, Verdict
-from vibench.results.tables import cell_text
+from vibench.results.formats import cell_text
 from vibench.terminal.console import print_frame
 from vibench.terminal.output import echo
 

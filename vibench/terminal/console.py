@@ -79,7 +79,7 @@ def print_frame(
     rest
         The command, or its option, that prints the columns that are left out.
     """
-    from vibench.results.tables import cell_text
+    from vibench.results.formats import cell_text
 
     columns = [
         PrintedColumn(str(name), tuple(map(cell_text, frame[name])), frame[name].dtype.kind in "iufb")

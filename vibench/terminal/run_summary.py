@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from vibench.qp.status import Status
-from vibench.results import invariants, tables, views
+from vibench.results import formats, invariants, tables, views
 from vibench.results.solver_agreement import sentence
 from vibench.terminal.console import print_frame
 from vibench.terminal.output import echo, run_argument
@@ -69,7 +69,7 @@ def failures(not_ok: Rows) -> Iterator[str]:
             continue
         which = f"the first is {first['cell']}, " if len(group) > 1 else f"{first['cell']}, "
         queries = f"{first['queries_ok']} of {first['queries']} queries ok"
-        yield f"{count}{first['status']}: {which}{tables.name_of_cell(first)}: {queries}; {first['reason']}"
+        yield f"{count}{first['status']}: {which}{formats.name_of_cell(first)}: {queries}; {first['reason']}"
     if others := sum(map(len, ranked[REASONS:])):
         yield f"{others} cells not ok for {len(ranked) - REASONS} other reasons"
 

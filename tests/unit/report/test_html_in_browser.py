@@ -20,7 +20,7 @@ from selenium.webdriver.common.by import By
 from selenium.webdriver.support.ui import WebDriverWait
 
 from vibench.report import html
-from vibench.results import tables
+from vibench.results import formats, tables
 from vibench.results.sqlite.reading import FILE
 
 MATTERS = {"cell", "problem", "dual", "primal", "δ", "solver", "error λ", "error u", "online [ms]", "offline [s]"}
@@ -182,7 +182,7 @@ def test_the_filter_filters_and_its_address_brings_it_back(browser: Chrome, made
     choose(browser, "solver", "piqp")
     found = shown_rows(browser)
     expected = cells[(cells["problem"] == "obstacle") & (cells["solver"] == "piqp")]
-    assert [row["error λ"] for row in found] == [tables.cell_text(error) for error in expected["error_lambda_mean"]]
+    assert [row["error λ"] for row in found] == [formats.cell_text(error) for error in expected["error_lambda_mean"]]
     assert {row["problem"] for row in found} == {"obstacle"}
     search = browser.find_element(By.CSS_SELECTOR, '[data-table="summary"] input[type=search]')
     search.send_keys("pga mcpg")
@@ -205,7 +205,7 @@ def test_columns_sort_numbers_as_numbers_and_missing_ones_last(
     for falling in (False, True):
         browser.execute_script(sort)
         known = (1e3 * cells["online_s"]).sort_values(ascending=not falling, na_position="last", kind="stable")
-        assert [row["online [ms]"] for row in shown_rows(browser)] == [tables.cell_text(value) for value in known]
+        assert [row["online [ms]"] for row in shown_rows(browser)] == [formats.cell_text(value) for value in known]
 
 
 def test_a_winner_of_the_leaderboard_is_a_link_to_its_row(browser: Chrome, made: Path) -> None:
@@ -278,7 +278,7 @@ def test_hover_tells_the_cell_and_the_legend_hides_it(browser: Chrome, made: Pat
     model = next(text for text in told if row["dual"] in text)
     assert row["primal"] in model
     assert row["problem"] in model
-    assert tables.cell_text(row["error_u_mean"]) == found["error"]
+    assert formats.cell_text(row["error_u_mean"]) == found["error"]
 
     (button,) = [
         one for one in browser.find_elements(By.CSS_SELECTOR, f"#{name} .legend button") if one.text == row["primal"]
@@ -338,6 +338,6 @@ def test_a_page_of_many_cells_shows_some_rows_at_a_time(browser: Chrome, quick_r
     assert {row["cell"] for row in first}.isdisjoint(row["cell"] for row in shown_rows(browser))
     # a value that all rows have is in the page once
     look(browser, page, fragment="#summary?show=solver&show=accuracy&page=2")
-    accuracy = tables.cell_text(tables.read(tmp_path / "many" / FILE, "cells")["accuracy"].iloc[0])
+    accuracy = formats.cell_text(tables.read(tmp_path / "many" / FILE, "cells")["accuracy"].iloc[0])
     assert [(row["solver"], row["accuracy"]) for row in shown_rows(browser)] == [("piqp", accuracy)] * 50
     assert complaints(browser) == []

@@ -24,20 +24,9 @@ from vibench.results import tables
 from vibench.results.break_even import break_even_rows
 from vibench.results.columns import CELLS, HISTORIES, KEYS, QUERIES, TABLES, THRESHOLDS, VERSION
 from vibench.results.database import ResultsDatabase
+from vibench.results.formats import cell_text, to_csv, to_json, to_latex, to_markdown
 from vibench.results.sqlite.reading import FILE
-from vibench.results.tables import (
-    benefits,
-    cell_text,
-    export,
-    in_order,
-    read,
-    results_file,
-    summary,
-    to_csv,
-    to_json,
-    to_latex,
-    to_markdown,
-)
+from vibench.results.tables import benefits, export, in_order, read, results_file, summary
 from vibench.results.views import look_up
 from vibench.study.matrix import expand
 from vibench.study.reader import read_study

@@ -10,7 +10,7 @@ from running import Changed, Main, refused
 
 from vibench.errors import RequestError
 from vibench.execution.recorded_cell import recorded_study
-from vibench.results import tables
+from vibench.results import formats, tables
 from vibench.results.sqlite.reading import FILE
 from vibench.study.cells import Cell
 from vibench.study.matrix import expand
@@ -54,7 +54,7 @@ def test_a_row_is_made_again_from_its_results_file(quick_run: Path, main: Main) 
     assert (study.name, study.timing_rounds) == ("quick", row["timing_rounds"])
     code, out, err = main("run", str(quick_run / FILE), "--cell", row["cell"][:6], "--dry-run")
     assert (code, err) == (0, "")
-    assert out == f"{row['cell']}  {tables.name_of_cell(row)}\n1 cells\n"
+    assert out == f"{row['cell']}  {formats.name_of_cell(row)}\n1 cells\n"
     assert main("run", "quick", "--cell", row["cell"], "--dry-run") == (code, out, err)
 
 

@@ -15,7 +15,7 @@ from rich.cells import cell_len
 from running import Main
 
 from vibench.cli.completion import SHOWN
-from vibench.results import tables, views
+from vibench.results import formats, tables, views
 from vibench.terminal.console import WIDTH, new_console, print_frame
 
 WIDTHS = (80, 120, 200)
@@ -41,7 +41,7 @@ def test_every_table_of_a_run_fits(
     assert "…" not in out
     found = views.look_up(tables.results_file(str(quick_run)), table, limit=60)
     frame = found.readable
-    texts = [*map(str, frame.columns), *(tables.cell_text(value) for name in frame for value in frame[name])]
+    texts = [*map(str, frame.columns), *(formats.cell_text(value) for name in frame for value in frame[name])]
     whole = {word for text in texts for word in text.split()} | {f"{width}"}
     shown = out.split("\n", 1)[1].replace(",", " ")
     words = {word for word in shown.split() if re.search(r"\d", word)}
@@ -58,7 +58,7 @@ def test_what_has_no_room_is_left_out_whole_and_named(rows: list[tuple[float, fl
     frame = pd.DataFrame(rows, columns=["first", "second", "third", "way"]).assign(k=range(len(rows)))
     lines = printed(frame, width, ["k", "way"])
     assert max(map(cell_len, lines)) <= width
-    whole = {tables.cell_text(value) for name in frame for value in frame[name]} | {str(width)}
+    whole = {formats.cell_text(value) for name in frame for value in frame[name]} | {str(width)}
     title_end = next(k for k, line in enumerate(lines) if set(line.strip()) == {"─"})
     body = [word for line in lines[title_end + 1 :] for word in line.split() if re.search(r"\d", word)]
     assert set(body) <= whole

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections import defaultdict
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -24,7 +25,7 @@ from vibench.report.comparison.differences import (
     of_seconds,
 )
 from vibench.report.comparison.runs import AXES, ComparedRun, compared_runs
-from vibench.results import tables
+from vibench.results import formats
 from vibench.results.break_even import FEWEST_ROUNDS
 from vibench.results.columns import CELLS
 from vibench.timing import median_interval
@@ -58,7 +59,7 @@ class Comparison:
     @cached_property
     def changes(self) -> pd.DataFrame:
         """What moved, a row per column of a cell, in the order of the cells."""
-        rows = [_row(pair, found) for pair in self.pairs for found in pair.differences if found.verdict in MOVED]
+        rows = [_row(pair, one) for pair in self.pairs for one in pair.differences if one.verdict in MOVED]
         return pd.DataFrame(rows, columns=COLUMNS)
 
     @property
@@ -69,8 +70,8 @@ class Comparison:
     def table(self, name: str) -> pd.DataFrame:
         """One of the tables "changes", "columns", "runs" and "cells"."""
         made = {"changes": "changes", "columns": "by_column", "runs": "by_run", "cells": "present"}
-        found: pd.DataFrame = getattr(self, made[name])
-        return found
+        frame: pd.DataFrame = getattr(self, made[name])
+        return frame
 
     @property
     def by_column(self) -> pd.DataFrame:
@@ -80,9 +81,9 @@ class Comparison:
         """
         rows = []
         for pair in self.pairs:
-            by_what: dict[str, list[Difference]] = {}
-            for found in pair.differences:
-                by_what.setdefault(found.what, []).append(found)
+            by_what = defaultdict[str, list[Difference]](list)
+            for one in pair.differences:
+                by_what[one.what].append(one)
             for what, differences in by_what.items():
                 counts = {verdict.value: sum(d.verdict == verdict for d in differences) for verdict in Verdict}
                 ratios = [d.ratio for d in differences if np.isfinite(d.ratio) and d.ratio > 0.0]
@@ -123,13 +124,7 @@ class Comparison:
     @property
     def present(self) -> pd.DataFrame:
         """A row per cell that is not in all runs, and in which of them it is."""
-        keys = dict.fromkeys(key for run in self.runs for key in run.cells)
-        partial = [key for key in keys if not all(key in run.cells for run in self.runs)]
-        rows = [
-            {**_named(self._cell(key)), **{run.name: "yes" if key in run.cells else "no" for run in self.runs}}
-            for key in partial
-        ]
-        return pd.DataFrame(rows, columns=[*AXES, "cell", *(run.name for run in self.runs)])
+        return self._across(range(1, len(self.runs)), lambda run, key: "yes" if key in run.cells else "no")
 
     def values(self, column: str) -> pd.DataFrame:
         """One column of the table of cells in every run, a row per cell that several runs have.
@@ -139,19 +134,24 @@ class Comparison:
         RequestError
             If there is no such column.
         """
-        known = {**CELLS, **{name: one for run in self.runs for name, one in run.extended.columns.items()}}
-        if column not in known:
-            raise unknown_name("column of cells", column, known)
-        keys = dict.fromkeys(key for run in self.runs for key in run.cells)
-        shared = [key for key in keys if sum(key in run.cells for run in self.runs) > 1]
+        columns = {**CELLS, **{name: one for run in self.runs for name, one in run.extended.columns.items()}}
+        if column not in columns:
+            raise unknown_name("column of cells", column, columns)
+        counts = range(2, len(self.runs) + 1)
+        return self._across(counts, lambda run, key: run.cells.get(key, {}).get(column))
+
+    def _across(self, counts: Collection[int], value: Callable[[ComparedRun, str], Any]) -> pd.DataFrame:
+        """A row per cell that so many runs have, with a value from every run."""
+        having = defaultdict[str, list[ComparedRun]](list)
+        for run in self.runs:
+            for key in run.cells:
+                having[key].append(run)
         rows = [
-            {**_named(self._cell(key)), **{run.name: run.cells.get(key, {}).get(column) for run in self.runs}}
-            for key in shared
+            _named(some[0].cells[key]) | {run.name: value(run, key) for run in self.runs}
+            for key, some in having.items()
+            if len(some) in counts
         ]
         return pd.DataFrame(rows, columns=[*AXES, "cell", *(run.name for run in self.runs)])
-
-    def _cell(self, key: str) -> Mapping[str, Any]:
-        return next(run.cells[key] for run in self.runs if key in run.cells)
 
 
 def compare(paths: Sequence[Path], limit: float) -> Comparison:
@@ -179,12 +179,12 @@ def compare(paths: Sequence[Path], limit: float) -> Comparison:
     """
     runs = compared_runs(paths)
     first, *others = runs
-    found: dict[tuple[str, str], list[Difference]] = {}
+    found = defaultdict[tuple[str, str], list[Difference]](list)
     notes: list[str] = []
     for k, run in enumerate(others, start=1):
         of_run = f"{run.name}: " if len(others) > 1 else ""
         shared = [key for key in first.cells if key in run.cells]
-        differences = found.setdefault((run.name, first.name), [])
+        differences = found[run.name, first.name]
         gone = [first.cells[key] for key in first.cells if key not in run.cells]
         new = [run.cells[key] for key in run.cells if key not in first.cells]
         differences += [Difference(cell, "cell", "present", "gone", Verdict.WORSE) for cell in gone]
@@ -204,7 +204,7 @@ def compare(paths: Sequence[Path], limit: float) -> Comparison:
             same = run.measured_beside(earlier, unless=runs[: runs.index(earlier)])
             compared += len(same)
             if same:
-                found.setdefault((run.name, earlier.name), []).extend(of_seconds(earlier, run, same, limit))
+                found[run.name, earlier.name] += of_seconds(earlier, run, same, limit)
         if compared < len([key for key in run.cells if any(key in earlier.cells for earlier in runs[:k])]):
             notes.append(f"{of_run}times and break-even of different machines are not compared")
     notes += dict.fromkeys(line for run in runs for line in run.extended.faults)
@@ -229,17 +229,17 @@ def _on_common_queries(one: ComparedRun, two: ComparedRun, shared: Sequence[str]
     return found[0], found[1]
 
 
-def _row(pair: Pair, found: Difference) -> dict[str, Any]:
-    shown = {"before": tables.cell_text(found.before), "after": tables.cell_text(found.after)}
-    ratio = {"ratio": found.ratio, "ratio_low": found.interval[0], "ratio_high": found.interval[1]}
-    about = {"run": pair.run, "against": pair.against, "what": found.what, "verdict": found.verdict.value}
-    return about | _named(found.cell) | shown | ratio
+def _row(pair: Pair, one: Difference) -> dict[str, Any]:
+    shown = {"before": formats.cell_text(one.before), "after": formats.cell_text(one.after)}
+    ratio = {"ratio": one.ratio, "ratio_low": one.interval[0], "ratio_high": one.interval[1]}
+    about = {"run": pair.run, "against": pair.against, "what": one.what, "verdict": one.verdict.value}
+    return about | _named(one.cell) | shown | ratio
 
 
 def _named(cell: Mapping[str, Any]) -> dict[str, Any]:
     """The columns that tell a cell from others."""
     tolerance = "" if pd.isna(cell["primal_tol"]) else f", δ {cell['primal_tol']:g}"
-    asked = f"{tables.asked(cell, 'pod')}, {tables.asked(cell, 'dual')}{tolerance}"
+    asked = f"{formats.asked(cell, 'pod')}, {formats.asked(cell, 'dual')}{tolerance}"
     return {name: cell[name] for name in (*AXES, "cell") if name != "asked"} | {"asked": asked}
 
 

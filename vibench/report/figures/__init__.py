@@ -30,7 +30,7 @@ from vibench.report.figures.plugins import DrawPages, FigureError, of_plugins
 from vibench.report.figures.solutions import solutions
 from vibench.report.figures.solvers import precision, solvers
 from vibench.report.figures.style import FORMATS, WRITTEN, caption_of, save, styled
-from vibench.text import parsed_json
+from vibench.text import json_object
 
 OF_PROBLEM: dict[str, DrawPages] = {
     "solutions": solutions,
@@ -154,10 +154,10 @@ def remove(folder: Path) -> None:
 def read_captions(folder: Path) -> dict[str, str]:
     """The captions beside the figures of a folder, by the names of the figures; empty where there are none."""
     try:
-        captions = parsed_json((folder / CAPTIONS).read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+        captions = json_object((folder / CAPTIONS).read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError):
         return {}
-    return {str(name): str(text) for name, text in captions.items()} if isinstance(captions, dict) else {}
+    return {name: str(text) for name, text in (captions or {}).items()}
 
 
 @dataclass(frozen=True)

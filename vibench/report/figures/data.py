@@ -18,7 +18,7 @@ from vibench.report.figures.looks import Series
 from vibench.results import pictures, tables
 from vibench.results.best import solved_too_loosely
 from vibench.results.plugin_columns import faults_of
-from vibench.text import parsed_json
+from vibench.text import json_object
 
 TABLES = ("cells", "queries", "histories", "thresholds", "outputs")
 
@@ -133,7 +133,7 @@ def problems(
             for table, frame in read.items()
         }
         drawn = tuple(one for one in shown if one.key == tuple(problem))
-        options = _options(problem[1])
+        options = json_object(problem[1]) or {}
         yield name, Data(label, _plugin_name(mine["cells"], "problem"), options, **mine, pictures=drawn)
 
 
@@ -148,7 +148,7 @@ def _tell_apart(axis: str, cells: pd.DataFrame, frames: list[pd.DataFrame]) -> N
     shared = found.duplicated(axis, keep=False)
     labels = dict[tuple[Any, ...], str]()
     for (label, text), several in zip(found.itertuples(index=False, name=None), shared, strict=True):
-        options = _options(text)
+        options = json_object(text) or {}
         named = ", ".join(f"{name} = {value}" for name, value in options.items())
         if options and (several or names.get((label, text)) == label):
             labels[label, text] = f"{label} ({named})"
@@ -169,18 +169,9 @@ def _per_combination(frame: pd.DataFrame, value: Callable[..., Any]) -> pd.Serie
 def _plugin_name(cells: pd.DataFrame, axis: str) -> str:
     """The name under which the plugin on an axis of some cells is registered; "" where no cell says so."""
     for definition in cells["definition"].dropna():
-        plugin = _options(definition).get(axis)
+        plugin = (json_object(definition) or {}).get(axis)
         return str(plugin.get("name", "")) if isinstance(plugin, dict) else ""
     return ""
-
-
-def _options(text: Any) -> dict[str, Any]:
-    """A JSON object, such as the options of a plugin; empty where a strangers' file has something else."""
-    try:
-        found = parsed_json(text) if isinstance(text, str) else {}
-    except ValueError:
-        return {}
-    return found if isinstance(found, dict) else {}
 
 
 def dimensions(rows: pd.DataFrame) -> str:

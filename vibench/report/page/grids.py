@@ -10,7 +10,7 @@ from typing import Any
 
 import pandas as pd
 
-from vibench.results import tables, views
+from vibench.results import formats, tables, views
 from vibench.results.columns import CELLS, THRESHOLDS, Column
 from vibench.results.plugin_columns import Extended
 from vibench.results.selection import short_keys
@@ -142,7 +142,7 @@ def _column(name: str, values: pd.Series) -> dict[str, Any]:
     if pd.api.types.is_numeric_dtype(values) or _numbers_in_text(values):
         numbers = [short(value) for value in values]
         return {"name": heading, "numbers": numbers if len(set(numbers)) > 1 else numbers[:1]}
-    texts = [printable(tables.cell_text(value)) for value in values]
+    texts = [printable(formats.cell_text(value)) for value in values]
     levels = list(dict.fromkeys(texts))
     if 2 * len(levels) > len(texts):
         return {"name": heading, "texts": texts}

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 from vibench.errors import RequestError
 from vibench.provenance import distribution_version, solver_distribution
-from vibench.results.tables import to_latex_text
+from vibench.results.formats import to_latex_text
 from vibench.text import unbroken
 
 DOI = re.compile(r"10\.\d{4,9}/[!-~]+")

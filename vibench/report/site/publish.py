@@ -8,8 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import pandas as pd
-from jinja2 import Environment, PackageLoader, StrictUndefined
-from markupsafe import Markup
 
 from vibench.provenance import distribution_version
 from vibench.report import html
@@ -19,10 +17,9 @@ from vibench.report.leaderboard import Criterion, Standings, leaderboard
 from vibench.report.site import folder
 from vibench.report.site.citation import Citation, requirements
 from vibench.report.site.published_run import FILTERED, SHOWN_CELLS, PublishedRun, folder_names
-from vibench.results import tables
+from vibench.results import formats, tables
 from vibench.results.plugin_columns import faults_of
 from vibench.results.sqlite.reading import FILE, open_read_only
-from vibench.text import printable
 
 TABLES = ("cells", "thresholds", "disagreements")
 """Tables that are published as CSV, too; all of them are in the results file."""
@@ -110,7 +107,7 @@ def _write_run(own: Path, run: PublishedRun, pages: _Pages, figures: bool) -> li
     _write(own / "report.html", html.page(run.run.path, figures=figures))
     extended = tables.extended_tables(run.run.path, TABLES)
     for name, one in extended.items():
-        _write(own / "tables" / f"{name}.csv", tables.to_csv(tables.whole_numbers(tables.in_order(one.frame))))
+        _write(own / "tables" / f"{name}.csv", formats.to_csv(tables.whole_numbers(tables.in_order(one.frame))))
     _write(own / "requirements.txt", requirements(run.run.versions, run.code))
     _write(own / "provenance.json", json.dumps(run.provenance, indent=1, ensure_ascii=True, sort_keys=True) + "\n")
     pages.write(own / "index.html", "run", "../../", run=run, cells=run.cells(), columns=SHOWN_CELLS, tables=TABLES)
@@ -142,7 +139,7 @@ def _boards(runs: Sequence[PublishedRun]) -> Iterator[tuple[str, tuple[Standings
 def _section(site: Path, number: int, study: str, found: Comparison) -> dict[str, Any]:
     """What the page of comparisons says of the runs of one study; their changes are a file, too."""
     file = f"comparison-{number}.csv"
-    _write(site / file, tables.to_csv(found.changes))
+    _write(site / file, formats.to_csv(found.changes))
     frames = {"runs": found.by_run, "cells by column": found.by_column, "changes": found.changes.head(MOST_CHANGES)}
     return {"study": study, "file": file, "notes": found.notes, "count": len(found.changes), "tables": frames}
 
@@ -155,13 +152,8 @@ class _Pages:
     """The templates, with what all pages show."""
 
     def __init__(self, citation: Citation) -> None:
-        self._environment = Environment(
-            loader=PackageLoader("vibench.report", "templates/site"),
-            autoescape=True,
-            undefined=StrictUndefined,
-            finalize=_shown,
-        )
-        self._environment.filters["number"] = tables.cell_text
+        self._environment = html.environment("templates/site")
+        self._environment.filters["number"] = formats.cell_text
         self._shared = {
             "citation": citation,
             "vibench": distribution_version("vibench"),
@@ -172,8 +164,3 @@ class _Pages:
         """Write a page of the template of that name; `root` leads from it to the folder of the site."""
         template = self._environment.get_template(f"{name}.html.j2")
         _write(path, template.render(**self._shared, **content, root=root, page=name))
-
-
-def _shown(value: Any) -> Any:
-    """A text that a template shows; what it has rendered itself stays as it is."""
-    return printable(value) if isinstance(value, str) and not isinstance(value, Markup) else value

@@ -12,7 +12,7 @@ from typing import Any
 import pandas as pd
 
 from vibench.report.comparison.runs import ComparedRun
-from vibench.results import tables
+from vibench.results.formats import asked, cell_text
 from vibench.results.sqlite.reading import FILE
 from vibench.study.kinds import STUDY
 from vibench.study.registry import registered
@@ -110,11 +110,11 @@ class PublishedRun:
                 "key": key,
                 "axes": [
                     str(row["problem"]), str(row["dual"]), f"{row['primal']}{_tolerance(row)}",
-                    f"{tables.asked(row, 'pod')}, {tables.asked(row, 'dual')}", f"{row['solver']} {row['accuracy']:g}",
+                    f"{asked(row, 'pod')}, {asked(row, 'dual')}", f"{row['solver']} {row['accuracy']:g}",
                     str(row["assembly"]),
                 ],
                 "status": str(row["status"]),
-                "numbers": [tables.cell_text(row[name]) for name in SHOWN_CELLS],
+                "numbers": [cell_text(row[name]) for name in SHOWN_CELLS],
                 "command": f"vibench run {FILE} --cell {shlex.quote(key)} --out again",
             }
             for key, row in self.run.cells.items()

@@ -3,24 +3,87 @@
 from __future__ import annotations
 
 import contextlib
+import shutil
 import sqlite3
+import tempfile
 from collections.abc import Callable, Iterator, Mapping
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 from vibench.errors import RequestError
+from vibench.files import TEMPORARY
 from vibench.qp.status import Status
 from vibench.results.columns import VERSION
 from vibench.results.sqlite.digests import DigestError, Digests
-from vibench.results.sqlite.files import DAMAGE, code_of, connected_read_only
-from vibench.text import one_line, parsed_json, printable
+from vibench.text import json_object, one_line, printable
 
 FILE = "results.sqlite"
 
 
 class DamagedError(RequestError):
     """A results file that cannot be read: cut off, overwritten, or from a disk that failed."""
+
+
+BUSY_SECONDS = 60.0
+"""Longest wait for a lock that another program holds."""
+
+DAMAGE = {sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB}
+"""SQLite's error codes of a damaged file."""
+
+DAMAGED = ".damaged"
+"""What `set_aside` adds to the name of a file."""
+
+WRITE_AHEAD_LOG, INDEX = "-wal", "-shm"
+"""What SQLite adds to the name of a database for its write-ahead log, and for the index of that."""
+
+
+def code_of(error: sqlite3.Error) -> int:
+    """SQLite's error code, without the bits that tell variants of an error apart; 0 for errors of Python's own."""
+    return getattr(error, "sqlite_errorcode", 0) & 0xFF
+
+
+@contextlib.contextmanager
+def open_read_only(path: Path) -> Iterator[sqlite3.Connection]:
+    """Context with a connection that cannot write to the results file, and runs no code that its schema names.
+
+    What it reads is `printable`. A database whose last writer was killed is read with its write-ahead log, for which
+    SQLite makes an index beside it: in a folder that cannot be written, copies of both are read.
+    """
+    with contextlib.ExitStack() as stack:
+        connection = stack.enter_context(contextlib.closing(_connection(path)))
+        if not _has_index(connection) and path.is_file():
+            copy = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix=TEMPORARY))) / path.name
+            for end in ("", WRITE_AHEAD_LOG):
+                with contextlib.suppress(FileNotFoundError):
+                    shutil.copyfile(f"{path}{end}", f"{copy}{end}")
+            connection = stack.enter_context(contextlib.closing(_connection(copy)))
+        connection.execute("PRAGMA trusted_schema=OFF")
+        connection.text_factory = text_reader()
+        yield connection
+
+
+def _connection(path: Path) -> sqlite3.Connection:
+    return sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro", uri=True, timeout=BUSY_SECONDS)
+
+
+def _has_index(connection: sqlite3.Connection) -> bool:
+    """Whether a database needs no index of a write-ahead log, or one can be made beside it."""
+    try:
+        connection.execute("PRAGMA schema_version").fetchone()
+    except sqlite3.OperationalError as error:
+        return code_of(error) not in (sqlite3.SQLITE_CANTOPEN, sqlite3.SQLITE_READONLY)
+    except sqlite3.DatabaseError:  # damaged: the reader will be told
+        return True
+    return True
+
+
+def set_aside(path: Path) -> None:
+    """Rename a database and its write-ahead log by `DAMAGED`; earlier ones of that name are replaced."""
+    for end in (WRITE_AHEAD_LOG, ""):  # the log first: a new database must not find it
+        with contextlib.suppress(FileNotFoundError):
+            Path(f"{path}{end}").replace(f"{path}{DAMAGED}{end}")
+    Path(f"{path}{INDEX}").unlink(missing_ok=True)
 
 
 def read_text(stored: bytes) -> str:
@@ -35,18 +98,6 @@ REMEMBERED = 1 << 16
 def text_reader() -> Callable[[bytes], str]:
     """`read_text` for one connection: a text that most rows of a table have is read, and kept in memory, once."""
     return lru_cache(maxsize=REMEMBERED)(read_text)
-
-
-@contextlib.contextmanager
-def open_read_only(path: Path) -> Iterator[sqlite3.Connection]:
-    """Context with a connection that cannot write to the results file, and runs no code that its schema names.
-
-    What it reads is `printable`.
-    """
-    with connected_read_only(path) as connection:
-        connection.execute("PRAGMA trusted_schema=OFF")
-        connection.text_factory = text_reader()
-        yield connection
 
 
 def read_meta(path: Path) -> dict[str, str]:
@@ -114,10 +165,7 @@ def study_of(path: Path, meta: Mapping[str, str]) -> dict[str, Any]:
     RequestError
         If the meta table does not hold them.
     """
-    try:
-        found = parsed_json(meta.get("study", ""))
-    except ValueError:
-        found = None
-    if not isinstance(found, dict):
+    study = json_object(meta.get("study"))
+    if study is None:
         raise RequestError(f"'{path}' does not say which study it belongs to; use --out")
-    return found
+    return study

@@ -17,8 +17,7 @@ from vibench.errors import RequestError, StorageError
 from vibench.execution.run_folder import claimed
 from vibench.results import tables
 from vibench.results.database import ResultsDatabase
-from vibench.results.sqlite.files import DAMAGED, set_aside
-from vibench.results.sqlite.reading import FILE, DamagedError, open_read_only, read_meta
+from vibench.results.sqlite.reading import DAMAGED, FILE, DamagedError, open_read_only, read_meta, set_aside
 
 STUDY = {"name": "sample", "seed": 1, "validation": 4}
 NOBODY = 65534
