@@ -34,6 +34,9 @@ STUDY: Mapping[str, Any] = {
 RECORDED: Mapping[str, Any] = {"name": "sample", "seed": 1, "validation": 4, "accuracy": 1e-7}
 """What a results file records of a study."""
 
+ROUNDS = 3
+"""Timing rounds of runs whose seconds no test looks at."""
+
 REMOVE = object()
 """Stands for a key that is taken away."""
 

@@ -115,7 +115,8 @@ def _check_code(job: Job, part: Part) -> None:
     """Refuse a job that was planned with other code than this process has: its artefact would have the wrong key."""
     stage = job.stage
     parts = (stage.stage_of(number) for number in part.numbers) if isinstance(stage, PiecewiseStage) else (stage,)
-    used = (plugin for one in {part.key: part for part in parts}.values() for plugin in one.plugins())
+    # Each once: stages reach the same plugins through many of their inputs.
+    used = dict.fromkeys(plugin for one in {part.key: part for part in parts}.values() for plugin in one.plugins())
     changed = [f"the {p}" for p in used if p.as_installed() != p]
     if job.code != code_here():
         changed.insert(0, "vibench or one of the libraries")
