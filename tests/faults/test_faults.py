@@ -9,7 +9,9 @@ import signal
 import sqlite3
 import subprocess
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -20,16 +22,21 @@ from samples import wire_study, write_study
 from vibench.results.sqlite.reading import FILE
 from vibench.storage.artefacts import CACHE_VARIABLE
 
-STUDY = wire_study(
-    problem=[{"name": "wire", "label": f"{nodes}", "options": {"nodes": nodes}} for nodes in (20, 40)],
+WIRES = [{"name": "wire", "label": f"{nodes}", "options": {"nodes": nodes}} for nodes in (20, 40)]
+LONG = wire_study(
+    problem=WIRES,
     timing_rounds=2,
     dual=["cpg", "mcpg"],
     primal=["decorrelated", "online-supremizers", "offline-pga"],
     solvers=["piqp", "osqp", "gives-up"],
     tolerances=[{"pod": [1e-2, 1e-3], "dual": [1e-2], "primal": {"offline-pga": [0.5, 0.1]}}],
 )
-CELLS = 2 * 2 * 4 * 3 * 2
+SHORT = LONG | {"problem": WIRES[:1], "tolerances": [{"pod": [1e-2], "dual": [1e-2], "primal": {"offline-pga": [0.5]}}]}
+STUDIES = {"long": LONG, "short": SHORT}
+CELLS = {"long": 2 * 2 * 4 * 3 * 2, "short": 2 * 3 * 3}
 OPTIONS = ("run", "study.toml", "--jobs", "2", "--out", "out")
+ALONE = ("--jobs", "1")
+"""The number of jobs changes no result: runs that nothing happens to do with one process."""
 
 
 @dataclass(frozen=True)
@@ -41,19 +48,25 @@ class Undisturbed:
 
 
 @pytest.fixture(scope="module")
-def undisturbed(vibench: Vibench, tmp_path_factory: pytest.TempPathFactory) -> Undisturbed:
-    folder, start = tmp_path_factory.mktemp("undisturbed"), time.monotonic()
-    write_study(folder, STUDY)
-    assert vibench(folder, *OPTIONS).returncode == 0
-    assert len(rows(folder / "out")) == CELLS
-    return Undisturbed(folder / "out", time.monotonic() - start)
+def undisturbed(vibench: Vibench, tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Undisturbed]:
+    """Function that runs one of the studies, once."""
+
+    @cache
+    def run(length: str) -> Undisturbed:
+        folder, start = tmp_path_factory.mktemp("undisturbed"), time.monotonic()
+        write_study(folder, STUDIES[length])
+        assert vibench(folder, *OPTIONS, *ALONE).returncode == 0
+        assert len(rows(folder / "out")) == CELLS[length]
+        return Undisturbed(folder / "out", time.monotonic() - start)
+
+    return run
 
 
 @pytest.fixture
-def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def place(length: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A folder with the study, and artefacts of its own."""
     monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path / "cache"))
-    write_study(tmp_path, STUDY)
+    write_study(tmp_path, STUDIES[length])
     return tmp_path
 
 
@@ -84,20 +97,25 @@ def kill_at_random(command: list[str], place: Path, plugins: Path, rng: random.R
 
 
 @pytest.mark.parametrize(
-    ("kills", "executor"),
-    [(2, "local"), *(pytest.param(50, executor, marks=pytest.mark.long) for executor in ("local", "dask"))],
+    ("kills", "executor", "length"),
+    [
+        (2, "local", "short"),
+        *(pytest.param(50, executor, "long", marks=pytest.mark.long) for executor in ("local", "dask")),
+    ],
 )
 def test_a_run_that_is_killed_again_and_again_loses_and_doubles_nothing(
     kills: int,
     executor: str,
-    undisturbed: Undisturbed,
+    length: str,
+    undisturbed: Callable[[str], Undisturbed],
     command: str,
     plugins_folder: Path,
     vibench: Vibench,
     place: Path,
 ) -> None:
     rng, killed, number, at_work = random.Random(kills), 0, 0, 0
-    seconds = 0.8 * undisturbed.seconds
+    whole = undisturbed(length)
+    seconds = 0.8 * whole.seconds
     while killed < kills:
         number += 1
         out, known = f"out{number}", {}
@@ -108,16 +126,25 @@ def test_a_run_that_is_killed_again_and_again_loses_and_doubles_nothing(
             assert {key: found.get(key) for key in known} == known  # not one that was there is gone, or another one
             at_work += len(found) > len(known)
             known = found
-        done = vibench(place, *OPTIONS[:-1], out)
+        done = vibench(place, *OPTIONS[:-1], out, *ALONE)
         assert (done.returncode, done.stderr) == (0, "")
         assert {key: seen(place / out)[key] for key in known} == known
-        assert_same_numbers(undisturbed.folder, place / out)
+        assert_same_numbers(whole.folder, place / out)
     assert at_work > 0 or kills < 10
 
 
-@pytest.mark.parametrize("kib", [*(pytest.param(kib, marks=pytest.mark.long) for kib in (1, 12, 40, 300)), 100])
+@pytest.mark.parametrize(
+    ("kib", "length"),
+    [*(pytest.param(kib, "long", marks=pytest.mark.long) for kib in (1, 12, 40, 100, 300)), (100, "short")],
+)
 def test_a_full_disk_stops_a_run_with_one_line_and_a_later_one_completes_it(
-    kib: int, undisturbed: Undisturbed, command: str, plugins_folder: Path, vibench: Vibench, place: Path
+    kib: int,
+    length: str,
+    undisturbed: Callable[[str], Undisturbed],
+    command: str,
+    plugins_folder: Path,
+    vibench: Vibench,
+    place: Path,
 ) -> None:
     """No file may be longer than so many KiB, which is how a disk of that size looks to every process of the run."""
     limited = ["bash", "-c", f'ulimit -f {kib}; PYTHONDONTWRITEBYTECODE=1 exec "$0" "$@"', command, *OPTIONS]
@@ -127,6 +154,6 @@ def test_a_full_disk_stops_a_run_with_one_line_and_a_later_one_completes_it(
     assert errors.startswith("vibench: ")
     assert "cannot be written" in errors
     assert errors.count("\n") == 1
-    done = vibench(place, *OPTIONS)
+    done = vibench(place, *OPTIONS, *ALONE)
     assert (done.returncode, done.stderr) == (0, "")
-    assert_same_numbers(undisturbed.folder, place / "out")
+    assert_same_numbers(undisturbed(length).folder, place / "out")
