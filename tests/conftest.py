@@ -25,6 +25,7 @@ from vibench.cli import start
 from vibench.results.sqlite.reading import FILE
 from vibench.storage.artefacts import CACHE_VARIABLE
 from vibench.study import registry
+from vibench.study.reader import find_study
 
 # The examples of a test are the same ones every time and everywhere; `--hypothesis-profile=explore` draws new ones.
 settings.register_profile("same", deadline=None, derandomize=True, database=None)
@@ -72,7 +73,7 @@ def quick_run(command: str, tmp_path_factory: pytest.TempPathFactory) -> Path:
     with (shared / "quick.lock").open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
         if not (folder / "printed.txt").exists():
-            registered = registry.study_path("quick").read_text(encoding="utf-8")
+            registered = find_study("quick").read_text(encoding="utf-8")
             (shared / "quick.toml").write_text(f"timing_rounds = {ROUNDS}\n{registered}", encoding="utf-8")
             run = [command, "run", "quick.toml", "--out", str(folder), "--jobs", "2"]
             done = subprocess.run(run, cwd=shared, capture_output=True, text=True, check=False)

@@ -11,7 +11,11 @@ import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-LOADED = ["numpy", "pandas", "pydantic", "rich.console", "scipy.optimize", "scipy.sparse.linalg", "skfem", "typer"]
+LOADED = [
+    "annotated_types", "cachetools", "jinja2", "lazy_loader", "multiprocessing.connection", "numpy", "osqp", "pandas",
+    "piqp", "platformdirs", "proxsuite", "pydantic", "rich.console", "rich.live", "rich.progress", "rich.table",
+    "safetensors", "scipy.optimize", "scipy.sparse.linalg", "skfem", "statistics", "typer",
+]  # fmt: skip
 """Libraries of others alone: vibench and plugins are imported by every process itself."""
 
 TESTS = Path(__file__).parents[1]

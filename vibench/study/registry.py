@@ -318,7 +318,8 @@ def _readable() -> tuple[tuple[EntryPoint, ...], dict[str, str]]:
 
 
 def _name(distribution: Distribution) -> str:
+    """The normalised name: from that of its folder, as importlib.metadata does, since METADATA is long to read."""
     try:
-        return str(distribution.metadata["Name"])
+        return str(getattr(distribution, "_normalized_name", None) or distribution.metadata["Name"])
     except Exception:  # noqa: BLE001  as above
         return str(distribution)
