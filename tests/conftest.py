@@ -18,14 +18,13 @@ import typer.main
 from forking import run_command
 from hypothesis import settings
 from running import Changed, Main, Register, Vibench, execute
-from samples import ROUNDS, install_fakes
+from samples import install_fakes
 from threadpoolctl import threadpool_limits
 
 from vibench.cli import start
 from vibench.results.sqlite.reading import FILE
 from vibench.storage.artefacts import CACHE_VARIABLE
 from vibench.study import registry
-from vibench.study.reader import find_study
 
 # The examples of a test are the same ones every time and everywhere; `--hypothesis-profile=explore` draws new ones.
 settings.register_profile("same", deadline=None, derandomize=True, database=None)
@@ -63,19 +62,14 @@ def command() -> str:
 
 @pytest.fixture(scope="session")
 def quick_run(command: str, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Folder of one run of the registered study `quick`, of three rounds, through the installed command.
-
-    It is shared by parallel workers.
-    """
+    """Folder of one run of the registered study `quick` through the installed command, shared by parallel workers."""
     base = tmp_path_factory.getbasetemp()
     shared = base.parent if "PYTEST_XDIST_WORKER" in os.environ else base
     folder = shared / "quick"
     with (shared / "quick.lock").open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
         if not (folder / "printed.txt").exists():
-            registered = find_study("quick").read_text(encoding="utf-8")
-            (shared / "quick.toml").write_text(f"timing_rounds = {ROUNDS}\n{registered}", encoding="utf-8")
-            run = [command, "run", "quick.toml", "--out", str(folder), "--jobs", "2"]
+            run = [command, "run", "quick", "--out", str(folder), "--jobs", "2"]
             done = subprocess.run(run, cwd=shared, capture_output=True, text=True, check=False)
             assert done.returncode == 0, done.stderr
             (folder / "printed.txt").write_text(done.stdout, encoding="utf-8")
