@@ -122,22 +122,15 @@ def unilateral(basis: Basis, sense: Sense, *, free: Indices | None = None, lumpe
     vertices = _vertices(basis)
     if free is not None:
         vertices = vertices[np.isin(basis.nodal_dofs[0, vertices], free)]
-    dofs = basis.nodal_dofs[0, vertices]
+    dofs, points = basis.nodal_dofs[0, vertices], basis.mesh.p[:, vertices]
     sign = 1.0 if sense == "<=" else -1.0
     if lumped:
         weights = _positive(lumped_mass(basis), dofs)
         B = sp.csr_array((sign * weights, (np.arange(len(dofs)), dofs)), shape=(len(dofs), basis.N))
-        return Unilateral(B, _diagonal(weights), vertices, basis.mesh.p[:, vertices], sense)
+        return Unilateral(B, _diagonal(weights), vertices, points, sense)
     rows = mass(basis)[dofs]
-    integrals = _Integrals(basis, dofs)
-    return Unilateral(
-        sp.csr_array(sign * rows),
-        InnerProduct(sp.csr_array(rows[:, dofs]), "X_W"),
-        vertices,
-        basis.mesh.p[:, vertices],
-        sense,
-        integrals,
-    )
+    W = InnerProduct(sp.csr_array(rows[:, dofs]), "X_W")
+    return Unilateral(sp.csr_array(sign * rows), W, vertices, points, sense, _Integrals(basis, dofs))
 
 
 def normal_constraint(

@@ -136,7 +136,10 @@ class SaddlePointSolver:
             found = self._solve_bordered(self._factorisation, active)
         if found is None:
             # in this order: the set must stay that of the last factorisation where this one fails
-            self._factorisation = _BorderedFactorisation(_saddle_point_matrix(self._A, self._B[active]))
+            B = self._B[active]
+            zero = sp.csr_array((len(active), len(active)))  # SciPy stacks blocks that are all CSR without triplets
+            saddle = sp.block_array([[self._A, sp.csr_array(B.T)], [B, zero]], format="csr").T
+            self._factorisation = _BorderedFactorisation(saddle)
             self._factorised_set = active
             found = self._solve_bordered(self._factorisation, active)
         assert found is not None  # an empty border is always independent
@@ -163,12 +166,6 @@ def _scaled(rows: Array, matrix: SparseMatrix, columns: Array) -> SparseMatrix:
     """A matrix (CSR) with its rows and columns multiplied by factors."""
     data = np.repeat(rows, np.diff(matrix.indptr)) * matrix.data * columns[matrix.indices]
     return sp.csr_array((data, matrix.indices, matrix.indptr), shape=matrix.shape)
-
-
-def _saddle_point_matrix(A: SparseMatrix, B: SparseMatrix) -> SparseMatrix:
-    """[[A, Bᵀ], [B, 0]] (CSC) of a symmetric A (c×c) and of B (m×c), both CSR."""
-    zero = sp.csr_array((B.shape[0], B.shape[0]))  # where all blocks are CSR, SciPy stacks them without triplets
-    return sp.block_array([[A, sp.csr_array(B.T)], [B, zero]], format="csr").T
 
 
 class _BorderedFactorisation:

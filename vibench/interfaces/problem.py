@@ -48,6 +48,11 @@ class ParameterBox:
         """Number d of parameters."""
         return len(self.names)
 
+    @property
+    def widths(self) -> Array:
+        """Widths (d,) by which distances of parameters are measured; never zero."""
+        return np.where(self.upper > self.lower, self.upper - self.lower, np.maximum(np.abs(self.lower), 1.0))
+
     def grid(self, *counts: int) -> Array:
         """Regular grid (P×d) with `counts` points per direction; the last parameter varies fastest."""
         axes = [np.linspace(a, b, k) for a, b, k in zip(self.lower, self.upper, counts, strict=True)]

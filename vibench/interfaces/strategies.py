@@ -263,19 +263,14 @@ def check_sample(box: ParameterBox, found: object) -> Array:
     for k, i in np.argwhere(box.outside(mus))[:1]:
         bounds = f"[{box.lower[i]:g}, {box.upper[i]:g}]"
         raise RequestError(f"parameter {k} has '{box.names[i]}' = {mus[k, i]:g}, outside the box {bounds}")
-    if box.listed is not None:
-        _check_listed(box, box.listed, mus)
+    if (listed := box.listed) is not None:
+        away = np.abs(listed[:, None] - mus) / box.widths
+        for k in np.flatnonzero(away.max(axis=2).min(axis=0, initial=np.inf) > LISTED_RTOL)[:1]:
+            raise RequestError(
+                f"parameter {k}, {mus[k].tolist()}, is none of the {len(listed)} listed ones, and the problem has "
+                "matrices at these only: name some of them"
+            )
     first = np.unique(mus, axis=0, return_index=True)[1]
     for k in sorted(set(range(len(mus))) - set(first.tolist()))[:1]:
         raise RequestError(f"parameter {k}, {mus[k].tolist()}, occurs twice")
     return mus
-
-
-def _check_listed(box: ParameterBox, listed: Array, mus: Array) -> None:
-    widths = np.where(box.upper > box.lower, box.upper - box.lower, np.maximum(np.abs(box.lower), 1.0))
-    for k, mu in enumerate(mus):
-        if not np.any(np.all(np.abs(listed - mu) <= LISTED_RTOL * widths, axis=1)):
-            raise RequestError(
-                f"parameter {k}, {mu.tolist()}, is none of the {len(listed)} listed ones, and the problem has matrices "
-                "at these only: name some of them"
-            )

@@ -90,7 +90,9 @@ class GrowingModel:
         if solved is None:
             return float("inf")
         u, lam = solved
-        energy = self._energy(vi)
+        if self._factor is None or "A" not in self._problem.constant:
+            self._factor = SparseCholesky(vi.A, "A")
+        energy = Energy(vi.A, self._factor, self._solver.condensed(vi))
         corrected = find_correction(vi, energy, u, lam)
         if corrected is None:
             return float("inf")
@@ -101,11 +103,6 @@ class GrowingModel:
             return of_u
         in_W = ratio(float(W.norm(corrected.nu - lam)), float(W.norm(lam)))
         return max(of_u, ratio(found.dual, pressed), in_W)
-
-    def _energy(self, vi: VariationalInequality) -> Energy:
-        if self._factor is None or "A" not in self._problem.constant:
-            self._factor = SparseCholesky(vi.A, "A")
-        return Energy(vi.A, self._factor, self._solver.condensed(vi))
 
 
 @dataclass(frozen=True)

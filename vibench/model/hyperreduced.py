@@ -237,9 +237,13 @@ class HyperReducedModel:
         return self.problem.contact(mu) if self._operators.B is None or self._operators.g is None else None
 
     def _members(self, samples: Samples, contact: Contact | None) -> VariationalInequality:
-        operators = self._operators
+        operators, generators = self._operators, self.generators
         A, f = operators.A.at(samples.get("A")), operators.f.at(samples.get("f"))
-        g = operators.g.at(samples.get("g")) if operators.g is not None else _projected_bound(self.model, contact)
+        if operators.g is not None:
+            g = operators.g.at(samples.get("g"))
+        else:
+            assert contact is not None  # from `_contact`
+            g = np.asarray(generators.T @ contact.g)
         return VariationalInequality(A, f, self._constraint(samples, contact), g)
 
     @property
@@ -275,8 +279,3 @@ class HyperReducedModel:
 def _reconstructed(space: Coordinates, Y: Array, x: Array) -> Array:
     """Vectors (n×k) from coordinates (N'×k) in an orthonormal basis with coordinates Y (d×N')."""
     return space.vectors(Y @ x)
-
-
-def _projected_bound(model: ReducedModel, contact: Contact | None) -> Array:
-    assert contact is not None  # evaluated by `HyperReducedModel.assemble`
-    return np.asarray(model.generators.T @ contact.g)

@@ -145,8 +145,7 @@ class _Reader:
             validation = self._parameters(given.validation, "parameters.validation")
             self._listed = np.vstack([training, validation])
         box = self._box or ParameterBox(self._names, self._listed.min(axis=0), self._listed.max(axis=0), units)
-        widths = np.where(box.upper > box.lower, box.upper - box.lower, np.maximum(np.abs(box.lower), 1.0))
-        self._listing, self._training = Listing(self._listed, widths), len(training)
+        self._listing, self._training = Listing(self._listed, box.widths), len(training)
         return training, validation, box
 
     def _parameters(self, given: schema.ParameterSet, what: str) -> Array:

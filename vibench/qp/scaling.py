@@ -100,7 +100,8 @@ class Units:
 
     def scaled(self, program: VariationalInequality) -> VariationalInequality:
         """The program in these units."""
-        B = program.B / self.rows[:, None] if isinstance(program.B, np.ndarray) else _divide(program.B, self.rows)
+        is_dense = isinstance(program.B, np.ndarray)
+        B = program.B / self.rows[:, None] if is_dense else sp.diags_array(1.0 / self.rows) @ program.B
         A, g = program.A / (self.force / self.length), program.g / (self.rows * self.length)
         return VariationalInequality(A, program.f / self.force, B, g)
 
@@ -126,7 +127,3 @@ def units_of_dual(dual: VariationalInequality) -> Units:
     """Units of the dual of a program without load, min ½ αᵀKα − dᵀα over α ≥ 0: d are lengths, K is a flexibility."""
     length = size(dual.f)
     return Units(np.ones(len(dual.g)), MULTIPLIER_UNIT * length / stiffness(dual.A), OBJECTIVE_UNIT * length)
-
-
-def _divide(B: SparseMatrix, rows: Array) -> SparseMatrix:
-    return sp.diags_array(1.0 / rows) @ B

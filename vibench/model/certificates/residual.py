@@ -17,10 +17,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
 from vibench.arrays import Array, Indices
+from vibench.linalg.inner_product import project_out
 
 TERMS, DIRECTIONS = 0.05, 0.4
 """Bounds of what is left out are these shares of the typical norm: of terms, and of directions, which are orthogonal to
@@ -86,22 +88,18 @@ def residual_basis(blocks: Sequence[Array], samples: Array, beside: float) -> tu
     sizes, ends = np.abs(samples), np.cumsum([0, *(block.shape[1] for block in blocks)])
     scale = sizes.max(axis=1, initial=0.0)
     norms = np.concatenate([np.linalg.norm(block, axis=0) for block in blocks])
-    typical = float(np.hypot(_typical_norm(blocks, ends, samples), beside))
+    ranges = list(pairwise(ends))
+    sampled = sum(block @ samples[a:b] for block, (a, b) in zip(blocks, ranges, strict=True))
+    typical = float(np.hypot(np.median(np.linalg.norm(sampled, axis=0)), beside))
     kept = _worth_keeping(norms * scale, norms * sizes.mean(axis=1), TERMS * typical)
-    pairs = zip(blocks, ends, ends[1:], strict=False)
-    R = np.hstack([block[:, kept[(kept >= a) & (kept < b)] - a] for block, a, b in pairs])
+    pairs = zip(blocks, ranges, strict=True)
+    R = np.hstack([block[:, kept[(kept >= a) & (kept < b)] - a] for block, (a, b) in pairs])
     inverse = 1.0 / scale[kept]
     reach = float(np.linalg.norm(inverse[:, None] * samples[kept], axis=0).mean())
     U, remainder = _directions(R * scale[kept], DIRECTIONS * typical / max(reach, np.finfo(float).tiny))
     norms[kept], factor = 0.0, U.T @ R
     round_off = 1.01 * UNIT * (len(kept) + 8.0) * float(np.linalg.norm(factor * scale[kept]))
     return ResidualBasis(kept, factor, inverse, remainder + round_off, norms), U
-
-
-def _typical_norm(blocks: Sequence[Array], ends: Array, samples: Array) -> float:
-    """Median norm of the sampled residuals."""
-    pairs = zip(blocks, ends, ends[1:], strict=False)
-    return float(np.median(np.linalg.norm(sum(block @ samples[a:b] for block, a, b in pairs), axis=0)))
 
 
 def _worth_keeping(largest: Array, mean: Array, allowed: float) -> Indices:
@@ -124,7 +122,7 @@ def _directions(scaled: Array, allowed: float) -> tuple[Array, float]:
         mixed = scaled @ np.random.default_rng(0).standard_normal((count, MOST + OVERSAMPLING))
         Q = np.linalg.qr(mixed)[0]  # a randomised range finder (Halko, Martinsson and Tropp, 2011)
         Q = np.linalg.qr(scaled @ (scaled.T @ Q))[0]
-        small, rest = Q.T @ scaled, float(np.linalg.norm(_beside(Q, scaled)))
+        small, rest = Q.T @ scaled, float(np.linalg.norm(project_out(Q, scaled)))
     else:
         Q, small = np.linalg.qr(scaled)
         rest, allowed = 0.0, allowed * SHARE_OF_FEW  # but for round-off
@@ -134,10 +132,3 @@ def _directions(scaled: Array, allowed: float) -> tuple[Array, float]:
     if remainders[enough] <= allowed and enough <= min(MOST, 0.7 * count):
         return Q @ left[:, :enough], float(remainders[enough])
     return (Q if count <= FEW else np.linalg.qr(scaled)[0]), 0.0
-
-
-def _beside(U: Array, columns: Array) -> Array:
-    """(I − UUᵀ) applied twice to columns (n×p)."""
-    for _ in range(2):
-        columns = columns - U @ (U.T @ columns)
-    return columns
