@@ -94,7 +94,7 @@ FAULTS = (
     ),
     Fault(
         "stale-values-in-the-heap",
-        "vibench/reduction/lazy_greedy.py",
+        "vibench/reduction/cones.py",
         "if not len(stale):",
         "if True:",
         ("tests/unit/reduction/test_lazy_greedy.py",),

@@ -15,8 +15,7 @@ from page import Page, machines, made_by, read, start
 
 from vibench.highfidelity.active_set import HighFidelitySolver
 from vibench.interfaces.strategies import Stop
-from vibench.reduction.cones import greedy_cone, project_on_cone
-from vibench.reduction.lazy_greedy import TIE
+from vibench.reduction.cones import TIE, greedy_cone, project_on_cone
 from vibench.study import registry
 
 LOOSE, TIGHT = 1e-2, 1e-3

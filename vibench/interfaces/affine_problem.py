@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -71,14 +72,18 @@ class AffineProblem(Problem):
             If a member has a wrong shape.
         """
         n, m = self.V.dim, self.W.dim
-        N = n if free is None else int(np.shape(_first(A))[0])
-        if free is not None and (len(free) != n or np.max(free, initial=-1) >= N):
-            raise NumericalError(f"there are {len(free)} free unknowns of {N}; V has the dimension {n}")
-        shapes = {"A": (N, N), "f": (N,), "B": (m, N), "g": (m,), "dirichlet_lift": (N,)}
         given = {"A": A, "f": f, "B": B, "g": g}
         if dirichlet_lift is not None:
             given["dirichlet_lift"] = dirichlet_lift
-        sums = {name: self._declared(name, member, shapes[name]) for name, member in given.items()}
+        sums = {name: self._sum(member) for name, member in given.items()}
+        N = n if free is None else int(np.shape(sums["A"].terms[0])[0])
+        if free is not None and (len(free) != n or np.max(free, initial=-1) >= N):
+            raise NumericalError(f"there are {len(free)} free unknowns of {N}; V has the dimension {n}")
+        shapes = {"A": (N, N), "f": (N,), "B": (m, N), "g": (m,), "dirichlet_lift": (N,)}
+        for name, each in sums.items():
+            if (found := np.shape(each.terms[0])) != shapes[name]:
+                raise NumericalError(f"{name} has shape {found}; the spaces V and W require {shapes[name]}")
+            sums[name] = each.mapped(sp.csr_array if name in ("A", "B") else partial(np.asarray, dtype=float))
         if dirichlet_lift is not None:
             sums["f"] = _minus(sums["f"], sums["A"], sums["dirichlet_lift"])
             sums["g"] = _minus(sums["g"], sums["B"], sums["dirichlet_lift"])
@@ -97,15 +102,11 @@ class AffineProblem(Problem):
             on_contact = sums["B"].mapped(lambda term: sp.csr_array(term[:, touched]))
             self._contact_columns = _constant_or_sum(on_contact)
 
-    def _declared(self, name: str, member: Declaration, shape: tuple[int, ...]) -> AffineSum:
-        """A member as a sum of sparse matrices or vectors of this shape."""
+    def _sum(self, member: Declaration) -> AffineSum:
         if not isinstance(member, AffineSum):
             pairs = member if isinstance(member, list | tuple) else [(1.0, member)]
-            member = AffineSum.of(pairs, self.parameters.names)
-        found = np.shape(member.terms[0])
-        if found != shape:
-            raise NumericalError(f"{name} has shape {found}; the spaces V and W require {shape}")
-        return member.mapped(lambda term: sp.csr_array(term) if len(shape) > 1 else np.asarray(term, float))
+            return AffineSum.of(pairs, self.parameters.names)
+        return member
 
     def assemble(self, mu: Array) -> VariationalInequality:
         """The declared members at mu (d,), in the free unknowns."""
@@ -143,13 +144,6 @@ def _minus(total: AffineSum, matrix: AffineSum, vector: AffineSum) -> AffineSum:
         minus = -np.outer(matrix.coefficients(NOWHERE), vector.coefficients(NOWHERE)).ravel()
         return AffineSum((*total.terms, *products), Thetas((*total.coefficients(NOWHERE), *minus)))
     return AffineSum((*total.terms, *products), _OfProduct(*thetas))
-
-
-def _first(member: Declaration) -> Any:
-    """The first term of a declared member."""
-    if isinstance(member, AffineSum):
-        return member.terms[0]
-    return member[0][1] if isinstance(member, list | tuple) and member else member
 
 
 def _constant_or_sum(member: AffineSum) -> Any:

@@ -107,10 +107,14 @@ def _check(node: ast.expr, text: str, names: Sequence[str]) -> None:
         case ast.Constant(value=bool() as value):
             raise RequestError(f"'{text}' contains {value}; expected arithmetic")
         case ast.Constant(value=int() | float() as value):
-            _float(value, text)
+            try:
+                float(value)
+            except OverflowError:
+                raise RequestError(f"'{text}' contains a number too large for double precision") from None
         case ast.Name(id=name):
             if name not in CONSTANTS and name not in names:
-                raise _unknown(name, text, names)
+                hint = f"{name} is a function, it needs arguments in brackets" if name in FUNCTIONS else None
+                raise RequestError(f"'{text}': {hint or unknown_name('parameter', name, names)}")
         case ast.BinOp(left=left, op=op, right=right) if type(op) in BINARY:
             _check(left, text, names)
             _check(right, text, names)
@@ -140,19 +144,6 @@ WORDS: Mapping[type[ast.expr], str] = {
     ast.UnaryOp: "an operator that is not one of + - * / **", ast.Constant: "a text",
 }  # fmt: skip
 """What the nodes that are refused most often are called."""
-
-
-def _unknown(name: str, text: str, names: Sequence[str]) -> RequestError:
-    if name in FUNCTIONS:
-        return RequestError(f"'{text}': {name} is a function, it needs arguments in brackets")
-    return RequestError(f"'{text}': {unknown_name('parameter', name, names)}")
-
-
-def _float(value: float, text: str) -> float:
-    try:
-        return float(value)
-    except OverflowError:
-        raise RequestError(f"'{text}' contains a number too large for double precision") from None
 
 
 def _value(node: ast.expr, values: Mapping[str, float]) -> float:

@@ -180,7 +180,10 @@ class _Entries:
         self.constant = several and spread <= CONSTANT_RTOL * float(np.abs(self.values).max(initial=0.0))
 
     def _of_matrices(self, matrices: list[SparseMatrix]) -> Array:
-        entries = [_canonical(sp.triu(matrix) if self._symmetric else matrix) for matrix in matrices]
+        rows = [sp.csr_array(sp.triu(matrix) if self._symmetric else matrix) for matrix in matrices]
+        for matrix in rows:
+            matrix.sum_duplicates()
+        entries = [sp.coo_array(matrix) for matrix in rows]
         width = self._shape[1]
         keys = [entry.coords[0].astype(np.int64) * width + entry.coords[1] for entry in entries]
         pattern = keys[0] if all(np.array_equal(keys[0], key) for key in keys) else np.unique(np.concatenate(keys))
@@ -198,13 +201,6 @@ class _Entries:
             return values
         matrix = sp.csr_array((values, (self.rows, self.columns)), shape=self._shape)
         return matrix + sp.triu(matrix, 1).T if self._symmetric else matrix
-
-
-def _canonical(matrix: SparseMatrix) -> SparseMatrix:
-    """In coordinate format, row by row; duplicate entries are summed in place."""
-    rows = sp.csr_array(matrix)
-    rows.sum_duplicates()
-    return sp.coo_array(rows)
 
 
 @dataclass(frozen=True)

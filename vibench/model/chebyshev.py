@@ -120,10 +120,9 @@ def interpolate_on_box(
         counts = _within(counts, budget)
         grid = along.coefficients(counts)
         found = {name: _compressed(c, units[name], 0.1 * tolerance, terms.get(name)) for name, c in grid.items()}
-        found = {
-            name: replace(p, error=_error(p.at(unit), values[name], scale[name]), scale=scale[name])
-            for name, p in found.items()
-        }
+        for name, p in found.items():
+            error = float(np.linalg.norm(p.at(unit) - values[name], axis=-1).max()) / scale[name]
+            found[name] = replace(p, error=error, scale=scale[name])
         if max(p.error for p in found.values()) <= tolerance or prod(counts) >= 0.7 * budget:
             break
         counts = [count + max(1, count // 4) if count > 1 else count for count in counts]
@@ -224,10 +223,6 @@ def _norms(terms: Array) -> Array:
     """Norms (Q,) of terms (Q×size), 1 for those that vanish."""
     norms = np.linalg.norm(terms, axis=1)
     return np.where(norms > 0.0, norms, 1.0)
-
-
-def _error(found: Array, values: Array, scale: float) -> float:
-    return float(np.linalg.norm(found - values, axis=-1).max()) / scale
 
 
 def _stacked(found: Sequence[Mapping[str, Array]]) -> dict[str, Array]:

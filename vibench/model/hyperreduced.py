@@ -206,7 +206,8 @@ class HyperReducedModel:
         A, f, B, g = members.A, members.f, members.B, members.g
         Y = None
         if space is not None:
-            Y, B = self._enriched(space, B)
+            count = len(B) - self.generators.shape[1]
+            Y, B = np.hstack([space.plain, orthonormal_range(B[:count].T, space.plain)]), B[count:]
             A, f, B = Y.T @ (A @ Y), Y.T @ f, B @ Y
             A = 0.5 * (A + A.T)
             reconstruct = partial(_reconstructed, space, Y)
@@ -269,11 +270,6 @@ class HyperReducedModel:
             return self.space.supremizers(np.asarray(contact.B.T @ np.hstack([eta, self.generators]))).T
         assert operators.contact_basis is not None  # set by `hyper_reduce`
         return np.asarray(self.model.generators.T @ (contact.B @ operators.contact_basis))
-
-    def _enriched(self, space: Coordinates, B: Array) -> tuple[Array, Array]:
-        """Orthonormal coordinates Y (d×N') of V_N and the supremizers, and the constraint (R×d) in coordinates."""
-        count = len(B) - self.generators.shape[1]
-        return np.hstack([space.plain, orthonormal_range(B[:count].T, space.plain)]), B[count:]
 
 
 def _reconstructed(space: Coordinates, Y: Array, x: Array) -> Array:

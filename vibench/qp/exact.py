@@ -62,7 +62,8 @@ def exact_solution(program: VariationalInequality) -> ExactSolution | None:
             alpha = np.maximum(alpha, 0.0)
             if kkt_residuals(program, x, alpha).dual > ROUND_OFF:
                 return None
-            return ExactSolution(x, alpha, whitened.are_independent(excess > -TIGHT * terms))
+            tight = excess > -TIGHT * terms  # multipliers are unique where these constraints are independent
+            return ExactSolution(x, alpha, len(whitened.factorised(tight)[0]) == int(np.sum(tight)))
         seen.add(active.tobytes())
         active = violated | (active & ~pulling)
         if active.tobytes() in seen:
@@ -92,11 +93,7 @@ class _Whitened:
             return np.zeros(len(d), dtype=bool)
         return np.asarray(weights > 0.0)
 
-    def are_independent(self, chosen: Mask) -> bool:
-        """Whether constraints (m,) are linearly independent: the multipliers of tight ones are unique then."""
-        return len(self._factorised(chosen)[0]) == int(np.sum(chosen))
-
-    def _factorised(self, chosen: Mask) -> tuple[Indices, Array, Array]:
+    def factorised(self, chosen: Mask) -> tuple[Indices, Array, Array]:
         """A largest independent set of constraints, and the QR factors of their columns of C."""
         columns = np.flatnonzero(chosen)
         if not len(columns):  # LAPACK does not factorise matrices without columns
@@ -108,7 +105,7 @@ class _Whitened:
 
     def solve_active(self, active: Mask) -> tuple[Array, Array]:
         """Solution x (n,), α (m,) with the active constraints as equalities, refined once."""
-        kept, q, r = self._factorised(active)
+        kept, q, r = self.factorised(active)
         program, B = self._program, self._program.B[kept] / self._rows[kept, None]
         x, alpha = np.zeros(len(program.f)), np.zeros(len(program.g))
         for _ in range(2):  # the second time for the residual of the first

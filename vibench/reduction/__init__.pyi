@@ -2,11 +2,11 @@
 
 from .cone_parts import part_in_cone as part_in_cone
 from .cones import REPRODUCED as REPRODUCED
+from .cones import TIE as TIE
 from .cones import GrowingCone as GrowingCone
 from .cones import LazyDistances as LazyDistances
+from .cones import LazyMaximum as LazyMaximum
 from .cones import refuse_negative as refuse_negative
-from .lazy_greedy import TIE as TIE
-from .lazy_greedy import LazyMaximum as LazyMaximum
 from .supremizers import constraint_classes as constraint_classes
 from .supremizers import projected_supremizers as projected_supremizers
 from .supremizers import supremizer_coordinates as supremizer_coordinates

@@ -19,7 +19,7 @@ import numpy as np
 from vibench.arrays import Array, Mask, SparseMatrix
 from vibench.interfaces.strategies import no_free
 from vibench.linalg.inner_product import RANK_RTOL, InnerProduct, singular_values, svd
-from vibench.reduction.lazy_greedy import LazyMaximum
+from vibench.reduction.cones import LazyMaximum
 from vibench.reduction.supremizers import ConstraintClasses, isometric_supremizers, projected_supremizers
 from vibench.stability.conic_infsup import cone_interval
 

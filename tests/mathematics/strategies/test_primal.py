@@ -14,7 +14,7 @@ from vibench.errors import NumericalError
 from vibench.highfidelity.active_set import HighFidelitySolver
 from vibench.interfaces.strategies import Kind, Offline, Stop
 from vibench.linalg.inner_product import orthonormal_range, project_out, singular_values
-from vibench.reduction.lazy_greedy import LazyMaximum
+from vibench.reduction.cones import LazyMaximum
 from vibench.reduction.pod import pod
 from vibench.reduction.supremizers import supremizers
 from vibench.stability.infsup import inf_sup_full, inf_sup_on, multipliers

@@ -19,7 +19,7 @@ from vibench.highfidelity.active_set import HighFidelitySolver
 from vibench.interfaces.strategies import Cone, Offline, Stop, no_free
 from vibench.interfaces.validation import check_enrichment
 from vibench.linalg.inner_product import orthonormal_range, project_out, singular_values
-from vibench.reduction.lazy_greedy import LazyMaximum
+from vibench.reduction.cones import LazyMaximum
 from vibench.reduction.nested import NestedStrategy, grow_through
 from vibench.reduction.pod import pod
 from vibench.reduction.supremizers import supremizers

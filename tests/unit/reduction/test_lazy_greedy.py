@@ -4,7 +4,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from vibench.reduction.lazy_greedy import TIE, LazyMaximum
+from vibench.reduction.cones import TIE, LazyMaximum
 
 
 def plain(values: np.ndarray, excluded: set[int]) -> int:
