@@ -103,10 +103,9 @@ class AffineProblem(Problem):
             self._contact_columns = _constant_or_sum(on_contact)
 
     def _sum(self, member: Declaration) -> AffineSum:
-        if not isinstance(member, AffineSum):
-            pairs = member if isinstance(member, list | tuple) else [(1.0, member)]
-            return AffineSum.of(pairs, self.parameters.names)
-        return member
+        if isinstance(member, AffineSum):
+            return member
+        return AffineSum.of(member if isinstance(member, list | tuple) else [(1.0, member)], self.parameters.names)
 
     def assemble(self, mu: Array) -> VariationalInequality:
         """The declared members at mu (d,), in the free unknowns."""
