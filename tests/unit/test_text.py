@@ -107,6 +107,6 @@ def test_files_with_such_json_are_refused_in_a_line(tmp_path: Path) -> None:
     deep = tmp_path / "deep.json"
     deep.write_text("[" * 100_000)
     with pytest.raises(RequestError, match="cannot be read as a file of pytest-benchmark"):
-        files.read(deep)
+        files.read_benchmarks(deep)
     with pytest.raises(RequestError, match="does not say which study"):
         study_of(deep, {"study": "[" * 100_000})

@@ -47,7 +47,7 @@ class PrimalChoice:
 
 
 @dataclass(frozen=True)
-class Spaces:
+class ReducedSpaces:
     """Where V_N and the reduced cone of a registered dual strategy stop."""
 
     modes: Stop
@@ -72,7 +72,7 @@ class Setting:
     """
 
     problems: tuple[str, ...]
-    spaces: Spaces
+    spaces: ReducedSpaces
     primal: PrimalChoice
     seconds: float
 
@@ -88,7 +88,7 @@ def setting(study: str) -> Setting:
     spec = read_study(study)
     table, dual, primal = spec.tolerances[0], spec.dual[-1], spec.primal[-1]
     modes = Stop(tolerance=table.pod[0]) if table.pod else Stop(size=(table.N or [0])[0])
-    spaces = Spaces(modes, table.of_dual(dual)[0], dual.name)
+    spaces = ReducedSpaces(modes, table.of_dual(dual)[0], dual.name)
     problems = tuple(dict.fromkeys(entry.name for entry in spec.problem))
     chosen = PrimalChoice(primal.name, table.of_primal(primal)[0])
     return Setting(problems, spaces, chosen, spec.limits.cell_seconds)
@@ -114,8 +114,8 @@ ACCURACIES = (1e-6, 1e-10)
 
 def at_resolutions(problem: str, wanted: Sequence[Resolution]) -> list[TimedProblem]:
     """A problem at those of the resolutions that it knows; once, as it is, where it knows none of them."""
-    known = [TimedProblem(problem, resolution) for resolution in wanted if knows(problem, resolution)]
-    return known or [TimedProblem(problem, None)]
+    cases = [TimedProblem(problem, resolution) for resolution in wanted if knows(problem, resolution)]
+    return cases or [TimedProblem(problem, None)]
 
 
 def knows(problem: str, resolution: Resolution) -> bool:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import pandas as pd
 
@@ -73,56 +74,55 @@ def is_slower(before: Measured, after: Measured, limit: float) -> bool:
 
 def verdict(before: Measured, after: Measured, limit: float) -> str:
     """What got worse, "" if nothing did."""
-    found = ["slower"] if is_slower(before, after, limit) else []
-    found += ["faster"] if not found and is_slower(after, before, limit) else []
-    found += ["less accurate"] if any(map(is_worse, figures(before, after))) else []
-    found += [f"{before.status}, now {after.status or 'nothing'}"] if before.status == "ok" != after.status else []
-    return ", ".join(found)
+    changes = ["slower"] if is_slower(before, after, limit) else []
+    changes += ["faster"] if not changes and is_slower(after, before, limit) else []
+    changes += ["less accurate"] if any(map(is_worse, figures(before, after))) else []
+    changes += [f"{before.status}, now {after.status or 'nothing'}"] if before.status == "ok" != after.status else []
+    return ", ".join(changes)
 
 
-def table(found: Timed) -> pd.DataFrame:
-    """A row per benchmark: what is timed, with what, its seconds with their quartiles, and what it reached."""
-    rows = [
-        {
-            "benchmark": name,
-            "group": one.group,
-            **{axis: one.axes.get(axis, "") for axis in AXES},
-            "median_s": one.seconds,
-            "q1_s": one.q1,
-            "q3_s": one.q3,
-            "rounds": one.rounds,
-            "status": one.status,
-            **{f"reached_{figure}": value for figure, value in one.accuracy.items()},
-        }
-        for name, one in found.benchmarks.items()
-    ]
-    return pd.DataFrame(rows)
+def table_of(timed: Timed, earlier: Timed | None = None, limit: float = LIMIT) -> pd.DataFrame:
+    """A row for every benchmark; with an earlier file, for every one of both, and what changed.
+
+    A row has what is timed, with what, its seconds with their quartiles, and what it reached; a row of two files has
+    both medians, and of the figures of accuracy the one that got worse most.
+    """
+    if earlier is None:
+        return pd.DataFrame([_row(name, one) for name, one in timed.benchmarks.items()])
+    both = (name for name in earlier.benchmarks if name in timed.benchmarks)
+    return pd.DataFrame([_change(name, earlier.benchmarks[name], timed.benchmarks[name], limit) for name in both])
 
 
-def compared(before: Timed, after: Timed, limit: float) -> pd.DataFrame:
-    """A row for every benchmark of both files; of its figures of accuracy, the one that got worse most."""
-    rows = []
-    for name, was in before.benchmarks.items():
-        now = after.benchmarks.get(name)
-        if now is None:
-            continue
-        worst = next((f for f in figures(was, now) if is_worse(f)), (*figures(was, now), ("", None, None))[0])
-        rows.append(
-            {
-                "benchmark": name,
-                "group": was.group,
-                **{axis: was.axes.get(axis, "") for axis in AXES},
-                "before_s": was.seconds,
-                "after_s": now.seconds,
-                "ratio": now.seconds / was.seconds if was.seconds > 0.0 else math.nan,
-                "apart": "yes" if now.low > was.high or was.low > now.high else "no",
-                "figure": worst[0],
-                "before": worst[1],
-                "after": worst[2],
-                "verdict": verdict(was, now, limit),
-            }
-        )
-    return pd.DataFrame(rows)
+def _row(name: str, one: Measured) -> dict[str, Any]:
+    return {
+        "benchmark": name,
+        "group": one.group,
+        **{axis: one.axes.get(axis, "") for axis in AXES},
+        "median_s": one.seconds,
+        "q1_s": one.q1,
+        "q3_s": one.q3,
+        "rounds": one.rounds,
+        "status": one.status,
+        **{f"reached_{figure}": value for figure, value in one.accuracy.items()},
+    }
+
+
+def _change(name: str, was: Measured, now: Measured, limit: float) -> dict[str, Any]:
+    changed = figures(was, now)
+    figure, before, after = next(filter(is_worse, changed), (*changed, ("", None, None))[0])
+    return {
+        "benchmark": name,
+        "group": was.group,
+        **{axis: was.axes.get(axis, "") for axis in AXES},
+        "before_s": was.seconds,
+        "after_s": now.seconds,
+        "ratio": now.seconds / was.seconds if was.seconds > 0.0 else math.nan,
+        "apart": "yes" if now.low > was.high or was.low > now.high else "no",
+        "figure": figure,
+        "before": before,
+        "after": after,
+        "verdict": verdict(was, now, limit),
+    }
 
 
 def remarks(before: Timed, after: Timed, limit: float) -> list[str]:
@@ -134,21 +134,20 @@ def remarks(before: Timed, after: Timed, limit: float) -> list[str]:
     for what, said in before.machine.items():
         if said != after.machine.get(what, ""):
             lines += [f"{what} before: {said}", f"{what} after:  {after.machine.get(what, '')}"]
-    frame = compared(before, after, limit)
+    frame = table_of(after, before, limit)
     ratios = frame["ratio"].dropna() if len(frame) else frame
     middle = f", median of the ratios {ratios.median():.3g}" if len(ratios) else ""
-    worse = regressions(before, after, limit)
-    return [*lines, f"{len(frame)} benchmarks in both files{middle}; {worse} worse (limit {limit:g})"]
+    return [*lines, f"{len(frame)} benchmarks in both files{middle}; {regressions(frame)} worse (limit {limit:g})"]
 
 
-def regressions(before: Timed, after: Timed, limit: float) -> int:
-    """How many benchmarks got worse in any way."""
-    return sum(row["verdict"] not in ("", "faster") for row in compared(before, after, limit).to_dict("records"))
+def regressions(frame: pd.DataFrame) -> int:
+    """How many benchmarks of a table of two files got worse in any way."""
+    return sum(row["verdict"] not in ("", "faster") for row in frame.to_dict("records"))
 
 
-def print_benchmarks(found: Timed, earlier: Timed | None, limit: float, failed: int = 0) -> None:
+def print_benchmarks(timed: Timed, earlier: Timed | None, limit: float, failed: int = 0) -> None:
     """Print a table for everything that was timed, beside an earlier file if there is one, and how many failed."""
-    frame = table(found) if earlier is None else compared(earlier, found, limit)
+    frame = table_of(timed, earlier, limit)
     if len(frame):
         for group, rows in frame.groupby("group", sort=False):
             shown = _measured(rows) if earlier is None else _compared(rows)
@@ -159,7 +158,7 @@ def print_benchmarks(found: Timed, earlier: Timed | None, limit: float, failed: 
         counts = f"{len(frame)} benchmarks" + (f", {failed} failed" if failed else "")
         echo(f"{counts}; times are CPU times of a call on one thread")
     else:
-        echo(*remarks(earlier, found, limit))
+        echo(*remarks(earlier, timed, limit))
 
 
 def _measured(rows: pd.DataFrame) -> pd.DataFrame:
@@ -179,9 +178,9 @@ def _measured(rows: pd.DataFrame) -> pd.DataFrame:
 
 def _largest(reached: dict[str, float | None]) -> str:
     """The largest figure of accuracy of a benchmark; those of its table are of the same kind."""
-    known = {name.removeprefix("reached_"): value for name, value in reached.items() if pd.notna(value)}
-    name = max(known, key=lambda name: known[name] or 0.0, default="")
-    return f"{name} {cell_text(known[name])}" if name else ""
+    figures = {name.removeprefix("reached_"): value for name, value in reached.items() if pd.notna(value)}
+    name = max(figures, key=lambda name: figures[name] or 0.0, default="")
+    return f"{name} {cell_text(figures[name])}" if name else ""
 
 
 def _compared(rows: pd.DataFrame) -> pd.DataFrame:

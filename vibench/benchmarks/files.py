@@ -116,7 +116,7 @@ class Timed:
     machine: Mapping[str, str]
 
 
-def read(path: Path) -> Timed:
+def read_benchmarks(path: Path) -> Timed:
     """What a file of pytest-benchmark holds.
 
     Raises
@@ -140,14 +140,14 @@ def parsed(content: bytes) -> Timed:
         If it is no JSON, has a benchmark twice, or seconds that no clock gives; like other exceptions of Python where
         the structure is another.
     """
-    known = parsed_json(content)
-    found: dict[str, Measured] = {}
-    for entry in known["benchmarks"]:
+    file = parsed_json(content)
+    benchmarks: dict[str, Measured] = {}
+    for entry in file["benchmarks"]:
         name = _name(entry["fullname"])
-        if name in found:
+        if name in benchmarks:
             raise ValueError(f"it has '{name}' twice")
-        found[name] = _measured(entry)
-    return Timed(found, _machine(known["machine_info"], known["benchmarks"]))
+        benchmarks[name] = _measured(entry)
+    return Timed(benchmarks, _machine(file["machine_info"], file["benchmarks"]))
 
 
 def _name(fullname: str) -> str:
@@ -158,12 +158,12 @@ def _name(fullname: str) -> str:
 def _measured(entry: Mapping[str, Any]) -> Measured:
     extra, stats = entry.get("extra_info", {}), entry["stats"]
     axes = {str(name): unbroken(str(value)) for name, value in extra.get("axes", {}).items()}
-    known = {"problem": axes.get("case", "")} | axes
+    axes = {"problem": axes.get("case", "")} | axes
     passes = [stats, *extra.get("passes", [])]
     calibrations = [_seconds(one, "calibration_s") for one in passes if "calibration_s" in one]
     return Measured(
         group=unbroken(str(entry.get("group") or _name(entry["fullname"]).partition("[")[0])),
-        axes={name: known[name] for name in AXES if known.get(name)},
+        axes={name: axes[name] for name in AXES if axes.get(name)},
         seconds=_seconds(stats, "median"),
         q1=_seconds(stats, "q1"),
         q3=_seconds(stats, "q3"),
@@ -192,5 +192,5 @@ def _machine(info: Mapping[str, Any], benchmarks: Sequence[Mapping[str, Any]]) -
     timers = sorted({entry["options"]["timer"] for entry in benchmarks if "options" in entry})
     machine = own.get("machine") or f"{info.get('cpu', {}).get('brand_raw', '')} {info.get('machine', '')}".strip()
     libraries = own.get("libraries") or f"python {info.get('python_version', '')}"
-    found = {"machine": machine, "libraries": libraries, "timer": ", ".join(timers), "code": own.get("code", "")}
-    return {name: unbroken(str(text)) for name, text in found.items()}
+    texts = {"machine": machine, "libraries": libraries, "timer": ", ".join(timers), "code": own.get("code", "")}
+    return {name: unbroken(str(text)) for name, text in texts.items()}

@@ -8,8 +8,8 @@ from functools import wraps
 from typing import Any, Concatenate, ParamSpec, TypeVar
 
 from vibench.arrays import Array
-from vibench.benchmarks.cases import PrimalChoice, Setting, Spaces, TimedProblem
-from vibench.errors import VibenchError, in_a_line, message_of
+from vibench.benchmarks.cases import PrimalChoice, ReducedSpaces, Setting, TimedProblem
+from vibench.errors import VibenchError, in_a_line
 from vibench.highfidelity.active_set import HighFidelitySolution, HighFidelitySolver
 from vibench.interfaces.problem import Problem, VariationalInequality
 from vibench.interfaces.strategies import Stop
@@ -32,7 +32,7 @@ INTERPOLATION = 1e-6
 """Tolerance of the separation."""
 
 SOLVER, ACCURACY = "piqp", 1e-10
-"""Of complete queries."""
+"""QP solver of complete queries, and what it is asked for."""
 
 
 @dataclass(frozen=True)
@@ -44,9 +44,11 @@ class ValidationQuery:
     exact: ReferenceSolutions
 
 
-def _once(
-    make: Callable[Concatenate[StageInputs, P], T],
-) -> Callable[Concatenate[StageInputs, P], T]:
+class InputError(VibenchError):
+    """What a benchmark needs cannot be made."""
+
+
+def _once(make: Callable[Concatenate[StageInputs, P], T]) -> Callable[Concatenate[StageInputs, P], T]:
     """A method that makes what it returns once for all benchmarks; where it fails, all fail with the same line."""
 
     @wraps(make)
@@ -55,13 +57,13 @@ def _once(
         if key not in self.made:
             try:
                 self.made[key] = make(self, *args, **kwargs)
-            except VibenchError as error:
-                self.made[key] = VibenchError(message_of(error))
+            except InputError as error:
+                self.made[key] = error
             except (Exception, SystemExit) as error:  # noqa: BLE001  plugins are code of strangers
-                self.made[key] = VibenchError(f"{self.case}, {make.__name__}: {in_a_line(error)}")
-        if isinstance(found := self.made[key], VibenchError):
-            raise found
-        return found  # type: ignore[no-any-return]
+                self.made[key] = InputError(f"{self.case}, {make.__name__}: {in_a_line(error)}")
+        if isinstance(value := self.made[key], InputError):
+            raise value
+        return value  # type: ignore[no-any-return]
 
     return made
 
@@ -122,7 +124,7 @@ class StageInputs:
         return [ValidationQuery(mu, checked_assembly(problem, mu), one) for mu, one in zip(mus, exact, strict=True)]
 
     @_once
-    def reduction(self, spaces: Spaces, primal: PrimalChoice | None = None) -> Reduction:
+    def reduction(self, spaces: ReducedSpaces, primal: PrimalChoice | None = None) -> Reduction:
         """V_N and the cone at some spaces, and the enrichment where there is a primal strategy.
 
         `given()` makes the same reduction anew, whose models have nothing in store from earlier queries.
@@ -145,8 +147,8 @@ class StageInputs:
         )
 
     @_once
-    def online(self, spaces: Spaces, primal: PrimalChoice) -> Reduction:
-        """The same with projected members, or with the reason why queries have to be assembled in full."""
+    def online(self, spaces: ReducedSpaces, primal: PrimalChoice) -> Reduction:
+        """The reduction with projected members, or with the reason why queries have to be assembled in full."""
         reduction = self.reduction(spaces, primal).given(members=self.members)
         return reduction.given(operators=reduction.operators)
 
@@ -155,7 +157,7 @@ class StageInputs:
         """N of the POD."""
         return len(pod(self.snapshots.u, self.problem.V, stop).basis.T)
 
-    def dimensions(self, spaces: Spaces) -> tuple[int, int]:
+    def dimensions(self, spaces: ReducedSpaces) -> tuple[int, int]:
         """N and R of some spaces."""
         reduction = self.reduction(spaces)
         return reduction.pod.basis.shape[1], reduction.cone.size

@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator
 from itertools import cycle
 
 from vibench.arrays import Array
-from vibench.benchmarks.cases import SIZES, PrimalChoice, Size, Spaces
+from vibench.benchmarks.cases import SIZES, PrimalChoice, ReducedSpaces, Size
 from vibench.benchmarks.inputs import QUERIES, StageInputs, ValidationQuery
 from vibench.benchmarks.measure import Info, Timing, largest_figures
 from vibench.benchmarks.offline import orthonormality, relative_difference, residual_figures
@@ -150,10 +150,10 @@ def time_solver(inputs: StageInputs, size: Size, solver: str, accuracy: float) -
     )
 
 
-def _spaces(inputs: StageInputs, size: Size) -> Spaces:
-    """Spaces of this size, as far as the snapshots give them."""
+def _spaces(inputs: StageInputs, size: Size) -> ReducedSpaces:
+    """ReducedSpaces of this size, as far as the snapshots give them."""
     modes = min(size.N, inputs.modes(Stop(tolerance=SMALLEST)))
-    return Spaces(Stop(size=modes), Stop(size=size.R), inputs.usual.dual)
+    return ReducedSpaces(Stop(size=modes), Stop(size=size.R), inputs.usual.dual)
 
 
 def _shape(reduced: ReducedProblem) -> dict[str, int | str]:

@@ -75,7 +75,7 @@ def planned(
         What completes what is timed.
     """
     every = setting.problems if chosen else filter(takes_no_option, registered(PROBLEM))
-    cases = [at_resolutions(name, resolutions) for name in chosen.get("problem", every)]
+    problems = [at_resolutions(name, resolutions) for name in chosen.get("problem", every)]
     choices: dict[str, Sequence[Any]] = {
         "size": SIZES,
         "dual": chosen.get("dual", [*registered(DUAL)]),
@@ -88,8 +88,8 @@ def planned(
         axes = [*inspect.signature(function).parameters][1:]
         if chosen and not chosen.keys() & {"problem", *axes}:
             continue
-        for known in cases:
-            for case, values in product(known[: 1 if "size" in axes else None], product(*(choices[a] for a in axes))):
+        for cases in problems:
+            for case, values in product(cases[: 1 if "size" in axes else None], product(*(choices[a] for a in axes))):
                 benchmarks.append(Benchmark(what, case, tuple(zip(axes, values, strict=True))))
     return benchmarks
 

@@ -45,20 +45,20 @@ def bench_plugins(
     from vibench.benchmarks import comparison, files
     from vibench.results import formats
 
-    earlier = files.read(against) if against is not None else None
+    earlier = files.read_benchmarks(against) if against is not None else None
     failed = 0
     if read is not None:
         if plugin or out is not None:
             raise RequestError("--read times nothing: leave out the plugins and --out")
-        timed = files.read(read)
+        timed = files.read_benchmarks(read)
     else:
         timed, failed = _timed(plugin or [], out, resolution or ["coarse"], study, seconds)
+    frame = comparison.table_of(timed, earlier, limit)
     if form == "terminal":
         comparison.print_benchmarks(timed, earlier, limit, failed)
     else:
-        frame = comparison.table(timed) if earlier is None else comparison.compared(earlier, timed, limit)
         sys.stdout.write(formats.FORMS[form](frame))
-    if failed or (earlier is not None and comparison.regressions(earlier, timed, limit)):
+    if failed or (earlier is not None and comparison.regressions(frame)):
         raise Exit(1)
 
 

@@ -19,7 +19,16 @@ from vibench.linalg.inner_product import SYMMETRY_RTOL, InnerProduct
 from vibench.model.affine import CONSTANT_RTOL
 from vibench.testing.case import MOST_POINTS, PARTIAL_RTOL, ProblemCase
 from vibench.testing.checks import ConformanceError, Doubt, Note, raised
-from vibench.testing.comparisons import Arrays, array_fault, at, copies, difference, differences, peak, unmutated
+from vibench.testing.comparisons import (
+    Arrays,
+    array_fault,
+    at,
+    copies,
+    difference,
+    differences,
+    largest_entry,
+    unmutated,
+)
 
 ENTRIES = 40
 """Number of entries of every member that are sampled."""
@@ -56,9 +65,9 @@ def assembly(case: ProblemCase) -> Iterator[str]:
             yield f"assemble returns a {type(vi).__name__} {at(mu)}; expected a vibench.VariationalInequality"
             return
         lift = {} if vi.dirichlet_lift is None else {"dirichlet_lift": np.shape(vi.dirichlet_lift)}
-        found = [array_fault(name, getattr(vi, name), s, sparse=name in "AB") for name, s in (shapes | lift).items()]
-        yield from (f"{fault} ({at(mu)})" for fault in found if fault)
-        if any(found):
+        faults = [array_fault(name, getattr(vi, name), s, sparse=name in "AB") for name, s in (shapes | lift).items()]
+        yield from (f"{fault} ({at(mu)})" for fault in faults if fault)
+        if any(faults):
             return
     yield Note(f"n = {n}, m = {m}, at {len(case.mus)} parameters")
 
@@ -75,20 +84,20 @@ def no_mutation(case: ProblemCase) -> None:
 
 def symmetry(case: ProblemCase) -> None:
     """A is symmetric."""
-    for where, found in case.results.items():
-        if what := difference(found["A"], found["A"].T, SYMMETRY_RTOL * peak(found["A"])):
+    for where, arrays in case.results.items():
+        if what := difference(arrays["A"], arrays["A"].T, SYMMETRY_RTOL * largest_entry(arrays["A"])):
             raise ConformanceError(f"A is not symmetric {where}: {what} in the transpose")
 
 
 def definiteness(case: ProblemCase) -> None:
     """A is positive definite."""
-    for where, found in case.results.items():
+    for where, arrays in case.results.items():
         try:
-            InnerProduct(found["A"], "A")
+            InnerProduct(arrays["A"], "A")
         except NumericalError as error:
             eigenvalue = ""
             if case.plugin.V.dim <= 2000:  # a dense eigenvalue problem
-                values, vectors = scipy.linalg.eigh(found["A"].toarray(), subset_by_index=(0, 0))
+                values, vectors = scipy.linalg.eigh(arrays["A"].toarray(), subset_by_index=(0, 0))
                 unknown = np.abs(vectors[:, 0]).argmax()
                 eigenvalue = f": its smallest eigenvalue is {values[0]:.3g}; the eigenvector peaks at unknown {unknown}"
             raise ConformanceError(f"{error} {where}{eigenvalue}") from error
@@ -100,8 +109,8 @@ def independence(case: ProblemCase) -> Iterator[str]:
     first = at(case.mus[0])
     for name in (name for name in MEMBERS if name in case.plugin.constant):
         reference = case.results[first][name]
-        for where, found in case.results.items():
-            if what := difference(found[name], reference, CONSTANT_RTOL * peak(reference)):
+        for where, arrays in case.results.items():
+            if what := difference(arrays[name], reference, CONSTANT_RTOL * largest_entry(reference)):
                 yield f"{name} is declared `constant` but depends on mu: {what} ({where} and {first})"
                 break
     yield from _without_effect(case) if case.points == MOST_POINTS else ()
@@ -124,7 +133,7 @@ def continuity(case: ProblemCase) -> Iterator[str]:
     if case.points < MOST_POINTS:
         yield Note("not looked for, for lack of time")
         return
-    largest = {name: max(peak(found[name]) for found in case.results.values()) for name in MEMBERS}
+    largest = {name: max(largest_entry(arrays[name]) for arrays in case.results.values()) for name in MEMBERS}
     scales = {name: s for name, s in largest.items() if s > 0.0 and name not in case.plugin.constant}
 
     def point(start: Array, end: Array, t: float) -> Arrays:
@@ -147,8 +156,8 @@ def continuity(case: ProblemCase) -> Iterator[str]:
 
 
 @dataclass(frozen=True, eq=False)
-class Piece:
-    """A piece of the line, and the arrays at its left end, in its middle and at its right end.
+class Segment:
+    """A segment of the line, and the arrays at its left end, in its middle and at its right end.
 
     In the middle the array `name` deviates most from the mean of both ends, relative to its largest entry.
     """
@@ -162,32 +171,33 @@ class Piece:
 
 def find_jump(
     evaluate: Callable[[float], Arrays], scales: dict[str, float], late: Callable[[], bool] = lambda: False
-) -> Piece | None:
-    """A piece of length `WIDTH` at most on which an array jumps, `None` if no jump is found before it is `late`.
+) -> Segment | None:
+    """A segment of length `WIDTH` at most on which an array jumps, `None` if no jump is found before it is `late`.
 
-    The piece with the largest deviation is halved again and again. The deviation of a smooth array falls by 4 each
+    The segment with the largest deviation is halved again and again. The deviation of a smooth array falls by 4 each
     time, that at a kink by 2; at a jump it stays half the jump. `evaluate` returns the arrays at t ∈ [0, 1]; `scales`
     names those that are examined, with their largest modulus.
     """
 
-    def piece(left: float, right: float, first: Arrays, last: Arrays) -> Piece:
+    def segment(left: float, right: float, first: Arrays, last: Arrays) -> Segment:
         middle = evaluate(0.5 * (left + right))
-        deviations = {name: peak(middle[name] - 0.5 * (first[name] + last[name])) / scales[name] for name in scales}
+        off = {name: middle[name] - 0.5 * (first[name] + last[name]) for name in scales}
+        deviations = {name: largest_entry(off[name]) / scales[name] for name in scales}
         name = max(deviations, key=deviations.__getitem__)
-        return Piece(left, right, (first, middle, last), name, deviations[name])
+        return Segment(left, right, (first, middle, last), name, deviations[name])
 
     knots = [(t, evaluate(t)) for t in (0.0, 0.25, 0.5, 0.75, 1.0)]
-    pieces = [piece(left, right, first, last) for (left, first), (right, last) in pairwise(knots)]
+    segments = [segment(left, right, first, last) for (left, first), (right, last) in pairwise(knots)]
     for _ in range(BISECTIONS):
-        worst = max(pieces, key=lambda each: each.deviation)
+        worst = max(segments, key=lambda each: each.deviation)
         if worst.deviation < 0.5 * JUMP or late():
             return None
         if worst.right - worst.left <= WIDTH:
             return worst
-        pieces.remove(worst)
+        segments.remove(worst)
         middle = 0.5 * (worst.left + worst.right)
         first, between, last = worst.values
-        pieces += [piece(worst.left, middle, first, between), piece(middle, worst.right, between, last)]
+        segments += [segment(worst.left, middle, first, between), segment(middle, worst.right, between, last)]
     return None
 
 
@@ -248,13 +258,13 @@ def affine(case: ProblemCase) -> Iterator[str]:
     for where, mu in case.arguments.items():
         for name, each in declared.items():
             try:
-                found = each.at(mu.copy())
+                summed = each.at(mu.copy())
             except NumericalError as error:
                 raise ConformanceError(f"the affine sum of {name} {where}: {error}") from error
             full = case.results[where]
-            if fault := array_fault(f"the affine sum of {name}", found, full[name].shape, sparse=name in "AB"):
+            if fault := array_fault(f"the affine sum of {name}", summed, full[name].shape, sparse=name in "AB"):
                 raise ConformanceError(f"{fault} ({where})")
-            _compare("affine", mu, {name: found}, full)
+            _compare("affine", mu, {name: summed}, full)
 
 
 def by_entries(case: ProblemCase) -> Iterator[str]:
@@ -295,13 +305,13 @@ def _check_sampler(case: ProblemCase, wanted: dict[str, tuple[Indices, Indices]]
             if fault := array_fault(f"{name} of the sampler", samples[name], rows.shape):
                 raise ConformanceError(f"{fault} ({at(mu)})")
             # A full copy with the sampled entries, so that the message names their place in the member.
-            found = copies({name: full[name]})
-            found[name][(rows, columns) if name in "AB" else rows] = samples[name]
-            _compare("sampler", mu, found, full)
+            sampled = copies({name: full[name]})
+            sampled[name][(rows, columns) if name in "AB" else rows] = samples[name]
+            _compare("sampler", mu, sampled, full)
 
 
-def _compare(function: str, mu: Array, found: Arrays, full: Arrays) -> None:
-    for name, what in differences(copies(found), {name: full[name] for name in found}, PARTIAL_RTOL):
+def _compare(function: str, mu: Array, arrays: Arrays, full: Arrays) -> None:
+    for name, what in differences(copies(arrays), {name: full[name] for name in arrays}, PARTIAL_RTOL):
         raise ConformanceError(f"{name} of `{function}` differs from that of `assemble` {at(mu)}: {what}")
 
 

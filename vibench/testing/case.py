@@ -259,7 +259,7 @@ class ProblemCase(Case[Problem, Array, Arrays]):
         return copies({**members, "X_V": problem.V.matrix, "X_W": problem.W.matrix})
 
     def arrays(self, result: Arrays) -> Arrays:
-        """All of them."""
+        """The members and Gram matrices."""
         return result
 
     def construction(self) -> Iterator[str]:

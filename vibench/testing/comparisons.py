@@ -19,15 +19,15 @@ Arrays = dict[str, Any]
 
 def copies(arrays: Arrays) -> Arrays:
     """Copies of dense arrays, and of sparse matrices in CSR format without duplicate entries."""
-    found: Arrays = {}
+    copied: Arrays = {}
     for name, value in arrays.items():
-        found[name] = value.copy() if isinstance(value, np.ndarray) else sp.csr_array(value, copy=True)
-        if sp.issparse(found[name]):
-            found[name].sum_duplicates()
-    return found
+        copied[name] = value.copy() if isinstance(value, np.ndarray) else sp.csr_array(value, copy=True)
+        if sp.issparse(copied[name]):
+            copied[name].sum_duplicates()
+    return copied
 
 
-def peak(value: Any) -> float:
+def largest_entry(value: Any) -> float:
     """Largest modulus of an entry of a dense array or a sparse matrix; 0 without entries."""
     return float(np.max(np.abs(_entries(value)), initial=0.0))
 
@@ -52,7 +52,7 @@ def differences(one: Arrays, other: Arrays, rtol: float = 0.0) -> Iterator[tuple
     for name in {**one, **other}:
         if name not in one or name not in other:
             yield name, "one of the two has none"
-        elif what := difference(one[name], other[name], rtol * peak(other[name])):
+        elif what := difference(one[name], other[name], rtol * largest_entry(other[name])):
             yield name, what
 
 

@@ -65,7 +65,7 @@ class FigureCase(Examined[FigurePlugin]):
 
     @cached_property
     def empty(self) -> Copies:
-        """Those of a run without cells."""
+        """The recorded tables of a run without cells."""
         return _read(write_sample_run(self.folder / "empty", empty=True))
 
     @cached_property
@@ -93,8 +93,8 @@ class FigureCase(Examined[FigurePlugin]):
         from vibench.report.figures.plugins import named  # noqa: PLC0415  loads matplotlib
 
         for data in self.problems:
-            found = [kind for kind, _ in named(NAME, self.plugin, data)]
-            yield Note(f"{data.problem}: {len(found)} figures")
+            kinds = [kind for kind, _ in named(NAME, self.plugin, data)]
+            yield Note(f"{data.problem}: {len(kinds)} figures")
 
     def figures(self) -> Iterator[str]:
         """Every figure is drawn or has nothing to show, has a caption, and changes no table."""
@@ -126,9 +126,9 @@ class FigureCase(Examined[FigurePlugin]):
         """Columns have a value of their type for every row, also where there is none."""
         for recorded in (self.recorded, self.empty):
             for column in self.columns:
-                found = self.clocked(f"column '{column.name}'", partial(_values, column, recorded))
-                if recorded is self.recorded and len(found) and found.isna().all():
-                    yield Doubt(f"column '{column.name}' is empty in all {len(found)} rows")
+                entries = self.clocked(f"column '{column.name}'", partial(_values, column, recorded))
+                if recorded is self.recorded and len(entries) and entries.isna().all():
+                    yield Doubt(f"column '{column.name}' is empty in all {len(entries)} rows")
 
     def determinism(self) -> Iterator[str]:
         """A second call and another instance give the same figures and columns."""
@@ -146,11 +146,11 @@ class FigureCase(Examined[FigurePlugin]):
         for column in self.columns:
             first = _values(column, self.recorded)
             for source, same in (("a second call", column), ("another instance", again[column.name])):
-                found = _values(same, self.recorded)
-                if not found.equals(first):
-                    row = int((~(found.eq(first) | (found.isna() & first.isna()))).to_numpy().argmax())
+                entries = _values(same, self.recorded)
+                if not entries.equals(first):
+                    row = int((~(entries.eq(first) | (entries.isna() & first.isna()))).to_numpy().argmax())
                     yield (
-                        f"{source} gives column '{column.name}' other values: {found.iloc[row]} against "
+                        f"{source} gives column '{column.name}' other values: {entries.iloc[row]} against "
                         f"{first.iloc[row]} in row {row}"
                     )
                     break
@@ -169,10 +169,10 @@ class FigureCase(Examined[FigurePlugin]):
 
 def _read(path: Path) -> Copies:
     """The tables of a results file that columns are made from."""
-    found = Copies(partial(tables.read, path))
+    recorded = Copies(partial(tables.read, path))
     for table in EXTENSIBLE:
-        found.of(table)
-    return found
+        recorded.of(table)
+    return recorded
 
 
 def _values(column: DerivedColumn, recorded: Copies) -> pd.Series:

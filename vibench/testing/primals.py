@@ -100,32 +100,32 @@ class PrimalCase(Case[PrimalStrategy, float | None, Enrichment]):
 
     def enrichment(self) -> Iterator[str]:
         """Enrichments have the right types and shapes; fixed vectors are orthonormal and orthogonal to V_N."""
-        for name, found in self.results.items():
-            if fault := self._fault(found, self.model):
+        for name, built in self.results.items():
+            if fault := self._fault(built, self.model):
                 raise ConformanceError(f"{name}: {fault}")
-            vectors = found.vectors if found.vectors is not None else found.eta
-            yield Note(f"{name}: {found.kind}" + ("" if vectors is None else f", {vectors.shape[1]} vectors"))
+            vectors = built.vectors if built.vectors is not None else built.eta
+            yield Note(f"{name}: {built.kind}" + ("" if vectors is None else f", {vectors.shape[1]} vectors"))
 
-    def _fault(self, found: Enrichment, offline: Offline) -> str:
+    def _fault(self, built: Enrichment, offline: Offline) -> str:
         V, W = offline.problem.V, offline.problem.W
         try:
-            check_enrichment(found, V, offline.basis)
+            check_enrichment(built, V, offline.basis)
         except NumericalError as error:
             return str(error)
-        if not isinstance(found.kind, Kind):
-            return f"the kind is {found.kind!r}; expected a vibench.Kind"
-        for name, value in self.arrays(found, offline).items():
+        if not isinstance(built.kind, Kind):
+            return f"the kind is {built.kind!r}; expected a vibench.Kind"
+        for name, value in self.arrays(built, offline).items():
             rows = W.dim if name == "eta" else V.dim
             if fault := array_fault(name, value, (rows, *np.shape(value)[-1:])):
                 return fault
-        for quantity, values in found.history.items():
+        for quantity, values in built.history.items():
             if np.ndim(values) != 1 or not np.all(np.isfinite(values)):
                 return f"the history of '{quantity}' is not a vector of finite numbers, one for each step"
         return ""
 
     def kind(self) -> Iterator[str]:
         """The kind does not depend on the tolerance."""
-        kinds = {found.kind: name for name, found in self.results.items()}
+        kinds = {built.kind: name for name, built in self.results.items()}
         if len(kinds) > 1:
             yield "the kind depends on the tolerance: " + ", ".join(f"{kind} at {name}" for kind, name in kinds.items())
 
@@ -153,7 +153,7 @@ class PrimalCase(Case[PrimalStrategy, float | None, Enrichment]):
 
     def _fixed(self) -> dict[str, Array]:
         """Vectors of fixed enrichments, from loose to tight."""
-        return {name: found.vectors for name, found in self.results.items() if found.vectors is not None}
+        return {name: built.vectors for name, built in self.results.items() if built.vectors is not None}
 
     def no_mutation(self) -> None:
         """`build` changes nothing of the reduced model."""
@@ -166,10 +166,10 @@ class PrimalCase(Case[PrimalStrategy, float | None, Enrichment]):
         none = np.zeros((self.model.problem.W.dim, 0))
         offline = replace(copy_of(self.model), cone=Cone(none, np.zeros(1), no_free(0)), span=none)
         try:
-            found = self.plugin.build(offline, next(iter(self.arguments.values())))
+            built = self.plugin.build(offline, next(iter(self.arguments.values())))
         except VibenchError:  # a strategy may refuse it in one line
             return
-        if fault := self._fault(found, offline):
+        if fault := self._fault(built, offline):
             yield f"with a cone without generators: {fault}"
 
 

@@ -112,8 +112,8 @@ def constants(case: ProblemCase) -> Iterator[str]:
     mesh. Diagonal matrices in their place have one of O(h⁻²), and so have a mass matrix and any norm without gradients;
     one in another order of the unknowns has a larger one. The ratio is compared with that of the diagonal of A.
     """
-    where, found = next(iter(case.results.items()))
-    A, V, W = found["A"], case.plugin.V, case.plugin.W
+    where, arrays = next(iter(case.results.items()))
+    A, V, W = arrays["A"], case.plugin.V, case.plugin.W
     lowest, highest = extreme_quotients(A, V)
     yield Note(f"{where}: α = {lowest:.3g}, γ_a = {highest:.3g}")
     low, high = extreme_quotients(A, InnerProduct(sp.diags_array(A.diagonal(), format="csc")))
@@ -126,7 +126,7 @@ def constants(case: ProblemCase) -> Iterator[str]:
     if W.dim > MOST_CONSTRAINTS:
         yield Note(f"β_HF is not computed for more than {MOST_CONSTRAINTS} constraints")
         return
-    values = singular_values(V.whiten_functional(np.asarray(found["B"].T @ W.unwhiten(np.eye(W.dim)))))
+    values = singular_values(V.whiten_functional(np.asarray(arrays["B"].T @ W.unwhiten(np.eye(W.dim)))))
     beta = float(values[-1]) if len(values) == W.dim else 0.0
     yield Note(f"β_HF = {beta:.3g}, γ_b = {values[0]:.3g}")
     if beta <= DEPENDENT * values[0]:
@@ -134,7 +134,7 @@ def constants(case: ProblemCase) -> Iterator[str]:
         yield Doubt(f"β_HF/γ_b = {beta / values[0]:.1g}: {dependent} rows of B depend linearly on the others")
 
 
-def solution(case: ProblemCase) -> Iterator[str]:
+def high_fidelity_solution(case: ProblemCase) -> Iterator[str]:
     """High-fidelity solutions exist; their multipliers lie in W⁺ and are not all zero."""
     mus, solver = training_parameters(case.plugin), active_set.HighFidelitySolver(case.plugin)
     solved: list[active_set.HighFidelitySolution] = []
@@ -146,14 +146,14 @@ def solution(case: ProblemCase) -> Iterator[str]:
         if len(solved) >= least and (contacts or case.late):
             break
         try:
-            found = solver.solve(mus[k].copy())
+            answer = solver.solve(mus[k].copy())
         except NumericalError as error:
             raise ConformanceError(f"no solution {at(mus[k])}: {error}") from error
-        if np.min(found.lam) < 0.0:
-            yield f"the multiplier is not in W⁺ {at(mus[k])}: entry {np.argmin(found.lam)} is {np.min(found.lam):.1e}"
+        if np.min(answer.lam) < 0.0:
+            yield f"the multiplier is not in W⁺ {at(mus[k])}: entry {np.argmin(answer.lam)} is {np.min(answer.lam):.1e}"
             return
-        solved.append(found)
-        contacts += bool(np.any(found.lam > 0.0))
+        solved.append(answer)
+        contacts += bool(np.any(answer.lam > 0.0))
     if not contacts:
         yield (
             f"no constraint is active at any of {len(solved)} training parameters, so that all multipliers are zero; "
@@ -174,8 +174,8 @@ def pictures(case: ProblemCase) -> Iterator[str]:
     for name, value in case.plugin.diagnostics(mu.copy()).items():
         if not isinstance(name, str) or not np.isscalar(value) or not np.isfinite(float(value)):  # type: ignore[arg-type]
             yield f"diagnostics returns {value!r} for {name!r} {at(mu)}; expected a finite number for a name"
-    found = active_set.HighFidelitySolver(case.plugin).solve(mu.copy())
-    u, lam = found.u.copy(), found.lam.copy()
+    solved = active_set.HighFidelitySolver(case.plugin).solve(mu.copy())
+    u, lam = solved.u.copy(), solved.lam.copy()
     picture = unmutated("picture", {"u": u, "lam": lam}, lambda: case.plugin.picture(mu.copy(), u, lam))
     if picture is None:
         yield Note("no picture")
@@ -199,22 +199,22 @@ def _picture_faults(picture: Picture, m: int) -> Iterator[str]:
         yield f"picture.triangles refers to points {triangles.min()} to {triangles.max()}; there are {count}"
 
 
-def outputs(case: ProblemCase) -> Iterator[str]:
+def quantities_of_interest(case: ProblemCase) -> Iterator[str]:
     """Quantities of interest have names and units, and finite values that a second call repeats."""
-    found, mu = case.plugin.outputs, training_parameters(case.plugin)[:1]
-    strange = [type(one).__name__ for one in found if not isinstance(one, Output)]
+    declared, mu = case.plugin.outputs, training_parameters(case.plugin)[:1]
+    strange = [type(one).__name__ for one in declared if not isinstance(one, Output)]
     if strange:
         yield f"outputs holds a {strange[0]}; expected objects of vibench.Output"
         return
-    for one in found:
+    for one in declared:
         if not all(isinstance(text, str) and text.strip() for text in (one.name, one.unit)):
             yield f"an output has the name {one.name!r} and the unit {one.unit!r}; expected texts, '1' for a number"
-    names = [one.name for one in found]
+    names = [one.name for one in declared]
     if len(set(names)) < len(names):
         yield f"two outputs have the same name: {', '.join(map(str, names))}"
     solved = active_set.HighFidelitySolver(case.plugin).solve(mu[0].copy())
     u, lam = solved.u[:, None], solved.lam[:, None]
-    for one, again in zip(found, case.plugin.outputs, strict=True):
+    for one, again in zip(declared, case.plugin.outputs, strict=True):
         for columns in ((u, lam), (0.0 * u, 0.0 * lam)):  # a reduced solution may have no contact
             if one.values(mu, *columns) != again.values(mu, *columns):
                 yield f"the output '{one.name}' differs in a second call {at(mu[0])}"
@@ -242,9 +242,9 @@ PROBLEM = Conformance("problem", ProblemCase, (
     Check("affine sums", assembly.affine, ("determinism",)),
     Check("assembly by entries", assembly.by_entries, ("determinism",)),
     Check("pickling", ProblemCase.pickling, ("determinism",)),
-    Check("high-fidelity solution", solution,
+    Check("high-fidelity solution", high_fidelity_solution,
           ("training set", "definiteness of A", "independence of mu", "assembly on the contact")),
     Check("picture and diagnostics", pictures, ("high-fidelity solution",)),
-    Check("outputs", outputs, ("high-fidelity solution",)),
+    Check("outputs", quantities_of_interest, ("high-fidelity solution",)),
     Check("time", ProblemCase.duration, ("assembly",)),
 ))  # fmt: skip

@@ -61,23 +61,23 @@ class SamplingCase(Case[Sampling, ParameterBox, Array]):
     @cached_property
     def tried(self) -> dict[str, Array | RequestError]:
         """Points in every box, or why the strategy refuses it."""
-        found: dict[str, Array | RequestError] = {}
+        tried: dict[str, Array | RequestError] = {}
         for name, box in self.boxes.items():
             try:
-                found[name] = self.evaluate(box)
+                tried[name] = self.evaluate(box)
             except RequestError as error:
-                found[name] = error
-        return found
+                tried[name] = error
+        return tried
 
     @property
     def arguments(self) -> dict[str, ParameterBox]:
         """The boxes that are not refused."""
-        return {name: self.boxes[name] for name, found in self.tried.items() if not isinstance(found, RequestError)}
+        return {name: self.boxes[name] for name, points in self.tried.items() if not isinstance(points, RequestError)}
 
     @cached_property
     def results(self) -> dict[str, Array]:
         """The points by the names of their boxes."""
-        return {name: found for name, found in self.tried.items() if not isinstance(found, RequestError)}
+        return {name: points for name, points in self.tried.items() if not isinstance(points, RequestError)}
 
     def evaluate(self, argument: ParameterBox, plugin: Sampling | None = None) -> Array:
         """Points in a box, as the strategy returns them."""
@@ -89,16 +89,16 @@ class SamplingCase(Case[Sampling, ParameterBox, Array]):
 
     def parameters(self) -> Iterator[str]:
         """Points have the right shape, are finite, different, and in the box; some box is not refused."""
-        for name, found in self.tried.items():
-            if isinstance(found, RequestError):
-                yield Note(f"{name}: refused, {found}")
+        for name, points in self.tried.items():
+            if isinstance(points, RequestError):
+                yield Note(f"{name}: refused, {points}")
                 continue
             try:
-                yield Note(f"{name}: P = {len(check_sample(self.boxes[name], found))}")
+                yield Note(f"{name}: P = {len(check_sample(self.boxes[name], points))}")
             except RequestError as error:
                 yield f"{name}: {error}"
         if not self.results:
-            reasons = dict.fromkeys(str(found) for found in self.tried.values())
+            reasons = dict.fromkeys(str(points) for points in self.tried.values())
             yield f"no box of one to three parameters ({', '.join(_WHOLE.names)}) is accepted: {'; '.join(reasons)}"
 
     def size(self) -> Iterator[str]:
@@ -109,12 +109,12 @@ class SamplingCase(Case[Sampling, ParameterBox, Array]):
         for size in dict.fromkeys([*SIZES, *([self._given["size"]] if "size" in self._given else [])]):
             for name, box in self.arguments.items():
                 try:
-                    found = self.evaluate(box, self._variant(size=size))
+                    points = self.evaluate(box, self._variant(size=size))
                 except RequestError as error:
                     yield Note(f"{name}: size {size} is refused, {error}")
                     continue
-                if len(found) != size:
-                    yield f"{name}: size = {size} was asked for; there are {len(found)} points"
+                if len(points) != size:
+                    yield f"{name}: size = {size} was asked for; there are {len(points)} points"
 
     def seed(self) -> Iterator[str]:
         """Another value of an option `seed` gives other points; without one nothing is random."""

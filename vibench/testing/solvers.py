@@ -128,37 +128,37 @@ class SolverCase:
         if not callable(self.create):
             raise ConformanceError(f"a {type(self.create).__name__} is no function of a program and an accuracy")
         try:
-            found = self.solve(self.typical)
+            answer = self.solve(self.typical)
         except NumericalError as error:
             raise ConformanceError(str(error)) from error
-        if found.x is None or found.alpha is None:
-            yield f"a program with a solution gets none: {found.solver_status}"
-        yield Note(found.solver_status)
+        if answer.x is None or answer.alpha is None:
+            yield f"a program with a solution gets none: {answer.solver_status}"
+        yield Note(answer.solver_status)
 
     def signs(self) -> Iterator[str]:
         """Multipliers α ≥ 0 are those of A x + Bᵀα = f."""
-        program, found = self.typical, self.create(self.typical, ACCURACY)
-        assert found.x is not None and found.alpha is not None  # noqa: PT018  the check "answer" passed
+        program, answer = self.typical, self.create(self.typical, ACCURACY)
+        assert answer.x is not None and answer.alpha is not None  # noqa: PT018  the check "answer" passed
         off = [
-            float(np.max(np.abs(program.A @ found.x - program.f + sign * program.B.T @ found.alpha)))
+            float(np.max(np.abs(program.A @ answer.x - program.f + sign * program.B.T @ answer.alpha)))
             for sign in (1, -1)
         ]
         if off[0] > 1e-3 > off[1]:
             yield f"multipliers have the other sign: ‖A x + Bᵀα − f‖ is {off[0]:.1g}, with −α {off[1]:.1g}"
-        elif np.min(found.alpha) < -SOLUTION_RTOL * np.max(np.abs(found.alpha)):
-            yield f"a multiplier is negative: entry {np.argmin(found.alpha)} is {np.min(found.alpha):.2g}"
+        elif np.min(answer.alpha) < -SOLUTION_RTOL * np.max(np.abs(answer.alpha)):
+            yield f"a multiplier is negative: entry {np.argmin(answer.alpha)} is {np.min(answer.alpha):.2g}"
 
     def solutions(self) -> Iterator[str]:
         """Programs with known solutions are solved to `ACCURACY`."""
         worst = 0.0
-        for name, known in self.programs.items():
-            found = self.solve(known.program)
-            status, reason, residuals = verify(known.program, found, ACCURACY)
+        for name, posed in self.programs.items():
+            answer = self.solve(posed.program)
+            status, reason, residuals = verify(posed.program, answer, ACCURACY)
             if status is not Status.OK or residuals is None:
                 yield f"{name}: {status}, {reason}"
                 continue
             worst = max(worst, residuals.worst)
-            for symbol, value, right in (("x", found.x, known.x), ("α", found.alpha, known.alpha)):
+            for symbol, value, right in (("x", answer.x, posed.x), ("α", answer.alpha, posed.alpha)):
                 if right is not None and value is not None and len(right):
                     gap, scale = np.abs(value - right), max(1e-3, float(np.max(np.abs(right))))
                     if np.max(gap) > SOLUTION_RTOL * scale:
@@ -168,10 +168,10 @@ class SolverCase:
 
     def accuracies(self) -> Iterator[str]:
         """Residuals are below the accuracy that is asked for."""
-        known = next(iter(self.programs.values())).program
+        program = next(iter(self.programs.values())).program
         for accuracy in ACCURACIES:
-            found = self.solve(known, accuracy)
-            status, reason, residuals = verify(known, found, accuracy)
+            answer = self.solve(program, accuracy)
+            status, reason, residuals = verify(program, answer, accuracy)
             if status is not Status.OK or residuals is None:
                 yield f"accuracy {accuracy:.0e}: {status}, {reason}"
             else:
@@ -180,14 +180,14 @@ class SolverCase:
     def infeasible(self) -> Iterator[str]:
         """A program without admissible points is answered, with whatever status, and not by an exception."""
         try:
-            found = self.solve(IMPOSSIBLE)
+            answer = self.solve(IMPOSSIBLE)
         except Exception as error:  # a plugin may raise anything
             advice = "return QPSolution(None, None, status) where there is no solution"
             raise ConformanceError(f"it raises {raised(error)}; {advice}") from error
-        status, _, _ = verify(IMPOSSIBLE, found, ACCURACY)
+        status, _, _ = verify(IMPOSSIBLE, answer, ACCURACY)
         if status is Status.NONFINITE:
             yield "x or α is not finite; return QPSolution(None, None, status) where there is no solution"
-        yield Note(found.solver_status)
+        yield Note(answer.solver_status)
 
     def no_mutation(self) -> None:
         """The solver does not write to the program."""
@@ -220,8 +220,8 @@ class SolverCase:
 
     def repetition(self) -> Iterator[str]:
         """A program that was solved before is solved again: it takes as long as a new one."""
-        known, again = self.programs["many constraints"].program, list[float]()
-        program, new = _scaled(known), list[float]()
+        program = _scaled(self.programs["many constraints"].program)
+        again, new = list[float](), list[float]()
         self.create(program, ACCURACY)
         for k in range(REPEATS):
             other = replace(program, f=program.f * (1.0 + 1e-6 * (k + 1)))
@@ -254,8 +254,8 @@ def _own(program: VariationalInequality) -> VariationalInequality:
     return copy.deepcopy(program)
 
 
-def _vectors(found: QPSolution) -> dict[str, Array]:
-    return {name: value for name, value in (("x", found.x), ("α", found.alpha)) if value is not None}
+def _vectors(answer: QPSolution) -> dict[str, Array]:
+    return {name: value for name, value in (("x", answer.x), ("α", answer.alpha)) if value is not None}
 
 
 def of_qpsolvers(program: VariationalInequality, accuracy: float, *, solver: str) -> QPSolution:
