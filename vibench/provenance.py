@@ -56,24 +56,14 @@ def solver_version(solver: str) -> str:
     return distribution_version(solver_distribution(solver))
 
 
-SHARED = ("arrays.py", "errors.py", "fem.py", "timing.py")
-"""Modules outside of rooms whose code determines numbers: it enters the key of every stage."""
-
-NUMERICAL = (
-    *SHARED, "linalg", "interfaces", "qp", "reduction", "stability", "highfidelity", "model", "storage", "stages",
-)  # fmt: skip
-"""Rooms and modules whose code determines numbers; the others carry requests and records, and show them."""
-
 LIBRARIES = ("numpy", "scipy", "scikit-fem", "qpsolvers", "piqp", "proxsuite")
-"""Libraries that the numerical rooms compute with; the solver of a cell and what a plugin needs count with these."""
+"""Libraries that numbers are computed with; the solver of a cell and what a plugin needs count with these."""
 
 
 @cache
-def core_code(*parts: str) -> str:
-    """Version of vibench with a hash of some of its rooms and modules, of all its sources where none is named."""
-    package = Path(__file__).parent
-    hashes = "".join(source_hash(package / part) for part in parts or [""])
-    return f"{distribution_version('vibench')} {hashlib.sha256(hashes.encode()).hexdigest()[:12]}"
+def core_code() -> str:
+    """Version of vibench with a hash of all its sources."""
+    return f"{distribution_version('vibench')} {source_hash(Path(__file__).parent)}"
 
 
 @cache

@@ -23,9 +23,10 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
+from vibench.dependencies import CELL, code_used
 from vibench.execution.descendants import MARK, kill_marked
 from vibench.execution.parts import Part, PartDone, parts
-from vibench.provenance import NUMERICAL, core_code, libraries
+from vibench.provenance import libraries
 from vibench.qp.status import Status
 from vibench.stages.base import Done, Failed, PiecewiseStage, Stage, Unstored
 from vibench.timing import KEPT_MEMORY, ONE_THREAD
@@ -45,7 +46,7 @@ GRACE = 2.0
 
 def code_here() -> str:
     """The code of vibench that determines numbers, and the libraries, in this process."""
-    return f"{core_code(*NUMERICAL)}; {libraries()}"
+    return f"{code_used(*CELL, whole=True)}; {libraries()}"
 
 
 @dataclass(frozen=True)

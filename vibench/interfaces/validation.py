@@ -197,3 +197,8 @@ class ReferenceAssembly:
         constants = {name: getattr(self._vi, name) for name in self._problem.constant}
         for deviation in _of(constants).deviations(self.fingerprint):
             raise NumericalError(f"a member declared `constant` is overwritten by later assemblies: {deviation}")
+
+
+def reference_assembly(problem: Problem) -> ReferenceAssembly:
+    """The assembly at the first training parameter, which those at others are compared with."""
+    return ReferenceAssembly(problem, checked_assembly(problem, training_parameters(problem)[0]))

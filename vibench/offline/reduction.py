@@ -25,10 +25,9 @@ from vibench.interfaces.strategies import (
     Stop,
 )
 from vibench.interfaces.validation import (
-    ReferenceAssembly,
     check_cone,
     check_enrichment,
-    checked_assembly,
+    reference_assembly,
     training_parameters,
 )
 from vibench.model.affine import AffineMember, affine_decomposition
@@ -68,11 +67,6 @@ def high_fidelity_sweep(problem: Problem, mus: Array) -> Snapshots:
     solver = HighFidelitySolver(problem)
     solutions = [solver.solve(mu) for mu in mus]
     return Snapshots(mus, np.column_stack([s.u for s in solutions]), np.column_stack([s.lam for s in solutions]))
-
-
-def reference_assembly(problem: Problem) -> ReferenceAssembly:
-    """The assembly at the first training parameter, which those at others are compared with."""
-    return ReferenceAssembly(problem, checked_assembly(problem, training_parameters(problem)[0]))
 
 
 @dataclass(frozen=True, eq=False)

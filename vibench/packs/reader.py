@@ -24,7 +24,6 @@ from vibench.packs import manifest as schema
 from vibench.packs.array_files import ArrayFiles, memory_limit, safe_path, size_of
 from vibench.packs.manifest import FILE, Manifest, read_manifest
 from vibench.packs.pack import Listing, ModelPack, PackMember, PackMesh, PackSolutions, TabulatedTheta
-from vibench.provenance import core_code
 
 
 def read_pack(path: str | Path) -> ModelPack:
@@ -45,14 +44,14 @@ def read_pack(path: str | Path) -> ModelPack:
 
 
 def pack_digest(path: str | Path) -> str:
-    """Digest of the manifest and of the files it names, and of the code that reads them.
+    """Digest of the manifest and of the files it names.
 
     Raises
     ------
     RequestError
         If the manifest is invalid or a file is missing.
     """
-    content = hashlib.sha256(core_code("packs").encode())
+    content = hashlib.sha256()
     with naming(path) as folder:
         for place, reference in (("manifest", FILE), *read_manifest(folder).references()):
             for file in _files(folder, place, reference.partition(":")[0]):

@@ -43,7 +43,6 @@ class AffineDecomposition(Stage):
     """
 
     label = "affine decomposition"
-    rooms = ("linalg", "interfaces", "model")
 
     problem: Plugin
     tolerance: float
@@ -68,7 +67,6 @@ class HyperReduction(Stage):
     """Projection of the decomposed members on the space of a reduced model."""
 
     label = "hyper-reduction"
-    rooms = ("linalg", "interfaces", "reduction", "model")
 
     enrichment: EnrichmentStage
     decomposition: AffineDecomposition
@@ -89,7 +87,6 @@ class NestedPrograms(Stage):
     """Reduced programs, in full, with all vectors of a nested strategy; its tolerances take their leading parts."""
 
     label = "nested programs"
-    rooms = ("linalg", "interfaces", "model")
 
     growth: GrowthStage
     validation: ParameterSet
@@ -131,7 +128,6 @@ class AssemblyStage(Stage):
     """Assembly of the reduced programs at the validation parameters; the value is a `ReducedPrograms`."""
 
     label = "assembly"
-    rooms = ("linalg", "interfaces", "reduction", "model")
 
     enrichment: EnrichmentStage
     interpolation: float | None
@@ -234,7 +230,6 @@ class ExactSolutions(Stage):
     """The reduced programs solved to round-off, for any QP solver and accuracy; not timed."""
 
     label = "exact reduced solutions"
-    rooms = ("linalg", "interfaces", "qp")
 
     assembly: AssemblyStage
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -10,9 +9,10 @@ from dataclasses import dataclass, fields, is_dataclass
 from functools import cached_property, lru_cache
 from typing import Any, ClassVar
 
+from vibench.dependencies import code_used
 from vibench.errors import NumericalError
 from vibench.interfaces.problem import Problem
-from vibench.provenance import SHARED, core_code, libraries
+from vibench.provenance import libraries
 from vibench.qp.status import Status
 from vibench.storage.artefacts import History, Store
 from vibench.study.cells import Axes, digest
@@ -83,8 +83,6 @@ class Stage(ABC):
 
     label: ClassVar[str]
     """What the stage computes, in a word or two, for messages and for the names of artefacts."""
-    rooms: ClassVar[tuple[str, ...]] = ()
-    """Rooms of vibench whose code determines the result; those of the inputs need not be repeated."""
     stored: ClassVar[bool] = True
     """Whether the value is kept as an artefact, under `key`."""
     partial: ClassVar[bool] = False
@@ -94,14 +92,19 @@ class Stage(ABC):
     def key(self) -> str:
         """Name of the artefact: the label, and a hash of everything that determines the value.
 
-        These are the fields of the stage, the keys of its inputs, the code and the libraries. The code of a plugin
-        enters through `Plugin.code`. Of vibench, only the module that defines the stage and `rooms` enter: an edited
-        figure or help text invalidates no artefact.
+        These are the fields of the stage, the keys of its inputs, the libraries, and the modules of vibench that `run`
+        depends on: an edited figure or help text invalidates no artefact. The code of a plugin, and what it uses of
+        vibench, enter through `Plugin.code`.
         """
-        parts = (*SHARED, *self.rooms, __file__, str(sys.modules[type(self).__module__].__file__))
         own = {name: _described(value) for name, value in self._fields().items()}
-        content = [type(self).__name__, core_code(*parts), libraries(), own, [stage.key for stage in self.inputs()]]
+        content = [type(self).__name__, code_used(*self.code()), libraries(), own, [one.key for one in self.inputs()]]
         return f"{self.label.lower().replace(' ', '-')}-{digest(content)}"
+
+    @classmethod
+    def code(cls) -> tuple[str, ...]:
+        """Where the code begins that determines the value, as for `code_used`: the class, and the method `run`."""
+        owner = next(one for one in cls.__mro__ if "run" in vars(one))
+        return (f"{cls.__module__}:{cls.__qualname__}", f"{owner.__module__}:{owner.__qualname__}.run")
 
     @property
     def sort(self) -> str:
@@ -188,6 +191,11 @@ class PiecewiseStage(Stage):
     """A stage whose pieces are kept one by one: if its process dies or hangs, only the current piece is lost."""
 
     stored = False
+
+    @classmethod
+    def code(cls) -> tuple[str, ...]:
+        """None: the value is not kept for another run."""
+        return ()
 
     @property
     @abstractmethod

@@ -26,12 +26,7 @@ from vibench.stages.assembly import AssemblyStage, ExactSolutions, assembly_stag
 from vibench.stages.base import Failed, Pieces, PiecewiseStage, Row, Stage, value_of
 from vibench.stages.cell_summary import summarise
 from vibench.stages.certification import CertificateStage
-from vibench.stages.infsup_constants import (
-    FullConstants,
-    OwnConstants,
-    PlainConstants,
-    ReferenceConstants,
-)
+from vibench.stages.infsup_constants import InfSupConstants, ReferenceConstants
 from vibench.stages.offline import ConstraintMatrices, ReducedCone
 from vibench.stages.query import Queries, Query, error_columns, run_query
 from vibench.stages.snapshots import gather, solution_stages
@@ -64,7 +59,6 @@ class CellQueries(PiecewiseStage):
     """All queries of one cell, each a piece; the value is a `CellRows`."""
 
     label = "queries"
-    rooms = ("linalg", "interfaces", "qp", "highfidelity", "model")
 
     assembly: AssemblyStage
     solver: str
@@ -98,13 +92,11 @@ class CellQueries(PiecewiseStage):
         return ReferenceConstants(self._constraints)
 
     @property
-    def constants(self) -> tuple[OwnConstants, FullConstants, PlainConstants]:
+    def constants(self) -> tuple[InfSupConstants, ...]:
         """The stages of the inf-sup constants of the reduced pair, of V with the cone, and of V_N alone."""
-        enrichment, constraints = self.assembly.enrichment, self._constraints
-        return (
-            OwnConstants(enrichment, constraints),
-            FullConstants(enrichment.cone, constraints),
-            PlainConstants(enrichment.pod, enrichment.cone, constraints),
+        enrichment = self.assembly.enrichment
+        return tuple(
+            InfSupConstants(space, enrichment.cone, self._constraints) for space in (enrichment, None, enrichment.pod)
         )
 
     @property

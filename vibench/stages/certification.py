@@ -29,7 +29,6 @@ class CertificateBaseStage(Stage):
     """What certificates of all reduced models of a problem have in common; the value is a `CertificateBase`."""
 
     label = "certificate base"
-    rooms = ("linalg", "interfaces", "stability", "model")
 
     decomposition: AffineDecomposition
 
@@ -46,7 +45,6 @@ class CertificateStage(Stage):
     """What certifies the queries of one reduced model; the value is an `OnlineCertificate`."""
 
     label = "certificate"
-    rooms = ("linalg", "interfaces", "qp", "stability", "reduction", "model")
 
     assembly: AssemblyStage
 

@@ -95,7 +95,6 @@ class GrowthStage(Stage):
     """A nested primal strategy, run once through all its tolerances; its seconds are recorded per tolerance."""
 
     label = "nested enrichment"
-    rooms = ("linalg", "interfaces", "qp", "reduction", "stability")
 
     pod: PODStage
     cone: ConeStage
@@ -128,7 +127,6 @@ class EnrichmentStage(Stage):
     """The primal strategy, offline, at one tolerance; it completes a reduced model."""
 
     label = "enrichment"
-    rooms = ("linalg", "interfaces", "qp", "reduction", "stability")
 
     pod: PODStage
     cone: ConeStage
@@ -266,8 +264,9 @@ def _reduction(store: Store, pod: PODStage, cone: ConeStage, interpolation: floa
 
 def _offline(store: Store, pod: PODStage, cone: ConeStage) -> Offline:
     """The offline data that a primal strategy is built from."""
-    training = parameters_in(store, pod.problem, pod.training)
-    return _reduction(store, pod, cone).given(parameters=training).offline
+    problem, basis = build_problem(pod.problem), value_of(store, pod).basis
+    reduced: ReducedCone = value_of(store, cone)
+    return Offline(problem, basis, reduced.cone, reduced.prepared.span, parameters_in(store, pod.problem, pod.training))
 
 
 def _projected(offline: Offline, vectors: Array, classes: ConstraintClasses) -> ProjectedSupremizers:

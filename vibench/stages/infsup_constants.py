@@ -36,7 +36,6 @@ class ReferenceConstants(Stage):
     """Constants of the high-fidelity problem: β_HF, α, γ_a and β_A; a `Stability` per parameter."""
 
     label = "high-fidelity constants"
-    rooms = ("linalg", "interfaces", "reduction", "stability")
 
     constraints: ConstraintMatrices
 
@@ -56,63 +55,44 @@ class ReferenceConstants(Stage):
 
 
 @dataclass(frozen=True)
-class FullConstants(Stage):
-    """Constants of the whole of V with a reduced cone, which online supremizers attain: an `InfSup` per parameter."""
+class InfSupConstants(Stage):
+    """Inf-sup constants of a primal space with a reduced cone: an `InfSup` per validation parameter.
 
-    label = "constants of V"
-    rooms = ("linalg", "interfaces", "reduction", "stability")
+    The space is that of a reduced model, V_N alone, or, with `None`, the whole of V, whose constants online supremizers
+    attain.
+    """
 
+    label = "inf-sup constants"
+
+    space: EnrichmentStage | PODStage | None
     cone: ConeStage
     constraints: ConstraintMatrices
 
-    def run(self, store: Store) -> Result:
-        """Compute the constants."""
-        classes, cone = value_of(store, self.constraints), value_of(store, self.cone).prepared
-        return Result(constants_full(build_problem(self.cone.problem).V, classes, cone))
-
-
-@dataclass(frozen=True)
-class PlainConstants(Stage):
-    """Constants of V_N alone with a reduced cone: an `InfSup` per parameter."""
-
-    label = "constants of V_N"
-    rooms = ("linalg", "interfaces", "reduction", "stability")
-
-    pod: PODStage
-    cone: ConeStage
-    constraints: ConstraintMatrices
-
-    def run(self, store: Store) -> Result:
-        """Compute the constants."""
-        basis, classes = value_of(store, self.pod).basis, value_of(store, self.constraints)
-        return Result(constants_on(basis, classes, value_of(store, self.cone).prepared))
-
-
-@dataclass(frozen=True)
-class OwnConstants(Stage):
-    """Constants of the pair of spaces of a reduced model: an `InfSup` per parameter."""
-
-    label = "constants of the model"
-    rooms = ("linalg", "interfaces", "reduction", "stability", "model")
-
-    enrichment: EnrichmentStage
-    constraints: ConstraintMatrices
+    @property
+    def sort(self) -> str:
+        """The constants of a larger space take longer."""
+        return f"{self.label} of {'V' if self.space is None else self.space.label}"
 
     def inputs(self) -> tuple[Stage, ...]:
-        """The reduced model and the constraint matrices."""
-        return (*self.enrichment.model_inputs, self.constraints)
+        """The space, the cone and the constraint matrices."""
+        spaces = self.space.model_inputs if isinstance(self.space, EnrichmentStage) else (self.space, self.cone)
+        return (*(stage for stage in spaces if stage is not None), self.constraints)
 
     def run(self, store: Store) -> Result:
         """Compute the constants."""
-        model, reduced = self.enrichment.reduction(store).projection, value_of(store, self.enrichment.cone)
-        cone: Multipliers = reduced.prepared
         classes: ConstraintClasses = value_of(store, self.constraints)
+        cone: Multipliers = value_of(store, self.cone).prepared
+        if self.space is None:
+            return Result(constants_full(build_problem(self.cone.problem).V, classes, cone))
+        if isinstance(self.space, PODStage):
+            return Result(constants_on(value_of(store, self.space).basis, classes, cone))
+        model = self.space.reduction(store).projection
         if model.kind is not Kind.PER_PARAMETER:
             return Result(constants_on(model.fixed_basis, classes, cone))
-        mus = self.constraints.parameters.of(model.problem)
+        mus, kept = self.constraints.parameters.of(model.problem), assemblies(model.problem)
         if model.enrichment.eta is None:
-            return Result([_constants_at(model, assemblies(model.problem).at(mu), cone) for mu in mus])
-        at_firsts = (assemblies(model.problem).at(mu) for mu in mus[classes.firsts])  # a class shares one space
+            return Result([_constants_at(model, kept.at(mu), cone) for mu in mus])
+        at_firsts = (kept.at(mu) for mu in mus[classes.firsts])  # a class shares one space
         return Result(everywhere(classes, [_constants_at(model, vi, cone) for vi in at_firsts]))
 
 

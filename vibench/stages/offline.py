@@ -28,7 +28,6 @@ class PODStage(Stage):
     """POD of the training displacements."""
 
     label = "POD"
-    rooms = ("linalg", "interfaces", "reduction")
 
     problem: Plugin
     stop: Stop
@@ -64,7 +63,6 @@ class ConeStage(Stage):
     """The dual strategy on the training multipliers."""
 
     label = "cone"
-    rooms = ("linalg", "interfaces", "qp", "reduction", "stability")
 
     problem: Plugin
     dual: Plugin
@@ -103,7 +101,6 @@ class ConstraintMatrices(Stage):
     """The constraint matrices at the parameters of a set, sorted into classes of proportional ones; not timed."""
 
     label = "constraint matrices"
-    rooms = ("linalg", "interfaces", "reduction")
 
     problem: Plugin
     parameters: ParameterSet
@@ -123,7 +120,6 @@ class TrainingConstants(Stage):
     """The upper bound of β_span over all enrichments of V_N, on the training set; not timed."""
 
     label = "training constants"
-    rooms = ("linalg", "interfaces", "reduction", "stability")
 
     cone: ConeStage
 

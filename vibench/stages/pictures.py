@@ -32,7 +32,6 @@ class PictureStage(Stage):
     """Pictures of a few training solutions of a problem."""
 
     label = "pictures"
-    rooms = ("interfaces",)
 
     problem: Plugin
     training: ParameterSet = OWN_TRAINING

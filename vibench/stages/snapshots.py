@@ -14,9 +14,8 @@ from vibench.arrays import Array
 from vibench.errors import NumericalError
 from vibench.highfidelity.active_set import HighFidelitySolution, HighFidelitySolver, check_stiffness
 from vibench.interfaces.problem import Problem, VariationalInequality
-from vibench.interfaces.validation import Fingerprint, checked_assembly
+from vibench.interfaces.validation import Fingerprint, checked_assembly, reference_assembly
 from vibench.model.growing import GrowingTrainer
-from vibench.offline.reduction import reference_assembly
 from vibench.qp.repeats import nearby
 from vibench.stages.base import Result, Stage, build_problem, faults_of, value_of
 from vibench.storage.artefacts import History, Store
@@ -74,7 +73,6 @@ class SnapshotStage(Stage):
     """High-fidelity solutions at one chunk of a parameter set."""
 
     label = "high-fidelity solutions"
-    rooms = ("linalg", "interfaces", "qp", "highfidelity")
     partial = True
 
     problem: Plugin
@@ -155,7 +153,6 @@ class AdaptiveTraining(Stage):
     """
 
     label = "adaptive training"
-    rooms = ("linalg", "interfaces", "qp", "highfidelity", "reduction", "stability", "model")
 
     problem: Plugin
     training: ParameterSet

@@ -8,8 +8,8 @@ from dataclasses import asdict, dataclass
 from functools import cached_property
 from typing import Any
 
+from vibench.dependencies import CELL, code_used
 from vibench.interfaces.strategies import Stop
-from vibench.provenance import NUMERICAL, core_code
 from vibench.study.kinds import SOLVER
 from vibench.study.parameter_sets import OWN_TRAINING, ParameterSet
 from vibench.study.plugin import Plugin
@@ -131,10 +131,9 @@ class Cell:
 
     @property
     def code(self) -> str:
-        """Hash of the code that computes the cell: the numerical rooms of the core, its plugins and its solver."""
-        return digest(
-            [core_code(*NUMERICAL), *(plugin.code for plugin in self.plugins), find(SOLVER, self.solver).code]
-        )
+        """Hash of the code that computes the cell: that of all stages, of its plugins and of its solver."""
+        codes = [*(plugin.code for plugin in self.plugins), find(SOLVER, self.solver).code]
+        return digest([code_used(*CELL, whole=True), *codes])
 
     def __str__(self) -> str:
         problem, dual, primal = self.labels

@@ -143,7 +143,7 @@ class RegisteredPlugin:
 
     @cached_property
     def code(self) -> str:
-        """Version with a hash of its outermost package, or of its module if it is in none, and of what it needs.
+        """Version with hashes of its outermost package, or its module in none, and of what it uses of vibench.
 
         Of a name that several packages use it is their versions: nothing is computed with it.
 
@@ -156,12 +156,14 @@ class RegisteredPlugin:
             return self.origin
         if self.kind is SOLVER and not self.entries:
             return solver_version(self.name)
+        from vibench.dependencies import code_used
+
         requirements = self._requirements
         module = Path(str(sys.modules[self._entry.module].__file__))
         while (module.parent / "__init__.py").is_file():
             module = module.parent
         needed = "".join(f" {required} {distribution_version(required)}" for required in requirements)
-        return f"{self.origin} {source_hash(module)}{needed}"
+        return f"{self.origin} {source_hash(module)} with {code_used(self.reference, whole=True)}{needed}"
 
     @property
     def _requirements(self) -> tuple[str, ...]:

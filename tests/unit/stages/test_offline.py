@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from statistics import median
@@ -20,9 +19,9 @@ from vibench.highfidelity.active_set import HighFidelitySolution, HighFidelitySo
 from vibench.interfaces.problem import Problem, VariationalInequality
 from vibench.interfaces.strategies import Kind, Stop
 from vibench.reduction.nested import Milestone
-from vibench.stages import base, snapshots
+from vibench.stages import snapshots
 from vibench.stages.assembly import AssemblyStage
-from vibench.stages.base import Stage, value_of
+from vibench.stages.base import value_of
 from vibench.stages.cell_queries import CellQueries
 from vibench.stages.cell_summary import summarise
 from vibench.stages.enrichment import NestedEnrichment, SingleEnrichment
@@ -73,38 +72,6 @@ def test_keys_say_what_determines_a_stage_and_nothing_else() -> None:
         *(c.key for c in solution_stages(PROBLEM, OWN_TRAINING)),
     }
     assert len(keys) == 2 + CHUNKS
-
-
-def stages_below(stage: Stage) -> Iterator[Stage]:
-    yield stage
-    for needed in stage.inputs():
-        yield from stages_below(needed)
-
-
-@pytest.mark.parametrize(
-    ("room", "changed", "kept"),
-    [
-        ("highfidelity", {"high-fidelity solutions", "POD", "cone", "enrichment", "queries"}, {"constraint matrices"}),
-        ("reduction", {"POD", "cone", "enrichment", "queries"}, {"high-fidelity solutions", "full assembly times"}),
-        ("stability", {"cone", "enrichment", "constants of V", "queries"}, {"high-fidelity solutions", "POD"}),
-        ("model", {"assembly", "queries"}, {"high-fidelity solutions", "POD", "cone", "enrichment"}),
-        ("report", set(), {"high-fidelity solutions", "POD", "cone", "enrichment", "assembly", "queries"}),
-    ],
-)
-def test_a_key_changes_with_the_rooms_that_compute_the_value_and_what_it_is_made_from(
-    monkeypatch: pytest.MonkeyPatch, room: str, changed: set[str], kept: set[str]
-) -> None:
-    def keys(edited: str) -> dict[str, set[str]]:
-        monkeypatch.setattr(base, "core_code", lambda *parts: f"{sorted(parts)} {edited in parts}")
-        found: dict[str, set[str]] = {}
-        for stage in stages_below(cell("offline-pga", 0.5)):
-            found.setdefault(stage.label, set()).add(stage.key)
-        return found
-
-    before, after = keys("nothing"), keys(room)
-    different = {label for label in before if before[label] != after[label]}
-    assert changed <= different
-    assert not kept & different
 
 
 def test_chunks_make_up_the_whole_sweep_in_order(store: SampleStore) -> None:

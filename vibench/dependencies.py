@@ -1,0 +1,227 @@
+"""The modules of vibench that determine what a function or a class computes, read from their sources.
+
+A definition depends on those that its names stand for, and on what these depend on. A method of a class among them
+counts if its name is an attribute of anything in what counts already, whatever the object: so too much may count, but
+never too little, unless a name is put together at run time.
+"""
+
+from __future__ import annotations
+
+import ast
+import hashlib
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from functools import cache
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TypeAlias
+
+CORE = Path(__file__).parent
+
+CELL = ("vibench.stages.cell_queries:cell_queries", "vibench.stages.timing_rounds:TimingRounds")
+"""Where the computation of a cell begins: with its last stage, whose inputs lead to all others, and with its timing."""
+
+CARRIERS = (
+    "vibench.study", "vibench.storage", "vibench.stages.base", "vibench.provenance", "vibench.errors", "vibench.text",
+)  # fmt: skip
+"""Packages and modules that determine no number: they hand over what does, and that counts by itself.
+
+What a study asks for is in the fields of stages, an artefact is read as it was written, a reason is no number.
+"""
+
+COUNTED = "vibench.study.parameter_sets"
+"""The module within `CARRIERS` that does determine numbers."""
+
+Place: TypeAlias = tuple[str, str]
+"""Module and name of a definition; the name "" stands for the module itself."""
+
+
+@dataclass(frozen=True)
+class _Definition:
+    """What occurs in a function, a class or an assignment: names, attributes and imports.
+
+    `members` are the methods of a class; its special methods are none, since Python calls them without their names.
+    """
+
+    names: set[str] = field(default_factory=set)
+    attributes: set[str] = field(default_factory=set)
+    imports: dict[str, Place] = field(default_factory=dict)
+    members: dict[str, _Definition] = field(default_factory=dict)
+
+
+@cache
+def modules_used(*roots: str, whole: bool = False) -> frozenset[str]:
+    """The modules of vibench that determine what is computed by "module:name" or "module:class.method".
+
+    Parameters
+    ----------
+    roots
+        Where the computation begins.
+    whole
+        Whether all methods of all classes that are reached count: others may call these, too.
+    """
+    found = _Reached(whole)
+    for root in roots:
+        module, _, path = root.partition(":")
+        name, _, method = path.partition(".")
+        for place in _origin(module, name, module):
+            found.add(place)
+            if method:
+                found.ahead.append((place[0], _definition(*place).members[method]))
+    found.follow()
+    return frozenset(module for module, _ in found.places if _outermost(module) == CORE.name)
+
+
+class _Reached:
+    """The definitions that count; `ahead` are those whose names have not been looked up."""
+
+    def __init__(self, whole: bool) -> None:
+        self._whole = whole
+        self.places: set[Place] = set()
+        self.ahead: list[tuple[str, _Definition]] = []
+        self._attributes: set[str] = set()
+        self._uncounted: dict[str, list[tuple[str, _Definition]]] = {}
+
+    def add(self, place: Place) -> None:
+        """Count a definition, and those of its members that are attributes of what counts."""
+        if place in self.places:
+            return
+        self.places.add(place)
+        module, definition = place[0], _definition(*place)
+        self.ahead.append((module, definition))
+        for name, member in definition.members.items():
+            counts = self._whole or name in self._attributes
+            (self.ahead if counts else self._uncounted.setdefault(name, [])).append((module, member))
+
+    def follow(self) -> None:
+        """Count what is needed by what counts, until nothing is left."""
+        while self.ahead:
+            module, definition = self.ahead.pop()
+            for place in _meant(module, definition):
+                self.add(place)
+            for name in definition.attributes - self._attributes:
+                self._attributes.add(name)
+                self.ahead += self._uncounted.pop(name, ())
+
+
+@cache
+def code_used(*roots: str, whole: bool = False) -> str:
+    """Hash of the sources of `modules_used`."""
+    content = hashlib.sha256()
+    for module in sorted(modules_used(*roots, whole=whole)):
+        content.update(f"{module} {hashlib.sha256(_source(module)).hexdigest()}\n".encode())
+    return content.hexdigest()[:12]
+
+
+def _meant(module: str, definition: _Definition) -> Iterator[Place]:
+    """The definitions that the names in one of a module stand for, in vibench and in the package of that module."""
+    here = _parsed(module)
+    for name in definition.names:
+        for imports in (definition.imports, here.imports):
+            if name in imports:
+                yield from _origin(*imports[name], module)
+        if name in here.members:
+            yield module, name
+
+
+def _origin(module: str, name: str, user: str) -> Iterator[Place]:
+    """Where a name is defined that is imported from a module, which may import it itself."""
+    carrier = module != COUNTED and any(f"{module}.".startswith(f"{one}.") for one in CARRIERS)
+    if carrier or _outermost(module) not in (CORE.name, _outermost(user)):
+        return
+    imported = _parsed(module).imports.get(name)
+    if not name or name in _parsed(module).members:
+        yield module, name
+    elif imported is not None and imported != (module, name):
+        yield from _origin(*imported, user)
+    elif _file(f"{module}.{name}") is not None:
+        yield from _origin(f"{module}.{name}", "", user)
+
+
+def _definition(module: str, name: str) -> _Definition:
+    return _parsed(module).members[name] if name else _Definition(members=_parsed(module).members)
+
+
+def _outermost(module: str) -> str:
+    return module.partition(".")[0]
+
+
+@cache
+def _file(module: str) -> Path | None:
+    """The source of a module; for a package with a stub, from which names are imported lazily, the stub."""
+    if _outermost(module) != CORE.name:
+        try:
+            found = find_spec(module)
+        except ModuleNotFoundError:  # its parent is no package
+            return None
+        return Path(found.origin) if found is not None and found.origin and found.has_location else None
+    path = CORE.joinpath(*module.split(".")[1:])
+    sources = (path / "__init__.pyi", path / "__init__.py", path.with_suffix(".py"))
+    return next((source for source in sources if source.is_file()), None)
+
+
+@cache
+def _source(module: str) -> bytes:
+    path = _file(module)
+    return path.read_bytes() if path is not None and path.suffix in (".py", ".pyi") else b""
+
+
+@cache
+def _parsed(module: str) -> _Definition:
+    """What a module imports and, as members, what it defines.
+
+    A statement that defines nothing is left out: none changes what a name stands for, it only registers that.
+    """
+    found, path = _Definition(), _file(module)
+    package = module if path is not None and path.stem == "__init__" else module.rpartition(".")[0]
+    ahead: list[ast.AST] = [ast.parse(_source(module))]
+    while ahead:
+        node = ahead.pop()
+        match node:
+            case ast.Import() | ast.ImportFrom():
+                found.imports.update(_imported(node, package))
+            case ast.FunctionDef() | ast.AsyncFunctionDef() | ast.ClassDef():
+                found.members[node.name] = _read(node, package)
+            case ast.Assign() | ast.AnnAssign():
+                stored = (part for part in ast.walk(node) if isinstance(part, ast.Name) and not _is_read(part))
+                found.members.update(dict.fromkeys((part.id for part in stored), _read(node, package)))
+            case ast.Module() | ast.If() | ast.Try() | ast.ExceptHandler() | ast.With():
+                ahead += ast.iter_child_nodes(node)
+    return found
+
+
+def _is_read(name: ast.Name) -> bool:
+    return isinstance(name.ctx, ast.Load)
+
+
+def _imported(node: ast.Import | ast.ImportFrom, package: str) -> Mapping[str, Place]:
+    """What the names stand for that a statement in a package imports."""
+    if isinstance(node, ast.Import):
+        return {one.asname or _outermost(one.name): (one.name if one.asname else _outermost(one.name), "")
+                for one in node.names}  # fmt: skip
+    parents = package.split(".")
+    above = parents[: len(parents) - node.level + 1] if node.level else []
+    module = ".".join([*above, *([node.module] if node.module else [])])
+    return {one.asname or one.name: (module, one.name) for one in node.names}
+
+
+def _read(statement: ast.stmt, package: str) -> _Definition:
+    """What occurs in a statement of a package."""
+    found = _Definition()
+    ahead: list[ast.AST] = [statement]
+    while ahead:
+        node = ahead.pop()
+        match node:
+            case ast.Name():
+                found.names.add(node.id)
+            case ast.Attribute():
+                found.attributes.add(node.attr)
+            case ast.Import() | ast.ImportFrom():
+                found.imports.update(_imported(node, package))
+        for child in ast.iter_child_nodes(node):
+            in_class = node is statement and isinstance(statement, ast.ClassDef)
+            if in_class and isinstance(child, ast.FunctionDef) and not child.name.startswith("__"):
+                found.members[child.name] = _read(child, package)
+            else:
+                ahead.append(child)
+    return found
