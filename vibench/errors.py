@@ -34,15 +34,15 @@ class UnsupportedError(VibenchError):
 
 def in_a_line(error: BaseException) -> str:
     """The sort of an exception and its message, in one line of bounded length."""
-    return one_line(f"{type(error).__name__}: {_message(error)}")
+    return one_line(f"{type(error).__name__}: {_text_of(error)}")
 
 
 def message_of(error: BaseException) -> str:
     """The message of an exception, in one line of bounded length."""
-    return one_line(_message(error))
+    return one_line(_text_of(error))
 
 
-def _message(error: BaseException) -> str:
+def _text_of(error: BaseException) -> str:
     try:
         return str(error)
     except Exception:  # noqa: BLE001  `__str__` of a plugin's exception may raise anything

@@ -18,7 +18,7 @@ from vibench.interfaces.problem import MEMBERS
 from vibench.interfaces.strategies import Stop
 from vibench.model.errors import errors
 from vibench.model.galerkin import ReducedProblem, project
-from vibench.model.hyperreduced import HyperReducedModel, Operators, hyper_reduce
+from vibench.model.hyperreduced import HyperReducedModel, ReducedOperators, hyper_reduce
 from vibench.offline.assemblies import assemblies
 from vibench.offline.models import AnyReducedModel
 from vibench.qp.solve import solve_qp
@@ -38,7 +38,7 @@ def time_projection_of_members(inputs: StageInputs, primal: PrimalChoice) -> Tim
     _check_reduced(inputs, primal)
     reduction, members = inputs.reduction(inputs.usual, primal), inputs.members
 
-    def judge(operators: Operators) -> Info:
+    def judge(operators: ReducedOperators) -> Info:
         return _judge_programs(inputs, HyperReducedModel(reduction.given().projection, operators))
 
     return Timing(

@@ -116,10 +116,10 @@ class SaddlePointSolver:
         stiffness = np.abs(A.diagonal())
         # Jacobi scaling: displacements and forces of steel in metres differ by 1e11, and `ROUND_OFF` compares them
         self._displacement = 1.0 / np.sqrt(np.where(stiffness > 0.0, stiffness, 1.0))
-        B = _scaled(np.ones(len(g)), sp.csr_array(B), self._displacement)
+        B = _in_units(np.ones(len(g)), sp.csr_array(B), self._displacement)
         self._force = 1.0 / row_norms(B)
-        self._A, self._f = _scaled(self._displacement, sp.csr_array(A), self._displacement), self._displacement * f
-        self._B, self._g = _scaled(self._force, B, np.ones(len(f))), self._force * g
+        self._A, self._f = _in_units(self._displacement, sp.csr_array(A), self._displacement), self._displacement * f
+        self._B, self._g = _in_units(self._force, B, np.ones(len(f))), self._force * g
         self._factorised_set = np.zeros(0, dtype=np.intp)
         self._factorisation: _BorderedFactorisation | None = None
 
@@ -162,7 +162,7 @@ class SaddlePointSolver:
         return self._displacement * found[0][:n], self._force * lam
 
 
-def _scaled(rows: Array, matrix: SparseMatrix, columns: Array) -> SparseMatrix:
+def _in_units(rows: Array, matrix: SparseMatrix, columns: Array) -> SparseMatrix:
     """A matrix (CSR) with its rows and columns multiplied by factors."""
     data = np.repeat(rows, np.diff(matrix.indptr)) * matrix.data * columns[matrix.indices]
     return sp.csr_array((data, matrix.indices, matrix.indptr), shape=matrix.shape)

@@ -86,17 +86,17 @@ def training_parameters(problem: Problem, sampling: Sampling | None = None) -> A
     """The training set (P×d), by default the problem's; refused if it is empty, of the wrong shape or not finite."""
     if sampling is not None:
         return check_sample(problem.parameters, sampling.parameters(problem.parameters))
-    return _checked(problem, "training_set", np.asarray(problem.training_set(), float), None)
+    return _finite_parameters(problem, "training_set", np.asarray(problem.training_set(), float), None)
 
 
 def validation_parameters(problem: Problem, count: int, seed: int, sampling: Sampling | None = None) -> Array:
     """The validation set (count×d), by default the problem's, with the same checks."""
     if sampling is not None:
         return check_sample(problem.parameters, sampling.parameters(problem.parameters))
-    return _checked(problem, "validation_set", np.asarray(problem.validation_set(count, seed), float), count)
+    return _finite_parameters(problem, "validation_set", np.asarray(problem.validation_set(count, seed), float), count)
 
 
-def _checked(problem: Problem, name: str, mus: Array, count: int | None) -> Array:
+def _finite_parameters(problem: Problem, name: str, mus: Array, count: int | None) -> Array:
     expected = f"({'P' if count is None else count}, {problem.parameters.dim}){' with P > 0' if count is None else ''}"
     if mus.ndim != 2 or mus.shape[1] != problem.parameters.dim or not len(mus) or count not in (None, len(mus)):
         raise NumericalError(f"{name} has shape {mus.shape}, expected {expected}")
@@ -159,12 +159,12 @@ def fingerprint(problem: Problem, vi: VariationalInequality) -> Fingerprint:
 
 
 def _of(arrays: Mapping[str, Any]) -> Fingerprint:
-    products = {name: _product(array) for name, array in arrays.items()}
+    products = {name: _probed(array) for name, array in arrays.items()}
     sizes = ((name, array.data if sp.issparse(array) else array) for name, array in arrays.items())
     return Fingerprint(products, {name: float(np.max(np.abs(size), initial=0.0)) for name, size in sizes})
 
 
-def _product(array: Any) -> Array:
+def _probed(array: Any) -> Array:
     """A copy of a vector; of a matrix its product with entries in [1, 2) that are the same in every process."""
     if array.ndim == 1:
         return np.array(array)

@@ -89,7 +89,7 @@ def affine_decomposition(problem: Problem, training: Array, tolerance: float) ->
         elif name in problem.affine:
             found[name] = AffineMember(Evaluation.AFFINE, problem.affine[name].terms)
         else:
-            found[name] = _member(name, assembled[name], problem, tolerance)
+            found[name] = _decomposed(name, assembled[name], problem, tolerance)
     return found
 
 
@@ -147,7 +147,7 @@ def _assembled(problem: Problem, training: Array, names: Sequence[str]) -> Mappi
     return found
 
 
-def _member(name: str, values: list[Any], problem: Problem, tolerance: float) -> AffineMember:
+def _decomposed(name: str, values: list[Any], problem: Problem, tolerance: float) -> AffineMember:
     entries = _Entries(values, symmetric=name == "A")
     if entries.constant:
         return AffineMember(Evaluation.CONSTANT, (values[0],))

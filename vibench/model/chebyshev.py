@@ -119,7 +119,7 @@ def interpolate_on_box(
     for _ in range(TRIALS):
         counts = _within(counts, budget)
         grid = along.coefficients(counts)
-        found = {name: _compressed(c, units[name], 0.1 * tolerance, terms.get(name)) for name, c in grid.items()}
+        found = {name: _truncated(c, units[name], 0.1 * tolerance, terms.get(name)) for name, c in grid.items()}
         for name, p in found.items():
             error = float(np.linalg.norm(p.at(unit) - values[name], axis=-1).max()) / scale[name]
             found[name] = replace(p, error=error, scale=scale[name])
@@ -186,7 +186,7 @@ def _within(counts: Sequence[int], budget: int) -> list[int]:
     return kept
 
 
-def _compressed(coefficients: Array, unit: Any, tolerance: float, terms: Array | None) -> AffinePolynomial:
+def _truncated(coefficients: Array, unit: Any, tolerance: float, terms: Array | None) -> AffinePolynomial:
     """A polynomial from its coefficients (n₁×…×n_d×size), without those that sum up to less than a tolerance.
 
     The coefficients are in a unit, a number or an array (size,). With given terms they are those of θ.
@@ -198,16 +198,16 @@ def _compressed(coefficients: Array, unit: Any, tolerance: float, terms: Array |
     kept = np.sort(rising[np.cumsum(norms[rising]) > tolerance]) if norms.sum() > tolerance else np.zeros(1, np.intp)
     indices = np.stack(np.unravel_index(kept, shape[:-1]), axis=1)
     if terms is not None:
-        return AffinePolynomial(indices, _sparse(flat[kept], tolerance) * unit, terms, np.inf)
+        return AffinePolynomial(indices, _without_smallest(flat[kept], tolerance) * unit, terms, np.inf)
     left, sigma, right = svd(flat[kept])
     # a value is a sum over all rows, with factors of at most 1
     lost = np.sqrt(len(kept) * np.append(np.cumsum(sigma[::-1] ** 2)[::-1], 0.0))
     count = max(1, int(np.argmax(lost <= tolerance)))
-    theta = _sparse(left[:, :count] * sigma[:count], tolerance)
+    theta = _without_smallest(left[:, :count] * sigma[:count], tolerance)
     return AffinePolynomial(indices, theta, right[:count] * unit, np.inf)
 
 
-def _sparse(coefficients: Array, tolerance: float) -> Array:
+def _without_smallest(coefficients: Array, tolerance: float) -> Array:
     """Coefficients without the smallest ones, which sum up to at most a tolerance.
 
     Products of Chebyshev polynomials are at most 1 on the box, and terms have norm 1: no value changes by more.

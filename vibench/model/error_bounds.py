@@ -132,7 +132,7 @@ def bound_errors_at(
         return ErrorBounds.none(NO_CORRECTION)
     w = corrected.w
     of_u = terms(w, vi, energy, u, lam)
-    of_lam = min((of_u, *_projected(of_u.residual, w, vi, energy, u, lam)), key=lambda terms: terms.rho)
+    of_lam = min((of_u, *_with_constrained_residual(of_u.residual, w, vi, energy, u, lam)), key=lambda terms: terms.rho)
     in_V = of_u.primal / float(np.sqrt(alpha.value))
     in_W = of_lam.dual / beta.value if beta.value > 0.0 else float("inf")
     terms_of_both = of_u.rho, of_lam.rho, of_u.omega, of_u.kappa
@@ -169,7 +169,7 @@ def terms(w: Array, vi: VariationalInequality, energy: Energy, u: Array, lam: Ar
     return Terms(residual, energy.dual_norm(residual), energy.norm(w), kappa, of_feasible)
 
 
-def _projected(
+def _with_constrained_residual(
     residual: Array, w: Array, vi: VariationalInequality, energy: Energy, u: Array, lam: Array
 ) -> Iterator[Terms]:
     """The terms for u + d, whose residual is the part of r in the range of Bᵀ, if w is feasible for it and d exists."""

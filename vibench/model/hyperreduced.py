@@ -74,7 +74,7 @@ class ProjectedMember:
 
 
 @dataclass(frozen=True)
-class Operators:
+class ReducedOperators:
     """Offline data of a hyper-reduced model: a space Φ of dimension d and the members projected on it.
 
     Attributes
@@ -120,7 +120,7 @@ def reason_for_full_assembly(model: ReducedModel, members: Mapping[str, AffineMe
     return "; ".join(members[name].reason for name in MEMBERS if members[name].way is Evaluation.FULL)
 
 
-def hyper_reduce(model: ReducedModel, members: Mapping[str, AffineMember]) -> Operators:
+def hyper_reduce(model: ReducedModel, members: Mapping[str, AffineMember]) -> ReducedOperators:
     """Project the affine members of a problem on the space of its reduced model; see `reason_for_full_assembly`."""
     problem, chi, eta = model.problem, model.generators, model.enrichment.eta
     # where B has one term, all supremizer spaces coincide and the enrichment is a fixed one
@@ -138,7 +138,7 @@ def hyper_reduce(model: ReducedModel, members: Mapping[str, AffineMember]) -> Op
     count, rank = model.generators.shape[1], model.span.shape[1]
     sampled, affine = evaluated_members(members)
     dual_is_regular = A.constant and coordinates is None and A.shape[0] >= count == rank > 0
-    return Operators(
+    return ReducedOperators(
         sampled_entries=sampled,
         affine=affine,
         A=A,
@@ -183,7 +183,7 @@ class HyperReducedModel:
         How the enrichment depends on the parameter, in the coordinates of the queries.
     """
 
-    def __init__(self, model: ReducedModel, operators: Operators) -> None:
+    def __init__(self, model: ReducedModel, operators: ReducedOperators) -> None:
         self.model, self._operators = model, operators
         self.problem, self.generators, self.fixed_basis = model.problem, model.generators, model.fixed_basis
         self.kind = Kind.FIXED if operators.supremizer_coordinates is None else Kind.PER_PARAMETER

@@ -36,7 +36,7 @@ from vibench.model.certificates.bounds import OnlineCertificate
 from vibench.model.certificates.preparation import prepare
 from vibench.model.galerkin import ReducedModel
 from vibench.model.growing import GrowingTrainer
-from vibench.model.hyperreduced import HyperReducedModel, Operators, hyper_reduce, reason_for_full_assembly
+from vibench.model.hyperreduced import HyperReducedModel, ReducedOperators, hyper_reduce, reason_for_full_assembly
 from vibench.offline.models import AnyReducedModel, Model
 from vibench.reduction.pod import POD, pod
 from vibench.stability.infsup import Multipliers, multipliers
@@ -198,7 +198,7 @@ class Reduction:
         return training_parameters(self.problem) if isinstance(self.training, AdaptiveSampling) else self.parameters
 
     @cached_property
-    def operators(self) -> Operators | str:
+    def operators(self) -> ReducedOperators | str:
         """The members projected on the reduced spaces, or why queries are assembled in full."""
         why = reason_for_full_assembly(self.projection, self.members)
         return why or hyper_reduce(self.projection, self.members)

@@ -25,11 +25,11 @@ Text: TypeAlias = Annotated[str, MinLen(1)]
 Points: TypeAlias = Annotated[list[Annotated[list[Finite], MinLen(1)]], MinLen(1)]
 
 
-class _Model(BaseModel):
+class _Table(BaseModel):
     model_config = ConfigDict(extra="forbid", strict=True, frozen=True)
 
 
-class ParameterSet(_Model):
+class PointSet(_Table):
     """Parameters: an array (P×d), a list of points, or the counts of a regular grid in the box; exactly one."""
 
     array: Annotated[str | None, Field(description="An array (P×d).")] = None
@@ -46,25 +46,23 @@ class ParameterSet(_Model):
         return {"array": value} if isinstance(value, str) else value
 
     @model_validator(mode="after")
-    def _one(self) -> ParameterSet:
+    def _one(self) -> PointSet:
         _exactly_one(self, "array", "points", "grid")
         return self
 
 
-class Parameters(_Model):
+class Parameters(_Table):
     """The parameter domain, and the training and validation sets."""
 
     names: Annotated[list[Text], MinLen(1), Field(description="One name per parameter, an identifier.")]
     units: Annotated[list[Text] | None, Field(description='Units; "1", the default, for numbers.')] = None
     lower: Annotated[list[Finite] | None, Field(description="Lower bounds; by default those of the sets.")] = None
     upper: Annotated[list[Finite] | None, Field(description="Upper bounds.")] = None
-    training: Annotated[ParameterSet, Field(description="Training set.")]
-    validation: Annotated[ParameterSet | None, Field(description="Validation set; by default random in the box.")] = (
-        None
-    )
+    training: Annotated[PointSet, Field(description="Training set.")]
+    validation: Annotated[PointSet | None, Field(description="Validation set; by default random in the box.")] = None
 
 
-class Term(_Model):
+class Term(_Table):
     """One term θ_q(µ)·term_q of an affine sum; θ_q is an expression, or tabulated at the listed parameters."""
 
     theta: Annotated[str | Finite | None, Field(description="Expression in the names of the parameters.")] = None
@@ -77,7 +75,7 @@ class Term(_Model):
         return self
 
 
-class Member(_Model):
+class Member(_Table):
     """One of A, f, B, g: an array, an affine sum, or one array per listed parameter; exactly one."""
 
     constant: Annotated[str | None, Field(description="An array that does not depend on the parameter.")] = None
@@ -97,7 +95,7 @@ class Member(_Model):
         return self
 
 
-class Spaces(_Model):
+class Spaces(_Table):
     """The inner products, and what belongs to the unknowns and the multipliers."""
 
     X_V: Annotated[str | None, Field(description="Gram matrix of the primal space (n×n).")] = None
@@ -111,7 +109,7 @@ class Spaces(_Model):
     ] = None
 
 
-class Operators(_Model):
+class Operators(_Table):
     """The members of the variational inequality."""
 
     A: Annotated[Member, Field(description="Stiffness (n×n), symmetric positive definite.")]
@@ -124,18 +122,18 @@ class Operators(_Model):
     ] = None
 
 
-class Solutions(_Model):
+class Solutions(_Table):
     """Reference solutions, one column per parameter."""
 
     u: Annotated[str | None, Field(description="Solutions (n×P).")] = None
     lam: Annotated[str, Field(description="Multipliers (m×P).")]
     parameters: Annotated[
-        ParameterSet | None, Field(description="Their parameters; by default the listed ones, or the training set.")
+        PointSet | None, Field(description="Their parameters; by default the listed ones, or the training set.")
     ] = None
     tolerance: Annotated[float, Gt(0.0), AllowInfNan(False), Field(description="Largest relative KKT residual.")] = 1e-6
 
 
-class Mesh(_Model):
+class Mesh(_Table):
     """A mesh for pictures."""
 
     file: Annotated[str, Field(description="A file that meshio reads, such as .vtu or .msh.")]
@@ -148,7 +146,7 @@ class Mesh(_Model):
     multiplier: Annotated[str, Field(description="Name of the multiplier, with its unit.")] = "λ"
 
 
-class LinearOutput(_Model):
+class LinearOutput(_Table):
     """A quantity of interest that is linear in u and λ; coefficients of at least one of them."""
 
     name: Annotated[Text, Field(description="What it is.")]
@@ -163,7 +161,7 @@ class LinearOutput(_Model):
         return self
 
 
-class Manifest(_Model):
+class Manifest(_Table):
     """`pack.toml`."""
 
     format: Annotated[int, Field(description="Version of the format: 1.")]
@@ -229,7 +227,7 @@ def read_manifest(folder: Path) -> Manifest:
         if len(set(names)) < len(names):
             raise RequestError(f"outputs: two of them have the same name: {', '.join(names)}")
     except ValidationError as error:
-        raise RequestError(f"{FILE}: {_line(error.errors(include_url=False)[0])}") from None
+        raise RequestError(f"{FILE}: {_fault_line(error.errors(include_url=False)[0])}") from None
     except RequestError as error:
         raise RequestError(f"{FILE}: {error}") from None
     return manifest
@@ -261,7 +259,7 @@ def _exactly_one(table: BaseModel, *keys: str) -> None:
         raise ValueError(f"give exactly one of {', '.join(keys)} (found {found})")
 
 
-def _line(error: Any) -> str:
+def _fault_line(error: Any) -> str:
     """The key that is wrong, what is wrong, and what was found."""
     where = [part for part in error["loc"] if isinstance(part, int) or part.isidentifier()]
     message, found = error["msg"].removeprefix("Value error, "), ""

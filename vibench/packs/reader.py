@@ -40,7 +40,7 @@ def read_pack(path: str | Path) -> ModelPack:
         Naming what is wrong in the manifest or with an array, and what would be right.
     """
     with naming(path) as folder:
-        return _Reader(folder, read_manifest(folder)).pack()
+        return _PackReader(folder, read_manifest(folder)).pack()
 
 
 def pack_digest(path: str | Path) -> str:
@@ -97,7 +97,7 @@ def naming(path: str | Path) -> Iterator[Path]:
         raise RequestError(f"pack '{path}': {error}") from None
 
 
-class _Reader:
+class _PackReader:
     """Reads the arrays of a manifest; every array is checked against the dimensions known so far."""
 
     def __init__(self, folder: Path, manifest: Manifest) -> None:
@@ -147,7 +147,7 @@ class _Reader:
         self._listing, self._training = Listing(self._listed, box.widths), len(training)
         return training, validation, box
 
-    def _parameters(self, given: schema.ParameterSet, what: str) -> Array:
+    def _parameters(self, given: schema.PointSet, what: str) -> Array:
         box, d = self._box, len(self._names)
         if given.grid is not None and box is not None:
             if len(given.grid) != d:

@@ -54,11 +54,11 @@ def write_pack(
     training = training_parameters(problem)
     listed = np.vstack([training, validation_parameters(problem, validation, seed)])
     with _new_folder(folder) as part:
-        lines = [f"format = {VERSION}", f"name = {_text(name)}", f"source = {_text(source)}", ""]
-        lines += _parameters(problem, len(training), listed, part) + _spaces(problem, part)
-        lines += _operators(problem, listed, part)
-        lines += _solutions(problem, listed, part) if solutions else []
-        lines += _outputs(problem, part)
+        lines = [f"format = {VERSION}", f"name = {_toml_text(name)}", f"source = {_toml_text(source)}", ""]
+        lines += _parameter_table(problem, len(training), listed, part) + _space_table(problem, part)
+        lines += _operator_table(problem, listed, part)
+        lines += _solution_table(problem, listed, part) if solutions else []
+        lines += _output_tables(problem, part)
         (part / FILE).write_text(EXPLANATION + "\n".join(lines) + "\n", encoding="utf-8")
 
 
@@ -76,13 +76,13 @@ def _new_folder(folder: Path) -> Iterator[Path]:
         part.rename(folder)
 
 
-def _parameters(problem: Problem, training: int, listed: Array, part: Path) -> list[str]:
+def _parameter_table(problem: Problem, training: int, listed: Array, part: Path) -> list[str]:
     box = problem.parameters
-    _save(part / "parameters.npz", {"training": listed[:training], "validation": listed[training:]})
+    _save_arrays(part / "parameters.npz", {"training": listed[:training], "validation": listed[training:]})
     return [
         "[parameters]",
-        f"names = [{', '.join(map(_text, box.names))}]",
-        f"units = [{', '.join(map(_text, box.units))}]",
+        f"names = [{', '.join(map(_toml_text, box.names))}]",
+        f"units = [{', '.join(map(_toml_text, box.units))}]",
         f"lower = {box.lower.tolist()}",
         f"upper = {box.upper.tolist()}",
         'training = "parameters.npz:training"',
@@ -91,8 +91,8 @@ def _parameters(problem: Problem, training: int, listed: Array, part: Path) -> l
     ]
 
 
-def _spaces(problem: Problem, part: Path) -> list[str]:
-    arrays = _sparse("X_V", problem.V.matrix) | _sparse("X_W", problem.W.matrix)
+def _space_table(problem: Problem, part: Path) -> list[str]:
+    arrays = _sparse_parts("X_V", problem.V.matrix) | _sparse_parts("X_W", problem.W.matrix)
     lines = ["[spaces]", 'X_V = "spaces.npz:X_V"', 'X_W = "spaces.npz:X_W"']
     if problem.contact_dofs is not None:
         arrays["contact"] = problem.contact_dofs
@@ -100,11 +100,11 @@ def _spaces(problem: Problem, part: Path) -> list[str]:
     if type(problem).multiplier_integrals is not Problem.multiplier_integrals:
         arrays["integrals"] = problem.multiplier_integrals()
         lines.append('integrals = "spaces.npz:integrals"')
-    _save(part / "spaces.npz", arrays)
+    _save_arrays(part / "spaces.npz", arrays)
     return [*lines, ""]
 
 
-def _operators(problem: Problem, listed: Array, part: Path) -> list[str]:
+def _operator_table(problem: Problem, listed: Array, part: Path) -> list[str]:
     """The table of the members, whose arrays are written."""
     found: dict[str, dict[str, Any]] = {name: {} for name in MEMBERS}
     varies = not set(MEMBERS) <= {*problem.constant, *problem.affine}
@@ -112,16 +112,16 @@ def _operators(problem: Problem, listed: Array, part: Path) -> list[str]:
         vi = checked_assembly(problem, mu)
         for name in MEMBERS:
             if name not in problem.affine and (k == 0 or name not in problem.constant):
-                found[name] |= _stored(str(k), getattr(vi, name))
+                found[name] |= _array_or_parts(str(k), getattr(vi, name))
     entrywise = sorted((problem.entrywise | set(problem.affine)) - problem.constant)
-    lines = ["[operators]", f"entrywise = [{', '.join(map(_text, entrywise))}]"]
+    lines = ["[operators]", f"entrywise = [{', '.join(map(_toml_text, entrywise))}]"]
     for name in MEMBERS:
         if name in problem.affine:
             found[name], line = _affine(name, problem.affine[name], listed)
         else:
             constant = name in problem.constant
             line = f'{name} = "{name}.npz:0"' if constant else f'{name}.each = "{name}.npz:{{}}"'
-        _save(part / f"{name}.npz", found[name])
+        _save_arrays(part / f"{name}.npz", found[name])
         lines.append(line)
     return [*lines, ""]
 
@@ -131,40 +131,40 @@ def _affine(name: str, declared: AffineSum, listed: Array) -> tuple[dict[str, An
     theta = np.column_stack([declared.coefficients(mu) for mu in listed])
     arrays: dict[str, Any] = {f"theta{q}": values for q, values in enumerate(theta)}
     for q, term in enumerate(declared.terms):
-        arrays |= _stored(f"term{q}", term)
+        arrays |= _array_or_parts(f"term{q}", term)
     entries = (f'{{ table = "{name}.npz:theta{q}", array = "{name}.npz:term{q}" }}' for q in range(len(theta)))
     return arrays, f"{name}.affine = [{', '.join(entries)}]"
 
 
-def _solutions(problem: Problem, listed: Array, part: Path) -> list[str]:
+def _solution_table(problem: Problem, listed: Array, part: Path) -> list[str]:
     solver = HighFidelitySolver(problem)
     found = [solver.solve(mu) for mu in listed]
     u, lam = (np.column_stack([getattr(one, name) for one in found]) for name in ("u", "lam"))
-    _save(part / "solutions.npz", {"u": u, "lam": lam})
+    _save_arrays(part / "solutions.npz", {"u": u, "lam": lam})
     return ["[solutions]", 'u = "solutions.npz:u"', 'lam = "solutions.npz:lam"', ""]
 
 
-def _outputs(problem: Problem, part: Path) -> list[str]:
+def _output_tables(problem: Problem, part: Path) -> list[str]:
     """The tables of the linear outputs; a function has no place in a pack."""
     lines: list[str] = []
     arrays: dict[str, Array] = {}
     for k, output in enumerate(output for output in problem.outputs if output.linear):
-        lines += ["[[outputs]]", f"name = {_text(output.name)}", f"unit = {_text(output.unit)}"]
+        lines += ["[[outputs]]", f"name = {_toml_text(output.name)}", f"unit = {_toml_text(output.unit)}"]
         for key, values in (("u", output.u), ("lam", output.lam)):
             if values is not None:
                 arrays[f"{key}{k}"] = values
                 lines.append(f'{key} = "outputs.npz:{key}{k}"')
         lines.append("")
     if arrays:
-        _save(part / "outputs.npz", arrays)
+        _save_arrays(part / "outputs.npz", arrays)
     return lines
 
 
-def _stored(name: str, value: Any) -> dict[str, Any]:
-    return {name: value} if isinstance(value, np.ndarray) else _sparse(name, value)
+def _array_or_parts(name: str, value: Any) -> dict[str, Any]:
+    return {name: value} if isinstance(value, np.ndarray) else _sparse_parts(name, value)
 
 
-def _sparse(name: str, matrix: Any) -> dict[str, Any]:
+def _sparse_parts(name: str, matrix: Any) -> dict[str, Any]:
     """The arrays of a sparse matrix, its entries in their order."""
     kept = matrix if matrix.format in ("csr", "csc") else sp.csr_array(matrix)
     return {
@@ -173,10 +173,10 @@ def _sparse(name: str, matrix: Any) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _save(path: Path, arrays: Mapping[str, Any]) -> None:
+def _save_arrays(path: Path, arrays: Mapping[str, Any]) -> None:
     np.savez_compressed(path, allow_pickle=False, **arrays)
 
 
-def _text(value: str) -> str:
+def _toml_text(value: str) -> str:
     """A text as a TOML string, which is one of JSON but for the character DEL."""
     return json.dumps(value).replace("\x7f", "\\u007f")

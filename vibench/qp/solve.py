@@ -89,14 +89,14 @@ def _solve_in(
         if start is not None and starter is not None and start.x is not None and start.alpha is not None:
             warm_start |= starter(*units.to(start.x, start.alpha))
         answer = _call_qpsolvers(scaled, solver, accuracy, warm_start)
-    answer = _checked(answer, program)
+    answer = _sound_answer(answer, program)
     if answer.x is None or answer.alpha is None:
         return replace(answer, x=None, alpha=None)
     x, alpha = units.back(answer.x, answer.alpha)
     return replace(answer, x=x, alpha=np.maximum(alpha, 0.0), negative=-float(np.min(alpha, initial=0.0)))
 
 
-def _checked(answer: QPSolution, program: VariationalInequality) -> QPSolution:
+def _sound_answer(answer: QPSolution, program: VariationalInequality) -> QPSolution:
     """An answer with vectors of the right shapes, a status of one line, and iterations if they are a number of them."""
     for name, value, count in (("x", answer.x, len(program.f)), ("α", answer.alpha, len(program.g))):
         if value is not None and value.shape != (count,):

@@ -128,13 +128,13 @@ def inf_sup(on_span: Array, on_generators: Array, cone: Multipliers) -> InfSup:
     span = beta_span(on_span)
     if np.any(cone.free) and np.all(cone.free):  # the cone is its span
         return InfSup(span, span, span, f"{UNSIGNED}/{UNSIGNED}")
-    lower, upper, sharp = cone_interval(_compressed(on_generators), cone.gram, span)
+    lower, upper, sharp = cone_interval(_with_few_rows(on_generators), cone.gram, span)
     if np.any(cone.free):  # α ≥ 0 is a subset of the cone: only upper bounds carry over
         return InfSup(span, min(span, upper), upper, f"{UNSIGNED}/{sharp.split('/')[1]}")
     return InfSup(span, lower, upper, sharp)
 
 
-def _compressed(projected: Array) -> Array:
+def _with_few_rows(projected: Array) -> Array:
     """An isometric image of the columns (k×R) with no more rows than columns."""
     return projected if projected.shape[0] <= projected.shape[1] else np.asarray(np.linalg.qr(projected, mode="r"))
 
@@ -146,7 +146,7 @@ def beta_span(on_span: Array) -> float:
         return float("inf")
     if rows < rank:
         return 0.0
-    return float(singular_values(_compressed(on_span))[-1])
+    return float(singular_values(_with_few_rows(on_span))[-1])
 
 
 def share(beta: float, reachable: float) -> float:

@@ -13,7 +13,7 @@ from vibench.linalg.cholesky import SparseCholesky
 from vibench.linalg.inner_product import InnerProduct
 from vibench.model.affine import AffineMember, Evaluation, affine_decomposition
 from vibench.model.galerkin import ReducedModel, leading_part, project
-from vibench.model.hyperreduced import HyperReducedModel, Operators, ProjectedMember
+from vibench.model.hyperreduced import HyperReducedModel, ProjectedMember, ReducedOperators
 from vibench.offline.assemblies import assemblies
 from vibench.offline.models import AnyReducedModel
 from vibench.offline.reduction import Reduction
@@ -29,7 +29,7 @@ from vibench.study.plugin import Plugin
 from vibench.timing import timed
 
 for _kind in (
-    AffineMember, Evaluation, Operators, ProjectedMember, ContactCoordinates, SpannedCoordinates, InnerProduct,
+    AffineMember, Evaluation, ReducedOperators, ProjectedMember, ContactCoordinates, SpannedCoordinates, InnerProduct,
     SparseCholesky, VariationalInequality, ExactSolution,
 ):  # fmt: skip
     storable(_kind)
@@ -76,7 +76,7 @@ class HyperReduction(Stage):
         return (*self.enrichment.model_inputs, self.decomposition)
 
     def run(self, store: Store) -> Result:
-        """The `Operators` of a reduced model, or why there are none and queries are assembled in full."""
+        """The `ReducedOperators` of a reduced model, or why there are none and queries are assembled in full."""
         reduction = self.enrichment.reduction(store).given(members=value_of(store, self.decomposition))
         reduction.projection  # noqa: B018  the clock begins after it
         return Result(*timed(lambda: reduction.operators))

@@ -109,7 +109,7 @@ def test_a_constant_member_that_is_the_same_object_costs_no_product(monkeypatch:
     bar = broken_variants.Bar()
     reference = ReferenceAssembly(bar, bar.assemble(np.array([2.0])))
     products: list[object] = []
-    monkeypatch.setattr("vibench.interfaces.validation._product", products.append)
+    monkeypatch.setattr("vibench.interfaces.validation._probed", products.append)
     vi = bar.assemble(np.array([3.0]))
     again = VariationalInequality(vi.A, vi.f, reference._vi.B, reference._vi.g)
     reference.refuse_false_constants(np.array([3.0]), again)

@@ -257,7 +257,7 @@ class _Program:
         found = np.where(chosen | (lam * size <= NEGLIGIBLE * np.abs(excess)), 0.0, -lam)
         if not len(rows):
             return found
-        block, wanted = _rows(self.B, chosen), excess[rows]
+        block, wanted = _selected_rows(self.B, chosen), excess[rows]
         if found.any():
             wanted = wanted - block @ (self.compliance @ (self.B.T @ found)) / self.gamma
         S = self.compliance.between(block) / self.gamma
@@ -269,7 +269,7 @@ class _Program:
         return found
 
 
-def _rows(B: SparseMatrix, chosen: Mask) -> SparseMatrix:
+def _selected_rows(B: SparseMatrix, chosen: Mask) -> SparseMatrix:
     """The chosen rows of a matrix; faster than its own selection, which checks indices."""
     counts = np.diff(B.indptr)
     kept = np.repeat(chosen, counts)

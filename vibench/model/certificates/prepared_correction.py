@@ -90,7 +90,7 @@ class PreparedCorrections:
         theta, terms = (B, self.terms) if isinstance(B, float) else (1.0, self.terms + int(np.diff(B.indptr).max()))
         if theta == 0.0:
             return None
-        excess, size, unit = _product(B, self.basis @ y) - g, _product(abs(B), self.sizes), 1.01 * terms * UNIT
+        excess, size, unit = _times(B, self.basis @ y) - g, _times(abs(B), self.sizes), 1.01 * terms * UNIT
         round_off = unit * (float(y @ y) ** 0.5 * size[:, 0] + g_size)
         margin, here = MARGIN * round_off, lam[self.rows]
         for _ in range(ATTEMPTS):
@@ -102,7 +102,7 @@ class PreparedCorrections:
             a = (theta / gamma) * (nu - here)  # c = B₀ᵀ a
             values = np.zeros(len(self.basis))
             values[self.moved] = self.responses @ a
-            slack = _product(B, values) - excess
+            slack = _times(B, values) - excess
             lacking = round_off + (unit * float(self.reach @ np.abs(a))) * size[:, 1] - slack
             if lacking.max() <= 0.0:  # NaN is not
                 square = float(a @ (values[self.rows] if isinstance(B, float) else self.compliance @ a))
@@ -117,7 +117,7 @@ class PreparedCorrections:
         return self.compliance.diagonal().copy()
 
 
-def _product(B: float | SparseMatrix, x: Array) -> Array:
+def _times(B: float | SparseMatrix, x: Array) -> Array:
     return np.asarray(B * x if isinstance(B, float) else B @ x)
 
 
