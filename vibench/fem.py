@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Literal
 
 import numpy as np
@@ -130,7 +131,7 @@ def unilateral(basis: Basis, sense: Sense, *, free: Indices | None = None, lumpe
         return Unilateral(B, _diagonal(weights), vertices, points, sense)
     rows = mass(basis)[dofs]
     W = InnerProduct(sp.csr_array(rows[:, dofs]), "X_W")
-    return Unilateral(sp.csr_array(sign * rows), W, vertices, points, sense, _Integrals(basis, dofs))
+    return Unilateral(sp.csr_array(sign * rows), W, vertices, points, sense, partial(_integrals, basis, dofs))
 
 
 def normal_constraint(
@@ -181,7 +182,7 @@ def normal_constraint(
     if lumped:
         return Unilateral(B, _diagonal(_positive(lumped_mass(scalar), dofs)), vertices, points, "<=")
     W = InnerProduct(sp.csr_array(mass(scalar)[dofs][:, dofs]), "X_W")
-    return Unilateral(B, W, vertices, points, "<=", _Integrals(scalar, dofs))
+    return Unilateral(B, W, vertices, points, "<=", partial(_integrals, scalar, dofs))
 
 
 def _normal_mass(scalar: FacetBasis, k: int, direction: Array | None) -> SparseMatrix:
@@ -210,15 +211,9 @@ def eliminate(vi: VariationalInequality, free: Indices, dirichlet_lift: Array | 
     return VariationalInequality(sp.csr_array(A[free][:, free]), f[free], sp.csr_array(B[:, free]), g, dirichlet_lift)
 
 
-@dataclass(frozen=True)
-class _Integrals:
+def _integrals(basis: Basis, dofs: Indices, values: Callable[[Array], Array]) -> Array:
     """∫ bound η for chosen functions η of a scalar basis, by its quadrature."""
-
-    basis: Basis
-    dofs: Indices
-
-    def __call__(self, values: Callable[[Array], Array]) -> Array:
-        return np.asarray(LinearForm(lambda v, w: values(np.asarray(w.x)) * v).assemble(self.basis))[self.dofs]
+    return np.asarray(LinearForm(lambda v, w: values(np.asarray(w.x)) * v).assemble(basis))[dofs]
 
 
 def _is_vector(basis: Basis) -> bool:

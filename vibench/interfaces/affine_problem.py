@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from functools import partial
 from typing import Any, TypeAlias
 
@@ -17,6 +16,8 @@ from vibench.interfaces.problem import MEMBERS, Contact, Problem, VariationalIne
 
 Declaration: TypeAlias = Any | Sequence[tuple[Theta, Any]] | AffineSum
 """A constant matrix or vector, the pairs (θ_q, term_q) of an affine sum, or the sum."""
+
+Coefficients: TypeAlias = Callable[[Array], Any]
 
 NOWHERE = np.zeros(0)
 """Where coefficients that do not depend on the parameter are evaluated."""
@@ -123,26 +124,19 @@ class AffineProblem(Problem):
         return Contact(_at(self._contact_columns, mu), _at(self._members["g"], mu))
 
 
-@dataclass(frozen=True)
-class _OfProduct:
-    """θ of first − second·third: those of the first, then minus the products of those of the others."""
-
-    first: Callable[[Array], Any]
-    second: Callable[[Array], Any]
-    third: Callable[[Array], Any]
-
-    def __call__(self, mu: Array) -> Array:
-        return np.concatenate([self.first(mu), -np.outer(self.second(mu), self.third(mu)).ravel()])
+def _of_product(first: Coefficients, second: Coefficients, third: Coefficients, mu: Array) -> Array:
+    """θ of first − second·third at mu: those of the first, then minus the products of those of the others."""
+    return np.concatenate([first(mu), -np.outer(second(mu), third(mu)).ravel()])
 
 
 def _minus(total: AffineSum, matrix: AffineSum, vector: AffineSum) -> AffineSum:
     """The sum of total − matrix · vector."""
     products = [A @ v for A in matrix.terms for v in vector.terms]
-    thetas = [each.thetas for each in (total, matrix, vector)]
+    thetas = total.thetas, matrix.thetas, vector.thetas
     if all(isinstance(theta, Thetas) and theta.constant for theta in thetas):  # stays a constant
         minus = -np.outer(matrix.coefficients(NOWHERE), vector.coefficients(NOWHERE)).ravel()
         return AffineSum((*total.terms, *products), Thetas((*total.coefficients(NOWHERE), *minus)))
-    return AffineSum((*total.terms, *products), _OfProduct(*thetas))
+    return AffineSum((*total.terms, *products), partial(_of_product, *thetas))
 
 
 def _constant_or_sum(member: AffineSum) -> Any:

@@ -100,8 +100,8 @@ class ReducedModel:
     def primal_basis(self, vi: VariationalInequality) -> Array:
         """V-orthonormal basis Z (n×N') at the parameter of `vi`; V_N comes first."""
         V, enrichment = self.problem.V, self.enrichment
-        if self._has_coordinates:
-            return np.hstack([self.fixed_basis, self._contact.vectors(self._added(vi))])
+        if (contact := self._contact) is not None:
+            return np.hstack([self.fixed_basis, contact.vectors(self._added(contact, vi))])
         if enrichment.eta is not None:
             whitened = V.whiten_functional(np.asarray(vi.B.T @ enrichment.eta))  # coordinates of T(mu)η
         elif enrichment.supply is not None:
@@ -116,38 +116,28 @@ class ReducedModel:
 
     def reconstruct(self, mu: Array, vi: VariationalInequality, x: Array) -> Array:  # noqa: ARG002
         """Vectors u = Z x (n×k) with coordinates x (N'×k) at mu, with `vi` assembled there."""
-        if not self._has_coordinates:
+        if (contact := self._contact) is None:
             return np.asarray(self.primal_basis(vi) @ x)
         count = self.fixed_basis.shape[1]
-        return np.asarray(self.fixed_basis @ x[:count] + self._contact.vectors(self._added(vi) @ x[count:]))
+        return np.asarray(self.fixed_basis @ x[:count] + contact.vectors(self._added(contact, vi) @ x[count:]))
 
     def project_supremizers(self, vi: VariationalInequality, eta: Array) -> Array:
         """ZᵀBᵀη (N'×k) for multipliers η (m×k) at the parameter of `vi`."""
-        if not self._has_coordinates:
+        if (contact := self._contact) is None:
             return projected_supremizers(self.primal_basis(vi), vi.B, eta)
-        Y = np.hstack([self._contact.plain, self._added(vi)])
-        return np.asarray(Y.T @ self._supremizers(vi, eta))
+        Y = np.hstack([contact.plain, self._added(contact, vi)])
+        return np.asarray(Y.T @ contact.supremizers(np.asarray(vi.B.T @ eta)[self.problem.contact_dofs]))
 
-    @property
-    def _has_coordinates(self) -> bool:
-        """Whether supremizers are orthonormalised in coordinates of contact size instead of vectors of mesh size."""
-        return self.enrichment.eta is not None and self.problem.contact_dofs is not None
-
-    def _added(self, vi: VariationalInequality) -> Array:
+    def _added(self, contact: ContactCoordinates, vi: VariationalInequality) -> Array:
         """Orthonormal coordinates (d×S) of what the supremizers at the parameter of `vi` add to V_N."""
-        assert self.enrichment.eta is not None  # `_has_coordinates`
-        return orthonormal_range(self._supremizers(vi, self.enrichment.eta), self._contact.plain)
-
-    def _supremizers(self, vi: VariationalInequality, eta: Array) -> Array:
-        """Coordinates (d×k) of T(mu)η."""
-        return self._contact.supremizers(np.asarray(vi.B.T @ eta)[self.problem.contact_dofs])
+        loads = np.asarray(vi.B.T @ self.enrichment.eta)[self.problem.contact_dofs]
+        return orthonormal_range(contact.supremizers(loads), contact.plain)
 
     @cached_property
-    def _contact(self) -> ContactCoordinates:
-        """Coordinates in V_N and all supremizers of a problem that declares its contact unknowns."""
+    def _contact(self) -> ContactCoordinates | None:
+        """Coordinates of contact size, in which supremizers are orthonormalised; `None` where vectors of mesh size are."""
         V, dofs = self.problem.V, self.problem.contact_dofs
-        assert dofs is not None  # `_has_coordinates`
-        return ContactCoordinates(V, self.fixed_basis, dofs)
+        return None if self.enrichment.eta is None or dofs is None else ContactCoordinates(V, self.fixed_basis, dofs)
 
     @cached_property
     def _whitened_basis(self) -> Array:
