@@ -13,10 +13,8 @@ import numpy as np
 import pandas as pd
 from page import Page, machines, made_by, read, start
 
-from vibench.highfidelity.active_set import HighFidelitySolver
-from vibench.interfaces.strategies import Stop
-from vibench.reduction.cones import TIE, greedy_cone, project_on_cone
-from vibench.study import registry
+from vibench import Reduction, Stop, create, project_on_cone
+from vibench.reduction import TIE
 
 LOOSE, TIGHT = 1e-2, 1e-3
 """δ_dual."""
@@ -164,10 +162,9 @@ def dimensions(meshes: Sequence[Mesh]) -> pd.DataFrame:
 def ties(mesh: Mesh) -> dict[str, object]:
     """How many steps of CPG are ties."""
     definition = json.loads(mesh.cells["definition"].iloc[0])["problem"]
-    problem = registry.create("problem", definition["name"], json.loads(definition["options"]))
-    solver = HighFidelitySolver(problem)
-    snapshots = np.column_stack([solver.solve(mu).lam for mu in problem.training_set()])
-    cone = greedy_cone(snapshots, problem.W, Stop(tolerance=TIGHT))
+    problem = create("problem", definition["name"], json.loads(definition["options"]))
+    reduction = Reduction(problem, create("dual strategy", "cpg"), None, Stop(size=1), Stop(tolerance=TIGHT))
+    snapshots, cone = reduction.snapshots.lam, reduction.cone
     tied, norms = 0, problem.W.norm(snapshots)
     for count in range(cone.size):
         generators = cone.generators[:, :count]

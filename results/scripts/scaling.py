@@ -28,23 +28,23 @@ import pandas as pd
 from matplotlib.figure import Figure
 from page import SECONDS, Page, made_by, start
 
-from vibench import provenance
-from vibench.highfidelity.active_set import HighFidelitySolver
-from vibench.interfaces.strategies import Offline, Stop
-from vibench.model.affine import affine_decomposition
-from vibench.model.galerkin import ReducedModel
-from vibench.model.hyperreduced import HyperReducedModel, hyper_reduce
-from vibench.qp.solve import solve_qp
-from vibench.reduction.pod import pod
+from vibench import Reduction, Stop, create, provenance, solve_qp
 from vibench.report.figures.style import STYLE
-from vibench.stability.infsup import multipliers
-from vibench.study import registry
 from vibench.timing import median_seconds, timed
 
 ACCURACY = 1e-10
 QUERIES = 8
 SEED = 2022
-OFFLINE = ("mesh and forms", "snapshots", "POD", "mCPG", "PGA", "affine decomposition", "reduction")
+STEPS = {
+    "snapshots": "snapshots", "POD": "pod", "mCPG": "cone", "PGA": "enrichment", "affine decomposition": "members",
+    "reduction": "operators",
+}  # fmt: skip
+"""Stages of the offline phase, and the steps of a reduction that they are."""
+
+UNTIMED = {"PGA": "offline", "reduction": "projection"}
+"""Steps that are no part of a stage and have to be there before it."""
+
+OFFLINE = ("mesh and forms", *STEPS)
 ONLINE = ("query, full", "query, reduced", "QP solution")
 
 
@@ -75,38 +75,21 @@ def measure(name: str, nodes: int | str, R: int, delta: float, N: int) -> Iterat
         result, seconds = (median_seconds if repeated else timed)(work)
         return result, about | {"stage": stage, "seconds": seconds.cpu, "memory_mib": _peak_memory()}
 
-    problem, found = row("mesh and forms", lambda: registry.create("problem", name, {"resolution": nodes}))
+    problem, measured = row("mesh and forms", lambda: create("problem", name, {"resolution": nodes}))
     about |= {"n": problem.V.dim, "m": problem.W.dim}
-    yield found | about
-    training, solver = problem.training_set(), HighFidelitySolver(problem)
-    solutions, found = row("snapshots", lambda: [solver.solve(mu) for mu in training])
-    yield found
-    u, lam = np.column_stack([s.u for s in solutions]), np.column_stack([s.lam for s in solutions])
-    basis, found = row("POD", lambda: pod(u, problem.V, Stop(size=N)).basis)
-    yield found
-    dual = registry.create("dual strategy", "mcpg", {})
-    cone, found = row("mCPG", lambda: dual.reduce(lam, problem.W, Stop(size=R)))
-    yield found
-    span = multipliers(cone.generators, problem.W).span
-    offline = Offline(problem, basis, cone, span, training)
-    primal = registry.create("primal strategy", "offline-pga", {})
-    enrichment, found = row("PGA", lambda: primal.build(offline, delta))
-    yield found | {"added": enrichment.vectors.shape[1]}
-    members, found = row("affine decomposition", lambda: affine_decomposition(problem, training, 1e-6))
-    yield found
-    model = ReducedModel(problem, basis, enrichment, cone.generators, span)
-    operators, found = row("reduction", lambda: hyper_reduce(model, members))
-    yield found
-    online = HyperReducedModel(model, operators)
+    yield measured | about
+    strategies = create("dual strategy", "mcpg"), create("primal strategy", "offline-pga")
+    reduction = Reduction(problem, *strategies, Stop(size=N), Stop(size=R), delta, assembly="reduced")
+    for stage, step in STEPS.items():
+        getattr(reduction, UNTIMED.get(stage, "problem"))
+        result, measured = row(stage, lambda: getattr(reduction, step))  # noqa: B023  called at once
+        yield measured | ({"added": result.vectors.shape[1]} if stage == "PGA" else {})
+    full, online = reduction.projection, reduction.assembled
     for mu in problem.validation_set(QUERIES, SEED):
         reduced = online.assemble(mu)
-        for stage, reduced_model in (("query, full", model), ("query, reduced", online)):
-            yield row(stage, lambda: _query(reduced_model, mu), repeated=True)[1]  # noqa: B023  called at once
+        for stage, model in (("query, full", full), ("query, reduced", online)):
+            yield row(stage, lambda: _solve(model.assemble(mu)), repeated=True)[1]  # noqa: B023  called at once
         yield row("QP solution", lambda: _solve(reduced), repeated=True)[1]  # noqa: B023
-
-
-def _query(model: Any, mu: Any) -> Any:
-    return _solve(model.assemble(mu))
 
 
 def _solve(reduced: Any) -> Any:

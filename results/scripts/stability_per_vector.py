@@ -5,19 +5,16 @@ python results/scripts/stability_per_vector.py results/stability-per-vector
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pandas as pd
 from page import Page, made_by, start
 
+from vibench import Reduction, Stop, create, project_on_cone
 from vibench.arrays import Array
-from vibench.highfidelity.active_set import HighFidelitySolver
-from vibench.interfaces.strategies import Offline, Stop
-from vibench.linalg.inner_product import InnerProduct
-from vibench.reduction.cones import project_on_cone
-from vibench.reduction.nested import NestedStrategy, grow_through
-from vibench.reduction.pod import pod
-from vibench.reduction.supremizers import constraint_classes, isometric_supremizers, projected_supremizers
-from vibench.stability.infsup import beta_span, multipliers
+from vibench.reduction.supremizers import constraint_classes, projected_supremizers
+from vibench.stability.infsup import beta_span
 from vibench.study import registry
 from vibench.study.kinds import PluginKind
 
@@ -39,56 +36,45 @@ CONES = (
 )
 
 
-def counts(data: Offline, vectors: Array) -> dict[str, int | None]:
+def counts(reduction: Reduction) -> dict[str, int | None]:
     """Smallest numbers of vectors that reach the shares; β_on and β_S do not come from the strategies."""
-    classes = constraint_classes([data.problem.constraint(mu)[0] for mu in data.training])
-    image = isometric_supremizers(data.problem.V, classes.representatives, data.span.shape[1])
-    online = np.array([beta_span(image(B, data.span)) for B in classes.representatives])
-    images = [projected_supremizers(np.hstack([data.basis, vectors]), B, data.span) for B in classes.representatives]
-    first = data.basis.shape[1]
-    reached = [
-        min(beta_span(rows[: first + k]) / beta for rows, beta in zip(images, online, strict=True))
+    problem, span, basis = reduction.problem, reduction.multipliers.span, reduction.pod.basis
+    matrices = constraint_classes([problem.constraint(mu)[0] for mu in reduction.parameters]).representatives
+    online = [beta_span(problem.V.whiten_functional(np.asarray(B.T @ span))) for B in matrices]
+    vectors: Array = reduction.enrichment.vectors
+    images = [projected_supremizers(np.hstack([basis, vectors]), B, span) for B in matrices]
+    shares = [
+        min(beta_span(rows[: basis.shape[1] + k]) / beta for rows, beta in zip(images, online, strict=True))
         for k in range(vectors.shape[1] + 1)
     ]
-    return {f"β_S ≥ {s:g} β_on": next((k for k, share in enumerate(reached) if share >= s), None) for s in SHARES}
+    return {f"β_S ≥ {s:g} β_on": next((k for k, share in enumerate(shares) if share >= s), None) for s in SHARES}
 
 
-def conditions(name: str, size: int, lam: Array, W: InnerProduct) -> list[dict[str, object]]:
-    """One row for every dual strategy."""
-    given = registry.create("dual strategy", "cpg", {}).reduce(lam, W, Stop(size=size)).generators
-    rows: list[dict[str, object]] = []
-    for dual in registry.registered(PluginKind.DUAL):
-        cone = registry.create("dual strategy", dual, {}).reduce(lam, W, Stop(size=size))
-        gram = W.gram(cone.generators, cone.generators)
-        rows.append(
-            {
-                "problem": name,
-                "dual": dual,
-                "R": cone.size,
-                "error": float(cone.errors[-1]),
-                "condition": float(np.linalg.cond(gram)),
-                "lost of cpg": max(project_on_cone(cone.rays, nu, W).distance for nu in given.T),
-                "fallbacks": len(cone.fallbacks),
-            }
-        )
-    return rows
+def condition(reduction: Reduction, given: Array) -> dict[str, object]:
+    """Size and conditioning of a cone, and the largest distance of the columns of `given` (m×R) from it."""
+    cone, W = reduction.cone, reduction.problem.W
+    return {
+        "R": cone.size,
+        "error": float(cone.errors[-1]),
+        "condition": float(np.linalg.cond(W.gram(cone.generators, cone.generators))),
+        "lost of cpg": max(project_on_cone(cone.rays, nu, W).distance for nu in given.T),
+        "fallbacks": len(cone.fallbacks),
+    }
 
 
 def main(target: str) -> None:
     shares, cones = [], []
     for name, (modes, size) in DIMENSIONS.items():
-        problem = registry.create("problem", name, {"resolution": "paper"})
-        training, solver = problem.training_set(), HighFidelitySolver(problem)
-        solved = [solver.solve(mu) for mu in training]
-        basis = pod(np.column_stack([s.u for s in solved]), problem.V, Stop(size=modes)).basis
-        lam = np.column_stack([s.lam for s in solved])
-        cone = registry.create("dual strategy", "mcpg", {}).reduce(lam, problem.W, Stop(size=size))
-        data = Offline(problem, basis, cone, multipliers(cone.generators, problem.W).span, training)
+        problem = create("problem", name, {"resolution": "paper"})
+        plain = Reduction(problem, create("dual strategy", "cpg"), None, Stop(size=modes), Stop(size=size))
+        snapshots = plain.snapshots
         for primal, tolerance in ENRICHMENTS.items():
-            strategy: NestedStrategy = registry.create("primal strategy", primal, {})
-            vectors = grow_through(strategy, data, [tolerance]).vectors
-            shares.append({"problem": name, "N": modes, "R": size, "primal": primal} | counts(data, vectors))
-        cones += conditions(name, size, lam, problem.W)
+            strategies = {"dual": create("dual strategy", "mcpg"), "primal": create("primal strategy", primal)}
+            reduction = replace(plain, **strategies, tolerance=tolerance).given(snapshots=snapshots)
+            shares.append({"problem": name, "N": modes, "R": size, "primal": primal} | counts(reduction))
+        for dual in registry.registered(PluginKind.DUAL):
+            reduction = replace(plain, dual=create("dual strategy", dual)).given(snapshots=snapshots)
+            cones.append({"problem": name, "dual": dual} | condition(reduction, plain.cone.generators))
     page = Page(
         target,
         "Vectors for a share of β_on, and conditioning of cones",
