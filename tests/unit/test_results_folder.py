@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import inspect
 import re
 import subprocess
 import sys
@@ -58,6 +59,14 @@ def test_every_link_of_a_page_resolves(page: Path) -> None:
 def test_every_page_is_in_the_overview() -> None:
     overview = RESULTS / "README.md"
     assert {page for page in PAGES if page != overview} <= linked(overview)
+
+
+@pytest.mark.parametrize("path", sorted({*SCRIPTS.glob("*.py")} - {SCRIPTS / "page.py"}), ids=lambda path: path.stem)
+def test_the_command_of_a_script_has_the_arguments_that_it_takes(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(str(SCRIPTS))
+    script = importlib.import_module(path.stem)
+    (command,) = re.findall(rf"python results/scripts/{path.name}((?: [^>\s]+)*)", script.__doc__ or "")
+    assert len(command.split()) == len(inspect.signature(script.main).parameters)
 
 
 @pytest.mark.parametrize("name", NAMES)
