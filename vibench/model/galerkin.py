@@ -135,7 +135,7 @@ class ReducedModel:
 
     @cached_property
     def _contact(self) -> ContactCoordinates | None:
-        """Coordinates of contact size, in which supremizers are orthonormalised; `None` where vectors of mesh size are."""
+        """Coordinates of contact size in which supremizers are orthonormalised; `None` where vectors (n,) are."""
         V, dofs = self.problem.V, self.problem.contact_dofs
         return None if self.enrichment.eta is None or dofs is None else ContactCoordinates(V, self.fixed_basis, dofs)
 
