@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any, TypeAlias
+from datetime import date, time
+from typing import Annotated, Any, Self, TypeAlias
 
 from annotated_types import Ge, Le, MinLen
 from pydantic import (
@@ -12,10 +13,15 @@ from pydantic import (
     ConfigDict,
     Discriminator,
     Field,
+    ModelWrapValidatorHandler,
+    PrivateAttr,
     Tag,
     model_validator,
 )
 
+from vibench.study.kinds import PluginKind
+from vibench.study.plugin import GivenPlugin, Plugin, give
+from vibench.study.registry import RegisteredPlugin, find
 from vibench.study.values import OWN
 
 Size: TypeAlias = Annotated[int, Ge(1), Le(100_000)]
@@ -31,8 +37,13 @@ STRICT = ConfigDict(extra="forbid", strict=True, frozen=True)
 """Configuration of the tables of a study file: unknown keys are refused, and no type is converted."""
 
 
+def is_text_of_a_file(value: Any) -> bool:
+    """Whether a value may stand in a study file, or is an entry already; what may not is a class or an object."""
+    return value is None or isinstance(value, str | int | float | list | dict | date | time | BaseModel)
+
+
 class Entry(BaseModel):
-    """One entry of an axis of plugins."""
+    """One entry of an axis of plugins; from Python its name may be a class or an object, too, or the entry be one."""
 
     model_config = STRICT
 
@@ -40,10 +51,47 @@ class Entry(BaseModel):
     label: Annotated[str, Field(description="Label in tables; its name by default.")] = ""
     options: Annotated[dict[str, Any], Field(description="Keyword arguments of its constructor.")] = {}
 
+    _given: Any = PrivateAttr(None)
+
+    @model_validator(mode="wrap")
+    @classmethod
+    def _from_python(cls, value: Any, build: ModelWrapValidatorHandler[Self]) -> Self:
+        """An entry whose name is a class or an object."""
+        given = value.get("name") if isinstance(value, dict) else value
+        if is_text_of_a_file(given):
+            return build(value)
+        name = (given if isinstance(given, type) else type(given)).__name__
+        entry = build((value if isinstance(value, dict) else {}) | {"name": name})
+        entry._given = given
+        return entry
+
     @model_validator(mode="before")
     @classmethod
     def _from_name(cls, value: Any) -> Any:
         return {"name": value} if isinstance(value, str) else value
+
+    @property
+    def is_registered(self) -> bool:
+        """Whether it names a plugin, and is no class or object."""
+        return self._given is None
+
+    def registered(self, kind: PluginKind) -> RegisteredPlugin:
+        """What is registered under its name, or the class or object that it was given, as it was at first.
+
+        Raises
+        ------
+        RequestError
+            If what it was given is none of the kind, or cannot be sent to worker processes.
+        """
+        if self.is_registered:
+            return find(kind, self.name)
+        if not isinstance(self._given, GivenPlugin):
+            self._given = give(kind, self.title, self._given)
+        return self._given
+
+    def plugin(self, kind: PluginKind) -> Plugin:
+        """The plugin with its options."""
+        return Plugin.of(self.registered(kind), self.options)
 
     @property
     def title(self) -> str:
@@ -74,7 +122,7 @@ class SamplingEntry(Entry):
 
 
 def _number_or_table(value: Any) -> str:
-    return "<table>" if isinstance(value, dict | str | SamplingEntry) else "<number>"
+    return "<number>" if is_text_of_a_file(value) and not isinstance(value, dict | str | SamplingEntry) else "<table>"
 
 
 def _drawn(entry: SamplingEntry) -> SamplingEntry:

@@ -13,7 +13,6 @@ from vibench.study.cells import Cell
 from vibench.study.entries import Entry
 from vibench.study.kinds import DUAL, PRIMAL, PROBLEM, PluginKind
 from vibench.study.plugin import Plugin
-from vibench.study.registry import find
 from vibench.study.spec import Study, ToleranceTable
 
 
@@ -64,11 +63,11 @@ _Made: TypeAlias = tuple[EntryT, Plugin]
 
 def _made(kind: PluginKind, entries: Sequence[EntryT]) -> list[_Made[EntryT]]:
     """The entries of an axis, each with its plugin: titles need not tell them apart."""
-    return [(entry, Plugin.from_entry(kind, entry)) for entry in entries]
+    return [(entry, entry.plugin(kind)) for entry in entries]
 
 
 def _nested_tolerances(primal: Entry, table: ToleranceTable) -> tuple[float, ...]:
-    plugin = find(PRIMAL, primal.name)
+    plugin = primal.registered(PRIMAL)
     if plugin.conflict or not issubclass(plugin.load(), NestedStrategy):
         return ()
     return tuple(sorted({value for value in table.of_primal(primal) if value is not None}, reverse=True))

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import importlib.metadata
 import json
-import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property
@@ -17,7 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from vibench.errors import RequestError, in_a_line, unknown_name
-from vibench.provenance import distribution_version, solver_version, source_hash
+from vibench.provenance import distribution_version, package_hash, solver_version
 from vibench.study import source
 from vibench.study.kinds import PROBLEM, SAMPLING, SOLVER, STUDY, PluginKind
 
@@ -158,22 +157,19 @@ class RegisteredPlugin:
             return solver_version(self.name)
         from vibench.dependencies import code_used
 
-        requirements = self._requirements
-        module = Path(str(sys.modules[self._entry.module].__file__))
-        while (module.parent / "__init__.py").is_file():
-            module = module.parent
-        needed = "".join(f" {required} {distribution_version(required)}" for required in requirements)
-        return f"{self.origin} {source_hash(module)} with {code_used(self.reference, whole=True)}{needed}"
+        used = code_used(self.reference, whole=True)
+        needed = "".join(f" {required} {distribution_version(required)}" for required in self.requirements)
+        return f"{self.origin} {package_hash(self._entry.module)} with {used}{needed}"
 
     @property
-    def _requirements(self) -> tuple[str, ...]:
+    def requirements(self) -> tuple[str, ...]:
         """Distributions that it `requires`, in addition to the requirements of its own distribution."""
         return tuple(getattr(self.load(), "requires", ()))
 
     @property
     def missing(self) -> list[str]:
         """Distributions that it `requires` and that are not installed."""
-        return [one for one in self._requirements if not distribution_version(one)]
+        return [one for one in self.requirements if not distribution_version(one)]
 
     @property
     def options(self) -> list[Option]:

@@ -10,7 +10,7 @@ from vibench.errors import RequestError
 from vibench.interfaces.strategies import Stop
 from vibench.study.cells import Cell
 from vibench.study.parameter_sets import ParameterSet
-from vibench.study.plugin import Plugin
+from vibench.study.plugin import GivenPlugin, Plugin
 from vibench.study.spec import Study
 from vibench.study.values import OWN
 
@@ -58,7 +58,9 @@ def study_of_cell(cell: Cell, name: str, **settings: Any) -> Study:
 
 
 def _entry(plugin: Plugin, label: str) -> Any:
-    return {"name": plugin.name, "label": label, "options": json.loads(plugin.options)}
+    given = plugin.registered
+    name = given.given if isinstance(given, GivenPlugin) else plugin.name
+    return {"name": name, "label": label, "options": json.loads(plugin.options)}
 
 
 def _entry_of_set(parameters: ParameterSet) -> Any:

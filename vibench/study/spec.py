@@ -112,7 +112,7 @@ class ToleranceTable(_Model):
 
     def of_primal(self, entry: Entry) -> list[float | None]:
         """Tolerances of one primal strategy; [`None`] for a strategy that takes none."""
-        plugin = find(PRIMAL, entry.name)
+        plugin = entry.registered(PRIMAL)
         if plugin.conflict:  # whether it takes one or not, its cells cannot be run
             return list(self.primal.get(entry.title, self.primal.get(entry.name, [None])))
         if not plugin.load().takes_tolerance:
@@ -213,7 +213,7 @@ class Study(_Model):
 
 
 def _sampling(entry: SamplingEntry) -> Plugin | None:
-    return None if entry.name == OWN else Plugin.from_entry(SAMPLING, entry)
+    return None if entry.name == OWN else entry.plugin(SAMPLING)
 
 
 MODELS: Mapping[str, type[BaseModel]] = {"tolerances": ToleranceTable, "limits": Limits, "problem": ProblemEntry}
@@ -248,7 +248,8 @@ def _check_names(study: Study) -> None:
     )  # fmt: skip
     for kind, axis in axes:
         for entry in axis:
-            find(kind, entry.name).check_options(entry.options)
+            entry.registered(kind).check_options(entry.options)
+        _check_given(kind, axis)
     for problem in study.problem:
         _check_sets(study, problem)
     solvers = {*SETTINGS, *registered(SOLVER)}
@@ -262,6 +263,20 @@ def _check_names(study: Study) -> None:
         _check_tolerances(study, table)
 
 
+def _check_given(kind: PluginKind, axis: Sequence[Entry]) -> None:
+    """Refuse a class or an object that has the name of another plugin of its axis."""
+    if all(entry.is_registered for entry in axis):
+        return
+    plugins = {entry.plugin(kind) for entry in axis}
+    names = [(plugin.name, plugin.options) for plugin in plugins]
+    for plugin in plugins:
+        if names.count((plugin.name, plugin.options)) > 1:
+            raise RequestError(
+                f"several plugins of the study are called {plugin}: give each a label, as in "
+                "{'name': …, 'label': 'coarse'}"
+            )
+
+
 def _check_sets(study: Study, entry: ProblemEntry) -> None:
     """Check the parameter sets of a problem, for which it is built if it reads files or a strategy samples its box.
 
@@ -270,10 +285,10 @@ def _check_sets(study: Study, entry: ProblemEntry) -> None:
     asked = [*(entry.training or study.training), entry.validation or study.validation]
     samplings = [one for one in asked if isinstance(one, SamplingEntry) and one.name != OWN]
     for sampling in samplings:
-        find(SAMPLING, sampling.name).check_options(sampling.options)
-    if not samplings and not find(PROBLEM, entry.name).data_digest(entry.options):
+        sampling.registered(SAMPLING).check_options(sampling.options)
+    if not samplings and not entry.registered(PROBLEM).data_digest(entry.options):
         return
-    problem, validation = Plugin.from_entry(PROBLEM, entry), study.validation_set(entry)
+    problem, validation = entry.plugin(PROBLEM), study.validation_set(entry)
     training = study.training_sets(entry)
     if is_available(problem, *(one.sampling for one in (validation, *training) if one.sampling is not None)):
         for trained in training:
