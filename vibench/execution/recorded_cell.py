@@ -27,7 +27,7 @@ from vibench.stages.base import Done, Stage, value_of
 from vibench.stages.cell_queries import cell_queries
 from vibench.storage.artefacts import Store, usable_store
 from vibench.study.cells import Cell
-from vibench.study.single_cell import study_of_cell
+from vibench.study.matrix import study_of_cell
 from vibench.study.spec import Study
 
 UNLIMITED = (1e6, 1e6, 1e6)

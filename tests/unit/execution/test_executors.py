@@ -25,9 +25,11 @@ from vibench.errors import ExecutorError, RequestError
 from vibench.execution import dask
 from vibench.execution.dask import Dask
 from vibench.execution.executors import Local
+from vibench.execution.run import Observer, Options, run_study
 from vibench.execution.supervisor import Job
 from vibench.stages.base import Done, Stage
 from vibench.storage.artefacts import Store
+from vibench.study.spec import Study
 
 
 def elsewhere(_: str) -> tuple[bool, str, str]:
@@ -96,6 +98,20 @@ def test_a_dask_worker_that_dies_is_survived(cluster: LocalCluster, tmp_path: Pa
             assert len((tmp_path / f"diary {k}").read_text().splitlines()) >= 2  # it was begun again
     finally:
         workers.close()
+
+
+def test_dask_workers_get_the_classes_of_a_notebook(cluster: LocalCluster, tmp_path: Path) -> None:
+    names: dict[str, Any] = {"__name__": "__main__"}
+    exec("import fake_plugins\nclass Mine(fake_plugins.Wire):\n    pass\n", names)
+    problems = [names["Mine"], {"name": names["Mine"](9), "label": "short"}]
+    tolerances = [{"pod": [1e-2], "dual": [1e-2]}]
+    study = Study(
+        name="mine", validation=3, solvers=["piqp"], problem=problems, dual=["cpg"], primal=["decorrelated"],
+        tolerances=tolerances, timing_rounds=1,
+    )  # fmt: skip
+    options = Options(executor="dask", scheduler=cluster.scheduler_address)
+    outcome = run_study(study, tmp_path, Observer(), options)
+    assert [(row["problem"], row["status"]) for row in outcome.rows] == [("Mine", "ok"), ("short", "ok")]
 
 
 @pytest.mark.parametrize(

@@ -179,7 +179,7 @@ def test_a_name_that_two_packages_use_is_refused_and_no_other(register: Register
     assert find(DUAL, "heir").load() is Heir
     assert list(registered(DUAL)) == ["heir", "plain"]
     assert "two packages" in refusal(lambda: find(DUAL, "plain").missing)
-    plugin = Plugin.from_entry(DUAL, Entry(name="plain", options={"mode": "slow"}))
+    plugin = Entry(name="plain", options={"mode": "slow"}).plugin(DUAL)
     assert plugin.options == '{"mode": "slow"}'
     assert "two packages" in refusal(plugin.create)
 

@@ -1,0 +1,125 @@
+"""Classes of a script run through a study without any package, and run again when they are edited."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+from running import Main, refused
+
+import vibench
+
+SCRIPT = '''
+import functools, json, sys
+import numpy as np
+import scipy.sparse as sp
+import vibench
+from vibench import InnerProduct, ParameterBox, Problem, VariationalInequality
+from vibench.execution.run import Observer
+
+DEPTH = 0.2
+
+@functools.cache
+def steps(nodes):
+    return 1.0 / (nodes + 1)
+
+class Wire(Problem):
+    """A wire between two fixed ends, pressed with a force mu on a flat support."""
+    parameters = ParameterBox(("force",), np.array([4.0]), np.array([8.0]), ("N/m",))
+
+    def __init__(self, nodes: int = 12):
+        self.step, ones = steps(nodes), np.ones(nodes)
+        self.stiffness = sp.diags_array([2 * ones, -ones[1:], -ones[1:]], offsets=[0, 1, -1]).tocsr() / self.step
+        self.mass = sp.diags_array(self.step * ones).tocsr()
+        self.V, self.W = InnerProduct(self.stiffness + self.mass), InnerProduct(self.mass)
+
+    def training_set(self):
+        return self.parameters.grid(5)
+
+    def assemble(self, mu):
+        ones = self.step * np.ones(self.V.dim)
+        return VariationalInequality(self.stiffness, -mu[0] * ones, -self.mass, DEPTH * ones)
+
+class Slack(Wire):
+    def assemble(self, mu):
+        raise ValueError("the wire is slack")
+
+class MyCone(vibench.DualStrategy):
+    def __init__(self, share: float = 1.0):
+        self.share = share
+
+    def reduce(self, snapshots, W, stop):
+        return vibench.greedy_cone(snapshots, W, stop)
+
+class Told(Observer):
+    cells = 0
+    def cell(self, cell, row):
+        self.cells += 1
+
+if __name__ == "__main__":
+    study = vibench.Study(
+        name="mine", validation=3, solvers=["piqp"], primal=["decorrelated"], timing_rounds=1,
+        problem=[Wire, {"name": Wire(9), "label": "short"}, Slack()],
+        dual=[{"name": MyCone, "options": {"share": 0.5}}], tolerances=[{"pod": [1e-2], "dual": [1e-2]}],
+    )
+    told = Told()
+    run = vibench.run(study, sys.argv[1], jobs=2, observer=told)
+    cells = run.cells.set_index("problem", drop=False).loc[["Wire", "short", "Slack"]]
+    model = run.model(cells["cell"].iloc[0])
+    rows = cells[["cell", "problem", "dual", "dual_options", "status", "reason", "error_u_mean"]]
+    print(json.dumps([told.cells, model.solve([5.0]).status, json.loads(rows.to_json(orient="records"))]))
+'''
+
+
+def run_script(folder: Path, out: str, source: str = SCRIPT) -> tuple[int, str, list[Any]]:
+    """Cells that had to be run, the status of a query of the first one's model, and the rows."""
+    (folder / "script.py").write_text(source)
+    line = [sys.executable, "script.py", out]
+    done = subprocess.run(line, cwd=folder, capture_output=True, text=True, check=False, timeout=120)
+    assert done.returncode == 0, done.stderr
+    count, status, rows = json.loads(done.stdout.splitlines()[-1])
+    return count, status, rows
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Folder in which the script has run, its results in `out`."""
+    folder = tmp_path_factory.mktemp("script")
+    count, status, rows = run_script(folder, "out")
+    assert (count, status) == (3, "ok")
+    assert [(row["problem"], row["dual"], row["dual_options"]) for row in rows] == [
+        (name, "MyCone", '{"share": 0.5}') for name in ("Wire", "short", "Slack")
+    ]
+    assert [row["status"] for row in rows] == ["ok", "ok", "error"]
+    assert "the wire is slack" in rows[2]["reason"]
+    assert rows[0]["error_u_mean"] != rows[1]["error_u_mean"]
+    return folder
+
+
+def test_the_same_classes_are_not_run_again_and_edited_ones_are(folder: Path) -> None:
+    before = vibench.open_run(folder / "out").cells
+    assert run_script(folder, "out", f"# a remark\n{SCRIPT}")[0] == 0
+    count, status, _ = run_script(folder, "out", SCRIPT.replace("DEPTH = 0.2", "DEPTH = 0.15"))
+    assert (count, status) == (3, "ok")
+    after = vibench.open_run(folder / "out").cells
+    assert list(after["cell"]) == list(before["cell"])
+    assert set(after["code"]).isdisjoint(before["code"])
+    changed = after["error_u_mean"] != before["error_u_mean"]
+    assert changed[after["problem"] != "Slack"].all()
+
+
+def test_other_processes_read_the_run_and_refuse_its_models_in_a_line(folder: Path, main: Main) -> None:
+    out = str(folder / "out")
+    code, printed, _ = main("show", out)
+    assert code == 0
+    assert "short" in printed
+    assert main("compare", out, out)[0] == 0
+    cell = vibench.open_run(out).cells.set_index("problem")["cell"]["Wire"]
+    for command in (("replay", out, cell), ("run", f"{out}/results.sqlite", "--cell", cell)):
+        refused(main(*command), "problem 'Wire' is a class or an object that", "another process")
+    with pytest.raises(vibench.RequestError, match="problem 'Wire' is a class or an object"):
+        vibench.open_run(out).model(cell)

@@ -1,0 +1,263 @@
+"""Classes and objects on the axes of a study: what identifies them, what is refused, and how they reach workers."""
+
+from __future__ import annotations
+
+import json
+import linecache
+import os
+import pickle
+import subprocess
+import sys
+from collections.abc import Mapping
+from dataclasses import asdict
+from pathlib import Path
+from textwrap import dedent
+from typing import Any
+
+import pytest
+from fake_plugins import Wire
+
+import vibench
+from vibench.errors import RequestError
+from vibench.provenance import fingerprint
+from vibench.study import plugin as module
+from vibench.study.cells import Cell
+from vibench.study.kinds import PROBLEM
+from vibench.study.matrix import expand, study_of_cell
+from vibench.study.plugin import give
+
+SOURCE = """
+    from functools import cache, cached_property
+    import numpy as np
+
+    LENGTH = 2.0
+    NAMES = {"left", "right", "bottom", "top"}
+
+    @cache
+    def half(x):
+        return x / 2.0
+
+    def width():
+        return half(LENGTH)
+
+    class Base:
+        def scaled(self, x):
+            return 3.0 * x
+
+    class Shape(Base):
+        sides = 4
+
+        def __init__(self, size=5):
+            self.size, self.tags, self.values = size, {"a", "b", "c"}, np.arange(size)
+
+        @cached_property
+        def area(self):
+            return sum(self.values) * width()
+
+        @property
+        def edges(self):
+            return [side for side in sorted(NAMES) if side in {"left", "top"}]
+
+        def circumference(self):
+            return (lambda: self.scaled(self.sides * width()))()
+"""
+
+
+def notebook(source: str = SOURCE, cell: str = "<cell 1>") -> dict[str, Any]:
+    """The names that a cell of a notebook defines, run as IPython runs it."""
+    text = dedent(source)
+    linecache.cache[cell] = (len(text), None, text.splitlines(keepends=True), cell)
+    names: dict[str, Any] = {"__name__": "__main__"}
+    exec(compile(text, cell, "exec", dont_inherit=True), names)
+    return names
+
+
+def hashed(source: str = SOURCE, what: str = "Shape()") -> str:
+    return fingerprint(eval(what, notebook(source)))[0]
+
+
+EDITS = {
+    "body of a method": ("self.sides * width()", "self.sides + width()"),
+    "constant in a method": ('{"left", "top"}', '{"left", "bottom"}'),
+    "inherited method": ("3.0 * x", "3.5 * x"),
+    "global constant": ("LENGTH = 2.0", "LENGTH = 2.5"),
+    "global set": ('"bottom", "top"}\n', '"bottom"}\n'),
+    "function that a function calls": ("x / 2.0", "x / 4.0"),
+    "attribute of the class": ("sides = 4", "sides = 5"),
+    "default of an argument": ("size=5", "size=6"),
+    "attribute of the object": ("np.arange(size)", "np.arange(size) + 1"),
+    "computed when asked for": ("sum(self.values)", "max(self.values)"),
+}
+
+
+@pytest.mark.parametrize("edit", EDITS)
+def test_an_edit_that_may_change_a_number_changes_the_fingerprint(edit: str) -> None:
+    before, after = EDITS[edit]
+    assert before in SOURCE
+    assert hashed(SOURCE.replace(before, after)) != hashed()
+
+
+@pytest.mark.parametrize(
+    ("before", "after"),
+    [
+        ("    LENGTH", "\n    # the length\n    LENGTH"),
+        ("x / 2.0", "(x /\n                2.0)"),
+        ("    class Shape", "    OTHER = LENGTH\n\n    def other():\n        return OTHER\n\n    class Shape"),
+    ],
+    ids=["comment", "line break", "a name that it does not use"],
+)
+def test_what_changes_no_number_changes_no_fingerprint(before: str, after: str) -> None:
+    assert hashed(SOURCE.replace(before, after)) == hashed()
+
+
+def test_a_class_and_its_objects_differ_and_what_they_compute_on_demand_does_not_count() -> None:
+    names = notebook()
+    used = names["Shape"]()
+    assert used.area == 10.0
+    assert fingerprint(used) == fingerprint(names["Shape"]())
+    assert len({fingerprint(one)[0] for one in (used, names["Shape"], names["Shape"](6))}) == 3
+
+
+def test_processes_with_other_hash_seeds_agree(tmp_path: Path) -> None:
+    """A script, `__main__`, and here a cell of a notebook in another file: one class, one fingerprint."""
+    script = tmp_path / "script.py"
+    script.write_text(f"{dedent(SOURCE)}\nfrom vibench.provenance import fingerprint\nprint(fingerprint(Shape())[0])\n")
+    seeds = ({"PYTHONHASHSEED": seed} for seed in ("1", "2"))
+    run = [sys.executable, str(script)]
+    printed = [subprocess.check_output(run, env=os.environ | seed, text=True).strip() for seed in seeds]
+    assert printed == [hashed()] * 2
+
+
+def test_an_imported_module_counts_with_its_sources(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "my_shapes.py").write_text(dedent(SOURCE))
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(sys.modules, "my_shapes", raising=False)
+    source = "import my_shapes\nclass Mine:\n    def f(self):\n        return my_shapes.width()\n"
+    before = hashed(source, "Mine"), hashed(source, "my_shapes.Shape")
+    (tmp_path / "my_shapes.py").write_text(dedent(SOURCE) + "# edited\n")
+    after = hashed(source, "Mine"), hashed(source, "my_shapes.Shape")
+    assert set(before).isdisjoint(after)
+
+
+@pytest.fixture(scope="module")
+def names() -> dict[str, Any]:
+    """Names of a notebook with a problem of its own."""
+    source = """
+        import threading
+        from fake_plugins import Wire
+
+        lock = threading.Lock()
+
+        class Mine(Wire):
+            def __init__(self, nodes: int = 12, thing=None):
+                super().__init__(nodes)
+                self.thing = thing
+
+        class Locked(Mine):
+            def assemble(self, mu):
+                with lock:
+                    return super().assemble(mu)
+    """
+    return notebook(source)
+
+
+def study(**axes: Any) -> vibench.Study:
+    usual: dict[str, Any] = {
+        "name": "given", "validation": 3, "solvers": ["piqp"], "problem": [Wire], "dual": ["cpg"],
+        "primal": ["decorrelated"], "tolerances": [{"pod": [1e-2], "dual": [1e-2]}], "timing_rounds": 1,
+    }  # fmt: skip
+    return vibench.Study(**usual | axes)
+
+
+REFUSED: Mapping[str, tuple[str, ...]] = {
+    "{'problem': [Mine(thing=threading.Lock())]}": (
+        "problem 'Mine' cannot be sent to worker processes", "cannot pickle '_thread.lock' object", "keep such objects",
+    ),
+    "{'problem': [Locked]}": ("problem 'Locked' cannot be sent to worker processes", "'_thread.lock'"),
+    "{'problem': [threading.Thread]}": ("expected a name, or a class or an object of vibench.Problem", "class Thread"),
+    "{'dual': [Mine]}": ("dual strategy: expected", "vibench.DualStrategy, found the class Mine"),
+    "{'dual': [Mine()]}": ("dual strategy: expected", "vibench.DualStrategy, found a Mine"),
+    "{'training': [Mine]}": ("sampling strategy: expected", "vibench.Sampling"),
+    "{'validation': Mine}": ("sampling strategy: expected", "vibench.Sampling"),
+    "{'problem': [lambda: Mine()]}": ("vibench.Problem, found a function",),
+    "{'problem': [Mine(12), Mine(13)]}": ("several plugins", "problem 'Mine'", "label"),
+    "{'problem': [Mine, {'name': Wire, 'label': 'Mine'}]}": ("several plugins", "problem 'Mine'", "label"),
+    "{'problem': [{'name': Mine, 'label': 'obstacle'}, 'obstacle']}": ("several plugins", "problem 'obstacle'"),
+    "{'problem': [{'name': Mine(), 'options': {'nodes': 9}}]}": ("problem 'Mine' is an object", "give its class"),
+    "{'problem': [{'name': Mine, 'options': {'nods': 9}}]}": ("problem 'Mine'", "did you mean 'nodes'"),
+    "{'problem': [{'name': Mine, 'options': {'nodes': 'x'}}]}": ("option 'nodes' of problem 'Mine'", "int"),
+    "{'problem': [3]}": ("problem.0", "expected a name"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("axes", REFUSED)
+def test_what_cannot_be_run_is_refused_in_a_line(axes: str, names: dict[str, Any]) -> None:
+    with pytest.raises(RequestError) as caught:
+        study(**eval(axes, names | {"Wire": Wire}))
+    line = str(caught.value)
+    assert "\n" not in line
+    assert [word for word in REFUSED[axes] if word not in line] == [], line
+
+
+def test_the_problem_is_the_one_at_the_time_of_the_study(names: dict[str, Any]) -> None:
+    mine = names["Mine"]()
+    asked = study(problem=[mine])
+    mine.depth = 7.0
+    (cell,) = expand(asked)
+    assert cell.problem.create().depth == 0.2
+    assert cell.problem.create() is not cell.problem.create()
+    (other,) = expand(study(problem=[mine]))
+    assert (other.key, other.problem.name) == (cell.key, "Mine")
+    assert other.code != cell.code
+
+
+def test_labels_and_options_tell_objects_and_classes_apart(names: dict[str, Any]) -> None:
+    Mine = names["Mine"]
+    labelled = [{"name": Mine(nodes), "label": f"{nodes} nodes"} for nodes in (6, 8)]
+    cells = expand(study(problem=[Mine, {"name": Mine, "options": {"nodes": 9}}, *labelled, Mine]))
+    assert [(cell.labels[0], cell.problem.options) for cell in cells] == [
+        ("Mine", "{}"), ("Mine", '{"nodes": 9}'), ("6 nodes", "{}"), ("8 nodes", "{}"),
+    ]  # fmt: skip
+    assert len({cell.key for cell in cells}) == 4
+    assert [cell.problem.create().V.dim for cell in cells] == [12, 9, 6, 8]
+
+
+def test_a_notebook_s_class_keeps_its_global_names(names: dict[str, Any]) -> None:
+    """Cloudpickle would give it copies of them where it is loaded in the process that defines it."""
+    before = names["Mine"].__init__
+    (cell,) = expand(study(problem=[names["Mine"]()]))
+    assert type(cell.problem.create()) is names["Mine"]
+    assert names["Mine"].__init__ is before
+
+
+def test_the_definition_of_a_cell_holds_no_object(names: dict[str, Any], monkeypatch: pytest.MonkeyPatch) -> None:
+    """It is found again by what made it, and refused in a line where that is not: another process, edited code."""
+    (cell,) = expand(study(problem=[names["Mine"](9)]))
+    content = json.loads(cell.definition)
+    assert content["problem"] == asdict(cell.problem)
+    assert set(content["problem"]) == {"kind", "name", "options", "code"}
+    again = Cell.from_definition(cell.definition)
+    assert (again.key, again.code) == (cell.key, cell.code)
+    (remade,) = expand(study_of_cell(again, "given"))
+    assert (remade.key, remade.problem.create().V.dim) == (cell.key, 9)
+    monkeypatch.setattr(module, "_given", {})
+    with pytest.raises(RequestError, match=r"problem 'Mine' is a class or an object that .* another process"):
+        Cell.from_definition(cell.definition)
+
+
+def test_a_pickled_plugin_brings_what_was_given(names: dict[str, Any], monkeypatch: pytest.MonkeyPatch) -> None:
+    (cell,) = expand(study(problem=[names["Mine"](9)]))
+    sent = pickle.dumps(cell.problem)
+    monkeypatch.setattr(module, "_given", {})
+    received = pickle.loads(sent)
+    assert received == cell.problem
+    assert pickle.loads(pickle.dumps(received)) == received  # a worker of dask sends it on
+    assert received.registered.package == "__main__"
+
+
+def test_what_a_worker_cannot_import_is_a_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    lost = give(PROBLEM, "wire", Wire)
+    monkeypatch.setitem(sys.modules, "fake_plugins", None)
+    monkeypatch.delitem(lost.__dict__, "given")
+    with pytest.raises(RequestError, match="problem 'wire' cannot be received by a worker process: ModuleNotFound"):
+        lost.create({})
