@@ -16,7 +16,8 @@ from typing import Any
 import cloudpickle
 
 from vibench.errors import RequestError, in_a_line, message_of
-from vibench.provenance import distribution_version, fingerprint, is_importable, module_version
+from vibench.provenance import distribution_version
+from vibench.study.fingerprint import fingerprint, is_computed_again, is_importable, module_version
 from vibench.study.kinds import PluginKind
 from vibench.study.registry import RegisteredPlugin, find
 
@@ -208,7 +209,7 @@ def _without_cache(given: Any) -> Any:
     """A copy of an object without what it computes again when asked for (`functools.cached_property`)."""
     kept = copy.copy(given)
     for name in [*getattr(kept, "__dict__", ())]:
-        if isinstance(getattr(type(kept), name, None), cached_property):
+        if is_computed_again(type(kept), name):
             del kept.__dict__[name]
     return kept
 

@@ -19,9 +19,10 @@ from fake_plugins import Wire
 
 import vibench
 from vibench.errors import RequestError
-from vibench.provenance import fingerprint
+from vibench.study import fingerprint as fingerprint_module
 from vibench.study import plugin as module
 from vibench.study.cells import Cell
+from vibench.study.fingerprint import fingerprint
 from vibench.study.kinds import PROBLEM
 from vibench.study.matrix import expand, study_of_cell
 from vibench.study.plugin import give
@@ -121,7 +122,9 @@ def test_a_class_and_its_objects_differ_and_what_they_compute_on_demand_does_not
 def test_processes_with_other_hash_seeds_agree(tmp_path: Path) -> None:
     """A script, `__main__`, and here a cell of a notebook in another file: one class, one fingerprint."""
     script = tmp_path / "script.py"
-    script.write_text(f"{dedent(SOURCE)}\nfrom vibench.provenance import fingerprint\nprint(fingerprint(Shape())[0])\n")
+    script.write_text(
+        f"{dedent(SOURCE)}\nfrom vibench.study.fingerprint import fingerprint\nprint(fingerprint(Shape())[0])\n"
+    )
     seeds = ({"PYTHONHASHSEED": seed} for seed in ("1", "2"))
     run = [sys.executable, str(script)]
     printed = [subprocess.check_output(run, env=os.environ | seed, text=True).strip() for seed in seeds]
@@ -137,6 +140,26 @@ def test_an_imported_module_counts_with_its_sources(tmp_path: Path, monkeypatch:
     (tmp_path / "my_shapes.py").write_text(dedent(SOURCE) + "# edited\n")
     after = hashed(source, "Mine"), hashed(source, "my_shapes.Shape")
     assert set(before).isdisjoint(after)
+
+
+def test_what_is_used_of_vibench_counts(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of the module only what is named; a class of vibench that another inherits from with all that it uses."""
+    source = """
+        import vibench
+        from vibench import DualStrategy
+        class Mine(DualStrategy):
+            def reduce(self, snapshots, W, stop):
+                return vibench.greedy_cone(snapshots, W, stop)
+    """
+    asked: list[str] = []
+    monkeypatch.setattr(fingerprint_module, "code_used", lambda *roots, whole: asked.extend(roots) or "code")
+    before = hashed(source, "Mine")
+    assert {"vibench:greedy_cone", "vibench.interfaces.strategies:DualStrategy"} <= set(asked)
+    assert "vibench:Problem" not in asked
+    monkeypatch.setattr(
+        fingerprint_module, "code_used", lambda *roots, whole: f"edited {'vibench:greedy_cone' in roots}"
+    )
+    assert hashed(source, "Mine") != before
 
 
 @pytest.fixture(scope="module")

@@ -1,0 +1,163 @@
+"""Fingerprints of classes and objects, which tell those apart that a study was given and no distribution has."""
+
+from __future__ import annotations
+
+import dis
+import functools
+import hashlib
+import sys
+from collections.abc import Iterator, Mapping
+from functools import cached_property
+from operator import attrgetter
+from pathlib import Path
+from types import CodeType, FunctionType, GetSetDescriptorType, MemberDescriptorType, ModuleType
+from typing import Any
+
+from vibench.dependencies import code_used
+from vibench.provenance import package_hash
+
+
+def fingerprint(value: Any) -> tuple[str, dict[str, str]]:
+    """Hash of a value and of the code that it runs, equal in all processes that make it in the same way.
+
+    Functions and classes of scripts and notebooks count with their bytecode and the global names that it uses, those of
+    modules with the `module_version` and what they use of vibench. What is computed again when it is asked for
+    (`functools.cached_property`) does not count.
+
+    Returns
+    -------
+    hash, modules
+        The hash, and the versions of the modules that it names.
+
+    Raises
+    ------
+    TypeError
+        If it holds something that cannot be pickled.
+    """
+    met: dict[int, tuple[int, Any]] = {}
+    found = _fingerprint(value, met)
+    modules = [one for _, one in met.values() if isinstance(one, ModuleType)]
+    return found, {one.__name__: version for one in modules if (version := module_version(one))}
+
+
+def _fingerprint(value: Any, met: dict[int, tuple[int, Any]]) -> str:
+    """The same within a value; what was met before is named by its number, and kept, since identities are reused."""
+    if type(value) in (type(None), bool, int, float, complex, str, bytes):
+        words = [repr(value)]
+    elif type(value) in (set, frozenset):
+        words = sorted(_fingerprint(one, dict(met)) for one in value)
+    elif not isinstance(value, tuple) and id(value) in met:
+        words = [f"again {met[id(value)][0]}"]
+    else:
+        met[id(value)] = len(met), value
+        if type(value) is dict:
+            keys = {_fingerprint(key, dict(met)): key for key in value}
+            words = [word for name in sorted(keys) for word in (name, _fingerprint(value[keys[name]], met))]
+        else:
+            words = [part if k == 0 else _fingerprint(part, met) for k, part in enumerate(_parts(value))]
+    return hashlib.sha256("\0".join([type(value).__name__, *words]).encode()).hexdigest()[:16]
+
+
+PARTS: Mapping[type, tuple[str, ...]] = {
+    property: ("fget", "fset"),
+    staticmethod: ("__wrapped__",),
+    classmethod: ("__wrapped__",),
+    functools._lru_cache_wrapper: ("__wrapped__",),
+    cached_property: ("func",),
+    CodeType: (
+        "co_code", "co_consts", "co_names", "co_varnames", "co_freevars", "co_argcount", "co_posonlyargcount",
+        "co_kwonlyargcount", "co_flags",
+    ),
+}  # fmt: skip
+"""What counts of some values, by their types."""
+
+
+def _parts(value: Any) -> Iterator[Any]:
+    """What a value is, in words, and what it consists of."""
+    kind = next((kind for kind in PARTS if isinstance(value, kind)), None)
+    if kind is not None:
+        yield from ("", *(getattr(value, name) for name in PARTS[kind]))
+    elif isinstance(value, ModuleType):
+        yield f"{value.__name__} {module_version(value)}"
+    elif isinstance(value, type | FunctionType) and is_importable(value):
+        module = sys.modules[value.__module__]
+        used = _is_ours(module) or module_version(module)
+        yield code_used(f"{module.__name__}:{value.__qualname__}", whole=True) if used else ""
+        yield from (value.__qualname__, module)
+    elif isinstance(value, FunctionType):
+        cells = [cell.cell_contents for cell in value.__closure__ or ()]
+        yield from ("", value.__code__, value.__defaults__, value.__kwdefaults__, cells, _globals(value))
+    elif isinstance(value, type):
+        members = {name: member for name, member in vars(value).items() if _counts(name, member)}
+        yield from (value.__qualname__, type(value), value.__bases__, members)
+    elif type(value) in (list, tuple):
+        yield from ("", *value)
+    else:
+        yield from _pickled_parts(value)
+
+
+def _pickled_parts(value: Any) -> Iterator[Any]:
+    """What pickle would make a value of."""
+    reduced = value.__reduce_ex__(4)
+    if isinstance(reduced, str):
+        yield from (reduced, sys.modules.get(getattr(value, "__module__", None) or ""))
+        return
+    function, arguments, state, items, pairs = (*reduced, None, None, None)[:5]
+    if isinstance(state, dict):
+        state = {name: one for name, one in state.items() if not is_computed_again(type(value), name)}
+    yield from ("", function, arguments, state, list(items or ()), dict(pairs or ()))
+
+
+def is_computed_again(cls: type, name: str) -> bool:
+    """Whether an attribute of objects of a class keeps what the class computes when it is asked for."""
+    return isinstance(getattr(cls, name, None), cached_property)
+
+
+def _globals(function: FunctionType) -> dict[str, Any]:
+    """The global names that a function uses, with their values; of modules of vibench what is used of them."""
+    code = [function.__code__]
+    for part in code:
+        code += [one for one in part.co_consts if isinstance(one, CodeType)]
+    loads = (one for part in code for one in dis.get_instructions(part) if one.opname.startswith("LOAD_"))
+    names = {str(one.argval) for one in loads if one.opname.endswith(("GLOBAL", "GLOBALS", "NAME"))}
+    used = {name: function.__globals__[name] for name in names if name in function.__globals__}
+    attributes = sorted({name for part in code for name in part.co_names})
+    for name, one in used.items():
+        if isinstance(one, ModuleType) and _is_ours(one):
+            used[name] = code_used(*(f"{one.__name__}:{attribute}" for attribute in attributes), whole=True)
+    return used
+
+
+def _counts(name: str, member: Any) -> bool:
+    """Whether a member of a class is part of its code, and not made by Python."""
+    special = name.startswith("__") and name.endswith("__")
+    made = isinstance(member, GetSetDescriptorType | MemberDescriptorType) or name == "_abc_impl"
+    return not made and (not special or callable(member) or isinstance(member, staticmethod | classmethod))
+
+
+def is_importable(value: Any) -> bool:
+    """Whether another process can import a class or a function by its name."""
+    module = sys.modules.get(str(value.__module__))
+    if module is None or module.__name__ == "__main__":
+        return False
+    try:
+        return attrgetter(value.__qualname__)(module) is value
+    except AttributeError:
+        return False
+
+
+def module_version(module: ModuleType) -> str:
+    """Version of the package of a module if it is installed and has one, else the hash of its sources.
+
+    It is "" for modules of Python, whose version is recorded anyway, and of vibench, of which what is used counts.
+    """
+    source, top = getattr(module, "__file__", None), module.__name__.partition(".")[0]
+    if source is None or _is_ours(module) or top in sys.stdlib_module_names:
+        return ""
+    installed = {"site-packages", "dist-packages"} & {*Path(source).parts}
+    released = getattr(sys.modules.get(top), "__version__", "") if installed else ""
+    return str(released or package_hash(module.__name__))
+
+
+def _is_ours(module: ModuleType) -> bool:
+    return module.__name__.partition(".")[0] == __name__.partition(".")[0]
