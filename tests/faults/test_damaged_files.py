@@ -49,7 +49,7 @@ def made(vibench: Callable[..., Any], tmp_path_factory: pytest.TempPathFactory) 
     write_study(folder, STUDY)
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv(CACHE_VARIABLE, str(folder / "cache"))
-        done = vibench(folder, "run", "study.toml", "--jobs", "2", "--out", "out")
+        done = vibench(folder, "run", "study.toml", "--jobs", "1", "--out", "out")
     assert done.returncode == 0, done.stderr
     return folder
 
@@ -161,7 +161,7 @@ def test_commands_refuse_a_damaged_cell_by_its_name(results: Path, main: Main) -
     for command in (
         ("show", folder),
         ("show", folder, "--table", "queries", "--format", "json"),
-        ("report", folder),
+        ("report", folder, "--no-figures"),
         ("diff", folder, folder),
         ("compare", folder, folder),
         ("replay", folder, cell),
@@ -251,7 +251,8 @@ def test_a_value_that_is_none_of_its_column_is_refused(
     """Written by a stranger, with the right digest."""
     table, column, value = wrong
     execute(results.parent, f"UPDATE {table} SET {column} = {value} WHERE rowid = 1")
-    folder, beside = str(results.parent), {"show": ["--table", table], "diff": [str(results.parent)]}
+    folder = str(results.parent)
+    beside = {"show": ["--table", table], "diff": [folder], "report": ["--no-figures"], "figures": ["--jobs", "1"]}
     code, _, errors = main(command, folder, *beside.get(command, []))
     assert code == 2
     assert f"in the column '{column}' of '{table}', expected {WRONG[wrong]}" in errors

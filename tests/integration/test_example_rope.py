@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
-from samples import write_study
+from samples import ROUNDS, write_study
 from sources import SOURCES, mentions
 
 from vibench.interfaces.problem import MEMBERS
@@ -40,6 +40,7 @@ STUDY: dict[str, Any] = {
     "assembly": ["full", "reduced"],
     "problem": [{"name": "rope", "options": {"half": 16}}],
     "tolerances": [{"pod": [1e-2], "dual": [1e-1], "primal": {"offline-pga": [0.5]}}],
+    "timing_rounds": ROUNDS,
 }
 
 

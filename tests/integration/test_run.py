@@ -14,7 +14,7 @@ from pathlib import Path
 import pandas as pd
 import pytest
 from running import Vibench, assert_same_numbers, by_solver, execute, rows, run_again, without_seconds
-from samples import wire_study, write_study
+from samples import ROUNDS, wire_study, write_study
 
 import vibench.execution.run  # noqa: F401  lists the classes of all stages
 from vibench.results.columns import TABLES
@@ -256,10 +256,10 @@ def test_only_an_edit_of_what_computes_numbers_runs_anything_again(
 def test_the_number_of_jobs_changes_no_result(vibench: Vibench, tmp_path: Path) -> None:
     study = wire_study(
         problem=[{"name": "wire", "label": "long", "options": {"nodes": 40}}],
-        dual=["cpg", "mcpg"],
         primal=["online-supremizers", "offline-pga"],
         solvers=["piqp", "osqp", "gives-up"],
         tolerances=[{"pod": [1e-3], "dual": [1e-2], "primal": {"offline-pga": [0.5]}}],
+        timing_rounds=ROUNDS,
     )
     write_study(tmp_path, study)
     for jobs in ("1", "2"):
