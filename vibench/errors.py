@@ -3,9 +3,14 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterable
+import typing
+from collections.abc import Collection, Iterable
+from typing import TYPE_CHECKING, Any
 
 from vibench.text import one_line
+
+if TYPE_CHECKING:
+    from pydantic import BaseModel, ValidationError
 
 
 class VibenchError(Exception):
@@ -63,3 +68,47 @@ def unknown_name(kind: str, name: str, known: Iterable[str]) -> RequestError:
     else:
         listed = f"known: {', '.join(choices) or 'none'}"
     return RequestError(f"no {kind} is called '{name}'{hint} ({listed})")
+
+
+def fault_line(fault: ValidationError, root: type[BaseModel], named: Collection[str] = ()) -> str:
+    """The key that is wrong in a file of a user, what is wrong, and what was found, from an error of pydantic.
+
+    Parameters
+    ----------
+    fault
+        The error; the first one counts where it holds several.
+    root
+        The model of the whole file.
+    named
+        Keys under which a name stands for a table.
+    """
+    error = fault.errors(include_url=False)[0]
+    # The last part of an unexpected key's path is the key itself, whatever its first character.
+    outer = error["loc"][:-1] if error["type"] == "extra_forbidden" else error["loc"]
+    where = [part for part in outer if isinstance(part, int) or not {*"<["} & {*part}]  # validators and types of unions
+    message, found = error["msg"].removeprefix("Value error, "), ""
+    if isinstance(error["input"], str | int | float):
+        found = f" (found {error['input']!r:.80})"
+    match error["type"]:
+        case "extra_forbidden":
+            fields = _model_at(root, where).model_fields
+            message, found = str(unknown_name("key", "".join(str(error["loc"][-1]).split()), fields)), ""
+        case "missing":
+            message, found = "required, but not given", ""
+        case "model_type":
+            message = "expected a name, or a table with one" if where[0] in named else "expected a table"
+    place = ".".join(map(str, where))
+    return " ".join(f"{place + ': ' if place else ''}{message}{found}".split())
+
+
+def _model_at(root: type[BaseModel], place: list[str | int]) -> type[BaseModel]:
+    """The model of the table at a place in a file."""
+    model = root
+    for key in place:
+        if key in model.model_fields:
+            parts: list[Any] = [model.model_fields[key].annotation]
+            while parts:
+                part = parts.pop()
+                parts += typing.get_args(part)
+                model = part if hasattr(part, "model_fields") else model
+    return model

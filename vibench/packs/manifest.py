@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import tomllib
-import typing
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeAlias
@@ -11,7 +10,7 @@ from typing import Annotated, Any, Literal, TypeAlias
 from annotated_types import Ge, Gt, MinLen
 from pydantic import AllowInfNan, BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from vibench.errors import RequestError, unknown_name
+from vibench.errors import RequestError, fault_line
 from vibench.packs.array_files import safe_path
 
 FILE = "pack.toml"
@@ -227,7 +226,7 @@ def read_manifest(folder: Path) -> Manifest:
         if len(set(names)) < len(names):
             raise RequestError(f"outputs: two of them have the same name: {', '.join(names)}")
     except ValidationError as error:
-        raise RequestError(f"{FILE}: {_fault_line(error.errors(include_url=False)[0])}") from None
+        raise RequestError(f"{FILE}: {fault_line(error, Manifest)}") from None
     except RequestError as error:
         raise RequestError(f"{FILE}: {error}") from None
     return manifest
@@ -257,35 +256,3 @@ def _exactly_one(table: BaseModel, *keys: str) -> None:
     if len(given) != 1:
         found = " and ".join(given) or "none"
         raise ValueError(f"give exactly one of {', '.join(keys)} (found {found})")
-
-
-def _fault_line(error: Any) -> str:
-    """The key that is wrong, what is wrong, and what was found."""
-    where = [part for part in error["loc"] if isinstance(part, int) or part.isidentifier()]
-    message, found = error["msg"].removeprefix("Value error, "), ""
-    if isinstance(error["input"], str | int | float):
-        found = f" (found {error['input']!r:.80})"
-    if error["type"] == "extra_forbidden":
-        *outer, key = error["loc"]
-        message, found = str(unknown_name("key", str(key), _model_at(outer).model_fields)), ""
-        where = [part for part in outer if part != key]
-    elif error["type"] == "missing":
-        message, found = "required, but not given", ""
-    elif error["type"] == "model_type":
-        message = "expected a table"
-    place = ".".join(map(str, where))
-    return " ".join(f"{place + ': ' if place else ''}{message}{found}".split())
-
-
-def _model_at(place: list[str | int]) -> type[BaseModel]:
-    """The model of the table at a place in the manifest."""
-    model: type[BaseModel] = Manifest
-    for key in place:
-        if isinstance(key, str) and key in model.model_fields:
-            parts: list[Any] = [model.model_fields[key].annotation]
-            while parts:
-                part = parts.pop()
-                parts += typing.get_args(part)
-                if isinstance(part, type) and issubclass(part, BaseModel):
-                    model = part
-    return model

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Annotated, Any, Literal, TypeAlias, TypeVar
 
 from annotated_types import Ge, Gt, Le, Lt, MinLen
@@ -19,7 +19,7 @@ from pydantic import (
     model_validator,
 )
 
-from vibench.errors import RequestError, unknown_name
+from vibench.errors import RequestError, fault_line, unknown_name
 from vibench.interfaces.strategies import Stop
 from vibench.qp.settings import SETTINGS
 from vibench.qp.solve import installed_solvers
@@ -191,7 +191,9 @@ class Study(_Model):
         try:
             study = build(given)
         except ValidationError as error:
-            raise RequestError(" ".join(_message(error.errors(include_url=False)[0]).split())) from None
+            raise RequestError(
+                fault_line(error, cls, named=("problem", "dual", "primal", "training", "validation"))
+            ) from None
         _check_names(study)
         return study
 
@@ -214,31 +216,6 @@ class Study(_Model):
 
 def _sampling(entry: SamplingEntry) -> Plugin | None:
     return None if entry.name == OWN else entry.plugin(SAMPLING)
-
-
-MODELS: Mapping[str, type[BaseModel]] = {"tolerances": ToleranceTable, "limits": Limits, "problem": ProblemEntry}
-"""Models of the tables in a study file, by their key; those under other keys are entries of an axis."""
-
-
-def _message(error: Any) -> str:
-    """The key of a study file that is wrong, the expected value and the one found."""
-    # The last part of an unexpected key's path is the key itself, whatever its first character.
-    outer = error["loc"][:-1] if error["type"] == "extra_forbidden" else error["loc"]
-    where = [part for part in outer if not str(part).startswith("<")]
-    message, found = error["msg"].removeprefix("Value error, "), ""
-    if isinstance(error["input"], str | int | float):
-        found = f" (found {error['input']!r:.80})"
-    match error["type"]:
-        case "extra_forbidden":
-            model: type[BaseModel] = MODELS.get(where[0], Entry) if where else Study
-            message, found = str(unknown_name("key", "".join(str(error["loc"][-1]).split()), model.model_fields)), ""
-        case "missing":
-            message = "required, but not given"
-        case "model_type":
-            of_plugin = where[0] in ("problem", "dual", "primal", "training", "validation")
-            message = "expected a name, or a table with one" if of_plugin else "expected a table"
-    place = ".".join(str(part) for part in where)
-    return f"{place + ': ' if place else ''}{message}{found}"
 
 
 def _check_names(study: Study) -> None:
