@@ -10,6 +10,7 @@ from skfem import Basis, BilinearForm, ElementTriP1, MeshTri, condense, solve
 from skfem.helpers import dot, grad
 
 from vibench import Array, Indices, SparseMatrix
+from vibench_problems.disc_mesh import cross
 
 DECAY = 6.0
 """Exponent of the weight |x|^−DECAY in the extension of the bulge: stiff near the disc, soft near the boundary."""
@@ -92,9 +93,9 @@ class DiscMap:
             (mode[:, triangles[1]] - mode[:, triangles[0]], mode[:, triangles[2]] - mode[:, triangles[0]])
             for mode in (self.modes[0], self.modes[-1])
         )
-        unit = _cross(e1, e2)
-        found = [unit, _cross(e1, f2) + _cross(f1, e2), _cross(f1, f2)]
-        return np.stack(found if self._bulge else found[:1]) / unit
+        unit = cross(e1, e2)
+        terms = [unit, cross(e1, f2) + cross(f1, e2), cross(f1, f2)]
+        return np.stack(terms if self._bulge else terms[:1]) / unit
 
     def monomials(self, weights: Array) -> Array:
         """mu_1² (1,), or with a bulge mu_1², mu_1·mu_1 mu_4 and (mu_1 mu_4)² (3,)."""
@@ -102,7 +103,3 @@ class DiscMap:
         if not self._bulge:
             return np.array([scale**2])
         return np.array([scale**2, scale * weights[4], weights[4] ** 2])
-
-
-def _cross(u: Array, v: Array) -> Array:
-    return np.asarray(u[0] * v[1] - u[1] * v[0])

@@ -8,7 +8,7 @@ from scipy.spatial import Delaunay
 from skfem import MeshTri
 
 from vibench import Array
-from vibench_problems.graded_mesh import DISPLACED, displaced
+from vibench_problems.graded_mesh import DISPLACED, displaced, neighbour_sums
 
 SMOOTHING_SWEEPS = 20
 
@@ -87,11 +87,12 @@ def aspect_ratios(points: Array, triangles: NDArray[np.int64]) -> Array:
     """
     a, b, c = (points[:, triangles[i]] for i in range(3))
     edges = np.stack([np.linalg.norm(b - a, axis=0), np.linalg.norm(c - b, axis=0), np.linalg.norm(a - c, axis=0)])
-    area = 0.5 * np.abs(_cross(b - a, c - a))
+    area = 0.5 * np.abs(cross(b - a, c - a))
     return np.asarray(edges.max(axis=0) * edges.sum(axis=0) / (4.0 * np.sqrt(3.0) * area))
 
 
-def _cross(u: Array, v: Array) -> Array:
+def cross(u: Array, v: Array) -> Array:
+    """Cross products (k,) of plane vectors (2×k)."""
     return np.asarray(u[0] * v[1] - u[1] * v[0])
 
 
@@ -161,7 +162,7 @@ def _delaunay_annulus(points: Array, used: NDArray[np.int64], radius: float) -> 
     inside = np.all(np.linalg.norm(corners, axis=2) < radius * (1.0 + 1e-9), axis=1)
     triangles = triangles[~inside]
     a, b, c = (points[triangles[:, i]].T for i in range(3))
-    twice_area = _cross(b - a, c - a)
+    twice_area = cross(b - a, c - a)
     proper = np.abs(twice_area) > 1e-12  # collinear nodes on a side of the square give slivers
     triangles = triangles[proper]
     flip = twice_area[proper] < 0.0
@@ -171,11 +172,8 @@ def _delaunay_annulus(points: Array, used: NDArray[np.int64], radius: float) -> 
 
 def _smoothed(points: Array, triangles: NDArray[np.int64], fixed: NDArray[np.bool_]) -> Array:
     """One Laplacian sweep: every free node moves to the mean of its neighbours."""
-    edges = np.vstack([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]])
-    edges = np.vstack([edges, edges[:, ::-1]])
-    count = np.bincount(edges[:, 0], minlength=len(points))
-    mean = np.column_stack([np.bincount(edges[:, 0], points[edges[:, 1], d], len(points)) for d in range(2)])
+    sums, count = neighbour_sums(points, triangles)
     moved = points.copy()
     free = ~fixed & (count > 0)
-    moved[free] = mean[free] / count[free, None]
+    moved[free] = sums[free] / count[free, None]
     return moved

@@ -171,12 +171,17 @@ def displaced(points: Array, triangles: Indices, free: Mask, share: float) -> Ar
     return np.asarray(np.where(free[:, None], points + shortest[:, None] * steps, points))
 
 
-def _smoothed(points: Array, triangles: Indices, fixed: int) -> Array:
-    """One damped Laplacian sweep over the nodes after the first `fixed`: half way to the mean of the neighbours."""
+def neighbour_sums(points: Array, triangles: Indices) -> tuple[Array, Indices]:
+    """Sums (n×2) of the neighbours of every node over the triangles around it, and their numbers (n,)."""
     edges = np.vstack([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]])
     edges = np.vstack([edges, edges[:, ::-1]])
-    count = np.maximum(np.bincount(edges[:, 0], minlength=len(points)), 1)
-    mean = np.column_stack([np.bincount(edges[:, 0], points[edges[:, 1], d], len(points)) for d in range(2)])
+    sums: Array = np.column_stack([np.bincount(edges[:, 0], points[edges[:, 1], d], len(points)) for d in range(2)])
+    return sums, np.bincount(edges[:, 0], minlength=len(points))
+
+
+def _smoothed(points: Array, triangles: Indices, fixed: int) -> Array:
+    """One damped Laplacian sweep over the nodes after the first `fixed`: half way to the mean of the neighbours."""
+    sums, count = neighbour_sums(points, triangles)
     moved = points.copy()
-    moved[fixed:] += 0.5 * (mean / count[:, None] - points)[fixed:]
+    moved[fixed:] += 0.5 * (sums / np.maximum(count, 1)[:, None] - points)[fixed:]
     return moved

@@ -81,15 +81,15 @@ class Pairing:
 
     def _beside_slave(self, rows: Indices, nodes: Indices, values: Array, count: int) -> SparseMatrix:
         """Matrix of the slave entries followed by those of `count` master nodes, sorted by row and node."""
-        known = self._on_slave
-        before = np.concatenate([[0], np.cumsum(np.bincount(rows, minlength=known.shape[0]))])
-        mine = np.arange(known.nnz) + before[self._slave_rows]
-        theirs = np.arange(len(rows)) + known.indptr[rows + 1]
-        data, columns = np.empty(known.nnz + len(rows)), np.empty(known.nnz + len(rows), dtype=known.indices.dtype)
-        data[mine], columns[mine] = known.data, known.indices
-        data[theirs], columns[theirs] = values, known.shape[1] + nodes
-        pointers = (known.indptr + before).astype(columns.dtype)
-        return sp.csr_array((data, columns, pointers), shape=(known.shape[0], known.shape[1] + count))
+        fixed = self._on_slave
+        before = np.concatenate([[0], np.cumsum(np.bincount(rows, minlength=fixed.shape[0]))])
+        mine = np.arange(fixed.nnz) + before[self._slave_rows]
+        theirs = np.arange(len(rows)) + fixed.indptr[rows + 1]
+        data, columns = np.empty(fixed.nnz + len(rows)), np.empty(fixed.nnz + len(rows), dtype=fixed.indices.dtype)
+        data[mine], columns[mine] = fixed.data, fixed.indices
+        data[theirs], columns[theirs] = values, fixed.shape[1] + nodes
+        pointers = (fixed.indptr + before).astype(columns.dtype)
+        return sp.csr_array((data, columns, pointers), shape=(fixed.shape[0], fixed.shape[1] + count))
 
     def _cut(self, abscissae: Array) -> tuple[Indices, Indices, Array, Array]:
         """Macro-edge, master edge, abscissa and weight of the midpoints of all segments between projected nodes."""

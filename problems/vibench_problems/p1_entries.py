@@ -71,8 +71,8 @@ def _shared(triangles: NDArray[np.integer], rows: Indices, columns: Indices) -> 
         for k, (i, j) in enumerate(zip(rows, columns, strict=True))
         for t in np.flatnonzero(np.any(triangles == i, axis=0) & np.any(triangles == j, axis=0))
     ]
-    found = np.array(pairs, dtype=np.intp).reshape(-1, 2)
-    return found[:, 0], found[:, 1]
+    incidences = np.array(pairs, dtype=np.intp).reshape(-1, 2)
+    return incidences[:, 0], incidences[:, 1]
 
 
 def _opposite(modes: Array, nodes: NDArray[np.integer], local: Indices) -> Array:

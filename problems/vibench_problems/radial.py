@@ -132,10 +132,10 @@ class Radial(AffineProblem):
 
         def distance(basis: Basis, field: Array, value: Radially, slope: Radially | None) -> float:
             x = np.asarray(basis.global_coordinates())
-            r, found = np.linalg.norm(x, axis=0), basis.interpolate(field)
-            square = (np.asarray(found) - value(r)) ** 2
+            r, interpolated = np.linalg.norm(x, axis=0), basis.interpolate(field)
+            square = (np.asarray(interpolated) - value(r)) ** 2
             if slope is not None:
-                square += self.length**2 * np.sum((found.grad - x * (slope(r) / r)) ** 2, axis=0)
+                square += self.length**2 * np.sum((interpolated.grad - x * (slope(r) / r)) ** 2, axis=0)
             return float(np.sqrt(np.sum(square * basis.dx)))
 
         def relative(basis: Basis, field: Array, value: Radially, slope: Radially | None = None) -> float:

@@ -23,7 +23,7 @@ class InfSupGreedy(NestedStrategy):
     def steps(self, offline: Offline) -> Iterator[Step]:
         """Add T(mu)η* at the mu of the smallest β_S(mu)/β_on(mu), η* its minimiser."""
         space = SupremizerSpace(offline)
-        shares = [Shares(found) for found in space.supremizers]
+        shares = [Shares(images) for images in space.supremizers]
         largest = LazyMaximum(np.ones(len(shares)))  # shares only rise as S grows
         history: list[float] = []
         while True:

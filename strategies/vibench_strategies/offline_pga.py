@@ -30,8 +30,8 @@ class OfflinePGA(NestedStrategy):
     def steps(self, offline: Offline) -> Iterator[Step]:
         """Algorithm 1, one vector per step."""
         space = SupremizerSpace(offline)  # lines 1 and 2: S_R(mu) of every training parameter; S = {0}
-        angles = [Angles(found, space.plain) for found in space.supremizers]
-        shares = [Shares(found) for found in space.supremizers] if self.stop == "beta" else []
+        angles = [Angles(images, space.plain) for images in space.supremizers]
+        shares = [Shares(images) for images in space.supremizers] if self.stop == "beta" else []
         # σ and the missing share of β_on do not increase with S (Lemma 3.2): old values are upper bounds of new ones.
         largest, missing = LazyMaximum(np.ones(len(angles))), LazyMaximum(np.ones(len(shares)))
         history: dict[str, list[float]] = {"sigma": []}

@@ -23,7 +23,7 @@ class PODSupremizers(NestedStrategy):
         """Add one mode per step."""
         space = SupremizerSpace(offline)
         weights = np.sqrt(space.shared_by)  # a class counts once for each of its training parameters
-        bases = [c * orthonormal_range(found) for c, found in zip(weights, space.supremizers, strict=True)]
+        bases = [c * orthonormal_range(images) for c, images in zip(weights, space.supremizers, strict=True)]
         modes, sigma, _ = svd(project_out(space.plain, np.hstack(bases)))
         squares = np.where(sigma > RANK_RTOL * weights.max(), sigma, 0.0) ** 2
         tails = np.sqrt(np.append(np.cumsum(squares[::-1])[::-1], 0.0))

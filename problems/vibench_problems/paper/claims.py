@@ -223,10 +223,10 @@ def published(claims: Iterable[Claim]) -> str:
 
 def compared(claims: Iterable[Claim]) -> str:
     """What agrees with the paper, what differs from it and what cannot be compared, as sentences."""
-    found: dict[Verdict, list[str]] = {verdict: [] for verdict in Verdict}
+    by_verdict: dict[Verdict, list[str]] = {verdict: [] for verdict in Verdict}
     for claim in claims:
-        found[claim.verdict].append(f"{claim.statement}: {claim.ours}")
-    said = (f"{verdict.capitalize()}: {'; '.join(texts)}." for verdict, texts in found.items() if texts)
+        by_verdict[claim.verdict].append(f"{claim.statement}: {claim.ours}")
+    said = (f"{verdict.capitalize()}: {'; '.join(texts)}." for verdict, texts in by_verdict.items() if texts)
     return typeset(" ".join(said))
 
 

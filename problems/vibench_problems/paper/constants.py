@@ -10,7 +10,7 @@ import pandas as pd
 
 from vibench.report import HIGH_FIDELITY_LOOK, CaptionedFigure, Look, Looks, Series, Sheet, plot
 from vibench_problems.paper.claims import ORDER, Claim, below, holds, judged_figure, same_order, span, text, unknown
-from vibench_problems.paper.evidence import VISIBLE, Evidence, drawn
+from vibench_problems.paper.evidence import VISIBLE, Evidence, for_log_axis
 from vibench_problems.paper.published import Pair
 
 STRATEGIES = {"decorrelated": "β_dec", "online-supremizers": "β_on", "offline-pga": "β_off"}
@@ -161,12 +161,12 @@ def comparison(evidence: Evidence) -> CaptionedFigure | None:
 
 def _constants(panel: Any, x: Any, rows: pd.DataFrame, part: str, looks: Looks, *, zeros: bool) -> None:
     """The four constants in one panel, with a text for those that are zero."""
-    plot(panel, x, drawn(rows[f"{HF}{part}"]), HIGH_FIDELITY_LOOK, "β_HF")
+    plot(panel, x, for_log_axis(rows[f"{HF}{part}"]), HIGH_FIDELITY_LOOK, "β_HF")
     for name, symbol in STRATEGIES.items():
         look: Look = looks[Series(name)]
         values = rows[COLUMNS[name] + part].to_numpy(float)
         wide = {"linewidth": 3.0} if symbol == "β_on" else {}  # another curve may lie upon it
-        plot(panel, x, drawn(values), look, symbol, **wide)
+        plot(panel, x, for_log_axis(values), look, symbol, **wide)
         if zeros and values.max() < VISIBLE:
             words = f"{symbol} = 0" if values.max() == 0.0 else f"{symbol} ≤ {values.max():.0e}"
             panel.text(0.02, 0.03, words, transform=panel.transAxes, fontsize=7)

@@ -40,7 +40,7 @@ def data(evidence: Evidence) -> Iterator[Claim]:
     yield holds(section, "d ≥ γ₀ / 2", f"{d:g} ≥ {problem.gap / 2:g}", d >= problem.gap / 2.0)
     share = d / max(1.0, float(problem.parameters.lower[0]))
     yield holds(section, "d below 10 % of max(R₁, R₂)", f"at most {100 * share:.3g} %", share < 0.1)
-    yield from contact(problem)
+    yield from contact_claims(problem)
     yield number(section, "E [Pa], ν", (15, 0.35), (problem.young, problem.poisson))
     steps = (len(training), float(training[1, 0] - training[0, 0]))
     yield number(section, "training points, step [m]", (81, 0.0075), steps)
@@ -57,7 +57,7 @@ def data(evidence: Evidence) -> Iterator[Claim]:
     yield unknown("Hertz, (48)", "load ℓ(µ)", "not given", "0", "The flats are moved by a lifting without stress.")
 
 
-def contact(problem: Hertz) -> Iterator[Claim]:
+def contact_claims(problem: Hertz) -> Iterator[Claim]:
     """Signs of b, and g."""
     (B, g), (_, other) = (problem.constraint(np.array([mu])) for mu in (0.7, 1.3))
     upward = float(B[:, np.searchsorted(problem.free, 2 * problem.slave.zone + 1)].sum())
@@ -192,7 +192,7 @@ def solution_claims(evidence: Evidence, contacts: Sequence[Pressed]) -> Iterator
     )
     exact = evidence.problem.quadrature == "exact"
     options: dict[str, Any] = {**evidence.tables.problem_options, "quadrature": 1 if exact else "exact"}
-    own, other = (max(one.oscillation for one in found) for found in (contacts, pressed(Hertz(**options))))
+    own, other = (max(one.oscillation for one in pressures) for pressures in (contacts, pressed(Hertz(**options))))
     direct, none = (other, own) if exact else (own, other)
     points = "one Gauss point" if exact else f"{evidence.problem.quadrature} Gauss points"
     yield holds(

@@ -153,7 +153,7 @@ def stopped(reduction: Reduction, stop: Stop, dual: str = MODIFIED) -> Cone:
     return other.given(snapshots=reduction.snapshots).cone
 
 
-def drawn(values: Any) -> Array:
+def for_log_axis(values: Any) -> Array:
     """Values for a logarithmic axis, without those that are zero up to round-off."""
     array = np.asarray(values, float)
     return np.where(array > VISIBLE, array, np.nan)

@@ -70,7 +70,7 @@ def data(evidence: Evidence) -> Iterator[Claim]:
         int(evidence.cells["queries"].max()),
         why="The sample is another one; that of the paper is not published.",
     )
-    yield nodes(evidence)
+    yield mesh_size(evidence)
     yield number(section, "nodes in ω̂", 467, len(problem.disc_nodes), within=MESH)
     cause = "The paper counts the nodes on Γ, where u = 0."
     yield number(section, "primal degrees of freedom", 3594, problem.V.dim, within=MESH, cause=cause)
@@ -84,7 +84,7 @@ def _radius(problem: Obstacle, scale: float) -> float:
     return float(np.linalg.norm(points, axis=0).max())
 
 
-def nodes(evidence: Evidence) -> Claim:
+def mesh_size(evidence: Evidence) -> Claim:
     """The size of the mesh."""
     return number("Obstacle, §5.1", "nodes", evidence.paper.nodes, evidence.problem.nodes, within=MESH)
 
@@ -190,4 +190,4 @@ def solution(evidence: Evidence) -> CaptionedFigure:
         f"−{-mu[2]:g}) m: left, the deflection u, {span(picture.values)} m; right, the multiplier λ on the disc, "
         f"{span(solved.lam)} 1/m. The orange line is the boundary of the contact, where λ becomes zero."
     )
-    return judged_figure(sheet, caption, [*solution_claims(evidence, solved), nodes(evidence)])
+    return judged_figure(sheet, caption, [*solution_claims(evidence, solved), mesh_size(evidence)])

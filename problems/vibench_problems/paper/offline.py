@@ -17,7 +17,7 @@ from vibench_problems.paper.evidence import (
     PLAIN,
     Evidence,
     History,
-    drawn,
+    for_log_axis,
     last,
     reached,
     reduction_of,
@@ -100,10 +100,10 @@ def projection_errors(evidence: Evidence) -> CaptionedFigure | None:
         return None
     sheet = Sheet(1, 2, f"Figure {paper.figures[0]}: projection errors, {paper.heading}")
     left, right = sheet.panels
-    plot(left, list(modes), drawn(list(modes.values())), Looks([POD])[POD], "POD")
+    plot(left, list(modes), for_log_axis(list(modes.values())), Looks([POD])[POD], "POD")
     looks = Looks(map(Series, cones))
     for name, curve in cones.items():
-        plot(right, list(curve), drawn(list(curve.values())), looks[Series(name)], CONES[name])
+        plot(right, list(curve), for_log_axis(list(curve.values())), looks[Series(name)], CONES[name])
     panels: tuple[tuple[Any, Mapping[float, int], str], ...] = (
         (left, paper.modes, "N"),
         (right, paper.generators, "R"),
@@ -160,7 +160,7 @@ def orthogonality(evidence: Evidence) -> CaptionedFigure | None:
     sheet = Sheet(1, 1, f"Figure {paper.figures[1]}: e_orth(r), {paper.heading}")
     looks = Looks(map(Series, curves))
     for name, curve in curves.items():
-        plot(sheet.panels[0], list(curve), drawn(list(curve.values())), looks[Series(name)], CONES[name])
+        plot(sheet.panels[0], list(curve), for_log_axis(list(curve.values())), looks[Series(name)], CONES[name])
     sheet.panels[0].set(xlabel="r", ylabel="e_orth(r)", yscale="log")
     caption = (
         "Distance e_orth(r), equation (41), of generator r + 1 of CPG and of mCPG from the cone of the r generators "
@@ -237,7 +237,7 @@ def greedy(evidence: Evidence) -> CaptionedFigure | None:
         for column, (quantity, ylabel) in enumerate((("sigma", "σ(µₙ)"), ("beta_span_min", "min β over D_train"))):
             panel, curve = sheet.at(row, column), evidence.growth(pair, quantity)
             look = looks[Series(PGA, paper.tight)]
-            plot(panel, list(curve), drawn(list(curve.values())), look, f"{PGA}, δ = {paper.tight:g}")
+            plot(panel, list(curve), for_log_axis(list(curve.values())), look, f"{PGA}, δ = {paper.tight:g}")
             panel.set(xlabel="vectors n", ylabel=ylabel, title=title, yscale="log")
         panel = sheet.at(row, 2)
         for delta in (paper.tight, pair.loose):

@@ -95,24 +95,24 @@ def table(evidence: Evidence, transcription: Mapping[str, float] | None = None) 
 
     `transcription` has the seconds of the published algorithms in a transcription, by stage.
     """
-    title, problem, found = f"Table {evidence.paper.table}", evidence.tables.problem_name, columns(evidence)
-    for column in found:
-        yield from rows(problem, column, f"{title}, {column.pair.name}")
-    computed = [break_even(*_interleaved(column.pair)).number for column in found]
+    title, problem, measured = f"Table {evidence.paper.table}", evidence.tables.problem_name, columns(evidence)
+    for column in measured:
+        yield from column_claims(problem, column, f"{title}, {column.pair.name}")
+    computed = [break_even(*_interleaved(column.pair)).number for column in measured]
     yield number(
         title,
         "benefit thresholds from the printed seconds",
-        [column.pair.threshold for column in found],
+        [column.pair.threshold for column in measured],
         [round(n) for n in computed if n is not None],
         why="(T_off − T_on) / (t_on − t_off), rounded.",
     )
     if transcription is not None:
         # the obstacle is timed at the first pair of the table, Hertz contact at the last
-        timed = found[0 if problem == "obstacle" else -1].pair
+        timed = measured[0 if problem == "obstacle" else -1].pair
         yield transcribed(transcription, timed, f"{title}, {timed.name}")
-    yield from sentences(found, f"{title}, text")
+    yield from sentences(measured, f"{title}, text")
     if problem == "obstacle":
-        yield from explanations(found, f"{title}, text")
+        yield from explanations(measured, f"{title}, text")
 
 
 def _interleaved(pair: Pair) -> tuple[float, float, float, float]:
@@ -120,7 +120,7 @@ def _interleaved(pair: Pair) -> tuple[float, float, float, float]:
     return offline_on, online_on, offline_off, online_off
 
 
-def rows(problem: str, column: Column, place: str) -> Iterator[Claim]:
+def column_claims(problem: str, column: Column, place: str) -> Iterator[Claim]:
     """One column, row by row."""
     pair, on, off = column.pair, column.on, column.off
     prescribed = (
@@ -209,9 +209,9 @@ def transcribed(seconds: Mapping[str, float], pair: Pair, place: str) -> Claim:
     )
 
 
-def sentences(found: Sequence[Column], place: str) -> Iterator[Claim]:
+def sentences(measured: Sequence[Column], place: str) -> Iterator[Claim]:
     """What the text concludes from the table."""
-    offline = [float(column.off["offline_s"] / column.on["offline_s"]) for column in found]
+    offline = [float(column.off["offline_s"] / column.on["offline_s"]) for column in measured]
     yield number(
         place,
         "offline phase off up to two times as expensive as on",
@@ -221,13 +221,13 @@ def sentences(found: Sequence[Column], place: str) -> Iterator[Claim]:
         why=f"The largest of {text(offline)}.",
         cause="See the rows of this ratio.",
     )
-    verdict = cheaper_from(column.break_even["meaning"] for column in found)
-    savings = f"saving {text([1e3 * column.saving for column in found])} ms"
+    verdict = cheaper_from(column.break_even["meaning"] for column in measured)
+    savings = f"saving {text([1e3 * column.saving for column in measured])} ms"
     why = reason(verdict, "", "See the rows of the ratio of online times.")
     yield Claim(place, "online phase off cheaper than on", "all pairs", savings, verdict, why)
-    yield larger_cone(found, place)
-    seconds = [column.off["online_s"] for column in found]
-    in_the_paper = [column.pair.online[1] for column in found]
+    yield larger_cone(measured, place)
+    seconds = [column.off["online_s"] for column in measured]
+    in_the_paper = [column.pair.online[1] for column in measured]
     yield holds(
         place,
         "online time off practically the same for the three pairs",
@@ -239,10 +239,10 @@ def sentences(found: Sequence[Column], place: str) -> Iterator[Claim]:
     )
 
 
-def larger_cone(found: Sequence[Column], place: str) -> Claim:
+def larger_cone(measured: Sequence[Column], place: str) -> Claim:
     """The advantage of the offline enrichment grows with R: in savings per query."""
-    largest = max(found, key=lambda column: column.pair.size[1])
-    others = [column for column in found if column is not largest]
+    largest = max(measured, key=lambda column: column.pair.size[1])
+    others = [column for column in measured if column is not largest]
     savings = [round(column.pair.online[0] - column.pair.online[1], 3) for column in (largest, *others)]
     contradicted = largest.pair.threshold > min(column.pair.threshold for column in others)
     return holds(
@@ -258,9 +258,9 @@ def larger_cone(found: Sequence[Column], place: str) -> Claim:
     )
 
 
-def explanations(found: Sequence[Column], place: str) -> Iterator[Claim]:
+def explanations(measured: Sequence[Column], place: str) -> Iterator[Claim]:
     """Why queries with online supremizers take longer, as the text has it for the obstacle."""
-    on, off = zip(*(column.dimensions for column in found), strict=True)
+    on, off = zip(*(column.dimensions for column in measured), strict=True)
     yield holds(
         place,
         "primal dimension smaller off than on",
@@ -268,12 +268,12 @@ def explanations(found: Sequence[Column], place: str) -> Iterator[Claim]:
         all(one < other for one, other in zip(off, on, strict=True)),
         cause="PGA saves only those directions of S_R that V_N contains to within δ_PGA.",
     )
-    assembly = [column.on["online_assemble_s"] - column.off["online_assemble_s"] for column in found]
-    shares = [seconds / column.saving for seconds, column in zip(assembly, found, strict=True)]
+    assembly = [column.on["online_assemble_s"] - column.off["online_assemble_s"] for column in measured]
+    shares = [seconds / column.saving for seconds, column in zip(assembly, measured, strict=True)]
     yield holds(
         place,
         "online time on is larger since the primal basis is reconstructed",
         f"assembly makes {text([f'{100 * share:.0f} %' for share in shares])} of the difference",
-        min(shares) > 0.5 and min(column.saving for column in found) > 0.0,
+        min(shares) > 0.5 and min(column.saving for column in measured) > 0.0,
         why="Assembly includes the supremizers and their orthonormalisation.",
     )

@@ -33,10 +33,10 @@ class File(Sampling):
         _read(self.path)
         try:
             if self.path.suffix == ".npy":
-                found: Array = np.load(self.path, allow_pickle=False)
-                if found.dtype.kind not in "fiu":
-                    raise RequestError(f"'{self.path}' holds values of the type {found.dtype}; expected real numbers")
-                return found[:, None] if found.ndim == 1 and box.dim == 1 else found
+                points: Array = np.load(self.path, allow_pickle=False)
+                if points.dtype.kind not in "fiu":
+                    raise RequestError(f"'{self.path}' holds values of the type {points.dtype}; expected real numbers")
+                return points[:, None] if points.ndim == 1 and box.dim == 1 else points
             if self.path.suffix != ".csv":
                 raise RequestError(f"'{self.path}' is neither a .csv nor a .npy file")
             head, *lines = self.path.read_text(encoding="utf-8-sig").strip().splitlines() or [""]

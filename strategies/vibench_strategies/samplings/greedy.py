@@ -42,17 +42,17 @@ class Greedy(AdaptiveSampling):
         """Solve in the middle of the box, then where the bound is worst."""
         mus, (coarse, fixed), unseen = nested_candidates(box, self.candidates, self.seed)
         trainer.solve(mus[0])
-        known, solved, passed, draws = dict[int, float](), 1, 0, coarse + self.drawn
-        while solved < self.most and (known or unseen):
+        bounds, solved, passed, draws = dict[int, float](), 1, 0, coarse + self.drawn
+        while solved < self.most and (bounds or unseen):
             for k in [unseen.pop() for _ in range(min(draws, len(unseen)))]:
-                known[k] = trainer.bound(mus[k])
-                passed = 0 if known[k] > self.tolerance else passed + int(k >= fixed)
-            k, draws = max(known, key=known.__getitem__), 0
-            known[k] = trainer.bound(mus[k])  # of the present model
-            if known[k] > self.tolerance and known[k] >= WEAK * max(known.values()):
-                trainer.solve(mus[k], known.pop(k))
+                bounds[k] = trainer.bound(mus[k])
+                passed = 0 if bounds[k] > self.tolerance else passed + int(k >= fixed)
+            k, draws = max(bounds, key=bounds.__getitem__), 0
+            bounds[k] = trainer.bound(mus[k])  # of the present model
+            if bounds[k] > self.tolerance and bounds[k] >= WEAK * max(bounds.values()):
+                trainer.solve(mus[k], bounds.pop(k))
                 solved, passed, draws = solved + 1, 0, self.drawn
-            elif max(known.values()) <= self.tolerance:
+            elif max(bounds.values()) <= self.tolerance:
                 if passed >= self.checked or not unseen:
                     return
                 draws = self.drawn
