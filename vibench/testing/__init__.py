@@ -12,32 +12,37 @@ because two instances are compared. A QP solver is the function itself.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
 
-from vibench.testing.checks import SECONDS, CheckResult, Conformance, ConformanceError, Verdict
+from vibench.testing.checks import SECONDS, CheckResult, ConformanceError, Verdict
 from vibench.testing.duals import DUAL
-from vibench.testing.figures import FIGURE
 from vibench.testing.primals import PRIMAL
 from vibench.testing.problems import PROBLEM
 from vibench.testing.sample_problem import MovingSupport, sample_offline, sample_snapshots
 from vibench.testing.samplings import SAMPLING
 from vibench.testing.solvers import SOLVER
 
-KINDS: Mapping[str, Conformance[..., Any]] = {
-    one.kind: one for one in (PROBLEM, DUAL, PRIMAL, SAMPLING, SOLVER, FIGURE)
-}
-"""The checks of every kind of plugins, by its word on the command line."""
+if TYPE_CHECKING:
+    from vibench.testing.figures import FIGURE
+
+    check_figure, examine_figure = FIGURE.check, FIGURE.examine
 
 check_dual, examine_dual = DUAL.check, DUAL.examine
-check_figure, examine_figure = FIGURE.check, FIGURE.examine
 check_primal, examine_primal = PRIMAL.check, PRIMAL.examine
 check_problem, examine_problem = PROBLEM.check, PROBLEM.examine
 check_sampling, examine_sampling = SAMPLING.check, SAMPLING.examine
 check_solver, examine_solver = SOLVER.check, SOLVER.examine
 
 __all__ = [
-    "KINDS", "SECONDS", "CheckResult", "ConformanceError", "MovingSupport", "Verdict", "check_dual", "check_figure",
+    "SECONDS", "CheckResult", "ConformanceError", "MovingSupport", "Verdict", "check_dual", "check_figure",
     "check_primal", "check_problem", "check_sampling", "check_solver", "examine_dual", "examine_figure",
     "examine_primal", "examine_problem", "examine_sampling", "examine_solver", "sample_offline", "sample_snapshots",
 ]  # fmt: skip
+
+
+def __getattr__(name: str) -> Any:
+    """Import the checks of figures when they are first asked for: they load pandas."""
+    if name in ("check_figure", "examine_figure"):
+        return getattr(import_module("vibench.testing.figures").FIGURE, name.removesuffix("_figure"))
+    raise AttributeError(f"module 'vibench.testing' has no attribute {name!r}")
