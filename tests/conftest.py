@@ -8,7 +8,7 @@ import shutil
 import subprocess
 import sys
 import sysconfig
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from functools import cache
 from importlib.metadata import EntryPoint
 from pathlib import Path
@@ -17,11 +17,12 @@ import pytest
 import typer.main
 from forking import run_command
 from hypothesis import settings
-from running import Changed, Main, Register, Vibench, execute
-from samples import install_fakes
+from running import Changed, Main, Register, Shared, Vibench, execute
+from samples import SMALL, install_fakes
 from threadpoolctl import threadpool_limits
 
 from vibench.cli import start
+from vibench.library import runs
 from vibench.results.sqlite.reading import FILE
 from vibench.storage.artefacts import CACHE_VARIABLE
 from vibench.study import registry
@@ -61,19 +62,40 @@ def command() -> str:
 
 
 @pytest.fixture(scope="session")
-def quick_run(command: str, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Folder of one run of the registered study `quick` through the installed command, shared by parallel workers."""
+def shared(tmp_path_factory: pytest.TempPathFactory) -> Shared:
+    """Function that makes a folder once, whichever of the parallel workers needs it first; nobody changes it."""
     base = tmp_path_factory.getbasetemp()
-    shared = base.parent if "PYTEST_XDIST_WORKER" in os.environ else base
-    folder = shared / "quick"
-    with (shared / "quick.lock").open("w") as lock:
-        fcntl.flock(lock, fcntl.LOCK_EX)
-        if not (folder / "printed.txt").exists():
-            run = [command, "run", "quick", "--out", str(folder), "--jobs", "2"]
-            done = subprocess.run(run, cwd=shared, capture_output=True, text=True, check=False)
-            assert done.returncode == 0, done.stderr
-            (folder / "printed.txt").write_text(done.stdout, encoding="utf-8")
-    return folder
+    parent = base.parent if "PYTEST_XDIST_WORKER" in os.environ else base
+
+    def once(name: str, make: Callable[[Path], object]) -> Path:
+        folder, made = parent / name, parent / f"{name}.made"
+        with (parent / f"{name}.lock").open("w") as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX)
+            if not made.exists():
+                make(folder)
+                made.touch()
+        return folder
+
+    return once
+
+
+@pytest.fixture(scope="session")
+def quick_run(command: str, shared: Shared) -> Path:
+    """Folder of one run of the registered study `quick` through the installed command."""
+
+    def run(folder: Path) -> None:
+        arguments = [command, "run", "quick", "--out", str(folder), "--jobs", "2"]
+        done = subprocess.run(arguments, cwd=folder.parent, capture_output=True, text=True, check=False)
+        assert done.returncode == 0, done.stderr
+        (folder / "printed.txt").write_text(done.stdout, encoding="utf-8")
+
+    return shared("quick", run)
+
+
+@pytest.fixture(scope="session")
+def small_run(shared: Shared) -> runs.Run:
+    """One run of the study `SMALL`."""
+    return runs.open_run(shared("small", lambda folder: runs.run(SMALL, folder, progress=False, jobs=1)))
 
 
 @pytest.fixture

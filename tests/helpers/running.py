@@ -27,6 +27,9 @@ Main = Callable[..., tuple[int, str, str]]
 Register = Callable[..., None]
 """Makes entry points, given as (group, name, value), the only ones there are."""
 
+Shared = Callable[[str, Callable[[Path], object]], Path]
+"""Makes a folder of a name by a function, once for all parallel workers."""
+
 Changed = Callable[..., Path]
 """Gives a copy of the results of a real run, changed by SQL."""
 

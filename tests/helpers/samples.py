@@ -229,3 +229,17 @@ def small_study(name: str, problem: Sequence[Mapping[str, Any]], **axes: Any) ->
         "tolerances": [{"pod": [1e-2], "dual": [1e-1]}], "validation": 1, "timing_rounds": 1,
     }  # fmt: skip
     return vibench.Study(name=name, problem=problem, **given | axes)
+
+
+SMALL = small_study(
+    "small",
+    [
+        {"name": "radial-obstacle", "options": {"resolution": 200}},
+        {"name": "obstacle", "options": {"resolution": 150}},
+    ],
+    primal=["decorrelated", "online-supremizers", "offline-pga"],
+    assembly=["full", "reduced", "certified"],
+    tolerances=[{"pod": [1e-2], "dual": [1e-1], "primal": {"offline-pga": [0.5]}}],
+    validation=3,
+)
+"""The study of the run that tests of models share."""

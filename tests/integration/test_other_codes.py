@@ -60,7 +60,7 @@ def run(example: Path, monkeypatch: pytest.MonkeyPatch) -> vibench.Run:
     for whole, part in FEW.items():
         text = text.replace(whole, part)
     (example / "study.toml").write_text(f"timing_rounds = 1\n{text}", encoding="utf-8")
-    return vibench.run(vibench.read_study("study.toml"), progress=False)
+    return vibench.run(vibench.read_study("study.toml"), progress=False, jobs=1)
 
 
 @pytest.mark.parametrize("script", ["freefem/obstacle.edp", "getfem/hertz.py"])

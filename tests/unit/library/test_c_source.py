@@ -46,12 +46,19 @@ def compiled(file: Path, unknowns: int, constraints: int) -> Solve:
     return solve
 
 
-@pytest.fixture(scope="module", params=["radial-obstacle", "obstacle"])
-def model(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> vibench.Model:
-    problem = {"name": request.param, "options": {"resolution": 150}}
-    study = small_study("small", [problem], tolerances=[{"pod": [5e-2], "dual": [2e-1]}])
-    run = vibench.run(study, tmp_path_factory.mktemp("c") / "run", progress=False)
-    return run.model(run.cells["cell"].iloc[0])
+PROBLEMS = ["radial-obstacle", "obstacle"]
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> vibench.Run:
+    problems = [{"name": name, "options": {"resolution": 150}} for name in PROBLEMS]
+    study = small_study("small", problems, tolerances=[{"pod": [5e-2], "dual": [2e-1]}])
+    return vibench.run(study, tmp_path_factory.mktemp("c") / "run", progress=False, jobs=1)
+
+
+@pytest.fixture(scope="module", params=PROBLEMS)
+def model(request: pytest.FixtureRequest, run: vibench.Run) -> vibench.Model:
+    return run.model(run.cells.set_index("problem").loc[request.param, "cell"])
 
 
 def test_a_c_source_gives_the_answers_of_the_model(model: vibench.Model, tmp_path: Path) -> None:

@@ -31,25 +31,13 @@ from vibench.model.affine import affine_decomposition
 from vibench.model.hyperreduced import HyperReducedModel, hyper_reduce
 from vibench.qp.exact import exact_solution
 
-PROBLEMS = [
-    {"name": "radial-obstacle", "options": {"resolution": 200}},
-    {"name": "obstacle", "options": {"resolution": 150}},
-]
-STUDY = small_study(
-    "small",
-    PROBLEMS,
-    primal=["online-supremizers", "offline-pga"],
-    assembly=["full", "reduced"],
-    tolerances=[{"pod": [1e-2], "dual": [1e-1], "primal": {"offline-pga": [0.5]}}],
-    validation=2,
-)
 FILES = {"model.npz", RUNTIME}
 FOUND = " was found at this parameter"
 
 
 @pytest.fixture(scope="module")
-def run(tmp_path_factory: pytest.TempPathFactory) -> vibench.Run:
-    return vibench.run(STUDY, tmp_path_factory.mktemp("export") / "run", progress=False)
+def run(small_run: vibench.Run) -> vibench.Run:
+    return small_run
 
 
 def model_of(run: vibench.Run, problem: str, primal: str = "offline-pga", assembly: str = "reduced") -> vibench.Model:
@@ -478,13 +466,6 @@ def test_the_command(run: vibench.Run, main: Main, tmp_path: Path) -> None:
     refused(main(*asked[:-1], str(tmp_path / "b.npz"), "--interpolate", "1e-14"), "A depends on mu", "--evaluations")
 
 
-@pytest.fixture(scope="module")
-def certified(tmp_path_factory: pytest.TempPathFactory) -> vibench.Run:
-    primal = ["decorrelated", "online-supremizers"]
-    study = small_study("certified", PROBLEMS, primal=primal, assembly=["certified"])
-    return vibench.run(study, tmp_path_factory.mktemp("bounds") / "run", progress=False)
-
-
 def certified_model(run: vibench.Run, problem: str = "radial-obstacle", primal: str = "decorrelated") -> vibench.Model:
     return model_of(run, problem, primal, "certified")
 
@@ -498,9 +479,9 @@ def certified_model(run: vibench.Run, problem: str = "radial-obstacle", primal: 
     ],
 )
 def test_an_exported_certificate_gives_the_bounds_of_vibench(
-    problem: str, primal: str, guarantee: str, certified: vibench.Run, tmp_path: Path
+    problem: str, primal: str, guarantee: str, run: vibench.Run, tmp_path: Path
 ) -> None:
-    model = certified_model(certified, problem, primal)
+    model = certified_model(run, problem, primal)
     assert model.certificate is not None
     found = export_model(model, tmp_path / "model.npz")
     assert {file.name for file in tmp_path.iterdir()} == FILES | {BOUNDS}
@@ -523,9 +504,9 @@ def test_an_exported_certificate_gives_the_bounds_of_vibench(
 
 
 def test_where_an_exported_certificate_has_no_bound_it_says_why(
-    certified: vibench.Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    run: vibench.Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    model = certified_model(certified, "obstacle")
+    model = certified_model(run, "obstacle")
     export_model(model, tmp_path / "model.npz")
     exported, mu = WithBounds(tmp_path / "model.npz"), model.parameters.sample(1, seed=5)[0]
     found = exported.solve(mu).solution
@@ -545,7 +526,7 @@ def test_errors_of_polynomials_are_in_the_bounds(tmp_path: Path) -> None:
     problem = [{"name": "obstacle", "options": {"resolution": 150}}]
     tight = [{"pod": [1e-6], "dual": [1e-4]}]
     study = small_study("tight", problem, assembly=["certified"], tolerances=tight)
-    model = certified_model(vibench.run(study, tmp_path / "run", progress=False), "obstacle")
+    model = certified_model(vibench.run(study, tmp_path / "run", progress=False, jobs=1), "obstacle")
     export_model(model, tmp_path / "model.npz", tolerance=1e-2)
     exported = WithBounds(tmp_path / "model.npz")
     for mu in model.parameters.sample(20, seed=5):
@@ -557,8 +538,8 @@ def test_errors_of_polynomials_are_in_the_bounds(tmp_path: Path) -> None:
         assert bound.u_energy < 10.0 * np.sqrt(solution.energy)
 
 
-def test_there_are_no_bounds_outside_the_box_and_no_odd_tolerances(certified: vibench.Run, tmp_path: Path) -> None:
-    model = certified_model(certified)
+def test_there_are_no_bounds_outside_the_box_and_no_odd_tolerances(run: vibench.Run, tmp_path: Path) -> None:
+    model = certified_model(run)
     export_model(model, tmp_path / "model.npz")
     exported, box = WithBounds(tmp_path / "model.npz"), model.parameters
     assert exported.solve(box.upper, tolerance=1e9).verdict == "certified"
@@ -581,16 +562,16 @@ def test_a_model_without_a_certificate_has_no_bounds_and_says_why(run: vibench.R
 
 
 def test_polynomials_that_are_not_the_functions_they_replace_are_not_called_certified(
-    certified: vibench.Run, monkeypatch: pytest.MonkeyPatch
+    run: vibench.Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    model = certified_model(certified)
+    model = certified_model(run)
     monkeypatch.setattr(exported_certificate, "EXACT", 0.0)
     assert exported_model(model).about["certificate"] == "verified"
 
 
-def test_the_command_says_what_has_bounds(certified: vibench.Run, main: Main, tmp_path: Path) -> None:
-    cell, file = str(certified_model(certified).row["cell"]), tmp_path / "out" / "model.npz"
-    code, out, err = main("export-model", str(certified.path.parent), cell, str(file), "--c")
+def test_the_command_says_what_has_bounds(run: vibench.Run, main: Main, tmp_path: Path) -> None:
+    cell, file = str(certified_model(run).row["cell"]), tmp_path / "out" / "model.npz"
+    code, out, err = main("export-model", str(run.path.parent), cell, str(file), "--c")
     assert (code, err) == (0, "")
     assert "\nerror bounds: certified\n" in out
     assert "the C source has no error bounds" in out

@@ -29,7 +29,7 @@ SETTINGS: dict[str, Any] = {
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> vibench.Run:
-    return vibench.run(vibench.Study(**SETTINGS), tmp_path_factory.mktemp("library") / "run", progress=False)
+    return vibench.run(vibench.Study(**SETTINGS), tmp_path_factory.mktemp("library") / "run", progress=False, jobs=1)
 
 
 class Following(Observer):

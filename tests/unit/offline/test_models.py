@@ -3,41 +3,31 @@
 from __future__ import annotations
 
 import warnings
+from itertools import product
 
 import numpy as np
 import pytest
-from samples import small_study
+from samples import SMALL, small_study
 
 import vibench
 from vibench.interfaces.validation import validation_parameters
 
-STUDY = small_study(
-    "small",
-    [{"name": "radial-obstacle", "options": {"resolution": 200}}],
-    primal=["online-supremizers", "offline-pga"],
-    assembly=["full", "reduced"],
-    tolerances=[{"pod": [1e-2], "dual": [1e-1], "primal": {"offline-pga": [0.5]}}],
-    validation=3,
-)
+CELLS = list(product(("online-supremizers", "offline-pga"), ("full", "reduced")))
 
 
-@pytest.fixture(scope="module")
-def run(tmp_path_factory: pytest.TempPathFactory) -> vibench.Run:
-    return vibench.run(STUDY, tmp_path_factory.mktemp("models") / "run", progress=False)
-
-
-@pytest.fixture(scope="module", params=range(4))
-def model(run: vibench.Run, request: pytest.FixtureRequest) -> vibench.Model:
-    return run.model(run.cells["cell"].iloc[request.param])
+@pytest.fixture(scope="module", params=CELLS, ids="-".join)
+def model(small_run: vibench.Run, request: pytest.FixtureRequest) -> vibench.Model:
+    rows = small_run.cells.set_index(["problem", "primal", "assembly"])
+    return small_run.model(rows.loc[("radial-obstacle", *request.param), "cell"])
 
 
 @pytest.fixture(scope="module")
 def mus(model: vibench.Model) -> np.ndarray:
-    return validation_parameters(model.problem, STUDY.validation, STUDY.seed)
+    return validation_parameters(model.problem, SMALL.validation, SMALL.seed)
 
 
-def test_a_model_answers_as_the_run_did(run: vibench.Run, model: vibench.Model, mus: np.ndarray) -> None:
-    rows = run.queries[run.queries["cell"] == model.row["cell"]].set_index("query")
+def test_a_model_answers_as_the_run_did(small_run: vibench.Run, model: vibench.Model, mus: np.ndarray) -> None:
+    rows = small_run.queries[small_run.queries["cell"] == model.row["cell"]].set_index("query")
     for query, mu in enumerate(mus):
         solution, exact = model.solve(mu), model.high_fidelity(mu)
         assert solution.status == "ok"
@@ -111,18 +101,18 @@ def test_a_solver_without_an_answer_has_no_solution(
             getattr(solution, vector)
 
 
-def test_a_cell_is_named_by_its_beginning(run: vibench.Run) -> None:
-    key = str(run.cells["cell"].iloc[0])
-    assert run.model(key[:12]).row["cell"] == key
+def test_a_cell_is_named_by_its_beginning(small_run: vibench.Run) -> None:
+    key = str(small_run.cells["cell"].iloc[0])
+    assert small_run.model(key[:12]).row["cell"] == key
     with pytest.raises(vibench.RequestError, match="0 cells of"):
-        run.model("zzz")
+        small_run.model("zzz")
 
 
 @pytest.fixture(scope="module")
 def certified(tmp_path_factory: pytest.TempPathFactory) -> vibench.Run:
     problem = {"name": "hertz", "options": {"resolution": 300}}
     study = small_study("certified", [problem], assembly=["reduced", "certified"], validation=3)
-    return vibench.run(study, tmp_path_factory.mktemp("certified") / "run", progress=False)
+    return vibench.run(study, tmp_path_factory.mktemp("certified") / "run", progress=False, jobs=1)
 
 
 def test_a_certified_model_bounds_its_errors_and_says_whether_they_keep_a_tolerance(certified: vibench.Run) -> None:

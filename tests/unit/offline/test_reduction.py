@@ -6,20 +6,12 @@ from functools import partial
 
 import numpy as np
 import pytest
-from samples import small_study
+from samples import SMALL
 
 import vibench
 from vibench.errors import UnsupportedError
 
 PROBLEM = {"name": "radial-obstacle", "options": {"resolution": 200}}
-STUDY = small_study(
-    "reduction",
-    [PROBLEM],
-    primal=["online-supremizers", "offline-pga"],
-    assembly=["full", "certified"],
-    tolerances=[{"pod": [1e-2], "dual": [1e-1], "primal": {"offline-pga": [0.5]}}],
-    validation=3,
-)
 
 
 @pytest.fixture(scope="module")
@@ -41,18 +33,13 @@ def snapshots(reduce: partial[vibench.Reduction]) -> vibench.Snapshots:
     return found
 
 
-@pytest.fixture(scope="module")
-def run(tmp_path_factory: pytest.TempPathFactory) -> vibench.Run:
-    return vibench.run(STUDY, tmp_path_factory.mktemp("reduction") / "run", progress=False)
-
-
 @pytest.mark.parametrize("assembly", ["full", "certified"])
 @pytest.mark.parametrize("primal", ["online-supremizers", "offline-pga"])
 def test_a_reduction_answers_as_the_run_of_the_same_study(
-    run: vibench.Run, problem: vibench.Problem, snapshots: vibench.Snapshots, primal: str, assembly: str
+    small_run: vibench.Run, problem: vibench.Problem, snapshots: vibench.Snapshots, primal: str, assembly: str
 ) -> None:
-    cells = run.cells.query("dual == 'mcpg' and primal == @primal and assembly == @assembly")
-    row = cells.iloc[0]
+    rows = small_run.cells.set_index(["problem", "primal", "assembly"])
+    row = rows.loc[(PROBLEM["name"], primal, assembly)]
     reduction = vibench.Reduction(
         problem,
         vibench.create("dual strategy", "mcpg"),
@@ -61,12 +48,12 @@ def test_a_reduction_answers_as_the_run_of_the_same_study(
         vibench.Stop(tolerance=1e-1),
         tolerance=0.5 if primal == "offline-pga" else None,
         assembly=assembly,
-        interpolation=STUDY.interpolation,
-        accuracy=STUDY.accuracy[0],
+        interpolation=SMALL.interpolation,
+        accuracy=SMALL.accuracy[0],
     ).given(snapshots=snapshots)
     assert (reduction.pod.basis.shape[1], reduction.cone.size) == (row["N"], row["R"])
     assert reduction.enrichment.kind == row["enrichment_kind"]
-    theirs = run.model(row["cell"])
+    theirs = small_run.model(row["cell"])
     for mu in problem.validation_set(3, 1):
         one, other = reduction.model.solve(mu), theirs.solve(mu)
         assert one.status == other.status == "ok"
