@@ -35,7 +35,7 @@ class Pack(Problem):
         return pack_digest(options["path"])
 
     def training_set(self) -> Array:
-        """That of the pack."""
+        """The training set of the pack."""
         return self._pack.training
 
     def validation_set(self, count: int, seed: int) -> Array:
@@ -63,11 +63,11 @@ class Pack(Problem):
 
     @property
     def outputs(self) -> tuple[Output, ...]:
-        """Those of the pack."""
+        """The quantities of interest of the pack."""
         return self._pack.outputs
 
     def multiplier_integrals(self) -> Array:
-        """Those of the pack, or X_W applied to ones."""
+        """The integrals of the multiplier functions as the pack has them, or X_W applied to ones."""
         return super().multiplier_integrals() if self._pack.integrals is None else self._pack.integrals
 
     def picture(self, mu: Array, u: Array, lam: Array) -> Picture | None:  # noqa: ARG002

@@ -15,6 +15,7 @@ from page import SECONDS, Page, machines, made_by, read, start
 from vibench.report.figures.looks import look_of
 from vibench.report.figures.style import Sheet, scatter, styled
 from vibench.study.values import CERTIFIED, OWN
+from vibench_problems.paper.published import PROBLEMS
 
 BOUNDS = {
     "HSW": ("hsw_u", "hsw_lambda"), "(ii)": ("u_energy", "lambda_natural"), "(ii) V, W": ("u", "lambda"),
@@ -22,12 +23,6 @@ BOUNDS = {
 }  # fmt: skip
 """Bounds of u and λ: those of Haasdonk, Salomon and Wohlmuth (2012) in V and W, the others in the energy norm and in
 the natural norm of the multiplier unless named."""
-
-PAPER = {
-    "obstacle": ((1e-3, 1e-2), (1e-4, 1e-3), (1e-6, 1e-2)),
-    "hertz": ((1e-3, 1e-2), (1e-3, 1e-3), (1e-2, 1e-2)),
-}
-"""Tolerances (δ_POD, δ_mCPG) of Niakh et al. (2022), §5.1 and §5.2."""
 
 ERRORS = {
     "HSW": ("error_u_absolute", "error_lambda_absolute"),
@@ -93,9 +88,9 @@ def equal_errors(cells: pd.DataFrame) -> pd.DataFrame:
         ratios = others[MEASURED].div([fixed[name] for name in MEASURED]).max(axis=1).rename("largest ratio of errors")
         ranked = others.join(ratios).assign(size=others["N"] + others["R"], above=ratios.clip(lower=1.0))
         greedy = ranked.sort_values(["above", "size"]).iloc[0]
-        pair = fixed["pod_tol"], fixed["dual_tol"]
+        published = {pair.tolerances for pair in PROBLEMS[fixed["problem"]].pairs}
         row = {name: fixed[name] for name in ("problem", "primal", "pod_tol", "dual_tol")}
-        row |= {"paper": "yes" if pair in PAPER[fixed["problem"]] else "no"}
+        row |= {"paper": "yes" if (fixed["pod_tol"], fixed["dual_tol"]) in published else "no"}
         row |= {f"fixed {name}": fixed[name] for name in compared[1:]}
         rows.append(row | {f"greedy {name}": greedy[name] for name in compared} | {ratios.name: greedy[ratios.name]})
     return pd.DataFrame(rows)
