@@ -14,7 +14,8 @@ from page import SECONDS, Page, machines, made_by, read, start
 
 from vibench.report.figures.looks import look_of
 from vibench.report.figures.style import Sheet, scatter, styled
-from vibench.study.values import CERTIFIED, OWN
+from vibench.study.cells import CERTIFIED
+from vibench.study.parameter_sets import OWN
 from vibench_problems.paper.published import PROBLEMS
 
 BOUNDS = {

@@ -130,7 +130,7 @@ def knows(problem: str, resolution: Resolution) -> bool:
 def takes_no_option(problem: str) -> bool:
     """Whether a problem needs no option, as a folder; one that cannot be loaded counts, its case then fails."""
     try:
-        return all(option.default for option in find(PROBLEM, problem).options)
+        return not any(option.required for option in find(PROBLEM, problem).options.values())
     except RequestError:
         return True
 

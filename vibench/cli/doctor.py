@@ -170,7 +170,7 @@ def _load_error(plugin: RegisteredPlugin) -> str:
         elif plugin.kind is SOLVER:
             plugin.load()
         else:
-            plugin.options  # noqa: B018  loads it and evaluates its annotations
+            list(map(str, plugin.options.values()))  # loads it and evaluates its annotations
     except RequestError as error:
         return str(error)
     except Exception as error:  # noqa: BLE001  annotations of plugins are evaluated

@@ -5,7 +5,6 @@ from __future__ import annotations
 import sys
 from collections.abc import Iterator
 from contextlib import suppress
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -25,25 +24,14 @@ HEADINGS = ("name", "from", "what", "options")
 Row = tuple[str, str, str, str]
 
 if TYPE_CHECKING:
+    from vibench.study.registry import RegisteredPlugin
+
     CliName = str
 else:
     CliName = Literal[tuple(CHECKED)]
 
 SECONDS = 120.0
 """Default of `--seconds`: that of `vibench.testing`, which is too slow to import for a help text."""
-
-
-@dataclass(frozen=True)
-class Checked:
-    """What is to be checked: its kind, its name, the plugin itself, and where it is, "module:attribute"."""
-
-    kind: PluginKind
-    name: str
-    plugin: Any
-    reference: str
-
-    def __str__(self) -> str:
-        return f"{self.kind} '{self.name}'"
 
 
 def list_plugins(
@@ -108,7 +96,8 @@ def check_plugin(
     given = {} if run is None else {"run": str(results_file(run).resolve())}
     options, remark = _options(checked, dict(map(key_value, option or [])))
     echo(f"{checked}{remark}")
-    examination = Examination(checked.kind.cli_name, checked.reference, options, seconds, given)
+    reference = checked.reference if checked.entries else OF_QPSOLVERS
+    examination = Examination(checked.kind.cli_name, reference, options, seconds, given)
     results = examine_in_process(examination, lambda result: echo(str(result)))
     counts = {verdict: sum(result.verdict is verdict for result in results) for verdict in Verdict}
     told = (f"{count} {verdict}" for verdict, count in counts.items() if count or verdict is not Verdict.WARNING)
@@ -117,26 +106,27 @@ def check_plugin(
         raise Exit(1)
 
 
-def _options(checked: Checked, given: dict[str, Any]) -> tuple[dict[str, Any] | None, str]:
-    """Options of a plugin, and what its title says of them: those that `vibench check` chooses where none are given."""
-    from vibench.study.options import checked_arguments, options_of
-    from vibench.testing.solvers import of_qpsolvers
+OF_QPSOLVERS = "vibench.testing.solvers:of_qpsolvers"
+"""What the solvers of qpsolvers are checked as, with the option `solver`."""
 
+
+def _options(checked: RegisteredPlugin, given: dict[str, Any]) -> tuple[dict[str, Any] | None, str]:
+    """Options of a plugin, and what its title says of them: those that `vibench check` chooses where none are given."""
     if checked.kind is SOLVER:
         if given:
             raise RequestError(f"{checked} has no options")
-        return ({"solver": checked.name} if checked.plugin is of_qpsolvers else None), ""
+        return (None if checked.entries else {"solver": checked.name}), ""
     if checked.kind is PROBLEM and "resolution" not in given:
         with suppress(RequestError):  # the problem has no resolution of that name
-            options = checked_arguments(checked.plugin, str(checked), {"resolution": "coarse", **given})
+            options = checked.check_options({"resolution": "coarse", **given})
             return options, ", at resolution coarse (--option resolution=… for another)"
     chosen = {}
     if checked.kind is SAMPLING:
-        needed = {option.name for option in options_of(checked.plugin) if not option.default}
+        needed = {name for name, option in checked.options.items() if option.required}
         chosen = {name: value for name, value in SAMPLE.items() if name in needed and name not in given}
     told = " and ".join(f"{name} = {value}" for name, value in chosen.items())
     remark = f", with {told} (--option {next(iter(chosen))}=… for another)" if chosen else ""
-    return checked_arguments(checked.plugin, str(checked), chosen | given), remark
+    return checked.check_options(chosen | given), remark
 
 
 SAMPLE = {"size": 16, "seed": 0}
@@ -182,20 +172,19 @@ def _loaded_rows(kind: PluginKind) -> Iterator[Row]:
     from vibench.study.registry import registered
 
     for name, plugin in registered(kind).items():
-        options, columns = [], []
+        lines: list[str] = []
         try:
             if kind is STUDY:
                 description = f"{len(expand(read_study(name)))} cells"
             else:
                 description = (plugin.load().__doc__ or "").strip().split("\n")[0]
-                options = plugin.options
-            columns = _columns(name) if kind is FIGURE else []
+                lines += map(str, plugin.options.values())
+            lines += _columns(name) if kind is FIGURE else []
         except VibenchError as error:
             description = str(error)
         except Exception as error:  # noqa: BLE001  annotations of plugins are evaluated
             description = f"{plugin} cannot be read: {in_a_line(error)}"
-        lines = [f"{o.name}: {o.expected}" + f" = {o.default}" * bool(o.default) for o in options]
-        yield name, plugin.origin, description, "\n".join([*lines, *columns])
+        yield name, plugin.origin, description, "\n".join(lines)
 
 
 def _columns(name: str) -> list[str]:
@@ -234,8 +223,8 @@ def _solver_rows() -> Iterator[Row]:
         yield name, provenance.solver_version(name), state, ""
 
 
-def _find(text: str) -> Checked:
-    """The plugin that NAME, KIND:NAME or MODULE:NAME refers to.
+def _find(text: str) -> RegisteredPlugin:
+    """The plugin that NAME, KIND:NAME or MODULE:NAME refers to, loaded.
 
     Raises
     ------
@@ -244,20 +233,22 @@ def _find(text: str) -> Checked:
     """
     from vibench.qp.solve import installed_solvers
     from vibench.study.registry import named, registered
-    from vibench.testing.solvers import of_qpsolvers
 
     prefix, colon, rest = text.partition(":")
     if colon and prefix not in CHECKED:
         return _find_object(prefix, rest)
     plugin = named(text, CHECKED, installed_solvers(registered(SOLVER)))
-    if plugin.kind is SOLVER and plugin.name not in registered(SOLVER):
-        return Checked(SOLVER, plugin.name, of_qpsolvers, f"{of_qpsolvers.__module__}:{of_qpsolvers.__name__}")
-    return Checked(plugin.kind, plugin.name, plugin.load(), plugin.reference)
+    if plugin.entries:
+        plugin.load()
+    return plugin
 
 
-def _find_object(module: str, name: str) -> Checked:
+def _find_object(module: str, name: str) -> RegisteredPlugin:
     """A plugin in an importable module; modules in the current folder count. A function is a QP solver."""
     import importlib
+    from importlib.metadata import EntryPoint
+
+    from vibench.study.registry import RegisteredPlugin
 
     where = f"{module}:{name}"
     title = f"'{where}'"
@@ -274,11 +265,11 @@ def _find_object(module: str, name: str) -> Checked:
     if isinstance(plugin, type):
         for kind, base in bases.items():
             if issubclass(plugin, base):
-                return Checked(kind, where, plugin, where)
+                return RegisteredPlugin(kind, where, (EntryPoint(where, where, kind.entry_points),))
         names = ", ".join(base.__name__ for base in bases.values())
         raise RequestError(f"{title} is no subclass of {names}, and no QP solver")
     if callable(plugin):
-        return Checked(SOLVER, where, plugin, where)
+        return RegisteredPlugin(SOLVER, where, (EntryPoint(where, where, SOLVER.entry_points),))
     classes = [value for value in contents.values() if isinstance(value, type)]
     own = [one.__name__ for one in classes if issubclass(one, tuple(bases.values())) and one.__module__ == module]
     raise unknown_name(f"plugin of the module {module}", name, own)

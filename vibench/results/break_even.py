@@ -12,7 +12,7 @@ import numpy as np
 from vibench.arrays import Array, Indices
 from vibench.interfaces.strategies import Kind
 from vibench.results.columns import KEYS, THRESHOLDS
-from vibench.study.values import CERTIFIED
+from vibench.study.cells import CERTIFIED
 
 DRAWS = 2000
 """Resamples of the rounds that an interval is taken from."""

@@ -31,10 +31,9 @@ from vibench.stages.offline import ConstraintMatrices, ReducedCone
 from vibench.stages.query import Queries, Query, error_columns, run_query
 from vibench.stages.snapshots import gather, solution_stages
 from vibench.storage.artefacts import Artefact, Store
-from vibench.study.cells import Cell
+from vibench.study.cells import CERTIFIED, Cell
 from vibench.study.kinds import SOLVER
 from vibench.study.registry import find
-from vibench.study.values import CERTIFIED
 from vibench.timing import median_interval, median_of
 
 CLEAR_GAP = 10.0

@@ -11,10 +11,12 @@ from typing import Any
 from vibench.dependencies import CELL, code_used
 from vibench.interfaces.strategies import Stop
 from vibench.study.kinds import SOLVER
-from vibench.study.parameter_sets import OWN_TRAINING, ParameterSet
+from vibench.study.parameter_sets import OWN, OWN_TRAINING, ParameterSet
 from vibench.study.plugin import Plugin
 from vibench.study.registry import find
-from vibench.study.values import OWN
+
+CERTIFIED = "certified"
+"""Assembly of queries that are assembled as reduced ones, and have certificates."""
 
 
 def digest(content: Any) -> str:

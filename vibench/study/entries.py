@@ -20,9 +20,9 @@ from pydantic import (
 )
 
 from vibench.study.kinds import PluginKind
+from vibench.study.parameter_sets import OWN
 from vibench.study.plugin import GivenPlugin, Plugin, give
 from vibench.study.registry import RegisteredPlugin, find
-from vibench.study.values import OWN
 
 Size: TypeAlias = Annotated[int, Ge(1), Le(100_000)]
 Name: TypeAlias = Annotated[str, MinLen(1)]

@@ -13,10 +13,9 @@ from vibench.reduction.nested import NestedStrategy
 from vibench.study.cells import Cell
 from vibench.study.entries import Entry
 from vibench.study.kinds import DUAL, PRIMAL, PROBLEM, PluginKind
-from vibench.study.parameter_sets import ParameterSet
+from vibench.study.parameter_sets import OWN, ParameterSet
 from vibench.study.plugin import GivenPlugin, Plugin
 from vibench.study.spec import Study, ToleranceTable
-from vibench.study.values import OWN
 
 
 def expand(study: Study) -> list[Cell]:

@@ -7,7 +7,7 @@ import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
-from pathlib import Path
+from inspect import Parameter
 from typing import Any, get_type_hints
 
 from pydantic import ConfigDict, PydanticUserError, TypeAdapter, ValidationError
@@ -20,19 +20,75 @@ FINITE = ConfigDict(allow_inf_nan=False)
 
 @dataclass(frozen=True)
 class Option:
-    """One option of a plugin: name, expected values in words, default as text ("" if it is required)."""
+    """One option of a plugin, an argument of its constructor.
+
+    Attributes
+    ----------
+    name, annotation
+        Name and annotation of the argument.
+    preset
+        Its default; `Parameter.empty` if it is required.
+    """
 
     name: str
-    expected: str
-    default: str
+    annotation: Any
+    preset: Any
+
+    def __str__(self) -> str:
+        return f"{self.name}: {self.expected}" + f" = {self.preset!r}" * (not self.required)
+
+    @property
+    def required(self) -> bool:
+        """Whether it has no default."""
+        return self.preset is Parameter.empty
+
+    @property
+    def expected(self) -> str:
+        """The annotation in words: "float > 0.0", "'coarse', 'fine' or int ≥ 150"."""
+        schema = TypeAdapter(self.annotation).json_schema()
+        return " or ".join(_words(part) for part in schema.get("anyOf", [schema]))
+
+    def read(self, value: Any) -> Any:
+        """A value, converted to the type of the annotation; a `ValidationError` if it does not conform to it."""
+        # In strict mode pydantic converts lists to tuples and texts to enumerations only from JSON.
+        text = json.dumps(value, default=str)
+        return TypeAdapter(self.annotation, config=FINITE).validate_json(text, strict=True)
+
+    @property
+    def doubt(self) -> str:
+        """What is doubtful of it: no annotation, or a default that does not conform to it; "" if nothing."""
+        if self.annotation is Any:
+            return "has no annotation that says what study files may set it to"
+        try:
+            expected = self.expected
+            if not self.required:
+                self.read(self.preset)
+        except PydanticUserError as error:
+            return f"has an annotation that no value of a study file conforms to: {in_a_line(error)}"
+        except ValidationError:
+            return f"has the default {self.preset!r}; its annotation expects {expected}"
+        return ""
 
 
-def options_of(plugin: type) -> list[Option]:
-    """The options of a class."""
-    return [
-        Option(option, _expected(annotation), "" if default is inspect.Parameter.empty else repr(default))
-        for option, (default, annotation) in _parameters(plugin).items()
-    ]
+@cache
+def options_of(plugin: Any) -> Mapping[str, Option]:
+    """The options of a class, by name.
+
+    Raises
+    ------
+    RequestError
+        If an annotation cannot be evaluated.
+    """
+    constructor = inspect.getattr_static(plugin, "__init__")
+    if constructor is object.__init__:
+        return {}
+    try:
+        hints = get_type_hints(constructor, include_extras=True)
+    except Exception as error:  # noqa: BLE001  evaluating annotations runs third-party code
+        raise RequestError(f"the options of {plugin.__name__} have annotations that fail: {in_a_line(error)}") from None
+    parameters = list(inspect.signature(constructor).parameters.values())[1:]  # without self
+    named = [p for p in parameters if p.kind not in (p.VAR_POSITIONAL, p.VAR_KEYWORD)]
+    return {p.name: Option(p.name, hints.get(p.name, Any), p.default) for p in named}
 
 
 def checked_arguments(plugin: type, what: str, given: Mapping[str, Any]) -> dict[str, Any]:
@@ -43,75 +99,25 @@ def checked_arguments(plugin: type, what: str, given: Mapping[str, Any]) -> dict
     RequestError
         If an option is unknown, missing, or not of its type.
     """
-    parameters = _parameters(plugin)
-    for option in given:
-        if option not in parameters:
-            raise unknown_name(f"option of {what}", option, parameters)
-    checked = {}
-    for option, (default, annotation) in parameters.items():
-        if option in given:
-            # In strict mode pydantic converts lists to tuples and texts to enumerations only from JSON.
-            text = json.dumps(given[option], default=str)
+    options, checked = options_of(plugin), {}
+    for name in given:
+        if name not in options:
+            raise unknown_name(f"option of {what}", name, options)
+    for name, option in options.items():
+        if name in given:
             try:
-                checked[option] = TypeAdapter(annotation, config=FINITE).validate_json(text, strict=True)
+                checked[name] = option.read(given[name])
             except ValidationError:
-                expected = _expected(annotation)
-                raise RequestError(f"option '{option}' of {what} is {given[option]!r}; expected {expected}") from None
-        elif default is inspect.Parameter.empty:
-            raise RequestError(f"{what} needs the option '{option}' ({_expected(annotation)})")
+                expected = option.expected
+                raise RequestError(f"option '{name}' of {what} is {given[name]!r}; expected {expected}") from None
+        elif option.required:
+            raise RequestError(f"{what} needs the option '{name}' ({option.expected})")
     return checked
 
 
-def canonical_options(plugin: type, what: str, given: Mapping[str, Any]) -> str:
-    """Options of a class as canonical JSON, checked by `checked_arguments`, without those that equal their default."""
-    parameters, checked = _parameters(plugin), checked_arguments(plugin, what, given)
-    kept = {option: value for option, value in checked.items() if value != parameters[option][0]}
-    return json.dumps(TypeAdapter(dict[str, Any]).dump_python(kept, mode="json"), sort_keys=True)
-
-
-def path_options(plugin: type) -> list[str]:
-    """Options of a class that are paths."""
-    return [option for option, (_, annotation) in _parameters(plugin).items() if annotation is Path]
-
-
-def doubtful_options(plugin: type) -> dict[str, str]:
-    """What is doubtful of the options of a class, by name: no annotation, or a default that does not conform to it."""
-    doubts = {}
-    for option, (default, annotation) in _parameters(plugin).items():
-        if annotation is Any:
-            doubts[option] = "has no annotation that says what study files may set it to"
-            continue
-        try:
-            expected = _expected(annotation)
-            if default is not inspect.Parameter.empty:
-                text = json.dumps(default, default=str)
-                TypeAdapter(annotation, config=FINITE).validate_json(text, strict=True)
-        except PydanticUserError as error:
-            doubts[option] = f"has an annotation that no value of a study file conforms to: {in_a_line(error)}"
-        except ValidationError:
-            doubts[option] = f"has the default {default!r}; its annotation expects {expected}"
-    return doubts
-
-
-@cache
-def _parameters(plugin: Any) -> Mapping[str, tuple[Any, Any]]:
-    """Default and annotation of every named parameter of a constructor."""
-    constructor = inspect.getattr_static(plugin, "__init__")
-    if constructor is object.__init__:
-        return {}
-    try:
-        hints = get_type_hints(constructor, include_extras=True)
-    except Exception as error:  # noqa: BLE001  evaluating annotations runs third-party code
-        raise RequestError(f"the options of {plugin.__name__} have annotations that fail: {in_a_line(error)}") from None
-    parameters = list(inspect.signature(constructor).parameters.values())[1:]  # without self
-    named = [p for p in parameters if p.kind not in (p.VAR_POSITIONAL, p.VAR_KEYWORD)]
-    return {p.name: (p.default, hints.get(p.name, Any)) for p in named}
-
-
-def _expected(annotation: Any) -> str:
-    """An annotation in words: "float > 0.0", "'coarse', 'fine' or int ≥ 150"."""
-    schema = TypeAdapter(annotation).json_schema()
-    return " or ".join(_words(part) for part in schema.get("anyOf", [schema]))
+def as_json(options: Mapping[str, Any]) -> str:
+    """Checked options as canonical JSON."""
+    return json.dumps(TypeAdapter(dict[str, Any]).dump_python(dict(options), mode="json"), sort_keys=True)
 
 
 def _words(schema: Mapping[str, Any]) -> str:

@@ -14,7 +14,9 @@ from vibench.interfaces.problem import Problem
 from vibench.interfaces.strategies import AdaptiveSampling, Sampling
 from vibench.interfaces.validation import training_parameters, validation_parameters
 from vibench.study.plugin import Plugin
-from vibench.study.values import OWN
+
+OWN = "own"
+"""Name of the training and the validation set that a problem itself has."""
 
 
 @dataclass(frozen=True)

@@ -160,10 +160,6 @@ class GivenPlugin(RegisteredPlugin):
             raise RequestError(f"the {self} is an object, whose options are chosen: give its class with options")
         return {}
 
-    def canonical_options(self, given: Mapping[str, Any]) -> str:
-        """Options of a class as canonical JSON; none of an object."""
-        return super().canonical_options(given) if self.is_class else json.dumps(self.check_options(given))
-
     def data_digest(self, options: Mapping[str, Any]) -> str:
         """Digest of the files that a class reads with these options; an object has read its own."""
         return super().data_digest(options) if self.is_class else ""
@@ -186,10 +182,12 @@ def give(kind: PluginKind, name: str, given: Any) -> GivenPlugin:
         If it is none of the kind, or cannot be sent to worker processes.
     """
     cls, base = given if isinstance(given, type) else type(given), kind.base
-    if base is None or not issubclass(cls, base):
-        expected = "a name" if base is None else f"a name, or a class or an object of vibench.{base.__name__}"
+    assert base is not None  # plugins of the axes are classes
+    if not issubclass(cls, base):
         found = f"the class {cls.__name__}" if given is cls else f"a {cls.__name__}"
-        raise RequestError(f"{kind}: expected {expected}, found {found}")
+        raise RequestError(
+            f"{kind}: expected a name, or a class or an object of vibench.{base.__name__}, found {found}"
+        )
     try:
         kept = given if given is cls else copy.deepcopy(_without_cache(given))
         pickled = _dumped(kept)

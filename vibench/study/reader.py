@@ -88,7 +88,9 @@ def _anchor(content: dict[str, Any], folder: Path) -> None:
 def _anchor_options(entry: dict[str, Any], folder: Path) -> None:
     given = entry.get("options")
     for options in (entry, given if isinstance(given, dict) else {}):
-        for name in find(SAMPLING, str(entry.get("name"))).path_options:
+        plugin = find(SAMPLING, str(entry.get("name")))
+        known = plugin.options if plugin.entries and not plugin.conflict else {}
+        for name in (name for name, option in known.items() if option.annotation is Path):
             if isinstance(options.get(name), str):
                 options[name] = str(folder / options[name])
 

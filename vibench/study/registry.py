@@ -7,7 +7,6 @@ imported at the top.
 from __future__ import annotations
 
 import importlib.metadata
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property
@@ -172,18 +171,11 @@ class RegisteredPlugin:
         return [one for one in self.requirements if not distribution_version(one)]
 
     @property
-    def options(self) -> list[Option]:
-        """Its options, read from its constructor."""
+    def options(self) -> Mapping[str, Option]:
+        """Its options by name, read from its constructor."""
         from vibench.study.options import options_of
 
         return options_of(self.load())
-
-    @property
-    def path_options(self) -> list[str]:
-        """Those of its options that are paths; none of a name that nobody, or several, registered."""
-        from vibench.study.options import path_options
-
-        return path_options(self.load()) if self.entries and not self.conflict else []
 
     def check_options(self, given: Mapping[str, Any]) -> dict[str, Any]:
         """Options, converted to the types of its constructor's arguments; as they are if several have its name.
@@ -198,12 +190,11 @@ class RegisteredPlugin:
         return dict(given) if self.conflict else checked_arguments(self.load(), str(self), given)
 
     def canonical_options(self, given: Mapping[str, Any]) -> str:
-        """Options as canonical JSON, without those that equal their default; as they are if several have its name."""
-        from vibench.study.options import canonical_options
+        """Checked options as canonical JSON, without those that equal their default."""
+        from vibench.study.options import as_json
 
-        if self.conflict:
-            return json.dumps(given, sort_keys=True, default=str)
-        return canonical_options(self.load(), str(self), given)
+        checked, options = self.check_options(given), {} if self.conflict else self.options
+        return as_json({name: v for name, v in checked.items() if name not in options or v != options[name].preset})
 
     def data_digest(self, options: Mapping[str, Any]) -> str:
         """Digest of the files that it reads with these options, "" if it reads none, or cannot be made here.

@@ -35,10 +35,9 @@ from vibench.study.entries import (
     as_list,
 )
 from vibench.study.kinds import DUAL, PRIMAL, PROBLEM, SAMPLING, SOLVER, PluginKind
-from vibench.study.parameter_sets import ParameterSet, check_sets, is_available
+from vibench.study.parameter_sets import OWN, ParameterSet, check_sets, is_available
 from vibench.study.plugin import Plugin
 from vibench.study.registry import find, registered
-from vibench.study.values import OWN
 
 Tolerance: TypeAlias = Annotated[float, Gt(0.0), Lt(1.0), AllowInfNan(False)]
 Seconds: TypeAlias = Annotated[float, Gt(0.0), Le(1e7), AllowInfNan(False)]

@@ -17,7 +17,7 @@ from vibench.arrays import Array
 from vibench.errors import NumericalError, in_a_line
 from vibench.interfaces.problem import MEMBERS, Problem
 from vibench.storage.serialisation import dumps, loads
-from vibench.study.options import doubtful_options
+from vibench.study.options import options_of
 from vibench.testing.checks import SECONDS, ConformanceError, Doubt, Note, plugin_line
 from vibench.testing.comparisons import Arrays, at, copies, differences
 from vibench.testing.processes import NotImportableError, call_in_other_process
@@ -134,8 +134,9 @@ class Case(Examined[PluginT], ABC, Generic[PluginT, ArgumentT, ResultT]):
         """Every option has an annotation that its default conforms to: study files may set no other to anything."""
         constructor = getattr(self.create, "func", self.create)
         if isinstance(constructor, type):
-            for option, problem in doubtful_options(constructor).items():
-                yield Doubt(f"the option '{option}' {problem}")
+            for option in options_of(constructor).values():
+                if doubt := option.doubt:
+                    yield Doubt(f"the option '{option.name}' {doubt}")
 
     def determinism(self) -> Iterator[str]:
         """A second call and another instance give the same results to the last bit."""

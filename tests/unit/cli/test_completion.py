@@ -147,7 +147,7 @@ def test_words_that_bash_breaks_are_completed_after_the_break(
 def test_the_overview_reads_the_options_that_the_registry_knows(kind: str) -> None:
     """Without importing any plugin."""
     for plugin in registered(LISTS[kind]).values():
-        assert plugin.names_of_options == [option.name for option in plugin.options]
+        assert plugin.names_of_options == list(plugin.options)
         assert plugin.summary == (plugin.load().__doc__ or "").split("\n")[0]
 
 

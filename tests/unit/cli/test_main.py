@@ -263,7 +263,7 @@ def test_list_shows_every_plugin_and_its_options(main: Main) -> None:
     for kind in LISTS.values():
         for name in registered(kind):
             assert name in out
-    options = find(kinds.PROBLEM, "obstacle").options
+    options = find(kinds.PROBLEM, "obstacle").options.values()
     assert ", ".join(option.name for option in options) in out
     _, out, _ = main("list", "problems")
     for option in options:

@@ -139,8 +139,8 @@ def test_registered_studies_are_files_that_load() -> None:
 def test_every_built_in_plugin_has_a_summary_and_options_with_defaults(kind: str) -> None:
     for name in registered(kind):
         assert (find(kind, name).load().__doc__ or "").strip()
-        assert all(option.expected for option in find(kind, name).options)
-        required = [option.name for option in find(kind, name).options if not option.default]
+        assert all(option.expected for option in find(kind, name).options.values())
+        required = [option.name for option in find(kind, name).options.values() if option.required]
         assert required == (["path"] if name == "pack" else [])
         assert find(kind, name).check_options(dict.fromkeys(required, "text")) == dict.fromkeys(required, "text")
 
@@ -349,7 +349,7 @@ def test_lists_and_texts_of_the_wrong_kind_are_refused(option: str, given: Any) 
 
 @pytest.mark.usefixtures("_own")
 def test_a_plugin_without_constructor_takes_no_options() -> None:
-    assert find(DUAL, "plain").options == []
+    assert find(DUAL, "plain").options == {}
     assert isinstance(find(DUAL, "plain").create({}), Plain)
     assert "known: none" in refusal(find(DUAL, "plain").check_options, {"x": 1})
 
@@ -373,7 +373,8 @@ def test_keyword_arguments_of_no_name_are_no_option_that_must_be_given() -> None
 
 @pytest.mark.usefixtures("_own")
 def test_options_are_listed_in_words() -> None:
-    listed = {option.name: (option.expected, option.default) for option in find(DUAL, "choosy").options}
+    options = find(DUAL, "choosy").options
+    listed = {name: (option.expected, str(option).partition(" = ")[2]) for name, option in options.items()}
     assert listed["weight"] == ("float > 0 and < 1", "")
     assert listed["count"] == ("int ≥ 1 and ≤ 9", "3")
     assert listed["mode"] == ("'slow', 'fast'", "'slow'")
