@@ -152,7 +152,7 @@ FAULTS = (
     Fault(
         "residuals-not-checked",
         "vibench/qp/verification.py",
-        "if found.worst <= accuracy:",
+        "if residuals.worst <= accuracy:",
         "if True:",
         ("tests/unit/qp/test_solve.py",),
     ),
@@ -173,8 +173,8 @@ FAULTS = (
     Fault(
         "infeasible-without-certificate",
         "vibench/qp/verification.py",
-        "if found.primal > accuracy and infeasibility_certificate(program) is not None:",
-        "if found.primal > accuracy:",
+        "if residuals.primal > accuracy and infeasibility_certificate(program) is not None:",
+        "if residuals.primal > accuracy:",
         ("tests/unit/qp/test_solve.py",),
     ),
     Fault(
@@ -355,7 +355,7 @@ FAULTS = (
     Fault(
         "coercivity-between-anchors",
         "vibench/model/certificates/spectral.py",
-        "lacking = float(np.abs(theta - found[2:]) @ self.norms) + 2.0 * self.error",
+        "lacking = float(np.abs(theta - combined[2:]) @ self.norms) + 2.0 * self.error",
         "lacking = 2.0 * self.error",
         ("tests/unit/model/certificates/test_spectral.py",),
     ),

@@ -58,9 +58,9 @@ MANY = 30
 """Names up to which an error lists all that are known."""
 
 
-def unknown_name(kind: str, name: str, known: Iterable[str]) -> RequestError:
-    """Build the error for a name nobody registered, with the nearest known one suggested."""
-    choices = sorted(known)
+def unknown_name(kind: str, name: str, choices: Iterable[str]) -> RequestError:
+    """Build the error for a name nobody registered, with the nearest of the choices suggested."""
+    choices = sorted(choices)
     near = difflib.get_close_matches(name, choices, n=5)
     hint = f"; did you mean '{near[0]}'?" if near else ""
     if len(choices) > MANY:
@@ -86,19 +86,19 @@ def fault_line(fault: ValidationError, root: type[BaseModel], named: Collection[
     # The last part of an unexpected key's path is the key itself, whatever its first character.
     outer = error["loc"][:-1] if error["type"] == "extra_forbidden" else error["loc"]
     where = [part for part in outer if isinstance(part, int) or not {*"<["} & {*part}]  # validators and types of unions
-    message, found = error["msg"].removeprefix("Value error, "), ""
+    message, shown = error["msg"].removeprefix("Value error, "), ""
     if isinstance(error["input"], str | int | float):
-        found = f" (found {error['input']!r:.80})"
+        shown = f" (found {error['input']!r:.80})"
     match error["type"]:
         case "extra_forbidden":
             fields = _model_at(root, where).model_fields
-            message, found = str(unknown_name("key", "".join(str(error["loc"][-1]).split()), fields)), ""
+            message, shown = str(unknown_name("key", "".join(str(error["loc"][-1]).split()), fields)), ""
         case "missing":
-            message, found = "required, but not given", ""
+            message, shown = "required, but not given", ""
         case "model_type":
             message = "expected a name, or a table with one" if where[0] in named else "expected a table"
     place = ".".join(map(str, where))
-    return " ".join(f"{place + ': ' if place else ''}{message}{found}".split())
+    return " ".join(f"{place + ': ' if place else ''}{message}{shown}".split())
 
 
 def _model_at(root: type[BaseModel], place: list[str | int]) -> type[BaseModel]:

@@ -33,8 +33,8 @@ def cores() -> int:
 
 def versions(solver: str) -> dict[str, str]:
     """Versions of Python, the numerical libraries, vibench and one solver."""
-    found = {name: distribution_version(name) for name in ("numpy", "scipy", "scikit-fem", "qpsolvers", "vibench")}
-    return {"python": platform.python_version(), **found, solver: solver_version(solver)}
+    numerical = {name: distribution_version(name) for name in ("numpy", "scipy", "scikit-fem", "qpsolvers", "vibench")}
+    return {"python": platform.python_version(), **numerical, solver: solver_version(solver)}
 
 
 @cache
@@ -70,8 +70,8 @@ def core_code() -> str:
 @cache
 def libraries() -> str:
     """Versions of Python and of the libraries that results of stages depend on."""
-    found = [f"{name} {distribution_version(name)}" for name in LIBRARIES]
-    return ", ".join([f"python {platform.python_version()}", *found])
+    installed = [f"{name} {distribution_version(name)}" for name in LIBRARIES]
+    return ", ".join([f"python {platform.python_version()}", *installed])
 
 
 def source_hash(source: Path) -> str:

@@ -83,22 +83,22 @@ class HighFidelitySolver:
             If the assembly is invalid, the solution does not reach `ACCURACY`, the problem refuses it, or B touches
             unknowns outside the declared `contact_dofs`.
         """
-        found = self.solve_assembled(mu, checked_assembly(self._problem, mu))
-        self.remember(mu, found)
-        return found
+        solution = self.solve_assembled(mu, checked_assembly(self._problem, mu))
+        self.remember(mu, solution)
+        return solution
 
     def solve_assembled(self, mu: Array, vi: VariationalInequality) -> HighFidelitySolution:
         """Solve the variational inequality `vi` assembled at mu (d,); unless remembered, no other starts from it."""
-        found = solve_high_fidelity(vi, self.condensed(vi), self._nearest_contact_set(mu))
-        reason = self._problem.refuse(mu, found.u, found.lam)
+        solution = solve_high_fidelity(vi, self.condensed(vi), self._nearest_contact_set(mu))
+        reason = self._problem.refuse(mu, solution.u, solution.lam)
         if reason:
             raise NumericalError(f"at mu = {mu.tolist()}: {reason}")
-        return found
+        return solution
 
-    def remember(self, mu: Array, found: HighFidelitySolution) -> None:
+    def remember(self, mu: Array, solution: HighFidelitySolution) -> None:
         """Let later solutions start from the contact set of this one, at mu (d,)."""
         self._solved.append(mu)
-        self._active.append(found.lam > 0.0)
+        self._active.append(solution.lam > 0.0)
 
     def check_coercive(self, mu: Array, vi: VariationalInequality) -> None:
         """Refuse a stiffness that is not symmetric positive definite.
@@ -126,8 +126,8 @@ class HighFidelitySolver:
         outside = np.setdiff1d(sp.csr_array(vi.B).indices, self._constrained)
         if len(outside):
             if self._problem.contact_dofs is not None:
-                found = f"{len(outside)} unknowns outside the declared contact_dofs, the first is {outside[0]}"
-                raise NumericalError(f"B touches {found}")
+                undeclared = f"{len(outside)} unknowns outside the declared contact_dofs, the first is {outside[0]}"
+                raise NumericalError(f"B touches {undeclared}")
             self._constrained, self._pattern = np.union1d(self._constrained, outside), None
         if self._pattern is None:
             self._pattern, self._stiffness = EliminationPattern.of(vi.A, self._constrained), None
@@ -170,18 +170,18 @@ def solve_high_fidelity(
     """
     system = (stiffness or CondensedStiffness(vi.A)).active_set_system(vi)
     empty = np.zeros(vi.B.shape[0], dtype=bool)
-    found = None if start is None else active_set_iterations(system, start)
-    found = found or active_set_iterations(system, empty)
+    settled = None if start is None else active_set_iterations(system, start)
+    settled = settled or active_set_iterations(system, empty)
     fallback = ""
-    if found is None:
+    if settled is None:
         answer = solve_qp(vi, FALLBACK_SOLVER, ACCURACY)
         if answer.alpha is None or not np.all(np.isfinite(answer.alpha)):
             raise NumericalError(f"the high-fidelity problem was not solved: {answer.solver_status}")
-        found = active_set_iterations(system, answer.alpha > 1e-8 * np.max(answer.alpha, initial=0.0))
+        settled = active_set_iterations(system, answer.alpha > 1e-8 * np.max(answer.alpha, initial=0.0))
         fallback = f"the active set cycled; first guess by {FALLBACK_SOLVER}"
-    if found is None:
+    if settled is None:
         raise NumericalError("no active set solves the high-fidelity problem; is it feasible?")
-    u_retained, lam, iterations = found
+    u_retained, lam, iterations = settled
     u = system.recover(u_retained)
     residuals = verification.kkt_residuals(vi, u, lam)
     if residuals.dual > 0.5 * ACCURACY:  # a large rigid displacement amplifies round-off in the eliminated unknowns

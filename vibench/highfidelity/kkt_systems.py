@@ -131,19 +131,19 @@ class SaddlePointSolver:
         RuntimeError
             If the system is exactly singular.
         """
-        found = None
+        solution = None
         if self._factorisation is not None and len(np.setxor1d(active, self._factorised_set)) <= MAX_BORDER:
-            found = self._solve_bordered(self._factorisation, active)
-        if found is None:
+            solution = self._solve_bordered(self._factorisation, active)
+        if solution is None:
             # in this order: the set must stay that of the last factorisation where this one fails
             B = self._B[active]
             zero = sp.csr_array((len(active), len(active)))  # SciPy stacks blocks that are all CSR without triplets
             saddle = sp.block_array([[self._A, sp.csr_array(B.T)], [B, zero]], format="csr").T
             self._factorisation = _BorderedFactorisation(saddle)
             self._factorised_set = active
-            found = self._solve_bordered(self._factorisation, active)
-        assert found is not None  # an empty border is always independent
-        return found
+            solution = self._solve_bordered(self._factorisation, active)
+        assert solution is not None  # an empty border is always independent
+        return solution
 
     def _solve_bordered(self, factorisation: _BorderedFactorisation, active: Indices) -> tuple[Array, Array] | None:
         """The solution from the factorised set; `None` where the border is not clearly linearly independent."""
@@ -153,13 +153,13 @@ class SaddlePointSolver:
         border[:n, : len(added)] = self._B[added].toarray().T
         border[n + removed, len(added) + np.arange(len(removed))] = 1.0
         values = np.concatenate([self._g[added], np.zeros(len(removed))])
-        found = factorisation.solve(border, np.concatenate([self._f, self._g[base]]), values)
-        if found is None:
+        solved = factorisation.solve(border, np.concatenate([self._f, self._g[base]]), values)
+        if solved is None:
             return None
         lam = np.zeros(self._B.shape[0])
-        lam[base], lam[added] = found[0][n:], found[1][: len(added)]
+        lam[base], lam[added] = solved[0][n:], solved[1][: len(added)]
         lam[base[removed]] = 0.0
-        return self._displacement * found[0][:n], self._force * lam
+        return self._displacement * solved[0][:n], self._force * lam
 
 
 def _in_units(rows: Array, matrix: SparseMatrix, columns: Array) -> SparseMatrix:

@@ -82,11 +82,11 @@ class AffineSum:
         NumericalError
             If they are not as many finite numbers as there are terms.
         """
-        found = np.asarray(self.thetas(mu), float)
-        if found.shape != (len(self.terms),) or not np.all(np.isfinite(found)):
-            where = f"at mu = {mu.tolist()}: {found.tolist()}"
+        theta = np.asarray(self.thetas(mu), float)
+        if theta.shape != (len(self.terms),) or not np.all(np.isfinite(theta)):
+            where = f"at mu = {mu.tolist()}: {theta.tolist()}"
             raise NumericalError(f"{len(self.terms)} terms need as many finite coefficients, found {where}")
-        return found
+        return theta
 
     def at(self, mu: Array) -> Any:
         """The sum at mu (d,); a matrix has the union of the patterns of the terms at every mu."""

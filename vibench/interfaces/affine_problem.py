@@ -82,8 +82,8 @@ class AffineProblem(Problem):
             raise NumericalError(f"there are {len(free)} free unknowns of {N}; V has the dimension {n}")
         shapes = {"A": (N, N), "f": (N,), "B": (m, N), "g": (m,), "dirichlet_lift": (N,)}
         for name, each in sums.items():
-            if (found := np.shape(each.terms[0])) != shapes[name]:
-                raise NumericalError(f"{name} has shape {found}; the spaces V and W require {shapes[name]}")
+            if (shape := np.shape(each.terms[0])) != shapes[name]:
+                raise NumericalError(f"{name} has shape {shape}; the spaces V and W require {shapes[name]}")
             sums[name] = each.mapped(sp.csr_array if name in ("A", "B") else partial(np.asarray, dtype=float))
         if dirichlet_lift is not None:
             sums["f"] = _minus(sums["f"], sums["A"], sums["dirichlet_lift"])

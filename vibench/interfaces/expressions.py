@@ -75,12 +75,12 @@ class Expression:
         values = dict(zip(self.names, map(float, mu), strict=True))
         where = f"'{self.text}' at {', '.join(f'{name} = {value:g}' for name, value in values.items())}"
         try:
-            found = _value(_tree(self.text), {**values, **CONSTANTS})
+            result = _value(_tree(self.text), {**values, **CONSTANTS})
         except (ArithmeticError, ValueError) as error:
             raise NumericalError(f"{where}: {error}") from None
-        if not math.isfinite(found):
-            raise NumericalError(f"{where} is {found}, which is not finite")
-        return found
+        if not math.isfinite(result):
+            raise NumericalError(f"{where} is {result}, which is not finite")
+        return result
 
 
 @lru_cache(maxsize=1000)

@@ -52,19 +52,19 @@ class Output:
             If its coefficients have the wrong shape, its function fails, or a value is not finite.
         """
         if self.function is None:
-            found = np.zeros(len(mus))
+            outputs = np.zeros(len(mus))
             for name, weights, columns in (("u", self.u, u), ("λ", self.lam, lam)):
                 if weights is not None and np.shape(weights) != (len(columns),):
                     expected = f"expected ({len(columns)},)"
                     raise NumericalError(
                         f"the output '{self.name}' has coefficients of {name} of shape {np.shape(weights)}; {expected}"
                     )
-                found += 0.0 if weights is None else weights @ columns
+                outputs += 0.0 if weights is None else weights @ columns
         else:
-            found = np.array([self._value(mus[k], u[:, k], lam[:, k]) for k in range(len(mus))])
-        for k in np.flatnonzero(~np.isfinite(found))[:1]:
-            raise NumericalError(f"the output '{self.name}' is {found[k]} at mu = {mus[k].tolist()}")
-        return found
+            outputs = np.array([self._value(mus[k], u[:, k], lam[:, k]) for k in range(len(mus))])
+        for k in np.flatnonzero(~np.isfinite(outputs))[:1]:
+            raise NumericalError(f"the output '{self.name}' is {outputs[k]} at mu = {mus[k].tolist()}")
+        return outputs
 
     def _value(self, mu: Array, u: Array, lam: Array) -> float:
         assert self.function is not None  # `values` asks for no other

@@ -246,7 +246,7 @@ class AdaptiveSampling(Sampling):
         """Call `trainer.solve` at every training parameter, at one at least, in an order that is always the same."""
 
 
-def check_sample(box: ParameterBox, found: object) -> Array:
+def check_sample(box: ParameterBox, returned: object) -> Array:
     """The parameters (P×d) that a sampling strategy returned, refused if they are none of the box.
 
     Raises
@@ -255,7 +255,7 @@ def check_sample(box: ParameterBox, found: object) -> Array:
         If they have the wrong shape, are not finite, lie outside the box, occur twice, or are not among the listed
         ones of a problem that has no other.
     """
-    mus = np.asarray(found, float)
+    mus = np.asarray(returned, float)
     if mus.ndim != 2 or mus.shape[1] != box.dim or not len(mus):
         raise RequestError(f"parameters of shape {mus.shape}; expected (P, {box.dim}), a row for each, with P > 0")
     for k, i in np.argwhere(~np.isfinite(mus))[:1]:

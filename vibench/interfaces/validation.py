@@ -36,15 +36,15 @@ def check_cone(cone: object, W: InnerProduct) -> Cone:
     norms = W.norm(chi)
     away = np.abs(norms - 1.0)
     if away.max(initial=0.0) > ROUND_OFF:
-        found = f"generator {away.argmax()} has norm {norms[away.argmax()]:.6g}"
-        raise NumericalError(f"the generators do not all have unit norm in W: {found}")
+        worst = f"generator {away.argmax()} has norm {norms[away.argmax()]:.6g}"
+        raise NumericalError(f"the generators do not all have unit norm in W: {worst}")
     if cone.free.shape != (chi.shape[1],):
         raise NumericalError(f"'free' has shape {cone.free.shape} for {chi.shape[1]} generators")
     signed = np.where(cone.free, 0.0, chi)
     if signed.min(initial=0.0) < 0.0:
         i, r = np.unravel_index(signed.argmin(), signed.shape)
-        found = f"the negative coefficient {signed[i, r]:.1e} and is not declared free"
-        raise NumericalError(f"a generator has {found}: look at coefficient {i} of generator {r}")
+        worst = f"the negative coefficient {signed[i, r]:.1e} and is not declared free"
+        raise NumericalError(f"a generator has {worst}: look at coefficient {i} of generator {r}")
     return cone
 
 
@@ -74,8 +74,8 @@ def check_enrichment(enrichment: object, V: InnerProduct, basis: Array) -> Enric
 
 def _matrix(name: str, value: object, rows: int) -> Array:
     if not isinstance(value, np.ndarray) or value.ndim != 2 or value.shape[0] != rows:
-        found = getattr(value, "shape", type(value).__name__)
-        raise NumericalError(f"the {name} have shape {found}, expected ({rows}, count)")
+        shape = getattr(value, "shape", type(value).__name__)
+        raise NumericalError(f"the {name} have shape {shape}, expected ({rows}, count)")
     wrong = np.flatnonzero(~np.isfinite(value).all(axis=0))
     if len(wrong):
         raise NumericalError(f"the {name} have entries that are not finite, the first in column {wrong[0]}")
@@ -117,8 +117,8 @@ def checked_assembly(problem: Problem, mu: Array) -> VariationalInequality:
     n, m = problem.V.dim, problem.W.dim
     for name, value, shape in (("A", vi.A, (n, n)), ("f", vi.f, (n,)), ("B", vi.B, (m, n)), ("g", vi.g, (m,))):
         if value.shape != shape:
-            found = f"shape {value.shape} at mu = {mu.tolist()}"
-            raise NumericalError(f"{name} has {found}; the spaces V and W require {shape}")
+            where = f"shape {value.shape} at mu = {mu.tolist()}"
+            raise NumericalError(f"{name} has {where}; the spaces V and W require {shape}")
         if np.iscomplexobj(value):
             raise NumericalError(f"{name} is complex at mu = {mu.tolist()}; vibench is for real problems")
         if not np.all(np.isfinite(value if isinstance(value, np.ndarray) else value.data)):

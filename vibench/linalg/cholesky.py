@@ -103,9 +103,9 @@ class SparseCholesky:
         """X⁻¹ r for right-hand sides (n,) or (n, k)."""
         if self._requested_order is None:
             return np.asarray(self._lu.solve(np.ascontiguousarray(right)))
-        found = np.empty_like(right, dtype=float)
-        found[self._requested_order] = self._lu.solve(np.ascontiguousarray(right[self._requested_order]))
-        return found
+        x = np.empty_like(right, dtype=float)
+        x[self._requested_order] = self._lu.solve(np.ascontiguousarray(right[self._requested_order]))
+        return x
 
     def apply_factor(self, u: Array) -> Array:
         """F u, for u (n,) or (n, k)."""

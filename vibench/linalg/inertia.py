@@ -77,6 +77,6 @@ def _factorisation_error(lu: SuperLU, inverse: Array) -> Array:
     gamma = terms * UNIT / (1.0 - terms * UNIT)
     mirrored = sp.csc_array(sp.diags_array(upper.diagonal()) @ lower.T)
     inner = gamma * (abs(upper) @ weights) + (1.0 + gamma) * (abs(upper - mirrored) @ weights)
-    found = np.empty_like(inverse)
-    found[back] = 1.01 * weights * (abs(lower) @ inner)  # these sums are rounded, too
-    return found
+    sums = np.empty_like(inverse)
+    sums[back] = 1.01 * weights * (abs(lower) @ inner)  # these sums are rounded, too
+    return sums

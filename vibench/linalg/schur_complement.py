@@ -73,8 +73,8 @@ class PrincipalSubmatrix:
             numbered = sp.csr_array((np.arange(A.nnz), *reversed(sparsity)), shape=A.shape)
             self._positions = numbered[self._chosen][:, self._chosen]
             self._positions.sort_indices()
-        found = self._positions
-        return sp.csr_array((A.data[found.data], found.indices.copy(), found.indptr.copy()), shape=found.shape)
+        block = self._positions
+        return sp.csr_array((A.data[block.data], block.indices.copy(), block.indptr.copy()), shape=block.shape)
 
 
 class StaticCondensation:
@@ -119,9 +119,9 @@ class StaticCondensation:
     @property
     def dense_schur(self) -> Array:
         """Ŝ as an array."""
-        found, interface = self._retained_block.toarray(), self._pattern.interface
-        found[np.ix_(interface, interface)] = self._interface_schur
-        return np.asarray(found)
+        schur, interface = self._retained_block.toarray(), self._pattern.interface
+        schur[np.ix_(interface, interface)] = self._interface_schur
+        return np.asarray(schur)
 
     def condense_load(self, f: Array) -> tuple[Array, Array]:
         """The condensed load (c,) of f (n,), and the particular solution that `recover` needs."""

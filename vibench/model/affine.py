@@ -82,15 +82,15 @@ def affine_decomposition(problem: Problem, training: Array, tolerance: float) ->
     check_affine(problem, training)
     varying = [name for name in MEMBERS if name not in problem.constant and name not in problem.affine]
     assembled = _assembled(problem, training, varying) if varying else {}
-    found: dict[str, AffineMember] = {}
+    members: dict[str, AffineMember] = {}
     for name in MEMBERS:
         if name in problem.constant:
-            found[name] = AffineMember(Evaluation.CONSTANT, (getattr(first, name),))
+            members[name] = AffineMember(Evaluation.CONSTANT, (getattr(first, name),))
         elif name in problem.affine:
-            found[name] = AffineMember(Evaluation.AFFINE, problem.affine[name].terms)
+            members[name] = AffineMember(Evaluation.AFFINE, problem.affine[name].terms)
         else:
-            found[name] = _decomposed(name, assembled[name], problem, tolerance)
-    return found
+            members[name] = _decomposed(name, assembled[name], problem, tolerance)
+    return members
 
 
 def evaluated_members(
@@ -124,10 +124,10 @@ def check_affine(problem: Problem, training: Array) -> None:
     for mu in training[[0, len(training) // 2, -1]] if problem.affine else ():
         vi = checked_assembly(problem, mu)
         for name, declared in problem.affine.items():
-            exact, found = getattr(vi, name), declared.at(mu)
-            if found.shape != exact.shape:
-                raise NumericalError(f"the affine sum of {name} has shape {found.shape}, {name} itself {exact.shape}")
-            away, size = float(abs(found - exact).max()), float(abs(exact).max())
+            exact, summed = getattr(vi, name), declared.at(mu)
+            if summed.shape != exact.shape:
+                raise NumericalError(f"the affine sum of {name} has shape {summed.shape}, {name} itself {exact.shape}")
+            away, size = float(abs(summed - exact).max()), float(abs(exact).max())
             if not away <= AFFINE_RTOL * size:
                 what = f"by {away:.1e} at mu = {mu.tolist()}, where its largest entry is {size:.1e}"
                 raise NumericalError(f"the affine sum declared for {name} differs from the assembled {name} {what}")
@@ -135,7 +135,7 @@ def check_affine(problem: Problem, training: Array) -> None:
 
 def _assembled(problem: Problem, training: Array, names: Sequence[str]) -> Mapping[str, list[Any]]:
     """The named members at all training parameters; the constraint alone where only B and g are needed."""
-    found: dict[str, list[Any]] = {name: [] for name in names}
+    assembled: dict[str, list[Any]] = {name: [] for name in names}
     for mu in training:
         if set(names) <= {"B", "g"}:
             values = dict(zip(("B", "g"), problem.constraint(mu), strict=True))
@@ -143,8 +143,8 @@ def _assembled(problem: Problem, training: Array, names: Sequence[str]) -> Mappi
             vi = checked_assembly(problem, mu)
             values = {name: getattr(vi, name) for name in names}
         for name in names:
-            found[name].append(values[name].copy())  # the next ones may be written into the same arrays
-    return found
+            assembled[name].append(values[name].copy())  # the next ones may be written into the same arrays
+    return assembled
 
 
 def _decomposed(name: str, values: list[Any], problem: Problem, tolerance: float) -> AffineMember:
@@ -153,12 +153,13 @@ def _decomposed(name: str, values: list[Any], problem: Problem, tolerance: float
         return AffineMember(Evaluation.CONSTANT, (values[0],))
     reason = f"{name} depends on mu and the problem does not evaluate it entry by entry"
     if name in problem.entrywise and len(values) > 1:
-        found = interpolate(entries.values, tolerance)
-        if len(found.points) <= max(1.0, MAX_TERMS_SHARE * len(values)):
-            terms = tuple(entries.assembled(mode) for mode in found.modes.T)
-            rows, columns = entries.rows[found.points], entries.columns[found.points]
-            return AffineMember(Evaluation.INTERPOLATED, terms, rows, columns, found.error)
-        reason = f"{name} depends on mu, and interpolation needs {len(found.points)} terms for {len(values)} parameters"
+        interpolation = interpolate(entries.values, tolerance)
+        if len(interpolation.points) <= max(1.0, MAX_TERMS_SHARE * len(values)):
+            terms = tuple(entries.assembled(mode) for mode in interpolation.modes.T)
+            rows, columns = entries.rows[interpolation.points], entries.columns[interpolation.points]
+            return AffineMember(Evaluation.INTERPOLATED, terms, rows, columns, interpolation.error)
+        count = len(interpolation.points)
+        reason = f"{name} depends on mu, and interpolation needs {count} terms for {len(values)} parameters"
     if name in ("B", "g") and problem.has_contact:
         return AffineMember(Evaluation.CONTACT, ())
     return AffineMember(Evaluation.FULL, (), reason=reason)
@@ -190,10 +191,10 @@ class _Entries:
         self.rows, self.columns = pattern // width, pattern % width
         if pattern is keys[0]:
             return np.column_stack([entry.data for entry in entries])
-        found = np.zeros((len(pattern), len(entries)))
+        values = np.zeros((len(pattern), len(entries)))
         for k, (key, entry) in enumerate(zip(keys, entries, strict=True)):
-            np.add.at(found[:, k], np.searchsorted(pattern, key), entry.data)
-        return found
+            np.add.at(values[:, k], np.searchsorted(pattern, key), entry.data)
+        return values
 
     def assembled(self, values: Array) -> Any:
         """The vector or matrix with these entries (k,)."""
@@ -247,15 +248,15 @@ def interpolate(snapshots: Array, tolerance: float) -> Interpolation:
         errors = np.linalg.norm(snapshots - cardinal @ snapshots[points], axis=0)
         return Interpolation(points, cardinal, float(errors.max()) / scale)
 
-    found, step, high = with_terms(low), 1, low  # gallop upwards, since the projection error is a close guess
-    while found.error > tolerance and high < rank:
+    best, step, high = with_terms(low), 1, low  # gallop upwards, since the projection error is a close guess
+    while best.error > tolerance and high < rank:
         low, high, step = high + 1, min(high + step, rank), 2 * step
-        found = with_terms(high)
-    while found.error <= tolerance and low < high:
+        best = with_terms(high)
+    while best.error <= tolerance and low < high:
         middle = (low + high) // 2
         candidate = with_terms(middle)
         if candidate.error <= tolerance:
-            found, high = candidate, middle
+            best, high = candidate, middle
         else:
             low = middle + 1
-    return found
+    return best

@@ -108,8 +108,8 @@ def interpolate_on_box(
     unit = np.vstack([random.random((MEASURED, len(lower))), corners.reshape(len(lower), -1).T])
     points = lower + unit * (upper - lower)
     values = _stacked([evaluate(mu) for mu in points])
-    values = {name: found @ terms[name] if name in terms else found for name, found in values.items()}
-    scale = {name: float(np.linalg.norm(found, axis=-1).max()) or 1.0 for name, found in values.items()}
+    values = {name: each @ terms[name] if name in terms else each for name, each in values.items()}
+    scale = {name: float(np.linalg.norm(each, axis=-1).max()) or 1.0 for name, each in values.items()}
     # A coefficient counts by what it adds to the array: times the norm of its term.
     units = {name: scale[name] / _norms(terms[name]) if name in terms else scale[name] for name in scale}
     along = _Sampled(evaluate, lower, upper, units)
@@ -119,14 +119,14 @@ def interpolate_on_box(
     for _ in range(TRIALS):
         counts = _within(counts, budget)
         grid = along.coefficients(counts)
-        found = {name: _truncated(c, units[name], 0.1 * tolerance, terms.get(name)) for name, c in grid.items()}
-        for name, p in found.items():
+        polynomials = {name: _truncated(c, units[name], 0.1 * tolerance, terms.get(name)) for name, c in grid.items()}
+        for name, p in polynomials.items():
             error = float(np.linalg.norm(p.at(unit) - values[name], axis=-1).max()) / scale[name]
-            found[name] = replace(p, error=error, scale=scale[name])
-        if max(p.error for p in found.values()) <= tolerance or prod(counts) >= 0.7 * budget:
+            polynomials[name] = replace(p, error=error, scale=scale[name])
+        if max(p.error for p in polynomials.values()) <= tolerance or prod(counts) >= 0.7 * budget:
             break
         counts = [count + max(1, count // 4) if count > 1 else count for count in counts]
-    return found
+    return polynomials
 
 
 class _Sampled:
@@ -137,8 +137,8 @@ class _Sampled:
 
     def _at(self, unit: Array) -> dict[str, Array]:
         """The arrays at points (P×d) of the unit box, (P×size) each."""
-        found = _stacked([self._evaluate(self._lower + at * (self._upper - self._lower)) for at in unit])
-        return {name: values / self._units[name] for name, values in found.items()}
+        stacked = _stacked([self._evaluate(self._lower + at * (self._upper - self._lower)) for at in unit])
+        return {name: values / self._units[name] for name, values in stacked.items()}
 
     def degree(self, direction: int, anchor: Array, tolerance: float, limit: int) -> int:
         """The degree in one direction from which on coefficients on the line through a point sum up to the tolerance.
@@ -159,10 +159,10 @@ class _Sampled:
     def coefficients(self, counts: Sequence[int]) -> dict[str, Array]:
         """Coefficients (n₁×…×n_d×size) of the interpolants on a grid with this many points per direction."""
         grid = np.stack(np.meshgrid(*map(_chebyshev_points, counts), indexing="ij"), axis=-1)
-        found = {name: v.reshape(*counts, -1) for name, v in self._at(grid.reshape(-1, len(counts))).items()}
+        coefficients = {name: v.reshape(*counts, -1) for name, v in self._at(grid.reshape(-1, len(counts))).items()}
         for axis in range(len(counts)):
-            found = {name: _transformed(values, axis) for name, values in found.items()}
-        return found
+            coefficients = {name: _transformed(values, axis) for name, values in coefficients.items()}
+        return coefficients
 
 
 def _chebyshev_points(count: int) -> Array:
@@ -173,9 +173,9 @@ def _chebyshev_points(count: int) -> Array:
 def _transformed(values: Array, axis: int) -> Array:
     """Chebyshev coefficients from values in the points above, along an axis."""
     count = values.shape[axis]
-    found = np.moveaxis(np.asarray(scipy.fft.dct(values, type=2, axis=axis)) / count, axis, 0)
-    found[0] *= 0.5
-    return np.moveaxis(found, 0, axis)
+    coefficients = np.moveaxis(np.asarray(scipy.fft.dct(values, type=2, axis=axis)) / count, axis, 0)
+    coefficients[0] *= 0.5
+    return np.moveaxis(coefficients, 0, axis)
 
 
 def _within(counts: Sequence[int], budget: int) -> list[int]:
@@ -214,9 +214,9 @@ def _without_smallest(coefficients: Array, tolerance: float) -> Array:
     """
     sizes = np.abs(coefficients).ravel()
     rising = np.argsort(sizes, kind="stable")
-    found = coefficients.ravel().copy()
-    found[rising[np.cumsum(sizes[rising]) <= tolerance]] = 0.0
-    return np.asarray(found.reshape(coefficients.shape))
+    kept = coefficients.ravel().copy()
+    kept[rising[np.cumsum(sizes[rising]) <= tolerance]] = 0.0
+    return np.asarray(kept.reshape(coefficients.shape))
 
 
 def _norms(terms: Array) -> Array:
@@ -225,6 +225,6 @@ def _norms(terms: Array) -> Array:
     return np.where(norms > 0.0, norms, 1.0)
 
 
-def _stacked(found: Sequence[Mapping[str, Array]]) -> dict[str, Array]:
+def _stacked(evaluated: Sequence[Mapping[str, Array]]) -> dict[str, Array]:
     """Arrays (P×size) by name from those at P parameters."""
-    return {name: np.stack([arrays[name] for arrays in found]) for name in found[0]}
+    return {name: np.stack([arrays[name] for arrays in evaluated]) for name in evaluated[0]}

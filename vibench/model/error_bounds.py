@@ -231,10 +231,10 @@ def _minimisers(
     """
     system = energy.stiffness.active_set_system(program)
     for active in (start, np.zeros_like(start)):
-        found = active_set_iterations(system, active)
-        if found is not None:
-            yield system.recover(found[0]), found[1]
-            if np.max(found[1], initial=0.0) <= largest:
+        settled = active_set_iterations(system, active)
+        if settled is not None:
+            yield system.recover(settled[0]), settled[1]
+            if np.max(settled[1], initial=0.0) <= largest:
                 return
     answer = solve_qp(program, FALLBACK_SOLVER, ACCURACY)
     if answer.x is not None and answer.alpha is not None:

@@ -127,11 +127,11 @@ def errors(
     norm_u, norm_lam, (zero_u, zero_lam) = V.norm(reference.u), W.norm(reference.lam), zeros(problem, reference)
     error_u, error_lam, integrals = V.norm(du), W.norm(dlam), problem.multiplier_integrals()
     excesses = [vi.B @ u[:, k] - vi.g for k, vi in enumerate(vis)]
-    found = []
+    rows = []
     for k, (vi, energy) in enumerate(zip(vis, energies, strict=True)):
         in_energy, energy_u = energy.norm(du[:, k]), energy.norm(reference.u[:, k])
         natural, natural_lam = (energy.dual_norm(vi.B.T @ eta) for eta in (dlam[:, k], reference.lam[:, k]))
-        found.append(
+        rows.append(
             Errors(
                 error_u=None if zero_u[k] else ratio(float(error_u[k]), float(norm_u[k])),
                 error_lambda=None if zero_lam[k] else ratio(float(error_lam[k]), float(norm_lam[k])),
@@ -147,7 +147,7 @@ def errors(
                 complementarity=float(reference.lam[:, k] @ excesses[k]),
             )
         )
-    return found
+    return rows
 
 
 OutputErrors = dict[str, Any]
@@ -171,15 +171,15 @@ def output_errors(
     An output that is at most `UNMEASURABLE` of its scale is zero: there is no contact, for instance. A relative error
     would divide round-off by round-off, and is `None`; the error over the scale is not.
     """
-    found: list[list[OutputErrors]] = [[] for _ in mus]
+    rows: list[list[OutputErrors]] = [[] for _ in mus]
     for output, largest in zip(outputs, scale, strict=True):
         pairs = zip(output.values(mus, *reduced), output.values(mus, *reference), strict=True)
-        for row, (value, exact) in zip(found, pairs, strict=True):
+        for row, (value, exact) in zip(rows, pairs, strict=True):
             error = abs(float(value - exact))
             relative = None if abs(exact) <= UNMEASURABLE * largest else error / abs(float(exact))
             own = {"value": float(value), "reference": float(exact), "error": relative}
             row.append({"output": output.name, "unit": output.unit} | own | {"scaled": ratio(error, largest)})
-    return found
+    return rows
 
 
 def summarise_outputs(

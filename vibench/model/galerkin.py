@@ -107,8 +107,8 @@ class ReducedModel:
         elif enrichment.supply is not None:
             added = enrichment.supply(V, vi, self.span)
             if added.ndim != 2 or added.shape[0] != V.dim:
-                found = f"vectors of shape {added.shape}, expected ({V.dim}, count)"
-                raise NumericalError(f"the enrichment supplied {found}")
+                shape = f"vectors of shape {added.shape}, expected ({V.dim}, count)"
+                raise NumericalError(f"the enrichment supplied {shape}")
             whitened = V.whiten(added)
         else:
             return self.fixed_basis

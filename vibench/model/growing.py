@@ -52,13 +52,13 @@ class GrowingModel:
         self.generators = np.zeros((problem.W.dim, 0))
         self._factor: SparseCholesky | None = None
 
-    def add(self, vi: VariationalInequality, found: HighFidelitySolution) -> str:
+    def add(self, vi: VariationalInequality, solution: HighFidelitySolution) -> str:
         """Add the solution of `vi`; returns what was less accurate than usual, "" if nothing."""
         V, W = self._problem.V, self._problem.W
-        part, note = part_in_cone(found.lam, self.generators, W)
-        new, rest = [found.u[:, None]], found.lam - part
+        part, note = part_in_cone(solution.lam, self.generators, W)
+        new, rest = [solution.u[:, None]], solution.lam - part
         norm = float(W.norm(rest))
-        if norm > IN_CONE * float(W.norm(found.lam)):
+        if norm > IN_CONE * float(W.norm(solution.lam)):
             new.append(supremizers(V, vi.B, rest[:, None]))
             self.generators = np.hstack([self.generators, rest[:, None] / norm])
         for column in new:  # one after the other: u must not lose to its supremizer
@@ -70,12 +70,12 @@ class GrowingModel:
     def solution(self, vi: VariationalInequality) -> tuple[Array, Array] | None:
         """The reduced solution u_N (n,) and λ_N ≥ 0 (m,) of `vi`; `None` if its program cannot be solved."""
         program = project(vi, self._basis, self.generators)
-        found: ExactSolution | QPSolution | None = exact_solution(program)
-        if found is None:
-            found = solve_qp(program, SOLVER, ACCURACY)
-        if found.x is None or found.alpha is None:
+        answer: ExactSolution | QPSolution | None = exact_solution(program)
+        if answer is None:
+            answer = solve_qp(program, SOLVER, ACCURACY)
+        if answer.x is None or answer.alpha is None:
             return None
-        return self._basis @ found.x, self.generators @ np.maximum(found.alpha, 0.0)
+        return self._basis @ answer.x, self.generators @ np.maximum(answer.alpha, 0.0)
 
     def bound(self, mu: Array) -> float:
         """The largest of two bounds and an estimate at mu (d,), relative to the reduced solution; infinite without one.
@@ -96,13 +96,13 @@ class GrowingModel:
         corrected = find_correction(vi, energy, u, lam)
         if corrected is None:
             return float("inf")
-        found = terms(corrected.w, vi, energy, u, lam)
-        of_u = ratio(found.primal, energy.norm(u))
+        of_pair = terms(corrected.w, vi, energy, u, lam)
+        of_u = ratio(of_pair.primal, energy.norm(u))
         pressed, W = energy.dual_norm(vi.B.T @ lam), self._problem.W
         if not pressed > 0.0:
             return of_u
         in_W = ratio(float(W.norm(corrected.nu - lam)), float(W.norm(lam)))
-        return max(of_u, ratio(found.dual, pressed), in_W)
+        return max(of_u, ratio(of_pair.dual, pressed), in_W)
 
 
 @dataclass(frozen=True)
@@ -161,6 +161,6 @@ class GrowingTrainer(Trainer):
 
     def bound(self, mu: Array) -> float:
         """That of the model of all solutions."""
-        found, seconds = timed(lambda: self._model.bound(np.array(mu, float)))
+        bound, seconds = timed(lambda: self._model.bound(np.array(mu, float)))
         self.selecting, self._evaluated = self.selecting + seconds, self._evaluated + 1
-        return found
+        return bound

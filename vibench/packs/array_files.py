@@ -94,41 +94,41 @@ class ArrayFiles:
     def dense(self, reference: str, what: str) -> Array:
         """A dense array; a sparse matrix of one column or row is a vector."""
         with self._reading(reference, what):
-            found = self._read(reference)
-            if isinstance(found, Mapping) or sp.issparse(found):
-                matrix = self._matrix(found)
+            stored = self._read(reference)
+            if isinstance(stored, Mapping) or sp.issparse(stored):
+                matrix = self._matrix(stored)
                 if 1 not in matrix.shape:
                     raise RequestError(f"a sparse matrix {size_of(matrix.shape)}; expected a dense array")
                 self._take(8 * max(matrix.shape))
-                found = matrix.toarray()
-            return self._real(found)
+                stored = matrix.toarray()
+            return self._real(stored)
 
     def vector(self, reference: str, what: str) -> Array:
         """A vector (k,); one row or column counts as one."""
-        found = self.dense(reference, what)
-        if found.ndim == 2 and 1 in found.shape:
-            return found.ravel()
-        if found.ndim != 1:
-            raise RequestError(f"{what}: an array {size_of(found.shape)}; expected a vector")
-        return found
+        array = self.dense(reference, what)
+        if array.ndim == 2 and 1 in array.shape:
+            return array.ravel()
+        if array.ndim != 1:
+            raise RequestError(f"{what}: an array {size_of(array.shape)}; expected a vector")
+        return array
 
     def sparse(self, reference: str, what: str) -> SparseMatrix:
         """A sparse matrix in the format of its rows or columns, its entries in the order of the file."""
         with self._reading(reference, what):
-            found = self._read(reference)
-            if not isinstance(found, Mapping) and not sp.issparse(found):
-                if found.ndim != 2:
-                    raise RequestError(f"an array {size_of(found.shape)}; expected a matrix")
-                found = sp.csr_array(self._real(found))
-            matrix = self._matrix(found)
+            stored = self._read(reference)
+            if not isinstance(stored, Mapping) and not sp.issparse(stored):
+                if stored.ndim != 2:
+                    raise RequestError(f"an array {size_of(stored.shape)}; expected a matrix")
+                stored = sp.csr_array(self._real(stored))
+            matrix = self._matrix(stored)
             matrix.data = self._real(matrix.data)
             return matrix
 
     def indices(self, reference: str, what: str, count: int) -> Indices:
         """Indices (k,) below `count`, from 0 whatever the index base of the pack."""
-        found = self.vector(reference, what)
+        values = self.vector(reference, what)
         with self._reading(reference, what):
-            return self._based(found, count)
+            return self._based(values, count)
 
     @contextlib.contextmanager
     def _reading(self, reference: str, what: str) -> Iterator[None]:
@@ -142,7 +142,7 @@ class ArrayFiles:
     def _read(self, reference: str) -> Any:
         """A dense array, or the arrays of a sparse matrix by name, or a matrix."""
         name, _, inner = reference.partition(":")
-        suffix = next((known for known in FORMATS if name.endswith(known)), "")
+        suffix = next((ending for ending in FORMATS if name.endswith(ending)), "")
         if not suffix:
             raise RequestError(f"'{name}' has a format that is not read; expected one of {', '.join(FORMATS)}")
         path = safe_path(self._folder, name)
@@ -171,8 +171,8 @@ class ArrayFiles:
                 with archive.open(members[name]) as file:
                     return self._array(file, members[name].file_size)
 
-            found = {name.removeprefix(f"{inner}/" if inner else ""): read(name) for name in names}
-        return found if single is None else next(iter(found.values()))
+            arrays = {name.removeprefix(f"{inner}/" if inner else ""): read(name) for name in names}
+        return arrays if single is None else next(iter(arrays.values()))
 
     def _array(self, file: IO[bytes], size: int) -> Array:
         """A .npy file of so many bytes; sizes are checked before it is read, and Python objects are refused."""
@@ -205,8 +205,8 @@ class ArrayFiles:
             text = head + file.read(entries * LINE + 1)
             if len(text) > entries * LINE + COMMENTS:
                 raise RequestError(f"the Matrix Market file is longer than the {entries} entries that it declares")
-        found = scipy.io.mmread(io.BytesIO(text))
-        return np.asarray(found) if layout == "array" else sp.csr_array(found)
+        matrix = scipy.io.mmread(io.BytesIO(text))
+        return np.asarray(matrix) if layout == "array" else sp.csr_array(matrix)
 
     def _hdf5(self, path: Path, inner: str) -> Any:
         try:
@@ -239,23 +239,23 @@ class ArrayFiles:
         self._take(dataset.size * dataset.dtype.itemsize)
         return np.asarray(dataset[()])
 
-    def _matrix(self, found: Any) -> SparseMatrix:
-        if sp.issparse(found):
-            return found
-        missing = {"data", "shape"} - found.keys()
-        compressed = found.keys() >= {"indices", "indptr"}
-        if missing or not (compressed or found.keys() >= {"row", "col"}):
+    def _matrix(self, stored: Any) -> SparseMatrix:
+        if sp.issparse(stored):
+            return stored
+        missing = {"data", "shape"} - stored.keys()
+        compressed = stored.keys() >= {"indices", "indptr"}
+        if missing or not (compressed or stored.keys() >= {"row", "col"}):
             raise RequestError(
-                f"it has the arrays {', '.join(sorted(found)) or 'none'}; a sparse matrix has data and shape, and "
+                f"it has the arrays {', '.join(sorted(stored)) or 'none'}; a sparse matrix has data and shape, and "
                 "either row and col, or indices and indptr"
             )
-        rows, columns = (int(length) for length in np.ravel(found["shape"]))
-        data = self._real(np.ravel(found["data"]))
+        rows, columns = (int(length) for length in np.ravel(stored["shape"]))
+        data = self._real(np.ravel(stored["data"]))
         if not compressed:
-            return self._from_triplets(found, data, rows, columns)
-        column_wise = "csc" in str(np.ravel(found.get("format", "csr"))[0])
+            return self._from_triplets(stored, data, rows, columns)
+        column_wise = "csc" in str(np.ravel(stored.get("format", "csr"))[0])
         kind, long, short = (sp.csc_array, columns, rows) if column_wise else (sp.csr_array, rows, columns)
-        indices, pointers = np.ravel(found["indices"]), np.ravel(found["indptr"])
+        indices, pointers = np.ravel(stored["indices"]), np.ravel(stored["indptr"])
         fits = f"the shape {size_of((rows, columns))} and the {len(data)} values"
         if len(pointers) != long + 1 or pointers[0] != 0 or pointers[-1] > len(data) or np.any(np.diff(pointers) < 0):
             raise RequestError(f"indptr does not fit {fits}")
@@ -265,8 +265,8 @@ class ArrayFiles:
             raise RequestError(f"indices do not fit {fits}")
         return kind((data, indices, pointers), shape=(rows, columns))
 
-    def _from_triplets(self, found: Any, data: Array, rows: int, columns: int) -> SparseMatrix:
-        i, j = np.ravel(found["row"]), np.ravel(found["col"])
+    def _from_triplets(self, stored: Any, data: Array, rows: int, columns: int) -> SparseMatrix:
+        i, j = np.ravel(stored["row"]), np.ravel(stored["col"])
         if not len(i) == len(j) == len(data):
             raise RequestError(f"row, col and data have {len(i)}, {len(j)} and {len(data)} entries")
         self._take(16 * len(data) + 8 * rows)
@@ -278,11 +278,11 @@ class ArrayFiles:
         if np.any(values != np.round(values)):
             raise RequestError("it has values that are no whole numbers; expected indices")
         if len(values) and (values.min() < low or values.max() > high):
-            found = f"it has indices from {values.min():.0f} to {values.max():.0f}; expected {low} to {high}"
+            fault = f"it has indices from {values.min():.0f} to {values.max():.0f}; expected {low} to {high}"
             other = 1 - self._base
             if other <= values.min() and values.max() <= other + count - 1:
-                found += f": they count from {other}, so the manifest needs index_base = {other}"
-            raise RequestError(found)
+                fault += f": they count from {other}, so the manifest needs index_base = {other}"
+            raise RequestError(fault)
         return np.asarray(values - self._base, dtype=np.intp)
 
     def _real(self, values: Array) -> Array:

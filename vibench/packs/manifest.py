@@ -254,5 +254,5 @@ def _check_parameters(given: Parameters) -> None:
 def _exactly_one(table: BaseModel, *keys: str) -> None:
     given = [key for key in keys if getattr(table, key) is not None]
     if len(given) != 1:
-        found = " and ".join(given) or "none"
-        raise ValueError(f"give exactly one of {', '.join(keys)} (found {found})")
+        keys_given = " and ".join(given) or "none"
+        raise ValueError(f"give exactly one of {', '.join(keys)} (found {keys_given})")

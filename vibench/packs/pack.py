@@ -260,8 +260,8 @@ def pack_multipliers(pack: ModelPack) -> tuple[Array, Array]:
     """
     if pack.reference is None:
         raise RequestError("the pack has no multipliers; [solutions] lam would give them")
-    known = {tuple(mu) for mu in pack.training.tolist()}
-    training = np.array([tuple(mu) in known for mu in pack.reference.parameters.tolist()])
+    of_training = {tuple(mu) for mu in pack.training.tolist()}
+    training = np.array([tuple(mu) in of_training for mu in pack.reference.parameters.tolist()])
     if not training.any():
         raise RequestError("none of the parameters of the solutions is a training parameter")
     lam = np.maximum(pack.reference.lam, 0.0)  # what is negative is round-off, as `check_pack` has found

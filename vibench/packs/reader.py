@@ -67,8 +67,8 @@ def _files(folder: Path, place: str, name: str) -> list[Path]:
             return [safe_path(folder, name)]
         before, _, after = name.partition("{}")
         parent = PurePosixPath(before + "x").parent.as_posix()
-        found = safe_path(folder, parent, is_folder=True).iterdir()
-        names = (each.relative_to(folder).as_posix() for each in found)
+        files = safe_path(folder, parent, is_folder=True).iterdir()
+        names = (each.relative_to(folder).as_posix() for each in files)
         return [safe_path(folder, each) for each in sorted(names) if each.startswith(before) and each.endswith(after)]
     except RequestError as error:
         raise RequestError(f"{place}: {error}") from None
@@ -154,22 +154,22 @@ class _PackReader:
                 raise RequestError(f"{what}.grid has {len(given.grid)} counts for {d} parameters")
             return box.grid(*given.grid)
         if given.array is not None:
-            found = self._files.dense(given.array, what)
-            found = found[:, None] if found.ndim == 1 and d == 1 else found
+            mus = self._files.dense(given.array, what)
+            mus = mus[:, None] if mus.ndim == 1 and d == 1 else mus
         elif any(len(point) != d for point in given.points or ()):
             raise RequestError(f"{what}: every point needs {d} values, one for each of {', '.join(self._names)}")
         else:
-            found = np.array(given.points, dtype=float)
-        if found.ndim != 2 or found.shape[1] != d:
-            transposed = "; it is transposed" if found.ndim == 2 and found.shape[0] == d else ""
+            mus = np.array(given.points, dtype=float)
+        if mus.ndim != 2 or mus.shape[1] != d:
+            transposed = "; it is transposed" if mus.ndim == 2 and mus.shape[0] == d else ""
             raise RequestError(
-                f"{what}: an array {size_of(found.shape)}; expected P×{d}, a row per parameter{transposed}"
+                f"{what}: an array {size_of(mus.shape)}; expected P×{d}, a row per parameter{transposed}"
             )
         if box is not None:
-            for k, i in np.argwhere(box.outside(found))[:1]:
+            for k, i in np.argwhere(box.outside(mus))[:1]:
                 sides, name = f"[{box.lower[i]:g}, {box.upper[i]:g}]", self._names[i]
-                raise RequestError(f"{what}: point {k} has '{name}' = {found[k, i]:g}, outside the box {sides}")
-        return found
+                raise RequestError(f"{what}: point {k} has '{name}' = {mus[k, i]:g}, outside the box {sides}")
+        return mus
 
     def _primal_space(self, reference: str) -> InnerProduct:
         X = self._files.sparse(reference, "spaces.X_V")
@@ -205,9 +205,9 @@ class _PackReader:
         what = f"operators.{name}"
 
         def read(reference: str, where: str) -> Any:
-            found = (self._files.sparse if len(stored) == 2 else self._files.vector)(reference, where)
-            self._expect(where, found, stored)
-            return found if stored == kept else self._restricted(name, found)
+            array = (self._files.sparse if len(stored) == 2 else self._files.vector)(reference, where)
+            self._expect(where, array, stored)
+            return array if stored == kept else self._restricted(name, array)
 
         if given.constant is not None:
             return PackMember((read(given.constant, what),))
@@ -227,11 +227,11 @@ class _PackReader:
             values = [column if stored == kept else self._restricted(name, column) for column in columns.T]
         return PackMember(tuple(values), listing=self._listing)
 
-    def _restricted(self, name: str, found: Any) -> Any:
+    def _restricted(self, name: str, member: Any) -> Any:
         """A member of all unknowns on the free ones."""
         if name == "B":
-            return sp.csr_array(found)[:, self._free]
-        return found[self._free] if name == "f" else sp.csr_array(found)[self._free][:, self._free]
+            return sp.csr_array(member)[:, self._free]
+        return member[self._free] if name == "f" else sp.csr_array(member)[self._free][:, self._free]
 
     def _theta(self, term: schema.Term, what: str) -> Expression | TabulatedTheta:
         if term.table is None:
@@ -242,17 +242,17 @@ class _PackReader:
         return TabulatedTheta(self._listing, self._vector(term.table, f"{what}.table", len(self._listed)))
 
     def _columns(self, reference: str, what: str, rows: int, count: int | None) -> Array:
-        found = self._files.dense(reference, what)
-        if found.ndim != 2 or found.shape[0] != rows or count not in (None, found.shape[1]):
-            transposed = "; it is transposed" if found.ndim == 2 and found.shape[1] == rows else ""
+        columns = self._files.dense(reference, what)
+        if columns.ndim != 2 or columns.shape[0] != rows or count not in (None, columns.shape[1]):
+            transposed = "; it is transposed" if columns.ndim == 2 and columns.shape[1] == rows else ""
             expected = f"{rows}×{'P' if count is None else count}, a column per parameter"
-            raise RequestError(f"{what}: an array {size_of(found.shape)}; expected {expected}{transposed}")
-        return found
+            raise RequestError(f"{what}: an array {size_of(columns.shape)}; expected {expected}{transposed}")
+        return columns
 
     def _contact(self, members: Mapping[str, PackMember], n: int) -> Indices:
         if self._manifest.spaces.contact is not None and members:
-            found = np.unique(self._files.indices(self._manifest.spaces.contact, "spaces.contact", self._all))
-            return found if self._free is None else np.flatnonzero(np.isin(self._free, found))
+            named = np.unique(self._files.indices(self._manifest.spaces.contact, "spaces.contact", self._all))
+            return named if self._free is None else np.flatnonzero(np.isin(self._free, named))
         touched = np.zeros(n, dtype=bool)
         for matrix in members["B"].arrays if members else ():
             touched[sp.csr_array(matrix).indices] = True
@@ -302,33 +302,33 @@ class _PackReader:
 
     def _unknowns(self, reference: str) -> Indices:
         """Unknowns of the pack that are named by their numbers in the files."""
-        found = self._files.indices(reference, "mesh.unknowns", self._all)
+        named = self._files.indices(reference, "mesh.unknowns", self._all)
         if self._free is None:
-            return found
+            return named
         number = np.full(self._all, -1)
         number[self._free] = np.arange(len(self._free))
-        if np.any(number[found] < 0):
+        if np.any(number[named] < 0):
             raise RequestError("mesh.unknowns names an unknown that is not free")
-        return number[found]
+        return number[named]
 
     def _kept(self, values: Array) -> Array:
         """Values (N, …) of all unknowns of the files at the free ones (n, …)."""
         return values if self._free is None else values[self._free]
 
     def _vector(self, reference: str, what: str, length: int) -> Array:
-        found = self._files.vector(reference, what)
-        self._expect(what, found, (length,))
-        return found
+        values = self._files.vector(reference, what)
+        self._expect(what, values, (length,))
+        return values
 
-    def _expect(self, what: str, found: Any, shape: tuple[int, ...]) -> None:
-        if found.shape == shape:
+    def _expect(self, what: str, array: Any, shape: tuple[int, ...]) -> None:
+        if array.shape == shape:
             return
         hint = ""
-        if len(shape) == 2 and found.shape == shape[::-1]:
+        if len(shape) == 2 and array.shape == shape[::-1]:
             hint = "; it is transposed"
-        elif self._free is None and self._manifest.operators is not None and max(found.shape) > max(shape):
+        elif self._free is None and self._manifest.operators is not None and max(array.shape) > max(shape):
             hint = "; if it has the Dirichlet unknowns, too, leave them out, or name the free ones in spaces.free"
-        raise RequestError(f"{what}: {size_of(found.shape)}; expected {'×'.join(map(str, shape))}{hint}")
+        raise RequestError(f"{what}: {size_of(array.shape)}; expected {'×'.join(map(str, shape))}{hint}")
 
 
 def one_triangle(matrix: Any, what: str) -> None:

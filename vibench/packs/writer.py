@@ -106,22 +106,22 @@ def _space_table(problem: Problem, part: Path) -> list[str]:
 
 def _operator_table(problem: Problem, listed: Array, part: Path) -> list[str]:
     """The table of the members, whose arrays are written."""
-    found: dict[str, dict[str, Any]] = {name: {} for name in MEMBERS}
+    arrays: dict[str, dict[str, Any]] = {name: {} for name in MEMBERS}
     varies = not set(MEMBERS) <= {*problem.constant, *problem.affine}
     for k, mu in enumerate(listed if varies else listed[:1]):
         vi = checked_assembly(problem, mu)
         for name in MEMBERS:
             if name not in problem.affine and (k == 0 or name not in problem.constant):
-                found[name] |= _array_or_parts(str(k), getattr(vi, name))
+                arrays[name] |= _array_or_parts(str(k), getattr(vi, name))
     entrywise = sorted((problem.entrywise | set(problem.affine)) - problem.constant)
     lines = ["[operators]", f"entrywise = [{', '.join(map(_toml_text, entrywise))}]"]
     for name in MEMBERS:
         if name in problem.affine:
-            found[name], line = _affine(name, problem.affine[name], listed)
+            arrays[name], line = _affine(name, problem.affine[name], listed)
         else:
             constant = name in problem.constant
             line = f'{name} = "{name}.npz:0"' if constant else f'{name}.each = "{name}.npz:{{}}"'
-        _save_arrays(part / f"{name}.npz", found[name])
+        _save_arrays(part / f"{name}.npz", arrays[name])
         lines.append(line)
     return [*lines, ""]
 
@@ -138,8 +138,8 @@ def _affine(name: str, declared: AffineSum, listed: Array) -> tuple[dict[str, An
 
 def _solution_table(problem: Problem, listed: Array, part: Path) -> list[str]:
     solver = HighFidelitySolver(problem)
-    found = [solver.solve(mu) for mu in listed]
-    u, lam = (np.column_stack([getattr(one, name) for one in found]) for name in ("u", "lam"))
+    exact = [solver.solve(mu) for mu in listed]
+    u, lam = (np.column_stack([getattr(one, name) for one in exact]) for name in ("u", "lam"))
     _save_arrays(part / "solutions.npz", {"u": u, "lam": lam})
     return ["[solutions]", 'u = "solutions.npz:u"', 'lam = "solutions.npz:lam"', ""]
 

@@ -117,10 +117,10 @@ class Units:
 def units_of(program: VariationalInequality) -> Units:
     """Units in which ‖f‖∞ = 1 and x is as it is; without load, those of what the constraints prescribe."""
     rows = row_norms(program.B)
-    found = prescribed(program, rows)
-    if found is None:
+    scale = prescribed(program, rows)
+    if scale is None:
         return Units(rows, 1.0, size(program.f))
-    return Units(rows, found.length, OBJECTIVE_UNIT * found.force)
+    return Units(rows, scale.length, OBJECTIVE_UNIT * scale.force)
 
 
 def units_of_dual(dual: VariationalInequality) -> Units:

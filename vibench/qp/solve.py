@@ -144,8 +144,8 @@ def installed_solvers(extra: Iterable[str] = ()) -> list[str]:
 
     Only those of an installed distribution: any folder called like a solver can be imported from the working directory.
     """
-    known = {name for name in qpsolvers.available_solvers if name in SETTINGS and solver_version(name)}
-    return sorted(known | set(extra))
+    installed = {name for name in qpsolvers.available_solvers if name in SETTINGS and solver_version(name)}
+    return sorted(installed | set(extra))
 
 
 def takes_start(solver: str) -> bool:

@@ -138,15 +138,15 @@ def verify(program: VariationalInequality, answer: QPSolution, accuracy: float) 
     # before any residual: max(0, nan) is 0 and would hide it
     if not (np.all(np.isfinite(answer.x)) and np.all(np.isfinite(answer.alpha))):
         return Status.NONFINITE, f"the solution is not finite: {answer.solver_status}", None
-    found = kkt_residuals(program, answer.x, answer.alpha)
-    if found.worst <= accuracy:
-        return Status.OK, "", found
-    if found.primal > accuracy and infeasibility_certificate(program) is not None:
-        return Status.INFEASIBLE, "no point satisfies the constraints (certified)", found
-    name = max(("primal", "dual", "gap"), key=lambda key: getattr(found, key))
+    residuals = kkt_residuals(program, answer.x, answer.alpha)
+    if residuals.worst <= accuracy:
+        return Status.OK, "", residuals
+    if residuals.primal > accuracy and infeasibility_certificate(program) is not None:
+        return Status.INFEASIBLE, "no point satisfies the constraints (certified)", residuals
+    name = max(("primal", "dual", "gap"), key=lambda key: getattr(residuals, key))
     clipped = f" after setting multipliers down to -{answer.negative:.0e} to zero" if answer.negative else ""
-    reason = f"{name} residual {above(getattr(found, name), accuracy)}{clipped}: {answer.solver_status}"
-    return Status.INACCURATE, reason, found
+    reason = f"{name} residual {above(getattr(residuals, name), accuracy)}{clipped}: {answer.solver_status}"
+    return Status.INACCURATE, reason, residuals
 
 
 def infeasibility_certificate(program: VariationalInequality, tolerance: float = 1e-10) -> Array | None:

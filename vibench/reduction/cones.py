@@ -252,9 +252,9 @@ class LazyDistances:
         return np.asarray(self._snapshots[:, q] - self._generators @ self._coefficients[:, q])
 
     def _distance(self, q: int) -> float:
-        found = _project_whitened(self._generators, self._snapshots[:, q])
-        self._coefficients[:, q] = found.coefficients
-        return found.distance / self._largest
+        projection = _project_whitened(self._generators, self._snapshots[:, q])
+        self._coefficients[:, q] = projection.coefficients
+        return projection.distance / self._largest
 
 
 def _best_combination(points: Array, nu: Array, targets: Array) -> tuple[Array, Array]:

@@ -78,19 +78,19 @@ def constraint_classes(matrices: Iterable[SparseMatrix]) -> ConstraintClasses:
     Where every B(mu) is one matrix times a scalar, one supremizer space replaces one for each parameter.
     """
     classes: list[tuple[SparseMatrix, Array]] = []
-    found: list[tuple[int, float]] = []
+    placed: list[tuple[int, float]] = []
     for matrix in matrices:
         fingerprint = _fingerprint(matrix)
         for k, (representative, other) in enumerate(classes):
             similar = _equal_up_to_sign(fingerprint, other)  # a cheap necessary condition
             factor = proportionality(matrix, representative) if similar else None
             if factor is not None:
-                found.append((k, factor))
+                placed.append((k, factor))
                 break
         else:
-            found.append((len(classes), 1.0))
+            placed.append((len(classes), 1.0))
             classes.append((matrix.copy(), fingerprint))
-    members, factors = [k for k, _ in found], [factor for _, factor in found]
+    members, factors = [k for k, _ in placed], [factor for _, factor in placed]
     return ConstraintClasses(tuple(B for B, _ in classes), np.array(members, dtype=np.intp), np.array(factors))
 
 
@@ -232,8 +232,8 @@ def supremizer_coordinates(
     constrained = _constrained_unknowns(matrices)
     if SPAN_COST * V.dim * eta.shape[1] * len(matrices) <= len(constrained) ** 2:
         space = SpannedCoordinates(V, basis, np.hstack([supremizers(V, B, eta) for B in matrices]))
-        found = space.represented
+        coordinates = space.represented
     else:
         space = ContactCoordinates(V, basis, constrained)
-        found = space.supremizers(np.hstack([_loads(B, constrained, eta) for B in matrices]))
-    return space, np.split(found, len(matrices), axis=1)
+        coordinates = space.supremizers(np.hstack([_loads(B, constrained, eta) for B in matrices]))
+    return space, np.split(coordinates, len(matrices), axis=1)

@@ -154,8 +154,8 @@ def energy_inf_sup(A: SparseMatrix, B: SparseMatrix, W: InnerProduct) -> Constan
         saddle = -_saddle_point(A, B, beta**2 * W.matrix)
         return bool(proved_positive([saddle], np.concatenate([roots[0], beta * roots[1]]), order) >= m)
 
-    found = _moved(float(np.sqrt(square)), -1.0, stable)
-    return found if found.proved else Constant(0.0, True)
+    constant = _moved(float(np.sqrt(square)), -1.0, stable)
+    return constant if constant.proved else Constant(0.0, True)
 
 
 def _smallest_compliance(

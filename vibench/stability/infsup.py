@@ -176,8 +176,8 @@ def nodal_multipliers(W: InnerProduct) -> Multipliers:
 def constants_full(V: InnerProduct, classes: ConstraintClasses, cone: Multipliers) -> list[InfSup]:
     """Constants of the whole of V at every B(mu) (m×n)."""
     image = isometric_supremizers(V, classes.representatives, cone.rank + cone.chi.shape[1])
-    found = [inf_sup(image(B, cone.span), image(B, cone.chi), cone) for B in classes.representatives]
-    return everywhere(classes, found)
+    constants = [inf_sup(image(B, cone.span), image(B, cone.chi), cone) for B in classes.representatives]
+    return everywhere(classes, constants)
 
 
 def constants_on(Z: Array, classes: ConstraintClasses, cone: Multipliers) -> list[InfSup]:
@@ -185,9 +185,9 @@ def constants_on(Z: Array, classes: ConstraintClasses, cone: Multipliers) -> lis
     return everywhere(classes, [inf_sup_on(Z, B, cone) for B in classes.representatives])
 
 
-def everywhere(classes: ConstraintClasses, found: Sequence[InfSup]) -> list[InfSup]:
+def everywhere(classes: ConstraintClasses, constants: Sequence[InfSup]) -> list[InfSup]:
     """Constants of all matrices from those of the representatives."""
-    return [found[k].scaled(c) for k, c in zip(classes.members, classes.factors, strict=True)]
+    return [constants[k].scaled(c) for k, c in zip(classes.members, classes.factors, strict=True)]
 
 
 @dataclass(frozen=True)

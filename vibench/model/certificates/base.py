@@ -153,9 +153,9 @@ def _constant_constraint(
 def injected(problem: Problem) -> Array:
     """E (n×k): the functionals that act on one contact unknown each."""
     dofs = contact_unknowns(problem)
-    found = np.zeros((problem.V.dim, len(dofs)))
-    found[dofs, np.arange(len(dofs))] = 1.0
-    return found
+    E = np.zeros((problem.V.dim, len(dofs)))
+    E[dofs, np.arange(len(dofs))] = 1.0
+    return E
 
 
 def contact_unknowns(problem: Problem) -> Indices:

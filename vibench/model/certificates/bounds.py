@@ -171,9 +171,9 @@ class OnlineCertificate:
         prepared = self.prepared
         if prepared is not None:
             B, g, g_size = self._constraint(problem, mu, evaluated)
-            found = prepared.correction(B, g, g_size, y, lam, gamma)
-            if found is not None:
-                return found, ""
+            quick = prepared.correction(B, g, g_size, y, lam, gamma)
+            if quick is not None:
+                return quick, ""
         on_contact, uncertain = self.contact_basis @ y, float(np.linalg.norm(y)) * self._round_off
         correction = find_contact_correction(
             self.compliance, evaluated.contact or contact_at(problem, mu), on_contact, uncertain, lam, gamma

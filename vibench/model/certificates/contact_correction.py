@@ -200,9 +200,9 @@ def find_contact_correction(
         near[np.repeat(np.arange(len(lam)), np.diff(B.indptr))[~inside]] = False
         if not near[lam > 0.0].all():
             continue
-        found = _Program(C, restricted, near, excess, round_off, reach, terms, lam, gamma).best()
-        if found is not None:
-            return ContactCorrection(unknowns, *found)
+        best = _Program(C, restricted, near, excess, round_off, reach, terms, lam, gamma).best()
+        if best is not None:
+            return ContactCorrection(unknowns, *best)
     return None
 
 
@@ -254,19 +254,19 @@ class _Program:
     def _difference(self, chosen: Mask, excess: Array, size: Array) -> Array:
         """ν − λ (m,) with ν = 0 on rows that are not chosen, but for those where λ is negligible: there ν = λ."""
         lam, rows = self.lam, np.flatnonzero(chosen)
-        found = np.where(chosen | (lam * size <= NEGLIGIBLE * np.abs(excess)), 0.0, -lam)
+        difference = np.where(chosen | (lam * size <= NEGLIGIBLE * np.abs(excess)), 0.0, -lam)
         if not len(rows):
-            return found
+            return difference
         block, wanted = _selected_rows(self.B, chosen), excess[rows]
-        if found.any():
-            wanted = wanted - block @ (self.compliance @ (self.B.T @ found)) / self.gamma
+        if difference.any():
+            wanted = wanted - block @ (self.compliance @ (self.B.T @ difference)) / self.gamma
         S = self.compliance.between(block) / self.gamma
         S[np.diag_indices_from(S)] += REGULAR * S.diagonal().max()
         factor, singular = dpotrf(S, lower=1, clean=0)
-        found[rows] = (
+        difference[rows] = (
             np.linalg.lstsq(S, wanted)[0] if singular else _complementary(factor, wanted, lam[rows]) - lam[rows]
         )
-        return found
+        return difference
 
 
 def _selected_rows(B: SparseMatrix, chosen: Mask) -> SparseMatrix:

@@ -56,14 +56,14 @@ def prepare(
 
 def _near(problem: Problem, chi: Array, training: Array) -> Indices:
     """Contact unknowns that rows in the support of a generator, or next to it, touch at some training parameter."""
-    found = np.zeros(len(contact_unknowns(problem)), bool)
+    near = np.zeros(len(contact_unknowns(problem)), bool)
     for mu in training:
         contact = contact_at(problem, mu)
         touches, rows = abs(sp.csr_array(contact.B)) > 0.0, np.any(chi > 0.0, axis=1)
         for _ in range(RINGS):
             rows = touches @ (touches.T @ rows)
-        found |= touches.T @ rows
-    return np.flatnonzero(found)
+        near |= touches.T @ rows
+    return np.flatnonzero(near)
 
 
 def _sampled(
@@ -78,7 +78,7 @@ def _sampled(
     Coefficients (Z×S) of their residuals, the median norm of corrections, and the rows (m,) that some of these hold.
     `forces` are those of `residual_coefficients`.
     """
-    problem, found, norms = model.problem, [], [0.0]
+    problem, residuals, norms = model.problem, [], [0.0]
     rows, held = model.basis[contact_unknowns(problem)], np.zeros(len(model.generators), bool)
     for number, mu in enumerate(training[:: -(-len(training) // SAMPLES)]):
         reduced = model.assemble(mu)
@@ -88,11 +88,11 @@ def _sampled(
         evaluated, alpha = reduced.evaluated, np.maximum(answer.alpha, 0.0)
         lam, y = model.generators @ alpha, evaluated.in_space(answer.x)
         contact, theta = evaluated.contact or contact_at(problem, mu), base.coefficients(evaluated.samples)
-        found.append(residual_coefficients(theta, y, forces, contact, alpha, lam))
+        residuals.append(residual_coefficients(theta, y, forces, contact, alpha, lam))
         held |= held_rows(compliance, contact, rows @ y, lam)
         if number % 8 == 0:
             correction = find_contact_correction(compliance, contact, rows @ y, np.zeros(len(rows)), lam, 1.0)
             norms += [] if correction is None else [correction.norm]
-    if not found:
+    if not residuals:
         raise UnsupportedError("no reduced program at a training parameter has a solution")
-    return np.column_stack(found), float(np.median(norms)), held
+    return np.column_stack(residuals), float(np.median(norms)), held

@@ -73,9 +73,9 @@ class SpectralBounds:
     def at(self, mu: Array, theta: Array) -> tuple[float, float]:
         """α(µ) and γ(µ) at mu (d,) with the rotated θ(µ) (Q,); α(µ) ≤ 0 says nothing."""
         where, c = self._weights(mu)
-        found = np.array(c) @ self._known[where]
-        lacking = float(np.abs(theta - found[2:]) @ self.norms) + 2.0 * self.error
-        return float(found[0]) - lacking, float(found[1]) + lacking
+        combined = np.array(c) @ self._known[where]
+        lacking = float(np.abs(theta - combined[2:]) @ self.norms) + 2.0 * self.error
+        return float(combined[0]) - lacking, float(combined[1]) + lacking
 
     @cached_property
     def _known(self) -> Array:
@@ -109,18 +109,18 @@ def spectral_bounds(
 ) -> SpectralBounds:
     """Bounds from the terms A_q (n×n) of A, their coefficients θ (Q,) as a function of mu, and η."""
     points, count = anchors(problem.parameters)
-    known = [coercivity_and_continuity(checked_assembly(problem, mu).A, X) for mu in points]
+    constants = [coercivity_and_continuity(checked_assembly(problem, mu).A, X) for mu in points]
     norms = [operator_norm(term, X) for term in terms]
     return SpectralBounds(
         lower=problem.parameters.lower,
         upper=problem.parameters.upper,
         count=count,
-        alpha=np.array([alpha.value for alpha, _ in known]),
-        gamma=np.array([gamma.value for _, gamma in known]),
+        alpha=np.array([alpha.value for alpha, _ in constants]),
+        gamma=np.array([gamma.value for _, gamma in constants]),
         theta=np.column_stack([theta(mu) for mu in points]),
         norms=np.array([norm.value for norm in norms]),
         error=error,
-        proved=all(constant.proved for pair in known for constant in pair) and all(norm.proved for norm in norms),
+        proved=all(constant.proved for pair in constants for constant in pair) and all(norm.proved for norm in norms),
     )
 
 
@@ -134,5 +134,5 @@ def rotated(terms: tuple[SparseMatrix, ...], theta: Array) -> tuple[Array, list[
     entries = np.column_stack([np.asarray(sp.csr_array(term)[rows, columns]).ravel() for term in terms])
     q, r = np.linalg.qr(entries)
     left, _, _ = np.linalg.svd(r @ theta)
-    found = [sp.csr_array((mode, (rows, columns)), shape=pattern.shape) for mode in (q @ left).T]
-    return np.asarray(left.T @ r), found
+    modes = [sp.csr_array((mode, (rows, columns)), shape=pattern.shape) for mode in (q @ left).T]
+    return np.asarray(left.T @ r), modes
