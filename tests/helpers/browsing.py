@@ -13,11 +13,17 @@ import pytest
 from selenium import webdriver
 from selenium.webdriver.chrome.service import Service
 
+FORMULA = "=decorrelated"
+"""Label of a strategy in a report, which a spreadsheet would take for a formula."""
+
 REQUIRED = "VIBENCH_NEEDS_BROWSER"
 """Where this is set, a missing browser is a failure."""
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 """Names under which it is installed."""
+
+PATIENCE = 120.0
+"""Seconds until what a test waits for is missing: it comes at once, but for a machine that does other work, too."""
 
 OPTIONS = (
     "--headless=new", "--no-sandbox", "--disable-gpu", "--disable-dev-shm-usage", "--hide-scrollbars",
@@ -46,6 +52,7 @@ def chromium(downloads: Path) -> Iterator[webdriver.Chrome]:
         options.add_argument(option)
     options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
     browser = webdriver.Chrome(options=options, service=Service(driver))
+    browser.set_script_timeout(PATIENCE)
     try:
         saving = {"behavior": "allow", "downloadPath": str(downloads)}
         browser.execute_cdp_cmd("Browser.setDownloadBehavior", saving)

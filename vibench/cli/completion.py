@@ -202,14 +202,14 @@ def column_names(context: typer.Context, incomplete: str) -> list[str]:
 
 def _added(table: str) -> Iterable[str]:
     """Columns that a table for reading has beside those of the results file."""
-    from vibench.results import best, error_measures
+    from vibench.results import ranking
 
-    return {"best": [best.BAND], "benefits": error_measures.COLUMNS}.get(table, ())
+    return {"best": [ranking.BAND], "benefits": ranking.ERROR_COLUMNS}.get(table, ())
 
 
 def error_measures(incomplete: str) -> list[str]:
     """Completes measures of errors; names of outputs are those of a run."""
-    from vibench.results.error_measures import OF_SOLUTION, OUTPUT
+    from vibench.results.ranking import OF_SOLUTION, OUTPUT
 
     return _beginning(incomplete, [*OF_SOLUTION, OUTPUT])
 

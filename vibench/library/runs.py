@@ -18,7 +18,7 @@ from vibench.execution.recorded_cell import recorded_cell
 from vibench.execution.run import Observer, Options, run_study
 from vibench.execution.run_folder import REPORT
 from vibench.offline.models import Model
-from vibench.results import error_measures, tables
+from vibench.results import ranking, tables
 from vibench.results.columns import TABLES
 from vibench.results.plugin_columns import Extended
 from vibench.results.sqlite.reading import read_meta, study_of
@@ -89,7 +89,7 @@ class Run:
         """A row per pair of cells, or of the high-fidelity model and a cell: the break-even and its interval."""
         return self.table("thresholds")
 
-    def break_even(self, error: str = error_measures.SOLUTION, within: float | None = None) -> pd.DataFrame:
+    def break_even(self, error: str = ranking.SOLUTION, within: float | None = None) -> pd.DataFrame:
         """The thresholds with the errors of both models, `error_a` and `error_b`; 0 of the high-fidelity model.
 
         Parameters
@@ -105,8 +105,8 @@ class Run:
         RequestError
             If there is no such measure, or the largest error is not positive.
         """
-        found = error_measures.with_errors(self.thresholds, *tables.measured(self.path, error))
-        return found if within is None else error_measures.within(found, within).reset_index(drop=True)
+        found = ranking.with_errors(self.thresholds, *tables.measured(self.path, error))
+        return found if within is None else ranking.within(found, within).reset_index(drop=True)
 
     @property
     def summary(self) -> pd.DataFrame:

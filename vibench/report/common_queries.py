@@ -59,8 +59,8 @@ def on_common_queries(cells: pd.DataFrame, queries: pd.DataFrame) -> Comparable:
     by = ok.groupby("query")["cell"].nunique()
     common = by.index[by == len(kept)]
     means = ok[ok["query"].isin(common)].groupby("cell")[list(MEANS.values())].mean()
-    found = kept.assign(**{column: kept["cell"].map(means[name]) for column, name in MEANS.items()})
-    return Comparable(found, len(common), int(kept["queries"].max()) if len(kept) else 0)
+    compared = kept.assign(**{column: kept["cell"].map(means[name]) for column, name in MEANS.items()})
+    return Comparable(compared, len(common), int(kept["queries"].max()) if len(kept) else 0)
 
 
 def common_programs(queries: pd.DataFrame) -> pd.DataFrame:

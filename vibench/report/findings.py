@@ -25,9 +25,16 @@ from vibench.report.figures.data import (
     label,
     problems,
 )
-from vibench.report.leaderboard import Criterion, Standings, leaderboard
 from vibench.results import formats, invariants, tables
-from vibench.results.best import LARGEST_BAND, SOLVER_SHARE, eligible, solved_too_loosely
+from vibench.results.ranking import (
+    LARGEST_BAND,
+    SOLVER_SHARE,
+    Criterion,
+    Standings,
+    eligible,
+    leaderboard,
+    solved_too_loosely,
+)
 from vibench.results.solver_agreement import sentence
 from vibench.stability.infsup import VANISHES
 
@@ -99,11 +106,11 @@ MOST = 10
 """Findings that a report begins with; the others are folded."""
 
 
-def leading(found: Iterable[Finding], most: int = MOST) -> list[Finding]:
+def leading(findings: Iterable[Finding], most: int = MOST) -> list[Finding]:
     """The findings that say most, by weight; of equal weight, every subject has its first one before its second."""
     before = defaultdict[tuple[Weight, str], int](int)
     ranked = list[tuple[Weight, int, Finding]]()
-    for one in found:
+    for one in findings:
         ranked.append((one.weight, before[one.weight, one.subject], one))
         before[one.weight, one.subject] += 1
     return [one for *_, one in sorted(ranked, key=lambda entry: entry[:2])][:most]
@@ -162,8 +169,8 @@ def _number(count: int, noun: str) -> str:
     return f"{count} {noun}{'s' * (count != 1)}"
 
 
-def _are(found: pd.DataFrame | list[Any]) -> str:
-    return "is" if len(found) == 1 else "are"
+def _are(items: pd.DataFrame | list[Any]) -> str:
+    return "is" if len(items) == 1 else "are"
 
 
 def _answer(data: Data) -> Iterator[str]:
@@ -207,8 +214,8 @@ def _milliseconds(seconds: float) -> str:
 
 
 def _errors(cell: Any) -> str:
-    known = {"u": cell["error_u_mean"], "λ": cell["error_lambda_mean"]}
-    return " and ".join(f"{value:.3g} in {name}" for name, value in known.items() if not pd.isna(value))
+    errors = {"u": cell["error_u_mean"], "λ": cell["error_lambda_mean"]}
+    return " and ".join(f"{value:.3g} in {name}" for name, value in errors.items() if not pd.isna(value))
 
 
 def _stability(cells: pd.DataFrame, compared: Comparable) -> Iterator[str]:
@@ -292,11 +299,11 @@ def _costs(cells: pd.DataFrame, thresholds: pd.DataFrame) -> Iterator[str]:
         f"{_milliseconds(row['hf_setup_s'])}."
     )
     against = thresholds[(thresholds["cell_b"] == row["cell"]) & thresholds["cell_a"].isna()]
-    for found in against.itertuples():
-        number = "" if pd.isna(found.benefit_threshold) else " queries"
-        interval = formats.interval(found.threshold_low, found.threshold_high)
+    for threshold in against.itertuples():
+        number = "" if pd.isna(threshold.benefit_threshold) else " queries"
+        interval = formats.interval(threshold.threshold_low, threshold.threshold_high)
         within = f", 95 % interval {interval}" if interval else ""
-        break_even = f"{formats.break_even(found.meaning, found.benefit_threshold)}{number}{within}"
+        break_even = f"{formats.break_even(threshold.meaning, threshold.benefit_threshold)}{number}{within}"
         yield f"Break-even of {name} against high-fidelity solutions: {break_even}."
 
 

@@ -21,13 +21,12 @@ from vibench.qp.status import Status
 from vibench.report import findings
 from vibench.report.figures import FigureTask, figures_of, processes, render
 from vibench.report.figures.data import TABLES, Data, Extent, label, problems
-from vibench.report.leaderboard import Criterion, Winner, leaderboard
 from vibench.report.page import plots
 from vibench.report.page.grids import Grid, grid_of, grid_of_cells, grid_of_thresholds, script_safe, to_json
 from vibench.report.page.images import image_of
 from vibench.results import pictures, tables
-from vibench.results.best import LARGEST_BAND
 from vibench.results.plugin_columns import Extended, faults_of
+from vibench.results.ranking import LARGEST_BAND, Criterion, Winner, leaderboard
 from vibench.results.selection import short_keys
 from vibench.results.sqlite.reading import read_meta, study_of
 from vibench.text import printable
@@ -182,7 +181,7 @@ def _grids(read: Mapping[str, Extended]) -> Iterator[Grid]:
     failed = cells[cells["status"] != Status.OK][["cell", *IDENTITY, "queries_ok", "queries", "reason"]]
     queries = read["queries"].frame
     failed_queries = queries[queries["status"] != Status.OK][["cell", "query", *IDENTITY, "reason"]]
-    found = [
+    grids = [
         grid_of("failed", "Cells that are not ok", "", failed, IDENTITY, keys),
         grid_of("failed-queries", "Queries that are not ok", "", failed_queries, IDENTITY, keys),
         grid_of_cells(read["cells"], ERRORS),
@@ -197,10 +196,10 @@ def _grids(read: Mapping[str, Extended]) -> Iterator[Grid]:
         ("model", "Break-even against the high-fidelity model", thresholds.frame[model]),
     ):
         if len(rows):
-            found.append(grid_of_thresholds(name, title, caption, thresholds.of(rows), cells))
+            grids.append(grid_of_thresholds(name, title, caption, thresholds.of(rows), cells))
     caption = "Any two solvers on one reduced model: relative differences of u in V, and the differences allowed."
     disagreements = tables.in_order(read["disagreements"].frame)
     disagreements = disagreements[["solver_a", *disagreements.columns.drop(["solver_a", "problem_options"])]]
     axes = ["problem", "dual", "primal", "primal_tol", "accuracy", "assembly", "solver_a", "solver_b"]
-    found.append(grid_of("disagreements", "Agreement of the solvers", caption, disagreements, axes, keys))
-    return (grid for grid in found if len(grid.frame))
+    grids.append(grid_of("disagreements", "Agreement of the solvers", caption, disagreements, axes, keys))
+    return (grid for grid in grids if len(grid.frame))

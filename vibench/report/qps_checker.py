@@ -69,15 +69,15 @@ def main(folder: Path) -> int:
             solution = np.load(folder / "solutions" / f"{row['program']}.npz", allow_pickle=False)
             x, z = solution[f"x_{row['cell']}"], solution[f"z_{row['cell']}"]
             finite = bool(np.all(np.isfinite(x)) and np.all(np.isfinite(z)))
-            found = residuals(program["P"], program["q"], program["G"], program["h"], x, z)
+            recomputed = residuals(program["P"], program["q"], program["G"], program["h"], x, z)
             claimed = [float(row[name] or "nan") for name in ("primal_residual", "dual_residual", "gap")]
-            honest = all(abs(a - b) <= ROUND_OFF + 1e-6 * abs(b) for a, b in zip(found, claimed, strict=True))
-            good = finite and z.min(initial=0.0) >= 0.0 and max(found) <= float(row["accuracy"]) + ROUND_OFF
+            honest = all(abs(a - b) <= ROUND_OFF + 1e-6 * abs(b) for a, b in zip(recomputed, claimed, strict=True))
+            good = finite and z.min(initial=0.0) >= 0.0 and max(recomputed) <= float(row["accuracy"]) + ROUND_OFF
             fine += row["status"] == "ok"
             if not honest or (row["status"] == "ok" and not good):
                 wrong += 1
                 about = f"{row['program']} {row['solver']} at {row['accuracy']}: {row['status']}"
-                print(f"{about!r}, claimed {claimed}, found {found}")  # the rows may be those of others
+                print(f"{about!r}, claimed {claimed}, found {recomputed}")  # the rows may be those of others
     print(f"{count} solutions, {fine} claimed ok, {wrong} wrong")
     return wrong
 

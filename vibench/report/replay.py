@@ -65,21 +65,21 @@ def replay(recorded: RecordedCell, query: int, file: Path) -> pd.DataFrame:
     program, accuracy = recorded.program(query), recorded.cell.accuracy
     with _writing(file):
         write_program(program, file)
-    known: Array | None = None
+    recorded_x: Array | None = None
     table: list[dict[str, Any]] = []
-    if found := recorded.rows("solutions").get(query):
-        known, alpha = vectors(found)
-        solution = QPSolution(known, alpha, rows[query]["solver_status"] or "", rows[query]["iterations"])
+    if solved := recorded.rows("solutions").get(query):
+        recorded_x, alpha = vectors(solved)
+        solution = QPSolution(recorded_x, alpha, rows[query]["solver_status"] or "", rows[query]["iterations"])
         status, reason, residuals = verify(program, solution, accuracy)
         line = _line(Trial(status, reason, solution, residuals), None) | {"seconds": rows[query]["solve_s"]}
         table.append({"solver": f"{recorded.cell.solver} (recorded)"} | line)
     solvers = installed_solvers(registered(SOLVER))
     for solver, trial in solver_trials(program, accuracy, solvers).items():
-        table.append({"solver": solver} | _line(trial, known))
+        table.append({"solver": solver} | _line(trial, recorded_x))
     return pd.DataFrame(table)
 
 
-def _line(trial: Trial, known: Array | None) -> dict[str, Any]:
+def _line(trial: Trial, recorded_x: Array | None) -> dict[str, Any]:
     solution = trial.solution
     if solution is None:
         return {"claims": trial.reason, "status": trial.status.value}
@@ -87,8 +87,8 @@ def _line(trial: Trial, known: Array | None) -> dict[str, Any]:
     line |= {"iterations": solution.iterations, "seconds": trial.seconds.cpu}
     if trial.residuals is not None:
         line |= asdict(trial.residuals)
-    if known is not None and solution.x is not None:
-        line["distance"] = float(np.linalg.norm(solution.x - known))
+    if recorded_x is not None and solution.x is not None:
+        line["distance"] = float(np.linalg.norm(solution.x - recorded_x))
     return line
 
 

@@ -84,16 +84,16 @@ class Costs:
 def resampled_break_even(a: Costs, b: Costs) -> BreakEven:
     """Break-even of b against a with its interval; undecided where the resamples do not agree on its meaning."""
     dearer, faster = b.offline_draws - a.offline_draws, a.online_draws - b.online_draws
-    found = {
+    drawn = {
         Meaning.AT_ONCE: (dearer <= 0.0) & (faster >= 0.0),
         Meaning.FROM: (dearer > 0.0) & (faster > 0.0),
         Meaning.UNTIL: (dearer < 0.0) & (faster < 0.0),
     }
-    found[Meaning.NEVER] = ~np.any(list(found.values()), axis=0)
+    drawn[Meaning.NEVER] = ~np.any(list(drawn.values()), axis=0)
     measured = break_even(a.offline, a.online, b.offline, b.online)
-    equal = found[Meaning.FROM] | found[Meaning.UNTIL]
+    equal = drawn[Meaning.FROM] | drawn[Meaning.UNTIL]
     low, high = np.quantile(dearer[equal] / faster[equal], (TAIL, 1.0 - TAIL)) if equal.any() else (None, None)
-    if np.mean(found[measured.meaning]) < 1.0 - TAIL:
+    if np.mean(drawn[measured.meaning]) < 1.0 - TAIL:
         return BreakEven(None, Meaning.UNDECIDED, low)
     return measured if measured.number is None else BreakEven(measured.number, measured.meaning, low, high)
 
@@ -109,7 +109,7 @@ SHARED_PHASES = ("offline_snapshots_s", "offline_pod_s", "offline_cone_s")
 """Offline phases that compared cells have in common; measured once for both, they do not differ between them."""
 
 MODEL_PHASES = (*SHARED_PHASES, "offline_enrichment_s", "offline_assembly_s")
-"""Those that cells of the same model have in common, with certificates and without."""
+"""Offline phases that cells of the same model have in common, with certificates and without."""
 
 NORMAL_95 = 1.96
 """Half the width of the 95 % interval of a normal distribution, in standard deviations."""
@@ -201,10 +201,10 @@ class _Resampling:
         return rng.choice(self._slowdowns, DRAWS)
 
 
-def _row(a: Mapping[str, Any], b: Mapping[str, Any], found: BreakEven) -> dict[str, Any]:
+def _row(a: Mapping[str, Any], b: Mapping[str, Any], result: BreakEven) -> dict[str, Any]:
     row = {name: b[name] for name in _SHARED}
     for side, cell in (("a", a), ("b", b)):
         row |= {f"{name}_{side}": cell[name] for name in ("cell", "primal", "primal_tol", "assembly")}
         row |= {f"{phase}_{side}_s": cell[f"{phase}_s"] for phase in ("offline", "online")}
-    numbers = {"benefit_threshold": found.number, "threshold_low": found.low, "threshold_high": found.high}
-    return row | numbers | {"meaning": found.meaning.value}
+    numbers = {"benefit_threshold": result.number, "threshold_low": result.low, "threshold_high": result.high}
+    return row | numbers | {"meaning": result.meaning.value}

@@ -223,8 +223,8 @@ class ResultsDatabase:
 
     def fine_queries(self, cell: str) -> tuple[int, ...]:
         """Numbers of the queries of a cell that are ok."""
-        found = self._db.execute("SELECT query FROM queries WHERE cell = ? AND status = 'ok' ORDER BY query", (cell,))
-        return tuple(number for (number,) in found)
+        rows = self._db.execute("SELECT query FROM queries WHERE cell = ? AND status = 'ok' ORDER BY query", (cell,))
+        return tuple(number for (number,) in rows)
 
     def cell(self, key: str) -> dict[str, Any] | None:
         """The row of a cell, if it has one."""
@@ -302,22 +302,22 @@ class ResultsDatabase:
 
     def _add_columns(self, queries: Sequence[Mapping[str, Any]]) -> None:
         """Add a column for every parameter mu_1, mu_2, … of the rows."""
-        known = {row[1] for row in self._db.execute("PRAGMA table_info(queries)")}
+        there = {row[1] for row in self._db.execute("PRAGMA table_info(queries)")}
         for name in dict.fromkeys(name for row in queries for name in row):
-            if name not in known and name.startswith("mu_"):
+            if name not in there and name.startswith("mu_"):
                 self._db.execute(f'ALTER TABLE queries ADD COLUMN "{name}" REAL')
 
 
 def _refuse_other(path: Path, study: Mapping[str, Any]) -> None:
     try:
-        found = read_meta(path) if path.exists() else {}
+        meta = read_meta(path) if path.exists() else {}
     except DamagedError as error:
         raise RequestError(f"{error}; use another --out, or --fresh, which keeps it as {FILE}{DAMAGED}") from None
-    if not found:  # empty where a run was killed before its first transaction
+    if not meta:  # empty where a run was killed before its first transaction
         return
-    if found.get("schema") != str(VERSION):
-        raise RequestError(f"'{path}' has schema {found.get('schema')}, this vibench writes {VERSION}; use --out")
-    there = study_of(path, found)
+    if meta.get("schema") != str(VERSION):
+        raise RequestError(f"'{path}' has schema {meta.get('schema')}, this vibench writes {VERSION}; use --out")
+    there = study_of(path, meta)
     if there != json.loads(json.dumps(study)):
         what = ", ".join(
             f"{key} {there.get(key)!r} instead of {study[key]!r}" for key in study if there.get(key) != study[key]

@@ -91,8 +91,8 @@ def to_json(frame: pd.DataFrame) -> str:
     JSON has no infinity; parsers read a number beyond the largest double as infinite.
     """
     # DataFrame.to_json keeps 15 digits at most and writes infinite values as null.
-    known = frame.astype(object).where(frame.notna(), None).to_dict("records")
-    rows = [",\n".join(f"  {_json(str(name))}: {_json(value)}" for name, value in row.items()) for row in known]
+    records = frame.astype(object).where(frame.notna(), None).to_dict("records")
+    rows = [",\n".join(f"  {_json(str(name))}: {_json(value)}" for name, value in row.items()) for row in records]
     return printable_lines("[\n" + ",\n".join(f" {{\n{row}\n }}" for row in rows) + "\n]\n")
 
 

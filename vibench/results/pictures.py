@@ -60,9 +60,9 @@ def _packed(picture: Picture) -> bytes:
 
 
 def _unpacked(data: bytes, names: str) -> Picture:
-    with np.load(io.BytesIO(data), allow_pickle=False) as found:
+    with np.load(io.BytesIO(data), allow_pickle=False) as arrays:
         members: dict[str, Any] = {
-            name: found[name].astype(np.intp if name == "triangles" else float) for name in ARRAYS
+            name: arrays[name].astype(np.intp if name == "triangles" else float) for name in ARRAYS
         }
     # a file of an earlier version has no unit of length
     members |= zip(TEXTS, (printable(str(text)) for text in json.loads(names)), strict=False)

@@ -16,7 +16,7 @@ import pandas as pd
 
 from vibench.errors import RequestError, VibenchError, in_a_line
 from vibench.interfaces.figures import EXTENSIBLE, DerivedColumn, FigurePlugin
-from vibench.results import best, error_measures
+from vibench.results import ranking
 from vibench.results.columns import INTEGER, REAL, STORED, TEXT, THRESHOLDS, Column
 from vibench.results.sqlite.values import stored
 from vibench.study.kinds import FIGURE
@@ -28,7 +28,7 @@ TYPES: Mapping[type, str] = {float: REAL, int: INTEGER, str: TEXT}
 AFTER = 100
 """Places of columns of plugins in a table for reading: after all others."""
 
-_SHOWN = {**best.HEADINGS, **THRESHOLDS, **error_measures.COLUMNS}
+_SHOWN = {**ranking.HEADINGS, **THRESHOLDS, **ranking.ERROR_COLUMNS}
 
 RESERVED = {"pair", *_SHOWN, *(name.lower() for table in STORED.values() for name in table)}
 """Names of columns of results files, for which SQLite knows no case, and of those that figures and summaries add."""
@@ -81,20 +81,26 @@ def extended_tables(names: Collection[str], read: Read) -> dict[str, Extended]:
 
     Every table is read once, and every plugin created once, whatever the number of tables.
     """
-    tables = Copies(read)
-    found = {name: Extended(tables.of(name)) for name in names}
-    extensible = [name for name in found if name in EXTENSIBLE]
-    for one in _declared() if extensible else ():
-        if isinstance(one, str):
-            found |= {name: found[name].with_fault(one) for name in extensible}
-        elif one[1].table in found:
-            found[one[1].table] = _with_column(found[one[1].table], *one, tables)
-    return found
+    tables, owners = Copies(read), dict[str, str]()
+    extended = {name: Extended(tables.of(name)) for name in names}
+    extensible = [name for name in extended if name in EXTENSIBLE]
+    for plugin in registered(FIGURE) if extensible else ():
+        try:
+            columns = list(_named(plugin, declared(plugin, loaded(plugin)), owners))
+        except VibenchError as error:
+            extended |= {name: extended[name].with_fault(str(error)) for name in extensible}
+            continue
+        for column, fault in columns:
+            if fault:
+                extended |= {name: extended[name].with_fault(fault) for name in extensible}
+            elif column.table in extended:
+                extended[column.table] = _with_column(extended[column.table], plugin, column, tables)
+    return extended
 
 
-def faults_of(found: Iterable[Extended]) -> list[str]:
+def faults_of(extended: Iterable[Extended]) -> list[str]:
     """The lines on what could not be used of some tables, each once."""
-    return list(dict.fromkeys(line for one in found for line in one.faults))
+    return list(dict.fromkeys(line for one in extended for line in one.faults))
 
 
 def _with_column(table: Extended, plugin: str, column: DerivedColumn, tables: Copies) -> Extended:
@@ -112,39 +118,27 @@ def _with_column(table: Extended, plugin: str, column: DerivedColumn, tables: Co
     )
 
 
-def _declared() -> Iterator[tuple[str, DerivedColumn] | str]:
-    """The columns of all plugins, with the names of the plugins, and lines on what cannot be used."""
-    owners: dict[str, str] = {}
-    for name in registered(FIGURE):
-        try:
-            found = declared(name, loaded(name))
-        except VibenchError as error:
-            yield str(error)
-            continue
-        for column in found:
-            if fault := _taken(name, column, owners):
-                yield fault
-            else:
-                owners |= _names(name, column)
-                yield name, column
-
-
 def name_faults(plugin: str, columns: Sequence[DerivedColumn]) -> Iterator[str]:
     """A line for each column of a plugin whose name or heading vibench or an earlier column of it has."""
-    owners: dict[str, str] = {}
+    return (fault for _, fault in _named(plugin, columns, {}) if fault)
+
+
+def _named(
+    plugin: str, columns: Sequence[DerivedColumn], owners: dict[str, str]
+) -> Iterator[tuple[DerivedColumn, str]]:
+    """Columns of a plugin, each with why it cannot have its name or heading, "" if it can.
+
+    `owners` are the plugins by the names and headings that their columns have; those that this one gets are added.
+    """
     for column in columns:
-        if fault := _taken(plugin, column, owners):
-            yield fault
-        owners |= _names(plugin, column)
-
-
-def _names(plugin: str, column: DerivedColumn) -> dict[str, str]:
-    """The plugin by the name and the heading of its column, which no other one may have."""
-    return {text: plugin for text in (column.name.lower(), column.heading) if text}
+        fault = _taken(plugin, column, owners)
+        if not fault:
+            owners |= {name: plugin for name in (column.name.lower(), column.heading) if name}
+        yield column, fault
 
 
 def _taken(plugin: str, column: DerivedColumn, owners: Mapping[str, str]) -> str:
-    """Why a column cannot have its name or heading; "" if it can. `owners` are the plugins of those before it."""
+    """Why a column cannot have its name or heading; "" if it can."""
     name, title = column.name.lower(), _title(plugin, column)
     if name in RESERVED or PARAMETERS.fullmatch(name):
         return f"{title} has the name of a column of vibench, and needs another"
@@ -185,13 +179,13 @@ def declared(name: str, plugin: FigurePlugin) -> Sequence[DerivedColumn]:
         If it raises, or returns something else.
     """
     try:
-        found = tuple(plugin.columns())
+        columns = tuple(plugin.columns())
     except (Exception, SystemExit) as error:  # noqa: BLE001  third-party code
         raise ColumnError(f"{FIGURE} '{name}' has no columns: {in_a_line(error)}") from None
-    for column in found:
+    for column in columns:
         if not isinstance(column, DerivedColumn):
             raise ColumnError(f"{FIGURE} '{name}' declares a {type(column).__name__}, expected a vibench.DerivedColumn")
-    return found
+    return columns
 
 
 def column_values(plugin: str, column: DerivedColumn, tables: Copies, frame: pd.DataFrame) -> pd.Series:
@@ -204,15 +198,15 @@ def column_values(plugin: str, column: DerivedColumn, tables: Copies, frame: pd.
     """
     title = _title(plugin, column)
     try:
-        found = column.values(tables)
-        values = list(found)
+        given = column.values(tables)
+        values = list(given)
     except (Exception, SystemExit) as error:  # noqa: BLE001  third-party code
         raise ColumnError(f"{title} cannot be computed: {in_a_line(error)}") from None
-    if isinstance(found, str | bytes | Mapping | pd.DataFrame):
-        raise ColumnError(f"{title} is a {type(found).__name__}, expected a value for each row")
+    if isinstance(given, str | bytes | Mapping | pd.DataFrame):
+        raise ColumnError(f"{title} is a {type(given).__name__}, expected a value for each row")
     if len(values) != len(frame):
         raise ColumnError(f"{title} has {len(values)} values for the {len(frame)} rows of '{column.table}'")
-    if isinstance(found, pd.Series) and not found.index.equals(frame.index):
+    if isinstance(given, pd.Series) and not given.index.equals(frame.index):
         raise ColumnError(f"{title} is a Series with another index than the table '{column.table}' has")
     kept = [_stored(title, column, k, value) for k, value in enumerate(values)]
     kind = {float: "float64", int: "Int64" if None in kept else "int64", str: "object"}[column.kind]

@@ -82,7 +82,7 @@ def matching(
         db.setlimit(sqlite3.SQLITE_LIMIT_EXPR_DEPTH, 100)
         db.set_authorizer(allowed)
         try:
-            return np.array([found for (found,) in db.execute(query)], dtype=bool)
+            return np.array([matches for (matches,) in db.execute(query)], dtype=bool)
         except sqlite3.Error as error:
             unknown = re.fullmatch(r"no such column: (.+)", str(error))
             if unknown and unknown[1] in made:
@@ -100,8 +100,8 @@ def _opened(path: Path, table: str, expression: str, plugins: Extended | None) -
         with open_read_only(path) as db:
             yield db
         return
-    frame, known = plugins.frame, {**STORED[table], **plugins.columns}
-    kinds = ", ".join(f'"{name}" {known.get(name, PARAMETER).kind.split()[0]}' for name in frame.columns)
+    frame, columns = plugins.frame, {**STORED[table], **plugins.columns}
+    kinds = ", ".join(f'"{name}" {columns.get(name, PARAMETER).kind.split()[0]}' for name in frame.columns)
     values = frame.astype(object).where(frame.notna(), None)
     with contextlib.closing(sqlite3.connect(":memory:")) as db:
         db.execute(f'CREATE TABLE "{table}" ({kinds})')
@@ -155,8 +155,8 @@ def sorted_by(frame: pd.DataFrame, keys: Sequence[str], what: str) -> pd.DataFra
 
 def short_keys(keys: Iterable[str], least: int = 4) -> int:
     """Number of characters that tell the keys of cells apart, at least `least`."""
-    known = set(keys)
-    longest = max(map(len, known), default=least)
+    different = set(keys)
+    longest = max(map(len, different), default=least)
     with contextlib.suppress(StopIteration):
-        return next(n for n in range(least, longest) if len({key[:n] for key in known}) == len(known))
+        return next(n for n in range(least, longest) if len({key[:n] for key in different}) == len(different))
     return longest

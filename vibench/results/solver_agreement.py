@@ -48,18 +48,18 @@ def disagreement_rows(
 ) -> list[dict[str, Any]]:
     """Rows of the disagreements table from rows of the cells, queries and solutions tables."""
     fine = {(row["cell"], row["query"]) for row in queries if row["status"] == Status.OK}
-    known = {cell["cell"]: cell for cell in cells if cell["model"]}
+    by_key = {cell["cell"]: cell for cell in cells if cell["model"]}
     answers: dict[tuple[str, float], list[Recorded]] = {}
     for row in solutions:
         if (row["cell"], row["query"]) in fine:
-            cell, left_open = known[row["cell"]], Slack(row["slack_linear"], row["slack_constant"])
+            cell, left_open = by_key[row["cell"]], Slack(row["slack_linear"], row["slack_constant"])
             answer = Recorded(cell["solver"], row["query"], vectors(row)[0], left_open)
             answers.setdefault((cell["model"], cell["accuracy"]), []).append(answer)
     keys = {
         (cell["model"], cell["accuracy"]): {name: cell[name] for name in DISAGREEMENTS if name in KEYS}
-        for cell in known.values()
+        for cell in by_key.values()
     }
-    return [keys[programs] | row for programs, found in answers.items() for row in compare(found)]
+    return [keys[programs] | row for programs, given in answers.items() for row in compare(given)]
 
 
 def sentence(disagreements: pd.DataFrame, solvers: int) -> str:

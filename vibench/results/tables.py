@@ -13,7 +13,7 @@ import pandas as pd
 from vibench.errors import RequestError
 from vibench.files import write_atomically
 from vibench.qp.status import Status
-from vibench.results import error_measures, plugin_columns
+from vibench.results import plugin_columns, ranking
 from vibench.results.break_even import Meaning
 from vibench.results.columns import (
     BLOB,
@@ -75,8 +75,8 @@ def read(path: Path, table: str) -> pd.DataFrame:
         is_right, right = A_NUMBER if number else RIGHT.get(name, A_TEXT)
         for value in frame[name].dropna().unique():
             if not is_right(value):
-                found = f"{brief(repr(value), 60)} in the column '{name}' of '{table}'"
-                raise RequestError(f"'{path}' has {found}, expected {right}")
+                strange = f"{brief(repr(value), 60)} in the column '{name}' of '{table}'"
+                raise RequestError(f"'{path}' has {strange}, expected {right}")
         if number:
             frame[name] = frame[name].astype(float)  # every value is NULL
     return frame
@@ -118,7 +118,7 @@ EXPORTED = (*(f"{table}.csv" for table in TABLES), SUMMARY)
 """Names of the files that `export` writes."""
 
 
-def measured(path: Path, measure: str = error_measures.SOLUTION) -> tuple[pd.DataFrame, pd.Series]:
+def measured(path: Path, measure: str = ranking.SOLUTION) -> tuple[pd.DataFrame, pd.Series]:
     """The recorded cells of a results file, and the error of each by a measure.
 
     Raises
@@ -127,7 +127,7 @@ def measured(path: Path, measure: str = error_measures.SOLUTION) -> tuple[pd.Dat
         If there is no such measure, or the file cannot be read.
     """
     cells = read(path, "cells")
-    return cells, error_measures.errors_of(cells, read(path, "outputs"), measure)
+    return cells, ranking.errors_of(cells, read(path, "outputs"), measure)
 
 
 def export(path: Path, folder: Path, note: Callable[[str], None] = lambda _: None) -> list[Path]:
@@ -136,11 +136,11 @@ def export(path: Path, folder: Path, note: Callable[[str], None] = lambda _: Non
     `note` is called with a line for every column of a plugin that could not be written.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    found = extended_tables(path, TABLES)
-    for line in plugin_columns.faults_of(found.values()):
+    read_tables = extended_tables(path, TABLES)
+    for line in plugin_columns.faults_of(read_tables.values()):
         note(line)
-    texts = {f"{table}.csv": to_csv(whole_numbers(in_order(one.frame))) for table, one in found.items()}
-    texts[SUMMARY] = to_markdown(summary(found["cells"].frame, found["cells"].columns))
+    texts = {f"{table}.csv": to_csv(whole_numbers(in_order(one.frame))) for table, one in read_tables.items()}
+    texts[SUMMARY] = to_markdown(summary(read_tables["cells"].frame, read_tables["cells"].columns))
     for name, text in texts.items():
         write_atomically(folder / name, text.encode("utf-8"))
     return [folder / name for name in texts]

@@ -12,9 +12,10 @@ from typing import NoReturn
 import pandas as pd
 
 from vibench.errors import RequestError, unknown_name
-from vibench.results import best, error_measures, selection, tables
+from vibench.results import ranking, selection, tables
 from vibench.results.columns import CELLS, THRESHOLDS, Column
 from vibench.results.plugin_columns import Extended
+from vibench.results.ranking import BAND
 from vibench.text import json_object
 
 AXES = ("problem", "training", "dual", "primal", "primal_tol", "solver", "pod_tol", "dual_tol", "accuracy", "assembly")
@@ -59,7 +60,7 @@ class View:
 
 VIEWS: Mapping[str, View] = {
     "summary": View("cells", (*OF_CELLS, *(name for name in CELLS if CELLS[name].heading)), CELLS),
-    "best": View("cells", ("problem", best.BAND, *OF_CELLS), best.HEADINGS, best.fastest, best.NO_BEST_CELL),
+    "best": View("cells", ("problem", BAND, *OF_CELLS), ranking.HEADINGS, ranking.fastest, ranking.NO_BEST_CELL),
     "benefits": View("thresholds", (*OF_BENEFITS, *(n for n in THRESHOLDS if THRESHOLDS[n].heading)), THRESHOLDS),
     "cells": View("cells", (*OF_CELLS, "reason")),
     "queries": View(
@@ -133,9 +134,9 @@ class Table:
     @property
     def _placed(self) -> list[str]:
         """The columns in their places, or in the order in which they were asked for."""
-        known = self.view.headings
-        order = list(known or self.rows.columns)
-        by_place = sorted(self.columns, key=lambda name: (known[name].place if known else 0, order.index(name)))
+        headings = self.view.headings
+        order = list(headings or self.rows.columns)
+        by_place = sorted(self.columns, key=lambda name: (headings[name].place if headings else 0, order.index(name)))
         return list(self.columns) if self.chosen else by_place
 
     @property
@@ -166,7 +167,7 @@ def look_up(
 ) -> Table:
     """A table of a results file: the rows that satisfy a condition, sorted, the first `limit` of them.
 
-    With an error measure (`error_measures`) models are compared by it: `best` has its bands, tables of break-even have
+    With an error measure (`ranking`) models are compared by it: `best` has its bands, tables of break-even have
     the errors of both models, of which neither is above `largest`.
 
     Raises
@@ -177,14 +178,14 @@ def look_up(
     if name not in VIEWS:
         raise unknown_name("table", name, VIEWS)
     view, extended = _measured(path, name, error, largest is not None)
-    view, found = _with_columns(view, extended.columns), extended.frame
-    keys = found.get("cell", [])
+    view, frame = _with_columns(view, extended.columns), extended.frame
+    keys = frame.get("cell", [])
     if where:
-        made = set(view.headings or {}) - set(found.columns)
-        found = found[selection.matching(path, view.source, where, found.columns, extended, made)]
-        if found.empty:  # what keeps rows out of the table is not why there are none
+        made = set(view.headings or {}) - set(frame.columns)
+        frame = frame[selection.matching(path, view.source, where, frame.columns, extended, made)]
+        if frame.empty:  # what keeps rows out of the table is not why there are none
             view = replace(view, empty="")
-    rows = view.rows(found if largest is None else error_measures.within(found, largest))
+    rows = view.rows(frame if largest is None else ranking.within(frame, largest))
     by_heading = {column.heading: key for key, column in (view.headings or {}).items() if column.heading}
     if sort:
         resolved = [f"{'-' * key.startswith('-')}{by_heading.get(k, k)}" for key in sort for k in [key.lstrip("-")]]
@@ -203,7 +204,7 @@ def look_up(
 
 def _varying_options(frame: pd.DataFrame) -> dict[tuple[str, str], tuple[str, ...]]:
     """Options that differ between plugins of one name, by the column of the name and the name."""
-    found = {}
+    varying = {}
     for axis in PLUGINS:
         if f"{axis}_options" not in frame:
             continue
@@ -212,8 +213,8 @@ def _varying_options(frame: pd.DataFrame) -> dict[tuple[str, str], tuple[str, ..
             keys = dict.fromkeys(key for options in given for key in options)
             differing = tuple(key for key in keys if len({options.get(key) for options in given}) > 1)
             if differing:
-                found[axis, str(name)] = differing
-    return found
+                varying[axis, str(name)] = differing
+    return varying
 
 
 PLUGINS = ("problem", "training", "dual", "primal")
@@ -250,12 +251,12 @@ def _measured(path: Path, name: str, error: str, limited: bool) -> tuple[View, E
         raise RequestError(f"the table {name} compares no models by an error; expected {', '.join(COMPARING)}")
     if limited and name == "best":
         raise RequestError("--within is for tables of break-even points; the table best has all levels of error")
-    cells, errors = tables.measured(path, error or error_measures.SOLUTION)
+    cells, errors = tables.measured(path, error or ranking.SOLUTION)
     if name == "best":
-        return replace(view, rows=partial(best.fastest, errors=errors)), extended
-    frame = error_measures.with_errors(extended.frame, cells, errors)
+        return replace(view, rows=partial(ranking.fastest, errors=errors)), extended
+    frame = ranking.with_errors(extended.frame, cells, errors)
     first = ("problem", "dual", "primal_a", "primal_b", "benefit_threshold", "error_b", "error_a")
-    columns = {**extended.columns, **error_measures.COLUMNS}
+    columns = {**extended.columns, **ranking.ERROR_COLUMNS}
     return replace(view, columns=tuple(dict.fromkeys((*first, *view.columns)))), replace(
         extended, frame=frame, columns=columns
     )

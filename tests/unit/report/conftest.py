@@ -1,11 +1,42 @@
 from __future__ import annotations
 
+import fcntl
+import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from browsing import chromium
+from browsing import FORMULA, chromium
+from running import execute
 from selenium.webdriver import Chrome
+
+from vibench.report import html
+from vibench.results.sqlite.reading import FILE
+
+
+@pytest.fixture(scope="session")
+def reported(quick_run: Path) -> Path:
+    """Folder of a real run with its report, drawn once for all workers.
+
+    A strategy has a label that looks like a formula, and the seconds of two cells were measured on a disturbed machine.
+    """
+    folder = quick_run.parent / "reported"
+    with (quick_run.parent / "reported.lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if not (folder / "report.html").exists():
+            folder.mkdir(exist_ok=True)
+            shutil.copy(quick_run / FILE, folder / FILE)
+            execute(
+                folder,
+                *(
+                    f"UPDATE {table} SET primal = '{FORMULA}' WHERE primal = 'decorrelated'"
+                    for table in ("cells", "queries", "histories", "disagreements")
+                ),
+                "UPDATE cells SET disturbed = 0",
+                "UPDATE cells SET disturbed = 1 WHERE rowid IN (2, 9)",
+            )
+            html.write(folder / FILE, folder / "report.html")
+    return folder
 
 
 @pytest.fixture(scope="module")

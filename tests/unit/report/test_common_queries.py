@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from samples import query_rows
 
-from vibench.report.common_queries import FEWEST, common_programs, on_common_queries
+from vibench.report.common_queries import FEWEST, PROGRAM, common_programs, on_common_queries
 
 QUERIES = 6
 solved_by_cell = st.lists(st.sets(st.integers(0, QUERIES - 1)), min_size=1, max_size=5)
@@ -19,7 +19,7 @@ def tables(solved: list[set[int]], zero: set[int] | None = None) -> tuple[pd.Dat
     """Cells named by numbers, the k-th of which solved these queries; the error of query q is q + 1 + 10 k."""
     cells = pd.DataFrame({"cell": [str(k) for k in range(len(solved))], "queries": QUERIES, "error_u_mean": -1.0})
     rows = [
-        row
+        {name: row[name] for name in ("cell", *PROGRAM)}
         | {"status": "ok" if q in mine else "inaccurate", "error_u": q + 1.0 + 10.0 * k}
         | {"error_lambda": None if q in (zero or ()) else 2.0 * q}
         | {"solver": f"s{k}", "accuracy": 1e-7}

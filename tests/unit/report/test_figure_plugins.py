@@ -173,9 +173,10 @@ def test_what_cannot_be_used_is_a_line(name: str, line: str, register: Register,
 
 
 def test_figures_that_fail_are_reported_and_the_others_are_drawn(
-    register: Register, changed: Changed, tmp_path: Path
+    register: Register, changed: Changed, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     registered(register, "fails", "sizes")
+    monkeypatch.setattr(figures, "OF_PROBLEM", {kind: figures.OF_PROBLEM[kind] for kind in ("errors", "outputs")})
     path = changed("DELETE FROM queries WHERE problem = 'hertz' OR dual = 'cpg'")
     lines: list[str] = []
     files = figures.draw_all(path, tmp_path / "figures", ("svg",), note=lines.append)

@@ -14,17 +14,17 @@ from running import Changed, Main
 from vibench.report import html
 from vibench.report.figures.data import problems
 from vibench.report.findings import MOST, findings
-from vibench.report.leaderboard import leaderboard
 from vibench.results import tables
 from vibench.results.columns import TABLES
+from vibench.results.ranking import leaderboard
 from vibench.results.sqlite.reading import FILE
 from vibench.text import brief
 
 
 @pytest.fixture(scope="module")
-def made(quick_run: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def made(reported: Path) -> Path:
     """The report of a real run."""
-    return html.write(quick_run / FILE, tmp_path_factory.mktemp("report") / "report.html")
+    return reported / "report.html"
 
 
 def test_it_needs_nothing_but_itself(made: Path) -> None:
@@ -44,14 +44,14 @@ def data(page: str, name: str) -> Any:
     return json.loads(page.split(f'id="{name}">')[1].split("</script>", maxsplit=1)[0])
 
 
-def test_findings_tables_and_facts_are_in_it(made: Path, quick_run: Path) -> None:
+def test_findings_tables_and_facts_are_in_it(made: Path, reported: Path) -> None:
     page = made.read_text(encoding="utf-8")
-    texts = [text for found in findings(quick_run / FILE).values() for text in found]
+    texts = [text for found in findings(reported / FILE).values() for text in found]
     assert [text for text in texts if text not in page] == []
     first = page.split('<section id="findings">')[1].split("<details>")[0]
     assert first.count("<li>") == MOST < len(texts)
     assert page.index('id="leaderboard"') < page.index('id="findings"') < page.index('id="summary"')
-    cells = tables.read(quick_run / FILE, "cells")
+    cells = tables.read(reported / FILE, "cells")
     assert cells["machine"].iloc[0] in page
     embedded = data(page, "table-data")["summary"]
     assert embedded["rows"] == len(cells)
@@ -66,9 +66,9 @@ def test_findings_tables_and_facts_are_in_it(made: Path, quick_run: Path) -> Non
     assert "None: every query of every cell is ok." in page
 
 
-def test_without_pictures_all_else_is_in_it(made: Path, quick_run: Path, tmp_path: Path, main: Main) -> None:
+def test_without_pictures_all_else_is_in_it(made: Path, reported: Path, tmp_path: Path, main: Main) -> None:
     target = tmp_path / "plain.html"
-    code, printed, _ = main("report", str(quick_run), "--no-figures", "--out", str(target))
+    code, printed, _ = main("report", str(reported), "--no-figures", "--out", str(target))
     assert (code, printed) == (0, f"report: {target}\n")
     whole, page = (file.read_text(encoding="utf-8") for file in (made, target))
     assert "<img" in whole

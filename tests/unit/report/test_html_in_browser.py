@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import io
-import shutil
-import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pandas as pd
 import pytest
-from browsing import complaints, look
+from browsing import FORMULA, PATIENCE, complaints, look
 from many_cells import write_many
-from running import execute
+from selenium.common.exceptions import TimeoutException
 from selenium.webdriver import ActionChains, Chrome
 from selenium.webdriver.common.by import By
 from selenium.webdriver.support.ui import WebDriverWait
@@ -25,9 +24,6 @@ from vibench.results.sqlite.reading import FILE
 
 MATTERS = {"cell", "problem", "dual", "primal", "δ", "solver", "error λ", "error u", "online [ms]", "offline [s]"}
 """Columns that are seen at 1280 pixels without scrolling."""
-
-FORMULA = "=decorrelated"
-"""Label of a strategy that a spreadsheet would take for a formula."""
 
 GEOMETRY = """
 const outside = [], wide = document.documentElement.scrollWidth;
@@ -68,35 +64,18 @@ return texts;
 
 
 @pytest.fixture(scope="module")
-def results(quick_run: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The results of a real run, a strategy under a label that looks like a formula, two cells disturbed."""
-    folder = tmp_path_factory.mktemp("results")
-    shutil.copy(quick_run / FILE, folder / FILE)
-    execute(
-        folder,
-        *(
-            f"UPDATE {table} SET primal = '{FORMULA}' WHERE primal = 'decorrelated'"
-            for table in ("cells", "queries", "histories", "disagreements")
-        ),
-        "UPDATE cells SET disturbed = 0",
-        "UPDATE cells SET disturbed = 1 WHERE rowid IN (2, 9)",
-    )
-    return folder / FILE
+def made(reported: Path) -> Path:
+    """The report of a real run."""
+    return reported / "report.html"
 
 
 @pytest.fixture(scope="module")
-def made(results: Path) -> Path:
-    """Its report."""
-    return html.write(results, results.parent / "report.html")
-
-
-@pytest.fixture(scope="module")
-def cells(results: Path) -> pd.DataFrame:
-    return tables.in_order(tables.read(results, "cells"))
+def cells(reported: Path) -> pd.DataFrame:
+    return tables.in_order(tables.read(reported / FILE, "cells"))
 
 
 def awaited(browser: Chrome, condition: Callable[[Chrome], Any]) -> Any:
-    return WebDriverWait(browser, 20, 0.1).until(condition)
+    return WebDriverWait(browser, PATIENCE, 0.1).until(condition)
 
 
 def shown_rows(browser: Chrome, table: str = "summary") -> list[dict[str, str]]:
@@ -221,9 +200,7 @@ def test_the_csv_is_what_is_shown(browser: Chrome, made: Path, downloads: Path, 
     look(browser, made, fragment="#summary?is+problem=hertz&sort=-error+u&hide=N")
     browser.find_element(By.CSS_SELECTOR, '[data-table="summary"] .download').click()
     file = downloads / "summary.csv"
-    awaited(browser, lambda _: file.exists())
-    while not (text := file.read_text(encoding="utf-8")):
-        time.sleep(0.05)
+    text = awaited(browser, lambda _: file.exists() and file.read_text(encoding="utf-8"))
     rows = list(csv.DictReader(io.StringIO(text)))
     shown = shown_rows(browser)
     assert list(rows[0]) == [*shown[0], "disturbed"]
@@ -247,14 +224,29 @@ def test_rows_of_a_disturbed_machine_are_flagged(browser: Chrome, made: Path, ce
     assert all(key.startswith(short) for key, short in zip(expected, flagged, strict=True))
 
 
+def move(browser: Chrome, *places: tuple[float, float]) -> None:
+    """Move the pointer from place to place."""
+    actions = ActionChains(browser)
+    for x, y in places:
+        actions.w3c_actions.pointer_action.move_to_location(round(x), round(y))
+    actions.perform()
+
+
 def hover(browser: Chrome, name: str, series: int) -> dict[str, Any]:
-    """Hover over the first point of a series that is shown; returns where it is and what it is."""
-    found: dict[str, Any] = browser.execute_script(POINT, name, series)
-    body = ActionChains(browser)
-    body.w3c_actions.pointer_action.move_to_location(2, 2)
-    body.w3c_actions.pointer_action.move_to_location(round(found["x"]), round(found["y"]))
-    body.perform()
-    return found
+    """Hover over the first point of a series until it says which cell it is; returns where and what it is.
+
+    What is above the plot may still take its place: the pointer is moved again to where the point is then.
+    """
+
+    def point(browser: Chrome) -> dict[str, Any] | None:
+        found: dict[str, Any] = browser.execute_script(POINT, name, series)
+        move(browser, (2, 2), (found["x"], found["y"]))
+        with contextlib.suppress(TimeoutException):
+            WebDriverWait(browser, 3, 0.1).until(lambda b: found["cell"] in b.execute_script(TOOLTIP))
+            return found
+        return None
+
+    return awaited(browser, point)
 
 
 def show_plot(browser: Chrome, name: str) -> None:
@@ -263,7 +255,6 @@ def show_plot(browser: Chrome, name: str) -> None:
         "return [...Bokeh.index.roots].some(view => view.el.closest('#' + arguments[0]) && view.frame.x_range.start)"
     )
     awaited(browser, lambda b: b.execute_script(ready, name))
-    time.sleep(0.3)  # pictures above it may still take their places
 
 
 def test_hover_tells_the_cell_and_the_legend_hides_it(browser: Chrome, made: Path, cells: pd.DataFrame) -> None:
@@ -271,7 +262,7 @@ def test_hover_tells_the_cell_and_the_legend_hides_it(browser: Chrome, made: Pat
     look(browser, made)
     show_plot(browser, name)
     found = hover(browser, name, 1)
-    told = awaited(browser, lambda b: b.execute_script(TOOLTIP))
+    told = browser.execute_script(TOOLTIP)
     assert found["cell"] in told
     assert found["error"] in told
     (row,) = [row for _, row in cells.iterrows() if row["cell"].startswith(found["cell"])]
@@ -287,11 +278,8 @@ def test_hover_tells_the_cell_and_the_legend_hides_it(browser: Chrome, made: Pat
     assert button.get_attribute("aria-pressed") == "false"
     left = browser.execute_script(POINT, name, 0)
     assert left["series"] == found["series"] - 1
-    hover(browser, name, 0)
-    awaited(browser, lambda b: left["cell"] in b.execute_script(TOOLTIP))
-    body = ActionChains(browser)
-    body.w3c_actions.pointer_action.move_to_location(round(found["x"]), round(found["y"]))
-    body.perform()
+    assert hover(browser, name, 0)["cell"] == left["cell"]
+    move(browser, (found["x"], found["y"]))
     awaited(browser, lambda b: found["cell"] not in b.execute_script(TOOLTIP))
     button.click()
     assert browser.execute_script(POINT, name, 1)["series"] == found["series"]
@@ -307,9 +295,15 @@ def test_a_plot_zooms_where_a_box_is_drawn(browser: Chrome, made: Path) -> None:
     """
     before = browser.execute_script(limits, name)
     panel = browser.find_element(By.CSS_SELECTOR, f"#{name} .panels > div")
-    drag = ActionChains(browser).move_to_element_with_offset(panel, -60, -60)
-    drag.click_and_hold().move_by_offset(80, 80).release().perform()
-    awaited(browser, lambda b: b.execute_script(limits, name) < 0.7 * before)
+
+    def zoomed(browser: Chrome) -> bool:
+        drag = ActionChains(browser).move_to_element_with_offset(panel, -60, -60)
+        drag.click_and_hold().move_by_offset(80, 80).release().perform()
+        with contextlib.suppress(TimeoutException):
+            return WebDriverWait(browser, 3, 0.1).until(lambda b: b.execute_script(limits, name) < 0.7 * before)
+        return False
+
+    assert awaited(browser, zoomed)
 
 
 def test_on_paper_pictures_take_the_place_of_plots(browser: Chrome, made: Path) -> None:

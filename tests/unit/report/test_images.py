@@ -14,11 +14,12 @@ from vibench.results.sqlite.reading import FILE
 
 def test_several_processes_draw_the_same_pictures_in_the_same_order(quick_run: Path) -> None:
     """Also those that read tables which are not sent to other processes."""
-    tasks = [task for name, data in problems(quick_run / FILE) for task in tasks_of(name, data)][:14]
+    name, data = next(iter(problems(quick_run / FILE)))
+    tasks = [task for task in tasks_of(name, data) if task[0].endswith(("errors", "shares", "outputs", "-inf-sup"))]
     alone = render(tasks, image_of)
     with processes(2) as pool:
         together = render(tasks, image_of, pool)
-    assert sum(len(figure.pages) for figure in alone) > 10
+    assert [len(figure.pages) for figure in alone] == [1] * 4
     assert alone == together
 
 

@@ -29,7 +29,7 @@ LABELS = [
 
 def sheet(text: str) -> Figure:
     """A figure with a text wherever one from others may stand."""
-    made = Sheet(1, 2, text)
+    made = Sheet(1, 1, text)
     for panel in made.panels:
         plot(panel, [1.0, 2.0], [1.0, 10.0], look_of(text), text)
         made.label(panel, 1.5, 3.0, text)

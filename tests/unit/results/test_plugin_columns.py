@@ -20,9 +20,9 @@ from vibench.report import figures, html
 from vibench.report.comparison.compare import compare
 from vibench.report.page.grids import grid_of_cells
 from vibench.results import tables
-from vibench.results.best import fastest
 from vibench.results.database import ResultsDatabase
 from vibench.results.plugin_columns import extended_tables
+from vibench.results.ranking import fastest
 from vibench.results.sqlite.reading import FILE
 from vibench.testing.sample_run import write_sample_run
 
@@ -259,7 +259,11 @@ TWO = [
 ]
 
 
-def test_figures_say_once_which_columns_their_data_do_not_have(register: Register, main: Main, tmp_path: Path) -> None:
+def test_figures_say_once_which_columns_their_data_do_not_have(
+    register: Register, main: Main, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(figures, "OF_PROBLEM", {"errors": figures.OF_PROBLEM["errors"]})
+    monkeypatch.setattr(figures, "OF_DUAL", {})
     register((GROUP, "two", f"{HERE}:Two"))
     path = write_sample_run(tmp_path / "run")
     lines: list[str] = []

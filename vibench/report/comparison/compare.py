@@ -179,12 +179,12 @@ def compare(paths: Sequence[Path], limit: float) -> Comparison:
     """
     runs = compared_runs(paths)
     first, *others = runs
-    found = defaultdict[tuple[str, str], list[Difference]](list)
+    by_pair = defaultdict[tuple[str, str], list[Difference]](list)
     notes: list[str] = []
     for k, run in enumerate(others, start=1):
         of_run = f"{run.name}: " if len(others) > 1 else ""
         shared = [key for key in first.cells if key in run.cells]
-        differences = found[run.name, first.name]
+        differences = by_pair[run.name, first.name]
         gone = [first.cells[key] for key in first.cells if key not in run.cells]
         new = [run.cells[key] for key in run.cells if key not in first.cells]
         differences += [Difference(cell, "cell", "present", "gone", Verdict.WORSE) for cell in gone]
@@ -204,11 +204,11 @@ def compare(paths: Sequence[Path], limit: float) -> Comparison:
             same = run.measured_beside(earlier, unless=runs[: runs.index(earlier)])
             compared += len(same)
             if same:
-                found[run.name, earlier.name] += of_seconds(earlier, run, same, limit)
+                by_pair[run.name, earlier.name] += of_seconds(earlier, run, same, limit)
         if compared < len([key for key in run.cells if any(key in earlier.cells for earlier in runs[:k])]):
             notes.append(f"{of_run}times and break-even of different machines are not compared")
     notes += dict.fromkeys(line for run in runs for line in run.extended.faults)
-    pairs = tuple(Pair(*names, differences) for names, differences in found.items())
+    pairs = tuple(Pair(*names, differences) for names, differences in by_pair.items())
     return Comparison(tuple(runs), pairs, tuple(notes))
 
 
@@ -221,12 +221,12 @@ def _on_common_queries(one: ComparedRun, two: ComparedRun, shared: Sequence[str]
     different = set(one.ok_queries.index.symmetric_difference(two.ok_queries.index).get_level_values("cell"))
     keys = [key for key in shared if key in different]
     both = one.ok_queries.index.intersection(two.ok_queries.index)
-    found: list[Means] = []
+    both_means: list[Means] = []
     for run in (one, two):
         common = run.ok_queries[run.ok_queries.index.isin(both)].groupby("cell")
         means = {column: common[name].agg(how).reindex(keys) for column, (name, how) in ERRORS.items()}
-        found.append({key: {column: float(values[key]) for column, values in means.items()} for key in keys})
-    return found[0], found[1]
+        both_means.append({key: {column: float(values[key]) for column, values in means.items()} for key in keys})
+    return both_means[0], both_means[1]
 
 
 def _row(pair: Pair, one: Difference) -> dict[str, Any]:

@@ -38,7 +38,7 @@ WHATS = ("cell", "queries_ok", "status", *DIMENSIONS, *CONSTANTS, *ERRORS, *ZERO
 
 Interval = tuple[float, float]
 UNKNOWN: Interval = (float("nan"), float("nan"))
-"""Of a ratio that has no interval."""
+"""The interval of a ratio that has none."""
 
 
 class Verdict(StrEnum):
@@ -77,19 +77,19 @@ class Difference(NamedTuple):
 def of_numbers(one: Mapping[str, Any], two: Mapping[str, Any], limit: float) -> Iterator[Difference]:
     """Differences of a cell in what does not depend on the machine; nothing of columns that are empty in both runs."""
     severities = (Status(one["status"]).severity, Status(two["status"]).severity)
-    found: dict[str, Verdict | None] = {
+    verdicts: dict[str, Verdict | None] = {
         "queries_ok": _verdict(one["queries_ok"], two["queries_ok"], 1.0, more_is_better=True),
         "status": _verdict(*severities, 1.0),
     }
     for name in DIMENSIONS:
         verdict = _verdict(one[name], two[name], limit)
-        found[name] = Verdict.CHANGED if verdict is Verdict.WITHIN_LIMIT else verdict
+        verdicts[name] = Verdict.CHANGED if verdict is Verdict.WITHIN_LIMIT else verdict
     for name in CONSTANTS:
-        found[name] = _verdict(one[name], two[name], limit, floor=VANISHES, more_is_better=True)
+        verdicts[name] = _verdict(one[name], two[name], limit, floor=VANISHES, more_is_better=True)
     for name in (*ERRORS, *ZERO_ERRORS):
         allowed = _solvers_part(one, name) + _solvers_part(two, name)
-        found[name] = _verdict(one[name], two[name], limit, floor=ERROR_FLOOR, allowed=allowed)
-    for name, verdict in found.items():
+        verdicts[name] = _verdict(one[name], two[name], limit, floor=ERROR_FLOOR, allowed=allowed)
+    for name, verdict in verdicts.items():
         if verdict is not None:
             yield Difference(one, name, one[name], two[name], verdict)
 

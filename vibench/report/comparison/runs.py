@@ -60,11 +60,11 @@ class ComparedRun:
     @cached_property
     def versions(self) -> dict[str, str]:
         """Versions of Python, libraries and solvers; several, where its cells were run with several."""
-        found: dict[str, set[str]] = {}
+        by_name: dict[str, set[str]] = {}
         for text in {row["versions"] for row in self.cells.values() if isinstance(row["versions"], str)}:
             for name, version in json.loads(text).items():
-                found.setdefault(name, set()).add(str(version))
-        return {name: ", ".join(sorted(several)) for name, several in sorted(found.items())}
+                by_name.setdefault(name, set()).add(str(version))
+        return {name: ", ".join(sorted(several)) for name, several in sorted(by_name.items())}
 
     @cached_property
     def ok_queries(self) -> pd.DataFrame:

@@ -52,7 +52,7 @@ OF_DUAL: dict[str, DrawPages] = {"enrichment": enrichment, "inf-sup": inf_sup}
 """Figures of every problem and dual strategy."""
 
 OF_HISTORIES: frozenset[DrawPages] = frozenset({diagnostics, projection_errors, orthogonality, enrichment})
-"""Those that read the histories; no other one does."""
+"""The figures that read the histories; no other one does."""
 
 CAPTIONS = "captions.json"
 """File beside the figures: the caption of every figure, by the name of its files."""
@@ -267,9 +267,12 @@ def _submitted(
     # None, for a figure that reads histories without being one of OF_HISTORIES would not notice empty ones
     none = cast("pd.DataFrame", None)
     sent = [(name, draw, replace(data, histories=none)) for name, draw, data in (tasks[k] for k in places)]
-    with tempfile.TemporaryDirectory(prefix=TEMPORARY) as folder:
-        file = Path(folder) / "tasks"
-        file.write_bytes(pickle.dumps(sent))  # once for all of them: what they have in common is large
+    with contextlib.ExitStack() as stack:
+        try:
+            file = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix=TEMPORARY))) / "tasks"
+            file.write_bytes(pickle.dumps(sent))  # once for all of them: what they have in common is large
+        except OSError:  # no room for it: this process draws them all
+            places.clear()
         yield {
             places[number]: pool.submit(_render_sent, file, number, finish) for number in reversed(range(len(places)))
         }

@@ -40,16 +40,16 @@ POD = Series("POD")
 
 def diagnostics(data: Data) -> Pages:
     """Quantities that the problem reports at every parameter, such as the largest aspect ratio (paper, Figure 3)."""
-    found = data.histories[data.histories["stage"].isin(DIAGNOSED)]
-    if found.empty:
+    reported = data.histories[data.histories["stage"].isin(DIAGNOSED)]
+    if reported.empty:
         return
-    quantities = list(found["quantity"].unique())
+    quantities = list(reported["quantity"].unique())
     sheet = Sheet.of(len(quantities), f"{data.problem}: diagnostics over the parameters")
     looks = Looks(map(Series, DIAGNOSED))
     for panel, quantity in zip(sheet.panels, quantities, strict=False):
         first = 1
         for stage in DIAGNOSED:
-            mine = found[(found["stage"] == stage) & (found["quantity"] == quantity)]
+            mine = reported[(reported["stage"] == stage) & (reported["quantity"] == quantity)]
             values = mine.drop_duplicates("step").sort_values("step")["value"].to_numpy()
             scatter(panel, first + np.arange(len(values)), values, looks[Series(stage)], f"{stage} parameters")
             first += len(values)
@@ -67,8 +67,8 @@ def projection_errors(data: Data) -> Pages:
     cones = _in_panels(errors[errors["stage"] == "cone"])
     sheet = Sheet.of(1 + len(cones), f"{data.problem}: projection errors over the training set")
     left, *others = sheet.panels
-    for _, found in longest(errors[errors["stage"] == "pod"]):
-        shown = found[found["value"] > ROUND_OFF]
+    for _, steps in longest(errors[errors["stage"] == "pod"]):
+        shown = steps[steps["value"] > ROUND_OFF]
         plot(left, shown["step"], shown["value"], Looks([POD])[POD], POD.name)
     left.set(xlabel="number of modes N", ylabel="relative error of the POD", title="primal", yscale="log")
     counted(left)
@@ -84,10 +84,10 @@ def projection_errors(data: Data) -> Pages:
 
 def orthogonality(data: Data) -> Pages:
     """Relative distance of every generator from the cone of the preceding ones (paper, Figures 6 and 12)."""
-    found = data.histories[(data.histories["stage"] == "cone") & (data.histories["quantity"] == "e_orth")]
-    if found.empty:
+    steps = data.histories[(data.histories["stage"] == "cone") & (data.histories["quantity"] == "e_orth")]
+    if steps.empty:
         return
-    cones = _in_panels(found)
+    cones = _in_panels(steps)
     sheet = Sheet.of(len(cones), f"{data.problem}: angles between generators", share="all")
     for panel, names in zip(sheet.panels, cones, strict=False):
         _cones(panel, names, "number of preceding generators r", "e_orth(r)")
@@ -115,15 +115,15 @@ def cone_errors(title: str, errors: Mapping[str, Array]) -> CaptionedFigure:
 
 def _in_panels(histories: pd.DataFrame) -> list[dict[str, pd.DataFrame]]:
     """The longest cone of every dual strategy, in groups of as many as a panel takes."""
-    found = [(str(dual), rows) for dual, rows in longest(histories)]
-    return [dict(group) for group in parts(found, SERIES)] or [{}]
+    cones = [(str(dual), rows) for dual, rows in longest(histories)]
+    return [dict(group) for group in parts(cones, SERIES)] or [{}]
 
 
 def _cones(axes: Axes, cones: Mapping[str, pd.DataFrame], xlabel: str, ylabel: str) -> None:
     """A line for every cone."""
     looks = Looks(map(Series, cones))
-    for dual, found in cones.items():
-        plot(axes, found["step"], positive(found["value"]), looks[Series(dual)], dual)
+    for dual, steps in cones.items():
+        plot(axes, steps["step"], positive(steps["value"]), looks[Series(dual)], dual)
     axes.set(xlabel=xlabel, ylabel=ylabel, yscale="log")
     counted(axes)
 

@@ -13,9 +13,8 @@ from vibench.report.common_queries import on_common_queries
 from vibench.report.figures.data import Data, best_solver, by_dimensions, label, point_names, series, titled_parts
 from vibench.report.figures.looks import HIGH_FIDELITY_LOOK, Looks, Series
 from vibench.report.figures.style import ABREAST, DEEP, SERIES, Layout, Pages, Sheet, plot, scatter
-from vibench.results import error_measures
+from vibench.results import ranking
 from vibench.results.break_even import HIGH_FIDELITY, Meaning
-from vibench.results.error_measures import OUTPUT
 
 ERRORS = {"error_u_mean": "mean relative error of u", "error_lambda_mean": "mean relative error of λ"}
 
@@ -137,9 +136,9 @@ def break_even(data: Data) -> Pages:
     models = cells.merge(against, "inner", left_on="cell", right_index=True)
     decided = models[models["meaning"] == Meaning.FROM]
     errors = {
-        measure: error_measures.errors_of(decided, data.outputs, measure).dropna()
-        for measure in error_measures.measures(data.outputs)
-        if measure != error_measures.SOLUTION
+        measure: ranking.errors_of(decided, data.outputs, measure).dropna()
+        for measure in ranking.measures(data.outputs)
+        if measure != ranking.SOLUTION
     }
     panels = [(measure, decided.loc[error.index], error) for measure, error in errors.items() if len(error)]
     without = len(models) - len(decided)
@@ -155,7 +154,7 @@ def break_even(data: Data) -> Pages:
             panel.vlines(error, low, high, color="0.6", lw=0.8, zorder=0)
             best = mine.iloc[_front(error.to_numpy(float), number.to_numpy(float))]
             _name_points(sheet, panel, best, error, number)
-            title = measure.removeprefix(OUTPUT).replace("lambda", "λ")
+            title = measure.removeprefix(ranking.OUTPUT).replace("lambda", "λ")
             panel.set(xlabel="mean relative error", ylabel="break-even [queries]", title=title)
             panel.set(xscale="log", yscale="log")
         yield sheet.finish(

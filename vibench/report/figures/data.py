@@ -16,8 +16,8 @@ import pandas as pd
 
 from vibench.report.figures.looks import Series
 from vibench.results import pictures, tables
-from vibench.results.best import solved_too_loosely
 from vibench.results.plugin_columns import faults_of
+from vibench.results.ranking import solved_too_loosely
 from vibench.text import json_object
 
 TABLES = ("cells", "queries", "histories", "thresholds", "outputs")
@@ -103,18 +103,18 @@ class Data:
 
 def problems(
     path: Path,
-    known: Mapping[str, pd.DataFrame] = MappingProxyType({}),
+    given: Mapping[str, pd.DataFrame] = MappingProxyType({}),
     note: Callable[[str], None] = lambda _: None,
 ) -> Iterator[tuple[str, Data]]:
     """Every problem and training set of a results file that has queries, with the name its files begin with.
 
-    The training set is named where a problem has several. Tables that are `known` are not read again; `note` is called
+    The training set is named where a problem has several. Tables that are `given` are not read again; `note` is called
     with a line for every column of a plugin that those read here do not have.
     """
-    extended = tables.extended_tables(path, [name for name in TABLES if name not in known])
+    extended = tables.extended_tables(path, [name for name in TABLES if name not in given])
     for line in faults_of(extended.values()):
         note(line)
-    read = {name: tables.in_order(known[name] if name in known else extended.pop(name).frame) for name in TABLES}
+    read = {name: tables.in_order(given[name] if name in given else extended.pop(name).frame) for name in TABLES}
     if read["queries"].empty:
         return
     for axis in ("training", "dual", "primal"):
@@ -143,11 +143,11 @@ def _tell_apart(axis: str, cells: pd.DataFrame, frames: list[pd.DataFrame]) -> N
     A label that the study gives stands for the options; they are added where several strategies have the same one.
     """
     columns = [axis, f"{axis}_options"]
-    found = pd.concat([frame[columns].dropna().drop_duplicates() for frame in frames]).drop_duplicates()
+    strategies = pd.concat([frame[columns].dropna().drop_duplicates() for frame in frames]).drop_duplicates()
     names = {tuple(key): _plugin_name(rows, axis) for key, rows in cells.groupby(columns)}
-    shared = found.duplicated(axis, keep=False)
+    shared = strategies.duplicated(axis, keep=False)
     labels = dict[tuple[Any, ...], str]()
-    for (label, text), several in zip(found.itertuples(index=False, name=None), shared, strict=True):
+    for (label, text), several in zip(strategies.itertuples(index=False, name=None), shared, strict=True):
         options = json_object(text) or {}
         named = ", ".join(f"{name} = {value}" for name, value in options.items())
         if options and (several or names.get((label, text)) == label):
@@ -161,9 +161,9 @@ def _per_combination(frame: pd.DataFrame, value: Callable[..., Any]) -> pd.Serie
     """A function of the values of a row, called once for every combination of them: millions of rows have few."""
     number = frame.groupby(list(frame.columns), dropna=False, sort=False).ngroup().to_numpy()
     _, first = np.unique(number, return_index=True)
-    found = np.empty(len(first), dtype=object)
-    found[:] = [value(*row) for row in frame.iloc[first].itertuples(index=False, name=None)]
-    return pd.Series(found[number], frame.index)
+    values = np.empty(len(first), dtype=object)
+    values[:] = [value(*row) for row in frame.iloc[first].itertuples(index=False, name=None)]
+    return pd.Series(values[number], frame.index)
 
 
 def _plugin_name(cells: pd.DataFrame, axis: str) -> str:
@@ -203,8 +203,8 @@ def series(name: Any, tolerance: Any = None, assembly: str = "full") -> Series:
 
 def some(values: Any, most: int = 6) -> str:
     """Numbers as an enumeration, in their order; the middle of many is left out."""
-    known = [f"{value:g}" for value in np.unique(np.asarray(values, float))]
-    return ", ".join(known if len(known) <= most else [*known[: most - 1], "…", known[-1]])
+    texts = [f"{value:g}" for value in np.unique(np.asarray(values, float))]
+    return ", ".join(texts if len(texts) <= most else [*texts[: most - 1], "…", texts[-1]])
 
 
 def parts(items: list[Any], most: int) -> list[list[Any]]:
@@ -229,14 +229,14 @@ def label(name: Any, tolerance: Any = None, assembly: str = "full") -> str:
 
 def point_names(cells: pd.DataFrame) -> dict[Any, str]:
     """(N, R) and δ of cells, for labels at their points, by index; of several tolerances only the first has (N, R)."""
-    found, named = {}, set()
+    names, named = {}, set()
     for index, cell in cells.iterrows():
         size = f"({cell['N']:.0f}, {cell['R']:.0f})"
         tolerance = "" if pd.isna(cell["primal_tol"]) else f"{cell['primal_tol']:g}"
         key = (cell["primal"], cell["dual"], size)
-        found[index] = tolerance if tolerance and key in named else size + f", δ = {tolerance}" * bool(tolerance)
+        names[index] = tolerance if tolerance and key in named else size + f", δ = {tolerance}" * bool(tolerance)
         named.add(key)
-    return found
+    return names
 
 
 def one_solver(queries: pd.DataFrame) -> pd.DataFrame:
@@ -252,8 +252,8 @@ def best_solver(cells: pd.DataFrame) -> pd.DataFrame:
     timed = cells[cells["online_s"].notna() & ~solved_too_loosely(cells)]
     if timed.empty:
         return timed
-    known = timed.groupby(["solver", "accuracy"]).agg(ok=("queries_ok", "sum"), seconds=("online_s", "mean"))
-    solver, accuracy = known.sort_values(["ok", "seconds"], ascending=[False, True]).index[0]
+    ways = timed.groupby(["solver", "accuracy"]).agg(ok=("queries_ok", "sum"), seconds=("online_s", "mean"))
+    solver, accuracy = ways.sort_values(["ok", "seconds"], ascending=[False, True]).index[0]
     return timed[(timed["solver"] == solver) & (timed["accuracy"] == accuracy)]
 
 
@@ -267,9 +267,9 @@ def at_best_tolerance(rows: pd.DataFrame, score: pd.Series) -> pd.DataFrame:
     `score` has the index (primal, primal_tol). Of tolerances whose scores are equal up to round-off the largest counts,
     so that a figure does not depend on the last digits of a run.
     """
-    known = score.dropna().rename("score").reset_index()
-    top = known.groupby("primal")["score"].transform("max")
-    near = known[known["score"] >= top - TIED * top.abs()]
+    scores = score.dropna().rename("score").reset_index()
+    top = scores.groupby("primal")["score"].transform("max")
+    near = scores[scores["score"] >= top - TIED * top.abs()]
     tolerances = near.groupby("primal")["primal_tol"].max()
     return rows[rows["primal_tol"].isna() | (rows["primal_tol"] == rows["primal"].map(tolerances))]
 
@@ -294,12 +294,12 @@ def longest(histories: pd.DataFrame) -> Iterator[tuple[Any, pd.DataFrame]]:
 def file_names(labels: list[str]) -> list[str]:
     """File names for labels, in their order, all different."""
     plain = [_file_name(label) for label in labels]
-    found: list[str] = []
+    names: list[str] = []
     for name in plain:
         numbered = (f"{name}-{k}" for k in count(1))
-        taken = {*plain, *found}
-        found.append(name if plain.count(name) == 1 else next(one for one in numbered if one not in taken))
-    return found
+        taken = {*plain, *names}
+        names.append(name if plain.count(name) == 1 else next(one for one in numbered if one not in taken))
+    return names
 
 
 def _file_name(label: str) -> str:

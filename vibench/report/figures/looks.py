@@ -19,7 +19,7 @@ MARKERS = "os^vDPX*dph"
 """Triangles to the left and to the right mark break-evens."""
 
 SEED = (732809).to_bytes(8, "big")
-"""Of the hash of names; with this number the strategies and solvers that are shipped all look different."""
+"""Salt of the hash of names; with this number the strategies and solvers that are shipped all look different."""
 
 MARKED = 9
 """Number of markers on a line, to identify it in grey print."""
@@ -42,7 +42,7 @@ class Look:
     rank: int = 0
 
     def line(self, count: int = 0) -> dict[str, Any]:
-        """As arguments of `Axes.plot`; of `count` points only about `MARKED` carry the marker."""
+        """The look as arguments of `Axes.plot`; of `count` points only about `MARKED` carry the marker."""
         return {
             "color": self.colour,
             "linestyle": DASHES[self.rank % len(DASHES)],
@@ -106,6 +106,6 @@ class Looks:
 
 
 def _order(series: Series) -> tuple[str, bool, float, str]:
-    """By name, texts before numbers."""
+    """The key by which series are sorted: name, then variants, texts before numbers."""
     number = isinstance(series.variant, float)
     return series.name, number, float(series.variant) if number else 0.0, str(series.variant)

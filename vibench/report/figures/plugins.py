@@ -50,20 +50,6 @@ def of_plugins(data: Data, taken: set[str]) -> dict[str, DrawPages]:
     return by_name
 
 
-def publications() -> Iterator[tuple[str, FigurePlugin]]:
-    """The plugins that draw the figures of a publication again, with their names.
-
-    Raises
-    ------
-    RequestError
-        If a figure plugin cannot be loaded: it may be the one that is asked for.
-    """
-    for name in registered(FIGURE):
-        plugin = loaded(name)
-        if plugin.publication:
-            yield name, plugin
-
-
 def named(name: str, plugin: FigurePlugin, data: Data) -> Iterator[tuple[str, Drawing]]:
     """The drawings of a plugin for a problem, by names that are part of a file name.
 
@@ -73,13 +59,13 @@ def named(name: str, plugin: FigurePlugin, data: Data) -> Iterator[tuple[str, Dr
         If the plugin raises, or returns something else.
     """
     try:
-        found = plugin.drawings(data)
+        drawings = plugin.drawings(data)
     except (Exception, SystemExit) as error:  # noqa: BLE001  third-party code
         raise FigureError(f"{FIGURE} '{name}' has no figures of {data.problem}: {in_a_line(error)}") from None
-    if not isinstance(found, Mapping) or not all(isinstance(k, str) and callable(f) for k, f in found.items()):
-        raise FigureError(f"{FIGURE} '{name}' returned {type(found).__name__}, expected functions by their names")
-    files = file_names([kind or "unnamed" for kind in found])
-    yield from ((file if kind else "", draw) for (kind, draw), file in zip(found.items(), files, strict=True))
+    if not isinstance(drawings, Mapping) or not all(isinstance(k, str) and callable(f) for k, f in drawings.items()):
+        raise FigureError(f"{FIGURE} '{name}' returned {type(drawings).__name__}, expected functions by their names")
+    files = file_names([kind or "unnamed" for kind in drawings])
+    yield from ((file if kind else "", draw) for (kind, draw), file in zip(drawings.items(), files, strict=True))
 
 
 def draw_guarded(name: str, kind: str, draw: Drawing) -> Figure | None:

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import html
 import re
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 from matplotlib.figure import Figure
@@ -14,9 +16,12 @@ from vibench.errors import RequestError
 from vibench.files import write_atomically
 from vibench.interfaces.figures import Drawing
 from vibench.report.figures.data import Data, file_names, problems
-from vibench.report.figures.plugins import FigureError, draw_guarded, named, publications
+from vibench.report.figures.plugins import FigureError, draw_guarded, named
 from vibench.report.figures.style import FORMATS, caption_of, save, styled
+from vibench.results.plugin_columns import loaded
 from vibench.results.sqlite.reading import read_meta, study_of
+from vibench.study.kinds import FIGURE
+from vibench.study.registry import registered
 from vibench.text import unbroken
 
 PAGE = "paper-figures.md"
@@ -30,7 +35,6 @@ class Twin:
     """A figure of a publication that can be drawn from a run."""
 
     publication: str
-    plugin: str
     name: str
     draw: Drawing
     run: str
@@ -81,7 +85,7 @@ def draw_published(
         progress(twin.name, k, len(twins))
         with styled():
             try:
-                figure = draw_guarded(twin.plugin, twin.name, twin.draw)
+                figure = twin.draw()
             except FigureError as error:
                 note(str(error))
                 continue
@@ -97,21 +101,22 @@ def draw_published(
 
 def _twins(paths: Sequence[Path], note: Callable[[str], None]) -> Iterator[Twin]:
     """What can be drawn; of figures that several runs have, each after the first is named after its run."""
-    seen: dict[str, int] = {}
-    plugins = list(publications())
+    seen = Counter[str]()
+    plugins = {name: loaded(name) for name in registered(FIGURE)}  # one that cannot be loaded may be asked for
     for path in paths:
+        (run,) = file_names([path.parent.name])
         for _, data in problems(path, note=note):
-            for plugin_name, plugin in plugins:
+            for plugin_name, plugin in plugins.items():
                 try:
-                    kinds = list(named(plugin_name, plugin, data))
+                    kinds = list(named(plugin_name, plugin, data)) if plugin.publication else []
                 except FigureError as error:
                     note(str(error))
                     continue
-                run = file_names([path.parent.name])[0]
                 for kind, draw in kinds:
-                    count = seen[kind] = seen.get(kind, 0) + 1
-                    name = kind + f"-{run}" * (count > 1) + f"-{count}" * (count > 2)
-                    yield Twin(plugin.publication, plugin_name, name, draw, path.parent.name, data)
+                    seen[kind] += 1
+                    name = kind + f"-{run}" * (seen[kind] > 1) + f"-{seen[kind]}" * (seen[kind] > 2)
+                    drawn = partial(draw_guarded, plugin_name, name, draw)
+                    yield Twin(plugin.publication, name, drawn, path.parent.name, data)
 
 
 def _page(drawn: Sequence[tuple[Twin, Figure]], paths: Sequence[Path], form: str) -> str:

@@ -91,8 +91,8 @@ def draw_multiplier(axes: Axes, picture: Picture, limits: Limits, *, bar: bool =
 
 def name_axes(axes: Axes, unit: str, places: Sequence[Array]) -> None:
     """Name the axes of space, with the same limits wherever the points of these pictures are drawn."""
-    known = np.hstack(places)
-    ends = np.array([known.min(axis=1), known.max(axis=1)]) if known.size else np.zeros((2, len(known)))
+    points = np.hstack(places)
+    ends = np.array([points.min(axis=1), points.max(axis=1)]) if points.size else np.zeros((2, len(points)))
     room = 0.04 * float((ends[1] - ends[0]).max()) or 0.5
     for name, low, high in zip("xy", *ends, strict=False):
         axes.set(**{f"{name}label": f"{name}{f' [{unit}]' * bool(unit)}", f"{name}lim": (low - room, high + room)})

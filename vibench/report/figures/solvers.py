@@ -68,11 +68,11 @@ def precision(data: Data) -> Pages:
     for row, group in enumerate(groups):
         for solver in group:
             mine = shared[shared["solver"] == solver]
-            found = mine.groupby("accuracy")[["solve_s", "solver_error_u", "solver_error_lambda"]].median()
+            medians = mine.groupby("accuracy")[["solve_s", "solver_error_u", "solver_error_lambda"]].median()
             for column, name in enumerate(("u", "lambda")):
-                error = np.maximum(found[f"solver_error_{name}"], EXACT)
+                error = np.maximum(medians[f"solver_error_{name}"], EXACT)
                 # a marker per accuracy
-                plot(sheet.at(row, column), 1e3 * found["solve_s"], error, looks[Series(solver)], solver, markevery=1)
+                plot(sheet.at(row, column), 1e3 * medians["solve_s"], error, looks[Series(solver)], solver, markevery=1)
         for column, name in enumerate(("u", "λ")):
             panel = sheet.at(row, column)
             panel.set(xlabel="median time of a program [ms]", ylabel=f"median error of {name} made by the solver")
@@ -90,8 +90,8 @@ def _accuracy(panel: Axes, queries: pd.DataFrame, names: list[str], looks: Looks
     for solver in names:
         mine = queries[(queries["solver"] == solver) & queries["solve_s"].notna()]
         rows = mine.assign(worst=mine[RESIDUALS].max(axis=1) / mine["accuracy"]).groupby("cell")
-        found = rows.agg(time=("solve_s", "median"), worst=("worst", "max"))
-        finite = found[np.isfinite(found["worst"])]  # a query without a solution has no residual
+        models = rows.agg(time=("solve_s", "median"), worst=("worst", "max"))
+        finite = models[np.isfinite(models["worst"])]  # a query without a solution has no residual
         scatter(panel, 1e3 * finite["time"], np.maximum(finite["worst"], EXACT), looks[Series(solver)], solver)
     panel.set(xlabel="median time of a program [ms]", ylabel="largest residual / accuracy")
     panel.set(xscale="log", yscale="log")

@@ -274,8 +274,8 @@ def counted(axes: Axes) -> None:
 
 def positive(values: Any, floor: float = 0.0) -> np.ndarray[Any, np.dtype[np.float64]]:
     """Values for a logarithmic axis; values up to the floor become NaN."""
-    found = np.asarray(values, float)
-    return np.where(found > floor, found, np.nan)
+    numbers = np.asarray(values, float)
+    return np.where(numbers > floor, numbers, np.nan)
 
 
 def styled() -> AbstractContextManager[None]:

@@ -65,13 +65,13 @@ class Grid:
 
 def grid_of_cells(extended: Extended, caption: str) -> Grid:
     """The table of all cells, in the order of the rows; columns of plugins without a heading are offered besides."""
-    cells, known, own = extended.frame, {**CELLS, **extended.columns}, tuple(extended.columns)
+    cells, columns, own = extended.frame, {**CELLS, **extended.columns}, tuple(extended.columns)
     names = [n for n in (*OF_CELLS, *MORE_OF_CELLS, *own) if n in ("cell", *views.AXES) or cells[n].notna().any()]
-    says_nothing = [name for name in names if known[name].heading and not tables.says_something(cells, name)]
+    says_nothing = [name for name in names if columns[name].heading and not tables.says_something(cells, name)]
     length = short_keys(cells["cell"])
-    frame = tables.under_headings(cells.assign(cell=cells["cell"].str[:length]), names, known)
-    offered = (*MORE_OF_CELLS, *(name for name in own if not known[name].heading))
-    hidden = [_heading(known, name) for name in (*says_nothing, *offered) if name in names]
+    frame = tables.under_headings(cells.assign(cell=cells["cell"].str[:length]), names, columns)
+    offered = (*MORE_OF_CELLS, *(name for name in own if not columns[name].heading))
+    hidden = [_heading(columns, name) for name in (*says_nothing, *offered) if name in names]
     axes = tuple(_heading(CELLS, name) for name in (*views.AXES, "status"))
     return Grid(
         "summary", "All cells", caption, frame, axes, (*hidden, *_constant(frame)), _disturbed(cells["cell"], cells)
@@ -108,8 +108,8 @@ def _constant(frame: pd.DataFrame) -> list[str]:
 
 
 def _disturbed(keys: pd.Series, cells: pd.DataFrame) -> tuple[int, ...]:
-    known = set(cells["cell"][cells["disturbed"] == 1])
-    return tuple(k for k, key in enumerate(keys) if key in known)
+    disturbed = set(cells["cell"][cells["disturbed"] == 1])
+    return tuple(k for k, key in enumerate(keys) if key in disturbed)
 
 
 def to_json(grids: Sequence[Grid]) -> str:
@@ -166,5 +166,5 @@ def short(value: Any, digits: int = DIGITS) -> float | int | str | None:
     number = float(value)
     if math.isinf(number):
         return str(number)
-    found = float(f"{number:.{digits}g}")
-    return int(found) if found.is_integer() and abs(found) < 1e15 else found
+    rounded = float(f"{number:.{digits}g}")
+    return int(rounded) if rounded.is_integer() and abs(rounded) < 1e15 else rounded

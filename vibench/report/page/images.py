@@ -23,7 +23,7 @@ DPI = 110
 """Dots per inch: sharp enough at the width of a page, and a tenth of the bytes of a vector picture of many lines."""
 
 EFFORT = {"method": 1, "quality": 0}
-"""Of the compression: a third of the time of more thorough ones, for a quarter more bytes."""
+"""Options of the compression: a third of the time of more thorough ones, for a quarter more bytes."""
 
 NAMED = 6
 """Series of a panel that an alternative text describes one by one."""
@@ -131,5 +131,5 @@ def _name(line: Line2D) -> str:
 
 
 def _values(line: Line2D) -> Array:
-    found: Array = np.asarray(line.get_ydata(), dtype=float).ravel()
-    return found[np.isfinite(found)]
+    values: Array = np.asarray(line.get_ydata(), dtype=float).ravel()
+    return values[np.isfinite(values)]

@@ -28,7 +28,7 @@ def check(site: Path) -> None:
     """
     if site.is_dir():
         if any(site.iterdir()):
-            _known(site)
+            _written(site)
     elif site.exists() or site.is_symlink():
         raise RequestError(f"'{site}' is not a folder; choose another for the site")
 
@@ -67,20 +67,20 @@ def write(site: Path, fill: Callable[[Path], None]) -> None:
 
 def _replace_files(site: Path, new: Path, files: Mapping[str, str]) -> None:
     """Replace the files of a site, remove those it has no more, and keep all others."""
-    known = _known(site)
-    for name in (*files, *known):
+    before = _written(site)
+    for name in (*files, *before):
         _refuse_links(site, name)
     for name in files:
-        if (site / name).exists() and _digest(site / name) not in (*known.get(name, ()), files[name]):
+        if (site / name).exists() and _digest(site / name) not in (*before.get(name, ()), files[name]):
             raise RequestError(f"'{site / name}' was not written by vibench, or changed since; move it elsewhere")
     # Whatever interrupts the next steps: all files that they have written by then are in the catalogue.
-    both = {name: [*known.get(name, ()), *([files[name]] if name in files else [])] for name in {**known, **files}}
+    both = {name: [*before.get(name, ()), *([files[name]] if name in files else [])] for name in {**before, **files}}
     _write_catalogue(new, both)
     (new / CATALOGUE).replace(site / CATALOGUE)
     for name in sorted(files, key=lambda name: name == FIRST_PAGE):
         (site / name).parent.mkdir(parents=True, exist_ok=True)
         (new / name).replace(site / name)
-    for name, digests in known.items():
+    for name, digests in before.items():
         if name not in files and (site / name).is_file() and _digest(site / name) in digests:
             (site / name).unlink()
             _remove_empty(site, (site / name).parent)
@@ -117,7 +117,7 @@ def _write_catalogue(folder: Path, files: Mapping[str, Sequence[str]]) -> None:
     (folder / CATALOGUE).write_text(json.dumps(content, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
 
 
-def _known(site: Path) -> dict[str, list[str]]:
+def _written(site: Path) -> dict[str, list[str]]:
     """Files that vibench has written into a site, with the digests of what it wrote."""
     catalogue = site / CATALOGUE
     if not catalogue.is_file():

@@ -13,12 +13,12 @@ from vibench.provenance import distribution_version
 from vibench.report import html
 from vibench.report.comparison.compare import Comparison, compare
 from vibench.report.comparison.runs import ComparedRun, run_names
-from vibench.report.leaderboard import Criterion, Standings, leaderboard
 from vibench.report.site import folder
 from vibench.report.site.citation import Citation, requirements
 from vibench.report.site.published_run import FILTERED, SHOWN_CELLS, PublishedRun, folder_names
 from vibench.results import formats, tables
 from vibench.results.plugin_columns import faults_of
+from vibench.results.ranking import Criterion, Standings, leaderboard
 from vibench.results.sqlite.reading import FILE, open_read_only
 
 TABLES = ("cells", "thresholds", "disagreements")
@@ -121,9 +121,9 @@ def _comparable(runs: Sequence[PublishedRun]) -> Iterator[tuple[str, list[Publis
         by_study.setdefault(str(run.run.identity["study"]), []).append(run)
     for study, group in by_study.items():
         first = group[0].run.cells.keys()
-        found = [run for run in group if run.run.cells.keys() & first]
-        if len(found) > 1:
-            yield study, found
+        comparable = [run for run in group if run.run.cells.keys() & first]
+        if len(comparable) > 1:
+            yield study, comparable
 
 
 def _boards(runs: Sequence[PublishedRun]) -> Iterator[tuple[str, tuple[Standings, ...]]]:
@@ -136,12 +136,16 @@ def _boards(runs: Sequence[PublishedRun]) -> Iterator[tuple[str, tuple[Standings
         yield machine, leaderboard(pd.DataFrame(rows))
 
 
-def _section(site: Path, number: int, study: str, found: Comparison) -> dict[str, Any]:
+def _section(site: Path, number: int, study: str, comparison: Comparison) -> dict[str, Any]:
     """What the page of comparisons says of the runs of one study; their changes are a file, too."""
     file = f"comparison-{number}.csv"
-    _write(site / file, formats.to_csv(found.changes))
-    frames = {"runs": found.by_run, "cells by column": found.by_column, "changes": found.changes.head(MOST_CHANGES)}
-    return {"study": study, "file": file, "notes": found.notes, "count": len(found.changes), "tables": frames}
+    _write(site / file, formats.to_csv(comparison.changes))
+    frames = {
+        "runs": comparison.by_run,
+        "cells by column": comparison.by_column,
+        "changes": comparison.changes.head(MOST_CHANGES),
+    }
+    return {"study": study, "file": file, "notes": comparison.notes, "count": len(comparison.changes), "tables": frames}
 
 
 def _write(path: Path, text: str) -> None:

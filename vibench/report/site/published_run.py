@@ -45,13 +45,13 @@ class PublishedRun:
     @cached_property
     def values(self) -> dict[str, list[str]]:
         """What the run is found by: all values that its cells have of each of `FILTERED`."""
-        found = {
+        axes = {
             axis: sorted({str(row[axis]) for row in self.run.cells.values()})
             for axis in ("problem", "dual", "primal", "solver")
         }
         versions = self.run.versions.get("vibench", "")
         study = str(self.run.identity["study"])
-        return {"study": [study], **found, "machine": self.run.machines, "vibench": versions.split(", ")}
+        return {"study": [study], **axes, "machine": self.run.machines, "vibench": versions.split(", ")}
 
     @property
     def code(self) -> str:
@@ -97,14 +97,14 @@ class PublishedRun:
     def commands(self) -> list[tuple[str, str]]:
         """Commands on the run as a whole, and what they do; they are meant for the folder of the results file."""
         study = str(self.run.identity["study"])
-        found = [("pip install -r requirements.txt", "the versions that computed it")]
+        commands = [("pip install -r requirements.txt", "the versions that computed it")]
         if study in registered(STUDY):
-            found.append((f"vibench run {shlex.quote(study)}", "the whole study, on your machine"))
-        found.append((f"vibench compare {FILE} YOUR-RUN", "your run beside this one"))
-        return found
+            commands.append((f"vibench run {shlex.quote(study)}", "the whole study, on your machine"))
+        commands.append((f"vibench compare {FILE} YOUR-RUN", "your run beside this one"))
+        return commands
 
     def cells(self) -> list[dict[str, Any]]:
-        """Its cells with the command that makes each of them again, in the order of the axes."""
+        """The cells of the run with the command that makes each of them again, in the order of the axes."""
         return [
             {
                 "key": key,
@@ -127,10 +127,10 @@ def _tolerance(row: Mapping[str, Any]) -> str:
 
 def folder_names(names: Sequence[str]) -> list[str]:
     """Names of folders for runs of these names: what a link needs no escapes for, all different in any case."""
-    found: list[str] = []
+    folders: list[str] = []
     for name in names:
         plain = re.sub(r"[^A-Za-z0-9._-]+", "-", name).strip("-.") or "run"
-        taken = {other.lower() for other in found}
+        taken = {other.lower() for other in folders}
         same = (plain if k == 1 else f"{plain}-{k}" for k in range(1, len(names) + 2))
-        found.append(next(one for one in same if one.lower() not in taken))
-    return found
+        folders.append(next(one for one in same if one.lower() not in taken))
+    return folders

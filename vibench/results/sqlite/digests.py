@@ -42,8 +42,8 @@ class Digests:
         """Add the rows of a table under a condition, before they are changed with `sign` −1."""
         cursor = self._db.execute(f'SELECT * FROM "{table}" WHERE {same}', values)
         for cell, total in _totals([column[0] for column in cursor.description], cursor.fetchall()).items():
-            known = self._db.execute("SELECT total FROM digests WHERE name = ? AND cell = ?", (table, cell)).fetchone()
-            now = int(known[0] if known else NONE, 16) + sign * total
+            stored = self._db.execute("SELECT total FROM digests WHERE name = ? AND cell = ?", (table, cell)).fetchone()
+            now = int(stored[0] if stored else NONE, 16) + sign * total
             self._db.execute("INSERT OR REPLACE INTO digests VALUES (?, ?, ?)", (table, cell, f"{now:x}"))
 
     def forget(self, **keys: str) -> None:
@@ -86,18 +86,18 @@ class Digests:
         self, table: str, names: Sequence[str], rows: Sequence[tuple[Any, ...]], cell: str = ""
     ) -> tuple[str, ...]:
         same, values = ("AND cell = ?", (table, cell)) if cell else ("", (table,))
-        known = dict(self._db.execute(f"SELECT cell, total FROM digests NOT INDEXED WHERE name = ? {same}", values))
-        found = {str(key): f"{total:x}" for key, total in _totals(names, rows).items()}
-        either = sorted(map(str, known.keys() | found.keys()))
-        return tuple(key for key in either if known.get(key, NONE) != found.get(key, NONE))
+        written = dict(self._db.execute(f"SELECT cell, total FROM digests NOT INDEXED WHERE name = ? {same}", values))
+        now = {str(key): f"{total:x}" for key, total in _totals(names, rows).items()}
+        either = sorted(map(str, written.keys() | now.keys()))
+        return tuple(key for key in either if written.get(key, NONE) != now.get(key, NONE))
 
 
 def _totals(names: Sequence[str], rows: Sequence[tuple[Any, ...]]) -> dict[Any, int]:
     """Sum over the rows of each cell."""
-    at, found = (names.index("cell") if "cell" in names else None), dict[Any, int]()
+    at, totals = (names.index("cell") if "cell" in names else None), dict[Any, int]()
     for cell, group in groupby(rows, key=(lambda row: row[at]) if at is not None else lambda _: ""):
-        found[cell] = found.get(cell, 0) + sum(map(_digest, group))
-    return found
+        totals[cell] = totals.get(cell, 0) + sum(map(_digest, group))
+    return totals
 
 
 def _digest(row: tuple[Any, ...]) -> int:

@@ -118,10 +118,10 @@ def read_meta(path: Path) -> dict[str, str]:
             damage = "; ".join(line for (line,) in db.execute("PRAGMA quick_check(1)") if line != "ok")
             if damage:
                 raise DamagedError(f"'{path}' is damaged: {' '.join(damage.split())}")
-            found = dict(db.execute("SELECT key, value FROM meta")) if kinds else {}
-            if found.get("schema") == str(VERSION):  # other versions are refused, or have no digests
+            meta = dict(db.execute("SELECT key, value FROM meta")) if kinds else {}
+            if meta.get("schema") == str(VERSION):  # other versions are refused, or have no digests
                 Digests(db).verified("meta")
-            return found
+            return meta
     except DigestError as error:
         raise DamagedError(f"'{path}' is damaged: {error}") from None
     except sqlite3.Error as error:
@@ -152,8 +152,8 @@ def read_rows(path: Path, table: str, cell: str = "") -> tuple[list[str], list[t
     if "status" in names:
         strange = {row[names.index("status")] for row in rows}.difference(STATUSES)
         if strange:
-            known = f"expected one of {', '.join(STATUSES)}"
-            raise RequestError(f"'{path}' has the status {str(min(strange, key=str))[:60]!a} in '{table}', {known}")
+            expected = f"expected one of {', '.join(STATUSES)}"
+            raise RequestError(f"'{path}' has the status {str(min(strange, key=str))[:60]!a} in '{table}', {expected}")
     return names, rows
 
 

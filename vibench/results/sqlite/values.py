@@ -46,13 +46,13 @@ def storable(table: str, row: Mapping[str, Any]) -> dict[str, Any]:
         For the first value that it cannot hold.
     """
     columns = STORED[table]
-    found: dict[str, Any] = {}
+    values: dict[str, Any] = {}
     for name, value in row.items():
         try:
-            found[name] = stored(columns.get(name, PARAMETER), value)
+            values[name] = stored(columns.get(name, PARAMETER), value)
         except (TypeError, OverflowError) as error:
             raise UnstorableError(f"column '{name}' of the table '{table}': {error}") from None
-    return found
+    return values
 
 
 def error_row(cell: Mapping[str, Any], reason: str) -> dict[str, Any]:

@@ -7,8 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from samples import cells_of, row_of
 
-from vibench.report.leaderboard import COLUMNS, Criterion, Standings, leaderboard
-from vibench.results.best import LARGEST_BAND
+from vibench.results.ranking import COMPARED, LARGEST_BAND, Criterion, Standings, leaderboard
 
 
 def won(standings: Standings, criterion: Criterion) -> list[tuple[float, str]]:
@@ -97,4 +96,4 @@ def test_nobody_in_a_band_is_better_than_its_winner(found: list[tuple[float, flo
         assert band.error <= LARGEST_BAND * (1 + 1e-12)
     taken = [one for one in found if one[0] <= LARGEST_BAND and one[3] > 0.0]
     assert bool(standings.bands) == bool(taken)
-    assert set(COLUMNS) == set(Criterion)
+    assert set(COMPARED) == set(Criterion)

@@ -1,0 +1,283 @@
+"""How models are compared: by the error of u and λ or of a quantity of interest, in bands of it, and who wins."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator, Mapping
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from vibench.errors import RequestError, unknown_name
+from vibench.qp.status import Status
+from vibench.results.columns import CELLS, Column, real
+from vibench.stability.infsup import VANISHES
+
+SOLUTION = "solution"
+"""The larger of the mean relative errors of u and λ; the other one where one is missing."""
+
+OF_SOLUTION: Mapping[str, tuple[str, ...]] = {
+    SOLUTION: ("error_u_mean", "error_lambda_mean"), "u": ("error_u_mean",), "lambda": ("error_lambda_mean",),
+}  # fmt: skip
+"""Columns of the cells table whose maximum is the measure."""
+
+OUTPUT = "output:"
+"""Before the name of a quantity of interest."""
+
+ERROR_COLUMNS: Mapping[str, Column] = {
+    "error_a": real("1", "Error of model a by the chosen measure; 0 of the high-fidelity one.", "error a", 22),
+    "error_b": real("1", "Error of model b by the chosen measure.", "error b", 23),
+}
+"""What a measure adds to a table of break-even points."""
+
+
+def measures(outputs: pd.DataFrame) -> list[str]:
+    """The measures that a run has, from its table of outputs."""
+    return [*OF_SOLUTION, *(f"{OUTPUT}{name}" for name in outputs["output"].unique())]
+
+
+def errors_of(cells: pd.DataFrame, outputs: pd.DataFrame, measure: str = SOLUTION) -> pd.Series:
+    """Mean relative errors, one for each row of the cells table; missing where none is known.
+
+    A quantity of interest is measured by its mean relative error over the ok queries where it is not zero.
+
+    Raises
+    ------
+    RequestError
+        If there is no such measure.
+    """
+    if measure not in measures(outputs):
+        raise unknown_name("error measure", measure, measures(outputs))
+    if measure in OF_SOLUTION:
+        return errors_of_solution(cells, measure)
+    of_output = outputs[outputs["output"] == measure.removeprefix(OUTPUT)]
+    return cells["cell"].map(of_output.set_index("cell")["error_mean"]).astype(float)
+
+
+def errors_of_solution(cells: pd.DataFrame, measure: str = SOLUTION) -> pd.Series:
+    """Mean relative errors of u, of λ, or the larger one of these; the other one where one is missing."""
+    return cells[list(OF_SOLUTION[measure])].astype(float).max(axis=1, skipna=True)
+
+
+def with_errors(thresholds: pd.DataFrame, cells: pd.DataFrame, errors: pd.Series) -> pd.DataFrame:
+    """Break-even points with the errors of both models; `errors` are those of the cells, in their rows."""
+    by_cell = pd.Series(errors.to_numpy(float), index=cells["cell"])
+    of_a, of_b = (thresholds[end].map(by_cell).astype(float) for end in ("cell_a", "cell_b"))
+    return thresholds.assign(error_a=of_a.mask(thresholds["cell_a"].isna(), 0.0), error_b=of_b)
+
+
+def within(thresholds: pd.DataFrame, largest: float) -> pd.DataFrame:
+    """The break-even points of models that both have errors of at most `largest`.
+
+    Raises
+    ------
+    RequestError
+        If it is no positive number.
+    """
+    if not largest > 0.0:
+        raise RequestError(f"the largest error is {largest:g}, expected a positive number")
+    return thresholds[(thresholds["error_a"] <= largest) & (thresholds["error_b"] <= largest)]
+
+
+LARGEST_BAND = 0.1
+"""Mean errors above this are no answer: such cells win nothing, however fast they are."""
+
+SOLVER_SHARE = 0.1
+"""Cells whose QP solver makes a larger share of an error are not compared: the solver, not the strategy, decides."""
+
+NO_BEST_CELL = (
+    "no cell takes part in the comparison: one that does has every query ok, β over the span above zero at every "
+    f"parameter, mean errors of at most {100.0 * LARGEST_BAND:g} %, and less than {100.0 * SOLVER_SHARE:g} % of an "
+    "error made by the QP solver"
+)
+"""Why a run may have no best cell."""
+
+BAND = "error_below"
+"""Column of the accuracy: a power of ten that the mean errors of u and λ do not exceed."""
+
+HEADINGS: Mapping[str, Column] = {
+    **CELLS,
+    BAND: real("1", "Power of ten that the mean errors, of u and λ unless told, do not exceed.", "error ≤", 1),
+}
+
+
+def excluded(cells: pd.DataFrame, errors: pd.Series | None = None) -> pd.DataFrame:
+    """Whether a row of the cells table takes no part, for each reason; a row has the first reason that holds.
+
+    A query is not ok (`incomplete`); the inf-sup constant β over the span vanishes at a parameter, so that the
+    multiplier is not unique there (`unstable`); the QP solver makes too large a share of the error (`loose`); a mean
+    error is above `LARGEST_BAND`, or none is known (`inexact`). `errors` are those of the cells by another measure than
+    the larger one of u and λ.
+    """
+    reasons = {
+        "incomplete": cells["status"] != Status.OK,
+        "unstable": cells["beta_span_min"].astype(float) < VANISHES,
+        "loose": solved_too_loosely(cells),
+        "inexact": ~((errors_of_solution(cells) if errors is None else errors) <= LARGEST_BAND),
+    }
+    holds = pd.DataFrame(reasons, index=cells.index).astype(bool)
+    earlier = holds.astype(int).cumsum(axis=1).shift(1, axis=1, fill_value=0) > 0
+    return holds & ~earlier
+
+
+def eligible(cells: pd.DataFrame) -> pd.Series:
+    """Which rows of the cells table take part in a comparison; `excluded` says why the others do not."""
+    return ~excluded(cells).any(axis=1)
+
+
+def solved_too_loosely(cells: pd.DataFrame) -> pd.Series:
+    """Which cells are left out where strategies are compared."""
+    return cells["solver_share_mean"].astype(float) >= SOLVER_SHARE
+
+
+def fastest(cells: pd.DataFrame, errors: pd.Series | None = None) -> pd.DataFrame:
+    """The timed cell, for every problem and power of ten, with the fastest query whose mean errors do not exceed it.
+
+    Cells that are not `eligible` take no part, as in the leaderboard of a report. A band whose cell is that of the next
+    smaller one is left out. `errors` are those of the cells by another measure, in their rows or in more.
+    """
+    measured = errors_of_solution(cells) if errors is None else errors.reindex(cells.index)
+    fine = ~excluded(cells, measured).any(axis=1) & cells["online_s"].notna()
+    rows = [
+        pd.concat([mine.loc[fastest_of["online_s"]], pd.Series({BAND: error})])
+        for _, mine in cells[fine].groupby(["problem", "problem_options"], dropna=False)
+        for error, _, fastest_of in bands(mine, measured[mine.index], ["online_s"])
+    ]
+    columns = ["problem", BAND, *cells.columns.drop("problem")]
+    return pd.DataFrame(rows, columns=columns).astype({**cells.dtypes, BAND: float}).reset_index(drop=True)
+
+
+def bands(
+    cells: pd.DataFrame, errors: pd.Series, columns: Collection[str]
+) -> Iterator[tuple[float, pd.DataFrame, dict[str, Any]]]:
+    """The bands of accuracy that the cells of one problem reach, from the largest error to the smallest.
+
+    Yields the power of ten that the errors in the band do not exceed, its cells, and by each of the columns of which it
+    has a value the index of the smallest one, of equal ones the first. A band in which the same cells have these as in
+    the next smaller one is left out.
+    """
+    exponents = np.log10(errors.clip(lower=np.finfo(float).tiny))
+    digits = np.ceil(exponents - 1e-12)  # by round-off the logarithm of 1e-3 may be above -3
+    smaller: dict[str, Any] | None = None
+    reached = list[tuple[float, pd.DataFrame, dict[str, Any]]]()
+    for digit in sorted(set(digits)):
+        mine = cells[digits <= digit]
+        smallest = {name: mine[name].astype(float).idxmin() for name in columns if mine[name].notna().any()}
+        keys = {name: mine.at[index, "cell"] for name, index in smallest.items()}
+        if keys != smaller:
+            reached.append((10.0**digit, mine, smallest))
+        smaller = keys
+    yield from reversed(reached)
+
+
+class Criterion(StrEnum):
+    """What is the smallest of the winner; its column of the cells table, but for the error, stands in `COMPARED`."""
+
+    QUERY = "fastest query"
+    OFFLINE = "fewest offline seconds"
+    ERROR = "smallest error"
+
+
+COMPARED: Mapping[Criterion, str] = {
+    Criterion.QUERY: "online_s",
+    Criterion.OFFLINE: "offline_s",
+    Criterion.ERROR: "largest_mean_error",
+}
+"""What is compared: CPU seconds of a query, CPU seconds offline, the larger of the mean relative errors of u and λ."""
+
+
+@dataclass(frozen=True)
+class Winner:
+    """A cell with the smallest value among the cells of its problem whose mean errors are within a band.
+
+    Attributes
+    ----------
+    value
+        What is compared, as `COMPARED` says: seconds, or a relative error.
+    cell
+        The whole row of the cells table, its key under "cell".
+    """
+
+    criterion: Criterion
+    value: float
+    cell: Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class Band:
+    """The winners among the cells whose mean errors of u and λ are both at most `error`, a power of ten.
+
+    Attributes
+    ----------
+    cells
+        Number of cells that the band has.
+    """
+
+    error: float
+    cells: int
+    winners: tuple[Winner, ...]
+
+    def winner(self, criterion: Criterion) -> Winner | None:
+        """Who wins by a criterion; `None` where no cell of the band has a value of it."""
+        return next((one for one in self.winners if one.criterion is criterion), None)
+
+
+@dataclass(frozen=True)
+class Standings:
+    """The leaderboard of one problem: its bands from the largest error to the smallest that is reached.
+
+    Attributes
+    ----------
+    problem, options
+        Label of the problem and its options as JSON, as the cells table has them.
+    cells, incomplete, unstable, loose, inexact
+        Number of its cells, and of those that take no part: since a query is not ok; since the inf-sup constant β over
+        the span vanishes at a parameter, so that the multiplier is not unique there; since the QP solver makes too
+        large a share of the error; and since a mean error is above `LARGEST_BAND` or unknown.
+    """
+
+    problem: str
+    options: str
+    bands: tuple[Band, ...]
+    cells: int
+    incomplete: int
+    unstable: int
+    loose: int
+    inexact: int
+
+
+def leaderboard(cells: pd.DataFrame) -> tuple[Standings, ...]:
+    """The winners of every problem in every band of accuracy, in the order of the cells.
+
+    Parameters
+    ----------
+    cells
+        Rows of the cells table: of one run, or of several that one machine measured, since seconds are compared.
+
+    Returns
+    -------
+    :
+        One leaderboard per problem and options of it; without bands where no cell takes part. Of equal values the
+        first cell wins. A band in which the same cells win as in the next smaller one is left out.
+    """
+    groups = cells.groupby(["problem", "problem_options"], dropna=False, sort=False)
+    return tuple(_standings(str(problem), str(options), mine) for (problem, options), mine in groups)
+
+
+def _standings(problem: str, options: str, cells: pd.DataFrame) -> Standings:
+    without, errors = excluded(cells), errors_of_solution(cells)
+    rows = cells.assign(**{COMPARED[Criterion.ERROR]: errors})[~without.any(axis=1)]
+    reached = tuple(
+        Band(error, len(mine), tuple(_winners(cells, rows, smallest)))
+        for error, mine, smallest in bands(rows, errors[rows.index], COMPARED.values())
+    )
+    counts = {str(reason): int(count) for reason, count in without.sum().items()}
+    return Standings(problem, options, reached, len(cells), **counts)
+
+
+def _winners(cells: pd.DataFrame, rows: pd.DataFrame, smallest: Mapping[str, Any]) -> Iterator[Winner]:
+    for criterion, column in COMPARED.items():
+        if column in smallest:
+            yield Winner(criterion, float(rows.at[smallest[column], column]), cells.loc[smallest[column]])
