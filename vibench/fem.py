@@ -76,7 +76,7 @@ class Unilateral:
     nodes
         Vertices (m,) of the mesh that carry a multiplier, rising.
     points
-        Their places (dim×m).
+        Places of the nodes (dim×m).
     sense
         "<=" or ">=".
     """

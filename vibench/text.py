@@ -63,7 +63,7 @@ def one_line(text: str) -> str:
 
 
 def above(value: float, limit: float) -> str:
-    """Such as "3.1e-07 above 1e-07": a number above a limit, with the digits that tell it from the limit."""
+    """A number above a limit with the digits that tell it from the limit, such as "3.1e-07 above 1e-07"."""
     digits = next((n for n in range(1, 16) if float(f"{value:.{n}e}") > limit), 16)
     return f"{value:.{digits}e} above {limit:g}"
 

@@ -50,7 +50,7 @@ class Seconds:
         return Seconds(self.cpu + other.cpu, self.wall + other.wall)
 
     def beyond(self, other: Seconds) -> Seconds:
-        """By how much these exceed others, not less than nothing."""
+        """The seconds by which these exceed others, not less than nothing."""
         return Seconds(max(self.cpu - other.cpu, 0.0), max(self.wall - other.wall, 0.0))
 
 

@@ -48,11 +48,11 @@ class ProblemTables(RecordedTables, Protocol):
 
     @property
     def problem_name(self) -> str:
-        """Name under which its plugin is registered."""
+        """Name under which the plugin of the problem is registered."""
 
     @property
     def problem_options(self) -> Mapping[str, Any]:
-        """Its options that are not at their default."""
+        """Options of the problem that are not at their default."""
 
     @property
     def machine(self) -> str:

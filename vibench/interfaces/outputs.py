@@ -44,7 +44,7 @@ class Output:
         return self.u is not None or self.lam is not None
 
     def values(self, mus: Array, u: Array, lam: Array) -> Array:
-        """Its values (P,) at parameters (P×d) and solutions, columns of u (n×P) and λ (m×P).
+        """Values (P,) of the output at parameters (P×d) and solutions, columns of u (n×P) and λ (m×P).
 
         Raises
         ------

@@ -118,7 +118,7 @@ class VariationalInequality:
     dirichlet_lift: Array | None = None
 
     def copy(self) -> VariationalInequality:
-        """The same in arrays of its own: a problem may write its next assembly into those of this one."""
+        """A copy in arrays of its own: a problem may write its next assembly into those of this one."""
         lift = None if self.dirichlet_lift is None else self.dirichlet_lift.copy()
         return VariationalInequality(self.A.copy(), self.f.copy(), self.B.copy(), self.g.copy(), lift)
 

@@ -138,7 +138,7 @@ class SparseCholesky:
 
     @cached_property
     def _extension(self) -> tuple[Indices, Array | None]:
-        """Those of the last `dense` unknowns that couple to others (c,); the extension from them, or `None`."""
+        """Unknowns (c,) among the last `dense` ones that couple to others, and the extension from them, or `None`."""
         corner, coupling, _ = self._blocks
         where = np.unique(coupling.indices)
         if self._split * len(where) > FILL_RATIO * (corner.nnz + coupling.nnz):

@@ -42,7 +42,7 @@ class AffinePolynomial:
     error
         Largest Euclidean error at `MEASURED` random points of the box and at its corners, over the largest norm there.
     scale
-        That norm.
+        The largest norm.
     """
 
     indices: Indices
@@ -98,7 +98,7 @@ def interpolate_on_box(
     budget
         Largest number of points of a grid.
     seed
-        Of the random points.
+        Seed of the random points.
     terms
         Flat terms (Q×size) of those arrays for which `evaluate` returns the coefficients θ (Q,) instead.
     """

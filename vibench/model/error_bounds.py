@@ -78,9 +78,9 @@ class ErrorBounds:
     Attributes
     ----------
     u_energy, u
-        Of ‖u − u_N‖ in the norms of A and of V.
+        Bounds of ‖u − u_N‖ in the norms of A and of V.
     lambda_natural, lam
-        Of ‖Bᵀ(λ − λ_N)‖ in the norm of A⁻¹ and of ‖λ − λ_N‖ in the norm of W.
+        Bounds of ‖Bᵀ(λ − λ_N)‖ in the norm of A⁻¹ and of ‖λ − λ_N‖ in the norm of W.
     rho, rho_range, omega, kappa
         ρ, ρ_B and ω, in the unit of `u_energy`, and κ in that of its square.
     note
@@ -242,7 +242,7 @@ def _minimisers(
 
 
 def _largest_multiplier(vi: VariationalInequality, excess: Array) -> float:
-    """At least the largest multiplier s / b A⁻¹ bᵀ that a row b w ≥ s of the excess s (m,) would have alone.
+    """An upper bound of the largest multiplier s / b A⁻¹ bᵀ that a row b w ≥ s of the excess s (m,) would have alone.
 
     It is at most s b A bᵀ / |b|⁴, by the inequality of Cauchy and Schwarz.
     """
@@ -253,7 +253,7 @@ def _largest_multiplier(vi: VariationalInequality, excess: Array) -> float:
 
 
 def _lacking(vi: VariationalInequality, u: Array, w: Array) -> Array:
-    """By how much the constraints B w ≥ s may be violated in exact arithmetic (m,); negative where they hold."""
+    """What the constraints B w ≥ s may lack in exact arithmetic (m,); negative where they hold."""
     return _round_off(vi, u, w) - _slack(vi, u, w)
 
 

@@ -77,11 +77,11 @@ class Errors:
     Attributes
     ----------
     error_u, error_lambda
-        Relative, in the norms of V and of W; `None` where u or λ, respectively, is zero: see `zeros`.
+        Relative errors in the norms of V and of W; `None` where u or λ, respectively, is zero: see `zeros`.
     error_u_energy, error_lambda_natural
-        Likewise ‖u − u_N‖ in the norm of A(mu), and ‖Bᵀ(λ − λ_N)‖ in that of A(mu)⁻¹ over ‖Bᵀλ‖.
+        Relative errors ‖u − u_N‖ in the norm of A(mu), and ‖Bᵀ(λ − λ_N)‖ in that of A(mu)⁻¹ over ‖Bᵀλ‖.
     error_u_absolute, error_lambda_absolute, error_u_energy_absolute, error_lambda_natural_absolute
-        These without the division.
+        The errors above without the division.
     error_u_scaled, error_lambda_scaled
         The first two over the largest training norms, or as they are where those are zero.
     violation

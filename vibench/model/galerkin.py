@@ -28,7 +28,7 @@ class Evaluated:
     contact
         The constraint on the contact unknowns, where B or g are evaluated there.
     coordinates
-        Those (d×N') of the primal basis Z in the space Φ of the model; `None` where they are the same.
+        Coordinates (d×N') of the primal basis Z in the space Φ of the model; `None` where Z is Φ.
     """
 
     samples: Mapping[str, Array] = field(default_factory=dict)

@@ -160,7 +160,7 @@ class GrowingTrainer(Trainer):
         self.selecting += growing
 
     def bound(self, mu: Array) -> float:
-        """That of the model of all solutions."""
+        """The bound of the model of all solutions."""
         bound, seconds = timed(lambda: self._model.bound(np.array(mu, float)))
         self.selecting, self._evaluated = self.selecting + seconds, self._evaluated + 1
         return bound

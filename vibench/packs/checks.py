@@ -179,7 +179,7 @@ class _Solution:
         return kkt_residuals(self.vi, self.u, np.maximum(self.lam, 0.0)).worst
 
     def change(self, *, u: float = 1.0, lam: float = 1.0, **factors: float) -> _Solution:
-        """The same with its parts multiplied by factors."""
+        """A copy with its parts multiplied by factors."""
         vi = replace(self.vi, **{name: factor * getattr(self.vi, name) for name, factor in factors.items()})
         return _Solution(vi, u * self.u, lam * self.lam)
 

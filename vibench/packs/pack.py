@@ -73,7 +73,7 @@ class PackMember:
     Attributes
     ----------
     arrays
-        These arrays.
+        The arrays it is made of.
     thetas
         Coefficients of the terms of an affine sum; of no other member.
     listing

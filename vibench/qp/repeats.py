@@ -19,7 +19,7 @@ APART = 1e3
 """Units of the unknowns vary by this many times the accuracy, so that the answer in other units is not the answer."""
 
 WIDEST, NARROWEST = 1e-2, 1e-12
-"""They vary by shares between these: the program is as difficult as before, and differs in its bytes."""
+"""Units vary by shares between these: the program is as difficult as before, and differs in its bytes."""
 
 RECOGNISED = 30.0
 """A timed answer with residuals above this many times the accuracy is not one of the program that was posed."""

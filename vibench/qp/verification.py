@@ -29,7 +29,7 @@ ENERGY_FLOOR = 1e-4
 """Share of the energy of load or constraints below which the scale of the gap never falls."""
 
 FORCE_FLOOR = 1e-4
-"""The same of the prescribed force and the dual residual; small, since nodal forces decrease with the mesh width."""
+"""Share of the prescribed force that the scale of the dual residual keeps; nodal forces decrease with mesh width."""
 
 
 @dataclass(frozen=True)

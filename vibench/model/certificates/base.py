@@ -23,7 +23,7 @@ VERIFICATION = 16
 """Random parameters at which interpolation errors are measured."""
 
 SEED = 21
-"""Their seed: they are none of the training or validation parameters."""
+"""Seed of these parameters, which are none of the training or validation sets."""
 
 SAFETY = 2.0
 """Factor on the largest error measured."""

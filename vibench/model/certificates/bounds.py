@@ -58,9 +58,9 @@ class OnlineBound:
     Attributes
     ----------
     u_energy, lambda_natural
-        Of ‖u − u_N‖ in the norm of A(µ) and of ‖Bᵀ(λ − λ_N)‖ in that of A(µ)⁻¹.
+        Bounds of ‖u − u_N‖ in the norm of A(µ) and of ‖Bᵀ(λ − λ_N)‖ in that of A(µ)⁻¹.
     relative
-        Of ‖u − u_N‖ / ‖u‖ in the norm of A(µ).
+        Bound of ‖u − u_N‖ / ‖u‖ in the norm of A(µ).
     rho, omega, kappa
         Upper bounds of the terms ρ/√α, ω√γ and κ.
     coercivity

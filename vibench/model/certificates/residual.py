@@ -34,7 +34,7 @@ NEGLIGIBLE = 1e-12
 UNIT = float(np.finfo(float).eps)
 
 FEW, SHARE_OF_FEW = 1000, 0.25
-"""Of up to so many terms all principal directions are computed, and this share of the above is left out."""
+"""All principal directions of up to so many terms are computed, and this share of the above is left out."""
 
 MOST, OVERSAMPLING = 800, 100
 """Largest number of principal directions, and how many more a randomised method computes."""
