@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import suppress
-from dataclasses import dataclass
 from functools import partial
-from itertools import pairwise
 
 import numpy as np
 import scipy.linalg
@@ -26,21 +24,13 @@ from vibench.testing.comparisons import (
     copies,
     difference,
     differences,
+    find_jump,
     largest_entry,
     unmutated,
 )
 
 ENTRIES = 40
 """Number of entries of every member that are sampled."""
-
-JUMP = 1e-3
-"""Smallest jump that is found, relative to the largest entry of the array."""
-
-WIDTH = 2.0**-30
-"""Length in t that localises a jump; a continuous array that changes by `JUMP` over it has a slope of at least 1e6."""
-
-BISECTIONS = 60
-"""Largest number of bisections on one line; a kink is bisected, too, until its deviation is below `JUMP`."""
 
 
 def one_assembly(case: ProblemCase) -> Iterator[str]:
@@ -155,52 +145,6 @@ def continuity(case: ProblemCase) -> Iterator[str]:
             raise ConformanceError(f"{jump.name} jumps {where}: {difference(first, last)} over a step of {step:.0e}")
 
 
-@dataclass(frozen=True, eq=False)
-class Segment:
-    """A segment of the line, and the arrays at its left end, in its middle and at its right end.
-
-    In the middle the array `name` deviates most from the mean of both ends, relative to its largest entry.
-    """
-
-    left: float
-    right: float
-    values: tuple[Arrays, Arrays, Arrays]
-    name: str
-    deviation: float
-
-
-def find_jump(
-    evaluate: Callable[[float], Arrays], scales: dict[str, float], late: Callable[[], bool] = lambda: False
-) -> Segment | None:
-    """A segment of length `WIDTH` at most on which an array jumps, `None` if no jump is found before it is `late`.
-
-    The segment with the largest deviation is halved again and again. The deviation of a smooth array falls by 4 each
-    time, that at a kink by 2; at a jump it stays half the jump. `evaluate` returns the arrays at t ∈ [0, 1]; `scales`
-    names those that are examined, with their largest modulus.
-    """
-
-    def segment(left: float, right: float, first: Arrays, last: Arrays) -> Segment:
-        middle = evaluate(0.5 * (left + right))
-        off = {name: middle[name] - 0.5 * (first[name] + last[name]) for name in scales}
-        deviations = {name: largest_entry(off[name]) / scales[name] for name in scales}
-        name = max(deviations, key=deviations.__getitem__)
-        return Segment(left, right, (first, middle, last), name, deviations[name])
-
-    knots = [(t, evaluate(t)) for t in (0.0, 0.25, 0.5, 0.75, 1.0)]
-    segments = [segment(left, right, first, last) for (left, first), (right, last) in pairwise(knots)]
-    for _ in range(BISECTIONS):
-        worst = max(segments, key=lambda each: each.deviation)
-        if worst.deviation < 0.5 * JUMP or late():
-            return None
-        if worst.right - worst.left <= WIDTH:
-            return worst
-        segments.remove(worst)
-        middle = 0.5 * (worst.left + worst.right)
-        first, between, last = worst.values
-        segments += [segment(worst.left, middle, first, between), segment(middle, worst.right, between, last)]
-    return None
-
-
 def on_contact(case: ProblemCase) -> Iterator[str]:
     """`contact_dofs`, `contact` and `constraint` agree with B and g."""
     problem, dofs = case.plugin, case.plugin.contact_dofs
@@ -235,14 +179,10 @@ def _dofs_fault(dofs: object, n: int) -> str:
 
 
 def _check_contact(case: ProblemCase, dofs: Indices, mu: Array, full: Arrays) -> None:
-    given, m = mu.copy(), case.plugin.W.dim
+    given, columns = mu.copy(), "B[:, contact_dofs]"
     contact = unmutated("contact", {"its argument mu": given}, partial(case.plugin.contact, given))
     if not isinstance(contact, Contact):
         raise ConformanceError(f"contact returns a {type(contact).__name__} {at(mu)}; expected a vibench.Contact")
-    fault = array_fault("contact.B", contact.B, (m, len(dofs)), sparse=True)
-    if fault := fault or array_fault("contact.g", contact.g, (m,)):
-        raise ConformanceError(f"{fault} ({at(mu)})")
-    columns = "B[:, contact_dofs]"
     _compare("contact", mu, {columns: contact.B, "g": contact.g}, full | {columns: full["B"][:, dofs]})
 
 
@@ -261,10 +201,7 @@ def affine(case: ProblemCase) -> Iterator[str]:
                 summed = each.at(mu.copy())
             except NumericalError as error:
                 raise ConformanceError(f"the affine sum of {name} {where}: {error}") from error
-            full = case.results[where]
-            if fault := array_fault(f"the affine sum of {name}", summed, full[name].shape, sparse=name in "AB"):
-                raise ConformanceError(f"{fault} ({where})")
-            _compare("affine", mu, {name: summed}, full)
+            _compare("affine", mu, {name: summed}, case.results[where])
 
 
 def by_entries(case: ProblemCase) -> Iterator[str]:
@@ -311,6 +248,10 @@ def _check_sampler(case: ProblemCase, wanted: dict[str, tuple[Indices, Indices]]
 
 
 def _compare(function: str, mu: Array, arrays: Arrays, full: Arrays) -> None:
+    """Raise a `ConformanceError` for the first array whose type, shape or values are not those of `assemble` at mu."""
+    for name, array in arrays.items():
+        if fault := array_fault(f"{name} of `{function}`", array, full[name].shape, sparse=sp.issparse(full[name])):
+            raise ConformanceError(f"{fault} ({at(mu)})")
     for name, what in differences(copies(arrays), {name: full[name] for name in arrays}, PARTIAL_RTOL):
         raise ConformanceError(f"{name} of `{function}` differs from that of `assemble` {at(mu)}: {what}")
 

@@ -24,9 +24,8 @@ from vibench import testing
 from vibench.interfaces.strategies import DualStrategy
 from vibench.study.kinds import CHECKED
 from vibench.study.registry import create, find
-from vibench.testing.assembly import JUMP, WIDTH, find_jump
 from vibench.testing.checks import Check, Conformance, Note, Verdict
-from vibench.testing.comparisons import difference
+from vibench.testing.comparisons import JUMP, WIDTH, difference, find_jump
 
 Case = tuple[str, list[str]]
 """The one check that fails, and parts of its message."""
