@@ -170,7 +170,11 @@ def normal_constraint(
     B = sp.csr_array((len(vertices), basis.N))
     for k, unknowns in enumerate(basis.nodal_dofs):
         dofs = scalar.nodal_dofs[0, vertices]
-        part = _normal_mass(scalar, k, direction)[dofs][:, dofs]
+        if direction is not None:
+            part = float(direction[k]) * mass(scalar)
+        else:
+            part = sp.csr_array(BilinearForm(lambda u, v, w, k=k: w.n[k] * u * v).assemble(scalar))
+        part = part[dofs][:, dofs]
         part = sp.diags_array(part.sum(axis=1)) if lumped else part
         places = (np.arange(len(vertices)), unknowns[vertices])
         B = B + part @ sp.csr_array((np.ones(len(vertices)), places), shape=B.shape)
@@ -183,13 +187,6 @@ def normal_constraint(
         return Unilateral(B, _diagonal(_positive(lumped_mass(scalar), dofs)), vertices, points, "<=")
     W = InnerProduct(sp.csr_array(mass(scalar)[dofs][:, dofs]), "X_W")
     return Unilateral(B, W, vertices, points, "<=", partial(_integrals, scalar, dofs))
-
-
-def _normal_mass(scalar: FacetBasis, k: int, direction: Array | None) -> SparseMatrix:
-    """∫ n_k φ_i φ_j, or with a fixed direction in place of the normal n."""
-    if direction is not None:
-        return float(direction[k]) * mass(scalar)
-    return sp.csr_array(BilinearForm(lambda u, v, w: w.n[k] * u * v).assemble(scalar))
 
 
 def eliminate(vi: VariationalInequality, free: Indices, dirichlet_lift: Array | None = None) -> VariationalInequality:

@@ -91,12 +91,12 @@ def reduce_cones(
     rows, errors = [], {}
     for name in wanted:
         try:
-            found = reduce_multipliers(pack, find(DUAL, name).create({}), dual_tol)
+            cone, other_error = reduce_multipliers(pack, find(DUAL, name).create({}), dual_tol)
         except NumericalError as error:
             echo(f"failed: {name}: {error}")
             continue
-        errors[name] = found.cone.errors
-        rows.append((name, found.cone.size, found.cone.errors[-1], found.validation_error, len(found.cone.fallbacks)))
+        errors[name] = cone.errors
+        rows.append((name, cone.size, cone.errors[-1], other_error, len(cone.fallbacks)))
     columns = ("dual", "R", "error, training", "error, other parameters", "fallbacks")
     print_frame(pd.DataFrame(rows, columns=columns), f"cones of tolerance {dual_tol:g}")
     out.mkdir(parents=True, exist_ok=True)

@@ -12,7 +12,6 @@ from vibench.errors import NumericalError
 from vibench.highfidelity.kkt_systems import ActiveSetSystem, CondensedStiffness
 from vibench.interfaces.problem import Problem, VariationalInequality
 from vibench.interfaces.validation import checked_assembly
-from vibench.linalg.cholesky import SparseCholesky
 from vibench.linalg.inner_product import check_symmetric
 from vibench.linalg.schur_complement import EliminationPattern
 from vibench.qp import verification
@@ -134,19 +133,6 @@ class HighFidelitySolver:
         if self._stiffness is None or "A" not in self._problem.constant:
             self._stiffness = CondensedStiffness(vi.A, self._pattern, reused="A" in self._problem.constant)
         return self._stiffness
-
-
-def check_stiffness(mu: Array, vi: VariationalInequality) -> None:
-    """Refuse a stiffness, assembled at mu (d,), that is not symmetric positive definite; nothing is reused.
-
-    Raises
-    ------
-    NumericalError
-        Naming mu and the missing property.
-    """
-    name = f"A at mu = {mu.tolist()}"
-    check_symmetric(vi.A, name)
-    SparseCholesky(vi.A, name)
 
 
 def solve_high_fidelity(

@@ -242,14 +242,6 @@ class ModelPack:
         return self.validation[:count]
 
 
-@dataclass(frozen=True)
-class ReducedMultipliers:
-    """A cone, and its largest relative error over the multipliers it was not built from, if there are any."""
-
-    cone: Cone
-    validation_error: float | None
-
-
 def pack_multipliers(pack: ModelPack) -> tuple[Array, Array]:
     """The multipliers of a pack at training parameters (m×P), and the others (m×Q).
 
@@ -268,19 +260,15 @@ def pack_multipliers(pack: ModelPack) -> tuple[Array, Array]:
     return lam[:, training], lam[:, ~training]
 
 
-def reduce_multipliers(pack: ModelPack, strategy: DualStrategy, tolerance: float) -> ReducedMultipliers:
-    """Build a cone from the multipliers at training parameters; errors are relative to the largest norm there.
+def reduce_multipliers(pack: ModelPack, strategy: DualStrategy, tolerance: float) -> tuple[Cone, float | None]:
+    """A cone of the multipliers at training parameters, and its largest error at others, relative to the largest norm.
 
     Raises
     ------
-    RequestError
-        If the pack has no multipliers.
     NumericalError
         If the strategy fails, or what it returns is no cone.
     """
     training, others = pack_multipliers(pack)
     cone = check_cone(strategy.reduce(training, pack.W, Stop(tolerance=tolerance)), pack.W)
-    if not others.shape[1]:
-        return ReducedMultipliers(cone, None)
     distances = [project_on_cone(cone.rays, column, pack.W).distance for column in others.T]
-    return ReducedMultipliers(cone, float(max(distances) / pack.W.norm(training).max()))
+    return cone, float(max(distances) / pack.W.norm(training).max()) if distances else None

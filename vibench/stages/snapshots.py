@@ -12,9 +12,10 @@ import numpy as np
 
 from vibench.arrays import Array
 from vibench.errors import NumericalError
-from vibench.highfidelity.active_set import HighFidelitySolution, HighFidelitySolver, check_stiffness
+from vibench.highfidelity.active_set import HighFidelitySolution, HighFidelitySolver
 from vibench.interfaces.problem import Problem, VariationalInequality
 from vibench.interfaces.validation import Fingerprint, checked_assembly, reference_assembly
+from vibench.linalg.inner_product import InnerProduct
 from vibench.model.growing import GrowingTrainer
 from vibench.qp.repeats import nearby
 from vibench.stages.base import Result, Stage, build_problem, faults_of, value_of
@@ -100,7 +101,7 @@ class SnapshotStage(Stage):
             try:
                 return vi, solver.solve_assembled(mu, vi)
             except NumericalError:
-                check_stiffness(mu, vi)  # the cause rather than what came of it
+                InnerProduct(vi.A, f"A at mu = {mu.tolist()}")  # refuses the cause rather than what came of it
                 reference.refuse_false_constants(mu, vi)
                 raise
 

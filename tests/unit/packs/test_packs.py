@@ -154,8 +154,8 @@ def test_multipliers_alone_are_enough_for_cones(tmp_path: Path, main: Main) -> N
     content = manifest()
     del content["operators"], content["solutions"]["u"], content["spaces"]["X_V"]
     pack = pack_with(tmp_path / "pack", content)
-    found = reduce_multipliers(pack, create("dual strategy", "mcpg", {}), 1e-3)
-    assert found.cone.errors[-1] <= 1e-3
+    cone, _ = reduce_multipliers(pack, create("dual strategy", "mcpg", {}), 1e-3)
+    assert cone.errors[-1] <= 1e-3
     code, out, _ = main("import", str(tmp_path / "pack"))
     assert (code, "it has no operators" in out) == (0, True)
     code, out, _ = main("cones", str(tmp_path / "pack"), "--dual", "cpg", "--dual", "mcpg", "--out", "here")
