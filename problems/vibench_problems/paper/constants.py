@@ -13,12 +13,14 @@ from vibench_problems.paper.claims import ORDER, Claim, below, holds, judged_fig
 from vibench_problems.paper.evidence import VISIBLE, Evidence, for_log_axis
 from vibench_problems.paper.published import Pair
 
-STRATEGIES = {"decorrelated": "β_dec", "online-supremizers": "β_on", "offline-pga": "β_off"}
-COLUMNS = {"decorrelated": "beta_plain_", "online-supremizers": "beta_full_", "offline-pga": "beta_"}
-"""Columns of a query of the fixed enrichment with the three constants: an enrichment per parameter reaches all of V."""
-
 OFF, ON, DEC, HF = "beta_", "beta_full_", "beta_plain_", "beta_hf_"
-"""Prefixes of the columns of β_off, β_on, β_dec and β_HF."""
+"""Prefixes of the columns of β_off, β_on, β_dec and β_HF.
+
+Queries with PGA have all four: β_dec is the constant of V_N alone, β_on that of the whole of V.
+"""
+
+STRATEGIES = {"decorrelated": ("β_dec", DEC), "online-supremizers": ("β_on", ON), "offline-pga": ("β_off", OFF)}
+"""Symbol and column of the constant of a strategy."""
 
 SMALL = 0.1
 """What is at most this share of β_HF is very small."""
@@ -162,9 +164,9 @@ def comparison(evidence: Evidence) -> CaptionedFigure | None:
 def _constants(panel: Any, x: Any, rows: pd.DataFrame, part: str, looks: Looks, *, zeros: bool) -> None:
     """The four constants in one panel, with a text for those that are zero."""
     plot(panel, x, for_log_axis(rows[f"{HF}{part}"]), HIGH_FIDELITY_LOOK, "β_HF")
-    for name, symbol in STRATEGIES.items():
+    for name, (symbol, prefix) in STRATEGIES.items():
         look: Look = looks[Series(name)]
-        values = rows[COLUMNS[name] + part].to_numpy(float)
+        values = rows[prefix + part].to_numpy(float)
         wide = {"linewidth": 3.0} if symbol == "β_on" else {}  # another curve may lie upon it
         plot(panel, x, for_log_axis(values), look, symbol, **wide)
         if zeros and values.max() < VISIBLE:

@@ -22,7 +22,7 @@ from vibench_problems.paper import published
 from vibench_problems.paper.claims import Claim, Verdict, compared, exceptions, holds, typeset
 from vibench_problems.paper.evidence import Evidence, reached
 from vibench_problems.paper.figures import PaperFigures
-from vibench_problems.paper.sections import figure_claims
+from vibench_problems.paper.sections import figure_claims, sections
 
 FIXED = "primal = 'offline-pga'"
 TABLES = ("queries", "cells", "histories")
@@ -213,6 +213,12 @@ def test_five_pressures_lie_in_one_panel_with_hertz_s_theory(quick_run: Path) ->
         exact = theory(problem, np.array([radius]), found.u)
         x, pressure = np.asarray(ellipse.get_xydata(), float).T
         np.testing.assert_allclose((x / exact.half_width) ** 2 + (pressure / exact.peak) ** 2, 1.0, rtol=1e-12)
+
+
+def test_a_run_without_the_pairs_of_the_paper_makes_no_page(quick_run: Path) -> None:
+    obstacle, hertz = (tables_of(quick_run / "results.sqlite", name) for name in ("obstacle", "hertz"))
+    with pytest.raises(ValueError, match=r"the run of obstacle has no models for \(19, 50\), \(51, 70\), \(89, 50\)"):
+        sections(obstacle, hertz, hertz, {})
 
 
 def test_claims_are_sorted_by_their_verdicts() -> None:
