@@ -7,8 +7,9 @@ multipliers α ≥ 0 such that A x + Bᵀα = f.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -63,18 +64,19 @@ def solve_qp(
     NumericalError
         If the solver does not return a `QPSolution` of the right shapes, with a text as its status.
     """
+    solve = partial(_solve_in, solver=solver, accuracy=accuracy, extra=extra)
     if factor is None or not len(program.f):
-        return _solve_in(units_of(program), program, solver, accuracy, extra, start)
-    return _solve_dual(program, solver, accuracy, extra, factor, start)
+        return solve(units_of(program), program, start)
+    return _solve_dual(program, solve, factor, start)
 
 
 def _solve_in(
     units: Units,
     program: VariationalInequality,
+    start: QPSolution | None,
     solver: str,
     accuracy: float,
     extra: Mapping[str, QPSolver] | None,
-    start: QPSolution | None,
 ) -> QPSolution:
     """Solve a program in these units; an answer without x or without multipliers is none."""
     if not len(program.f):
@@ -110,12 +112,7 @@ def _sound_answer(answer: QPSolution, program: VariationalInequality) -> QPSolut
 
 
 def _solve_dual(
-    program: VariationalInequality,
-    solver: str,
-    accuracy: float,
-    extra: Mapping[str, QPSolver] | None,
-    factor: Array,
-    start: QPSolution | None,
+    program: VariationalInequality, solve: Callable[..., QPSolution], factor: Array, start: QPSolution | None
 ) -> QPSolution:
     """Solve a dense program with A = L Lᵀ through its dual, which has one unknown per constraint.
 
@@ -131,7 +128,7 @@ def _solve_dual(
         slack = np.maximum(program.g - program.B @ start.x, 0.0) / rows
         start = replace(start, x=rows * start.alpha, alpha=slack)
     units = units_of(dual) if prescribed(program, rows) is None else units_of_dual(dual)
-    answer = _solve_in(units, dual, solver, accuracy, extra, start)
+    answer = solve(units, dual, start)
     if answer.x is None:
         return answer
     forces = np.maximum(answer.x, 0.0)
