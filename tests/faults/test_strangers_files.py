@@ -13,7 +13,8 @@ from typing import Any
 import pytest
 from running import seal
 
-from vibench.cli.result_commands import export_qps, replay_query, show, write_report
+from vibench.cli.output_commands import export_qps, write_report
+from vibench.cli.result_commands import replay_query, show
 from vibench.errors import NumericalError, RequestError
 from vibench.execution.run_folder import LOCK, REPORT, claimed
 from vibench.files import locked, write_atomically

@@ -15,23 +15,14 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 from typer import Argument, Option
 
-from vibench.cli import result_commands
+from vibench.cli import output_commands
 from vibench.cli.bench_command import bench_plugins
 from vibench.cli.completion import examples, names, solvers, studies, whole_words
-from vibench.cli.export_commands import export_reduced_model
 from vibench.cli.interrupts import INTERRUPTED, Interrupted, interrupted_at_once, interruptible
+from vibench.cli.output_commands import draw_figures, export_qps, export_reduced_model, publish_runs, write_report
 from vibench.cli.pack_commands import import_pack, reduce_cones, write_pack
 from vibench.cli.plugin_commands import check_plugin, list_plugins, new_plugin
-from vibench.cli.publish_command import publish_runs
-from vibench.cli.result_commands import (
-    compare_runs,
-    diff_runs,
-    draw_figures,
-    export_qps,
-    replay_query,
-    show,
-    write_report,
-)
+from vibench.cli.result_commands import compare_runs, diff_runs, replay_query, show
 from vibench.errors import RequestError, VibenchError
 from vibench.study.kinds import DUAL, PRIMAL, PROBLEM
 from vibench.terminal.output import echo, warn
@@ -158,7 +149,7 @@ def _conclude(name: str, outcome: Outcome, folder: Path, *, draw: int | None, fr
     if nothing_ran:
         raise VibenchError(f"no cell could run here: {run_summary.reasons(outcome.rows)}")
     if draw is not None:
-        result_commands.draw(path, folder / "figures", draw)
+        output_commands.draw(path, folder / "figures", draw)
     fine = statuses.count(Status.OK)
     run_summary.next_steps(folder, len(statuses), len(statuses) - fine, figures=draw is not None)
     if strict and any(status not in (Status.OK, Status.UNAVAILABLE) for status in statuses):

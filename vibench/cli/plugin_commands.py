@@ -167,6 +167,7 @@ def _read_rows(kind: PluginKind) -> Iterator[Row]:
 
 def _loaded_rows(kind: PluginKind) -> Iterator[Row]:
     """Name, origin, description and options of every plugin of a kind; of one that does not load, the error."""
+    from vibench.results.plugin_columns import declared, loaded
     from vibench.study.matrix import expand
     from vibench.study.reader import read_study
     from vibench.study.registry import registered
@@ -179,22 +180,14 @@ def _loaded_rows(kind: PluginKind) -> Iterator[Row]:
             else:
                 description = (plugin.load().__doc__ or "").strip().split("\n")[0]
                 lines += map(str, plugin.options.values())
-            lines += _columns(name) if kind is FIGURE else []
+            for column in declared(name, loaded(name)) if kind is FIGURE else ():
+                unit = f" [{column.unit}]" * bool(column.unit)
+                lines.append(f"column {column.name} of {column.table}{unit}: {column.meaning}")
         except VibenchError as error:
             description = str(error)
         except Exception as error:  # noqa: BLE001  annotations of plugins are evaluated
             description = f"{plugin} cannot be read: {in_a_line(error)}"
         yield name, plugin.origin, description, "\n".join(lines)
-
-
-def _columns(name: str) -> list[str]:
-    """The columns that a figure plugin adds to tables, a line for each."""
-    from vibench.results.plugin_columns import declared, loaded
-
-    return [
-        f"column {one.name} of {one.table}{f' [{one.unit}]' * bool(one.unit)}: {one.meaning}"
-        for one in declared(name, loaded(name))
-    ]
 
 
 def _solvers_by_version() -> list[Row]:

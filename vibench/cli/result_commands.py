@@ -1,9 +1,8 @@
-"""Commands on finished runs: tables, reports, comparisons, and their quadratic programs solved again or exported."""
+"""Commands that print what finished runs hold: tables, comparisons, and a quadratic program that is solved again."""
 
 from __future__ import annotations
 
 import sys
-from enum import StrEnum
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Literal
@@ -11,16 +10,7 @@ from typing import Annotated, Literal
 from typer import Argument, Exit, Option
 
 from vibench.cli.completion import SHOWN, cell_columns, cells, column_names, error_measures, runs, table_names
-from vibench.terminal.output import echo, run_argument, warn
-
-
-class Picture(StrEnum):
-    """Formats of figures."""
-
-    PNG = "png"
-    SVG = "svg"
-    PDF = "pdf"
-
+from vibench.terminal.output import echo, warn
 
 EXAMPLE = "solver = 'piqp' and beta_span_min < 1e-3"
 """Condition in the help of `--where`."""
@@ -73,87 +63,6 @@ def show(
             echo(found.view.empty)
     else:
         sys.stdout.write(formats.FORMS[form](found.exact if form in {"csv", "json"} else found.readable))
-
-
-def write_report(
-    run: RunArgument,
-    out: Annotated[Path | None, Option(help="HTML file; RUN/report.html by default.")] = None,
-    figures: Annotated[
-        bool, Option("--figures/--no-figures", help="Add pictures of the figures, which take most of the time.")
-    ] = True,
-) -> None:
-    """Write the report of a run as one HTML page."""
-    from vibench import provenance
-    from vibench.execution.run_folder import REPORT
-    from vibench.report import html
-    from vibench.results import tables
-
-    path = tables.results_file(run)
-    written = html.write(path, out or path.parent / REPORT, provenance.cores(), figures=figures)
-    echo(f"report: {written}")
-
-
-def draw_figures(
-    names: Annotated[
-        list[str], Argument(metavar="RUN", help="A run folder, or its name in runs/ (several).", autocompletion=runs)
-    ],
-    out: Annotated[
-        Path | None, Option(metavar="DIR", help="Folder; RUN/figures, or paper-figures with --paper, by default.")
-    ] = None,
-    paper: Annotated[
-        bool, Option("--paper", help="Draw the figures of a publication again, on one page with what it says.")
-    ] = False,
-    formats: Annotated[
-        list[Picture] | None, Option("--format", help="Format (repeatable); PNG and SVG by default.")
-    ] = None,
-    jobs: Annotated[int, Option("--jobs", "-j", min=0, help="Processes; 0 for one per core.")] = 0,
-) -> None:
-    """Draw the figures of runs, with captions."""
-    from vibench.errors import RequestError
-    from vibench.report.figures.style import FORMATS
-    from vibench.results import tables
-
-    paths = list({tables.results_file(name).resolve(): tables.results_file(name) for name in names}.values())
-    forms = tuple(dict.fromkeys(map(str, formats or FORMATS)))
-    if paper:
-        draw_paper(paths, out or Path("paper-figures"), forms)
-        return
-    if out is not None and len(paths) > 1:
-        raise RequestError("--out is for the figures of one run, and --paper; those of several go into their folders")
-    for path in paths:
-        draw(path, out or path.parent / "figures", jobs, forms)
-
-
-def draw_paper(paths: list[Path], folder: Path, formats: tuple[str, ...]) -> None:
-    """Draw the figures of publications again, and say where their page is."""
-    from vibench.report.figures.publication import PAGE, draw_published
-    from vibench.terminal.console import new_console
-    from vibench.terminal.progress import DrawingDisplay
-
-    notes: list[str] = []
-    with DrawingDisplay(new_console()) as display:
-        drawn = draw_published(paths, folder, formats, display.show, notes.append)
-    echo(*dict.fromkeys(notes), f"{len(drawn)} figures: {folder}", f"page: {folder / PAGE}")
-
-
-def draw(path: Path, folder: Path, jobs: int, formats: tuple[str, ...] = ("png", "svg")) -> None:
-    """Draw all figures of a results file and say so; Ctrl-C leaves those that are drawn, and the results."""
-    from vibench import provenance
-    from vibench.report import figures
-    from vibench.terminal.console import new_console
-    from vibench.terminal.progress import DrawingDisplay
-
-    cores, failures = provenance.cores(), list[str]()
-    try:
-        with DrawingDisplay(new_console()) as display:
-            drawn = figures.draw_all(path, folder, formats, min(jobs or cores, cores), display.show, failures.append)
-    except KeyboardInterrupt:
-        echo(
-            "interrupted while drawing: results and tables are complete, some figures are missing; "
-            f"`vibench figures {run_argument(path.parent)}` draws them"
-        )
-        raise Exit(130) from None
-    echo(*failures, f"{len(drawn)} figures: {folder}")
 
 
 LimitOption = Annotated[float, Option(min=1.0, help="Factor by which a number may get worse.")]
@@ -236,13 +145,3 @@ def replay_query(
     echo(f"{recorded.cell}, query {number}: mu = {recorded.parameters[number].tolist()}")
     print_frame(frame, f"accuracy {recorded.cell.accuracy:g}, our residuals; distance of u from the record")
     echo(f"the program, as qpsolvers reads it: {file}")
-
-
-def export_qps(
-    run: RunArgument, folder: Annotated[Path, Argument(metavar="DIR", help="A new or empty folder.")]
-) -> None:
-    """Export the programs of a run as a test set for QP solvers. The set includes their solutions."""
-    from vibench.report import replay
-
-    count = replay.export(run, folder)
-    echo(f"{count} programs in {folder / 'programs'}; `python {folder / replay.CHECKER}` rechecks every solution")

@@ -190,7 +190,7 @@ def give(kind: PluginKind, name: str, given: Any) -> GivenPlugin:
         )
     try:
         kept = given if given is cls else copy.deepcopy(_without_cache(given))
-        pickled = _dumped(kept)
+        _Pickler(file := io.BytesIO()).dump(kept)
         needs = {one: distribution_version(one) for one in getattr(cls, "requires", ())}
         code, modules = fingerprint([kept, needs])
     except Exception as error:  # noqa: BLE001  pickling runs third-party code
@@ -198,7 +198,7 @@ def give(kind: PluginKind, name: str, given: Any) -> GivenPlugin:
             f"the {kind} '{name}' cannot be sent to worker processes: {message_of(error)}; keep such objects out of "
             "attributes and global names, or make them where they are used"
         ) from None
-    plugin = GivenPlugin(kind, name, (), f"{GIVEN}{code}", pickled, modules)
+    plugin = GivenPlugin(kind, name, (), f"{GIVEN}{code}", file.getvalue(), modules)
     plugin.__dict__["given"] = kept  # unpickled here, a class of a notebook would lose its global names
     return _given.setdefault((kind, name, plugin.fingerprint), plugin)
 
@@ -232,12 +232,6 @@ def _computed_once(function: Callable[[Any], Any], name: str) -> Any:
     made = cached_property(function)
     made.__set_name__(object, name)
     return made
-
-
-def _dumped(value: Any) -> bytes:
-    with io.BytesIO() as file:
-        _Pickler(file).dump(value)
-        return file.getvalue()
 
 
 def _received(kind: PluginKind, name: str, options: str, code: str, given: GivenPlugin | None) -> Plugin:

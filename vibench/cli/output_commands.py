@@ -1,0 +1,188 @@
+"""Commands that write files of finished runs: reports, sites, figures, quadratic programs and reduced models."""
+
+from __future__ import annotations
+
+from enum import StrEnum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+from typer import Argument, Exit, Option
+
+from vibench.cli.completion import cells, runs
+from vibench.cli.result_commands import RunArgument
+from vibench.errors import RequestError
+from vibench.terminal.output import echo, run_argument, warn
+
+if TYPE_CHECKING:
+    from vibench.model.chebyshev import AffinePolynomial
+
+
+class Picture(StrEnum):
+    """Formats of figures."""
+
+    PNG = "png"
+    SVG = "svg"
+    PDF = "pdf"
+
+
+def write_report(
+    run: RunArgument,
+    out: Annotated[Path | None, Option(help="HTML file; RUN/report.html by default.")] = None,
+    figures: Annotated[
+        bool, Option("--figures/--no-figures", help="Add pictures of the figures, which take most of the time.")
+    ] = True,
+) -> None:
+    """Write the report of a run as one HTML page."""
+    from vibench import provenance
+    from vibench.execution.run_folder import REPORT
+    from vibench.report import html
+    from vibench.results import tables
+
+    path = tables.results_file(run)
+    written = html.write(path, out or path.parent / REPORT, provenance.cores(), figures=figures)
+    echo(f"report: {written}")
+
+
+def draw_figures(
+    names: Annotated[
+        list[str], Argument(metavar="RUN", help="A run folder, or its name in runs/ (several).", autocompletion=runs)
+    ],
+    out: Annotated[
+        Path | None, Option(metavar="DIR", help="Folder; RUN/figures, or paper-figures with --paper, by default.")
+    ] = None,
+    paper: Annotated[
+        bool, Option("--paper", help="Draw the figures of a publication again, on one page with what it says.")
+    ] = False,
+    formats: Annotated[
+        list[Picture] | None, Option("--format", help="Format (repeatable); PNG and SVG by default.")
+    ] = None,
+    jobs: Annotated[int, Option("--jobs", "-j", min=0, help="Processes; 0 for one per core.")] = 0,
+) -> None:
+    """Draw the figures of runs, with captions."""
+    from vibench.report.figures.style import FORMATS
+    from vibench.results import tables
+
+    paths = list({tables.results_file(name).resolve(): tables.results_file(name) for name in names}.values())
+    forms = tuple(dict.fromkeys(map(str, formats or FORMATS)))
+    if paper:
+        draw_paper(paths, out or Path("paper-figures"), forms)
+        return
+    if out is not None and len(paths) > 1:
+        raise RequestError("--out is for the figures of one run, and --paper; those of several go into their folders")
+    for path in paths:
+        draw(path, out or path.parent / "figures", jobs, forms)
+
+
+def draw_paper(paths: list[Path], folder: Path, formats: tuple[str, ...]) -> None:
+    """Draw the figures of publications again, and say where their page is."""
+    from vibench.report.figures.publication import PAGE, draw_published
+    from vibench.terminal.console import new_console
+    from vibench.terminal.progress import DrawingDisplay
+
+    notes: list[str] = []
+    with DrawingDisplay(new_console()) as display:
+        drawn = draw_published(paths, folder, formats, display.show, notes.append)
+    echo(*dict.fromkeys(notes), f"{len(drawn)} figures: {folder}", f"page: {folder / PAGE}")
+
+
+def draw(path: Path, folder: Path, jobs: int, formats: tuple[str, ...] = ("png", "svg")) -> None:
+    """Draw all figures of a results file and say so; Ctrl-C leaves those that are drawn, and the results."""
+    from vibench import provenance
+    from vibench.report import figures
+    from vibench.terminal.console import new_console
+    from vibench.terminal.progress import DrawingDisplay
+
+    cores, failures = provenance.cores(), list[str]()
+    try:
+        with DrawingDisplay(new_console()) as display:
+            drawn = figures.draw_all(path, folder, formats, min(jobs or cores, cores), display.show, failures.append)
+    except KeyboardInterrupt:
+        echo(
+            "interrupted while drawing: results and tables are complete, some figures are missing; "
+            f"`vibench figures {run_argument(path.parent)}` draws them"
+        )
+        raise Exit(130) from None
+    echo(*failures, f"{len(drawn)} figures: {folder}")
+
+
+def publish_runs(
+    run: Annotated[
+        list[str], Argument(metavar="RUN", help="Run folders, results files, or names in runs/.", autocompletion=runs)
+    ],
+    site: Annotated[Path, Argument(metavar="SITE", help="A new folder, or one that this command wrote.")],
+    title: Annotated[str, Option(help="Title of the site.")] = "Benchmark results",
+    author: Annotated[
+        list[str] | None, Option(metavar="NAME", help='"Family, Given", or a group (repeatable).')
+    ] = None,
+    doi: Annotated[str, Option(help="DOI of the deposit, such as 10.5281/zenodo.1234567.")] = "",
+    url: Annotated[str, Option(help="Address of the site.")] = "",
+    figures: Annotated[bool, Option("--figures/--no-figures", help="Add pictures to the reports.")] = True,
+) -> None:
+    """Write a static site of runs: reports, data, leaderboard.
+
+    Links are relative: the site can be opened from a disk and served by any host of static files.
+    """
+    from vibench.report.site.citation import Citation
+    from vibench.report.site.publish import publish
+    from vibench.results import tables
+
+    if not title.strip():
+        raise RequestError("--title is empty; a site needs one to be cited")
+    citation = Citation(title, tuple(author or ()), doi, url)
+    page = publish([tables.results_file(one) for one in run], site, citation, warn=warn, figures=figures)
+    echo(f"site of {len(run)} run{'s' * (len(run) > 1)}: {page}")
+
+
+def export_qps(
+    run: RunArgument, folder: Annotated[Path, Argument(metavar="DIR", help="A new or empty folder.")]
+) -> None:
+    """Export the programs of a run as a test set for QP solvers. The set includes their solutions."""
+    from vibench.report import replay
+
+    count = replay.export(run, folder)
+    echo(f"{count} programs in {folder / 'programs'}; `python {folder / replay.CHECKER}` rechecks every solution")
+
+
+def export_reduced_model(
+    run: RunArgument,
+    cell: Annotated[str, Argument(metavar="CELL", help="Key of a cell, or its beginning.", autocompletion=cells)],
+    file: Annotated[Path, Argument(metavar="FILE", help="A new file, whose name ends in .npz.")],
+    interpolate: Annotated[
+        float | None,
+        Option(metavar="TOL", help="Allowed error of the polynomials that replace members; 1e-11 by default."),
+    ] = None,
+    evaluations: Annotated[
+        int, Option(min=16, help="Largest number of parameters at which a member is evaluated.")
+    ] = 4096,
+    bases: Annotated[bool, Option("--bases/--no-bases", help="Include the bases that reconstruct u and λ.")] = True,
+    c: Annotated[bool, Option("--c", help="Also write a C99 source, under the same name.")] = False,
+) -> None:
+    """Export a reduced model for use without vibench."""
+    from vibench.library.export import BOUNDS, RUNTIME, TOLERANCE, export_model
+    from vibench.library.runs import open_run
+    from vibench.model.chebyshev import MEASURED
+
+    model = open_run(run).model(cell)
+    tolerance = TOLERANCE if interpolate is None else interpolate
+    found = export_model(model, file, tolerance, evaluations=evaluations, bases=bases, c=c)
+    echo(*(f"{name}: {_in_words(member)}" for name, member in found.members.items()))
+    echo(f"relative errors are those at {MEASURED} random parameters and at the corners of the box")
+    if found.about["solver"] != model.solver:
+        echo(f"the cell's solver is {model.solver}, the script solves by {found.about['solver']}")
+    why = found.about["no_bounds"]
+    has_bounds = not why
+    echo(f"error bounds: {found.about['certificate']}" if has_bounds else f"no error bounds: {why}")
+    if c and has_bounds:
+        echo("the C source has no error bounds")
+    beside = [file.with_name(BOUNDS)] if has_bounds else []
+    written = ", ".join(map(str, [file, file.with_name(RUNTIME), *beside, *([file.with_suffix(".c")] if c else [])]))
+    script = Path(BOUNDS if has_bounds else RUNTIME).stem
+    echo(f"{written}: `from {script} import Model`, then `Model({str(file)!r}).solve(mu)`")
+
+
+def _in_words(member: AffinePolynomial) -> str:
+    if not any(member.degrees):
+        return f"constant, relative error {member.error:.1e}"
+    degrees = ", ".join(map(str, member.degrees))
+    count = len(member.terms)
+    return f"{count} term{'s' * (count > 1)}, polynomials of degree ({degrees}), relative error {member.error:.1e}"
