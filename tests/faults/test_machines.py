@@ -71,7 +71,7 @@ def test_a_distribution_with_unreadable_entry_points_costs_its_own(
     done = vibench(tmp_path, "run", write_study(tmp_path, wire_study()), "--dry-run", plugins=site)
     assert (done.returncode, done.stderr) == (0, "")
     monkeypatch.setattr(doctor, "unreadable", lambda: {"words": "unreadable"})
-    assert doctor.Finding("words", "unreadable", doctor.Health.BROKEN) in list(doctor.plugins())
+    assert doctor.Diagnosis("words", "unreadable", doctor.Health.BROKEN) in list(doctor.check_plugins())
 
 
 def test_a_plugin_whose_annotations_name_nothing_is_listed_with_the_reason(main: Main, register: Register) -> None:

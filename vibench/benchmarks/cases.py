@@ -10,7 +10,7 @@ from vibench.interfaces.strategies import Stop
 from vibench.qp.solve import installed_solvers
 from vibench.study.kinds import DUAL, PRIMAL, PROBLEM, SOLVER
 from vibench.study.reader import read_study
-from vibench.study.registry import find, named, registered
+from vibench.study.registry import find, find_named, registered
 
 Resolution = str | int
 """A name that a problem knows, or a number of nodes."""
@@ -161,7 +161,7 @@ def chosen_plugins(plugins: Sequence[str]) -> dict[str, list[str]]:
     """
     chosen, solvers = dict[str, list[str]](), installed_solvers(registered(SOLVER))
     for text in plugins:
-        plugin = named(text, TIMED, solvers)
+        plugin = find_named(text, TIMED, solvers)
         if plugin.kind is PROBLEM and not takes_no_option(plugin.name):
             raise RequestError(f"the {plugin} needs options, which `vibench bench` has no place for")
         chosen.setdefault(plugin.kind.cli_name, []).append(plugin.name)

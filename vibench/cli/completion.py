@@ -81,7 +81,7 @@ EXAMPLES: Mapping[str, tuple[str, ...]] = {
     "clean": ("vibench clean --dry-run", "vibench clean --older-than 30"),
     "doctor": ("vibench doctor", "vibench doctor --out /scratch/runs"),
 }
-"""By command."""
+"""Examples of every command."""
 
 
 def examples(command: str) -> str:
@@ -120,11 +120,11 @@ BREAKS = (":", "=")
 """Characters at which bash breaks words, and which words of vibench have."""
 
 
-def words(known: Callable[[], Iterable[str]]) -> Callable[[str], list[str]]:
+def words(choices: Callable[[], Iterable[str]]) -> Callable[[str], list[str]]:
     """Completes the words of a function, which is called when a shell asks."""
 
     def complete(incomplete: str) -> list[str]:
-        return _beginning(incomplete, known())
+        return _beginning(incomplete, choices())
 
     return complete
 
@@ -183,10 +183,10 @@ def cells(context: typer.Context, incomplete: str) -> list[tuple[str, str]]:
     from vibench.results import tables
 
     try:
-        found = tables.read(tables.results_file(str(context.params.get("run"))), "cells")
+        table = tables.read(tables.results_file(str(context.params.get("run"))), "cells")
     except (VibenchError, OSError, sqlite3.Error):
         return []
-    rows = found[["cell", "problem", "dual", "primal", "solver"]].astype(str).itertuples(index=False)
+    rows = table[["cell", "problem", "dual", "primal", "solver"]].astype(str).itertuples(index=False)
     return sorted((key, " · ".join(axes)) for key, *axes in rows if key.startswith(incomplete))
 
 
@@ -196,8 +196,8 @@ def column_names(context: typer.Context, incomplete: str) -> list[str]:
     source = {"summary": "cells", "best": "cells", "benefits": "thresholds"}.get(table, table)
     before, comma, last = incomplete.rpartition(",")
     sign = "-" * last.startswith("-")
-    found = _beginning(last.removeprefix("-"), [*TABLES.get(source, ()), *_added(table)])
-    return [f"{before}{comma}{sign}{name}" for name in found]
+    names = _beginning(last.removeprefix("-"), [*TABLES.get(source, ()), *_added(table)])
+    return [f"{before}{comma}{sign}{name}" for name in names]
 
 
 def _added(table: str) -> Iterable[str]:
@@ -223,9 +223,9 @@ def _registered(*kinds: PluginKind) -> set[str]:
     return {name for kind in kinds for name in registered(kind)}
 
 
-def _beginning(word: str, known: Iterable[str]) -> list[str]:
-    """The known names that begin with a word, if a prompt can show them; none, and no error, if they cannot be read."""
+def _beginning(word: str, choices: Iterable[str]) -> list[str]:
+    """The choices that begin with a word, if a prompt can show them; none, and no error, if they cannot be read."""
     try:
-        return sorted(name for name in known if name.startswith(word) and name.isprintable())
+        return sorted(name for name in choices if name.startswith(word) and name.isprintable())
     except OSError:
         return []

@@ -1,4 +1,4 @@
-"""Findings of `vibench doctor`: versions, QP solvers, plugins, machine, disk, and whether timings can be trusted."""
+"""What `vibench doctor` says: versions, QP solvers, plugins, machine, disk, and whether timings can be trusted."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ ACCURACY = 1e-7
 """Relative accuracy that solvers are tried at: the default of studies."""
 
 UNKNOWNS = 12
-"""Of the program that they are tried with."""
+"""Unknowns of the program that solvers are tried with."""
 
 MIN_GIB = 1.0
 """Less free memory or disk space than this is a note."""
@@ -54,7 +54,7 @@ MEASURED_SECONDS = 0.5
 
 
 class Health(StrEnum):
-    """Severity of a finding: `BROKEN` if a required part is missing, or an installed one does not work."""
+    """Severity of a diagnosis: `BROKEN` if a required part is missing, or an installed one does not work."""
 
     OK = "ok"
     NOTE = "note"
@@ -65,55 +65,58 @@ STYLES = {Health.OK: "", Health.NOTE: "yellow", Health.BROKEN: "bold red"}
 
 
 @dataclass(frozen=True)
-class Finding:
-    """Result of one check: its subject, what was found, and how severe that is."""
+class Diagnosis:
+    """What one check says: its subject, what is the case, and how severe that is."""
 
     subject: str
-    found: str
+    text: str
     health: Health = Health.OK
 
 
-def print_findings(out: Path) -> list[str]:
-    """Print the findings of all checks; returns the subjects of those that are broken."""
+def print_diagnoses(out: Path) -> list[str]:
+    """Print the diagnoses of all checks; returns the subjects of those that are broken."""
     console, broken = new_console(), []
     sections = {
-        "versions": versions(), "QP solvers": solvers(), "plugins": plugins(),
-        "machine": machine(), "disk": disk(out), "timings": timings(),
+        "versions": check_versions(), "QP solvers": check_solvers(), "plugins": check_plugins(),
+        "machine": check_machine(), "disk": check_disk(out), "timings": check_timings(),
     }  # fmt: skip
-    for title, findings in sections.items():
+    for title, diagnoses in sections.items():
         table = Table.grid(padding=(0, 2))
         for options in ({"min_width": 6}, {"min_width": 18, "no_wrap": True}, {"overflow": "fold"}):
             table.add_column(**options)
-        for finding in findings:
-            table.add_row(Text(finding.health, STYLES[finding.health]), shown(finding.subject), shown(finding.found))
-            broken += [finding.subject] * (finding.health is Health.BROKEN)
+        for diagnosis in diagnoses:
+            table.add_row(
+                Text(diagnosis.health, STYLES[diagnosis.health]), shown(diagnosis.subject), shown(diagnosis.text)
+            )
+            broken += [diagnosis.subject] * (diagnosis.health is Health.BROKEN)
         console.print(title, style="bold")
         console.print(table)
     echo(f"broken: {', '.join(broken)}" if broken else "nothing is broken")
     return broken
 
 
-def versions() -> Iterator[Finding]:
+def check_versions() -> Iterator[Diagnosis]:
     """Versions of Python, vibench and the libraries it requires."""
-    yield Finding("Python", f"{platform.python_version()}, {platform.python_implementation()}, {platform.platform()}")
-    yield Finding("vibench", provenance.core_code())
-    found = {name: provenance.distribution_version(name) for name, extras in requirements().items() if not extras}
-    yield Finding("libraries", ", ".join(f"{name} {version}" for name, version in found.items() if version))
-    missing = (name for name, version in found.items() if not version)
-    yield from (Finding(name, "is required and not installed", Health.BROKEN) for name in missing)
+    yield Diagnosis("Python", f"{platform.python_version()}, {platform.python_implementation()}, {platform.platform()}")
+    yield Diagnosis("vibench", provenance.core_code())
+    required = (name for name, extras in required_distributions().items() if not extras)
+    versions = {name: provenance.distribution_version(name) for name in required}
+    yield Diagnosis("libraries", ", ".join(f"{name} {version}" for name, version in versions.items() if version))
+    missing = (name for name, version in versions.items() if not version)
+    yield from (Diagnosis(name, "is required and not installed", Health.BROKEN) for name in missing)
 
 
-def requirements() -> dict[str, list[str]]:
+def required_distributions() -> dict[str, list[str]]:
     """Distributions that vibench depends on, each with the extras that include it; no extra if it is required."""
-    found: dict[str, list[str]] = {}
+    extras: dict[str, list[str]] = {}
     for line in requires("vibench") or ():
         name = re.match(r"[\w.-]+", line)
         assert name is not None
-        found.setdefault(name[0], []).extend(re.findall(r"extra\s*==\s*['\"]([\w.-]+)['\"]", line))
-    return found
+        extras.setdefault(name[0], []).extend(re.findall(r"extra\s*==\s*['\"]([\w.-]+)['\"]", line))
+    return extras
 
 
-def solvers() -> Iterator[Finding]:
+def check_solvers() -> Iterator[Diagnosis]:
     """All known QP solvers; the installed ones solve a small program each."""
     trials = solver_trials(wire(), ACCURACY, installed_solvers(registered(SOLVER)))
     for name in sorted({*SETTINGS, *registered(SOLVER)}):
@@ -121,9 +124,9 @@ def solvers() -> Iterator[Finding]:
         if name not in trials:
             yield _unavailable(name, version)
         elif (trial := trials[name]).status is Status.OK and trial.residuals is not None:
-            yield Finding(name, f"{version}: largest residual {trial.residuals.worst:.0e}")
+            yield Diagnosis(name, f"{version}: largest residual {trial.residuals.worst:.0e}")
         else:
-            yield Finding(name, f"{version}: {trial.status}, {trial.reason}", Health.BROKEN)
+            yield Diagnosis(name, f"{version}: {trial.status}, {trial.reason}", Health.BROKEN)
 
 
 def wire() -> VariationalInequality:
@@ -135,31 +138,33 @@ def wire() -> VariationalInequality:
     )
 
 
-def _unavailable(solver: str, version: str) -> Finding:
+def _unavailable(solver: str, version: str) -> Diagnosis:
     """Why a solver cannot be run."""
     distribution = provenance.SOLVER_DISTRIBUTIONS.get(solver, solver)
     if version:
         try:
             importlib.import_module(distribution)
         except (Exception, SystemExit) as error:  # noqa: BLE001  a library may raise anything when it is imported
-            return Finding(solver, f"{version} is installed and cannot be imported: {in_a_line(error)}", Health.BROKEN)
-        return Finding(solver, f"{version} is installed and qpsolvers does not know it", Health.BROKEN)
-    extras = requirements().get(distribution)
+            return Diagnosis(
+                solver, f"{version} is installed and cannot be imported: {in_a_line(error)}", Health.BROKEN
+            )
+        return Diagnosis(solver, f"{version} is installed and qpsolvers does not know it", Health.BROKEN)
+    extras = required_distributions().get(distribution)
     if extras == []:
-        return Finding(solver, "is required and not installed", Health.BROKEN)
+        return Diagnosis(solver, "is required and not installed", Health.BROKEN)
     hint = f"; pip install 'vibench[{extras[0]}]' installs it" if extras else ""
-    return Finding(solver, f"not installed{hint}", Health.NOTE)
+    return Diagnosis(solver, f"not installed{hint}", Health.NOTE)
 
 
-def plugins() -> Iterator[Finding]:
+def check_plugins() -> Iterator[Diagnosis]:
     """The plugins of each kind that load, and the errors of those that do not."""
     for kind in PluginKind:
         errors = {name: error for name, plugin in registered(kind).items() if (error := _load_error(plugin))}
-        yield Finding(kind, ", ".join(name for name in registered(kind) if name not in errors) or "none")
+        yield Diagnosis(kind, ", ".join(name for name in registered(kind) if name not in errors) or "none")
         for name, error in errors.items():
             plugin = find(kind, name)
-            yield Finding(str(plugin), f"{error} (from {plugin.origin})", Health.BROKEN)
-    yield from (Finding(name, reason, Health.BROKEN) for name, reason in unreadable().items())
+            yield Diagnosis(str(plugin), f"{error} (from {plugin.origin})", Health.BROKEN)
+    yield from (Diagnosis(name, reason, Health.BROKEN) for name, reason in unreadable().items())
 
 
 def _load_error(plugin: RegisteredPlugin) -> str:
@@ -178,32 +183,32 @@ def _load_error(plugin: RegisteredPlugin) -> str:
     return ""
 
 
-def machine() -> Iterator[Finding]:
+def check_machine() -> Iterator[Diagnosis]:
     """Processor, free memory, and the BLAS libraries of NumPy and SciPy."""
-    yield Finding("processor", provenance.machine())
+    yield Diagnosis("processor", provenance.machine())
     info = Path("/proc/meminfo")
-    found = re.search(r"MemAvailable:\s*(\d+) kB", info.read_text()) if info.is_file() else None
-    free = int(found[1]) / 2**20 if found else os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30
-    yield Finding("free memory", f"{free:.1f} GiB", _note_if(free < MIN_GIB))
+    available = re.search(r"MemAvailable:\s*(\d+) kB", info.read_text()) if info.is_file() else None
+    free = int(available[1]) / 2**20 if available else os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30
+    yield Diagnosis("free memory", f"{free:.1f} GiB", _note_if(free < MIN_GIB))
     for pool in threadpool_info():
         name = f"{pool['internal_api']} {pool.get('version') or ''}".strip()
         threads = f"{pool['num_threads']} threads here, 1 in workers"
         subject = "BLAS" if pool["user_api"] == "blas" else pool["user_api"]
-        yield Finding(subject, f"{name} of {Path(pool['filepath']).parent.name}, {threads}")
+        yield Diagnosis(subject, f"{name} of {Path(pool['filepath']).parent.name}, {threads}")
 
 
-def disk(out: Path) -> Iterator[Finding]:
+def check_disk(out: Path) -> Iterator[Diagnosis]:
     """Free space and permissions in the folders of runs and artefacts, and the size of stored artefacts."""
     store = Store(default_folder())
     yield _folder("runs", out.absolute())
     yield _folder("artefacts", store.folder)
     sizes = [size for _, size, _ in store.contents()]
-    yield Finding("stored", f"{len(sizes)} artefacts, {sum(sizes) / 2**20:.1f} MiB; `vibench clean` deletes them")
+    yield Diagnosis("stored", f"{len(sizes)} artefacts, {sum(sizes) / 2**20:.1f} MiB; `vibench clean` deletes them")
     source = f"${CACHE_VARIABLE}" if os.environ.get(CACHE_VARIABLE) else f"the default; ${CACHE_VARIABLE} changes it"
-    yield Finding("artefact folder", source)
+    yield Diagnosis("artefact folder", source)
 
 
-def _folder(subject: str, folder: Path) -> Finding:
+def _folder(subject: str, folder: Path) -> Diagnosis:
     """Free space of a folder, or of the one it will be created in, and whether locks and databases work there."""
     existing = next(parent for parent in (folder, *folder.parents) if parent.exists())
     try:
@@ -220,11 +225,11 @@ def _folder(subject: str, folder: Path) -> Finding:
             raise RequestError("SQLite cannot keep a write-ahead log here; is it a network drive?")
     except (OSError, RequestError, sqlite3.Error) as error:
         reason = error.strerror if isinstance(error, OSError) else str(error)
-        return Finding(subject, f"{folder}: cannot be used: {reason}", Health.BROKEN)
-    return Finding(subject, f"{folder}: {free:.1f} GiB free", _note_if(free < MIN_GIB))
+        return Diagnosis(subject, f"{folder}: cannot be used: {reason}", Health.BROKEN)
+    return Diagnosis(subject, f"{folder}: {free:.1f} GiB free", _note_if(free < MIN_GIB))
 
 
-def timings() -> Iterator[Finding]:
+def check_timings() -> Iterator[Diagnosis]:
     """Load of other processes, slowdown of a fixed calculation, and whether timings can be trusted."""
     before, watch = _busy_seconds(), Stopwatch()
     with threadpool_limits(1):
@@ -238,15 +243,15 @@ def timings() -> Iterator[Finding]:
     others = max(load - spent.cpu / spent.wall, 0.0)
     slowdown, ratio = float(np.quantile(slowdowns, 0.9)), spent.wall / spent.cpu
     doubts = []
-    for subject, found, doubtful in (
+    for subject, text, doubtful in (
         ("other load", f"{others:.1f} of {cores} cores", others > MAX_OTHER_LOAD * cores),
         ("slowdown", f"{slowdown:.2f}; rows are marked above {DISTURBED}", slowdown > DISTURBED),
         ("wall over CPU", f"{ratio:.2f}; rows are marked above {WAITED}", ratio > WAITED),
     ):
-        yield Finding(subject, found, _note_if(doubtful))
+        yield Diagnosis(subject, text, _note_if(doubtful))
         doubts += [subject] * doubtful
     verdict = f"cannot be trusted: {', '.join(doubts)}" if doubts else "can be trusted"
-    yield Finding("verdict", f"seconds measured now {verdict}", _note_if(bool(doubts)))
+    yield Diagnosis("verdict", f"seconds measured now {verdict}", _note_if(bool(doubts)))
 
 
 def _note_if(doubtful: bool) -> Health:

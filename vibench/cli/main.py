@@ -20,7 +20,7 @@ from vibench.cli.bench_command import bench_plugins
 from vibench.cli.completion import examples, names, solvers, studies, whole_words
 from vibench.cli.interrupts import INTERRUPTED, Interrupted, interrupted_at_once, interruptible
 from vibench.cli.output_commands import draw_figures, export_qps, export_reduced_model, publish_runs, write_report
-from vibench.cli.pack_commands import import_pack, reduce_cones, write_pack
+from vibench.cli.pack_commands import import_pack, pack_problem, reduce_cones
 from vibench.cli.plugin_commands import check_plugin, list_plugins, new_plugin
 from vibench.cli.result_commands import compare_runs, diff_runs, replay_query, show
 from vibench.errors import RequestError, VibenchError
@@ -60,7 +60,7 @@ def _print_version(asked: bool) -> None:
 
 
 @app.callback()
-def _options(
+def _global_options(
     version: Annotated[
         bool, Option("--version", callback=_print_version, is_eager=True, help="Print the version and stop.")
     ] = False,
@@ -68,7 +68,7 @@ def _options(
     pass
 
 
-def run(
+def run_study_command(
     study: Annotated[
         str,
         Argument(help="A registered study, or a TOML file; with --cell a results file, too.", autocompletion=studies),
@@ -149,7 +149,7 @@ def _conclude(name: str, outcome: Outcome, folder: Path, *, draw: int | None, fr
     if nothing_ran:
         raise VibenchError(f"no cell could run here: {run_summary.reasons(outcome.rows)}")
     if draw is not None:
-        output_commands.draw(path, folder / "figures", draw)
+        output_commands.draw_run(path, folder / "figures", draw)
     fine = statuses.count(Status.OK)
     run_summary.next_steps(folder, len(statuses), len(statuses) - fine, figures=draw is not None)
     if strict and any(status not in (Status.OK, Status.UNAVAILABLE) for status in statuses):
@@ -199,18 +199,18 @@ def clean(
     from vibench.terminal.console import print_frame
 
     store = usable_store()
-    found = pd.DataFrame(store.contents(), columns=["stored", "MiB", "days"])
-    going = int((found["days"] >= older_than * 86400.0).sum())
-    found["MiB"], found["days"] = found["MiB"] / 2**20, found["days"] / 86400.0
-    found["stored"] = found["stored"].str.replace("-", " ")
+    stored = pd.DataFrame(store.contents(), columns=["stored", "MiB", "days"])
+    going = int((stored["days"] >= older_than * 86400.0).sum())
+    stored["MiB"], stored["days"] = stored["MiB"] / 2**20, stored["days"] / 86400.0
+    stored["stored"] = stored["stored"].str.replace("-", " ")
     columns = {"files": ("MiB", "size"), "MiB": ("MiB", "sum"), "oldest [days]": ("days", "max")}
-    print_frame(found.groupby("stored", as_index=False).agg(**columns), f"stored in {store.folder}")
+    print_frame(stored.groupby("stored", as_index=False).agg(**columns), f"stored in {store.folder}")
     if dry_run:
         return
     if going and not yes:
         if not sys.stdin.isatty():
             raise RequestError("nothing was deleted: answer the question on a terminal, or say --yes")
-        typer.confirm(f"Delete {going} of {len(found)} files?", abort=True)
+        typer.confirm(f"Delete {going} of {len(stored)} files?", abort=True)
     freed = store.clear(older_than * 86400.0)
     echo(f"{freed / 2**20:.1f} MiB freed; later runs recompute what they need")
 
@@ -221,19 +221,19 @@ def doctor(out: Annotated[Path, Option(metavar="DIR", help="Folder of the runs."
     Every installed solver solves a small program. Exit code 1 if a required part is missing or an installed one does
     not work.
     """
-    from vibench.cli.doctor import print_findings
+    from vibench.cli.doctor import print_diagnoses
 
-    if print_findings(out):
+    if print_diagnoses(out):
         raise typer.Exit(1)
 
 
 COMMANDS: dict[str, Callable[..., None]] = {
-    "run": run, "list": list_plugins, "show": show, "report": write_report, "figures": draw_figures,
+    "run": run_study_command, "list": list_plugins, "show": show, "report": write_report, "figures": draw_figures,
     "diff": diff_runs, "compare": compare_runs, "publish": publish_runs,
     "replay": replay_query, "export-qps": export_qps,
     "export-model": export_reduced_model, "clean": clean, "doctor": doctor,
     "check": check_plugin, "bench": bench_plugins, "new": new_plugin,
-    "import": import_pack, "pack": write_pack, "cones": reduce_cones,
+    "import": import_pack, "pack": pack_problem, "cones": reduce_cones,
 }  # fmt: skip
 for _name, _command in COMMANDS.items():
     app.command(_name, epilog=examples(_name))(interruptible(_command))

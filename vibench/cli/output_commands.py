@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from vibench.model.chebyshev import AffinePolynomial
 
 
-class Picture(StrEnum):
+class FigureFormat(StrEnum):
     """Formats of figures."""
 
     PNG = "png"
@@ -54,7 +54,7 @@ def draw_figures(
         bool, Option("--paper", help="Draw the figures of a publication again, on one page with what it says.")
     ] = False,
     formats: Annotated[
-        list[Picture] | None, Option("--format", help="Format (repeatable); PNG and SVG by default.")
+        list[FigureFormat] | None, Option("--format", help="Format (repeatable); PNG and SVG by default.")
     ] = None,
     jobs: Annotated[int, Option("--jobs", "-j", min=0, help="Processes; 0 for one per core.")] = 0,
 ) -> None:
@@ -70,7 +70,7 @@ def draw_figures(
     if out is not None and len(paths) > 1:
         raise RequestError("--out is for the figures of one run, and --paper; those of several go into their folders")
     for path in paths:
-        draw(path, out or path.parent / "figures", jobs, forms)
+        draw_run(path, out or path.parent / "figures", jobs, forms)
 
 
 def draw_paper(paths: list[Path], folder: Path, formats: tuple[str, ...]) -> None:
@@ -85,7 +85,7 @@ def draw_paper(paths: list[Path], folder: Path, formats: tuple[str, ...]) -> Non
     echo(*dict.fromkeys(notes), f"{len(drawn)} figures: {folder}", f"page: {folder / PAGE}")
 
 
-def draw(path: Path, folder: Path, jobs: int, formats: tuple[str, ...] = ("png", "svg")) -> None:
+def draw_run(path: Path, folder: Path, jobs: int, formats: tuple[str, ...] = ("png", "svg")) -> None:
     """Draw all figures of a results file and say so; Ctrl-C leaves those that are drawn, and the results."""
     from vibench import provenance
     from vibench.report import figures
@@ -164,14 +164,14 @@ def export_reduced_model(
 
     model = open_run(run).model(cell)
     tolerance = TOLERANCE if interpolate is None else interpolate
-    found = export_model(model, file, tolerance, evaluations=evaluations, bases=bases, c=c)
-    echo(*(f"{name}: {_in_words(member)}" for name, member in found.members.items()))
+    exported = export_model(model, file, tolerance, evaluations=evaluations, bases=bases, c=c)
+    echo(*(f"{name}: {_member_in_words(member)}" for name, member in exported.members.items()))
     echo(f"relative errors are those at {MEASURED} random parameters and at the corners of the box")
-    if found.about["solver"] != model.solver:
-        echo(f"the cell's solver is {model.solver}, the script solves by {found.about['solver']}")
-    why = found.about["no_bounds"]
+    if exported.about["solver"] != model.solver:
+        echo(f"the cell's solver is {model.solver}, the script solves by {exported.about['solver']}")
+    why = exported.about["no_bounds"]
     has_bounds = not why
-    echo(f"error bounds: {found.about['certificate']}" if has_bounds else f"no error bounds: {why}")
+    echo(f"error bounds: {exported.about['certificate']}" if has_bounds else f"no error bounds: {why}")
     if c and has_bounds:
         echo("the C source has no error bounds")
     beside = [file.with_name(BOUNDS)] if has_bounds else []
@@ -180,7 +180,7 @@ def export_reduced_model(
     echo(f"{written}: `from {script} import Model`, then `Model({str(file)!r}).solve(mu)`")
 
 
-def _in_words(member: AffinePolynomial) -> str:
+def _member_in_words(member: AffinePolynomial) -> str:
     if not any(member.degrees):
         return f"constant, relative error {member.error:.1e}"
     degrees = ", ".join(map(str, member.degrees))

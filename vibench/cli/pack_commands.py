@@ -36,7 +36,7 @@ def import_pack(folder: Folder) -> None:
     echo(*_description(pack, residual), *_uses(pack, folder))
 
 
-def write_pack(
+def pack_problem(
     problem: Annotated[str, Argument(help="A registered problem.", autocompletion=names(PROBLEM))],
     folder: Annotated[Path, Argument(metavar="FOLDER", help="Folder to be made.")],
     option: Annotated[list[str] | None, Option(metavar="KEY=VALUE", help="Option of the problem (repeatable).")] = None,
@@ -133,14 +133,14 @@ def _uses(pack: ModelPack, folder: Path) -> Iterator[str]:
         yield "  [[problem]]"
         yield '  name = "pack"'
         yield f"  options = {{ path = {path} }}"
-        yield _assembly(pack)
+        yield _assembly_in_words(pack)
     if pack.reference is not None:
         yield f"its multipliers give cones: vibench cones {folder}"
     if not pack.members:
         yield "it has no operators: a study, whose primal half needs them, cannot run it"
 
 
-def _assembly(pack: ModelPack) -> str:
+def _assembly_in_words(pack: ModelPack) -> str:
     reduced = "reduced assembly interpolates " + ", ".join(sorted(pack.entrywise)) if pack.entrywise else ""
     where = "anywhere in the box" if pack.everywhere else "at its listed parameters only"
     return f"it is evaluated {where}{'; ' * bool(reduced)}{reduced}"

@@ -94,7 +94,7 @@ def check_plugin(
     if run is not None and checked.kind is not FIGURE:
         raise RequestError(f"--run is for figure plugins; {checked} is none")
     given = {} if run is None else {"run": str(results_file(run).resolve())}
-    options, remark = _options(checked, dict(map(key_value, option or [])))
+    options, remark = _chosen_options(checked, dict(map(key_value, option or [])))
     echo(f"{checked}{remark}")
     reference = checked.reference if checked.entries else OF_QPSOLVERS
     examination = Examination(checked.kind.cli_name, reference, options, seconds, given)
@@ -110,7 +110,7 @@ OF_QPSOLVERS = "vibench.testing.solvers:of_qpsolvers"
 """What the solvers of qpsolvers are checked as, with the option `solver`."""
 
 
-def _options(checked: RegisteredPlugin, given: dict[str, Any]) -> tuple[dict[str, Any] | None, str]:
+def _chosen_options(checked: RegisteredPlugin, given: dict[str, Any]) -> tuple[dict[str, Any] | None, str]:
     """Options of a plugin, and what its title says of them: those that `vibench check` chooses where none are given."""
     if checked.kind is SOLVER:
         if given:
@@ -225,12 +225,12 @@ def _find(text: str) -> RegisteredPlugin:
         If there is no such plugin, or several.
     """
     from vibench.qp.solve import installed_solvers
-    from vibench.study.registry import named, registered
+    from vibench.study.registry import find_named, registered
 
     prefix, colon, rest = text.partition(":")
     if colon and prefix not in CHECKED:
         return _find_object(prefix, rest)
-    plugin = named(text, CHECKED, installed_solvers(registered(SOLVER)))
+    plugin = find_named(text, CHECKED, installed_solvers(registered(SOLVER)))
     if plugin.entries:
         plugin.load()
     return plugin

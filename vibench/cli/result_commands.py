@@ -55,14 +55,14 @@ def show(
 
     path = tables.results_file(run)
     measured = partial(views.look_up, path, table, error=error, largest=within)
-    found = measured(columns=parts(columns), where=where, sort=parts(sort), limit=limit)
-    warn(*found.faults)
+    view = measured(columns=parts(columns), where=where, sort=parts(sort), limit=limit)
+    warn(*view.faults)
     if form == "terminal":
-        print_frame(found.readable, f"{path.parent.name}: {table}", found.priority, axes=found.axes, every=found.chosen)
-        if found.rows.empty and found.view.empty:
-            echo(found.view.empty)
+        print_frame(view.readable, f"{path.parent.name}: {table}", view.priority, axes=view.axes, every=view.chosen)
+        if view.rows.empty and view.view.empty:
+            echo(view.view.empty)
     else:
-        sys.stdout.write(formats.FORMS[form](found.exact if form in {"csv", "json"} else found.readable))
+        sys.stdout.write(formats.FORMS[form](view.exact if form in {"csv", "json"} else view.readable))
 
 
 LimitOption = Annotated[float, Option(min=1.0, help="Factor by which a number may get worse.")]
@@ -81,12 +81,12 @@ def diff_runs(
     from vibench.results import formats, tables
     from vibench.terminal import comparison
 
-    found = compare([tables.results_file(a), tables.results_file(b)], limit)
+    compared = compare([tables.results_file(a), tables.results_file(b)], limit)
     if form == "terminal":
-        comparison.print_changes(found, limit)
+        comparison.print_changes(compared, limit)
     else:
-        sys.stdout.write(formats.FORMS[form](found.changes))
-    if found.regressions:
+        sys.stdout.write(formats.FORMS[form](compared.changes))
+    if compared.regressions:
         raise Exit(1)
 
 
@@ -113,16 +113,16 @@ def compare_runs(
     from vibench.results import formats, tables
     from vibench.terminal import comparison
 
-    found = compare([tables.results_file(one) for one in run], limit)
+    compared = compare([tables.results_file(one) for one in run], limit)
     if column:
-        title, frame = f"{column} of the cells", found.values(column)
+        title, frame = f"{column} of the cells", compared.values(column)
     elif table is None and form == "terminal":
-        comparison.print_comparison(found, limit)
+        comparison.print_comparison(compared, limit)
         return
     else:
-        title, frame = table or "changes", found.table(table or "changes")
+        title, frame = table or "changes", compared.table(table or "changes")
     if form == "terminal":
-        comparison.print_table(found, frame, title)
+        comparison.print_table(compared, frame, title)
     else:
         sys.stdout.write(formats.FORMS[form](tables.whole_numbers(frame)))
 

@@ -17,7 +17,7 @@ from vibench.dependencies import code_used
 from vibench.provenance import package_hash
 
 
-def fingerprint(value: Any) -> tuple[str, dict[str, str]]:
+def fingerprint_of(value: Any) -> tuple[str, dict[str, str]]:
     """Hash of a value and of the code that it runs, equal in all processes that make it in the same way.
 
     Functions and classes of scripts and notebooks count with their bytecode and the global names that it uses, those of
@@ -35,26 +35,26 @@ def fingerprint(value: Any) -> tuple[str, dict[str, str]]:
         If it holds something that cannot be pickled.
     """
     met: dict[int, tuple[int, Any]] = {}
-    found = _fingerprint(value, met)
+    own = _hash_of(value, met)
     modules = [one for _, one in met.values() if isinstance(one, ModuleType)]
-    return found, {one.__name__: version for one in modules if (version := module_version(one))}
+    return own, {one.__name__: version for one in modules if (version := module_version(one))}
 
 
-def _fingerprint(value: Any, met: dict[int, tuple[int, Any]]) -> str:
-    """The same within a value; what was met before is named by its number, and kept, since identities are reused."""
+def _hash_of(value: Any, met: dict[int, tuple[int, Any]]) -> str:
+    """Hash of a value within another; what was met before has a number, and is kept, since identities are reused."""
     if type(value) in (type(None), bool, int, float, complex, str, bytes):
         words = [repr(value)]
     elif type(value) in (set, frozenset):
-        words = sorted(_fingerprint(one, dict(met)) for one in value)
+        words = sorted(_hash_of(one, dict(met)) for one in value)
     elif not isinstance(value, tuple) and id(value) in met:
         words = [f"again {met[id(value)][0]}"]
     else:
         met[id(value)] = len(met), value
         if type(value) is dict:
-            keys = {_fingerprint(key, dict(met)): key for key in value}
-            words = [word for name in sorted(keys) for word in (name, _fingerprint(value[keys[name]], met))]
+            keys = {_hash_of(key, dict(met)): key for key in value}
+            words = [word for name in sorted(keys) for word in (name, _hash_of(value[keys[name]], met))]
         else:
-            words = [part if k == 0 else _fingerprint(part, met) for k, part in enumerate(_parts(value))]
+            words = [part if k == 0 else _hash_of(part, met) for k, part in enumerate(_parts(value))]
     return hashlib.sha256("\0".join([type(value).__name__, *words]).encode()).hexdigest()[:16]
 
 

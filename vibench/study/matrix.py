@@ -102,7 +102,8 @@ def study_of_cell(cell: Cell, name: str, **settings: Any) -> Study:
         If a plugin of the cell is not installed, or the name is none of a study.
     """
     problem, dual, primal = (
-        _entry(plugin, label) for plugin, label in zip((cell.problem, cell.dual, cell.primal), cell.labels, strict=True)
+        _plugin_entry(plugin, label)
+        for plugin, label in zip((cell.problem, cell.dual, cell.primal), cell.labels, strict=True)
     )
     tolerances: dict[str, Any] = dict([_stop("pod", "N", cell.pod), _stop("dual", "R", cell.cone)])
     if cell.primal_tol is not None:
@@ -126,7 +127,7 @@ def study_of_cell(cell: Cell, name: str, **settings: Any) -> Study:
     return Study(**content, **settings)
 
 
-def _entry(plugin: Plugin, label: str) -> Any:
+def _plugin_entry(plugin: Plugin, label: str) -> Any:
     given = plugin.registered
     name = given.given if isinstance(given, GivenPlugin) else plugin.name
     return {"name": name, "label": label, "options": json.loads(plugin.options)}
@@ -134,7 +135,7 @@ def _entry(plugin: Plugin, label: str) -> Any:
 
 def _entry_of_set(parameters: ParameterSet) -> Any:
     """The entry of a sampling strategy; `None` of a set of the problem itself."""
-    return None if parameters.sampling is None else _entry(parameters.sampling, parameters.label)
+    return None if parameters.sampling is None else _plugin_entry(parameters.sampling, parameters.label)
 
 
 def _stop(tolerance: str, size: str, stop: Stop) -> tuple[str, list[float] | list[int]]:
@@ -150,7 +151,7 @@ def only_cell(cells: Sequence[Cell], key: str, where: str) -> Cell:
     RequestError
         If there is none, or several.
     """
-    found = [cell for cell in cells if cell.key.startswith(key)]
-    if len(found) != 1:
-        raise RequestError(f"{len(found)} cells of {where} begin with '{key}', expected one")
-    return found[0]
+    matching = [cell for cell in cells if cell.key.startswith(key)]
+    if len(matching) != 1:
+        raise RequestError(f"{len(matching)} cells of {where} begin with '{key}', expected one")
+    return matching[0]

@@ -17,7 +17,7 @@ import cloudpickle
 
 from vibench.errors import RequestError, in_a_line, message_of
 from vibench.provenance import distribution_version
-from vibench.study.fingerprint import fingerprint, is_computed_again, is_importable, module_version
+from vibench.study.fingerprint import fingerprint_of, is_computed_again, is_importable, module_version
 from vibench.study.kinds import PluginKind
 from vibench.study.registry import RegisteredPlugin, find
 
@@ -58,7 +58,7 @@ class Plugin:
         return _given.get((self.kind, self.name, code)) or GivenPlugin(self.kind, self.name, (), code)
 
     def as_installed(self) -> Plugin:
-        """The same with the version of the code that is installed, and of the files its options name, now.
+        """The plugin with the version that its code and the files that its options name have now.
 
         Raises
         ------
@@ -184,15 +184,15 @@ def give(kind: PluginKind, name: str, given: Any) -> GivenPlugin:
     cls, base = given if isinstance(given, type) else type(given), kind.base
     assert base is not None  # plugins of the axes are classes
     if not issubclass(cls, base):
-        found = f"the class {cls.__name__}" if given is cls else f"a {cls.__name__}"
+        instead = f"the class {cls.__name__}" if given is cls else f"a {cls.__name__}"
         raise RequestError(
-            f"{kind}: expected a name, or a class or an object of vibench.{base.__name__}, found {found}"
+            f"{kind}: expected a name, or a class or an object of vibench.{base.__name__}, found {instead}"
         )
     try:
         kept = given if given is cls else copy.deepcopy(_without_cache(given))
         _Pickler(file := io.BytesIO()).dump(kept)
         needs = {one: distribution_version(one) for one in getattr(cls, "requires", ())}
-        code, modules = fingerprint([kept, needs])
+        code, modules = fingerprint_of([kept, needs])
     except Exception as error:  # noqa: BLE001  pickling runs third-party code
         raise RequestError(
             f"the {kind} '{name}' cannot be sent to worker processes: {message_of(error)}; keep such objects out of "

@@ -89,8 +89,8 @@ def _anchor_options(entry: dict[str, Any], folder: Path) -> None:
     given = entry.get("options")
     for options in (entry, given if isinstance(given, dict) else {}):
         plugin = find(SAMPLING, str(entry.get("name")))
-        known = plugin.options if plugin.entries and not plugin.conflict else {}
-        for name in (name for name, option in known.items() if option.annotation is Path):
+        options_of = plugin.options if plugin.entries and not plugin.conflict else {}
+        for name in (name for name, option in options_of.items() if option.annotation is Path):
             if isinstance(options.get(name), str):
                 options[name] = str(folder / options[name])
 
@@ -103,7 +103,9 @@ def _replace_axes(content: dict[str, Any], given: Mapping[str, list[Any]]) -> di
     tables = content.get("tolerances")
     if isinstance(tables, list) and all(isinstance(table, dict) for table in tables):
         primal = content.get("primal")
-        names = [_title(entry) for entry in primal if _takes_tolerance(entry)] if isinstance(primal, list) else []
+        names = (
+            [_title_of_entry(entry) for entry in primal if _takes_tolerance(entry)] if isinstance(primal, list) else []
+        )
         for table in tables:
             for key, tolerance, size in (("pod", "pod", "N"), ("dual_tol", "dual", "R")):
                 if key in given:
@@ -114,7 +116,7 @@ def _replace_axes(content: dict[str, Any], given: Mapping[str, list[Any]]) -> di
     return content
 
 
-def _title(entry: Any) -> str:
+def _title_of_entry(entry: Any) -> str:
     return str(entry.get("label", entry.get("name")) if isinstance(entry, dict) else entry)
 
 

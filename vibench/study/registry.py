@@ -191,10 +191,12 @@ class RegisteredPlugin:
 
     def canonical_options(self, given: Mapping[str, Any]) -> str:
         """Checked options as canonical JSON, without those that equal their default."""
-        from vibench.study.options import as_json
+        from vibench.study.options import options_as_json
 
         checked, options = self.check_options(given), {} if self.conflict else self.options
-        return as_json({name: v for name, v in checked.items() if name not in options or v != options[name].preset})
+        return options_as_json(
+            {name: v for name, v in checked.items() if name not in options or v != options[name].preset}
+        )
 
     def data_digest(self, options: Mapping[str, Any]) -> str:
         """Digest of the files that it reads with these options, "" if it reads none, or cannot be made here.
@@ -233,7 +235,7 @@ def registered(kind: PluginKind) -> dict[str, RegisteredPlugin]:
     return {name: RegisteredPlugin(kind, name, tuple(entries.values())) for name, entries in sorted(named.items())}
 
 
-def named(text: str, kinds: Mapping[str, PluginKind], solvers: Sequence[str]) -> RegisteredPlugin:
+def find_named(text: str, kinds: Mapping[str, PluginKind], solvers: Sequence[str]) -> RegisteredPlugin:
     """The plugin that NAME or KIND:NAME refers to, of kinds by their names on the command line.
 
     QP solvers are those that are installed (`installed_solvers`), whether they are plugins or not.
@@ -296,7 +298,7 @@ def _readable() -> tuple[tuple[EntryPoint, ...], dict[str, str]]:
     readable: dict[str, tuple[EntryPoint, ...]] = {}
     broken: dict[str, str] = {}
     for distribution in importlib.metadata.distributions():
-        name = _name(distribution)
+        name = _distribution_name(distribution)
         if name in readable or name in broken:  # the first on the path is the one that is imported
             continue
         try:
@@ -306,7 +308,7 @@ def _readable() -> tuple[tuple[EntryPoint, ...], dict[str, str]]:
     return tuple(entry for entries in readable.values() for entry in entries), broken
 
 
-def _name(distribution: Distribution) -> str:
+def _distribution_name(distribution: Distribution) -> str:
     """The normalised name: from that of its folder, as importlib.metadata does, since METADATA is long to read."""
     try:
         return str(getattr(distribution, "_normalized_name", None) or distribution.metadata["Name"])

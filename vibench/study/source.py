@@ -30,7 +30,7 @@ def _definitions(module: str, name: str, below: tuple[tuple[str, str], ...] = ()
     """
     if (module, name) in below or (below and module.partition(".")[0] != below[0][0].partition(".")[0]):
         return
-    tree = _parsed(module)
+    tree = _syntax_tree(module)
     classes = [node for node in tree.body if isinstance(node, ast.ClassDef) and node.name == name]
     yield from classes
     origins = [(module, base.id) for node in classes for base in node.bases if isinstance(base, ast.Name)]
@@ -41,7 +41,7 @@ def _definitions(module: str, name: str, below: tuple[tuple[str, str], ...] = ()
         yield from _definitions(*origin, (*below, (module, name)))
 
 
-def _parsed(module: str) -> ast.Module:
+def _syntax_tree(module: str) -> ast.Module:
     try:
         spec = importlib.util.find_spec(module)
         return ast.parse(Path(str(spec.origin)).read_bytes() if spec is not None else b"")

@@ -123,10 +123,10 @@ def _meant_for(values: Any, entry: Entry, key: str) -> list[Any]:
     """The values for one entry: of a table those under its label or name, of a list all."""
     if not isinstance(values, dict):
         return list(values)
-    found = values.get(entry.title, values.get(entry.name))
-    if found is None:
+    own = values.get(entry.title, values.get(entry.name))
+    if own is None:
         raise RequestError(f"{key} gives nothing for '{entry.title}', which takes a tolerance")
-    return list(found)
+    return list(own)
 
 
 class Limits(_Model):
@@ -278,10 +278,10 @@ def _check_tolerances(study: Study, table: ToleranceTable) -> None:
         (PRIMAL, study.primal, table.primal),
     ):
         # A tolerance may name a plugin that an option of the command line removed from the axis.
-        known = {name for entry in axis for name in (entry.name, entry.title)}
+        names = {name for entry in axis for name in (entry.name, entry.title)}
         for name in tolerances if isinstance(tolerances, dict) else ():
-            if name not in known and name not in registered(kind):
-                raise unknown_name(f"{kind} of this study", name, known)
+            if name not in names and name not in registered(kind):
+                raise unknown_name(f"{kind} of this study", name, names)
     for entry in study.dual:
         table.of_dual(entry)
     for entry in study.primal:

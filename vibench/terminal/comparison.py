@@ -25,33 +25,33 @@ PRIORITY = (
 """Columns of the tables, those that matter most first."""
 
 
-def print_changes(found: Comparison, limit: float) -> None:
+def print_changes(compared: Comparison, limit: float) -> None:
     """Print what changed between runs, the worst first, and how many changes there are."""
-    changes = readable(_by_weight(found.changes))
+    changes = readable(_by_weight(compared.changes))
     if len(changes):
-        names = [run.name for run in found.runs]
+        names = [run.name for run in compared.runs]
         title = " → ".join(names) if len(names) == 2 else f"changes from {names[0]}"
-        print_frame(changes.head(MOST).drop(columns=_pair_columns(found)), title, PRIORITY, rest=REST)
+        print_frame(changes.head(MOST).drop(columns=_pair_columns(compared)), title, PRIORITY, rest=REST)
     if len(changes) > MOST:
         echo(f"{len(changes) - MOST} more changes: `{REST}` lists all of them")
-    echo(*found.notes, f"{len(changes)} changes beyond a factor of {limit:g}, {found.regressions} for the worse")
+    echo(*compared.notes, f"{len(changes)} changes beyond a factor of {limit:g}, {compared.regressions} for the worse")
 
 
-def print_comparison(found: Comparison, limit: float) -> None:
+def print_comparison(compared: Comparison, limit: float) -> None:
     """Print the runs, what moved by column, and the changes."""
-    print_frame(found.by_run, "runs", PRIORITY, every=True, rest=REST)
+    print_frame(compared.by_run, "runs", PRIORITY, every=True, rest=REST)
     echo("")
-    names = [run.name for run in found.runs]
+    names = [run.name for run in compared.runs]
     title = f"{names[1]} against {names[0]}" if len(names) == 2 else f"against {names[0]}"
-    columns = readable(_with_counts(found.by_column))
-    print_frame(columns.drop(columns=_pair_columns(found)), f"cells by column, {title}", PRIORITY, rest=REST)
+    columns = readable(_with_counts(compared.by_column))
+    print_frame(columns.drop(columns=_pair_columns(compared)), f"cells by column, {title}", PRIORITY, rest=REST)
     echo("")
-    print_changes(found, limit)
+    print_changes(compared, limit)
 
 
-def print_table(found: Comparison, frame: pd.DataFrame, title: str) -> None:
+def print_table(compared: Comparison, frame: pd.DataFrame, title: str) -> None:
     """Print one table of a comparison; what it says of each run, in a column of its own, matters most."""
-    print_frame(frame, title, [*(run.name for run in found.runs), *PRIORITY], rest=REST)
+    print_frame(frame, title, [*(run.name for run in compared.runs), *PRIORITY], rest=REST)
 
 
 def readable(frame: pd.DataFrame) -> pd.DataFrame:
@@ -63,9 +63,9 @@ def readable(frame: pd.DataFrame) -> pd.DataFrame:
     return shown.rename(columns={"farthest_ratio": "farthest ratio"})
 
 
-def _pair_columns(found: Comparison) -> list[str]:
+def _pair_columns(compared: Comparison) -> list[str]:
     """Columns that name the runs of a pair, where there is one pair, which the title names."""
-    return ["run", "against"] if len(found.runs) == 2 else []
+    return ["run", "against"] if len(compared.runs) == 2 else []
 
 
 def _with_counts(by_column: pd.DataFrame) -> pd.DataFrame:

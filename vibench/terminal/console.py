@@ -36,10 +36,10 @@ LONG = 60
 def new_console() -> Console:
     """A console for the standard output, which takes no text for markup."""
     columns = os.environ.get("COLUMNS", "")
-    known = POSITIVE.fullmatch(columns) is not None
-    environment = {name: value for name, value in os.environ.items() if known or name != "COLUMNS"}
+    prescribed = POSITIVE.fullmatch(columns) is not None
+    environment = {name: value for name, value in os.environ.items() if prescribed or name != "COLUMNS"}
     console = Console(highlight=False, markup=False, emoji=False, _environ=environment)
-    if not console.is_terminal and not known:
+    if not console.is_terminal and not prescribed:
         console.width = WIDTH
     return console
 
@@ -164,7 +164,7 @@ class PrintedColumn:
 
 
 def _fitting(columns: Sequence[PrintedColumn], width: int) -> list[PrintedColumn]:
-    """Those columns, the first at least, that find room one after the other."""
+    """The columns that fit a width one after the other, the first in any case."""
     kept: list[PrintedColumn] = []
     left = width + 1  # no blank after the last one
     for column in columns:

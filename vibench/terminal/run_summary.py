@@ -76,9 +76,9 @@ def failures(not_ok: Rows) -> Iterator[str]:
 
 def reasons(rows: Rows) -> str:
     """The reasons of cells, each once."""
-    found = list(dict.fromkeys(str(row["reason"]) for row in rows))
-    more = [f"{len(found) - REASONS} other reasons"] if len(found) > REASONS else []
-    return "; ".join([*found[:REASONS], *more])
+    distinct = list(dict.fromkeys(str(row["reason"]) for row in rows))
+    more = [f"{len(distinct) - REASONS} other reasons"] if len(distinct) > REASONS else []
+    return "; ".join([*distinct[:REASONS], *more])
 
 
 def kind_of_failure(row: Mapping[str, Any]) -> tuple[str, str]:

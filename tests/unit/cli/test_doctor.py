@@ -12,7 +12,7 @@ from running import Main, Register
 
 from vibench import provenance
 from vibench.cli import doctor
-from vibench.cli.doctor import Finding, Health
+from vibench.cli.doctor import Diagnosis, Health
 from vibench.errors import RequestError
 from vibench.execution.solver_trials import Trial
 from vibench.qp.settings import SETTINGS
@@ -33,7 +33,7 @@ def trials(monkeypatch: pytest.MonkeyPatch) -> dict[str, Trial]:
     return found
 
 
-def by_subject(findings: list[Finding]) -> dict[str, Finding]:
+def by_subject(findings: list[Diagnosis]) -> dict[str, Diagnosis]:
     return {finding.subject: finding for finding in findings}
 
 
@@ -70,14 +70,14 @@ class TestSolvers:
         self, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         self._without("ecos", "", monkeypatch)
-        found = by_subject(list(doctor.solvers()))
+        found = by_subject(list(doctor.check_solvers()))
         assert set(found) >= set(SETTINGS)
         assert found["ecos"].health is Health.NOTE
-        assert "'vibench[solvers]'" in found["ecos"].found
+        assert "'vibench[solvers]'" in found["ecos"].text
 
     def test_one_that_vibench_needs_is_broken_without_it(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self._without("osqp", "", monkeypatch)
-        assert by_subject(list(doctor.solvers()))["osqp"].health is Health.BROKEN
+        assert by_subject(list(doctor.check_solvers()))["osqp"].health is Health.BROKEN
 
     def test_one_that_cannot_be_imported_is_broken_with_the_reason(
         self, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
@@ -86,9 +86,9 @@ class TestSolvers:
         monkeypatch.syspath_prepend(str(tmp_path))
         monkeypatch.delitem(sys.modules, "ecos", raising=False)
         self._without("ecos", "2.0.14", monkeypatch)
-        found = by_subject(list(doctor.solvers()))["ecos"]
+        found = by_subject(list(doctor.check_solvers()))["ecos"]
         assert found.health is Health.BROKEN
-        assert "ImportError: built for another NumPy" in found.found
+        assert "ImportError: built for another NumPy" in found.text
 
     @staticmethod
     def _without(solver: str, version: str, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -99,7 +99,7 @@ class TestSolvers:
 
 
 def test_what_vibench_needs_and_what_is_for_extras_is_read_from_its_metadata() -> None:
-    found = doctor.requirements()
+    found = doctor.required_distributions()
     assert found["numpy"] == found["qpsolvers"] == []
     assert found["daqp"] == ["solvers"]
     assert found["cvxopt"] == ["solvers", "test"]
@@ -108,9 +108,9 @@ def test_what_vibench_needs_and_what_is_for_extras_is_read_from_its_metadata() -
 def test_a_library_that_is_missing_is_broken(monkeypatch: pytest.MonkeyPatch) -> None:
     known = provenance.distribution_version
     monkeypatch.setattr(provenance, "distribution_version", lambda name: "" if name == "scipy" else known(name))
-    found = by_subject(list(doctor.versions()))
+    found = by_subject(list(doctor.check_versions()))
     assert found["scipy"].health is Health.BROKEN
-    assert f"numpy {importlib.metadata.version('numpy')}" in found["libraries"].found
+    assert f"numpy {importlib.metadata.version('numpy')}" in found["libraries"].text
 
 
 def test_every_plugin_that_does_not_load_has_a_line_with_the_reason(register: Register, tmp_path: Path) -> None:
@@ -122,9 +122,9 @@ def test_every_plugin_that_does_not_load_has_a_line_with_the_reason(register: Re
         ("vibench.studies", "wrong", "test_doctor:WRONG"),
     )
     globals()["WRONG"] = tmp_path / "wrong.toml"
-    found = by_subject(list(doctor.plugins()))
-    assert found["problem"] == Finding("problem", "fine")
-    broken = {subject: finding.found for subject, finding in found.items() if finding.health is Health.BROKEN}
+    found = by_subject(list(doctor.check_plugins()))
+    assert found["problem"] == Diagnosis("problem", "fine")
+    broken = {subject: finding.text for subject, finding in found.items() if finding.health is Health.BROKEN}
     assert set(broken) == {"problem 'gone'", "problem 'no-problem'", "study 'wrong'"}
     assert "no_such_module" in broken["problem 'gone'"]
     assert "not a subclass" in broken["problem 'no-problem'"]
@@ -147,9 +147,9 @@ def test_the_error_of_a_plugin_is_no_markup_and_no_escape_sequence(
 
 def test_a_name_that_two_packages_register_is_broken_and_stops_nothing(register: Register) -> None:
     register(("vibench.qp_solvers", "mine", "one:solve"), ("vibench.qp_solvers", "mine", "other:solve"))
-    found = by_subject(list(doctor.plugins()))
+    found = by_subject(list(doctor.check_plugins()))
     assert found["QP solver 'mine'"].health is Health.BROKEN
-    assert "two packages" in found["QP solver 'mine'"].found
+    assert "two packages" in found["QP solver 'mine'"].text
     assert "problem" in found
 
 
@@ -166,13 +166,13 @@ class TestDisk:
             raise RequestError(f"'{path}' cannot be locked: No locks available")
 
         monkeypatch.setattr(doctor, "locked", locked)
-        found = by_subject(list(doctor.disk(tmp_path)))["runs"]
+        found = by_subject(list(doctor.check_disk(tmp_path)))["runs"]
         assert found.health is Health.BROKEN
-        assert "No locks available" in found.found
+        assert "No locks available" in found.text
 
     def test_little_room_is_a_note(self, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
         monkeypatch.setattr("shutil.disk_usage", lambda _: SimpleNamespace(free=2**28))
-        assert by_subject(list(doctor.disk(tmp_path / "new")))["runs"] == Finding(
+        assert by_subject(list(doctor.check_disk(tmp_path / "new")))["runs"] == Diagnosis(
             "runs", f"{tmp_path / 'new'}: 0.2 GiB free", Health.NOTE
         )
 
@@ -181,10 +181,10 @@ class TestDisk:
     ) -> None:
         monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path / "cache"))
         Store(default_folder()).put("pod-1", "x" * 2**20, NO_TIME, ())
-        found = by_subject(list(doctor.disk(tmp_path)))
-        assert found["stored"].found.startswith("1 artefacts, 1.0 MiB")
-        assert CACHE_VARIABLE in found["artefact folder"].found
-        assert str(tmp_path / "cache" / "artefacts") in found["artefacts"].found
+        found = by_subject(list(doctor.check_disk(tmp_path)))
+        assert found["stored"].text.startswith("1 artefacts, 1.0 MiB")
+        assert CACHE_VARIABLE in found["artefact folder"].text
+        assert str(tmp_path / "cache" / "artefacts") in found["artefacts"].text
 
 
 class TestTimings:
@@ -199,10 +199,10 @@ class TestTimings:
         monkeypatch.setattr(doctor, "Stopwatch", _SecondOfWork)
         monkeypatch.setattr("os.cpu_count", lambda: 2)
         monkeypatch.setattr(doctor.Calibration, "slowdown", lambda _: slowdown)
-        found = by_subject(list(doctor.timings()))
+        found = by_subject(list(doctor.check_timings()))
         assert [subject for subject in found if found[subject].health is Health.NOTE][:-1] == doubts
-        assert f"{others:.1f} of 2 cores" in found["other load"].found
-        assert ("can be trusted" in found["verdict"].found) is not bool(doubts)
+        assert f"{others:.1f} of 2 cores" in found["other load"].text
+        assert ("can be trusted" in found["verdict"].text) is not bool(doubts)
 
     def test_the_machine_that_works_is_seen_to_work(self) -> None:
         before = doctor._busy_seconds()

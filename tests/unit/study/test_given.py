@@ -22,7 +22,7 @@ from vibench.errors import RequestError
 from vibench.study import fingerprint as fingerprint_module
 from vibench.study import plugin as module
 from vibench.study.cells import Cell
-from vibench.study.fingerprint import fingerprint
+from vibench.study.fingerprint import fingerprint_of
 from vibench.study.kinds import PROBLEM
 from vibench.study.matrix import expand, study_of_cell
 from vibench.study.plugin import give
@@ -74,7 +74,7 @@ def notebook(source: str = SOURCE, cell: str = "<cell 1>") -> dict[str, Any]:
 
 
 def hashed(source: str = SOURCE, what: str = "Shape()") -> str:
-    return fingerprint(eval(what, notebook(source)))[0]
+    return fingerprint_of(eval(what, notebook(source)))[0]
 
 
 EDITS = {
@@ -115,15 +115,15 @@ def test_a_class_and_its_objects_differ_and_what_they_compute_on_demand_does_not
     names = notebook()
     used = names["Shape"]()
     assert used.area == 10.0
-    assert fingerprint(used) == fingerprint(names["Shape"]())
-    assert len({fingerprint(one)[0] for one in (used, names["Shape"], names["Shape"](6))}) == 3
+    assert fingerprint_of(used) == fingerprint_of(names["Shape"]())
+    assert len({fingerprint_of(one)[0] for one in (used, names["Shape"], names["Shape"](6))}) == 3
 
 
 def test_processes_with_other_hash_seeds_agree(tmp_path: Path) -> None:
     """A script, `__main__`, and here a cell of a notebook in another file: one class, one fingerprint."""
     script = tmp_path / "script.py"
     script.write_text(
-        f"{dedent(SOURCE)}\nfrom vibench.study.fingerprint import fingerprint\nprint(fingerprint(Shape())[0])\n"
+        f"{dedent(SOURCE)}\nfrom vibench.study.fingerprint import fingerprint_of\nprint(fingerprint_of(Shape())[0])\n"
     )
     seeds = ({"PYTHONHASHSEED": seed} for seed in ("1", "2"))
     run = [sys.executable, str(script)]
