@@ -9,7 +9,7 @@ import os
 import statistics
 import subprocess
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -140,6 +140,17 @@ def test_where_all_fail_there_is_a_file_of_none(main: Main, tmp_path: Path) -> N
     path = tmp_path / "file.json"
     path.write_bytes(files.written(benchmarks, results.passes))
     assert main("bench", "--read", str(path))[:2] == (0, "0 benchmarks; times are CPU times of a call on one thread\n")
+
+
+def test_a_benchmark_that_hangs_costs_itself(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(install_fakes(tmp_path / "site"))  # where the watched process finds them registered
+    told, problems = list[str](), [cases.TimedProblem(name, None) for name in ("wire-sleeps", "wire")]
+    benchmarks = [running.Benchmark("high_fidelity_solution", problem, ()) for problem in problems]
+    setting = replace(cases.setting("quick"), seconds=5.0)
+    results = running.run_benchmarks(benchmarks, setting, 0.001, told.append)
+    assert results.failed == {benchmarks[0].name: "stopped after 5 s"}
+    assert results.passes.keys() == {benchmarks[1].name}
+    assert f"[2/2] failed: {benchmarks[0].name}: stopped after 5 s" in told
 
 
 def test_the_file_says_where_it_was_measured(third_party: Timed) -> None:

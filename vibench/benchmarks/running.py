@@ -29,6 +29,7 @@ from vibench.benchmarks.online import ONLINE, LeftOutError
 from vibench.errors import VibenchError
 from vibench.execution.watched import WatchedWork, watched
 from vibench.qp.solve import installed_solvers
+from vibench.qp.status import Status
 from vibench.stages.base import Failed
 from vibench.study.kinds import DUAL, PRIMAL, PROBLEM, SOLVER
 from vibench.study.registry import registered
@@ -142,7 +143,9 @@ class TimedBenchmarks(WatchedWork):
     def instead(self, number: int, failed: Failed) -> Turn:
         """Why a benchmark failed."""
         turn, which = divmod(number, len(self.benchmarks))
-        return Turn(self.benchmarks[which].name, turn, failed=failed.reason)
+        late = failed.status is Status.TIMEOUT
+        reason = f"stopped after {self.setting.seconds:g} s" if late else failed.reason
+        return Turn(self.benchmarks[which].name, turn, failed=reason)
 
 
 class BenchmarkResults:
@@ -160,15 +163,13 @@ class BenchmarkResults:
         self.passes: dict[str, list[PassTimes]] = {}
         self.failed, self.left_out = dict[str, str](), dict[str, str]()
         self._count, self._show = count, show
-        self._told: set[tuple[str, int]] = set()
+        self._ended: set[str] = set()
         self._pass = 0
 
     def take(self, turn: Turn) -> None:
-        """Note how a benchmark ended in its pass, unless that was told before."""
-        if (turn.name, turn.number) in self._told:
-            return
-        self._told.add((turn.name, turn.number))
-        ended = f"[{len({name for name, _ in self._told})}/{self._count}]"
+        """Note how a benchmark ended in its pass."""
+        self._ended.add(turn.name)
+        ended = f"[{len(self._ended)}/{self._count}]"
         if turn.failed:
             self.failed[turn.name] = turn.failed
             self._show(f"{ended} failed: {turn.name}: {turn.failed}")
@@ -209,6 +210,4 @@ def run_benchmarks(
     turns = watched(work, setting.seconds, results.take, in_all=setting.seconds * work.pieces)
     if isinstance(turns, Failed):
         raise VibenchError(f"the process of the benchmarks failed: {turns.reason}")
-    for turn in turns:
-        results.take(turn)
     return results

@@ -41,24 +41,24 @@ class WatchedWork(PiecewiseStage, Pieces):
         """Nothing to prepare."""
         return self
 
-    def resume(self, done: Mapping[int, Any]) -> None:
+    def resume(self, done: Mapping[int, tuple[int, Any]]) -> None:
         """Keep the values of the items that another process did."""
-        self._done.update(done)
+        self._done.update(done.values())
 
-    def piece(self, number: int, watch: Callable[[bool], None]) -> Any:
-        """Do an item under its time limit."""
+    def piece(self, number: int, watch: Callable[[bool], None]) -> tuple[int, Any]:
+        """Do an item under its time limit; gives its number and value."""
         watch(True)
         self._done[number] = self.do(number, self._done)
-        return self._done[number]
+        return number, self._done[number]
 
-    def lost(self, number: int, failed: Failed) -> Any:
-        """Keep what stands for the value of an item that failed."""
+    def lost(self, number: int, failed: Failed) -> tuple[int, Any]:
+        """Keep what stands for the value of an item that failed; gives its number and that."""
         self._done[number] = self.instead(number, failed)
-        return self._done[number]
+        return number, self._done[number]
 
-    def finish(self, pieces: Sequence[Any]) -> list[Any]:
+    def finish(self, pieces: Sequence[tuple[int, Any]]) -> list[Any]:
         """The values of all items."""
-        return list(pieces)
+        return [value for _, value in pieces]
 
 
 def watched(
@@ -78,7 +78,7 @@ def watched(
     seconds
         Time limit of an item; wall seconds.
     observe
-        Gets the values of items as soon as they are there, but for those of items that ended the process.
+        Gets the values of items as soon as they are there; those of items that ended the process come last.
     in_all
         Time limit of all items together; by default that of an item.
     supervisor
@@ -89,13 +89,22 @@ def watched(
     list or Failed
         The values of all items, or why none could be done.
     """
+    told: set[int] = set()
+
+    def tell(item: tuple[int, Any]) -> None:
+        told.add(item[0])
+        observe(item[1])
+
     job = Job("", work, seconds, max(in_all or seconds, 1.0), Limits().memory_gib)
     if supervisor is None:
         with closing(Supervisor()) as own:
-            answer = own.run(job, observe)
+            answer = own.run(job, tell)
     else:
-        answer = supervisor.run(job, observe)
-    if isinstance(answer, Done):
-        values: list[Any] = answer.value
-        return values
-    return Failed(answer.status if isinstance(answer, Failed) else Status.ERROR, answer.reason)
+        answer = supervisor.run(job, tell)
+    if not isinstance(answer, Done):
+        return Failed(answer.status if isinstance(answer, Failed) else Status.ERROR, answer.reason)
+    values: list[Any] = answer.value
+    for number, value in enumerate(values):
+        if number not in told:
+            observe(value)
+    return values

@@ -84,10 +84,10 @@ class Examination(WatchedWork):
         name, late = self.conformance.checks[number].name, failed.status is Status.TIMEOUT
         return CheckResult(name, Verdict.SKIPPED, LATE) if late else CheckResult(name, Verdict.FAILED, failed.reason)
 
-    def finish(self, pieces: Sequence[CheckResult]) -> list[CheckResult]:
+    def finish(self, pieces: Sequence[tuple[int, CheckResult]]) -> list[CheckResult]:
         """All results; the first check that had no time left has failed, those after it are skipped together."""
-        results = [result for result in pieces if result.message != LATE]
-        late = [result.check for result in pieces if result.message == LATE]
+        results = [result for _, result in pieces if result.message != LATE]
+        late = [result.check for _, result in pieces if result.message == LATE]
         if late:
             reason = f"stopped: the checks take longer than {self.seconds:g} s"
             results.append(CheckResult(late[0], Verdict.FAILED, reason))
@@ -101,18 +101,10 @@ LATE = "no time is left"
 
 def examine_in_process(examination: Examination, observe: Callable[[CheckResult], None]) -> list[CheckResult]:
     """Make the checks in a watched process; `observe` is called with every result as soon as it is there."""
-    told: list[CheckResult] = []
-
-    def tell(result: CheckResult) -> None:
-        told.append(result)
-        observe(result)
-
-    results = watched(examination, examination.seconds, tell)
+    results = watched(examination, examination.seconds, observe)
     if isinstance(results, Failed):
         results = [CheckResult("all", Verdict.FAILED, results.reason)]
-    for result in results:
-        if result not in told:
-            tell(result)
+        observe(results[0])
     return results
 
 
