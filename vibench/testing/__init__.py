@@ -42,7 +42,7 @@ __all__ = [
 
 
 def __getattr__(name: str) -> Any:
-    """Import the checks of figures when they are first asked for: they load pandas."""
+    """Import the checks of figures when they are first asked for: they load pandas and matplotlib."""
     if name in ("check_figure", "examine_figure"):
         return getattr(import_module("vibench.testing.figures").FIGURE, name.removesuffix("_figure"))
     raise AttributeError(f"module 'vibench.testing' has no attribute {name!r}")

@@ -10,19 +10,18 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property, partial
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import pandas as pd
 
 from vibench.interfaces.figures import EXTENSIBLE, DerivedColumn, FigurePlugin
+from vibench.report.figures.data import Data, problems
+from vibench.report.figures.plugins import draw_guarded, named
+from vibench.report.figures.style import caption_of, styled
 from vibench.results import tables
 from vibench.results.plugin_columns import Copies, column_values, declared, name_faults
 from vibench.testing.case import Examined
 from vibench.testing.checks import Check, Conformance, Doubt, Note
 from vibench.testing.sample_run import write_sample_run
-
-if TYPE_CHECKING:
-    from vibench.report.figures.data import Data
 
 NAME = "examined"
 """What the plugin is called in messages of the functions that draw."""
@@ -71,8 +70,6 @@ class FigureCase(Examined[FigurePlugin]):
     @cached_property
     def problems(self) -> list[Data]:
         """The tables of every problem of the run."""
-        from vibench.report.figures.data import problems  # noqa: PLC0415  loads matplotlib
-
         return [data for _, data in problems(self.path)]
 
     @cached_property
@@ -90,17 +87,12 @@ class FigureCase(Examined[FigurePlugin]):
 
     def drawings(self) -> Iterator[str]:
         """Every problem has figures, as functions by the ends of their names."""
-        from vibench.report.figures.plugins import named  # noqa: PLC0415  loads matplotlib
-
         for data in self.problems:
             kinds = [kind for kind, _ in named(NAME, self.plugin, data)]
             yield Note(f"{data.problem}: {len(kinds)} figures")
 
     def figures(self) -> Iterator[str]:
         """Every figure is drawn or has nothing to show, has a caption, and changes no table."""
-        from vibench.report.figures.plugins import draw_guarded, named  # noqa: PLC0415  loads matplotlib
-        from vibench.report.figures.style import caption_of, styled  # noqa: PLC0415  likewise
-
         drawn = 0
         for data in self.problems:
             before = _frames(data)
@@ -132,8 +124,6 @@ class FigureCase(Examined[FigurePlugin]):
 
     def determinism(self) -> Iterator[str]:
         """A second call and another instance give the same figures and columns."""
-        from vibench.report.figures.plugins import named  # noqa: PLC0415  loads matplotlib
-
         other = self.create()
         for data in self.problems:
             here, there = ([kind for kind, _ in named(NAME, plugin, data)] for plugin in (self.plugin, other))
