@@ -27,13 +27,10 @@ def import_pack(folder: Folder) -> None:
 
     One line names the first thing that is wrong, and what was probably meant.
     """
-    from vibench.packs.checks import check_pack
-    from vibench.packs.reader import naming, read_pack
+    from vibench.packs.checks import read_model_pack
 
-    pack = read_pack(folder)
-    with naming(folder):
-        residual = check_pack(pack)
-    echo(*_description(pack, residual), *_uses(pack, folder))
+    pack = read_model_pack(folder)
+    echo(*_description(pack), *_uses(pack, folder))
 
 
 def pack_problem(
@@ -108,7 +105,7 @@ def reduce_cones(
     echo(f"table: {table}, figures: {', '.join(map(str, drawn))}")
 
 
-def _description(pack: ModelPack, residual: float | None) -> Iterator[str]:
+def _description(pack: ModelPack) -> Iterator[str]:
     """What a pack holds."""
     manifest, d = pack.manifest, pack.box.dim
     yield f"{manifest.name or 'model pack'}{': ' * bool(manifest.description)}{manifest.description}"
@@ -118,9 +115,8 @@ def _description(pack: ModelPack, residual: float | None) -> Iterator[str]:
     count = "drawn at random in the box" if pack.validation is None else f"{len(pack.validation)} listed"
     yield f"  training parameters: {len(pack.training)}, validation parameters: {count}"
     if pack.reference is not None:
-        checked = (
-            "not checked, for want of u or operators" if residual is None else f"KKT residuals up to {residual:.0e}"
-        )
+        worst = pack.residual
+        checked = "not checked, for want of u or operators" if worst is None else f"KKT residuals up to {worst:.0e}"
         yield f"  reference solutions: {pack.reference.lam.shape[1]}, {checked}"
 
 

@@ -15,8 +15,9 @@ from vibench.errors import NumericalError, RequestError
 from vibench.interfaces.problem import MEMBERS, VariationalInequality
 from vibench.linalg.cholesky import SparseCholesky
 from vibench.linalg.inner_product import InnerProduct, asymmetry
+from vibench.packs.manifest import read_manifest
 from vibench.packs.pack import ModelPack, PackSolutions
-from vibench.packs.reader import naming, one_triangle, read_pack
+from vibench.packs.reader import PackReader, naming, one_triangle
 from vibench.qp.verification import kkt_residuals
 
 FACTORISED = 3
@@ -40,22 +41,15 @@ def read_model_pack(path: str | Path) -> ModelPack:
     Raises
     ------
     RequestError
-        Naming what is wrong, and what would be right.
+        Naming what is wrong in the manifest or with an array, what was probably meant, and what would be right.
     """
-    pack = read_pack(path)
-    with naming(path):
-        check_pack(pack)
-    return pack
+    with naming(path) as folder:
+        pack = PackReader(folder, read_manifest(folder)).pack()
+        return replace(pack, residual=_check(pack))
 
 
-def check_pack(pack: ModelPack) -> float | None:
-    """Check a pack beyond its shapes; returns the largest KKT residual of its reference solutions, if it has any.
-
-    Raises
-    ------
-    RequestError
-        Naming the property that is violated and what was probably meant.
-    """
+def _check(pack: ModelPack) -> float | None:
+    """Check a pack beyond its shapes; returns the largest KKT residual of its reference solutions, if it has any."""
     if pack.V is not None:
         try:
             _check_operators(pack, pack.V.matrix)

@@ -147,7 +147,7 @@ class PackMesh:
 
 @dataclass(frozen=True)
 class ModelPack:
-    """A model pack, read into memory; sizes are checked, what its numbers mean is checked by `check_pack`.
+    """A model pack, read into memory and checked.
 
     Attributes
     ----------
@@ -171,6 +171,8 @@ class ModelPack:
         Data of pictures, or `None`.
     outputs
         Quantities of interest.
+    residual
+        Largest KKT residual of the reference solutions; `None` without, or without operators or u.
     """
 
     manifest: Manifest
@@ -185,6 +187,7 @@ class ModelPack:
     reference: PackSolutions | None
     mesh: PackMesh | None
     outputs: tuple[Output, ...] = ()
+    residual: float | None = None
 
     @property
     def constant(self) -> frozenset[str]:
@@ -256,7 +259,7 @@ def pack_multipliers(pack: ModelPack) -> tuple[Array, Array]:
     training = np.array([tuple(mu) in of_training for mu in pack.reference.parameters.tolist()])
     if not training.any():
         raise RequestError("none of the parameters of the solutions is a training parameter")
-    lam = np.maximum(pack.reference.lam, 0.0)  # what is negative is round-off, as `check_pack` has found
+    lam = np.maximum(pack.reference.lam, 0.0)  # what is negative is round-off, as checks of the pack have found
     return lam[:, training], lam[:, ~training]
 
 

@@ -26,23 +26,6 @@ from vibench.packs.manifest import FILE, Manifest, read_manifest
 from vibench.packs.pack import Listing, ModelPack, PackMember, PackMesh, PackSolutions, TabulatedTheta
 
 
-def read_pack(path: str | Path) -> ModelPack:
-    """Read a model pack.
-
-    Parameters
-    ----------
-    path
-        Its folder.
-
-    Raises
-    ------
-    RequestError
-        Naming what is wrong in the manifest or with an array, and what would be right.
-    """
-    with naming(path) as folder:
-        return _PackReader(folder, read_manifest(folder)).pack()
-
-
 def pack_digest(path: str | Path) -> str:
     """Digest of the manifest and of the files it names.
 
@@ -97,7 +80,7 @@ def naming(path: str | Path) -> Iterator[Path]:
         raise RequestError(f"pack '{path}': {error}") from None
 
 
-class _PackReader:
+class PackReader:
     """Reads the arrays of a manifest; every array is checked against the dimensions known so far."""
 
     def __init__(self, folder: Path, manifest: Manifest) -> None:
@@ -108,6 +91,7 @@ class _PackReader:
         self._free: Indices | None = None
 
     def pack(self) -> ModelPack:
+        """The pack; a `RequestError` names what is wrong with an array, and what would be right."""
         given, spaces, operators = self._manifest.parameters, self._manifest.spaces, self._manifest.operators
         solutions, mesh = self._manifest.solutions, self._manifest.mesh
         if operators is None and (solutions is None or spaces.free or mesh):
