@@ -43,17 +43,6 @@ def write_atomically(path: Path, content: bytes, *, durable: bool = False) -> No
         part.unlink(missing_ok=True)
 
 
-def open_unlinked(path: Path) -> int:
-    """Descriptor of a file for reading and writing, created if need be; symbolic links are refused.
-
-    Raises
-    ------
-    OSError
-        If it is a symbolic link, or cannot be opened.
-    """
-    return os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o666)
-
-
 @contextlib.contextmanager
 def locked(path: Path, *, busy: str, shared: bool = False) -> Iterator[None]:
     """Hold a lock file; the system releases it when the process ends.
@@ -66,7 +55,8 @@ def locked(path: Path, *, busy: str, shared: bool = False) -> Iterator[None]:
         With the text `busy` and the holder if another process holds the lock; if the file cannot be written.
     """
     try:
-        file = os.fdopen(open_unlinked(path), "r+", encoding="utf-8")
+        flags = os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC  # symbolic links are refused
+        file = os.fdopen(os.open(path, flags, 0o666), "r+", encoding="utf-8")
     except OSError as error:
         if path.is_symlink():
             raise RequestError(f"'{path}' is a symbolic link, expected a lock file of vibench") from None

@@ -5,7 +5,8 @@ from __future__ import annotations
 import contextlib
 import json
 import tempfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,8 @@ from vibench.interfaces.affine import AffineSum
 from vibench.interfaces.problem import MEMBERS, Problem
 from vibench.interfaces.validation import checked_assembly, training_parameters, validation_parameters
 from vibench.packs.manifest import FILE, VERSION
+
+_save_arrays: Callable[..., None] = partial(np.savez_compressed, allow_pickle=False)
 
 EXPLANATION = """\
 # u = argmin ½ uᵀA u − fᵀu subject to B u ≤ g, with A u + Bᵀλ = f and λ ≥ 0, on the free unknowns.
@@ -78,7 +81,7 @@ def _new_folder(folder: Path) -> Iterator[Path]:
 
 def _parameter_table(problem: Problem, training: int, listed: Array, part: Path) -> list[str]:
     box = problem.parameters
-    _save_arrays(part / "parameters.npz", {"training": listed[:training], "validation": listed[training:]})
+    _save_arrays(part / "parameters.npz", training=listed[:training], validation=listed[training:])
     return [
         "[parameters]",
         f"names = [{', '.join(map(_toml_text, box.names))}]",
@@ -92,7 +95,7 @@ def _parameter_table(problem: Problem, training: int, listed: Array, part: Path)
 
 
 def _space_table(problem: Problem, part: Path) -> list[str]:
-    arrays = _sparse_parts("X_V", problem.V.matrix) | _sparse_parts("X_W", problem.W.matrix)
+    arrays = _parts("X_V", problem.V.matrix) | _parts("X_W", problem.W.matrix)
     lines = ["[spaces]", 'X_V = "spaces.npz:X_V"', 'X_W = "spaces.npz:X_W"']
     if problem.contact_dofs is not None:
         arrays["contact"] = problem.contact_dofs
@@ -100,7 +103,7 @@ def _space_table(problem: Problem, part: Path) -> list[str]:
     if type(problem).multiplier_integrals is not Problem.multiplier_integrals:
         arrays["integrals"] = problem.multiplier_integrals()
         lines.append('integrals = "spaces.npz:integrals"')
-    _save_arrays(part / "spaces.npz", arrays)
+    _save_arrays(part / "spaces.npz", **arrays)
     return [*lines, ""]
 
 
@@ -112,7 +115,7 @@ def _operator_table(problem: Problem, listed: Array, part: Path) -> list[str]:
         vi = checked_assembly(problem, mu)
         for name in MEMBERS:
             if name not in problem.affine and (k == 0 or name not in problem.constant):
-                arrays[name] |= _array_or_parts(str(k), getattr(vi, name))
+                arrays[name] |= _parts(str(k), getattr(vi, name))
     entrywise = sorted((problem.entrywise | set(problem.affine)) - problem.constant)
     lines = ["[operators]", f"entrywise = [{', '.join(map(_toml_text, entrywise))}]"]
     for name in MEMBERS:
@@ -121,7 +124,7 @@ def _operator_table(problem: Problem, listed: Array, part: Path) -> list[str]:
         else:
             constant = name in problem.constant
             line = f'{name} = "{name}.npz:0"' if constant else f'{name}.each = "{name}.npz:{{}}"'
-        _save_arrays(part / f"{name}.npz", arrays[name])
+        _save_arrays(part / f"{name}.npz", **arrays[name])
         lines.append(line)
     return [*lines, ""]
 
@@ -131,7 +134,7 @@ def _affine(name: str, declared: AffineSum, listed: Array) -> tuple[dict[str, An
     theta = np.column_stack([declared.coefficients(mu) for mu in listed])
     arrays: dict[str, Any] = {f"theta{q}": values for q, values in enumerate(theta)}
     for q, term in enumerate(declared.terms):
-        arrays |= _array_or_parts(f"term{q}", term)
+        arrays |= _parts(f"term{q}", term)
     entries = (f'{{ table = "{name}.npz:theta{q}", array = "{name}.npz:term{q}" }}' for q in range(len(theta)))
     return arrays, f"{name}.affine = [{', '.join(entries)}]"
 
@@ -140,7 +143,7 @@ def _solution_table(problem: Problem, listed: Array, part: Path) -> list[str]:
     solver = HighFidelitySolver(problem)
     exact = [solver.solve(mu) for mu in listed]
     u, lam = (np.column_stack([getattr(one, name) for one in exact]) for name in ("u", "lam"))
-    _save_arrays(part / "solutions.npz", {"u": u, "lam": lam})
+    _save_arrays(part / "solutions.npz", u=u, lam=lam)
     return ["[solutions]", 'u = "solutions.npz:u"', 'lam = "solutions.npz:lam"', ""]
 
 
@@ -156,25 +159,19 @@ def _output_tables(problem: Problem, part: Path) -> list[str]:
                 lines.append(f'{key} = "outputs.npz:{key}{k}"')
         lines.append("")
     if arrays:
-        _save_arrays(part / "outputs.npz", arrays)
+        _save_arrays(part / "outputs.npz", **arrays)
     return lines
 
 
-def _array_or_parts(name: str, value: Any) -> dict[str, Any]:
-    return {name: value} if isinstance(value, np.ndarray) else _sparse_parts(name, value)
-
-
-def _sparse_parts(name: str, matrix: Any) -> dict[str, Any]:
-    """The arrays of a sparse matrix, its entries in their order."""
+def _parts(name: str, matrix: Any) -> dict[str, Any]:
+    """A dense array, or the arrays of a sparse matrix, its entries in their order."""
+    if isinstance(matrix, np.ndarray):
+        return {name: matrix}
     kept = matrix if matrix.format in ("csr", "csc") else sp.csr_array(matrix)
     return {
         f"{name}/data": kept.data, f"{name}/indices": kept.indices, f"{name}/indptr": kept.indptr,
         f"{name}/shape": np.array(kept.shape), f"{name}/format": np.array(kept.format, dtype="S3"),
     }  # fmt: skip
-
-
-def _save_arrays(path: Path, arrays: Mapping[str, Any]) -> None:
-    np.savez_compressed(path, allow_pickle=False, **arrays)
 
 
 def _toml_text(value: str) -> str:
