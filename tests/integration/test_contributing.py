@@ -11,7 +11,7 @@ import vibench
 
 ROOT = Path(__file__).parents[2]
 TEXT = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
-ROOMS = re.findall(r"^    (\w+)/ ", TEXT, re.MULTILINE)
+PACKAGES = re.findall(r"^    (\w+)/ ", TEXT, re.MULTILINE)
 WALK = re.findall(r"^\d\. `vibench\.([\w.]+)`", TEXT, re.MULTILINE)
 LAYERS = [
     name.strip()
@@ -20,10 +20,10 @@ LAYERS = [
 ]
 
 
-def test_the_map_names_every_room_in_the_order_of_the_layers() -> None:
+def test_the_map_names_every_package_in_the_order_of_the_layers() -> None:
     package = Path(str(vibench.__file__)).parent
-    assert set(ROOMS) == {path.parent.name for path in package.glob("*/__init__.py")}
-    assert [layer for layer in LAYERS if layer in ROOMS] == ROOMS
+    assert set(PACKAGES) == {path.parent.name for path in package.glob("*/__init__.py")}
+    assert [layer for layer in LAYERS if layer in PACKAGES] == PACKAGES
 
 
 def test_the_walk_from_a_study_to_a_row_leads_through_eight_modules_each_once_and_downwards() -> None:
@@ -41,7 +41,7 @@ def test_the_walk_from_a_study_to_a_row_leads_through_eight_modules_each_once_an
     assert places == sorted(places)
 
 
-def test_no_room_has_more_than_fourteen_entries_and_each_says_what_it_is_for() -> None:
+def test_no_package_has_more_than_fourteen_entries_and_each_says_what_it_is_for() -> None:
     package = Path(str(vibench.__file__)).parent
     for folder in {path.parent for path in package.glob("*/**/*.py")} - {package}:
         assert len([path for path in folder.iterdir() if path.name != "__pycache__"]) <= 14, folder
