@@ -36,7 +36,11 @@ Changed = Callable[..., Path]
 
 @contextlib.contextmanager
 def started(command: list[str], folder: Path, plugins: Path) -> Iterator[subprocess.Popen[str]]:
-    """A process that leads a group of its own; whoever is left of the group at the end is killed."""
+    """A process that leads a group of its own; whoever is left of the group at the end is killed.
+
+    Ctrl-C does to it what it does in a terminal, also where the tests run with Ctrl-C ignored, as in the background.
+    """
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
     process = subprocess.Popen(
         command,
         cwd=folder,
@@ -46,6 +50,7 @@ def started(command: list[str], folder: Path, plugins: Path) -> Iterator[subproc
         text=True,
         start_new_session=True,
     )
+    signal.signal(signal.SIGINT, before)
     try:
         yield process
     finally:

@@ -1,6 +1,6 @@
 """The command line, and what the installed command calls."""
 
-from vibench.cli.interrupts import interrupted_at_once
+from vibench.interrupts import interrupted_at_once
 
 
 def start() -> None:

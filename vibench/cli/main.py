@@ -18,12 +18,12 @@ from typer import Argument, Option
 from vibench.cli import output_commands
 from vibench.cli.bench_command import bench_plugins
 from vibench.cli.completion import examples, names, solvers, studies, whole_words
-from vibench.cli.interrupts import INTERRUPTED, Interrupted, interrupted_at_once, interruptible
 from vibench.cli.output_commands import draw_figures, export_qps, export_reduced_model, publish_runs, write_report
 from vibench.cli.pack_commands import import_pack, pack_problem, reduce_cones
 from vibench.cli.plugin_commands import check_plugin, list_plugins, new_plugin
 from vibench.cli.result_commands import compare_runs, diff_runs, replay_query, show
 from vibench.errors import RequestError, VibenchError
+from vibench.interrupts import INTERRUPTED, Interrupted, interrupted_at_once, interruptible
 from vibench.study.kinds import DUAL, PRIMAL, PROBLEM
 from vibench.terminal.output import echo, warn
 from vibench.text import unbroken

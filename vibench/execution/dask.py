@@ -5,14 +5,12 @@ from __future__ import annotations
 import contextlib
 import resource
 import secrets
-import signal
 import threading
-from collections.abc import Iterator
 from concurrent.futures import Future
-from multiprocessing import resource_tracker
 from pathlib import Path
 from typing import Any
 
+from vibench import interrupts
 from vibench.errors import ExecutorError, RequestError, in_a_line
 from vibench.execution.executors import Executor, Outcome
 from vibench.execution.supervisor import Job, Supervisor, code_here
@@ -67,8 +65,7 @@ class Dask(Executor):
         self._token = secrets.token_hex(8)
         self._cluster: Any = None
         if scheduler is None:
-            resource_tracker.ensure_running()  # started first, because its start unblocks SIGINT
-            with _interrupts_held():
+            with interrupts.held():
                 self._cluster = LocalCluster(
                     n_workers=slots,
                     threads_per_worker=1,
@@ -151,16 +148,6 @@ def _has_credentials() -> bool:
     from distributed.security import Security  # noqa: PLC0415
 
     return Security().get_connection_args("client")["ssl_context"] is not None
-
-
-@contextlib.contextmanager
-def _interrupts_held() -> Iterator[None]:
-    """Block SIGINT: processes started in the block inherit the signal mask and do not receive Ctrl-C."""
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def _hand_over(theirs: Any, ours: Future[Outcome]) -> None:

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import signal
-import threading
 from collections.abc import Mapping, Sequence, Set
 from concurrent.futures import FIRST_COMPLETED, Future, wait
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from vibench import provenance
+from vibench import interrupts, provenance
 from vibench.errors import ExecutorError, RequestError, StorageError, VibenchError, in_a_line
 from vibench.execution.dask import Dask
 from vibench.execution.executors import Executor, Local
@@ -233,7 +231,7 @@ class _Run:
             if workers is not None:
                 self._loop(workers)
         except KeyboardInterrupt:
-            _ignore_interrupts()
+            interrupts.ignore()  # until the results are complete
             return True
         finally:
             if workers is not None:
@@ -340,9 +338,3 @@ def _outcome(future: Future[Any]) -> Done | Failed:
         raise StorageError(result.reason)
     assert isinstance(result, Done | Failed)  # what `Supervisor.run` returns
     return result
-
-
-def _ignore_interrupts() -> None:
-    """Ignore Ctrl-C from now on: the results are completed, then the process ends."""
-    if threading.current_thread() is threading.main_thread():
-        signal.signal(signal.SIGINT, signal.SIG_IGN)

@@ -19,6 +19,7 @@ from typing import Any, TypeVar
 
 from threadpoolctl import threadpool_limits
 
+from vibench import interrupts
 from vibench.errors import NumericalError, StorageError, UnsupportedError, VibenchError, in_a_line, message_of
 from vibench.execution.descendants import MARK, kill_marked
 from vibench.execution.parts import Part, PartDone
@@ -46,7 +47,7 @@ def main() -> None:
     for stream in (1, 2):  # what plugins print must not look like output of vibench
         os.dup2(log, stream)
     faulthandler.enable()
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    interrupts.ignore()
     threadpool_limits(1)
     threading.Thread(target=_end_with, args=(os.getppid(),), daemon=True).start()
     own, first = os.getpid(), True

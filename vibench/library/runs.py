@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import signal
-import threading
 import warnings
-from collections.abc import Iterator, Sequence
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from collections.abc import Sequence
+from contextlib import AbstractContextManager, nullcontext
 from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import pandas as pd
 
+from vibench import interrupts
 from vibench.errors import unknown_name
 from vibench.execution.recorded_cell import recorded_cell
 from vibench.execution.run import Observer, Options, run_study
@@ -184,17 +183,6 @@ class Run:
         return Model(recorded.model, asked.solver, asked.accuracy, recorded.certificate, recorded.row)
 
 
-@contextmanager
-def _interrupts_as_before() -> Iterator[None]:
-    """Block after which Ctrl-C does what it did before: a run that it ends ignores any other until all is written."""
-    before = signal.getsignal(signal.SIGINT)
-    try:
-        yield
-    finally:
-        if threading.current_thread() is threading.main_thread():
-            signal.signal(signal.SIGINT, before)
-
-
 def _following(observer: Observer | None, progress: bool) -> AbstractContextManager[Observer]:
     """Who follows a run."""
     if observer is not None or not progress:
@@ -263,7 +251,8 @@ def run(
     """
     folder = Path("runs") / study.name if out is None else Path(out)
     options = Options(jobs, fresh, retry, executor, scheduler)
-    with _following(observer, progress) as following, _interrupts_as_before():
+    # A run that Ctrl-C ends ignores any other until all is written.
+    with _following(observer, progress) as following, interrupts.restored():
         outcome = run_study(study, folder, following, options)
     if outcome.interrupted:
         raise KeyboardInterrupt(f"{outcome.missing} cells have no row yet; the same call continues the run")

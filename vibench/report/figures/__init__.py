@@ -6,9 +6,7 @@ import contextlib
 import json
 import pickle
 import re
-import signal
 import tempfile
-import threading
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor
 from dataclasses import dataclass, replace
@@ -20,6 +18,7 @@ from typing import Generic, TypeVar, cast
 import pandas as pd
 from matplotlib.figure import Figure
 
+from vibench import interrupts
 from vibench.errors import RequestError, unknown_name
 from vibench.files import TEMPORARY, write_atomically
 from vibench.report.figures.constants import inf_sup, shares
@@ -223,7 +222,7 @@ def processes(jobs: int) -> Iterator[ProcessPoolExecutor | None]:
         return
     pool = ProcessPoolExecutor(jobs - 1, get_context("spawn"))
     try:
-        with interrupts_ignored():  # the processes inherit it: Ctrl-C is for this one to handle
+        with interrupts.held():  # Ctrl-C is for this process to handle
             for _ in range(jobs - 1):
                 pool.submit(_tasks_in, None)
         yield pool
@@ -303,16 +302,3 @@ def _render_sent(file: Path, number: int, finish: Callable[[str, Figure], Made])
 def _tasks_in(file: Path | None) -> Sequence[FigureTask]:
     """The figures that another process has written to a file of its own; none without one."""
     return () if file is None else pickle.loads(file.read_bytes())
-
-
-@contextlib.contextmanager
-def interrupts_ignored() -> Iterator[None]:
-    """Ignore Ctrl-C inside the block, and in the processes that start there."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGINT, before)

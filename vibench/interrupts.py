@@ -1,4 +1,4 @@
-"""Ctrl-C: it ends a command with one line, and at once while that only imports."""
+"""Ctrl-C: what it does to a command, to a run, and to the processes that these start."""
 
 from __future__ import annotations
 
@@ -14,7 +14,6 @@ from types import FrameType
 INTERRUPTED = 130
 """Exit code of a command that Ctrl-C has ended."""
 
-
 Handler = Callable[[int, FrameType | None], object] | int | None
 
 
@@ -27,8 +26,9 @@ def interruptible(command: Callable[..., None]) -> Callable[..., None]:
 
     @functools.wraps(command)
     def wrapped(*arguments: object, **options: object) -> None:
+        raising = signal.getsignal(signal.SIGINT) is _leave
         try:
-            with _raising():
+            with _handled(signal.default_int_handler) if raising else contextlib.nullcontext():
                 command(*arguments, **options)
         except KeyboardInterrupt:
             raise Interrupted from None
@@ -43,33 +43,55 @@ def interrupted_at_once() -> Iterator[None]:
     A `KeyboardInterrupt` that is raised in the import of an extension module may become an `ImportError`, or be lost;
     outside of all commands nobody catches it.
     """
+    ignored = signal.getsignal(signal.SIGINT) is signal.SIG_IGN
+    with contextlib.nullcontext() if ignored else _handled(_leave):
+        yield
+
+
+def ignore() -> None:
+    """Ignore Ctrl-C from now on."""
+    _set(signal.SIG_IGN)
+
+
+@contextlib.contextmanager
+def restored() -> Iterator[None]:
+    """Block after which Ctrl-C does what it did before, whatever the block has set."""
     before = signal.getsignal(signal.SIGINT)
-    if threading.current_thread() is not threading.main_thread() or before is signal.SIG_IGN:
+    try:
         yield
-        return
-    with _handled(_leave, before):
-        yield
+    finally:
+        _set(before)
 
 
 @contextlib.contextmanager
-def _raising() -> Iterator[None]:
-    """Block within `interrupted_at_once` in which Ctrl-C raises `KeyboardInterrupt` all the same."""
-    if signal.getsignal(signal.SIGINT) is not _leave:
+def held() -> Iterator[None]:
+    """Block Ctrl-C: processes that are started in the block inherit this and never receive it."""
+    from multiprocessing import resource_tracker  # noqa: PLC0415  most commands start no processes
+
+    resource_tracker.ensure_running()  # its start would unblock SIGINT
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
         yield
-        return
-    with _handled(signal.default_int_handler, _leave):
-        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 @contextlib.contextmanager
-def _handled(handler: Handler, before: Handler) -> Iterator[None]:
+def _handled(handler: Handler) -> Iterator[None]:
     """Block with a handler of Ctrl-C; the one of before comes back unless the block has set another, for good."""
-    signal.signal(signal.SIGINT, handler)
+    before = signal.getsignal(signal.SIGINT)
+    _set(handler)
     try:
         yield
     finally:
         if signal.getsignal(signal.SIGINT) is handler:
-            signal.signal(signal.SIGINT, before)
+            _set(before)
+
+
+def _set(handler: Handler) -> None:
+    """Set a handler of Ctrl-C; only the main thread can."""
+    if threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGINT, handler)
 
 
 def _leave(number: int, frame: FrameType | None) -> None:  # noqa: ARG001  the signature of a handler

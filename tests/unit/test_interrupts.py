@@ -8,7 +8,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from vibench.cli.interrupts import Interrupted, interrupted_at_once, interruptible
+from vibench.interrupts import Interrupted, interrupted_at_once, interruptible
 
 
 @pytest.fixture(autouse=True)
