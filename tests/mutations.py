@@ -60,8 +60,8 @@ FAULTS = (
     Fault(
         "cell-after-cell",
         "vibench/stages/timing_rounds.py",
-        "number, within = divmod(piece, len(self.cells))\n",
-        "within, number = divmod(piece, self.rounds)\n",
+        "number, within = divmod(item, len(self.cells))\n",
+        "within, number = divmod(item, self.rounds)\n",
         ("tests/unit/stages/test_timing_rounds.py",),
     ),
     Fault(
@@ -439,14 +439,14 @@ FAULTS = (
     Fault(
         "limit-of-a-query-not-enforced",
         "vibench/execution/supervisor.py",
-        "if self.seconds > self._piece_limit:",
+        "if self.seconds > self._item_limit:",
         "if False:",
         ("tests/faults/test_supervisor.py",),
     ),
     Fault(
-        "good-pieces-thrown-away",
+        "good-items-thrown-away",
         "vibench/execution/supervisor.py",
-        "self.progress.found[message.piece] = message.value",
+        "self.progress.done[message.number] = message.value",
         "pass",
         ("tests/faults/test_supervisor.py",),
     ),

@@ -16,10 +16,11 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from fake_stages import InPieces, OfAPlugin, Whole
+from fake_stages import InItems, OfAPlugin, Whole
 
 from vibench.execution import supervisor
-from vibench.execution.supervisor import Begun, Job, StoppedError, Supervisor
+from vibench.execution.jobs import Begun, Job
+from vibench.execution.supervisor import StoppedError, Supervisor
 from vibench.qp.status import Status
 from vibench.stages.base import Done, Failed, Stage, Unstored
 from vibench.storage.artefacts import Store
@@ -64,15 +65,15 @@ def test_a_stage_that_goes_well_is_stored(run: Run, tmp_path: Path) -> None:
 
 
 def test_the_process_is_kept_from_one_stage_to_the_next(run: Run) -> None:
-    processes = {run(InPieces(("fine",) * k)).value[0][1] for k in (1, 2, 3)}
+    processes = {run(InItems(("fine",) * k)).value[0][1] for k in (1, 2, 3)}
     assert len(processes) == 1
     assert os.getpid() not in processes
 
 
 @pytest.mark.parametrize("how", ["sleep", "hang"])
-def test_a_piece_beyond_its_limit_costs_itself(run: Run, how: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_item_beyond_its_limit_costs_itself(run: Run, how: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(supervisor, "GRACE", 0.1)
-    found = run(InPieces(("fine", how, "fine", "fine")), query=1.0)
+    found = run(InItems(("fine", how, "fine", "fine")), query=1.0)
     assert isinstance(found, Done)
     assert [number for number, _ in found.value] == [0, 1, 2, 3]
     assert found.value[1][1] == Failed(Status.TIMEOUT, "stopped after query_seconds = 1 s")
@@ -80,50 +81,50 @@ def test_a_piece_beyond_its_limit_costs_itself(run: Run, how: str, monkeypatch: 
 
 
 @pytest.mark.parametrize(("how", "words"), [("exit", "exit code 5"), ("segfault", "signal SIGSEGV")])
-def test_a_piece_that_kills_its_process_costs_itself(run: Run, how: str, words: str) -> None:
-    found = run(InPieces((how, "fine", how, "fine")))
+def test_an_item_that_kills_its_process_costs_itself(run: Run, how: str, words: str) -> None:
+    found = run(InItems((how, "fine", how, "fine")))
     assert isinstance(found, Done)
     for number in (0, 2):
         assert found.value[number][1] == Failed(Status.CRASHED, f"the worker process died with {words}")
     assert found.value[1][1] != found.value[3][1]  # each death takes another process
 
 
-def test_what_a_piece_raises_costs_itself(run: Run) -> None:
-    found = run(InPieces(("interrupt", "fine")))
+def test_what_an_item_raises_costs_itself(run: Run) -> None:
+    found = run(InItems(("interrupt", "fine")))
     assert isinstance(found, Done)
     assert found.value[0][1].status is Status.ERROR
     assert "KeyboardInterrupt" in found.value[0][1].reason
 
 
-def test_beyond_the_limit_of_the_cell_the_pieces_done_are_kept(run: Run) -> None:
-    found = run(InPieces(("fine", "fine", "sleep", "fine")), query=60.0, cell=2.0)
+def test_beyond_the_limit_of_the_cell_the_items_done_are_kept(run: Run) -> None:
+    found = run(InItems(("fine", "fine", "sleep", "fine")), query=60.0, cell=2.0)
     assert isinstance(found, Done)
     assert [isinstance(value, Failed) for _, value in found.value] == [False, False, True, True]
     assert found.value[3][1] == Failed(Status.TIMEOUT, "stopped after cell_seconds = 2 s")
 
 
-def test_a_piece_that_dies_before_it_is_watched_costs_itself(run: Run) -> None:
-    found = run(InPieces(("fine", "fine", "fine"), unwatched=("", "exit", "")))
+def test_an_item_that_dies_before_it_is_watched_costs_itself(run: Run) -> None:
+    found = run(InItems(("fine", "fine", "fine"), unwatched=("", "exit", "")))
     assert isinstance(found, Done)
     assert [isinstance(value, Failed) for _, value in found.value] == [False, True, False]
 
 
-def test_many_quick_pieces_have_the_limit_of_the_cell_too(run: Run) -> None:
-    found = run(InPieces(("moment",) * 400), cell=2.0)
+def test_many_quick_items_have_the_limit_of_the_cell_too(run: Run) -> None:
+    found = run(InItems(("moment",) * 400), cell=2.0)
     assert isinstance(found, Done)
     lost = [value for _, value in found.value if isinstance(value, Failed)]
     assert 300 < len(lost) < 400
     assert set(lost) == {Failed(Status.TIMEOUT, "stopped after cell_seconds = 2 s")}
 
 
-def test_a_death_beyond_the_limit_is_not_the_reason_of_pieces_never_asked(run: Run) -> None:
-    found = run(InPieces(("fine", "sleep", "exit", "fine")), query=600.0, cell=1.0)
+def test_a_death_beyond_the_limit_is_not_the_reason_of_items_never_asked(run: Run) -> None:
+    found = run(InItems(("fine", "sleep", "exit", "fine")), query=600.0, cell=1.0)
     assert isinstance(found, Done)
     assert {value.status for _, value in found.value[1:]} == {Status.TIMEOUT}
 
 
 def test_a_process_without_memory_is_replaced(run: Run) -> None:
-    found = run(InPieces(("fine", "hunger", "fine")))
+    found = run(InItems(("fine", "hunger", "fine")))
     assert isinstance(found, Done)
     assert found.value[1][1] == Failed(Status.ERROR, "out of memory: the limit is memory_gib = 8")
     assert found.value[0][1] != found.value[2][1]
@@ -134,7 +135,7 @@ def test_a_process_without_memory_is_replaced(run: Run) -> None:
 
 
 def test_a_finish_that_dies_is_tried_once_more_with_what_is_there(run: Run) -> None:
-    found = run(InPieces(("fine", "fine"), at_end="exit"))
+    found = run(InItems(("fine", "fine"), at_end="exit"))
     assert isinstance(found, Failed)
     assert found.status is Status.CRASHED
 
@@ -142,7 +143,7 @@ def test_a_finish_that_dies_is_tried_once_more_with_what_is_there(run: Run) -> N
 @pytest.mark.parametrize("kind", ["child", "daemon"])
 def test_what_a_plugin_started_ends_with_its_process(kind: str, watcher: Supervisor, tmp_path: Path) -> None:
     seconds = unique()
-    assert isinstance(watcher.run(Job(str(tmp_path), InPieces((f"{kind} {seconds}",)), 1.0, 30.0, 8.0)), Done)
+    assert isinstance(watcher.run(Job(str(tmp_path), InItems((f"{kind} {seconds}",)), 1.0, 30.0, 8.0)), Done)
     await_sleeper(seconds)
     watcher.close()
     assert not sleepers(seconds)
@@ -150,7 +151,7 @@ def test_what_a_plugin_started_ends_with_its_process(kind: str, watcher: Supervi
 
 def test_a_daemon_does_not_outlive_a_process_that_dies(run: Run) -> None:
     seconds = unique()
-    found = run(InPieces((f"daemon {seconds}", "exit", "fine")))
+    found = run(InItems((f"daemon {seconds}", "exit", "fine")))
     assert isinstance(found, Done)
     assert [isinstance(value, Failed) for _, value in found.value] == [False, True, False]
     assert not sleepers(seconds)
@@ -220,7 +221,7 @@ def test_a_process_that_never_begins_is_given_up(
 
 
 def test_a_talkative_job_can_be_stopped(watcher: Supervisor, tmp_path: Path) -> None:
-    job = Job(str(tmp_path), InPieces(("moment",) * 2000), 1.0, 600.0, 8.0)
+    job = Job(str(tmp_path), InItems(("moment",) * 2000), 1.0, 600.0, 8.0)
     threading.Timer(2.0, watcher.stop).start()
     with pytest.raises(StoppedError):  # long before its limits, which are ten minutes away
         watcher.run(job)
@@ -230,8 +231,8 @@ def test_a_talkative_job_can_be_stopped(watcher: Supervisor, tmp_path: Path) -> 
 @pytest.mark.parametrize(
     ("how", "status"), [("sleep", Status.TIMEOUT), ("exit", Status.CRASHED), ("interrupt", Status.ERROR)]
 )
-def test_what_is_not_of_a_piece_costs_the_cell(run: Run, where: str, how: str, status: Status) -> None:
-    found = run(InPieces(("fine",), **{where: how}), cell=0.5 if how == "sleep" else 20.0)
+def test_what_is_not_of_an_item_costs_the_cell(run: Run, where: str, how: str, status: Status) -> None:
+    found = run(InItems(("fine",), **{where: how}), cell=0.5 if how == "sleep" else 20.0)
     assert isinstance(found, Failed)
     assert found.status is status
 
@@ -248,7 +249,7 @@ def test_a_whole_stage_that_hangs_or_dies_is_said_so(run: Run, how: str, status:
 
 def test_a_process_that_forks_answers_once(run: Run) -> None:
     for _ in range(3):
-        found = run(InPieces(("fine", "fork", "fine")))
+        found = run(InItems(("fine", "fork", "fine")))
         assert isinstance(found, Done)
         assert len({process for _, process in found.value}) == 1
 
@@ -286,8 +287,9 @@ def test_a_worker_does_not_outlive_its_supervisor(tmp_path: Path) -> None:
     """Not even one that sleeps in a plugin, nor what that started, when the supervisor's process is killed."""
     diary, seconds = tmp_path / "diary", unique()
     code = (
-        "from vibench.execution.supervisor import *; from fake_stages import InPieces, Whole\n"
-        f"one = Supervisor(); one.run(Job({str(tmp_path)!r}, InPieces(('daemon {seconds}',)), 1.0, 600.0, 8.0))\n"
+        "from vibench.execution.jobs import Job; from vibench.execution.supervisor import Supervisor\n"
+        "from fake_stages import InItems, Whole\n"
+        f"one = Supervisor(); one.run(Job({str(tmp_path)!r}, InItems(('daemon {seconds}',)), 1.0, 600.0, 8.0))\n"
         f"one.run(Job({str(tmp_path)!r}, Whole('sleep', {str(diary)!r}), 1.0, 600.0, 8.0))"
     )
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}

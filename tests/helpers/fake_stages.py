@@ -15,7 +15,7 @@ from typing import Any
 import fake_plugins
 import numpy as np
 
-from vibench.stages.base import Failed, Pieces, PiecewiseStage, Result, Stage
+from vibench.stages.base import Failed, Items, ItemwiseStage, Result, Stage
 from vibench.storage.artefacts import Store
 from vibench.study.plugin import Plugin
 from vibench.timing import Seconds
@@ -53,7 +53,7 @@ def start(kind: str = "", *seconds: str) -> None:
 
 @dataclass(frozen=True)
 class Whole(Stage):
-    """A stage in one piece; it notes that it was begun."""
+    """A stage in one item; it notes that it was begun."""
 
     label = "whole"
 
@@ -109,10 +109,10 @@ class KillsItsParent(Stage):
 
 
 @dataclass(frozen=True)
-class InPieces(PiecewiseStage):
-    """Every piece does what its word says, and what the one in `unwatched` says before the supervisor is told."""
+class InItems(ItemwiseStage):
+    """Every item does what its word says, and what the one in `unwatched` says before the supervisor is told."""
 
-    label = "in pieces"
+    label = "in items"
 
     hows: tuple[str, ...]
     at_begin: str = ""
@@ -120,22 +120,22 @@ class InPieces(PiecewiseStage):
     unwatched: tuple[str, ...] = ()
 
     @property
-    def pieces(self) -> int:
+    def items(self) -> int:
         return len(self.hows)
 
     def inputs(self) -> tuple[Stage, ...]:
         return ()
 
-    def begin(self, store: Store) -> Pieces:
+    def begin(self, store: Store) -> Items:
         misbehave(self.at_begin)
         return Work(self)
 
 
-class Work(Pieces):
-    def __init__(self, stage: InPieces) -> None:
+class Work(Items):
+    def __init__(self, stage: InItems) -> None:
         self.stage = stage
 
-    def piece(self, number: int, watch: Callable[[bool], None]) -> Any:
+    def item(self, number: int, watch: Callable[[bool], None]) -> Any:
         misbehave(self.stage.unwatched[number] if self.stage.unwatched else "")
         watch(True)
         misbehave(self.stage.hows[number])
@@ -145,6 +145,6 @@ class Work(Pieces):
     def lost(self, number: int, failed: Failed) -> Any:
         return number, failed
 
-    def finish(self, pieces: Sequence[Any]) -> Any:
+    def finish(self, items: Sequence[Any]) -> Any:
         misbehave(self.stage.at_end)
-        return list(pieces)
+        return list(items)

@@ -117,7 +117,7 @@ class TimedBenchmarks(WatchedWork):
     seconds: float
 
     @property
-    def pieces(self) -> int:
+    def items(self) -> int:
         """Number of turns."""
         return PASSES * len(self.benchmarks)
 
@@ -207,7 +207,7 @@ def run_benchmarks(
         If no benchmark can be begun.
     """
     work, results = TimedBenchmarks(tuple(benchmarks), setting, seconds), BenchmarkResults(len(benchmarks), show)
-    turns = watched(work, setting.seconds, results.take, in_all=setting.seconds * work.pieces)
+    turns = watched(work, setting.seconds, results.take, in_all=setting.seconds * work.items)
     if isinstance(turns, Failed):
         raise VibenchError(f"the process of the benchmarks failed: {turns.reason}")
     return results

@@ -157,7 +157,7 @@ def _conclude(name: str, outcome: Outcome, folder: Path, *, draw: int | None, fr
 
 
 def _warn_of_open_scheduler(scheduler: str, executor: str) -> None:
-    from vibench.execution.dask import is_authenticated
+    from vibench.execution.executors import is_authenticated
 
     if executor != "dask":
         raise RequestError(f"--scheduler {scheduler} is for --executor dask")

@@ -1,17 +1,33 @@
-"""Executors run stages: here the interface and the worker processes of this machine; `dask` has the other one."""
+"""Executors run stages: in worker processes of this machine, or in such processes on the workers of a dask cluster."""
 
 from __future__ import annotations
 
+import contextlib
+import resource
+import secrets
+import threading
 from abc import ABC, abstractmethod
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from queue import SimpleQueue
+from typing import Any, TypeAlias
 
-from vibench.execution.supervisor import Job, Supervisor
+from vibench import interrupts
+from vibench.errors import ExecutorError, RequestError, in_a_line
+from vibench.execution.jobs import Job, code_here
+from vibench.execution.supervisor import Supervisor
 from vibench.provenance import machine
+from vibench.qp.status import Status
 from vibench.stages.base import Done, Failed, Unstored
 
-Outcome = Done | Failed | Unstored
+OPEN_FILES, OPEN_FILES_OF_A_WORKER = 64, 16
+"""Files and sockets that a cluster keeps open, and for each worker; about 30 and 11 were counted in /proc."""
+
+ASKED_AGAIN = 5.0
+"""Seconds after which a result that has not come is asked for again, if the client is still there."""
+
+StageOutcome: TypeAlias = Done | Failed | Unstored
+"""How a stage ended."""
 
 
 class Executor(ABC):
@@ -23,7 +39,7 @@ class Executor(ABC):
     """The machines they run on."""
 
     @abstractmethod
-    def submit(self, job: Job) -> Future[Outcome]:
+    def submit(self, job: Job) -> Future[StageOutcome]:
         """Begin a job."""
 
     def check(self) -> None:  # noqa: B027  nothing to check where jobs run in our own threads
@@ -60,11 +76,11 @@ class Local(Executor):
             self._free.put(supervisor)
         self._threads = ThreadPoolExecutor(slots)
 
-    def submit(self, job: Job) -> Future[Outcome]:
+    def submit(self, job: Job) -> Future[StageOutcome]:
         """Begin a job in a worker process that is free."""
         return self._threads.submit(self._run, job)
 
-    def _run(self, job: Job) -> Outcome:
+    def _run(self, job: Job) -> StageOutcome:
         supervisor = self._free.get()
         try:
             return supervisor.run(job)
@@ -80,3 +96,177 @@ class Local(Executor):
             supervisor.close()
         if self._log.is_file() and not self._log.stat().st_size:
             self._log.unlink()
+
+
+class Dask(Executor):
+    """The workers of a dask cluster, one job at a time on each.
+
+    They must have the same vibench installed and see the folder of the artefacts under the same path. The job of a
+    worker that dies is repeated by another one, which is safe because stages are pure functions.
+
+    Parameters
+    ----------
+    scheduler
+        Address of the scheduler; `None` for a cluster of processes on this machine, which speak TLS with credentials
+        made for it. Those of a scheduler tls://… come from dask's configuration.
+    slots
+        Number of workers of a cluster on this machine.
+    store
+        Folder of the artefacts.
+
+    Raises
+    ------
+    RequestError
+        If dask.distributed is not installed, this process may not open enough files, the scheduler does not answer, or
+        a worker cannot run the jobs.
+    """
+
+    def __init__(self, scheduler: str | None, slots: int, store: Path) -> None:
+        try:
+            from distributed import Client, LocalCluster  # noqa: PLC0415  an optional dependency
+            from distributed.security import Security  # noqa: PLC0415
+
+            # Whoever reaches a scheduler can run code on its workers: others on this machine are kept out, too.
+            own = Security.temporary() if scheduler is None else None
+        except ImportError:
+            raise RequestError(
+                "the executor 'dask' needs dask.distributed and cryptography: install vibench with its extra 'cluster'"
+            ) from None
+        if scheduler is not None and is_authenticated(scheduler) and not _has_credentials():
+            raise RequestError(f"the scheduler '{scheduler}' asks for credentials: set distributed.comm.tls of dask")
+        _allow_open_files(slots if scheduler is None else 0)
+        self._token = secrets.token_hex(8)
+        self._cluster: Any = None
+        if scheduler is None:
+            with interrupts.held():
+                self._cluster = LocalCluster(
+                    n_workers=slots,
+                    threads_per_worker=1,
+                    processes=True,
+                    host="127.0.0.1",
+                    protocol="tls",
+                    security=own,
+                    dashboard_address="127.0.0.1:0",
+                    memory_limit=0,
+                    silence_logs="CRITICAL",
+                )
+        try:
+            self._client = Client(self._cluster or scheduler, timeout="10s", set_as_default=False)
+        except (OSError, ValueError) as error:
+            raise RequestError(f"no dask scheduler answers at '{scheduler}': {error}") from None
+        self.slots, self.machines = self._check_workers(store)
+
+    def _check_workers(self, store: Path) -> tuple[int, frozenset[str]]:
+        """Number of workers and their machines; refuses workers with other code or without access to the artefacts."""
+        token = store / f"{self._token}.part"
+        token.touch()
+        try:
+            found: dict[str, tuple[bool, str, str]] = self._client.run(_describe, str(token))
+        except Exception as error:  # noqa: BLE001  a worker without vibench may raise anything
+            raise RequestError(f"the dask workers cannot run vibench: {in_a_line(error)}") from None
+        finally:
+            token.unlink()
+        if not found:
+            raise RequestError("the dask cluster has no workers")
+        for address, (sees, code, _) in found.items():
+            if not sees:
+                raise RequestError(f"the dask worker {address} does not see the artefacts in '{store}'")
+            if code != code_here():
+                raise RequestError(f"the dask worker {address} has other code: {code} instead of {code_here()}")
+        return len(found), frozenset(where for _, _, where in found.values())
+
+    def submit(self, job: Job) -> Future[StageOutcome]:
+        """Begin a job on a worker."""
+        result: Future[StageOutcome] = Future()
+        theirs = self._client.submit(_run_for, self._token, job, pure=False)
+        theirs.add_done_callback(lambda done: _hand_over(done, result))
+        return result
+
+    def check(self) -> None:
+        """Check that the scheduler is connected."""
+        if self._client.status != "running":
+            raise ExecutorError("the dask scheduler is not connected any more; run the same command again to continue")
+
+    def close(self) -> None:
+        """End the jobs and their processes, and the cluster if this run started it."""
+        with contextlib.suppress(Exception):  # a cluster that was lost has no jobs to end
+            if self._client.status == "running":
+                self._client.run(_dismiss, self._token)
+        self._client.close()
+        if self._cluster is not None:
+            self._cluster.close()
+
+
+def _allow_open_files(workers: int) -> None:
+    """Raise the soft limit of open files as far as a cluster needs it: below that, dask does not stop trying."""
+    needed = OPEN_FILES + workers * OPEN_FILES_OF_A_WORKER
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    if soft == resource.RLIM_INFINITY or soft >= needed:
+        return
+    if hard != resource.RLIM_INFINITY and hard < needed:
+        raise RequestError(
+            f"the executor 'dask' needs {needed} open files, the limit is {hard}: raise it (`ulimit -n {needed}`), "
+            "ask for fewer --jobs, or use the executor 'local'"
+        )
+    resource.setrlimit(resource.RLIMIT_NOFILE, (needed, hard))
+
+
+def is_authenticated(scheduler: str) -> bool:
+    """Whether both sides of a connection to the address of a scheduler prove who they are."""
+    return scheduler.startswith(("tls://", "wss://"))
+
+
+def _has_credentials() -> bool:
+    """Whether dask's configuration has credentials of a client."""
+    from distributed.security import Security  # noqa: PLC0415
+
+    return Security().get_connection_args("client")["ssl_context"] is not None
+
+
+def _hand_over(theirs: Any, ours: Future[StageOutcome]) -> None:
+    """Pass the result of a dask future to a standard one, because `concurrent.futures.wait` works only on these."""
+    try:
+        ours.set_result(_result(theirs))
+    except BaseException as error:  # noqa: BLE001  in a thread of dask: passed to the waiting thread
+        line = in_a_line(error)
+        if type(error).__name__ == "KilledWorker":
+            ours.set_result(Failed(Status.CRASHED, f"dask does not repeat the job again: {line}"))
+        else:
+            ours.set_exception(
+                ExecutorError(f"the dask cluster was lost: {line}; run the same command again to continue")
+            )
+
+
+def _result(theirs: Any) -> StageOutcome:
+    """The result of a dask future that is done, for as long as its client can fetch it.
+
+    A client that closes meanwhile never answers, and the thread that asks is that of the callbacks of all clients.
+    """
+    while True:
+        try:
+            outcome: StageOutcome = theirs.result(timeout=ASKED_AGAIN)
+        except TimeoutError:
+            if theirs.status == "error" or theirs.client.status != "running":  # the error may be the job's own
+                raise
+        else:
+            return outcome
+
+
+_supervisors: dict[tuple[str, int], Supervisor] = {}
+"""In a dask worker: the supervisors of every run, one per thread."""
+
+
+def _run_for(token: str, job: Job) -> StageOutcome:
+    """Run a job of a run with the supervisor that this thread of a dask worker has for it."""
+    return _supervisors.setdefault((token, threading.get_ident()), Supervisor()).run(job)
+
+
+def _dismiss(token: str) -> None:
+    """End the supervisors of a run on a dask worker."""
+    for key in [key for key in _supervisors if key[0] == token]:
+        _supervisors.pop(key).close()
+
+
+def _describe(token: str) -> tuple[bool, str, str]:
+    """Describe a dask worker: whether it sees a file, its code, its machine."""
+    return Path(token).exists(), code_here(), machine()

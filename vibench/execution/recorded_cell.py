@@ -15,7 +15,8 @@ import pandas as pd
 from vibench.arrays import Array
 from vibench.errors import RequestError
 from vibench.execution.graph import Graph
-from vibench.execution.supervisor import Job, Supervisor
+from vibench.execution.jobs import Job
+from vibench.execution.supervisor import Supervisor
 from vibench.interfaces.problem import VariationalInequality
 from vibench.model.certificates.bounds import OnlineCertificate
 from vibench.offline.models import AnyReducedModel

@@ -10,12 +10,11 @@ from typing import Any
 
 from vibench import interrupts, provenance
 from vibench.errors import ExecutorError, RequestError, StorageError, VibenchError, in_a_line
-from vibench.execution.dask import Dask
-from vibench.execution.executors import Executor, Local
+from vibench.execution.executors import Dask, Executor, Local
 from vibench.execution.graph import Graph
+from vibench.execution.jobs import Job
 from vibench.execution.result_writer import ResultWriter, labels_of
 from vibench.execution.run_folder import LOG, claimed, clear
-from vibench.execution.supervisor import Job
 from vibench.execution.timing_plan import TimingPlan
 from vibench.provenance import solver_distribution
 from vibench.qp.solve import installed_solvers

@@ -48,7 +48,7 @@ class SolverTrials(WatchedWork):
     solvers: tuple[str, ...]
 
     @property
-    def pieces(self) -> int:
+    def items(self) -> int:
         """Number of solvers."""
         return len(self.solvers)
 

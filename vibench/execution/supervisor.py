@@ -1,8 +1,8 @@
 """Stages in worker processes with hard limits: every job has an outcome, even if its process dies or hangs.
 
 A supervisor runs one job at a time, in a worker process for the packages that the job needs, and talks to it through a
-socket. It follows what the worker reports, kills it when a limit is exceeded, and starts another one. Of a piecewise
-stage only the current piece is lost.
+socket. It follows what the worker reports, kills it when a limit is exceeded, and starts another one. Of a stage
+in items only the current one is lost.
 """
 
 from __future__ import annotations
@@ -17,18 +17,14 @@ import sys
 import threading
 import time
 from collections import OrderedDict
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator, Mapping
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
-from vibench.dependencies import CELL, code_used
-from vibench.execution.descendants import MARK, kill_marked
-from vibench.execution.parts import Part, PartDone, parts
-from vibench.provenance import libraries
+from vibench.execution.jobs import Batch, BatchDone, Begun, InItem, ItemDone, Job, OutOfMemory, Progress, batches
 from vibench.qp.status import Status
-from vibench.stages.base import Done, Failed, PiecewiseStage, Stage, Unstored
+from vibench.stages.base import Done, Failed, ItemwiseStage, Unstored
 from vibench.timing import KEPT_MEMORY, ONE_THREAD
 
 POLL = 0.2
@@ -43,58 +39,11 @@ KEPT = 4
 GRACE = 2.0
 """Seconds allowed beyond the limit of a query, for the work before and after the solver."""
 
+MARK = "VIBENCH_WORKER"
+"""Variable in the environment of a worker process and of whatever is started in it; its value is unique."""
 
-def code_here() -> str:
-    """The code of vibench that determines numbers, and the libraries, in this process."""
-    return f"{code_used(*CELL, whole=True)}; {libraries()}"
-
-
-@dataclass(frozen=True)
-class Job:
-    """A stage to be run: where artefacts are, the limits of a query and of the stage, and with what code."""
-
-    store: str
-    stage: Stage
-    query_seconds: float
-    cell_seconds: float
-    memory_gib: float
-    code: str = field(default_factory=code_here)
-
-
-@dataclass(frozen=True)
-class Begun:
-    """A worker has received its job."""
-
-
-@dataclass(frozen=True)
-class Watch:
-    """A worker is in a piece; `on` while it is in an operation with a time limit of its own."""
-
-    piece: int
-    on: bool
-
-
-@dataclass(frozen=True)
-class Finished:
-    """A worker has done a piece."""
-
-    piece: int
-    value: Any
-
-
-@dataclass(frozen=True)
-class OutOfMemory:
-    """A worker has no memory left, for its work (`failed`) or for another job, and has to be replaced."""
-
-    failed: Failed | None
-
-
-@dataclass
-class Progress:
-    """The pieces of a stage that are done, and those that are lost."""
-
-    found: dict[int, Any] = field(default_factory=dict)
-    lost: dict[int, Failed] = field(default_factory=dict)
+PASSES = 100
+"""Searches for processes that were started during the one before."""
 
 
 class StoppedError(Exception):
@@ -110,7 +59,7 @@ class _WorkerLostError(Exception):
 
 
 class _JobState:
-    """What workers have reported of a job: finished pieces, the current piece and its deadline.
+    """What workers have reported of a job: finished items, the current item and its deadline.
 
     Time is added up in steps of bounded length, so that a suspended machine does not exhaust the limits. The start of a
     process counts separately: on a busy machine it may take longer than a limit.
@@ -119,18 +68,18 @@ class _JobState:
     def __init__(self, job: Job, observe: Callable[[Any], None]) -> None:
         self.job, self.progress, self._observe = job, Progress(), observe
         self.seconds = 0.0
-        self.start(Part(frozenset(), (), ends=False))
+        self.start(Batch(frozenset(), (), ends=False))
 
-    def start(self, part: Part) -> Progress:
-        """Note that a process is given a part of the job; returns what it needs to know of the others."""
-        self.part = part
+    def start(self, batch: Batch) -> Progress:
+        """Note that a process is given a batch of the job; returns what it needs to know of the others."""
+        self.batch = batch
         self._last, self._begun, self._starting = time.monotonic(), False, 0.0
-        self._next_piece()
-        return self.progress if part.ends else Progress()
+        self._next_item()
+        return self.progress if batch.ends else Progress()
 
-    def _next_piece(self) -> None:
-        self.piece: int | None = None
-        self._piece_limit = float("inf")
+    def _next_item(self) -> None:
+        self.item: int | None = None
+        self._item_limit = float("inf")
 
     def tick(self, limit: float) -> None:
         """Count the seconds since the last call; a `_WorkerLostError` beyond a limit, `limit` being the stage's."""
@@ -145,24 +94,24 @@ class _JobState:
         self.seconds += step
         if self.seconds > limit:
             raise _WorkerLostError(_beyond("cell_seconds", self.job.cell_seconds))
-        if self.seconds > self._piece_limit:
+        if self.seconds > self._item_limit:
             raise _WorkerLostError(_beyond("query_seconds", self.job.query_seconds))
 
-    def update(self, message: Any) -> Done | Failed | Unstored | PartDone | None:
+    def update(self, message: Any) -> Done | Failed | Unstored | BatchDone | None:
         """Process a message of the worker; returns the outcome if it is one."""
         match message:
             case Begun():
                 self._begun, self._last = True, time.monotonic()
-            case Watch():
-                self.piece = message.piece
-                self._piece_limit = self.seconds + self.job.query_seconds + GRACE if message.on else float("inf")
-            case Finished():
-                self.progress.found[message.piece] = message.value
+            case InItem():
+                self.item = message.number
+                self._item_limit = self.seconds + self.job.query_seconds + GRACE if message.watched else float("inf")
+            case ItemDone():
+                self.progress.done[message.number] = message.value
                 self._observe(message.value)
-                self._next_piece()
+                self._next_item()
             case OutOfMemory():
                 raise _WorkerLostError(message.failed)
-            case Done() | Failed() | Unstored() | PartDone():
+            case Done() | Failed() | Unstored() | BatchDone():
                 return message
         return None
 
@@ -174,7 +123,7 @@ _Worker = tuple[Connection, "subprocess.Popen[bytes]", str]
 class Supervisor:
     """Runs stages, one at a time, in worker processes that it starts, watches and replaces.
 
-    Every set of packages of third parties has a process of its own: whatever they do to it concerns no others. Pieces
+    Every set of packages of third parties has a process of its own: whatever they do to it concerns no others. Items
     of one stage that need several are done by these in turn.
 
     Parameters
@@ -191,7 +140,7 @@ class Supervisor:
         self._stop = threading.Event()
 
     def run(self, job: Job, observe: Callable[[Any], None] = lambda _: None) -> Done | Failed | Unstored:
-        """Run a stage until it ends or exceeds its limits; `observe` gets the value of every piece that is done.
+        """Run a stage until it ends or exceeds its limits; `observe` gets the value of every item that is done.
 
         Raises
         ------
@@ -215,44 +164,44 @@ class Supervisor:
 
     def _run(self, job: Job, observe: Callable[[Any], None]) -> Done | Failed | Unstored:
         state, limit, retried = _JobState(job, observe), job.cell_seconds, False
-        found, lost = state.progress.found, state.progress.lost
+        done, lost = state.progress.done, state.progress.lost
         while len(self._workers) > KEPT:
             self._kill(next(iter(self._workers)))
         while True:
             try:
                 return self._attempt(state, limit)
             except _WorkerLostError as error:
-                self._kill(state.part.packages)
+                self._kill(state.batch.packages)
                 if error.failed is None:
                     continue
-                if state.piece is not None:
-                    lost[state.piece] = error.failed
-                if not isinstance(job.stage, PiecewiseStage) or not (found or lost) or limit > job.cell_seconds:
+                if state.item is not None:
+                    lost[state.item] = error.failed
+                if not isinstance(job.stage, ItemwiseStage) or not (done or lost) or limit > job.cell_seconds:
                     return error.failed
-                if state.seconds > job.cell_seconds:  # another process may finish with these pieces
+                if state.seconds > job.cell_seconds:  # another process may finish with these items
                     limit += state.seconds
-                    for late in set(range(job.stage.pieces)) - found.keys():
+                    for late in set(range(job.stage.items)) - done.keys():
                         lost.setdefault(late, _beyond("cell_seconds", job.cell_seconds))
-                elif state.piece is None and retried:  # died outside any piece for the second time
+                elif state.item is None and retried:  # died outside any item for the second time
                     return error.failed
-                retried = retried or state.piece is None
+                retried = retried or state.item is None
 
     def _attempt(self, state: _JobState, limit: float) -> Done | Failed | Unstored:
-        """Run the rest of a stage, part by part."""
-        for part in parts(state.job.stage, state.progress.found.keys() | state.progress.lost.keys()):
-            outcome = self._attempt_part(state, limit, part)
-            if not isinstance(outcome, PartDone):
+        """Run the rest of a stage, batch by batch."""
+        for batch in batches(state.job.stage, state.progress.done.keys() | state.progress.lost.keys()):
+            outcome = self._attempt_batch(state, limit, batch)
+            if not isinstance(outcome, BatchDone):
                 return outcome
-        raise AssertionError("the last part ends the stage")
+        raise AssertionError("the last batch ends the stage")
 
-    def _attempt_part(self, state: _JobState, limit: float, part: Part) -> Done | Failed | Unstored | PartDone:
-        """Run a part of a stage in one process."""
+    def _attempt_batch(self, state: _JobState, limit: float, batch: Batch) -> Done | Failed | Unstored | BatchDone:
+        """Run a batch of a stage in one process."""
         try:
-            connection, process, _ = self._worker(part.packages)
+            connection, process, _ = self._worker(batch.packages)
         except OSError as error:
             return Failed(Status.CRASHED, f"no worker process could be started: {error.strerror}")
         try:
-            connection.send((state.job, state.start(part), part))
+            connection.send((state.job, state.start(batch), batch))
             while not self._stop.is_set():
                 if connection.poll(POLL):
                     outcome = state.update(connection.recv())
@@ -316,11 +265,35 @@ def manner_of_death(code: int) -> str:
     """What an exit code of `subprocess` says: an exit code, or the name of a signal."""
     if code >= 0:
         return f"exit code {code}"
-    known = {number.value: number.name for number in signal.Signals}
-    return f"signal {known.get(-code, -code)}"
+    names = {number.value: number.name for number in signal.Signals}
+    return f"signal {names.get(-code, -code)}"
 
 
 def _environment(parent: Mapping[str, str]) -> dict[str, str]:
     """One thread for numerical libraries, freed memory kept, and the modules that this process finds."""
     path = os.pathsep.join(folder for folder in sys.path if folder)
     return {**parent, **ONE_THREAD, **KEPT_MEMORY, "PYTHONPATH": path}
+
+
+def kill_marked(mark: str) -> None:
+    """Kill all processes with this value of `MARK` but the calling one.
+
+    A process that became a daemon is in no group or session of the worker, and after the worker's death not among its
+    children. Systems without /proc do not tell the environment of a process: only its group ends with a worker there.
+    """
+    for _ in range(PASSES):
+        found = list(_marked(mark))
+        if not found:
+            return
+        for process in found:
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(process, signal.SIGKILL)
+
+
+def _marked(mark: str) -> Iterator[int]:
+    entry = f"{MARK}={mark}".encode()
+    for folder in Path("/proc").glob("[0-9]*"):
+        # Processes of others cannot be read; those that have just ended are not there, or have no environment.
+        with contextlib.suppress(OSError):
+            if int(folder.name) != os.getpid() and entry in (folder / "environ").read_bytes().split(b"\0"):
+                yield int(folder.name)

@@ -9,16 +9,17 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
-from vibench.execution.supervisor import Job, Supervisor
+from vibench.execution.jobs import Job
+from vibench.execution.supervisor import Supervisor
 from vibench.qp.status import Status
-from vibench.stages.base import Done, Failed, Pieces, PiecewiseStage
+from vibench.stages.base import Done, Failed, Items, ItemwiseStage
 from vibench.storage.artefacts import Store
 from vibench.study.spec import Limits
 
 
 @dataclass(frozen=True)
-class WatchedWork(PiecewiseStage, Pieces):
-    """Items of work; a subclass says how many `pieces` there are, and how one is done.
+class WatchedWork(ItemwiseStage, Items):
+    """Items of work; a subclass says how many `items` there are, and how one is done.
 
     It is sent to the process that does the items; what they share is a cached property there.
     """
@@ -37,7 +38,7 @@ class WatchedWork(PiecewiseStage, Pieces):
     def _done(self) -> dict[int, Any]:
         return {}
 
-    def begin(self, store: Store) -> Pieces:  # noqa: ARG002
+    def begin(self, store: Store) -> Items:  # noqa: ARG002
         """Nothing to prepare."""
         return self
 
@@ -45,7 +46,7 @@ class WatchedWork(PiecewiseStage, Pieces):
         """Keep the values of the items that another process did."""
         self._done.update(done.values())
 
-    def piece(self, number: int, watch: Callable[[bool], None]) -> tuple[int, Any]:
+    def item(self, number: int, watch: Callable[[bool], None]) -> tuple[int, Any]:
         """Do an item under its time limit; gives its number and value."""
         watch(True)
         self._done[number] = self.do(number, self._done)
@@ -56,9 +57,9 @@ class WatchedWork(PiecewiseStage, Pieces):
         self._done[number] = self.instead(number, failed)
         return number, self._done[number]
 
-    def finish(self, pieces: Sequence[tuple[int, Any]]) -> list[Any]:
+    def finish(self, items: Sequence[tuple[int, Any]]) -> list[Any]:
         """The values of all items."""
-        return [value for _, value in pieces]
+        return [value for _, value in items]
 
 
 def watched(

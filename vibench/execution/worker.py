@@ -21,11 +21,10 @@ from threadpoolctl import threadpool_limits
 
 from vibench import interrupts
 from vibench.errors import NumericalError, StorageError, UnsupportedError, VibenchError, in_a_line, message_of
-from vibench.execution.descendants import MARK, kill_marked
-from vibench.execution.parts import Part, PartDone
-from vibench.execution.supervisor import Begun, Finished, Job, OutOfMemory, Progress, Watch, code_here
+from vibench.execution.jobs import Batch, BatchDone, Begun, InItem, ItemDone, Job, OutOfMemory, Progress, code_here
+from vibench.execution.supervisor import MARK, kill_marked
 from vibench.qp.status import Status
-from vibench.stages.base import Done, Failed, Pieces, PiecewiseStage, Unstored
+from vibench.stages.base import Done, Failed, Items, ItemwiseStage, Unstored
 from vibench.storage.artefacts import Store
 
 T = TypeVar("T")
@@ -59,7 +58,7 @@ def main() -> None:
 
     while True:
         try:
-            job, progress, part = connection.recv()
+            job, progress, batch = connection.recv()
         except EOFError:
             return
         send(Begun())
@@ -69,7 +68,7 @@ def main() -> None:
             return
         first = False
         faulthandler.dump_traceback_later(2.0 * job.cell_seconds + 60.0, exit=True)  # in case the supervisor has died
-        send(perform(job, progress, part, send))
+        send(perform(job, progress, batch, send))
         faulthandler.cancel_dump_traceback_later()
 
 
@@ -81,22 +80,24 @@ def _end_with(parent: int) -> None:
     os.killpg(0, signal.SIGKILL)
 
 
-def perform(job: Job, progress: Progress, part: Part, send: Send) -> Done | PartDone | Failed | Unstored | OutOfMemory:
-    """Run one stage or a part of it; an exception of a plugin is the reason of a failed stage and ends no run."""
+def perform(
+    job: Job, progress: Progress, batch: Batch, send: Send
+) -> Done | BatchDone | Failed | Unstored | OutOfMemory:
+    """Run a batch of a stage; an exception of a plugin is the reason of a failed stage and ends no run."""
     start = time.perf_counter()
 
-    def work() -> Done | PartDone:
-        _check_code(job, part)
+    def work() -> Done | BatchDone:
+        _check_code(job, batch)
         store = _store(job.store)
-        if isinstance(job.stage, PiecewiseStage):
-            pieces = _begun(job.stage, store)
-            known = {number: pieces.lost(number, failed) for number, failed in progress.lost.items()} | progress.found
-            pieces.resume(known)
-            found = known | _pieces(job, pieces, part, send)
-            if not part.ends:
-                return PartDone()
+        if isinstance(job.stage, ItemwiseStage):
+            items = _begun(job.stage, store)
+            earlier = {number: items.lost(number, failed) for number, failed in progress.lost.items()} | progress.done
+            items.resume(earlier)
+            done = earlier | _done(job, items, batch, send)
+            if not batch.ends:
+                return BatchDone()
             _last.clear()
-            value = pieces.finish([found[number] for number in range(job.stage.pieces)])
+            value = items.finish([done[number] for number in range(job.stage.items)])
             return Done((), value, time.perf_counter() - start)
         result = job.stage.run(store)
         store.put(job.stage.key, result.value, result.seconds, result.histories)
@@ -112,43 +113,43 @@ def perform(job: Job, progress: Progress, part: Part, send: Send) -> Done | Part
         return OutOfMemory(Failed(Status.ERROR, f"out of memory: the limit is memory_gib = {job.memory_gib:g}"))
 
 
-def _check_code(job: Job, part: Part) -> None:
+def _check_code(job: Job, batch: Batch) -> None:
     """Refuse a job that was planned with other code than this process has: its artefact would have the wrong key."""
     stage = job.stage
-    parts = (stage.stage_of(number) for number in part.numbers) if isinstance(stage, PiecewiseStage) else (stage,)
+    stages = [stage.stage_of(number) for number in batch.numbers] if isinstance(stage, ItemwiseStage) else [stage]
     # Each once: stages reach the same plugins through many of their inputs.
-    used = dict.fromkeys(plugin for one in {part.key: part for part in parts}.values() for plugin in one.plugins())
-    changed = [f"the {p}" for p in used if p.as_installed() != p]
+    used = dict.fromkeys(plugin for one in {one.key: one for one in stages}.values() for plugin in one.plugins())
+    changed = [f"the {plugin}" for plugin in used if plugin.as_installed() != plugin]
     if job.code != code_here():
         changed.insert(0, "vibench or one of the libraries")
     if changed:
         raise NumericalError(f"{changed[0]} was changed since the run began; run the study again")
 
 
-_last: dict[str, Pieces] = {}
-"""The piecewise stage that was begun and has not ended, by its key: other processes may do parts of it meanwhile."""
+_last: dict[str, Items] = {}
+"""The items of the stage that was begun and has not ended, by its key; other processes may do batches of it, too."""
 
 
-def _begun(stage: PiecewiseStage, store: Store) -> Pieces:
+def _begun(stage: ItemwiseStage, store: Store) -> Items:
     if stage.key not in _last:
         _last.clear()
         _last[stage.key] = stage.begin(store)
     return _last[stage.key]
 
 
-def _pieces(job: Job, pieces: Pieces, part: Part, send: Send) -> dict[int, Any]:
-    """Do the pieces of a part."""
-    found = {}
-    for number in part.numbers:
+def _done(job: Job, items: Items, batch: Batch, send: Send) -> dict[int, Any]:
+    """The values of the items of a batch, which are done here."""
+    done = {}
+    for number in batch.numbers:
 
         def watch(on: bool, number: int = number) -> None:
-            send(Watch(number, on))
+            send(InItem(number, on))
 
         watch(False)
-        value = _guarded(job.memory_gib, partial(pieces.piece, number, watch))
-        found[number] = pieces.lost(number, value) if isinstance(value, Failed) else value
-        send(Finished(number, found[number]))
-    return found
+        value = _guarded(job.memory_gib, partial(items.item, number, watch))
+        done[number] = items.lost(number, value) if isinstance(value, Failed) else value
+        send(ItemDone(number, done[number]))
+    return done
 
 
 def _guarded(memory_gib: float, work: Callable[[], T]) -> T | Failed:

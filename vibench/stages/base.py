@@ -61,7 +61,7 @@ class Done:
 
 @dataclass(frozen=True)
 class Failed:
-    """A stage, or a piece of one, that failed: the status of the rows that need it, and the reason."""
+    """A stage, or a item of one, that failed: the status of the rows that need it, and the reason."""
 
     status: Status
     reason: str
@@ -168,27 +168,27 @@ def _described(value: Any) -> Any:
     return value
 
 
-class Pieces(ABC):
-    """A piecewise stage in progress; its pieces can be done in any order and by several processes."""
+class Items(ABC):
+    """The items of a stage in progress, which can be done in any order and by several processes."""
 
     def resume(self, done: Mapping[int, Any]) -> None:  # noqa: B027
-        """Take note of the values of pieces that another process did, or lost; by default nothing."""
+        """Take note of the values of items that another process did, or lost; by default nothing."""
 
     @abstractmethod
-    def piece(self, number: int, watch: Callable[[bool], None]) -> Any:
-        """Do one piece; `watch(True)` is called before an operation with its own time limit, `watch(False)` after."""
+    def item(self, number: int, watch: Callable[[bool], None]) -> Any:
+        """Do one item; `watch(True)` is called before an operation with its own time limit, `watch(False)` after."""
 
     @abstractmethod
     def lost(self, number: int, failed: Failed) -> Any:
-        """The substitute for a piece that exceeded its limit or whose process died."""
+        """The substitute for a item that exceeded its limit or whose process died."""
 
     @abstractmethod
-    def finish(self, pieces: Sequence[Any]) -> Any:
+    def finish(self, items: Sequence[Any]) -> Any:
         """The value of the stage."""
 
 
-class PiecewiseStage(Stage):
-    """A stage whose pieces are kept one by one: if its process dies or hangs, only the current piece is lost."""
+class ItemwiseStage(Stage):
+    """A stage whose items are kept one by one: if its process dies or hangs, only the current item is lost."""
 
     stored = False
 
@@ -199,21 +199,21 @@ class PiecewiseStage(Stage):
 
     @property
     @abstractmethod
-    def pieces(self) -> int:
-        """Number of pieces."""
+    def items(self) -> int:
+        """Number of items."""
 
     def stage_of(self, number: int) -> Stage:  # noqa: ARG002
-        """The stage whose plugins a piece runs; pieces that run those of other packages get other processes."""
+        """The stage whose plugins a item runs; items that run those of other packages get other processes."""
         return self
 
     @abstractmethod
-    def begin(self, store: Store) -> Pieces:
-        """Prepare for pieces; the artefacts of the inputs are in the store."""
+    def begin(self, store: Store) -> Items:
+        """Prepare for items; the artefacts of the inputs are in the store."""
 
     def run(self, store: Store) -> Result:
-        """All pieces in this process, in their order."""
+        """All items in this process, in their order."""
         work = self.begin(store)
-        return Result(work.finish([work.piece(number, lambda _: None) for number in range(self.pieces)]))
+        return Result(work.finish([work.item(number, lambda _: None) for number in range(self.items)]))
 
 
 def value_of(store: Store, stage: Stage) -> Any:

@@ -23,7 +23,7 @@ from vibench.results.solver_agreement import vectors
 from vibench.stability.coercivity import Stability
 from vibench.stability.infsup import InfSup, share
 from vibench.stages.assembly import AssemblyStage, ExactSolutions, assembly_stage
-from vibench.stages.base import Failed, Pieces, PiecewiseStage, Row, Stage, value_of
+from vibench.stages.base import Failed, Items, ItemwiseStage, Row, Stage, value_of
 from vibench.stages.cell_summary import summarise
 from vibench.stages.certification import CertificateStage
 from vibench.stages.infsup_constants import InfSupConstants, ReferenceConstants
@@ -54,8 +54,8 @@ class CellRows:
 
 
 @dataclass(frozen=True)
-class CellQueries(PiecewiseStage):
-    """All queries of one cell, each a piece; the value is a `CellRows`."""
+class CellQueries(ItemwiseStage):
+    """All queries of one cell, each a item; the value is a `CellRows`."""
 
     label = "queries"
 
@@ -77,7 +77,7 @@ class CellQueries(PiecewiseStage):
         return super().packages | {find(SOLVER, self.solver).package} - {""}
 
     @property
-    def pieces(self) -> int:
+    def items(self) -> int:
         """One query per validation parameter."""
         return self.assembly.validation.count
 
@@ -149,7 +149,7 @@ def cell_queries(cell: Cell, query_seconds: float) -> CellQueries:
     return CellQueries(assembly, cell.solver, cell.accuracy, query_seconds, cell.warm_start, certificate)
 
 
-class _Queries(Pieces):
+class _Queries(Items):
     """The queries of a cell: solve, verify and assess every one."""
 
     def __init__(self, stage: CellQueries, store: Store) -> None:
@@ -174,7 +174,7 @@ class _Queries(Pieces):
             None if stage.certificate is None else value_of(store, stage.certificate)
         )
 
-    def piece(self, number: int, watch: Callable[[bool], None]) -> QueryRows:
+    def item(self, number: int, watch: Callable[[bool], None]) -> QueryRows:
         """The rows of one query."""
         found, solution = run_query(self._stage.query(self._queries, number), self._stage.query_seconds, watch)
         return self._known(number) | found, solution and {"query": number} | solution
@@ -184,11 +184,11 @@ class _Queries(Pieces):
         outcome = {"status": failed.status.value, "reason": failed.reason}
         return self._known(number) | outcome, None
 
-    def finish(self, pieces: Sequence[QueryRows]) -> CellRows:
+    def finish(self, items: Sequence[QueryRows]) -> CellRows:
         """All rows; the row of the cell has means and extremes over the queries."""
-        solutions = {k: solution for k, (_, solution) in enumerate(pieces) if solution is not None}
+        solutions = {k: solution for k, (_, solution) in enumerate(items) if solution is not None}
         assessed = dict(zip(solutions, self._assess(solutions), strict=True))
-        rows = [row | assessed.get(k, {}) for k, (row, _) in enumerate(pieces)]
+        rows = [row | assessed.get(k, {}) for k, (row, _) in enumerate(items)]
         own = summarise(rows) | self._sizes() | self._shares() | self._offline()
         outputs = self._outputs(rows)
         written = [row | {"outputs": json.dumps(found) if (found := row.get("outputs")) else None} for row in rows]

@@ -17,7 +17,7 @@ from vibench.model.hyperreduced import HyperReducedModel
 from vibench.provenance import machine
 from vibench.qp.repeats import check_answer, units
 from vibench.stages.assembly import AssemblyStage
-from vibench.stages.base import Failed, Pieces, PiecewiseStage, Row, Stage, value_of
+from vibench.stages.base import Failed, Items, ItemwiseStage, Row, Stage, value_of
 from vibench.stages.cell_queries import CellQueries
 from vibench.stages.certification import CertificateStage
 from vibench.stages.query import Queries, Watch
@@ -73,8 +73,8 @@ class TimedCell:
 
 
 @dataclass(frozen=True)
-class TimingRounds(PiecewiseStage):
-    """Timing of the queries of cells that are compared; a piece is one round of one cell.
+class TimingRounds(ItemwiseStage):
+    """Timing of the queries of cells that are compared; a item is one round of one cell.
 
     A disturbance of the machine that lasts longer than a round meets all cells alike. The order of the cells is another
     one in each round. The value is a `TimedCell` per cell.
@@ -88,7 +88,7 @@ class TimingRounds(PiecewiseStage):
     rounds: int
 
     @property
-    def pieces(self) -> int:
+    def items(self) -> int:
         """One for each round of each cell."""
         return self.rounds * len(self.cells)
 
@@ -103,13 +103,13 @@ class TimingRounds(PiecewiseStage):
         read += [cell.certificate for cell in self.cells if cell.certificate is not None]
         return tuple(dict.fromkeys(read))
 
-    def place(self, piece: int) -> tuple[int, int]:
-        """The round and the cell of a piece."""
-        number, within = divmod(piece, len(self.cells))
+    def place(self, item: int) -> tuple[int, int]:
+        """The round and the cell of a item."""
+        number, within = divmod(item, len(self.cells))
         return number, int(np.random.default_rng(number).permutation(len(self.cells))[within])
 
     def stage_of(self, number: int) -> CellQueries:
-        """The cell of a piece: processes take turns where its plugins are of other packages than the next one's."""
+        """The cell of a item: processes take turns where its plugins are of other packages than the next one's."""
         return self.cells[self.place(number)[1]]
 
     def begin(self, store: Store) -> _Rounds:
@@ -117,7 +117,7 @@ class TimingRounds(PiecewiseStage):
         return _Rounds(self, store)
 
 
-class _Rounds(Pieces):
+class _Rounds(Items):
     """Rounds in progress."""
 
     def __init__(self, stage: TimingRounds, store: Store) -> None:
@@ -127,7 +127,7 @@ class _Rounds(Pieces):
         self._warm: set[int] = set()
         self._forms: dict[tuple[int, int], tuple[VariationalInequality, Seconds]] = {}
 
-    def piece(self, number: int, watch: Watch) -> TimedRound:
+    def item(self, number: int, watch: Watch) -> TimedRound:
         """One round of one cell, after a warm-up if it is the cell's first one in this process."""
         at, cell = self._stage.place(number)
         if cell not in self._warm:
@@ -202,11 +202,11 @@ class _Rounds(Pieces):
         """A round without a result."""
         return failed
 
-    def finish(self, pieces: Sequence[TimedRound | Failed]) -> tuple[TimedCell, ...]:
+    def finish(self, items: Sequence[TimedRound | Failed]) -> tuple[TimedCell, ...]:
         """The rounds of every cell, in their order."""
         found: list[list[TimedRound]] = [[] for _ in self._stage.cells]
         lost: list[list[Failed]] = [[] for _ in self._stage.cells]
-        for number, outcome in enumerate(pieces):
+        for number, outcome in enumerate(items):
             cell = self._stage.place(number)[1]
             if isinstance(outcome, Failed):
                 lost[cell].append(outcome)

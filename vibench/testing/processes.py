@@ -17,7 +17,7 @@ from vibench.errors import in_a_line
 from vibench.execution.supervisor import Supervisor
 from vibench.execution.watched import WatchedWork, watched
 from vibench.qp.status import Status
-from vibench.stages.base import Failed, Pieces
+from vibench.stages.base import Failed, Items
 from vibench.storage.artefacts import Store
 from vibench.testing.checks import CheckResult, Conformance, ConformanceError, Verdict
 
@@ -59,11 +59,11 @@ class Examination(WatchedWork):
         return checks
 
     @property
-    def pieces(self) -> int:
+    def items(self) -> int:
         """Number of checks."""
         return len(self.conformance.checks)
 
-    def begin(self, store: Store) -> Pieces:  # noqa: ARG002
+    def begin(self, store: Store) -> Items:  # noqa: ARG002
         """Import the plugin: none of the checks can be made without it."""
         self._case  # noqa: B018
         return self
@@ -84,10 +84,10 @@ class Examination(WatchedWork):
         name, late = self.conformance.checks[number].name, failed.status is Status.TIMEOUT
         return CheckResult(name, Verdict.SKIPPED, LATE) if late else CheckResult(name, Verdict.FAILED, failed.reason)
 
-    def finish(self, pieces: Sequence[tuple[int, CheckResult]]) -> list[CheckResult]:
+    def finish(self, items: Sequence[tuple[int, CheckResult]]) -> list[CheckResult]:
         """All results; the first check that had no time left has failed, those after it are skipped together."""
-        results = [result for _, result in pieces if result.message != LATE]
-        late = [result.check for _, result in pieces if result.message == LATE]
+        results = [result for _, result in items if result.message != LATE]
+        late = [result.check for _, result in items if result.message == LATE]
         if late:
             reason = f"stopped: the checks take longer than {self.seconds:g} s"
             results.append(CheckResult(late[0], Verdict.FAILED, reason))
@@ -113,7 +113,7 @@ class Call(WatchedWork):
     """One call of a pickled function with its arguments, where these folders are searched for modules."""
 
     label = "call"
-    pieces = 1
+    items = 1
 
     pickled: bytes
     path: tuple[str, ...]

@@ -22,11 +22,10 @@ from running import Vibench, assert_same_numbers, read_until, started
 from samples import ROUNDS, wire_study, write_study
 
 from vibench.errors import ExecutorError, RequestError
-from vibench.execution import dask
-from vibench.execution.dask import Dask
-from vibench.execution.executors import Local
+from vibench.execution import executors
+from vibench.execution.executors import Dask, Local
+from vibench.execution.jobs import Job
 from vibench.execution.run import Observer, Options, run_study
-from vibench.execution.supervisor import Job
 from vibench.stages.base import Done, Stage
 from vibench.storage.artefacts import Store
 from vibench.study.spec import Study
@@ -34,7 +33,7 @@ from vibench.study.spec import Study
 
 def elsewhere(_: str) -> tuple[bool, str, str]:
     """What a worker says that does not see the folder of the artefacts."""
-    return dask._describe("/on/another/machine")
+    return executors._describe("/on/another/machine")
 
 
 def job(stage: Stage, store: Path) -> Job:
@@ -121,7 +120,7 @@ def test_a_client_that_closes_while_it_is_asked_holds_up_nobody(
     client: str, job_status: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The callbacks of all clients share one thread: a result that never comes would be the end of all later runs."""
-    monkeypatch.setattr(dask, "ASKED_AGAIN", 0.0)
+    monkeypatch.setattr(executors, "ASKED_AGAIN", 0.0)
     asked: list[float] = []
 
     def result(timeout: float) -> str:
@@ -131,7 +130,7 @@ def test_a_client_that_closes_while_it_is_asked_holds_up_nobody(
         return "outcome"
 
     ours: Future[Any] = Future()
-    dask._hand_over(SimpleNamespace(client=SimpleNamespace(status=client), status=job_status, result=result), ours)
+    executors._hand_over(SimpleNamespace(client=SimpleNamespace(status=client), status=job_status, result=result), ours)
     if (client, job_status) != ("running", "finished"):
         with pytest.raises(ExecutorError, match="the dask cluster was lost"):
             ours.result(timeout=0)
@@ -143,7 +142,7 @@ def test_a_client_that_closes_while_it_is_asked_holds_up_nobody(
 def test_workers_with_another_vibench_are_refused(
     cluster: LocalCluster, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(dask, "code_here", lambda: "mine")
+    monkeypatch.setattr(executors, "code_here", lambda: "mine")
     with pytest.raises(RequestError, match=r"the dask worker tcp://.* has other code: .* instead of mine"):
         Dask(cluster.scheduler_address, 1, tmp_path)
 
@@ -151,7 +150,7 @@ def test_workers_with_another_vibench_are_refused(
 def test_workers_that_do_not_see_the_artefacts_are_refused(
     cluster: LocalCluster, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(dask, "_describe", elsewhere)
+    monkeypatch.setattr(executors, "_describe", elsewhere)
     with pytest.raises(RequestError, match="does not see the artefacts"):
         Dask(cluster.scheduler_address, 1, tmp_path)
 

@@ -57,7 +57,7 @@ def steady(seconds: float, queries: tuple[int, ...] = (0, 1), slowdown: float = 
 @given(st.integers(1, 9), st.integers(1, 9))
 def test_every_round_has_every_cell_once_before_the_next_one_begins(rounds: int, count: int) -> None:
     stage = TimingRounds((CELLS[0],) * count, (EVERY,) * count, rounds)
-    places = [stage.place(piece) for piece in range(stage.pieces)]
+    places = [stage.place(item) for item in range(stage.items)]
     assert [number for number, _ in places] == sorted(number for number, _ in places)
     assert sorted(places) == [(number, k) for number in range(rounds) for k in range(count)]
 
@@ -72,8 +72,8 @@ def test_the_order_of_the_cells_changes_from_round_to_round() -> None:
 def test_a_machine_that_slows_down_halfway_meets_all_cells_alike() -> None:
     """Cell after cell, the second of two equal ones would seem thrice as slow."""
     stage = TimingRounds((CELLS[0],) * 2, (EVERY,) * 2, 12)
-    pieces = [steady(1.0 if piece < stage.pieces / 2 else 3.0) for piece in range(stage.pieces)]
-    timed = timing_rounds._Rounds.finish(_in(stage), pieces)
+    items = [steady(1.0 if item < stage.items / 2 else 3.0) for item in range(stage.items)]
+    timed = timing_rounds._Rounds.finish(_in(stage), items)
     one, other = (seconds_of_cell(round_rows(each.rounds), 1.0) for each in timed)
     assert one == other
     assert one["online_q1_s"] < one["online_s"] < one["online_q3_s"]
@@ -127,10 +127,10 @@ def test_a_round_that_takes_long_ends_early(store: SampleStore, monkeypatch: pyt
 
 def test_a_lost_round_is_told_and_the_others_count() -> None:
     stage = TimingRounds((CELLS[0],) * 2, (EVERY,) * 2, 3)
-    pieces: list[TimedRound | Failed] = [steady(2.0) for _ in range(stage.pieces)]
-    pieces[stage.pieces - 1] = Failed(Status.CRASHED, "the worker died")
-    unlucky = stage.place(stage.pieces - 1)[1]
-    timed = _in(stage).finish(pieces)
+    items: list[TimedRound | Failed] = [steady(2.0) for _ in range(stage.items)]
+    items[stage.items - 1] = Failed(Status.CRASHED, "the worker died")
+    unlucky = stage.place(stage.items - 1)[1]
+    timed = _in(stage).finish(items)
     assert [len(one.rounds) for one in timed] == [2 if k == unlucky else 3 for k in range(2)]
     assert timed[unlucky].reason == "1 of 3 rounds: the worker died"
     assert timed[1 - unlucky].reason == ""

@@ -1,0 +1,103 @@
+"""What a supervisor and its worker processes say to each other: jobs, the batches they are done in, and reports."""
+
+from __future__ import annotations
+
+from collections.abc import Container, Iterator
+from dataclasses import dataclass, field
+from itertools import groupby
+from typing import Any
+
+from vibench.dependencies import CELL, code_used
+from vibench.provenance import libraries
+from vibench.stages.base import Failed, ItemwiseStage, Stage
+
+
+def code_here() -> str:
+    """The code of vibench that determines numbers, and the libraries, in this process."""
+    return f"{code_used(*CELL, whole=True)}; {libraries()}"
+
+
+@dataclass(frozen=True)
+class Job:
+    """A stage to be run: where artefacts are, the limits of a query and of the stage, and with what code."""
+
+    store: str
+    stage: Stage
+    query_seconds: float
+    cell_seconds: float
+    memory_gib: float
+    code: str = field(default_factory=code_here)
+
+
+@dataclass(frozen=True)
+class Batch:
+    """What one process does in succession: items of a stage, or a stage that has none.
+
+    Packages of third parties share no process, and the items of a stage may need several.
+
+    Attributes
+    ----------
+    packages
+        Packages whose code it runs.
+    numbers
+        The items.
+    ends
+        Whether the stage ends with it.
+    """
+
+    packages: frozenset[str]
+    numbers: tuple[int, ...]
+    ends: bool
+
+
+def batches(stage: Stage, done: Container[int]) -> Iterator[Batch]:
+    """What is left of a stage, in the order of its items; those in `done` are not."""
+    if not isinstance(stage, ItemwiseStage):
+        yield Batch(stage.packages, (), ends=True)
+        return
+    left = [number for number in range(stage.items) if number not in done]
+    grouped = [(packages, tuple(ks)) for packages, ks in groupby(left, lambda k: stage.stage_of(k).packages)]
+    grouped = grouped or [(stage.packages, ())]
+    for k, (packages, numbers) in enumerate(grouped, 1):
+        yield Batch(packages, numbers, ends=k == len(grouped))
+
+
+@dataclass
+class Progress:
+    """The values of the items of a stage that are done, and the items that are lost, by their numbers."""
+
+    done: dict[int, Any] = field(default_factory=dict)
+    lost: dict[int, Failed] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Begun:
+    """A worker has received its job."""
+
+
+@dataclass(frozen=True)
+class InItem:
+    """A worker is in an item; `watched` while it is in an operation with a time limit of its own."""
+
+    number: int
+    watched: bool
+
+
+@dataclass(frozen=True)
+class ItemDone:
+    """A worker has done an item."""
+
+    number: int
+    value: Any
+
+
+@dataclass(frozen=True)
+class BatchDone:
+    """A batch is done that does not end its stage."""
+
+
+@dataclass(frozen=True)
+class OutOfMemory:
+    """A worker has no memory left, for its work (`failed`) or for another job, and has to be replaced."""
+
+    failed: Failed | None
