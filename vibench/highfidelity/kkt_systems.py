@@ -59,7 +59,28 @@ class CondensedStiffness:
         if self._condensed.dense:
             self._compliance  # noqa: B018  its Cholesky factorisation fails otherwise
         else:
-            SparseCholesky(self._condensed.schur, name)
+            SparseCholesky(self._condensed.schur, name)  # its message has this name
+
+    def solve(self, right: Array) -> Array:
+        """A⁻¹ r for right-hand sides (n, k)."""
+        solutions = np.empty_like(right)
+        for k, column in enumerate(right.T):
+            load, particular = self._condensed.condense_load(column)
+            retained = self._compliance @ load if self._condensed.dense else self._schur_factor.solve(load)
+            solutions[:, k] = self._condensed.recover(retained, particular)
+        return solutions
+
+    def condensed_program(self, vi: VariationalInequality) -> VariationalInequality | None:
+        """`vi`, whose stiffness must be this one, dense and in the retained unknowns; `None` if these are many."""
+        if not self._condensed.dense:
+            return None
+        load, _ = self._condensed.condense_load(vi.f)
+        B = sp.csc_array(vi.B)[:, self._pattern.retained].toarray()
+        return VariationalInequality(self._condensed.dense_schur, load, B, vi.g)
+
+    @cached_property
+    def _schur_factor(self) -> SparseCholesky:
+        return SparseCholesky(self._condensed.schur, "A")
 
     @cached_property
     def _compliance(self) -> Array:
@@ -220,9 +241,10 @@ def _compliance_solver(compliance: Array, f: Array, B: SparseMatrix, g: Array) -
             return unconstrained, lam
         displacements = np.asarray(rows @ compliance)
         contact = rows @ displacements.T
-        factor = scipy.linalg.cho_factor(contact)
-        forces = scipy.linalg.cho_solve(factor, excess[active])
-        forces += scipy.linalg.cho_solve(factor, excess[active] - contact @ forces)
+        scale = 1.0 / np.sqrt(np.diag(contact))  # rows of any length
+        factor = scipy.linalg.cho_factor(contact * np.outer(scale, scale))
+        forces = scale * scipy.linalg.cho_solve(factor, scale * excess[active])
+        forces += scale * scipy.linalg.cho_solve(factor, scale * (excess[active] - contact @ forces))
         lam[active] = forces
         return unconstrained - forces @ displacements, lam
 

@@ -74,7 +74,7 @@ class Model:
         A, f, B, g, Y = self.program(mu)
         rows = np.where((norms := np.linalg.norm(B, axis=1)) > 0.0, norms, 1.0)
         N, b = B / rows[:, None], g / rows
-        length, force = _scales(A, f, b)[:2]  # units in which the solver's tolerances are relative ones
+        length, force = _units(A, f, b)  # in which the solver's tolerances are relative ones
         settings = self.about["settings"][self.solver]
         answer = SOLVERS[self.solver](A * (length / force), f / force, N, b / length, settings)
         y, z = (np.nan_to_num(vector, nan=0.0, posinf=0.0, neginf=0.0) for vector in answer)
@@ -86,22 +86,22 @@ class Model:
 
 
 def residuals(A: Array, f: Array, B: Array, g: Array, x: Array, alpha: Array) -> tuple[float, float, float]:
-    """Relative residuals, with rows of B of norm 1: max (B x − g)₊, ‖A x − f + Bᵀα‖∞, |xᵀA x − fᵀx + gᵀα|."""
-    _, _, length, force, energy = _scales(A, f, g)
-    parts, terms = np.stack([A @ x, -f, B.T @ alpha]), (float(x @ A @ x), -float(f @ x), float(g @ alpha))
-    dual = max(force, float(abs(parts).max())) or 1.0
-    gap = max(0.5 * abs(terms[0]), abs(terms[1]), abs(terms[2]), energy) or 1.0
-    excess, rest = float((B @ x - g).max(initial=0.0)), float(abs(parts.sum(axis=0)).max())
-    return excess / length, rest / dual, abs(sum(terms)) / gap
+    """With s = B x − g, S² = xᵀA x + ‖Bᵀα‖² and norms in A⁻¹: max (s_i)₊/‖B_i‖S, ‖f − A x − Bᵀα‖/S, |αᵀs|/S²."""
+    s, force = B @ x - g, B.T @ alpha
+    violated = s > 1.01 * np.finfo(float).eps * (np.count_nonzero(B, axis=1) + 2.0) * (abs(B) @ abs(x) + abs(g))
+    whitened = np.linalg.solve(np.linalg.cholesky(A), np.column_stack([f - A @ x - force, force, B[violated].T]))
+    norms = np.linalg.norm(whitened, axis=0)
+    S = np.hypot(np.sqrt(max(float(x @ A @ x), 0.0)), norms[1])
+    with np.errstate(divide="ignore", invalid="ignore"):  # a row of zeros, or the solution 0
+        ways = np.array([np.max(s[violated] / norms[2:], initial=0.0), norms[0], abs(alpha @ s)])
+        return tuple(np.where(ways == 0.0, 0.0, ways / [S, S, S**2]).tolist())
 
 
-def _scales(A: Array, f: Array, g: Array) -> tuple[float, float, float, float, float]:
-    """Units of length and force for the solver; the least length, force and energy that residuals are relative to."""
-    longest, k, load = float(abs(g).max()), float(A.trace()) / len(f), float(abs(f).max())
-    if load > 1e-10 * k * (-g).max(initial=0.0):
-        return 1.0, load, max(1.0, longest), 0.0, 0.5e-4 * float(f @ f) ** 2 / float(f @ A @ f)
-    length = longest or 1.0  # no load: the constraints prescribe a length and a force
-    return length, 1e-3 * k * length, length, 1e-4 * k * length, 1e-4 * k * length**2
+def _units(A: Array, f: Array, g: Array) -> tuple[float, float]:
+    """Units of length and force for the solver: of the load, or without load of what violated constraints prescribe."""
+    k, load, curvature = float(A.trace()) / len(f), float(abs(f).max()), float(f @ A @ f)
+    moved, depth = load * float(f @ f) / (curvature or np.inf), float((-g).max(initial=0.0))
+    return (max(moved, depth), load) if moved > 1e-10 * depth else (depth or 1.0, 1e-3 * k * (depth or 1.0))
 
 
 def _polished(A: Array, f: Array, B: Array, g: Array, active: NDArray[np.bool_]) -> tuple[Array, Array]:

@@ -18,7 +18,8 @@ from vibench.interfaces.validation import checked_assembly
 from vibench.linalg.inner_product import svd
 
 CONSTANT_RTOL = 1e-13
-"""A member whose entries vary by less over the training set, relative to the largest one, is constant."""
+"""A member whose entries vary by less over the training set, relative to the largest one, is constant; of B and g
+relative to the largest one of the row."""
 
 AFFINE_RTOL = 1e-9
 """Largest difference of a declared affine sum from the assembled member, relative to its largest entry."""
@@ -149,17 +150,18 @@ def _assembled(problem: Problem, training: Array, names: Sequence[str]) -> Mappi
 
 def _decomposed(name: str, values: list[Any], problem: Problem, tolerance: float) -> AffineMember:
     entries = _Entries(values, symmetric=name == "A")
-    if entries.constant:
+    weights = entries.row_weights() if name in ("B", "g") else np.ones(len(entries.rows))
+    if entries.is_constant(weights):
         return AffineMember(Evaluation.CONSTANT, (values[0],))
     reason = f"{name} depends on mu and the problem does not evaluate it entry by entry"
     if name in problem.entrywise and len(values) > 1:
-        interpolation = interpolate(entries.values, tolerance)
-        if len(interpolation.points) <= max(1.0, MAX_TERMS_SHARE * len(values)):
-            terms = tuple(entries.assembled(mode) for mode in interpolation.modes.T)
-            rows, columns = entries.rows[interpolation.points], entries.columns[interpolation.points]
-            return AffineMember(Evaluation.INTERPOLATED, terms, rows, columns, interpolation.error)
-        count = len(interpolation.points)
-        reason = f"{name} depends on mu, and interpolation needs {count} terms for {len(values)} parameters"
+        found = interpolate(weights[:, None] * entries.values, tolerance)
+        if len(found.points) <= max(1.0, MAX_TERMS_SHARE * len(values)):
+            modes = found.modes * weights[found.points] / weights[:, None]
+            terms = tuple(entries.assembled(mode) for mode in modes.T)
+            rows, columns = entries.rows[found.points], entries.columns[found.points]
+            return AffineMember(Evaluation.INTERPOLATED, terms, rows, columns, found.error)
+        reason = f"{name} depends on mu, and interpolation needs {len(found.points)} terms for {len(values)} parameters"
     if name in ("B", "g") and problem.has_contact:
         return AffineMember(Evaluation.CONTACT, ())
     return AffineMember(Evaluation.FULL, (), reason=reason)
@@ -176,9 +178,19 @@ class _Entries:
             self.rows, self.columns = np.arange(len(self.values)), np.zeros(len(self.values), np.intp)
         else:
             self.values = self._of_matrices(values)
-        spread = float(np.ptp(self.values, axis=1).max(initial=0.0))
+
+    def row_weights(self) -> Array:
+        """One over the largest entry (k,) in the row of each: rows of constraints may have any scale, or be far."""
+        largest = np.zeros(self._shape[0])
+        np.maximum.at(largest, self.rows, np.abs(self.values).max(axis=1, initial=0.0))
+        return np.asarray(1.0 / np.where(largest > 0.0, largest, 1.0)[self.rows])
+
+    def is_constant(self, weights: Array) -> bool:
+        """Whether no entry varies by more than `CONSTANT_RTOL` of the largest one, with weights (k,)."""
+        spread = weights * np.ptp(self.values, axis=1)
         several = self.values.shape[1] > 1  # one parameter cannot show what varies
-        self.constant = several and spread <= CONSTANT_RTOL * float(np.abs(self.values).max(initial=0.0))
+        largest = float((weights * np.abs(self.values).max(axis=1, initial=0.0)).max(initial=0.0))
+        return several and float(spread.max(initial=0.0)) <= CONSTANT_RTOL * largest
 
     def _of_matrices(self, matrices: list[SparseMatrix]) -> Array:
         rows = [sp.csr_array(sp.triu(matrix) if self._symmetric else matrix) for matrix in matrices]

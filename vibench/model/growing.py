@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from vibench.arrays import Array
-from vibench.highfidelity.active_set import HighFidelitySolution, HighFidelitySolver
+from vibench.highfidelity.active_set import ActiveSetSolution, HighFidelitySolution, HighFidelitySolver
 from vibench.interfaces.problem import Problem, VariationalInequality
 from vibench.interfaces.strategies import Trainer
 from vibench.interfaces.validation import ReferenceAssembly, checked_assembly
@@ -143,15 +143,16 @@ class GrowingTrainer(Trainer):
         """Assemble, solve, and let the model grow."""
         mu = np.array(mu, float)
 
-        def work() -> tuple[VariationalInequality, HighFidelitySolution]:
+        def work() -> tuple[VariationalInequality, ActiveSetSolution]:
             vi = checked_assembly(self._problem, mu)
             return vi, self._solver.solve_assembled(mu, vi)
 
-        (vi, solution), seconds = timed(work)
+        (vi, unverified), seconds = timed(work)
         if not self.solved:
             _, marginal = timed(work)
             self.setup, seconds = seconds.beyond(marginal), marginal
-        self._solver.check_coercive(mu, vi)  # verification, which is not timed
+        solution = self._solver.verify(mu, vi, unverified)  # as what follows, this is not timed
+        self._solver.check_coercive(mu, vi)
         self._reference.refuse_false_constants(mu, vi)
         self._solver.remember(mu, solution)
         note, growing = timed(lambda: self._model.add(vi, solution))

@@ -8,17 +8,20 @@ from typing import NamedTuple
 import numpy as np
 import scipy.sparse as sp
 
-from vibench.arrays import Array, SparseMatrix
+from vibench.arrays import Array, Mask, SparseMatrix
 from vibench.interfaces.problem import VariationalInequality
 
 NO_LOAD = 1e-10
-"""A load below this share of the forces at work in the constraints is round-off, as −A·lift is for a rigid lift."""
+"""A load that moves x by less than this share of what the constraints prescribe is round-off."""
 
 OBJECTIVE_UNIT = 1e-3
 """Share of what the constraints prescribe that is a solver's unit of A x − f, of force or in the dual of length.
 
 Its absolute tolerances then serve a solution that is small beside that, as of constraints that barely act.
 """
+
+FAR = 1e4
+"""A constraint so many lengths away is left out, and the solution without it must satisfy it: see `near`."""
 
 MULTIPLIER_UNIT = 0.1
 """Share of the prescribed force that is the unit of the unknowns of a dual program.
@@ -49,27 +52,44 @@ def ratio(value: float, scale: float) -> float:
     return value / scale if scale > 0.0 else value
 
 
-class Prescribed(NamedTuple):
-    """What the constraints of a program without load prescribe; the data have no other length and no other force.
+class Drive(NamedTuple):
+    """What drives the solution of a program away from 0, in the units of its data.
+
+    Constraints that are satisfied at 0 drive nothing: however far they are, they have no part in it.
 
     Attributes
     ----------
-    length
-        L = max |g_i| / ‖B_i‖, or 1 where g = 0.
-    force
-        k L with the stiffness k, the mean of the diagonal of A.
+    length, force
+        Sizes of x and of forces on its entries: those of the load, or of what violated constraints prescribe.
+    loaded
+        Whether there is a load; one that is round-off, as −A·lift is for a rigid lift, is none.
     """
 
     length: float
     force: float
+    loaded: bool
 
 
-def prescribed(program: VariationalInequality, rows: Array) -> Prescribed | None:
-    """What the constraints prescribe, `rows` (m,) being the norms of B's rows; `None` for a program with a load f."""
-    bound, k = program.g / rows, stiffness(program.A)
-    if peak(program.f) > NO_LOAD * k * float(np.max(-bound, initial=0.0)):  # x = 0 violates them by that much
-        return None
-    return Prescribed(size(bound), k * size(bound))
+def drive(program: VariationalInequality, rows: Array) -> Drive:
+    """What drives the solution of a program, `rows` (m,) being the norms of B's rows.
+
+    A load f moves x by one step of steepest descent, (fᵀf / fᵀA f) f, a violated constraint by −g_i / ‖B_i‖. Where
+    neither moves anything the solution is 0, and all units are 1.
+    """
+    A, f = program.A, program.f
+    k, load, curvature = stiffness(A), peak(f), float(f @ (A @ f))
+    moved = load * float(f @ f) / curvature if curvature > 0.0 else 0.0
+    depth = float(np.max(-program.g / rows, initial=0.0))
+    if moved > NO_LOAD * depth:
+        return Drive(max(moved, depth), load, loaded=True)
+    length = depth if depth > 0.0 else 1.0
+    return Drive(length, k * length, loaded=False)
+
+
+def near_rows(program: VariationalInequality) -> Mask:
+    """Constraints (m,) that are less than `FAR` lengths from 0; solvers lose their digits to the others."""
+    rows = row_norms(program.B)
+    return np.asarray(program.g <= FAR * drive(program, rows).length * rows)
 
 
 def stiffness(A: SparseMatrix | Array) -> float:
@@ -115,15 +135,20 @@ class Units:
 
 
 def units_of(program: VariationalInequality) -> Units:
-    """Units in which ‖f‖∞ = 1 and x is as it is; without load, those of what the constraints prescribe."""
+    """Units of what drives a program: those in which ‖f‖∞ = 1, or of what the constraints prescribe without load."""
     rows = row_norms(program.B)
-    scale = prescribed(program, rows)
-    if scale is None:
-        return Units(rows, 1.0, size(program.f))
-    return Units(rows, scale.length, OBJECTIVE_UNIT * scale.force)
+    found = drive(program, rows)
+    return Units(rows, found.length, found.force if found.loaded else OBJECTIVE_UNIT * found.force)
 
 
-def units_of_dual(dual: VariationalInequality) -> Units:
-    """Units of the dual of a program without load, min ½ αᵀKα − dᵀα over α ≥ 0: d are lengths, K is a flexibility."""
-    length = size(dual.f)
-    return Units(np.ones(len(dual.g)), MULTIPLIER_UNIT * length / stiffness(dual.A), OBJECTIVE_UNIT * length)
+def units_of_dual(dual: VariationalInequality, loaded: bool) -> Units:
+    """Units of a dual program, min ½ αᵀKα − dᵀα over α ≥ 0: d are lengths, K is a flexibility.
+
+    Entries of d below zero are constraints that the unconstrained solution satisfies, and drive nothing.
+    """
+    length = float(np.max(dual.f, initial=0.0)) or size(dual.f)
+    return Units(
+        np.ones(len(dual.g)),
+        MULTIPLIER_UNIT * length / stiffness(dual.A),
+        length if loaded else OBJECTIVE_UNIT * length,
+    )

@@ -17,11 +17,11 @@ import qpsolvers
 import scipy.linalg
 import scipy.sparse as sp
 
-from vibench.arrays import Array
+from vibench.arrays import Array, Mask
 from vibench.errors import NumericalError, message_of
 from vibench.interfaces.problem import VariationalInequality
 from vibench.provenance import solver_version
-from vibench.qp.scaling import Units, prescribed, row_norms, units_of, units_of_dual
+from vibench.qp.scaling import Units, drive, near_rows, row_norms, units_of, units_of_dual
 from vibench.qp.settings import SETTINGS
 from vibench.qp.verification import QPSolution, QPSolver
 from vibench.text import one_line
@@ -40,9 +40,10 @@ def solve_qp(
 ) -> QPSolution:
     """Solve a quadratic program with a named solver.
 
-    The data are scaled first (`Units`), every constraint row to unit norm and the objective to ‖f‖∞ = 1, so that the
-    absolute tolerances of the solvers correspond to the relative residuals of the benchmark. Without a load the length
-    and the force that the constraints prescribe are the units. The solution is scaled back.
+    The data are scaled first (`Units`), every constraint row to unit norm and x and the objective by what drives them
+    (`drive`), so that the absolute tolerances of the solvers correspond to the relative residuals of the benchmark.
+    Constraints that are far beyond are left out at first, and brought back if the solution violates one of them. The
+    solution is scaled back.
 
     Parameters
     ----------
@@ -64,10 +65,32 @@ def solve_qp(
     NumericalError
         If the solver does not return a `QPSolution` of the right shapes, with a text as its status.
     """
+    if not np.any(program.f) and np.all(program.g >= 0.0):
+        return QPSolution(np.zeros_like(program.f), np.zeros_like(program.g), "nothing to solve: 0 is the solution")
+    near = near_rows(program)
+    if not np.all(near):
+        answer = solve_qp(_rows(program, near), solver, accuracy, extra, factor, _start_of(start, near))
+        if answer.x is None or answer.alpha is None:
+            return answer
+        if np.all(program.B[~near] @ answer.x <= program.g[~near]):
+            alpha = np.zeros(len(near))
+            alpha[near] = answer.alpha
+            return replace(answer, alpha=alpha)
     solve = partial(_solve_in, solver=solver, accuracy=accuracy, extra=extra)
     if factor is None or not len(program.f):
         return solve(units_of(program), program, start)
     return _solve_dual(program, solve, factor, start)
+
+
+def _rows(program: VariationalInequality, chosen: Mask) -> VariationalInequality:
+    """The program with some of its constraints."""
+    B = program.B[chosen] if isinstance(program.B, np.ndarray) else sp.csr_array(program.B)[chosen]
+    return replace(program, B=B, g=program.g[chosen])
+
+
+def _start_of(start: QPSolution | None, chosen: Mask) -> QPSolution | None:
+    """A warm start of the program with these constraints."""
+    return None if start is None or start.alpha is None else replace(start, alpha=start.alpha[chosen])
 
 
 def _solve_in(
@@ -127,7 +150,7 @@ def _solve_dual(
     if start is not None and start.alpha is not None and start.x is not None:  # slack g − Bx of the constraints −α ≤ 0
         slack = np.maximum(program.g - program.B @ start.x, 0.0) / rows
         start = replace(start, x=rows * start.alpha, alpha=slack)
-    units = units_of(dual) if prescribed(program, rows) is None else units_of_dual(dual)
+    units = units_of_dual(dual, drive(program, rows).loaded)
     answer = solve(units, dual, start)
     if answer.x is None:
         return answer

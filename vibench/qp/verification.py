@@ -1,35 +1,51 @@
-"""Solutions of QP solvers, and their verification: residuals recomputed, and a status from them alone.
+"""KKT verification: residuals recomputed from the solution, and a status from them alone, not from the solver.
 
-How far apart can two solutions of one program be when the KKT residuals of both meet an accuracy? For two solutions
-k = 1, 2 of min ½xᵀAx − fᵀx, Bx ≤ g, with α_k ≥ 0, residuals r_k = Ax_k − f + Bᵀα_k, excesses p_k = (Bx_k − g)₊ and
-gaps δ_k = x_kᵀAx_k − fᵀx_k + gᵀα_k, the difference d = x₁ − x₂ satisfies
+A residual means something only in the norms of the program. With r = f − A x − Bᵀα, s = B x − g and the energy
+S² = ‖x‖²_A + ‖Bᵀα‖²_{A⁻¹} of the solution, the *natural* residuals
 
-    dᵀAd ≤ dᵀ(r₁ − r₂) + Σ_k (δ_k − x_kᵀr_k) + p₁ᵀα₂ + p₂ᵀα₁.
+    dual ‖r‖_{A⁻¹} / S,    primal max_i (s_i)₊ / ‖B_i‖_{A⁻¹} / S,    gap |αᵀs| / S²,    ‖B_i‖²_{A⁻¹} = B_i A⁻¹ B_iᵀ,
 
-Where every relative residual is at most ε, each term is bounded by data of one solution alone. With the smallest
-eigenvalue of A this gives ‖d‖² ≤ (l₁ + l₂)‖d‖ + c₁ + c₂. In a V-orthonormal basis ‖d‖ is the distance of the two
-displacements in V. Solvers that are `ok` on the same reduced problem and farther apart reveal a bug.
+are the same in all units of x and f, in any basis of x, and for any scaling of rows of B with g. They are the terms of
+the error bound of `vibench.model.error_bounds`: (s_i)₊ / ‖B_i‖_{A⁻¹} is the energy norm of the smallest correction that
+row i needs alone. Whether a row is violated is decided row by row, against the round-off of its own s_i: a far row, as
+one with g_i = ∞, says nothing of the others.
+
+How far apart can two solutions of one program be when the residuals of both meet an accuracy? For two solutions
+k = 1, 2 with α_k ≥ 0, residuals r_k = f − Ax_k − Bᵀα_k and excesses
+s_k = Bx_k − g, the difference d = x₁ − x₂ satisfies
+
+    ‖d‖²_A = dᵀ(r₂ − r₁) − (α₁ − α₂)ᵀ(s₁ − s₂) ≤ ‖d‖_A (‖r₁‖ + ‖r₂‖) + |α₁ᵀs₁| + |α₂ᵀs₂| + α₁ᵀ(s₂)₊ + α₂ᵀ(s₁)₊
+
+in the norm of A⁻¹. Where every natural residual is at most ε, ‖r_k‖ ≤ ε S_k, |α_kᵀs_k| ≤ ε S_k² and
+(s_k)_i ≤ ε S_k ‖B_i‖; with p_k = Σ_i ‖B_i‖ (α_k)_i the last terms are at most ε S_k p_l ≤ ε (S_k² + p_l²)/2. This
+gives ‖d‖²_A ≤ (l₁ + l₂)‖d‖_A + c₁ + c₂, each term from data of one solution alone, and the smallest eigenvalue of A
+the distance ‖d‖. In a V-orthonormal basis ‖d‖ is the distance of the two displacements in V. Solvers that are `ok` on
+the same reduced problem and farther apart reveal a bug.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
+import scipy.linalg
+import scipy.sparse as sp
 from scipy.optimize import nnls
 
-from vibench.arrays import Array
+from vibench.arrays import Array, SparseMatrix
+from vibench.errors import NumericalError
 from vibench.interfaces.problem import VariationalInequality
-from vibench.qp.scaling import peak, prescribed, ratio, row_norms, size
+from vibench.linalg.cholesky import SparseCholesky
+from vibench.qp.scaling import row_norms
 from vibench.qp.status import Status
 from vibench.text import above
 
-ENERGY_FLOOR = 1e-4
-"""Share of the energy of load or constraints below which the scale of the gap never falls."""
+UNIT = float(np.finfo(float).eps)
 
-FORCE_FLOOR = 1e-4
-"""Share of the prescribed force that the scale of the dual residual keeps; nodal forces decrease with mesh width."""
+DualNorms = Callable[[Array], Array]
+"""From functionals, the columns of an array (n×k), to their norms (k,) in A⁻¹."""
 
 
 @dataclass(frozen=True)
@@ -56,22 +72,18 @@ class QPSolver(Protocol):
 
 @dataclass(frozen=True)
 class Residuals:
-    """Relative KKT residuals, recomputed from the solution.
+    """Natural KKT residuals, recomputed from the solution; see above.
 
     Attributes
     ----------
     primal
-        max (B x − g)₊ with every row in units of its own norm, over max(1, ‖g‖∞).
+        Largest energy norm that the correction of one violated row takes, over S.
     dual
-        ‖A x − f + Bᵀα‖∞ over max(‖A x‖∞, ‖f‖∞, ‖Bᵀα‖∞).
+        ‖f − A x − Bᵀα‖_{A⁻¹} over S.
     gap
-        |xᵀA x − fᵀx + gᵀα| over max(|½ xᵀA x|, |fᵀx|, |gᵀα|, `ENERGY_FLOOR` (fᵀf)² / 2fᵀA f). The last term is a share
-        of the energy gained by one step of steepest descent from 0: where the constraints admit almost no displacement,
-        the other terms are round-off.
+        |αᵀ(B x − g)| over S².
 
-    A program without load has no length but the one that its constraints prescribe: the primal residual is over that.
-    Where they barely act, or not at all, x and α are round-off: the scales of dual residual and gap are at least the
-    shares `FORCE_FLOOR` of the prescribed force and `ENERGY_FLOOR` of its product with that length; see `prescribed`.
+    The solution 0 of a program without load, whose constraints are satisfied there, has the residuals 0.
     """
 
     primal: float
@@ -80,53 +92,95 @@ class Residuals:
 
     @property
     def worst(self) -> float:
-        """The largest of the three."""
-        return max(self.primal, self.dual, self.gap)
+        """The largest of the three; not a number if one of them is."""
+        return float(np.max([self.primal, self.dual, self.gap]))
 
 
-@dataclass(frozen=True)
-class Scales:
-    """Denominators of the residuals of a solution; the primal one in units of each row's own norm."""
+def kkt_residuals(program: VariationalInequality, x: Array, alpha: Array, norms: DualNorms | None = None) -> Residuals:
+    """Natural residuals of x (n,), α (m,) ≥ 0.
 
-    primal: float
-    dual: float
-    gap: float
+    Parameters
+    ----------
+    program
+        A, f, B, g, dense or sparse; g may be infinite in rows that constrain nothing.
+    x, alpha
+        The solution.
+    norms
+        Norms in A⁻¹ where A is factorised already.
 
-
-def kkt_residuals(program: VariationalInequality, x: Array, alpha: Array) -> Residuals:
-    """Relative residuals of x (n,), α (m,) ≥ 0; see `Residuals`."""
-    return residuals_and_scales(program, x, alpha)[0]
-
-
-def residuals_and_scales(program: VariationalInequality, x: Array, alpha: Array) -> tuple[Residuals, Scales]:
-    """Relative residuals of x (n,), α (m,) ≥ 0, and their denominators; see `Residuals`."""
-    A, f, B, g = program.A, program.f, program.B, program.g
-    norms, Ax, force = row_norms(B), A @ x, B.T @ alpha
-    energy, work, bound = float(x @ Ax), float(f @ x), float(g @ alpha)
-    least = _smallest_scales(program, norms)
-    scale = Scales(
-        primal=least.primal,
-        dual=max(peak(Ax), peak(f), peak(force), least.dual),
-        gap=max(abs(0.5 * energy), abs(work), abs(bound), least.gap),
+    Raises
+    ------
+    NumericalError
+        If A is not positive definite.
+    """
+    B, g = program.B, program.g
+    norms = norms or dual_norms(program.A)
+    residual, excess = accurate_residuals(program, x, alpha)
+    violated = np.flatnonzero(excess > round_off(B, x, g))
+    rows = B[violated].T if isinstance(B, np.ndarray) else sp.csr_array(B)[violated].toarray().T
+    reach, energy = norms(rows), solution_energy(program, x, alpha, norms)
+    steps = np.divide(excess[violated], reach, out=np.full(len(violated), np.inf), where=reach > 0.0)
+    pressed = alpha > 0.0  # elsewhere s may be infinite
+    gap = abs(float(alpha[pressed] @ excess[pressed]))
+    return Residuals(
+        primal=_over(float(np.max(steps, initial=0.0)), energy),
+        dual=_over(float(norms(residual[:, None])[0]), energy),
+        gap=_over(gap, energy**2),
     )
-    residuals = Residuals(
-        primal=float(np.max((B @ x - g) / norms, initial=0.0)) / scale.primal,
-        dual=ratio(peak(Ax - f + force), scale.dual),
-        gap=ratio(abs(energy - work + bound), scale.gap),
+
+
+def accurate_residuals(program: VariationalInequality, x: Array, alpha: Array) -> tuple[Array, Array]:
+    """F − A x − Bᵀα (n,) and B x − g (m,), summed in extended precision where the machine has one.
+
+    Of a stiff A, double precision would leave round-off times the condition number in the norm of A⁻¹.
+    """
+    A, B, u, lam = (member.astype(np.longdouble) for member in (program.A, program.B, x, alpha))
+    residual, excess = program.f - A @ u - B.T @ lam, B @ u - program.g
+    return residual.astype(float), excess.astype(float)
+
+
+def solution_energy(program: VariationalInequality, x: Array, alpha: Array, norms: DualNorms) -> float:
+    """S of a solution x (n,), α (m,)."""
+    force = float(norms((program.B.T @ alpha)[:, None])[0])
+    return float(np.hypot(np.sqrt(max(float(x @ (program.A @ x)), 0.0)), force))
+
+
+def dual_norms(A: SparseMatrix | Array) -> DualNorms:
+    """The `DualNorms` of a symmetric positive definite A (n×n), which is factorised here.
+
+    Raises
+    ------
+    NumericalError
+        If it is not positive definite.
+    """
+    if not isinstance(A, np.ndarray):
+        factor = SparseCholesky(A, "A")
+        return lambda columns: norms_by_solutions(columns, factor.solve(columns))
+    try:
+        L = np.linalg.cholesky(A)
+    except np.linalg.LinAlgError:
+        raise NumericalError("A is not positive definite") from None
+    if not len(L):  # LAPACK solves no system without unknowns
+        return lambda columns: np.zeros(columns.shape[1])
+    return lambda columns: np.linalg.norm(
+        scipy.linalg.solve_triangular(L, columns, lower=True, check_finite=False), axis=0
     )
-    return residuals, scale
 
 
-def _smallest_scales(program: VariationalInequality, norms: Array) -> Scales:
-    """What the denominators never fall below, `norms` (m,) being those of B's rows."""
-    driven = prescribed(program, norms)
-    if driven is not None:
-        return Scales(driven.length, FORCE_FLOOR * driven.force, ENERGY_FLOOR * driven.force * driven.length)
-    f = program.f
-    curvature = float(f @ (program.A @ f))
-    # gained by the best multiple of f, a lower bound on the energy gained by A⁻¹f
-    descent = 0.5 * float(f @ f) ** 2 / curvature if curvature > 0.0 else 0.0
-    return Scales(max(1.0, peak(program.g / norms)), 0.0, ENERGY_FLOOR * descent)
+def norms_by_solutions(functionals: Array, solutions: Array) -> Array:
+    """Norms (k,) in A⁻¹ of functionals (n×k), from the solutions A⁻¹ of them."""
+    return np.asarray(np.sqrt(np.maximum(np.einsum("ik,ik->k", functionals, solutions), 0.0)))
+
+
+def round_off(B: SparseMatrix | Array, x: Array, g: Array) -> Array:
+    """Bound (m,) of the round-off in B x − g (Higham 2002, §3.1), each row from its own terms."""
+    terms = np.count_nonzero(B, axis=1) if isinstance(B, np.ndarray) else np.diff(sp.csr_array(B).indptr)
+    return np.asarray(1.01 * UNIT * (terms + 2.0) * (abs(B) @ np.abs(x) + np.abs(g)))
+
+
+def _over(value: float, scale: float) -> float:
+    """A residual over its scale; infinite beside a solution without energy, not a number where either is none."""
+    return 0.0 if value == 0.0 else value / scale if scale != 0.0 else float("inf")
 
 
 def verify(program: VariationalInequality, answer: QPSolution, accuracy: float) -> tuple[Status, str, Residuals | None]:
@@ -151,37 +205,46 @@ def verify(program: VariationalInequality, answer: QPSolution, accuracy: float) 
 
 def infeasibility_certificate(program: VariationalInequality, tolerance: float = 1e-10) -> Array | None:
     """α ≥ 0 with Bᵀα = 0 and gᵀα = −1 (Farkas), or `None` if no such α is found; dense programs only."""
-    if not isinstance(program.B, np.ndarray) or not len(program.g):
+    if not isinstance(program.B, np.ndarray):
         return None
-    rows = row_norms(program.B)
-    system = np.vstack([(program.B / rows[:, None]).T, program.g / rows / size(program.g / rows)])
+    kept = np.isfinite(program.g)
+    B, g = program.B[kept], program.g[kept]
+    rows = row_norms(B)
+    depth = float(np.max(-g / rows, initial=0.0))
+    if not depth > 0.0:  # x = 0 satisfies them
+        return None
+    system = np.vstack([(B / rows[:, None]).T, g / (rows * depth)])
+    columns = np.linalg.norm(system, axis=0)  # far constraints have huge ones, rows of zeros may have none
+    columns[columns == 0.0] = 1.0
     target = np.append(np.zeros(len(system) - 1), -1.0)
     try:
-        alpha, distance = nnls(system, target, maxiter=30 * system.shape[1])
+        alpha, distance = nnls(system / columns, target, maxiter=30 * system.shape[1])
     except RuntimeError:  # nnls did not converge, which certifies nothing
         return None
     if distance > tolerance * max(1.0, float(alpha.max(initial=0.0))):
         return None
-    return np.asarray(alpha / rows)
+    certificate = np.zeros(len(kept))
+    certificate[kept] = alpha / (columns * rows * depth)
+    return certificate
 
 
 @dataclass(frozen=True)
 class Slack:
-    """The terms l and c of one solution in the bound of how far two are apart."""
+    """The terms l and c of one solution in the bound above, for ‖d‖ instead of ‖d‖_A."""
 
     linear: float
     constant: float
 
 
 def slack(program: VariationalInequality, x: Array, alpha: Array, accuracy: float) -> Slack:
-    """Slack of a solution x (n,), α (m,) whose three relative residuals are at most `accuracy`."""
-    _, scale = residuals_and_scales(program, x, alpha)
+    """Slack of a solution x (n,), α (m,) of a dense program whose three natural residuals are at most `accuracy`."""
     smallest = float(np.min(np.linalg.eigvalsh(program.A), initial=np.inf))
     if not smallest > 0.0:
         return Slack(float("inf"), float("inf"))
-    excess = scale.primal * float(row_norms(program.B) @ alpha)
-    constant = accuracy * (scale.gap + float(np.abs(x).sum()) * scale.dual + excess)
-    return Slack(accuracy * np.sqrt(len(x)) * scale.dual / smallest, constant / smallest)
+    norms = dual_norms(program.A)
+    energy, pressed = solution_energy(program, x, alpha, norms), float(norms(program.B.T) @ alpha)
+    constant = accuracy * (1.5 * energy**2 + 0.5 * pressed**2)
+    return Slack(accuracy * energy / np.sqrt(smallest), constant / smallest)
 
 
 def allowed(first: Slack, second: Slack) -> float:

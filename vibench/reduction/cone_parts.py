@@ -7,8 +7,8 @@ import numpy as np
 from vibench.arrays import Array, Mask
 from vibench.interfaces.problem import VariationalInequality
 from vibench.linalg.inner_product import InnerProduct
+from vibench.qp.scaling import peak, ratio
 from vibench.qp.solve import solve_qp
-from vibench.qp.verification import kkt_residuals
 
 SOLVERS = ("piqp", "proxqp")
 """QP solvers tried for line 9, in this order."""
@@ -78,9 +78,20 @@ def _least_squares(theta: Array, generators: Array, support: Mask, W: InnerProdu
             continue
         if not np.all(np.isfinite(np.append(solution.x, solution.alpha))):
             continue
-        residual = kkt_residuals(program, solution.x, solution.alpha).worst
+        residual = _largest_residual(program, solution.x, solution.alpha)
         if residual < smallest:
             best, smallest = np.maximum(solution.x, 0.0), residual
         if smallest <= ACCEPTED:
             break
     return best, smallest
+
+
+def _largest_residual(program: VariationalInequality, x: Array, alpha: Array) -> float:
+    """Largest entry of the KKT residuals over those of their terms; A may be singular, and has no natural residuals."""
+    A, f, B, g = program.A, program.f, program.B, program.g
+    force, excess, energy = B.T @ alpha, B @ x - g, float(x @ A @ x)
+    return max(
+        ratio(float(np.max(excess, initial=0.0)), max(peak(g), peak(B @ x))),
+        ratio(peak(A @ x - f + force), max(peak(f), peak(force))),
+        ratio(abs(float(alpha @ excess)), max(energy, abs(float(f @ x)))),
+    )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import lru_cache, partial
 from typing import TypeVar
@@ -12,7 +13,7 @@ import numpy as np
 
 from vibench.arrays import Array
 from vibench.errors import NumericalError
-from vibench.highfidelity.active_set import HighFidelitySolution, HighFidelitySolver
+from vibench.highfidelity.active_set import ActiveSetSolution, HighFidelitySolver
 from vibench.interfaces.problem import Problem, VariationalInequality
 from vibench.interfaces.validation import Fingerprint, checked_assembly, reference_assembly
 from vibench.linalg.inner_product import InnerProduct
@@ -96,25 +97,35 @@ class SnapshotStage(Stage):
         u, lam = np.zeros((problem.V.dim, len(mus))), np.zeros((problem.W.dim, len(mus)))
         seconds, setups, fallbacks, solver = [], [], [], HighFidelitySolver(problem)
 
-        def solve(mu: Array) -> tuple[VariationalInequality, HighFidelitySolution]:
-            vi = checked_assembly(problem, mu)
+        @contextmanager
+        def explained(mu: Array, vi: VariationalInequality) -> Iterator[None]:
+            """Name the cause rather than what came of it."""
             try:
-                return vi, solver.solve_assembled(mu, vi)
+                yield
             except NumericalError:
-                InnerProduct(vi.A, f"A at mu = {mu.tolist()}")  # refuses the cause rather than what came of it
+                InnerProduct(vi.A, f"A at mu = {mu.tolist()}")
                 reference.refuse_false_constants(mu, vi)
                 raise
+
+        def solve(mu: Array) -> tuple[VariationalInequality, ActiveSetSolution]:
+            vi = checked_assembly(problem, mu)
+            with explained(mu, vi):
+                return vi, solver.solve_assembled(mu, vi)
 
         for k, mu in enumerate(mus):
             near = (nearby(problem.parameters, mu, self.parameters.seed, k, repeat) for repeat in itertools.count())
             if k == 0:  # with the set-up; what it costs without is measured next to it
-                (vi, solution), beginning = timed(partial(solve, mu))
+                (vi, unverified), beginning = timed(partial(solve, mu))
                 _, marginal = self._measure(solve, near)
                 setups.append(beginning.beyond(marginal))
             else:
-                (vi, solution), marginal = self._measure(solve, itertools.chain([mu], near))
-            seconds.append(marginal)
-            if k == 0 or "A" not in problem.constant:  # verification, as is what follows, which is not timed
+                (vi, unverified), marginal = self._measure(solve, itertools.chain([mu], near))
+            seconds.append(marginal)  # verification, which is what follows, is not timed
+            if k == 0 or self.parameters.role != "training":
+                vi = checked_assembly(problem, mu)  # repetitions at other parameters may have written into its arrays
+            with explained(mu, vi):
+                solution = solver.verify(mu, vi, unverified)
+            if k == 0 or "A" not in problem.constant:
                 solver.check_coercive(mu, vi)
             reference.refuse_false_constants(mu, vi)
             solver.remember(mu, solution)

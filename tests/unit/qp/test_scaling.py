@@ -9,10 +9,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numerics import exact, spd
 
-from vibench.highfidelity.active_set import solve_high_fidelity
 from vibench.interfaces.problem import MEMBERS, VariationalInequality
 from vibench.qp import verification
-from vibench.qp.scaling import prescribed, row_norms, stiffness, units_of, units_of_dual
+from vibench.qp.scaling import drive, near_rows, row_norms, stiffness, units_of, units_of_dual
 from vibench.qp.solve import installed_solvers, solve_qp
 from vibench.qp.status import Status
 from vibench.qp.verification import QPSolution
@@ -48,28 +47,29 @@ def test_scaling_back_is_exact(seed: int, length: int, modulus: int, load: str) 
     assert np.allclose(np.linalg.norm(scaled.B, axis=1), 1.0)
 
 
-@given(seeds)
-def test_a_load_is_the_unit_and_lengths_are_as_they_are(seed: int) -> None:
-    """As they were before programs without load had units of their own: published numbers depend on it."""
-    vi = indentation(seed, load=1.0)
-    rows, cost = np.linalg.norm(vi.B, axis=1), np.abs(vi.f).max()
-    scaled = units_of(vi).scaled(vi)
-    for found, expected in ((scaled.A, vi.A / cost), (scaled.f, vi.f / cost), (scaled.g, vi.g / row_norms(vi.B))):
-        assert found.tobytes() == expected.tobytes()
-    assert np.allclose(scaled.B, vi.B / rows[:, None], rtol=1e-15)
-
-
-@pytest.mark.parametrize("load", ["no load", "round-off"])
+@pytest.mark.parametrize("load", sorted(LOADS))
 @given(seed=seeds, length=exponents, modulus=exponents)
-def test_without_load_the_scaled_program_knows_no_units(load: str, seed: int, length: int, modulus: int) -> None:
+def test_the_scaled_program_knows_no_units(load: str, seed: int, length: int, modulus: int) -> None:
     one, other = indentation(seed, load=LOADS[load]), indentation(seed, length, modulus, LOADS[load])
     here, there = units_of(one).scaled(one), units_of(other).scaled(other)
     for name in MEMBERS:
         assert np.allclose(getattr(there, name), getattr(here, name), rtol=1e-9, atol=1e-12), name
-    found = prescribed(other, row_norms(other.B))
-    assert found is not None
-    assert found.length == pytest.approx(10.0**length)
-    assert found.force == pytest.approx(10.0 ** (length + modulus) * stiffness(one.A))
+    assert np.abs(here.f).max() == pytest.approx(1.0) or load != "load"
+    driven = drive(other, row_norms(other.B))
+    assert driven.loaded == (load == "load")
+    if not driven.loaded:
+        assert driven.length == pytest.approx(0.3 * 10.0**length)  # the depth of what is violated, not the farthest gap
+        assert driven.force == pytest.approx(0.3 * 10.0 ** (length + modulus) * stiffness(one.A))
+
+
+@given(seeds, st.floats(1.0, 1e12))
+def test_far_constraints_have_no_part_in_the_units(seed: int, far: float) -> None:
+    vi = indentation(seed)
+    row = np.append(vi.g, far * np.linalg.norm(vi.B[0]))
+    beside = VariationalInequality(vi.A, vi.f, np.vstack([vi.B, vi.B[:1]]), row)
+    assert units_of(beside).length == units_of(vi).length
+    assert units_of(beside).force == units_of(vi).force
+    assert near_rows(beside)[-1] == (far <= 0.3e4)
 
 
 def test_sparse_members_have_the_units_of_dense_ones() -> None:
@@ -88,8 +88,9 @@ def test_data_that_are_zero_have_units_too() -> None:
         units = units_of(vi)
         assert (units.length, units.force > 0.0) == (1.0, True)
         assert np.all(np.isfinite(units.scaled(vi).A))
-        assert verification.kkt_residuals(vi, np.zeros(2), np.zeros(len(vi.g))).worst == 0.0
-    assert units_of_dual(VariationalInequality(np.eye(1), np.zeros(1), -np.eye(1), np.zeros(1))).length > 0.0
+    assert verification.kkt_residuals(unconstrained, np.zeros(2), np.zeros(0)).worst == 0.0
+    dual = VariationalInequality(np.eye(1), np.zeros(1), -np.eye(1), np.zeros(1))
+    assert all(units_of_dual(dual, loaded).length > 0.0 for loaded in (True, False))
 
 
 @pytest.mark.parametrize("solver", sorted({"piqp", "proxqp", "osqp", "cvxopt"} & set(installed_solvers())))
@@ -124,48 +125,20 @@ def test_without_load_and_contact_or_nearly_so_a_solution_is_ok(solver: str, for
         assert status is Status.OK, (seed, reason)
 
 
-@given(seeds, exponents, exponents)
-def test_residuals_without_load_are_relative_to_what_the_constraints_prescribe(
-    seed: int, length: int, modulus: int
-) -> None:
-    """In any units: `max(1, ‖g‖∞)` took x = 0 for a solution of an indentation by nanometres."""
-    one, other = indentation(seed), indentation(seed, length, modulus)
-    rng = np.random.default_rng(seed)
-    x, alpha = rng.standard_normal(6), rng.random(4)
-    here = verification.kkt_residuals(one, x, alpha)
-    there = verification.kkt_residuals(other, 10.0**length * x, 10.0 ** (length + modulus) * alpha)
-    for name in ("primal", "dual", "gap"):
-        assert getattr(there, name) == pytest.approx(getattr(here, name), rel=1e-6, abs=1e-12)
-    nothing = verification.kkt_residuals(other, np.zeros(6), np.zeros(4))
-    assert nothing.primal == pytest.approx(0.3)
-
-
-def test_scales_without_load_as_defined_by_hand() -> None:
-    vi = VariationalInequality(np.diag([1.0, 3.0]), np.zeros(2), np.array([[0.0, 2.0]]), np.array([-0.02]))
-    x, alpha = np.array([0.0, -0.009]), np.array([0.0])  # k = 2, L = 0.01
-    found = verification.kkt_residuals(vi, x, alpha)
-    assert found.primal == pytest.approx(0.001 / 0.01)
-    assert found.dual == pytest.approx(1.0)  # A x alone, 0.027, beside which 1e-4 k L is small
-    small = verification.kkt_residuals(vi, 1e-6 * x, alpha)
-    assert small.dual == pytest.approx(0.027e-6 / (1e-4 * 2.0 * 0.01))
-    assert small.gap == pytest.approx(3.0 * (0.009e-6) ** 2 / (1e-4 * 2.0 * 0.01**2))
-
-
-def test_no_scale_of_an_indentation_on_a_fine_mesh_is_the_smallest_there_is() -> None:
-    """Nodal forces decrease with the mesh width; those of a string of 2000 nodes are weighed by themselves."""
-    n, ones = 2000, np.ones(1999)
-    A = sp.csc_array(sp.diags_array([2.0 * np.ones(n), -ones, -ones], offsets=[0, 1, -1])) * (n + 1.0)
-    B = sp.csr_array(([1.0], ([0], [n // 2])), shape=(1, n))
-    vi = VariationalInequality(A, np.zeros(n), B, np.array([-1e-3]))
-    found = solve_high_fidelity(vi)
-    force = np.abs(B.T @ found.lam).max()
-    assert verification.residuals_and_scales(vi, found.u, found.lam)[1].dual == pytest.approx(force)
-
-
 def test_a_bound_that_is_far_away_does_not_turn_a_load_into_none() -> None:
     vi = VariationalInequality(np.eye(1), np.ones(1), np.ones((1, 1)), np.full(1, 1e15))
-    assert prescribed(vi, np.ones(1)) is None
-    assert verification.kkt_residuals(vi, np.zeros(1), np.zeros(1)).dual == 1.0
+    assert drive(vi, np.ones(1)).loaded
+    assert verification.kkt_residuals(vi, np.full(1, 0.5), np.zeros(1)).dual == 1.0
+
+
+@pytest.mark.parametrize("form", ["primal", "dual"])
+def test_a_constraint_that_was_left_out_is_brought_back_where_it_matters(form: str) -> None:
+    """A load that a soft direction turns into a way of 5e4 lengths of the first step."""
+    vi = VariationalInequality(np.diag([1.0, 1e-6]), np.array([1.0, 5e-2]), np.array([[0.0, 1.0]]), np.array([2e4]))
+    assert not near_rows(vi).any()
+    answer = solve_qp(vi, "piqp", 1e-10, factor=np.sqrt(vi.A) if form == "dual" else None)
+    assert np.allclose(answer.x, [1.0, 2e4], rtol=1e-6)
+    assert np.allclose(answer.alpha, 5e-2 - 2e-2, rtol=1e-6)
 
 
 def test_half_an_answer_is_none() -> None:

@@ -1,0 +1,139 @@
+"""Natural KKT residuals: what they are, what they do not depend on, and what they find."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import scipy.sparse as sp
+from hypothesis import given
+from hypothesis import strategies as st
+from numerics import exact, spd
+
+from vibench.errors import NumericalError
+from vibench.interfaces.problem import VariationalInequality
+from vibench.qp.solve import solve_qp
+from vibench.qp.status import Status
+from vibench.qp.verification import QPSolution, Residuals, infeasibility_certificate, kkt_residuals, verify
+
+seeds = st.integers(0, 10_000)
+NAMES = ("primal", "dual", "gap")
+
+
+def program(seed: int, load: float = 1.0) -> VariationalInequality:
+    """Six unknowns and four constraints, some of which are active."""
+    rng = np.random.default_rng(seed)
+    B = rng.standard_normal((4, 6))
+    return VariationalInequality(spd(6, rng), load * rng.standard_normal(6), B, 0.2 * rng.standard_normal(4) - 0.05)
+
+
+def answer(seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """An inexact solution, whose residuals are all of the same size."""
+    rng = np.random.default_rng(seed + 1)
+    x, alpha = exact(program(seed))
+    return x + 1e-3 * rng.standard_normal(6), np.maximum(alpha + 1e-3 * rng.standard_normal(4), 0.0)
+
+
+def same(one: Residuals, other: Residuals) -> None:
+    for name in NAMES:
+        assert getattr(one, name) == pytest.approx(getattr(other, name), rel=1e-6, abs=1e-12), name
+
+
+def test_as_defined_by_hand() -> None:
+    vi = VariationalInequality(A=np.diag([4.0, 1.0]), f=np.array([4.0, 1.0]), B=np.array([[2.0, 0.0]]), g=np.ones(1))
+    x, alpha = np.array([0.75, 1.0]), np.array([0.25])
+    energy = np.sqrt(4.0 * 0.75**2 + 1.0 + 0.5**2 / 4.0)  # ‖x‖²_A and (2 · 0.25)² / 4
+    found = kkt_residuals(vi, x, alpha)
+    assert found.primal == pytest.approx(0.5 / 1.0 / energy)  # B A⁻¹ Bᵀ = 1
+    assert found.dual == pytest.approx(abs(4.0 - 3.0 - 0.5) / 2.0 / energy)
+    assert found.gap == pytest.approx(0.25 * 0.5 / energy**2)
+    assert found.worst == max(found.primal, found.dual, found.gap)
+
+
+@given(seeds, st.integers(-9, 9), st.integers(-9, 9), st.booleans())
+def test_units_rows_and_bases_change_nothing(seed: int, length: int, force: int, loaded: bool) -> None:
+    vi, (x, alpha) = program(seed, float(loaded)), answer(seed)
+    here, rng = kkt_residuals(vi, x, alpha), np.random.default_rng(seed)
+    m, n = 10.0**length, 10.0**force
+    scaled = VariationalInequality(n / m * vi.A, n * vi.f, vi.B, m * vi.g)
+    same(kkt_residuals(scaled, m * x, n * alpha), here)
+    rows = 10.0 ** rng.uniform(-8, 8, 4)
+    same(kkt_residuals(replace(vi, B=rows[:, None] * vi.B, g=rows * vi.g), x, alpha / rows), here)
+    T = np.linalg.qr(rng.standard_normal((6, 6)))[0] * 10.0 ** rng.uniform(-2, 2, 6)
+    moved = VariationalInequality(T.T @ vi.A @ T, T.T @ vi.f, vi.B @ T, vi.g)
+    same(kkt_residuals(moved, np.linalg.solve(T, x), alpha), here)
+
+
+@given(seeds, st.sampled_from([1e6, 1e20, np.inf]))
+def test_a_far_row_says_nothing_of_the_others(seed: int, far: float) -> None:
+    vi, (x, alpha) = program(seed), answer(seed)
+    beside = replace(vi, B=np.vstack([vi.B, vi.B[:1]]), g=np.append(vi.g, far))
+    same(kkt_residuals(beside, x, np.append(alpha, 0.0)), kkt_residuals(vi, x, alpha))
+
+
+@given(seeds)
+def test_sparse_and_dense_programs_have_the_same(seed: int) -> None:
+    vi, (x, alpha) = program(seed), answer(seed)
+    sparse = replace(vi, A=sp.csr_array(vi.A), B=sp.csr_array(vi.B))
+    same(kkt_residuals(sparse, x, alpha), kkt_residuals(vi, x, alpha))
+
+
+@given(seeds)
+def test_they_bound_the_error_and_vanish_with_it(seed: int) -> None:
+    """(ii) of the error bounds with the smallest w: ‖e‖²_A ≤ ρ² + ω² + 2 λᵀ(B w − s); ω is at least the primal one."""
+    vi, (x, alpha), (u, lam) = program(seed), answer(seed), exact(program(seed))
+    assert kkt_residuals(vi, u, lam).worst <= 1e-12
+    found, e = kkt_residuals(vi, x, alpha), x - u
+    energy = np.sqrt(u @ vi.A @ u + (vi.B.T @ lam) @ np.linalg.solve(vi.A, vi.B.T @ lam))
+    assert found.worst >= 1e-3 * (e @ vi.A @ e) / energy**2
+
+
+def test_a_membrane_in_small_units_without_contact_is_no_solution() -> None:
+    """An absolute floor of the primal residual called the unconstrained solution ok."""
+    vi = program(3)
+    small = VariationalInequality(vi.A, 1e-9 * vi.f, vi.B, 1e-9 * vi.g)
+    x = np.linalg.solve(small.A, small.f)
+    assert np.any(small.B @ x > small.g)
+    status, reason, _ = verify(small, QPSolution(x, np.zeros(4), "solved"), 1e-6)
+    assert status is Status.INACCURATE
+    assert reason.startswith("primal residual")
+
+
+@pytest.mark.parametrize("far", [2e5, 2e7, 1e20])
+def test_far_gaps_are_no_scale(far: float) -> None:
+    """Without load, an error of 10 % of the penetration beside a gap that is far away."""
+    vi = VariationalInequality(np.eye(2), np.zeros(2), np.array([[1.0, 0.0], [0.0, 1.0]]), np.array([-1.0, far]))
+    assert verify(vi, QPSolution(np.array([-1.0, 0.0]), np.array([1.0, 0.0]), ""), 1e-8)[0] is Status.OK
+    assert verify(vi, QPSolution(np.array([-0.9, 0.0]), np.array([0.9, 0.0]), ""), 1e-8)[0] is Status.INACCURATE
+    assert verify(vi, QPSolution(np.array([-1.1, 0.0]), np.array([1.1, 0.0]), ""), 1e-8)[0] is Status.INACCURATE
+
+
+def test_what_nothing_drives_stays_where_it_is() -> None:
+    vi = VariationalInequality(np.diag([4.0, 1.0]), np.zeros(2), np.eye(2), np.array([0.0, 1e20]))
+    found = solve_qp(vi, "piqp", 1e-8)
+    assert (found.x.tolist(), found.alpha.tolist()) == ([0.0, 0.0], [0.0, 0.0])
+    assert kkt_residuals(vi, found.x, found.alpha).worst == 0.0
+    assert kkt_residuals(vi, np.array([1e-9, 0.0]), np.zeros(2)).dual == pytest.approx(1.0)  # no other scale is there
+
+
+def test_no_data_have_no_residual_and_what_is_not_definite_has_none_either() -> None:
+    empty = VariationalInequality(np.zeros((0, 0)), np.zeros(0), np.zeros((1, 0)), np.ones(1))
+    assert kkt_residuals(empty, np.zeros(0), np.zeros(1)).worst == 0.0
+    with pytest.raises(NumericalError, match="A is not positive definite"):
+        kkt_residuals(replace(program(0), A=-np.eye(6)), np.ones(6), np.zeros(4))
+
+
+def test_what_is_not_a_number_is_not_hidden() -> None:
+    assert not kkt_residuals(program(0), np.full(6, np.nan), np.zeros(4)).worst <= 1.0
+
+
+@pytest.mark.parametrize("far", [1.0, 1e20, np.inf])
+def test_contradictions_are_certified_beside_a_far_row(far: float) -> None:
+    B, g = np.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0]]), np.array([-1.0, 0.5, far])
+    vi = VariationalInequality(np.eye(2), np.zeros(2), B, g)
+    alpha = infeasibility_certificate(vi)
+    assert alpha is not None
+    assert np.allclose(B.T @ alpha, 0.0, atol=1e-9)
+    assert alpha[:2] @ g[:2] < 0.0
+    assert infeasibility_certificate(replace(vi, g=np.array([-1.0, 1.5, far]))) is None
