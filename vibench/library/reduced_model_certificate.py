@@ -124,8 +124,6 @@ class Model:
         margin = MARGIN * uncertain
         for _ in range(ATTEMPTS):
             nu = self._complementary(gamma / theta**2, (excess + margin)[rows], lam[rows])
-            if nu is None:
-                return None
             a = (theta / gamma) * (nu - lam[rows])
             values = data["responses"] @ a
             slack = theta * values - excess
@@ -137,7 +135,7 @@ class Model:
             margin = margin + 2.0 * np.maximum(lacking, 0.0)
         return None
 
-    def _complementary(self, scale: float, excess: Array, lam: Array) -> Array | None:
+    def _complementary(self, scale: float, excess: Array, lam: Array) -> Array:
         """ν = λ + scale · M (s + v) with ν, v ≥ 0 and νᵀv = 0, by the primal-dual active set method."""
         inverse = self._data["inverse"]
         fixed = lam + scale * (inverse @ excess)
@@ -152,4 +150,31 @@ class Model:
             if np.array_equal(wanted, released):
                 return nu
             released = wanted
-        return None
+        return np.asarray(fixed + inverse @ _descent(inverse, fixed))  # it cycles
+
+
+def _descent(M: Array, fixed: Array) -> Array:
+    """The minimiser v ≥ 0 of ½ vᵀM v + ν₀ᵀv (Lawson and Hanson 1974, chapter 23), for which M v + ν₀ = ν."""
+    size, unit = len(fixed), np.sqrt(M.diagonal())
+    v, positive, passed = np.zeros(size), np.zeros(size, bool), np.zeros(size, bool)
+    for _ in range(20 * size):
+        nu = (fixed + M @ v + UNIT * size * (abs(fixed) + abs(M) @ v)) / unit
+        entering = int(np.argmin(np.where(positive | passed, 0.0, nu)))
+        if positive[entering] or passed[entering] or nu[entering] >= 0.0:
+            break
+        before, positive[entering] = v, True
+        while np.any(positive):
+            K, z = positive.nonzero()[0], np.zeros(size)
+            z[K] = np.linalg.solve(M[np.ix_(K, K)], -fixed[K])
+            blocking = positive & (z <= 0.0)
+            if v is before and blocking[entering]:  # round-off made its sign
+                positive[entering], passed[entering] = False, True
+                break
+            if not np.any(blocking):
+                v, passed = z, np.zeros(size, bool)
+                break
+            steps = np.where(blocking, v / np.where(blocking, v - z, 1.0), np.inf)
+            v = v + steps.min() * (z - v)
+            positive &= (steps > steps.min()) & (v > 0.0)
+            v[~positive] = 0.0
+    return v

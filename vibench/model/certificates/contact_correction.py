@@ -8,8 +8,9 @@ norm ‖w‖² = cᵀ C c. As B w depends on w_E alone, the minimiser of
 is of this form with γ c = Bᵀ(ν − λ), multipliers ν ≥ 0 and complementarity. Let S = B C Bᵀ / γ and v = B w − s. Let I
 be the rows with λ_i > 0 in which releasing λ_i alone violates the constraint, λ_i S_ii > −s_i, and those that other w
 violate; on the other rows, J, ν = 0. Then ν = λ + S_II⁻¹(s + v + S_IJ λ_J) on I: a linear complementarity problem for
-v ≥ 0 and ν ≥ 0, solved by a primal-dual active set method from v = 0, where λ > 0 costs nothing (Hintermüller, Ito and
-Kunisch, 2002). Few rows leave v = 0, so that one factorisation of S_II serves all steps.
+v ≥ 0 and ν ≥ 0, solved from v = 0, where λ > 0 costs nothing, by a primal-dual active set method (Hintermüller, Ito and
+Kunisch, 2002) and by one that always ends where that cycles (`vibench.model.certificates.complementarity`). Few rows
+leave v = 0, so that one factorisation of S_II serves all steps.
 
 Any w with B w ≥ s is as good as another for a bound to hold. Optimality is not verified, feasibility is: s is raised by
 a margin above its round-off. Rows far from the contact are not evaluated where |B w| ≤ Σ_j |B_ij| √C_jj ‖w‖, which is
@@ -18,23 +19,18 @@ the inequality of Cauchy and Schwarz, suffices.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from contextlib import suppress
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
 
 import numpy as np
 import scipy.sparse as sp
-from scipy.linalg import solve_triangular
-from scipy.linalg.lapack import dposv, dpotrf, dpotrs
-from scipy.optimize import nnls
+from scipy.linalg.lapack import dpotrf, dpotrs
 
 from vibench.arrays import Array, Indices, Mask, SparseMatrix
 from vibench.interfaces.problem import Contact
-
-STEPS = 30
-"""Steps of the active set method for one I."""
+from vibench.model.certificates.complementarity import complementary
 
 EXTENSIONS = 10
 """How often rows are added to I."""
@@ -283,40 +279,10 @@ def _complementary(factor: Array, excess: Array, lam: Array) -> Array:
     inverse, computed = np.zeros((len(lam), len(lam))), np.zeros(len(lam), bool)
 
     def rows_of_inverse(rows: Indices) -> Array:
-        new = rows[~computed[rows]]
-        if len(new):
+        if len(new := rows[~computed[rows]]):
             units = np.zeros((len(lam), len(new)), order="F")
             units[new, np.arange(len(new))] = 1.0
             inverse[new], computed[new] = dpotrs(factor, units, lower=1, overwrite_b=1)[0].T, True
         return inverse[rows]
 
-    nu = complementary(fixed, rows_of_inverse, np.zeros(len(lam), bool))
-    if nu is None:  # it may cycle where S is no M-matrix: the same minimiser, at more cost
-        L, nu = np.tril(factor), fixed
-        target = L.T @ lam + solve_triangular(L, excess, lower=True, check_finite=False)
-        with suppress(RuntimeError):  # no convergence either: whether the w of `fixed` is feasible is verified
-            nu = nnls(L.T, target, maxiter=30 * len(lam))[0]
-    return np.maximum(nu, 0.0)
-
-
-def complementary(fixed: Array, rows_of: Callable[[Indices], Array], released: Mask) -> Array | None:
-    """ν ≥ 0 (i,) with ν = fixed + M v, v ≥ 0 and νᵀv = 0, by a primal-dual active set method; `None` where it cycles.
-
-    `rows_of` gives rows of M, symmetric positive definite (i×i). `released` (i,) is where v is not zero in the first
-    step. The systems that are solved have the size of this set.
-    """
-    for _ in range(STEPS):
-        rows = released.nonzero()[0]
-        among, nu, v = rows_of(rows), fixed, np.zeros(0)
-        if len(rows):
-            _, v, singular = dposv(among[:, rows], -fixed[rows])
-            if singular:
-                return None
-            nu = fixed + v @ among
-            nu[rows] = 0.0
-        wanted = nu < 0.0
-        wanted[rows] = v >= 0.0
-        if not (wanted != released).any():
-            return nu
-        released = wanted
-    return None
+    return np.maximum(complementary(fixed, rows_of_inverse, fixed < 0.0), 0.0)

@@ -5,7 +5,7 @@ from fractions import Fraction
 import numpy as np
 import pytest
 import scipy.sparse as sp
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 from numerics import exact, spd
 
@@ -34,6 +34,7 @@ def prepared(
     st.integers(0, 10_000), st.booleans(), st.sampled_from([0.0, 0.1, 3.0]), st.sampled_from([1e-6, 1.0]),
     st.sampled_from([1.0, 2.5]),
 )  # fmt: skip
+@example(838, False, 0.0, 1e-6, 1.0)  # exchanging all wrong signs at once cycles
 def test_corrections_are_feasible_also_in_exact_arithmetic_and_the_best_ones(
     seed: int, scaled: bool, pressure: float, violation: float, gamma: float
 ) -> None:
@@ -67,6 +68,24 @@ def test_corrections_are_feasible_also_in_exact_arithmetic_and_the_best_ones(
     assert 0.5 * gamma * norm**2 + kappa <= least + 1e-5 * (gamma * norm**2 + lam @ np.abs(s)) + 1e-12 * (
         1.0 + lam.sum()
     )
+
+
+@pytest.mark.parametrize("condition", [1e2, 1e5])
+def test_where_rows_are_independent_there_is_always_a_correction(condition: float) -> None:
+    """S₀ has no sign structure: in about one case of ten, exchanging all wrong signs at once cycles."""
+    size, rows = 30, 24
+    for seed in range(150):
+        rng = np.random.default_rng(seed)
+        C, B = np.linalg.inv(spd(size, rng, condition)), rng.standard_normal((rows, size))
+        everything = prepare_corrections(
+            sp.csr_array(B), True, 0.5 * (C + C.T), np.ones(rows, bool), rng.standard_normal((size, D)), np.eye(size)
+        )
+        assert everything is not None
+        y, lam = rng.standard_normal(D), np.maximum(rng.standard_normal(rows), 0.0) * rng.choice([0.0, 1.0])
+        g = everything.basis @ y - rng.uniform(-1.0, 0.5, rows)
+        found = everything.correction(1.0, g, np.abs(g), y, lam, 1.0)
+        assert found is not None
+        assert np.all(B @ (C @ found[0]) >= everything.basis @ y - g)
 
 
 def fractions(array: np.ndarray) -> np.ndarray:
