@@ -174,9 +174,8 @@ def exported(
         basis = queried.basis if isinstance(queried, HyperReducedModel) else queried.fixed_basis
         arrays |= {"basis": basis, "generators": queried.generators}
     if certificate is not None:
-        interpolated = polynomials | members
-        arrays |= exported_certificate.arrays(certificate, interpolated)
-        about["certificate"] = exported_certificate.guarantee(certificate, interpolated).value
+        arrays |= exported_certificate.arrays(certificate, polynomials | members)
+        about["certificate"] = exported_certificate.guarantee(certificate, model.problem.constant).value
     return ExportedModel(members, arrays, about, polynomials)
 
 

@@ -56,6 +56,9 @@ class CertificateBase:
         Bounds of A against X; `None` where A is X.
     load_error, stiffness_error
         Bounds of ‖f − f̃‖ in the dual norm of X and of the operator norm of A − Ã; zero where they are exact.
+    is_exact
+        Whether A and f are declared to be constant or affine sums, so that no bound rests on what was measured at some
+        parameters. An error that was measured to be zero proves nothing about other ones.
     constraint
         B₀ (m×k) on the contact unknowns: what B is a multiple of where there are `bound_terms`; elsewhere B on the
         bodies where that is the same at all training parameters, and zero on the others.
@@ -70,13 +73,9 @@ class CertificateBase:
     spectral: SpectralBounds | None
     load_error: float
     stiffness_error: float
+    is_exact: bool
     constraint: SparseMatrix
     bound_terms: Array | None
-
-    @property
-    def is_exact(self) -> bool:
-        """Whether bounds rest on no measured interpolation error."""
-        return self.load_error == self.stiffness_error == 0.0
 
     @property
     def guarantee(self) -> Guarantee:
@@ -107,7 +106,10 @@ def unsupported(problem: Problem, members: Mapping[str, AffineMember]) -> str:
 
 
 def is_exact(problem: Problem, name: str, member: AffineMember) -> bool:
-    """Whether a member has no interpolation error."""
+    """Whether a member is declared to be constant or an affine sum, and has therefore no interpolation error.
+
+    One that did not vary over the training set is treated as a constant and may be none.
+    """
     return member.way is Evaluation.AFFINE or (member.way is Evaluation.CONSTANT and name in problem.constant)
 
 
@@ -135,7 +137,8 @@ def certificate_base(problem: Problem, members: Mapping[str, AffineMember], trai
         spectral = spectral_bounds(problem, X, terms, lambda mu: T @ evaluate(mu).get("A", ONE), stiffness)
     C = 0.5 * (compliance + compliance.T)
     constraint, bound = _constant_constraint(problem, members, C, training)
-    return CertificateBase(X, C, tuple(terms), rotation, spectral, load, stiffness, constraint, bound)
+    exact = all(is_exact(problem, name, members[name]) for name in "Af")
+    return CertificateBase(X, C, tuple(terms), rotation, spectral, load, stiffness, exact, constraint, bound)
 
 
 def _constant_constraint(

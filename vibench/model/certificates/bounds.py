@@ -16,11 +16,11 @@ A, α = γ = 1, and nothing is lost. Elsewhere X is A at the centre of the param
   `vibench.model.certificates.contact_correction`, with the compliance C = Eᵀ X⁻¹ E of the contact unknowns E.
 - α and γ are those of `vibench.model.certificates.spectral`.
 
-Members that the problem declares to be constant or affine sums are exact, those that are interpolated are not. With
-A = Ã + D and f = f̃ + d, the residual of Ã and f̃ lacks d − D u_N, and ρ grows by the largest ‖d‖ and ‖D‖ ‖u_N‖_X. These
-are measured at random parameters and doubled, which proves nothing: the bounds are then called verified instead of
-certified. They are certified where α, γ and the norms in them are proved, too. Outside the parameter box, where nothing
-was measured, there are none with interpolated members.
+Members that the problem declares to be constant or affine sums are exact. All others are not, also those that did not
+vary over the training set. With A = Ã + D and f = f̃ + d, the residual of Ã and f̃ lacks d − D u_N, and ρ grows by the
+largest ‖d‖ and ‖D‖ ‖u_N‖_X. These are measured at random parameters and doubled, which proves nothing, even if they are
+zero: the bounds are then called verified instead of certified. They are certified where α, γ and the norms in them are
+proved, too. Outside the parameter box, where nothing was measured, there are none with such members.
 
 Round-off is bounded where it decides whether w is feasible, and in the coordinates of the residual: it may be all that
 is left of Δ² + 2 rᵀw, in which these are multiplied with those of X w.

@@ -333,6 +333,43 @@ def test_what_bounds_are_worth() -> None:
     assert prepared("constant")[2].base.spectral is None
 
 
+class Bump(Family):
+    """A and f are constant but for bumps between the parameters at which the problem is looked at."""
+
+    where = np.array([1.07, 0.31])
+
+    def __init__(self, member: str, declared: frozenset[str]) -> None:
+        super().__init__("constant", "scaled")
+        self.member, self.constant = member, declared
+
+    def assemble(self, mu: np.ndarray) -> VariationalInequality:
+        vi, height = super().assemble(mu), 0.5 * float(np.linalg.norm(mu - self.where) < 1e-3)
+        return replace(vi, **{self.member: (1.0 + height) * getattr(vi, self.member)})
+
+
+@pytest.mark.parametrize("member", ["A", "f"])
+@pytest.mark.parametrize("declared", ["", "A", "f"])
+def test_what_is_not_declared_is_not_certified_however_constant_it_was_found(member: str, declared: str) -> None:
+    """The measured errors are zero, and bounds are above errors but in the bump: those are worth what was measured."""
+    problem = Bump(member, frozenset(declared))
+    training = problem.training_set()
+    members = affine_decomposition(problem, training, 1e-3)
+    base = certificate_base(problem, members, training)
+    assert base.load_error == base.stiffness_error == 0.0
+    assert base.guarantee is Guarantee.VERIFIED
+    model = ReducedModel(problem, problem.V.orthonormalise(np.eye(N)), Enrichment(Kind.NONE), np.eye(M), np.eye(M))
+    reduced = HyperReducedModel(model, hyper_reduce(model, members))
+    given = problem, reduced, prepare(reduced, members, base, training)
+    bound, error, *_ = found(given, problem.where, *exact(reduced.assemble(problem.where).program))
+    if member in declared:
+        return  # the problem says what is not so, which no measurement can be expected to find
+    assert bound.guarantee is Guarantee.VERIFIED
+    assert error > 10.0 * bound.u_energy
+    mu = np.array([2.3, 0.4])
+    outside, *_ = found(given, mu, *exact(reduced.assemble(mu).program))
+    assert outside.note == OUTSIDE
+
+
 def test_interpolation_errors_are_in_the_bound() -> None:
     """A coarse interpolation makes an error that the residual of the interpolated A does not see."""
     problem, model, certificate = prepared("interpolated", tolerance=0.02)
