@@ -20,6 +20,7 @@ import numpy as np
 import vibench
 from vibench.library.export import TOLERANCE
 from vibench.library.reduced_model import Model
+from vibench.library.reduced_model_certificate import Model as WithBounds
 from vibench.qp.exact import exact_solution
 
 QUERIES = 1000
@@ -64,6 +65,31 @@ def main(run: str, cell: str, tolerance: float) -> None:
     for name, found in errors.items():
         of_u, of_lam = np.max(found, axis=0)
         print(f"{name:8} u {of_u:.1e}  λ {of_lam:.1e}  {1e6 * np.median(seconds[name]):6.0f} µs")
+    if model.certificate is not None:
+        bounds(model, tolerance)
+
+
+def bounds(model: vibench.Model, tolerance: float) -> None:
+    """Print how far the bounds of the script are from those of vibench, relative: median and largest."""
+    certificate, differences = model.certificate, dict[str, list[float]]()
+    assert certificate is not None
+    with tempfile.TemporaryDirectory() as folder:
+        vibench.export_model(model, Path(folder) / "model.npz", tolerance)
+        exported = WithBounds(Path(folder) / "model.npz")
+    for mu in model.parameters.sample(QUERIES // 10, seed=5):
+        reduced, (solution, bound, _) = model.reduced.assemble(mu), exported.solve(mu)
+        others = {"of the same solution": (solution.x, solution.alpha)}
+        if (exact := exact_solution(reduced.program)) is not None:
+            others["of the program solved to round-off"] = exact.x, exact.alpha
+        if (own := model.solve(mu)).x is not None and own.alpha is not None:
+            others[f"of `model.solve`, accuracy {model.accuracy:g}"] = own.x, own.alpha
+        for name, (x, alpha) in others.items():
+            of_vibench = certificate.evaluate(model.problem, mu, reduced, x, alpha)
+            pairs = ((bound.u_energy, of_vibench.u_energy), (bound.lambda_natural, of_vibench.lambda_natural))
+            differences.setdefault(name, []).append(max(abs(mine / theirs - 1.0) for mine, theirs in pairs))
+    print(f"bounds of the script at {QUERIES // 10} parameters, relative to those of vibench:")
+    for name, found in differences.items():
+        print(f"    {name:45} median {np.median(found):.1e}  largest {np.max(found):.1e}")
 
 
 if __name__ == "__main__":

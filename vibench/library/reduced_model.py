@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import warnings
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -20,7 +21,11 @@ FORMAT = "vibench reduced model 1"
 
 
 class Solution(NamedTuple):
-    """Status ("ok" up to the accuracy in the file, or "inaccurate"), x, α, u and λ with bases, residuals, and uᵀA u."""
+    """Status, x, α, u and λ with bases, residuals, and uᵀA u.
+
+    "ok" is a solution up to the accuracy in the file, "outside" one outside the box, "inaccurate" none, there or not;
+    "failed" means that A is not positive definite or an array is not finite, and that the numbers are NaN.
+    """
 
     status: str
     x: Array
@@ -74,15 +79,29 @@ class Model:
         A, f, B, g, Y = self.program(mu)
         rows = np.where((norms := np.linalg.norm(B, axis=1)) > 0.0, norms, 1.0)
         N, b = B / rows[:, None], g / rows
-        length, force = _units(A, f, b)  # in which the solver's tolerances are relative ones
-        settings = self.about["settings"][self.solver]
-        answer = SOLVERS[self.solver](A * (length / force), f / force, N, b / length, settings)
-        y, z = (np.nan_to_num(vector, nan=0.0, posinf=0.0, neginf=0.0) for vector in answer)
-        answers = [(length * y, force * np.maximum(z, 0.0)), _polished(A, f, N, b, z > b / length - N @ y)]
-        x, forces = min(answers, key=lambda answer: max(residuals(A, f, N, b, *answer)))
-        found, energy, x, alpha = residuals(A, f, N, b, x, forces), float(x @ A @ x), Y @ x, forces / rows
+        x, forces, found, status = np.full(len(f), np.nan), np.full(len(g), np.nan), (np.nan,) * 3, "failed"
+        with suppress(np.linalg.LinAlgError):
+            x, forces = self._solved(A, f, N, b)
+            found, status = residuals(A, f, N, b, x, forces), "ok"
+            if not all(residual <= self.about["accuracy"] for residual in found):  # NaN is not
+                status = "inaccurate"
+            elif np.any((at := np.asarray(mu, dtype=float)) < self.lower) or np.any(at > self.upper):
+                status = "outside"
+        energy, x, alpha = float(x @ A @ x), Y @ x, forces / rows
         u, lam = (self.data[n] @ v if n in self.data else None for n, v in (("basis", x), ("generators", alpha)))
-        return Solution("ok" if max(found) <= self.about["accuracy"] else "inaccurate", x, alpha, u, lam, found, energy)
+        return Solution(status, x, alpha, u, lam, found, energy)
+
+    def _solved(self, A: Array, f: Array, B: Array, g: Array) -> tuple[Array, Array]:
+        """The solver's x and α for rows of B of norm 1, or those of its active set, whichever are better."""
+        if not all(np.all(np.isfinite(array)) for array in (A, f, B, g)):
+            raise np.linalg.LinAlgError("an array is not finite")
+        np.linalg.cholesky(A)
+        length, force = _units(A, f, g)  # in which the solver's tolerances are relative ones
+        settings = self.about["settings"][self.solver]
+        answer = SOLVERS[self.solver](A * (length / force), f / force, B, g / length, settings)
+        y, z = (np.nan_to_num(vector, nan=0.0, posinf=0.0, neginf=0.0) for vector in answer)
+        answers = [(length * y, force * np.maximum(z, 0.0)), _polished(A, f, B, g, z > g / length - B @ y)]
+        return min(answers, key=lambda one: float(np.nan_to_num(np.max(residuals(A, f, B, g, *one)), nan=np.inf)))
 
 
 def residuals(A: Array, f: Array, B: Array, g: Array, x: Array, alpha: Array) -> tuple[float, float, float]:
@@ -97,11 +116,13 @@ def residuals(A: Array, f: Array, B: Array, g: Array, x: Array, alpha: Array) ->
         return tuple(np.where(ways == 0.0, 0.0, ways / [S, S, S**2]).tolist())
 
 
-def _units(A: Array, f: Array, g: Array) -> tuple[float, float]:
-    """Units of length and force for the solver: of the load, or without load of what violated constraints prescribe."""
-    k, load, curvature = float(A.trace()) / len(f), float(abs(f).max()), float(f @ A @ f)
-    moved, depth = load * float(f @ f) / (curvature or np.inf), float((-g).max(initial=0.0))
-    return (max(moved, depth), load) if moved > 1e-10 * depth else (depth or 1.0, 1e-3 * k * (depth or 1.0))
+def _scales(A: Array, f: Array, g: Array) -> tuple[float, float, float, float, float]:
+    """Units of length and force for the solver; the least length, force and energy that residuals are relative to."""
+    longest, k, load = float(abs(g).max()), float(A.trace()) / len(f), float(abs(f).max())
+    if load > 1e-10 * k * (-g).max(initial=0.0):
+        return 1.0, load, max(1.0, longest), 0.0, 0.5e-4 * float(f @ f) * (float(f @ f) / float(f @ A @ f))
+    length = longest or 1.0  # no load: the constraints prescribe a length and a force
+    return length, 1e-3 * k * length, length, 1e-4 * k * length, 1e-4 * k * length**2
 
 
 def _polished(A: Array, f: Array, B: Array, g: Array, active: NDArray[np.bool_]) -> tuple[Array, Array]:
@@ -124,6 +145,8 @@ def _polished(A: Array, f: Array, B: Array, g: Array, active: NDArray[np.bool_])
 def _enriched(plain: Array, vectors: Array) -> Array:
     """Orthonormal columns `plain`, and an orthonormal basis of what vectors add to them."""
     rest = (vectors - plain @ (plain.T @ vectors)) / np.linalg.norm(vectors, axis=0)
+    if not np.all(np.isfinite(rest)):  # far outside the box
+        return plain
     left, sigma, _ = np.linalg.svd(rest, full_matrices=False)
     return np.linalg.qr(np.hstack([plain, left[:, sigma > 1e-12]]))[0]
 

@@ -66,6 +66,8 @@ class Model:
     def _bound(self, mu: Array, y: Array, alpha: Array, energy: float) -> Bound:
         """Bounds of a solution: u_N has the coordinates y in the basis, λ_N is generators · α, `energy` is ‖u_N‖²_A."""
         data, lam = self._data, self._data["generators"] @ alpha
+        if not (np.all(np.isfinite(y)) and np.all(np.isfinite(lam))):
+            return Bound(inf, inf, inf, "none", "there is no solution")
         if np.min(lam, initial=0.0) < 0.0:
             return Bound(inf, inf, inf, "none", "λ_N has negative coefficients")
         if np.any((mu < self._box[0]) | (mu > self._box[1])):

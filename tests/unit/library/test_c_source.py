@@ -5,6 +5,7 @@ from __future__ import annotations
 import ctypes
 import shutil
 import subprocess
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 
@@ -78,6 +79,11 @@ def test_a_c_source_gives_the_answers_of_the_model(model: vibench.Model, tmp_pat
         assert np.allclose(x, script.solve(mu).x, rtol=0.0, atol=1e-11 * np.abs(x).max())
     width = script.upper - script.lower
     assert [solve(mu)[0] & 16 for mu in (script.upper, script.upper + width, script.lower - width)] == [0, 16, 16]
+    says = {0: "ok", 1: "inaccurate", 16: "outside", 17: "inaccurate", 18: "inaccurate", 19: "failed"}
+    for far in (0.0, 0.1, 1.0, 1e3, 1e200):
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            assert says[solve(script.upper + far * width)[0]] == script.solve(script.upper + far * width).status
 
 
 def test_terms_that_a_problem_declares_are_exported_as_they_are(model: vibench.Model) -> None:
