@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import NamedTuple
 
-VERSION = 12
+VERSION = 13
 """Schema version of a results file; a file of another version is refused."""
 
 TEXT, REAL, INTEGER, BLOB = "TEXT", "REAL", "INTEGER", "BLOB"
@@ -216,7 +216,8 @@ CELLS: Mapping[str, Column] = {
     ),
     "error_lambda_zero_max": real("1", "Largest error_lambda_scaled of these queries.", "error, λ = 0", 21),
     **_medians(
-        "u_energy", "u", "lambda_natural", "lambda", "online_u_energy", "online_lambda_natural", "hsw_u", "hsw_lambda"
+        "u_energy", "u", "lambda_natural", "lambda", "online_u_energy", "online_lambda_natural", "online_lambda",
+        "hsw_u", "hsw_lambda",
     ),
     "certificate": text("Bounds at online cost: certified, verified, or none.", "certificate", 10),
     "bound_online_violations": integer("Ok queries where bound_online_violated is 1; empty without a certificate."),
@@ -333,13 +334,18 @@ QUERIES: Mapping[str, Column] = {
     ),
     "bound_online_u_energy": real("A", "Bound of error_u_energy_absolute at online cost."),
     "bound_online_lambda_natural": real("A", "Bound of error_lambda_natural_absolute at online cost."),
-    **_effectivities("online_u_energy", "online_lambda_natural"),
+    "bound_online_lambda": real(
+        "W", "Bound of error_lambda_absolute at online cost; empty where beta_energy_online_note says why."
+    ),
+    **_effectivities("online_u_energy", "online_lambda_natural", "online_lambda"),
     "bound_online_rho": real("A", "Its bound of ρ."),
     "bound_online_omega": real("A", "Its bound of ω."),
     "bound_online_kappa": real("A²", "Its κ."),
     "coercivity_online": real(
         "1", "Lower bound of A(µ) against A at the centre of the parameters; 1 where A is constant."
     ),
+    "beta_energy_online": real("b/AW", "Lower bound of β_A at online cost; 0 where there is none."),
+    "beta_energy_online_note": text("Which lower bound of β_A this is, or why there is none."),
     "bound_online_violated": integer(
         "1 where an error is above its bound by more than 1e-10 of the solution, else 0; empty without."
     ),

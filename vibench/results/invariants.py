@@ -22,7 +22,8 @@ from vibench.stability.infsup import UNSIGNED
 
 EFFECTIVITIES = (
     "effectivity_u_energy", "effectivity_u", "effectivity_lambda_natural", "effectivity_lambda",
-    "effectivity_online_u_energy", "effectivity_online_lambda_natural", "effectivity_hsw_u", "effectivity_hsw_lambda",
+    "effectivity_online_u_energy", "effectivity_online_lambda_natural", "effectivity_online_lambda",
+    "effectivity_hsw_u", "effectivity_hsw_lambda",
 )  # fmt: skip
 """Error bound over error, at least 1."""
 

@@ -12,7 +12,8 @@ from vibench.qp.status import Status
 from vibench.stages.base import Row
 
 BOUNDS = (
-    "u_energy", "u", "lambda_natural", "lambda", "online_u_energy", "online_lambda_natural", "hsw_u", "hsw_lambda",
+    "u_energy", "u", "lambda_natural", "lambda", "online_u_energy", "online_lambda_natural", "online_lambda", "hsw_u",
+    "hsw_lambda",
 )  # fmt: skip
 """Error bounds, as in the names of their columns."""
 

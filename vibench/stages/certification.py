@@ -9,6 +9,7 @@ from vibench.model.affine import AffineMember
 from vibench.model.certificates.base import CertificateBase, certificate_base
 from vibench.model.certificates.bounds import OnlineCertificate
 from vibench.model.certificates.contact_correction import ContactCompliance
+from vibench.model.certificates.inf_sup import OnlineInfSup
 from vibench.model.certificates.prepared_correction import PreparedCorrections
 from vibench.model.certificates.residual import ResidualBasis
 from vibench.model.certificates.spectral import SpectralBounds
@@ -19,7 +20,8 @@ from vibench.storage.serialisation import storable
 from vibench.timing import timed
 
 for _kind in (
-    CertificateBase, ContactCompliance, OnlineCertificate, PreparedCorrections, ResidualBasis, SpectralBounds,
+    CertificateBase, ContactCompliance, OnlineCertificate, OnlineInfSup, PreparedCorrections, ResidualBasis,
+    SpectralBounds,
 ):  # fmt: skip
     storable(_kind)
 

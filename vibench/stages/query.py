@@ -269,8 +269,10 @@ def _online_columns(bound: OnlineBound, error: Row) -> Row:
     row: Row = {"certificate": bound.guarantee.value, "bound_online_note": bound.note}
     if bound.guarantee is Guarantee.NONE:
         return row
-    violated = False
-    for name, value in (("u_energy", bound.u_energy), ("lambda_natural", bound.lambda_natural)):
+    violated, bounds = False, {"u_energy": bound.u_energy, "lambda_natural": bound.lambda_natural}
+    if bound.inf_sup > 0.0:
+        bounds["lambda"] = bound.lam
+    for name, value in bounds.items():
         absolute, relative = error[f"error_{name}_absolute"], error[f"error_{name}"]
         row[f"bound_online_{name}"] = value
         if f"effectivity_{name}" in error:
@@ -278,6 +280,7 @@ def _online_columns(bound: OnlineBound, error: Row) -> Row:
         size = absolute / relative if relative else value
         violated |= not absolute <= value + VIOLATION * size
     row |= {"bound_online_rho": bound.rho, "bound_online_omega": bound.omega, "bound_online_kappa": bound.kappa}
+    row |= {"beta_energy_online": bound.inf_sup, "beta_energy_online_note": bound.inf_sup_note}
     return row | {"coercivity_online": bound.coercivity, "bound_online_violated": int(violated)}
 
 

@@ -15,6 +15,7 @@ from vibench.interfaces.problem import Contact, Problem
 from vibench.interfaces.validation import checked_assembly
 from vibench.linalg.inner_product import InnerProduct
 from vibench.model.affine import AffineMember, Evaluation, coefficients, evaluated_members
+from vibench.model.certificates.inf_sup import OnlineInfSup, online_inf_sup
 from vibench.model.certificates.prepared_correction import constant_unknowns
 from vibench.model.certificates.spectral import SpectralBounds, rotated, spectral_bounds
 from vibench.stability.coercivity import operator_norm
@@ -64,6 +65,8 @@ class CertificateBase:
         bodies where that is the same at all training parameters, and zero on the others.
     bound_terms
         The terms of g (m×Q) where B is a multiple of one matrix and g an exact sum; `None` elsewhere.
+    inf_sup
+        What bounds β_A(µ) from below.
     """
 
     X: InnerProduct
@@ -76,6 +79,7 @@ class CertificateBase:
     is_exact: bool
     constraint: SparseMatrix
     bound_terms: Array | None
+    inf_sup: OnlineInfSup
 
     @property
     def guarantee(self) -> Guarantee:
@@ -136,21 +140,26 @@ def certificate_base(problem: Problem, members: Mapping[str, AffineMember], trai
         rotation, terms = T, _ = rotated(A.terms, samples)
         spectral = spectral_bounds(problem, X, terms, lambda mu: T @ evaluate(mu).get("A", ONE), stiffness)
     C = 0.5 * (compliance + compliance.T)
-    constraint, bound = _constant_constraint(problem, members, C, training)
+    constraint, bound, inf_sup = _constant_constraint(problem, members, X, C, training)
     exact = all(is_exact(problem, name, members[name]) for name in "Af")
-    return CertificateBase(X, C, tuple(terms), rotation, spectral, load, stiffness, exact, constraint, bound)
+    return CertificateBase(X, C, tuple(terms), rotation, spectral, load, stiffness, exact, constraint, bound, inf_sup)
 
 
 def _constant_constraint(
-    problem: Problem, members: Mapping[str, AffineMember], compliance: Array, training: Array
-) -> tuple[SparseMatrix, Array | None]:
-    """B₀ and the terms of g of a `CertificateBase`."""
-    B, g = members["B"], members["g"]
-    if len(B.terms) == 1 and is_exact(problem, "B", B) and is_exact(problem, "g", g):
-        return sp.csr_array(B.terms[0])[:, contact_unknowns(problem)], np.column_stack(g.terms)
+    problem: Problem, members: Mapping[str, AffineMember], X: InnerProduct, compliance: Array, training: Array
+) -> tuple[SparseMatrix, Array | None, OnlineInfSup]:
+    """B₀, the terms of g, and the bounds of β_A of a `CertificateBase`."""
+    B, g, contact = members["B"], members["g"], contact_unknowns(problem)
+    multiple = sp.csr_array(B.terms[0])[:, contact] if len(B.terms) == 1 and is_exact(problem, "B", B) else None
+    if multiple is not None and is_exact(problem, "g", g):
+        inf_sup = online_inf_sup(X, problem.W, contact, multiple, None)
+        return multiple, np.column_stack(g.terms), inf_sup
     constraints = [contact_at(problem, mu).B.copy() for mu in training]
     kept = constant_unknowns(compliance, constraints)
-    return sp.csr_array(sp.csr_array(constraints[0]) @ sp.diags_array(kept.astype(float))), None
+    constraint = sp.csr_array(sp.csr_array(constraints[0]) @ sp.diags_array(kept.astype(float)))
+    if multiple is not None:
+        return constraint, None, online_inf_sup(X, problem.W, contact, multiple, None)
+    return constraint, None, online_inf_sup(X, problem.W, contact, constraint, kept)
 
 
 def injected(problem: Problem) -> Array:

@@ -5,7 +5,8 @@ With an inner product X that does not depend on the parameter, bounds α X ≼ A
     ‖e‖²_A ≤ Δ² = ρ²/α + γ ω² + 2κ,    ‖Bᵀε‖_{A⁻¹} ≤ min(√(Δ² + 2 rᵀw), ω √γ + Δ),    ρ = ‖r‖_{X⁻¹}, ω = ‖w‖_X,
 
 follow from the bounds (ii) there, as ‖r‖²_{A⁻¹} ≤ ρ²/α and ‖w‖²_A ≤ γ ω². Where A does not depend on the parameter X is
-A, α = γ = 1, and nothing is lost. Elsewhere X is A at the centre of the parameter box.
+A, α = γ = 1, and nothing is lost. Elsewhere X is A at the centre of the parameter box. In W, ‖ε‖_W ≤ ‖Bᵀε‖_{A⁻¹}/β_A
+where there is one of the lower bounds of β_A in `vibench.model.certificates.inf_sup`.
 
 - ρ comes from coordinates of the residual in an orthonormal basis (`vibench.model.certificates.residual`). Its terms
   are those of f, of A times the basis of the reduced space, and of Bᵀ times the generators. Where B is assembled on
@@ -31,7 +32,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
-from math import sqrt
+from math import inf, sqrt
 
 import numpy as np
 
@@ -67,6 +68,10 @@ class OnlineBound:
         α.
     guarantee, note
         What they are worth; and why there are none, that no prepared correction was feasible, or "".
+    lam
+        Of ‖λ − λ_N‖ in the norm of W: `lambda_natural` over `inf_sup`.
+    inf_sup, inf_sup_note
+        A lower bound of β_A, and which it is; 0, and why there is none.
     """
 
     u_energy: float
@@ -78,11 +83,13 @@ class OnlineBound:
     coercivity: float
     guarantee: Guarantee
     note: str = ""
+    lam: float = inf
+    inf_sup: float = 0.0
+    inf_sup_note: str = ""
 
     @classmethod
     def none(cls, note: str) -> OnlineBound:
         """No bound, and why."""
-        inf = float("inf")
         return cls(inf, inf, inf, inf, inf, inf, 0.0, Guarantee.NONE, note)
 
 
@@ -161,8 +168,20 @@ class OnlineCertificate:
         work = float(along @ coordinates) + (beside + missing + lacking) * norm  # at least rᵀw
         natural = min(sqrt(max(0.0, square + 2.0 * work)), omega + bound)
         least = sqrt(max(0.0, square_of_u - base.stiffness_error * u_norm**2)) - bound  # of ‖u‖
-        relative = bound / least if least > 0.0 else float("inf")
-        return OnlineBound(bound, natural, relative, rho / sqrt(lower), omega, kappa, lower, base.guarantee, note)
+        relative = bound / least if least > 0.0 else inf
+        beta, which = self._inf_sup(problem, mu, evaluated, float(theta["B"][0]), upper)
+        in_W = natural / beta if beta > 0.0 else inf
+        terms = rho / sqrt(lower), omega, kappa, lower
+        return OnlineBound(bound, natural, relative, *terms, base.guarantee, note, in_W, beta, which)
+
+    def _inf_sup(
+        self, problem: Problem, mu: Array, evaluated: Evaluated, theta: float, gamma: float
+    ) -> tuple[float, str]:
+        """A lower bound of β_A, and which it is."""
+        known = self.base.inf_sup
+        if known.reason or known.bodies is None:
+            return known.at(theta, None, gamma)
+        return known.at(1.0, (evaluated.contact or contact_at(problem, mu)).B, gamma)
 
     def _corrected(
         self, problem: Problem, mu: Array, evaluated: Evaluated, y: Array, lam: Array, gamma: float

@@ -21,6 +21,7 @@ from vibench.model.affine import affine_decomposition
 from vibench.model.certificates import base as base_module
 from vibench.model.certificates.base import CertificateBase, Guarantee, certificate_base, injected, unsupported
 from vibench.model.certificates.bounds import NOT_COERCIVE, NOT_PREPARED, OUTSIDE, OnlineBound, OnlineCertificate
+from vibench.model.certificates.inf_sup import NO_BODY, NOT_CONSTANT, ON_BODIES, SCALED
 from vibench.model.certificates.preparation import prepare
 from vibench.model.certificates.prepared_correction import prepare_corrections
 from vibench.model.certificates.residual import residual_basis
@@ -176,6 +177,57 @@ def test_no_error_is_above_its_bound(kind: tuple[str, bool, str], seed: int, siz
     assert error <= bound.u_energy + 1e-7 * scale
     assert natural <= bound.lambda_natural + 1e-7 * scale
     assert error <= bound.relative * norm * (1.0 + 1e-9) + 1e-7 * scale
+
+
+BETA = {"moving": NO_BODY, "scaled": SCALED, "half": ON_BODIES}
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@given(st.integers(0, 10_000), st.sampled_from([0.0, 1e-3, 1.0, 20.0]), st.floats(0.5, 2.0), st.floats(-1.0, 1.0))
+@settings(max_examples=20)
+def test_no_error_of_the_multiplier_in_W_is_above_its_bound(
+    kind: tuple[str, bool, str], seed: int, size: float, a: float, b: float
+) -> None:
+    """Nor is β_A below what is said to be a lower bound of it, where there is one."""
+    rng, mu = np.random.default_rng(seed), np.array([a, b])
+    problem, model, certificate = prepared(*kind)
+    reduced, vi = model.assemble(mu), problem.assemble(mu)
+    x, alpha = exact(reduced.program)
+    x = x + size * rng.standard_normal(len(x))
+    alpha = np.maximum(alpha + size * rng.standard_normal(len(alpha)), 0.0)
+    bound = certificate.evaluate(problem, mu, reduced, x, alpha)
+    A, B = vi.A.toarray(), vi.B.toarray()
+    lam = exact(VariationalInequality(A, vi.f, B, vi.g))[1]
+    beta = float(np.sqrt(np.linalg.eigvalsh(B @ np.linalg.solve(A, B.T))[0]))  # X_W is the identity
+    assert bound.inf_sup_note == BETA[kind[2]]
+    assert (bound.inf_sup > 0.0) == np.isfinite(bound.lam) == (kind[2] != "moving")
+    assert bound.inf_sup <= beta
+    assert np.linalg.norm(lam - model.generators @ alpha) <= bound.lam * (1.0 + 1e-9) + 1e-7 * (1.0 + size) / beta
+    if kind[2] == "scaled" and kind[0] == "constant":
+        assert bound.inf_sup >= 0.998 * beta
+
+
+def test_where_a_constant_body_moves_at_a_parameter_there_is_no_bound_in_W() -> None:
+    """What was the same at all training parameters may be another one elsewhere: this is looked at."""
+    problem, model, certificate = prepared("constant", constraint="half")
+    mu = np.array([1.3, 0.2])
+    reduced = model.assemble(mu)
+    solution = exact(reduced.program)
+    moved = Turned("constant", "half")
+    reduced = replace(reduced, evaluated=replace(reduced.evaluated, contact=moved.contact(mu)))
+    bound = certificate.evaluate(moved, mu, reduced, *solution)
+    assert (bound.inf_sup, bound.inf_sup_note, bound.lam) == (0.0, NOT_CONSTANT, np.inf)
+    assert np.isfinite(bound.lambda_natural)
+
+
+class Turned(Family):
+    """One entry of the constraint on the first body changes with the parameter."""
+
+    def contact(self, mu: np.ndarray) -> Contact:
+        contact = super().contact(mu)
+        B = contact.B.toarray()
+        B[0, 0] += 1e-9 * mu[0]
+        return Contact(sp.csr_array(B), contact.g)
 
 
 @pytest.mark.parametrize("kind", KINDS)
