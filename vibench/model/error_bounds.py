@@ -139,6 +139,16 @@ def bound_errors_at(
     return ErrorBounds(of_u.primal, in_V, of_lam.dual, in_W, *terms_of_both, "" if alpha.proved else ESTIMATED)
 
 
+def corrected_pair(vi: VariationalInequality, energy: Energy, u: Array, lam: Array) -> tuple[Array, Array] | None:
+    """The pair v = u_N − w (n,) and ν ≥ 0 (m,) of the correction of u_N (n,) and λ_N ≥ 0 (m,); `None` without one.
+
+    v is feasible, ν complementary to it, and the residual of both is r: they solve (7) with the load f − r. The errors
+    are bounded by `bound_errors_at`, as those of any other pair; nothing but the residual is left there.
+    """
+    correction = find_correction(vi, energy, u, lam)
+    return None if correction is None else (u - correction.w, np.maximum(correction.nu, 0.0))
+
+
 @dataclass(frozen=True)
 class Terms:
     """The terms of (ii), with the residual r (n,) and ‖r + A w‖_{A⁻¹}, and the bounds that need no constants."""

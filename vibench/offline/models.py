@@ -16,7 +16,8 @@ from vibench.arrays import Array
 from vibench.errors import RequestError, unknown_name
 from vibench.highfidelity.active_set import HighFidelitySolution, HighFidelitySolver
 from vibench.interfaces.problem import ParameterBox, Problem
-from vibench.model.certificates.bounds import OnlineBound, OnlineCertificate
+from vibench.model.certificates.base import contact_unknowns
+from vibench.model.certificates.bounds import OnlineBound, OnlineCertificate, OnlineCorrection
 from vibench.model.error_bounds import ErrorBounds, bound_errors_at
 from vibench.model.galerkin import ReducedModel, ReducedProblem
 from vibench.model.hyperreduced import HyperReducedModel
@@ -55,6 +56,8 @@ class Solution:
         Seconds of the assembly of the program, and of its solution.
     bound, tolerance
         Its error bounds at online cost where the cell is certified, and the relative error asked for; else `None`.
+    correction
+        What corrects it where that was asked for: `u`, `lam` and `bound` are of the corrected pair, x and α are not.
     """
 
     mu: Array
@@ -69,6 +72,7 @@ class Solution:
     _reduced: ReducedProblem = field(repr=False)
     bound: OnlineBound | None = None
     tolerance: float | None = None
+    correction: OnlineCorrection | None = None
 
     @property
     def verdict(self) -> str:
@@ -84,11 +88,17 @@ class Solution:
     @cached_property
     def u(self) -> Array:
         """The primal solution u (n,)."""
-        return np.asarray(self._reduced.reconstruct(self._given(self.x)[:, None])[:, 0])
+        u = np.asarray(self._reduced.reconstruct(self._given(self.x)[:, None])[:, 0])
+        if self.correction is None:
+            return u
+        assert self._model.certificate is not None  # it made the correction
+        return self._model.certificate.corrected(u, self.correction, contact_unknowns(self._model.problem))
 
     @cached_property
     def lam(self) -> Array:
         """The multiplier λ (m,)."""
+        if self.correction is not None:
+            return self.correction.nu
         return np.asarray(self._model.reduced.generators @ self._given(self.alpha))
 
     @cached_property
@@ -146,6 +156,7 @@ class Model:
         solver: str | None = None,
         accuracy: float | None = None,
         tolerance: float | None = None,
+        corrected: bool = False,
     ) -> Solution:
         """Assemble and solve the reduced program at a parameter, verify the solution, and bound its errors.
 
@@ -161,17 +172,23 @@ class Model:
             QP solver and the relative accuracy that it has to reach; those of the model by default.
         tolerance
             Largest relative error of u in the energy norm; `verdict` of the solution says whether the bound keeps it.
+        corrected
+            Whether `u` and `lam` of the solution are those that its certificate corrects, which satisfy the constraints
+            and are more accurate where the violation dominates the bound (`omega` > `rho`). Where there is no bound
+            there is no correction either.
 
         Raises
         ------
         RequestError
             If mu is not a parameter of the problem, the solver is not installed, the tolerance is not positive, or
-            there is one and the model is not certified.
+            there is one, or a correction is asked for, and the model is not certified.
         """
         if tolerance is not None and not 0.0 < tolerance < inf:
             raise RequestError(f"the tolerance is {tolerance:g}, expected a positive finite number")
         if tolerance is not None and self.certificate is None:
             raise RequestError('the model has no error bounds: a tolerance needs one with assembly = "certified"')
+        if corrected and self.certificate is None:
+            raise RequestError('the model has no error bounds: corrections need one with assembly = "certified"')
         at, name = self._parameter(mu), solver or self.solver
         accuracy = self.accuracy if accuracy is None else accuracy
         own = registry.registered(SOLVER)
@@ -183,13 +200,15 @@ class Model:
         solve = partial(solve_qp, reduced.program, name, accuracy, registry.qp_solver(name), reduced.factor)
         found, solution = timed(solve)
         status, reason, residuals = verify(reduced.program, found, accuracy)
-        bound = None
+        bound = correction = None
         if self.certificate is not None:
             bound = OnlineBound.none(f"the program has no solution: {reason}")
             if residuals is not None and found.x is not None and found.alpha is not None:
-                bound = self.certificate.evaluate(self.problem, at, reduced, found.x, found.alpha)
+                given = self.problem, at, reduced, found.x, found.alpha
+                correction = self.certificate.correct(*given) if corrected else None
+                bound = self.certificate.evaluate(*given) if correction is None else correction.bound
         answer = at, status, reason, found.x, found.alpha, residuals
-        return Solution(*answer, assembly, solution, self, reduced, bound, tolerance)
+        return Solution(*answer, assembly, solution, self, reduced, bound, tolerance, correction)
 
     def reconstruct(self, mu: Parameters, x: Array, alpha: Array) -> tuple[Array, Array]:
         """The solution u (n,), λ (m,) with coordinates x (N',) in the primal basis at mu and α (R,) on generators."""

@@ -18,6 +18,7 @@ from vibench.model.error_bounds import (
     NO_CORRECTION,
     NOT_IN_CONE,
     ErrorBounds,
+    corrected_pair,
     error_bounds,
     find_correction,
 )
@@ -108,6 +109,24 @@ def test_no_error_is_above_its_bound(
         assert float(W.norm(lam - lam_N)) <= found.lam + allowed / beta
     else:
         assert found.lam == np.inf  # of dependent rows the multiplier is not unique
+
+
+@given(approximations())
+def test_corrected_pairs_are_feasible_and_nothing_but_the_residual_is_left_of_their_bounds(
+    given: tuple[VariationalInequality, np.ndarray, np.ndarray, np.ndarray, np.ndarray],
+) -> None:
+    vi, u, lam, u_N, lam_N = given
+    norm, before, pair = energy(vi), bounds(vi, u_N, lam_N), corrected_pair(vi, energy(vi), u_N, lam_N)
+    assert pair is not None
+    v, nu = pair
+    after = bounds(vi, v, nu)
+    scale = norm.norm(u) + norm.norm(u_N) + norm.dual_norm(vi.f) + norm.dual_norm(vi.B.T @ lam_N)
+    assert np.min(nu) >= 0.0
+    assert np.max(vi.B @ v - vi.g) <= EXACT * (1.0 + float((abs(vi.B) @ np.abs(v) + np.abs(vi.g)).max()))
+    assert norm.norm(u - v) <= after.u_energy + EXACT * scale
+    assert norm.dual_norm(vi.B.T @ (lam - nu)) <= after.lambda_natural + EXACT * scale
+    # The best w comes from an interior-point method where rows are dependent, at the root of its accuracy.
+    assert after.u_energy <= before.rho * (1.0 + 1e-3) + 1e-4 * scale
 
 
 @given(st.integers(0, 10_000), st.sampled_from([1e-6, 1e-8, 1e-10]))

@@ -11,6 +11,8 @@ from samples import SMALL, small_study
 
 import vibench
 from vibench.interfaces.validation import validation_parameters
+from vibench.model.certificates.inf_sup import ON_BODIES
+from vibench.offline.assemblies import assemblies
 
 CELLS = list(product(("online-supremizers", "offline-pga"), ("full", "reduced")))
 
@@ -134,6 +136,39 @@ def test_a_certified_model_bounds_its_errors_and_says_whether_they_keep_a_tolera
         assert model.solve(mu, tolerance=0.99 * relative).verdict == "not certified"
         rough = model.solve(mu, accuracy=1e-14, tolerance=1.01 * relative)  # more than the solver reaches, or less
         assert rough.verdict == ("certified" if rough.status == "ok" else "not certified")
+
+
+def test_the_bound_of_the_multiplier_is_in_rows_and_says_what_it_rests_on(certified: vibench.Run) -> None:
+    row = certified.cells.set_index("assembly").loc["certified"]
+    rows = certified.queries[certified.queries["cell"] == row["cell"]]
+    assert set(rows["beta_energy_online_note"]) == {ON_BODIES}
+    assert (rows["beta_energy_online"] <= rows["beta_energy"] * (1.0 + 1e-2)).all()  # both are moved outwards
+    assert (rows["bound_online_lambda"] >= rows["error_lambda_absolute"]).all()
+    assert row["effectivity_online_lambda_median"] == pytest.approx(rows["effectivity_online_lambda"].median())
+    assert 1.0 <= row["effectivity_online_lambda_median"] < 20.0
+
+
+def test_corrected_solutions_satisfy_the_constraints_and_have_bounds_of_their_own(certified: vibench.Run) -> None:
+    model = certified.model(certified.cells.set_index("assembly").loc["certified", "cell"])
+    for mu in model.parameters.sample(5, seed=4):
+        plain, corrected, exact = model.solve(mu), model.solve(mu, corrected=True), model.high_fidelity(mu)
+        vi, norm = model.problem.assemble(mu), assemblies(model.problem).energy_at(mu)
+        assert plain.correction is None
+        assert corrected.correction is not None
+        assert corrected.bound is not None
+        assert np.array_equal(corrected.x, plain.x)
+        assert not np.array_equal(corrected.lam, plain.lam)
+        assert np.min(corrected.lam) >= 0.0
+        assert np.max(vi.B @ corrected.u - vi.g) <= 1e-12 * np.abs(vi.g).max()
+        force = vi.B.T @ (exact.lam - corrected.lam)
+        assert norm.norm(exact.u - corrected.u) <= corrected.bound.u_energy
+        assert norm.dual_norm(force) <= corrected.bound.lambda_natural
+        assert model.problem.W.norm(exact.lam - corrected.lam) <= corrected.bound.lam
+        bounds = corrected.error_bounds  # at high-fidelity cost, of the corrected pair
+        assert norm.norm(exact.u - corrected.u) <= bounds.u_energy <= corrected.bound.u_energy * (1.0 + 1e-3)
+    uncertified = certified.model(certified.cells.set_index("assembly").loc["reduced", "cell"])
+    with pytest.raises(vibench.RequestError, match="corrections need one"):
+        uncertified.solve([1.0], corrected=True)
 
 
 def test_a_tolerance_needs_a_certificate(certified: vibench.Run) -> None:

@@ -23,6 +23,14 @@ largest ‖d‖ and ‖D‖ ‖u_N‖_X. These are measured at random parameters
 zero: the bounds are then called verified instead of certified. They are certified where α, γ and the norms in them are
 proved, too. Outside the parameter box, where nothing was measured, there are none with such members.
 
+A correction w that is the best one for c X in place of A comes with a multiplier ν ≥ 0, c X w = Bᵀ(ν − λ_N). The pair
+v = u_N − w and ν has the residual f − A v − Bᵀν = r − (c X − A) w and no violation. For it the identity (i) gives
+
+    ‖u − v‖²_A + ‖Bᵀ(λ − ν)‖²_{A⁻¹} ≤ ‖r − (c X − A) w‖²_{A⁻¹} + 2 νᵀ(B w − s),
+
+the first norm at most ρ/√α + ½ (γ − α)/√α ‖w‖_X for c = ½ (α + γ), where |c X − A| ≼ ½ (γ − α) X. Where A is constant
+the residual alone is left. This *corrected pair* is better where ω > ρ.
+
 Round-off is bounded where it decides whether w is feasible, and in the coordinates of the residual: it may be all that
 is left of Δ² + 2 rᵀw, in which these are multiplied with those of X w.
 """
@@ -36,7 +44,7 @@ from math import inf, sqrt
 
 import numpy as np
 
-from vibench.arrays import Array, SparseMatrix
+from vibench.arrays import Array, Indices, SparseMatrix
 from vibench.interfaces.problem import Contact, Problem
 from vibench.model.certificates.base import ONE, CertificateBase, Guarantee, contact_at
 from vibench.model.certificates.contact_correction import ContactCompliance, find_contact_correction
@@ -91,6 +99,25 @@ class OnlineBound:
     def none(cls, note: str) -> OnlineBound:
         """No bound, and why."""
         return cls(inf, inf, inf, inf, inf, inf, 0.0, Guarantee.NONE, note)
+
+
+@dataclass(frozen=True)
+class OnlineCorrection:
+    """The corrected pair v = u_N − w and ν of one reduced solution.
+
+    Attributes
+    ----------
+    load
+        c (k,) on the contact unknowns E, w = X⁻¹ E c.
+    nu
+        ν ≥ 0 (m,).
+    bound
+        Its bounds. ω is zero in them, ρ the norm of its residual, and κ is νᵀ(B w − s).
+    """
+
+    load: Array
+    nu: Array
+    bound: OnlineBound
 
 
 @dataclass(frozen=True)
@@ -173,6 +200,46 @@ class OnlineCertificate:
         in_W = natural / beta if beta > 0.0 else inf
         terms = rho / sqrt(lower), omega, kappa, lower
         return OnlineBound(bound, natural, relative, *terms, base.guarantee, note, in_W, beta, which)
+
+    def correct(
+        self, problem: Problem, mu: Array, reduced: ReducedProblem, x: Array, alpha: Array
+    ) -> OnlineCorrection | None:
+        """The corrected pair of a solution as in `evaluate`, with its bounds; `None` where that has none."""
+        bound, base = self.evaluate(problem, mu, reduced, x, alpha), self.base
+        if bound.guarantee is Guarantee.NONE:
+            return None
+        evaluated, lam, alpha_A = reduced.evaluated, self.generators @ alpha, bound.coercivity
+        contact, y = evaluated.contact or contact_at(problem, mu), evaluated.in_space(x)
+        theta = base.coefficients(evaluated.samples)
+        gamma = 1.0 if base.spectral is None else base.spectral.at(mu, theta["A"])[1]
+        middle = 0.5 * (alpha_A + gamma)
+        found = None
+        if self.prepared is not None and base.bound_terms is not None:
+            B, g, g_size = self._constraint(problem, mu, evaluated)
+            found = self.prepared.multiplier(float(B), g, g_size, y, lam, middle)
+        if found is None:  # the best of all w
+            on_contact, uncertain = self.contact_basis @ y, float(np.linalg.norm(y)) * self._round_off
+            best = find_contact_correction(self.compliance, contact, on_contact, uncertain, lam, middle)
+            if best is None:
+                return None
+            found = best.nu, best.norm, best.gap
+        nu, norm, gap = found
+        rho = bound.rho + 0.5 * (gamma - alpha_A) / sqrt(alpha_A) * norm
+        both = sqrt(rho**2 + 2.0 * gap)
+        relative = inf
+        if 0.0 < bound.relative < inf:
+            relative = both / (bound.u_energy / bound.relative)  # over the least ‖u‖ that is known
+        in_W = both / bound.inf_sup if bound.inf_sup > 0.0 else inf
+        corrected = replace(
+            bound, u_energy=both, lambda_natural=both, relative=relative, rho=rho, omega=0.0, kappa=gap, lam=in_W
+        )
+        return OnlineCorrection(np.asarray(contact.B.T @ (nu - lam)) / middle, nu, corrected)
+
+    def corrected(self, u: Array, correction: OnlineCorrection, unknowns: Indices) -> Array:
+        """V = u_N − w (n,) from u_N (n,) and the contact unknowns (k,) of the problem; by arrays of mesh size."""
+        load = np.zeros(self.base.X.dim)
+        load[unknowns] = correction.load
+        return np.asarray(u - self.base.X.riesz(load))
 
     def _inf_sup(
         self, problem: Problem, mu: Array, evaluated: Evaluated, theta: float, gamma: float

@@ -65,12 +65,16 @@ class ContactCorrection:
         ‖w‖ in X.
     kappa
         λᵀ(B w − s) ≥ 0.
+    nu, gap
+        ν ≥ 0 (m,) with γ c = Bᵀ(ν − λ), and νᵀ(B w − s) ≥ 0, which is zero but for round-off where w is the best one.
     """
 
     unknowns: Indices
     load: Array
     norm: float
     kappa: float
+    nu: Array
+    gap: float
 
 
 @dataclass(frozen=True)
@@ -216,34 +220,36 @@ class _Program:
     lam: Array
     gamma: float
 
-    def best(self) -> tuple[Array, float, float] | None:
-        """C on the unknowns of the block, the norm of w, and κ."""
+    def best(self) -> tuple[Array, float, float, Array, float] | None:
+        """What a `ContactCorrection` has besides its unknowns, in this order."""
         B, margin = self.B, MARGIN * self.round_off
         size = sp.csr_array((np.abs(B.data), B.indices, B.indptr), B.shape)
         for _ in range(ATTEMPTS):
-            for load, values, norm in self._minimisers(self.excess + margin):
+            for load, values, norm, nu in self._minimisers(self.excess + margin):
                 slack = self.B @ values - self.excess
                 lacking = self.terms * (size @ np.abs(values)) + self.round_off - slack
                 far = self.reach * norm * (1.0 + 1e-10) + self.excess + self.round_off
                 lacking = np.where(self.near, lacking, far)
                 if np.all(lacking <= 0.0):  # NaN is not
-                    return load, norm, max(0.0, float(self.lam @ slack))
+                    return load, norm, max(0.0, float(self.lam @ slack)), nu, max(0.0, float(nu @ slack))
                 if np.any(lacking[~self.near] > 0.0):
                     return None
                 margin = np.maximum(margin, 2.0 * np.nan_to_num(lacking, nan=0.0, posinf=0.0))
             margin = 10.0 * margin
         return None
 
-    def _minimisers(self, excess: Array) -> Iterator[tuple[Array, Array, float]]:
-        """The last w of the active set method: c, w on the unknowns of the block, and its norm."""
+    def _minimisers(self, excess: Array) -> Iterator[tuple[Array, Array, float, Array]]:
+        """The last w of the active set method: c, w on the unknowns of the block, its norm, and ν."""
         size = self.reach**2 / self.gamma  # at least the diagonal of S
         chosen = (self.lam > 0.0) & (self.lam * size > -excess)
         for _ in range(EXTENSIONS):
-            load = (self.B.T @ self._difference(chosen, excess, size)) / self.gamma
+            difference = self._difference(chosen, excess, size)
+            load = (self.B.T @ difference) / self.gamma
             values = self.compliance @ load
             violated = self.near & ~chosen & (excess - self.B @ values > self.round_off)
             if not violated.any():
-                yield load, values, float(np.sqrt(max(0.0, float(load @ values))))
+                nu = np.maximum(self.lam + difference, 0.0)
+                yield load, values, float(np.sqrt(max(0.0, float(load @ values)))), nu
                 return
             chosen |= violated
 

@@ -87,6 +87,30 @@ class PreparedCorrections:
         y, lam, gamma
             Coordinates (d,) of u_N, λ ≥ 0 (m,), and γ.
         """
+        found = self._feasible(B, g, g_size, y, lam, gamma)
+        if found is None:
+            return None
+        _, a, norm, slack = found
+        return a @ self.directions, norm, max(0.0, float(lam @ slack))
+
+    def multiplier(
+        self, theta: float, g: Array, g_size: Array, y: Array, lam: Array, gamma: float
+    ) -> tuple[Array, float, float] | None:
+        """ν ≥ 0 (m,) with γ X w = Bᵀ(ν − λ), ‖w‖, and νᵀ(B w − s), where B(µ) is θ B₀ everywhere; `None` as above.
+
+        Elsewhere w is the best of those that deform some bodies alone, and there is no such ν.
+        """
+        found = self._feasible(theta, g, g_size, y, lam, gamma)
+        if found is None:
+            return None
+        (nu, _, norm, slack), on_all = found, lam.copy()
+        on_all[self.rows] = np.maximum(nu, 0.0)
+        return on_all, norm, max(0.0, float(on_all @ slack))
+
+    def _feasible(
+        self, B: float | SparseMatrix, g: Array, g_size: Array, y: Array, lam: Array, gamma: float
+    ) -> tuple[Array, Array, float, Array] | None:
+        """ν on the rows J, a with c = B₀ᵀ a, ‖w‖ and B w − s (m,) of a w that is feasible."""
         B = B if isinstance(B, (float, sp.csr_array)) else sp.csr_array(B)
         theta, terms = (B, self.terms) if isinstance(B, float) else (1.0, self.terms + int(np.diff(B.indptr).max()))
         if theta == 0.0:
@@ -98,6 +122,7 @@ class PreparedCorrections:
             wanted, scale = (excess + margin)[self.rows], gamma / theta**2
             released = here * self._diagonal <= -scale * wanted
             nu = complementary(here + scale * (self.inverse @ wanted), self.inverse.__getitem__, released)
+            nu = np.maximum(nu, 0.0)
             a = (theta / gamma) * (nu - here)  # c = B₀ᵀ a
             values = np.zeros(len(self.basis))
             values[self.moved] = self.responses @ a
@@ -105,7 +130,7 @@ class PreparedCorrections:
             lacking = round_off + (unit * float(self.reach @ np.abs(a))) * size[:, 1] - slack
             if lacking.max() <= 0.0:  # NaN is not
                 square = float(a @ (values[self.rows] if isinstance(B, float) else self.compliance @ a))
-                return a @ self.directions, max(0.0, square) ** 0.5, max(0.0, float(lam @ slack))
+                return nu, a, max(0.0, square) ** 0.5, slack
             if lacking[self.rows].max() <= 0.0:  # rows beyond J are violated
                 return None
             margin = margin + 2.0 * np.maximum(lacking, 0.0)

@@ -185,7 +185,7 @@ BETA = {"moving": NO_BODY, "scaled": SCALED, "half": ON_BODIES}
 @pytest.mark.parametrize("kind", KINDS)
 @given(st.integers(0, 10_000), st.sampled_from([0.0, 1e-3, 1.0, 20.0]), st.floats(0.5, 2.0), st.floats(-1.0, 1.0))
 @settings(max_examples=20)
-def test_no_error_of_the_multiplier_in_W_is_above_its_bound(
+def test_no_error_of_the_multiplier_is_above_its_bound_in_the_norm_of_its_space(
     kind: tuple[str, bool, str], seed: int, size: float, a: float, b: float
 ) -> None:
     """Nor is β_A below what is said to be a lower bound of it, where there is one."""
@@ -207,9 +207,41 @@ def test_no_error_of_the_multiplier_in_W_is_above_its_bound(
         assert bound.inf_sup >= 0.998 * beta
 
 
-def test_where_a_constant_body_moves_at_a_parameter_there_is_no_bound_in_W() -> None:
+@pytest.mark.parametrize("kind", KINDS)
+@given(st.integers(0, 10_000), st.sampled_from([0.0, 1e-3, 1.0, 20.0]), st.floats(0.5, 2.0), st.floats(-1.0, 1.0))
+@settings(max_examples=20)
+def test_corrected_pairs_are_feasible_and_no_error_of_them_is_above_its_bound(
+    kind: tuple[str, bool, str], seed: int, size: float, a: float, b: float
+) -> None:
+    rng, mu = np.random.default_rng(seed), np.array([a, b])
+    problem, model, certificate = prepared(*kind)
+    reduced, vi = model.assemble(mu), problem.assemble(mu)
+    x, alpha = exact(reduced.program)
+    x = x + size * rng.standard_normal(len(x))
+    alpha = np.maximum(alpha + size * rng.standard_normal(len(alpha)), 0.0)
+    bound = certificate.evaluate(problem, mu, reduced, x, alpha)
+    found = certificate.correct(problem, mu, reduced, x, alpha)
+    assert found is not None
+    A, B, corrected, nu = vi.A.toarray(), vi.B.toarray(), found.bound, found.nu
+    u, lam = exact(VariationalInequality(A, vi.f, B, vi.g))
+    u_N = reduced.reconstruct(x[:, None])[:, 0]
+    v = certificate.corrected(u_N, found, CONTACT)
+    scale = float(np.sqrt(u @ A @ u)) + np.linalg.norm(x) + np.linalg.norm(alpha)
+    assert np.min(nu) >= 0.0
+    assert np.max(B @ v - vi.g) <= 1e-11 * scale
+    e, force = u - v, B.T @ (lam - nu)
+    assert np.sqrt(e @ A @ e) <= corrected.u_energy + 1e-7 * scale
+    assert np.sqrt(force @ np.linalg.solve(A, force)) <= corrected.lambda_natural + 1e-7 * scale
+    assert np.linalg.norm(lam - nu) <= corrected.lam + 1e-6 * scale
+    assert np.sqrt(e @ A @ e) <= corrected.relative * np.sqrt(u @ A @ u) + 1e-7 * scale
+    assert corrected.rho >= bound.rho
+    if kind[0] == "constant":  # nothing but the residual is left
+        assert corrected.u_energy == pytest.approx(bound.rho, rel=1e-3, abs=1e-6 * scale)
+
+
+def test_where_a_constant_body_moves_at_a_parameter_there_is_no_inf_sup_constant() -> None:
     """What was the same at all training parameters may be another one elsewhere: this is looked at."""
-    problem, model, certificate = prepared("constant", constraint="half")
+    _, model, certificate = prepared("constant", constraint="half")
     mu = np.array([1.3, 0.2])
     reduced = model.assemble(mu)
     solution = exact(reduced.program)
