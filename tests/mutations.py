@@ -362,8 +362,22 @@ FAULTS = (
     Fault(
         "verified-called-certified",
         "vibench/model/certificates/base.py",
-        "return self.load_error == self.stiffness_error == 0.0",
-        "return True",
+        'exact = all(is_exact(problem, name, members[name]) for name in "Af")',
+        "exact = load == stiffness == 0.0",
+        ("tests/unit/model/certificates/test_bounds.py",),
+    ),
+    Fault(
+        "inf-sup-constant-of-a-body-that-moves",
+        "vibench/model/certificates/inf_sup.py",
+        "if np.any(difference.data[self.bodies[difference.indices]] != 0.0):",
+        "if False:",
+        ("tests/unit/model/certificates/test_bounds.py",),
+    ),
+    Fault(
+        "corrected-pair-without-the-loss-of-spectral-bounds",
+        "vibench/model/certificates/bounds.py",
+        "rho = bound.rho + 0.5 * (gamma - alpha_A) / sqrt(alpha_A) * norm",
+        "rho = bound.rho",
         ("tests/unit/model/certificates/test_bounds.py",),
     ),
     Fault(

@@ -239,6 +239,28 @@ def test_corrected_pairs_are_feasible_and_no_error_of_them_is_above_its_bound(
         assert corrected.u_energy == pytest.approx(bound.rho, rel=1e-3, abs=1e-6 * scale)
 
 
+def test_the_residual_of_a_corrected_pair_is_that_of_the_inner_product_in_place_of_the_stiffness() -> None:
+    """u_N and λ_N satisfy the equation, and violate the constraints: what is left is (c X − A) w alone."""
+    problem = Family("affine", "scaled")
+    training = problem.training_set()
+    members = affine_decomposition(problem, training, 1e-3)
+    model = ReducedModel(problem, problem.V.orthonormalise(np.eye(N)), Enrichment(Kind.NONE), np.eye(M), np.eye(M))
+    reduced = HyperReducedModel(model, hyper_reduce(model, members))
+    certificate = prepare(reduced, members, certificate_base(problem, members, training), training)
+    rng = np.random.default_rng(2)
+    for mu in BOX.sample(10, 6):
+        assembled, vi = reduced.assemble(mu), problem.assemble(mu)
+        A, lam = vi.A.toarray(), rng.uniform(0.0, 0.2, M)
+        u_N = np.linalg.solve(A, vi.f - vi.B.T @ lam)
+        x = np.linalg.lstsq(assembled.basis, u_N)[0]
+        bound, found = (one(problem, mu, assembled, x, lam) for one in (certificate.evaluate, certificate.correct))
+        assert found is not None
+        v = certificate.corrected(u_N, found, CONTACT)
+        r = vi.f - A @ v - vi.B.T @ found.nu
+        assert bound.rho < 1e-2 * found.bound.rho
+        assert float(np.sqrt(r @ np.linalg.solve(A, r))) <= found.bound.rho
+
+
 def test_where_a_constant_body_moves_at_a_parameter_there_is_no_inf_sup_constant() -> None:
     """What was the same at all training parameters may be another one elsewhere: this is looked at."""
     _, model, certificate = prepared("constant", constraint="half")
