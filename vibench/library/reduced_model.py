@@ -116,13 +116,11 @@ def residuals(A: Array, f: Array, B: Array, g: Array, x: Array, alpha: Array) ->
         return tuple(np.where(ways == 0.0, 0.0, ways / [S, S, S**2]).tolist())
 
 
-def _scales(A: Array, f: Array, g: Array) -> tuple[float, float, float, float, float]:
-    """Units of length and force for the solver; the least length, force and energy that residuals are relative to."""
-    longest, k, load = float(abs(g).max()), float(A.trace()) / len(f), float(abs(f).max())
-    if load > 1e-10 * k * (-g).max(initial=0.0):
-        return 1.0, load, max(1.0, longest), 0.0, 0.5e-4 * float(f @ f) * (float(f @ f) / float(f @ A @ f))
-    length = longest or 1.0  # no load: the constraints prescribe a length and a force
-    return length, 1e-3 * k * length, length, 1e-4 * k * length, 1e-4 * k * length**2
+def _units(A: Array, f: Array, g: Array) -> tuple[float, float]:
+    """Units of length and force for the solver: of the load, or without load of what violated constraints prescribe."""
+    k, load, square, curvature = float(A.trace()) / len(f), float(abs(f).max()), float(f @ f), float(f @ A @ f)
+    moved, depth = load * (square / (curvature or np.inf)), float((-g).max(initial=0.0))
+    return (max(moved, depth), load) if moved > 1e-10 * depth else (depth or 1.0, 1e-3 * k * (depth or 1.0))
 
 
 def _polished(A: Array, f: Array, B: Array, g: Array, active: NDArray[np.bool_]) -> tuple[Array, Array]:
