@@ -26,6 +26,7 @@ from vibench.stages.base import value_of
 from vibench.stages.cell_queries import CellQueries, CellRows
 from vibench.stages.enrichment import SingleEnrichment
 from vibench.stages.offline import ConeStage, PODStage
+from vibench.study.kinds import PluginKind
 from vibench.study.parameter_sets import ParameterSet
 from vibench.study.plugin import Plugin
 from vibench.study.registry import find
@@ -128,7 +129,7 @@ def test_rows_of_a_negative_control_are_ok_and_keep_the_invariants(
     store: SampleStore, interpolation: float | None
 ) -> None:
     def plugin(kind: str, name: str, options: str = "{}") -> Plugin:
-        return Plugin(kind, name, options, find(kind, name).code)
+        return Plugin(PluginKind(kind), name, options, find(PluginKind(kind), name).code)
 
     problem = plugin("problem", "hertz", '{"resolution": "coarse"}')
     cone = ConeStage(problem, plugin("dual strategy", "pod-dual"), Stop(tolerance=1e-2))

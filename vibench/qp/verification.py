@@ -113,8 +113,12 @@ def kkt_residuals(program: VariationalInequality, x: Array, alpha: Array, norms:
     NumericalError
         If A is not positive definite.
     """
+    with np.errstate(over="ignore", invalid="ignore"):  # what a diverging solver returns has infinite residuals
+        return _residuals(program, x, alpha, norms or dual_norms(program.A))
+
+
+def _residuals(program: VariationalInequality, x: Array, alpha: Array, norms: DualNorms) -> Residuals:
     B, g = program.B, program.g
-    norms = norms or dual_norms(program.A)
     residual, excess = accurate_residuals(program, x, alpha)
     violated = np.flatnonzero(excess > round_off(B, x, g))
     rows = B[violated].T if isinstance(B, np.ndarray) else sp.csr_array(B)[violated].toarray().T
@@ -125,7 +129,7 @@ def kkt_residuals(program: VariationalInequality, x: Array, alpha: Array, norms:
     return Residuals(
         primal=_over(float(np.max(steps, initial=0.0)), energy),
         dual=_over(float(norms(residual[:, None])[0]), energy),
-        gap=_over(gap, energy**2),
+        gap=_over(gap, energy * energy),
     )
 
 

@@ -35,7 +35,7 @@ def residuals(P: np.ndarray, q: np.ndarray, G: np.ndarray, h: np.ndarray, x: np.
     S = float(np.hypot(np.sqrt(max(float(x @ P @ x), 0.0)), norms[1]))
     primal, gap = float(np.max(s[violated] / norms[2:], initial=0.0)), abs(float(z[z > 0.0] @ s[z > 0.0]))
     sizes = (primal, S), (float(norms[0]), S), (gap, S**2)
-    return [0.0 if size == 0.0 else size / (scale or 1e-300) for size, scale in sizes]
+    return [0.0 if size == 0.0 else size / scale if scale else float("inf") for size, scale in sizes]
 
 
 def main(folder: Path) -> int:

@@ -97,12 +97,17 @@ class SnapshotStage(Stage):
         u, lam = np.zeros((problem.V.dim, len(mus))), np.zeros((problem.W.dim, len(mus)))
         seconds, setups, fallbacks, solver = [], [], [], HighFidelitySolver(problem)
 
+        def refuse_shifted() -> None:
+            if not np.array_equal(mus, given):
+                raise NumericalError("assemble changes its argument mu: work on a copy")
+
         @contextmanager
         def explained(mu: Array, vi: VariationalInequality) -> Iterator[None]:
             """Name the cause rather than what came of it."""
             try:
                 yield
             except NumericalError:
+                refuse_shifted()
                 InnerProduct(vi.A, f"A at mu = {mu.tolist()}")
                 reference.refuse_false_constants(mu, vi)
                 raise
@@ -132,8 +137,7 @@ class SnapshotStage(Stage):
             u[:, k], lam[:, k] = solution.u, solution.lam
             fallbacks.append(solution.fallback)
         reference.refuse_rewritten_constants()
-        if not np.array_equal(mus, given):
-            raise NumericalError("assemble changes its argument mu: work on a copy")
+        refuse_shifted()
         found = Snapshots(mus, u, lam, tuple(seconds), tuple(setups), tuple(fallbacks), reference.fingerprint)
         return Result(found, sum(seconds, NO_TIME), self._diagnostics(problem, mus, first))
 

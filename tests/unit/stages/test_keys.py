@@ -174,7 +174,7 @@ EDITS: Mapping[str, tuple[set[str], set[str]]] = {
     "stability.infsup": ({"cone", "enrichment", CONSTANTS}, {SOLUTIONS, "POD", MATRICES}),
     "stability.conic_infsup": ({CONSTANTS}, {SOLUTIONS, "POD", "cone", "enrichment", "assembly"}),
     "model.hyperreduced": ({"hyper-reduction", "assembly"}, {SOLUTIONS, "POD", "cone", "enrichment"}),
-    "qp.exact": ({"exact reduced solutions"}, {SOLUTIONS, "POD", "cone", "enrichment"}),
+    "qp.exact": ({"exact reduced solutions", SOLUTIONS, "POD", "cone", "enrichment"}, set()),
     "study.parameter_sets": ({SOLUTIONS, "affine decomposition", "assembly"}, set()),
     **dict.fromkeys(SHOWN, (set(), {SOLUTIONS, "POD", "cone", "enrichment", "assembly", "queries", "pictures"})),
 }
