@@ -8,6 +8,7 @@ import re
 import signal
 import sys
 import time
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -20,6 +21,7 @@ from vibench import (
     Cone,
     DualStrategy,
     Enrichment,
+    Indices,
     InnerProduct,
     Kind,
     Offline,
@@ -27,6 +29,7 @@ from vibench import (
     PrimalStrategy,
     Problem,
     QPSolution,
+    Sampler,
     Stop,
     VariationalInequality,
     greedy_cone,
@@ -55,6 +58,21 @@ class Wire(Problem):
     def assemble(self, mu: Array) -> VariationalInequality:
         load = np.full(self.V.dim, -mu[0] * self.step)
         return VariationalInequality(self.stiffness, load, -self.mass, np.full(self.W.dim, self.depth * self.step))
+
+
+class UnevenWire(Wire):
+    """Its load has another shape between the training parameters, which interpolation over them cannot see."""
+
+    entrywise = frozenset({"f"})
+
+    def assemble(self, mu: Array) -> VariationalInequality:
+        vi, x = super().assemble(mu), np.linspace(0.0, np.pi, self.V.dim)
+        return VariationalInequality(
+            vi.A, vi.f * (1.0 + 0.5 * np.sin(2.0 * np.pi * mu[0]) ** 2 * np.cos(x)), vi.B, vi.g
+        )
+
+    def sampler(self, wanted: Mapping[str, tuple[Indices, Indices]]) -> Sampler:
+        return lambda mu: {"f": self.assemble(mu).f[wanted["f"][0]]}
 
 
 class Raises(Wire):

@@ -100,7 +100,7 @@ def cells_of(*rows: dict[str, Any]) -> pd.DataFrame:
     """Cells that differ in what is given alone, and are stable, exact in u and ok otherwise."""
     common = {
         "problem": "box", "problem_options": "{}", "status": "ok", "error_u_mean": 1e-9, "solver_share_mean": 1e-6,
-        "beta_span_min": 0.1, "offline_s": 1.0,
+        "assembly_share_mean": None, "beta_span_min": 0.1, "offline_s": 1.0,
     }  # fmt: skip
     return pd.DataFrame([cell_row(**common | row) for row in rows], columns=list(CELLS))
 

@@ -130,10 +130,24 @@ def _uses(pack: ModelPack, folder: Path) -> Iterator[str]:
         yield '  name = "pack"'
         yield f"  options = {{ path = {path} }}"
         yield _assembly_in_words(pack)
+        yield from _interpolation(pack)
     if pack.reference is not None:
         yield f"its multipliers give cones: vibench cones {folder}"
     if not pack.members:
         yield "it has no operators: a study, whose primal half needs them, cannot run it"
+
+
+def _interpolation(pack: ModelPack) -> Iterator[str]:
+    """Which members reduced assembly gets wrong between the training parameters."""
+    from vibench.model.affine import INTERPOLATION_RTOL, MISSED
+
+    for name, error in pack.interpolation_errors(INTERPOLATION_RTOL).items():
+        if error > MISSED * INTERPOLATION_RTOL:
+            yield (
+                f"warning: {name}, interpolated over {len(pack.training)} training parameters to "
+                f"{INTERPOLATION_RTOL:g}, has an error of {error:.1e} at the listed validation parameters: "
+                "use full assembly, or list more"
+            )
 
 
 def _assembly_in_words(pack: ModelPack) -> str:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Any
@@ -10,12 +10,15 @@ from typing import Any
 import numpy as np
 import scipy.linalg
 import scipy.sparse as sp
+import scipy.sparse.linalg
 
 from vibench.arrays import Array, Indices, SparseMatrix
 from vibench.errors import NumericalError
+from vibench.interfaces.affine import entries_of
 from vibench.interfaces.problem import MEMBERS, Problem, Sampler
 from vibench.interfaces.validation import checked_assembly
 from vibench.linalg.inner_product import svd
+from vibench.qp.scaling import ratio
 
 CONSTANT_RTOL = 1e-13
 """A member whose entries vary by less over the training set, relative to the largest one, is constant; of B and g
@@ -23,6 +26,12 @@ relative to the largest one of the row."""
 
 AFFINE_RTOL = 1e-9
 """Largest difference of a declared affine sum from the assembled member, relative to its largest entry."""
+
+INTERPOLATION_RTOL = 1e-6
+"""Tolerance of empirical interpolation where none is given."""
+
+MISSED = 10.0
+"""Interpolation errors at parameters outside the training set above this multiple of the tolerance are reported."""
 
 MAX_TERMS_SHARE = 0.75
 """Interpolation is used where it needs no more terms than this share of the training parameters."""
@@ -64,6 +73,13 @@ class AffineMember:
     error: float = 0.0
     reason: str = ""
 
+    def interpolated(self, value: Any) -> Any:
+        """What the terms of a constant or an interpolated member make of its value at a parameter."""
+        if self.way is Evaluation.CONSTANT:
+            return self.terms[0]
+        theta = entries_of(value, self.rows, self.columns)
+        return sum(coefficient * term for coefficient, term in zip(theta, self.terms, strict=True))
+
 
 def affine_decomposition(problem: Problem, training: Array, tolerance: float) -> dict[str, AffineMember]:
     """The members "A", "f", "B", "g", each with its cheapest evaluation.
@@ -82,7 +98,7 @@ def affine_decomposition(problem: Problem, training: Array, tolerance: float) ->
     first = checked_assembly(problem, training[0]).copy()
     check_affine(problem, training)
     varying = [name for name in MEMBERS if name not in problem.constant and name not in problem.affine]
-    assembled = _assembled(problem, training, varying) if varying else {}
+    assembled = assembled_members(problem, training, varying) if varying else {}
     members: dict[str, AffineMember] = {}
     for name in MEMBERS:
         if name in problem.constant:
@@ -90,7 +106,8 @@ def affine_decomposition(problem: Problem, training: Array, tolerance: float) ->
         elif name in problem.affine:
             members[name] = AffineMember(Evaluation.AFFINE, problem.affine[name].terms)
         else:
-            members[name] = _decomposed(name, assembled[name], problem, tolerance)
+            entrywise = name in problem.entrywise
+            members[name] = decomposed(name, assembled[name], tolerance, entrywise, contact=problem.has_contact)
     return members
 
 
@@ -134,10 +151,10 @@ def check_affine(problem: Problem, training: Array) -> None:
                 raise NumericalError(f"the affine sum declared for {name} differs from the assembled {name} {what}")
 
 
-def _assembled(problem: Problem, training: Array, names: Sequence[str]) -> Mapping[str, list[Any]]:
-    """The named members at all training parameters; the constraint alone where only B and g are needed."""
+def assembled_members(problem: Problem, mus: Iterable[Array], names: Sequence[str]) -> Mapping[str, list[Any]]:
+    """Copies of the named members at parameters (d,); the constraint alone is assembled where B and g are enough."""
     assembled: dict[str, list[Any]] = {name: [] for name in names}
-    for mu in training:
+    for mu in mus:
         if set(names) <= {"B", "g"}:
             values = dict(zip(("B", "g"), problem.constraint(mu), strict=True))
         else:
@@ -148,29 +165,67 @@ def _assembled(problem: Problem, training: Array, names: Sequence[str]) -> Mappi
     return assembled
 
 
-def _decomposed(name: str, values: list[Any], problem: Problem, tolerance: float) -> AffineMember:
+def decomposed(
+    name: str, values: Sequence[Any], tolerance: float, entrywise: bool = True, contact: bool = False
+) -> AffineMember:
+    """The decomposition of a member of which nothing is declared, from its values at the training parameters.
+
+    Parameters
+    ----------
+    name
+        "A", "f", "B" or "g".
+    values
+        The member at every training parameter.
+    tolerance
+        Largest relative interpolation error there.
+    entrywise, contact
+        Whether the problem evaluates the member entry by entry, and whether it has `Problem.contact`.
+    """
     entries = _Entries(values, symmetric=name == "A")
     weights = entries.row_weights() if name in ("B", "g") else np.ones(len(entries.rows))
     if entries.is_constant(weights):
         return AffineMember(Evaluation.CONSTANT, (values[0],))
     reason = f"{name} depends on mu and the problem does not evaluate it entry by entry"
-    if name in problem.entrywise and len(values) > 1:
-        found = interpolate(weights[:, None] * entries.values, tolerance)
-        if len(found.points) <= max(1.0, MAX_TERMS_SHARE * len(values)):
-            modes = found.modes * weights[found.points] / weights[:, None]
+    if entrywise and len(values) > 1:
+        interpolation = interpolate(weights[:, None] * entries.values, tolerance)
+        points = interpolation.points
+        if len(points) <= max(1.0, MAX_TERMS_SHARE * len(values)):
+            modes = interpolation.modes * weights[points] / weights[:, None]
             terms = tuple(entries.assembled(mode) for mode in modes.T)
-            rows, columns = entries.rows[found.points], entries.columns[found.points]
-            return AffineMember(Evaluation.INTERPOLATED, terms, rows, columns, found.error)
-        reason = f"{name} depends on mu, and interpolation needs {len(found.points)} terms for {len(values)} parameters"
-    if name in ("B", "g") and problem.has_contact:
+            rows, columns = entries.rows[points], entries.columns[points]
+            return AffineMember(Evaluation.INTERPOLATED, terms, rows, columns, interpolation.error)
+        reason = f"{name} depends on mu, and interpolation needs {len(points)} terms for {len(values)} parameters"
+    if name in ("B", "g") and contact:
         return AffineMember(Evaluation.CONTACT, ())
     return AffineMember(Evaluation.FULL, (), reason=reason)
+
+
+def held_out_error(name: str, member: AffineMember, values: Sequence[Any]) -> float:
+    """Largest error of a member with samples or one term, at parameters outside the training set.
+
+    `values` are the assembled ones there; the error is Euclidean, relative to the longest of them, and B and g are
+    taken in units of the largest entry of each row, as by `interpolate`.
+    """
+    if not member.terms or not values:
+        return 0.0
+    assembled = np.column_stack([_rows(value) for value in values])
+    differences = np.column_stack([_rows(value - member.interpolated(value)) for value in values])
+    if name in ("B", "g"):
+        largest = assembled.max(axis=1, keepdims=True)
+        units = np.where(largest > 0.0, largest, 1.0)
+        assembled, differences = assembled / units, differences / units
+    return ratio(float(np.linalg.norm(differences, axis=0).max()), float(np.linalg.norm(assembled, axis=0).max()))
+
+
+def _rows(array: Any) -> Array:
+    """Euclidean norms of the rows (k,) of a matrix, or of the entries of a vector."""
+    return np.abs(array) if isinstance(array, np.ndarray) else np.asarray(sp.linalg.norm(sp.csr_array(array), axis=1))
 
 
 class _Entries:
     """The entries of a member at all training parameters, as columns (k×P) on the union of their sparsity patterns."""
 
-    def __init__(self, values: list[Any], symmetric: bool) -> None:
+    def __init__(self, values: Sequence[Any], symmetric: bool) -> None:
         self._shape, self._symmetric = values[0].shape, symmetric
         self._vector = isinstance(values[0], np.ndarray)
         if self._vector:
@@ -192,7 +247,7 @@ class _Entries:
         largest = float((weights * np.abs(self.values).max(axis=1, initial=0.0)).max(initial=0.0))
         return several and float(spread.max(initial=0.0)) <= CONSTANT_RTOL * largest
 
-    def _of_matrices(self, matrices: list[SparseMatrix]) -> Array:
+    def _of_matrices(self, matrices: Sequence[SparseMatrix]) -> Array:
         rows = [sp.csr_array(sp.triu(matrix) if self._symmetric else matrix) for matrix in matrices]
         for matrix in rows:
             matrix.sum_duplicates()

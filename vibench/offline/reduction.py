@@ -30,7 +30,7 @@ from vibench.interfaces.validation import (
     reference_assembly,
     training_parameters,
 )
-from vibench.model.affine import AffineMember, affine_decomposition
+from vibench.model.affine import INTERPOLATION_RTOL, AffineMember, affine_decomposition
 from vibench.model.certificates.base import CertificateBase, certificate_base
 from vibench.model.certificates.bounds import OnlineCertificate
 from vibench.model.certificates.preparation import prepare
@@ -107,7 +107,7 @@ class Reduction:
     tolerance: float | None = None
     training: Sampling | None = None
     assembly: Assembly = "full"
-    interpolation: float = 1e-6
+    interpolation: float = INTERPOLATION_RTOL
     solver: str = "piqp"
     accuracy: float = 1e-9
 

@@ -22,6 +22,7 @@ from vibench.interfaces.problem import MEMBERS, ParameterBox, VariationalInequal
 from vibench.interfaces.strategies import Cone, DualStrategy, Stop
 from vibench.interfaces.validation import check_cone
 from vibench.linalg.inner_product import InnerProduct
+from vibench.model.affine import decomposed, held_out_error
 from vibench.packs.manifest import Manifest
 from vibench.reduction.cones import project_on_cone
 
@@ -206,6 +207,19 @@ class ModelPack:
         """Affine members that reduced assembly may use."""
         members = {name: self.members[name] for name in MEMBERS if name in self.entrywise}
         return {name: member.sum for name, member in members.items() if member.thetas}
+
+    def interpolation_errors(self, tolerance: float) -> dict[str, float]:
+        """Relative errors, at the listed validation parameters, of members that reduced assembly interpolates.
+
+        `tolerance` is that of the interpolation at the training parameters. Declared affine members have no error.
+        """
+        errors, others = dict[str, float](), () if self.validation is None else self.validation
+        for name in MEMBERS:
+            if name in self.entrywise and name not in self.affine:
+                at = self.members[name].at
+                member = decomposed(name, [at(mu) for mu in self.training], tolerance)
+                errors[name] = held_out_error(name, member, [at(mu) for mu in others])
+        return errors
 
     @property
     def everywhere(self) -> bool:

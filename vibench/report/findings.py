@@ -7,7 +7,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from enum import IntEnum
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import pandas as pd
@@ -28,12 +28,12 @@ from vibench.report.figures.data import (
 from vibench.results import formats, invariants, tables
 from vibench.results.ranking import (
     LARGEST_BAND,
-    SOLVER_SHARE,
+    LARGEST_SHARE,
     Criterion,
     Standings,
     eligible,
     leaderboard,
-    solved_too_loosely,
+    too_loose,
 )
 from vibench.results.solver_agreement import sentence
 from vibench.stability.infsup import VANISHES
@@ -141,14 +141,20 @@ def _whole_run(read: Mapping[str, pd.DataFrame]) -> Iterator[tuple[Weight, str]]
     if agreement := sentence(disagreements, cells["solver"].nunique()):
         flagged = bool(disagreements["flagged"].sum())
         yield Weight.ALARM if flagged else Weight.WHOLE_RUN, f"{agreement[:1].upper()}{agreement[1:]}."
-    loose = cells[solved_too_loosely(cells)]
-    if len(loose):
-        yield (
-            Weight.WHOLE_RUN,
-            f"{_number(len(loose), 'cell')} {_are(loose)} not compared with others: the QP solver makes "
-            f"{100.0 * SOLVER_SHARE:.0f} % or more of an error there (column solver_share_mean). A smaller "
-            "accuracy would help.",
-        )
+    remedies: Mapping[Literal["solver", "assembly"], tuple[str, str]] = {
+        "solver": ("the QP solver makes", "A smaller accuracy would help."),
+        "assembly": (
+            "reduced assembly makes",
+            "More training parameters, a smaller interpolation tolerance or full assembly would help.",
+        ),
+    }
+    for source, (what, remedy) in remedies.items():
+        if len(loose := cells[too_loose(cells, source)]):
+            yield (
+                Weight.WHOLE_RUN,
+                f"{_number(len(loose), 'cell')} {_are(loose)} not compared with others: {what} "
+                f"{100.0 * LARGEST_SHARE:.0f} % or more of an error there (column {source}_share_mean). {remedy}",
+            )
     few = cells[cells["queries_ok"] < FEWEST * cells["queries"]]
     if len(few):
         yield (

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import NamedTuple
 
-VERSION = 13
+VERSION = 14
 """Schema version of a results file; a file of another version is refused."""
 
 TEXT, REAL, INTEGER, BLOB = "TEXT", "REAL", "INTEGER", "BLOB"
@@ -236,6 +236,13 @@ CELLS: Mapping[str, Column] = {
         "Mean contribution of the QP solver divided by the mean error of u or λ; cells are compared only below 0.1.",
     ),
     "assembly_error_max": real("1", "Largest difference of a member of a reduced program from its projection."),
+    "assembly_error_u_max": real("1", "Largest contribution of reduced assembly to the relative error of u."),
+    "assembly_error_lambda_max": real("1", "Largest contribution of reduced assembly to the relative error of λ."),
+    "assembly_share_max": real("1", "Largest ratio of this contribution to the error, over the queries."),
+    "assembly_share_mean": real(
+        "1",
+        "Mean contribution of reduced assembly divided by the mean error of u or λ; cells are compared only below 0.1.",
+    ),
     "violation_max": real("u", "Largest constraint violation of a reduced solution."),
     "residual_max": real("1", "Largest of all natural residuals."),
     "fallbacks": text("Steps that deviate from their algorithm, and what was done instead."),
@@ -320,6 +327,15 @@ QUERIES: Mapping[str, Column] = {
         "1", "Likewise for λ; also empty if the tight constraints are dependent, so that λ is not unique."
     ),
     "solver_share": real(
+        "1", "The larger of these two, each divided by its error of u or λ; empty if both errors are at most 1e-8."
+    ),
+    "assembly_error_u": real(
+        "1",
+        "Distance of u from that with assembly in full, both solved to round-off, relative to ‖u‖; empty with full "
+        "assembly, or if error_u is empty or there are no such solutions.",
+    ),
+    "assembly_error_lambda": real("1", "Likewise for λ; also empty if λ is not unique."),
+    "assembly_share": real(
         "1", "The larger of these two, each divided by its error of u or λ; empty if both errors are at most 1e-8."
     ),
     "bound_u_energy": real("A", "Bound √(ρ² + ω² + 2κ) of error_u_energy_absolute."),

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import pandas as pd
@@ -84,13 +84,13 @@ def within(thresholds: pd.DataFrame, largest: float) -> pd.DataFrame:
 LARGEST_BAND = 0.1
 """Mean errors above this are no answer: such cells win nothing, however fast they are."""
 
-SOLVER_SHARE = 0.1
-"""Cells whose QP solver makes a larger share of an error are not compared: the solver, not the strategy, decides."""
+LARGEST_SHARE = 0.1
+"""Cells where the QP solver or reduced assembly, not the strategies, makes this share of an error are not compared."""
 
 NO_BEST_CELL = (
     "no cell takes part in the comparison: one that does has every query ok, β over the span above zero at every "
-    f"parameter, mean errors of at most {100.0 * LARGEST_BAND:g} %, and less than {100.0 * SOLVER_SHARE:g} % of an "
-    "error made by the QP solver"
+    f"parameter, mean errors of at most {100.0 * LARGEST_BAND:g} %, and less than {100.0 * LARGEST_SHARE:g} % of an "
+    "error made by the QP solver, and by reduced assembly"
 )
 """Why a run may have no best cell."""
 
@@ -107,14 +107,15 @@ def excluded(cells: pd.DataFrame, errors: pd.Series | None = None) -> pd.DataFra
     """Whether a row of the cells table takes no part, for each reason; a row has the first reason that holds.
 
     A query is not ok (`incomplete`); the inf-sup constant β over the span vanishes at a parameter, so that the
-    multiplier is not unique there (`unstable`); the QP solver makes too large a share of the error (`loose`); a mean
-    error is above `LARGEST_BAND`, or none is known (`inexact`). `errors` are those of the cells by another measure than
-    the larger one of u and λ.
+    multiplier is not unique there (`unstable`); the QP solver makes too large a share of the error (`loose`), or
+    reduced assembly does (`interpolated`); a mean error is above `LARGEST_BAND`, or none is known (`inexact`). `errors`
+    are those of the cells by another measure than the larger one of u and λ.
     """
     reasons = {
         "incomplete": cells["status"] != Status.OK,
         "unstable": cells["beta_span_min"].astype(float) < VANISHES,
-        "loose": solved_too_loosely(cells),
+        "loose": too_loose(cells, "solver"),
+        "interpolated": too_loose(cells, "assembly"),
         "inexact": ~((errors_of_solution(cells) if errors is None else errors) <= LARGEST_BAND),
     }
     holds = pd.DataFrame(reasons, index=cells.index).astype(bool)
@@ -127,9 +128,9 @@ def eligible(cells: pd.DataFrame) -> pd.Series:
     return ~excluded(cells).any(axis=1)
 
 
-def solved_too_loosely(cells: pd.DataFrame) -> pd.Series:
-    """Which cells are left out where strategies are compared."""
-    return cells["solver_share_mean"].astype(float) >= SOLVER_SHARE
+def too_loose(cells: pd.DataFrame, source: Literal["solver", "assembly"]) -> pd.Series:
+    """Which cells are left out where strategies are compared, since the source makes too large a share of an error."""
+    return cells[f"{source}_share_mean"].astype(float) >= LARGEST_SHARE
 
 
 def fastest(cells: pd.DataFrame, errors: pd.Series | None = None) -> pd.DataFrame:
@@ -232,10 +233,10 @@ class Standings:
     ----------
     problem, options
         Label of the problem and its options as JSON, as the cells table has them.
-    cells, incomplete, unstable, loose, inexact
+    cells, incomplete, unstable, loose, interpolated, inexact
         Number of its cells, and of those that take no part: since a query is not ok; since the inf-sup constant β over
-        the span vanishes at a parameter, so that the multiplier is not unique there; since the QP solver makes too
-        large a share of the error; and since a mean error is above `LARGEST_BAND` or unknown.
+        the span vanishes at a parameter, so that the multiplier is not unique there; since the QP solver, or reduced
+        assembly, makes too large a share of the error; and since a mean error is above `LARGEST_BAND` or unknown.
     """
 
     problem: str
@@ -245,6 +246,7 @@ class Standings:
     incomplete: int
     unstable: int
     loose: int
+    interpolated: int
     inexact: int
 
 

@@ -116,11 +116,15 @@ class ReducedPrograms:
     errors
         Largest relative difference of a member of the reduced program from its Galerkin projection, per parameter; zero
         where it is assembled in full.
+    projected
+        The Galerkin projections solved to round-off, or `None` where that fails; none where programs are assembled in
+        full, which are these projections.
     """
 
     programs: tuple[VariationalInequality, ...]
     factor: Array | None
     errors: tuple[float, ...]
+    projected: tuple[ExactSolution | None, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -199,16 +203,16 @@ InFull = Sequence[VariationalInequality] | None
 def _reduced(model: HyperReducedModel, mus: Array, known: InFull) -> ReducedPrograms:
     """The hyper-reduced assembly at every parameter, compared with the Galerkin projection."""
     matrices = assemblies(model.problem)
-    programs, errors, factor = [], [], None
+    programs, errors, projected, factor = [], [], [], None
     for k, mu in enumerate(mus):
-        found = model.assemble(mu)
-        factor = found.factor
-        full = known and leading_part(known[k], len(found.program.f))
-        errors.append(
-            _largest_difference(found.program, full or project(matrices.at(mu), found.basis, model.generators))
-        )
-        programs.append(found.program)
-    return ReducedPrograms(tuple(programs), factor, tuple(errors))
+        reduced = model.assemble(mu)
+        program, factor = reduced.program, reduced.factor
+        full = leading_part(known[k], len(program.f)) if known else None
+        full = full or project(matrices.at(mu), reduced.basis, model.generators)
+        errors.append(_largest_difference(program, full))
+        projected.append(exact_solution(full))
+        programs.append(program)
+    return ReducedPrograms(tuple(programs), factor, tuple(errors), tuple(projected))
 
 
 def _in_full(model: ReducedModel, mus: Array, known: InFull) -> ReducedPrograms:
@@ -220,8 +224,8 @@ def _in_full(model: ReducedModel, mus: Array, known: InFull) -> ReducedPrograms:
     return ReducedPrograms(tuple(programs), None, (0.0,) * len(mus))
 
 
-def _largest_difference(found: VariationalInequality, exact: VariationalInequality) -> float:
-    pairs = [(getattr(found, name), getattr(exact, name)) for name in MEMBERS]
+def _largest_difference(program: VariationalInequality, exact: VariationalInequality) -> float:
+    pairs = [(getattr(program, name), getattr(exact, name)) for name in MEMBERS]
     return max(float(np.linalg.norm(one - other)) / (float(np.linalg.norm(other)) or 1.0) for one, other in pairs)
 
 

@@ -13,6 +13,7 @@ import numpy as np
 
 from vibench.errors import in_a_line
 from vibench.interfaces.strategies import Kind
+from vibench.model.affine import MISSED
 from vibench.model.certificates.base import Guarantee
 from vibench.model.certificates.bounds import OnlineCertificate
 from vibench.model.errors import ReferenceSolutions, output_scales, summarise_outputs, zeros
@@ -211,6 +212,7 @@ class _Queries(Items):
                 self._compared.at(numbers),
                 [self._stability[k] for k in numbers],
                 [self._exact[k] for k in numbers],
+                [self._reduced.projected[k] for k in numbers] if self._reduced.projected else (),
                 self._certificate,
             )
         except MemoryError:
@@ -244,6 +246,12 @@ class _Queries(Items):
         for purpose, found in (("training", self._training), ("validation", self._reference)):
             notes = [note for note in found.fallbacks if note]
             fallbacks += [f"{len(notes)} of the {purpose} solutions: {notes[0]}"] if notes else []
+        tolerance, error = assembly.interpolation, max(self._reduced.errors)
+        if tolerance is not None and error > MISSED * tolerance:
+            fallbacks.append(
+                f"reduced assembly differs from the Galerkin projection by up to {error:.1e} at validation parameters: "
+                f"the interpolation tolerance {tolerance:g} holds at training parameters only"
+            )
         if (gap := cone.prepared.rank_gap) < CLEAR_GAP:
             rank = cone.prepared.rank
             fallbacks.append(f"the rank {rank} is in doubt: its last singular value is {gap:.2g} times what is below")

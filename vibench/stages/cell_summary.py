@@ -41,11 +41,16 @@ def summarise(rows: Sequence[Row]) -> Row:
         found = column(name, among)
         return float(found.max()) if found.size else None
 
-    def solver_share(name: str) -> float | None:
-        known = [row for row in fine if row.get(f"solver_error_{name}") is not None]
-        whole = sum(row[f"error_{name}"] for row in known)
-        measurable = whole > UNMEASURABLE * len(known)
-        return float(sum(row[f"solver_error_{name}"] for row in known) / whole) if measurable else None
+    def share(source: str, name: str) -> float | None:
+        measured = [row for row in fine if row.get(f"{source}_error_{name}") is not None]
+        whole = sum(row[f"error_{name}"] for row in measured)
+        measurable = whole > UNMEASURABLE * len(measured)
+        return float(sum(row[f"{source}_error_{name}"] for row in measured) / whole) if measurable else None
+
+    def contributions(source: str) -> Row:
+        shares = [part for name in ("u", "lambda") if (part := share(source, name)) is not None]
+        names = (f"{source}_error_u", f"{source}_error_lambda", f"{source}_share")
+        return {f"{name}_max": largest(name) for name in names} | {f"{source}_share_mean": max(shares, default=None)}
 
     def errors(name: str) -> Row:
         zero = [row for row in fine if row.get(f"zero_{name}")]
@@ -67,10 +72,8 @@ def summarise(rows: Sequence[Row]) -> Row:
         **errors("lambda"),
         **{f"effectivity_{name}_median": median(f"effectivity_{name}") for name in BOUNDS},
         "bound_online_violations": int(column("bound_online_violated").sum()) if certified else None,
-        **{f"{name}_max": largest(name) for name in ("solver_error_u", "solver_error_lambda", "solver_share")},
-        "solver_share_mean": max(
-            (share for name in ("u", "lambda") if (share := solver_share(name)) is not None), default=None
-        ),
+        **contributions("solver"),
+        **contributions("assembly"),
         "assembly_error_max": largest("assembly_error"),
         "violation_max": largest("violation"),
         "residual_max": max((r for r in residuals if r is not None), default=None),

@@ -196,12 +196,14 @@ def error_columns(
     reference: ReferenceSolutions,
     known: Sequence[Stability],
     exact: Sequence[ExactSolution | None],
+    projected: Sequence[ExactSolution | None] = (),
     online: OnlineCertificate | None = None,
 ) -> list[Row]:
     """Errors of solutions (x, α), one per parameter of `mus` (P×d), their error bounds and effectivities.
 
-    `exact` are the same programs solved to round-off: what the solver contributes to the errors. `online` gives bounds
-    at online cost, too.
+    `exact` are the same programs solved to round-off: what the solver contributes to the errors. `projected` are the
+    programs assembled in full, solved to round-off, where those of the queries are not: what reduced assembly
+    contributes. `online` gives bounds at online cost, too.
     """
     if not solutions:
         return []
@@ -228,17 +230,35 @@ def error_columns(
         for row, mu, (x, alpha) in zip(rows, mus, solutions, strict=True):
             row.update(_online_columns(online.evaluate(problem, mu, model.assemble(mu), x, alpha), row))
     norms = zip(problem.V.norm(reference.u), problem.W.norm(reference.lam), strict=True)
-    for row, (x, alpha), program, (norm_u, norm_lam) in zip(rows, solutions, exact, norms, strict=True):
-        if program is None:
+    full = projected or [None] * len(rows)
+    for row, (x, alpha), own, galerkin, scales in zip(rows, solutions, exact, full, norms, strict=True):
+        if own is None:
             continue
-        if row["error_u"] is not None:
-            row["solver_error_u"] = ratio(float(np.linalg.norm(x - program.x)), norm_u)  # the basis is orthonormal in V
-        if row["error_lambda"] is not None and program.unique:
-            difference = model.generators @ (alpha - program.alpha)
-            row["solver_error_lambda"] = ratio(float(problem.W.norm(difference)), norm_lam)
-        names = [name for name in ("u", "lambda") if (row[f"error_{name}"] or 0.0) > UNMEASURABLE]
-        row["solver_share"] = max((row.get(f"solver_error_{n}", 0.0) / row[f"error_{n}"] for n in names), default=None)
+        row.update(_contribution("solver", row, model, ExactSolution(x, alpha, unique=True), own, scales))
+        if galerkin is not None:
+            row.update(_contribution("assembly", row, model, own, galerkin, scales))
     return rows
+
+
+def _contribution(
+    source: str,
+    row: Row,
+    model: AnyReducedModel,
+    one: ExactSolution,
+    other: ExactSolution,
+    scales: tuple[float, float],
+) -> Row:
+    """What the source of a difference contributes to the relative errors of a query; `scales` are ‖u‖ and ‖λ‖."""
+    parts: Row = {}
+    if row["error_u"] is not None:
+        distance = float(np.linalg.norm(one.x - other.x))  # the basis is orthonormal in V
+        parts["u"] = ratio(distance, scales[0])
+    if row["error_lambda"] is not None and one.unique and other.unique:
+        distance = float(model.problem.W.norm(model.generators @ (one.alpha - other.alpha)))
+        parts["lambda"] = ratio(distance, scales[1])
+    names = [name for name in ("u", "lambda") if (row[f"error_{name}"] or 0.0) > UNMEASURABLE]
+    share = max((parts.get(name, 0.0) / row[f"error_{name}"] for name in names), default=None)
+    return {f"{source}_error_{name}": part for name, part in parts.items()} | {f"{source}_share": share}
 
 
 def _columns(error: Errors, bounds: ErrorBounds, hsw: HSWBounds | None) -> Row:

@@ -11,9 +11,10 @@ from vibench.arrays import Array
 from vibench.errors import NumericalError
 from vibench.highfidelity import active_set
 from vibench.interfaces.outputs import Output
-from vibench.interfaces.problem import ParameterBox, Picture
+from vibench.interfaces.problem import MEMBERS, ParameterBox, Picture
 from vibench.interfaces.validation import training_parameters, validation_parameters
 from vibench.linalg.inner_product import InnerProduct, singular_values
+from vibench.model.affine import INTERPOLATION_RTOL, MISSED, assembled_members, decomposed, held_out_error
 from vibench.stability.coercivity import extreme_quotients
 from vibench.testing import assembly
 from vibench.testing.case import ProblemCase
@@ -31,6 +32,12 @@ EXTREME = 10.0
 
 DIAGONAL_SHARE = 0.8
 """Share of the condition number of A with its own diagonal that a good norm stays below, already on coarse meshes."""
+
+VALIDATION = 5
+"""Number of validation parameters looked at."""
+
+SHARE_OF_TIME = 0.25
+"""Interpolation is tried where its assemblies take at most this share of the time limit."""
 
 DEPENDENT = 1e-10
 """β_HF / γ_b below which rows of B are linearly dependent up to round-off."""
@@ -93,7 +100,7 @@ def training_set(case: ProblemCase) -> Iterator[str]:
 
 def validation_set(case: ProblemCase) -> Iterator[str]:
     """Validation parameters lie in the box and are reproducible."""
-    mus = validation_parameters(case.plugin, 5, case.seed)
+    mus = validation_parameters(case.plugin, VALIDATION, case.seed)
     yield from _outside("validation_set", mus, case.plugin.parameters)
     if what := difference(validation_parameters(case.plugin, len(mus), case.seed), mus):
         yield f"validation_set is not the same for the same seed: {what} before; draw from default_rng(seed)"
@@ -166,6 +173,28 @@ def high_fidelity_solution(case: ProblemCase) -> Iterator[str]:
     worst, fallbacks = max(each.residuals.worst for each in solved), sum(bool(each.fallback) for each in solved)
     initial = f", {fallbacks} started from an interior-point solution" if fallbacks else ""
     yield Note(f"residuals up to {worst:.0e}, contact at {contacts} of {len(solved)} parameters{initial}")
+
+
+def interpolation(case: ProblemCase) -> Iterator[str]:
+    """What reduced assembly interpolates is also right at parameters outside the training set."""
+    problem, mus = case.plugin, training_parameters(case.plugin)
+    names = [name for name in MEMBERS if name in problem.entrywise - problem.constant - set(problem.affine)]
+    if not names or case.one_assembly * (len(mus) + VALIDATION) > SHARE_OF_TIME * case.seconds:
+        yield Note("an assembly takes too long" if names else "no member is interpolated")
+        return
+    assembled = assembled_members(problem, [*mus, *validation_parameters(problem, VALIDATION, case.seed)], names)
+    for name, values in assembled.items():
+        member = decomposed(name, values[: len(mus)], INTERPOLATION_RTOL, contact=problem.has_contact)
+        if not member.terms:
+            yield Note(f"{name} is not interpolated: {member.reason or 'its terms are too many'}")
+            continue
+        error = held_out_error(name, member, values[len(mus) :])
+        yield Note(f"{name}: {len(member.terms)} terms, error {error:.0e}")
+        if error > MISSED * INTERPOLATION_RTOL:
+            yield Doubt(
+                f"{name}, interpolated over {len(mus)} training parameters to {INTERPOLATION_RTOL:g}, has an error of "
+                f"{error:.1e} at validation parameters: reduced assembly needs more training parameters"
+            )
 
 
 def pictures(case: ProblemCase) -> Iterator[str]:
@@ -241,6 +270,8 @@ PROBLEM = Conformance("problem", ProblemCase, (
     Check("assembly on the contact", assembly.on_contact, ("determinism",)),
     Check("affine sums", assembly.affine, ("determinism",)),
     Check("assembly by entries", assembly.by_entries, ("determinism",)),
+    Check("interpolation", interpolation,
+          ("training set", "validation set", "independence of mu", "assembly by entries")),
     Check("pickling", ProblemCase.pickling, ("determinism",)),
     Check("high-fidelity solution", high_fidelity_solution,
           ("training set", "definiteness of A", "independence of mu", "assembly on the contact")),

@@ -81,7 +81,7 @@ def _cell(key: str, keys: Row, kind: Kind, rng: np.random.Generator, *, failed: 
     named = {"cell": key, "machine": "sample", "validation": "own", "versions": "{}", "definition": json.dumps(plugins)}
     row = _row(CELLS, rng) | keys | named | {"status": "ok", "reason": "", "enrichment_kind": kind.value}
     row |= {"queries": QUERIES_PER_CELL, "queries_ok": QUERIES_PER_CELL, "timing_rounds": ROUNDS, "disturbed": 0}
-    row |= {"solver_share_mean": 1e-3, "bound_online_violations": None}
+    row |= {"solver_share_mean": 1e-3, "assembly_share_mean": 1e-3, "bound_online_violations": None}
     if not failed:
         return row
     kept = {*keys, *named, "validation_options", "threads", "seed", "study_hash", "code", "queries"}

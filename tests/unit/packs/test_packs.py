@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gzip
 import json
+import re
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -176,6 +177,20 @@ def test_import_says_what_a_pack_can_do(tmp_path: Path, main: Main) -> None:
         "validation = 2 at most",
     ):
         assert words in out
+
+
+@pytest.mark.parametrize("bump", [0.0, 1e-3])
+def test_import_warns_of_what_interpolation_misses(tmp_path: Path, main: Main, bump: float) -> None:
+    content, cable = manifest(), Cable()
+    listed = content["parameters"]["training"] + content["parameters"]["validation"]
+    content["operators"] |= {"f": {"each": "more.npz:f"}}
+    f = np.column_stack([-load * cable.mass for load, _ in listed])
+    f[0, len(content["parameters"]["training"]) :] *= 1.0 + bump
+    pack_with(tmp_path / "pack", content, f=f)
+    code, out, _ = main("import", str(tmp_path / "pack"))
+    warned = re.search(r"warning: f, interpolated over 3 training parameters to 1e-06, has an error of (\S+) at", out)
+    assert (code, bool(warned)) == (0, bump > 0.0)
+    assert warned is None or 0.2 * bump < float(warned[1]) < bump
 
 
 def test_a_pack_is_written_whole_or_not_at_all(tmp_path: Path, main: Main, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -44,6 +44,11 @@ def test_cells_whose_solver_makes_the_error_are_counted_and_left_out(said: Said)
     assert not [text for text in of_model if "online-supremizers" in text]
 
 
+def test_cells_whose_reduced_assembly_makes_the_error_are_counted(said: Said) -> None:
+    texts = said("UPDATE cells SET assembly_share_mean = 0.2 WHERE solver = 'osqp'")
+    assert any(text.startswith("12 cells are not compared with others: reduced assembly makes") for text in texts[""])
+
+
 def test_zero_solutions_are_counted_and_measured_by_the_training_set(said: Said) -> None:
     mine = "problem = 'hertz' AND query IN (2, 5)"
     texts = said(

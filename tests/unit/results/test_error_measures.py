@@ -42,7 +42,14 @@ def cell(name: str) -> dict[str, Any]:
     row = cell_row(name, **axes | seconds | phases) | {"pod_tol": 0.1, "dual_tol": 0.1, "accuracy": 1e-8}
     row |= {"hf_low_s": 5.999, "hf_high_s": 6.001, "assembly": "full", "solver": "piqp", "machine": "m"}
     row |= {"error_u_mean": error_u, "error_lambda_mean": error_lam, "enrichment_kind": kind.value, "primal": name}
-    row |= {"primal_tol": None, "beta_span_min": 0.1, "solver_share_mean": 1e-6, "definition": "{}", "disturbed": 0}
+    row |= {
+        "primal_tol": None,
+        "beta_span_min": 0.1,
+        "solver_share_mean": 1e-6,
+        "assembly_share_mean": None,
+        "definition": "{}",
+        "disturbed": 0,
+    }
     return row | {f"{name}_options": "{}" for name in ("problem", "training", "dual", "primal")}
 
 

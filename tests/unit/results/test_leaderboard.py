@@ -44,13 +44,14 @@ def test_what_is_not_ok_or_solved_too_loosely_takes_no_part() -> None:
         cells_of(
             row_of("failed", 1e-9, 1e-9, status="inaccurate"),
             row_of("loose", 1e-3, 1e-9, solver_share_mean=0.5),
+            row_of("interpolated", 1e-3, 1e-9, assembly_share_mean=0.5),
             row_of("unknown", None, 1e-9, error_u_mean=None),
             row_of("untimed", 1e-4, None),
         )
     )
     assert won(found, Criterion.QUERY) == []
     assert won(found, Criterion.ERROR) == [(1e-4, "untimed")]
-    assert (found.incomplete, found.loose, found.inexact) == (1, 1, 1)
+    assert (found.incomplete, found.loose, found.interpolated, found.inexact) == (1, 1, 1, 1)
 
 
 def test_constants_that_were_not_computed_exclude_nobody() -> None:

@@ -352,7 +352,11 @@ def test_a_column_may_be_called_error(
     monkeypatch.setattr(One, "made", given)
     register((GROUP, "one", f"{HERE}:One"))
     found = tables.extended(path, "cells").frame.assign(
-        error_u_mean=1e-3, error_lambda_mean=[1e-3, 2e-3, 0.01], beta_span_min=0.5, solver_share_mean=0.0
+        error_u_mean=1e-3,
+        error_lambda_mean=[1e-3, 2e-3, 0.01],
+        beta_span_min=0.5,
+        solver_share_mean=0.0,
+        assembly_share_mean=0.0,
     )
     assert list(fastest(found)["error"]) == [5, 3, 4]
     assert main("show", str(path), "--table", "best")[0] == 0

@@ -4,6 +4,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 from running import Register
 from samples import SampleStore, carry_out
@@ -14,6 +15,8 @@ from vibench.interfaces.validation import checked_assembly
 from vibench.model.affine import Evaluation
 from vibench.model.galerkin import ReducedModel, project
 from vibench.model.hyperreduced import HyperReducedModel
+from vibench.results.columns import CELLS as CELL_COLUMNS
+from vibench.results.ranking import too_loose
 from vibench.stages.assembly import AffineDecomposition, AssemblyStage
 from vibench.stages.base import value_of
 from vibench.stages.cell_queries import CellQueries
@@ -26,6 +29,7 @@ OBSTACLE = Plugin("problem", "obstacle", '{"resolution": 200}', "test")
 RADIAL = Plugin("problem", "radial-obstacle", '{"resolution": 300}', "test")
 HERTZ = Plugin("problem", "hertz", '{"resolution": 300}', "test")
 WIRE = Plugin("problem", "wire", "{}", "test")
+UNEVEN = Plugin("problem", "uneven", "{}", "test")
 TOLERANCE = 1e-6
 QUERIES = 3
 
@@ -78,12 +82,12 @@ def wire_store(register: Register, tmp_path: Path) -> SampleStore:
     return store
 
 
-def wire(interpolation: float | None) -> CellQueries:
+def wire(interpolation: float | None, problem: Plugin = WIRE) -> CellQueries:
     """A cell of few modes and generators."""
-    found = cell(WIRE, "decorrelated", interpolation)
+    found = cell(problem, "decorrelated", interpolation)
     enrichment = replace(
         found.assembly.enrichment,
-        pod=PODStage(WIRE, Stop(tolerance=1e-2)),
+        pod=PODStage(problem, Stop(tolerance=1e-2)),
         cone=replace(found.assembly.enrichment.cone, stop=Stop(tolerance=1e-2)),
     )
     return replace(found, assembly=replace(found.assembly, enrichment=enrichment))
@@ -98,11 +102,38 @@ def test_rows_of_an_interpolated_problem(store: SampleStore) -> None:
     assert rows.cell["terms_A"] == len(members["A"].rows) > 20
     assert rows.cell["interpolation_error"] == members["A"].error == max(m.error for m in members.values())
     assert 0.0 < rows.cell["interpolation_error"] <= TOLERANCE
+    assert 0.0 < rows.cell["assembly_error_u_max"] < 1e-5
+    assert rows.cell["assembly_share_max"] < 0.01
     errors = [row["assembly_error"] for row in rows.queries]
     assert rows.cell["assembly_error_max"] == max(errors)
     assert 0.0 < min(errors) < max(errors) < 1e-3
     assert {row["form"] for row in rows.queries} == {"primal"}
     assert rows.cell["fallbacks"] == ""
+
+
+def test_what_interpolation_misses_between_training_parameters_is_measured_noted_and_not_compared(
+    register: Register, tmp_path: Path
+) -> None:
+    register(
+        ("vibench.problems", "uneven", "fake_plugins:UnevenWire"),
+        ("vibench.dual_strategies", "mcpg", "vibench_strategies.mcpg:ModifiedCPG"),
+        ("vibench.primal_strategies", "decorrelated", "vibench_strategies.decorrelated:Decorrelated"),
+    )
+    store, reduced, full = SampleStore(tmp_path), wire(TOLERANCE, UNEVEN), wire(None, UNEVEN)
+    for stage in (reduced, full):
+        carry_out(stage, store)
+    one, other = value_of(store, reduced), value_of(store, full)
+    assert one.cell["interpolation_error"] < 1e-12  # the training set sees nothing of it
+    assert one.cell["assembly_error_max"] > 0.01
+    assert one.cell["fallbacks"].startswith("reduced assembly differs from the Galerkin projection by up to")
+    assert other.cell["fallbacks"] == ""
+    for row, right in zip(one.queries, other.queries, strict=True):
+        # exact programs, so that a triangle inequality holds between the errors and the contribution
+        assert abs(row["error_u"] - right["error_u"]) <= row["assembly_error_u"] * (1.0 + 1e-6)
+        assert row["assembly_share"] >= row["assembly_error_u"] / row["error_u"]
+    assert one.cell["assembly_share_mean"] > 0.1
+    cells = pd.DataFrame([dict.fromkeys(CELL_COLUMNS) | rows.cell for rows in (one, other)])
+    assert too_loose(cells, "assembly").tolist() == [True, False]
 
 
 def test_a_looser_tolerance_has_fewer_terms_and_larger_errors(store: SampleStore) -> None:
@@ -181,6 +212,7 @@ def test_assembly_in_full_has_no_offline_part_and_no_error(store: SampleStore, n
     assert rows.cell["offline_assembly_s"] == 0.0
     assert "interpolation_tol" not in rows.cell
     assert [row["assembly_error"] for row in rows.queries] == [0.0] * QUERIES
+    assert rows.cell["assembly_share_mean"] is None
 
 
 @pytest.mark.parametrize("name", ["obstacle", "hertz", "radial"])

@@ -17,7 +17,7 @@ import pandas as pd
 from vibench.report.figures.looks import Series
 from vibench.results import pictures, tables
 from vibench.results.plugin_columns import faults_of
-from vibench.results.ranking import solved_too_loosely
+from vibench.results.ranking import too_loose
 from vibench.text import json_object
 
 TABLES = ("cells", "queries", "histories", "thresholds", "outputs")
@@ -245,11 +245,11 @@ def one_solver(queries: pd.DataFrame) -> pd.DataFrame:
 
 
 def best_solver(cells: pd.DataFrame) -> pd.DataFrame:
-    """The timed cells of the solver and accuracy with the most ok queries, without those `solved_too_loosely`.
+    """The timed cells of the solver and accuracy with the most ok queries, without those that are `too_loose`.
 
     Of several such solvers, the fastest.
     """
-    timed = cells[cells["online_s"].notna() & ~solved_too_loosely(cells)]
+    timed = cells[cells["online_s"].notna() & ~too_loose(cells, "solver") & ~too_loose(cells, "assembly")]
     if timed.empty:
         return timed
     ways = timed.groupby(["solver", "accuracy"]).agg(ok=("queries_ok", "sum"), seconds=("online_s", "mean"))
