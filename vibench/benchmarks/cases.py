@@ -57,24 +57,14 @@ class ReducedSpaces:
 
 @dataclass(frozen=True)
 class Setting:
-    """What completes a reduced model of which one part is timed: the last strategies and first tolerances of a study.
-
-    Attributes
-    ----------
-    problems
-        Problems of the study.
-    spaces
-        Where V_N and the cone stop, and the dual strategy.
-    primal
-        The primal strategy.
-    seconds
-        Wall seconds that the study allows for a stage.
-    """
+    """What completes a model of which one part is timed: the last strategies and first tolerances of a study."""
 
     problems: tuple[str, ...]
     spaces: ReducedSpaces
+    """Where V_N and the cone stop, and the dual strategy."""
     primal: PrimalChoice
     seconds: float
+    """Wall seconds that the study allows for a stage."""
 
 
 def setting(study: str) -> Setting:

@@ -32,27 +32,17 @@ Info = Mapping[str, Any]
 
 @dataclass(frozen=True)
 class Timing:
-    """Some work to be timed.
-
-    Attributes
-    ----------
-    group
-        The table to list it in.
-    work
-        What is timed.
-    judge
-        What a result has reached; if it raises, nothing is timed.
-    fresh
-        Gives, untimed, a new argument of `work` for every round, where it takes one.
-    together
-        How many calls in succession make a round, because each does something else.
-    """
+    """Some work to be timed."""
 
     group: str
     work: Callable[..., Any]
+    """What is timed."""
     judge: Callable[[Any], Info]
+    """What a result has reached; if it raises, nothing is timed."""
     fresh: Callable[[], Any] | None = None
+    """Gives, untimed, a new argument of `work` for every round, where it takes one."""
     together: int = 1
+    """How many calls in succession make a round, because each does something else."""
 
     def given(self) -> tuple[Any, ...]:
         """The arguments of a call."""
@@ -61,30 +51,19 @@ class Timing:
 
 @dataclass(frozen=True)
 class PassTimes:
-    """One pass of a benchmark.
-
-    Attributes
-    ----------
-    group
-        The table to list it in.
-    seconds
-        CPU seconds of a call, for every round.
-    calls
-        Calls in a round.
-    calibration
-        CPU seconds of fixed work beside it.
-    slow
-        Whether one pass is all that it takes.
-    info
-        What the first pass has reached.
-    """
+    """One pass of a benchmark."""
 
     group: str
     seconds: tuple[float, ...]
+    """CPU seconds of a call, for every round."""
     calls: int
+    """Calls in a round."""
     calibration: float
+    """CPU seconds of fixed work beside it."""
     slow: bool = False
+    """Whether one pass is all that it takes."""
     info: Info = field(default_factory=dict)
+    """What the first pass has reached."""
 
 
 def measure(timing: Timing, budget: float, *, first: bool) -> PassTimes:

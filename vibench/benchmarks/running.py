@@ -151,12 +151,7 @@ class TimedBenchmarks(WatchedWork):
 class BenchmarkResults:
     """What comes of benchmarks, each told to `show` in a line when it ends.
 
-    Attributes
-    ----------
-    passes
-        The passes of every benchmark that was timed, by name.
-    failed, left_out
-        Why others failed or were left out.
+    `passes` has those of every benchmark that was timed, by name, `failed` and `left_out` why others were not.
     """
 
     def __init__(self, count: int, show: Callable[[str], None]) -> None:

@@ -39,18 +39,11 @@ DEEPEST = 200
 
 @dataclass(frozen=True)
 class Expression:
-    """An arithmetic expression in the parameters, such as "scale**2 * sin(pi * x)"; `parse` makes one.
-
-    Attributes
-    ----------
-    text
-        The expression.
-    names
-        The parameters, in the order of their values.
-    """
+    """An arithmetic expression in the parameters, such as "scale**2 * sin(pi * x)"; `parse` makes one."""
 
     text: str
     names: tuple[str, ...]
+    """The parameters, in the order of their values."""
 
     @classmethod
     def parse(cls, text: str, names: Sequence[str]) -> Expression:

@@ -14,21 +14,14 @@ from vibench.linalg.cholesky import SparseCholesky, elimination_order
 
 @dataclass(frozen=True)
 class EliminationPattern:
-    """Which unknowns are retained and in which order the others are eliminated, for one sparsity pattern.
-
-    Attributes
-    ----------
-    retained
-        Unknowns (c,) that the system is condensed on, rising.
-    order
-        Elimination order of all others, followed by the interface: the retained unknowns that couple to others.
-    interface
-        Positions of the interface among the retained unknowns.
-    """
+    """Which unknowns are retained and in which order the others are eliminated, for one sparsity pattern."""
 
     retained: Indices
+    """Unknowns (c,) that the system is condensed on, rising."""
     order: Indices
+    """Elimination order of all others, followed by the interface: the retained unknowns that couple to others."""
     interface: Indices
+    """Positions of the interface among the retained unknowns."""
 
     @cached_property
     def factorised_block(self) -> PrincipalSubmatrix:

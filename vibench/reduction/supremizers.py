@@ -46,21 +46,14 @@ def proportionality(B: SparseMatrix, reference: SparseMatrix) -> float | None:
 
 @dataclass(frozen=True)
 class ConstraintClasses:
-    """Constraint matrices B(mu_p) sorted into classes of proportional ones, which share their supremizer space.
-
-    Attributes
-    ----------
-    representatives
-        One matrix per class, the first one.
-    members
-        Class of every p (P,).
-    factors
-        c_p (P,) with B(mu_p) = c_p · representatives[members[p]].
-    """
+    """Constraint matrices B(mu_p) sorted into classes of proportional ones, which share their supremizer space."""
 
     representatives: tuple[SparseMatrix, ...]
+    """One matrix per class, the first one."""
     members: Indices
+    """Class of every p (P,)."""
     factors: Array
+    """c_p (P,) with B(mu_p) = c_p · representatives[members[p]]."""
 
     @property
     def firsts(self) -> Indices:

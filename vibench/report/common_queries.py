@@ -24,18 +24,12 @@ PROGRAM = [*(name for name in KEYS if name not in ("problem", "problem_options",
 
 @dataclass(frozen=True)
 class Comparable:
-    """Cells of one problem whose errors can be compared.
-
-    Attributes
-    ----------
-    cells
-        Those with enough ok queries; their means of errors are over the common ones.
-    common, asked
-        Number of queries that are ok in all of them, and of all queries.
-    """
+    """Cells of one problem whose errors can be compared."""
 
     cells: pd.DataFrame
+    """Those with enough ok queries; their means of errors are over the common ones."""
     common: int
+    """Number of queries that are ok in all of them."""
     asked: int
 
     @property

@@ -18,26 +18,20 @@ MEMBER = "TEXT NOT NULL REFERENCES cells(cell) ON DELETE CASCADE"
 
 
 class Column(NamedTuple):
-    """A column of a table.
-
-    Attributes
-    ----------
-    kind
-        SQLite type, with its constraints.
-    unit, meaning
-        For the documentation; units stand in `UNITS`.
-    heading, place
-        Heading and place in the table for reading that is made of this one; "" where the column is not shown there.
-    whole
-        Whether a text is JSON, which is never cut.
-    """
+    """A column of a table."""
 
     kind: str
+    """SQLite type, with its constraints."""
     unit: str
+    """For the documentation, one of `UNITS`."""
     meaning: str
+    """For the documentation."""
     heading: str = ""
+    """Heading in the table for reading that is made of this one; "" where the column is not shown there."""
     place: int = 0
+    """Place in that table."""
     whole: bool = False
+    """Whether a text is JSON, which is never cut."""
 
 
 def real(unit: str, meaning: str, heading: str = "", place: int = 0) -> Column:

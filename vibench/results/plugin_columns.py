@@ -48,24 +48,15 @@ class ColumnError(VibenchError):
 
 @dataclass(frozen=True)
 class Extended:
-    """A table with the columns that plugins add to it.
-
-    Attributes
-    ----------
-    frame
-        Its rows.
-    columns
-        Those of plugins, by their names.
-    better
-        Whether a smaller or a larger value is better, by the names of those of which one is.
-    faults
-        A line for every plugin or column that could not be used.
-    """
+    """A table with the columns that plugins add to it."""
 
     frame: pd.DataFrame
     columns: Mapping[str, Column] = field(default_factory=dict)
+    """Those of plugins, by their names."""
     better: Mapping[str, str] = field(default_factory=dict)
+    """Whether a smaller or a larger value is better, by the names of those of which one is."""
     faults: tuple[str, ...] = ()
+    """A line for every plugin or column that could not be used."""
 
     def of(self, frame: pd.DataFrame) -> Extended:
         """The same with other rows."""

@@ -191,33 +191,22 @@ COMPARED: Mapping[Criterion, str] = {
 
 @dataclass(frozen=True)
 class Winner:
-    """A cell with the smallest value among the cells of its problem whose mean errors are within a band.
-
-    Attributes
-    ----------
-    value
-        What is compared, as `COMPARED` says: seconds, or a relative error.
-    cell
-        The whole row of the cells table, its key under "cell".
-    """
+    """A cell with the smallest value among the cells of its problem whose mean errors are within a band."""
 
     criterion: Criterion
     value: float
+    """What is compared, as `COMPARED` says: seconds, or a relative error."""
     cell: Mapping[str, Any]
+    """The whole row of the cells table, its key under "cell"."""
 
 
 @dataclass(frozen=True)
 class Band:
-    """The winners among the cells whose mean errors of u and λ are both at most `error`, a power of ten.
-
-    Attributes
-    ----------
-    cells
-        Number of cells that the band has.
-    """
+    """The winners among the cells whose mean errors of u and λ are both at most `error`, a power of ten."""
 
     error: float
     cells: int
+    """Number of cells that the band has."""
     winners: tuple[Winner, ...]
 
     def winner(self, criterion: Criterion) -> Winner | None:
@@ -227,27 +216,25 @@ class Band:
 
 @dataclass(frozen=True)
 class Standings:
-    """The leaderboard of one problem: its bands from the largest error to the smallest that is reached.
-
-    Attributes
-    ----------
-    problem, options
-        Label of the problem and its options as JSON, as the cells table has them.
-    cells, incomplete, unstable, loose, interpolated, inexact
-        Number of its cells, and of those that take no part: since a query is not ok; since the inf-sup constant β over
-        the span vanishes at a parameter, so that the multiplier is not unique there; since the QP solver, or reduced
-        assembly, makes too large a share of the error; and since a mean error is above `LARGEST_BAND` or unknown.
-    """
+    """The leaderboard of one problem, and the numbers of its cells: of all, and of those that take no part."""
 
     problem: str
+    """Label of the problem in the table of cells."""
     options: str
+    """Options of the problem as JSON, as the table of cells has them."""
     bands: tuple[Band, ...]
+    """From the largest error to the smallest that is reached."""
     cells: int
     incomplete: int
+    """A query is not ok."""
     unstable: int
+    """The inf-sup constant β over the span vanishes at a parameter, so that the multiplier is not unique there."""
     loose: int
+    """The QP solver makes too large a share of the error."""
     interpolated: int
+    """Reduced assembly makes too large a share of the error."""
     inexact: int
+    """A mean error is above `LARGEST_BAND` or unknown."""
 
 
 def leaderboard(cells: pd.DataFrame) -> tuple[Standings, ...]:

@@ -35,27 +35,19 @@ OF_BENEFITS = (
 
 @dataclass(frozen=True)
 class View:
-    """A table for reading.
-
-    Attributes
-    ----------
-    source
-        Table of the results file that it is made of.
-    columns
-        Its columns by their names there, those that matter most first: on a narrow terminal the last ones are left out.
-    headings
-        Columns with headings and places of their own; empty where names are headings.
-    rows
-        Its rows, in their order, from those of the source.
-    empty
-        Why it may have no rows where the source has some.
-    """
+    """A table for reading."""
 
     source: str
+    """Table of the results file that it is made of."""
     columns: tuple[str, ...]
+    """Its columns by their names there, those that matter most first: on a narrow terminal the last ones are left
+    out."""
     headings: Mapping[str, Column] | None = None
+    """Columns with headings and places of their own; empty where names are headings."""
     rows: Callable[[pd.DataFrame], pd.DataFrame] = tables.in_order
+    """Its rows, in their order, from those of the source."""
     empty: str = ""
+    """Why it may have no rows where the source has some."""
 
 
 VIEWS: Mapping[str, View] = {

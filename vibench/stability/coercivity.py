@@ -52,22 +52,16 @@ class Constant:
 
 @dataclass(frozen=True)
 class Stability:
-    """Constants of the high-fidelity problem at one parameter.
-
-    Attributes
-    ----------
-    inf_sup
-        β_HF in the norms of V and W.
-    coercivity, continuity
-        Lower bound of α and upper bound of γ_a.
-    energy_inf_sup
-        Lower bound of β_A, the inf-sup constant over the span with the norm of A instead of that of V.
-    """
+    """Constants of the high-fidelity problem at one parameter."""
 
     inf_sup: InfSup
+    """β_HF in the norms of V and W."""
     coercivity: Constant
+    """Lower bound of α."""
     continuity: Constant
+    """Upper bound of γ_a."""
     energy_inf_sup: Constant
+    """Lower bound of β_A, the inf-sup constant over the span with the norm of A instead of that of V."""
 
 
 def coercivity_and_continuity(A: SparseMatrix, V: InnerProduct) -> tuple[Constant, Constant]:

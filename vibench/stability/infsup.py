@@ -36,27 +36,19 @@ class Multipliers:
 
     One instance serves every constant of a cone, so that all share one rank decision: constants of different primal
     spaces would not be comparable otherwise.
-
-    Attributes
-    ----------
-    chi
-        Generators (m×R), unit norm in W.
-    span
-        W-orthonormal basis of span χ (m×rank): the leading left singular vectors.
-    gram
-        G (R×R).
-    free
-        Which generators may be used with either sign (R,).
-    singular_values
-        Singular values of χ in W, falling; those above `RANK_RTOL` of the largest count for the rank. Empty for the
-        high-fidelity cone, whose generators are independent.
     """
 
     chi: Array
+    """Generators (m×R), unit norm in W."""
     span: Array
+    """W-orthonormal basis of span χ (m×rank): the leading left singular vectors."""
     gram: Array
+    """G (R×R)."""
     free: Mask
+    """Which generators may be used with either sign (R,)."""
     singular_values: Array
+    """Singular values of χ in W, falling; those above `RANK_RTOL` of the largest count for the rank. Empty for the
+    high-fidelity cone, whose generators are independent."""
 
     @property
     def rank(self) -> int:

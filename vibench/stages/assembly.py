@@ -105,26 +105,18 @@ class NestedPrograms(Stage):
 @storable
 @dataclass(frozen=True)
 class ReducedPrograms:
-    """Reduced programs, for any QP solver.
-
-    Attributes
-    ----------
-    programs
-        One per validation parameter.
-    factor
-        Cholesky factor (lower) of A, where A is constant and the programs are solved in dual form.
-    errors
-        Largest relative difference of a member of the reduced program from its Galerkin projection, per parameter; zero
-        where it is assembled in full.
-    projected
-        The Galerkin projections solved to round-off, or `None` where that fails; none where programs are assembled in
-        full, which are these projections.
-    """
+    """Reduced programs, for any QP solver."""
 
     programs: tuple[VariationalInequality, ...]
+    """One per validation parameter."""
     factor: Array | None
+    """Cholesky factor (lower) of A, where A is constant and the programs are solved in dual form."""
     errors: tuple[float, ...]
+    """Largest relative difference of a member of the reduced program from its Galerkin projection, per parameter; zero
+    where it is assembled in full."""
     projected: tuple[ExactSolution | None, ...] = ()
+    """The Galerkin projections solved to round-off, or `None` where that fails; none where programs are assembled in
+    full, which are these projections."""
 
 
 @dataclass(frozen=True)

@@ -72,22 +72,16 @@ def _functions(strategy: PrimalStrategy) -> dict[str, FunctionType]:
 @storable
 @dataclass(frozen=True)
 class AssessedGrowth:
-    """A nested enrichment and its inf-sup constants on the training set.
-
-    Attributes
-    ----------
-    grown
-        The vectors, and how many of them each tolerance takes.
-    steps, shares
-        The smallest β_span over the training set after every vector (S+1,), and its smallest share of that of V.
-    training
-        β_span at every training parameter (P,), by tolerance.
-    """
+    """A nested enrichment and its inf-sup constants on the training set."""
 
     grown: Grown
+    """The vectors, and how many of them each tolerance takes."""
     steps: Array
+    """The smallest β_span over the training set after every vector (S+1,)."""
     shares: Array
+    """The smallest share of β_span in that of V after every vector (S+1,)."""
     training: Mapping[float, Array]
+    """β_span at every training parameter (P,), by tolerance."""
 
 
 @dataclass(frozen=True)

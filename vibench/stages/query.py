@@ -43,23 +43,16 @@ Watch = Callable[[bool], None]
 
 @dataclass(frozen=True)
 class Query:
-    """A reduced program, and the QP solver that is to solve it.
-
-    Attributes
-    ----------
-    program, factor
-        The program, and the Cholesky factor of A where it is known.
-    solver, accuracy
-        Name of the solver, and the relative accuracy prescribed to it.
-    start
-        Number and program of the query whose solution the solver starts from; `None` for a cold start.
-    """
+    """A reduced program, and the QP solver that is to solve it."""
 
     program: VariationalInequality
     factor: Array | None
+    """The Cholesky factor of A where it is known."""
     solver: str
     accuracy: float
+    """Relative accuracy prescribed to the solver."""
     start: tuple[int, VariationalInequality] | None = None
+    """Number and program of the query whose solution the solver starts from; `None` for a cold start."""
 
     def repeated(self, *seed: int) -> Query:
         """The same query in other units of the unknowns, which depend on the seed; see `vibench.qp.repeats`."""
@@ -93,21 +86,9 @@ class Query:
 class Queries:
     """The queries of a reduced model, one per validation parameter, for any QP solver.
 
-    Parameters
-    ----------
-    store
-        Holds the artefacts of `assembly` and of its inputs.
-    assembly
-        The stage of the reduced programs.
-
-    Attributes
-    ----------
-    model, note
-        The reduced model, and why requested reduced assembly was replaced by full assembly, or "".
-    mus
-        Validation parameters (P×d).
-    reduced
-        The reduced programs.
+    The store holds the artefacts of the stage of the reduced programs and of its inputs. `model` is the reduced model,
+    `note` says why requested reduced assembly was replaced by full assembly, or is "", `mus` are the validation
+    parameters (P×d) and `reduced` the reduced programs.
     """
 
     def __init__(self, store: Store, assembly: AssemblyStage) -> None:

@@ -43,24 +43,15 @@ CELL_SECONDS = (
 
 @dataclass(frozen=True)
 class TimedRound:
-    """One round of one cell: seconds of its queries by their number, and how slow the machine was beside them.
-
-    Attributes
-    ----------
-    assemble
-        Seconds of the assembly; in full, of one query, which counts for all.
-    solve
-        Seconds of the solver.
-    slowdown
-        Of the calibration, before or after, whichever is larger.
-    certify
-        Seconds of the certificate; nothing without one.
-    """
+    """One round of one cell: seconds of its queries by their number, and how slow the machine was beside them."""
 
     assemble: Mapping[int, Seconds]
+    """Seconds of the assembly; in full, of one query, which counts for all."""
     solve: Mapping[int, Seconds]
     slowdown: float
+    """Slowdown of the calibration before or after it, whichever is larger."""
     certify: Mapping[int, Seconds] = field(default_factory=dict)
+    """Seconds of the certificate; nothing without one."""
 
 
 @dataclass(frozen=True)

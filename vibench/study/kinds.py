@@ -8,24 +8,16 @@ from pkgutil import resolve_name
 
 
 class PluginKind(StrEnum):
-    """A kind of plugin; as a text it is what messages and records call it: "dual strategy".
-
-    Attributes
-    ----------
-    plural
-        The list of `vibench list` that shows it.
-    entry_points
-        Its group of entry points.
-    cli_name
-        What stands for it on the command line, in `vibench check NAME:…`; "" where no plugin of it is checked.
-    module
-        The module that `vibench new` writes it to.
-    """
+    """A kind of plugin; as a text it is what messages and records call it: "dual strategy"."""
 
     plural: str
+    """The list of `vibench list` that shows it."""
     entry_points: str
+    """Its group of entry points."""
     cli_name: str
+    """What stands for it on the command line, in `vibench check NAME:…`; "" where no plugin of it is checked."""
     module: str
+    """The module that `vibench new` writes it to."""
     _base: str
 
     def __new__(  # noqa: D102

@@ -20,19 +20,12 @@ FINITE = ConfigDict(allow_inf_nan=False)
 
 @dataclass(frozen=True)
 class Option:
-    """One option of a plugin, an argument of its constructor.
-
-    Attributes
-    ----------
-    name, annotation
-        Name and annotation of the argument.
-    preset
-        Its default; `Parameter.empty` if it is required.
-    """
+    """One option of a plugin, an argument of its constructor."""
 
     name: str
     annotation: Any
     preset: Any
+    """Its default; `Parameter.empty` if it is required."""
 
     def __str__(self) -> str:
         return f"{self.name}: {self.expected}" + f" = {self.preset!r}" * (not self.required)

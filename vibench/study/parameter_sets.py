@@ -21,27 +21,18 @@ OWN = "own"
 
 @dataclass(frozen=True)
 class ParameterSet:
-    """The training or the validation set of a problem: its own, or that of a sampling strategy.
-
-    Attributes
-    ----------
-    role
-        What the solutions at its parameters are for.
-    count
-        Number of parameters of a validation set; 0 for training sets, whose size the problem or the strategy chooses.
-    seed
-        Seed of the validation set of a problem itself, and of what is drawn to time solutions; 0 for training sets.
-    sampling
-        The sampling strategy; `None` for the set of the problem itself.
-    label
-        Its name in results. Sets that differ in their labels alone are the same set.
-    """
+    """The training or the validation set of a problem: its own, or that of a sampling strategy."""
 
     role: Literal["training", "validation"]
+    """What the solutions at its parameters are for."""
     count: int = 0
+    """Number of parameters of a validation set; 0 for training sets, whose size the problem or the strategy chooses."""
     seed: int = 0
+    """Seed of the validation set of a problem itself, and of what is drawn to time solutions; 0 for training sets."""
     sampling: Plugin | None = None
+    """The sampling strategy; `None` for the set of the problem itself."""
     label: str = field(default=OWN, compare=False)
+    """Its name in results. Sets that differ in their labels alone are the same set."""
 
     @property
     def is_adaptive(self) -> bool:

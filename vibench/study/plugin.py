@@ -94,20 +94,14 @@ class GivenPlugin(RegisteredPlugin):
     """A class or an object that a study was given in Python.
 
     Only the process that has made it knows it, and the workers that this process sends it to.
-
-    Attributes
-    ----------
-    fingerprint
-        `GIVEN` and the hash of its code and state.
-    pickled
-        The class or the object by cloudpickle; empty where another process was given it.
-    modules
-        Versions of the modules that it uses, which are imported and not pickled, by name.
     """
 
     fingerprint: str = ""
+    """`GIVEN` and the hash of its code and state."""
     pickled: bytes = b""
+    """The class or the object by cloudpickle; empty where another process was given it."""
     modules: Mapping[str, str] = field(default_factory=dict, compare=False)
+    """Versions of the modules that it uses, which are imported and not pickled, by name."""
 
     def __reduce__(self) -> Any:
         return GivenPlugin, (self.kind, self.name, (), self.fingerprint, self.pickled, self.modules)

@@ -26,22 +26,13 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class RegisteredPlugin:
-    """What is registered under a name.
-
-    Attributes
-    ----------
-    kind
-        Its kind.
-    name
-        The name.
-    entries
-        Its entry point. There are several where packages register different objects, and none where nobody registers
-        any, as for the QP solvers of qpsolvers; either is refused only where the plugin is loaded.
-    """
+    """What is registered under a name."""
 
     kind: PluginKind
     name: str
     entries: tuple[EntryPoint, ...] = ()
+    """Its entry point. There are several where packages register different objects, and none where nobody registers
+    any, as for the QP solvers of qpsolvers; either is refused only where the plugin is loaded."""
 
     def __str__(self) -> str:
         return f"{self.kind} '{self.name}'"

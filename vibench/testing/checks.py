@@ -107,19 +107,12 @@ class Conformance(Generic[P, CaseT_contra]):
 
     `examine` and `check` are the functions `vibench.testing.examine_KIND` and `check_KIND`. Their parameters are those
     of the case, whose docstring explains them.
-
-    Attributes
-    ----------
-    kind
-        The kind, as `vibench check KIND:NAME` has it.
-    case
-        What makes a case of a plugin, or of a function that makes an instance, and of further arguments.
-    checks
-        The checks in their order.
     """
 
     kind: str
+    """The kind, as `vibench check KIND:NAME` has it."""
     case: Callable[P, CaseT_contra]
+    """What makes a case of a plugin, or of a function that makes an instance, and of further arguments."""
     checks: tuple[Check[CaseT_contra], ...]
 
     @cached_property

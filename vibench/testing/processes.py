@@ -27,29 +27,20 @@ HASH_SEEDS = ("1", "2")
 
 @dataclass(frozen=True)
 class Examination(WatchedWork):
-    """The checks of a plugin: one that ends its process or is stopped costs those that need it.
-
-    Attributes
-    ----------
-    kind
-        Kind of the plugin, as in `vibench check KIND:NAME`.
-    plugin
-        Where the plugin is, "module:attribute".
-    options
-        Arguments of its constructor; `None` for one that is a function.
-    seconds
-        Wall time [s] of all checks.
-    given
-        Further arguments of its case.
-    """
+    """The checks of a plugin: one that ends its process or is stopped costs those that need it."""
 
     label = "checks"
 
     kind: str
+    """Kind of the plugin, as in `vibench check KIND:NAME`."""
     plugin: str
+    """Where the plugin is, "module:attribute"."""
     options: Mapping[str, Any] | None
+    """Arguments of its constructor; `None` for one that is a function."""
     seconds: float
+    """Wall time [s] of all checks."""
     given: Mapping[str, Any] = field(default_factory=dict)
+    """Further arguments of its case."""
 
     @property
     def conformance(self) -> Conformance[..., Any]:

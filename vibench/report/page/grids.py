@@ -38,29 +38,21 @@ MORE_OF_CELLS = (
 
 @dataclass(frozen=True)
 class Grid:
-    """A table of the report.
-
-    Attributes
-    ----------
-    name, title, caption
-        Its identifier in the page, and what stands above it.
-    frame
-        Its rows as they are shown, under their headings; the first column names a row.
-    axes
-        Headings that rows can be filtered by.
-    hidden
-        Headings that are not shown at first.
-    disturbed
-        Numbers of the rows whose seconds were measured on a disturbed machine.
-    """
+    """A table of the report."""
 
     name: str
+    """Its identifier in the page."""
     title: str
     caption: str
+    """What stands below the heading."""
     frame: pd.DataFrame
+    """Its rows as they are shown, under their headings; the first column names a row."""
     axes: tuple[str, ...] = ()
+    """Headings that rows can be filtered by."""
     hidden: tuple[str, ...] = ()
+    """Headings that are not shown at first."""
     disturbed: tuple[int, ...] = ()
+    """Numbers of the rows whose seconds were measured on a disturbed machine."""
 
 
 def grid_of_cells(extended: Extended, caption: str) -> Grid:

@@ -31,27 +31,20 @@ NAMED = 6
 
 @dataclass(frozen=True)
 class FigureImage:
-    """The picture of a figure.
-
-    Attributes
-    ----------
-    name, caption
-        Those of the figure.
-    cut
-        Whether it is only the beginning of the figure.
-    alternative
-        What is seen.
-    source, width, height
-        Its data URI, and its size in pixels.
-    """
+    """The picture of a figure."""
 
     name: str
     caption: str
     cut: bool
+    """Whether it is only the beginning of the figure."""
     alternative: str
+    """What is seen."""
     source: str
+    """Its data URI."""
     width: int
+    """Pixels in a row."""
     height: int
+    """Rows of pixels."""
 
 
 def image_of(name: str, figure: Figure) -> FigureImage:

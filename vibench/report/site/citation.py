@@ -25,17 +25,6 @@ NAME, VERSION = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*"), re.compile(r"[A-Za-z0
 class Citation:
     """What a site is called, by whom it is, and where it is deposited.
 
-    Attributes
-    ----------
-    title
-        Its title.
-    authors
-        Names, "Family, Given" for persons; without a comma the name of a group.
-    doi
-        DOI of the deposit, "" where there is none yet.
-    url
-        Address of the site, "" where it has none yet.
-
     Raises
     ------
     RequestError
@@ -44,8 +33,11 @@ class Citation:
 
     title: str
     authors: tuple[str, ...] = ()
+    """Names, "Family, Given" for persons; without a comma the name of a group."""
     doi: str = ""
+    """DOI of the deposit, "" where there is none yet."""
     url: str = ""
+    """Address of the site, "" where it has none yet."""
 
     def __post_init__(self) -> None:
         if self.doi and not DOI.fullmatch(self.doi):

@@ -26,21 +26,13 @@ SHOWN_CELLS = ("N", "R", "enrichment", "error_u_mean", "error_lambda_mean", "onl
 
 @dataclass(frozen=True, eq=False)
 class PublishedRun:
-    """A run and the folder of the site that is about it.
-
-    Attributes
-    ----------
-    run
-        The run.
-    folder
-        Name of its folder below `runs/`: letters, digits, "-", "_" and "." only.
-    note
-        A remark on where the file comes from, "" where there is none.
-    """
+    """A run and the folder of the site that is about it."""
 
     run: ComparedRun
     folder: str
+    """Name of its folder below `runs/`: letters, digits, "-", "_" and "." only."""
     note: str = ""
+    """A remark on where the file comes from, "" where there is none."""
 
     @cached_property
     def values(self) -> dict[str, list[str]]:
