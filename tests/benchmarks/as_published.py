@@ -20,17 +20,24 @@ from typing import Any, NamedTuple
 if __name__ == "__main__":  # before NumPy is imported
     for library in ("OMP", "OPENBLAS", "MKL", "NUMEXPR"):
         os.environ[f"{library}_NUM_THREADS"] = "1"
+sys.path.append(str(Path(__file__).parents[2] / "results" / "scripts"))
 
 import numpy as np
 import pandas as pd
 import published
+from page import Page
 from sides import CASES, TOTAL, TOTAL_NAME, Ours, Published, Side
 
 from vibench import provenance
 from vibench.arrays import Array
 from vibench.qp import verification
-from vibench.results import formats
 from vibench.timing import median_seconds, timed
+
+ABOUT = (
+    "The transcription is ours, too: the algorithms of Niakh, Drouet, Ehrlacher and Ern (2022) as printed, written "
+    "around cvxopt (`tests/benchmarks/published.py`). The last column of the first table has the seconds of the paper "
+    "itself, for its own reduced dimensions."
+)
 
 SEED = 2022
 STAGES = ("snapshots", "POD", "CPG", "mCPG", "PGA", "PGA, residuals kept", "reduction")
@@ -221,23 +228,20 @@ def main(arguments: Sequence[str] | None = None) -> int:
     figures = pd.DataFrame([(name, *pair) for name, pair in found.items()], columns=["figure", "transcription", "ours"])
     held = pd.DataFrame([(*v, "no" if v in broken(verdicts) else "yes") for v in verdicts])
     held.columns = pd.Index(["check", "found", "at most", "holds"])
-    command = f"python tests/benchmarks/as_published.py {asked.problem} --repeats {asked.repeats}"
-    title = f"# {asked.problem}, resolution {resolution}: the published algorithms and ours\n\n`{command}` on {where}\n"
-    about_columns = (
-        "The transcription is ours, too: the algorithms of Niakh, Drouet, Ehrlacher and Ern (2022) as printed, written "
-        "around cvxopt (`tests/benchmarks/published.py`). The last column has the seconds of the paper itself, for its "
-        "own reduced dimensions.\n"
+    page = Page(
+        asked.out or Path(),
+        f"{asked.problem}, resolution {resolution}: the published algorithms and ours",
+        f"python tests/benchmarks/as_published.py {asked.problem} --repeats {asked.repeats}",
+        ABOUT,
+        machine=where,
+        file=f"as-published-{asked.problem}.md",
     )
-    text = "\n".join(
-        [title, about_columns, *map(formats.to_markdown, (times, ratio_table(seconds | of_queries), figures, held))]
-    )
-    print(text)
+    page.add(times, ratio_table(seconds | of_queries), figures, held)
+    print(page.text)
     if asked.out:
-        asked.out.mkdir(parents=True, exist_ok=True)
-        name = asked.out / f"as-published-{asked.problem}"
-        name.with_suffix(".md").write_text(text, encoding="utf-8")
+        page.write()
         about = {"problem": asked.problem, "resolution": resolution, "solver": asked.solver, "machine": where}
-        name.with_suffix(".csv").write_text(formats.to_csv(times.assign(**about)), encoding="utf-8")
+        page.link(f"as-published-{asked.problem}", times.assign(**about))
     return int(bool(broken(verdicts)))
 
 
