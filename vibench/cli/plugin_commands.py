@@ -167,27 +167,39 @@ def _read_rows(kind: PluginKind) -> Iterator[Row]:
 
 def _loaded_rows(kind: PluginKind) -> Iterator[Row]:
     """Name, origin, description and options of every plugin of a kind; of one that does not load, the error."""
-    from vibench.results.plugin_columns import declared, loaded
-    from vibench.study.matrix import expand
-    from vibench.study.reader import read_study
     from vibench.study.registry import registered
 
     for name, plugin in registered(kind).items():
         lines: list[str] = []
         try:
             if kind is STUDY:
-                description = f"{len(expand(read_study(name)))} cells"
+                description = _number_of_cells(name)
             else:
                 description = (plugin.load().__doc__ or "").strip().split("\n")[0]
                 lines += map(str, plugin.options.values())
-            for column in declared(name, loaded(name)) if kind is FIGURE else ():
-                unit = f" [{column.unit}]" * bool(column.unit)
-                lines.append(f"column {column.name} of {column.table}{unit}: {column.meaning}")
+            if kind is FIGURE:
+                lines += _columns(name)
         except VibenchError as error:
             description = str(error)
         except Exception as error:  # noqa: BLE001  annotations of plugins are evaluated
             description = f"{plugin} cannot be read: {in_a_line(error)}"
         yield name, plugin.origin, description, "\n".join(lines)
+
+
+def _number_of_cells(study: str) -> str:
+    from vibench.study.matrix import expand
+    from vibench.study.reader import read_study
+
+    return f"{len(expand(read_study(study)))} cells"
+
+
+def _columns(plugin: str) -> Iterator[str]:
+    """The columns that a figure plugin adds to tables, each in a line."""
+    from vibench.results.plugin_columns import declared, loaded
+
+    for column in declared(plugin, loaded(plugin)):
+        unit = f" [{column.unit}]" * bool(column.unit)
+        yield f"column {column.name} of {column.table}{unit}: {column.meaning}"
 
 
 def _solvers_by_version() -> list[Row]:

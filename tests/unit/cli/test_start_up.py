@@ -23,16 +23,23 @@ def imported(command: str, *arguments: str, **environment: str) -> tuple[set[str
 
 @pytest.mark.parametrize("name", ["", *COMMANDS])
 def test_help_imports_no_heavy_library(name: str, command: str) -> None:
-    found, printed = imported(command, *name.split(), "--help")
+    packages, printed = imported(command, *name.split(), "--help")
     assert printed.startswith(f"Usage: vibench {name}".rstrip())
-    assert "vibench" in found
-    assert found & HEAVY == set()
+    assert "vibench" in packages
+    assert packages & HEAVY == set()
 
 
 def test_the_list_imports_no_plugin_and_no_table(command: str) -> None:
-    found, printed = imported(command, "list")
+    packages, printed = imported(command, "list")
     assert "obstacle" in printed
-    assert found & {"scipy", "pandas", "skfem", "qpsolvers", "matplotlib"} == set()
+    assert packages & {"scipy", "pandas", "skfem", "qpsolvers", "matplotlib"} == set()
+
+
+def test_a_list_of_problems_loads_them_and_no_tables(command: str) -> None:
+    packages, printed = imported(command, "list", "problems")
+    assert "resolution: " in printed
+    assert "skfem" in packages
+    assert packages & {"pandas", "matplotlib", "qpsolvers"} == set()
 
 
 @pytest.mark.parametrize(
@@ -49,8 +56,8 @@ def test_the_list_imports_no_plugin_and_no_table(command: str) -> None:
 )
 def test_completion_imports_no_heavy_library(line: str, word: str, command: str) -> None:
     words = {"COMP_WORDS": line, "COMP_CWORD": str(line.count(" "))}
-    found, printed = imported(command, _VIBENCH_COMPLETE="complete_bash", **words)
+    packages, printed = imported(command, _VIBENCH_COMPLETE="complete_bash", **words)
     assert word in printed.split()
-    assert "vibench" in found
+    assert "vibench" in packages
     package = {"vibench_problems"} if "--option" in line else set()  # the package that holds the module, not the module
-    assert found & (HEAVY - {"pydantic"}) == package  # typer itself checks the words before with pydantic
+    assert packages & (HEAVY - {"pydantic"}) == package  # typer itself checks the words before with pydantic
