@@ -57,7 +57,7 @@ from .linalg.inner_product import InnerProduct as InnerProduct
 from .offline.models import Model as Model
 from .offline.models import Solution as Solution
 from .offline.reduction import Reduction as Reduction
-from .offline.reduction import Snapshots as Snapshots
+from .offline.sweep import Snapshots as Snapshots
 from .qp.solve import solve_qp as solve_qp
 from .qp.status import Status as Status
 from .qp.verification import QPSolution as QPSolution

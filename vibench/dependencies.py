@@ -53,23 +53,19 @@ class _Definition:
 def modules_used(*roots: str, whole: bool = False) -> frozenset[str]:
     """The modules of vibench that determine what is computed by "module:name" or "module:class.method".
 
-    Parameters
-    ----------
-    roots
-        Where the computation begins.
-    whole
-        Whether all methods of all classes that are reached count: others may call these, too.
+    Computation begins at the `roots`. With `whole` all methods of all classes that are reached count: others may call
+    these, too.
     """
-    found = _Reached(whole)
+    reached = _Reached(whole)
     for root in roots:
         module, _, path = root.partition(":")
         name, _, method = path.partition(".")
         for place in _origin(module, name, module):
-            found.add(place)
+            reached.add(place)
             if method:
-                found.ahead.append((place[0], _definition(*place).members[method]))
-    found.follow()
-    return frozenset(module for module, _ in found.places if _outermost(module) == CORE.name)
+                reached.ahead.append((place[0], _definition(*place).members[method]))
+    reached.follow()
+    return frozenset(module for module, _ in reached.places if _outermost(module) == CORE.name)
 
 
 class _Reached:
@@ -151,10 +147,10 @@ def _file(module: str) -> Path | None:
     """The source of a module; for a package with a stub, from which names are imported lazily, the stub."""
     if _outermost(module) != CORE.name:
         try:
-            found = find_spec(module)
+            spec = find_spec(module)
         except ModuleNotFoundError:  # its parent is no package
             return None
-        return Path(found.origin) if found is not None and found.origin and found.has_location else None
+        return Path(spec.origin) if spec is not None and spec.origin and spec.has_location else None
     path = CORE.joinpath(*module.split(".")[1:])
     sources = (path / "__init__.pyi", path / "__init__.py", path.with_suffix(".py"))
     return next((source for source in sources if source.is_file()), None)
@@ -172,22 +168,22 @@ def _parsed(module: str) -> _Definition:
 
     A statement that defines nothing is left out: none changes what a name stands for, it only registers that.
     """
-    found, path = _Definition(), _file(module)
+    defined, path = _Definition(), _file(module)
     package = module if path is not None and path.stem == "__init__" else module.rpartition(".")[0]
     ahead: list[ast.AST] = [ast.parse(_source(module))]
     while ahead:
         node = ahead.pop()
         match node:
             case ast.Import() | ast.ImportFrom():
-                found.imports.update(_imported(node, package))
+                defined.imports.update(_imported(node, package))
             case ast.FunctionDef() | ast.AsyncFunctionDef() | ast.ClassDef():
-                found.members[node.name] = _read(node, package)
+                defined.members[node.name] = _read(node, package)
             case ast.Assign() | ast.AnnAssign():
                 stored = (part for part in ast.walk(node) if isinstance(part, ast.Name) and not _is_read(part))
-                found.members.update(dict.fromkeys((part.id for part in stored), _read(node, package)))
+                defined.members.update(dict.fromkeys((part.id for part in stored), _read(node, package)))
             case ast.Module() | ast.If() | ast.Try() | ast.ExceptHandler() | ast.With():
                 ahead += ast.iter_child_nodes(node)
-    return found
+    return defined
 
 
 def _is_read(name: ast.Name) -> bool:
@@ -207,21 +203,21 @@ def _imported(node: ast.Import | ast.ImportFrom, package: str) -> Mapping[str, P
 
 def _read(statement: ast.stmt, package: str) -> _Definition:
     """What occurs in a statement of a package."""
-    found = _Definition()
+    occurring = _Definition()
     ahead: list[ast.AST] = [statement]
     while ahead:
         node = ahead.pop()
         match node:
             case ast.Name():
-                found.names.add(node.id)
+                occurring.names.add(node.id)
             case ast.Attribute():
-                found.attributes.add(node.attr)
+                occurring.attributes.add(node.attr)
             case ast.Import() | ast.ImportFrom():
-                found.imports.update(_imported(node, package))
+                occurring.imports.update(_imported(node, package))
         for child in ast.iter_child_nodes(node):
             in_class = node is statement and isinstance(statement, ast.ClassDef)
             if in_class and isinstance(child, ast.FunctionDef) and not child.name.startswith("__"):
-                found.members[child.name] = _read(child, package)
+                occurring.members[child.name] = _read(child, package)
             else:
                 ahead.append(child)
-    return found
+    return occurring

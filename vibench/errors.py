@@ -73,14 +73,8 @@ def unknown_name(kind: str, name: str, choices: Iterable[str]) -> RequestError:
 def fault_line(fault: ValidationError, root: type[BaseModel], named: Collection[str] = ()) -> str:
     """The key that is wrong in a file of a user, what is wrong, and what was found, from an error of pydantic.
 
-    Parameters
-    ----------
-    fault
-        The error; the first one counts where it holds several.
-    root
-        The model of the whole file.
-    named
-        Keys under which a name stands for a table.
+    Of several errors the first one counts. `root` is the model of the whole file, `named` are the keys under which a
+    name stands for a table.
     """
     error = fault.errors(include_url=False)[0]
     # The last part of an unexpected key's path is the key itself, whatever its first character.

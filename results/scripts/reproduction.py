@@ -17,7 +17,7 @@ from page import start
 
 from vibench.report.figures.data import Data, problems
 from vibench.results import tables
-from vibench_problems.paper.claims import DIMENSION, MESH, ORDER, RATIO, WIDEST, Claim, Verdict, typeset
+from vibench_problems.paper.claims import DIMENSION, MESH, ORDER, RATIO, WIDEST, Agreement, Claim, typeset
 from vibench_problems.paper.evidence import Evidence
 from vibench_problems.paper.sections import sections
 from vibench_problems.paper.tables import columns
@@ -99,8 +99,8 @@ def summary(claims: Mapping[str, Sequence[Claim]]) -> str:
     """Number of verdicts of each kind, by section and in all."""
     counts = {title: Counter(row.verdict for row in rows) for title, rows in claims.items()}
     counts["all"] = sum(counts.values(), Counter())
-    rows = ([title, *(str(count[verdict]) for verdict in Verdict)] for title, count in counts.items())
-    return markdown(("section", *(verdict.value for verdict in Verdict)), rows)
+    rows = ([title, *(str(count[verdict]) for verdict in Agreement)] for title, count in counts.items())
+    return markdown(("section", *(verdict.value for verdict in Agreement)), rows)
 
 
 def markdown(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:

@@ -14,7 +14,7 @@ from types import ModuleType
 import pytest
 
 from vibench_problems.paper import claims
-from vibench_problems.paper.claims import Verdict
+from vibench_problems.paper.claims import Agreement
 
 ROOT = Path(__file__).parents[2]
 PAGE = ROOT / "docs" / "reproduction.md"
@@ -147,7 +147,7 @@ def test_the_page_has_every_figure(page: str) -> None:
 
 def test_the_counts_of_the_page_are_those_of_its_rows(page: str) -> None:
     found = [row["verdict"] for row in ROW.finditer(page)]
-    counts = [found.count(verdict.value) for verdict in Verdict]
+    counts = [found.count(verdict.value) for verdict in Agreement]
     assert f"| all | {' | '.join(map(str, counts))} |" in page
     assert sum(counts) > 150
 
@@ -162,7 +162,7 @@ SECTION = re.compile(
     r"^## Figure (?P<number>\d+)(?P<direct> hertz direct)?\n.*?^\*\*Here\.\*\* (?P<said>.+?)$", re.M | re.S
 )
 DRAWN = re.compile(r"Fig\. ([3-8]|1\d)\b")
-GROUPS = "|".join(verdict.capitalize() for verdict in Verdict)
+GROUPS = "|".join(verdict.capitalize() for verdict in Agreement)
 
 
 def unescaped(markdown: str) -> str:

@@ -16,7 +16,8 @@ from vibench.interfaces.strategies import Stop
 from vibench.interfaces.validation import checked_assembly, training_parameters, validation_parameters
 from vibench.model.affine import AffineMember, affine_decomposition
 from vibench.model.errors import ReferenceSolutions
-from vibench.offline.reduction import Reduction, Snapshots, high_fidelity_sweep
+from vibench.offline.reduction import Reduction
+from vibench.offline.sweep import Snapshots, high_fidelity_sweep
 from vibench.reduction.pod import pod
 from vibench.study.kinds import DUAL, PRIMAL, PROBLEM
 from vibench.study.registry import find
@@ -71,12 +72,8 @@ def _once(make: Callable[Concatenate[StageInputs, P], T]) -> Callable[Concatenat
 class StageInputs:
     """The problem of a case and what comes of it.
 
-    Parameters
-    ----------
-    case
-        The problem.
-    setting
-        Where V_N and the cone stop, unless a method is told, and what completes a model of which one part is timed.
+    The setting says where V_N and the cone stop, unless a method is told, and what completes a model of which one part
+    is timed.
     """
 
     def __init__(self, case: TimedProblem, setting: Setting) -> None:

@@ -65,15 +65,9 @@ def planned(
 ) -> list[Benchmark]:
     """The benchmarks in which one of the plugins takes part; of all that is registered where none is chosen.
 
-    Parameters
-    ----------
-    chosen
-        Names of plugins by the word for their kind (`kinds.CHECKED`). Problems that are needed and not named are those
-        of the setting.
-    resolutions
-        Resolutions at which problems are timed that know them; QP solvers at the first of these alone.
-    setting
-        What completes what is timed.
+    `chosen` has names of plugins by the word for their kind (`kinds.CHECKED`). Problems that are needed and not named
+    are those of the setting, which completes what is timed. Problems are timed at those of the resolutions that they
+    know, QP solvers at the first of these alone.
     """
     every = setting.problems if chosen else filter(takes_no_option, registered(PROBLEM))
     problems = [at_resolutions(name, resolutions) for name in chosen.get("problem", every)]

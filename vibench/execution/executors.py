@@ -161,19 +161,19 @@ class Dask(Executor):
         token = store / f"{self._token}.part"
         token.touch()
         try:
-            found: dict[str, tuple[bool, str, str]] = self._client.run(_describe, str(token))
+            workers: dict[str, tuple[bool, str, str]] = self._client.run(_describe, str(token))
         except Exception as error:  # noqa: BLE001  a worker without vibench may raise anything
             raise RequestError(f"the dask workers cannot run vibench: {in_a_line(error)}") from None
         finally:
             token.unlink()
-        if not found:
+        if not workers:
             raise RequestError("the dask cluster has no workers")
-        for address, (sees, code, _) in found.items():
+        for address, (sees, code, _) in workers.items():
             if not sees:
                 raise RequestError(f"the dask worker {address} does not see the artefacts in '{store}'")
             if code != code_here():
                 raise RequestError(f"the dask worker {address} has other code: {code} instead of {code_here()}")
-        return len(found), frozenset(where for _, _, where in found.values())
+        return len(workers), frozenset(where for _, _, where in workers.values())
 
     def submit(self, job: Job) -> Future[StageOutcome]:
         """Begin a job on a worker."""

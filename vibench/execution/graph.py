@@ -79,11 +79,11 @@ class Graph:
 
 def _closure(keys: Iterable[str], edges: Mapping[str, Set[str]]) -> set[str]:
     """The keys and all that can be reached from them."""
-    found: set[str] = set()
+    reached: set[str] = set()
     ahead = list(keys)
     while ahead:
         key = ahead.pop()
-        if key not in found:
-            found.add(key)
+        if key not in reached:
+            reached.add(key)
             ahead += edges.get(key, ())
-    return found
+    return reached

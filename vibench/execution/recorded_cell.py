@@ -88,8 +88,8 @@ class RecordedCell:
             return None
         store = usable_store()
         _provide((stage,), store)
-        found: OnlineCertificate = value_of(store, stage)
-        return found
+        certificate: OnlineCertificate = value_of(store, stage)
+        return certificate
 
     @cached_property
     def parameters(self) -> Array:
@@ -103,8 +103,8 @@ class RecordedCell:
     def rows(self, table: str) -> dict[int, dict[str, Any]]:
         """The cell's rows of the queries or the solutions table, by query."""
         names, rows = read_rows(self.path, table, self.row["cell"])
-        found = [dict(zip(names, row, strict=True)) for row in rows]
-        return {int(row["query"]): row for row in found}
+        named = [dict(zip(names, row, strict=True)) for row in rows]
+        return {int(row["query"]): row for row in named}
 
 
 def _provide(stages: Iterable[Stage], store: Store) -> None:
@@ -159,10 +159,10 @@ def recorded_cell(run: str, cell: str) -> RecordedCell:
     RequestError
         If the prefix fits no cell or several, or the cell failed before it had a reduced model.
     """
-    found = _matching(run, cell)
-    if not found.row["model"]:
-        raise RequestError(f"cell {found.row['cell']} has no reduced model: {found.row['reason']}")
-    return found
+    recorded = _matching(run, cell)
+    if not recorded.row["model"]:
+        raise RequestError(f"cell {recorded.row['cell']} has no reduced model: {recorded.row['reason']}")
+    return recorded
 
 
 def recorded_study(run: str, cell: str) -> Study:
@@ -173,26 +173,28 @@ def recorded_study(run: str, cell: str) -> Study:
     RequestError
         If the prefix fits no cell or several, or the cell cannot be run here: its plugins or options are others.
     """
-    found = _matching(run, cell)
-    name = str(study_of(found.path, read_meta(found.path)).get("name"))
-    rounds = found.row["timing_rounds"]
+    recorded = _matching(run, cell)
+    name = str(study_of(recorded.path, read_meta(recorded.path)).get("name"))
+    rounds = recorded.row["timing_rounds"]
     settings = {} if pd.isna(rounds) else {"timing_rounds": int(rounds)}
     try:
-        recorded = found.cell
+        definition = recorded.cell
     except (
         ValueError,
         TypeError,
         KeyError,
         AttributeError,
     ) as error:  # whoever wrote the file may have written anything
-        raise RequestError(f"'{found.path}': the definition of cell {found.row['cell']} cannot be read") from error
-    return study_of_cell(recorded, name, **settings)
+        raise RequestError(
+            f"'{recorded.path}': the definition of cell {recorded.row['cell']} cannot be read"
+        ) from error
+    return study_of_cell(definition, name, **settings)
 
 
 def _matching(run: str, cell: str) -> RecordedCell:
     path, rows = _rows(run)
     matching = [row for row in rows if str(row["cell"]).startswith(cell)]
     if len(matching) != 1:
-        known = "the column 'cell' of `vibench show RUN --table cells` lists them"
-        raise RequestError(f"{len(matching)} cells of '{run}' begin with '{cell}', expected one; {known}")
+        listed = "the column 'cell' of `vibench show RUN --table cells` lists them"
+        raise RequestError(f"{len(matching)} cells of '{run}' begin with '{cell}', expected one; {listed}")
     return RecordedCell(path, matching[0])

@@ -27,10 +27,10 @@ class ResultWriter:
     database: ResultsDatabase
     labels: Mapping[Plugin, str]
 
-    def cell(self, cell: Cell, found: CellRows) -> Row:
+    def cell(self, cell: Cell, rows: CellRows) -> Row:
         """Write the rows of a cell; returns its own as it is stored."""
         keys = cell_columns(cell)
-        row = {"cell": cell.key, **keys, "machine": provenance.machine(), **found.cell}
+        row = {"cell": cell.key, **keys, "machine": provenance.machine(), **rows.cell}
         row |= {
             "seed": cell.validation.seed,
             **_set_columns(cell.validation),
@@ -40,9 +40,9 @@ class ResultWriter:
             "versions": json.dumps(provenance.versions(cell.solver), sort_keys=True),
             "definition": cell.definition,
         }
-        queries = [{"cell": cell.key, **keys, "query": k, **query} for k, query in enumerate(found.queries)]
-        solutions = [{"cell": cell.key, **solution} for solution in found.solutions]
-        outputs = [{"cell": cell.key, **keys, **output} for output in found.outputs]
+        queries = [{"cell": cell.key, **keys, "query": k, **query} for k, query in enumerate(rows.queries)]
+        solutions = [{"cell": cell.key, **solution} for solution in rows.solutions]
+        outputs = [{"cell": cell.key, **keys, **output} for output in rows.outputs]
         return self.database.write_cell(row, queries, solutions, outputs)
 
     def seconds(self, cell: Cell, timed: TimedCell, asked: int) -> None:
@@ -57,12 +57,12 @@ class ResultWriter:
 
     def stage(self, stage: Stage, histories: Iterable[History], store: Store) -> None:
         """Write the histories and rows of a stage whose value is stored."""
-        keys, found = axis_columns(stage.axes, self.labels), []
+        keys, rows = axis_columns(stage.axes, self.labels), []
         for history in histories:
             named = {"artefact": stage.key, "stage": history.stage, **keys, "quantity": history.quantity}
-            found.append([named | {"step": history.first_step + k, "value": v} for k, v in enumerate(history.values)])
-        if found:
-            self.database.write_histories(found, partial=stage.partial)
+            rows.append([named | {"step": history.first_step + k, "value": v} for k, v in enumerate(history.values)])
+        if rows:
+            self.database.write_histories(rows, partial=stage.partial)
         if type(stage).rows is not Stage.rows:  # artefacts are large: read only if rows are made of them
             self._tables(stage, stage.rows(value_of(store, stage)))
 
@@ -85,11 +85,11 @@ def cell_columns(cell: Cell) -> dict[str, Any]:
 
 def labels_of(cells: Iterable[Cell]) -> dict[Plugin, str]:
     """The names of a study's plugins in its results: their labels in the first cell that has them."""
-    found: dict[Plugin, str] = {}
+    labels: dict[Plugin, str] = {}
     for cell in cells:
         for plugin, label in zip((cell.problem, cell.dual, cell.primal), cell.labels, strict=True):
-            found.setdefault(plugin, label)
-    return found
+            labels.setdefault(plugin, label)
+    return labels
 
 
 def _set_columns(parameters: ParameterSet) -> dict[str, Any]:

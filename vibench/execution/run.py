@@ -88,8 +88,8 @@ class Outcome:
 
 def identity(study: Study) -> dict[str, Any]:
     """The settings that all numbers of a study depend on; a run folder holds results of one identity only."""
-    known = study.validation
-    validation = known if isinstance(known, int) else known.model_dump(mode="json", exclude={"label"})
+    asked = study.validation
+    validation = asked if isinstance(asked, int) else asked.model_dump(mode="json", exclude={"label"})
     return {"name": study.name, "seed": study.seed, "validation": validation}
 
 

@@ -8,7 +8,15 @@ from pathlib import Path
 
 from vibench.errors import RequestError
 from vibench.files import locked
-from vibench.results.sqlite.reading import DAMAGED, FILE, WRITE_AHEAD_LOG, DamagedError, read_meta, set_aside, study_of
+from vibench.results.sqlite.reading import (
+    DAMAGED,
+    FILE,
+    WRITE_AHEAD_LOG,
+    DamagedResultsError,
+    read_meta,
+    set_aside,
+    study_of,
+)
 from vibench.results.tables import EXPORTED
 
 LOCK = ".lock"
@@ -33,8 +41,8 @@ def claimed(folder: Path) -> Iterator[None]:
     try:
         if folder.exists() and not folder.is_dir():
             raise RequestError(f"output folder '{folder}' is a file")
-        known = {LOCK, FILE + DAMAGED, FILE + DAMAGED + WRITE_AHEAD_LOG}
-        if folder.is_dir() and not (folder / FILE).exists() and {path.name for path in folder.iterdir()} - known:
+        ours = {LOCK, FILE + DAMAGED, FILE + DAMAGED + WRITE_AHEAD_LOG}
+        if folder.is_dir() and not (folder / FILE).exists() and {path.name for path in folder.iterdir()} - ours:
             raise RequestError(f"output folder '{folder}' is not empty and holds no {FILE}; choose another with --out")
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -57,7 +65,7 @@ def clear(folder: Path, study: str, note: Callable[[str], None]) -> None:
     path = folder / FILE
     try:
         meta = read_meta(path) if path.is_file() else {}
-    except DamagedError as error:
+    except DamagedResultsError as error:
         set_aside(path)
         note(f"{error}; it is kept as '{path}{DAMAGED}'")
         meta = {}

@@ -54,7 +54,7 @@ class SolverTrials(WatchedWork):
 
     @cached_property
     def packages(self) -> frozenset[str]:
-        """Those of the solvers."""
+        """The packages of the solvers."""
         return frozenset(registry.find(SOLVER, solver).package for solver in self.solvers) - {""}
 
     def stage_of(self, number: int) -> Stage:

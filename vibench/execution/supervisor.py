@@ -282,10 +282,10 @@ def kill_marked(mark: str) -> None:
     children. Systems without /proc do not tell the environment of a process: only its group ends with a worker there.
     """
     for _ in range(PASSES):
-        found = list(_marked(mark))
-        if not found:
+        processes = list(_marked(mark))
+        if not processes:
             return
-        for process in found:
+        for process in processes:
             with contextlib.suppress(ProcessLookupError):
                 os.kill(process, signal.SIGKILL)
 

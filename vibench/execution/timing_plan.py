@@ -50,11 +50,6 @@ class TimingPlan:
         complete = [group for group, left in self._open.items() if not left]
         return [stage for group in complete if (stage := self._stage(group)) is not None]
 
-    @property
-    def open(self) -> int:
-        """Groups that wait for rows of their cells."""
-        return sum(1 for left in self._open.values() if left)
-
     def ended(self, cell: Cell) -> TimingRounds | None:
         """Note that a cell has its row; the stage of its group if it was the last one."""
         left = self._open[_group(cell)]

@@ -172,13 +172,7 @@ def _probed(array: Any) -> Array:
 
 
 class ReferenceAssembly:
-    """The assembly at one parameter that those at others are compared with; it is kept as the problem returned it.
-
-    Parameters
-    ----------
-    problem, vi
-        A problem, and its assembly at some parameter.
-    """
+    """The assembly at one parameter that those at others are compared with; it is kept as the problem returned it."""
 
     def __init__(self, problem: Problem, vi: VariationalInequality) -> None:
         self._problem, self._vi = problem, vi

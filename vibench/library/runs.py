@@ -63,10 +63,10 @@ class Run:
 
     def _extended(self, name: str) -> Extended:
         """A table with the columns of plugins; what cannot be used is a warning."""
-        found = tables.extended(self.path, name)
-        for line in found.faults:
+        extended = tables.extended(self.path, name)
+        for line in extended.faults:
             warnings.warn(line, stacklevel=3)
-        return found
+        return extended
 
     @property
     def cells(self) -> pd.DataFrame:
@@ -104,14 +104,14 @@ class Run:
         RequestError
             If there is no such measure, or the largest error is not positive.
         """
-        found = ranking.with_errors(self.thresholds, *tables.measured(self.path, error))
-        return found if within is None else ranking.within(found, within).reset_index(drop=True)
+        rows = ranking.with_errors(self.thresholds, *tables.measured(self.path, error))
+        return rows if within is None else ranking.within(rows, within).reset_index(drop=True)
 
     @property
     def summary(self) -> pd.DataFrame:
         """The table that `vibench show` prints."""
-        found = self._extended("cells")
-        return tables.summary(found.frame, found.columns)
+        extended = self._extended("cells")
+        return tables.summary(extended.frame, extended.columns)
 
     @property
     def findings(self) -> dict[str, list[str]]:

@@ -27,7 +27,7 @@ class Comparable:
     """Cells of one problem whose errors can be compared."""
 
     cells: pd.DataFrame
-    """Those with enough ok queries; their means of errors are over the common ones."""
+    """Cells with enough ok queries; their means of errors are over the common ones."""
     common: int
     """Number of queries that are ok in all of them."""
     asked: int
@@ -41,10 +41,7 @@ class Comparable:
 def on_common_queries(cells: pd.DataFrame, queries: pd.DataFrame) -> Comparable:
     """The cells without those that have fewer than half of their queries ok, with means over what is ok in all.
 
-    Parameters
-    ----------
-    cells, queries
-        Rows of these tables, of one problem; queries of other cells are ignored.
+    Both are rows of these tables, of one problem; queries of other cells are ignored.
     """
     ok = queries[(queries["status"] == Status.OK) & queries["cell"].isin(cells["cell"])]
     solved = cells["cell"].map(ok.groupby("cell").size()).fillna(0)

@@ -78,12 +78,7 @@ READ = ("cells", "queries", "disagreements")
 def all_findings(read: Mapping[str, pd.DataFrame], by_problem: Iterable[tuple[str, Data]]) -> Iterator[Finding]:
     """Every finding of a run, by subject: the whole run, then problem by problem.
 
-    Parameters
-    ----------
-    read
-        The tables `READ` of the run.
-    by_problem
-        What `problems` finds: the names of the problems, and their data.
+    They are made from the tables `READ` of the run, and from what `problems` gives: names and data of its problems.
     """
     for weight, text in _whole_run(read):
         yield Finding("", text, weight)

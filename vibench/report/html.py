@@ -22,7 +22,7 @@ from vibench.report import findings
 from vibench.report.figures import FigureTask, figures_of, processes, render
 from vibench.report.figures.data import TABLES, Data, Extent, label, problems
 from vibench.report.page import plots
-from vibench.report.page.grids import Grid, grid_of, grid_of_cells, grid_of_thresholds, script_safe, to_json
+from vibench.report.page.grids import TableGrid, grid_of, grid_of_cells, grid_of_thresholds, script_safe, to_json
 from vibench.report.page.images import image_of
 from vibench.results import pictures, tables
 from vibench.results.plugin_columns import Extended, faults_of
@@ -174,7 +174,7 @@ def _facts(study: dict[str, Any], cells: pd.DataFrame) -> Iterator[tuple[str, st
     yield "seconds", "CPU seconds of one process; the offline time of a cell includes every stage it depends on"
 
 
-def _grids(read: Mapping[str, Extended]) -> Iterator[Grid]:
+def _grids(read: Mapping[str, Extended]) -> Iterator[TableGrid]:
     """The tables of the page, those of failures first; a table without rows is none."""
     cells, thresholds = read["cells"].frame, read["thresholds"]
     keys = short_keys(cells["cell"])

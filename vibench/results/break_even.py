@@ -152,11 +152,6 @@ class _Resampling:
     Of a query: the median over rounds drawn with replacement, the same ones for both models, since what disturbs a
     round disturbs both. Of what is measured once, an offline phase or the high-fidelity model: the measured seconds
     with the slowdown of another time of the run.
-
-    Parameters
-    ----------
-    timings
-        Rows of the timings table.
     """
 
     def __init__(self, timings: Iterable[Mapping[str, Any]]) -> None:

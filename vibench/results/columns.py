@@ -23,9 +23,9 @@ class Column(NamedTuple):
     kind: str
     """SQLite type, with its constraints."""
     unit: str
-    """For the documentation, one of `UNITS`."""
+    """Unit, one of `UNITS`."""
     meaning: str
-    """For the documentation."""
+    """What the documentation says of it."""
     heading: str = ""
     """Heading in the table for reading that is made of this one; "" where the column is not shown there."""
     place: int = 0

@@ -17,7 +17,7 @@ from vibench.results.sqlite.reading import (
     BUSY_SECONDS,
     DAMAGED,
     FILE,
-    DamagedError,
+    DamagedResultsError,
     code_of,
     read_meta,
     study_of,
@@ -44,24 +44,15 @@ UNWRITABLE = {
 class ResultsDatabase:
     """The results of one study in one folder.
 
-    Parameters
-    ----------
-    folder
-        Run folder; created if it does not exist.
-    study
-        Settings that determine the numbers of the study: results of another study are refused.
-    anew
-        Drop all existing tables, in the transaction that creates the new ones.
+    Settings that determine the numbers of the study are kept with them: results of another study are refused. `anew`
+    drops all existing tables, in the transaction that creates the new ones.
 
     Raises
     ------
     RequestError
         If the folder holds results of another study or schema, or damage that no cell explains, or cannot be written.
 
-    Attributes
-    ----------
-    damaged
-        Cells whose rows were damaged and are removed: they have to be computed again.
+    The cells in `damaged` are those whose rows were damaged and are removed: they have to be computed again.
     """
 
     def __init__(self, folder: Path, study: Mapping[str, Any], *, anew: bool = False) -> None:
@@ -85,7 +76,7 @@ class ResultsDatabase:
                 self._opened = self._path.stat()
                 opened.pop_all()
         except DigestError as error:
-            raise DamagedError(f"'{path}' is damaged: {error}; use another --out, or --fresh") from None
+            raise DamagedResultsError(f"'{path}' is damaged: {error}; use another --out, or --fresh") from None
         except (OSError, sqlite3.Error) as error:
             raise RequestError(f"output folder '{folder}' cannot be written: {error}") from None
 
@@ -195,14 +186,7 @@ class ResultsDatabase:
     ) -> None:
         """Write the seconds of a cell that has its rows, in one transaction; earlier ones are replaced.
 
-        Parameters
-        ----------
-        cell
-            Key of the cell.
-        own, queries
-            Columns of the cell, and of its queries by their number.
-        rounds
-            Rows of the timings table.
+        `own` are columns of the cell, `queries` those of its queries by their number, `rounds` rows of timings.
         """
         changed = ("cells", "queries") if queries else ("cells",)
         with self._writing():
@@ -311,7 +295,7 @@ class ResultsDatabase:
 def _refuse_other(path: Path, study: Mapping[str, Any]) -> None:
     try:
         meta = read_meta(path) if path.exists() else {}
-    except DamagedError as error:
+    except DamagedResultsError as error:
         raise RequestError(f"{error}; use another --out, or --fresh, which keeps it as {FILE}{DAMAGED}") from None
     if not meta:  # empty where a run was killed before its first transaction
         return

@@ -52,7 +52,7 @@ class Extended:
 
     frame: pd.DataFrame
     columns: Mapping[str, Column] = field(default_factory=dict)
-    """Those of plugins, by their names."""
+    """The columns of plugins, by their names."""
     better: Mapping[str, str] = field(default_factory=dict)
     """Whether a smaller or a larger value is better, by the names of those of which one is."""
     faults: tuple[str, ...] = ()

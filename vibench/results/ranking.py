@@ -223,7 +223,7 @@ class Standings:
     options: str
     """Options of the problem as JSON, as the table of cells has them."""
     bands: tuple[Band, ...]
-    """From the largest error to the smallest that is reached."""
+    """Its bands, from the largest error to the smallest that is reached."""
     cells: int
     incomplete: int
     """A query is not ok."""
@@ -240,16 +240,9 @@ class Standings:
 def leaderboard(cells: pd.DataFrame) -> tuple[Standings, ...]:
     """The winners of every problem in every band of accuracy, in the order of the cells.
 
-    Parameters
-    ----------
-    cells
-        Rows of the cells table: of one run, or of several that one machine measured, since seconds are compared.
-
-    Returns
-    -------
-    :
-        One leaderboard per problem and options of it; without bands where no cell takes part. Of equal values the
-        first cell wins. A band in which the same cells win as in the next smaller one is left out.
+    The cells are those of one run, or of several that one machine measured, since seconds are compared. There are no
+    bands where no cell takes part. Of equal values the first cell wins. A band in which the same cells win as in the
+    next smaller one is left out.
     """
     groups = cells.groupby(["problem", "problem_options"], dropna=False, sort=False)
     return tuple(_standings(str(problem), str(options), mine) for (problem, options), mine in groups)

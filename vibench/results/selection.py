@@ -43,18 +43,8 @@ def matching(
     write, under an authoriser that refuses functions, subqueries and other tables. One that names a column of a plugin
     runs on a copy in memory.
 
-    Parameters
-    ----------
-    path, table
-        The results file and the table.
-    expression
-        The expression.
-    columns
-        Columns that the table has, to suggest one.
-    plugins
-        The table with its columns of plugins, if it has any.
-    made
-        Columns of what is made of the rows that are selected, which they do not have themselves.
+    Of the columns that the table has one is suggested for a name that is none. `plugins` is the table with its columns
+    of plugins, if it has any; `made` are columns of what is made of the rows, which they do not have themselves.
 
     Raises
     ------

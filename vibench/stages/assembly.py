@@ -158,10 +158,10 @@ class AssemblyStage(Stage):
         """Assemble at every parameter; compare reduced programs with full ones."""
         model, _ = self.model(store)
         mus = self.validation.of(model.problem)
-        known = None if self.nested is None else value_of(store, self.nested)
+        larger = None if self.nested is None else value_of(store, self.nested)
         if isinstance(model, HyperReducedModel):
-            return Result(_reduced(model, mus, known))
-        return Result(_in_full(model, mus, known))
+            return Result(_reduced(model, mus, larger))
+        return Result(_in_full(model, mus, larger))
 
     def offline(self, store: Store) -> Reduction:
         """The offline phase of the model that queries use, with all its steps."""
@@ -192,14 +192,14 @@ InFull = Sequence[VariationalInequality] | None
 """Fully assembled programs of a larger nested space, one per parameter, if they are known."""
 
 
-def _reduced(model: HyperReducedModel, mus: Array, known: InFull) -> ReducedPrograms:
+def _reduced(model: HyperReducedModel, mus: Array, larger: InFull) -> ReducedPrograms:
     """The hyper-reduced assembly at every parameter, compared with the Galerkin projection."""
     matrices = assemblies(model.problem)
     programs, errors, projected, factor = [], [], [], None
     for k, mu in enumerate(mus):
         reduced = model.assemble(mu)
         program, factor = reduced.program, reduced.factor
-        full = leading_part(known[k], len(program.f)) if known else None
+        full = leading_part(larger[k], len(program.f)) if larger else None
         full = full or project(matrices.at(mu), reduced.basis, model.generators)
         errors.append(_largest_difference(program, full))
         projected.append(exact_solution(full))
@@ -207,11 +207,11 @@ def _reduced(model: HyperReducedModel, mus: Array, known: InFull) -> ReducedProg
     return ReducedPrograms(tuple(programs), factor, tuple(errors), tuple(projected))
 
 
-def _in_full(model: ReducedModel, mus: Array, known: InFull) -> ReducedPrograms:
+def _in_full(model: ReducedModel, mus: Array, larger: InFull) -> ReducedPrograms:
     """The projection of the high-fidelity matrices at every parameter."""
     matrices, size = assemblies(model.problem), model.fixed_basis.shape[1]
     programs = (
-        [leading_part(p, size) for p in known] if known else [model.reduce(matrices.at(mu)).program for mu in mus]
+        [leading_part(p, size) for p in larger] if larger else [model.reduce(matrices.at(mu)).program for mu in mus]
     )
     return ReducedPrograms(tuple(programs), None, (0.0,) * len(mus))
 

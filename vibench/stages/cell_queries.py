@@ -74,7 +74,7 @@ class CellQueries(ItemwiseStage):
 
     @cached_property
     def packages(self) -> frozenset[str]:
-        """Those of the strategies and the problem, and that of the solver."""
+        """The packages of the strategies, the problem and the solver."""
         return super().packages | {find(SOLVER, self.solver).package} - {""}
 
     @property
@@ -135,8 +135,8 @@ class CellQueries(ItemwiseStage):
         """All stages whose artefacts enter the rows of the cell."""
         timed = (stage for stages in self.offline.values() for stage in stages)
         read = (self.assembly, self.exact, *self.assembly.model_inputs, *timed)
-        found = (*read, *self.constants, self.reference, *self.validation)
-        return tuple(dict.fromkeys(found))
+        stages = (*read, *self.constants, self.reference, *self.validation)
+        return tuple(dict.fromkeys(stages))
 
     def begin(self, store: Store) -> _Queries:
         """Load the reduced programs and the reference solutions."""
@@ -168,7 +168,7 @@ class _Queries(Items):
             output_scales(problem.outputs, trained.mu, trained.u, trained.lam),
         )
         self._zeros = zeros(problem, self._compared)
-        self._own, self._full, self._plain = (value_of(store, known) for known in stage.constants)
+        self._own, self._full, self._plain = (value_of(store, one) for one in stage.constants)
         self._stability: list[Stability] = value_of(store, stage.reference)
         self._exact: tuple[ExactSolution | None, ...] = value_of(store, stage.exact)
         self._certificate: OnlineCertificate | None = (
@@ -177,8 +177,8 @@ class _Queries(Items):
 
     def item(self, number: int, watch: Callable[[bool], None]) -> QueryRows:
         """The rows of one query."""
-        found, solution = run_query(self._stage.query(self._queries, number), self._stage.query_seconds, watch)
-        return self._known(number) | found, solution and {"query": number} | solution
+        row, solution = run_query(self._stage.query(self._queries, number), self._stage.query_seconds, watch)
+        return self._known(number) | row, solution and {"query": number} | solution
 
     def lost(self, number: int, failed: Failed) -> QueryRows:
         """The row of a query that exceeded its limit or whose process died."""
@@ -192,7 +192,7 @@ class _Queries(Items):
         rows = [row | assessed.get(k, {}) for k, (row, _) in enumerate(items)]
         own = summarise(rows) | self._sizes() | self._shares() | self._offline()
         outputs = self._outputs(rows)
-        written = [row | {"outputs": json.dumps(found) if (found := row.get("outputs")) else None} for row in rows]
+        written = [row | {"outputs": json.dumps(values) if (values := row.get("outputs")) else None} for row in rows]
         return CellRows(own, tuple(written), tuple(solutions.values()), outputs)
 
     def _outputs(self, rows: Sequence[Row]) -> tuple[Row, ...]:
@@ -243,8 +243,8 @@ class _Queries(Items):
         built = assembly.enrichment.enrichment(self._store)
         size = value_of(self._store, assembly.enrichment.pod).basis.shape[1]
         fallbacks = [*cone.cone.fallbacks, *built.fallbacks, *([self._queries.note] if self._queries.note else [])]
-        for purpose, found in (("training", self._training), ("validation", self._reference)):
-            notes = [note for note in found.fallbacks if note]
+        for purpose, solved in (("training", self._training), ("validation", self._reference)):
+            notes = [note for note in solved.fallbacks if note]
             fallbacks += [f"{len(notes)} of the {purpose} solutions: {notes[0]}"] if notes else []
         tolerance, error = assembly.interpolation, max(self._reduced.errors)
         if tolerance is not None and error > MISSED * tolerance:
@@ -288,7 +288,7 @@ class _Queries(Items):
     def _offline(self) -> Row:
         """Offline seconds as if the cell had been run alone, and the machines that measured them."""
         artefacts = {name: [self._artefact(stage) for stage in parts] for name, parts in self._stage.offline.items()}
-        spent = {name: [artefact.seconds for artefact in found] for name, found in artefacts.items()}
+        spent = {name: [artefact.seconds for artefact in read] for name, read in artefacts.items()}
         # The chunks of a parameter set have a set-up each, for the sake of parallel runs: one counts.
         setup = median_of([*self._training.setups, *self._reference.setups])
         spent["snapshots"].append(setup)
@@ -300,7 +300,7 @@ class _Queries(Items):
         row |= {"hf_setup_s": setup.cpu, "hf_s": float(np.median(marginal))}
         row |= dict(zip(("hf_low_s", "hf_high_s"), median_interval(marginal), strict=True))
         solved = [self._artefact(stage) for stage in self._stage.validation]
-        machines = {artefact.machine for found in (*artefacts.values(), solved) for artefact in found} | {machine()}
+        machines = {artefact.machine for read in (*artefacts.values(), solved) for artefact in read} | {machine()}
         return row | {"machine": "; ".join(sorted(machines))}
 
     def _artefact(self, stage: Stage) -> Artefact:
@@ -317,11 +317,11 @@ def _constants(prefix: str, constants: InfSup) -> Row:
     }
 
 
-def _energy_constants(known: Stability) -> Row:
+def _energy_constants(constants: Stability) -> Row:
     return {
-        "coercivity": known.coercivity.value,
-        "coercivity_proved": int(known.coercivity.proved),
-        "continuity": known.continuity.value,
-        "continuity_proved": int(known.continuity.proved),
-        "beta_energy": known.energy_inf_sup.value,
+        "coercivity": constants.coercivity.value,
+        "coercivity_proved": int(constants.coercivity.proved),
+        "continuity": constants.continuity.value,
+        "continuity_proved": int(constants.continuity.proved),
+        "beta_energy": constants.energy_inf_sup.value,
     }

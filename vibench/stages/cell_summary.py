@@ -38,8 +38,8 @@ def summarise(rows: Sequence[Row]) -> Row:
         return float(np.median(column(name))) if column(name).size else None
 
     def largest(name: str, among: Sequence[Row] = fine) -> float | None:
-        found = column(name, among)
-        return float(found.max()) if found.size else None
+        values = column(name, among)
+        return float(values.max()) if values.size else None
 
     def share(source: str, name: str) -> float | None:
         measured = [row for row in fine if row.get(f"{source}_error_{name}") is not None]

@@ -44,7 +44,7 @@ class BuiltEnrichment:
     fallbacks: tuple[str, ...]
 
     @classmethod
-    def of(cls, found: Enrichment, strategy: PrimalStrategy) -> BuiltEnrichment:
+    def of(cls, enrichment: Enrichment, strategy: PrimalStrategy) -> BuiltEnrichment:
         """The enrichment that a strategy has built.
 
         Raises
@@ -52,10 +52,10 @@ class BuiltEnrichment:
         NumericalError
             If it has a supply that is not a function in the module of the strategy.
         """
-        name = "" if found.supply is None else getattr(found.supply, "__name__", "")
-        if found.supply is not None and _functions(strategy).get(name) is not found.supply:
+        name = "" if enrichment.supply is None else getattr(enrichment.supply, "__name__", "")
+        if enrichment.supply is not None and _functions(strategy).get(name) is not enrichment.supply:
             raise NumericalError(f"the supply of the enrichment is not a function in {type(strategy).__module__}")
-        return cls(found.kind, found.vectors, found.eta, name, found.history, found.fallbacks)
+        return cls(enrichment.kind, enrichment.vectors, enrichment.eta, name, enrichment.history, enrichment.fallbacks)
 
     def restored(self, strategy: Callable[[], PrimalStrategy]) -> Enrichment:
         """The enrichment of a strategy; its supply is looked up where `of` found it."""
@@ -65,8 +65,8 @@ class BuiltEnrichment:
 
 def _functions(strategy: PrimalStrategy) -> dict[str, FunctionType]:
     """The functions in the module of a strategy, by name."""
-    found = vars(sys.modules[type(strategy).__module__])
-    return {name: value for name, value in found.items() if isinstance(value, FunctionType)}
+    module = vars(sys.modules[type(strategy).__module__])
+    return {name: value for name, value in module.items() if isinstance(value, FunctionType)}
 
 
 @storable
@@ -171,19 +171,19 @@ class SingleEnrichment(EnrichmentStage):
         enrichment, seconds = timed(lambda: strategy.build(offline, self.tolerance))
         with faults_of(self.primal):
             check_enrichment(enrichment, offline.problem.V, offline.basis)
-        known = dict(enrichment.history)
+        quantities = dict(enrichment.history)
         if enrichment.vectors is not None:
             projected = _projected(offline, enrichment.vectors, value_of(store, self.cone.constraints))
             size, reachable = offline.basis.shape[1], value_of(store, self.reachable)
-            known |= {"beta_span_min": projected.over_steps(size)}
-            known |= {"share_min": projected.shares_over_steps(size, reachable)}
-            known |= {"beta_span_training": projected.beta_span(), "beta_full_span_training": reachable}
-        return Result(BuiltEnrichment.of(enrichment, strategy), seconds, _histories(known))
+            quantities |= {"beta_span_min": projected.over_steps(size)}
+            quantities |= {"share_min": projected.shares_over_steps(size, reachable)}
+            quantities |= {"beta_span_training": projected.beta_span(), "beta_full_span_training": reachable}
+        return Result(BuiltEnrichment.of(enrichment, strategy), seconds, _histories(quantities))
 
     def enrichment(self, store: Store) -> Enrichment:
         """The stored value."""
-        found: BuiltEnrichment = value_of(store, self)
-        return found.restored(self.primal.create)
+        stored: BuiltEnrichment = value_of(store, self)
+        return stored.restored(self.primal.create)
 
 
 @dataclass(frozen=True)
@@ -213,18 +213,18 @@ class NestedEnrichment(EnrichmentStage):
         milestone: Milestone = growth.grown.milestone(self.tolerance)
         with faults_of(self.primal):
             check_enrichment(growth.grown.at(milestone), offline.problem.V, offline.basis)
-        known = dict(milestone.history) | {
+        quantities = dict(milestone.history) | {
             "beta_span_min": growth.steps[: milestone.count + 1],
             "share_min": growth.shares[: milestone.count + 1],
             "beta_span_training": growth.training[self.tolerance],
             "beta_full_span_training": value_of(store, self.reachable),
         }
-        return Result(milestone, milestone.seconds, _histories(known))
+        return Result(milestone, milestone.seconds, _histories(quantities))
 
     def enrichment(self, store: Store) -> Enrichment:
         """The vectors up to the milestone."""
-        found: Enrichment = value_of(store, self.growth).grown.at(value_of(store, self))
-        return found
+        stored: Enrichment = value_of(store, self.growth).grown.at(value_of(store, self))
+        return stored
 
 
 def enrichment_stage(cell: Cell) -> EnrichmentStage:
@@ -236,8 +236,8 @@ def enrichment_stage(cell: Cell) -> EnrichmentStage:
     return SingleEnrichment(pods, cone, cell.primal, cell.primal_tol)
 
 
-def _histories(known: Mapping[str, Array]) -> tuple[History, ...]:
-    return tuple(History.of("enrichment", quantity, values) for quantity, values in known.items())
+def _histories(quantities: Mapping[str, Array]) -> tuple[History, ...]:
+    return tuple(History.of("enrichment", quantity, values) for quantity, values in quantities.items())
 
 
 def _reduction(store: Store, pod: PODStage, cone: ConeStage, interpolation: float | None = None) -> Reduction:

@@ -50,8 +50,8 @@ class ReferenceConstants(Stage):
         different = mus[:1] if {"A", "B"} <= problem.constant else mus
         energies = [energy_inf_sup(vi.A, vi.B, problem.W) for vi in map(assemblies(problem).at, different)]
         energies *= len(mus) // len(different)
-        found = zip(inf_sup, quotients, energies, strict=True)
-        return Result([Stability(hf, *extremes, energy) for hf, extremes, energy in found])
+        constants = zip(inf_sup, quotients, energies, strict=True)
+        return Result([Stability(hf, *extremes, energy) for hf, extremes, energy in constants])
 
 
 @dataclass(frozen=True)

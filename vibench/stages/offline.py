@@ -45,8 +45,8 @@ class PODStage(Stage):
     def run(self, store: Store) -> Result:
         """Compute the modes; the history is the relative tail over the number of modes."""
         snapshots = gather(store, self.inputs()).u
-        found, seconds = timed(lambda: pod(snapshots, build_problem(self.problem).V, self.stop))
-        return Result(found, seconds, (History.of("pod", "error", found.errors),))
+        basis, seconds = timed(lambda: pod(snapshots, build_problem(self.problem).V, self.stop))
+        return Result(basis, seconds, (History.of("pod", "error", basis.errors),))
 
 
 @storable

@@ -47,12 +47,12 @@ class PictureStage(Stage):
 
     def run(self, store: Store) -> Result:
         """Titles and pictures, in the order of `CORNERS`; empty for a problem without pictures."""
-        problem, found = build_problem(self.problem), gather(store, self.inputs())
+        problem, solutions = build_problem(self.problem), gather(store, self.inputs())
         drawn = []
-        for k in _nearest(problem.parameters, found.mu):
-            picture = problem.picture(found.mu[k], found.u[:, k], found.lam[:, k])
+        for k in _nearest(problem.parameters, solutions.mu):
+            picture = problem.picture(solutions.mu[k], solutions.u[:, k], solutions.lam[:, k])
             if picture is not None:
-                drawn.append((_title(problem.parameters, found.mu[k]), _checked(picture)))
+                drawn.append((_title(problem.parameters, solutions.mu[k]), _checked(picture)))
         return Result(tuple(drawn))
 
     def rows(self, value: tuple[tuple[str, Picture], ...]) -> Mapping[str, Sequence[Row]]:

@@ -76,9 +76,9 @@ class Query:
 
         def solution() -> tuple[QPSolution, Seconds]:
             watch(True)
-            found = timed(lambda: solve(self.program, start=start))
+            solved = timed(lambda: solve(self.program, start=start))
             watch(False)
-            return found
+            return solved
 
         return solution
 
@@ -175,7 +175,7 @@ def error_columns(
     mus: Array,
     solutions: Sequence[tuple[Array, Array]],
     reference: ReferenceSolutions,
-    known: Sequence[Stability],
+    constants: Sequence[Stability],
     exact: Sequence[ExactSolution | None],
     projected: Sequence[ExactSolution | None] = (),
     online: OnlineCertificate | None = None,
@@ -197,13 +197,13 @@ def error_columns(
         u = model.reconstruct(mus[0], vis[0], np.column_stack([x for x, _ in solutions]))
     lam = model.generators @ np.column_stack([alpha for _, alpha in solutions])
     energies = [assemblies(problem).energy_at(mu) for mu in mus]
-    found = zip(
+    measured = zip(
         errors(problem, vis, energies, reference, u, lam),
-        error_bounds(vis, energies, known, u, lam),
-        hsw_bounds(problem, vis, known, u, lam),
+        error_bounds(vis, energies, constants, u, lam),
+        hsw_bounds(problem, vis, constants, u, lam),
         strict=True,
     )
-    rows = [_columns(*one) for one in found]
+    rows = [_columns(*one) for one in measured]
     compared = (u, lam), (reference.u, reference.lam), reference.scale_outputs
     for row, of_query in zip(rows, output_errors(problem.outputs, mus, *compared), strict=True):
         row["outputs"] = of_query
@@ -246,19 +246,19 @@ def _columns(error: Errors, bounds: ErrorBounds, hsw: HSWBounds | None) -> Row:
     row: Row = asdict(error) | {"bound_note": bounds.note}
     of_u = _measured(error.error_u, error.error_u_scaled) > UNMEASURABLE
     of_lam = _measured(error.error_lambda, error.error_lambda_scaled) > UNMEASURABLE
-    found: dict[str, tuple[float, bool, float]] = {}  # a bound, the error, and whether that is measurable
+    checked: dict[str, tuple[float, bool, float]] = {}  # a bound, the error, and whether that is measurable
     if np.isfinite(bounds.u_energy):
         row |= {f"bound_{name}": getattr(bounds, name) for name in ("rho", "rho_range", "omega", "kappa")}
-        found |= {
+        checked |= {
             "u_energy": (bounds.u_energy, of_u, error.error_u_energy_absolute),
             "u": (bounds.u, of_u, error.error_u_absolute),
             "lambda_natural": (bounds.lambda_natural, of_lam, error.error_lambda_natural_absolute),
             "lambda": (bounds.lam, of_lam, error.error_lambda_absolute),
         }
     if hsw is not None:
-        found["hsw_u"] = hsw.u, of_u, error.error_u_absolute
-        found["hsw_lambda"] = hsw.lam, of_lam, error.error_lambda_absolute
-    for name, (bound, measurable, absolute) in found.items():
+        checked["hsw_u"] = hsw.u, of_u, error.error_u_absolute
+        checked["hsw_lambda"] = hsw.lam, of_lam, error.error_lambda_absolute
+    for name, (bound, measurable, absolute) in checked.items():
         row[f"bound_{name}"] = bound
         if measurable:
             row[f"effectivity_{name}"] = ratio(bound, absolute)

@@ -18,6 +18,7 @@ from vibench.interfaces.problem import Problem, VariationalInequality
 from vibench.interfaces.validation import Fingerprint, checked_assembly, reference_assembly
 from vibench.linalg.inner_product import InnerProduct
 from vibench.model.growing import GrowingTrainer
+from vibench.offline.sweep import Snapshots
 from vibench.qp.repeats import nearby
 from vibench.stages.base import Result, Stage, build_problem, faults_of, value_of
 from vibench.storage.artefacts import History, Store
@@ -39,35 +40,19 @@ storable(Fingerprint)
 
 @storable
 @dataclass(frozen=True)
-class Snapshots:
-    """High-fidelity solutions at some parameters.
+class TimedSnapshots(Snapshots):
+    """High-fidelity solutions at some parameters, and what they took."""
 
-    Attributes
-    ----------
-    mu
-        Parameters (P×d).
-    u, lam
-        Columns u(mu) (n×P) and λ(mu) (m×P).
-    seconds
-        Seconds per solution, assembly included and set-up excluded: the median of repeats at validation parameters.
-    setups
-        Seconds of the set-up, once per chunk: what the first solution took beyond its repetition from the same start.
-    fallbacks
-        Fallbacks of the active set method per solution, "" where it needed none.
-    fingerprint
-        Of the problem at the first training parameter, as the process of the chunk assembled it.
-    selecting
-        Seconds of the choice of the parameters, none unless the training is adaptive.
-    """
-
-    mu: Array
-    u: Array
-    lam: Array
     seconds: tuple[Seconds, ...]
+    """Seconds per solution, assembly included and set-up excluded: the median of repeats at validation parameters."""
     setups: tuple[Seconds, ...]
+    """Seconds of the set-up, once per chunk: what the first solution took beyond its repetition from the same start."""
     fallbacks: tuple[str, ...]
+    """Fallbacks of the active set method per solution, "" where it needed none."""
     fingerprint: Fingerprint
+    """Fingerprint of the problem at the first training parameter, as the process of the chunk assembled it."""
     selecting: Seconds = NO_TIME
+    """Seconds of the choice of the parameters, none unless the training is adaptive."""
 
 
 @dataclass(frozen=True)
@@ -138,7 +123,7 @@ class SnapshotStage(Stage):
             fallbacks.append(solution.fallback)
         reference.refuse_rewritten_constants()
         refuse_shifted()
-        found = Snapshots(mus, u, lam, tuple(seconds), tuple(setups), tuple(fallbacks), reference.fingerprint)
+        found = TimedSnapshots(mus, u, lam, tuple(seconds), tuple(setups), tuple(fallbacks), reference.fingerprint)
         return Result(found, sum(seconds, NO_TIME), self._diagnostics(problem, mus, first))
 
     def _measure(self, work: Callable[[Array], T], mus: Iterator[Array]) -> tuple[T, Seconds]:
@@ -154,18 +139,20 @@ class SnapshotStage(Stage):
         return int(edges[self.chunk]), everything[edges[self.chunk] : edges[self.chunk + 1]]
 
     def _diagnostics(self, problem: Problem, mus: Array, first: int) -> tuple[History, ...]:
-        found: dict[str, list[float]] = {}
+        by_quantity: dict[str, list[float]] = {}
         for mu in mus:
             for quantity, value in problem.diagnostics(mu).items():
-                found.setdefault(quantity, []).append(float(value))
-        return tuple(History.of(self.parameters.role, quantity, values, first) for quantity, values in found.items())
+                by_quantity.setdefault(quantity, []).append(float(value))
+        return tuple(
+            History.of(self.parameters.role, quantity, values, first) for quantity, values in by_quantity.items()
+        )
 
 
 @dataclass(frozen=True)
 class AdaptiveTraining(Stage):
     """Training parameters chosen one after the other by a sampling strategy, with their high-fidelity solutions.
 
-    The value is a `Snapshots`; the seconds of the stage have those of the choice, which is made of error bounds.
+    The value is a `TimedSnapshots`; the seconds of the stage have those of the choice, which is made of error bounds.
     """
 
     label = "adaptive training"
@@ -193,7 +180,7 @@ class AdaptiveTraining(Stage):
         seconds, mus = tuple(one.seconds for one in solved), np.array([one.mu for one in solved])
         u, lam = (np.column_stack([getattr(one.solution, name) for one in solved]) for name in ("u", "lam"))
         fallbacks, setups = tuple(one.fallback for one in solved), (trainer.setup,)
-        found = Snapshots(mus, u, lam, seconds, setups, fallbacks, reference.fingerprint, trainer.selecting)
+        swept = TimedSnapshots(mus, u, lam, seconds, setups, fallbacks, reference.fingerprint, trainer.selecting)
         histories = (
             History.of("selection", "bound", [one.bound for one in solved]),
             History.of("selection", "bounds evaluated", [one.evaluated for one in solved]),
@@ -202,7 +189,7 @@ class AdaptiveTraining(Stage):
                 for name, column in zip(problem.parameters.names, mus.T, strict=True)
             ),
         )
-        return Result(found, sum(seconds, trainer.selecting), histories)
+        return Result(swept, sum(seconds, trainer.selecting), histories)
 
 
 def solution_stages(problem: Plugin, parameters: ParameterSet) -> tuple[Stage, ...]:
@@ -230,7 +217,7 @@ def fingerprint_here(problem: Plugin) -> Fingerprint:
     return reference_assembly(build_problem(problem)).fingerprint
 
 
-def gather(store: Store, chunks: tuple[Stage, ...]) -> Snapshots:
+def gather(store: Store, chunks: tuple[Stage, ...]) -> TimedSnapshots:
     """The snapshots of all chunks.
 
     Raises
@@ -247,7 +234,7 @@ def gather(store: Store, chunks: tuple[Stage, ...]) -> Snapshots:
                 f"two assemblies at one parameter are not the same, as in another process: {deviation}; look for "
                 "unseeded random numbers, the order of sets, and what is kept between calls"
             )
-    return Snapshots(
+    return TimedSnapshots(
         np.concatenate([part.mu for part in parts]),
         np.hstack([part.u for part in parts]),
         np.hstack([part.lam for part in parts]),

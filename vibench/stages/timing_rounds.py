@@ -75,7 +75,7 @@ class TimingRounds(ItemwiseStage):
 
     cells: tuple[CellQueries, ...]
     queries: tuple[tuple[int, ...], ...]
-    """Per cell, the queries that are ok."""
+    """The queries of every cell that are ok."""
     rounds: int
 
     @property
@@ -195,16 +195,16 @@ class _Rounds(Items):
 
     def finish(self, items: Sequence[TimedRound | Failed]) -> tuple[TimedCell, ...]:
         """The rounds of every cell, in their order."""
-        found: list[list[TimedRound]] = [[] for _ in self._stage.cells]
+        rounds: list[list[TimedRound]] = [[] for _ in self._stage.cells]
         lost: list[list[Failed]] = [[] for _ in self._stage.cells]
         for number, outcome in enumerate(items):
             cell = self._stage.place(number)[1]
             if isinstance(outcome, Failed):
                 lost[cell].append(outcome)
             else:
-                found[cell].append(outcome)
+                rounds[cell].append(outcome)
         reasons = [f"{len(gone)} of {self._stage.rounds} rounds: {gone[0].reason}" if gone else "" for gone in lost]
-        return tuple(TimedCell(tuple(f), machine(), reason) for f, reason in zip(found, reasons, strict=True))
+        return tuple(TimedCell(tuple(f), machine(), reason) for f, reason in zip(rounds, reasons, strict=True))
 
 
 def round_rows(rounds: Sequence[TimedRound]) -> list[Row]:

@@ -17,7 +17,7 @@ from cachetools import LRUCache
 from vibench.errors import RequestError, StorageError
 from vibench.files import PART, TEMPORARY, locked, write_atomically
 from vibench.provenance import machine
-from vibench.storage.serialisation import DamagedError, dumps, loads, storable
+from vibench.storage.serialisation import DamagedArtefactError, dumps, loads, storable
 from vibench.text import one_line
 from vibench.timing import Seconds
 
@@ -81,17 +81,17 @@ class Artefact:
 
         Raises
         ------
-        DamagedError
+        DamagedArtefactError
             If the content is anything else.
         """
-        found = loads(content)
-        if not isinstance(found, cls):
-            raise DamagedError("no artefact")
-        seconds, histories = found.seconds, found.histories
-        right = isinstance(seconds, Seconds) and isinstance(histories, tuple) and isinstance(found.machine, str)
+        artefact = loads(content)
+        if not isinstance(artefact, cls):
+            raise DamagedArtefactError("no artefact")
+        seconds, histories = artefact.seconds, artefact.histories
+        right = isinstance(seconds, Seconds) and isinstance(histories, tuple) and isinstance(artefact.machine, str)
         if not right or not all(isinstance(history, History) for history in histories):
-            raise DamagedError("an artefact with members of other types")
-        return found
+            raise DamagedArtefactError("an artefact with members of other types")
+        return artefact
 
 
 def default_folder() -> Path:
@@ -122,7 +122,7 @@ class Store:
             if digest != _digest(key, content):
                 return None  # truncated, corrupted or renamed
             artefact = Artefact.read(content)
-        except (FileNotFoundError, DamagedError):
+        except (FileNotFoundError, DamagedArtefactError):
             return None
         except OSError as error:
             raise StorageError(f"artefacts cannot be read from '{self.folder}': {error.strerror}") from None
@@ -161,12 +161,12 @@ class Store:
 
     def contents(self) -> list[tuple[str, int, float]]:
         """The stored artefacts: label of the stage, bytes, and age in seconds."""
-        found = []
+        listed = []
         for path in sorted(self.folder.glob(f"*{SUFFIX}")):
             with contextlib.suppress(FileNotFoundError):
                 status = path.stat()
-                found.append((path.name.rpartition("-")[0], status.st_size, time.time() - status.st_mtime))
-        return found
+                listed.append((path.name.rpartition("-")[0], status.st_size, time.time() - status.st_mtime))
+        return listed
 
     def clear(self, older_than: float = 0.0) -> int:
         """Remove artefacts older than so many seconds, and temporary files of killed runs; returns the bytes freed.

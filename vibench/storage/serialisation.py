@@ -41,7 +41,7 @@ _classes: dict[str, type] = {}
 ClassT = TypeVar("ClassT", bound=type)
 
 
-class DamagedError(VibenchError):
+class DamagedArtefactError(VibenchError):
     """Bytes that `dumps` did not write."""
 
 
@@ -74,7 +74,7 @@ def loads(content: bytes) -> Any:
 
     Raises
     ------
-    DamagedError
+    DamagedArtefactError
         If the content is anything else. It imports and runs nothing that the content names.
     """
     try:
@@ -92,7 +92,7 @@ def loads(content: bytes) -> Any:
         MemoryError,
         VibenchError,  # a factorisation that is computed again
     ) as error:
-        raise DamagedError(one_line(str(error))) from None
+        raise DamagedArtefactError(one_line(str(error))) from None
 
 
 class _Writer:
@@ -190,13 +190,13 @@ class _Reader:
             raise ValueError("no format of a sparse matrix")
         make = getattr(sp, f"{kind}_{'array' if array else 'matrix'}")
         given = (arrays[2], (arrays[0], arrays[1])) if kind == "coo" else tuple(arrays)
-        found = make(given, shape=tuple(shape))
+        matrix = make(given, shape=tuple(shape))
         if kind in ("csr", "csc", "bsr"):
             if not arrays[1].dtype.kind == arrays[2].dtype.kind == "i":
                 raise ValueError("indices that are no integers")
-            found.check_format(full_check=True)  # compiled loops trust the indices
-            found.indices, found.indptr = arrays[1], arrays[2]  # as they were: the constructor may have copied them
-        return found if wanted == kind else found.asformat(wanted)
+            matrix.check_format(full_check=True)  # compiled loops trust the indices
+            matrix.indices, matrix.indptr = arrays[1], arrays[2]  # as they were: the constructor may have copied them
+        return matrix if wanted == kind else matrix.asformat(wanted)
 
     def _object(self, name: str, described: dict[str, Any]) -> Any:
         kind = make = _class(name, object)
@@ -205,18 +205,18 @@ class _Reader:
             if state.keys() != {field.name for field in fields(kind)}:
                 raise TypeError(f"other fields than those of {name}")
             return make(**state)
-        found = object.__new__(kind)
-        set_state = getattr(found, "__setstate__", found.__dict__.update)
+        made = object.__new__(kind)
+        set_state = getattr(made, "__setstate__", made.__dict__.update)
         set_state(state)
-        return found
+        return made
 
 
 def _class(name: str, base: type) -> Any:
     """The class of a name, from the closed list."""
-    found = _classes[name]
-    if issubclass(found, Enum) is not (base is Enum):
+    named = _classes[name]
+    if issubclass(named, Enum) is not (base is Enum):
         raise TypeError(f"{name} is another sort of class")
-    return found
+    return named
 
 
 def _is_cached(kind: type, name: str) -> bool:
@@ -225,10 +225,10 @@ def _is_cached(kind: type, name: str) -> bool:
 
 def _no_duplicates(pairs: Iterable[tuple[str, Any]]) -> dict[str, Any]:
     pairs = list(pairs)
-    found = dict(pairs)
-    if len(found) != len(pairs):
+    unique = dict(pairs)
+    if len(unique) != len(pairs):
         raise ValueError("a name that occurs twice")
-    return found
+    return unique
 
 
 def _refuse(constant: str) -> None:

@@ -52,4 +52,4 @@ class PluginKind(StrEnum):
 PROBLEM, SAMPLING, PRIMAL, DUAL, FIGURE, STUDY, SOLVER = PluginKind
 
 CHECKED = {kind.cli_name: kind for kind in PluginKind if kind.cli_name}
-"""Those whose plugins `vibench check` examines and `vibench new` writes, by their names on the command line."""
+"""The kinds whose plugins `vibench check` examines and `vibench new` writes, by their names on the command line."""

@@ -87,14 +87,7 @@ def _combinations(
 def study_of_cell(cell: Cell, name: str, **settings: Any) -> Study:
     """The study that has one cell, whose key is that of the cell given.
 
-    Parameters
-    ----------
-    cell
-        The cell.
-    name
-        Name of the study.
-    settings
-        Settings of the study that do not determine its numbers: `timing_rounds`, `limits`.
+    Other settings are those that do not determine its numbers: `timing_rounds`, `limits`.
 
     Raises
     ------

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pandas as pd
 
 from vibench.report.comparison.compare import Comparison
-from vibench.report.comparison.differences import MOVED, Verdict
+from vibench.report.comparison.differences import MOVED, ChangeKind
 from vibench.results.formats import cell_text
 from vibench.terminal.console import print_frame
 from vibench.terminal.output import echo
@@ -69,8 +69,8 @@ def _pair_columns(compared: Comparison) -> list[str]:
 
 
 def _with_counts(by_column: pd.DataFrame) -> pd.DataFrame:
-    """Without columns of verdicts that no cell has."""
-    return by_column.drop(columns=[verdict.value for verdict in Verdict if not by_column[verdict.value].any()])
+    """A table without the columns of verdicts that no cell has."""
+    return by_column.drop(columns=[verdict.value for verdict in ChangeKind if not by_column[verdict.value].any()])
 
 
 def _by_weight(changes: pd.DataFrame) -> pd.DataFrame:

@@ -23,17 +23,7 @@ Rows = Sequence[Mapping[str, Any]]
 
 
 def print_summary(study: str, path: Path, rows: Rows) -> None:
-    """Print the summary of a run, why cells are not ok, and violated invariants.
-
-    Parameters
-    ----------
-    study
-        Its name.
-    path
-        Its results file.
-    rows
-        The cells of its matrix.
-    """
+    """Print the summary of a run, why cells are not ok, and violated invariants."""
     cells, queries = tables.read(path, "cells"), tables.read(path, "queries")
     table = views.look_up(path, "summary" if len(cells) <= WHOLE else "best")
     if len(table.rows):

@@ -13,7 +13,8 @@ from vibench.arrays import Array, SparseMatrix
 from vibench.interfaces.problem import ParameterBox, Problem, VariationalInequality
 from vibench.interfaces.strategies import Cone, DualStrategy, Offline, Stop
 from vibench.linalg.inner_product import InnerProduct
-from vibench.offline.reduction import Reduction, Snapshots, high_fidelity_sweep
+from vibench.offline.reduction import Reduction
+from vibench.offline.sweep import Snapshots, high_fidelity_sweep
 from vibench.reduction.cones import greedy_cone
 from vibench.testing.comparisons import Arrays
 

@@ -38,7 +38,7 @@ ROUND_OFF = 1e-9
 """Relative violation of an inequality that counts as round-off."""
 
 
-class Verdict(StrEnum):
+class Agreement(StrEnum):
     """Outcome of a comparison."""
 
     AGREES = "agrees"
@@ -68,7 +68,7 @@ class Claim:
     statement: str
     paper: str
     ours: str
-    verdict: Verdict
+    verdict: Agreement
     why: str = ""
 
     @property
@@ -103,7 +103,7 @@ def holds(
 
 def unknown(place: str, statement: str, paper: object, ours: object, why: str) -> Claim:
     """A claim for which one of the two sides is missing, or means something else."""
-    return Claim(place, statement, text(paper), text(ours), Verdict.OPEN, why)
+    return Claim(place, statement, text(paper), text(ours), Agreement.OPEN, why)
 
 
 def ordered(
@@ -122,14 +122,14 @@ def ordered(
     return holds(place, statement, ours, not bad, paper="for all r", why=why, cause=cause)
 
 
-def judged(condition: Any) -> Verdict:
+def judged(condition: Any) -> Agreement:
     """The verdict of a predicate, open where it is `None`."""
-    return Verdict.OPEN if condition is None else Verdict.AGREES if condition else Verdict.DIFFERS
+    return Agreement.OPEN if condition is None else Agreement.AGREES if condition else Agreement.DIFFERS
 
 
-def reason(verdict: Verdict, why: str, cause: str) -> str:
+def reason(verdict: Agreement, why: str, cause: str) -> str:
     """The remark, and the cause where they do not agree."""
-    return why if verdict is Verdict.AGREES else " ".join(part for part in (why, cause) if part)
+    return why if verdict is Agreement.AGREES else " ".join(part for part in (why, cause) if part)
 
 
 def close(paper: float | Sequence[float], ours: float | Sequence[float], within: float = 0.0) -> bool:
@@ -154,19 +154,19 @@ def exceptions(smaller: Mapping[int, float], larger: Mapping[int, float]) -> lis
     return [k for k in smaller if k in larger and smaller[k] > larger[k] * (1.0 + ROUND_OFF)]
 
 
-def break_even_verdict(paper: float, meaning: str, low: float | None, high: float | None) -> Verdict:
+def break_even_verdict(paper: float, meaning: str, low: float | None, high: float | None) -> Agreement:
     """Whether a published break-even lies in a measured interval; "from" is the only meaning that the paper knows.
 
     Open where the break-even is undecided, or where the interval contains the number and is too wide to confirm it.
     """
     if meaning == "undecided":
-        return Verdict.OPEN
+        return Agreement.OPEN
     if meaning != "from" or low is None or high is None or not low <= paper <= high:
-        return Verdict.DIFFERS
-    return Verdict.AGREES if high <= WIDEST * low else Verdict.OPEN
+        return Agreement.DIFFERS
+    return Agreement.AGREES if high <= WIDEST * low else Agreement.OPEN
 
 
-def cheaper_from(meanings: Iterable[str]) -> Verdict:
+def cheaper_from(meanings: Iterable[str]) -> Agreement:
     """Whether several break-evens all read "from"; open where none contradicts it but some are undecided."""
     different = set(meanings) - {"from"}
     return judged(False if different - {"undecided"} else None if different else True)
@@ -223,7 +223,7 @@ def published(claims: Iterable[Claim]) -> str:
 
 def compared(claims: Iterable[Claim]) -> str:
     """What agrees with the paper, what differs from it and what cannot be compared, as sentences."""
-    by_verdict: dict[Verdict, list[str]] = {verdict: [] for verdict in Verdict}
+    by_verdict: dict[Agreement, list[str]] = {verdict: [] for verdict in Agreement}
     for claim in claims:
         by_verdict[claim.verdict].append(f"{claim.statement}: {claim.ours}")
     said = (f"{verdict.capitalize()}: {'; '.join(texts)}." for verdict, texts in by_verdict.items() if texts)

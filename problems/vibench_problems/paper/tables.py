@@ -11,8 +11,8 @@ from vibench import break_even
 from vibench_problems.paper.claims import (
     DIMENSION,
     RATIO,
+    Agreement,
     Claim,
-    Verdict,
     break_even_text,
     break_even_verdict,
     cheaper_from,
@@ -49,7 +49,7 @@ COSTS = {
 
 
 @dataclass(frozen=True)
-class Column:
+class PaperColumn:
     """One column of a table: the paper's numbers, our cells, and the break-even between them.
 
     Attributes
@@ -79,14 +79,14 @@ class Column:
         return float(self.on["online_s"] - self.off["online_s"])
 
 
-def columns(evidence: Evidence) -> list[Column]:
+def columns(evidence: Evidence) -> list[PaperColumn]:
     """The columns of the table of the problem that the run has."""
     thresholds = evidence.tables.thresholds
     result = []
     for pair in evidence.pairs:
         on, off = evidence.cell(pair, "per-parameter"), evidence.cell(pair, "fixed", evidence.paper.tight)
         between = (thresholds["cell_a"] == on["cell"]) & (thresholds["cell_b"] == off["cell"])
-        result.append(Column(pair, on, off, thresholds[between].iloc[0]))
+        result.append(PaperColumn(pair, on, off, thresholds[between].iloc[0]))
     return result
 
 
@@ -120,7 +120,7 @@ def _interleaved(pair: Pair) -> tuple[float, float, float, float]:
     return offline_on, online_on, offline_off, online_off
 
 
-def column_claims(problem: str, column: Column, place: str) -> Iterator[Claim]:
+def column_claims(problem: str, column: PaperColumn, place: str) -> Iterator[Claim]:
     """One column, row by row."""
     pair, on, off = column.pair, column.on, column.off
     prescribed = (
@@ -140,7 +140,7 @@ def column_claims(problem: str, column: Column, place: str) -> Iterator[Claim]:
     yield threshold(column, place, COSTS[problem]["offline"])
 
 
-def offline_ratio(column: Column, place: str, cause: str) -> Claim:
+def offline_ratio(column: PaperColumn, place: str, cause: str) -> Claim:
     """Offline time with PGA over that without."""
     (on, off), enrichment = column.pair.offline, column.off["offline_enrichment_s"]
     queries, in_the_paper = enrichment / column.on["online_s"], (off - on) / column.pair.online[0]
@@ -156,7 +156,7 @@ def offline_ratio(column: Column, place: str, cause: str) -> Claim:
     )
 
 
-def online_ratio(column: Column, place: str, cause: str) -> Claim:
+def online_ratio(column: PaperColumn, place: str, cause: str) -> Claim:
     """Time of a query with online supremizers over that with the space of PGA."""
     cells = (column.on, column.off)
     assembly = [f"{1e3 * cell['online_assemble_s']:.3g} of {1e3 * cell['online_s']:.3g} ms" for cell in cells]
@@ -172,7 +172,7 @@ def online_ratio(column: Column, place: str, cause: str) -> Claim:
     )
 
 
-def threshold(column: Column, place: str, cause: str) -> Claim:
+def threshold(column: PaperColumn, place: str, cause: str) -> Claim:
     """The benefit threshold; ours carries a 95 % interval."""
     row, pair = column.break_even, column.pair
     interval = (row["meaning"], row["threshold_low"], row["threshold_high"])
@@ -186,7 +186,7 @@ def threshold(column: Column, place: str, cause: str) -> Claim:
         "undecided": "The sign of the saving is not significant at 95 %.",
         "never": "Queries off are slower, see the row above.",
     }
-    wide = row["meaning"] == "from" and verdict is Verdict.OPEN
+    wide = row["meaning"] == "from" and verdict is Agreement.OPEN
     cause = "The interval is too wide to decide." if wide else causes.get(row["meaning"], cause)
     ours = break_even_text(row["benefit_threshold"], *interval)
     return Claim(place, "benefit threshold", f"from {pair.threshold}", ours, verdict, reason(verdict, why, cause))
@@ -209,7 +209,7 @@ def transcribed(seconds: Mapping[str, float], pair: Pair, place: str) -> Claim:
     )
 
 
-def sentences(measured: Sequence[Column], place: str) -> Iterator[Claim]:
+def sentences(measured: Sequence[PaperColumn], place: str) -> Iterator[Claim]:
     """What the text concludes from the table."""
     offline = [float(column.off["offline_s"] / column.on["offline_s"]) for column in measured]
     yield number(
@@ -239,7 +239,7 @@ def sentences(measured: Sequence[Column], place: str) -> Iterator[Claim]:
     )
 
 
-def larger_cone(measured: Sequence[Column], place: str) -> Claim:
+def larger_cone(measured: Sequence[PaperColumn], place: str) -> Claim:
     """The advantage of the offline enrichment grows with R: in savings per query."""
     largest = max(measured, key=lambda column: column.pair.size[1])
     others = [column for column in measured if column is not largest]
@@ -258,7 +258,7 @@ def larger_cone(measured: Sequence[Column], place: str) -> Claim:
     )
 
 
-def explanations(measured: Sequence[Column], place: str) -> Iterator[Claim]:
+def explanations(measured: Sequence[PaperColumn], place: str) -> Iterator[Claim]:
     """Why queries with online supremizers take longer, as the text has it for the obstacle."""
     on, off = zip(*(column.dimensions for column in measured), strict=True)
     yield holds(

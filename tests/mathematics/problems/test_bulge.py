@@ -14,7 +14,8 @@ from skfem.helpers import dot, grad
 from vibench.highfidelity.active_set import HighFidelitySolver
 from vibench.interfaces.strategies import Stop
 from vibench.model.affine import Evaluation, affine_decomposition
-from vibench.offline.reduction import Reduction, high_fidelity_sweep
+from vibench.offline.reduction import Reduction
+from vibench.offline.sweep import high_fidelity_sweep
 from vibench.reduction.supremizers import constraint_classes, supremizers
 from vibench_problems.disc_mesh import aspect_ratios
 from vibench_problems.obstacle import RADIUS, Obstacle

@@ -19,7 +19,7 @@ from vibench_problems.hertz import Hertz
 from vibench_problems.line_contact import theory
 from vibench_problems.obstacle import RADIUS, Obstacle
 from vibench_problems.paper import published
-from vibench_problems.paper.claims import Claim, Verdict, compared, exceptions, holds, typeset
+from vibench_problems.paper.claims import Agreement, Claim, compared, exceptions, holds, typeset
 from vibench_problems.paper.evidence import Evidence, reached
 from vibench_problems.paper.figures import PaperFigures
 from vibench_problems.paper.sections import figure_claims, sections
@@ -157,7 +157,7 @@ def test_figures_and_the_page_of_claims_have_the_same_verdicts(problem: str, cha
         (number,) = re.findall(r"Fig\. (\d+)", claim.place)
         before, found, after = said[f"figure-{number}"].partition(f"{typeset(f'{claim.statement}: {claim.ours}')}")
         assert found, claim.name
-        groups = re.findall("|".join(verdict.capitalize() for verdict in Verdict), before)
+        groups = re.findall("|".join(verdict.capitalize() for verdict in Agreement), before)
         assert groups[-1].lower() == claim.verdict.value
         assert after[0] in ";."
 

@@ -13,7 +13,7 @@ from running import DECIDED, Changed, Main, refused
 from vibench.cli.result_commands import diff_runs
 from vibench.errors import RequestError
 from vibench.report.comparison.compare import compare
-from vibench.report.comparison.differences import Verdict
+from vibench.report.comparison.differences import ChangeKind
 from vibench.report.comparison.runs import run_names
 from vibench.results.sqlite.reading import FILE
 
@@ -43,22 +43,26 @@ def steady(changed: Changed, tmp_path: Path) -> Path:
 @pytest.mark.parametrize(
     ("statement", "what", "verdict"),
     [
-        (f"UPDATE cells SET queries_ok = queries_ok - 1 WHERE {ONE}", "queries_ok", Verdict.WORSE),
-        (f"UPDATE cells SET error_lambda_mean = 2 * error_lambda_mean WHERE {ONE}", "error_lambda_mean", Verdict.WORSE),
-        (f"UPDATE cells SET error_u_max = 0.5 * error_u_max WHERE {ONE}", "error_u_max", Verdict.BETTER),
-        (f"UPDATE cells SET beta_span_min = 0.5 * beta_span_min WHERE {ONE}", "beta_span_min", Verdict.WORSE),
-        (f"UPDATE cells SET online_s = 2 * online_s WHERE {ONE}", "online_s", Verdict.WORSE),
-        (f"UPDATE cells SET offline_s = 0.5 * offline_s WHERE {ONE}", "offline_s", Verdict.BETTER),
-        (f"UPDATE cells SET enrichment = 2 * enrichment WHERE {ONE}", "enrichment", Verdict.WORSE),
-        (f"UPDATE cells SET enrichment = enrichment + 1 WHERE {ONE}", "enrichment", Verdict.CHANGED),
-        (f"UPDATE cells SET error_u_mean = NULL WHERE {ONE}", "error_u_mean", Verdict.WORSE),
-        (f"UPDATE cells SET beta_span_min = NULL WHERE {ONE}", "beta_span_min", Verdict.WORSE),
-        (f"UPDATE cells SET status = 'crashed' WHERE {ONE}", "status", Verdict.WORSE),
-        (f"DELETE FROM cells WHERE {ONE}", "cell", Verdict.WORSE),
+        (f"UPDATE cells SET queries_ok = queries_ok - 1 WHERE {ONE}", "queries_ok", ChangeKind.WORSE),
+        (
+            f"UPDATE cells SET error_lambda_mean = 2 * error_lambda_mean WHERE {ONE}",
+            "error_lambda_mean",
+            ChangeKind.WORSE,
+        ),
+        (f"UPDATE cells SET error_u_max = 0.5 * error_u_max WHERE {ONE}", "error_u_max", ChangeKind.BETTER),
+        (f"UPDATE cells SET beta_span_min = 0.5 * beta_span_min WHERE {ONE}", "beta_span_min", ChangeKind.WORSE),
+        (f"UPDATE cells SET online_s = 2 * online_s WHERE {ONE}", "online_s", ChangeKind.WORSE),
+        (f"UPDATE cells SET offline_s = 0.5 * offline_s WHERE {ONE}", "offline_s", ChangeKind.BETTER),
+        (f"UPDATE cells SET enrichment = 2 * enrichment WHERE {ONE}", "enrichment", ChangeKind.WORSE),
+        (f"UPDATE cells SET enrichment = enrichment + 1 WHERE {ONE}", "enrichment", ChangeKind.CHANGED),
+        (f"UPDATE cells SET error_u_mean = NULL WHERE {ONE}", "error_u_mean", ChangeKind.WORSE),
+        (f"UPDATE cells SET beta_span_min = NULL WHERE {ONE}", "beta_span_min", ChangeKind.WORSE),
+        (f"UPDATE cells SET status = 'crashed' WHERE {ONE}", "status", ChangeKind.WORSE),
+        (f"DELETE FROM cells WHERE {ONE}", "cell", ChangeKind.WORSE),
     ],
 )
 def test_a_change_of_one_cell_is_told_with_its_meaning(
-    statement: str, what: str, verdict: Verdict, changed: Changed, steady: Path
+    statement: str, what: str, verdict: ChangeKind, changed: Changed, steady: Path
 ) -> None:
     found = compare([steady, changed(statement, *STEADY)], 1.25)
     (row,) = found.changes.to_dict("records")
@@ -98,7 +102,7 @@ def test_an_error_that_moves_by_no_more_than_the_solvers_contributed_has_not_cha
     changed: Changed, tmp_path: Path
 ) -> None:
     before = changed("UPDATE cells SET error_u_mean = 1e-6, solver_error_u_max = 2e-6").rename(tmp_path / "a.sqlite")
-    for moved, verdict in ((4.9e-6, Verdict.WITHIN_ACCURACY), (5.1e-6, Verdict.WORSE)):
+    for moved, verdict in ((4.9e-6, ChangeKind.WITHIN_ACCURACY), (5.1e-6, ChangeKind.WORSE)):
         after = changed(f"UPDATE cells SET error_u_mean = {moved}, solver_error_u_max = 2e-6")
         columns = compare([before, after], 1.25).by_column.set_index("what")
         assert columns.loc["error_u_mean", verdict.value] == 36
@@ -113,14 +117,14 @@ def test_seconds_have_not_changed_where_the_rounds_do_not_tell(changed: Changed,
     before = changed(noisy).rename(tmp_path / "a.sqlite")
     after = changed("UPDATE cells SET online_s = 1.5 * online_s", noisy)
     columns = compare([before, after], 1.25).by_column.set_index("what")
-    assert columns.loc["online_s", Verdict.UNDECIDED.value] == 36
+    assert columns.loc["online_s", ChangeKind.UNDECIDED.value] == 36
     assert columns.loc["online_s", "ratio"] == pytest.approx(1.5)
     disturbed = changed("UPDATE cells SET online_s = 9 * online_s", *STEADY, "UPDATE cells SET disturbed = 1")
     columns = compare([before, disturbed], 1.25).by_column.set_index("what")
-    assert columns.loc["online_s", Verdict.UNDECIDED.value] == 36
+    assert columns.loc["online_s", ChangeKind.UNDECIDED.value] == 36
     few = changed("UPDATE cells SET online_s = 9 * online_s", "DELETE FROM timings WHERE round >= 5", *STEADY)
     columns = compare([before, few], 1.25).by_column.set_index("what")
-    assert columns.loc["online_s", Verdict.UNDECIDED.value] == 36
+    assert columns.loc["online_s", ChangeKind.UNDECIDED.value] == 36
 
 
 def test_a_ratio_of_seconds_has_the_interval_of_resampled_rounds(changed: Changed, tmp_path: Path) -> None:
@@ -210,7 +214,7 @@ def test_columns_without_any_value_are_no_obstacle(changed: Changed, quick_run: 
 def test_a_new_cell_is_no_regression(changed: Changed, quick_run: Path) -> None:
     found = compare([changed(f"DELETE FROM cells WHERE {ONE}"), quick_run / FILE], 1.25)
     (row,) = found.changes.to_dict("records")
-    assert (row["after"], row["verdict"]) == ("new", Verdict.CHANGED.value)
+    assert (row["after"], row["verdict"]) == ("new", ChangeKind.CHANGED.value)
 
 
 def test_the_command_ends_with_one_where_something_got_worse(

@@ -24,7 +24,7 @@ from vibench.linalg.cholesky import SparseCholesky
 from vibench.linalg.inner_product import InnerProduct
 from vibench.reduction.supremizers import ContactCoordinates
 from vibench.stages import assembly  # noqa: F401  lists what operators consist of
-from vibench.storage.serialisation import STRUCTURE, DamagedError, dumps, loads, storable
+from vibench.storage.serialisation import STRUCTURE, DamagedArtefactError, dumps, loads, storable
 from vibench.timing import Seconds
 
 
@@ -229,7 +229,7 @@ DAMAGED = {
 
 @pytest.mark.parametrize("content", DAMAGED.values(), ids=DAMAGED)
 def test_what_a_stranger_writes_is_damaged_and_no_more(content: bytes) -> None:
-    with pytest.raises(DamagedError):
+    with pytest.raises(DamagedArtefactError):
         loads(content)
 
 
@@ -240,7 +240,7 @@ def test_no_bit_makes_another_error(data: st.DataObject) -> None:
     value = {"sample": Sample(1, (0.5,)), "time": Seconds(1.0, 2.0), "arrays": [np.arange(5), matrix]}
     content = bytearray(dumps(value))
     content[data.draw(st.integers(0, len(content) - 1))] ^= 1 << data.draw(st.integers(0, 7))
-    with contextlib.suppress(DamagedError):
+    with contextlib.suppress(DamagedArtefactError):
         loads(bytes(content))
 
 

@@ -18,8 +18,8 @@ from vibench.report.comparison.differences import (
     MOVED,
     UNKNOWN,
     WHATS,
+    ChangeKind,
     Difference,
-    Verdict,
     of_numbers,
     of_plugins,
     of_seconds,
@@ -37,7 +37,7 @@ COLUMNS = [
 """Columns of the changes."""
 
 
-class Pair(NamedTuple):
+class RunPair(NamedTuple):
     """All differences of a run from an earlier one."""
 
     run: str
@@ -53,7 +53,7 @@ class Comparison:
     """
 
     runs: tuple[ComparedRun, ...]
-    pairs: tuple[Pair, ...]
+    pairs: tuple[RunPair, ...]
     notes: tuple[str, ...]
 
     @cached_property
@@ -65,7 +65,7 @@ class Comparison:
     @property
     def regressions(self) -> int:
         """Number of changes for the worse."""
-        return int((self.changes["verdict"] == Verdict.WORSE).sum())
+        return int((self.changes["verdict"] == ChangeKind.WORSE).sum())
 
     def table(self, name: str) -> pd.DataFrame:
         """One of the tables "changes", "columns", "runs" and "cells"."""
@@ -85,7 +85,7 @@ class Comparison:
             for one in pair.differences:
                 by_what[one.what].append(one)
             for what, differences in by_what.items():
-                counts = {verdict.value: sum(d.verdict == verdict for d in differences) for verdict in Verdict}
+                counts = {verdict.value: sum(d.verdict == verdict for d in differences) for verdict in ChangeKind}
                 ratios = [d.ratio for d in differences if np.isfinite(d.ratio) and d.ratio > 0.0]
                 low, high = median_interval(ratios) if len(ratios) >= FEWEST_ROUNDS else UNKNOWN
                 middle = float(np.median(ratios)) if ratios else float("nan")
@@ -165,12 +165,8 @@ def compare(paths: Sequence[Path], limit: float) -> Comparison:
     runs. Seconds are compared only where one machine measured both, and have changed only where the 95 % interval of
     their ratio, from resampled rounds, does not contain 1; with fewer than six rounds they are undecided.
 
-    Parameters
-    ----------
-    paths
-        Two results files or more; the first one is what the others are compared with.
-    limit
-        Factor, at least 1, within which a number may change.
+    The first of the files is what the others are compared with; a number may change within the factor `limit`, at least
+    1.
 
     Raises
     ------
@@ -187,8 +183,8 @@ def compare(paths: Sequence[Path], limit: float) -> Comparison:
         differences = by_pair[run.name, first.name]
         gone = [first.cells[key] for key in first.cells if key not in run.cells]
         new = [run.cells[key] for key in run.cells if key not in first.cells]
-        differences += [Difference(cell, "cell", "present", "gone", Verdict.WORSE) for cell in gone]
-        differences += [Difference(cell, "cell", "", "new", Verdict.CHANGED) for cell in new]
+        differences += [Difference(cell, "cell", "present", "gone", ChangeKind.WORSE) for cell in gone]
+        differences += [Difference(cell, "cell", "", "new", ChangeKind.CHANGED) for cell in new]
         means = _on_common_queries(first, run, shared)
         # a column that fails for one of the runs is no difference between their cells
         judged = {name: better for name, better in first.extended.better.items() if name in run.extended.columns}
@@ -208,7 +204,7 @@ def compare(paths: Sequence[Path], limit: float) -> Comparison:
         if compared < len([key for key in run.cells if any(key in earlier.cells for earlier in runs[:k])]):
             notes.append(f"{of_run}times and break-even of different machines are not compared")
     notes += dict.fromkeys(line for run in runs for line in run.extended.faults)
-    pairs = tuple(Pair(*names, differences) for names, differences in by_pair.items())
+    pairs = tuple(RunPair(*names, differences) for names, differences in by_pair.items())
     return Comparison(tuple(runs), pairs, tuple(notes))
 
 
@@ -229,7 +225,7 @@ def _on_common_queries(one: ComparedRun, two: ComparedRun, shared: Sequence[str]
     return both_means[0], both_means[1]
 
 
-def _row(pair: Pair, one: Difference) -> dict[str, Any]:
+def _row(pair: RunPair, one: Difference) -> dict[str, Any]:
     shown = {"before": formats.cell_text(one.before), "after": formats.cell_text(one.after)}
     ratio = {"ratio": one.ratio, "ratio_low": one.interval[0], "ratio_high": one.interval[1]}
     about = {"run": pair.run, "against": pair.against, "what": one.what, "verdict": one.verdict.value}

@@ -41,7 +41,7 @@ UNKNOWN: Interval = (float("nan"), float("nan"))
 """The interval of a ratio that has none."""
 
 
-class Verdict(StrEnum):
+class ChangeKind(StrEnum):
     """What a difference between two numbers means."""
 
     EQUAL = "equal"
@@ -53,7 +53,7 @@ class Verdict(StrEnum):
     WORSE = "worse"
 
 
-MOVED = (Verdict.WORSE, Verdict.BETTER, Verdict.CHANGED)
+MOVED = (ChangeKind.WORSE, ChangeKind.BETTER, ChangeKind.CHANGED)
 """Verdicts on what is listed as a change, those first that matter most."""
 
 
@@ -64,7 +64,7 @@ class Difference(NamedTuple):
     what: str
     before: Any
     after: Any
-    verdict: Verdict
+    verdict: ChangeKind
     interval: Interval = UNKNOWN
 
     @property
@@ -77,13 +77,13 @@ class Difference(NamedTuple):
 def of_numbers(one: Mapping[str, Any], two: Mapping[str, Any], limit: float) -> Iterator[Difference]:
     """Differences of a cell in what does not depend on the machine; nothing of columns that are empty in both runs."""
     severities = (Status(one["status"]).severity, Status(two["status"]).severity)
-    verdicts: dict[str, Verdict | None] = {
+    verdicts: dict[str, ChangeKind | None] = {
         "queries_ok": _verdict(one["queries_ok"], two["queries_ok"], 1.0, more_is_better=True),
         "status": _verdict(*severities, 1.0),
     }
     for name in DIMENSIONS:
         verdict = _verdict(one[name], two[name], limit)
-        verdicts[name] = Verdict.CHANGED if verdict is Verdict.WITHIN_LIMIT else verdict
+        verdicts[name] = ChangeKind.CHANGED if verdict is ChangeKind.WITHIN_LIMIT else verdict
     for name in CONSTANTS:
         verdicts[name] = _verdict(one[name], two[name], limit, floor=VANISHES, more_is_better=True)
     for name in (*ERRORS, *ZERO_ERRORS):
@@ -104,8 +104,8 @@ def of_plugins(
     comparable = one["machine"] == two["machine"] and not (one["disturbed"] == 1 or two["disturbed"] == 1)
     for name, direction in better.items():
         verdict = _verdict(one.get(name), two.get(name), limit, more_is_better=direction == "larger")
-        if verdict in (Verdict.WORSE, Verdict.BETTER) and not comparable:
-            verdict = Verdict.UNDECIDED
+        if verdict in (ChangeKind.WORSE, ChangeKind.BETTER) and not comparable:
+            verdict = ChangeKind.UNDECIDED
         if verdict is not None:
             yield Difference(one, name, one.get(name), two.get(name), verdict)
 
@@ -118,20 +118,22 @@ def _solvers_part(cell: Mapping[str, Any], error: str) -> float:
 
 def _verdict(
     before: Any, after: Any, limit: float, *, floor: float = 0.0, allowed: float = 0.0, more_is_better: bool = False
-) -> Verdict | None:
-    """Verdict on a number that should be small, or large, `None` where there is none; one that is gone is worse."""
+) -> ChangeKind | None:
+    """ChangeKind on a number that should be small, or large, `None` where there is none; one that is gone is worse."""
     if pd.isna(before) or pd.isna(after):
-        return None if pd.isna(before) and pd.isna(after) else Verdict.WORSE if pd.isna(after) else Verdict.CHANGED
+        return (
+            None if pd.isna(before) and pd.isna(after) else ChangeKind.WORSE if pd.isna(after) else ChangeKind.CHANGED
+        )
     if before == after:
-        return Verdict.EQUAL
+        return ChangeKind.EQUAL
     if abs(after - before) <= allowed:
-        return Verdict.WITHIN_ACCURACY
+        return ChangeKind.WITHIN_ACCURACY
     small, large = (max(before, floor), max(after, floor))
     if more_is_better:
         small, large = large, small
     if large > limit * small:
-        return Verdict.WORSE
-    return Verdict.BETTER if small > limit * large else Verdict.WITHIN_LIMIT
+        return ChangeKind.WORSE
+    return ChangeKind.BETTER if small > limit * large else ChangeKind.WITHIN_LIMIT
 
 
 def of_seconds(one: ComparedRun, two: ComparedRun, shared: Sequence[str], limit: float) -> Iterator[Difference]:
@@ -148,10 +150,10 @@ def of_seconds(one: ComparedRun, two: ComparedRun, shared: Sequence[str], limit:
         }
         for name in SECONDS:
             verdict, interval = _verdict(before[name], after[name], limit), UNKNOWN
-            if verdict in (Verdict.WORSE, Verdict.BETTER) and pd.notna(after[name]):
+            if verdict in (ChangeKind.WORSE, ChangeKind.BETTER) and pd.notna(after[name]):
                 interval = intervals[name]()
                 decided = key not in disturbed and (interval[0] > 1.0 or interval[1] < 1.0)
-                verdict = verdict if decided else Verdict.UNDECIDED
+                verdict = verdict if decided else ChangeKind.UNDECIDED
             if verdict is not None:
                 yield Difference(before, name, before[name], after[name], verdict, interval)
     calm = [key for key in shared if key not in disturbed]
@@ -179,18 +181,20 @@ def _break_evens(one: pd.DataFrame, two: pd.DataFrame, limit: float) -> Iterator
     keys = [name for name in THRESHOLDS if not name.endswith(("_s", *NUMBERS, "meaning"))]
     for row in one.merge(two, on=keys, suffixes=("_one", "_two")).to_dict("records"):
         before, after = (_break_even(row, k) for k in ("one", "two"))
-        verdict: Verdict | None = Verdict.CHANGED
+        verdict: ChangeKind | None = ChangeKind.CHANGED
         if before == after:
-            verdict = Verdict.EQUAL
+            verdict = ChangeKind.EQUAL
         elif before.overlaps(after):
-            verdict = Verdict.WITHIN_LIMIT
+            verdict = ChangeKind.WITHIN_LIMIT
         elif before.meaning == after.meaning:
             verdict = _verdict(before.number, after.number, limit, more_is_better=before.meaning == Meaning.UNTIL)
         own = [_verdict(row[f"{phase}_b_s_one"], row[f"{phase}_b_s_two"], limit) for phase in ("offline", "online")]
-        if Verdict.WORSE not in own and verdict is Verdict.WORSE:  # because the model it is compared with became faster
-            verdict = Verdict.CHANGED
-        elif Verdict.WORSE in own and verdict is Verdict.CHANGED and after.meaning == Meaning.NEVER:
-            verdict = Verdict.WORSE
+        if (
+            ChangeKind.WORSE not in own and verdict is ChangeKind.WORSE
+        ):  # because the model it is compared with became faster
+            verdict = ChangeKind.CHANGED
+        elif ChangeKind.WORSE in own and verdict is ChangeKind.CHANGED and after.meaning == Meaning.NEVER:
+            verdict = ChangeKind.WORSE
         cell = row | {name: row[f"{name}_b"] for name in ("cell", "primal", "assembly", "primal_tol")}
         if verdict is not None:
             yield Difference(cell, f"break-even against {row['primal_a']}", str(before), str(after), verdict)

@@ -83,10 +83,10 @@ class ComparedRun:
 
     def thresholds_of(self, cells: Collection[str]) -> pd.DataFrame:
         """Rows of the break-evens in which no other cells take part."""
-        found, known = self._thresholds, set(cells)
-        both = (found[end].isin(known) for end in ("cell_a", "cell_b"))
+        thresholds, keys = self._thresholds, set(cells)
+        both = (thresholds[end].isin(keys) for end in ("cell_a", "cell_b"))
         of_a, of_b = both
-        return found[(of_a | found["cell_a"].isna()) & of_b]
+        return thresholds[(of_a | thresholds["cell_a"].isna()) & of_b]
 
     @cached_property
     def _thresholds(self) -> pd.DataFrame:

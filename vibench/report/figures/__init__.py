@@ -179,21 +179,9 @@ def draw_all(
 
     Beside them is `CAPTIONS`, with the caption of every figure.
 
-    Parameters
-    ----------
-    path
-        The results file.
-    folder
-        Where the figures go.
-    formats
-        Keys of `style.WRITTEN`.
-    jobs
-        Processes that draw, this one included.
-    progress
-        Called before a figure is drawn here, with its name, the number of those done, and that of all there may be.
-    note
-        Called with a line for every column of a plugin that the data do not have, and for every figure of a plugin
-        that could not be drawn.
+    Formats are keys of `style.WRITTEN`; `jobs` processes draw, this one included. `progress` is called before a figure
+    is drawn here, with its name, the number of those done, and that of all there may be, `note` with a line for every
+    column of a plugin that the data do not have, and for every figure of a plugin that could not be drawn.
     """
     faults: list[str] = []
     with processes(jobs) as pool:

@@ -56,18 +56,9 @@ def draw_published(
 ) -> list[Path]:
     """Draw the figures of publications for which runs have data, and write a page that compares them: `PAGE`.
 
-    Parameters
-    ----------
-    paths
-        Results files.
-    folder
-        Where figures and page go; figures of the same names and the page are replaced.
-    formats
-        Keys of `style.WRITTEN`; the page shows the first one that a browser can.
-    progress
-        Called before a figure is drawn, with its name, the number of those done, and that of all.
-    note
-        Called with a line for every figure that could not be drawn, or that has no data.
+    Figures of the same names and the page are replaced in the folder; the page shows the first of the formats, keys of
+    `style.WRITTEN`, that a browser can. `progress` is called before a figure is drawn, with its name, the number of
+    those done, and that of all, `note` with a line for every figure that could not be drawn, or that has no data.
 
     Raises
     ------

@@ -37,7 +37,7 @@ MORE_OF_CELLS = (
 
 
 @dataclass(frozen=True)
-class Grid:
+class TableGrid:
     """A table of the report."""
 
     name: str
@@ -55,7 +55,7 @@ class Grid:
     """Numbers of the rows whose seconds were measured on a disturbed machine."""
 
 
-def grid_of_cells(extended: Extended, caption: str) -> Grid:
+def grid_of_cells(extended: Extended, caption: str) -> TableGrid:
     """The table of all cells, in the order of the rows; columns of plugins without a heading are offered besides."""
     cells, columns, own = extended.frame, {**CELLS, **extended.columns}, tuple(extended.columns)
     names = [n for n in (*OF_CELLS, *MORE_OF_CELLS, *own) if n in ("cell", *views.AXES) or cells[n].notna().any()]
@@ -65,12 +65,12 @@ def grid_of_cells(extended: Extended, caption: str) -> Grid:
     offered = (*MORE_OF_CELLS, *(name for name in own if not columns[name].heading))
     hidden = [_heading(columns, name) for name in (*says_nothing, *offered) if name in names]
     axes = tuple(_heading(CELLS, name) for name in (*views.AXES, "status"))
-    return Grid(
+    return TableGrid(
         "summary", "All cells", caption, frame, axes, (*hidden, *_constant(frame)), _disturbed(cells["cell"], cells)
     )
 
 
-def grid_of_thresholds(name: str, title: str, caption: str, rows: Extended, cells: pd.DataFrame) -> Grid:
+def grid_of_thresholds(name: str, title: str, caption: str, rows: Extended, cells: pd.DataFrame) -> TableGrid:
     """A table of break-even points; a row is disturbed if one of its cells is."""
     ordered = tables.in_order(rows.frame)
     frame = tables.benefits(rows.frame, rows.columns)
@@ -80,14 +80,14 @@ def grid_of_thresholds(name: str, title: str, caption: str, rows: Extended, cell
     texts = [heading for heading in frame.columns if not pd.api.types.is_numeric_dtype(frame[heading])]
     axes = tuple(heading for heading in texts if heading not in results)
     disturbed = {*_disturbed(ordered["cell_a"], cells), *_disturbed(ordered["cell_b"], cells)}
-    return Grid(name, title, caption, frame, axes, tuple(_constant(frame)), tuple(sorted(disturbed)))
+    return TableGrid(name, title, caption, frame, axes, tuple(_constant(frame)), tuple(sorted(disturbed)))
 
 
-def grid_of(name: str, title: str, caption: str, frame: pd.DataFrame, axes: Sequence[str], keys: int) -> Grid:
+def grid_of(name: str, title: str, caption: str, frame: pd.DataFrame, axes: Sequence[str], keys: int) -> TableGrid:
     """Any other table, without columns that are empty, and with so many characters of the keys of cells."""
     shown = frame.dropna(axis=1, how="all")
     shown = shown.assign(cell=shown["cell"].str[:keys]) if "cell" in shown else shown
-    return Grid(name, title, caption, shown, tuple(one for one in axes if one in shown), tuple(_constant(shown)))
+    return TableGrid(name, title, caption, shown, tuple(one for one in axes if one in shown), tuple(_constant(shown)))
 
 
 def _heading(table: dict[str, Column] | Any, name: str) -> str:
@@ -104,7 +104,7 @@ def _disturbed(keys: pd.Series, cells: pd.DataFrame) -> tuple[int, ...]:
     return tuple(k for k, key in enumerate(keys) if key in disturbed)
 
 
-def to_json(grids: Sequence[Grid]) -> str:
+def to_json(grids: Sequence[TableGrid]) -> str:
     """The tables as JSON that may stand in a script element: nothing in it ends the element."""
     return script_safe({grid.name: _columnar(grid) for grid in grids})
 
@@ -115,7 +115,7 @@ def script_safe(value: Any) -> str:
     return text.replace("<", "\\u003c")
 
 
-def _columnar(grid: Grid) -> dict[str, Any]:
+def _columnar(grid: TableGrid) -> dict[str, Any]:
     return {
         "rows": len(grid.frame),
         "columns": [_column(str(name), grid.frame[name]) for name in grid.frame.columns],

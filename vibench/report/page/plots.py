@@ -47,7 +47,7 @@ def library() -> str:
 
 
 @dataclass(frozen=True)
-class Axes:
+class PlotPanel:
     """A panel of a plot: columns of its rows, what they are called, and whether its axes are logarithmic."""
 
     x: str
@@ -73,12 +73,8 @@ class Plot:
 def plots(name: str, data: Data, rows: Mapping[str, int]) -> Iterator[Plot]:
     """The plots of one problem.
 
-    Parameters
-    ----------
-    name
-        What the names of its pictures begin with.
-    rows
-        The row of every cell in the table of cells, from which the page takes what a point says.
+    The names of its pictures begin with `name`; `rows` has the row of every cell in the table of cells, from which the
+    page takes what a point says.
     """
     compared = on_common_queries(best_solver(data.cells), data.queries)
     cells = compared.cells
@@ -92,15 +88,17 @@ def plots(name: str, data: Data, rows: Mapping[str, int]) -> Iterator[Plot]:
         "offline": ("errors against offline seconds", "offline_s", "offline [s]"),
     }
     for kind, (title, column, x_label) in kinds.items():
-        panels = [Axes(column, error, x_label, y_label) for error, y_label in ERRORS.items()]
+        panels = [PlotPanel(column, error, x_label, y_label) for error, y_label in ERRORS.items()]
         yield from _plot(f"{name}-{kind}", f"{data.problem}{solver}: {title}{compared.over}", shown, panels, rows)
     fixed = data.cells[data.cells["share_training"].notna()].drop_duplicates("model")
-    panels = [Axes("share_training", "share_validation", "training parameters", "validation parameters", False)]
+    panels = [PlotPanel("share_training", "share_validation", "training parameters", "validation parameters", False)]
     title = "smallest share of β over the span in that of the whole of V"
     yield from _plot(f"{name}-shares", f"{data.problem}: {title}", fixed, panels, rows)
 
 
-def _plot(name: str, title: str, cells: pd.DataFrame, panels: list[Axes], rows: Mapping[str, int]) -> Iterator[Plot]:
+def _plot(
+    name: str, title: str, cells: pd.DataFrame, panels: list[PlotPanel], rows: Mapping[str, int]
+) -> Iterator[Plot]:
     """A plot, unless no cell has a point in it."""
     drawn = [(panel, _coordinates(cells, panel)) for panel in panels]
     drawn = [(panel, points) for panel, points in drawn if points.notna().to_numpy().any()]
@@ -124,14 +122,14 @@ def _series(way: Series, look: Look) -> dict[str, Any]:
     return {"name": name, "colour": look.colour, "marker": MARKERS[look.marker], "edge": 1.0 + 1.4 * look.rank}
 
 
-def _coordinates(cells: pd.DataFrame, panel: Axes) -> pd.DataFrame:
+def _coordinates(cells: pd.DataFrame, panel: PlotPanel) -> pd.DataFrame:
     """Both values of every cell, missing where one of them is, or is not above zero on a logarithmic axis."""
     values = cells[[panel.x, panel.y]].astype(float)
     fine = np.isfinite(values).all(axis=1) & ((values > 0.0).all(axis=1) | (not panel.logarithmic))
     return values.where(fine)
 
 
-def _panel(panel: Axes, points: pd.DataFrame) -> dict[str, Any]:
+def _panel(panel: PlotPanel, points: pd.DataFrame) -> dict[str, Any]:
     return {
         "x_label": panel.x_label,
         "y_label": panel.y_label,

@@ -92,13 +92,8 @@ def _cff_author(author: str) -> list[str]:
 def requirements(versions: Mapping[str, str], code: str) -> str:
     """The file of requirements with which pip installs the versions that a run was computed with.
 
-    Parameters
-    ----------
-    versions
-        Versions by name of distribution or solver, as the cells record them; several, separated by ", ", where cells
-        differ: none of them is required then.
-    code
-        Hashes of the code, for the comment: a version of vibench under development has no release.
+    Versions are by name of distribution or solver, as the cells record them; of several, separated by ", ", where cells
+    differ, none is required. The hashes of the code are a comment: a vibench under development has no release.
     """
     lines = [f"# versions recorded in the results file; code of the cells: {unbroken(code)}"]
     for name, version in sorted(versions.items()):

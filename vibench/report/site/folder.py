@@ -36,12 +36,7 @@ def check(site: Path) -> None:
 def write(site: Path, fill: Callable[[Path], None]) -> None:
     """Write a site: a new one appears whole, the files of an earlier one are replaced one by one, its first page last.
 
-    Parameters
-    ----------
-    site
-        Its folder: new, empty, or written by this function.
-    fill
-        Writes the files into a folder that it is given.
+    The folder is new, empty, or written by this function; `fill` writes the files into one that it is given.
 
     Raises
     ------

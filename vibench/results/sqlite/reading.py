@@ -21,7 +21,7 @@ from vibench.text import json_object, one_line, printable
 FILE = "results.sqlite"
 
 
-class DamagedError(RequestError):
+class DamagedResultsError(RequestError):
     """A results file that cannot be read: cut off, overwritten, or from a disk that failed."""
 
 
@@ -105,7 +105,7 @@ def read_meta(path: Path) -> dict[str, str]:
 
     Raises
     ------
-    DamagedError
+    DamagedResultsError
         If the file cannot be read.
     RequestError
         If it is a database, but no results file.
@@ -117,15 +117,15 @@ def read_meta(path: Path) -> dict[str, str]:
                 raise RequestError(f"'{path}' is not a results file of vibench: it has a {min(strange)}")
             damage = "; ".join(line for (line,) in db.execute("PRAGMA quick_check(1)") if line != "ok")
             if damage:
-                raise DamagedError(f"'{path}' is damaged: {' '.join(damage.split())}")
+                raise DamagedResultsError(f"'{path}' is damaged: {' '.join(damage.split())}")
             meta = dict(db.execute("SELECT key, value FROM meta")) if kinds else {}
             if meta.get("schema") == str(VERSION):  # other versions are refused, or have no digests
                 Digests(db).verified("meta")
             return meta
     except DigestError as error:
-        raise DamagedError(f"'{path}' is damaged: {error}") from None
+        raise DamagedResultsError(f"'{path}' is damaged: {error}") from None
     except sqlite3.Error as error:
-        sort = DamagedError if code_of(error) in DAMAGE else RequestError
+        sort = DamagedResultsError if code_of(error) in DAMAGE else RequestError
         raise sort(f"'{path}' is not a results file of vibench: {error}") from None
 
 

@@ -17,7 +17,7 @@ from vibench.errors import RequestError, StorageError
 from vibench.execution.run_folder import claimed
 from vibench.results import tables
 from vibench.results.database import ResultsDatabase
-from vibench.results.sqlite.reading import DAMAGED, FILE, DamagedError, open_read_only, read_meta, set_aside
+from vibench.results.sqlite.reading import DAMAGED, FILE, DamagedResultsError, open_read_only, read_meta, set_aside
 
 STUDY = {"name": "sample", "seed": 1, "validation": 4}
 NOBODY = 65534
@@ -142,4 +142,4 @@ def test_the_file_of_another_application_is_not_damaged(tmp_path: Path) -> None:
         other.execute("CREATE TABLE notes (text TEXT)")
     with pytest.raises(RequestError) as caught:
         read_meta(tmp_path / FILE)
-    assert not isinstance(caught.value, DamagedError)
+    assert not isinstance(caught.value, DamagedResultsError)
