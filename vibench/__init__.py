@@ -18,10 +18,8 @@ _attached, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
 def __getattr__(name: str) -> object:
     """A public name; of one that a submodule has, the error says which.
 
-    Raises
-    ------
-    ImportError
-        If a submodule has the name. `from vibench import NAME` would not show the message of an `AttributeError`.
+    Raises an `ImportError` if a submodule has the name. `from vibench import NAME` would not show the message of an
+    `AttributeError`.
     """
     if name not in __all__ and not name.startswith("_"):
         for group in GROUPS:

@@ -66,18 +66,26 @@ class Unilateral:
 
     c(u) is a scalar field or a component of a displacement field. Signs are those of B u ≤ g: for ≥ both sides change
     theirs.
+
+    Attributes
+    ----------
+    B
+        Constraint (m×N) on all unknowns of the basis.
+    W
+        L² product of the multipliers (m×m), consistent or lumped.
+    nodes
+        Vertices (m,) of the mesh that carry a multiplier, rising.
+    points
+        Places of the nodes (dim×m).
+    sense
+        "<=" or ">=".
     """
 
     B: SparseMatrix
-    """Constraint (m×N) on all unknowns of the basis."""
     W: InnerProduct
-    """L² product of the multipliers (m×m), consistent or lumped."""
     nodes: Indices
-    """Vertices (m,) of the mesh that carry a multiplier, rising."""
     points: Array
-    """Places of the nodes (dim×m)."""
     sense: Sense
-    """"<=" or ">="."""
     _integrals: Callable[[Callable[[Array], Array]], Array] | None = field(repr=False, default=None)
 
     def bound(self, values: Callable[[Array], Array] | Array) -> Array:

@@ -25,10 +25,7 @@ def write_atomically(path: Path, content: bytes, *, durable: bool = False) -> No
 
     `durable` content is on the disk when the function returns.
 
-    Raises
-    ------
-    OSError
-        If it cannot be written; nothing is left behind.
+    Raises an `OSError` if it cannot be written; nothing is left behind.
     """
     handle, name = tempfile.mkstemp(dir=path.parent, prefix=TEMPORARY, suffix=PART)
     part = Path(name)

@@ -12,10 +12,7 @@ LONGEST = 2000
 def parsed_json(text: str | bytes) -> Any:
     """The value of a JSON text that others wrote.
 
-    Raises
-    ------
-    ValueError
-        If it is no JSON, or nested too deeply to be read.
+    Raises a `ValueError` if it is no JSON, or nested too deeply to be read.
     """
     try:
         return json.loads(text)

@@ -70,10 +70,7 @@ class Setting:
 def setting(study: str) -> Setting:
     """The setting of a study, by its name or file.
 
-    Raises
-    ------
-    RequestError
-        If there is no such study.
+    Raises a `RequestError` if there is no such study.
     """
     spec = read_study(study)
     table, dual, primal = spec.tolerances[0], spec.dual[-1], spec.primal[-1]
@@ -144,10 +141,7 @@ TIMED = {kind.cli_name: kind for kind in (PROBLEM, PRIMAL, DUAL, SOLVER)}
 def chosen_plugins(plugins: Sequence[str]) -> dict[str, list[str]]:
     """Names of plugins by the word for their kind, from names as `vibench list` shows them, or KIND:NAME.
 
-    Raises
-    ------
-    RequestError
-        If there is no such plugin, several have the name, or a solver is not installed.
+    Raises a `RequestError` if there is no such plugin, several have the name, or a solver is not installed.
     """
     chosen, solvers = dict[str, list[str]](), installed_solvers(registered(SOLVER))
     for text in plugins:

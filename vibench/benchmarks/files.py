@@ -119,10 +119,7 @@ class Timed:
 def read_benchmarks(path: Path) -> Timed:
     """What a file of pytest-benchmark holds.
 
-    Raises
-    ------
-    RequestError
-        If it is none.
+    Raises a `RequestError` if it is none.
     """
     try:
         return parsed(path.read_bytes())
@@ -134,11 +131,8 @@ def read_benchmarks(path: Path) -> Timed:
 def parsed(content: bytes) -> Timed:
     """What the content of a file of pytest-benchmark says.
 
-    Raises
-    ------
-    ValueError
-        If it is no JSON, has a benchmark twice, or seconds that no clock gives; like other exceptions of Python where
-        the structure is another.
+    Raises a `ValueError` if it is no JSON, has a benchmark twice, or seconds that no clock gives; like other exceptions
+    of Python where the structure is another.
     """
     file = parsed_json(content)
     benchmarks: dict[str, Measured] = {}

@@ -176,10 +176,7 @@ class BenchmarkResults:
 def check_installed() -> None:
     """Refuse to go on without pytest-benchmark, which has the statistics and the format of the file.
 
-    Raises
-    ------
-    VibenchError
-        If it is not installed; the message has the command that installs it.
+    Raises a `VibenchError` if it is not installed; the message has the command that installs it.
     """
     if importlib.util.find_spec("pytest_benchmark") is None:
         raise VibenchError("`vibench bench` needs pytest-benchmark: pip install 'vibench[bench]'")
@@ -190,10 +187,7 @@ def run_benchmarks(
 ) -> BenchmarkResults:
     """Run benchmarks; one that ends its process, or takes longer than a stage of the study may, has failed.
 
-    Raises
-    ------
-    VibenchError
-        If no benchmark can be begun.
+    Raises a `VibenchError` if no benchmark can be begun.
     """
     work, results = TimedBenchmarks(tuple(benchmarks), setting, seconds), BenchmarkResults(len(benchmarks), show)
     turns = watched(work, setting.seconds, results.take, in_all=setting.seconds * work.items)

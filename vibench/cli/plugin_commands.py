@@ -231,10 +231,7 @@ def _solver_rows() -> Iterator[Row]:
 def _find(text: str) -> RegisteredPlugin:
     """The plugin that NAME, KIND:NAME or MODULE:NAME refers to, loaded.
 
-    Raises
-    ------
-    RequestError
-        If there is no such plugin, or several.
+    Raises a `RequestError` if there is no such plugin, or several.
     """
     from vibench.qp.solve import installed_solvers
     from vibench.study.registry import find_named, registered

@@ -25,12 +25,8 @@ def write_package(kind: PluginKind, name: str, parent: Path) -> Path:
 
     The parent folder is created if necessary.
 
-    Raises
-    ------
-    RequestError
-        If the name is invalid or taken, or the folder exists.
-    StorageError
-        If a file cannot be written.
+    Raises a `RequestError` if the name is invalid or taken, or the folder exists, and a `StorageError` if a file cannot
+    be written.
     """
     check_name(kind, name)
     target = parent / f"vibench-{name}"

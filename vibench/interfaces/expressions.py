@@ -49,10 +49,7 @@ class Expression:
     def parse(cls, text: str, names: Sequence[str]) -> Expression:
         """Check an expression.
 
-        Raises
-        ------
-        RequestError
-            If it is not arithmetic on numbers, `names`, `CONSTANTS` and `FUNCTIONS`.
+        Raises a `RequestError` if it is not arithmetic on numbers, `names`, `CONSTANTS` and `FUNCTIONS`.
         """
         _check(_tree(text), text, names)
         return cls(text, tuple(names))
@@ -60,10 +57,7 @@ class Expression:
     def __call__(self, mu: Iterable[float]) -> float:
         """The value at mu (d,).
 
-        Raises
-        ------
-        NumericalError
-            If it is not a finite real number.
+        Raises a `NumericalError` if it is not a finite real number.
         """
         values = dict(zip(self.names, map(float, mu), strict=True))
         where = f"'{self.text}' at {', '.join(f'{name} = {value:g}' for name, value in values.items())}"

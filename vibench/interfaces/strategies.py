@@ -249,11 +249,8 @@ class AdaptiveSampling(Sampling):
 def check_sample(box: ParameterBox, returned: object) -> Array:
     """The parameters (P×d) that a sampling strategy returned, refused if they are none of the box.
 
-    Raises
-    ------
-    RequestError
-        If they have the wrong shape, are not finite, lie outside the box, occur twice, or are not among the listed
-        ones of a problem that has no other.
+    Raises a `RequestError` if they have the wrong shape, are not finite, lie outside the box, occur twice, or are not
+    among the listed ones of a problem that has no other.
     """
     mus = np.asarray(returned, float)
     if mus.ndim != 2 or mus.shape[1] != box.dim or not len(mus):

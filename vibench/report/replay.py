@@ -95,10 +95,7 @@ def _line(trial: Trial, recorded_x: Array | None) -> dict[str, Any]:
 def write_program(program: VariationalInequality, file: Path) -> None:
     """Write min ½xᵀPx + qᵀx, Gx ≤ h in the format of qpsolvers: an npz file with P, q, G, h.
 
-    Raises
-    ------
-    OSError
-        If it cannot be written; nothing is left behind.
+    Raises an `OSError` if it cannot be written; nothing is left behind.
     """
     content = io.BytesIO()  # zipfile itself leaves half a file on a full disk, and a traceback when that is closed
     qpsolvers.Problem(program.A, -program.f, program.B, program.g).save(content)  # type: ignore[arg-type]  # a file will do

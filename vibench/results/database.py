@@ -100,10 +100,7 @@ class ResultsDatabase:
     def _remove_damaged(self, path: Path) -> tuple[str, ...]:
         """Remove cells whose rows are not those that were written, and tables derived from them; returns their keys.
 
-        Raises
-        ------
-        RequestError
-            If other tables are damaged, or the file itself is.
+        Raises a `RequestError` if other tables are damaged, or the file itself is.
         """
         sound = self._is_sound()
         if not sound:

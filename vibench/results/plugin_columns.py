@@ -144,10 +144,7 @@ def _taken(plugin: str, column: DerivedColumn, owners: Mapping[str, str]) -> str
 def loaded(name: str) -> FigurePlugin:
     """A figure plugin.
 
-    Raises
-    ------
-    RequestError
-        If it cannot be loaded or created.
+    Raises a `RequestError` if it cannot be loaded or created.
     """
     registered_plugin = find(FIGURE, name)
     if missing := registered_plugin.missing:
@@ -164,10 +161,7 @@ def loaded(name: str) -> FigurePlugin:
 def declared(name: str, plugin: FigurePlugin) -> Sequence[DerivedColumn]:
     """The columns that a plugin declares.
 
-    Raises
-    ------
-    ColumnError
-        If it raises, or returns something else.
+    Raises a `ColumnError` if it raises, or returns something else.
     """
     try:
         columns = tuple(plugin.columns())
@@ -182,10 +176,7 @@ def declared(name: str, plugin: FigurePlugin) -> Sequence[DerivedColumn]:
 def column_values(plugin: str, column: DerivedColumn, tables: Copies, frame: pd.DataFrame) -> pd.Series:
     """The values of a column for the rows of its table.
 
-    Raises
-    ------
-    ColumnError
-        If the function raises, returns another number of values, or values of another type.
+    Raises a `ColumnError` if the function raises, returns another number of values, or values of another type.
     """
     title = _title(plugin, column)
     try:

@@ -43,10 +43,7 @@ def errors_of(cells: pd.DataFrame, outputs: pd.DataFrame, measure: str = SOLUTIO
 
     A quantity of interest is measured by its mean relative error over the ok queries where it is not zero.
 
-    Raises
-    ------
-    RequestError
-        If there is no such measure.
+    Raises a `RequestError` if there is no such measure.
     """
     if measure not in measures(outputs):
         raise unknown_name("error measure", measure, measures(outputs))
@@ -71,10 +68,7 @@ def with_errors(thresholds: pd.DataFrame, cells: pd.DataFrame, errors: pd.Series
 def within(thresholds: pd.DataFrame, largest: float) -> pd.DataFrame:
     """The break-even points of models that both have errors of at most `largest`.
 
-    Raises
-    ------
-    RequestError
-        If it is no positive number.
+    Raises a `RequestError` if it is no positive number.
     """
     if not largest > 0.0:
         raise RequestError(f"the largest error is {largest:g}, expected a positive number")

@@ -46,10 +46,7 @@ def matching(
     Of the columns that the table has one is suggested for a name that is none. `plugins` is the table with its columns
     of plugins, if it has any; `made` are columns of what is made of the rows, which they do not have themselves.
 
-    Raises
-    ------
-    RequestError
-        If it is no such expression, or names a column that the table does not have.
+    Raises a `RequestError` if it is no such expression, or names a column that the table does not have.
     """
     outside = QUOTED.sub("''", expression)
     if len(expression) > LONGEST:
@@ -130,10 +127,7 @@ def parts(text: str) -> list[str]:
 def sorted_by(frame: pd.DataFrame, keys: Sequence[str], what: str) -> pd.DataFrame:
     """Rows sorted by columns, each named with a "-" before it for the largest first; missing values are last.
 
-    Raises
-    ------
-    RequestError
-        If there is no such column; `what` names the table in the message.
+    Raises a `RequestError` if there is no such column; `what` names the table in the message.
     """
     names = [key.removeprefix("-") for key in keys]
     for name in names:

@@ -43,10 +43,7 @@ ORDER = (
 def results_file(run: str) -> Path:
     """Results file of a run: a results file, its folder, or the name of a study under `runs/`.
 
-    Raises
-    ------
-    RequestError
-        If there is no results file, or its schema has another version.
+    Raises a `RequestError` if there is no results file, or its schema has another version.
     """
     for folder in (Path(run), Path("runs") / run):
         path = folder if folder.is_file() else folder / FILE
@@ -61,10 +58,7 @@ def results_file(run: str) -> Path:
 def read(path: Path, table: str) -> pd.DataFrame:
     """One table of a results file, in the order in which its rows were written.
 
-    Raises
-    ------
-    RequestError
-        If they are damaged, or have a value that is none of its column.
+    Raises a `RequestError` if they are damaged, or have a value that is none of its column.
     """
     names, rows = read_rows(path, table)
     frame = pd.DataFrame.from_records(rows, columns=names, coerce_float=True)
@@ -94,10 +88,7 @@ RIGHT: Mapping[str, tuple[Callable[[object], bool], str]] = {
 def extended(path: Path, table: str) -> Extended:
     """One table of a results file with the columns that plugins add to it, in the order in which it was written.
 
-    Raises
-    ------
-    RequestError
-        If it is damaged; what is wrong with a plugin is among the faults instead.
+    Raises a `RequestError` if it is damaged; what is wrong with a plugin is among the faults instead.
     """
     return extended_tables(path, (table,))[table]
 
@@ -105,10 +96,7 @@ def extended(path: Path, table: str) -> Extended:
 def extended_tables(path: Path, names: Collection[str]) -> dict[str, Extended]:
     """Several tables of a results file, as `extended` reads one; plugins are loaded once for all of them.
 
-    Raises
-    ------
-    RequestError
-        If one is damaged.
+    Raises a `RequestError` if one is damaged.
     """
     return plugin_columns.extended_tables(names, partial(read, path))
 
@@ -121,10 +109,7 @@ EXPORTED = (*(f"{table}.csv" for table in TABLES), SUMMARY)
 def measured(path: Path, measure: str = ranking.SOLUTION) -> tuple[pd.DataFrame, pd.Series]:
     """The recorded cells of a results file, and the error of each by a measure.
 
-    Raises
-    ------
-    RequestError
-        If there is no such measure, or the file cannot be read.
+    Raises a `RequestError` if there is no such measure, or the file cannot be read.
     """
     cells = read(path, "cells")
     return cells, ranking.errors_of(cells, read(path, "outputs"), measure)

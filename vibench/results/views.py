@@ -162,10 +162,8 @@ def look_up(
     With an error measure (`ranking`) models are compared by it: `best` has its bands, tables of break-even have
     the errors of both models, of which neither is above `largest`.
 
-    Raises
-    ------
-    RequestError
-        If there is no such table, column or measure, the table does not depend on one, or the condition is none.
+    Raises a `RequestError` if there is no such table, column or measure, the table does not depend on one, or the
+    condition is none.
     """
     if name not in VIEWS:
         raise unknown_name("table", name, VIEWS)

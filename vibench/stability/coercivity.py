@@ -67,10 +67,7 @@ class Stability:
 def coercivity_and_continuity(A: SparseMatrix, V: InnerProduct) -> tuple[Constant, Constant]:
     """Lower bound of α and upper bound of γ_a for A (n×n).
 
-    Raises
-    ------
-    NumericalError
-        If A is not symmetric positive definite.
+    Raises a `NumericalError` if A is not symmetric positive definite.
     """
     low, high = extreme_quotients(A, V)
     X, root_A, root_X = V.matrix, np.sqrt(A.diagonal()), np.sqrt(V.matrix.diagonal())
@@ -114,10 +111,7 @@ def _moved(estimate: float, sign: float, proves: Callable[[float], bool]) -> Con
 def extreme_quotients(A: SparseMatrix, V: InnerProduct) -> tuple[float, float]:
     """Estimates of α and γ_a for A (n×n): the extreme eigenvalues of A against X_V, by Lanczos iterations.
 
-    Raises
-    ------
-    NumericalError
-        If A is not symmetric positive definite.
+    Raises a `NumericalError` if A is not symmetric positive definite.
     """
     factor = SparseCholesky(A, "A")
     if V.dim <= FEW:
@@ -130,10 +124,7 @@ def extreme_quotients(A: SparseMatrix, V: InnerProduct) -> tuple[float, float]:
 def energy_inf_sup(A: SparseMatrix, B: SparseMatrix, W: InnerProduct) -> Constant:
     """Lower bound of β_A, proved where A (n×n) is positive definite, for B (m×n); 0 where no other is proved.
 
-    Raises
-    ------
-    NumericalError
-        If A is not positive definite.
+    Raises a `NumericalError` if A is not positive definite.
     """
     factor, (m, n) = SparseCholesky(A, "A"), B.shape
     if not m:

@@ -219,10 +219,7 @@ class ItemwiseStage(Stage):
 def value_of(store: Store, stage: Stage) -> Any:
     """The stored value of a stage that has been run.
 
-    Raises
-    ------
-    NumericalError
-        If its artefact is missing.
+    Raises a `NumericalError` if its artefact is missing.
     """
     artefact = store.get(stage.key)
     if artefact is None:

@@ -63,10 +63,7 @@ class CertificateStage(Stage):
     def run(self, store: Store) -> Result:
         """Prepare the certificate.
 
-        Raises
-        ------
-        UnsupportedError
-            If the model is assembled in full.
+        Raises an `UnsupportedError` if the model is assembled in full.
         """
         problem = build_problem(self.base.decomposition.problem)
         reduction = self.assembly.offline(store).given(

@@ -47,10 +47,7 @@ class BuiltEnrichment:
     def of(cls, enrichment: Enrichment, strategy: PrimalStrategy) -> BuiltEnrichment:
         """The enrichment that a strategy has built.
 
-        Raises
-        ------
-        NumericalError
-            If it has a supply that is not a function in the module of the strategy.
+        Raises a `NumericalError` if it has a supply that is not a function in the module of the strategy.
         """
         name = "" if enrichment.supply is None else getattr(enrichment.supply, "__name__", "")
         if enrichment.supply is not None and _functions(strategy).get(name) is not enrichment.supply:

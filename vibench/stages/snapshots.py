@@ -220,10 +220,7 @@ def fingerprint_here(problem: Plugin) -> Fingerprint:
 def gather(store: Store, chunks: tuple[Stage, ...]) -> TimedSnapshots:
     """The snapshots of all chunks.
 
-    Raises
-    ------
-    NumericalError
-        If the problem was assembled otherwise for a chunk than it is in this process.
+    Raises a `NumericalError` if the problem was assembled otherwise for a chunk than it is in this process.
     """
     parts = [value_of(store, chunk) for chunk in chunks]
     (problem,) = {plugin for chunk in chunks for plugin in chunk.plugins() if plugin.kind is PROBLEM}

@@ -54,10 +54,7 @@ class History:
     def of(cls, stage: str, quantity: object, values: Iterable[Any], first_step: int = 0) -> History:
         """The history of a quantity that a plugin may have named and evaluated: its name is one printable line.
 
-        Raises
-        ------
-        TypeError, ValueError, OverflowError
-            If a value is no number, or too large for one.
+        Raises a `TypeError`, a `ValueError` or an `OverflowError` if a value is no number, or too large for one.
         """
         return cls(stage, one_line(str(quantity)), tuple(map(float, values)), first_step)
 
@@ -79,10 +76,7 @@ class Artefact:
     def read(cls, content: bytes) -> Artefact:
         """The artefact that `dumps` wrote.
 
-        Raises
-        ------
-        DamagedArtefactError
-            If the content is anything else.
+        Raises a `DamagedArtefactError` if the content is anything else.
         """
         artefact = loads(content)
         if not isinstance(artefact, cls):
@@ -109,10 +103,7 @@ class Store:
     def get(self, key: str) -> Artefact | None:
         """The artefact stored under a key; `None` if it is missing or damaged.
 
-        Raises
-        ------
-        StorageError
-            If the folder cannot be read.
+        Raises a `StorageError` if the folder cannot be read.
         """
         if key in self._recent:
             return self._recent[key]
@@ -132,12 +123,8 @@ class Store:
     def put(self, key: str, value: Any, seconds: Seconds, histories: tuple[History, ...]) -> None:
         """Store an artefact atomically: it is written to a temporary file, synced and renamed.
 
-        Raises
-        ------
-        NumericalError
-            If the value holds anything but arrays and data.
-        StorageError
-            If it cannot be written.
+        Raises a `NumericalError` if the value holds anything but arrays and data, and a `StorageError` if it cannot be
+        written.
         """
         content = encoded(key, Artefact(value, seconds, histories, machine()))
         self._recent.pop(key, None)
@@ -151,10 +138,7 @@ class Store:
     def used(self) -> Iterator[None]:
         """Keep the store from being cleared inside the block.
 
-        Raises
-        ------
-        RequestError
-            If it is being cleared now, or cannot be written.
+        Raises a `RequestError` if it is being cleared now, or cannot be written.
         """
         with locked(self.folder / LOCK, shared=True, busy=f"the artefacts in '{self.folder}' are being removed"):
             yield
@@ -171,10 +155,7 @@ class Store:
     def clear(self, older_than: float = 0.0) -> int:
         """Remove artefacts older than so many seconds, and temporary files of killed runs; returns the bytes freed.
 
-        Raises
-        ------
-        RequestError
-            If a run uses the store.
+        Raises a `RequestError` if a run uses the store.
         """
         freed = 0
         if not self.folder.is_dir():
@@ -208,10 +189,7 @@ def _digest(key: str, content: bytes) -> bytes:
 def usable_store() -> Store:
     """The store all runs share.
 
-    Raises
-    ------
-    RequestError
-        If its folder cannot be created, or others may write into it.
+    Raises a `RequestError` if its folder cannot be created, or others may write into it.
     """
     store = Store(default_folder())
     try:

@@ -72,10 +72,7 @@ def dumps(value: Any) -> bytes:
 def loads(content: bytes) -> Any:
     """The value that `dumps` wrote; arrays have the same entries, shape and order in memory, and may be written to.
 
-    Raises
-    ------
-    DamagedArtefactError
-        If the content is anything else. It imports and runs nothing that the content names.
+    Raises a `DamagedArtefactError` if the content is anything else. It imports and runs nothing that the content names.
     """
     try:
         arrays = safetensors.numpy.load(content)

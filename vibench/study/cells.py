@@ -101,10 +101,7 @@ class Cell:
     def from_definition(cls, text: str) -> Cell:
         """The cell of a definition, with the code of its plugins as installed.
 
-        Raises
-        ------
-        RequestError
-            If a plugin is not installed, or a file that its options name cannot be read.
+        Raises a `RequestError` if a plugin is not installed, or a file that its options name cannot be read.
         """
         content = json.loads(text)
         for name in PLUGINS:  # older definitions have no sampling strategies

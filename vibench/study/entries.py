@@ -78,10 +78,7 @@ class Entry(BaseModel):
     def registered(self, kind: PluginKind) -> RegisteredPlugin:
         """What is registered under its name, or the class or object that it was given, as it was at first.
 
-        Raises
-        ------
-        RequestError
-            If what it was given is none of the kind, or cannot be sent to worker processes.
+        Raises a `RequestError` if what it was given is none of the kind, or cannot be sent to worker processes.
         """
         if self.is_registered:
             return find(kind, self.name)

@@ -21,10 +21,7 @@ from vibench.study.spec import Study, ToleranceTable
 def expand(study: Study) -> list[Cell]:
     """All cells of a study without duplicates, in the order of its axes.
 
-    Raises
-    ------
-    RequestError
-        If the matrix is empty, or a strategy that takes a tolerance has none.
+    Raises a `RequestError` if the matrix is empty, or a strategy that takes a tolerance has none.
     """
     cells: dict[str, Cell] = {}
     problems = [
@@ -89,10 +86,7 @@ def study_of_cell(cell: Cell, name: str, **settings: Any) -> Study:
 
     Other settings are those that do not determine its numbers: `timing_rounds`, `limits`.
 
-    Raises
-    ------
-    RequestError
-        If a plugin of the cell is not installed, or the name is none of a study.
+    Raises a `RequestError` if a plugin of the cell is not installed, or the name is none of a study.
     """
     problem, dual, primal = (
         _plugin_entry(plugin, label)
@@ -139,10 +133,7 @@ def _stop(tolerance: str, size: str, stop: Stop) -> tuple[str, list[float] | lis
 def only_cell(cells: Sequence[Cell], key: str, where: str) -> Cell:
     """The cell whose key begins so.
 
-    Raises
-    ------
-    RequestError
-        If there is none, or several.
+    Raises a `RequestError` if there is none, or several.
     """
     matching = [cell for cell in cells if cell.key.startswith(key)]
     if len(matching) != 1:

@@ -67,10 +67,7 @@ class Option:
 def options_of(plugin: Any) -> Mapping[str, Option]:
     """The options of a class, by name.
 
-    Raises
-    ------
-    RequestError
-        If an annotation cannot be evaluated.
+    Raises a `RequestError` if an annotation cannot be evaluated.
     """
     constructor = inspect.getattr_static(plugin, "__init__")
     if constructor is object.__init__:
@@ -87,10 +84,7 @@ def options_of(plugin: Any) -> Mapping[str, Option]:
 def checked_arguments(plugin: type, what: str, given: Mapping[str, Any]) -> dict[str, Any]:
     """Options of a class, converted to the types in its constructor's annotations; `what` is its name in messages.
 
-    Raises
-    ------
-    RequestError
-        If an option is unknown, missing, or not of its type.
+    Raises a `RequestError` if an option is unknown, missing, or not of its type.
     """
     options, checked = options_of(plugin), {}
     for name in given:

@@ -55,12 +55,8 @@ class ParameterSet:
     def of(self, problem: Problem) -> Array:
         """The parameters (P×d) of a problem.
 
-        Raises
-        ------
-        NumericalError
-            If the set of the problem itself has the wrong shape, or values that are not finite.
-        RequestError
-            If the sampling strategy makes no set in the box of the problem.
+        Raises a `NumericalError` if the set of the problem itself has the wrong shape, or values that are not finite,
+        and a `RequestError` if the sampling strategy makes no set in the box of the problem.
         """
         if self.role == "training":
             return training_parameters(problem, self.strategy())
@@ -96,10 +92,7 @@ def _problem(plugin: Plugin) -> Problem:
 def parameters_of(problem: Plugin, parameters: ParameterSet) -> Array:
     """The parameters (P×d) of a set for a problem, which is built; for reading only.
 
-    Raises
-    ------
-    RequestError
-        If there is no such set; the message names the problem, and the strategy if there is one.
+    Raises a `RequestError` if there is no such set; the message names the problem, and the strategy if there is one.
     """
     built, sampling = _problem(problem), parameters.sampling
     try:
@@ -115,10 +108,7 @@ def check_sets(problem: Plugin, training: ParameterSet, validation: ParameterSet
     Errors there would say nothing of other parameters; two strategies with the same seed draw the same points. The sets
     of a problem itself are its own business.
 
-    Raises
-    ------
-    RequestError
-        If it is so.
+    Raises a `RequestError` if it is so.
     """
     if validation.is_adaptive and validation.sampling is not None:
         raise RequestError(

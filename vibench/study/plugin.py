@@ -60,10 +60,7 @@ class Plugin:
     def as_installed(self) -> Plugin:
         """The plugin with the version that its code and the files that its options name have now.
 
-        Raises
-        ------
-        RequestError
-            If it is not installed, or one of its files cannot be read.
+        Raises a `RequestError` if it is not installed, or one of its files cannot be read.
         """
         data = self.registered.data_digest(json.loads(self.options))
         return replace(self, code=self.registered.code + f"{DATA}{data}" * bool(data))
@@ -110,10 +107,8 @@ class GivenPlugin(RegisteredPlugin):
     def given(self) -> Any:
         """The class or the object.
 
-        Raises
-        ------
-        RequestError
-            If this process neither was given it nor received it, or cannot import what it is made of.
+        Raises a `RequestError` if this process neither was given it nor received it, or cannot import what it is made
+        of.
         """
         if not self.pickled:
             raise RequestError(
@@ -170,10 +165,7 @@ _given: dict[tuple[str, str, str], GivenPlugin] = {}
 def give(kind: PluginKind, name: str, given: Any) -> GivenPlugin:
     """Take a class or an object, as it is now, for a plugin of this process.
 
-    Raises
-    ------
-    RequestError
-        If it is none of the kind, or cannot be sent to worker processes.
+    Raises a `RequestError` if it is none of the kind, or cannot be sent to worker processes.
     """
     cls, base = given if isinstance(given, type) else type(given), kind.base
     assert base is not None  # plugins of the axes are classes

@@ -17,10 +17,7 @@ from vibench.study.spec import Study
 def find_study(request: str) -> Path:
     """File of a study, from its path or the name under which it is registered.
 
-    Raises
-    ------
-    RequestError
-        If there is no such file or registered study.
+    Raises a `RequestError` if there is no such file or registered study.
     """
     path = Path(request)
     # os.path, since methods of Path raise OSError for names too long for a file.

@@ -111,10 +111,7 @@ class RegisteredPlugin:
     def load(self) -> Any:
         """The object that its entry point refers to.
 
-        Raises
-        ------
-        RequestError
-            If no plugin or several have the name, it cannot be imported, or it is not of its kind.
+        Raises a `RequestError` if no plugin or several have the name, it cannot be imported, or it is not of its kind.
         """
         where = f"{self} ({self._entry.value})"
         try:
@@ -136,10 +133,7 @@ class RegisteredPlugin:
 
         Of a name that several packages use it is their versions: nothing is computed with it.
 
-        Raises
-        ------
-        RequestError
-            If no plugin has the name.
+        Raises a `RequestError` if no plugin has the name.
         """
         if self.conflict:
             return self.origin
@@ -171,10 +165,7 @@ class RegisteredPlugin:
     def check_options(self, given: Mapping[str, Any]) -> dict[str, Any]:
         """Options, converted to the types of its constructor's arguments; as they are if several have its name.
 
-        Raises
-        ------
-        RequestError
-            If an option is unknown, missing, or not of its type.
+        Raises a `RequestError` if an option is unknown, missing, or not of its type.
         """
         from vibench.study.options import checked_arguments
 
@@ -192,10 +183,7 @@ class RegisteredPlugin:
     def data_digest(self, options: Mapping[str, Any]) -> str:
         """Digest of the files that it reads with these options, "" if it reads none, or cannot be made here.
 
-        Raises
-        ------
-        RequestError
-            If one of the files cannot be read.
+        Raises a `RequestError` if one of the files cannot be read.
         """
         if self.kind not in (PROBLEM, SAMPLING) or self.conflict or self.missing:
             return ""
@@ -204,10 +192,7 @@ class RegisteredPlugin:
     def create(self, options: Mapping[str, Any]) -> Any:
         """An instance, its options checked.
 
-        Raises
-        ------
-        RequestError
-            If there is no such plugin, or it does not take these options.
+        Raises a `RequestError` if there is no such plugin, or it does not take these options.
         """
         return self.load()(**self.check_options(options))
 
@@ -231,10 +216,7 @@ def find_named(text: str, kinds: Mapping[str, PluginKind], solvers: Sequence[str
 
     QP solvers are those that are installed (`installed_solvers`), whether they are plugins or not.
 
-    Raises
-    ------
-    RequestError
-        If there is no such plugin, or several.
+    Raises a `RequestError` if there is no such plugin, or several.
     """
     prefix, colon, rest = text.partition(":")
     name = rest if colon else text

@@ -126,12 +126,8 @@ class NotImportableError(Exception):
 def call_in_other_process(function: Callable[..., Any], *arguments: Any, seconds: float) -> Any:
     """The value of a function in another process, whose hashes have another seed than those here.
 
-    Raises
-    ------
-    NotImportableError
-        If function or arguments cannot be sent there.
-    ConformanceError
-        If the call fails there, or takes longer than so many seconds.
+    Raises a `NotImportableError` if function or arguments cannot be sent there, and a `ConformanceError` if the call
+    fails there, or takes longer than so many seconds.
     """
     try:
         call = Call(pickle.dumps((function, arguments)), tuple(folder for folder in sys.path if folder))

@@ -129,10 +129,7 @@ class Comparison:
     def values(self, column: str) -> pd.DataFrame:
         """One column of the table of cells in every run, a row per cell that several runs have.
 
-        Raises
-        ------
-        RequestError
-            If there is no such column.
+        Raises a `RequestError` if there is no such column.
         """
         columns = {**CELLS, **{name: one for run in self.runs for name, one in run.extended.columns.items()}}
         if column not in columns:
@@ -168,10 +165,7 @@ def compare(paths: Sequence[Path], limit: float) -> Comparison:
     The first of the files is what the others are compared with; a number may change within the factor `limit`, at least
     1.
 
-    Raises
-    ------
-    RequestError
-        If there are fewer than two files, or one cannot be read.
+    Raises a `RequestError` if there are fewer than two files, or one cannot be read.
     """
     runs = compared_runs(paths)
     first, *others = runs

@@ -109,10 +109,7 @@ class ComparedRun:
 def compared_runs(paths: Sequence[Path]) -> list[ComparedRun]:
     """The runs of some results files, each under a name of its own: as many folders of its path as that needs.
 
-    Raises
-    ------
-    RequestError
-        If there are fewer than two.
+    Raises a `RequestError` if there are fewer than two.
     """
     if len(paths) < 2:
         raise RequestError(f"{len(paths)} run is given, expected two or more to compare")

@@ -71,10 +71,7 @@ def named(name: str, plugin: FigurePlugin, data: Data) -> Iterator[tuple[str, Dr
 def draw_guarded(name: str, kind: str, draw: Drawing) -> Figure | None:
     """A figure of a plugin with its caption.
 
-    Raises
-    ------
-    FigureError
-        If it cannot be drawn or rendered, or is no figure.
+    Raises a `FigureError` if it cannot be drawn or rendered, or is no figure.
     """
     try:
         figure = draw()

@@ -60,10 +60,7 @@ def draw_published(
     `style.WRITTEN`, that a browser can. `progress` is called before a figure is drawn, with its name, the number of
     those done, and that of all, `note` with a line for every figure that could not be drawn, or that has no data.
 
-    Raises
-    ------
-    RequestError
-        If no plugin draws figures of these runs' problems, or a figure plugin cannot be loaded.
+    Raises a `RequestError` if no plugin draws figures of these runs' problems, or a figure plugin cannot be loaded.
     """
     twins = sorted(_twins(paths, note), key=lambda twin: (twin.publication, _natural(twin.name)))
     if not twins:

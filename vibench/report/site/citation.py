@@ -25,10 +25,7 @@ NAME, VERSION = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*"), re.compile(r"[A-Za-z0
 class Citation:
     """What a site is called, by whom it is, and where it is deposited.
 
-    Raises
-    ------
-    RequestError
-        If the DOI is none.
+    Raises a `RequestError` if the DOI is none.
     """
 
     title: str

@@ -21,10 +21,7 @@ FIRST_PAGE = "index.html"
 def check(site: Path) -> None:
     """Refuse a folder that a site cannot be written into.
 
-    Raises
-    ------
-    RequestError
-        If it is a file, or holds files and is no site, or its list of files cannot be read.
+    Raises a `RequestError` if it is a file, or holds files and is no site, or its list of files cannot be read.
     """
     if site.is_dir():
         if any(site.iterdir()):
@@ -38,10 +35,8 @@ def write(site: Path, fill: Callable[[Path], None]) -> None:
 
     The folder is new, empty, or written by this function; `fill` writes the files into one that it is given.
 
-    Raises
-    ------
-    RequestError
-        If the folder holds files of others under names of the site, or cannot be written; nothing is changed then.
+    Raises a `RequestError` if the folder holds files of others under names of the site, or cannot be written; nothing
+    is changed then.
     """
     check(site)
     try:

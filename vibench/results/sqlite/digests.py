@@ -58,10 +58,7 @@ class Digests:
     def verified(self, table: str, cell: str = "") -> tuple[list[str], list[tuple[Any, ...]]]:
         """Columns and rows of a table, or those of one cell.
 
-        Raises
-        ------
-        DigestError
-            If they are not those that were written.
+        Raises a `DigestError` if they are not those that were written.
         """
         names, rows = self._read(table, cell)
         if changed := self._compared(table, names, rows, cell):

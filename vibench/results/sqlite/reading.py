@@ -103,12 +103,8 @@ def text_reader() -> Callable[[bytes], str]:
 def read_meta(path: Path) -> dict[str, str]:
     """The meta table of a results file; empty if the file has no tables.
 
-    Raises
-    ------
-    DamagedResultsError
-        If the file cannot be read.
-    RequestError
-        If it is a database, but no results file.
+    Raises a `DamagedResultsError` if the file cannot be read, and a `RequestError` if it is a database, but no results
+    file.
     """
     try:
         with open_read_only(path) as db:
@@ -135,10 +131,7 @@ STATUSES = tuple(status.value for status in Status)
 def read_rows(path: Path, table: str, cell: str = "") -> tuple[list[str], list[tuple[Any, ...]]]:
     """Columns and rows of a table of a results file, or those of one cell, in the order in which they were written.
 
-    Raises
-    ------
-    RequestError
-        If they are damaged, or have a status that does not exist.
+    Raises a `RequestError` if they are damaged, or have a status that does not exist.
     """
     try:
         with open_read_only(path) as db, db:
@@ -160,10 +153,7 @@ def read_rows(path: Path, table: str, cell: str = "") -> tuple[list[str], list[t
 def study_of(path: Path, meta: Mapping[str, str]) -> dict[str, Any]:
     """The settings of the study that a results file belongs to, from its meta table.
 
-    Raises
-    ------
-    RequestError
-        If the meta table does not hold them.
+    Raises a `RequestError` if the meta table does not hold them.
     """
     study = json_object(meta.get("study"))
     if study is None:
