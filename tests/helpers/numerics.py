@@ -52,6 +52,21 @@ class Varying(Problem):
         )
 
 
+class Tied(Varying):
+    """The string with two of its averages prescribed, each by a row and its opposite."""
+
+    def __init__(self, n: int = 30, m: int = 8) -> None:
+        super().__init__(n, m)
+        self.W = InnerProduct(sp.block_diag([self.W.matrix, np.eye(4) / m]))
+
+    def assemble(self, mu: Array) -> VariationalInequality:
+        vi, x = super().assemble(mu), np.linspace(0.0, 1.0, self._n + 2)[1:-1]
+        ties = np.array([(x < 0.2) + 0.1 * mu[0], x > 0.8 - 0.1 * mu[0]], float)
+        values = np.array([0.3 - 0.5 * mu[0], -0.5])
+        B, g = sp.vstack([vi.B, ties, -ties], format="csr"), np.concatenate([vi.g, values, -values])
+        return VariationalInequality(vi.A, vi.f, B, g)
+
+
 def fitted_rate(widths: Sequence[float], errors: Sequence[float]) -> float:
     """Slope of the errors over the mesh widths, both logarithmic."""
     return float(np.polyfit(np.log(widths), np.log(errors), 1)[0])

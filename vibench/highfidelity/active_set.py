@@ -12,10 +12,12 @@ from vibench.errors import NumericalError
 from vibench.highfidelity.kkt_systems import ActiveSetSystem, CondensedStiffness
 from vibench.interfaces.problem import Problem, VariationalInequality
 from vibench.interfaces.validation import checked_assembly
+from vibench.linalg.cholesky import SparseCholesky
 from vibench.linalg.inner_product import check_symmetric
 from vibench.linalg.schur_complement import EliminationPattern
 from vibench.qp import verification
-from vibench.qp.exact import exact_solution
+from vibench.qp.exact import least_distance_solution
+from vibench.qp.rows import rows_that_matter
 from vibench.qp.scaling import peak, ratio, row_norms
 from vibench.qp.solve import solve_qp
 
@@ -30,6 +32,9 @@ REFINEMENTS = 3
 
 SIGNIFICANT = 4.0
 """A constraint is violated by more than this multiple of the bound of its own round-off."""
+
+NO_ROOM = 1e-14
+"""Opposite rows whose bounds differ by less than this share of them are an equality."""
 
 MAX_ITERATIONS = 100
 """Largest number of iterations, or the number of constraints if larger: the contact set may move node by node."""
@@ -200,13 +205,18 @@ def solve_unverified(
     NumericalError
         If neither the active set method nor what replaces it finds one.
     """
-    system = stiffness.active_set_system(vi)
-    found, fallback = None if start is None else active_set_iterations(system, start), ""
-    found = found or active_set_iterations(system, np.zeros(vi.B.shape[0], dtype=bool))
-    if found is None:
-        found, fallback = _without_cycling(vi, stiffness, system)
-    u_retained, lam, iterations = found
-    u = system.recover(u_retained)
+    reading = rows_that_matter(vi.B, vi.g, NO_ROOM * np.abs(vi.g))
+    program = reading.program(vi)
+    system = stiffness.active_set_system(program)
+    starts = [] if start is None else [start[reading.kept]]
+    for active in [*starts, np.zeros(len(reading.kept), bool)]:
+        if found := active_set_iterations(system, active, reading.equal):
+            u, forces, iterations = system.recover(found[0]), *found[1:]
+            fallback = ""
+            break
+    else:
+        (u, forces, iterations), fallback = _without_cycling(program, reading.equal, system)
+    lam = reading.multipliers(forces, len(vi.g))
     if _backward_error(vi, u, lam) > ROUND_OFF:  # a large rigid displacement amplifies it in the eliminated unknowns
         u = u + system.correct_eliminated(vi.f - vi.A @ u - vi.B.T @ lam)
     if _backward_error(vi, u, lam) > ROUND_OFF:  # a stiff problem
@@ -243,20 +253,20 @@ def verified(
 
 
 def _without_cycling(
-    vi: VariationalInequality, stiffness: CondensedStiffness, system: ActiveSetSystem
+    vi: VariationalInequality, equal: Mask, system: ActiveSetSystem
 ) -> tuple[tuple[Array, Array, int], str]:
-    """The solution where active sets cycle, or are linearly dependent but for round-off, and what it is due to."""
-    answer = solve_qp(vi, FALLBACK_SOLVER, ACCURACY)
-    if answer.alpha is not None and np.all(np.isfinite(answer.alpha)):
+    """The solution where active sets cycle, or are linearly dependent, and what it is due to."""
+    answer, guess = solve_qp(vi, FALLBACK_SOLVER, ACCURACY), np.zeros(len(vi.g), bool)
+    if not equal.any() and answer.alpha is not None and np.all(np.isfinite(answer.alpha)):
         weights = answer.alpha * row_norms(vi.B)
-        found = active_set_iterations(system, weights > 1e-8 * np.max(weights, initial=0.0))
+        guess = weights > 1e-8 * np.max(weights, initial=0.0)
+        found = active_set_iterations(system, guess)
         if found is not None:
-            return found, f"the active set cycled; first guess by {FALLBACK_SOLVER}"
-    program = stiffness.condensed_program(vi)
-    exact = None if program is None else exact_solution(program)
+            return (system.recover(found[0]), *found[1:]), f"the active set cycled; first guess by {FALLBACK_SOLVER}"
+    exact = least_distance_solution(vi, SparseCholesky(vi.A, "A"), equal, guess)
     if exact is None:
         raise NumericalError("no active set solves the high-fidelity problem; is it feasible?")
-    return (exact.x, exact.alpha, 0), "the active set cycled; solved as a least distance problem"
+    return (*exact, 0), "the active set cycled; solved as a least distance problem"
 
 
 def _backward_error(vi: VariationalInequality, u: Array, lam: Array) -> float:
@@ -277,14 +287,20 @@ def _refined(vi: VariationalInequality, stiffness: CondensedStiffness, u: Array,
     return u + system.recover(change), np.maximum(lam + forces, 0.0)
 
 
-def active_set_iterations(system: ActiveSetSystem, active: Mask) -> tuple[Array, Array, int] | None:
+def active_set_iterations(
+    system: ActiveSetSystem, active: Mask, equal: Mask | None = None
+) -> tuple[Array, Array, int] | None:
     """Run the primal–dual active set method from an initial active set (m,): u (c,), λ (m,) and iterations.
+
+    Constraints that are `equal` (m,) stay active, whatever the sign of their multiplier.
 
     `None` if the sets cycle or one of them has linearly dependent constraints. Signs are decided row by row, against
     the round-off of the row itself, and multipliers as the forces that they are: no result depends on the scaling of a
     row, or on a far one.
     """
     seen: set[bytes] = set()
+    always = np.zeros_like(active) if equal is None else equal
+    active = active | always
     B, g, weights = system.B, system.g, row_norms(system.B)
     sizes, unit = abs(B), SIGNIFICANT * verification.UNIT * (np.diff(B.indptr) + 2.0)
     for iteration in range(1, max(MAX_ITERATIONS, len(active)) + 1):
@@ -295,7 +311,7 @@ def active_set_iterations(system: ActiveSetSystem, active: Mask) -> tuple[Array,
         forces = weights * lam
         violated = ~active & (B @ u - g > unit * (sizes @ np.abs(u) + np.abs(g)))
         in_contact = active & (forces > 1e-14 * np.max(np.abs(forces), initial=0.0))
-        following = violated | in_contact
+        following = violated | in_contact | always
         if np.array_equal(following, active):
             return u, lam, iteration
         if following.tobytes() in seen:

@@ -70,14 +70,6 @@ class CondensedStiffness:
             solutions[:, k] = self._condensed.recover(retained, particular)
         return solutions
 
-    def condensed_program(self, vi: VariationalInequality) -> VariationalInequality | None:
-        """`vi`, whose stiffness must be this one, dense and in the retained unknowns; `None` if these are many."""
-        if not self._condensed.dense:
-            return None
-        load, _ = self._condensed.condense_load(vi.f)
-        B = sp.csc_array(vi.B)[:, self._pattern.retained].toarray()
-        return VariationalInequality(self._condensed.dense_schur, load, B, vi.g)
-
     @cached_property
     def _schur_factor(self) -> SparseCholesky:
         return SparseCholesky(self._condensed.schur, "A")

@@ -40,26 +40,36 @@ of B u_N − g and of B w, and the w that is used satisfies the constraints by m
 d for which w is feasible at u_N + d, too, gives a bound of ε; d = 0 where w is not feasible, or where constraints are
 dependent and d is lost in round-off. The norms ρ, ρ_B and ω and the product κ are evaluated in floating-point
 arithmetic without such a bound.
+
+Equalities, a row and its opposite, leave no room for a margin. A w' that holds them is within η of the computed w
+(`vibench.model.equalities`), and satisfies the other rows where w does by a margin. (ii) holds for w', with ω + η, with
+‖r + A w‖_{A⁻¹} + η in the duality gap, and with 2 λ_Nᵀ|B(w' − w)| added to 2κ. λ is not unique there, nor is it where
+other rows are dependent: β_A is zero, and its error is bounded in the norm ‖Bᵀε‖_{A⁻¹} alone.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy.sparse as sp
 
 from vibench.arrays import Array, Mask
-from vibench.highfidelity.active_set import FALLBACK_SOLVER, active_set_iterations
+from vibench.highfidelity.active_set import active_set_iterations
 from vibench.interfaces.problem import VariationalInequality
 from vibench.linalg.inertia import UNIT
+from vibench.model.equalities import Equalities
 from vibench.model.errors import Energy
-from vibench.qp.solve import solve_qp
+from vibench.qp.exact import least_distance_solution
+from vibench.qp.rows import Rows, rows_that_matter
 from vibench.stability.coercivity import Constant, Stability
 
-ACCURACY = 1e-10
-"""Relative accuracy asked of the solver that replaces the active set method."""
+NO_ROOM = 1e-12
+"""Opposite rows are an equality where there is less room between them than this share of the terms of B u_N − g."""
+
+IMPLIED = 1e4
+"""Equalities that depend on others hold with them up to this multiple of round-off, or the problem has no solution."""
 
 MARGIN = 4.0
 """The first margin of s, as a multiple of the round-off in s."""
@@ -84,7 +94,7 @@ class ErrorBounds:
     rho, rho_range, omega, kappa
         ρ, ρ_B and ω, in the unit of `u_energy`, and κ in that of its square.
     note
-        Why there are none, or which constant in them is estimated; "" where they are proved.
+        Why there are none, or none in W, or which constant in them is estimated; "" where all are proved.
     """
 
     u_energy: float
@@ -105,8 +115,10 @@ class ErrorBounds:
 
 
 NOT_IN_CONE = "λ_N has negative coefficients"
+ON_ABSENT_ROW = "λ_N is not zero on a row whose g is infinite"
 NO_CORRECTION = "no w with B w ≥ s was found"
 ESTIMATED = "α is estimated"
+NOT_UNIQUE = "λ has no bound in W: no β_A > 0 is proved, as where rows are dependent or equalities"
 
 
 def error_bounds(
@@ -127,16 +139,19 @@ def bound_errors_at(
     """Bounds (ii) of one reduced u (n,) and λ (m,), from lower bounds of α and of β_A."""
     if np.min(lam, initial=0.0) < 0.0:
         return ErrorBounds.none(NOT_IN_CONE)
+    if np.any(lam[~np.isfinite(vi.g)]):
+        return ErrorBounds.none(ON_ABSENT_ROW)
     corrected = find_correction(vi, energy, u, lam)
     if corrected is None:
         return ErrorBounds.none(NO_CORRECTION)
-    w = corrected.w
-    of_u = terms(w, vi, energy, u, lam)
-    of_lam = min((of_u, *_with_constrained_residual(of_u.residual, w, vi, energy, u, lam)), key=lambda terms: terms.rho)
+    of_u = terms(corrected, vi, energy, u, lam)
+    with_d = _with_constrained_residual(of_u.residual, corrected, vi, energy, u, lam)
+    of_lam = min((of_u, *with_d), key=lambda terms: terms.rho)
     in_V = of_u.primal / float(np.sqrt(alpha.value))
     in_W = of_lam.dual / beta.value if beta.value > 0.0 else float("inf")
     terms_of_both = of_u.rho, of_lam.rho, of_u.omega, of_u.kappa
-    return ErrorBounds(of_u.primal, in_V, of_lam.dual, in_W, *terms_of_both, "" if alpha.proved else ESTIMATED)
+    notes = [ESTIMATED] * (not alpha.proved) + [NOT_UNIQUE] * (not beta.value > 0.0)
+    return ErrorBounds(of_u.primal, in_V, of_lam.dual, in_W, *terms_of_both, "; ".join(notes))
 
 
 def corrected_pair(vi: VariationalInequality, energy: Energy, u: Array, lam: Array) -> tuple[Array, Array] | None:
@@ -171,25 +186,39 @@ class Terms:
         return min(float(np.sqrt(gap)), self.omega + self.primal)
 
 
-def terms(w: Array, vi: VariationalInequality, energy: Energy, u: Array, lam: Array) -> Terms:
-    """The terms with a correction w (n,), B w ≥ B u − g, of u (n,) and λ ≥ 0 (m,)."""
-    residual = vi.f - vi.A @ u - vi.B.T @ lam
-    kappa = max(0.0, float(lam @ _slack(vi, u, w)))
-    of_feasible = energy.dual_norm(residual + vi.A @ w)
-    return Terms(residual, energy.dual_norm(residual), energy.norm(w), kappa, of_feasible)
+@dataclass(frozen=True)
+class Constraints:
+    """The rows of one inequality that matter, and those of them that are equalities."""
 
+    vi: VariationalInequality
+    rows: Rows
+    equalities: Equalities | None
 
-def _with_constrained_residual(
-    residual: Array, w: Array, vi: VariationalInequality, energy: Energy, u: Array, lam: Array
-) -> Iterator[Terms]:
-    """The terms for u + d, whose residual is the part of r in the range of Bᵀ, if w is feasible for it and d exists."""
-    system = energy.stiffness.active_set_system(VariationalInequality(vi.A, residual, vi.B, np.zeros_like(vi.g)))
-    try:
-        d = system.recover(system.solve_active(np.arange(len(vi.g)))[0])
-    except (RuntimeError, np.linalg.LinAlgError):  # an exactly singular system
-        return
-    if np.all(_lacking(vi, u + d, w) <= 0.0):
-        yield terms(w, vi, energy, u + d, lam)
+    @classmethod
+    def of(cls, vi: VariationalInequality, energy: Energy, u: Array, lam: Array) -> Constraints:
+        """As a correction of u_N (n,) and λ_N (m,) reads them."""
+        room = NO_ROOM * (abs(sp.csr_array(vi.B)) @ np.abs(u) + np.abs(vi.g))
+        rows, equalities = rows_that_matter(vi.B, vi.g, room, lam), None
+        if rows.equal.any():
+            K = energy.factor.solve_factor_transposed(sp.csr_array(vi.B)[rows.kept[rows.equal]].toarray().T)
+            equalities = Equalities.of(K, energy.factor.solve_factor, vi.B)
+        return cls(vi, rows, equalities)
+
+    def moved(self, u: Array, w: Array) -> Array:
+        """The correction w (n,) with the equalities held."""
+        return w if self.equalities is None else w - self.equalities.step(_slack(self.vi, u, w)[self.rows.equalities])
+
+    def lacking(self, u: Array, w: Array) -> tuple[Array, float]:
+        """What rows may lack of B w' ≥ s in exact arithmetic (m,), and η, a bound of ‖w' − w‖_A."""
+        slack, round_off, eta, equal = _slack(self.vi, u, w), _round_off(self.vi, u, w), 0.0, self.rows.equalities
+        lacking = np.where(self.rows.implied, 0.0, round_off - slack)
+        if self.equalities is not None:
+            eta = self.equalities.distance((np.abs(slack) + round_off)[equal])
+            lacking = np.where(self.rows.implied, 0.0, lacking + eta * self.equalities.reach)
+            missed = np.abs(slack[equal]) > IMPLIED * round_off[equal]
+            missed[self.equalities.chosen] = False
+            lacking[equal[missed]] = np.inf
+        return lacking, eta
 
 
 @dataclass(frozen=True)
@@ -197,11 +226,41 @@ class Correction:
     """A w (n,) with B w ≥ s also in exact arithmetic, and ν ≥ 0 (m,) with A w = Bᵀ(ν − λ_N).
 
     As A(u_N − w) + Bᵀν = f − r and ν is complementary to B(u_N − w) ≤ g, u_N − w and ν solve (7) with the load f − r:
-    up to the residual of (u_N, λ_N), ν is the high-fidelity multiplier. It is approximate where w is.
+    up to the residual of (u_N, λ_N), ν is the high-fidelity multiplier. It is approximate where w is. Where there are
+    equalities B w ≥ s holds for a w' with ‖w' − w‖_A ≤ `eta`.
     """
 
     w: Array
     nu: Array
+    eta: float
+    constraints: Constraints
+
+
+def terms(correction: Correction, vi: VariationalInequality, energy: Energy, u: Array, lam: Array) -> Terms:
+    """The terms with a correction of u (n,) and λ ≥ 0 (m,)."""
+    w, eta, equalities = correction.w, correction.eta, correction.constraints.equalities
+    residual, pressed = vi.f - vi.A @ u - vi.B.T @ lam, lam > 0.0  # elsewhere g may be infinite
+    kappa = max(0.0, float(lam[pressed] @ _slack(vi, u, w)[pressed]))
+    if equalities is not None:
+        kappa += eta * float(lam @ equalities.reach)
+    of_feasible = energy.dual_norm(residual + vi.A @ w) + eta
+    return Terms(residual, energy.dual_norm(residual), energy.norm(w) + eta, kappa, of_feasible)
+
+
+def _with_constrained_residual(
+    residual: Array, correction: Correction, vi: VariationalInequality, energy: Energy, u: Array, lam: Array
+) -> Iterator[Terms]:
+    """The terms for u + d, whose residual is the part of r in the range of Bᵀ, if w is feasible for it and d exists."""
+    constraints = correction.constraints
+    program = constraints.rows.program(VariationalInequality(vi.A, residual, vi.B, np.zeros_like(vi.g)))
+    system = energy.stiffness.active_set_system(program)
+    try:
+        d = system.recover(system.solve_active(np.arange(len(program.g)))[0])
+    except (RuntimeError, np.linalg.LinAlgError):  # an exactly singular system
+        return
+    lacking, eta = constraints.lacking(u + d, correction.w)
+    if np.all(lacking <= 0.0):
+        yield terms(replace(correction, eta=eta), vi, energy, u + d, lam)
 
 
 def find_correction(vi: VariationalInequality, energy: Energy, u: Array, lam: Array) -> Correction | None:
@@ -214,41 +273,45 @@ def find_correction(vi: VariationalInequality, energy: Energy, u: Array, lam: Ar
     u, lam
         u_N (n,) and λ_N ≥ 0 (m,).
     """
-    excess, margin = vi.B @ u - vi.g, MARGIN * _round_off(vi, u, np.zeros_like(u))
-    largest = IMPLAUSIBLE * max(np.max(lam, initial=0.0), _largest_multiplier(vi, excess))
+    constraints = Constraints.of(vi, energy, u, lam)
+    kept, equal = constraints.rows.kept, constraints.rows.equal
+    B, excess = sp.csr_array(vi.B)[kept], (vi.B @ u - vi.g)[kept]
+    margin = np.where(equal, 0.0, MARGIN * _round_off(vi, u, np.zeros_like(u))[kept])
+    largest = IMPLAUSIBLE * max(np.max(lam, initial=0.0), _largest_multiplier(replace(vi, B=B), excess))
     doubtful = None
     for _ in range(ATTEMPTS):
-        raised = VariationalInequality(vi.A, -(vi.B.T @ lam), -vi.B, -(excess + margin))
-        for w, nu in _minimisers(raised, energy, lam > 0.0, largest):
-            lacking = _lacking(vi, u, w)
+        raised = VariationalInequality(vi.A, -(vi.B.T @ lam), -B, -(excess + margin))
+        for w, forces in _minimisers(raised, energy, equal, lam[kept] > 0.0, largest):
+            moved = constraints.moved(u, w)
+            lacking, eta = constraints.lacking(u, moved)
             if not np.all(lacking <= 0.0):  # NaN is not
-                margin = np.maximum(margin, 2.0 * np.nan_to_num(lacking, nan=0.0, posinf=0.0))
-            elif np.max(nu, initial=0.0) <= largest:
-                return Correction(w, nu)
-            else:
-                doubtful = Correction(w, nu)
+                margin = np.maximum(margin, 2.0 * np.nan_to_num(lacking[kept], nan=0.0, posinf=0.0))
+                continue
+            found = Correction(moved, constraints.rows.multipliers(forces, len(vi.g)), eta, constraints)
+            if np.max(forces[~equal], initial=0.0) <= largest:
+                return found
+            doubtful = found
         margin = 10.0 * margin
     return doubtful
 
 
 def _minimisers(
-    program: VariationalInequality, energy: Energy, start: Mask, largest: float
+    program: VariationalInequality, energy: Energy, equal: Mask, start: Mask, largest: float
 ) -> Iterator[tuple[Array, Array]]:
-    """Approximate solutions and multipliers of the program: by active sets, then by an interior-point method.
+    """Solutions and multipliers of the program, up to round-off: by active sets, then as a least distance problem.
 
     Active sets of constraints that are dependent but for round-off may have a w that is feasible and huge, with a
-    multiplier above `largest`: others follow it.
+    multiplier above `largest`: the other follows it.
     """
     system = energy.stiffness.active_set_system(program)
     for active in (start, np.zeros_like(start)):
-        settled = active_set_iterations(system, active)
+        settled = active_set_iterations(system, active, equal)
         if settled is not None:
             yield system.recover(settled[0]), settled[1]
-            if np.max(settled[1], initial=0.0) <= largest:
+            if np.max(settled[1][~equal], initial=0.0) <= largest:
                 return
-    answer = solve_qp(program, FALLBACK_SOLVER, ACCURACY)
-    if answer.x is not None and answer.alpha is not None:
-        yield answer.x, np.maximum(answer.alpha, 0.0)
+    if (nearest := least_distance_solution(program, energy.factor, equal, start)) is not None:
+        yield nearest
 
 
 def _largest_multiplier(vi: VariationalInequality, excess: Array) -> float:
@@ -262,11 +325,6 @@ def _largest_multiplier(vi: VariationalInequality, excess: Array) -> float:
     return float(np.max(excess * shares, initial=0.0))
 
 
-def _lacking(vi: VariationalInequality, u: Array, w: Array) -> Array:
-    """What the constraints B w ≥ s may lack in exact arithmetic (m,); negative where they hold."""
-    return _round_off(vi, u, w) - _slack(vi, u, w)
-
-
 def _slack(vi: VariationalInequality, u: Array, w: Array) -> Array:
     """B w − s (m,)."""
     return np.asarray(vi.B @ w - (vi.B @ u - vi.g))
@@ -276,4 +334,5 @@ def _round_off(vi: VariationalInequality, u: Array, w: Array) -> Array:
     """Bound (m,) of the round-off in `_slack` (Higham 2002, §3.1)."""
     B = sp.csr_array(vi.B)
     terms = np.diff(B.indptr) + 4.0
-    return np.asarray(1.01 * terms * UNIT * (abs(B) @ (np.abs(w) + np.abs(u)) + np.abs(vi.g)))
+    g = np.where(np.isfinite(vi.g), np.abs(vi.g), 0.0)
+    return np.asarray(1.01 * terms * UNIT * (abs(B) @ (np.abs(w) + np.abs(u)) + g))

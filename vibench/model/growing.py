@@ -96,7 +96,7 @@ class GrowingModel:
         corrected = find_correction(vi, energy, u, lam)
         if corrected is None:
             return float("inf")
-        of_pair = terms(corrected.w, vi, energy, u, lam)
+        of_pair = terms(corrected, vi, energy, u, lam)
         of_u = ratio(of_pair.primal, energy.norm(u))
         pressed, W = energy.dual_norm(vi.B.T @ lam), self._problem.W
         if not pressed > 0.0:

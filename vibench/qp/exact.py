@@ -1,4 +1,8 @@
-"""Reduced programs solved to round-off, against which the part of an error that a QP solver makes is measured."""
+"""Programs solved to round-off as least distance problems, whether their constraints are independent or not.
+
+Reduced ones are solved as a whole: the part of an error that a QP solver makes is measured against these solutions. Of
+large ones with sparse matrices the constraints are added that the solution so far violates.
+"""
 
 from __future__ import annotations
 
@@ -6,10 +10,13 @@ from dataclasses import dataclass
 
 import numpy as np
 import scipy.linalg
+import scipy.sparse as sp
 from scipy.optimize import nnls
 
 from vibench.arrays import Array, Indices, Mask
 from vibench.interfaces.problem import VariationalInequality
+from vibench.linalg.cholesky import SparseCholesky
+from vibench.linalg.inner_product import project_out
 from vibench.qp.scaling import row_norms, size
 
 ROUND_OFF = 1e-12
@@ -22,7 +29,7 @@ TIGHT = 1e-8
 """Constraints with a smaller slack than this fraction of its terms may carry a multiplier."""
 
 MAX_ITERATIONS = 20
-"""Active sets tried after the first."""
+"""Active sets tried after the first, and how often constraints are added."""
 
 
 @dataclass(frozen=True)
@@ -69,6 +76,62 @@ def exact_solution(program: VariationalInequality) -> ExactSolution | None:
         if active.tobytes() in seen:
             return None
     return None
+
+
+def least_distance_solution(
+    vi: VariationalInequality, factor: SparseCholesky, equal: Mask, start: Mask
+) -> tuple[Array, Array] | None:
+    """The solution u (n,) and λ (m,) of a sparse program whose constraints may be dependent; `None` if none is found.
+
+    Parameters
+    ----------
+    vi, factor
+        A, f, B and g, and the Cholesky factor of A.
+    equal, start
+        Constraints that hold as equalities (m,), with multipliers of any sign, and those to begin with (m,).
+    """
+    B, lengths = sp.csr_array(vi.B), row_norms(vi.B)
+    tolerance = ROUND_OFF * lengths
+    chosen, load = start | equal, factor.solve_factor_transposed(vi.f)
+    for _ in range(MAX_ITERATIONS):
+        rows = np.flatnonzero(chosen)
+        scaled = sp.csr_array(sp.diags_array(1.0 / lengths[rows]) @ B[rows])
+        K = factor.solve_factor_transposed(scaled.toarray().T)
+        forces = _on_rows(K, load, vi.g[rows] / lengths[rows], equal[rows])
+        if forces is None:
+            return None
+        lam = np.zeros(len(vi.g))
+        lam[rows] = forces / lengths[rows]
+        u = factor.solve(vi.f - B.T @ lam)
+        violated = ~chosen & (B @ u - vi.g > tolerance * (size(u) + np.abs(vi.g) / lengths))
+        if not violated.any():
+            return u, lam
+        chosen |= violated
+    return None
+
+
+def _on_rows(K: Array, load: Array, g: Array, equal: Mask) -> Array | None:
+    """Multipliers (k,) of min ½|y|² − load·y subject to Kᵀy ≤ g, or = g, from the columns of K (n×k)."""
+    held, free, forces = np.flatnonzero(equal), np.flatnonzero(~equal), np.zeros(len(g))
+    Q, R = np.zeros((len(K), 0)), np.zeros((0, 0))
+    if len(held):
+        q, r, order = scipy.linalg.qr(K[:, held], mode="economic", pivoting=True)
+        pivots = np.abs(np.diag(r))
+        rank = int(np.sum(pivots > DEPENDENT * pivots[0]))
+        Q, R, held = q[:, :rank], r[:rank, :rank], held[order[:rank]]
+    prescribed = scipy.linalg.solve_triangular(R, g[held], trans="T") if len(held) else np.zeros(0)
+    rest = project_out(Q, K[:, free])
+    left = np.linalg.norm(rest, axis=0) > DEPENDENT * np.linalg.norm(K[:, free], axis=0)  # others follow from `equal`
+    free, rest = free[left], rest[:, left]
+    along = Q.T @ K[:, free]
+    P, S = np.linalg.qr(rest)
+    inner = exact_solution(VariationalInequality(np.eye(P.shape[1]), P.T @ load, S.T, g[free] - along.T @ prescribed))
+    if inner is None:
+        return None
+    forces[free] = inner.alpha
+    if len(held):
+        forces[held] = scipy.linalg.solve_triangular(R, Q.T @ load - along @ inner.alpha - prescribed)
+    return forces
 
 
 class _Whitened:

@@ -345,7 +345,9 @@ QUERIES: Mapping[str, Column] = {
     ),
     "bound_omega": real("A", "ω, the norm of the correction w of the constraint violation."),
     "bound_kappa": real("A²", "κ = λ_Nᵀ(B w − s), the complementarity of w and λ_N."),
-    "bound_note": text("Why there are no bounds, or which of their constants is estimated; empty if they are proved."),
+    "bound_note": text(
+        "Why there are no bounds, or none of λ in W, or which constant is estimated; empty if all are proved."
+    ),
     "certificate": text(
         "Bounds at online cost: certified, verified up to interpolation errors that were measured, or none."
     ),

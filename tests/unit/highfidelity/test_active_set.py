@@ -66,9 +66,9 @@ def test_a_cycling_active_set_is_helped_and_the_help_is_recorded(monkeypatch: py
     assert alone.fallback == ""
     iterate, calls = active_set.active_set_iterations, []
 
-    def cycles_at_first(system, active):
+    def cycles_at_first(system, active, *equal):
         calls.append(active)
-        return None if len(calls) == 1 else iterate(system, active)
+        return None if len(calls) == 1 else iterate(system, active, *equal)
 
     monkeypatch.setattr(active_set, "active_set_iterations", cycles_at_first)
     helped = active_set.solve_high_fidelity(vi)

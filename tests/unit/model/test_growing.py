@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
-from numerics import Varying
+from numerics import Tied, Varying
 
 from vibench import create, project_on_cone
 from vibench.highfidelity.active_set import HighFidelitySolver
@@ -14,12 +16,15 @@ from vibench.linalg.cholesky import SparseCholesky
 from vibench.model.growing import GrowingModel, GrowingTrainer
 from vibench.reduction import part_in_cone
 
-PROBLEMS = {"B and A vary": Varying, "A is constant": lambda: create("problem", "hertz", {"resolution": 300})}
+PROBLEMS = {
+    "B and A vary": Varying,
+    "A is constant": lambda: create("problem", "hertz", {"resolution": 300}),
+}
 
 
-@pytest.mark.parametrize("case", PROBLEMS)
-def test_bounds_hold_everywhere_and_vanish_at_the_solutions(case: str) -> None:
-    problem: Problem = PROBLEMS[case]()
+@pytest.mark.parametrize("make", [*PROBLEMS.values(), Tied], ids=[*PROBLEMS, "equalities"])
+def test_bounds_hold_everywhere_and_vanish_at_the_solutions(make: Callable[[], Problem]) -> None:
+    problem = make()
     solver = HighFidelitySolver(problem)
     model = GrowingModel(problem, solver)
     solved = problem.parameters.sample(4, 1)

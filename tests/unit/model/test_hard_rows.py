@@ -1,0 +1,69 @@
+"""Rows that are dependent, nearly so, equalities, or in any units, against solutions of 100 digits."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import scipy.sparse as sp
+from decimals import difference, exact_decimal
+from numerics import spd
+
+from vibench.highfidelity.active_set import solve_high_fidelity
+from vibench.highfidelity.kkt_systems import CondensedStiffness
+from vibench.interfaces.problem import VariationalInequality
+from vibench.linalg.cholesky import SparseCholesky
+from vibench.model.error_bounds import NOT_UNIQUE, bound_errors_at, corrected_pair
+from vibench.model.errors import Energy
+from vibench.stability.coercivity import Constant
+
+KINDS = ["plain", "opposite", "dependent", "nearly dependent", "copies", "opposite copies", "opposite dependent"]
+
+
+def hard(kind: str, seed: int) -> VariationalInequality:
+    """A random inequality with rows of one kind, scaled by powers of two between 1e-8 and 1e8."""
+    rng, n = np.random.default_rng(seed), 8
+    A, f = spd(n, rng, 10.0 ** rng.uniform(0.0, 4.0)), rng.standard_normal(n)
+    free, B = np.linalg.solve(A, f), rng.standard_normal((4, n))
+    g = B @ free - rng.uniform(-0.5, 1.0, 4) * np.linalg.norm(free)
+    if "opposite" in kind:
+        B, g = np.vstack([B, -B[:2]]), np.append(g, -g[:2])
+    if "nearly" in kind:
+        B = np.vstack([B, B[2] + 1e-8 * rng.standard_normal(n)])
+        g = np.append(g, B[-1] @ free - (B[2] @ free - g[2]))
+    elif "dependent" in kind:
+        sums = rng.uniform(0.2, 1.0, 2)
+        B, g = np.vstack([B, sums @ B[2:4], B[2]]), np.append(g, [sums @ g[2:4], g[2]])
+    if "copies" in kind:
+        B, g = np.vstack([B, B, B[:2]]), np.concatenate([g, g, g[:2]])
+    scale = 2.0 ** np.round(rng.uniform(-27.0, 27.0, len(g)))
+    return VariationalInequality(sp.csc_array(A), f, sp.csr_array(scale[:, None] * B), scale * g)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("seed", range(8))
+def test_solutions_are_right_and_bounds_exist_and_hold(kind: str, seed: int) -> None:
+    vi, rng = hard(kind, seed), np.random.default_rng(seed)
+    solution = solve_high_fidelity(vi)
+    u, lam = exact_decimal(vi, solution.lam > 0.0)
+    norm = Energy(vi.A, SparseCholesky(vi.A), CondensedStiffness(vi.A))
+    exact_u, exact_lam = np.asarray(u, float), np.asarray(lam, float)
+    size = norm.norm(exact_u) + norm.dual_norm(vi.B.T @ exact_lam)
+    assert norm.norm(difference(u, solution.u)) <= 1e-12 * size
+    share = 10.0 ** rng.uniform(-8.0, 0.0)
+    u_N = exact_u + share * np.linalg.norm(exact_u) * rng.standard_normal(len(u))
+    lengths = np.linalg.norm(vi.B.toarray(), axis=1)
+    lam_N = np.maximum(exact_lam * (1.0 + share * rng.standard_normal(len(lam))), 0.0)
+    lam_N += (
+        share * np.max(exact_lam * lengths) / lengths * rng.uniform(0.0, 1.0, len(lam)) * (rng.random(len(lam)) < 0.3)
+    )
+    pair = corrected_pair(vi, norm, u_N, lam_N)
+    assert pair is not None
+    for v, nu in ((u_N, lam_N), pair):
+        found = bound_errors_at(vi, norm, Constant(1.0, True), Constant(0.0, True), v, nu)
+        assert found.note == NOT_UNIQUE
+        errors = norm.norm(difference(u, v)), norm.dual_norm(vi.B.T @ difference(lam, nu))
+        assert errors[0] <= found.u_energy + 1e-13 * size
+        assert errors[1] <= found.lambda_natural + 1e-13 * size
+        # what the identity bounds is the sum of both, and of this
+        together = sum(error**2 for error in errors) + 2.0 * nu @ np.maximum(vi.g - vi.B @ exact_u, 0.0)
+        assert found.u_energy <= 10.0 * np.sqrt(together) + 1e-6 * size
