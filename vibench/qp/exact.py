@@ -97,7 +97,7 @@ def least_distance_solution(
         rows = np.flatnonzero(chosen)
         scaled = sp.csr_array(sp.diags_array(1.0 / lengths[rows]) @ B[rows])
         K = factor.solve_factor_transposed(scaled.toarray().T)
-        forces = _on_rows(K, load, vi.g[rows] / lengths[rows], equal[rows])
+        forces = least_distance(K, load, vi.g[rows] / lengths[rows], equal[rows])
         if forces is None:
             return None
         lam = np.zeros(len(vi.g))
@@ -110,8 +110,11 @@ def least_distance_solution(
     return None
 
 
-def _on_rows(K: Array, load: Array, g: Array, equal: Mask) -> Array | None:
-    """Multipliers (k,) of min ½|y|² − load·y subject to Kᵀy ≤ g, or = g, from the columns of K (n×k)."""
+def least_distance(K: Array, load: Array, g: Array, equal: Mask) -> Array | None:
+    """Multipliers (k,) of min ½|y|² − loadᵀy subject to Kᵀy ≤ g, or = g where `equal`; `None` if none are found.
+
+    The columns of K (n×k) may be dependent; the point itself is y = load − K · multipliers.
+    """
     held, free, forces = np.flatnonzero(equal), np.flatnonzero(~equal), np.zeros(len(g))
     Q, R = np.zeros((len(K), 0)), np.zeros((0, 0))
     if len(held):

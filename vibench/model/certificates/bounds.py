@@ -182,7 +182,7 @@ class OnlineCertificate:
         corrected, note = self._corrected(problem, mu, evaluated, y, lam, upper)
         if corrected is None:
             return OnlineBound.none(note)
-        along, norm, kappa = corrected
+        along, norm, kappa, eta = corrected
         z = residual_coefficients(theta, y, self.forces, evaluated.contact, alpha, lam)
         coordinates, beside, missing = self.residual.parts(z)
         square_of_u = float(x @ (reduced.program.A @ x))
@@ -192,7 +192,7 @@ class OnlineCertificate:
         omega = norm * sqrt(upper)
         square = rho**2 / lower + omega**2 + 2.0 * kappa
         bound = sqrt(square)
-        work = float(along @ coordinates) + (beside + missing + lacking) * norm  # at least rᵀw
+        work = float(along @ coordinates) + (beside + missing + lacking) * norm + rho * eta  # at least rᵀw
         natural = min(sqrt(max(0.0, square + 2.0 * work)), omega + bound)
         least = sqrt(max(0.0, square_of_u - base.stiffness_error * u_norm**2)) - bound  # of ‖u‖
         relative = bound / least if least > 0.0 else inf
@@ -213,7 +213,7 @@ class OnlineCertificate:
         theta = base.coefficients(evaluated.samples)
         gamma = 1.0 if base.spectral is None else base.spectral.at(mu, theta["A"])[1]
         middle = 0.5 * (alpha_A + gamma)
-        found = None
+        found, eta = None, 0.0
         if self.prepared is not None and base.bound_terms is not None:
             B, g, g_size = self._constraint(problem, mu, evaluated)
             found = self.prepared.multiplier(float(B), g, g_size, y, lam, middle)
@@ -222,10 +222,10 @@ class OnlineCertificate:
             best = find_contact_correction(self.compliance, contact, on_contact, uncertain, lam, middle)
             if best is None:
                 return None
-            found = best.nu, best.norm, best.gap
+            found, eta = (best.nu, best.norm, best.gap), best.eta
         nu, norm, gap = found
-        rho = bound.rho + 0.5 * (gamma - alpha_A) / sqrt(alpha_A) * norm
-        both = sqrt(rho**2 + 2.0 * gap)
+        rho = bound.rho + (0.5 * (gamma - alpha_A) * norm + middle * eta) / sqrt(alpha_A)
+        both = sqrt(rho**2 + 2.0 * gap) + eta * sqrt(gamma)
         relative = inf
         if 0.0 < bound.relative < inf:
             relative = both / (bound.u_energy / bound.relative)  # over the least ‖u‖ that is known
@@ -252,14 +252,14 @@ class OnlineCertificate:
 
     def _corrected(
         self, problem: Problem, mu: Array, evaluated: Evaluated, y: Array, lam: Array, gamma: float
-    ) -> tuple[tuple[Array, float, float] | None, str]:
-        """Coordinates of X w in the basis of residuals, ‖w‖ and κ; and why it is no prepared w, or there is none."""
+    ) -> tuple[tuple[Array, float, float, float] | None, str]:
+        """Coordinates of X w in the basis of residuals, ‖w‖, κ and η; and why w is not prepared, or there is none."""
         prepared = self.prepared
         if prepared is not None:
             B, g, g_size = self._constraint(problem, mu, evaluated)
             quick = prepared.correction(B, g, g_size, y, lam, gamma)
             if quick is not None:
-                return quick, ""
+                return (*quick, 0.0), ""
         on_contact, uncertain = self.contact_basis @ y, float(np.linalg.norm(y)) * self._round_off
         correction = find_contact_correction(
             self.compliance, evaluated.contact or contact_at(problem, mu), on_contact, uncertain, lam, gamma
@@ -267,7 +267,7 @@ class OnlineCertificate:
         if correction is None:
             return None, NO_CORRECTION
         along = correction.load @ self.contact_directions[correction.unknowns]
-        return (along, correction.norm, correction.kappa), "" if prepared is None else NOT_PREPARED
+        return (along, correction.norm, correction.kappa, correction.eta), "" if prepared is None else NOT_PREPARED
 
     def _constraint(
         self, problem: Problem, mu: Array, evaluated: Evaluated

@@ -31,6 +31,7 @@ from scipy.linalg.lapack import dpotrf, dpotrs
 from vibench.arrays import Array, Indices, Mask, SparseMatrix
 from vibench.interfaces.problem import Contact
 from vibench.model.certificates.complementarity import complementary
+from vibench.model.certificates.tied_correction import tied_correction
 
 EXTENSIONS = 10
 """How often rows are added to I."""
@@ -67,6 +68,8 @@ class ContactCorrection:
         λᵀ(B w − s) ≥ 0.
     nu, gap
         ν ≥ 0 (m,) with γ c = Bᵀ(ν − λ), and νᵀ(B w − s) ≥ 0, which is zero but for round-off where w is the best one.
+    eta
+        Where there are equalities, another w' satisfies B w' ≥ s, with ‖w' − w‖ at most this; the others are of w'.
     """
 
     unknowns: Indices
@@ -75,6 +78,7 @@ class ContactCorrection:
     kappa: float
     nu: Array
     gap: float
+    eta: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -203,7 +207,9 @@ def find_contact_correction(
         best = _Program(C, restricted, near, excess, round_off, reach, terms, lam, gamma).best()
         if best is not None:
             return ContactCorrection(unknowns, *best)
-    return None
+    total = size @ np.abs(on_contact) + np.abs(contact.g)
+    tied = tied_correction(compliance.matrix, contact, excess, round_off, total, lam, gamma)
+    return None if tied is None else ContactCorrection(np.arange(len(compliance.matrix)), *tied)
 
 
 @dataclass(frozen=True)

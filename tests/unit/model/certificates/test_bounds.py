@@ -53,7 +53,8 @@ BODY = 9
 class Family(Problem):
     """Random matrices; A is constant, an affine sum, or interpolated, B and g vary on the contact unknowns.
 
-    B is "moving"; or "scaled", one matrix times a function of mu; or "half" moving, on the second of two bodies.
+    B is "moving"; or "scaled", one matrix times a function of mu; or "half" moving, on the second of two bodies; or
+    "tied", where the last row is opposite to the one before.
     """
 
     parameters = BOX
@@ -72,6 +73,9 @@ class Family(Problem):
         self.constant = frozenset(constant)  # type: ignore[misc]
         self.entrywise = frozenset({"A"} if stiffness == "interpolated" else set())  # type: ignore[misc]
         sums = {"A": AffineSum(self._terms, theta)} if stiffness == "affine" else {}
+        if constraint == "tied":
+            for rows in (self._B, self._turn, self._g):
+                rows[-1] = -2.0 * rows[-2]
         if constraint == "scaled":
             B = np.zeros((M, N))
             B[:, CONTACT] = self._B
@@ -146,6 +150,8 @@ KINDS: list[tuple[str, bool, str]] = [
     ("constant", True, "half"),
 ]
 
+TIED = [("constant", False, "tied"), ("affine", True, "tied")]
+
 
 def found(kind: Prepared, mu: np.ndarray, x: np.ndarray, alpha: np.ndarray) -> tuple[OnlineBound, float, float, float]:
     """The bound of some x and α, the errors, and the norm of u."""
@@ -160,7 +166,7 @@ def found(kind: Prepared, mu: np.ndarray, x: np.ndarray, alpha: np.ndarray) -> t
     return bound, error, natural, size
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", KINDS + TIED)
 @given(st.integers(0, 10_000), st.sampled_from([0.0, 1e-3, 1.0, 20.0]), st.floats(0.5, 2.0), st.floats(-1.0, 1.0))
 @settings(max_examples=40)
 def test_no_error_is_above_its_bound(kind: tuple[str, bool, str], seed: int, size: float, a: float, b: float) -> None:
@@ -207,7 +213,7 @@ def test_no_error_of_the_multiplier_is_above_its_bound_in_the_norm_of_its_space(
         assert bound.inf_sup >= 0.998 * beta
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", KINDS + TIED)
 @given(st.integers(0, 10_000), st.sampled_from([0.0, 1e-3, 1.0, 20.0]), st.floats(0.5, 2.0), st.floats(-1.0, 1.0))
 @settings(max_examples=20)
 def test_corrected_pairs_are_feasible_and_no_error_of_them_is_above_its_bound(
