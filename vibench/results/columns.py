@@ -96,12 +96,11 @@ KEYS: Mapping[str, Column] = {
 """What names a cell. Where a study prescribes N or R, `pod_size` or `dual_size` is filled instead of the tolerance."""
 
 
-def _medians(*names: str) -> dict[str, Column]:
-    return {
-        f"effectivity_{name}_median": real("1", f"Median effectivity of bound_{name} over the ok queries.")
-        for name in names
-    }
-
+BOUNDS = (
+    "u_energy", "u", "lambda_natural", "lambda", "online_u_energy", "online_lambda_natural", "online_lambda", "hsw_u",
+    "hsw_lambda",
+)  # fmt: skip
+"""Error bounds, as in the names of their columns."""
 
 CELLS: Mapping[str, Column] = {
     "cell": text(
@@ -209,17 +208,10 @@ CELLS: Mapping[str, Column] = {
         "Ok queries with zero_lambda = 1, which means and maxima of the error of λ leave out.", "λ = 0", 20
     ),
     "error_lambda_zero_max": real("1", "Largest error_lambda_scaled of these queries.", "error, λ = 0", 21),
-    **_medians(
-        "u_energy",
-        "u",
-        "lambda_natural",
-        "lambda",
-        "online_u_energy",
-        "online_lambda_natural",
-        "online_lambda",
-        "hsw_u",
-        "hsw_lambda",
-    ),
+    **{
+        f"effectivity_{name}_median": real("1", f"Median effectivity of bound_{name} over the ok queries.")
+        for name in BOUNDS
+    },
     "certificate": text("Bounds at online cost: certified, verified, or none.", "certificate", 10),
     "bound_online_violations": integer("Ok queries where bound_online_violated is 1; empty without a certificate."),
     "solver_error_u_max": real("1", "Largest contribution of the QP solver to the relative error of u."),

@@ -16,15 +16,11 @@ import numpy as np
 import pandas as pd
 
 from vibench.interfaces.strategies import Kind
-from vibench.results.columns import CONSTANTS
+from vibench.results.columns import BOUNDS, CONSTANTS
 from vibench.stability.conic_infsup import ABSOLUTE, RELATIVE
 from vibench.stability.infsup import UNSIGNED
 
-EFFECTIVITIES = (
-    "effectivity_u_energy", "effectivity_u", "effectivity_lambda_natural", "effectivity_lambda",
-    "effectivity_online_u_energy", "effectivity_online_lambda_natural", "effectivity_online_lambda",
-    "effectivity_hsw_u", "effectivity_hsw_lambda",
-)  # fmt: skip
+EFFECTIVITIES = tuple(f"effectivity_{name}" for name in BOUNDS)
 """Error bound over error, at least 1."""
 
 ROUND_OFF = 1e-10

@@ -123,8 +123,8 @@ class SnapshotStage(Stage):
             fallbacks.append(solution.fallback)
         reference.refuse_rewritten_constants()
         refuse_shifted()
-        found = TimedSnapshots(mus, u, lam, tuple(seconds), tuple(setups), tuple(fallbacks), reference.fingerprint)
-        return Result(found, sum(seconds, NO_TIME), self._diagnostics(problem, mus, first))
+        swept = TimedSnapshots(mus, u, lam, tuple(seconds), tuple(setups), tuple(fallbacks), reference.fingerprint)
+        return Result(swept, sum(seconds, NO_TIME), self._diagnostics(problem, mus, first))
 
     def _measure(self, work: Callable[[Array], T], mus: Iterator[Array]) -> tuple[T, Seconds]:
         """A training solution is an offline cost, timed once; a validation solution is timed as a query is.

@@ -135,7 +135,7 @@ class SamplingCase(Case[Sampling, ParameterBox, Array]):
             for what in ("lower", "upper"):
                 if not np.array_equal(getattr(given, what), getattr(box, what)):
                     yield f"{name}: parameters changes box.{what}; work on copies"
-            if not _same_state(state, np.random.get_state()):  # noqa: NPY002
+            if not all(map(np.array_equal, state, np.random.get_state())):  # noqa: NPY002
                 yield f"{name}: parameters changes NumPy's global random numbers: use np.random.default_rng(seed)"
 
     def training(self) -> Iterator[str]:
@@ -210,10 +210,6 @@ def _train(plugin: Sampling, box: ParameterBox) -> list[Array]:
     except Exception as error:
         raise ConformanceError(f"train fails after {len(trainer.solved)} solutions: {raised(error)}") from error
     return trainer.solved
-
-
-def _same_state(one: Any, other: Any) -> bool:
-    return all(np.array_equal(a, b) for a, b in zip(one, other, strict=True))
 
 
 SAMPLING = Conformance("sampling", SamplingCase, (

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import copy
 import statistics
 import time
 from collections.abc import Iterator
+from copy import deepcopy
 from dataclasses import KW_ONLY, dataclass, replace
 from functools import cached_property, partial
 
@@ -191,13 +191,13 @@ class SolverCase:
 
     def no_mutation(self) -> None:
         """The solver does not write to the program."""
-        program = _own(self.typical)
+        program = deepcopy(self.typical)
         arrays = {name: getattr(program, name) for name in MEMBERS}
         unmutated("the solver", arrays, lambda: self.create(program, ACCURACY))
 
     def determinism(self) -> Iterator[str]:
         """A second call gives the same solution, to the accuracy; to the last bit is noted."""
-        first, second = (_vectors(self.create(_own(self.typical), ACCURACY)) for _ in range(2))
+        first, second = (_vectors(self.create(deepcopy(self.typical), ACCURACY)) for _ in range(2))
         for name, what in differences(second, first, 10.0 * ACCURACY):
             yield f"a second call gives another {name}: {what}"
         if list(differences(second, first)):
@@ -205,7 +205,7 @@ class SolverCase:
 
     def independence(self) -> Iterator[str]:
         """An answer depends on nothing but the program: not on where it is stored, nor on other calls."""
-        program = _own(self.typical)
+        program = deepcopy(self.typical)
         earlier = self.create(program, ACCURACY)
         kept = copies(_vectors(earlier))
         program.f[:] *= -0.5  # the same arrays with other values
@@ -226,7 +226,7 @@ class SolverCase:
         for k in range(REPEATS):
             other = replace(program, f=program.f * (1.0 + 1e-6 * (k + 1)))
             new.append(timed(partial(self.create, other, ACCURACY))[1].cpu)
-            again.append(timed(partial(self.create, _own(program), ACCURACY))[1].cpu)
+            again.append(timed(partial(self.create, deepcopy(program), ACCURACY))[1].cpu)
         fast, slow = statistics.median(again), statistics.median(new)
         if slow > KEPT_RATIO * fast:
             yield (
@@ -248,10 +248,6 @@ class SolverCase:
 
 def _scaled(program: VariationalInequality) -> VariationalInequality:
     return units_of(program).scaled(program)
-
-
-def _own(program: VariationalInequality) -> VariationalInequality:
-    return copy.deepcopy(program)
 
 
 def _vectors(answer: QPSolution) -> dict[str, Array]:

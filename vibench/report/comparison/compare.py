@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import pandas as pd
 
-from vibench.errors import unknown_name
+from vibench.errors import RequestError, unknown_name
 from vibench.report.comparison.differences import (
     ERRORS,
     MOVED,
@@ -167,6 +167,8 @@ def compare(paths: Sequence[Path], limit: float) -> Comparison:
 
     Raises a `RequestError` if there are fewer than two files, or one cannot be read.
     """
+    if len(paths) < 2:
+        raise RequestError(f"{len(paths)} run is given, expected two or more to compare")
     runs = compared_runs(paths)
     first, *others = runs
     by_pair = defaultdict[tuple[str, str], list[Difference]](list)

@@ -11,7 +11,6 @@ from typing import Any
 
 import pandas as pd
 
-from vibench.errors import RequestError
 from vibench.qp.status import Status
 from vibench.results import tables
 from vibench.results.plugin_columns import Extended
@@ -107,12 +106,7 @@ class ComparedRun:
 
 
 def compared_runs(paths: Sequence[Path]) -> list[ComparedRun]:
-    """The runs of some results files, each under a name of its own: as many folders of its path as that needs.
-
-    Raises a `RequestError` if there are fewer than two.
-    """
-    if len(paths) < 2:
-        raise RequestError(f"{len(paths)} run is given, expected two or more to compare")
+    """The runs of some results files, each under a name of its own: as many folders of its path as that needs."""
     return [ComparedRun(path, name) for path, name in zip(paths, run_names(paths), strict=True)]
 
 

@@ -16,12 +16,11 @@ import numpy as np
 import pandas as pd
 
 from vibench.report.common_queries import on_common_queries
+from vibench.report.figures.costs import ERRORS
 from vibench.report.figures.data import Data, best_solver, label
 from vibench.report.figures.looks import Look, Looks, Series
 from vibench.report.page.grids import short
 from vibench.text import printable
-
-ERRORS = {"error_u_mean": "mean relative error of u", "error_lambda_mean": "mean relative error of λ"}
 
 MARKERS = {
     "o": "circle", "s": "square", "^": "triangle", "v": "inverted_triangle", "D": "diamond", "P": "plus",

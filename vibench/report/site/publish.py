@@ -12,7 +12,7 @@ import pandas as pd
 from vibench.provenance import distribution_version
 from vibench.report import html
 from vibench.report.comparison.compare import Comparison, compare
-from vibench.report.comparison.runs import ComparedRun, run_names
+from vibench.report.comparison.runs import compared_runs
 from vibench.report.site import folder
 from vibench.report.site.citation import Citation, requirements
 from vibench.report.site.published_run import FILTERED, SHOWN_CELLS, PublishedRun, folder_names
@@ -68,7 +68,7 @@ def publish(
         If a results file cannot be read, or the folder holds files of others or cannot be written.
     """
     folder.check(site)
-    runs = [ComparedRun(path, name) for path, name in zip(paths, run_names(paths), strict=True)]
+    runs = compared_runs(paths)
     published = [
         PublishedRun(run, own, (notes or {}).get(run.path, ""))
         for run, own in zip(runs, folder_names([run.name for run in runs]), strict=True)
