@@ -71,6 +71,6 @@ from .reduction.pod import pod as pod
 from .reduction.supremizers import supremizers as supremizers
 from .results.break_even import BreakEven as BreakEven
 from .results.break_even import break_even as break_even
-from .study.reader import read_study as read_study
+from .study.matrix import read_study as read_study
 from .study.registry import create as create
 from .study.spec import Study as Study

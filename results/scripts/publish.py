@@ -21,8 +21,7 @@ from vibench.report.site.publish import publish
 from vibench.results.columns import STORED
 from vibench.results.database import ResultsDatabase
 from vibench.results.sqlite.reading import FILE
-from vibench.study.matrix import expand
-from vibench.study.reader import read_study
+from vibench.study.matrix import expand, read_study
 
 RESULTS = Path(__file__).parents[1]
 

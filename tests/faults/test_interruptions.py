@@ -160,7 +160,7 @@ def read_to_the_end(process: subprocess.Popen[str]) -> tuple[str, str]:
 
 @pytest.mark.parametrize(
     "module",
-    ["typer", "vibench.cli.main", "numpy", "scipy.sparse", "pandas", "vibench.execution.run", "vibench.study.reader"],
+    ["typer", "vibench.cli.main", "numpy", "scipy.sparse", "pandas", "vibench.execution.run", "vibench.study.matrix"],
 )
 def test_an_interrupt_among_the_imports_ends_the_command_with_a_line(
     module: str, command: str, plugins_folder: Path, waiting: Path, monkeypatch: pytest.MonkeyPatch

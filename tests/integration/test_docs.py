@@ -33,8 +33,7 @@ from vibench.results import columns, tables
 from vibench.study import registry
 from vibench.study.entries import Entry, ProblemEntry, SamplingEntry
 from vibench.study.kinds import STUDY, PluginKind
-from vibench.study.matrix import expand
-from vibench.study.reader import read_study
+from vibench.study.matrix import expand, read_study
 from vibench.study.spec import Limits, Study, ToleranceTable
 from vibench.testing import check_figure, check_problem
 

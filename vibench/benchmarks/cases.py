@@ -9,7 +9,7 @@ from vibench.errors import RequestError
 from vibench.interfaces.strategies import Stop
 from vibench.qp.solve import installed_solvers
 from vibench.study.kinds import DUAL, PRIMAL, PROBLEM, SOLVER
-from vibench.study.reader import read_study
+from vibench.study.matrix import read_study
 from vibench.study.registry import find, find_named, registered
 
 Resolution = str | int

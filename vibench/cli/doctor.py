@@ -31,7 +31,7 @@ from vibench.qp.solve import installed_solvers
 from vibench.qp.status import Status
 from vibench.storage.artefacts import CACHE_VARIABLE, LOCK, Store, default_folder
 from vibench.study.kinds import SOLVER, STUDY, PluginKind
-from vibench.study.reader import read_study
+from vibench.study.matrix import read_study
 from vibench.study.registry import RegisteredPlugin, find, registered, unreadable
 from vibench.terminal.console import new_console, shown
 from vibench.terminal.output import echo

@@ -169,8 +169,7 @@ def _warn_of_open_scheduler(scheduler: str, executor: str) -> None:
 def _study(request: str, key: str, overrides: dict[str, list[Any]]) -> Study:
     """The study that is asked for, or what it has, or a results file, of one cell."""
     from vibench.execution.recorded_cell import recorded_study
-    from vibench.study.matrix import expand, only_cell, study_of_cell
-    from vibench.study.reader import read_study
+    from vibench.study.matrix import expand, only_cell, read_study, study_of_cell
 
     if key and Path(request).suffix == SQLITE:
         if overrides:

@@ -187,8 +187,7 @@ def _loaded_rows(kind: PluginKind) -> Iterator[Row]:
 
 
 def _number_of_cells(study: str) -> str:
-    from vibench.study.matrix import expand
-    from vibench.study.reader import read_study
+    from vibench.study.matrix import expand, read_study
 
     return f"{len(expand(read_study(study)))} cells"
 

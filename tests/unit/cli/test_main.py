@@ -21,8 +21,7 @@ from vibench.results.columns import TABLES
 from vibench.results.sqlite.reading import FILE
 from vibench.results.tables import read
 from vibench.study import kinds
-from vibench.study.matrix import expand
-from vibench.study.reader import read_study
+from vibench.study.matrix import expand, read_study
 from vibench.study.registry import find, registered
 from vibench.text import printable
 
@@ -408,6 +407,6 @@ def test_an_error_that_nobody_foresaw_is_not_hidden(main: Main, monkeypatch: pyt
     def broken(*_: object) -> None:
         raise ZeroDivisionError
 
-    monkeypatch.setattr("vibench.study.reader.read_study", broken)
+    monkeypatch.setattr("vibench.study.matrix.read_study", broken)
     with pytest.raises(ZeroDivisionError):
         main("run")

@@ -15,8 +15,7 @@ from vibench.stages.cell_queries import cell_queries
 from vibench.stages.pictures import PictureStage
 from vibench.storage.artefacts import Store
 from vibench.study.kinds import STUDY
-from vibench.study.matrix import expand
-from vibench.study.reader import read_study
+from vibench.study.matrix import expand, read_study
 from vibench.study.registry import registered
 
 

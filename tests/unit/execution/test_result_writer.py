@@ -19,8 +19,7 @@ from vibench.stages.infsup_constants import ReferenceConstants
 from vibench.stages.offline import ConeStage, PODStage
 from vibench.stages.snapshots import SnapshotStage
 from vibench.study.cells import Cell
-from vibench.study.matrix import expand
-from vibench.study.reader import read_study
+from vibench.study.matrix import expand, read_study
 from vibench.study.spec import Study
 
 

@@ -15,8 +15,7 @@ from vibench.stages.base import Failed
 from vibench.stages.cell_queries import cell_queries
 from vibench.stages.timing_rounds import TimedCell, TimedRound, TimingRounds
 from vibench.study.cells import Cell
-from vibench.study.matrix import expand
-from vibench.study.reader import read_study
+from vibench.study.matrix import expand, read_study
 from vibench.timing import Seconds
 
 STUDY = read_study("quick")

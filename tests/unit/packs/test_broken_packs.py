@@ -22,7 +22,7 @@ from samples import write_study
 from vibench.errors import RequestError
 from vibench.packs import reader
 from vibench.packs.checks import read_model_pack
-from vibench.study.reader import read_study
+from vibench.study.matrix import read_study
 
 Content = dict[str, Any]
 Mistake = Callable[[Content, Cable, Path], None]

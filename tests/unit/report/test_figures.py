@@ -27,7 +27,7 @@ from vibench.report.figures.data import Extent, _per_combination
 from vibench.report.figures.style import save, styled
 from vibench.results import tables
 from vibench.results.sqlite.reading import FILE
-from vibench.study.reader import read_study
+from vibench.study.matrix import read_study
 
 Drawn = dict[str, Figure]
 

@@ -28,8 +28,7 @@ from vibench.results.formats import cell_text, to_csv, to_json, to_latex, to_mar
 from vibench.results.sqlite.reading import FILE
 from vibench.results.tables import benefits, export, in_order, read, results_file, summary
 from vibench.results.views import look_up
-from vibench.study.matrix import expand
-from vibench.study.reader import read_study
+from vibench.study.matrix import expand, read_study
 from vibench.text import printable_lines
 
 STUDY = {"name": "sample", "seed": 1, "validation": 4, "accuracy": 1e-7}

@@ -18,10 +18,9 @@ from vibench.interfaces.strategies import Stop
 from vibench.study import cells as module
 from vibench.study import registry
 from vibench.study.cells import Cell, digest
-from vibench.study.matrix import expand
+from vibench.study.matrix import expand, read_study
 from vibench.study.parameter_sets import ParameterSet
 from vibench.study.plugin import Plugin
-from vibench.study.reader import read_study
 
 Expand = Callable[[Mapping[str, Any]], list[Cell]]
 

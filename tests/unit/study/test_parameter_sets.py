@@ -13,10 +13,9 @@ from samples import STUDY, changed, write_study
 
 from vibench.errors import RequestError
 from vibench.study.cells import Cell
-from vibench.study.matrix import expand, study_of_cell
+from vibench.study.matrix import expand, read_study, study_of_cell
 from vibench.study.parameter_sets import OWN_TRAINING, ParameterSet, parameters_of
 from vibench.study.plugin import Plugin
-from vibench.study.reader import read_study
 
 SOBOL = {"name": "sobol", "size": 8, "seed": 1}
 

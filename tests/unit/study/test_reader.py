@@ -15,8 +15,7 @@ from hypothesis import strategies as st
 from samples import REMOVE, STUDY, changed, toml, write_study
 
 from vibench.errors import RequestError
-from vibench.study.matrix import expand
-from vibench.study.reader import find_study, read_study
+from vibench.study.matrix import expand, find_study, read_study
 from vibench.study.spec import Study
 
 JARGON = ("list[", "dict[", "literal[", "constrained", "instance of")

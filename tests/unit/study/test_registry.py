@@ -23,8 +23,8 @@ from vibench.interfaces.problem import Problem
 from vibench.interfaces.strategies import DualStrategy, PrimalStrategy
 from vibench.study import registry
 from vibench.study.kinds import DUAL, PRIMAL, PROBLEM, SOLVER, STUDY, PluginKind
+from vibench.study.matrix import read_study
 from vibench.study.plugin import Plugin
-from vibench.study.reader import read_study
 from vibench.study.registry import find, registered
 from vibench.study.spec import Entry
 

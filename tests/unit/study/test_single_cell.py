@@ -13,8 +13,7 @@ from vibench.execution.recorded_cell import recorded_study
 from vibench.results import formats, tables
 from vibench.results.sqlite.reading import FILE
 from vibench.study.cells import Cell
-from vibench.study.matrix import expand, only_cell, study_of_cell
-from vibench.study.reader import read_study
+from vibench.study.matrix import expand, only_cell, read_study, study_of_cell
 from vibench.study.spec import Study
 
 

@@ -20,10 +20,9 @@ from vibench.stages.cell_queries import CellQueries, cell_queries
 from vibench.stages.offline import PODStage
 from vibench.stages.snapshots import CHUNKS, SnapshotStage
 from vibench.study.cells import Cell
-from vibench.study.matrix import expand
+from vibench.study.matrix import expand, read_study
 from vibench.study.parameter_sets import OWN_TRAINING
 from vibench.study.plugin import Plugin
-from vibench.study.reader import read_study
 from vibench.terminal.progress import ALIKE, DrawingDisplay, ProgressDisplay, TimeLeft, duration
 
 PROBLEM = Plugin("problem", "p", "{}", "")
