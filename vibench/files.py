@@ -46,10 +46,8 @@ def locked(path: Path, *, busy: str, shared: bool = False) -> Iterator[None]:
 
     The file is created in an existing folder and never deleted. Several processes may hold a `shared` lock.
 
-    Raises
-    ------
-    RequestError
-        With the text `busy` and the holder if another process holds the lock; if the file cannot be written.
+    Raises a `RequestError`, with the text `busy` and the holder if another process holds the lock, or if the file
+    cannot be written.
     """
     try:
         flags = os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC  # symbolic links are refused

@@ -155,10 +155,7 @@ def chosen_plugins(plugins: Sequence[str]) -> dict[str, list[str]]:
 def resolutions(texts: Sequence[str]) -> list[Resolution]:
     """Resolutions from texts.
 
-    Raises
-    ------
-    RequestError
-        For the first one that no problem has.
+    Raises a `RequestError` for the first one that no problem has.
     """
     wanted: list[Resolution] = [int(text) if text.isdigit() else text for text in texts]
     for resolution in wanted:

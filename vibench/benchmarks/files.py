@@ -75,37 +75,27 @@ def _statistics(seconds: Sequence[float]) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class Measured:
-    """One benchmark of a file.
-
-    Attributes
-    ----------
-    group, axes
-        What is timed, and with which plugins.
-    seconds, q1, q3
-        Median and quartiles over the rounds, in CPU seconds of one call.
-    low, high
-        The smallest lower and the largest upper quartile of a pass; the quartiles, where there was one.
-    rounds
-        Their number.
-    accuracy
-        Figures that should be small; `None` where one was not finite.
-    status
-        Of what a QP solver answered, "" where none was asked.
-    calibration
-        CPU seconds of fixed work beside it, median over the passes: how fast the machine was then; NaN where unknown.
-    """
+    """One benchmark of a file."""
 
     group: str
+    """What is timed."""
     axes: Mapping[str, str]
+    """With which plugins."""
     seconds: float
+    """Median over the rounds, in CPU seconds of one call."""
     q1: float
     q3: float
     low: float
+    """The smallest lower quartile of a pass; `q1`, where there was one."""
     high: float
+    """The largest upper quartile of a pass; `q3`, where there was one."""
     rounds: int
     accuracy: Mapping[str, float | None]
+    """Figures that should be small; `None` where one was not finite."""
     status: str
+    """Status of what a QP solver answered, "" where none was asked."""
     calibration: float
+    """CPU seconds of fixed work beside it, median over the passes: how fast the machine was then; NaN where unknown."""
 
 
 @dataclass(frozen=True)

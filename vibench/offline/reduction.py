@@ -23,12 +23,7 @@ from vibench.interfaces.strategies import (
     Sampling,
     Stop,
 )
-from vibench.interfaces.validation import (
-    check_cone,
-    check_enrichment,
-    reference_assembly,
-    training_parameters,
-)
+from vibench.interfaces.validation import check_cone, check_enrichment, reference_assembly, training_parameters
 from vibench.model.affine import INTERPOLATION_RTOL, AffineMember, affine_decomposition
 from vibench.model.certificates.base import CertificateBase, certificate_base
 from vibench.model.certificates.bounds import OnlineCertificate

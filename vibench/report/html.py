@@ -50,18 +50,11 @@ IDENTITY = ["problem", "dual", "primal", "primal_tol", "solver", "accuracy", "as
 def write(path: Path, target: Path, jobs: int = 1, *, figures: bool = True) -> Path:
     """Write the page of a results file as `target`; an interrupted call leaves no incomplete file under its name.
 
-    Parameters
-    ----------
-    jobs
-        Processes that draw its pictures, this one included. The others import the main module: with more than one, a
-        script that calls this has to guard what it does by ``if __name__ == "__main__"``.
-    figures
-        Whether the page has pictures of the figures, which take most of the time.
+    As many processes as `jobs` draw its pictures, this one included; pictures of the figures take most of the time. The
+    other processes import the main module: with more than one, a script that calls this has to guard what it does by
+    ``if __name__ == "__main__"``.
 
-    Raises
-    ------
-    RequestError
-        If `target` is the results file, or cannot be written.
+    Raises a `RequestError` if `target` is the results file, or cannot be written.
     """
     if target.resolve() == path.resolve():
         raise RequestError(f"'{target}' is the results file itself; choose another file for the report")

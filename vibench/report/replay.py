@@ -46,16 +46,10 @@ def worst_query(recorded: RecordedCell) -> int:
 def replay(recorded: RecordedCell, query: int, file: Path) -> pd.DataFrame:
     """Write the program of one query to a file, and solve it with every installed solver, each within limits.
 
-    Returns
-    -------
-    DataFrame
-        A row for the recorded solution, if there is one, and a row per solver: the status that the solver claims, the
-        verified status with residuals, seconds, and the distance of u in V from the recorded solution.
+    The table has a row for the recorded solution, if there is one, and a row per solver: the status that the solver
+    claims, the verified status with residuals, seconds, and the distance of u in V from the recorded solution.
 
-    Raises
-    ------
-    RequestError
-        If the cell has no such query, or the file is no npz file or cannot be written.
+    Raises a `RequestError` if the cell has no such query, or the file is no npz file or cannot be written.
     """
     if file.suffix != ".npz":
         raise RequestError(f"'{file}': the program is written as an npz file, whose name must end in .npz")
@@ -119,10 +113,8 @@ def export(run: str, folder: Path) -> int:
     solution: a solver at an accuracy), `rows.csv` (a line per solution: status, accuracy, residuals) and `check.py`,
     which recomputes the residuals of every solution. It gets its name when it is complete.
 
-    Raises
-    ------
-    RequestError
-        If there is no such run, the folder is not empty or cannot be written, or other code computed the run.
+    Raises a `RequestError` if there is no such run, the folder is not empty or cannot be written, or other code
+    computed the run.
     """
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise RequestError(f"'{folder}' exists and is not an empty folder; choose another")

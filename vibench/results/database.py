@@ -45,14 +45,11 @@ class ResultsDatabase:
     """The results of one study in one folder.
 
     Settings that determine the numbers of the study are kept with them: results of another study are refused. `anew`
-    drops all existing tables, in the transaction that creates the new ones.
+    drops all existing tables, in the transaction that creates the new ones. `damaged` are the cells whose rows were
+    damaged and are removed: they have to be computed again.
 
-    Raises
-    ------
-    RequestError
-        If the folder holds results of another study or schema, or damage that no cell explains, or cannot be written.
-
-    The cells in `damaged` are those whose rows were damaged and are removed: they have to be computed again.
+    Raises a `RequestError` if the folder holds results of another study or schema, or damage that no cell explains, or
+    cannot be written.
     """
 
     def __init__(self, folder: Path, study: Mapping[str, Any], *, anew: bool = False) -> None:
@@ -150,15 +147,7 @@ class ResultsDatabase:
 
         Rows that cannot be stored because of their values cost the cell, not the run: it gets an `error` row instead.
 
-        Returns
-        -------
-        dict
-            The row of the cell as it is stored.
-
-        Raises
-        ------
-        StorageError
-            If the file cannot be written.
+        Returns the row of the cell as it is stored. Raises a `StorageError` if the file cannot be written.
         """
         try:
             return self._write_cell(cell, queries=queries, solutions=solutions, outputs=outputs)

@@ -79,10 +79,7 @@ def _title(box: ParameterBox, mu: Array) -> str:
 def _checked(picture: Picture) -> Picture:
     """A picture whose arrays hold real numbers and fit together, and whose names are texts.
 
-    Raises
-    ------
-    NumericalError
-        Naming the member that does not.
+    Raises a `NumericalError` that names the member that does not.
     """
     mistyped = [name for name in ARRAYS if getattr(picture, name).dtype.kind not in "fiu"]
     mistyped += [name for name in TEXTS if not isinstance(getattr(picture, name), str)]

@@ -59,10 +59,7 @@ def storable(kind: ClassT) -> ClassT:
 def dumps(value: Any) -> bytes:
     """A value as bytes: `None`, truth values, numbers, texts, tuples, lists, dictionaries, arrays, `storable` objects.
 
-    Raises
-    ------
-    NumericalError
-        Naming the first part that is none of these.
+    Raises a `NumericalError` that names the first part that is none of these.
     """
     writer = _Writer()
     text = json.dumps(writer.described(value), allow_nan=False, separators=(",", ":"))

@@ -42,30 +42,12 @@ def publish(
 ) -> Path:
     """Write the site of some results files; the same files give the same site.
 
-    Parameters
-    ----------
-    paths
-        The results files.
-    site
-        Folder of the site: new, empty, or one that was written by this function, whose files are replaced.
-    citation
-        How the site is cited.
-    notes
-        Remarks on results files, which stand on the pages of their runs.
-    warn
-        Called with a line for every column of a plugin that a published table does not have.
-    figures
-        Whether the reports have pictures.
+    The folder is new, empty, or one that was written by this function, whose files are replaced. Notes are remarks on
+    results files, which stand on the pages of their runs; `warn` is called with a line for every column of a plugin
+    that a published table does not have; with `figures` reports have pictures.
 
-    Returns
-    -------
-    Path
-        Its first page.
-
-    Raises
-    ------
-    RequestError
-        If a results file cannot be read, or the folder holds files of others or cannot be written.
+    Returns the first page. Raises a `RequestError` if a results file cannot be read, or the folder holds files of
+    others or cannot be written.
     """
     folder.check(site)
     runs = compared_runs(paths)

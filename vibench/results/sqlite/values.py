@@ -40,10 +40,7 @@ class UnstorableError(VibenchError):
 def storable(table: str, row: Mapping[str, Any]) -> dict[str, Any]:
     """The row of a table as the results file holds it.
 
-    Raises
-    ------
-    UnstorableError
-        For the first value that it cannot hold.
+    Raises an `UnstorableError` for the first value that it cannot hold.
     """
     columns = STORED[table]
     values: dict[str, Any] = {}
