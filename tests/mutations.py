@@ -397,8 +397,8 @@ FAULTS = (
     Fault(
         "corrected-pair-without-the-loss-of-spectral-bounds",
         "vibench/model/certificates/bounds.py",
-        "rho = bound.rho + 0.5 * (gamma - alpha_A) / sqrt(alpha_A) * norm",
-        "rho = bound.rho",
+        "rho = bound.rho + (0.5 * (gamma - alpha_A) * norm + middle * eta) / sqrt(alpha_A)",
+        "rho = bound.rho + middle * eta / sqrt(alpha_A)",
         ("tests/unit/model/certificates/test_bounds.py",),
     ),
     Fault(
