@@ -93,6 +93,22 @@ class ParameterBox:
         return [self.names.index(name) for name in dict.fromkeys(log)]
 
 
+ABSENT = 1e100
+"""g of a row that constrains nothing: a finite number, so that no sum with it, and no product with zero, is NaN."""
+
+
+def is_absent(g: Array) -> Mask:
+    """Which rows (m,) constrain nothing: those whose g is infinite, or was before something finite was added to it."""
+    return np.asarray(g >= 0.5 * ABSENT)
+
+
+def without_infinities(g: Any) -> Any:
+    """A bound g (m,) with `ABSENT` in place of +inf."""
+    if not isinstance(g, np.ndarray) or g.dtype.kind != "f" or not np.isposinf(g).any():
+        return g
+    return np.where(np.isposinf(g), ABSENT, g)
+
+
 @dataclass(frozen=True)
 class VariationalInequality:
     """u = argmin ½ uᵀA u − fᵀu subject to B u ≤ g at one parameter (paper, equations (1), (2) and (7)).
@@ -106,7 +122,8 @@ class VariationalInequality:
     B
         Constraint, sparse (m×n), sign such that A u + Bᵀλ = f with λ ≥ 0.
     g
-        Bound (m,), including the contribution of the Dirichlet lift.
+        Bound (m,), including the contribution of the Dirichlet lift; +inf, read as `ABSENT`, where a row constrains
+        nothing, and its multiplier is zero.
     dirichlet_lift
         Lifting of inhomogeneous Dirichlet data, added to u in pictures only; `None` for homogeneous data.
     """
@@ -116,6 +133,9 @@ class VariationalInequality:
     B: SparseMatrix
     g: Array
     dirichlet_lift: Array | None = None
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "g", without_infinities(self.g))
 
     def copy(self) -> VariationalInequality:
         """A copy in arrays of its own: a problem may write its next assembly into those of this one."""
@@ -129,6 +149,9 @@ class Contact:
 
     B: SparseMatrix
     g: Array
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "g", without_infinities(self.g))
 
 
 @dataclass(frozen=True)

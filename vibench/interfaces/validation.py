@@ -14,7 +14,7 @@ import scipy.sparse as sp
 
 from vibench.arrays import Array
 from vibench.errors import NumericalError
-from vibench.interfaces.problem import MEMBERS, Problem, VariationalInequality
+from vibench.interfaces.problem import MEMBERS, Problem, VariationalInequality, is_absent
 from vibench.interfaces.strategies import Cone, Enrichment, Sampling, check_sample
 from vibench.linalg.inner_product import InnerProduct
 
@@ -122,7 +122,8 @@ def checked_assembly(problem: Problem, mu: Array) -> VariationalInequality:
         if np.iscomplexobj(value):
             raise NumericalError(f"{name} is complex at mu = {mu.tolist()}; vibench is for real problems")
         if not np.all(np.isfinite(value if isinstance(value, np.ndarray) else value.data)):
-            raise NumericalError(f"{name} has entries that are not finite at mu = {mu.tolist()}")
+            infinite = "; +inf, which means that a row constrains nothing, is allowed" if name == "g" else ""
+            raise NumericalError(f"{name} has entries that are not finite at mu = {mu.tolist()}{infinite}")
     return vi
 
 
@@ -161,6 +162,7 @@ def fingerprint(problem: Problem, vi: VariationalInequality) -> Fingerprint:
 def _of(arrays: Mapping[str, Any]) -> Fingerprint:
     products = {name: _probed(array) for name, array in arrays.items()}
     sizes = ((name, array.data if sp.issparse(array) else array) for name, array in arrays.items())
+    sizes = ((name, array[~is_absent(array)] if name == "g" else array) for name, array in sizes)  # they are far
     return Fingerprint(products, {name: float(np.max(np.abs(size), initial=0.0)) for name, size in sizes})
 
 

@@ -15,7 +15,7 @@ import scipy.sparse.linalg
 from vibench.arrays import Array, Indices, SparseMatrix
 from vibench.errors import NumericalError
 from vibench.interfaces.affine import entries_of
-from vibench.interfaces.problem import MEMBERS, Problem, Sampler
+from vibench.interfaces.problem import MEMBERS, Problem, Sampler, is_absent, without_infinities
 from vibench.interfaces.validation import checked_assembly
 from vibench.linalg.inner_product import svd
 from vibench.qp.scaling import ratio
@@ -104,7 +104,8 @@ def affine_decomposition(problem: Problem, training: Array, tolerance: float) ->
         if name in problem.constant:
             members[name] = AffineMember(Evaluation.CONSTANT, (getattr(first, name),))
         elif name in problem.affine:
-            members[name] = AffineMember(Evaluation.AFFINE, problem.affine[name].terms)
+            terms = problem.affine[name].terms
+            members[name] = AffineMember(Evaluation.AFFINE, tuple(map(without_infinities, terms)))
         else:
             entrywise = name in problem.entrywise
             members[name] = decomposed(name, assembled[name], tolerance, entrywise, contact=problem.has_contact)
@@ -142,9 +143,11 @@ def check_affine(problem: Problem, training: Array) -> None:
     for mu in training[[0, len(training) // 2, -1]] if problem.affine else ():
         vi = checked_assembly(problem, mu)
         for name, declared in problem.affine.items():
-            exact, summed = getattr(vi, name), declared.at(mu)
+            exact, summed = getattr(vi, name), without_infinities(declared.at(mu))
             if summed.shape != exact.shape:
                 raise NumericalError(f"the affine sum of {name} has shape {summed.shape}, {name} itself {exact.shape}")
+            if name == "g":  # absent rows would hide all others
+                exact, summed = (np.where(is_absent(exact) & is_absent(summed), 0.0, each) for each in (exact, summed))
             away, size = float(abs(summed - exact).max()), float(abs(exact).max())
             if not away <= AFFINE_RTOL * size:
                 what = f"by {away:.1e} at mu = {mu.tolist()}, where its largest entry is {size:.1e}"
@@ -181,6 +184,9 @@ def decomposed(
     entrywise, contact
         Whether the problem evaluates the member entry by entry, and whether it has `Problem.contact`.
     """
+    if name == "g" and (sometimes := np.any([is_absent(g) ^ is_absent(values[0]) for g in values], axis=0)).any():
+        reason = f"row {int(np.argmax(sometimes))} of g is infinite at some parameters and not at others"
+        return AffineMember(Evaluation.CONTACT, ()) if contact else AffineMember(Evaluation.FULL, (), reason=reason)
     entries = _Entries(values, symmetric=name == "A")
     weights = entries.row_weights() if name in ("B", "g") else np.ones(len(entries.rows))
     if entries.is_constant(weights):

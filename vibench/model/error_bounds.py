@@ -57,12 +57,13 @@ import scipy.sparse as sp
 
 from vibench.arrays import Array, Mask
 from vibench.highfidelity.active_set import active_set_iterations
-from vibench.interfaces.problem import VariationalInequality
+from vibench.interfaces.problem import VariationalInequality, is_absent
 from vibench.linalg.inertia import UNIT
 from vibench.model.equalities import Equalities
 from vibench.model.errors import Energy
 from vibench.qp.exact import least_distance_solution
 from vibench.qp.rows import Rows, rows_that_matter
+from vibench.qp.scaling import near_rows
 from vibench.stability.coercivity import Constant, Stability
 
 NO_ROOM = 1e-12
@@ -139,7 +140,7 @@ def bound_errors_at(
     """Bounds (ii) of one reduced u (n,) and λ (m,), from lower bounds of α and of β_A."""
     if np.min(lam, initial=0.0) < 0.0:
         return ErrorBounds.none(NOT_IN_CONE)
-    if np.any(lam[~np.isfinite(vi.g)]):
+    if np.any(lam[is_absent(vi.g)]):
         return ErrorBounds.none(ON_ABSENT_ROW)
     corrected = find_correction(vi, energy, u, lam)
     if corrected is None:
@@ -239,8 +240,7 @@ class Correction:
 def terms(correction: Correction, vi: VariationalInequality, energy: Energy, u: Array, lam: Array) -> Terms:
     """The terms with a correction of u (n,) and λ ≥ 0 (m,)."""
     w, eta, equalities = correction.w, correction.eta, correction.constraints.equalities
-    residual, pressed = vi.f - vi.A @ u - vi.B.T @ lam, lam > 0.0  # elsewhere g may be infinite
-    kappa = max(0.0, float(lam[pressed] @ _slack(vi, u, w)[pressed]))
+    residual, kappa = vi.f - vi.A @ u - vi.B.T @ lam, max(0.0, float(lam @ _slack(vi, u, w)))
     if equalities is not None:
         kappa += eta * float(lam @ equalities.reach)
     of_feasible = energy.dual_norm(residual + vi.A @ w) + eta
@@ -252,7 +252,8 @@ def _with_constrained_residual(
 ) -> Iterator[Terms]:
     """The terms for u + d, whose residual is the part of r in the range of Bᵀ, if w is feasible for it and d exists."""
     constraints = correction.constraints
-    program = constraints.rows.program(VariationalInequality(vi.A, residual, vi.B, np.zeros_like(vi.g)))
+    rows = constraints.rows.kept[near_rows(vi)[constraints.rows.kept]]  # any d will do for which w is feasible
+    program = VariationalInequality(vi.A, residual, sp.csr_array(vi.B)[rows], np.zeros(len(rows)))
     system = energy.stiffness.active_set_system(program)
     try:
         d = system.recover(system.solve_active(np.arange(len(program.g)))[0])
@@ -334,5 +335,4 @@ def _round_off(vi: VariationalInequality, u: Array, w: Array) -> Array:
     """Bound (m,) of the round-off in `_slack` (Higham 2002, §3.1)."""
     B = sp.csr_array(vi.B)
     terms = np.diff(B.indptr) + 4.0
-    g = np.where(np.isfinite(vi.g), np.abs(vi.g), 0.0)
-    return np.asarray(1.01 * terms * UNIT * (abs(B) @ (np.abs(w) + np.abs(u)) + g))
+    return np.asarray(1.01 * terms * UNIT * (abs(B) @ (np.abs(w) + np.abs(u)) + np.abs(vi.g)))

@@ -31,7 +31,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from vibench.arrays import Array
-from vibench.interfaces.problem import Problem, VariationalInequality
+from vibench.interfaces.problem import Problem, VariationalInequality, is_absent
 from vibench.linalg.inner_product import InnerProduct
 from vibench.reduction import cones
 from vibench.stability.coercivity import Stability
@@ -50,12 +50,16 @@ def hsw_bounds(
 ) -> list[HSWBounds | None]:
     """Δ_u and Δ_λ of reduced u (n×P), λ (m×P), column by column at the parameters of `vis`; see above.
 
-    Infinite where β_HF over the span is zero; `None` where λ is not in W⁺ and nothing is certified.
+    Infinite where β_HF over the span is zero; `None` where λ is not in W⁺ and nothing is certified, and where rows are
+    absent: the distance of B u_N − g from the cone is one in W of all rows.
     """
     residuals = np.column_stack([vi.f - vi.A @ u[:, k] - vi.B.T @ lam[:, k] for k, vi in enumerate(vis)])
     dual_norms = np.linalg.norm(problem.V.whiten_functional(residuals), axis=0)
     excesses = (vi.B @ u[:, k] - vi.g for k, vi in enumerate(vis))
-    return [_bound(problem.W, s, lam[:, k], float(dual_norms[k]), constants[k]) for k, s in enumerate(excesses)]
+    return [
+        None if is_absent(vis[k].g).any() else _bound(problem.W, s, lam[:, k], float(dual_norms[k]), constants[k])
+        for k, s in enumerate(excesses)
+    ]
 
 
 def _bound(W: InnerProduct, excess: Array, lam: Array, residual: float, stability: Stability) -> HSWBounds | None:

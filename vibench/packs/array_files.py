@@ -91,8 +91,8 @@ class ArrayFiles:
     def __init__(self, folder: Path, index_base: int, limit: int) -> None:
         self._folder, self._base, self._limit, self._left = folder, index_base, limit, limit
 
-    def dense(self, reference: str, what: str) -> Array:
-        """A dense array; a sparse matrix of one column or row is a vector."""
+    def dense(self, reference: str, what: str, infinite: bool = False) -> Array:
+        """A dense array; a sparse matrix of one column or row is a vector. It may have +inf where that is allowed."""
         with self._reading(reference, what):
             stored = self._read(reference)
             if isinstance(stored, Mapping) or sp.issparse(stored):
@@ -101,11 +101,11 @@ class ArrayFiles:
                     raise RequestError(f"a sparse matrix {size_of(matrix.shape)}; expected a dense array")
                 self._take(8 * max(matrix.shape))
                 stored = matrix.toarray()
-            return self._real(stored)
+            return self._real(stored, infinite)
 
-    def vector(self, reference: str, what: str) -> Array:
+    def vector(self, reference: str, what: str, infinite: bool = False) -> Array:
         """A vector (k,); one row or column counts as one."""
-        array = self.dense(reference, what)
+        array = self.dense(reference, what, infinite)
         if array.ndim == 2 and 1 in array.shape:
             return array.ravel()
         if array.ndim != 1:
@@ -285,14 +285,15 @@ class ArrayFiles:
             raise RequestError(fault)
         return np.asarray(values - self._base, dtype=np.intp)
 
-    def _real(self, values: Array) -> Array:
+    def _real(self, values: Array, infinite: bool = False) -> Array:
         if values.dtype.kind == "c":
             raise RequestError("it holds complex numbers; expected real ones")
         if values.dtype.kind == "S":
             raise RequestError("it holds text; expected numbers")
-        wrong = np.count_nonzero(~np.isfinite(values))
+        wrong = np.count_nonzero(~(np.isfinite(values) | (infinite & (values == np.inf))))
         if wrong:
-            raise RequestError(f"{wrong} of its entries are not finite (nan or inf)")
+            allowed = "nan or -inf; inf means a row that constrains nothing" if infinite else "nan or inf"
+            raise RequestError(f"{wrong} of its entries are not finite ({allowed})")
         return np.asarray(values, dtype=float)
 
     def _take(self, count: int) -> None:

@@ -7,7 +7,7 @@ import hashlib
 import os
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -18,7 +18,7 @@ from vibench.arrays import Array, Indices
 from vibench.errors import NumericalError, RequestError
 from vibench.interfaces.expressions import Expression
 from vibench.interfaces.outputs import Output
-from vibench.interfaces.problem import MEMBERS, ParameterBox
+from vibench.interfaces.problem import MEMBERS, ParameterBox, without_infinities
 from vibench.linalg.inner_product import InnerProduct
 from vibench.packs import manifest as schema
 from vibench.packs.array_files import ArrayFiles, memory_limit, safe_path, size_of
@@ -189,7 +189,8 @@ class PackReader:
         what = f"operators.{name}"
 
         def read(reference: str, where: str) -> Any:
-            array = (self._files.sparse if len(stored) == 2 else self._files.vector)(reference, where)
+            vector = partial(self._files.vector, infinite=name == "g")
+            array = without_infinities((self._files.sparse if len(stored) == 2 else vector)(reference, where))
             self._expect(where, array, stored)
             return array if stored == kept else self._restricted(name, array)
 
@@ -207,7 +208,7 @@ class PackReader:
         elif len(stored) == 2:
             raise RequestError(f"{what}.each: '{given.each}' has no {{}} that stands for the number of the parameter")
         else:
-            columns = self._columns(given.each, f"{what}.each", stored[0], len(self._listed))
+            columns = self._columns(given.each, f"{what}.each", stored[0], len(self._listed), infinite=name == "g")
             values = [column if stored == kept else self._restricted(name, column) for column in columns.T]
         return PackMember(tuple(values), listing=self._listing)
 
@@ -225,8 +226,8 @@ class PackReader:
                 raise RequestError(f"{what}.theta: {error}") from None
         return TabulatedTheta(self._listing, self._vector(term.table, f"{what}.table", len(self._listed)))
 
-    def _columns(self, reference: str, what: str, rows: int, count: int | None) -> Array:
-        columns = self._files.dense(reference, what)
+    def _columns(self, reference: str, what: str, rows: int, count: int | None, infinite: bool = False) -> Array:
+        columns = np.asarray(without_infinities(self._files.dense(reference, what, infinite)))
         if columns.ndim != 2 or columns.shape[0] != rows or count not in (None, columns.shape[1]):
             transposed = "; it is transposed" if columns.ndim == 2 and columns.shape[1] == rows else ""
             expected = f"{rows}×{'P' if count is None else count}, a column per parameter"

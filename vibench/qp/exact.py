@@ -6,7 +6,7 @@ large ones with sparse matrices the constraints are added that the solution so f
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy.linalg
@@ -14,7 +14,7 @@ import scipy.sparse as sp
 from scipy.optimize import nnls
 
 from vibench.arrays import Array, Indices, Mask
-from vibench.interfaces.problem import VariationalInequality
+from vibench.interfaces.problem import ABSENT, VariationalInequality
 from vibench.linalg.cholesky import SparseCholesky
 from vibench.linalg.inner_product import project_out
 from vibench.qp.scaling import row_norms, size
@@ -24,6 +24,9 @@ ROUND_OFF = 1e-12
 
 DEPENDENT = 1e-10
 """Constraints are dependent where a pivot of their factorisation is below this fraction of the largest."""
+
+FARTHEST = 1e-50 * ABSENT
+"""Constraints are absent from here on: reduced ones are sums of products of absent ones with generators of any unit."""
 
 TIGHT = 1e-8
 """Constraints with a smaller slack than this fraction of its terms may carry a multiplier."""
@@ -51,6 +54,18 @@ def exact_solution(program: VariationalInequality) -> ExactSolution | None:
     """
     if not len(program.f):
         return ExactSolution(np.zeros(0), np.zeros(len(program.g)), unique=True)
+    if (absent := program.g >= FARTHEST).any():
+        present = exact_solution(replace(program, B=program.B[~absent], g=program.g[~absent]))
+        if present is None:
+            return None
+        alpha = np.zeros(len(absent))
+        alpha[~absent] = present.alpha
+        return replace(present, alpha=alpha)
+    return _exact_solution(program)
+
+
+def _exact_solution(program: VariationalInequality) -> ExactSolution | None:
+    """That of a program that has unknowns, without absent constraints."""
     try:
         for member in (program.A, program.f, program.B, program.g):
             np.asarray_chkfinite(member)

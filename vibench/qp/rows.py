@@ -2,7 +2,7 @@
 
 Rows b u ≤ g and −c b u ≤ g', c > 0, with c g + g' = 0 are the equality b u = g. No u satisfies both by a margin, and
 they are linearly dependent. An equality in their place, with a multiplier of any sign, has neither defect: its positive
-part belongs to the one row, its negative part to the other. Rows whose g is infinite constrain nothing.
+part belongs to the one row, its negative part to the other. Rows that are absent constrain nothing.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from vibench.arrays import Array, Indices, Mask, SparseMatrix
-from vibench.interfaces.problem import VariationalInequality
+from vibench.interfaces.problem import VariationalInequality, is_absent
 from vibench.qp.scaling import row_norms
 
 PARALLEL = 8.0 * float(np.finfo(float).eps)
@@ -36,7 +36,7 @@ class Rows:
     opposite, ratio
         Of equalities the row on the other side (k,), and the length of this row over that of the other.
     implied
-        Rows (m,) that need no look of their own: equalities, those parallel to them, and those with an infinite g.
+        Rows (m,) that need no look of their own: equalities, those parallel to them, and absent ones.
     """
 
     kept: Indices
@@ -76,7 +76,7 @@ def rows_that_matter(B: SparseMatrix, g: Array, room: Array, preferred: Array | 
     """
     B, m = sp.csr_array(B), len(g)
     lengths, opposite, ratio = row_norms(B), np.arange(m), np.ones(m)
-    dropped, equal = ~np.isfinite(g), np.zeros(m, bool)
+    dropped, equal = is_absent(g), np.zeros(m, bool)
     implied = dropped.copy()
     members, group, side = _parallel(B, lengths, ~dropped)
     bounds = g[members] / lengths[members]

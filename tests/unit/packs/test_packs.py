@@ -18,7 +18,7 @@ from running import Main
 
 from vibench.errors import NumericalError, RequestError
 from vibench.highfidelity.active_set import HighFidelitySolver
-from vibench.interfaces.problem import MEMBERS, Problem, VariationalInequality
+from vibench.interfaces.problem import ABSENT, MEMBERS, Problem, VariationalInequality
 from vibench.interfaces.validation import checked_assembly
 from vibench.packs import writer
 from vibench.packs.checks import read_model_pack
@@ -99,6 +99,23 @@ def test_hdf5_datasets_groups_and_links(tmp_path: Path) -> None:
         write_manifest(folder, content)
         with pytest.raises(RequestError, match=line):
             read_model_pack(folder)
+
+
+def test_an_infinite_entry_of_g_is_a_row_that_constrains_nothing(tmp_path: Path, main: Main) -> None:
+    content, cable = manifest(), Cable()
+    content["operators"]["g"] = "more.npz:g"
+    g = DEPTH * cable.mass
+    g[-1] = np.inf  # the multiplier is zero there
+    pack = pack_with(tmp_path / "pack", content, g=g)
+    assert pack.at(MU).g[-1] == ABSENT
+    assert np.array_equal(pack.at(MU).g[:-1], g[:-1])
+    assert main("import", str(tmp_path / "pack"))[0] == 0
+    for name, wrong in (("one", -np.inf), ("two", np.nan)):
+        g[-1] = wrong
+        with pytest.raises(
+            RequestError, match=r"operators.g: 1 of its entries are not finite \(nan or -inf; inf"
+        ):
+            pack_with(tmp_path / name, content, g=g)
 
 
 def test_tables_and_arrays_by_parameter_hold_at_listed_parameters_only(tmp_path: Path) -> None:
