@@ -80,6 +80,7 @@ def cell_columns(cell: Cell) -> dict[str, Any]:
     """The key columns of a cell."""
     labels = labels_of([cell])
     how = {"solver": cell.solver, "accuracy": cell.accuracy, "assembly": cell.assembly}
+    how["correction"] = cell.correction
     return axis_columns(cell.axes, labels) | how
 
 

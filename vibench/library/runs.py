@@ -16,6 +16,7 @@ from vibench.errors import unknown_name
 from vibench.execution.recorded_cell import recorded_cell
 from vibench.execution.run import Observer, Options, run_study
 from vibench.execution.run_folder import REPORT
+from vibench.model.error_bounds import CorrectionMode
 from vibench.offline.models import Model
 from vibench.results import ranking, tables
 from vibench.results.columns import TABLES
@@ -180,7 +181,8 @@ class Run:
         """
         recorded = recorded_cell(str(self.path), cell)
         asked = recorded.cell
-        return Model(recorded.model, asked.solver, asked.accuracy, recorded.certificate, recorded.row)
+        certificate, mode = recorded.certificate, CorrectionMode(asked.correction)
+        return Model(recorded.model, asked.solver, asked.accuracy, certificate, recorded.row, mode)
 
 
 def _following(observer: Observer | None, progress: bool) -> AbstractContextManager[Observer]:

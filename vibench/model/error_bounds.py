@@ -51,6 +51,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from enum import StrEnum
 
 import numpy as np
 import scipy.sparse as sp
@@ -155,14 +156,40 @@ def bound_errors_at(
     return ErrorBounds(of_u.primal, in_V, of_lam.dual, in_W, *terms_of_both, "; ".join(notes))
 
 
-def corrected_pair(vi: VariationalInequality, energy: Energy, u: Array, lam: Array) -> tuple[Array, Array] | None:
-    """The pair v = u_N − w (n,) and ν ≥ 0 (m,) of the correction of u_N (n,) and λ_N ≥ 0 (m,); `None` without one.
+class CorrectionMode(StrEnum):
+    """Which solutions are corrected: none, all, or those whose violation dominates the bound, ω > ρ."""
+
+    NONE = "none"
+    FEASIBLE = "feasible"
+    AUTO = "auto"
+
+    def applies(self, omega: float, rho: float) -> bool:
+        """Whether a solution with these ω and ρ is corrected."""
+        return self is CorrectionMode.FEASIBLE or (self is CorrectionMode.AUTO and omega > rho)
+
+
+@dataclass(frozen=True)
+class CorrectedPair:
+    """v = u_N − w (n,) and ν ≥ 0 (m,), and the ω and ρ of u_N and λ_N: the pair is more accurate where ω > ρ.
 
     v is feasible, ν complementary to it, and the residual of both is r: they solve (7) with the load f − r. The errors
     are bounded by `bound_errors_at`, as those of any other pair; nothing but the residual is left there.
     """
+
+    u: Array
+    lam: Array
+    omega: float
+    rho: float
+
+
+def corrected_pair(vi: VariationalInequality, energy: Energy, u: Array, lam: Array) -> CorrectedPair | None:
+    """The pair that the correction of u_N (n,) and λ_N ≥ 0 (m,) leads to; `None` without one."""
     correction = find_correction(vi, energy, u, lam)
-    return None if correction is None else (u - correction.w, np.maximum(correction.nu, 0.0))
+    if correction is None:
+        return None
+    rho = energy.dual_norm(vi.f - vi.A @ u - vi.B.T @ lam)
+    omega = energy.norm(correction.w) + correction.eta
+    return CorrectedPair(u - correction.w, np.maximum(correction.nu, 0.0), omega, rho)
 
 
 @dataclass(frozen=True)

@@ -22,7 +22,7 @@ FACTORS = 2**29
 
 
 class Assemblies:
-    """Cached assemblies of one problem; timed code must not use them."""
+    """Cached assemblies of one problem; timed code must use none of it but `energy_of`."""
 
     def __init__(self, problem: Problem, limit: int = LIMIT) -> None:
         self._problem = problem
@@ -42,16 +42,19 @@ class Assemblies:
 
     def energy_at(self, mu: Array) -> Energy:
         """Factorisations of A at mu (d,); a constant A is factorised once."""
-        vi = self.at(mu)
-        if "A" in self._problem.constant:
-            self._constant = self._constant or SparseCholesky(vi.A, "A")
-            return Energy(vi.A, self._constant, self._solver.condensed(vi))
-        found = self._energies.get(_key(mu))
+        vi, found = self.at(mu), self._energies.get(_key(mu))
         if found is None:
-            found = Energy(vi.A, SparseCholesky(vi.A, "A"), self._solver.condensed(vi))
-            if found.nbytes <= self._energies.maxsize:
+            found = self.energy_of(vi)
+            if "A" not in self._problem.constant and found.nbytes <= self._energies.maxsize:
                 self._energies[_key(mu)] = found
         return found
+
+    def energy_of(self, vi: VariationalInequality) -> Energy:
+        """Factorisations of an assembled A, which are not kept unless it is constant: this may be timed."""
+        if "A" not in self._problem.constant:
+            return Energy(vi.A, SparseCholesky(vi.A, "A"), self._solver.condensed(vi))
+        self._constant = self._constant or SparseCholesky(vi.A, "A")
+        return Energy(vi.A, self._constant, self._solver.condensed(vi))
 
 
 @lru_cache(maxsize=1)

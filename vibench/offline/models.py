@@ -18,10 +18,11 @@ from vibench.highfidelity.active_set import HighFidelitySolution, HighFidelitySo
 from vibench.interfaces.problem import ParameterBox, Problem
 from vibench.model.certificates.base import contact_unknowns
 from vibench.model.certificates.bounds import OnlineBound, OnlineCertificate, OnlineCorrection
-from vibench.model.error_bounds import ErrorBounds, bound_errors_at
+from vibench.model.error_bounds import CorrectionMode, ErrorBounds, bound_errors_at
 from vibench.model.galerkin import ReducedModel, ReducedProblem
 from vibench.model.hyperreduced import HyperReducedModel
 from vibench.offline.assemblies import assemblies
+from vibench.offline.correction import Answer, Corrector
 from vibench.qp.settings import SETTINGS
 from vibench.qp.solve import installed_solvers, solve_qp
 from vibench.qp.status import Status
@@ -57,7 +58,10 @@ class Solution:
     bound, tolerance
         Its error bounds at online cost where the cell is certified, and the relative error asked for; else `None`.
     correction
-        What corrects it where that was asked for: `u`, `lam` and `bound` are of the corrected pair, x and α are not.
+        What corrects it at online cost: `u`, `lam` and `bound` are of the corrected pair, x and α are not.
+    mode
+        Whether a correction was asked for. Without a certificate it is made when `u` or `lam` is, at high-fidelity
+        cost.
     """
 
     mu: Array
@@ -73,6 +77,7 @@ class Solution:
     bound: OnlineBound | None = None
     tolerance: float | None = None
     correction: OnlineCorrection | None = None
+    mode: CorrectionMode = CorrectionMode.NONE
 
     @property
     def verdict(self) -> str:
@@ -85,21 +90,28 @@ class Solution:
         kept = self.status is Status.OK and self.bound.relative <= self.tolerance
         return self.bound.guarantee.value if kept else "not certified"
 
-    @cached_property
+    @property
     def u(self) -> Array:
         """The primal solution u (n,)."""
-        u = np.asarray(self._reduced.reconstruct(self._given(self.x)[:, None])[:, 0])
-        if self.correction is None:
-            return u
-        assert self._model.certificate is not None  # it made the correction
-        return self._model.certificate.corrected(u, self.correction, contact_unknowns(self._model.problem))
+        return self.answer.u
 
-    @cached_property
+    @property
     def lam(self) -> Array:
         """The multiplier λ (m,)."""
-        if self.correction is not None:
-            return self.correction.nu
-        return np.asarray(self._model.reduced.generators @ self._given(self.alpha))
+        return self.answer.lam
+
+    @cached_property
+    def answer(self) -> Answer:
+        """Both of these, whether they are a corrected pair, and why not."""
+        certificate = self._model.certificate
+        u = np.asarray(self._reduced.reconstruct(self._given(self.x)[:, None])[:, 0])
+        lam = np.asarray(self._model.reduced.generators @ self._given(self.alpha))
+        if certificate is None and self.mode is not CorrectionMode.NONE:
+            return Corrector(self._model.reduced, None, self.mode).in_full(self.mu, u, lam)
+        if certificate is None or self.correction is None:
+            return Answer(u, lam, self.bound)
+        v = certificate.corrected(u, self.correction, contact_unknowns(self._model.problem))
+        return Answer(v, self.correction.nu, self.bound, is_corrected=True)
 
     @cached_property
     def error_bounds(self) -> ErrorBounds:
@@ -131,6 +143,8 @@ class Model:
         What bounds errors at online cost; `None` where the model is not certified.
     row
         Its row of the cells table; empty for a model that is of no run.
+    correction
+        Which solutions are corrected where nothing else is asked for: as in its cell.
     """
 
     def __init__(
@@ -140,9 +154,10 @@ class Model:
         accuracy: float,
         certificate: OnlineCertificate | None = None,
         row: Mapping[str, Any] = MappingProxyType({}),
+        correction: CorrectionMode = CorrectionMode.NONE,
     ) -> None:
         self.reduced, self.solver, self.accuracy = reduced, solver, accuracy
-        self.certificate, self.row = certificate, row
+        self.certificate, self.row, self.correction = certificate, row, correction
         self.problem: Problem = reduced.problem
 
     @property
@@ -156,7 +171,7 @@ class Model:
         solver: str | None = None,
         accuracy: float | None = None,
         tolerance: float | None = None,
-        corrected: bool = False,
+        corrected: bool | None = None,
     ) -> Solution:
         """Assemble and solve the reduced program at a parameter, verify the solution, and bound its errors.
 
@@ -173,22 +188,22 @@ class Model:
         tolerance
             Largest relative error of u in the energy norm; `verdict` of the solution says whether the bound keeps it.
         corrected
-            Whether `u` and `lam` of the solution are those that its certificate corrects, which satisfy the constraints
-            and are more accurate where the violation dominates the bound (`omega` > `rho`). Where there is no bound
-            there is no correction either.
+            Whether `u` and `lam` of the solution are corrected: they satisfy the constraints, and are more accurate
+            where the violation dominates the bound (`omega` > `rho`). A certificate does that at online cost; without
+            one it takes factorisations at mu. Where there is no bound there is no correction either, as
+            `solution.answer` says. By default as in the cell of the model.
 
         Raises
         ------
         RequestError
             If mu is not a parameter of the problem, the solver is not installed, the tolerance is not positive, or
-            there is one, or a correction is asked for, and the model is not certified.
+            there is one and the model is not certified.
         """
         if tolerance is not None and not 0.0 < tolerance < inf:
             raise RequestError(f"the tolerance is {tolerance:g}, expected a positive finite number")
         if tolerance is not None and self.certificate is None:
             raise RequestError('the model has no error bounds: a tolerance needs one with assembly = "certified"')
-        if corrected and self.certificate is None:
-            raise RequestError('the model has no error bounds: corrections need one with assembly = "certified"')
+        mode = self.correction if corrected is None else CorrectionMode("feasible" if corrected else "none")
         at, name = self._parameter(mu), solver or self.solver
         accuracy = self.accuracy if accuracy is None else accuracy
         own = registry.registered(SOLVER)
@@ -205,10 +220,10 @@ class Model:
             bound = OnlineBound.none(f"the program has no solution: {reason}")
             if residuals is not None and found.x is not None and found.alpha is not None:
                 given = self.problem, at, reduced, found.x, found.alpha
-                correction = self.certificate.correct(*given) if corrected else None
-                bound = self.certificate.evaluate(*given) if correction is None else correction.bound
+                bound, correction = self.certificate.certify(*given, mode)
+                bound = bound if correction is None else correction.bound
         answer = at, status, reason, found.x, found.alpha, residuals
-        return Solution(*answer, assembly, solution, self, reduced, bound, tolerance, correction)
+        return Solution(*answer, assembly, solution, self, reduced, bound, tolerance, correction, mode)
 
     def reconstruct(self, mu: Parameters, x: Array, alpha: Array) -> tuple[Array, Array]:
         """The solution u (n,), λ (m,) with coordinates x (N',) in the primal basis at mu and α (R,) on generators."""

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import NamedTuple
 
-VERSION = 14
+VERSION = 15
 """Schema version of a results file; a file of another version is refused."""
 
 TEXT, REAL, INTEGER, BLOB = "TEXT", "REAL", "INTEGER", "BLOB"
@@ -92,6 +92,11 @@ KEYS: Mapping[str, Column] = {
     "solver": text("QP solver.", "solver", 7),
     "accuracy": real("1", "Relative accuracy prescribed to the solver.", "accuracy", 8),
     "assembly": text("Assembly of the queries: full, reduced, or certified: reduced with bounds.", "assembly", 9),
+    "correction": text(
+        "Which solutions are corrected: none, feasible: all, or auto: where ω > ρ; rows judge the corrected pair.",
+        "correction",
+        10,
+    ),
 }
 """What names a cell. Where a study prescribes N or R, `pod_size` or `dual_size` is filled instead of the tolerance."""
 
@@ -143,6 +148,10 @@ CELLS: Mapping[str, Column] = {
     "terms_f": integer("Likewise for f."),
     "terms_B": integer("Likewise for B; empty if B is assembled on the contact unknowns."),
     "terms_g": integer("Likewise for g."),
+    "correction_cost": text(
+        "What a correction costs: online, with a certificate, or high-fidelity; empty without corrections."
+    ),
+    "corrected_share": real("1", "Share of the ok queries that are corrected; empty without corrections."),
     "offline_snapshots_s": real("s", "High-fidelity solutions at the training parameters, with one set-up."),
     "offline_selection_s": real(
         "s", "Choice of the training parameters by error bounds, a part of the time before; 0 for fixed sets."
@@ -166,7 +175,7 @@ CELLS: Mapping[str, Column] = {
     "offline_wall_s": real("s", "The same sum in wall seconds."),
     "online_s": real(
         "s",
-        "One query, assembly, solution and certificate: median over the rounds of the mean over ok queries.",
+        "One query with assembly, certificate and correction: median over the rounds of the mean over ok queries.",
         "online [ms]",
         23,
     ),
@@ -175,7 +184,9 @@ CELLS: Mapping[str, Column] = {
     "online_wall_s": real("s", "The same as online_s, in wall seconds."),
     "online_assemble_s": real("s", "Assembly of a query: median over the rounds."),
     "online_solve_s": real("s", "Solution of a query by the solver: median over the rounds."),
-    "online_certify_s": real("s", "Certificate of a query: median over the rounds; empty without certificates."),
+    "online_certify_s": real(
+        "s", "Certificate and correction of a query: median over the rounds; empty without either."
+    ),
     "timing_rounds": integer("Number of timing rounds; empty if the cell has not been timed yet."),
     "timing_reason": text("Why rounds are missing."),
     "hf_setup_s": real(
@@ -286,9 +297,12 @@ QUERIES: Mapping[str, Column] = {
     "assembly_error": real("1", "Largest relative difference of a member of the program from its projection."),
     "assemble_s": real("s", "Assembly of the reduced program: median over the rounds."),
     "solve_s": real("s", "The solver: median over the rounds."),
-    "certify_s": real("s", "The certificate: median over the rounds; empty without one."),
+    "certify_s": real("s", "The certificate and the correction: median over the rounds; empty without either."),
     "total_s": real("s", "Sum of the three."),
     "total_wall_s": real("s", "The same in wall seconds."),
+    "corrected": integer("1 if the answer is the corrected pair, 0 if the reduced solution; empty if none was asked."),
+    "correction_share": real("1", "ω/ρ of the reduced solution, above which auto corrects at 1; empty if unknown."),
+    "correction_note": text("Why the answer is not corrected although that was asked for."),
     "hf_s": real(
         "s", "High-fidelity solution at this parameter, with assembly but without set-up: median of the repetitions."
     ),
@@ -399,7 +413,7 @@ TIMINGS: Mapping[str, Column] = {
     "queries": integer("Number of ok queries solved in the round."),
     "assemble_s": real("s", "Assembly of a query: mean over these, or with full assembly that of one of them."),
     "solve_s": real("s", "Solution of a query by the solver: mean over these."),
-    "certify_s": real("s", "Certificate of a query: mean over these; empty without one."),
+    "certify_s": real("s", "Certificate and correction of a query: mean over these; empty without either."),
     "total_s": real("s", "Sum of the three."),
     "total_wall_s": real("s", "The same in wall seconds."),
     "slowdown": real("1", "Time of the calibration next to the round, divided by its best in that process."),
@@ -413,7 +427,7 @@ def _without(*names: str) -> dict[str, Column]:
     return {name: column for name, column in KEYS.items() if name not in names}
 
 
-HISTORY_KEYS = _without("solver", "accuracy", "assembly")
+HISTORY_KEYS = _without("solver", "accuracy", "assembly", "correction")
 
 HISTORIES: Mapping[str, Column] = {
     "artefact": text("Hash of the stage it comes from."),
@@ -449,7 +463,7 @@ THRESHOLDS: Mapping[str, Column] = {
 }
 
 DISAGREEMENTS: Mapping[str, Column] = {
-    **_without("solver"),
+    **_without("solver", "correction"),
     "solver_a": text("One solver."),
     "solver_b": text("The other."),
     "queries": integer("Number of queries that both solved."),

@@ -16,7 +16,9 @@ from vibench.interfaces.strategies import Kind
 from vibench.model.affine import MISSED
 from vibench.model.certificates.base import Guarantee
 from vibench.model.certificates.bounds import OnlineCertificate
+from vibench.model.error_bounds import CorrectionMode
 from vibench.model.errors import ReferenceSolutions, output_scales, summarise_outputs, zeros
+from vibench.offline.correction import Corrector
 from vibench.provenance import machine
 from vibench.qp.exact import ExactSolution
 from vibench.qp.status import Status
@@ -66,6 +68,7 @@ class CellQueries(ItemwiseStage):
     query_seconds: float
     warm_start: bool = False
     certificate: CertificateStage | None = None
+    correction: CorrectionMode = CorrectionMode.NONE
 
     @property
     def sort(self) -> str:
@@ -147,7 +150,8 @@ def cell_queries(cell: Cell, query_seconds: float) -> CellQueries:
     """The last stage of a cell; all its other stages are inputs of it, directly or indirectly."""
     assembly = assembly_stage(cell)
     certificate = CertificateStage(assembly) if cell.assembly == CERTIFIED else None
-    return CellQueries(assembly, cell.solver, cell.accuracy, query_seconds, cell.warm_start, certificate)
+    mode, asked = CorrectionMode(cell.correction), (cell.solver, cell.accuracy, query_seconds, cell.warm_start)
+    return CellQueries(assembly, *asked, certificate, mode)
 
 
 class _Queries(Items):
@@ -174,6 +178,7 @@ class _Queries(Items):
         self._certificate: OnlineCertificate | None = (
             None if stage.certificate is None else value_of(store, stage.certificate)
         )
+        self._corrector = Corrector(self._model, self._certificate, stage.correction)
 
     def item(self, number: int, watch: Callable[[bool], None]) -> QueryRows:
         """The rows of one query."""
@@ -190,7 +195,7 @@ class _Queries(Items):
         solutions = {k: solution for k, (_, solution) in enumerate(items) if solution is not None}
         assessed = dict(zip(solutions, self._assess(solutions), strict=True))
         rows = [row | assessed.get(k, {}) for k, (row, _) in enumerate(items)]
-        own = summarise(rows) | self._sizes() | self._shares() | self._offline()
+        own = summarise(rows) | self._sizes(rows) | self._shares() | self._offline()
         outputs = self._outputs(rows)
         written = [row | {"outputs": json.dumps(values) if (values := row.get("outputs")) else None} for row in rows]
         return CellRows(own, tuple(written), tuple(solutions.values()), outputs)
@@ -206,14 +211,13 @@ class _Queries(Items):
         numbers = list(solutions)
         try:
             return error_columns(
-                self._model,
+                self._corrector,
                 self._reference.mu[numbers],
                 [vectors(solution) for solution in solutions.values()],
                 self._compared.at(numbers),
                 [self._stability[k] for k in numbers],
                 [self._exact[k] for k in numbers],
                 [self._reduced.projected[k] for k in numbers] if self._reduced.projected else (),
-                self._certificate,
             )
         except MemoryError:
             raise
@@ -237,7 +241,7 @@ class _Queries(Items):
             | {"bounds": self._own[number].sharp, "assembly_error": self._reduced.errors[number]}
         )
 
-    def _sizes(self) -> Row:
+    def _sizes(self, rows: Sequence[Row]) -> Row:
         """Dimensions, fallbacks, memory."""
         assembly, cone = self._stage.assembly, self._cone
         built = assembly.enrichment.enrichment(self._store)
@@ -255,6 +259,8 @@ class _Queries(Items):
         if (gap := cone.prepared.rank_gap) < CLEAR_GAP:
             rank = cone.prepared.rank
             fallbacks.append(f"the rank {rank} is in doubt: its last singular value is {gap:.2g} times what is below")
+        if uncorrected := [note for row in rows if (note := row.get("correction_note"))]:
+            fallbacks.append(f"{len(uncorrected)} of {len(rows)} queries are not corrected: {uncorrected[0]}")
         added = self._model.fixed_basis.shape[1] - size
         return {
             "model": assembly.key,
@@ -269,6 +275,7 @@ class _Queries(Items):
             "snapshots": len(self._training.mu),
             "enrichment": cone.prepared.rank if built.kind is Kind.PER_PARAMETER else added,
             **assembly.columns(self._store),
+            "correction_cost": self._corrector.cost,
             "certificate": (Guarantee.NONE if self._certificate is None else self._certificate.base.guarantee).value,
             "fallbacks": "; ".join(fallbacks),
             "peak_memory_mib": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,

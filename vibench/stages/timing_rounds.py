@@ -13,13 +13,15 @@ from vibench.arrays import Array
 from vibench.interfaces.problem import VariationalInequality
 from vibench.interfaces.validation import checked_assembly
 from vibench.model.certificates.bounds import OnlineCertificate
+from vibench.model.error_bounds import CorrectionMode
 from vibench.model.hyperreduced import HyperReducedModel
+from vibench.offline.assemblies import Assemblies
+from vibench.offline.correction import corrected_in_full
 from vibench.provenance import machine
 from vibench.qp.repeats import check_answer, units
 from vibench.stages.assembly import AssemblyStage
 from vibench.stages.base import Failed, Items, ItemwiseStage, Row, Stage, value_of
 from vibench.stages.cell_queries import CellQueries
-from vibench.stages.certification import CertificateStage
 from vibench.stages.query import Queries, Watch
 from vibench.storage.artefacts import Store
 from vibench.timing import DISTURBED, WAITED, Seconds, calibration, timed
@@ -115,6 +117,7 @@ class _Rounds(Items):
         self._stage, self._store = stage, store
         self._models: dict[str, Queries] = {}
         self._certificates: dict[str, OnlineCertificate] = {}
+        self._factors: dict[str, Assemblies] = {}
         self._warm: set[int] = set()
         self._forms: dict[tuple[int, int], tuple[VariationalInequality, Seconds]] = {}
 
@@ -131,7 +134,7 @@ class _Rounds(Items):
     def _round(
         self, at: int, cell: int, watch: Watch, *, warm_up: bool = False
     ) -> tuple[dict[int, Seconds], dict[int, Seconds], dict[int, Seconds]]:
-        """Seconds of assembly, solution and certificate of the cell's queries, or of one to warm up.
+        """Seconds of assembly, solution, certificate and correction of the cell's queries, or of one to warm up.
 
         What is timed is equivalent to the queries and nowhere the same: nothing is gained by remembering it.
         """
@@ -147,23 +150,29 @@ class _Rounds(Items):
             query = stage.query(queries, k).repeated(*seed)
             answer, solve[k] = query.prepare(watch)()
             check_answer(query.program, answer, query.accuracy)
-            if stage.certificate is not None and answer.x is not None and answer.alpha is not None:
+            asked = stage.certificate is not None or stage.correction is not CorrectionMode.NONE
+            if asked and answer.x is not None and answer.alpha is not None:
                 x = units(len(answer.x), query.accuracy, *seed) * answer.x
                 near = queries.near(k, at, cell, int(warm_up))
-                certify[k] = self._certified(stage.certificate, queries, near, (x, answer.alpha))
+                certify[k] = self._certified(stage, queries, near, (x, answer.alpha))
             if sum(seconds.wall for seconds in solve.values()) > ROUND_SECONDS:
                 break
         return assemble, solve, certify
 
-    def _certified(
-        self, stage: CertificateStage, queries: Queries, near: Array, solution: tuple[Array, Array]
-    ) -> Seconds:
-        """Seconds of the certificate of a solution at a parameter."""
-        if stage.key not in self._certificates:
-            self._certificates[stage.key] = value_of(self._store, stage)
-        certificate, model = self._certificates[stage.key], queries.model
-        reduced = model.assemble(near)
-        return timed(partial(certificate.evaluate, model.problem, near, reduced, *solution))[1]
+    def _certified(self, stage: CellQueries, queries: Queries, near: Array, solution: tuple[Array, Array]) -> Seconds:
+        """Seconds of the certificate of a solution at a parameter and of its correction, or of that in full."""
+        model = queries.model
+        if stage.certificate is None:
+            kept = self._factors.setdefault(stage.assembly.key, Assemblies(model.problem, 0))
+            vi, assembly = timed(lambda: checked_assembly(model.problem, near).copy())
+            _, seconds = timed(partial(corrected_in_full, model, kept, near, vi, *solution))
+            return assembly + seconds if isinstance(model, HyperReducedModel) else seconds
+        key = stage.certificate.key
+        if key not in self._certificates:
+            self._certificates[key] = value_of(self._store, stage.certificate)
+        assert isinstance(model, HyperReducedModel)  # it has a certificate
+        given = model.problem, near, model.assemble(near), *solution
+        return timed(partial(self._certificates[key].certify, *given, stage.correction))[1]
 
     def _queries(self, assembly: AssemblyStage) -> Queries:
         if assembly.key not in self._models:

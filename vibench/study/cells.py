@@ -25,6 +25,10 @@ def digest(content: Any) -> str:
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
+UNCORRECTED = "none"
+"""Correction of cells that answer with the reduced solution itself."""
+
+
 PLUGINS = ("problem", "dual", "primal", "training", "validation_sampling")
 """Names of plugins in the definition of a cell; the last two, of sampling strategies, may be `None`."""
 
@@ -44,7 +48,7 @@ class Axes:
 
 @dataclass(frozen=True)
 class Cell:
-    """One cell: problem × training set × dual × primal strategy × tolerances × QP solver × accuracy × assembly.
+    """One cell: a problem, strategies, tolerances, a QP solver, and how queries are assembled and corrected.
 
     `interpolation` is the tolerance of reduced assembly, `None` for full assembly; certified queries are assembled as
     reduced ones. `labels` of problem, dual and primal strategy are no part of the identity, nor are those of the
@@ -67,6 +71,7 @@ class Cell:
     labels: tuple[str, str, str]
     nested_tolerances: tuple[float, ...] = ()
     training: ParameterSet = OWN_TRAINING
+    correction: str = UNCORRECTED
 
     @cached_property
     def key(self) -> str:
@@ -89,6 +94,8 @@ class Cell:
         """The cell as results files hold it: its parameter sets lie in five entries beside the others."""
         content = asdict(self)
         training, validation = content.pop("training"), content.pop("validation")
+        if self.correction == UNCORRECTED:  # as before there was a choice
+            del content["correction"]
         return content | {
             "seed": validation["seed"],
             "validation": validation["count"],
@@ -119,7 +126,7 @@ class Cell:
 
     @property
     def axes(self) -> Axes:
-        """The axes of the cell, without solver and assembly."""
+        """The axes of the cell, without solver, assembly and correction."""
         return Axes(self.problem, self.dual, self.primal, self.pod, self.cone, self.primal_tol, self.training)
 
     @property
@@ -142,5 +149,6 @@ class Cell:
             f"{size}={stop.size}" if stop.tolerance is None else f"{stop.tolerance:g}"
             for size, stop in (("N", self.pod), ("R", self.cone))
         )
-        assembly = "" if self.assembly == "full" else f" · {self.assembly}"
-        return f"{problem} · {dual} · {primal}{tolerance} · {pod}, {cone} · {self.solver} {self.accuracy:g}{assembly}"
+        way = "" if self.assembly == "full" else f" · {self.assembly}"
+        way += "" if self.correction == UNCORRECTED else f" · corrected: {self.correction}"
+        return f"{problem} · {dual} · {primal}{tolerance} · {pod}, {cone} · {self.solver} {self.accuracy:g}{way}"

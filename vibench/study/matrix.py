@@ -151,7 +151,8 @@ def expand(study: Study) -> list[Cell]:
     for (problem, plugin, sets, validation), table in product(problems, study.tolerances):
         nested = {entry.title: _nested_tolerances(entry, table) for entry in study.primal}
         for training, (dual, pod, cone, primal, tolerance) in product(sets, _combinations(duals, primals, table)):
-            for assembly, solver, accuracy in product(study.assembly, study.solver_names(), study.accuracy):
+            solved = product(study.assembly, study.correction, study.solver_names(), study.accuracy)
+            for assembly, correction, solver, accuracy in solved:
                 cell = Cell(
                     problem=plugin,
                     dual=dual[1],
@@ -164,6 +165,7 @@ def expand(study: Study) -> list[Cell]:
                     interpolation=None if assembly == "full" else study.interpolation,
                     warm_start=study.warm_start,
                     accuracy=accuracy,
+                    correction=correction,
                     training=training,
                     validation=validation,
                     labels=(problem.title, dual[0].title, primal[0].title),
@@ -225,6 +227,7 @@ def study_of_cell(cell: Cell, name: str, **settings: Any) -> Study:
         "dual": [dual],
         "primal": [primal],
         "assembly": [cell.assembly],
+        "correction": [cell.correction],
         "warm_start": cell.warm_start,
         "tolerances": [tolerances],
     }

@@ -166,6 +166,11 @@ class Study(_Model):
     assembly: Annotated[
         list[Literal["full", "reduced", "certified"]], MinLen(1), Field(description="How queries are assembled.")
     ] = ["full"]
+    correction: Annotated[
+        list[Literal["none", "feasible", "auto"]],
+        MinLen(1),
+        Field(description="Whether solutions are corrected; `auto` for those whose violation dominates the bound."),
+    ] = ["none"]
     interpolation: Annotated[
         Tolerance, Field(description="Tolerance of empirical interpolation in reduced assembly.")
     ] = 1e-6

@@ -119,7 +119,7 @@ def test_corrected_pairs_are_feasible_and_nothing_but_the_residual_is_left_of_th
     vi, u, lam, u_N, lam_N = given
     norm, before, pair = energy(vi), bounds(vi, u_N, lam_N), corrected_pair(vi, energy(vi), u_N, lam_N)
     assert pair is not None
-    v, nu = pair
+    v, nu = pair.u, pair.lam
     after = bounds(vi, v, nu)
     scale = norm.norm(u) + norm.norm(u_N) + norm.dual_norm(vi.f) + norm.dual_norm(vi.B.T @ lam_N)
     assert np.min(nu) >= 0.0
@@ -127,6 +127,7 @@ def test_corrected_pairs_are_feasible_and_nothing_but_the_residual_is_left_of_th
     assert norm.norm(u - v) <= after.u_energy + EXACT * scale
     assert norm.dual_norm(vi.B.T @ (lam - nu)) <= after.lambda_natural + EXACT * scale
     assert after.u_energy <= before.rho * (1.0 + 1e-6) + ROUND_OFF * scale
+    assert (pair.omega, pair.rho) == (before.omega, before.rho)
 
 
 @given(st.integers(0, 10_000), st.sampled_from([1e-6, 1e-8, 1e-10]))

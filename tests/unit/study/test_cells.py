@@ -48,6 +48,17 @@ def test_accuracies_are_an_axis(cells_of: Expand) -> None:
     assert len({str(cell) for cell in cells}) == len(cells)
 
 
+def test_corrections_are_an_axis_and_cells_without_one_are_those_of_studies_without_it(cells_of: Expand) -> None:
+    cells = cells_of(STUDY | {"correction": ["none", "feasible", "auto"]})
+    alone = cells_of(STUDY)
+    assert len(cells) == 3 * len(alone)
+    assert [cell for cell in cells if cell.correction == "none"] == alone
+    assert [cell.key for cell in cells if cell.correction == "none"] == [cell.key for cell in alone]
+    assert all(("correction" in cell.definition) == (cell.correction != "none") for cell in cells)
+    assert all(Cell.from_definition(cell.definition) == cell for cell in cells)
+    assert len({str(cell) for cell in cells}) == len(cells)
+
+
 def test_a_strategy_without_tolerance_is_not_repeated(cells_of: Expand) -> None:
     few, many = (
         cells_of(changed(STUDY, "tolerances", 0, "primal", to={"offline-pga": values}))
@@ -168,6 +179,7 @@ OTHER: Mapping[str, Mapping[str, Any]] = {
     "no primal_tol": {"primal_tol": None},
     "solver": {"solver": "osqp"},
     "assembly": {"assembly": "reduced"},
+    "correction": {"correction": "auto"},
     "interpolation": {"interpolation": 1e-6},
     "warm start": {"warm_start": True},
     "seed": {"validation": ParameterSet("validation", 8, 2)},

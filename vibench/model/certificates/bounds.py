@@ -50,7 +50,7 @@ from vibench.model.certificates.base import ONE, CertificateBase, Guarantee, con
 from vibench.model.certificates.contact_correction import ContactCompliance, find_contact_correction
 from vibench.model.certificates.prepared_correction import PreparedCorrections
 from vibench.model.certificates.residual import ResidualBasis
-from vibench.model.error_bounds import NO_CORRECTION, NOT_IN_CONE
+from vibench.model.error_bounds import NO_CORRECTION, NOT_IN_CONE, CorrectionMode
 from vibench.model.galerkin import Evaluated, ReducedProblem
 
 NOT_PREPARED = "no prepared correction satisfies B w ≥ s: the best w was computed at the parameter"
@@ -201,13 +201,26 @@ class OnlineCertificate:
         terms = rho / sqrt(lower), omega, kappa, lower
         return OnlineBound(bound, natural, relative, *terms, base.guarantee, note, in_W, beta, which)
 
-    def correct(
-        self, problem: Problem, mu: Array, reduced: ReducedProblem, x: Array, alpha: Array
+    def certify(
+        self,
+        problem: Problem,
+        mu: Array,
+        reduced: ReducedProblem,
+        x: Array,
+        alpha: Array,
+        mode: CorrectionMode = CorrectionMode.FEASIBLE,
+    ) -> tuple[OnlineBound, OnlineCorrection | None]:
+        """The bounds of `evaluate`, and the corrected pair with its own where the mode asks for it and there is one."""
+        bound = self.evaluate(problem, mu, reduced, x, alpha)
+        if bound.guarantee is Guarantee.NONE or not mode.applies(bound.omega, bound.rho):
+            return bound, None
+        return bound, self._corrected_pair(problem, mu, reduced, x, alpha, bound)
+
+    def _corrected_pair(
+        self, problem: Problem, mu: Array, reduced: ReducedProblem, x: Array, alpha: Array, bound: OnlineBound
     ) -> OnlineCorrection | None:
-        """The corrected pair of a solution as in `evaluate`, with its bounds; `None` where that has none."""
-        bound, base = self.evaluate(problem, mu, reduced, x, alpha), self.base
-        if bound.guarantee is Guarantee.NONE:
-            return None
+        """The corrected pair of a solution whose bounds are known."""
+        base = self.base
         evaluated, lam, alpha_A = reduced.evaluated, self.generators @ alpha, bound.coercivity
         contact, y = evaluated.contact or contact_at(problem, mu), evaluated.in_space(x)
         theta = base.coefficients(evaluated.samples)

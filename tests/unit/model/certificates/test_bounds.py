@@ -226,7 +226,8 @@ def test_corrected_pairs_are_feasible_and_no_error_of_them_is_above_its_bound(
     x = x + size * rng.standard_normal(len(x))
     alpha = np.maximum(alpha + size * rng.standard_normal(len(alpha)), 0.0)
     bound = certificate.evaluate(problem, mu, reduced, x, alpha)
-    found = certificate.correct(problem, mu, reduced, x, alpha)
+    same, found = certificate.certify(problem, mu, reduced, x, alpha)
+    assert same == bound
     assert found is not None
     A, B, corrected, nu = vi.A.toarray(), vi.B.toarray(), found.bound, found.nu
     u, lam = exact(VariationalInequality(A, vi.f, B, vi.g))
@@ -260,7 +261,7 @@ def test_the_residual_of_a_corrected_pair_is_that_of_the_inner_product_in_place_
         A, lam = vi.A.toarray(), rng.uniform(0.0, 0.2, M) * pressed
         u_N = np.linalg.solve(A, vi.f - vi.B.T @ lam)
         x = np.linalg.lstsq(assembled.basis, u_N)[0]
-        bound, found = (one(problem, mu, assembled, x, lam) for one in (certificate.evaluate, certificate.correct))
+        bound, found = certificate.certify(problem, mu, assembled, x, lam)
         assert found is not None
         v = certificate.corrected(u_N, found, CONTACT)
         r = vi.f - A @ v - vi.B.T @ found.nu

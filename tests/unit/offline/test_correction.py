@@ -1,0 +1,120 @@
+"""Queries that answer with the pair that their certificate corrects: rows, bounds, models."""
+
+from __future__ import annotations
+
+from itertools import product
+
+import numpy as np
+import pandas as pd
+import pytest
+from samples import small_study
+
+import vibench
+from vibench.interfaces.validation import validation_parameters
+from vibench.model.error_bounds import NO_CORRECTION, NOT_IN_CONE, CorrectionMode
+from vibench.offline import correction as module
+from vibench.offline.assemblies import assemblies
+from vibench.offline.correction import Corrector
+
+PROBLEMS = [
+    {"name": "obstacle", "options": {"resolution": "coarse"}},
+    {"name": "hertz", "options": {"resolution": 300}},
+]
+BOUNDS = ("u_energy", "u", "lambda_natural", "lambda", "online_u_energy", "online_lambda_natural", "online_lambda")
+ERRORS = {name: f"error_{name.removeprefix('online_')}_absolute" for name in BOUNDS}
+MODEL = ["problem", "pod_tol", "assembly"]
+
+
+@pytest.fixture(scope="module")
+def corrected(tmp_path_factory: pytest.TempPathFactory) -> vibench.Run:
+    study = small_study(
+        "corrected", PROBLEMS, primal=["offline-pga"], assembly=["reduced", "certified"], validation=4, timing_rounds=1,
+        correction=["none", "feasible", "auto"], tolerances=[{"pod": [1e-2, 1e-4], "dual": [1e-2], "primal": {"offline-pga": [0.5]}}],
+    )  # fmt: skip
+    return vibench.run(study, tmp_path_factory.mktemp("corrected") / "run", progress=False, jobs=1)
+
+
+def by(run: vibench.Run, correction: str) -> pd.DataFrame:
+    rows = run.queries[run.queries["correction"] == correction]
+    return rows.set_index([*MODEL, "query"]).sort_index()
+
+
+def test_every_answer_of_a_corrected_cell_is_feasible_and_no_error_is_above_its_bound(corrected: vibench.Run) -> None:
+    assert (corrected.cells["status"] == "ok").all()
+    rows, plain = by(corrected, "feasible"), by(corrected, "none")
+    assert (rows["corrected"] == 1).all()
+    assert (rows["violation"] <= 1e-12 * plain["error_u_absolute"].max()).all()
+    assert plain["violation"].max() > 1e-6
+    for name, error in ERRORS.items():
+        bound = rows[f"bound_{name}"].dropna()
+        assert len(bound) == len(rows) // (1 + name.startswith("online"))
+        assert (rows.loc[bound.index, error] <= bound * (1.0 + 1e-9)).all(), name
+    assert (corrected.cells["bound_online_violations"].dropna() == 0.0).all()
+    at_mesh = rows.index.get_level_values("assembly") == "reduced"
+    assert (rows["bound_omega"][at_mesh] <= 1e-9 * plain["bound_omega"].max()).all()
+    obstacle = rows.loc[("obstacle", 1e-4)]["error_lambda"] / plain.loc[("obstacle", 1e-4)]["error_lambda"]
+    assert obstacle.median() < 0.2
+
+
+def test_auto_corrects_where_the_violation_dominates_the_bound_and_leaves_the_others(corrected: vibench.Run) -> None:
+    rows, plain, pairs = (by(corrected, name) for name in ("auto", "none", "feasible"))
+    assert (rows["corrected"] == (rows["correction_share"] > 1.0)).all()
+    assert set(rows["corrected"]) == {0, 1}
+    at_mesh = rows.index.get_level_values("assembly") == "reduced"
+    assert np.allclose(rows["correction_share"][at_mesh], (plain["bound_omega"] / plain["bound_rho"])[at_mesh])
+    online = (plain["bound_online_omega"] / plain["bound_online_rho"])[~at_mesh]
+    assert np.allclose(rows["correction_share"][~at_mesh], online)
+    for name in ("error_u", "error_lambda", "violation", "bound_lambda", "bound_online_lambda", "solver_error_lambda"):
+        expected = pairs[name].where(rows["corrected"] == 1, plain[name])
+        assert np.allclose(rows[name], expected, rtol=1e-12, equal_nan=True), name
+    cells = corrected.cells.set_index([*MODEL, "correction"])
+    shares = rows.groupby(MODEL)["corrected"].mean()
+    for model, share in shares.items():
+        assert cells.loc[(*model, "auto"), "corrected_share"] == share
+
+
+def test_rows_say_what_a_correction_costs_and_its_seconds_are_those_of_the_query(corrected: vibench.Run) -> None:
+    cells = corrected.cells.set_index(["assembly", "correction"]).sort_index()
+    for assembly, correction in product(("reduced", "certified"), ("none", "feasible", "auto")):
+        mine = cells.loc[[(assembly, correction)]]
+        asked = {"reduced": "high-fidelity", "certified": "online"}[assembly] if correction != "none" else ""
+        assert set(mine["correction_cost"]) == {asked}
+        assert mine["corrected_share"].isna().all() == (correction == "none")
+        assert mine["online_certify_s"].notna().all() == (asked != "" or assembly == "certified")
+    assert (cells["online_certify_s"].fillna(0.0) < cells["online_s"]).all()
+
+
+@pytest.mark.parametrize("problem", ["obstacle", "hertz"])
+def test_models_answer_as_their_cells_do_and_bounds_hold_at_unseen_parameters(
+    corrected: vibench.Run, problem: str
+) -> None:
+    cells = corrected.cells[corrected.cells["problem"] == problem].set_index(["pod_tol", "assembly", "correction"])
+    for tolerance, assembly in product((1e-2, 1e-4), ("reduced", "certified")):
+        model = corrected.model(cells.loc[(tolerance, assembly, "feasible"), "cell"])
+        V, W = model.problem.V, model.problem.W
+        recorded = by(corrected, "feasible").loc[(problem, tolerance, assembly)]
+        for query, mu in enumerate(validation_parameters(model.problem, 1, 0)):
+            solution, exact = model.solve(mu), model.high_fidelity(mu)
+            assert W.norm(exact.lam - solution.lam) == pytest.approx(recorded.loc[query, "error_lambda_absolute"], 1e-4)
+            assert not np.array_equal(solution.lam, model.solve(mu, corrected=False).lam)
+        for mu in model.parameters.sample(6, seed=8):
+            solution, exact = model.solve(mu), model.high_fidelity(mu)
+            vi, norm = assemblies(model.problem).at(mu), assemblies(model.problem).energy_at(mu)
+            assert solution.answer.is_corrected
+            assert np.max(vi.B @ solution.u - vi.g) <= 1e-12 * np.abs(vi.g).max()
+            found = [solution.error_bounds] if solution.bound is None else [solution.error_bounds, solution.bound]
+            for bound in found:
+                assert norm.norm(exact.u - solution.u) <= bound.u_energy * (1.0 + 1e-9)
+                assert norm.dual_norm(vi.B.T @ (exact.lam - solution.lam)) <= bound.lambda_natural * (1.0 + 1e-9)
+                assert W.norm(exact.lam - solution.lam) <= bound.lam * (1.0 + 1e-9)
+            assert V.norm(exact.u - solution.u) <= found[0].u * (1.0 + 1e-9)
+
+
+def test_a_query_that_cannot_be_corrected_says_why(corrected: vibench.Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The answer is the reduced solution then."""
+    model = corrected.model(corrected.cells["cell"].iloc[0])
+    corrector, mu = Corrector(model.reduced, None, CorrectionMode.FEASIBLE), model.parameters.sample(1, seed=3)[0]
+    u, lam = np.zeros(model.problem.V.dim), np.zeros(model.problem.W.dim)
+    assert corrector.in_full(mu, u, lam - 1.0)._replace(u=u, lam=lam) == (u, lam, None, False, None, NOT_IN_CONE)
+    monkeypatch.setattr(module, "corrected_pair", lambda *_: None)
+    assert corrector.in_full(mu, u, lam).note == NO_CORRECTION
