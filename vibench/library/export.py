@@ -48,9 +48,9 @@ EVALUATIONS = 4096
 RECORDED = (
     "cell", "problem", "problem_options", "training", "training_options", "dual", "dual_options", "primal",
     "primal_options", "pod_tol", "pod_size", "dual_tol", "dual_size", "primal_tol", "solver", "accuracy", "assembly",
-    "queries", "queries_ok", "snapshots", "N", "R", "enrichment", "error_u_mean", "error_u_max", "error_lambda_mean",
-    "error_lambda_max", "assembly_error_max", "seed", "validation", "validation_options", "code", "versions",
-    "definition",
+    "correction", "queries", "queries_ok", "snapshots", "N", "R", "enrichment", "error_u_mean", "error_u_max",
+    "error_lambda_mean", "error_lambda_max", "assembly_error_max", "seed", "validation", "validation_options", "code",
+    "versions", "definition",
 )  # fmt: skip
 """Columns of the cell that an exported model repeats."""
 

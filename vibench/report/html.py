@@ -43,7 +43,7 @@ READ = tuple(dict.fromkeys((*TABLES, *findings.READ)))
 FOLDED = 300
 """Findings that can be unfolded; thousands of a large study would be read by nobody."""
 
-IDENTITY = ["problem", "dual", "primal", "primal_tol", "solver", "accuracy", "assembly", "status"]
+IDENTITY = ["problem", "dual", "primal", "primal_tol", "solver", "accuracy", "assembly", "correction", "status"]
 """Columns that cells and queries share in the tables of failures."""
 
 
@@ -158,7 +158,7 @@ def _way(winner: Winner) -> str:
 
 def _facts(study: dict[str, Any], cells: pd.DataFrame) -> Iterator[tuple[str, str]]:
     yield "study", ", ".join(f"{key} {value}" for key, value in study.items())
-    for axis in ("problem", "dual", "primal", "solver", "accuracy", "assembly"):
+    for axis in ("problem", "dual", "primal", "solver", "accuracy", "assembly", "correction"):
         yield axis, ", ".join(str(name) for name in cells[axis].unique())
     yield "cells", f"{len(cells)}, {int(cells['queries'].fillna(0).sum())} queries"
     yield "machine", "; ".join(str(name) for name in cells["machine"].unique())

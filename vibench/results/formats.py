@@ -121,10 +121,11 @@ def name_of_cell(row: Mapping[str, Any] | pd.Series) -> str:
     """A cell by all its axes, as `Cell` prints itself."""
     tolerance = "" if pd.isna(row["primal_tol"]) else f" {row['primal_tol']:g}"
     sizes = ", ".join(asked(row, axis) for axis in ("pod", "dual"))
-    assembly = "" if row["assembly"] == "full" else f" · {row['assembly']}"
+    how = "" if row["assembly"] == "full" else f" · {row['assembly']}"
+    how += "" if row["correction"] == "none" else f" · corrected: {row['correction']}"
     trained = "" if row["training"] == "own" else f" ({row['training']})"
     way = f"{row['problem']}{trained} · {row['dual']} · {row['primal']}{tolerance}"
-    return f"{way} · {sizes} · {row['solver']} {row['accuracy']:g}{assembly}"
+    return f"{way} · {sizes} · {row['solver']} {row['accuracy']:g}{how}"
 
 
 def break_even(meaning: str, number: float | None) -> str:

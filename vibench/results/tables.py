@@ -31,6 +31,7 @@ from vibench.results.columns import (
 from vibench.results.formats import asked, break_even, interval, to_csv, to_markdown
 from vibench.results.plugin_columns import Extended
 from vibench.results.sqlite.reading import FILE, read_meta, read_rows
+from vibench.study.cells import UNCORRECTED
 from vibench.text import brief, json_object
 
 ORDER = (
@@ -154,9 +155,11 @@ def _for_reading(frame: pd.DataFrame, table: Mapping[str, Column]) -> pd.DataFra
 
 
 def says_something(frame: pd.DataFrame, name: str) -> bool:
-    """Whether to show a column unasked: accuracy and training sets where they are an axis, zero solutions if any."""
+    """Whether to show a column unasked: accuracy and training sets if they vary, corrections and zeros if any."""
     if name == "accuracy":
         return bool(frame[name].nunique() > 1)
+    if name == "correction":
+        return bool((frame[name] != UNCORRECTED).any())
     if name in ("training", "snapshots"):
         return bool(frame["training"].nunique() > 1)
     if name == "status":

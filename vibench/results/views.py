@@ -18,7 +18,10 @@ from vibench.results.plugin_columns import Extended
 from vibench.results.ranking import BAND
 from vibench.text import json_object
 
-AXES = ("problem", "training", "dual", "primal", "primal_tol", "solver", "pod_tol", "dual_tol", "accuracy", "assembly")
+AXES = (
+    "problem", "training", "dual", "primal", "primal_tol", "solver", "pod_tol", "dual_tol", "accuracy", "assembly",
+    "correction",
+)  # fmt: skip
 """Columns that tell rows apart; where all rows have one value, it stands in the title and takes no room."""
 
 OF_CELLS = (
@@ -28,8 +31,8 @@ OF_CELLS = (
 
 OF_BENEFITS = (
     "problem", "dual", "primal_a", "primal_b", "benefit_threshold", "primal_tol_b", "solver", "assembly_a",
-    "assembly_b", "threshold_high", "pod_tol", "dual_tol", "accuracy", "online_b_s", "online_a_s", "offline_b_s",
-    "offline_a_s",
+    "assembly_b", "correction", "threshold_high", "pod_tol", "dual_tol", "accuracy", "online_b_s", "online_a_s",
+    "offline_b_s", "offline_a_s",
 )  # fmt: skip
 
 
@@ -70,9 +73,9 @@ VIEWS: Mapping[str, View] = {
     "thresholds": View("thresholds", OF_BENEFITS),
     "outputs": View(
         "outputs",
-        ("problem", "training", "dual", "primal", "primal_tol", "solver", "assembly", "output", "unit", "error_mean",
-         "error_max", "error_scaled_mean", "scale", "queries_ok", "queries_zero", "pod_tol", "dual_tol", "accuracy",
-         "cell"),
+        ("problem", "training", "dual", "primal", "primal_tol", "solver", "assembly", "correction", "output", "unit",
+         "error_mean", "error_max", "error_scaled_mean", "scale", "queries_ok", "queries_zero", "pod_tol", "dual_tol",
+         "accuracy", "cell"),
     ),
     "disagreements": View(
         "disagreements",

@@ -19,8 +19,8 @@ REST = "--format csv"
 PRIORITY = (
     "run", "what", "verdict", "before", "after", "ratio", "cells", "equal", "worse", "better", "changed", "problem",
     "dual", "primal", "solver", "asked", "interval", "within accuracy", "within limit", "undecided", "farthest ratio",
-    "against", "accuracy", "assembly", "cell", "study", "ok", "only here", "same code", "in all runs", "machine",
-    "seed", "validation",
+    "against", "accuracy", "assembly", "correction", "cell", "study", "ok", "only here", "same code", "in all runs",
+    "machine", "seed", "validation",
 )  # fmt: skip
 """Columns of the tables, those that matter most first."""
 

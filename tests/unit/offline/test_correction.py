@@ -29,7 +29,8 @@ MODEL = ["problem", "pod_tol", "assembly"]
 def corrected(tmp_path_factory: pytest.TempPathFactory) -> vibench.Run:
     study = small_study(
         "corrected", PROBLEMS, primal=["offline-pga"], assembly=["reduced", "certified"], validation=4, timing_rounds=1,
-        correction=["none", "feasible", "auto"], tolerances=[{"pod": [1e-2, 1e-4], "dual": [1e-2], "primal": {"offline-pga": [0.5]}}],
+        correction=["none", "feasible", "auto"],
+        tolerances=[{"pod": [1e-2, 1e-4], "dual": [1e-2], "primal": {"offline-pga": [0.5]}}],
     )  # fmt: skip
     return vibench.run(study, tmp_path_factory.mktemp("corrected") / "run", progress=False, jobs=1)
 

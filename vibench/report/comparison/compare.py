@@ -31,8 +31,8 @@ from vibench.results.columns import CELLS
 from vibench.timing import median_interval
 
 COLUMNS = [
-    "run", "against", "problem", "dual", "primal", "asked", "solver", "accuracy", "assembly", "what", "before", "after",
-    "ratio", "ratio_low", "ratio_high", "verdict", "cell",
+    "run", "against", "problem", "dual", "primal", "asked", "solver", "accuracy", "assembly", "correction", "what",
+    "before", "after", "ratio", "ratio_low", "ratio_high", "verdict", "cell",
 ]  # fmt: skip
 """Columns of the changes."""
 
