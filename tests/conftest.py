@@ -15,13 +15,14 @@ from pathlib import Path
 
 import pytest
 import typer.main
-from forking import run_command
+from forking import fork_workers, run_command, start_new_worker
 from hypothesis import settings
 from running import Changed, Main, Register, Shared, Vibench, execute
 from samples import SMALL, install_fakes
 from threadpoolctl import threadpool_limits
 
 from vibench.cli import start
+from vibench.execution import supervisor
 from vibench.library import runs
 from vibench.results.sqlite.reading import FILE
 from vibench.storage.artefacts import CACHE_VARIABLE
@@ -53,6 +54,19 @@ def artefacts(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
         patch.delenv("PYTHONDONTWRITEBYTECODE", raising=False)
         patch.delenv("COLUMNS", raising=False)  # pytest-xdist sets it: tables would leave out what does not fit
         yield folder / "artefacts"
+
+
+@pytest.fixture(scope="session", autouse=True)
+def forked_workers(artefacts: Path) -> Iterator[None]:
+    """Worker processes of runs and checks that tests make in this process are forked, as those of `vibench` are."""
+    with fork_workers():
+        yield
+
+
+@pytest.fixture
+def new_workers(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Worker processes are new interpreters, as those of users, where a test is about them."""
+    monkeypatch.setattr(supervisor, "start_worker", start_new_worker)
 
 
 @pytest.fixture(scope="session")

@@ -80,6 +80,7 @@ def test_an_item_beyond_its_limit_costs_itself(run: Run, how: str, monkeypatch: 
     assert all(isinstance(process, int) for number, process in found.value if number != 1)
 
 
+@pytest.mark.usefixtures("new_workers")
 @pytest.mark.parametrize(("how", "words"), [("exit", "exit code 5"), ("segfault", "signal SIGSEGV")])
 def test_an_item_that_kills_its_process_costs_itself(run: Run, how: str, words: str) -> None:
     found = run(InItems((how, "fine", how, "fine")))
@@ -140,6 +141,7 @@ def test_a_finish_that_dies_is_tried_once_more_with_what_is_there(run: Run) -> N
     assert found.status is Status.CRASHED
 
 
+@pytest.mark.usefixtures("new_workers")
 @pytest.mark.parametrize("kind", ["child", "daemon"])
 def test_what_a_plugin_started_ends_with_its_process(kind: str, watcher: Supervisor, tmp_path: Path) -> None:
     seconds = unique()
@@ -149,6 +151,7 @@ def test_what_a_plugin_started_ends_with_its_process(kind: str, watcher: Supervi
     assert not sleepers(seconds)
 
 
+@pytest.mark.usefixtures("new_workers")
 def test_a_daemon_does_not_outlive_a_process_that_dies(run: Run) -> None:
     seconds = unique()
     found = run(InItems((f"daemon {seconds}", "exit", "fine")))
@@ -212,6 +215,7 @@ def test_limits_begin_when_the_work_begins(
     assert isinstance(found, Done)
 
 
+@pytest.mark.usefixtures("new_workers")
 def test_a_process_that_never_begins_is_given_up(
     watcher: Supervisor, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import ctypes
 import os
-import re
 import signal
 import sys
 import time
@@ -279,7 +278,7 @@ def dies(program: VariationalInequality, accuracy: float) -> QPSolution:
 
 def hangs(program: VariationalInequality, accuracy: float) -> QPSolution:
     """In native code that keeps every other thread of its process waiting."""
-    re.fullmatch("(a|a)*b", "a" * 200)
+    ctypes.PyDLL(None).sleep(3600)
     return careful(program, accuracy)
 
 

@@ -1,27 +1,109 @@
-"""The command in a process that is forked from one with the libraries loaded: their import is most of a short run."""
+"""Commands and worker processes, forked from a process with the libraries loaded: imports are most of a short run.
+
+A template process imports the libraries and vibench, and hashes its sources, once for each process of the tests. What
+is forked from it has the arguments, folder, environment and path that a new interpreter would get, and imports plugins
+itself. Tests of how processes start, die and are stopped take new interpreters: the fixtures `command` and
+`new_workers`.
+"""
 
 from __future__ import annotations
 
+import atexit
 import contextlib
-import multiprocessing
+import faulthandler
+import gc
 import os
+import pickle
+import select
+import shutil
 import signal
+import socket
+import struct
 import subprocess
 import sys
-from collections.abc import Mapping, Sequence
+import tempfile
+import threading
+import traceback
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import cache
+from importlib import import_module
 from pathlib import Path
+from pkgutil import walk_packages
+from typing import Any
+
+from vibench.execution import supervisor
 
 LOADED = [
     "annotated_types", "cachetools", "jinja2", "lazy_loader", "multiprocessing.connection", "numpy", "osqp", "pandas",
     "piqp", "platformdirs", "proxsuite", "pydantic", "rich.console", "rich.live", "rich.progress", "rich.table",
     "safetensors", "scipy.optimize", "scipy.sparse.linalg", "skfem", "statistics", "typer",
 ]  # fmt: skip
-"""Libraries of others alone: vibench and plugins are imported by every process itself."""
+"""Libraries that the template imports."""
+
+PACKAGES = ("cli", "execution", "results", "stages", "storage", "study", "terminal", "testing")
+"""Packages of vibench that the template imports with all their modules, and so most others; plugins it does not."""
 
 TESTS = Path(__file__).parents[1]
 
-context = multiprocessing.get_context("forkserver")
-context.set_forkserver_preload(LOADED)
+start_new_worker = supervisor.start_worker
+"""Starts a worker process as users' runs do."""
+
+
+class Forked:
+    """A process that the template has forked; what `subprocess.Popen` is to a supervisor."""
+
+    def __init__(self, address: str, request: Mapping[str, Any], *files: int) -> None:
+        self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+        self._socket.connect(address)
+        content = pickle.dumps(request)
+        socket.send_fds(self._socket, [struct.pack("q", len(content))], files)
+        self._socket.sendall(content)
+        self.pid, self.returncode = self._number(), None
+
+    def _number(self) -> int:
+        """A number from the template: the process id, and the exit code once there is one."""
+        return int(struct.unpack("q", self._socket.recv(8, socket.MSG_WAITALL))[0])
+
+    def poll(self) -> int | None:
+        """The exit code, if the process has ended."""
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            self.wait(0.0)
+        return self.returncode
+
+    def wait(self, timeout: float | None = None) -> int:
+        """The exit code; a `TimeoutExpired` if the process does not end within so many seconds."""
+        if self.returncode is None:
+            if not select.select([self._socket], [], [], timeout)[0]:
+                raise subprocess.TimeoutExpired("a forked process", timeout or 0.0)
+            self.returncode = self._number()
+            self._socket.close()
+        return self.returncode
+
+
+@cache
+def template() -> str:
+    """The address of the template process, which ends with this one."""
+    folder = tempfile.mkdtemp(prefix="vibench-tests-")
+    ours, theirs = socket.socketpair()
+    address = f"{folder}/socket"
+    with theirs:
+        process = subprocess.Popen(
+            [sys.executable, "-P", __file__, str(theirs.fileno()), address],
+            env={name: value for name, value in os.environ.items() if name != "VIBENCH_WORKER"}
+            | {"PYTHONPATH": os.pathsep.join(paths()), "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"},
+            pass_fds=[theirs.fileno()],
+            stdin=subprocess.DEVNULL,
+            start_new_session=True,
+        )
+    assert ours.recv(1) == b"+"
+    atexit.register(process.wait)
+    atexit.register(ours.close)  # first: the template ends when it is closed
+    return address
+
+
+def paths() -> list[str]:
+    """Where this process finds modules, the tests left out."""
+    return [entry for entry in sys.path if entry and TESTS not in (Path(entry), *Path(entry).parents)]
 
 
 def run_command(
@@ -29,33 +111,150 @@ def run_command(
 ) -> subprocess.CompletedProcess[str]:
     """Run `vibench ARGUMENTS` in a folder, third-party plugins first on its path; as `subprocess.run` does."""
     printed = [folder / f".printed-{name}" for name in ("out", "err")]
-    path = [str(plugins), *(entry for entry in sys.path if entry and TESTS not in (Path(entry), *Path(entry).parents))]
-    process = context.Process(target=_main, args=(list(arguments), str(folder), path, dict(os.environ), printed))
-    process.start()
-    process.join(timeout)
-    if process.exitcode is None:
-        assert process.pid is not None
+    request = {
+        "main": "command", "arguments": ["vibench", *arguments], "folder": str(folder), "template": template(),
+        "environment": dict(os.environ), "path": [str(plugins), *paths()],
+    }  # fmt: skip
+    with contextlib.ExitStack() as opened:
+        files = [opened.enter_context(file.open("w")).fileno() for file in printed]
+        process = Forked(template(), request, *files)
+    try:
+        process.wait(timeout)
+    except subprocess.TimeoutExpired:
         with contextlib.suppress(ProcessLookupError):
             os.killpg(process.pid, signal.SIGKILL)
-        process.join()
-        raise subprocess.TimeoutExpired(list(arguments), timeout)
+        process.wait()
+        raise subprocess.TimeoutExpired(list(arguments), timeout) from None
     out, err = (file.read_text(encoding="utf-8") for file in printed)
     for file in printed:
         file.unlink()
-    return subprocess.CompletedProcess(list(arguments), process.exitcode, out, err)
+    return subprocess.CompletedProcess(list(arguments), process.wait(), out, err)
 
 
-def _main(
-    arguments: list[str], folder: str, path: list[str], environment: Mapping[str, str], printed: Sequence[Path]
-) -> None:
-    """What the installed command does, in the forked process; it leads a process group of its own."""
-    os.setsid()
-    os.chdir(folder)
-    os.environ.clear()
-    os.environ.update(environment)
-    sys.path[:], sys.argv = path, ["vibench", *arguments]
-    for descriptor, file in zip((1, 2), printed, strict=True):
-        os.dup2(os.open(file, os.O_WRONLY | os.O_CREAT | os.O_TRUNC), descriptor)
-    from vibench.cli import start  # noqa: PLC0415  in this process and no earlier
+@contextlib.contextmanager
+def fork_workers(address: Callable[[], str] = template) -> Iterator[None]:
+    """Block in which the worker processes that this process starts are forked, by the template at an address."""
 
-    start()
+    def start(descriptor: int, log: str, environment: Mapping[str, str]) -> Any:
+        if "PYTHONHASHSEED" in environment:  # only a new interpreter has another one
+            return start_new_worker(descriptor, log, environment)
+        request = {
+            "main": "worker", "arguments": ["worker", str(descriptor), log], "folder": str(Path.cwd()),
+            "environment": dict(environment), "path": environment["PYTHONPATH"].split(os.pathsep),
+        }  # fmt: skip
+        return Forked(address(), request, descriptor)
+
+    supervisor.start_worker = start
+    try:
+        yield
+    finally:
+        supervisor.start_worker = start_new_worker
+
+
+def main() -> None:
+    """Serve requests at an address until the other end of a socket is closed."""
+    alive, address = socket.socket(fileno=int(sys.argv[1])), sys.argv[2]
+    _load()
+    listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+    listener.bind(address)
+    listener.listen(64)
+    wake, waking = socket.socketpair()
+    for end in (wake, waking):
+        end.setblocking(False)
+    signal.signal(signal.SIGCHLD, lambda *_: None)
+    signal.set_wakeup_fd(waking.fileno(), warn_on_full_buffer=False)
+    alive.sendall(b"+")
+    children: dict[int, socket.socket] = {}
+    while alive not in (ready := select.select([alive, listener, wake], [], [])[0]):
+        if wake in ready:
+            wake.recv(1024)
+            _tell(children)
+        if listener in ready:
+            client = listener.accept()[0]
+            pid = _forked(client, (alive, listener, wake, waking, client, *children.values()))
+            children[pid] = client
+            with contextlib.suppress(BrokenPipeError):
+                client.sendall(struct.pack("q", pid))
+    shutil.rmtree(Path(address).parent)
+
+
+def _load() -> None:
+    """Import, and do once what every command and every worker process would do again."""
+    for name in LOADED:
+        import_module(name)
+    for package in PACKAGES:
+        for module in walk_packages(import_module(f"vibench.{package}").__path__, f"vibench.{package}."):
+            import_module(module.name)
+    import_module("vibench.execution.jobs").code_here()
+    typer = import_module("typer.main")
+    typer.get_command = cache(typer.get_command)
+    typer.get_command(import_module("vibench.cli.main").app)
+    gc.freeze()  # collections in the processes forked leave alone what they share
+
+
+def _forked(client: socket.socket, own: Sequence[socket.socket]) -> int:
+    """Fork the process that a client asks for; gives its number. It closes what is the template's own."""
+    length, files, _, _ = socket.recv_fds(client, 8, 2)
+    content, missing = b"", struct.unpack("q", length)[0]
+    while len(content) < missing:
+        content += client.recv(missing - len(content))
+    pid = os.fork()
+    if not pid:
+        for end in own:
+            end.close()
+        _be(pickle.loads(content), files)
+    with contextlib.suppress(PermissionError, ProcessLookupError):
+        os.setpgid(pid, pid)  # it leads a group of its own, whoever is first to say so
+    for file in files:
+        os.close(file)
+    return pid
+
+
+def _tell(children: dict[int, socket.socket]) -> None:
+    """Tell who asked for them how the processes ended that have ended."""
+    for pid, client in list(children.items()):
+        ended, status = os.waitpid(pid, os.WNOHANG)
+        if ended:
+            with contextlib.suppress(BrokenPipeError):
+                client.sendall(struct.pack("q", os.waitstatus_to_exitcode(status)))
+            children.pop(pid).close()
+
+
+def _be(request: Mapping[str, Any], files: Sequence[int]) -> None:
+    """Be the process that was asked for, and exit as an interpreter does."""
+    code = 1
+    try:
+        os.setpgid(0, 0)
+        signal.set_wakeup_fd(-1)
+        signal.signal(signal.SIGCHLD, signal.SIG_DFL)
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+        os.chdir(request["folder"])
+        os.environ.clear()
+        os.environ.update(request["environment"])
+        sys.path[:], sys.argv = request["path"], request["arguments"]
+        if request["main"] == "command":
+            for descriptor, file in zip((1, 2), files, strict=True):
+                os.dup2(file, descriptor)
+                os.close(file)
+            with fork_workers(lambda: request["template"]):
+                import_module("vibench.cli").start()
+        else:
+            sys.argv[1] = str(files[0])
+            import_module("vibench.execution.worker").main()
+        code = 0
+    except SystemExit as error:
+        code = error.code if isinstance(error.code, int) else int(error.code is not None)
+    except BaseException:  # noqa: BLE001  as an interpreter prints it
+        traceback.print_exc()
+    finally:
+        faulthandler.cancel_dump_traceback_later()
+        threading._shutdown()
+        atexit._run_exitfuncs()
+        for stream in (sys.stdout, sys.stderr):
+            with contextlib.suppress(OSError, ValueError):
+                stream.flush()
+        os._exit(code)
+
+
+if __name__ == "__main__":
+    main()

@@ -216,22 +216,12 @@ class Supervisor:
         raise StoppedError
 
     def _worker(self, packages: frozenset[str]) -> _Worker:
-        """The connection to the worker process of some packages, and the process, started where there is none.
-
-        It leads its own process group: Ctrl-C on the terminal does not reach it, and children of plugins die with it,
-        as do those in other groups, by their mark.
-        """
+        """The connection to the worker process of some packages, and the process, started where there is none."""
         if packages not in self._workers:
             (ours, theirs), mark = socket.socketpair(), secrets.token_hex(8)
-            command = ["-P", "-m", "vibench.execution.worker", str(theirs.fileno()), str(self._log or os.devnull)]
+            environment = _environment({**os.environ, **self._environment}) | {MARK: mark}
             with theirs:
-                process = subprocess.Popen(
-                    [sys.executable, *command],
-                    env=_environment({**os.environ, **self._environment}) | {MARK: mark},
-                    pass_fds=[theirs.fileno()],
-                    stdin=subprocess.DEVNULL,
-                    process_group=0,
-                )
+                process = start_worker(theirs.fileno(), str(self._log or os.devnull), environment)
             self._workers[packages] = Connection(ours.detach()), process, mark
         self._workers.move_to_end(packages)
         return self._workers[packages]
@@ -247,6 +237,16 @@ class Supervisor:
             process.wait()
             kill_marked(mark)
             connection.close()
+
+
+def start_worker(descriptor: int, log: str, environment: Mapping[str, str]) -> subprocess.Popen[bytes]:
+    """A worker process that serves the other end of a socket; what plugins print goes to `log`.
+
+    It leads its own process group: Ctrl-C on the terminal does not reach it, and children of plugins die with it, as do
+    those in other groups, by their mark.
+    """
+    command = [sys.executable, "-P", "-m", "vibench.execution.worker", str(descriptor), log]
+    return subprocess.Popen(command, env=environment, pass_fds=[descriptor], stdin=subprocess.DEVNULL, process_group=0)
 
 
 def _beyond(name: str, limit: float) -> Failed:
