@@ -17,12 +17,12 @@ from vibench.errors import NumericalError
 from vibench.interfaces.affine import entries_of
 from vibench.interfaces.problem import MEMBERS, Problem, Sampler, is_absent, without_infinities
 from vibench.interfaces.validation import checked_assembly
-from vibench.linalg.inner_product import svd
+from vibench.linalg.inner_product import InnerProduct, svd
 from vibench.qp.scaling import ratio
 
 CONSTANT_RTOL = 1e-13
-"""A member whose entries vary by less over the training set, relative to the largest one, is constant; of B and g
-relative to the largest one of the row."""
+"""A member is constant where its entries, in the units of `decomposed`, vary by less over the training set, relative to
+the largest one."""
 
 AFFINE_RTOL = 1e-9
 """Largest difference of a declared affine sum from the assembled member, relative to its largest entry."""
@@ -108,7 +108,7 @@ def affine_decomposition(problem: Problem, training: Array, tolerance: float) ->
             members[name] = AffineMember(Evaluation.AFFINE, tuple(map(without_infinities, terms)))
         else:
             entrywise = name in problem.entrywise
-            members[name] = decomposed(name, assembled[name], tolerance, entrywise, contact=problem.has_contact)
+            members[name] = decomposed(name, assembled[name], problem.V, tolerance, entrywise, problem.has_contact)
     return members
 
 
@@ -169,7 +169,7 @@ def assembled_members(problem: Problem, mus: Iterable[Array], names: Sequence[st
 
 
 def decomposed(
-    name: str, values: Sequence[Any], tolerance: float, entrywise: bool = True, contact: bool = False
+    name: str, values: Sequence[Any], V: InnerProduct, tolerance: float, entrywise: bool = True, contact: bool = False
 ) -> AffineMember:
     """The decomposition of a member of which nothing is declared, from its values at the training parameters.
 
@@ -179,6 +179,9 @@ def decomposed(
         "A", "f", "B" or "g".
     values
         The member at every training parameter.
+    V
+        Inner product of the primal space. Unknowns are measured in units of the norms of their basis functions, rows of
+        B and g by their largest entry, so that neither the scaling of an unknown nor that of a constraint matters.
     tolerance
         Largest relative interpolation error there.
     entrywise, contact
@@ -188,7 +191,7 @@ def decomposed(
         reason = f"row {int(np.argmax(sometimes))} of g is infinite at some parameters and not at others"
         return AffineMember(Evaluation.CONTACT, ()) if contact else AffineMember(Evaluation.FULL, (), reason=reason)
     entries = _Entries(values, symmetric=name == "A")
-    weights = entries.row_weights() if name in ("B", "g") else np.ones(len(entries.rows))
+    weights = entries.weights(name, 1.0 / np.sqrt(V.matrix.diagonal()))
     if entries.is_constant(weights):
         return AffineMember(Evaluation.CONSTANT, (values[0],))
     reason = f"{name} depends on mu and the problem does not evaluate it entry by entry"
@@ -206,26 +209,28 @@ def decomposed(
     return AffineMember(Evaluation.FULL, (), reason=reason)
 
 
-def held_out_error(name: str, member: AffineMember, values: Sequence[Any]) -> float:
+def held_out_error(name: str, member: AffineMember, values: Sequence[Any], V: InnerProduct) -> float:
     """Largest error of a member with samples or one term, at parameters outside the training set.
 
-    `values` are the assembled ones there; the error is Euclidean, relative to the longest of them, and B and g are
-    taken in units of the largest entry of each row, as by `interpolate`.
+    `values` are the assembled ones there; the error is Euclidean, relative to the longest of them, in the units in
+    which `decomposed` interpolates.
     """
     if not member.terms or not values:
         return 0.0
-    assembled = np.column_stack([_rows(value) for value in values])
-    differences = np.column_stack([_rows(value - member.interpolated(value)) for value in values])
+    units = 1.0 / np.sqrt(V.matrix.diagonal())
+    assembled = np.column_stack([_rows(name, value, units) for value in values])
+    differences = np.column_stack([_rows(name, value - member.interpolated(value), units) for value in values])
     if name in ("B", "g"):
         largest = assembled.max(axis=1, keepdims=True)
-        units = np.where(largest > 0.0, largest, 1.0)
-        assembled, differences = assembled / units, differences / units
+        largest[largest == 0.0] = 1.0
+        assembled, differences = assembled / largest, differences / largest
     return ratio(float(np.linalg.norm(differences, axis=0).max()), float(np.linalg.norm(assembled, axis=0).max()))
 
 
-def _rows(array: Any) -> Array:
-    """Euclidean norms of the rows (k,) of a matrix, or of the entries of a vector."""
-    return np.abs(array) if isinstance(array, np.ndarray) else np.asarray(sp.linalg.norm(sp.csr_array(array), axis=1))
+def _rows(name: str, member: Any, units: Array) -> Array:
+    """Euclidean norms of the rows (k,) of a member, a matrix or a vector, with unknowns in these units."""
+    size = np.abs(member) if name in ("f", "g") else sp.linalg.norm(sp.csr_array(member * units), axis=1)
+    return np.asarray(units * size if name in ("A", "f") else size)
 
 
 class _Entries:
@@ -240,11 +245,18 @@ class _Entries:
         else:
             self.values = self._of_matrices(values)
 
-    def row_weights(self) -> Array:
-        """One over the largest entry (k,) in the row of each: rows of constraints may have any scale, or be far."""
-        largest = np.zeros(self._shape[0])
-        np.maximum.at(largest, self.rows, np.abs(self.values).max(axis=1, initial=0.0))
-        return np.asarray(1.0 / np.where(largest > 0.0, largest, 1.0)[self.rows])
+    def weights(self, name: str, units: Array) -> Array:
+        """Factors (k,) of the entries: unknowns have the units (n,), rows of constraints that of their largest."""
+        weights = np.ones(len(self.rows))
+        if name in ("A", "f"):
+            weights *= units[self.rows]
+        if name in ("A", "B"):
+            weights *= units[self.columns]
+        if name in ("B", "g"):  # rows may have any scale, or be far
+            largest = np.zeros(self._shape[0])
+            np.maximum.at(largest, self.rows, weights * np.abs(self.values).max(axis=1, initial=0.0))
+            weights /= np.where(largest > 0.0, largest, 1.0)[self.rows]
+        return weights
 
     def is_constant(self, weights: Array) -> bool:
         """Whether no entry varies by more than `CONSTANT_RTOL` of the largest one, with weights (k,)."""

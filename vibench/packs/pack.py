@@ -215,10 +215,10 @@ class ModelPack:
         """
         errors, others = dict[str, float](), () if self.validation is None else self.validation
         for name in MEMBERS:
-            if name in self.entrywise and name not in self.affine:
+            if self.V is not None and name in self.entrywise and name not in self.affine:
                 at = self.members[name].at
-                member = decomposed(name, [at(mu) for mu in self.training], tolerance)
-                errors[name] = held_out_error(name, member, [at(mu) for mu in others])
+                member = decomposed(name, [at(mu) for mu in self.training], self.V, tolerance)
+                errors[name] = held_out_error(name, member, [at(mu) for mu in others], self.V)
         return errors
 
     @property

@@ -20,7 +20,10 @@ ACCEPTED = 1e-9
 """A solution of line 9 with a larger residual is recorded as a fallback; Remark 4.1 holds for any feasible one."""
 
 ZERO = 1e-12
-"""Entries of θ − Υ below this share of max θ are round-off; left there, they would exclude generators later on."""
+"""Entries of θ − Υ below this share of the largest of θ are round-off; left there, they would exclude generators later.
+
+Entries are compared in units of the norms of their basis functions, so that the scaling of a row decides nothing.
+"""
 
 
 def part_in_cone(theta: Array, generators: Array, W: InnerProduct) -> tuple[Array, str]:
@@ -39,7 +42,7 @@ def part_in_cone(theta: Array, generators: Array, W: InnerProduct) -> tuple[Arra
     -------
     tuple
         Υ (m,) such that θ − Υ has no negative entry, and exact zeros where round-off would leave less than `ZERO` of
-        its maximum; and a note, empty where Υ is optimal to `ACCEPTED`.
+        the largest entry of θ; and a note, empty where Υ is optimal to `ACCEPTED`.
     """
     # A generator that is positive where θ is zero must have the coefficient 0. Without such generators, and restricted
     # to the support of θ, the problem has strictly feasible points; otherwise it has none, and QP solvers break down.
@@ -56,7 +59,8 @@ def part_in_cone(theta: Array, generators: Array, W: InnerProduct) -> tuple[Arra
         shrink = float(np.min(theta[over] / part[over]))
         part *= shrink if shrink < 1.0 - ACCEPTED else 1.0
     rest = np.maximum(theta - part, 0.0)
-    rest[rest < ZERO * theta.max()] = 0.0
+    units = np.sqrt(W.matrix.diagonal())
+    rest[units * rest < ZERO * (units * theta).max()] = 0.0
     note = "" if residual <= ACCEPTED else f"line 9 solved only to {residual:.0e}, made feasible"
     return theta - rest, note
 
@@ -64,12 +68,12 @@ def part_in_cone(theta: Array, generators: Array, W: InnerProduct) -> tuple[Arra
 def _least_squares(theta: Array, generators: Array, support: Mask, W: InnerProduct) -> tuple[Array, float]:
     """Coefficients α ≥ 0 (r,) that minimise ‖θ − Σ α_i ν_i‖_W with Σ α_i ν_i ≤ θ, and the largest KKT residual."""
     whitened, target = W.whiten(generators), W.whiten(theta)
-    count = generators.shape[1]
+    count, units = generators.shape[1], np.sqrt(W.matrix.diagonal())[support]
     program = VariationalInequality(
         A=whitened.T @ whitened,
         f=whitened.T @ target,
-        B=np.vstack([-np.eye(count), generators[support]]),
-        g=np.concatenate([np.zeros(count), theta[support]]),
+        B=np.vstack([-np.eye(count), units[:, None] * generators[support]]),
+        g=np.concatenate([np.zeros(count), units * theta[support]]),
     )
     best, smallest = np.zeros(count), np.inf
     for solver in SOLVERS:

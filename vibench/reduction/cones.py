@@ -89,7 +89,8 @@ def project_on_orthant(functional: Array, W: InnerProduct) -> Array:
     X_W π − s ≥ 0 and π ≥ 0 are complementary. An active set method starts from the support of the positive part of s;
     where its sets cycle, nonnegative least squares replaces it.
     """
-    free, seen = functional > 0.0, set[bytes]()
+    free, seen, norms = functional > 0.0, set[bytes](), np.sqrt(W.matrix.diagonal())
+    round_off = 1e-14 * norms * np.max(np.abs(functional) / norms, initial=0.0)
     while free.tobytes() not in seen:
         seen.add(free.tobytes())
         support = np.flatnonzero(free)
@@ -98,7 +99,7 @@ def project_on_orthant(functional: Array, W: InnerProduct) -> Array:
             block = W.matrix[support][:, support]
             projection[support] = SparseCholesky(block, "a block of X_W").solve(functional[support])
         residual = functional - W.apply(projection)
-        following = np.where(free, projection > 0.0, residual > 1e-14 * np.max(np.abs(functional), initial=0.0))
+        following = np.where(free, projection > 0.0, residual > round_off)
         if np.array_equal(following, free):
             return projection
         free = following

@@ -184,11 +184,11 @@ def interpolation(case: ProblemCase) -> Iterator[str]:
         return
     assembled = assembled_members(problem, [*mus, *validation_parameters(problem, VALIDATION, case.seed)], names)
     for name, values in assembled.items():
-        member = decomposed(name, values[: len(mus)], INTERPOLATION_RTOL, contact=problem.has_contact)
+        member = decomposed(name, values[: len(mus)], problem.V, INTERPOLATION_RTOL, contact=problem.has_contact)
         if not member.terms:
             yield Note(f"{name} is not interpolated: {member.reason or 'its terms are too many'}")
             continue
-        error = held_out_error(name, member, values[len(mus) :])
+        error = held_out_error(name, member, values[len(mus) :], problem.V)
         yield Note(f"{name}: {len(member.terms)} terms, error {error:.0e}")
         if error > MISSED * INTERPOLATION_RTOL:
             yield Doubt(
