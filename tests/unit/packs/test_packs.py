@@ -112,9 +112,7 @@ def test_an_infinite_entry_of_g_is_a_row_that_constrains_nothing(tmp_path: Path,
     assert main("import", str(tmp_path / "pack"))[0] == 0
     for name, wrong in (("one", -np.inf), ("two", np.nan)):
         g[-1] = wrong
-        with pytest.raises(
-            RequestError, match=r"operators.g: 1 of its entries are not finite \(nan or -inf; inf"
-        ):
+        with pytest.raises(RequestError, match=r"operators.g: 1 of its entries are not finite \(nan or -inf; inf"):
             pack_with(tmp_path / name, content, g=g)
 
 

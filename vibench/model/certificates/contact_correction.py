@@ -49,7 +49,7 @@ MOST_BLOCKS = 8
 """Largest number of blocks of C that are treated one by one."""
 
 REGULAR = 1e-13
-"""Share of the largest diagonal entry of S_II that is added to all, so that dependent rows have a factorisation."""
+"""Share of the diagonal of S_II that is added to it, so that dependent rows have a factorisation."""
 
 UNIT = float(np.finfo(float).eps)
 
@@ -269,11 +269,15 @@ class _Program:
         if difference.any():
             wanted = wanted - block @ (self.compliance @ (self.B.T @ difference)) / self.gamma
         S = self.compliance.between(block) / self.gamma
-        S[np.diag_indices_from(S)] += REGULAR * S.diagonal().max()
+        units = np.sqrt(S.diagonal())  # of rows, which may have any scale
+        units[~(units > 0.0)] = 1.0
+        S /= np.outer(units, units)
+        S[np.diag_indices_from(S)] += REGULAR
         factor, singular = dpotrf(S, lower=1, clean=0)
+        wanted, known = wanted / units, lam[rows] * units
         difference[rows] = (
-            np.linalg.lstsq(S, wanted)[0] if singular else _complementary(factor, wanted, lam[rows]) - lam[rows]
-        )
+            np.linalg.lstsq(S, wanted)[0] if singular else _complementary(factor, wanted, known) - known
+        ) / units
         return difference
 
 
