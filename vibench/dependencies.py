@@ -179,15 +179,12 @@ def _parsed(module: str) -> _Definition:
             case ast.FunctionDef() | ast.AsyncFunctionDef() | ast.ClassDef():
                 defined.members[node.name] = _read(node, package)
             case ast.Assign() | ast.AnnAssign():
-                stored = (part for part in ast.walk(node) if isinstance(part, ast.Name) and not _is_read(part))
-                defined.members.update(dict.fromkeys((part.id for part in stored), _read(node, package)))
+                names = (part for part in ast.walk(node) if isinstance(part, ast.Name))
+                stored = (part.id for part in names if isinstance(part.ctx, ast.Store))
+                defined.members.update(dict.fromkeys(stored, _read(node, package)))
             case ast.Module() | ast.If() | ast.Try() | ast.ExceptHandler() | ast.With():
                 ahead += ast.iter_child_nodes(node)
     return defined
-
-
-def _is_read(name: ast.Name) -> bool:
-    return isinstance(name.ctx, ast.Load)
 
 
 def _imported(node: ast.Import | ast.ImportFrom, package: str) -> Mapping[str, Place]:

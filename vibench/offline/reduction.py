@@ -104,8 +104,8 @@ class Reduction:
 
         Steps that were given before are kept, steps that were computed are computed again: they may depend on the new.
         """
-        other, known = replace(self), self.__dict__.get("_given", {}) | steps
-        other.__dict__.update(known, _given=known)
+        other, kept = replace(self), self.__dict__.get("_given", {}) | steps
+        other.__dict__.update(kept, _given=kept)
         return other
 
     @cached_property
