@@ -73,6 +73,7 @@ def recorded(folder: Path, text: str, count: Any) -> Path:
         "meaning": "never",
         "assembly": "full",
         "solver_share_mean": 0.01,
+        "assembly_share_mean": 0.01,
         "definition": json.dumps(names),
     }
     of_cells, of_queries = ({k: v for k, v in said.items() if k in TABLES[table]} for table in ("cells", "queries"))
