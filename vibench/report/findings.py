@@ -23,9 +23,11 @@ from vibench.report.figures.data import (
     best_solver,
     by_dimensions,
     label,
+    label_of,
     problems,
 )
 from vibench.results import formats, invariants, tables
+from vibench.results.columns import KEYS
 from vibench.results.ranking import (
     LARGEST_BAND,
     LARGEST_SHARE,
@@ -37,6 +39,7 @@ from vibench.results.ranking import (
 )
 from vibench.results.solver_agreement import sentence
 from vibench.stability.infsup import VANISHES
+from vibench.study.cells import FEASIBLE, UNCORRECTED
 
 SHARE_ATOL = 1e-8
 """Shares of an inf-sup constant that differ by less are equal up to round-off."""
@@ -88,6 +91,7 @@ def all_findings(read: Mapping[str, pd.DataFrame], by_problem: Iterable[tuple[st
             compared = on_common_queries(cells, data.queries)
             yield from _about(f"{name}, {title}", Weight.COMPARISON, _stability(cells, compared))
             yield from _about(f"{name}, {title}", Weight.COMPARISON, _costs(cells, data.thresholds))
+        yield from _about(f"{name}, corrections", Weight.COMPARISON, _corrections(data))
         yield from _about(f"{name}, enrichments", Weight.DETAIL, _off_training(data))
         yield from _about(f"{name}, zero solutions", Weight.DETAIL, _zero_solutions(data))
         yield from _about(f"{name}, solvers", Weight.DETAIL, _solvers(data))
@@ -199,7 +203,7 @@ def _no_winner(standings: Standings) -> str:
 
 
 def _way(cell: Any) -> str:
-    return f"{label(cell['primal'], cell['primal_tol'], cell['assembly'])} on the cone of {cell['dual']}"
+    return f"{label_of(cell)} on the cone of {cell['dual']}"
 
 
 def _sizes(cell: Any) -> str:
@@ -222,6 +226,8 @@ def _errors(cell: Any) -> str:
 def _stability(cells: pd.DataFrame, compared: Comparable) -> Iterator[str]:
     """Effect of the enrichments on the inf-sup constant over the span and on the error of the multiplier."""
     errors = dict(zip(compared.cells["cell"], compared.cells["error_lambda_mean"], strict=True))
+    if (plain := cells["correction"] == UNCORRECTED).any():
+        cells = cells[plain]
     for row in cells[cells["enrichment_kind"] == Kind.NONE].head(1).itertuples():
         if np.isfinite(row.beta_span_min):
             value = "zero" if row.beta_span_min < VANISHES else f"{row.beta_span_min:.3g}"
@@ -236,6 +242,25 @@ def _stability(cells: pd.DataFrame, compared: Comparable) -> Iterator[str]:
             f"{row.beta_span_min:.3g}, at every validation parameter at least {100.0 * row.share_validation:.0f} % of "
             f"the constant of the whole of V{_mean_error(errors.get(row.cell), compared.over)}."
         )
+
+
+def _corrections(data: Data) -> Iterator[str]:
+    """What the correction of all solutions changes: errors and seconds against those of the same models without."""
+    model = [name for name in KEYS if name != "correction"]
+    both = data.cells.merge(data.cells[data.cells["correction"] == UNCORRECTED], on=model, suffixes=("", "_without"))
+    for assembly, cells in both[both["correction"] == FEASIBLE].groupby("assembly", sort=False):
+        ratios = {
+            name: cells[f"{column}_without"] / cells[column]
+            for name, column in (("u", "error_u_mean"), ("λ", "error_lambda_mean"), ("query", "online_s"))
+        }
+        medians, best = {name: values.median() for name, values in ratios.items()}, ratios["λ"].max()
+        if np.isfinite([*medians.values(), best]).all():
+            yield (
+                f"Correction of all solutions, with {assembly} assembly, divides the mean error of u by "
+                f"{medians['u']:.2g} and that of λ by {medians['λ']:.2g} in the median of "
+                f"{_number(len(cells), 'model')}, of λ by at most {best:.2g}; a query takes "
+                f"{1.0 / medians['query']:.2g} times as long."
+            )
 
 
 def _mean_error(error: float | None, over: str) -> str:
@@ -281,7 +306,7 @@ def _zero_solutions(data: Data) -> Iterator[str]:
             worst = answered.loc[scaled.idxmax()]
             yield (
                 f"The reduced {symbol} is at most {scaled.max():.2g} of the largest of the training set there "
-                f"({label(worst['primal'], worst['primal_tol'], worst['assembly'])}, {worst['dual']}, "
+                f"({label_of(worst)}, {worst['dual']}, "
                 f"{worst['solver']}), in the median {scaled.median():.2g}."
             )
 
@@ -292,7 +317,7 @@ def _costs(cells: pd.DataFrame, thresholds: pd.DataFrame) -> Iterator[str]:
     if timed.empty:
         return
     row = timed.loc[timed["online_s"].idxmin()]
-    name = label(row["primal"], row["primal_tol"], row["assembly"])
+    name = label_of(row)
     yield (
         f"The fastest query with mean errors of at most {_share(LARGEST_BAND)} is that of {name}: "
         f"{_milliseconds(row['online_s'])}, of which the QP solver takes {_milliseconds(row['online_solve_s'])}, with "

@@ -20,7 +20,7 @@ from vibench.files import write_atomically
 from vibench.qp.status import Status
 from vibench.report import findings
 from vibench.report.figures import FigureTask, figures_of, processes, render
-from vibench.report.figures.data import TABLES, Data, Extent, label, problems
+from vibench.report.figures.data import TABLES, Data, Extent, label_of, problems
 from vibench.report.page import plots
 from vibench.report.page.grids import TableGrid, grid_of, grid_of_cells, grid_of_thresholds, script_safe, to_json
 from vibench.report.page.images import image_of
@@ -153,7 +153,7 @@ def _way(winner: Winner) -> str:
     """The model of a cell that wins: its enrichment, cone, dimensions and solver."""
     cell = winner.cell
     size = f"N = {cell['N']:.0f}, R = {cell['R']:.0f}"
-    return f"{label(cell['primal'], cell['primal_tol'], cell['assembly'])}; {cell['dual']}, {size}; {cell['solver']}"
+    return f"{label_of(cell)}; {cell['dual']}, {size}; {cell['solver']}"
 
 
 def _facts(study: dict[str, Any], cells: pd.DataFrame) -> Iterator[tuple[str, str]]:

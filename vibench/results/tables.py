@@ -136,7 +136,13 @@ def in_order(frame: pd.DataFrame) -> pd.DataFrame:
     """Rows sorted by the columns that identify them, loose tolerances first, whatever order cells finished in."""
     by = [name for name in ORDER if name in frame.columns]
     ascending = ["_tol" not in name for name in by]
-    return frame.sort_values(by, ascending=ascending, kind="stable", na_position="first", ignore_index=True)
+    return frame.sort_values(
+        by, ascending=ascending, kind="stable", na_position="first", ignore_index=True, key=_without_correction_first
+    )
+
+
+def _without_correction_first(column: pd.Series) -> pd.Series:
+    return column != UNCORRECTED if column.name == "correction" else column
 
 
 def summary(cells: pd.DataFrame, plugins: Mapping[str, Column] = MappingProxyType({})) -> pd.DataFrame:

@@ -25,8 +25,8 @@ def digest(content: Any) -> str:
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
-UNCORRECTED = "none"
-"""Correction of cells that answer with the reduced solution itself."""
+UNCORRECTED, FEASIBLE = "none", "feasible"
+"""Corrections of cells that answer with reduced solutions as they are, and with corrected pairs alone."""
 
 
 PLUGINS = ("problem", "dual", "primal", "training", "validation_sampling")

@@ -10,18 +10,28 @@ import pandas as pd
 from matplotlib.axes import Axes
 
 from vibench.report.common_queries import on_common_queries
-from vibench.report.figures.data import Data, best_solver, by_dimensions, label, point_names, series, titled_parts
+from vibench.report.figures.data import (
+    CORRECTED,
+    Data,
+    best_solver,
+    by_dimensions,
+    label,
+    point_names,
+    series,
+    titled_parts,
+)
 from vibench.report.figures.looks import HIGH_FIDELITY_LOOK, Looks, Series
 from vibench.report.figures.style import ABREAST, DEEP, SERIES, Layout, Pages, Sheet, plot, scatter
 from vibench.results import ranking
 from vibench.results.break_even import HIGH_FIDELITY, Meaning
+from vibench.study.cells import UNCORRECTED
 
 ERRORS = {"error_u_mean": "mean relative error of u", "error_lambda_mean": "mean relative error of λ"}
 
 MOST_QUERIES = 1e6
 """Total cost is drawn up to this number of queries."""
 
-MODEL = ["primal", "primal_options", "assembly"]
+MODEL = ["primal", "primal_options", "way"]
 """Columns of which total cost has a line for every combination, at one tolerance."""
 
 MARKS = {Meaning.FROM: ">", Meaning.UNTIL: "<"}
@@ -47,11 +57,11 @@ def work_precision(data: Data) -> Pages:
 def _errors_against(
     data: Data, cells: pd.DataFrame, x: pd.Series, xlabel: str, title: str, *, front: bool = False
 ) -> Pages:
-    """One point per cell with its (N, R) and δ; a row of panels for every dual strategy and assembly among them."""
+    """One point per cell with its (N, R) and δ; a row of panels for every dual strategy, assembly and correction."""
     compared = on_common_queries(cells[x.notna()], data.queries)
     cells = compared.cells[compared.cells[list(ERRORS)].notna().any(axis=1)]
     over = compared.over or f" over all {compared.asked} queries"
-    rows_of = "dual strategy" + " and assembly" * (cells["assembly"].nunique() > 1)
+    rows_of = "dual strategy" + " and way of a query" * (cells["way"].nunique() > 1)
     beyond = "The thin line is the Pareto front: no model is both faster and more accurate." if front else ""
     looks = Looks(Series(str(primal)) for primal in cells["primal"].unique())
     for rows, part in data.pages(list(_ways(cells)), DEEP):
@@ -89,14 +99,16 @@ def _name_points(sheet: Sheet, panel: Axes, cells: pd.DataFrame, x: pd.Series, y
 
 
 def _of_one_assembly(cells: pd.DataFrame) -> pd.DataFrame:
-    """Cells of full assembly, where there are any: reduced assembly changes no dimension."""
-    return cells[(cells["assembly"] == "full") | ~(cells["assembly"] == "full").any()]
+    """Cells of full assembly, where a correction has any: reduced assembly changes no dimension."""
+    full = cells["assembly"] == "full"
+    return cells[full | ~full.groupby(cells["correction"]).transform("any")]
 
 
 def _ways(cells: pd.DataFrame) -> Iterator[tuple[str, pd.DataFrame, list[str]]]:
-    """Every dual strategy and assembly of some cells: title, cells, and as many primal strategies as a panel takes."""
-    for (dual, assembly), mine in cells.groupby(["dual", "assembly"], sort=False):
+    """Dual strategies and ways of a query: title, cells, and as many primal strategies as a panel takes."""
+    for (dual, assembly, correction), mine in cells.groupby(["dual", "assembly", "correction"], sort=False):
         title = f"{dual}{f', {assembly} assembly' * (assembly != 'full')}"
+        title += f", {CORRECTED.get(correction, correction)}" * (correction != UNCORRECTED)
         for part, names in titled_parts(title, [str(name) for name in mine["primal"].unique()], SERIES):
             yield part, mine, names
 
@@ -135,6 +147,9 @@ def break_even(data: Data) -> Pages:
     against = data.thresholds[data.thresholds["cell_a"].isna()].set_index("cell_b")[numbers]
     models = cells.merge(against, "inner", left_on="cell", right_index=True)
     decided = models[models["meaning"] == Meaning.FROM]
+    if (decided["correction"] != UNCORRECTED).any():  # strategies are told apart by their colours alone otherwise
+        named = [label(row.primal, None, CORRECTED.get(row.correction, "")) for row in decided.itertuples()]
+        decided = decided.assign(primal=named)
     errors = {
         measure: ranking.errors_of(decided, data.outputs, measure).dropna()
         for measure in ranking.measures(data.outputs)
@@ -191,7 +206,7 @@ def total_cost(data: Data) -> Pages:
             model = mine.iloc[0]
             plot(panel, queries, model["hf_setup_s"] + queries * model["hf_s"], HIGH_FIDELITY_LOOK, HIGH_FIDELITY)
             for cell in mine.itertuples():
-                name = label(cell.primal, cell.primal_tol, cell.assembly)
+                name = label(cell.primal, cell.primal_tol, cell.way)
                 plot(panel, queries, cell.offline_s + queries * cell.online_s, looks[_model(cell)], name)
             _marks(panel, mine, data.thresholds)
             panel.set(xlabel="number of queries", ylabel="offline + online [s]", title=title)
@@ -207,7 +222,7 @@ def total_cost(data: Data) -> Pages:
 
 
 def _most_vectors(cells: pd.DataFrame) -> pd.DataFrame:
-    """The cells with the most vectors of every strategy and assembly: a line per tolerance would hide the crossings."""
+    """The cells with the most vectors of every strategy and way: a line per tolerance would hide the crossings."""
     added = cells.assign(added=cells["enrichment"].fillna(0)).sort_values(
         ["added", "primal_tol"], ascending=[False, True], kind="stable"
     )
@@ -215,7 +230,7 @@ def _most_vectors(cells: pd.DataFrame) -> pd.DataFrame:
 
 
 def _model(cell: Any) -> Series:
-    return series(cell.primal, cell.primal_tol, cell.assembly)
+    return series(cell.primal, cell.primal_tol, cell.way)
 
 
 def _marks(panel: Axes, cells: pd.DataFrame, thresholds: pd.DataFrame) -> None:

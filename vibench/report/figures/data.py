@@ -121,6 +121,8 @@ def problems(
         _tell_apart(axis, read["cells"], [frame for frame in read.values() if axis in frame])
     read["queries"] = read["queries"].merge(read["cells"][["cell", "enrichment_kind", "N", "R"]], "left", "cell")
     for frame in read.values():
+        if "assembly" in frame:
+            frame["way"] = _per_combination(frame[["assembly", "correction"]], way)
         frame["pair"] = _per_combination(frame[PAIR].astype(float), lambda *pair: str(pair))
     shown = tuple(pictures.read(path))
     keys = list(dict.fromkeys(read["queries"][[*PROBLEM, "training"]].itertuples(index=False, name=None)))
@@ -195,10 +197,18 @@ def by_strategy(rows: pd.DataFrame) -> Iterator[tuple[str, pd.DataFrame]]:
         yield label(primal, tolerance), group
 
 
-def series(name: Any, tolerance: Any = None, assembly: str = "full") -> Series:
-    """A primal strategy, told from itself at other tolerances and assemblies."""
+CORRECTED = {"none": "", "feasible": "corrected", "auto": "corrected where ω > ρ"}
+
+
+def way(assembly: str, correction: str) -> str:
+    """How queries are assembled and corrected; "" in full and not at all."""
+    return ", ".join(filter(None, ("" if assembly == "full" else assembly, CORRECTED.get(correction, correction))))
+
+
+def series(name: Any, tolerance: Any = None, way: str = "") -> Series:
+    """A primal strategy, told from itself at other tolerances, assemblies and corrections."""
     variant = "" if pd.isna(tolerance) else float(tolerance)
-    return Series(str(name), variant if assembly in {"full", ""} else f"{assembly} {variant}")
+    return Series(str(name), f"{way} {variant}" if way else variant)
 
 
 def some(values: Any, most: int = 6) -> str:
@@ -221,10 +231,15 @@ def titled_parts(title: str, items: list[Any], most: int, noun: str = "strategie
         yield title + f", {noun} {k} of {len(groups)}" * (len(groups) > 1), group
 
 
-def label(name: Any, tolerance: Any = None, assembly: str = "full") -> str:
-    """A primal strategy with its tolerance and, unless it is full, its assembly."""
+def label(name: Any, tolerance: Any = None, way: str = "") -> str:
+    """A primal strategy with its tolerance, and the `way` of its queries."""
     with_tolerance = str(name) if pd.isna(tolerance) else f"{name}, δ = {tolerance:g}"
-    return with_tolerance if assembly in ("full", "") else f"{with_tolerance}, {assembly}"
+    return f"{with_tolerance}, {way}" if way else with_tolerance
+
+
+def label_of(row: Any) -> str:
+    """The same of a row of the cells or the queries table."""
+    return label(row["primal"], row["primal_tol"], way(row["assembly"], row["correction"]))
 
 
 def point_names(cells: pd.DataFrame) -> dict[Any, str]:
@@ -240,7 +255,7 @@ def point_names(cells: pd.DataFrame) -> dict[Any, str]:
 
 
 def one_solver(queries: pd.DataFrame) -> pd.DataFrame:
-    """One row per strategy, tolerance and query: inf-sup constants depend neither on solver nor on assembly."""
+    """One row per strategy, tolerance and query: inf-sup constants depend on no solver, assembly or correction."""
     return queries.drop_duplicates([*PRIMAL, "query"])
 
 

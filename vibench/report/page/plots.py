@@ -1,7 +1,7 @@
 """Plots to work with: a point per cell that says which one it is, series that can be hidden, and zoom.
 
 BokehJS draws them in the browser; the page contains it, and the numbers of the points. A series is a primal strategy
-with its assembly, in the colour of the pictures; the filling of its points is that of the dual strategy.
+with its assembly and correction, in the colour of the pictures; the filling of its points is that of the dual strategy.
 """
 
 from __future__ import annotations
@@ -103,7 +103,7 @@ def _plot(
     drawn = [(panel, points) for panel, points in drawn if points.notna().to_numpy().any()]
     if not drawn:
         return
-    ways = [Series(*way) for way in zip(cells["primal"], cells["assembly"], strict=True)]
+    ways = [Series(*way) for way in zip(cells["primal"], cells["way"], strict=True)]
     looks, places, duals = Looks(ways), list(dict.fromkeys(ways)), list(dict.fromkeys(cells["dual"]))
     data = {
         "series": [_series(way, looks[way]) for way in places],

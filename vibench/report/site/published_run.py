@@ -12,6 +12,7 @@ from typing import Any
 import pandas as pd
 
 from vibench.report.comparison.runs import ComparedRun
+from vibench.report.figures.data import way
 from vibench.results.formats import asked, cell_text
 from vibench.results.sqlite.reading import FILE
 from vibench.study.kinds import STUDY
@@ -103,7 +104,7 @@ class PublishedRun:
                 "axes": [
                     str(row["problem"]), str(row["dual"]), f"{row['primal']}{_tolerance(row)}",
                     f"{asked(row, 'pod')}, {asked(row, 'dual')}", f"{row['solver']} {row['accuracy']:g}",
-                    str(row["assembly"]),
+                    way(row["assembly"], row["correction"]) or "full",
                 ],
                 "status": str(row["status"]),
                 "numbers": [cell_text(row[name]) for name in SHOWN_CELLS],
