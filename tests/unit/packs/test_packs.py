@@ -17,7 +17,7 @@ from packs import DEPTH, SIZE, Cable, group, manifest, write_arrays, write_cable
 from running import Main
 
 from vibench.errors import NumericalError, RequestError
-from vibench.highfidelity.active_set import HighFidelitySolver
+from vibench.highfidelity.active_set import HighFidelitySolver, solve_high_fidelity
 from vibench.interfaces.problem import ABSENT, MEMBERS, Problem, VariationalInequality
 from vibench.interfaces.validation import checked_assembly
 from vibench.packs import writer
@@ -114,6 +114,59 @@ def test_an_infinite_entry_of_g_is_a_row_that_constrains_nothing(tmp_path: Path,
         g[-1] = wrong
         with pytest.raises(RequestError, match=r"operators.g: 1 of its entries are not finite \(nan or -inf; inf"):
             pack_with(tmp_path / name, content, g=g)
+
+
+@pytest.mark.parametrize("far", [1e12, 1e16, 1e20, np.inf])
+def test_no_obstacle_on_every_second_row_leaves_the_others_in_force(tmp_path: Path, far: float) -> None:
+    """A g of 1e20, as codes write it where there is none, once switched all rows off, and the solution was ok."""
+    content = manifest()
+    del content["solutions"]
+    content["operators"]["g"] = {
+        "affine": [{"theta": "depth", "array": "more.npz:near"}, {"theta": "1", "array": "more.npz:far"}]
+    }
+    second = np.arange(SIZE) % 2 == 1
+    pack = pack_with(
+        tmp_path / "pack", content, near=np.where(second, 0.0, Cable().mass), far=np.where(second, far, 0.0)
+    )
+    vi = pack.at(MU)
+    kept = np.flatnonzero(~second)
+    alone = VariationalInequality(vi.A, vi.f, sp.csr_array(vi.B)[kept], vi.g[kept])
+    solution, expected = solve_high_fidelity(vi), solve_high_fidelity(alone)
+    assert np.any(expected.lam > 0.0)
+    assert np.max(vi.B @ solution.u - vi.g) <= 1e-14
+    assert np.allclose(solution.u, expected.u, rtol=1e-10, atol=0.0)
+    assert np.allclose(solution.lam[kept], expected.lam, rtol=1e-10, atol=1e-14)
+    assert not solution.lam[second].any()
+
+
+@pytest.mark.parametrize("precision", [np.float16, np.float32])
+def test_numbers_may_be_stored_in_few_digits(tmp_path: Path, precision: type) -> None:
+    """What is stored is exact: computations with it are not made in its precision."""
+    cable, content = Cable(), manifest()
+    del content["solutions"]
+    content["operators"] |= {name: f"more.npz:{name}" for name in ("A", "B")}
+    stored = {name: group(name, getattr(cable, name)) for name in ("A", "B", "X_V", "X_W")}
+    mass = cable.mass.astype(precision)
+    packs = []
+    for dtype in (precision, np.float64):
+        folder = tmp_path / str(np.dtype(dtype))
+        folder.mkdir()
+        groups = {
+            name: parts | {f"{name}/data": parts[f"{name}/data"].astype(precision).astype(dtype)}
+            for name, parts in stored.items()
+        }
+        np.savez(folder / "spaces.npz", **groups["X_V"], **groups["X_W"])
+        np.savez(folder / "more.npz", **groups["A"], **groups["B"])
+        np.savez(folder / "vectors.npz", mass=mass.astype(dtype))
+        write_manifest(folder, content)
+        packs.append(read_model_pack(folder))
+    few, many = packs
+    for name in MEMBERS:
+        one, other = (getattr(pack.at(MU), name) for pack in packs)
+        assert one.dtype == np.float64
+        assert abs(one - other).max() == 0.0, name
+    assert abs(few.V.matrix - many.V.matrix).max() == 0.0
+    assert np.array_equal(solve_high_fidelity(few.at(MU)).u, solve_high_fidelity(many.at(MU)).u)
 
 
 def test_tables_and_arrays_by_parameter_hold_at_listed_parameters_only(tmp_path: Path) -> None:
