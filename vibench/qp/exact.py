@@ -25,6 +25,9 @@ ROUND_OFF = 1e-12
 DEPENDENT = 1e-10
 """Constraints are dependent where a pivot of their factorisation is below this fraction of the largest."""
 
+CANCELLED = 32.0 * float(np.finfo(float).eps)
+"""Round-off in B x, relative to what the load alone would make of it."""
+
 FARTHEST = 1e-50 * ABSENT
 """Constraints are absent from here on: reduced ones are sums of products of absent ones with generators of any unit."""
 
@@ -78,7 +81,7 @@ def _exact_solution(program: VariationalInequality) -> ExactSolution | None:
         x, alpha = whitened.solve_active(active)
         # An excess is compared with the terms that it is the difference of, not with g alone, which may be small.
         excess, terms = program.B @ x - program.g, np.abs(program.B) @ np.abs(x) + np.abs(program.g)
-        violated, pulling = excess > ROUND_OFF * terms, alpha < -ROUND_OFF * size(alpha)
+        violated, pulling = excess > ROUND_OFF * terms + whitened.noise, alpha < -ROUND_OFF * size(alpha)
         if not np.any(violated) and not np.any(pulling):
             alpha = np.maximum(alpha, 0.0)
             forces = np.abs(program.A) @ np.abs(x) + np.abs(program.f) + np.abs(program.B.T) @ alpha
@@ -158,6 +161,8 @@ class _Whitened:
     def __init__(self, program: VariationalInequality, L: Array) -> None:
         self._program, self._L, self._rows = program, L, row_norms(program.B)
         self._C, self._load = self._whiten((program.B / self._rows[:, None]).T), self._whiten(program.f)
+        # What is left of the load where forces balance it: all there is of x where constraints hold it at zero.
+        self.noise = CANCELLED * self._rows * np.linalg.norm(self._C, axis=0) * np.linalg.norm(self._load)
 
     def _whiten(self, right: Array) -> Array:
         return np.asarray(scipy.linalg.solve_triangular(self._L, right, lower=True, check_finite=False))

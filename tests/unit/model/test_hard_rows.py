@@ -58,7 +58,7 @@ def test_solutions_are_right_and_bounds_exist_and_hold(kind: str, seed: int) -> 
     )
     pair = corrected_pair(vi, norm, u_N, lam_N)
     assert pair is not None
-    for v, nu in ((u_N, lam_N), pair):
+    for v, nu in ((u_N, lam_N), (pair.u, pair.lam)):
         found = bound_errors_at(vi, norm, Constant(1.0, True), Constant(0.0, True), v, nu)
         assert found.note == NOT_UNIQUE
         errors = norm.norm(difference(u, v)), norm.dual_norm(vi.B.T @ difference(lam, nu))

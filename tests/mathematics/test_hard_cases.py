@@ -1,0 +1,77 @@
+"""Stiff problems, dependent rows and equalities: short versions of `tests/benchmarks/hard_cases.py`."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from decimals import difference, exact_decimal
+from hard_problems import Beam, DoubleObstacle, Truss
+
+from vibench import AffineProblem, Array, Problem, Reduction, Stop, create
+from vibench.highfidelity.active_set import HighFidelitySolver
+from vibench.linalg.cholesky import SparseCholesky
+from vibench.model.error_bounds import bound_errors_at, corrected_pair
+from vibench.offline.assemblies import assemblies
+from vibench.stability.coercivity import Constant
+
+SMALL = [Beam(40), Beam(80), Truss(40), Truss(80), DoubleObstacle(50)]
+
+
+def energy_error(problem: Problem, mu: Array) -> float:
+    """The error of the high-fidelity solution at mu against one of 100 digits, relative, in the energy norm."""
+    solution, vi = HighFidelitySolver(problem).solve(mu), problem.assemble(mu)
+    u, lam = exact_decimal(vi, solution.lam > 0.0)
+    e, size = difference(u, solution.u), np.asarray(u, float)
+    force, whole = vi.B.T @ difference(lam, solution.lam), vi.B.T @ np.asarray(lam, float)
+    factor = SparseCholesky(vi.A)
+    of_lam = np.sqrt(force @ factor.solve(force) / max(whole @ factor.solve(whole), 1e-300))
+    return max(float(np.sqrt(e @ (vi.A @ e) / (size @ (vi.A @ size)))), float(of_lam))
+
+
+@pytest.mark.parametrize("problem", SMALL, ids=lambda problem: f"{type(problem).__name__}-{problem.W.dim}")
+def test_solutions_are_those_of_a_hundred_digits(problem: AffineProblem) -> None:
+    for mu in problem.parameters.sample(3, 1):
+        assert energy_error(problem, mu) <= 1e-10
+
+
+def test_what_condensation_loses_is_won_back() -> None:
+    """A truss of 320 bays, whose solutions had natural residuals of 1e-4 to 1e-8 however they were refined."""
+    problem = Truss(320)
+    solver = HighFidelitySolver(problem)
+    for mu in problem.parameters.sample(3, 1):
+        found = solver.solve(mu)
+        assert found.residuals.worst <= 1e-10
+        assert found.fallback == "solved without condensation"
+
+
+@pytest.mark.parametrize("problem", [Beam(40), Truss(40), DoubleObstacle(50)], ids=lambda each: type(each).__name__)
+def test_certified_models_of_hard_problems_have_bounds_that_hold(problem: AffineProblem) -> None:
+    """At online cost and at that of the mesh, of the pair and of the corrected one."""
+    reduction = Reduction(
+        problem,
+        create("dual strategy", "mcpg"),
+        create("primal strategy", "offline-pga"),
+        Stop(1e-4),
+        Stop(1e-2),
+        tolerance=0.5,
+        assembly="certified",
+    )
+    model, solver, kept = reduction.model, HighFidelitySolver(problem), assemblies(problem)
+    for mu in problem.parameters.sample(10, 7):
+        exact, found, corrected = solver.solve(mu), model.solve(mu), model.solve(mu, corrected=True)
+        vi, energy = kept.at(mu), kept.energy_at(mu)
+        assert found.status == "ok"
+        size = energy.norm(exact.u) + energy.dual_norm(vi.B.T @ exact.lam)
+        pair = corrected_pair(vi, energy, found.u, found.lam)
+        assert pair is not None
+        unknown = Constant(1.0, True), Constant(0.0, True)
+        for (u, lam), bound in (
+            ((found.u, found.lam), found.bound),
+            ((corrected.u, corrected.lam), corrected.bound),
+            ((found.u, found.lam), bound_errors_at(vi, energy, *unknown, found.u, found.lam)),
+            ((pair.u, pair.lam), bound_errors_at(vi, energy, *unknown, pair.u, pair.lam)),
+        ):
+            assert bound is not None
+            assert energy.norm(exact.u - u) <= bound.u_energy + 1e-9 * size
+            assert energy.dual_norm(vi.B.T @ (exact.lam - lam)) <= bound.lambda_natural + 1e-9 * size
+            assert bound.u_energy <= 10.0 * size
