@@ -50,7 +50,7 @@ def print_line(console: Console, line: str) -> None:
 
 
 def print_frame(
-    frame: pd.DataFrame,
+    table: pd.DataFrame | list[PrintedColumn],
     title: str,
     priority: Sequence[str] = (),
     *,
@@ -65,8 +65,8 @@ def print_frame(
 
     Parameters
     ----------
-    frame
-        The table.
+    table
+        The table, or its columns as texts.
     title
         Its title.
     priority
@@ -79,31 +79,7 @@ def print_frame(
     rest
         The command, or its option, that prints the columns that are left out.
     """
-    from vibench.results.formats import cell_text
-
-    columns = [
-        PrintedColumn(str(name), tuple(map(cell_text, frame[name])), frame[name].dtype.kind in "iufb")
-        for name in frame.columns
-    ]
-    print_columns(columns, title, priority, axes=axes, every=every, rest=rest)
-
-
-def print_rows(rows: Iterable[Sequence[str]], headings: Sequence[str], title: str) -> None:
-    """Print rows of texts as `print_frame` prints a table."""
-    cells = list(zip(*rows, strict=True)) or [()] * len(headings)
-    print_columns([PrintedColumn(name, tuple(own)) for name, own in zip(headings, cells, strict=True)], title)
-
-
-def print_columns(
-    columns: Sequence[PrintedColumn],
-    title: str,
-    priority: Sequence[str] = (),
-    *,
-    axes: Collection[str] = (),
-    every: bool = False,
-    rest: str = "vibench show --columns",
-) -> None:
-    """Print columns as `print_frame` prints a table."""
+    columns = table if isinstance(table, list) else _columns_of(table)
     console = new_console()
     count = len(columns[0].cells) if columns else 0
     titled = [column for column in columns if not every and (count > 1 or column.heading in axes)]
@@ -120,18 +96,33 @@ def print_columns(
     drawn = [column for column in own if column in kept]
     whole = sum(max(column.width, cell_len(column.heading)) + 2 for column in drawn) <= console.width + 2
     # the box has a blank between columns; there is another where there is room
-    table = Table(box=box.SIMPLE_HEAD, show_edge=False, pad_edge=False, padding=(0, int(whole), 0, 0))
+    printed = Table(box=box.SIMPLE_HEAD, show_edge=False, pad_edge=False, padding=(0, int(whole), 0, 0))
     for column in drawn:
         width = max(column.width, cell_len(column.heading)) if whole else column.width
         limits = {"min_width": width, "max_width": LONG} if column.long else {"width": width}
         justify = "right" if column.numeric else "left"
-        table.add_column(shown(column.heading), justify=justify, overflow="fold", **limits)  # type: ignore[arg-type]
+        printed.add_column(shown(column.heading), justify=justify, overflow="fold", **limits)  # type: ignore[arg-type]
     for row in zip(*(column.cells for column in drawn), strict=True):
-        table.add_row(*map(shown, row))
-    console.print(table)
+        printed.add_row(*map(shown, row))
+    console.print(printed)
     if left_out := [column.heading for column in own if column not in kept]:
         text = f"not shown at {console.width} columns: {', '.join(left_out)} (`{rest}`)"
         console.print(shown(text), overflow="fold")
+
+
+def _columns_of(frame: pd.DataFrame) -> list[PrintedColumn]:
+    from vibench.results.formats import cell_text
+
+    return [
+        PrintedColumn(str(name), tuple(map(cell_text, frame[name])), frame[name].dtype.kind in "iufb")
+        for name in frame.columns
+    ]
+
+
+def print_rows(rows: Iterable[Sequence[str]], headings: Sequence[str], title: str) -> None:
+    """Print rows of texts as `print_frame` prints a table."""
+    cells = list(zip(*rows, strict=True)) or [()] * len(headings)
+    print_frame([PrintedColumn(name, tuple(own)) for name, own in zip(headings, cells, strict=True)], title)
 
 
 @dataclass(frozen=True, eq=False)

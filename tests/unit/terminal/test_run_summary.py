@@ -21,7 +21,8 @@ from vibench.terminal.run_summary import REASONS, WHOLE, failures, next_steps, p
 
 def row(cell: str, reason: str, status: str = "inaccurate", **more: Any) -> dict[str, Any]:
     own = {"problem": "box", "dual": "cpg", "primal": "pga", "primal_tol": 0.5, "pod_tol": 1e-3, "dual_size": 4,
-           "solver": "osqp", "accuracy": 1e-8, "assembly": "reduced", "queries": 16, "queries_ok": 15}  # fmt: skip
+           "solver": "osqp", "accuracy": 1e-8, "assembly": "reduced", "correction": "none", "queries": 16,
+           "queries_ok": 15}  # fmt: skip
     return cell_row(**own | {"pod_size": None, "cell": cell, "reason": reason, "status": status} | more)
 
 
