@@ -23,7 +23,7 @@ from vibench.interfaces.validation import training_parameters
 from vibench.library import c_source, exported_certificate
 from vibench.library.reduced_model import FORMAT, SOLVERS
 from vibench.model.affine import affine_decomposition, check_affine
-from vibench.model.certificates.base import Guarantee
+from vibench.model.certificates.base import Guarantee, contact_unknowns
 from vibench.model.certificates.bounds import OnlineCertificate
 from vibench.model.chebyshev import AffinePolynomial, interpolate_on_box
 from vibench.model.hyperreduced import HyperReducedModel, hyper_reduce
@@ -174,7 +174,8 @@ def exported(
         basis = queried.basis if isinstance(queried, HyperReducedModel) else queried.fixed_basis
         arrays |= {"basis": basis, "generators": queried.generators}
     if certificate is not None:
-        arrays |= exported_certificate.arrays(certificate, polynomials | members)
+        unknowns = contact_unknowns(model.problem) if bases else None
+        arrays |= exported_certificate.arrays(certificate, polynomials | members, unknowns)
         about["certificate"] = exported_certificate.guarantee(certificate, model.problem.constant).value
     return ExportedModel(members, arrays, about, polynomials)
 

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Set
 
 import numpy as np
 
-from vibench.arrays import Array
+from vibench.arrays import Array, Indices
 from vibench.interfaces.problem import MEMBERS
 from vibench.model.certificates.base import ONE, SAFETY, Guarantee
 from vibench.model.certificates.bounds import OnlineCertificate
@@ -34,9 +34,12 @@ def thetas(certificate: OnlineCertificate, samples: Mapping[str, Array]) -> dict
     return {f"theta_{name}": value for name, value in found.items()}
 
 
-def arrays(certificate: OnlineCertificate, polynomials: Mapping[str, AffinePolynomial]) -> dict[str, Array]:
+def arrays(
+    certificate: OnlineCertificate, polynomials: Mapping[str, AffinePolynomial], unknowns: Indices | None
+) -> dict[str, Array]:
     """The arrays of a certificate for which there is no `reason_for_none`.
 
+    With the positions of the contact `unknowns`, those that take ν to a corrected u at mesh size are among them.
     Bounds grow by what the measured errors of the polynomials, of A and of all θ, may add, with the factor `SAFETY`.
     """
     base, residual, corrections, terms = (
@@ -53,6 +56,10 @@ def arrays(certificate: OnlineCertificate, polynomials: Mapping[str, AffinePolyn
         "terms": np.array(corrections.terms), "kept": residual.kept, "factor": residual.factor,
         "inverse_scale": residual.inverse_scale, "remainder": np.array(residual.remainder), "norms": residual.norms,
     }  # fmt: skip
+    if unknowns is not None:
+        loads = np.zeros((base.X.dim, len(corrections.rows)))
+        loads[unknowns] = base.constraint[corrections.rows].toarray().T
+        found["lift"] = base.X.riesz(loads)
     error = {name: _error(polynomial) for name, polynomial in polynomials.items()}
     sizes = residual.norms.copy()  # of all terms of residuals
     sizes[residual.kept] = np.hypot(

@@ -54,32 +54,64 @@ class Model:
         self._box = data["lower"] - slack, data["upper"] + slack
         self._data = {name.removeprefix(start): data[name] for name in data if name.startswith(start)}
 
-    def solve(self, mu: Sequence[float] | Array, tolerance: float | None = None) -> Certified:
-        """The solution at a parameter and its bounds; the tolerance is of the relative error of u in the norm of A."""
+    def solve(self, mu: Sequence[float] | Array, tolerance: float | None = None, corrected: bool = False) -> Certified:
+        """The solution at a parameter and its bounds; the tolerance is of the relative error of u in the norm of A.
+
+        With `corrected`, `u` and `lam` of the solution and the bounds are those of the corrected pair u_N − w and ν,
+        which satisfies the constraints, c X w = Bᵀ(ν − λ_N) with c = ½ (α + γ); x and α are as they are without. Where
+        there is no bound nothing is corrected. A file without bases has ν alone.
+        """
         if tolerance is not None and not 0.0 < tolerance < inf:
             raise ValueError(f"the tolerance is {tolerance}, expected a positive finite number")
         solution = self.plain.solve(mu)
-        bound = self._bound(np.asarray(mu, dtype=float), solution.x, solution.alpha, solution.energy)
+        at = np.asarray(mu, dtype=float)
+        bound, rho = self._bound(at, solution.x, solution.alpha, solution.energy)
+        if corrected and bound.guarantee != "none":
+            solution, bound = self._pair(at, solution, bound, rho)
         kept = tolerance is None or (solution.status == "ok" and bound.relative <= tolerance)
         return Certified(solution, bound, "not certified" if not kept else "" if tolerance is None else bound.guarantee)
 
-    def _bound(self, mu: Array, y: Array, alpha: Array, energy: float) -> Bound:
-        """Bounds of a solution: u_N has the coordinates y in the basis, λ_N is generators · α, `energy` is ‖u_N‖²_A."""
+    def _pair(self, mu: Array, solution: Any, bound: Bound, rho: float) -> tuple[Any, Bound]:
+        """The corrected pair of a solution with bounds, and ρ/√α, and its own bounds."""
+        A, B, g = (self.plain.member(f"theta_{name}", mu) for name in "ABg")
+        (lower, upper), lam, theta = self._spectrum(mu, A), self._data["generators"] @ solution.alpha, float(B[0])
+        c, rows = 0.5 * (lower + upper), self._data["rows"]
+        lifting = self._lifting(theta, g, solution.x, lam, c)
+        if lifting is None:
+            none = "no corrected pair was found at this parameter: the solution is that of the reduced model"
+            return solution, bound._replace(note=none)
+        a, norm, slack = lifting
+        nu = lam.copy()
+        nu[rows] = np.maximum(lam[rows] + (c / theta) * a, 0.0)
+        missed = float(self._data["constraint_error"]) / abs(theta) * c  # of θ in c X w = Bᵀ(ν − λ_N)
+        rho += (0.5 * (upper - lower) + missed) / sqrt(lower) * norm
+        both = sqrt(rho**2 + 2.0 * max(0.0, float(nu @ slack)))
+        least = bound.u_energy / bound.relative if bound.relative > 0.0 else 0.0  # of ‖u‖
+        u = None if solution.u is None or "lift" not in self._data else solution.u - self._data["lift"] @ a
+        found = Bound(both, both, both / least if least > 0.0 else inf, bound.guarantee)
+        return solution._replace(u=u, lam=nu), found
+
+    def _bound(self, mu: Array, y: Array, alpha: Array, energy: float) -> tuple[Bound, float]:
+        """Bounds of a solution: u_N has the coordinates y in the basis, λ_N is generators · α, `energy` is ‖u_N‖²_A.
+
+        And ρ/√α.
+        """
         data, lam = self._data, self._data["generators"] @ alpha
         if not (np.all(np.isfinite(y)) and np.all(np.isfinite(lam))):
-            return Bound(inf, inf, inf, "none", "there is no solution")
+            return Bound(inf, inf, inf, "none", "there is no solution"), inf
         if np.min(lam, initial=0.0) < 0.0:
-            return Bound(inf, inf, inf, "none", "λ_N has negative coefficients")
+            return Bound(inf, inf, inf, "none", "λ_N has negative coefficients"), inf
         if np.any((mu < self._box[0]) | (mu > self._box[1])):
-            return Bound(inf, inf, inf, "none", "mu is outside the parameter box")
+            return Bound(inf, inf, inf, "none", "mu is outside the parameter box"), inf
         A, f, B, g = (self.plain.member(f"theta_{name}", mu) for name in "AfBg")
         lower, upper = self._spectrum(mu, A)
         error = float(data["stiffness_error"])
-        corrected = self._corrected(float(B[0]), g, y, lam, upper) if lower > error else None
-        if corrected is None:
+        lifting = self._lifting(float(B[0]), g, y, lam, upper) if lower > error else None
+        if lifting is None:
             which = "α > 0" if lower <= error else "w with B w ≥ s"
-            return Bound(inf, inf, inf, "none", f"no {which} was found at this parameter")
-        along, norm, kappa = corrected
+            return Bound(inf, inf, inf, "none", f"no {which} was found at this parameter"), inf
+        a, norm, slack = lifting
+        along, kappa = a @ data["directions"], max(0.0, float(lam @ slack))
         z = np.concatenate([f, np.outer(-A, y).ravel(), np.outer(-B, alpha).ravel()])
         coordinates = data["factor"] @ z[data["kept"]]
         beside = float(data["remainder"] * np.linalg.norm(data["inverse_scale"] * z[data["kept"]]))
@@ -94,7 +126,7 @@ class Model:
         work = float(along @ coordinates) + (beside + lacking) * norm
         least = sqrt(max(0.0, energy - of_energy - error * of_u**2)) - found
         natural = min(sqrt(max(0.0, square + 2.0 * work)), omega + found)
-        return Bound(found, natural, found / least if least > 0.0 else inf, self.guarantee)
+        return Bound(found, natural, found / least if least > 0.0 else inf, self.guarantee), rho / sqrt(lower)
 
     def _spectrum(self, mu: Array, theta: Array) -> tuple[float, float]:
         """α and γ from the values at the anchors around mu, a grid of the parameter box."""
@@ -111,10 +143,10 @@ class Model:
         lacking = float(abs(theta - found[2:]) @ data["term_norms"]) + 2.0 * float(data["spectral_error"])
         return float(found[0]) - lacking, float(found[1]) + lacking
 
-    def _corrected(
+    def _lifting(
         self, theta: float, of_g: Array, y: Array, lam: Array, gamma: float
-    ) -> tuple[Array, float, float] | None:
-        """Coordinates of X w in the basis of residuals, ‖w‖, and κ, for a w with B w ≥ s in spite of all errors."""
+    ) -> tuple[Array, float, Array] | None:
+        """For a w with B w ≥ s in spite of all errors: θ (ν − λ)/γ on `rows`, ‖w‖, and bounds of B w − s."""
         data, unit = self._data, 1.01 * float(self._data["terms"]) * UNIT
         if theta == 0.0:
             return None
@@ -125,7 +157,7 @@ class Model:
         uncertain = error + unit * (of_y + abs(data["bounds"]) @ abs(of_g))
         margin = MARGIN * uncertain
         for _ in range(ATTEMPTS):
-            nu = self._complementary(gamma / theta**2, (excess + margin)[rows], lam[rows])
+            nu = np.maximum(self._complementary(gamma / theta**2, (excess + margin)[rows], lam[rows]), 0.0)
             a = (theta / gamma) * (nu - lam[rows])
             values = data["responses"] @ a
             slack = theta * values - excess
@@ -133,7 +165,7 @@ class Model:
             lacking = uncertain + (unit + share) * of_w - slack
             if lacking.max() <= 0.0:
                 norm = sqrt(max(0.0, float(a @ values[rows])))
-                return a @ data["directions"], norm, max(0.0, float(lam @ (slack + error + share * of_w)))
+                return a, norm, slack + error + share * of_w
             margin = margin + 2.0 * np.maximum(lacking, 0.0)
         return None
 
