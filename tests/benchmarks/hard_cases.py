@@ -1,0 +1,131 @@
+"""Hard cases: solutions against ones of 100 digits, and certified models against high-fidelity solutions.
+
+Usage: python tests/benchmarks/hard_cases.py [COUNT [QUERIES]]
+
+The first table has beams of 40 to 640 elements, trusses of 40 to 320 bays, and double obstacles with dependent rows and
+equalities: how many of QUERIES (20 by default) are ok, and the largest errors of three of them. The second one has
+certified models of the smaller ones at COUNT (1000 by default) random parameters: bounds of u in the energy norm and
+in V, of λ in the natural norm and in W, at online cost and at that of the mesh, of the pair and of the corrected one.
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from vibench import AffineProblem, Array, Reduction, Stop, create
+from vibench.errors import NumericalError
+from vibench.highfidelity.active_set import HighFidelitySolver
+from vibench.linalg.cholesky import SparseCholesky
+from vibench.model.error_bounds import bound_errors_at, corrected_pair
+from vibench.offline.assemblies import assemblies
+from vibench.stability.coercivity import coercivity_and_continuity, energy_inf_sup
+from vibench.stages.query import VIOLATION
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "helpers"))
+from decimals import difference, exact_decimal
+from hard_problems import Beam, DoubleObstacle, Truss
+
+LARGE: list[AffineProblem] = [
+    *(Beam(elements) for elements in (40, 80, 160, 320, 640)),
+    *(Truss(bays) for bays in (40, 80, 160, 320)),
+    *(DoubleObstacle(nodes) for nodes in (50, 100, 200, 400)),
+]
+SMALL: list[AffineProblem] = [Beam(40), Truss(40), DoubleObstacle(50), Beam(80), Truss(80), DoubleObstacle(100)]
+COMPARED = 3
+"""Parameters of a problem with a solution of 100 digits."""
+
+SEED = 2031
+
+
+def name(problem: AffineProblem) -> str:
+    """The kind of the problem, its unknowns and its rows."""
+    return f"{type(problem).__name__:14} {problem.V.dim:5} {problem.W.dim:5}"
+
+
+def solved(problem: AffineProblem, count: int) -> str:
+    """How many of the queries are ok, and the largest errors of u and λ in the energy norms."""
+    solver, ok, errors, started = HighFidelitySolver(problem), 0, [(0.0, 0.0)], time.process_time()
+    mus = problem.parameters.sample(count, SEED)
+    for mu in mus:
+        try:
+            solver.solve(mu)
+            ok += 1
+        except NumericalError as error:
+            print(error)
+    seconds = (time.process_time() - started) / count
+    for mu in mus[:COMPARED]:
+        found, vi = solver.solve(mu), problem.assemble(mu)
+        u, lam = exact_decimal(vi, found.lam > 0.0)
+        factor, e, size = SparseCholesky(vi.A), difference(u, found.u), np.asarray(u, float)
+        force, whole = vi.B.T @ difference(lam, found.lam), vi.B.T @ np.asarray(lam, float)
+        of_u = np.sqrt(e @ (vi.A @ e) / (size @ (vi.A @ size)))
+        of_lam = np.sqrt(force @ factor.solve(force) / max(whole @ factor.solve(whole), np.finfo(float).tiny))
+        errors.append((float(of_u), float(of_lam)))
+    return f"{name(problem)} {ok:4}/{count:<4} {np.max(errors, axis=0)[0]:8.1e} {np.max(errors, axis=0)[1]:8.1e} {seconds:8.3f}"
+
+
+def compared(problem: AffineProblem, mus: Array) -> Iterator[tuple[str, float, float, float]]:
+    """Kind of a bound, bound, error, and the size that round-off is relative to; of all queries of a certified model."""
+    dual, primal = create("dual strategy", "mcpg"), create("primal strategy", "offline-pga")
+    reduction = Reduction(problem, dual, primal, Stop(1e-4), Stop(1e-2), tolerance=0.5, assembly="certified")
+    model, solver, kept, constants = reduction.model, HighFidelitySolver(problem), assemblies(problem), None
+    for mu in mus:
+        exact, found, corrected = solver.solve(mu), model.solve(mu), model.solve(mu, corrected=True)
+        yield "ok", float(found.status == "ok"), 1.0, 1.0
+        vi, energy = kept.at(mu), kept.energy_at(mu)
+        if constants is None or "A" not in problem.constant:
+            constants = coercivity_and_continuity(vi.A, problem.V)[0], energy_inf_sup(vi.A, vi.B, problem.W)
+        pair = corrected_pair(vi, energy, found.u, found.lam)
+        online = [
+            ("online", found.u, found.lam, found.bound),
+            ("online, corrected", corrected.u, corrected.lam, corrected.bound),
+        ]
+        at_mesh = [("mesh", found.u, found.lam)] + [("mesh, corrected", pair.u, pair.lam) for pair in [pair] if pair]
+        bounds = [*online, *((*of, bound_errors_at(vi, energy, *constants, *of[1:])) for of in at_mesh)]
+        sizes = energy.norm(exact.u), energy.dual_norm(vi.B.T @ exact.lam)
+        for which, u, lam, bound in bounds:
+            assert bound is not None
+            force = energy.dual_norm(vi.B.T @ (exact.lam - lam))
+            yield f"{which}: u", bound.u_energy, energy.norm(exact.u - u), sizes[0]
+            yield f"{which}: λ", bound.lambda_natural, force, sizes[1]
+            yield (
+                f"{which}: λ in W",
+                bound.lam,
+                float(problem.W.norm(exact.lam - lam)),
+                float(problem.W.norm(exact.lam)),
+            )
+            if which.startswith("mesh"):
+                in_V = float(problem.V.norm(exact.u - u))
+                yield f"{which}: u in V", bound.u, in_V, float(problem.V.norm(exact.u))
+
+
+def certified(problem: AffineProblem, count: int) -> Iterator[str]:
+    """Rows of the second table: queries, those without a bound, violations, and effectivities."""
+    found: dict[str, list[tuple[float, float, float]]] = {}
+    for which, *numbers in compared(problem, problem.parameters.sample(count, SEED)):
+        found.setdefault(which, []).append((numbers[0], numbers[1], numbers[2]))
+    ok = np.array(found.pop("ok"))[:, 0]
+    yield f"{name(problem)}: {int(ok.sum())} of {count} queries ok"
+    for which, rows in found.items():
+        bound, error, size = np.array(rows).T
+        has = np.isfinite(bound)
+        violated = has & ~(error <= bound + VIOLATION * size)
+        measurable = has & (error > 1e-8 * size)
+        of = bound[measurable] / error[measurable]
+        spread = " ".join(f"{value:9.3g}" for value in np.percentile(of, [0, 50, 100])) if len(of) else "none"
+        yield f"    {which:26} {np.count_nonzero(~has):6} {np.count_nonzero(violated):6}   {spread}"
+
+
+if __name__ == "__main__":
+    count, queries = (int(given) for given in (*sys.argv[1:3], *("1000", "20")[len(sys.argv) - 1 :]))
+    print("problem            n     m   ok        error u  error λ  CPU s per query")
+    for problem in LARGE:
+        print(solved(problem, queries), flush=True)
+    print("\nproblem, bound: without, violated, effectivity min, median, max")
+    for problem in SMALL:
+        print(*certified(problem, count), sep="\n", flush=True)
