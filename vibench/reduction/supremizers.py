@@ -99,23 +99,9 @@ def _equal_up_to_sign(one: Array, other: Array) -> bool:
 
 
 class SpannedCoordinates:
-    """Euclidean coordinates in V_N + span of given vectors.
+    """Euclidean coordinates in V_N, given by a V-orthonormal basis (n×N), + span of vectors (n×k), dependent or not.
 
-    Parameters
-    ----------
-    V
-        Inner product of the primal space.
-    basis
-        V-orthonormal basis of V_N (n×N).
-    vectors
-        Vectors (n×k), possibly linearly dependent.
-
-    Attributes
-    ----------
-    plain
-        Coordinates (d×N) of the basis of V_N, orthonormal.
-    represented
-        Coordinates (d×k) of the vectors.
+    `plain` are the coordinates (d×N) of the basis, orthonormal, `represented` those (d×k) of the vectors.
     """
 
     def __init__(self, V: InnerProduct, basis: Array, vectors: Array) -> None:
@@ -134,21 +120,8 @@ class ContactCoordinates:
     """Euclidean coordinates in V_N + X_V⁻¹E: with E the contact unknowns, this contains the supremizers of every B(mu).
 
     X_V = FᵀF is factorised with E last. For every load r on E, F X_V⁻¹ r = F⁻ᵀ r is then F_EE⁻ᵀ r in its last entries
-    and zero before: no array larger than E is needed for it.
-
-    Parameters
-    ----------
-    V
-        Inner product of the primal space.
-    basis
-        V-orthonormal basis of V_N (n×N).
-    dofs
-        E, rising.
-
-    Attributes
-    ----------
-    plain
-        Coordinates (d×N) of the basis of V_N, orthonormal.
+    and zero before: no array larger than E is needed for it. V_N is given by a V-orthonormal basis (n×N), E by `dofs`,
+    rising; `plain` are the coordinates (d×N) of the basis, orthonormal.
     """
 
     def __init__(self, V: InnerProduct, basis: Array, dofs: Indices) -> None:

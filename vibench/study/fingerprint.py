@@ -24,15 +24,8 @@ def fingerprint_of(value: Any) -> tuple[str, dict[str, str]]:
     modules with the `module_version` and what they use of vibench. What is computed again when it is asked for
     (`functools.cached_property`) does not count.
 
-    Returns
-    -------
-    hash, modules
-        The hash, and the versions of the modules that it names.
-
-    Raises
-    ------
-    TypeError
-        If it holds something that cannot be pickled.
+    Returned with it are the versions of the modules that it names. Raises a `TypeError` if the value holds something
+    that cannot be pickled.
     """
     met: dict[int, tuple[int, Any]] = {}
     own = _hash_of(value, met)

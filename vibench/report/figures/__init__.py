@@ -93,22 +93,12 @@ def draw(
 ) -> Figure:
     """One figure of a results file.
 
-    Parameters
-    ----------
-    kind
-        A key of `OF_PROBLEM` or `OF_DUAL`, or a figure of a plugin.
-    problem, dual
-        Label of the problem ("LABEL, TRAINING" where it has several training sets), and of the dual strategy for a kind
-        of `OF_DUAL`; `None` where there is only one.
-    note
-        Called with a line for every column of a plugin that the data do not have.
+    Its kind is a key of `OF_PROBLEM` or `OF_DUAL`, or a figure of a plugin. The problem is given by its label ("LABEL,
+    TRAINING" where it has several training sets), the dual strategy for a kind of `OF_DUAL` by its own; `None` is for
+    the only one. `note` is called with a line for every column of a plugin that the data do not have.
 
-    Raises
-    ------
-    RequestError
-        If there is no such figure, or nothing to draw in it.
-    FigureError
-        If it is a plugin's figure, which cannot be drawn.
+    Raises a `RequestError` if there is no such figure, or nothing to draw in it, and a `FigureError` if it is a
+    plugin's figure, which cannot be drawn.
     """
     faults: list[str] = []
     by_problem = {data.problem: data for _, data in problems(path, note=faults.append)}
