@@ -6,6 +6,7 @@ pandas, rich or pydantic): every command imports what it needs when it runs.
 
 from __future__ import annotations
 
+import io
 import os
 import sys
 from collections.abc import Callable
@@ -245,6 +246,7 @@ def run_command_line() -> None:
     """
     usage_error = typer.BadParameter.__mro__[2]  # click's ClickException, whichever copy of click typer brings
     try:
+        _print_any_text()
         _search_working_directory_last()
         with whole_words():
             code = app(args=sys.argv[1:] or ["--help"], standalone_mode=False)
@@ -262,6 +264,13 @@ def run_command_line() -> None:
             raise
         code = _print_error(error.format_message(), 2)  # type: ignore[attr-defined]
     sys.exit(code if isinstance(code, int) else 0)
+
+
+def _print_any_text() -> None:
+    """Print a question mark for what the encoding of a terminal or a pipe lacks, rather than abort a run."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):  # not what has taken its place in a test or a notebook
+            stream.reconfigure(errors="replace")
 
 
 def _search_working_directory_last() -> None:

@@ -52,7 +52,8 @@ def storable(kind: ClassT) -> ClassT:
     `__getstate__` returns. Cached properties are not stored. A module that defines a stage lists the classes of its
     value; two classes of the same name cannot be on the list.
     """
-    assert _classes.setdefault(kind.__name__, kind) is kind, f"two storable classes are called {kind.__name__}"
+    if _classes.setdefault(kind.__name__, kind) is not kind:
+        raise TypeError(f"two storable classes are called {kind.__name__}")
     return kind
 
 

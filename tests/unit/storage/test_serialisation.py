@@ -245,5 +245,5 @@ def test_no_bit_makes_another_error(data: st.DataObject) -> None:
 
 
 def test_two_classes_cannot_have_one_name() -> None:
-    with pytest.raises(AssertionError, match="two storable classes are called Sample"):
+    with pytest.raises(TypeError, match="two storable classes are called Sample"):
         storable(type("Sample", (), {}))
