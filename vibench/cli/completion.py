@@ -164,6 +164,9 @@ def studies(incomplete: str) -> list[str]:
     return sorted([*_beginning(incomplete, _registered(STUDY)), *_beginning(incomplete, files)])
 
 
+CORRECTIONS = ("none", "feasible", "auto")
+
+
 def solvers(incomplete: str) -> list[str]:
     """Completes QP solvers, installed or not."""
     from vibench.qp.settings import SETTINGS

@@ -18,7 +18,7 @@ from typer import Argument, Option
 
 from vibench.cli import output_commands
 from vibench.cli.bench_command import bench_plugins
-from vibench.cli.completion import examples, names, solvers, studies, whole_words
+from vibench.cli.completion import CORRECTIONS, examples, names, solvers, studies, whole_words, words
 from vibench.cli.output_commands import draw_figures, export_qps, export_reduced_model, publish_runs, write_report
 from vibench.cli.pack_commands import import_pack, pack_problem, reduce_cones
 from vibench.cli.plugin_commands import check_plugin, list_plugins, new_plugin
@@ -81,6 +81,9 @@ def run_study_command(
     dual: Annotated[Names, Option(help="Replace the dual strategies.", autocompletion=names(DUAL))] = None,
     primal: Annotated[Names, Option(help="Replace the primal strategies.", autocompletion=names(PRIMAL))] = None,
     solver: Annotated[Names, Option(help="Replace the QP solvers.", autocompletion=solvers)] = None,
+    correction: Annotated[
+        Names, Option(help="Replace the corrections of solutions.", autocompletion=words(lambda: CORRECTIONS))
+    ] = None,
     pod_tol: Annotated[Tolerances, Option(help="Replace the tolerances (or sizes) of the POD.")] = None,
     dual_tol: Annotated[Tolerances, Option(help="Replace the tolerances (or sizes) of the dual strategies.")] = None,
     primal_tol: Annotated[Tolerances, Option(help="Replace the tolerances of the primal strategies.")] = None,
@@ -106,7 +109,7 @@ def run_study_command(
         from vibench.terminal.progress import ProgressDisplay
 
         overrides = {
-            "problem": problem, "dual": dual, "primal": primal, "solvers": solver,
+            "problem": problem, "dual": dual, "primal": primal, "solvers": solver, "correction": correction,
             "pod": pod_tol, "dual_tol": dual_tol, "primal_tol": primal_tol,
         }  # fmt: skip
         loaded = _study(study, cell, {axis: values for axis, values in overrides.items() if values})

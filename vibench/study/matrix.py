@@ -47,8 +47,8 @@ def read_study(request: str, overrides: Mapping[str, Sequence[Any]] | None = Non
     request
         Path of a TOML file, or the name of a registered study.
     overrides
-        Values that replace those of the file: of the axes "problem", "dual", "primal" and "solvers", and of the
-        tolerances "pod", "dual_tol" and "primal_tol" in every table. Empty sequences replace nothing.
+        Values that replace those of the file: of the axes "problem", "dual", "primal", "solvers" and "correction", and
+        of the tolerances "pod", "dual_tol" and "primal_tol" in every table. Empty sequences replace nothing.
 
     Raises
     ------
@@ -105,6 +105,7 @@ def _replace_axes(content: dict[str, Any], given: Mapping[str, list[Any]]) -> di
     for axis in ("problem", "dual", "primal", "solvers"):
         if axis in given:
             content[axis] = [entry for name in given[axis] for entry in _entries_in(content.get(axis), name)]
+    content |= {axis: given[axis] for axis in ("correction",) if axis in given}
     tables = content.get("tolerances")
     if isinstance(tables, list) and all(isinstance(table, dict) for table in tables):
         primal = content.get("primal")

@@ -12,7 +12,7 @@ import numpy as np
 
 from vibench.interfaces.strategies import Kind
 from vibench.results.break_even import break_even_rows
-from vibench.results.columns import CELLS, INTEGER, OUTPUTS, QUERIES, REAL, TEXT, TIMINGS, Column
+from vibench.results.columns import CELLS, HISTORY_KEYS, INTEGER, OUTPUTS, QUERIES, REAL, TEXT, TIMINGS, Column
 from vibench.results.database import ResultsDatabase
 from vibench.results.sqlite.reading import FILE
 
@@ -73,7 +73,7 @@ def _keys(problem: str, dual: str, primal: str, tolerance: float | None) -> Row:
     options = {f"{axis}_options": "{}" for axis in ("problem", "training", "dual", "primal")}
     own = {"problem": problem, "training": "own", "dual": dual, "primal": primal, "primal_tol": tolerance}
     stops = {"pod_tol": 1e-3, "pod_size": None, "dual_tol": 1e-2, "dual_size": None}
-    return options | own | stops | {"solver": "piqp", "accuracy": 1e-8, "assembly": "full"}
+    return options | own | stops | {"solver": "piqp", "accuracy": 1e-8, "assembly": "full", "correction": "none"}
 
 
 def _cell(key: str, keys: Row, kind: Kind, rng: np.random.Generator, *, failed: bool) -> Row:
@@ -97,7 +97,7 @@ def _query(cell: str, keys: Row, number: int, rng: np.random.Generator) -> Row:
 
 
 def _history(keys: Row, stage: str, quantity: str, number: int) -> list[Row]:
-    named = {name: keys[name] for name in keys if name not in ("solver", "accuracy", "assembly")}
+    named = {name: keys[name] for name in keys if name in HISTORY_KEYS}
     row = named | {"artefact": f"{stage}-{number}", "stage": stage, "quantity": quantity}
     return [row | {"step": step, "value": 10.0 ** (-0.5 * step)} for step in range(1, STEPS + 1)]
 

@@ -47,6 +47,7 @@ def completed(line: str) -> list[str]:
         ("vibench run quick --dual ", list(registered(DUAL))),
         ("vibench run quick --primal o", ["offline-pga", "online-supremizers"]),
         ("vibench run quick --solver ", sorted(SETTINGS)),
+        ("vibench run quick --correction ", ["auto", "feasible", "none"]),
         ("vibench check o", ["obstacle", "offline-pga", "online-supremizers", "orthant"]),
         ("vibench check sol", ["solver:"]),
         ("vibench check solver:p", ["solver:piqp", "solver:proxqp"]),

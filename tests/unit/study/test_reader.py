@@ -74,6 +74,8 @@ WRONG: Mapping[str, tuple[tuple[str | int, ...], Any, tuple[str, ...]]] = {
     "solvers one word": (("solvers",), "piqp", ("solvers", "'available'", "list", "'piqp'")),
     "solvers a number": (("solvers",), 3, ("solvers", "'available'", "list")),
     "solvers of numbers": (("solvers",), [3], ("solvers", "string")),
+    "correction unknown": (("correction",), ["all"], ("correction", "'none', 'feasible' or 'auto'", "'all'")),
+    "correction empty": (("correction",), [], ("correction", "at least 1")),
     "solver unknown": (("solvers",), ["pipq"], ("QP solver", "'pipq'", "did you mean 'piqp'")),
     "dual missing": (("dual",), REMOVE, ("dual", "required")),
     "dual empty": (("dual",), [], ("dual", "at least 1")),
@@ -258,10 +260,12 @@ def test_a_folder_does_not_hide_a_registered_study(tmp_path: Path, monkeypatch: 
 
 def test_overrides_replace_whole_axes(tmp_path: Path) -> None:
     given = {"dual": ["mcpg"], "primal": ["online-supremizers"], "solvers": ["proxqp"], "problem": ["obstacle"]}
+    given["correction"] = ["auto"]
     study = read_study(write_study(tmp_path), given)
     assert [entry.name for entry in study.dual] == ["mcpg"]
     assert [entry.name for entry in study.primal] == ["online-supremizers"]
     assert study.solver_names() == ["proxqp"]
+    assert study.correction == ["auto"]
 
 
 def test_overrides_keep_the_options_of_the_entry(tmp_path: Path) -> None:
