@@ -66,11 +66,12 @@ def solved(problem: AffineProblem, count: int) -> str:
         of_u = np.sqrt(e @ (vi.A @ e) / (size @ (vi.A @ size)))
         of_lam = np.sqrt(force @ factor.solve(force) / max(whole @ factor.solve(whole), np.finfo(float).tiny))
         errors.append((float(of_u), float(of_lam)))
-    return f"{name(problem)} {ok:4}/{count:<4} {np.max(errors, axis=0)[0]:8.1e} {np.max(errors, axis=0)[1]:8.1e} {seconds:8.3f}"
+    worst = np.max(errors, axis=0)
+    return f"{name(problem)} {ok:4}/{count:<4} {worst[0]:8.1e} {worst[1]:8.1e} {seconds:8.3f}"
 
 
 def compared(problem: AffineProblem, mus: Array) -> Iterator[tuple[str, float, float, float]]:
-    """Kind of a bound, bound, error, and the size that round-off is relative to; of all queries of a certified model."""
+    """Kind of a bound, bound, error, and the size that round-off is relative to, of a certified model at `mus`."""
     dual, primal = create("dual strategy", "mcpg"), create("primal strategy", "offline-pga")
     reduction = Reduction(problem, dual, primal, Stop(1e-4), Stop(1e-2), tolerance=0.5, assembly="certified")
     model, solver, kept, constants = reduction.model, HighFidelitySolver(problem), assemblies(problem), None
