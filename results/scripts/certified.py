@@ -1,4 +1,4 @@
-"""Results of the studies `certified` and `training`: effectivities, cost of a certificate, greedy and fixed training.
+"""Results of the studies `certified` and `training`: effectivities, costs, corrected solutions, greedy training.
 
 vibench run certified --no-figures && vibench run training --no-figures
 python results/scripts/certified.py runs/certified runs/training results/certified
@@ -14,7 +14,8 @@ from page import SECONDS, Page, machines, made_by, read, start
 
 from vibench.report.figures.looks import look_of
 from vibench.report.figures.style import Sheet, scatter, styled
-from vibench.study.cells import CERTIFIED
+from vibench.results import ranking
+from vibench.study.cells import CERTIFIED, FEASIBLE, UNCORRECTED
 from vibench.study.parameter_sets import OWN
 from vibench_problems.paper.published import PROBLEMS
 
@@ -40,7 +41,7 @@ MEASURED = ["error_u_mean", "error_u_max", "error_lambda_mean", "error_lambda_ma
 def effectivities(cells: pd.DataFrame, queries: pd.DataFrame) -> pd.DataFrame:
     """Median effectivities over the ok queries of every certified model, and the number of violations."""
     rows = []
-    for cell in cells[cells["assembly"] == CERTIFIED].to_dict("records"):
+    for cell in cells[(cells["assembly"] == CERTIFIED) & (cells["correction"] == UNCORRECTED)].to_dict("records"):
         mine = queries[(queries["cell"] == cell["cell"]) & (queries["status"] == "ok")]
         row = {name: cell[name] for name in [*MODEL, "certificate"]} | {"queries": len(mine)}
         for name, (u, lam) in BOUNDS.items():
@@ -51,7 +52,8 @@ def effectivities(cells: pd.DataFrame, queries: pd.DataFrame) -> pd.DataFrame:
 
 def costs(cells: pd.DataFrame) -> pd.DataFrame:
     """Seconds of a query with and without its certificate, and of what is prepared offline."""
-    without, with_one = (cells[cells["assembly"] == assembly].set_index(MODEL) for assembly in ("reduced", CERTIFIED))
+    plain = cells[cells["correction"] == UNCORRECTED]
+    without, with_one = (plain[plain["assembly"] == assembly].set_index(MODEL) for assembly in ("reduced", CERTIFIED))
     compared = pd.DataFrame(
         {
             "query without [ms]": 1e3 * without["online_s"],
@@ -64,6 +66,37 @@ def costs(cells: pd.DataFrame) -> pd.DataFrame:
         }
     )
     return compared.reset_index()
+
+
+def corrections(cells: pd.DataFrame, queries: pd.DataFrame) -> pd.DataFrame:
+    """Errors and seconds of every model, uncorrected, corrected at online cost, and corrected at high-fidelity cost.
+
+    Ratios are of errors of λ in W without correction and with it: medians over the queries.
+    """
+    ways = {"": ("reduced", UNCORRECTED), " online": (CERTIFIED, FEASIBLE), " in full": ("reduced", FEASIBLE)}
+    found = {name: cells[(cells["assembly"] == way[0]) & (cells["correction"] == way[1])] for name, way in ways.items()}
+    table = found[""][MODEL].set_index(MODEL)
+    for name, mine in found.items():
+        of_model = mine.set_index(MODEL)
+        table[f"error u{name}"], table[f"error λ{name}"] = of_model["error_u_mean"], of_model["error_lambda_mean"]
+        table[f"query{name} [ms]"] = 1e3 * of_model["online_s"]
+    for name in (" online", " in full"):
+        pairs = found[""].merge(found[name], on=MODEL, suffixes=("_without", "_with"))
+        for pair in pairs.to_dict("records"):
+            errors = [queries[queries["cell"] == pair[f"cell_{k}"]].set_index("query") for k in ("without", "with")]
+            ratio = errors[0]["error_lambda"] / errors[1]["error_lambda"]
+            where = tuple(pair[key] for key in MODEL)
+            table.loc[where, f"λ without / with{name}"] = ratio.median()
+            table.loc[where, f"ω > ρ{name}"] = (errors[1]["correction_share"] > 1.0).mean()
+    return table.reset_index()
+
+
+def cheapest(cells: pd.DataFrame) -> pd.DataFrame:
+    """The fastest model at every level of the mean error of λ."""
+    fastest = ranking.fastest(cells, ranking.errors_of_solution(cells, "lambda"))
+    fastest["query [ms]"] = 1e3 * fastest["online_s"]
+    names = [*MODEL, "assembly", "correction", "N", "R", "error_u_mean", "error_lambda_mean", "query [ms]"]
+    return fastest[["problem", ranking.BAND, *names[1:]]]
 
 
 def trainings(cells: pd.DataFrame) -> pd.DataFrame:
@@ -99,7 +132,7 @@ def equal_errors(cells: pd.DataFrame) -> pd.DataFrame:
 
 def figure(cells: pd.DataFrame, queries: pd.DataFrame) -> Figure:
     """Bounds against errors of all certified queries; on the grey line they are equal."""
-    certified = cells[cells["assembly"] == CERTIFIED]
+    certified = cells[(cells["assembly"] == CERTIFIED) & (cells["correction"] == UNCORRECTED)]
     problems = list(certified["problem"].unique())
     sheet = Sheet(2, len(problems), "bounds against errors, all queries of certified models")
     for column, problem in enumerate(problems):
@@ -139,6 +172,15 @@ def main(certified: str, training: str, target: str) -> None:
     with styled():
         page.draw("bounds", figure(cells, queries), "bounds against errors")
     page.section("Cost of a certificate", costs(cells).rename(columns=HEADINGS))
+    page.section(
+        "Corrected solutions",
+        "Relative mean errors and seconds of a query with its certificate and correction: of the reduced solution, of "
+        "the pair corrected at online cost, and of that corrected at high-fidelity cost. Medians of the ratios of "
+        "errors of λ in W, and the share of queries with ω > ρ.",
+        corrections(cells, queries).rename(columns=HEADINGS),
+        "The fastest model at every level of the mean error of λ:",
+        cheapest(cells).rename(columns=HEADINGS),
+    )
     page.section(
         "Greedy against fixed training",
         "The study `training`: relative errors over the validation set, reduced assembly.",

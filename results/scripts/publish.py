@@ -21,6 +21,7 @@ from vibench.report.site.publish import publish
 from vibench.results.columns import STORED
 from vibench.results.database import ResultsDatabase
 from vibench.results.sqlite.reading import FILE
+from vibench.study.cells import UNCORRECTED
 from vibench.study.matrix import expand, read_study
 
 RESULTS = Path(__file__).parents[1]
@@ -73,8 +74,9 @@ def rows(table: Path) -> list[dict[str, Any]]:
 
 
 def stored(table: str, row: dict[str, Any]) -> dict[str, Any]:
-    """The columns of a row that the results file has."""
-    return {name: value for name, value in row.items() if name in STORED[table]}
+    """The columns of a row that the results file has; cells of before there were corrections have none."""
+    uncorrected = {name: UNCORRECTED for name in ("correction",) if name in STORED[table]}
+    return uncorrected | {name: value for name, value in row.items() if name in STORED[table]}
 
 
 if __name__ == "__main__":

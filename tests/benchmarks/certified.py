@@ -3,8 +3,9 @@
 Usage: python tests/benchmarks/certified.py RUN [COUNT [PROBLEM]]
 
 For every certified cell of a run, or of one problem of it: bounds at COUNT random parameters (10000 by default) that
-the model has not seen, compared with high-fidelity solutions, which the models of a problem share. Every tenth query is
-timed.
+the model has not seen, compared with high-fidelity solutions, which the models of a problem share. The same of the
+corrected pairs, how many times more accurate λ is in W (at online cost, and at high-fidelity cost), and how often it is
+at all, in the queries where ω > ρ and in the others. Every tenth query is timed.
 
 Usage: python tests/benchmarks/certified.py --meshes [COUNT]
 
@@ -23,7 +24,6 @@ from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
-from vibench.library.models import Model
 
 import vibench
 from vibench import AffineProblem, Array, InnerProduct, ParameterBox
@@ -32,11 +32,14 @@ from vibench.highfidelity.active_set import HighFidelitySolution, HighFidelitySo
 from vibench.interfaces.strategies import Enrichment, Kind
 from vibench.model.affine import affine_decomposition
 from vibench.model.certificates.base import Guarantee, certificate_base
-from vibench.model.certificates.bounds import OnlineCertificate
+from vibench.model.certificates.bounds import OnlineBound, OnlineCertificate
 from vibench.model.certificates.preparation import prepare
+from vibench.model.error_bounds import CorrectionMode
 from vibench.model.galerkin import ReducedModel
 from vibench.model.hyperreduced import HyperReducedModel, hyper_reduce
 from vibench.offline.assemblies import Assemblies
+from vibench.offline.correction import Answer, Corrector
+from vibench.offline.models import Model
 from vibench.qp.solve import solve_qp
 from vibench.stages.query import VIOLATION
 from vibench.study.plugin import Plugin
@@ -61,7 +64,9 @@ class Tally:
     parameters, violations, without
         All parameters, those with an error above its bound, and those without a bound.
     effectivities, seconds
-        Of u and λ by parameter, and of the query and its certificate by timed parameter.
+        Of u and λ by parameter, and of the query, its certificate, and that with the correction, by timed parameter.
+    gains
+        Errors of λ in W over those of the corrected pairs at online and at high-fidelity cost, and whether ω > ρ.
     """
 
     row: Mapping[str, Any]
@@ -71,24 +76,41 @@ class Tally:
     violations: int = 0
     without: int = 0
     effectivities: list[tuple[float, float]] = field(default_factory=list)
-    seconds: list[tuple[float, float]] = field(default_factory=list)
+    seconds: list[tuple[float, float, float]] = field(default_factory=list)
+    gains: list[tuple[float, float, bool]] = field(default_factory=list)
 
     def query(self, kept: Assemblies, mu: Array, exact: HighFidelitySolution) -> None:
         """Compare the bounds at mu (d,) with the errors."""
-        solution, self.parameters = self.model.solve(mu), self.parameters + 1
+        solution, self.parameters = self.model.solve(mu, corrected=False), self.parameters + 1
         bound = solution.bound
         if bound is None or bound.guarantee is Guarantee.NONE or solution.x is None or solution.alpha is None:
             self.without += 1
             return
         if self.parameters % TIMED == 1:
             self.time(mu, solution.x, solution.alpha, solution.solution.cpu)
-        vi, energy = kept.at(mu), kept.energy_at(mu)
-        errors = energy.norm(exact.u - solution.u), energy.dual_norm(vi.B.T @ (exact.lam - solution.lam))
-        sizes = energy.norm(exact.u), energy.dual_norm(vi.B.T @ exact.lam)
-        bounds = bound.u_energy, bound.lambda_natural
-        pairs = zip(errors, bounds, sizes, strict=True)
-        self.violations += any(not error <= limit + VIOLATION * size for error, limit, size in pairs)
-        self.effectivities.append((bounds[0] / errors[0], bounds[1] / errors[1]))
+        errors = self.errors(kept, mu, exact, solution.answer, bound)
+        self.effectivities.append((bound.u_energy / errors[0], bound.lambda_natural / errors[1]))
+        own = solution.x, solution.alpha, solution.u, solution.lam
+        pairs = [
+            Corrector(self.model.reduced, certificate, CorrectionMode.FEASIBLE).answer(mu, *own)
+            for certificate in (self.certificate, None)
+        ]
+        if all(pair.is_corrected for pair in pairs):
+            online, in_full = (self.errors(kept, mu, exact, pair, pair.bound)[2] for pair in pairs)
+            self.gains.append((errors[2] / online, errors[2] / in_full, bound.omega > bound.rho))
+
+    def errors(
+        self, kept: Assemblies, mu: Array, exact: HighFidelitySolution, answer: Answer, bound: OnlineBound | None
+    ) -> tuple[float, ...]:
+        """Errors of u in the energy norm, and of λ in the natural norm and in W; counts an answer that is above one."""
+        vi, energy, W = kept.at(mu), kept.energy_at(mu), self.model.problem.W
+        pairs = (exact.u - answer.u, exact.lam - answer.lam), (exact.u, exact.lam)
+        errors, sizes = ((energy.norm(u), energy.dual_norm(vi.B.T @ lam), float(W.norm(lam))) for u, lam in pairs)
+        if bound is not None:
+            limits = bound.u_energy, bound.lambda_natural, bound.lam
+            above = zip(errors, limits, sizes, strict=True)
+            self.violations += any(not error <= limit + VIOLATION * size for error, limit, size in above)
+        return errors
 
     def time(self, mu: Array, x: Array, alpha: Array, solved: float) -> None:
         """Seconds of the assembly and the solution, of which `solved` are known, and of the certificate, at mu (d,)."""
@@ -97,11 +119,14 @@ class Tally:
         middle = time.process_time_ns()
         self.certificate.evaluate(self.model.problem, mu, reduced, x, alpha)
         end = time.process_time_ns()
-        self.seconds.append((1e-9 * (middle - start) + solved, 1e-9 * (end - middle)))
+        self.certificate.certify(self.model.problem, mu, reduced, x, alpha)
+        corrected = time.process_time_ns()
+        self.seconds.append((1e-9 * (middle - start) + solved, 1e-9 * (end - middle), 1e-9 * (corrected - end)))
 
     def __str__(self) -> str:
         """One line."""
-        (of_u, of_lam), (query, certify) = np.median(self.effectivities, axis=0), 1e3 * np.median(self.seconds, axis=0)
+        of_u, of_lam = np.median(self.effectivities, axis=0)
+        query, certify, correct = 1e3 * np.median(self.seconds, axis=0)
         least = np.min(self.effectivities, axis=0)
         training, primal, size = (self.row[name] for name in ("training", "primal", "snapshots"))
         return (
@@ -109,8 +134,23 @@ class Tally:
             f"{self.certificate.base.guarantee.value}: {self.parameters} parameters, "
             f"{self.violations} violations, {self.without} without a bound; effectivity of u {of_u:.2f} (least "
             f"{least[0]:.4f}), of λ {of_lam:.2f} (least {least[1]:.4f}); query {query:.2f} ms, certificate "
-            f"{certify:.2f} ms"
+            f"{certify:.2f} ms, with correction {correct:.2f} ms{self.corrected}"
         )
+
+    @property
+    def corrected(self) -> str:
+        """How much more accurate corrected pairs are."""
+        gains, texts = np.array(self.gains), []
+        where = (lambda gain: gain[:, 2] >= 0.0, lambda gain: gain[:, 2] == 1.0, lambda gain: gain[:, 2] == 0.0)
+        for which, chosen_of in zip(("all", "ω > ρ", "ω ≤ ρ"), where, strict=True) if len(gains) else ():
+            chosen = chosen_of(gains)
+            if chosen.any():
+                (online, in_full, _), better = np.median(gains[chosen], axis=0), np.mean(gains[chosen, 0] > 1.0)
+                texts.append(
+                    f"{which}: {chosen.sum()} queries, error of λ in W divided by {online:.2f} online and "
+                    f"{in_full:.2f} in full (medians), smaller online in {100.0 * better:.0f} %"
+                )
+        return "".join(f"\n    corrected, {text}" for text in texts)
 
 
 def main(run: str, count: int, only: str = "") -> int:

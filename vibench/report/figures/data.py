@@ -200,9 +200,10 @@ def by_strategy(rows: pd.DataFrame) -> Iterator[tuple[str, pd.DataFrame]]:
 CORRECTED = {"none": "", "feasible": "corrected", "auto": "corrected where ω > ρ"}
 
 
-def way(assembly: str, correction: str) -> str:
-    """How queries are assembled and corrected; "" in full and not at all."""
-    return ", ".join(filter(None, ("" if assembly == "full" else assembly, CORRECTED.get(correction, correction))))
+def way(assembly: Any, correction: Any) -> str:
+    """How queries are assembled and corrected; "" in full and not at all, or where that is missing."""
+    parts = ("" if assembly == "full" else assembly, CORRECTED.get(correction, correction))
+    return ", ".join(part for part in parts if isinstance(part, str) and part)
 
 
 def series(name: Any, tolerance: Any = None, way: str = "") -> Series:
