@@ -34,6 +34,26 @@ settings.register_profile("explore", deadline=None, print_blob=True)
 settings.load_profile("same")
 
 
+LONGEST = (
+    "test_executors", "test_run", "test_docs", "test_figures", "test_interruptions", "test_scaffold",
+    "test_conformance", "test_export", "test_html_in_browser", "test_other_codes", "test_own_classes",
+    "test_as_published", "test_faults",
+    "test_supervisor", "test_machines", "test_timing", "test_results_folder", "test_example_rope",
+)  # fmt: skip
+"""Files that take longest, though some have few tests: parallel workers begin with them, so that all end together."""
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Let pytest-xdist, where it is, keep the order of the files; of its own it would begin with the most tests."""
+    config.option.loadscopereorder = False
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Put the longest files first."""
+    places = {name: place for place, name in enumerate(LONGEST)}
+    items.sort(key=lambda item: places.get(item.path.stem, len(places)))
+
+
 @pytest.fixture(scope="session", autouse=True)
 def one_thread() -> Iterator[None]:
     """BLAS on one thread, as in workers: on several, products of this size spend twice the CPU seconds on waiting.

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from running import Main, refused, rows
+from running import Main, Vibench, refused, rows
 
 from vibench.cli import scaffold
 from vibench.errors import RequestError
@@ -36,12 +36,18 @@ Run = Callable[..., "subprocess.CompletedProcess[str]"]
 
 
 @pytest.fixture(scope="module")
-def installed(written: dict[str, Path], tmp_path_factory: pytest.TempPathFactory) -> Run:
-    """Function that runs Python where the new packages are installed, and not their sources but their wheels."""
-    site = tmp_path_factory.mktemp("site")
+def site(written: dict[str, Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Where the new packages are installed, and not their sources but their wheels."""
+    folder = tmp_path_factory.mktemp("site")
     pip = ["-m", "pip", "install", "--quiet", "--disable-pip-version-check", "--no-index", "--no-deps"]
-    build = [*pip, "--no-build-isolation", "--target", str(site), *map(str, written.values())]
+    build = [*pip, "--no-build-isolation", "--target", str(folder), *map(str, written.values())]
     subprocess.run([sys.executable, *build], check=True, capture_output=True, text=True)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def installed(site: Path) -> Run:
+    """Function that runs Python where the new packages are installed."""
 
     def run(*arguments: str, folder: Path) -> subprocess.CompletedProcess[str]:
         environment = os.environ | {"PYTHONPATH": str(site)}
@@ -49,9 +55,6 @@ def installed(written: dict[str, Path], tmp_path_factory: pytest.TempPathFactory
         return subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=False)
 
     return run
-
-
-COMMAND = ("-c", "from vibench.cli import start; start()")
 
 
 def test_the_tests_of_new_packages_are_green(written: dict[str, Path], installed: Run, tmp_path: Path) -> None:
@@ -72,10 +75,10 @@ def test_new_plugins_pass_their_checks_as_they_are(installed: Run, tmp_path: Pat
     assert done.stdout.count("passed, 0 failed, 0 skipped") == len(NAMES)
 
 
-def test_new_plugins_give_rows_without_an_edit(installed: Run, tmp_path: Path) -> None:
+def test_new_plugins_give_rows_without_an_edit(vibench: Vibench, site: Path, tmp_path: Path) -> None:
     axes = ["--problem", "my-rope", "--dual", "cone", "--primal", "tied", "--primal-tol", "0.5"]
     axes += ["--solver", "for-rope"]
-    done = installed(*COMMAND, "run", "quick", *axes, "--out", "out", "--jobs", "1", "--no-figures", folder=tmp_path)
+    done = vibench(tmp_path, "run", "quick", *axes, "--out", "out", "--jobs", "1", plugins=site)
     assert done.returncode == 0, done.stdout + done.stderr
     (row,) = rows(tmp_path / "out")
     assert (row["status"], row["queries_ok"]) == ("ok", row["queries"])
