@@ -102,8 +102,8 @@ FAULTS = (
     Fault(
         "coefficientwise-constraint-dropped",
         "vibench/reduction/cone_parts.py",
-        "B=np.vstack([-np.eye(count), generators[support]]),\n"
-        "        g=np.concatenate([np.zeros(count), theta[support]]),",
+        "B=np.vstack([-np.eye(count), units[:, None] * generators[support]]),\n"
+        "        g=np.concatenate([np.zeros(count), units * theta[support]]),",
         "B=-np.eye(count),\n        g=np.zeros(count),",
         ("tests/mathematics/strategies",),
     ),
@@ -400,6 +400,27 @@ FAULTS = (
         "rho = bound.rho + (0.5 * (gamma - alpha_A) * norm + middle * eta) / sqrt(alpha_A)",
         "rho = bound.rho + middle * eta / sqrt(alpha_A)",
         ("tests/unit/model/certificates/test_bounds.py",),
+    ),
+    Fault(
+        "auto-corrects-all",
+        "vibench/model/error_bounds.py",
+        "(self is CorrectionMode.AUTO and omega > rho)",
+        "self is CorrectionMode.AUTO",
+        ("tests/unit/offline/test_correction.py",),
+    ),
+    Fault(
+        "bounds-of-the-uncorrected-solution",
+        "vibench/offline/correction.py",
+        "return Answer(v, correction.nu, correction.bound, is_corrected=True, share=share)",
+        "return Answer(v, correction.nu, bound, is_corrected=True, share=share)",
+        ("tests/unit/offline/test_correction.py",),
+    ),
+    Fault(
+        "exported-pair-without-the-loss-of-spectral-bounds",
+        "vibench/library/reduced_model_certificate.py",
+        "rho += (0.5 * (upper - lower) + missed) / sqrt(lower) * norm",
+        "rho += missed / sqrt(lower) * norm",
+        ("tests/unit/library/test_export.py",),
     ),
     Fault(
         "proof-without-round-off",

@@ -51,6 +51,7 @@ def test_every_answer_of_a_corrected_cell_is_feasible_and_no_error_is_above_its_
         assert len(bound) == len(rows) // (1 + name.startswith("online"))
         assert (rows.loc[bound.index, error] <= bound * (1.0 + 1e-9)).all(), name
     assert (corrected.cells["bound_online_violations"].dropna() == 0.0).all()
+    assert (rows["bound_online_omega"].dropna() == 0.0).all()
     at_mesh = rows.index.get_level_values("assembly") == "reduced"
     assert (rows["bound_omega"][at_mesh] <= 1e-9 * plain["bound_omega"].max()).all()
     obstacle = rows.loc[("obstacle", 1e-4)]["error_lambda"] / plain.loc[("obstacle", 1e-4)]["error_lambda"]
