@@ -6,7 +6,7 @@ import contextlib
 import fcntl
 import os
 import platform
-import tempfile
+import secrets
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TextIO
@@ -23,12 +23,14 @@ PART = ".part"
 def write_atomically(path: Path, content: bytes, *, durable: bool = False) -> None:
     """Write a file under a random name in the same folder and rename it; a link under its name is replaced.
 
-    `durable` content is on the disk when the function returns.
+    Who may read it is decided by the user's mask, as of files that other programs write. `durable` content is on the
+    disk when the function returns.
 
     Raises an `OSError` if it cannot be written; nothing is left behind.
     """
-    handle, name = tempfile.mkstemp(dir=path.parent, prefix=TEMPORARY, suffix=PART)
-    part = Path(name)
+    part = path.parent / f"{TEMPORARY}{secrets.token_hex(8)}{PART}"
+    flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
+    handle = os.open(part, flags, 0o666)
     try:
         with os.fdopen(handle, "wb") as file:
             file.write(content)

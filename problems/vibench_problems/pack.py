@@ -28,6 +28,7 @@ class Pack(Problem):
         # Declared by classes of other problems; here by what the folder holds.
         self.constant, self.entrywise = pack.constant, pack.entrywise  # type: ignore[misc]
         self.affine = pack.affine
+        self.licence = pack.manifest.license or "unknown"
 
     @classmethod
     def data_digest(cls, **options: Any) -> str:

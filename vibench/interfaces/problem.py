@@ -211,6 +211,8 @@ class Problem(ABC):
     """
     entrywise: ClassVar[frozenset[str]] = frozenset()
     """Members that `sampler` evaluates entry by entry."""
+    licence: str = ""
+    """Licence of the data that the problem is made of, "unknown" if it is; "" where that of its distribution holds."""
     requires: ClassVar[tuple[str, ...]] = ()
     """Optional distributions it cannot do without; where one is not installed its cells are unavailable."""
 

@@ -294,7 +294,7 @@ def _about(model: Model, members: Mapping[str, AffinePolynomial]) -> dict[str, A
         },
         "cell": {name: _plain(row[name]) for name in RECORDED if name in row},
         "exported_by": f"vibench {distribution_version('vibench')}",
-        "source": {"distribution": origin, "licence": _licence(origin.partition(" ")[0])},
+        "source": {"distribution": origin, "licence": model.problem.licence or _licence(origin.partition(" ")[0])},
     }
 
 

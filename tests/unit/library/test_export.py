@@ -379,6 +379,15 @@ def test_parameters_outside_the_box_are_warned_of_and_wrong_ones_refused(run: vi
             exported.solve(wrong)
 
 
+def test_the_licence_of_a_problem_with_data_of_its_own_is_theirs(
+    run: vibench.Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    model = model_of(run, "obstacle")
+    monkeypatch.setattr(type(model.problem), "licence", "CC-BY-4.0")
+    export_model(model, tmp_path / "model.npz", tolerance=1e-6, bases=False)
+    assert Exported(tmp_path / "model.npz").about["source"]["licence"] == "CC-BY-4.0"
+
+
 def test_what_a_file_says(run: vibench.Run, tmp_path: Path) -> None:
     model = model_of(run, "obstacle")
     export_model(model, tmp_path / "model.npz", tolerance=1e-6, bases=False)

@@ -58,6 +58,12 @@ def test_an_affine_pack_is_the_problem_anywhere_in_the_box(tmp_path: Path) -> No
     assert np.array_equal(pack.contact, np.arange(SIZE))
 
 
+@pytest.mark.parametrize(("given", "licence"), [({}, "unknown"), ({"license": "CC-BY-4.0"}, "CC-BY-4.0")])
+def test_the_licence_of_a_pack_is_that_of_its_manifest(tmp_path: Path, given: dict[str, str], licence: str) -> None:
+    pack_with(tmp_path / "pack", manifest() | given)
+    assert create("problem", "pack", {"path": str(tmp_path / "pack")}).licence == licence
+
+
 def test_the_problem_of_a_pack_conforms(tmp_path: Path) -> None:
     folder, content = write_cable(tmp_path / "pack"), manifest()
     del content["parameters"]["validation"]
