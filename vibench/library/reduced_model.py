@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 FORMAT = "vibench reduced model 1"
+DEGREE = 2**20
 
 
 class Solution(NamedTuple):
@@ -44,11 +45,25 @@ class Model:
             if "format" not in data or str(data["format"]) != FORMAT:
                 raise ValueError(f"'{file}' is no {FORMAT}")
             self.data = {name: data[name] for name in data.files}
+        self._check(str(file))
         self.about: dict[str, Any] = json.loads(str(self.data["about"]))
         self.lower, self.upper = self.data["lower"], self.data["upper"]
         self.solver = solver or self.about["solver"]
         if self.solver not in SOLVERS:
             raise ValueError(f"the solver is '{self.solver}', expected one of {', '.join(SOLVERS)}")
+
+    def _check(self, file: str) -> None:
+        """Refuse indices that are none, which NumPy would count from the end, and arrays that do not fit them."""
+        lower = self.data.get("lower", np.zeros(0))
+        for name in [key.removesuffix("_indices") for key in self.data if key.endswith("_indices")]:
+            of = [self.data.get(f"{name}_{part}", np.zeros(0)) for part in ("indices", "coefficients", "terms")]
+            fits = [array.ndim for array in of] == [2, 2, 2] and of[0].shape == (len(of[1]), lower.size)
+            whole = fits and of[0].size and of[0].dtype.kind in "iu" and 0 <= of[0].min() <= of[0].max() <= DEGREE
+            if not whole or of[1].shape[1] != len(of[2]):
+                raise ValueError(
+                    f"'{file}' is damaged: the arrays of {name} are no polynomial in {lower.size} variables"
+                )
+            self.data[f"{name}_indices"] = of[0].astype(np.int64)
 
     def program(self, mu: Sequence[float] | Array) -> tuple[Array, Array, Array, Array, Array]:
         """A, f, B, g at a parameter, and the coordinates Y of their unknowns in the basis; warns outside the box."""

@@ -99,7 +99,7 @@ class ArrayFiles:
                 matrix = self._matrix(stored)
                 if 1 not in matrix.shape:
                     raise RequestError(f"a sparse matrix {size_of(matrix.shape)}; expected a dense array")
-                self._take(8 * max(matrix.shape))
+                self.take(8 * max(matrix.shape))
                 stored = matrix.toarray()
             return self._real(stored, infinite)
 
@@ -188,7 +188,7 @@ class ArrayFiles:
         count = int(np.prod([int(length) for length in shape], dtype=object)) if shape else 1
         if count * dtype.itemsize > size:
             raise RequestError(f"the array {size_of(shape)} is larger than its file: it is damaged or cut off")
-        self._take(count * dtype.itemsize)
+        self.take(count * dtype.itemsize)
         flat = np.frombuffer(file.read(count * dtype.itemsize), dtype, count)
         return flat.reshape(shape, order="F" if fortran else "C")
 
@@ -201,12 +201,12 @@ class ArrayFiles:
             if field == "complex":
                 raise RequestError("it holds complex numbers; expected real ones")
             # the text, the indices and values that it becomes, and the pointers
-            self._take(entries * (LINE // 4 + 24) + 8 * min(rows, columns) + 16 * max(rows, columns))
+            self.take(entries * (LINE // 4 + 24) + 8 * min(rows, columns) + 16 * max(rows, columns))
             text = head + file.read(entries * LINE + 1)
             if len(text) > entries * LINE + COMMENTS:
                 raise RequestError(f"the Matrix Market file is longer than the {entries} entries that it declares")
         matrix = scipy.io.mmread(io.BytesIO(text))
-        return np.asarray(matrix) if layout == "array" else sp.csr_array(matrix)
+        return np.asarray(matrix) if layout == "array" else _checked(sp.csr_array(matrix))
 
     def _hdf5(self, path: Path, inner: str) -> Any:
         try:
@@ -236,7 +236,7 @@ class ArrayFiles:
             raise RequestError("the dataset refers to other files; a pack holds its arrays itself")
         if dataset.dtype.kind not in "biufcS" or dataset.shape is None:
             raise RequestError(f"it holds values of type {dataset.dtype}; expected numbers")
-        self._take(dataset.size * dataset.dtype.itemsize)
+        self.take(dataset.size * dataset.dtype.itemsize)
         return np.asarray(dataset[()])
 
     def _matrix(self, stored: Any) -> SparseMatrix:
@@ -249,36 +249,39 @@ class ArrayFiles:
                 f"it has the arrays {', '.join(sorted(stored)) or 'none'}; a sparse matrix has data and shape, and "
                 "either row and col, or indices and indptr"
             )
-        rows, columns = (int(length) for length in np.ravel(stored["shape"]))
+        rows, columns = whole(stored["shape"], "shape", 0, np.iinfo(np.int64).max, 2).tolist()
+        self.take(8 * (rows + columns))
         data = self._real(np.ravel(stored["data"]))
         if not compressed:
             return self._from_triplets(stored, data, rows, columns)
-        column_wise = "csc" in str(np.ravel(stored.get("format", "csr"))[0])
-        kind, long, short = (sp.csc_array, columns, rows) if column_wise else (sp.csr_array, rows, columns)
-        indices, pointers = np.ravel(stored["indices"]), np.ravel(stored["indptr"])
+        written = np.ravel(stored.get("format", b"csr")).tolist()
+        if written not in ([b"csr"], [b"csc"]):
+            raise RequestError(f"its format is {written}; expected 'csr' or 'csc'")
+        kind, long, short = (sp.csc_array, columns, rows) if written == [b"csc"] else (sp.csr_array, rows, columns)
+        pointers = whole(stored["indptr"], "indptr", 0, len(data), long + 1)
         fits = f"the shape {size_of((rows, columns))} and the {len(data)} values"
-        if len(pointers) != long + 1 or pointers[0] != 0 or pointers[-1] > len(data) or np.any(np.diff(pointers) < 0):
+        if pointers[0] != 0 or np.any(np.diff(pointers) < 0):
             raise RequestError(f"indptr does not fit {fits}")
         used = int(pointers[-1])  # SciPy may have allocated more
-        indices, data = indices[:used], data[:used]
-        if len(indices) != used or (used and not 0 <= indices.min() <= indices.max() < short):
-            raise RequestError(f"indices do not fit {fits}")
-        return kind((data, indices, pointers), shape=(rows, columns))
+        indices = np.ravel(stored["indices"])[:used]
+        try:
+            indices = whole(indices, "indices", 0, short - 1, used)
+        except RequestError as error:
+            raise RequestError(f"indices do not fit {fits}: {error}") from None
+        return _checked(kind((data[:used], indices, pointers), shape=(rows, columns)))
 
     def _from_triplets(self, stored: Any, data: Array, rows: int, columns: int) -> SparseMatrix:
         i, j = np.ravel(stored["row"]), np.ravel(stored["col"])
         if not len(i) == len(j) == len(data):
             raise RequestError(f"row, col and data have {len(i)}, {len(j)} and {len(data)} entries")
-        self._take(16 * len(data) + 8 * rows)
+        self.take(16 * len(data))
         places = (self._based(i, rows), self._based(j, columns))
-        return sp.csr_array(sp.coo_array((data, places), shape=(rows, columns)))
+        return _checked(sp.csr_array(sp.coo_array((data, places), shape=(rows, columns))))
 
-    def _based(self, values: Array, count: int) -> Indices:
-        low, high = self._base, self._base + count - 1
-        if np.any(values != np.round(values)):
-            raise RequestError("it has values that are no whole numbers; expected indices")
+    def _based(self, values: Any, count: int) -> Indices:
+        values, low, high = whole(values, "it"), self._base, self._base + count - 1
         if len(values) and (values.min() < low or values.max() > high):
-            fault = f"it has indices from {values.min():.0f} to {values.max():.0f}; expected {low} to {high}"
+            fault = f"it has indices from {values.min()} to {values.max()}; expected {low} to {high}"
             other = 1 - self._base
             if other <= values.min() and values.max() <= other + count - 1:
                 fault += f": they count from {other}, so the manifest needs index_base = {other}"
@@ -296,13 +299,33 @@ class ArrayFiles:
             raise RequestError(f"{wrong} of its entries are not finite ({allowed})")
         return np.asarray(values, dtype=float)
 
-    def _take(self, count: int) -> None:
+    def take(self, count: int) -> None:
+        """Count bytes that are about to be taken; a `RequestError` if they are more than are left."""
         self._left -= count
         if self._left < 0:
             needed, limit = (self._limit - self._left) / 2**30, self._limit / 2**30
             raise RequestError(
                 f"too big for memory: the arrays of the pack take {needed:.3g} GiB, {limit:.3g} GiB are allowed"
             )
+
+
+def whole(values: Any, what: str, low: int = -(2**62), high: int = 2**62, count: int | None = None) -> Indices:
+    """Whole numbers of any type as int64; compiled code checks neither types nor ranges of indices."""
+    values = np.ravel(values)
+    if values.dtype.kind not in "iuf" or np.any(values != np.round(values)):
+        raise RequestError(f"{what} has values that are no whole numbers; expected indices")
+    if count is not None and len(values) != count:
+        raise RequestError(f"{what} has {len(values)} entries; expected {count}")
+    least, most = (int(values.min()), int(values.max())) if len(values) else (low, low)
+    if len(values) and not low <= least <= most <= high:
+        raise RequestError(f"{what} has values from {least} to {most}; expected {low} to {high}")
+    return np.asarray(values, dtype=np.int64)
+
+
+def _checked(matrix: SparseMatrix) -> SparseMatrix:
+    """A matrix whose indices SciPy has checked one by one; what is wrong raises a ValueError."""
+    matrix.check_format(full_check=True)
+    return matrix
 
 
 def size_of(shape: Any) -> str:

@@ -21,7 +21,7 @@ from vibench.interfaces.outputs import Output
 from vibench.interfaces.problem import MEMBERS, ParameterBox, without_infinities
 from vibench.linalg.inner_product import InnerProduct
 from vibench.packs import manifest as schema
-from vibench.packs.array_files import ArrayFiles, memory_limit, safe_path, size_of
+from vibench.packs.array_files import ArrayFiles, memory_limit, safe_path, size_of, whole
 from vibench.packs.manifest import FILE, Manifest, read_manifest
 from vibench.packs.pack import Listing, ModelPack, PackMember, PackMesh, PackSolutions, TabulatedTheta
 
@@ -273,9 +273,10 @@ class PackReader:
         try:
             mesh = meshio.read(path)
             points = np.asarray(mesh.points, float)[:, :2].T
-            triangles = np.asarray(mesh.get_cells_type("triangle"), np.intp).reshape(-1, 3).T
+            triangles = np.asarray(mesh.get_cells_type("triangle")).reshape(-1, 3)
         except (Exception, SystemExit) as error:  # noqa: BLE001  meshio raises anything, and exits, for damaged files
             raise RequestError(f"mesh.file: '{given.file}' cannot be read: {type(error).__name__}") from None
+        corners = whole(triangles, f"mesh.file: the triangles of '{given.file}'", 0, points.shape[1] - 1)
         drawn = self._files.indices(given.points, "mesh.points", points.shape[1])
         unknowns = np.arange(n) if given.unknowns is None else self._unknowns(given.unknowns)
         self._expect("mesh.points", drawn, (len(unknowns),))
@@ -283,7 +284,7 @@ class PackReader:
         positions = positions[:, None] if positions.ndim == 1 else positions
         if positions.shape not in ((m, 1), (m, 2)):
             raise RequestError(f"mesh.positions: an array {size_of(positions.shape)}; expected {m}×1 or {m}×2")
-        return PackMesh(points, triangles, drawn, unknowns, positions.T, given.value, given.multiplier)
+        return PackMesh(points, corners.reshape(-1, 3).T, drawn, unknowns, positions.T, given.value, given.multiplier)
 
     def _unknowns(self, reference: str) -> Indices:
         """Unknowns of the pack that are named by their numbers in the files."""
