@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import math
 import operator
+import unicodedata
 import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -37,6 +38,24 @@ DEEPEST = 200
 """Levels of an expression; a sum has as many as terms."""
 
 
+def normal_names(names: Iterable[str]) -> tuple[str, ...]:
+    """Names of parameters in the Unicode form NFKC, in which the micro sign is a μ; names in expressions have it, too.
+
+    Raises
+    ------
+    RequestError
+        If two names are the same then, or one is that of a constant or function of expressions.
+    """
+    normal = tuple(unicodedata.normalize("NFKC", name) for name in names)
+    if len(set(normal)) < len(normal):
+        raise RequestError(f"two parameters have the same name: {', '.join(normal)}")
+    for name in normal:
+        if name in CONSTANTS or name in FUNCTIONS:
+            kind = "constant" if name in CONSTANTS else "function"
+            raise RequestError(f"'{name}' is a {kind} of expressions; give the parameter another name")
+    return normal
+
+
 @dataclass(frozen=True)
 class Expression:
     """An arithmetic expression in the parameters, such as "scale**2 * sin(pi * x)"; `parse` makes one."""
@@ -49,10 +68,12 @@ class Expression:
     def parse(cls, text: str, names: Sequence[str]) -> Expression:
         """Check an expression.
 
-        Raises a `RequestError` if it is not arithmetic on numbers, `names`, `CONSTANTS` and `FUNCTIONS`.
+        Raises a `RequestError` if it is not arithmetic on numbers, `names`, `CONSTANTS` and `FUNCTIONS`, or for what
+        `normal_names` refuses.
         """
+        names = normal_names(names)
         _check(_tree(text), text, names)
-        return cls(text, tuple(names))
+        return cls(text, names)
 
     def __call__(self, mu: Iterable[float]) -> float:
         """The value at mu (d,).

@@ -37,8 +37,8 @@ UNREADABLE = (
 """What NumPy, SciPy, zipfile and h5py raise for damaged files."""
 
 
-def safe_path(folder: Path, name: str, *, is_folder: bool = False) -> Path:
-    """Path of a file in a folder, or of a folder in it.
+def safe_path(folder: Path, name: str) -> Path:
+    """Path of a file in a folder.
 
     Raises
     ------
@@ -46,7 +46,7 @@ def safe_path(folder: Path, name: str, *, is_folder: bool = False) -> Path:
         If the name leads elsewhere, there is no such file, or it is a link or no regular file.
     """
     parts = PurePosixPath(name).parts
-    if not (parts or is_folder) or name.startswith("/") or ".." in parts or "\\" in name or "\0" in name:
+    if not parts or name.startswith("/") or ".." in parts or "\\" in name or "\0" in name:
         raise RequestError(f"'{name}' is not the name of a file inside the pack's folder")
     path = folder
     mode = folder.stat().st_mode
@@ -59,8 +59,8 @@ def safe_path(folder: Path, name: str, *, is_folder: bool = False) -> Path:
     except OSError as error:
         where = "does not exist" if isinstance(error, FileNotFoundError) else f"cannot be read: {error.strerror}"
         raise RequestError(f"the file '{name}' {where}") from None
-    if not (stat.S_ISDIR(mode) if is_folder else stat.S_ISREG(mode)):
-        raise RequestError(f"'{name}' is not a {'folder' if is_folder else 'regular file'}")
+    if not stat.S_ISREG(mode):
+        raise RequestError(f"'{name}' is not a regular file")
     return path
 
 

@@ -11,6 +11,7 @@ from annotated_types import Ge, Gt, MinLen
 from pydantic import AllowInfNan, BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from vibench.errors import RequestError, fault_line
+from vibench.interfaces.expressions import normal_names
 from vibench.packs.array_files import safe_path
 
 FILE = "pack.toml"
@@ -236,8 +237,10 @@ def _check_parameters(given: Parameters) -> None:
     for name in given.names:
         if not name.isidentifier():
             raise RequestError(f"parameters.names: '{name}' cannot stand in expressions; use letters, digits and _")
-    if len(set(given.names)) < len(given.names):
-        raise RequestError(f"parameters.names: two parameters have the same name: {', '.join(given.names)}")
+    try:
+        normal_names(given.names)
+    except RequestError as error:
+        raise RequestError(f"parameters.names: {error}") from None
     for key in ("units", "lower", "upper"):
         values = getattr(given, key)
         if values is not None and len(values) != len(given.names):

@@ -54,6 +54,19 @@ class Listing:
             raise NumericalError(f"the pack has arrays at its listed parameters only; mu = {mu.tolist()} is not listed")
         return nearest
 
+    def repeated(self) -> tuple[int, int] | None:
+        """Numbers of two listed parameters that count as the same, if there are any."""
+        from scipy.spatial import KDTree  # noqa: PLC0415  slow to import
+
+        places = (self.parameters - self.parameters.min(axis=0)) / self.widths
+        _, first, number = np.unique(places, axis=0, return_index=True, return_inverse=True)
+        if len(first) < len(places):  # of equal points a tree would find all pairs
+            again = int(np.setdiff1d(np.arange(len(places)), first)[0])
+            return int(first[number.ravel()[again]]), again
+        away, nearest = KDTree(places).query(places, k=2, p=np.inf)
+        k = int(away[:, 1].argmin())
+        return (k, int(nearest[k, 1])) if away[k, 1] <= SAME_RTOL else None
+
 
 @dataclass(frozen=True)
 class TabulatedTheta:

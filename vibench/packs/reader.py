@@ -8,7 +8,7 @@ import os
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from functools import lru_cache, partial
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,7 +16,7 @@ import scipy.sparse as sp
 
 from vibench.arrays import Array, Indices
 from vibench.errors import NumericalError, RequestError
-from vibench.interfaces.expressions import Expression
+from vibench.interfaces.expressions import Expression, normal_names
 from vibench.interfaces.outputs import Output
 from vibench.interfaces.problem import MEMBERS, ParameterBox, without_infinities
 from vibench.linalg.inner_product import InnerProduct
@@ -36,25 +36,24 @@ def pack_digest(path: str | Path) -> str:
     """
     content = hashlib.sha256()
     with naming(path) as folder:
-        for place, reference in (("manifest", FILE), *read_manifest(folder).references()):
-            for file in _files(folder, place, reference.partition(":")[0]):
+        manifest = read_manifest(folder)
+        for place, reference in (("manifest", FILE), *manifest.references()):
+            for file in _files(folder, place, reference.partition(":")[0], manifest.index_base):
                 state = file.stat()
                 content.update(_file_digest(file, state.st_size, state.st_mtime_ns, state.st_ino))
     return content.hexdigest()[:16]
 
 
-def _files(folder: Path, place: str, name: str) -> list[Path]:
-    """The files of a name; all of those that a {} in it numbers."""
+def _files(folder: Path, place: str, name: str, first: int) -> list[Path]:
+    """The files of a name; for `each`, those that a {} in it numbers from the first one, as far as there are any."""
+    numbered = "{}" in name and place.endswith(".each")
     try:
-        if "{}" not in name:
-            return [safe_path(folder, name)]
-        before, _, after = name.partition("{}")
-        parent = PurePosixPath(before + "x").parent.as_posix()
-        files = safe_path(folder, parent, is_folder=True).iterdir()
-        names = (each.relative_to(folder).as_posix() for each in files)
-        return [safe_path(folder, each) for each in sorted(names) if each.startswith(before) and each.endswith(after)]
+        files = [safe_path(folder, name.replace("{}", str(first)) if numbered else name)]
+        while numbered and os.path.lexists(folder / (each := name.replace("{}", str(first + len(files))))):
+            files.append(safe_path(folder, each))
     except RequestError as error:
         raise RequestError(f"{place}: {error}") from None
+    return files
 
 
 @lru_cache(maxsize=10_000)
@@ -86,7 +85,7 @@ class PackReader:
     def __init__(self, folder: Path, manifest: Manifest) -> None:
         self._folder, self._manifest = folder, manifest
         self._files = ArrayFiles(folder, manifest.index_base, memory_limit())
-        self._names = tuple(manifest.parameters.names)
+        self._names = normal_names(manifest.parameters.names)
         self._box: ParameterBox | None = None  # where its bounds are given
         self._free: Indices | None = None
 
@@ -108,6 +107,7 @@ class PackReader:
                 "parameters.validation: required, since arrays or tables are given at listed parameters only"
             )
         if not all(member.everywhere for member in members.values()):
+            _refuse_repeated(self._listing, "parameters.training and parameters.validation together")
             box = replace(box, listed=self._listed)
         return ModelPack(
             self._manifest, box, training, validation, V, W, members, self._contact(members, n),
@@ -129,6 +129,9 @@ class PackReader:
             self._listed = np.vstack([training, validation])
         box = self._box or ParameterBox(self._names, self._listed.min(axis=0), self._listed.max(axis=0), units)
         self._listing, self._training = Listing(self._listed, box.widths), len(training)
+        _refuse_repeated(Listing(training, box.widths), "parameters.training")
+        if validation is not None:
+            _refuse_repeated(Listing(validation, box.widths), "parameters.validation")
         return training, validation, box
 
     def _parameters(self, given: schema.PointSet, what: str) -> Array:
@@ -315,6 +318,13 @@ class PackReader:
         elif self._free is None and self._manifest.operators is not None and max(array.shape) > max(shape):
             hint = "; if it has the Dirichlet unknowns, too, leave them out, or name the free ones in spaces.free"
         raise RequestError(f"{what}: {size_of(array.shape)}; expected {'×'.join(map(str, shape))}{hint}")
+
+
+def _refuse_repeated(listing: Listing, what: str) -> None:
+    """Refuse a parameter that is listed twice: of its arrays one would be used, whatever is in the other."""
+    if repeated := listing.repeated():
+        i, j = sorted(repeated)
+        raise RequestError(f"{what}: the points {i} and {j} are the same, {listing.parameters[i].tolist()}")
 
 
 def one_triangle(matrix: Any, what: str) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 from pathlib import Path
 from typing import Any
+from unicodedata import normalize
 
 import numpy as np
 
@@ -40,13 +41,13 @@ class File(Sampling):
             if self.path.suffix != ".csv":
                 raise RequestError(f"'{self.path}' is neither a .csv nor a .npy file")
             head, *lines = self.path.read_text(encoding="utf-8-sig").strip().splitlines() or [""]
-            names = [name.strip() for name in head.split(",")]
-            if sorted(names) != sorted(box.names):
+            names, known = ([normalize("NFKC", name.strip()) for name in row] for row in (head.split(","), box.names))
+            if sorted(names) != sorted(known):
                 raise RequestError(f"'{self.path}' has the columns {', '.join(names)}; expected {', '.join(box.names)}")
             rows = [[float(value) for value in line.split(",")] for line in lines]
             if any(len(row) != box.dim for row in rows):
                 raise RequestError(f"'{self.path}' has a row without {box.dim} values")
-            return np.array(rows).reshape(-1, box.dim)[:, [names.index(name) for name in box.names]]
+            return np.array(rows).reshape(-1, box.dim)[:, [names.index(name) for name in known]]
         except (OSError, ValueError) as error:
             raise RequestError(f"'{self.path}' cannot be read: {error}") from None
 

@@ -64,6 +64,17 @@ simple("unknown table", "no key is called 'operatorz'; did you mean 'operators'"
 simple("number for a name", "spaces.X_V: Input should be a valid string", "spaces", "X_V", to=3)
 simple("index base 2", "index_base: Input should be 0 or 1", "index_base", to=2)
 simple("same names", "two parameters have the same name: load, load", "parameters", "names", to=["load", "load"])
+simple("name of a constant", "'e' is a constant of expressions; give the", "parameters", "names", to=["load", "e"])
+simple("name of a function", "'max' is a function of expressions", "parameters", "names", to=["max", "depth"])
+simple("micro and mu", "two parameters have the same name: μ, μ", "parameters", "names", to=["\u00b5", "\u03bc"])
+simple(
+    "a point twice", r"training: the points 0 and 2 are the same, \[4.0, 0.2\]", "parameters", "training",
+    to=[[4.0, 0.2], [6.0, 0.2], [4.0, 0.2]],
+)  # fmt: skip
+simple(
+    "a point nearly twice", "validation: the points 0 and 1 are the same", "parameters", "validation",
+    to=[[5.0, 0.2], [5.0 + 1e-9, 0.2], [6.0, 0.3]],
+)  # fmt: skip
 simple("name with a hyphen", "'my-load' cannot stand in expressions", "parameters", "names", to=["my-load", "depth"])
 simple("units", "parameters.units has 1 entries for 2 parameters", "parameters", "units", to=["m"])
 simple("bounds", "lower bound 9 of 'load' is above its upper bound 8", "parameters", "lower", to=[9.0, 0.1])
@@ -174,6 +185,13 @@ def no_manifest(content: Content, cable: Cable, folder: Path) -> None:
 @mistake("not valid TOML")
 def no_toml(content: Content, cable: Cable, folder: Path) -> None:
     later(folder, lambda folder: (folder / "pack.toml").write_text("format = \n"))
+
+
+@mistake("together: the points 1 and 4 are the same")
+def a_point_that_is_trained_and_validated(content: Content, cable: Cable, folder: Path) -> None:
+    content["parameters"]["validation"][1] = [6.0, 0.2]
+    content["operators"]["g"] = {"each": "g.npz"}
+    later(folder, lambda folder: np.savez(folder / "g.npz", g=np.ones((SIZE, 5))))
 
 
 @mistake("parameters.validation: required, since arrays")

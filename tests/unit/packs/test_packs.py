@@ -23,6 +23,7 @@ from vibench.interfaces.validation import checked_assembly
 from vibench.packs import writer
 from vibench.packs.checks import read_model_pack
 from vibench.packs.pack import ModelPack, reduce_multipliers
+from vibench.packs.reader import pack_digest
 from vibench.study.kinds import PROBLEM
 from vibench.study.plugin import Plugin
 from vibench.study.registry import create, find
@@ -352,3 +353,42 @@ def test_a_mesh_gives_pictures(tmp_path: Path) -> None:
     (folder / "mesh.vtu").write_text("<VTKFile>")
     with pytest.raises(RequestError, match=r"mesh.file: 'mesh.vtu' cannot be read"):
         read_model_pack(folder)
+
+
+@pytest.mark.parametrize("where", ["m/{}/A.npz", "m{}/{}.npz", "A-{}.npz"])
+def test_the_digest_has_every_file_of_a_numbered_name(where: str, tmp_path: Path) -> None:
+    folder, content = write_cable(tmp_path / "pack"), manifest()
+    content["operators"]["A"] = {"each": where}
+    write_manifest(folder, content)
+    files = [folder / where.replace("{}", str(k)) for k in range(5)]
+    for file in files:
+        file.parent.mkdir(parents=True, exist_ok=True)
+        sp.save_npz(file, Cable().A)
+    before = pack_digest(folder)
+    for file in files:
+        sp.save_npz(file, 2.0 * Cable().A)
+        assert pack_digest(folder) != before
+        before = pack_digest(folder)
+
+
+def test_a_file_whose_name_has_brackets_is_one_file(tmp_path: Path) -> None:
+    folder, content = write_cable(tmp_path / "pack"), manifest()
+    content["operators"]["A"] = "A{}.npz"
+    write_manifest(folder, content)
+    sp.save_npz(folder / "A{}.npz", Cable().A)
+    before = pack_digest(folder)
+    read_model_pack(folder)
+    sp.save_npz(folder / "A{}.npz", 2.0 * Cable().A)
+    assert pack_digest(folder) != before
+
+
+@pytest.mark.parametrize("written", ["\u00b5", "\u03bc"])
+@pytest.mark.parametrize("named", ["\u00b5", "\u03bc"])
+def test_the_micro_sign_and_mu_are_one_name(named: str, written: str, tmp_path: Path) -> None:
+    folder, content = write_cable(tmp_path / "pack"), manifest()
+    content["parameters"]["names"][0] = named
+    content["operators"]["f"]["affine"][0]["theta"] = f"-{written}"
+    write_manifest(folder, content)
+    pack = read_model_pack(folder)
+    assert pack.box.names == ("\u03bc", "depth")
+    assert np.array_equal(pack.at(MU).f, -MU[0] * Cable().mass)
