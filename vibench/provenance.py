@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import os
 import platform
 import sys
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 SOLVER_DISTRIBUTIONS = {"highs": "highspy", "proxqp": "proxsuite"}
 """Distributions of the solvers that are not called like their solver."""
@@ -22,8 +23,22 @@ def machine() -> str:
     if info.is_file():
         models = [line.split(":", 1)[1].strip() for line in info.read_text().splitlines() if "model name" in line]
         processor = models[0] if models else processor
-    memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30
-    return f"{processor}, {cores()} cores, {memory:.0f} GiB, {platform.system()} {platform.machine()}"
+    return f"{processor}, {cores()} cores, {memory() / 2**30:.0f} GiB, {platform.system()} {platform.machine()}"
+
+
+def memory(groups: Path = Path("/proc/self/cgroup"), root: Path = Path("/sys/fs/cgroup")) -> int:
+    """Bytes of memory that this process may use: those of the machine, or what its control groups (v2, v1) allow."""
+    amounts = [int(os.sysconf("SC_PAGE_SIZE")) * int(os.sysconf("SC_PHYS_PAGES"))]
+    for line in groups.read_text().splitlines() if groups.is_file() else ():
+        _, controllers, name = line.split(":", 2)
+        if controllers and "memory" not in controllers.split(","):
+            continue
+        top, limit = (root / "memory", "memory.limit_in_bytes") if controllers else (root, "memory.max")
+        inside = PurePosixPath(name.lstrip("/"))
+        for group in (inside, *inside.parents):  # every group above limits, too; "." is the top, as in a container
+            with contextlib.suppress(OSError, ValueError):  # no such file, or "max"
+                amounts.append(int((top / group / limit).read_text()))
+    return min(amounts)
 
 
 def cores() -> int:

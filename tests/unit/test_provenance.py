@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.metadata
+import os
 import platform
 import shutil
 from collections.abc import Callable, Iterator
@@ -22,6 +23,25 @@ from vibench.provenance import (
     versions,
 )
 from vibench.qp.settings import SETTINGS
+
+
+@pytest.mark.parametrize(
+    ("groups", "file", "limit"),
+    [
+        ("0::/\n", "memory.max", "123456789\n"),
+        ("0::/user/one.scope\n", "user/memory.max", "123456789\n"),
+        ("3:cpu,memory:/docker/ab\n1:cpu:/x\n0::/\n", "memory/docker/ab/memory.limit_in_bytes", "123456789\n"),
+        ("3:memory:/docker/ab\n", "memory/memory.limit_in_bytes", "123456789\n"),
+    ],
+)
+def test_memory_is_what_control_groups_allow(groups: str, file: str, limit: str, tmp_path: Path) -> None:
+    (tmp_path / "groups").write_text(groups)
+    (tmp_path / file).parent.mkdir(parents=True, exist_ok=True)
+    machine = provenance.memory(tmp_path / "groups", tmp_path)
+    assert machine == os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    for text, expected in ((limit, 123456789), ("max\n", machine), (f"{2**63 - 4096}\n", machine)):
+        (tmp_path / file).write_text(text)
+        assert provenance.memory(tmp_path / "groups", tmp_path) == expected
 
 
 def test_the_machine_is_named_with_cores_memory_and_system() -> None:

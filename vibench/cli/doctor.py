@@ -14,6 +14,7 @@ from contextlib import closing
 from dataclasses import dataclass
 from enum import StrEnum
 from importlib.metadata import requires
+from math import inf
 from pathlib import Path
 
 import numpy as np
@@ -188,7 +189,7 @@ def check_machine() -> Iterator[Diagnosis]:
     yield Diagnosis("processor", provenance.machine())
     info = Path("/proc/meminfo")
     available = re.search(r"MemAvailable:\s*(\d+) kB", info.read_text()) if info.is_file() else None
-    free = int(available[1]) / 2**20 if available else os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30
+    free = min(int(available[1]) / 2**20 if available else inf, provenance.memory() / 2**30)
     yield Diagnosis("free memory", f"{free:.1f} GiB", _note_if(free < MIN_GIB))
     for pool in threadpool_info():
         name = f"{pool['internal_api']} {pool.get('version') or ''}".strip()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import gzip
 import io
-import os
+import math
 import resource
 import stat
 import struct
@@ -21,6 +21,7 @@ import scipy.sparse as sp
 
 from vibench.arrays import Array, Indices, SparseMatrix
 from vibench.errors import RequestError, message_of, unknown_name
+from vibench.provenance import memory
 
 FORMATS = (".npz", ".npy", ".mtx", ".mtx.gz", ".h5", ".hdf5")
 
@@ -66,9 +67,8 @@ def safe_path(folder: Path, name: str) -> Path:
 
 def memory_limit() -> int:
     """Bytes that the arrays of a pack may take: half of the memory of the machine, or of the limit of the process."""
-    physical = int(os.sysconf("SC_PAGE_SIZE")) * int(os.sysconf("SC_PHYS_PAGES"))
     limit = resource.getrlimit(resource.RLIMIT_AS)[0]
-    return (physical if limit == resource.RLIM_INFINITY else min(physical, limit)) // 2
+    return (memory() if limit == resource.RLIM_INFINITY else min(memory(), limit)) // 2
 
 
 class ArrayFiles:
@@ -185,27 +185,33 @@ class ArrayFiles:
             raise RequestError("it holds Python objects (a pickle), which are not loaded; save numbers")
         if dtype.kind not in "biufcS":
             raise RequestError(f"it holds values of type {dtype}; expected numbers")
-        count = int(np.prod([int(length) for length in shape], dtype=object)) if shape else 1
+        if min(shape, default=0) < 0:
+            raise RequestError(f"its shape {size_of(shape)} is negative: it is damaged")
+        count = math.prod(map(int, shape))
         if count * dtype.itemsize > size:
             raise RequestError(f"the array {size_of(shape)} is larger than its file: it is damaged or cut off")
-        self.take(count * dtype.itemsize)
+        self.take(_bytes(count, dtype))
         flat = np.frombuffer(file.read(count * dtype.itemsize), dtype, count)
         return flat.reshape(shape, order="F" if fortran else "C")
 
     def _matrix_market(self, path: Path) -> Any:
         with gzip.open(path) if path.suffix == ".gz" else path.open("rb") as file:
             head = file.read(COMMENTS)
-            rows, columns, entries, layout, field, _ = scipy.io.mminfo(io.BytesIO(head))
+            rows, columns, entries, layout, field, symmetry = scipy.io.mminfo(io.BytesIO(head))
             if field == "pattern":
                 raise RequestError("the Matrix Market file has the field 'pattern', it holds no values")
             if field == "complex":
                 raise RequestError("it holds complex numbers; expected real ones")
-            # the text, the indices and values that it becomes, and the pointers
-            self.take(entries * (LINE // 4 + 24) + 8 * min(rows, columns) + 16 * max(rows, columns))
-            text = head + file.read(entries * LINE + 1)
+            if min(rows, columns, entries) < 0:
+                raise RequestError(f"the Matrix Market file declares {entries} entries of {rows}×{columns}")
+            # indices and values as triplets and as rows, and the pointers; what is read as text is given back
+            self.take((40 + 40 * (symmetry != "general")) * entries + 8 * min(rows, columns) + 16 * max(rows, columns))
+            text = head + file.read(min(entries * LINE, self._left) + 1)
             if len(text) > entries * LINE + COMMENTS:
                 raise RequestError(f"the Matrix Market file is longer than the {entries} entries that it declares")
+        self.take(len(text))
         matrix = scipy.io.mmread(io.BytesIO(text))
+        self._left += len(text)
         return np.asarray(matrix) if layout == "array" else _checked(sp.csr_array(matrix))
 
     def _hdf5(self, path: Path, inner: str) -> Any:
@@ -236,7 +242,7 @@ class ArrayFiles:
             raise RequestError("the dataset refers to other files; a pack holds its arrays itself")
         if dataset.dtype.kind not in "biufcS" or dataset.shape is None:
             raise RequestError(f"it holds values of type {dataset.dtype}; expected numbers")
-        self.take(dataset.size * dataset.dtype.itemsize)
+        self.take(_bytes(dataset.size, dataset.dtype))
         return np.asarray(dataset[()])
 
     def _matrix(self, stored: Any) -> SparseMatrix:
@@ -320,6 +326,11 @@ def whole(values: Any, what: str, low: int = -(2**62), high: int = 2**62, count:
     if len(values) and not low <= least <= most <= high:
         raise RequestError(f"{what} has values from {least} to {most}; expected {low} to {high}")
     return np.asarray(values, dtype=np.int64)
+
+
+def _bytes(count: int, dtype: np.dtype[Any]) -> int:
+    """Bytes of an array as it is stored, and as the doubles or 64-bit integers that it becomes."""
+    return int(count * (dtype.itemsize + 8 * (dtype != np.float64)))
 
 
 def _checked(matrix: SparseMatrix) -> SparseMatrix:

@@ -17,6 +17,9 @@ from vibench.packs.array_files import safe_path
 FILE = "pack.toml"
 """Name of the manifest in its folder."""
 
+LARGEST = 2**24
+"""Most bytes of the manifest."""
+
 VERSION = 1
 """Version of the format that is read and written."""
 
@@ -211,6 +214,8 @@ def read_manifest(folder: Path) -> Manifest:
         Naming the key, what is wrong with it, and what is expected.
     """
     path = safe_path(folder, FILE)
+    if (size := path.stat().st_size) > LARGEST:
+        raise RequestError(f"{FILE} has {size} bytes, at most {LARGEST} are read; write points to an array")
     try:
         content = tomllib.loads(path.read_text(encoding="utf-8"))
     except OSError as error:

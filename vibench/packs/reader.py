@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
+import math
 import os
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
@@ -139,6 +140,7 @@ class PackReader:
         if given.grid is not None and box is not None:
             if len(given.grid) != d:
                 raise RequestError(f"{what}.grid has {len(given.grid)} counts for {d} parameters")
+            self._files.take(8 * (2 * d + 1) * math.prod(given.grid) + 8 * sum(given.grid))
             return box.grid(*given.grid)
         if given.array is not None:
             mus = self._files.dense(given.array, what)

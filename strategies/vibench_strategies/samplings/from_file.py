@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from pathlib import Path
+from stat import S_ISDIR, S_ISREG
 from typing import Any
 from unicodedata import normalize
 
@@ -34,7 +35,8 @@ class File(Sampling):
         _read(self.path)
         try:
             if self.path.suffix == ".npy":
-                points: Array = np.load(self.path, allow_pickle=False)
+                with np.errstate(over="raise"):  # of the size that a header declares; it is that of the file at most
+                    points: Array = np.array(np.lib.format.open_memmap(self.path, mode="r"))
                 if points.dtype.kind not in "fiu":
                     raise RequestError(f"'{self.path}' holds values of the type {points.dtype}; expected real numbers")
                 return points[:, None] if points.ndim == 1 and box.dim == 1 else points
@@ -48,12 +50,15 @@ class File(Sampling):
             if any(len(row) != box.dim for row in rows):
                 raise RequestError(f"'{self.path}' has a row without {box.dim} values")
             return np.array(rows).reshape(-1, box.dim)[:, [names.index(name) for name in known]]
-        except (OSError, ValueError) as error:
+        except (OSError, ValueError, ArithmeticError, MemoryError) as error:
             raise RequestError(f"'{self.path}' cannot be read: {error}") from None
 
 
 def _read(path: Path) -> bytes:
     try:
+        mode = path.stat().st_mode
+        if not (S_ISREG(mode) or S_ISDIR(mode)):  # of a pipe or a device there is no end
+            raise RequestError(f"'{path}' cannot be read: it is no regular file")
         return path.read_bytes()
     except OSError as error:
         raise RequestError(f"'{path}' cannot be read: {error.strerror}") from None

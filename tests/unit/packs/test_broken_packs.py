@@ -255,6 +255,46 @@ def lying_header(content: Content, cable: Cable, folder: Path) -> None:
     later(folder, lie)
 
 
+def write_header(folder: Path, shape: tuple[int, ...], content: bytes) -> None:
+    """An array in a compressed file whose header says what it likes."""
+    header = io.BytesIO()
+    np.lib.format.write_array_header_1_0(header, {"descr": "<f8", "fortran_order": False, "shape": shape})
+    with zipfile.ZipFile(folder / "vectors.npz", "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("mass.npy", header.getvalue() + content)
+
+
+@mistake("its shape -1 is negative")
+def negative_shape(content: Content, cable: Cable, folder: Path) -> None:
+    later(folder, lambda folder: write_header(folder, (-1,), bytes(2**25)))
+
+
+@mistake("its shape -3×-4 is negative")
+def negative_shape_of_positive_size(content: Content, cable: Cable, folder: Path) -> None:
+    later(folder, lambda folder: write_header(folder, (-3, -4), bytes(96)))
+
+
+@mistake("operators.f.affine.0: too big for memory")
+def bytes_that_become_doubles(content: Content, cable: Cable, folder: Path) -> None:
+    later(folder, lambda folder: np.savez_compressed(folder / "vectors.npz", mass=np.ones(3 * 2**20, np.int8)))
+
+
+@mistake("operators.A: too big for memory")
+def padded_text(content: Content, cable: Cable, folder: Path) -> None:
+    content["operators"]["A"] = "A.mtx.gz"
+    head, line = b"%%MatrixMarket matrix coordinate real general\n12 12 110000\n", b"1 1 1.0" + b" " * 120 + b"\n"
+    later(folder, lambda folder: (folder / "A.mtx.gz").write_bytes(gzip.compress(head + 110_000 * line, 1)))
+
+
+simple("grid of a billion points", "pack': too big for memory", "parameters", "training", to={"grid": [10**6, 10**6]})
+simple("grid beyond int64", "too big for memory: the arrays of the pack take .*e", "parameters", "training",
+       to={"grid": [10**18, 10**18]})  # fmt: skip
+
+
+@mistake("has .* bytes, at most 16777216 are read")
+def manifest_without_end(content: Content, cable: Cable, folder: Path) -> None:
+    later(folder, lambda folder: os.truncate(folder / "pack.toml", 2**40))
+
+
 @mistake("is longer than the 1 entries that it declares")
 def gzip_bomb(content: Content, cable: Cable, folder: Path) -> None:
     content["operators"]["A"] = "A.mtx.gz"

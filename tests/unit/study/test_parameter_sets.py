@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -12,6 +14,7 @@ from packs import Cable, manifest, write_cable, write_manifest
 from samples import STUDY, changed, write_study
 
 from vibench.errors import RequestError
+from vibench.interfaces.problem import ParameterBox
 from vibench.study.cells import Cell
 from vibench.study.matrix import expand, read_study, study_of_cell
 from vibench.study.parameter_sets import OWN_TRAINING, ParameterSet, parameters_of
@@ -82,6 +85,32 @@ def test_a_file_is_beside_the_study_and_its_content_is_part_of_the_code(
     np.save(tmp_path / "points.npy", np.array([[0.9, 0.0, 0.0]]))
     content = changed(STUDY, "training", to={"name": "file", "options": {"path": "points.npy"}})
     assert len(cells_of(content, tmp_path)) == len(cells_of(STUDY, tmp_path))
+
+
+def test_a_pipe_and_a_device_hold_no_points(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe.csv")
+    for path in ("pipe.csv", "/dev/zero"):  # reading them would not end
+        content = changed(STUDY, "training", to={"name": "file", "path": path})
+        with pytest.raises(RequestError, match="cannot be read: it is no regular file"):
+            cells_of(content, tmp_path)
+
+
+@pytest.mark.parametrize("shape", [(-1, 3), (2**40, 3), (2**62, 2**62), (0, 3)])
+def test_an_array_of_points_is_no_larger_than_its_file(shape: tuple[int, ...], tmp_path: Path) -> None:
+    with (tmp_path / "points.npy").open("wb") as file:
+        np.lib.format.write_array_header_1_0(file, {"descr": "<f8", "fortran_order": False, "shape": shape})
+        file.write(bytes(48))
+    content = changed(STUDY, "training", to={"name": "file", "path": "points.npy"})
+    with pytest.raises(RequestError, match=r"points.npy' cannot be read|shape \(0, 3\)"):
+        cells_of(content, tmp_path)
+
+
+def test_the_columns_of_a_file_are_compared_as_names_in_expressions_are(tmp_path: Path) -> None:
+    (tmp_path / "points.csv").write_text("\u00b5\n0.5\n", encoding="utf-8")
+    box = ParameterBox(("\u03bc",), np.zeros(1), np.ones(1), ("1",))
+    assert plugin("file", json.dumps({"path": str(tmp_path / "points.csv")})).create().parameters(box).tolist() == [
+        [0.5]
+    ]
 
 
 BAD: dict[str, tuple[tuple[str, Any], list[str]]] = {
