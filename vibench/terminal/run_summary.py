@@ -32,7 +32,7 @@ def print_summary(study: str, path: Path, rows: Rows) -> None:
     elif len(cells):
         echo(table.view.empty)
     not_ok = [row for row in rows if row["status"] != Status.OK]
-    echo(*failures(not_ok))
+    echo(*failures(rows, run_argument(path.parent)))
     echo(f"{len(rows)} cells, {len(rows) - len(not_ok)} ok, {len(not_ok)} not ok")
     violations = invariants.violations(queries, cells.set_index("cell")["enrichment_kind"])
     for violation in violations[:REASONS]:
@@ -45,11 +45,16 @@ def print_summary(study: str, path: Path, rows: Rows) -> None:
         echo(agreement)
 
 
-def failures(not_ok: Rows) -> Iterator[str]:
-    """A line for every reason why cells are not ok; reasons that differ in their numbers alone are one."""
+def failures(rows: Rows, run: str) -> Iterator[str]:
+    """A line for every reason why cells are not ok; reasons that differ in their numbers alone are one.
+
+    A solver that has missed its accuracy has a remedy: those that are ok on the same model, or the command, with the
+    run as its argument, that tries them.
+    """
     groups: dict[tuple[str, str], list[Mapping[str, Any]]] = {}
-    for row in not_ok:
-        groups.setdefault(kind_of_failure(row), []).append(row)
+    for row in rows:
+        if row["status"] != Status.OK:
+            groups.setdefault(kind_of_failure(row), []).append(row)
     ranked = sorted(groups.values(), key=len, reverse=True)
     for group in ranked[:REASONS]:
         first = group[0]
@@ -59,9 +64,16 @@ def failures(not_ok: Rows) -> Iterator[str]:
             continue
         which = f"the first is {first['cell']}, " if len(group) > 1 else f"{first['cell']}, "
         queries = f"{first['queries_ok']} of {first['queries']} queries ok"
-        yield f"{count}{first['status']}: {which}{formats.name_of_cell(first)}: {queries}; {first['reason']}"
+        remedy = _remedy(first, rows, run) if first["status"] == Status.INACCURATE else ""
+        yield f"{count}{first['status']}: {which}{formats.name_of_cell(first)}: {queries}; {first['reason']}{remedy}"
     if others := sum(map(len, ranked[REASONS:])):
         yield f"{others} cells not ok for {len(ranked) - REASONS} other reasons"
+
+
+def _remedy(cell: Mapping[str, Any], rows: Rows, run: str) -> str:
+    same = [row for row in rows if all(row[name] == cell[name] for name in ("model", "accuracy", "correction"))]
+    fine = sorted({row["solver"] for row in same if row["status"] == Status.OK})
+    return f"; ok with {', '.join(fine)}" if fine else f"; `vibench replay {run} {cell['cell']}` tries other solvers"
 
 
 def reasons(rows: Rows) -> str:

@@ -28,12 +28,25 @@ def row(cell: str, reason: str, status: str = "inaccurate", **more: Any) -> dict
 
 def test_reasons_that_differ_in_their_numbers_alone_are_one_line() -> None:
     rows = [row(f"c{k}", f"{k} of 16 queries, first mu=({k}.5, -1e-0{k}): gap residual {k}.1e-07") for k in range(1, 9)]
-    (line,) = failures(rows)
+    (line,) = failures(rows, "runs/a")
     assert line.startswith("8 cells inaccurate: the first is c1, ")
 
 
+def test_a_missed_accuracy_has_a_remedy() -> None:
+    """Solvers that are ok on the same model at the same accuracy; where there are none, the command that finds one."""
+    missed = row("c1", "dual residual 3.5e-09", model="m")
+    others = [
+        row("c2", "", "ok", model="m", solver="quadprog"), row("c3", "", "ok", model="m", solver="proxqp"),
+        row("c4", "", "ok", model="other", solver="piqp"), row("c5", "", "ok", model="m", solver="scs", accuracy=1e-3),
+    ]  # fmt: skip
+    (line,) = failures([missed, *others], "runs/a")
+    assert line.endswith("dual residual 3.5e-09; ok with proxqp, quadprog")
+    (line,) = failures([missed, *others[2:]], "runs/a")
+    assert line.endswith("dual residual 3.5e-09; `vibench replay runs/a c1` tries other solvers")
+
+
 def test_a_cell_is_named_by_all_its_axes() -> None:
-    (line,) = failures([row("c1", "broke", "error")])
+    (line,) = failures([row("c1", "broke", "error")], "runs/a")
     assert (
         line == "error: c1, box (text) · cpg · pga 0.5 · 0.001, R=4 · osqp 1e-08 · reduced: 15 of 16 queries ok; broke"
     )
@@ -41,13 +54,13 @@ def test_a_cell_is_named_by_all_its_axes() -> None:
 
 def test_what_is_not_installed_is_said_once_with_the_command_that_installs_it() -> None:
     rows = [row(f"c{k}", "the QP solver 'ecos' is not installed: `pip install ecos`", "unavailable") for k in range(24)]
-    (line,) = failures(rows)
+    (line,) = failures(rows, "runs/a")
     assert line == "24 cells unavailable: the QP solver 'ecos' is not installed: `pip install ecos`"
 
 
 def test_never_more_lines_than_reasons_that_matter() -> None:
     rows = [row(f"c{k}", "a" * k, "error") for k in range(1000)]
-    lines = list(failures(rows))
+    lines = list(failures(rows, "runs/a"))
     assert len(lines) == REASONS + 1
     assert lines[-1] == f"{1000 - REASONS} cells not ok for {1000 - REASONS} other reasons"
 
