@@ -17,6 +17,9 @@ from vibench.model.galerkin import ReducedModel
 from vibench.model.hyperreduced import HyperReducedModel
 from vibench.offline.assemblies import Assemblies, assemblies
 
+NO_PAIR = "the certificate found a correction, but no multiplier ν ≥ 0 that belongs to it"
+"""Why a solution that has a bound at online cost has no corrected pair."""
+
 
 class Answer(NamedTuple):
     """u (n,) and λ (m,), whether they are the corrected pair, and why they are not although that is asked for, or "".
@@ -85,7 +88,8 @@ class Corrector:
             asked = self.mode is not CorrectionMode.NONE and (
                 share is None or self.mode.applies(bound.omega, bound.rho)
             )
-            return Answer(u, lam, bound, share=share, note=(bound.note or NO_CORRECTION) if asked else "")
+            why = bound.note if bound.guarantee is Guarantee.NONE else NO_PAIR
+            return Answer(u, lam, bound, share=share, note=why if asked else "")
         v = certificate.corrected(u, correction, contact_unknowns(problem))
         return Answer(v, correction.nu, correction.bound, is_corrected=True, share=share)
 

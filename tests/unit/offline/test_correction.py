@@ -11,10 +11,11 @@ from samples import small_study
 
 import vibench
 from vibench.interfaces.validation import validation_parameters
+from vibench.model.certificates.bounds import OnlineCertificate
 from vibench.model.error_bounds import NO_CORRECTION, NOT_IN_CONE, CorrectionMode
 from vibench.offline import correction as module
 from vibench.offline.assemblies import assemblies
-from vibench.offline.correction import Corrector
+from vibench.offline.correction import NO_PAIR, Corrector
 
 PROBLEMS = [
     {"name": "obstacle", "options": {"resolution": "coarse"}},
@@ -120,3 +121,11 @@ def test_a_query_that_cannot_be_corrected_says_why(corrected: vibench.Run, monke
     assert corrector.in_full(mu, u, lam - 1.0)._replace(u=u, lam=lam) == (u, lam, None, False, None, NOT_IN_CONE)
     monkeypatch.setattr(module, "corrected_pair", lambda *_: None)
     assert corrector.in_full(mu, u, lam).note == NO_CORRECTION
+    model = corrected.model(corrected.cells.set_index("assembly").loc["certified", "cell"].iloc[0])
+    solution = model.solve(model.parameters.sample(1, seed=3)[0], corrected=False)
+    corrector = Corrector(model.reduced, model.certificate, CorrectionMode.FEASIBLE)
+    monkeypatch.setattr(OnlineCertificate, "_corrected_pair", lambda *_: None)
+    answer = corrector.answer(solution.mu, solution.x, solution.alpha, solution.u, solution.lam)
+    assert not answer.is_corrected
+    assert answer.bound == solution.bound
+    assert answer.note == NO_PAIR

@@ -233,7 +233,7 @@ class OnlineCertificate:
         if found is None:  # the best of all w
             on_contact, uncertain = self.contact_basis @ y, float(np.linalg.norm(y)) * self._round_off
             best = find_contact_correction(self.compliance, contact, on_contact, uncertain, lam, middle)
-            if best is None:
+            if best is None or best.nu is None:
                 return None
             found, eta = (best.nu, best.norm, best.gap), best.eta
         nu, norm, gap = found

@@ -68,6 +68,7 @@ class ContactCorrection:
         λᵀ(B w − s) ≥ 0.
     nu, gap
         ν ≥ 0 (m,) with γ c = Bᵀ(ν − λ), and νᵀ(B w − s) ≥ 0, which is zero but for round-off where w is the best one.
+        ν is `None` for a w that holds dependent rows as equalities, with forces that pull: no such ν is known.
     eta
         Where there are equalities, another w' satisfies B w' ≥ s, with ‖w' − w‖ at most this; the others are of w'.
     """
@@ -76,7 +77,7 @@ class ContactCorrection:
     load: Array
     norm: float
     kappa: float
-    nu: Array
+    nu: Array | None
     gap: float
     eta: float = 0.0
 
@@ -226,7 +227,7 @@ class _Program:
     lam: Array
     gamma: float
 
-    def best(self) -> tuple[Array, float, float, Array, float] | None:
+    def best(self) -> tuple[Array, float, float, Array | None, float] | None:
         """What a `ContactCorrection` has besides its unknowns, in this order."""
         B, margin = self.B, MARGIN * self.round_off
         size = sp.csr_array((np.abs(B.data), B.indices, B.indptr), B.shape)
@@ -237,7 +238,9 @@ class _Program:
                 far = self.reach * norm * (1.0 + 1e-10) + self.excess + self.round_off
                 lacking = np.where(self.near, lacking, far)
                 if np.all(lacking <= 0.0):  # NaN is not
-                    return load, norm, max(0.0, float(self.lam @ slack)), nu, max(0.0, float(nu @ slack))
+                    kappa, pushing = max(0.0, float(self.lam @ slack)), np.maximum(nu, 0.0)
+                    pulls = np.any(nu < -8.0 * UNIT * self.lam)  # beyond the round-off in ν − λ + λ
+                    return load, norm, kappa, None if pulls else pushing, max(0.0, float(pushing @ slack))
                 if np.any(lacking[~self.near] > 0.0):
                     return None
                 margin = np.maximum(margin, 2.0 * np.nan_to_num(lacking, nan=0.0, posinf=0.0))
@@ -245,7 +248,7 @@ class _Program:
         return None
 
     def _minimisers(self, excess: Array) -> Iterator[tuple[Array, Array, float, Array]]:
-        """The last w of the active set method: c, w on the unknowns of the block, its norm, and ν."""
+        """The last w of the active set method: c, w on the unknowns of the block, its norm, and ν of any sign."""
         size = self.reach**2 / self.gamma  # at least the diagonal of S
         chosen = (self.lam > 0.0) & (self.lam * size > -excess)
         for _ in range(EXTENSIONS):
@@ -254,8 +257,7 @@ class _Program:
             values = self.compliance @ load
             violated = self.near & ~chosen & (excess - self.B @ values > self.round_off)
             if not violated.any():
-                nu = np.maximum(self.lam + difference, 0.0)
-                yield load, values, float(np.sqrt(max(0.0, float(load @ values)))), nu
+                yield load, values, float(np.sqrt(max(0.0, float(load @ values)))), self.lam + difference
                 return
             chosen |= violated
 

@@ -155,3 +155,23 @@ def test_where_no_method_ends_the_feasibility_of_the_last_correction_decides(mon
     given = np.linalg.inv(spd(K, rng, 100.0)), contact, u, np.zeros(M), 1.0
     found = corrected(given)
     assert found is None or np.all(B @ values(given[0], found) >= B @ u - contact.g)
+
+
+def test_a_multiplier_belongs_to_the_correction_or_is_none() -> None:
+    """Of dependent rows that couple unknowns on a soft support, S is known by round-off alone."""
+    known = []
+    for seed in range(60):
+        rng, B = np.random.default_rng(seed), np.zeros((9, 12))
+        factor = rng.standard_normal((12, 12))
+        for row in B:
+            row[rng.choice(12, 2, replace=False)] = 1.0, -1.0
+        B = np.vstack([B, 1.3 * B[:4], B[:2] + B[2:4]])
+        C, contact = factor @ factor.T / 12 + 1e6, Contact(sp.csr_array(B), rng.standard_normal(15))
+        u, lam = rng.standard_normal(12), np.where(rng.random(15) < 0.5, 3.0 * rng.random(15), 0.0)
+        found = find_contact_correction(ContactCompliance(C, np.arange(12)), contact, u, np.zeros(12), lam, 1.0)
+        known.append(found is not None and found.nu is not None)
+        if found is not None and found.nu is not None:
+            w = C @ (B.T @ (found.nu - lam))
+            assert found.nu.min() >= 0.0
+            assert np.min(B @ w - (B @ u - contact.g)) >= -1e-6
+    assert {True, False} == set(known)
