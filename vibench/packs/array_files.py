@@ -191,7 +191,7 @@ class ArrayFiles:
         if count * dtype.itemsize > size:
             raise RequestError(f"the array {size_of(shape)} is larger than its file: it is damaged or cut off")
         self.take(_bytes(count, dtype))
-        flat = np.frombuffer(file.read(count * dtype.itemsize), dtype, count)
+        flat = np.frombuffer(bytearray(file.read(count * dtype.itemsize)), dtype, count)  # SciPy sorts in place
         return flat.reshape(shape, order="F" if fortran else "C")
 
     def _matrix_market(self, path: Path) -> Any:

@@ -144,3 +144,10 @@ def test_a_mesh_whose_triangles_lead_beyond_its_points_is_refused(corner: int, t
     write_manifest(folder, {**manifest(), "mesh": {"file": "mesh.vtu", **named}})
     with pytest.raises(RequestError, match=r"triangles of 'mesh\.vtu' has values from .* expected 0 to 2"):
         read_model_pack(folder)
+
+
+def test_indices_that_are_not_sorted_are_read(tmp_path: Path) -> None:
+    order = np.concatenate([np.arange(A.indptr[k], A.indptr[k + 1])[::-1] for k in range(N)])
+    parts = {"data": A.data[order], "indices": A.indices[order].astype(np.int64), "indptr": A.indptr.astype(np.int64)}
+    pack = read_model_pack(write(tmp_path / "cable", **PARTS | parts))
+    assert np.array_equal(pack.members["A"].arrays[0].toarray(), A.toarray())
