@@ -74,8 +74,8 @@ def mutated(content):
 def write(folder):
     '''A pack with up to two faults in its files, and up to two in its manifest.'''
     folder.mkdir()
-    (folder / "link.npz").symlink_to("/etc/passwd")
-    (folder / "link").symlink_to("/etc")
+    (folder / "link.npz").symlink_to("../first/A.npz")
+    (folder / "link").symlink_to("../first")
     content, how = manifest(), rng.integers(6)
     write_arrays(folder, cable)
     parts = dict(pick([A, A, TRIPLETS]))
@@ -105,6 +105,8 @@ def write(folder):
         damaged = bytearray(file.read_bytes())
         damaged[rng.integers(len(damaged))] ^= 1 << rng.integers(8)
         file.write_bytes(damaged[: len(damaged) if rng.random() < 0.5 else rng.integers(len(damaged))])
+    if rng.random() < 0.1:
+        content["operators"]["A"] = pick(["link.npz", "link/A.npz", "../first/A.npz", str(first / "A.npz")])
     for _ in range(rng.integers(3)):
         mutated(content)
     write_manifest(folder, content)
@@ -138,7 +140,7 @@ opened, inside, spent = set(), False, resource.getrusage(resource.RUSAGE_SELF).r
 
 def watch(event, given):
     if inside and event in ("open", "os.listdir", "os.scandir", "subprocess.Popen", "os.system", "socket.connect"):
-        opened.add((event, str(given[0])))
+        opened.add((event, str(given[0]), k))
 
 
 sys.addaudithook(watch)
@@ -148,9 +150,12 @@ for k in range(count):
     inside = True
     accepted += read(root / str(k))
     inside = False
-allowed = (os.path.realpath(root), os.path.realpath("/proc/self/cgroup"), "/sys/fs/cgroup")
+limits = (os.path.realpath("/proc/self/cgroup"), "/sys/fs/cgroup")
 print()
-print(accepted, sorted(one for one in opened if one[0] != "open" or not os.path.realpath(one[1]).startswith(allowed)))
+print(accepted, sorted(
+    (event, path) for event, path, k in opened
+    if event != "open" or not os.path.realpath(path).startswith((os.path.realpath(root / str(k)) + "/", *limits))
+))
 print(resource.getrusage(resource.RUSAGE_SELF).ru_utime - spent, file=sys.stderr)
 """
 """Writes the packs first; the limit of memory and the hook are for reading."""
