@@ -229,8 +229,9 @@ def held_out_error(name: str, member: AffineMember, values: Sequence[Any], V: In
 
 def _rows(name: str, member: Any, units: Array) -> Array:
     """Euclidean norms of the rows (k,) of a member, a matrix or a vector, with unknowns in these units."""
-    size = np.abs(member) if name in ("f", "g") else sp.linalg.norm(sp.csr_array(member * units), axis=1)
-    return np.asarray(units * size if name in ("A", "f") else size)
+    if name in ("A", "B"):
+        member = sp.linalg.norm(sp.csr_array(member).multiply(units).tocsr(), axis=1)
+    return np.asarray(units * np.abs(member) if name in ("A", "f") else np.abs(member))
 
 
 class _Entries:

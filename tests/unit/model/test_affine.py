@@ -9,7 +9,7 @@ from numerics import Varying, spd
 
 from vibench.errors import NumericalError
 from vibench.interfaces.problem import MEMBERS, Contact, VariationalInequality
-from vibench.model.affine import Evaluation, affine_decomposition
+from vibench.model.affine import Evaluation, affine_decomposition, decomposed, held_out_error
 
 NEW = np.array([0.37])
 
@@ -232,6 +232,20 @@ def test_interpolation_may_take_three_quarters_of_the_training_parameters(powers
     problem = Summed(powers=powers, count=4)
     member = affine_decomposition(problem, problem.training_set(), 1e-11)["A"]
     assert member.way is (Evaluation.INTERPOLATED if compressed else Evaluation.FULL)
+
+
+@pytest.mark.parametrize("kind", [sp.csr_array, sp.csr_matrix, sp.coo_matrix])
+@pytest.mark.parametrize("name", ["A", "B"])
+def test_errors_outside_the_training_set_are_measured_whatever_the_kind_of_matrix(name: str, kind: type) -> None:
+    problem = Summed()
+    values, V = [kind(getattr(problem.assemble(mu), name)) for mu in problem.training_set()], problem.V
+    member = decomposed(name, values, V, 1e-10)
+    new = [kind(getattr(problem.assemble(mu), name)) for mu in (np.array([0.33]), np.array([0.77]))]
+    assert held_out_error(name, member, new, V) < 1e-9
+    bumped = [
+        kind(matrix + 1e-3 * matrix.multiply(np.arange(matrix.shape[1]) == 3)) for matrix in map(sp.csr_array, new)
+    ]
+    assert 1e-5 < held_out_error(name, member, bumped, V) < 1e-2
 
 
 def test_members_come_in_their_order() -> None:

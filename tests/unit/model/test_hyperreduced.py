@@ -322,7 +322,8 @@ def test_values_that_are_not_finite_are_refused(
 
     def spoiled(wanted):
         sample = sampler(wanted)
-        return lambda mu: {name: found * (value if name == member else 1.0) for name, found in sample(mu).items()}
+        factor = -value if member == "g" else value  # an infinite g constrains nothing, unless it is −∞
+        return lambda mu: {name: found * (factor if name == member else 1.0) for name, found in sample(mu).items()}
 
     monkeypatch.setattr(problem, "sampler", spoiled)
     if member == "contact":
