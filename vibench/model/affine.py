@@ -191,7 +191,7 @@ def decomposed(
         reason = f"row {int(np.argmax(sometimes))} of g is infinite at some parameters and not at others"
         return AffineMember(Evaluation.CONTACT, ()) if contact else AffineMember(Evaluation.FULL, (), reason=reason)
     entries = _Entries(values, symmetric=name == "A")
-    weights = entries.weights(name, 1.0 / np.sqrt(V.matrix.diagonal()))
+    weights = entries.weights(name, _units(V))
     if entries.is_constant(weights):
         return AffineMember(Evaluation.CONSTANT, (values[0],))
     reason = f"{name} depends on mu and the problem does not evaluate it entry by entry"
@@ -217,7 +217,7 @@ def held_out_error(name: str, member: AffineMember, values: Sequence[Any], V: In
     """
     if not member.terms or not values:
         return 0.0
-    units = 1.0 / np.sqrt(V.matrix.diagonal())
+    units = _units(V)
     assembled = np.column_stack([_rows(name, value, units) for value in values])
     differences = np.column_stack([_rows(name, value - member.interpolated(value), units) for value in values])
     if name in ("B", "g"):
@@ -225,6 +225,11 @@ def held_out_error(name: str, member: AffineMember, values: Sequence[Any], V: In
         largest[largest == 0.0] = 1.0
         assembled, differences = assembled / largest, differences / largest
     return ratio(float(np.linalg.norm(differences, axis=0).max()), float(np.linalg.norm(assembled, axis=0).max()))
+
+
+def _units(V: InnerProduct) -> Array:
+    """Units (n,) of the unknowns: one over the norms of their basis functions."""
+    return np.asarray(1.0 / np.sqrt(V.matrix.diagonal()))
 
 
 def _rows(name: str, member: Any, units: Array) -> Array:

@@ -32,15 +32,10 @@ from vibench.arrays import Array, Indices, Mask, SparseMatrix
 from vibench.interfaces.problem import Contact
 from vibench.model.certificates.complementarity import complementary
 from vibench.model.certificates.tied_correction import tied_correction
+from vibench.model.error_bounds import ATTEMPTS, MARGIN
 
 EXTENSIONS = 10
 """How often rows are added to I."""
-
-ATTEMPTS = 4
-"""Margins that are tried; each is larger than the one before in the rows that lacked something."""
-
-MARGIN = 4.0
-"""The first margin of s, as a multiple of the round-off in s."""
 
 NEGLIGIBLE = 1e-6
 """Below this share of what a row lacks, a multiplier of it does not move the minimiser."""

@@ -27,7 +27,8 @@ import scipy.sparse as sp
 
 from vibench.arrays import Array, Indices, Mask, SparseMatrix
 from vibench.model.certificates.complementarity import complementary
-from vibench.model.certificates.contact_correction import ATTEMPTS, MARGIN, UNIT, BlockDiagonal
+from vibench.model.certificates.contact_correction import UNIT, BlockDiagonal
+from vibench.model.error_bounds import ATTEMPTS, MARGIN
 
 LARGEST_CONDITION = 1e9
 """Rows of a B₀ whose S₀ has a larger condition number are treated as dependent: S₀ is not inverted."""

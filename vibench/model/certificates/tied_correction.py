@@ -14,20 +14,12 @@ import scipy.sparse as sp
 from vibench.arrays import Array
 from vibench.interfaces.problem import Contact
 from vibench.model.equalities import Equalities
+from vibench.model.error_bounds import ATTEMPTS, MARGIN, NO_ROOM
 from vibench.qp.exact import least_distance
 from vibench.qp.rows import rows_that_matter
 from vibench.qp.scaling import row_norms
 
-ATTEMPTS = 4
-"""Margins of the rows that are no equalities; each is larger than the one before where something lacked."""
-
-MARGIN = 4.0
-"""The first one, as a multiple of the round-off in s."""
-
 UNIT = 1.01 * float(np.finfo(float).eps)
-
-NO_ROOM = 1e-12
-"""Opposite rows are an equality where there is less room between them than this share of the terms of s."""
 
 
 def tied_correction(

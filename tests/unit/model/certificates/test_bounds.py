@@ -166,6 +166,13 @@ def found(kind: Prepared, mu: np.ndarray, x: np.ndarray, alpha: np.ndarray) -> t
     return bound, error, natural, size
 
 
+def disturbed(program: VariationalInequality, size: float, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """The solution x and α of a program, with normal errors of this size; α stays nonnegative."""
+    x, alpha = exact(program)
+    x = x + size * rng.standard_normal(len(x))
+    return x, np.maximum(alpha + size * rng.standard_normal(len(alpha)), 0.0)
+
+
 @pytest.mark.parametrize("kind", KINDS + TIED)
 @given(st.integers(0, 10_000), st.sampled_from([0.0, 1e-3, 1.0, 20.0]), st.floats(0.5, 2.0), st.floats(-1.0, 1.0))
 @settings(max_examples=40)
@@ -198,9 +205,7 @@ def test_no_error_of_the_multiplier_is_above_its_bound_in_the_norm_of_its_space(
     rng, mu = np.random.default_rng(seed), np.array([a, b])
     problem, model, certificate = prepared(*kind)
     reduced, vi = model.assemble(mu), problem.assemble(mu)
-    x, alpha = exact(reduced.program)
-    x = x + size * rng.standard_normal(len(x))
-    alpha = np.maximum(alpha + size * rng.standard_normal(len(alpha)), 0.0)
+    x, alpha = disturbed(reduced.program, size, rng)
     bound = certificate.evaluate(problem, mu, reduced, x, alpha)
     A, B = vi.A.toarray(), vi.B.toarray()
     lam = exact(VariationalInequality(A, vi.f, B, vi.g))[1]
@@ -222,9 +227,7 @@ def test_corrected_pairs_are_feasible_and_no_error_of_them_is_above_its_bound(
     rng, mu = np.random.default_rng(seed), np.array([a, b])
     problem, model, certificate = prepared(*kind)
     reduced, vi = model.assemble(mu), problem.assemble(mu)
-    x, alpha = exact(reduced.program)
-    x = x + size * rng.standard_normal(len(x))
-    alpha = np.maximum(alpha + size * rng.standard_normal(len(alpha)), 0.0)
+    x, alpha = disturbed(reduced.program, size, rng)
     bound = certificate.evaluate(problem, mu, reduced, x, alpha)
     same, found = certificate.certify(problem, mu, reduced, x, alpha)
     assert same == bound
