@@ -57,6 +57,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from vibench.arrays import Array, Mask
+from vibench.errors import NumericalError
 from vibench.highfidelity.active_set import active_set_iterations
 from vibench.interfaces.problem import VariationalInequality, is_absent
 from vibench.linalg.inertia import UNIT
@@ -64,7 +65,7 @@ from vibench.model.equalities import Equalities
 from vibench.model.errors import Energy
 from vibench.qp.exact import least_distance_solution
 from vibench.qp.rows import Rows, rows_that_matter
-from vibench.qp.scaling import near_rows
+from vibench.qp.scaling import near_rows, ratio
 from vibench.stability.coercivity import Constant, Stability
 
 NO_ROOM = 1e-12
@@ -72,6 +73,9 @@ NO_ROOM = 1e-12
 
 IMPLIED = 1e4
 """Equalities that depend on others hold with them up to this multiple of round-off, or the problem has no solution."""
+
+REFERENCE = 1e-6
+"""Largest error bound of a high-fidelity solution, relative to it in the energy norms."""
 
 MARGIN = 4.0
 """The first margin of s, as a multiple of the round-off in s."""
@@ -154,6 +158,30 @@ def bound_errors_at(
     terms_of_both = of_u.rho, of_lam.rho, of_u.omega, of_u.kappa
     notes = [ESTIMATED] * (not alpha.proved) + [NOT_UNIQUE] * (not beta.value > 0.0)
     return ErrorBounds(of_u.primal, in_V, of_lam.dual, in_W, *terms_of_both, "; ".join(notes))
+
+
+def reference_bound(vi: VariationalInequality, energy: Energy, u: Array, lam: Array) -> float:
+    """Δ_A / S of a high-fidelity solution u (n,) and λ ≥ 0 (m,), S² = ‖u‖²_A + ‖Bᵀλ‖²_{A⁻¹}; infinite without a w.
+
+    Residuals say less: what is κ in Δ_A is only the square of an error. `vi` and `energy` are of the same parameter.
+
+    Raises
+    ------
+    NumericalError
+        If it is above `REFERENCE`, and Δ_A above what the round-off of B u − g leaves open.
+    """
+    correction = find_correction(vi, energy, u, lam)
+    if correction is None:
+        return float("inf")
+    bound = terms(correction, vi, energy, u, lam).primal
+    size = float(np.hypot(energy.norm(u), energy.dual_norm(vi.B.T @ lam)))
+    open_by_round_off = np.sqrt(4.0 * MARGIN * float(lam @ np.nan_to_num(_round_off(vi, u, correction.w), posinf=0.0)))
+    if not bound <= max(REFERENCE * size, open_by_round_off):
+        raise NumericalError(
+            f"the error bound of the high-fidelity solution is {ratio(bound, size):.1e} of it in the energy norm, "
+            f"above {REFERENCE:.0e}"
+        )
+    return ratio(bound, size)
 
 
 class CorrectionMode(StrEnum):

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import NamedTuple
 
-VERSION = 15
+VERSION = 16
 """Schema version of a results file; a file of another version is refused."""
 
 TEXT, REAL, INTEGER, BLOB = "TEXT", "REAL", "INTEGER", "BLOB"
@@ -225,6 +225,7 @@ CELLS: Mapping[str, Column] = {
     },
     "certificate": text("Bounds at online cost: certified, verified, or none.", "certificate", 10),
     "bound_online_violations": integer("Ok queries where bound_online_violated is 1; empty without a certificate."),
+    "reference_bound_max": real("1", "Largest reference_bound of the queries."),
     "solver_error_u_max": real("1", "Largest contribution of the QP solver to the relative error of u."),
     "solver_error_lambda_max": real("1", "Largest contribution of the QP solver to the relative error of λ."),
     "solver_share_max": real("1", "Largest ratio of this contribution to the error, over the queries."),
@@ -303,6 +304,11 @@ QUERIES: Mapping[str, Column] = {
     "corrected": integer("1 if the answer is the corrected pair, 0 if the reduced solution; empty if none was asked."),
     "correction_share": real("1", "ω/ρ of the reduced solution, above which auto corrects at 1; empty if unknown."),
     "correction_note": text("Why the answer is not corrected although that was asked for."),
+    "reference_bound": real(
+        "1",
+        "Bound of the energy error of the high-fidelity solution, relative to ‖u‖_A and ‖Bᵀλ‖_A⁻¹; at most 1e-6, or "
+        "what round-off of B u − g leaves open; empty where no correction is found.",
+    ),
     "hf_s": real(
         "s", "High-fidelity solution at this parameter, with assembly but without set-up: median of the repetitions."
     ),

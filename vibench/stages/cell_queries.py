@@ -231,7 +231,7 @@ class _Queries(Items):
         reference, (zero_u, zero_lam) = self._reference, self._zeros
         return (
             {f"mu_{i + 1}": float(value) for i, value in enumerate(reference.mu[number])}
-            | {"hf_s": reference.seconds[number].cpu}
+            | {"hf_s": reference.seconds[number].cpu, "reference_bound": _finite(reference.bounds[number])}
             | {"zero_u": int(zero_u[number]), "zero_lambda": int(zero_lam[number])}
             | _constants("beta_", self._own[number])
             | _constants("beta_full_", self._full[number])
@@ -256,6 +256,8 @@ class _Queries(Items):
                 f"reduced assembly differs from the Galerkin projection by up to {error:.1e} at validation parameters: "
                 f"the interpolation tolerance {tolerance:g} holds at training parameters only"
             )
+        if unbounded := int(np.sum(np.isinf(self._reference.bounds))):
+            fallbacks.append(f"{unbounded} of the validation solutions have no error bound: residuals verify them")
         if (gap := cone.prepared.rank_gap) < CLEAR_GAP:
             rank = cone.prepared.rank
             fallbacks.append(f"the rank {rank} is in doubt: its last singular value is {gap:.2g} times what is below")
@@ -314,6 +316,10 @@ class _Queries(Items):
         artefact = self._store.get(stage.key)
         assert artefact is not None  # an input of this stage
         return artefact
+
+
+def _finite(bound: float) -> float | None:
+    return bound if math.isfinite(bound) else None
 
 
 def _constants(prefix: str, constants: InfSup) -> Row:

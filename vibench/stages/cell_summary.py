@@ -72,6 +72,7 @@ def summarise(rows: Sequence[Row]) -> Row:
         **errors("lambda"),
         **{f"effectivity_{name}_median": median(f"effectivity_{name}") for name in BOUNDS},
         "corrected_share": mean("corrected"),
+        "reference_bound_max": largest("reference_bound", rows),
         "bound_online_violations": int(column("bound_online_violated").sum()) if certified else None,
         **contributions("solver"),
         **contributions("assembly"),

@@ -17,7 +17,9 @@ from vibench.highfidelity.active_set import ActiveSetSolution, HighFidelitySolve
 from vibench.interfaces.problem import Problem, VariationalInequality
 from vibench.interfaces.validation import Fingerprint, checked_assembly, reference_assembly
 from vibench.linalg.inner_product import InnerProduct
+from vibench.model.error_bounds import reference_bound
 from vibench.model.growing import GrowingTrainer
+from vibench.offline.assemblies import Assemblies
 from vibench.offline.sweep import Snapshots
 from vibench.qp.repeats import nearby
 from vibench.stages.base import Result, Stage, build_problem, faults_of, value_of
@@ -53,6 +55,8 @@ class TimedSnapshots(Snapshots):
     """Fingerprint of the problem at the first training parameter, as the process of the chunk assembled it."""
     selecting: Seconds = NO_TIME
     """Seconds of the choice of the parameters, none unless the training is adaptive."""
+    bounds: tuple[float, ...] = ()
+    """Relative error bounds of validation solutions, infinite where there is none; none of training solutions."""
 
 
 @dataclass(frozen=True)
@@ -123,8 +127,18 @@ class SnapshotStage(Stage):
             fallbacks.append(solution.fallback)
         reference.refuse_rewritten_constants()
         refuse_shifted()
-        swept = TimedSnapshots(mus, u, lam, tuple(seconds), tuple(setups), tuple(fallbacks), reference.fingerprint)
+        measured = tuple(seconds), tuple(setups), tuple(fallbacks), reference.fingerprint
+        swept = TimedSnapshots(mus, u, lam, *measured, bounds=tuple(self._bounds(problem, mus, u, lam)))
         return Result(swept, sum(seconds, NO_TIME), self._diagnostics(problem, mus, first))
+
+    def _bounds(self, problem: Problem, mus: Array, u: Array, lam: Array) -> Iterator[float]:
+        """Verify the references by their error bounds; training solutions are none."""
+        assembled = Assemblies(problem)
+        for k, mu in enumerate(mus if self.parameters.role != "training" else ()):
+            try:
+                yield reference_bound(assembled.at(mu), assembled.energy_at(mu), u[:, k], lam[:, k])
+            except NumericalError as error:
+                raise NumericalError(f"at mu = {mu.tolist()}: {error}") from error
 
     def _measure(self, work: Callable[[Array], T], mus: Iterator[Array]) -> tuple[T, Seconds]:
         """A training solution is an offline cost, timed once; a validation solution is timed as a query is.
@@ -240,4 +254,5 @@ def gather(store: Store, chunks: tuple[Stage, ...]) -> TimedSnapshots:
         tuple(note for part in parts for note in part.fallbacks),
         here,
         sum((part.selecting for part in parts), NO_TIME),
+        tuple(bound for part in parts for bound in part.bounds),
     )

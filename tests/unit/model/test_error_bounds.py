@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from dataclasses import replace
 from fractions import Fraction
 
 import numpy as np
@@ -9,6 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numerics import exact, space, spd
 
+from vibench.errors import NumericalError
+from vibench.highfidelity.active_set import ACCURACY
 from vibench.highfidelity.kkt_systems import CondensedStiffness
 from vibench.interfaces.problem import VariationalInequality
 from vibench.linalg.cholesky import SparseCholesky
@@ -19,12 +22,15 @@ from vibench.model.error_bounds import (
     NOT_IN_CONE,
     NOT_UNIQUE,
     ON_ABSENT_ROW,
+    REFERENCE,
     ErrorBounds,
     corrected_pair,
     error_bounds,
     find_correction,
+    reference_bound,
 )
 from vibench.model.errors import Energy
+from vibench.qp.verification import kkt_residuals
 from vibench.stability.coercivity import Constant, Stability, coercivity_and_continuity, energy_inf_sup
 from vibench.stability.infsup import InfSup
 
@@ -277,6 +283,44 @@ def test_opposite_rows_are_an_equality_that_corrections_hold_without_a_margin() 
     assert found.note == NOT_UNIQUE
     empty = VariationalInequality(vi.A, vi.f, vi.B, np.array([1.0, -1.001]))
     assert bounds_or_note(empty, np.array([0.6]), np.array([0.8, 0.0]), known) == ErrorBounds.none(NO_CORRECTION)
+
+
+def test_what_equalities_may_miss_is_in_every_term(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As in arithmetic of two digits: rows of norm 1 in A⁻¹ have a round-off of 0.01, hence η = 0.02."""
+    vi = VariationalInequality(
+        sp.csc_array([[4.0]]), np.array([4.0]), sp.csr_array([[2.0], [-2.0]]), np.array([1.0, -1.0])
+    )
+    known = Stability(InfSup(0.0, 0.0, 0.0, ""), Constant(0.25, True), Constant(9.0, True), Constant(0.0, True))
+    monkeypatch.setattr(module, "_round_off", lambda vi, u, w: np.full(2, 0.01))
+    found = bounds_or_note(vi, np.array([0.6]), np.array([0.8, 0.0]), known)
+    square = 0.22**2 + 2.0 * 0.02 * 0.8  # r = 0, ω = 0.2 and κ = 0 without η
+    expected = ErrorBounds(np.sqrt(square), 2.0 * np.sqrt(square), np.sqrt(square), np.inf, 0.0, 0.0, 0.22, 0.016)
+    assert numbers(found) == pytest.approx(numbers(expected), abs=1e-7)
+    residual = bounds_or_note(vi, np.array([0.6]), np.array([0.7, 0.0]), known)  # r = 0.2: ‖r + A w‖ = 0.3
+    assert residual.lambda_natural == pytest.approx(np.sqrt(0.32**2 + 2.0 * 0.02 * 0.7), abs=1e-7)
+
+
+def test_a_reference_is_verified_by_its_bound_where_residuals_do_not_tell() -> None:
+    """A multiplier of a row without contact is a gap, which bounds the square of an error."""
+    vi, u, lam = scalar(lam=1.0, u=0.5)
+    assert reference_bound(vi, energy(vi), u, lam) < REFERENCE
+    apart, force = replace(vi, g=np.array([3.0])), 1e-10  # s = −1 at the solution u = 1, and S = 2
+    assert reference_bound(apart, energy(vi), np.array([1.0]), np.zeros(1)) == 0.0
+    u, lam = np.array([1.0 - 0.5 * force]), np.array([force])
+    assert kkt_residuals(apart, u, lam).worst <= ACCURACY
+    with pytest.raises(NumericalError, match=r"the error bound of the high-fidelity solution is 7\.1e-06 of it"):
+        reference_bound(apart, energy(vi), u, lam)
+    empty = VariationalInequality(vi.A, vi.f, sp.csr_array([[2.0], [-2.0]]), np.array([1.0, -1.001]))
+    assert reference_bound(empty, energy(vi), np.array([0.5]), np.array([1.0, 0.0])) == np.inf
+
+
+def test_what_round_off_leaves_open_refuses_no_reference() -> None:
+    """Two bodies far from zero on weak springs: their gap is a difference of positions. All numbers are exact."""
+    far, weak = 2.0**17, 2.0**-40
+    A, B = sp.csc_array([[4.0 + weak, -4.0], [-4.0, 4.0 + weak]]), sp.csr_array([[1.0, -1.0]])
+    u, lam = np.array([far, far - 0.5]), np.array([1.0])
+    vi = VariationalInequality(A, A @ u + B.T @ lam, B, np.array([0.5]))
+    assert REFERENCE < reference_bound(vi, energy(vi), u, lam) < 1e-3
 
 
 def test_rows_that_are_absent_bound_nothing() -> None:

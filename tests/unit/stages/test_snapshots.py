@@ -17,10 +17,11 @@ from running import Register
 
 from vibench import NumericalError, Problem, VariationalInequality
 from vibench.interfaces.validation import AGREEMENT_RTOL, Fingerprint, ReferenceAssembly, fingerprint
+from vibench.model.error_bounds import REFERENCE
 from vibench.stages.base import build_problem
 from vibench.stages.snapshots import fingerprint_here, gather, solution_stages
 from vibench.storage.artefacts import Store
-from vibench.study.parameter_sets import OWN_TRAINING
+from vibench.study.parameter_sets import OWN_TRAINING, ParameterSet
 from vibench.study.plugin import Plugin
 from vibench.testing.processes import call_in_other_process
 
@@ -38,6 +39,9 @@ REASONS: Mapping[str, str] = {
     "DependsOnTheCallBefore": "two assemblies at one parameter are not the same",
     "ShiftsTheParameter": "assemble changes its argument mu",
 }
+
+
+VALIDATION = ParameterSet("validation", 8, 3)
 
 
 def swept(name: str, folder: Path) -> None:
@@ -114,3 +118,23 @@ def test_a_constant_member_that_is_the_same_object_costs_no_product(monkeypatch:
     again = VariationalInequality(vi.A, vi.f, reference._vi.B, reference._vi.g)
     reference.refuse_false_constants(np.array([3.0]), again)
     assert products == []
+
+
+def test_references_are_verified_by_their_error_bounds(
+    register: Register, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Training solutions are none: their error would be that of a snapshot."""
+    register(("vibench.problems", "it", "broken_variants:Bar"))
+    store, problem = Store(tmp_path / "artefacts"), Plugin("problem", "it", "{}", "")
+    chunks = [solution_stages(problem, parameters)[0] for parameters in (OWN_TRAINING, VALIDATION)]
+    training, validation = (chunk.run(store).value for chunk in chunks)
+    assert training.bounds == ()
+    assert len(validation.bounds) == len(validation.mu) > 0
+    assert max(validation.bounds) <= REFERENCE
+    monkeypatch.setattr("vibench.model.error_bounds.find_correction", lambda *given: None)
+    assert set(chunks[1].run(store).value.bounds) == {np.inf}
+    monkeypatch.undo()
+    monkeypatch.setattr("vibench.model.error_bounds.REFERENCE", 1e-15)
+    monkeypatch.setattr("vibench.model.error_bounds.MARGIN", 0.0)
+    with pytest.raises(NumericalError, match=r"at mu = \[.*\]: the error bound of the high-fidelity solution is "):
+        chunks[1].run(store)

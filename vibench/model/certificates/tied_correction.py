@@ -50,10 +50,12 @@ def tied_correction(
         if forces is None:
             return None
         w = L @ (load - K @ forces) / np.sqrt(gamma)
-        w = w - equalities.step((B @ w - excess)[rows.equalities])
+        missed = (B @ w - excess)[rows.equalities]
+        w = w - equalities.step(missed)
         slack = B @ w - excess
         rounded = round_off + UNIT * (np.diff(B.indptr) + 4.0) * (abs(B) @ np.abs(w))
         eta = equalities.distance((np.abs(slack) + rounded)[rows.equalities])
+        eta += equalities.distance(np.abs(missed))  # ν belongs to the w before the step
         reach = equalities.reach * eta
         lacking = np.where(rows.implied, 0.0, rounded + reach - slack)
         if np.all(lacking <= 0.0):  # NaN is not

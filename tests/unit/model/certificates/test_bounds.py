@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 from functools import lru_cache
 from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 import pytest
@@ -19,6 +20,7 @@ from vibench.interfaces.strategies import Enrichment, Kind
 from vibench.linalg.inner_product import InnerProduct
 from vibench.model.affine import affine_decomposition
 from vibench.model.certificates import base as base_module
+from vibench.model.certificates import contact_correction
 from vibench.model.certificates.base import CertificateBase, Guarantee, certificate_base, injected, unsupported
 from vibench.model.certificates.bounds import NOT_COERCIVE, NOT_PREPARED, OUTSIDE, OnlineBound, OnlineCertificate
 from vibench.model.certificates.inf_sup import NO_BODY, NOT_CONSTANT, ON_BODIES, SCALED
@@ -247,6 +249,37 @@ def test_corrected_pairs_are_feasible_and_no_error_of_them_is_above_its_bound(
     assert corrected.rho >= bound.rho
     if kind[0] == "constant":  # nothing but the residual is left
         assert corrected.u_energy == pytest.approx(bound.rho, rel=1e-3, abs=1e-6 * scale)
+
+
+@pytest.mark.parametrize("kind", TIED)
+def test_what_equalities_may_miss_enters_where_the_derivation_says(
+    kind: tuple[str, bool, str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A larger η, with all else as it is, shows in the bound of λ_N and in those of the corrected pair."""
+    mu, eta = np.array([1.2, 0.3]), 0.1
+    problem, model, certificate = prepared(*kind)
+    reduced = model.assemble(mu)
+    x, alpha = disturbed(reduced.program, 1e-3, np.random.default_rng(4))
+    (before, pair), of_ties = certificate.certify(problem, mu, reduced, x, alpha), contact_correction.tied_correction
+
+    def missing_more(*given: Any) -> Any:
+        found = of_ties(*given)
+        assert found is not None
+        assert found[-1] < 1e-9
+        return (*found[:-1], eta)
+
+    monkeypatch.setattr(contact_correction, "tied_correction", missing_more)
+    bound, other = certificate.certify(problem, mu, reduced, x, alpha)
+    assert pair is not None
+    assert other is not None
+    spectral, at = certificate.base.spectral, certificate.base.coefficients(reduced.evaluated.samples)
+    lower, upper = (1.0, 1.0) if spectral is None else spectral.at(mu, at["A"])
+    added = bound.lambda_natural**2 - before.lambda_natural**2
+    assert bound.lambda_natural < bound.omega + bound.u_energy  # the other bound of the two
+    assert added == pytest.approx(2.0 * before.rho * np.sqrt(lower) * eta, rel=1e-6)
+    rho = pair.bound.rho + 0.5 * (lower + upper) * eta / np.sqrt(lower)
+    assert other.bound.rho == pytest.approx(rho)
+    assert other.bound.u_energy == pytest.approx(np.sqrt(rho**2 + 2.0 * pair.bound.kappa) + eta * np.sqrt(upper))
 
 
 def test_the_residual_of_a_corrected_pair_is_that_of_the_inner_product_in_place_of_the_stiffness() -> None:
