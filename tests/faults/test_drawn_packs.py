@@ -15,9 +15,9 @@ import encodings.ascii, gzip, os, resource, sys
 from pathlib import Path
 
 import numpy as np, scipy.io, scipy.sparse as sp
-from packs import Cable, group, manifest, write_arrays, write_cable, write_manifest
-from vibench.errors import RequestError
-from vibench.packs import read_model_pack
+from packs import Cable, group, manifest, write_arrays, write_cable, write_manifest, write_mesh
+from vibench.errors import RequestError, in_a_line
+from vibench.packs import mesh_process, meshes, read_model_pack, reader
 from vibench.packs.reader import pack_digest
 
 root, count, rng = Path(sys.argv[1]), int(sys.argv[2]), np.random.default_rng(int(sys.argv[3]))
@@ -31,6 +31,21 @@ TEXTS = ["", ":", "..", "../A.npz", "/etc/passwd", "A.npz:", "A.npz:no", "A{}.np
          "pack.toml", "A.h5", "A.h5:/A", "A.mtx", "A.mtx.gz", "e",
          "pi", "max", "\\u00b5", "\\u03bc", "x\\u00b2", "load", "-load",
          "load.real", "1/0", "1e999", "__import__('os')", "exp(1000)", "(" * 300, "\\0", "x" * 3000]
+
+
+MESHES = ["xdmf", "inp", "ele", "e", "xml", "med", "VTU", *(end[1:] for end in meshes.FORMATS)]
+
+
+def read_mesh(path, limit):
+    '''In this process, whose files are watched; otherwise in one of its own.'''
+    form = meshes.format_of(path)
+    try:
+        return mesh_process.triangles_of(form, str(path)).values()
+    except (Exception, SystemExit) as error:
+        raise RequestError(in_a_line(error)) from None
+
+
+reader.read_mesh = read_mesh
 
 
 def pick(values):
@@ -105,6 +120,14 @@ def write(folder):
         damaged = bytearray(file.read_bytes())
         damaged[rng.integers(len(damaged))] ^= 1 << rng.integers(8)
         file.write_bytes(damaged[: len(damaged) if rng.random() < 0.5 else rng.integers(len(damaged))])
+    if rng.random() < 0.5:
+        name = f"mesh.{pick(MESHES)}"
+        content["mesh"] = write_mesh(folder, name, str(first / "A.npz"))
+        if rng.random() < 0.5:
+            damaged = bytearray((folder / name).read_bytes())
+            for _ in range(rng.integers(4)):
+                damaged[rng.integers(len(damaged))] ^= 1 << rng.integers(8)
+            (folder / name).write_bytes(damaged[: len(damaged) if rng.random() < 0.5 else rng.integers(len(damaged))])
     if rng.random() < 0.1:
         content["operators"]["A"] = pick(["link.npz", "link/A.npz", "../first/A.npz", str(first / "A.npz")])
     for _ in range(rng.integers(3)):
@@ -128,6 +151,10 @@ def read(folder):
 
 first = write_cable(root / "first")  # imports what is imported late
 scipy.io.mmwrite(first / "A.mtx", cable.A)
+write_manifest(first, {**manifest(), "operators": {**manifest()["operators"], "A": "A.mtx"}})
+for name in ("VTU", "msh", "vtk", "mesh", "ply", "stl", "off", "obj"):
+    write_manifest(first, {**manifest(), "mesh": write_mesh(first, f"mesh.{name}", "")})
+    assert read(first), name
 write_manifest(first, {**manifest(), "operators": {**manifest()["operators"], "A": "A.mtx"}})
 assert read(first)
 with np.errstate(all="ignore"):
@@ -163,6 +190,7 @@ print(resource.getrusage(resource.RUSAGE_SELF).ru_utime - spent, file=sys.stderr
 
 def test_drawn_packs_are_read_or_refused_in_a_line(tmp_path: Path) -> None:
     pytest.importorskip("h5py")
+    pytest.importorskip("meshio")
     command = [sys.executable, "-c", READ, str(tmp_path), str(COUNT), str(SEED)]
     helpers = str(Path(__file__).parents[1] / "helpers")
     done = subprocess.run(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import copy
 from collections.abc import Mapping
 from pathlib import Path
@@ -89,3 +90,29 @@ def write_cable(folder: Path) -> Path:
     write_arrays(folder, Cable())
     write_manifest(folder, MANIFEST)
     return folder
+
+
+def write_mesh(folder: Path, name: str, secret: str) -> dict[str, Any]:
+    """Write a mesh of two triangles, and return the table of the manifest; formats of several files name `secret`."""
+    x, y = np.linspace(0.0, 1.0, SIZE), np.zeros(SIZE)
+    points, corners = np.column_stack([x, np.where(x == 1.0, 1.0, 0.0), y]), [[0, 1, SIZE - 1], [1, 2, SIZE - 1]]
+    elsewhere = {
+        ".xdmf": '<Xdmf Version="3.0"><Domain><Grid><Geometry GeometryType="XYZ">'
+        f'<DataItem DataType="Float" Dimensions="3 3" Format="Binary" Precision="8">{secret}</DataItem></Geometry>'
+        '<Topology TopologyType="Triangle" NumberOfElements="1">'
+        '<DataItem DataType="Int" Dimensions="1 3" Format="XML" Precision="8">0 1 2</DataItem>'
+        "</Topology></Grid></Domain></Xdmf>",
+        ".inp": f"*INCLUDE, INPUT={secret}\n",
+    }
+    import meshio  # noqa: PLC0415  optional
+
+    file = folder / name
+    form = {".msh": "gmsh22", ".mesh": "medit"}.get(file.suffix.lower(), file.suffix.lower()[1:])
+    if form in ("vtu", "vtk", "gmsh22", "medit", "ply", "stl", "off", "obj"):
+        with contextlib.redirect_stdout(None), contextlib.redirect_stderr(None):  # it warns of what formats lack
+            meshio.Mesh(points, {"triangle": corners}).write(file, file_format=form)
+    else:
+        file.write_text(elsewhere.get(file.suffix, secret))
+    np.savez(folder / "mesh.npz", points=np.arange(2), positions=x)
+    named = {"points": "mesh.npz:points", "unknowns": "mesh.npz:points", "positions": "mesh.npz:positions"}
+    return {"file": name, **named}

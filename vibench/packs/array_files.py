@@ -305,6 +305,11 @@ class ArrayFiles:
             raise RequestError(f"{wrong} of its entries are not finite ({allowed})")
         return np.asarray(values, dtype=float)
 
+    @property
+    def left(self) -> int:
+        """Bytes that arrays may still take."""
+        return self._left
+
     def take(self, count: int) -> None:
         """Count bytes that are about to be taken; a `RequestError` if they are more than are left."""
         self._left -= count

@@ -139,7 +139,7 @@ class Solutions(_Table):
 class Mesh(_Table):
     """A mesh for pictures."""
 
-    file: Annotated[str, Field(description="A file that meshio reads, such as .vtu or .msh.")]
+    file: Annotated[str, Field(description="A file with the whole mesh that meshio reads, such as .vtu or .msh.")]
     points: Annotated[str, Field(description="Indices (k,) of mesh points.")]
     unknowns: Annotated[
         str | None, Field(description="Indices (k,) of the unknowns drawn at these points; by default all in order.")

@@ -24,6 +24,7 @@ from vibench.linalg.inner_product import InnerProduct
 from vibench.packs import manifest as schema
 from vibench.packs.array_files import ArrayFiles, memory_limit, safe_path, size_of, whole
 from vibench.packs.manifest import FILE, Manifest, read_manifest
+from vibench.packs.meshes import read_mesh
 from vibench.packs.pack import Listing, ModelPack, PackMember, PackMesh, PackSolutions, TabulatedTheta
 
 
@@ -270,17 +271,12 @@ class PackReader:
         return Output(given.name, given.unit, u, lam)
 
     def _mesh(self, given: schema.Mesh, n: int, m: int) -> PackMesh:
-        path = safe_path(self._folder, given.file)
         try:
-            import meshio  # noqa: PLC0415  optional
-        except ImportError:
-            raise RequestError("mesh.file needs meshio: pip install 'vibench[mesh]'") from None
-        try:
-            mesh = meshio.read(path)
-            points = np.asarray(mesh.points, float)[:, :2].T
-            triangles = np.asarray(mesh.get_cells_type("triangle")).reshape(-1, 3)
-        except (Exception, SystemExit) as error:  # noqa: BLE001  meshio raises anything, and exits, for damaged files
-            raise RequestError(f"mesh.file: '{given.file}' cannot be read: {type(error).__name__}") from None
+            points, triangles = read_mesh(safe_path(self._folder, given.file), self._files.left)
+        except RequestError as error:
+            raise RequestError(f"mesh.file: {error}") from None
+        points = points.T
+        self._files.take(2 * (points.nbytes + triangles.nbytes))  # as they are read, and as they are kept
         corners = whole(triangles, f"mesh.file: the triangles of '{given.file}'", 0, points.shape[1] - 1)
         drawn = self._files.indices(given.points, "mesh.points", points.shape[1])
         unknowns = np.arange(n) if given.unknowns is None else self._unknowns(given.unknowns)
