@@ -1,11 +1,12 @@
 """Hard cases: solutions against ones of 100 digits, and certified models against high-fidelity solutions.
 
-Usage: python tests/benchmarks/hard_cases.py [COUNT [QUERIES]]
+Usage: python tests/benchmarks/hard_cases.py [COUNT [QUERIES [PACK...]]]
 
 The first table has beams of 40 to 640 elements, trusses of 40 to 320 bays, and double obstacles with dependent rows and
 equalities: how many of QUERIES (20 by default) are ok, and the largest errors of three of them. The second one has
 certified models of the smaller ones at COUNT (1000 by default) random parameters: bounds of u in the energy norm and
 in V, of λ in the natural norm and in W, at online cost and at that of the mesh, of the pair and of the corrected one.
+With model packs, as that of examples/freefem/signorini.edp, it has these and nothing else.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from pathlib import Path
 
 import numpy as np
 
-from vibench import AffineProblem, Array, Reduction, Stop, create
+from vibench import AffineProblem, Array, Problem, Reduction, Stop, create
 from vibench.errors import NumericalError
 from vibench.highfidelity.active_set import HighFidelitySolver
 from vibench.linalg.cholesky import SparseCholesky
@@ -42,12 +43,12 @@ COMPARED = 3
 SEED = 2031
 
 
-def name(problem: AffineProblem) -> str:
+def name(problem: Problem) -> str:
     """The kind of the problem, its unknowns and its rows."""
     return f"{type(problem).__name__:14} {problem.V.dim:5} {problem.W.dim:5}"
 
 
-def solved(problem: AffineProblem, count: int) -> str:
+def solved(problem: Problem, count: int) -> str:
     """How many of the queries are ok, and the largest errors of u and λ in the energy norms."""
     solver, ok, errors, started = HighFidelitySolver(problem), 0, [(0.0, 0.0)], time.process_time()
     mus = problem.parameters.sample(count, SEED)
@@ -70,7 +71,7 @@ def solved(problem: AffineProblem, count: int) -> str:
     return f"{name(problem)} {ok:4}/{count:<4} {worst[0]:8.1e} {worst[1]:8.1e} {seconds:8.3f}"
 
 
-def compared(problem: AffineProblem, mus: Array) -> Iterator[tuple[str, float, float, float]]:
+def compared(problem: Problem, mus: Array) -> Iterator[tuple[str, float, float, float]]:
     """Kind of a bound, bound, error, and the size that round-off is relative to, of a certified model at `mus`."""
     dual, primal = create("dual strategy", "mcpg"), create("primal strategy", "offline-pga")
     reduction = Reduction(problem, dual, primal, Stop(1e-4), Stop(1e-2), tolerance=0.5, assembly="certified")
@@ -105,7 +106,7 @@ def compared(problem: AffineProblem, mus: Array) -> Iterator[tuple[str, float, f
                 yield f"{which}: u in V", bound.u, in_V, float(problem.V.norm(exact.u))
 
 
-def certified(problem: AffineProblem, count: int) -> Iterator[str]:
+def certified(problem: Problem, count: int) -> Iterator[str]:
     """Rows of the second table: queries, those without a bound, violations, and effectivities."""
     found: dict[str, list[tuple[float, float, float]]] = {}
     for which, *numbers in compared(problem, problem.parameters.sample(count, SEED)):
@@ -122,11 +123,16 @@ def certified(problem: AffineProblem, count: int) -> Iterator[str]:
         yield f"    {which:26} {np.count_nonzero(~has):6} {np.count_nonzero(violated):6}   {spread}"
 
 
-if __name__ == "__main__":
-    count, queries = (int(given) for given in (*sys.argv[1:3], *("1000", "20")[len(sys.argv) - 1 :]))
-    print("problem            n     m   ok        error u  error λ  CPU s per query")
-    for problem in LARGE:
-        print(solved(problem, queries), flush=True)
+def main(count: int = 1000, queries: int = 20, *packs: str) -> None:
+    """Print both tables, or the second one of packs."""
+    if not packs:
+        print("problem            n     m   ok        error u  error λ  CPU s per query")
+        for problem in LARGE:
+            print(solved(problem, queries), flush=True)
     print("\nproblem, bound: without, violated, effectivity min, median, max")
-    for problem in SMALL:
+    for problem in [create("problem", "pack", {"path": path}) for path in packs] or SMALL:
         print(*certified(problem, count), sep="\n", flush=True)
+
+
+if __name__ == "__main__":
+    main(*map(int, sys.argv[1:3]), *sys.argv[3:])

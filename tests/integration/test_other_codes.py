@@ -63,7 +63,7 @@ def run(example: Path, monkeypatch: pytest.MonkeyPatch) -> vibench.Run:
     return vibench.run(vibench.read_study("study.toml"), progress=False, jobs=1)
 
 
-@pytest.mark.parametrize("script", ["freefem/obstacle.edp", "getfem/hertz.py"])
+@pytest.mark.parametrize("script", ["freefem/obstacle.edp", "freefem/signorini.edp", "getfem/hertz.py"])
 def test_a_script_has_sixty_lines_at_most(script: str) -> None:
     assert len((EXAMPLES / script).read_text(encoding="utf-8").splitlines()) <= 60
 
@@ -92,6 +92,32 @@ def test_the_model_of_freefem_runs_through_the_matrix(freefem: Path, monkeypatch
     assert (theirs["R"] / ours["R"]).between(0.5, 2.0).all()
     constants = found.queries.groupby("problem")["beta_hf_span"].min()
     assert constants["FreeFEM"] == pytest.approx(constants["vibench"], rel=0.1)
+
+
+def test_the_signorini_problem_of_freefem_has_a_certified_model(freefem: Path) -> None:
+    """All of its members are declared: bounds rest on nothing else, of the solution and of the corrected pair."""
+    subprocess.run(
+        ["FreeFem++", "-nw", "signorini.edp", "signorini", "8"],
+        cwd=freefem,
+        check=True,
+        capture_output=True,
+        timeout=300,
+    )
+    pack = vibench.create("problem", "pack", {"path": str(freefem / "signorini")})
+    dual, primal = vibench.create("dual strategy", "mcpg"), vibench.create("primal strategy", "offline-pga")
+    given = vibench.Stop(1e-2), vibench.Stop(1e-2)
+    model = vibench.Reduction(pack, dual, primal, *given, tolerance=0.5, assembly="certified").model
+    solver, in_contact = vibench.HighFidelitySolver(pack), 0
+    for mu in pack.parameters.sample(12, 7):
+        exact, A = solver.solve(mu), pack.assemble(mu).A
+        in_contact += bool(exact.lam.any())
+        for corrected in (False, True):
+            found = model.solve(mu, corrected=corrected)
+            assert found.bound is not None
+            assert found.bound.guarantee == "certified"
+            error = np.sqrt((exact.u - found.u) @ (A @ (exact.u - found.u)))
+            assert 1e-6 * np.sqrt(exact.u @ (A @ exact.u)) < error <= found.bound.u_energy
+    assert in_contact >= 6
 
 
 def test_the_model_of_getfem_agrees_with_hertz(getfem: Path) -> None:
