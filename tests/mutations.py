@@ -423,6 +423,13 @@ FAULTS = (
         ("tests/unit/library/test_export.py",),
     ),
     Fault(
+        "pair-in-c-without-what-is-left-of-complementarity",
+        "vibench/library/reduced_model_certificate.c.template",
+        "sqrt(rho * rho + 2.0 * fmax(0.0, gap))",
+        "rho",
+        ("tests/unit/library/test_c_source.py",),
+    ),
+    Fault(
         "proof-without-round-off",
         "vibench/linalg/inertia.py",
         "if error <= shift:",

@@ -155,7 +155,7 @@ def export_reduced_model(
         int, Option(min=16, help="Largest number of parameters at which a member is evaluated.")
     ] = 4096,
     bases: Annotated[bool, Option("--bases/--no-bases", help="Include the bases that reconstruct u and λ.")] = True,
-    c: Annotated[bool, Option("--c", help="Also write a C99 source, under the same name.")] = False,
+    c: Annotated[bool, Option("--c", help="Also write a C99 source and its header, under the same name.")] = False,
 ) -> None:
     """Export a reduced model for use without vibench."""
     from vibench.library.export import BOUNDS, RUNTIME, TOLERANCE, export_model
@@ -172,10 +172,13 @@ def export_reduced_model(
     why = exported.about["no_bounds"]
     has_bounds = not why
     echo(f"error bounds: {exported.about['certificate']}" if has_bounds else f"no error bounds: {why}")
-    if c and has_bounds:
-        echo("the C source has no error bounds")
     beside = [file.with_name(BOUNDS)] if has_bounds else []
-    written = ", ".join(map(str, [file, file.with_name(RUNTIME), *beside, *([file.with_suffix(".c")] if c else [])]))
+    written = ", ".join(
+        map(
+            str,
+            [file, file.with_name(RUNTIME), *beside, *([file.with_suffix(".c"), file.with_suffix(".h")] if c else [])],
+        )
+    )
     script = Path(BOUNDS if has_bounds else RUNTIME).stem
     echo(f"{written}: `from {script} import Model`, then `Model({str(file)!r}).solve(mu)`")
 

@@ -6,6 +6,7 @@ import re
 from collections.abc import Iterable, Mapping
 from importlib.resources import files
 from string import Template
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -14,33 +15,82 @@ from vibench.arrays import Array, Indices
 from vibench.interfaces.problem import MEMBERS
 from vibench.model.chebyshev import AffinePolynomial
 
-TEMPLATE = "reduced_model.c.template"
 PER_LINE = 4
+
+PREFIX = "certificate_"
+"""Of the names of arrays of a certificate."""
+
+SPECTRAL = ("anchors", "lower", "upper", "count", "term_norms", "spectral_error")
+"""Arrays of a certificate that are only there where A depends on the parameter."""
 
 
 def source(
-    members: Mapping[str, AffinePolynomial], arrays: Mapping[str, Array], about: Mapping[str, Any], stem: str
-) -> str:
-    """The C source of a model whose basis does not depend on the parameter; its function is called after `stem`."""
+    members: Mapping[str, AffinePolynomial],
+    arrays: Mapping[str, Array],
+    about: Mapping[str, Any],
+    stem: str,
+    thetas: Mapping[str, AffinePolynomial] = MappingProxyType({}),
+) -> tuple[str, str]:
+    """The C source of a model whose basis does not depend on the parameter, and its header.
+
+    The names of its functions begin with `stem`. With the `thetas` of a certificate it has error bounds.
+    """
     name = re.sub(r"\W", "_", f"model_{stem}" if not stem[:1].isalpha() else stem, flags=re.ASCII)
-    box, cell = about["parameters"], about["cell"]
-    return Template((files("vibench.library") / TEMPLATE).read_text(encoding="utf-8")).substitute(
-        name=name,
-        macro=name.upper(),
-        origin=_comment(f"{cell['problem']}, {cell['dual']}, {cell['primal']}; cell {cell['cell']}"),
-        licence=_comment(f"{about['source']['distribution']}, {about['source']['licence']}"),
-        exporter=_comment(about["exported_by"]),
-        parameters=_comment(", ".join(f"{n} [{u}]" for n, u in zip(box["names"], box["units"], strict=True))),
-        dimension=len(arrays["lower"]),
-        unknowns=members["f"].terms.shape[1],
-        constraints=members["g"].terms.shape[1],
-        degree=max(max(member.degrees) for member in members.values()),
-        terms=max(len(member.terms) for member in members.values()),
-        accuracy=repr(float(about["accuracy"])),
-        lower=_numbers(arrays["lower"]),
-        upper=_numbers(arrays["upper"]),
-        members="\n".join(_member(key, members[key]) for key in MEMBERS),
-    )
+    box, cell, polynomials = about["parameters"], about["cell"], {**members, **thetas}
+    values = {
+        "name": name,
+        "macro": name.upper(),
+        "origin": _comment(f"{cell['problem']}, {cell['dual']}, {cell['primal']}; cell {cell['cell']}"),
+        "licence": _comment(f"{about['source']['distribution']}, {about['source']['licence']}"),
+        "exporter": _comment(about["exported_by"]),
+        "parameters": _comment(", ".join(f"{n} [{u}]" for n, u in zip(box["names"], box["units"], strict=True))),
+        "dimension": len(arrays["lower"]),
+        "unknowns": members["f"].terms.shape[1],
+        "constraints": members["g"].terms.shape[1],
+        "degree": max(max(member.degrees) for member in polynomials.values()),
+        "terms": max(len(member.terms) for member in polynomials.values()),
+        "accuracy": repr(float(about["accuracy"])),
+        "lower": _numbers(arrays["lower"]),
+        "upper": _numbers(arrays["upper"]),
+        "members": "\n".join(_member(key, members[key]) for key in MEMBERS),
+        "bounds": "",
+        "certificate": "",
+    }
+    if thetas:
+        values |= _of_certificate(thetas, arrays)
+        values |= {"bounds": _filled("reduced_model_certificate.h", values)}
+        values |= {"certificate": _filled("reduced_model_certificate.c", values)}
+    header = _filled("reduced_model.h", values)
+    return _filled("reduced_model.c", values | {"header": header}), header
+
+
+def _filled(template: str, values: Mapping[str, Any]) -> str:
+    return Template((files("vibench.library") / f"{template}.template").read_text(encoding="utf-8")).substitute(values)
+
+
+def _of_certificate(thetas: Mapping[str, AffinePolynomial], arrays: Mapping[str, Array]) -> dict[str, Any]:
+    """What the templates of a certificate have in place of names: sizes, polynomials and arrays."""
+    own: dict[str, Array] = {f"{PREFIX}{name}": np.zeros(1) for name in SPECTRAL}
+    own |= {name: array for name, array in arrays.items() if name.startswith(PREFIX) and name != f"{PREFIX}lift"}
+    (rows, loads), (directions, kept) = own[f"{PREFIX}responses"].shape, own[f"{PREFIX}factor"].shape
+    numbers = loads * (loads + 1) // 2 + 8 * rows + 16 * loads + own[f"{PREFIX}norms"].size + kept
+    sizes = {name: polynomial.terms.shape[1] for name, polynomial in thetas.items()}
+    return sizes | {
+        "rows": rows,
+        "loads": loads,
+        "directions": directions,
+        "kept": kept,
+        "residual_terms": own[f"{PREFIX}norms"].size,
+        "spectral": int(f"{PREFIX}anchors" in arrays),
+        "stack": round(8e-3 * numbers) + 1,
+        "thetas": "\n".join(_member(key, polynomial) for key, polynomial in thetas.items()),
+        "arrays": "\n".join(map(_array, own, own.values())),
+    }
+
+
+def _array(name: str, array: Array | Indices) -> str:
+    kind = "int" if array.dtype.kind in "iu" and array.ndim else "double"
+    return f"static const {kind} {name}[] = {{\n{_numbers(array if array.size else np.zeros(1))}\n}};"
 
 
 def _member(name: str, member: AffinePolynomial) -> str:

@@ -105,7 +105,7 @@ def export_model(
     bases
         Whether the file has the primal basis and the generators, from which u and λ are reconstructed.
     c
-        Whether to write a C99 source, under the same name, too.
+        Whether to write a C99 source and its header, under the same name, too.
 
     Raises
     ------
@@ -121,12 +121,13 @@ def export_model(
         raise RequestError(f"'{file.parent}' is no folder")
     scripts = [RUNTIME] if exported_certificate.reason_for_none(model.certificate) else [RUNTIME, BOUNDS]
     runtime = {file.with_name(name): (files("vibench.library") / name).read_bytes() for name in scripts}
-    source = file.with_suffix(".c")
-    _refuse_to_overwrite([file, *([source] if c else [])], runtime)
+    sources = [file.with_suffix(".c"), file.with_suffix(".h")] if c else []
+    _refuse_to_overwrite([file, *sources], runtime)
     found = exported(model, tolerance, evaluations, bases, c)
     contents = {file: _npz(found), **runtime}
     if c:
-        contents[source] = c_source.source(found.members, found.arrays, found.about, file.stem).encode()
+        texts = c_source.source(found.members, found.arrays, found.about, file.stem, found.thetas)
+        contents |= {path: text.encode() for path, text in zip(sources, texts, strict=True)}
     file.parent.mkdir(parents=True, exist_ok=True)
     for path, content in contents.items():
         write_atomically(path, content)

@@ -7,7 +7,9 @@ import shutil
 import subprocess
 import warnings
 from collections.abc import Callable
+from importlib.resources import files
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -17,6 +19,7 @@ import vibench
 from vibench.library import c_source
 from vibench.library.export import export_model, exported
 from vibench.library.reduced_model import Model as Exported
+from vibench.model.certificates import complementarity
 from vibench.model.chebyshev import AffinePolynomial, products
 from vibench.qp.exact import exact_solution
 from vibench.qp.verification import infeasibility_certificate
@@ -26,23 +29,31 @@ pytestmark = pytest.mark.skipif(COMPILER is None, reason="NO C COMPILER (cc, gcc
 
 Answer = tuple[int, np.ndarray, np.ndarray, np.ndarray]
 Solve = Callable[[np.ndarray], Answer]
+POINTER = ctypes.POINTER(ctypes.c_double)
 STRICT = ("-std=c99", "-pedantic", "-O2", "-Wall", "-Wextra", "-Wshadow", "-Wstrict-prototypes", "-Werror")
+
+
+def library(file: Path, strict: tuple[str, ...] = STRICT) -> ctypes.CDLL:
+    """A C source, compiled without a warning."""
+    done = subprocess.run(
+        [str(COMPILER), *strict, "-shared", "-fPIC", "-o", file.with_suffix(".so"), file, "-lm"],
+        capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    return ctypes.CDLL(str(file.with_suffix(".so")))
+
+
+def pointers(*arrays: np.ndarray) -> list[Any]:
+    return [array.ctypes.data_as(POINTER) for array in arrays]
 
 
 def compiled(file: Path, unknowns: int, constraints: int) -> Solve:
     """The function of a C source: its code, x, α, residuals."""
-    library = file.with_suffix(".so")
-    done = subprocess.run(
-        [str(COMPILER), *STRICT, "-shared", "-fPIC", "-o", library, file, "-lm"],
-        capture_output=True, text=True, check=False,
-    )  # fmt: skip
-    assert done.returncode == 0, done.stderr
-    function = getattr(ctypes.CDLL(str(library)), f"{file.stem}_solve")
-    pointer = ctypes.POINTER(ctypes.c_double)
+    function = getattr(library(file), f"{file.stem}_solve")
 
     def solve(mu: np.ndarray) -> Answer:
         arrays = [np.ascontiguousarray(mu), np.zeros(unknowns), np.zeros(constraints), np.zeros(3)]
-        return (function(*(array.ctypes.data_as(pointer) for array in arrays)), *arrays[1:])
+        return (function(*pointers(*arrays)), *arrays[1:])
 
     return solve
 
@@ -53,13 +64,18 @@ PROBLEMS = ["radial-obstacle", "obstacle"]
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> vibench.Run:
     problems = [{"name": name, "options": {"resolution": 150}} for name in PROBLEMS]
-    study = small_study("small", problems, tolerances=[{"pod": [5e-2], "dual": [2e-1]}])
+    assembly = ["reduced", "certified"]
+    study = small_study("small", problems, assembly=assembly, tolerances=[{"pod": [1e-2], "dual": [1e-1]}])
     return vibench.run(study, tmp_path_factory.mktemp("c") / "run", progress=False, jobs=1)
 
 
 @pytest.fixture(scope="module", params=PROBLEMS)
 def model(request: pytest.FixtureRequest, run: vibench.Run) -> vibench.Model:
-    return run.model(run.cells.set_index("problem").loc[request.param, "cell"])
+    return model_of(run, request.param, "reduced")
+
+
+def model_of(run: vibench.Run, problem: str, assembly: str) -> vibench.Model:
+    return run.model(str(run.cells.set_index(["problem", "assembly"]).loc[(problem, assembly), "cell"]))
 
 
 def test_a_c_source_gives_the_answers_of_the_model(model: vibench.Model, tmp_path: Path) -> None:
@@ -84,6 +100,72 @@ def test_a_c_source_gives_the_answers_of_the_model(model: vibench.Model, tmp_pat
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             assert says[solve(script.upper + far * width)[0]] == script.solve(script.upper + far * width).status
+
+
+@pytest.mark.parametrize("problem", PROBLEMS)
+def test_a_c_source_has_the_bounds_and_the_corrected_pair_of_the_model(
+    problem: str, run: vibench.Run, tmp_path: Path
+) -> None:
+    model = model_of(run, problem, "certified")
+    export_model(model, tmp_path / "model.npz", tolerance=2e-13, evaluations=6000, c=True)
+    found, data = library(tmp_path / "model.c"), dict(np.load(tmp_path / "model.npz"))
+    (rows, loads), basis = data["certificate_responses"].shape, data["basis"]
+
+    def certified(mu: np.ndarray, corrected: bool) -> tuple[int, np.ndarray, np.ndarray, np.ndarray]:
+        x, alpha, residuals = np.zeros(basis.shape[1]), np.zeros(data["generators"].shape[1]), np.zeros(3)
+        lam, shift, bounds = np.full(rows, np.nan), np.full(loads, np.nan), np.full(3, np.nan)
+        assert found.model_solve(*pointers(mu, x, alpha, residuals)) in {0, 16}
+        code = found.model_certify(*pointers(mu, x, alpha), int(corrected), *pointers(lam, shift, bounds))
+        return code, basis @ x - data["certificate_lift"] @ shift, lam, bounds
+
+    for mu in model.parameters.sample(20, seed=5):
+        for corrected in (False, True):
+            own = model.solve(mu, accuracy=1e-13, corrected=corrected)
+            assert own.bound is not None
+            assert own.answer.is_corrected is corrected
+            code, u, lam, bounds = certified(mu, corrected)
+            assert code == 0
+            assert np.linalg.norm(u - own.u) <= 1e-9 * np.linalg.norm(own.u)
+            assert np.linalg.norm(lam - own.lam) <= 1e-9 * np.linalg.norm(own.lam)
+            assert bounds[0] == pytest.approx(own.bound.u_energy, rel=1e-9)
+            assert bounds[1] == pytest.approx(own.bound.lambda_natural, rel=1e-9)
+            assert bounds[2] == pytest.approx(own.bound.relative, rel=2e-9)  # and of ‖u‖
+    assert certified(model.parameters.upper, corrected=True)[0] == 0
+    code, u, lam, bounds = certified(model.parameters.upper * 1.001, corrected=True)
+    assert code == 4
+    assert np.all(bounds == np.inf)
+    assert np.all(np.isfinite(u))
+    assert lam.min() >= 0.0
+
+
+@pytest.mark.parametrize("steps", [30, 1])  # after one step all that is not done goes to the other method
+def test_both_methods_of_the_correction_in_c_find_that_of_vibench(steps: int, tmp_path: Path) -> None:
+    size, zeros = 8, np.zeros(8)
+    text = files("vibench.library").joinpath("reduced_model_certificate.c.template").read_text(encoding="utf-8")
+    basic = files("vibench.library").joinpath("reduced_model.c.template").read_text(encoding="utf-8")
+    parts = [
+        "#include <float.h>\n#include <math.h>\n#include <string.h>\n"
+        f"enum {{ LOADS = {size}, STEPS = {steps} }};\n"
+        "double certificate_inverse[LOADS * LOADS], certificate_diagonal[LOADS];\n",
+        basic[basic.index("static double dot(") : basic.index("/* The largest of two")],
+        text[text.index("static double dot_sizes(") : text.index("/* A w with B w >= s")].replace("static", ""),
+    ]
+    (tmp_path / "part.c").write_text("".join(parts), encoding="utf-8")
+    found = library(tmp_path / "part.c", strict=())
+    found.complement.argtypes = [ctypes.c_double, POINTER, POINTER, POINTER]
+    matrix = np.ctypeslib.as_array((ctypes.c_double * size**2).in_dll(found, "certificate_inverse")).reshape(size, size)
+    np.ctypeslib.as_array((ctypes.c_double * size).in_dll(found, "certificate_diagonal"))[:] = 1.0
+    for seed in range(200):
+        rng = np.random.default_rng(seed)
+        Q = np.linalg.qr(rng.standard_normal((size, size)))[0]
+        M, excess = Q @ np.diag(np.geomspace(1.0, 1e3, size)) @ Q.T, rng.standard_normal(size)
+        matrix[:] = M = 0.5 * (M + M.T)
+        fixed, nu, descended = M @ excess, np.zeros(size), np.zeros(size)
+        expected = complementarity.complementary(fixed, M.__getitem__, excess <= 0.0)
+        found.complement(1.0, *pointers(excess, zeros, nu))
+        found.descend(*pointers(fixed, descended))
+        for one in (nu, descended):
+            assert one == pytest.approx(expected, abs=1e-9 * np.abs(fixed).max())
 
 
 def test_terms_that_a_problem_declares_are_exported_as_they_are(model: vibench.Model) -> None:
@@ -145,7 +227,7 @@ def test_any_constraints(case: str, scale: float, tmp_path: Path) -> None:
         "accuracy": 1e-9,
     }
     arrays = {"lower": -np.ones(dimension), "upper": np.ones(dimension)}
-    (tmp_path / "case.c").write_text(c_source.source(members, arrays, about, "case"), encoding="utf-8")
+    (tmp_path / "case.c").write_text(c_source.source(members, arrays, about, "case")[0], encoding="utf-8")
     solve = compiled(tmp_path / "case.c", n, count)
     random = np.random.default_rng(2)
     codes = []
@@ -177,6 +259,6 @@ def test_matrices_that_are_not_positive_definite_fail(tmp_path: Path) -> None:
         "cell": dict.fromkeys(("problem", "dual", "primal", "cell"), ""),
         "source": {"distribution": "", "licence": ""}, "exported_by": "", "accuracy": 1e-9,
     }  # fmt: skip
-    text = c_source.source(one, {"lower": np.zeros(1), "upper": np.ones(1)}, about, "9-lives")
+    text = c_source.source(one, {"lower": np.zeros(1), "upper": np.ones(1)}, about, "9-lives")[0]
     (tmp_path / "model_9_lives.c").write_text(text, encoding="utf-8")
     assert compiled(tmp_path / "model_9_lives.c", 1, 1)(np.array([0.5]))[0] == 3
