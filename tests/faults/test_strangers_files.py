@@ -7,6 +7,8 @@ import os
 import pickle
 import shutil
 import sqlite3
+import subprocess
+import sys
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -174,6 +176,52 @@ def test_a_report_does_not_replace_the_results(run: Path) -> None:
     with pytest.raises(RequestError, match="cannot be written"):
         write_report(str(run), run / "nowhere" / "report.html", figures=False)
     assert (run / FILE).read_bytes() == before
+
+
+PIPES = """
+import os, sys
+from pathlib import Path
+from vibench.benchmarks.files import read_benchmarks
+from vibench.errors import RequestError
+from vibench.report.figures import read_captions
+from vibench.results.database import ResultsDatabase
+from vibench.results.tables import read
+from vibench.study.matrix import read_study
+
+folder = Path(sys.argv[1])
+
+def said(name, call):
+    os.mkfifo(folder / name)
+    try:
+        print(call())
+    except RequestError as error:
+        print(str(error).replace(f"{folder}/", ""))
+    (folder / name).unlink()
+
+for end in ("-wal", "-shm", "-journal"):
+    said(f"results.sqlite{end}", lambda: read(folder / "results.sqlite", "cells"))
+    said(f"results.sqlite{end}", lambda: ResultsDatabase(folder, {}, anew=True))
+(folder / "results.sqlite").unlink()
+said("results.sqlite", lambda: ResultsDatabase(folder, {}))
+said("captions.json", lambda: read_captions(folder))
+said("before.json", lambda: read_benchmarks(folder / "before.json"))
+said("study.toml", lambda: read_study(str(folder / "study.toml")))
+"""
+"""A process of its own, since opening a pipe would wait for ever."""
+
+
+def test_pipes_of_others_are_refused_wherever_a_file_is_opened(run: Path) -> None:
+    done = subprocess.run(
+        [sys.executable, "-c", PIPES, str(run)], capture_output=True, text=True, check=False, timeout=120
+    )
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.splitlines() == [
+        *(f"'results.sqlite{end}' is no regular file; remove it" for end in ("-wal", "-shm", "-journal") for _ in "12"),
+        "'results.sqlite' is no regular file; remove it",
+        "{}",
+        "'before.json' cannot be read as a file of pytest-benchmark (OSError: [Errno 22] it is no regular file)",
+        "study file 'study.toml' is not a file",
+    ]
 
 
 @pytest.mark.parametrize("name", ["a b?mode=rwc", "100%", "#1", "ü//x"])

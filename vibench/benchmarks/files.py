@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 from vibench import provenance
 from vibench.benchmarks.measure import TIMER, PassTimes
 from vibench.errors import RequestError
+from vibench.files import read_regular
 from vibench.text import parsed_json, unbroken
 
 if TYPE_CHECKING:
@@ -112,7 +113,7 @@ def read_benchmarks(path: Path) -> Timed:
     Raises a `RequestError` if it is none.
     """
     try:
-        return parsed(path.read_bytes())
+        return parsed(read_regular(path))
     except (OSError, ValueError, OverflowError, KeyError, TypeError, AttributeError) as error:
         reason = unbroken(f"{type(error).__name__}: {error}")
         raise RequestError(f"'{path}' cannot be read as a file of pytest-benchmark ({reason})") from None

@@ -41,6 +41,8 @@ class Model:
     """A reduced model from a file; `about` says where it comes from, `solver` is "piqp" or "proxqp"."""
 
     def __init__(self, file: str | Path, solver: str = "") -> None:
+        if Path(file).exists() and not Path(file).is_file():  # a pipe may have no end
+            raise ValueError(f"'{file}' is no regular file")
         with np.load(file, allow_pickle=False) as data:
             if "format" not in data or str(data["format"]) != FORMAT:
                 raise ValueError(f"'{file}' is no {FORMAT}")

@@ -20,6 +20,7 @@ from vibench.results.sqlite.reading import (
     DamagedResultsError,
     code_of,
     read_meta,
+    refuse_pipes,
     study_of,
     text_reader,
 )
@@ -58,6 +59,7 @@ class ResultsDatabase:
             if not anew:
                 _refuse_other(path, study)
             folder.mkdir(parents=True, exist_ok=True)
+            refuse_pipes(path)
             self._path = path.absolute()  # SQLite may take a name that begins with "file:" for a URI
             self._db = sqlite3.connect(self._path, timeout=BUSY_SECONDS)
             self._db.text_factory = text_reader()

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any, TypeAlias, TypeVar
 
 from vibench.errors import RequestError
+from vibench.files import read_regular
 from vibench.interfaces.strategies import Stop
 from vibench.reduction.nested import NestedStrategy
 from vibench.study.cells import Cell
@@ -57,7 +58,7 @@ def read_study(request: str, overrides: Mapping[str, Sequence[Any]] | None = Non
     """
     path = find_study(request)
     try:
-        text = path.read_text(encoding="utf-8")
+        text = read_regular(path).decode()
     except (OSError, UnicodeDecodeError) as error:
         raise RequestError(f"{path}: cannot be read as text: {error}") from None
     try:

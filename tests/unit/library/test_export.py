@@ -413,6 +413,9 @@ def test_a_file_that_is_no_model_is_refused(tmp_path: Path) -> None:
         Exported(tmp_path / "other.npz")
     with pytest.raises(ValueError, match="Object arrays cannot be loaded"):
         Exported(tmp_path / "objects.npz")
+    for other in (tmp_path, Path("/dev/zero")):
+        with pytest.raises(ValueError, match="is no regular file"):
+            Exported(other)
 
 
 @pytest.mark.parametrize(

@@ -20,7 +20,7 @@ from matplotlib.figure import Figure
 
 from vibench import interrupts
 from vibench.errors import RequestError, unknown_name
-from vibench.files import TEMPORARY, write_atomically
+from vibench.files import TEMPORARY, read_regular, write_atomically
 from vibench.report.figures.constants import inf_sup, shares
 from vibench.report.figures.convergence import diagnostics, enrichment, orthogonality, projection_errors
 from vibench.report.figures.costs import break_even, dimension, outputs, total_cost, work_precision
@@ -143,7 +143,7 @@ def remove(folder: Path) -> None:
 def read_captions(folder: Path) -> dict[str, str]:
     """The captions beside the figures of a folder, by the names of the figures; empty where there are none."""
     try:
-        captions = json_object((folder / CAPTIONS).read_text(encoding="utf-8"))
+        captions = json_object(read_regular(folder / CAPTIONS).decode())
     except (OSError, UnicodeDecodeError):
         return {}
     return {name: str(text) for name, text in (captions or {}).items()}

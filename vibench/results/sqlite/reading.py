@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import shutil
 import sqlite3
 import tempfile
@@ -34,8 +35,8 @@ DAMAGE = {sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB}
 DAMAGED = ".damaged"
 """What `set_aside` adds to the name of a file."""
 
-WRITE_AHEAD_LOG, INDEX = "-wal", "-shm"
-"""What SQLite adds to the name of a database for its write-ahead log, and for the index of that."""
+WRITE_AHEAD_LOG, INDEX, JOURNAL = "-wal", "-shm", "-journal"
+"""What SQLite adds to the name of a database for its write-ahead log, the index of that, and a log for going back."""
 
 
 def code_of(error: sqlite3.Error) -> int:
@@ -63,7 +64,18 @@ def open_read_only(path: Path) -> Iterator[sqlite3.Connection]:
         yield connection
 
 
+def refuse_pipes(path: Path) -> None:
+    """Refuse a pipe or a device, of which there may be no end, as a database and among what SQLite opens beside it.
+
+    Raises a `RequestError` that names what is no regular file.
+    """
+    for beside in (f"{path}{end}" for end in ("", WRITE_AHEAD_LOG, INDEX, JOURNAL)):
+        if os.path.exists(beside) and not os.path.isfile(beside):  # noqa: PTH110, PTH113
+            raise RequestError(f"'{beside}' is no regular file; remove it")
+
+
 def _connection(path: Path) -> sqlite3.Connection:
+    refuse_pipes(path)
     return sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro", uri=True, timeout=BUSY_SECONDS)
 
 
