@@ -34,6 +34,7 @@ EXAMPLES: Mapping[str, tuple[str, ...]] = {
     "list": ("vibench list", "vibench list solvers"),
     "show": (
         "vibench show quick",
+        "vibench show quick 625b",
         "vibench show quick --table benefits",
         "vibench show quick --where \"solver = 'piqp' and beta_span_min < 1e-3\"",
         "vibench show quick --columns cell,solver,error_u_mean --sort -error_u_mean",

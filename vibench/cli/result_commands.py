@@ -10,7 +10,7 @@ from typing import Annotated, Literal
 from typer import Argument, Exit, Option
 
 from vibench.cli.completion import SHOWN, cell_columns, cells, column_names, error_measures, runs, table_names
-from vibench.terminal.output import echo, warn
+from vibench.terminal.output import echo, run_argument, warn
 
 EXAMPLE = "solver = 'piqp' and beta_span_min < 1e-3"
 """Condition in the help of `--where`."""
@@ -22,6 +22,14 @@ RunArgument = Annotated[str, Argument(metavar="RUN", help="A run folder, or its 
 
 def show(
     run: RunArgument,
+    cell: Annotated[
+        str,
+        Argument(
+            metavar="[CELL]",
+            help="Key of a cell, or its beginning: all of its columns, or its rows in another table.",
+            autocompletion=cells,
+        ),
+    ] = "",
     table: Annotated[str, Option(help=f"{', '.join(SHOWN)}.", autocompletion=table_names)] = "summary",
     columns: Annotated[
         str, Option(metavar="NAME,…", help="Columns to print, or all.", autocompletion=column_names)
@@ -45,7 +53,7 @@ def show(
     ] = None,
     form: FormOption = "terminal",
 ) -> None:
-    """Print a table of a run.
+    """Print a table of a run, or one cell of it.
 
     On a terminal, columns that do not fit are left out; csv and json have the values and names of the results file.
     """
@@ -54,11 +62,19 @@ def show(
     from vibench.terminal.console import print_frame
 
     path = tables.results_file(run)
-    measured = partial(views.look_up, path, table, error=error, largest=within)
+    measured = partial(views.look_up, path, table, cell=cell, error=error, largest=within)
     view = measured(columns=parts(columns), where=where, sort=parts(sort), limit=limit)
     warn(*view.faults)
+    if form == "terminal" and cell and table == "summary" and not columns:
+        (key,) = view.rows["cell"]
+        described, empty = view.described
+        print_frame(described, f"cell {key} of {path.parent.name}", every=True)
+        echo(f"empty: {', '.join(empty)}")
+        return
     if form == "terminal":
-        print_frame(view.readable, f"{path.parent.name}: {table}", view.priority, axes=view.axes, every=view.chosen)
+        rest = f"vibench show {run_argument(path.parent)} CELL" if view.view.source == "cells" else "--format csv"
+        title = f"{path.parent.name}: {table}"
+        print_frame(view.readable, title, view.priority, axes=view.axes, every=view.chosen, rest=rest)
         if view.rows.empty and view.view.empty:
             echo(view.view.empty)
     else:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shlex
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -13,7 +14,8 @@ import pandas as pd
 
 from vibench.errors import RequestError, unknown_name
 from vibench.results import ranking, selection, tables
-from vibench.results.columns import CELLS, THRESHOLDS, Column
+from vibench.results.columns import CELLS, STORED, THRESHOLDS, Column
+from vibench.results.formats import cell_text
 from vibench.results.plugin_columns import Extended
 from vibench.results.ranking import BAND
 from vibench.text import json_object
@@ -25,8 +27,8 @@ AXES = (
 """Columns that tell rows apart; where all rows have one value, it stands in the title and takes no room."""
 
 OF_CELLS = (
-    *AXES, "cell", "queries_ok", "error_lambda_mean", "online_s", "error_u_mean", "N", "R", "status", "offline_s",
-    "beta_cone_lower_min", "beta_span_min", "enrichment",
+    *AXES, "cell", "error_lambda_mean", "online_s", "beta_cone_lower_min", "error_u_mean", "queries_ok", "N", "R",
+    "status", "offline_s", "beta_span_min", "enrichment",
 )  # fmt: skip
 
 OF_BENEFITS = (
@@ -127,6 +129,16 @@ class Table:
         return tables.under_headings(rows, names, self.view.headings or {})
 
     @property
+    def described(self) -> tuple[pd.DataFrame, list[str]]:
+        """The columns of the first row with their values, units and meanings, and the names of those that are empty."""
+        row, columns = self.rows.iloc[0], {**STORED[self.view.source], **(self.view.headings or {})}
+        described = {name: columns[name] for name in row.index if name in columns}
+        texts = {name: cell_text(row[name]) for name in described}
+        filled = [(name, text, described[name].unit, described[name].meaning) for name, text in texts.items() if text]
+        frame = pd.DataFrame(filled, columns=["column", "value", "unit", "meaning"])
+        return frame, [name for name, text in texts.items() if not text]
+
+    @property
     def _placed(self) -> list[str]:
         """The columns in their places, or in the order in which they were asked for."""
         headings = self.view.headings
@@ -153,6 +165,7 @@ def look_up(
     path: Path,
     name: str,
     *,
+    cell: str = "",
     columns: Sequence[str] = (),
     where: str = "",
     sort: Sequence[str] = (),
@@ -163,9 +176,10 @@ def look_up(
     """A table of a results file: the rows that satisfy a condition, sorted, the first `limit` of them.
 
     With an error measure (`ranking`) models are compared by it: `best` has its bands, tables of break-even have
-    the errors of both models, of which neither is above `largest`.
+    the errors of both models, of which neither is above `largest`. `cell` is the key of a cell, or its beginning, to
+    which the rows belong.
 
-    Raises a `RequestError` if there is no such table, column or measure, the table does not depend on one, or the
+    Raises a `RequestError` if there is no such table, cell, column or measure, the table does not depend on one, or the
     condition is none.
     """
     if name not in VIEWS:
@@ -173,6 +187,8 @@ def look_up(
     view, extended = _measured(path, name, error, largest is not None)
     view, frame = _with_columns(view, extended.columns), extended.frame
     keys = frame.get("cell", [])
+    if cell:
+        frame = frame[frame["cell"] == _cell(path, cell)] if len(keys) else frame
     if where:
         made = set(view.headings or {}) - set(frame.columns)
         frame = frame[selection.matching(path, view.source, where, frame.columns, extended, made)]
@@ -193,6 +209,15 @@ def look_up(
     shown = rows.head(limit) if limit else rows
     listed, length = tuple(dict.fromkeys(asked or default)), selection.short_keys(keys)
     return Table(shown, listed, view, bool(asked), length, _varying_options(extended.frame), extended.faults)
+
+
+def _cell(path: Path, beginning: str) -> str:
+    """The one key of a cell that begins so."""
+    matching = [key for key in tables.read(path, "cells")["cell"] if key.startswith(beginning)]
+    if len(matching) != 1:
+        listed = f"`vibench show {shlex.quote(str(path.parent))}` lists them"
+        raise RequestError(f"{len(matching)} cells of '{path.parent}' begin with '{beginning}', expected one; {listed}")
+    return str(matching[0])
 
 
 def _varying_options(frame: pd.DataFrame) -> dict[tuple[str, str], tuple[str, ...]]:

@@ -7,7 +7,7 @@ import re
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 from rich import box
 from rich.cells import cell_len
@@ -28,6 +28,9 @@ POSITIVE = re.compile("0*[1-9][0-9]{0,5}")
 
 SHORT = 24
 """A text of more characters may be wrapped, between words if it can."""
+
+SUBJECT = 3
+"""Columns beside those that tell rows apart that a table is about."""
 
 LONG = 60
 """Characters of a line of a long text, where there is room."""
@@ -56,12 +59,13 @@ def print_frame(
     *,
     axes: Collection[str] = (),
     every: bool = False,
-    rest: str = "vibench show --columns",
+    rest: str = "",
 ) -> None:
     """Print a table that fits the width; nothing is cut, and no number is wrapped.
 
     Text columns with the same value in every row go into the title, and empty ones are left out. Where there is not
-    room for all others, those of the smallest priority are left out, and a line below names them.
+    room for all others, those of the smallest priority are left out, and a line below names them. What tells rows apart
+    is not left out: where it would take the room of the first `SUBJECT` other columns, it is one column of some lines.
 
     Parameters
     ----------
@@ -73,11 +77,11 @@ def print_frame(
         Columns, those that matter most first; the order of the table by default.
     axes
         Columns that tell rows apart: those of numbers go into the title, too, where they are the same in every row, and
-        of a single row they alone do.
+        of a single row they alone do. They come first in `priority`.
     every
         Print columns with the same value in every row, too, as columns.
     rest
-        The command, or its option, that prints the columns that are left out.
+        The command, or its option, that prints the columns that are left out, if there is one.
     """
     columns = table if isinstance(table, list) else _columns_of(table)
     console = new_console()
@@ -92,21 +96,26 @@ def print_frame(
         return
     own = [column for column in columns if column not in shared]
     rank = {name: k for k, name in enumerate(priority)}
-    kept = _fitting(sorted(own, key=lambda column: rank.get(column.heading, len(rank))), console.width)
+    ranked = sorted(own, key=lambda column: rank.get(column.heading, len(rank)))
+    telling, others = ([c for c in ranked if (c.heading in axes) is told] for told in (True, False))
+    kept = _fitting(ranked, console.width)
+    if len(telling) > 1 and not set(telling + others[:SUBJECT]) <= set(kept):
+        together = _in_one([column for column in own if column in telling])
+        own.insert(min(map(own.index, telling)), together)
+        own = [column for column in own if column not in telling]
+        kept = _fitting([together, *others], console.width)
     drawn = [column for column in own if column in kept]
     whole = sum(max(column.width, cell_len(column.heading)) + 2 for column in drawn) <= console.width + 2
     # the box has a blank between columns; there is another where there is room
     printed = Table(box=box.SIMPLE_HEAD, show_edge=False, pad_edge=False, padding=(0, int(whole), 0, 0))
-    for column in drawn:
-        width = max(column.width, cell_len(column.heading)) if whole else column.width
-        limits = {"min_width": width, "max_width": LONG} if column.long else {"width": width}
-        justify = "right" if column.numeric else "left"
-        printed.add_column(shown(column.heading), justify=justify, overflow="fold", **limits)  # type: ignore[arg-type]
+    for column, width in zip(drawn, _widths(drawn, console.width, whole), strict=True):
+        justify: Literal["left", "right"] = "right" if column.numeric else "left"
+        printed.add_column(shown(column.heading), justify=justify, overflow="fold", width=width)
     for row in zip(*(column.cells for column in drawn), strict=True):
         printed.add_row(*map(shown, row))
     console.print(printed)
     if left_out := [column.heading for column in own if column not in kept]:
-        text = f"not shown at {console.width} columns: {', '.join(left_out)} (`{rest}`)"
+        text = f"not shown at {console.width} columns: {', '.join(left_out)}" + f" (`{rest}`)" * bool(rest)
         console.print(shown(text), overflow="fold")
 
 
@@ -136,7 +145,7 @@ class PrintedColumn:
     @cached_property
     def long(self) -> bool:
         """Whether a text may be wrapped."""
-        return self._longest > SHORT
+        return self.longest > SHORT
 
     @cached_property
     def width(self) -> int:
@@ -145,13 +154,21 @@ class PrintedColumn:
             *self.heading.split(),
             *(word for cell in self.cells for word in printable_lines(cell).split() if self.long),
         ]
-        return max([min(cell_len(word), SHORT) for word in words] + [1 if self.long else self._longest])
+        return max([min(cell_len(word), SHORT) for word in words] + [1 if self.long else self.longest])
 
     @cached_property
-    def _longest(self) -> int:
+    def longest(self) -> int:
+        """Characters of its longest line."""
         return max(
             (cell_len(line) for cell in map(printable_lines, self.cells) for line in cell.split("\n")), default=1
         )
+
+
+def _in_one(axes: Sequence[PrintedColumn]) -> PrintedColumn:
+    """Columns that tell rows apart as one, whose texts may be wrapped between two of them."""
+    named = [[f"{axis.heading}={cell}" * bool(cell) if axis.numeric else cell for cell in axis.cells] for axis in axes]
+    joined = [" · ".join(text for text in row if text) for row in zip(*named, strict=True)]
+    return PrintedColumn("row", tuple(joined))
 
 
 def _fitting(columns: Sequence[PrintedColumn], width: int) -> list[PrintedColumn]:
@@ -163,6 +180,17 @@ def _fitting(columns: Sequence[PrintedColumn], width: int) -> list[PrintedColumn
             kept.append(column)
             left -= column.width + 1
     return kept
+
+
+def _widths(columns: Sequence[PrintedColumn], width: int, whole: bool) -> list[int]:
+    """Characters of every column: what it needs, and of what is left as much as long texts may use."""
+    widths = [max(column.width, cell_len(column.heading)) if whole else column.width for column in columns]
+    spare = width - sum(widths) - (1 + whole) * (len(widths) - 1)
+    long = sorted((min(column.longest, LONG) - widths[k], k) for k, column in enumerate(columns) if column.long)
+    for left, (wanted, k) in zip(range(len(long), 0, -1), long, strict=True):
+        more = max(0, min(wanted, spare // left))
+        widths[k], spare = widths[k] + more, spare - more
+    return widths
 
 
 def shown(text: str) -> Text:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import io
 import re
+from collections.abc import Sequence
 from pathlib import Path
 
 import pandas as pd
@@ -16,15 +17,16 @@ from running import Main
 
 from vibench.cli.completion import SHOWN
 from vibench.results import formats, tables, views
+from vibench.results.columns import CELLS
 from vibench.terminal.console import WIDTH, new_console, print_frame
 
 WIDTHS = (80, 120, 200)
 
 
-def printed(frame: pd.DataFrame, width: int, priority: list[str] | None = None) -> list[str]:
+def printed(frame: pd.DataFrame, width: int, priority: list[str] | None = None, axes: Sequence[str] = ()) -> list[str]:
     with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(io.StringIO()) as out:
         patch.setenv("COLUMNS", str(width))
-        print_frame(frame, "table", priority or [])
+        print_frame(frame, "table", priority or [], axes=axes)
     return out.getvalue().splitlines()
 
 
@@ -43,7 +45,8 @@ def test_every_table_of_a_run_fits(
     frame = found.readable
     texts = [*map(str, frame.columns), *(formats.cell_text(value) for name in frame for value in frame[name])]
     whole = {word for text in texts for word in text.split()} | {f"{width}"}
-    shown = out.split("\n", 1)[1].replace(",", " ")
+    whole |= {f"{axis}={formats.cell_text(value)}" for axis in found.axes & set(frame) for value in frame[axis]}
+    shown = out.split("\n", 1)[1].split("not shown")[0].replace(",", " ")
     words = {word for word in shown.split() if re.search(r"\d", word)}
     assert words - {word.strip(",") for word in whole} - {part for word in whole for part in word.split(",")} == set()
     assert len(words) > 3
@@ -69,6 +72,49 @@ def test_the_columns_that_matter_least_go_first() -> None:
     lines = printed(frame.assign(bravo=[1, 2], charlie=[3, 4]), 13, ["charlie", "alpha", "bravo"])
     assert lines[1].split() == ["alpha", "charlie"]
     assert "bravo" in " ".join(lines[5:])
+
+
+ALIKE = pd.DataFrame(
+    {
+        "cell": ["102e", "58e3", "0905"],
+        "problem": ["obstacle with a name", "obstacle with a name", "hertz"],
+        "primal": ["online-supremizers", "online-supremizers", "decorrelated"],
+        "δ": [0.5, 0.5, None],
+        "assembly": ["certified", "certified", "reduced"],
+        "correction": ["none", "feasible", "none"],
+        "error": [0.00123, 0.00456, 0.5],
+        "online [ms]": [1.25, 1.75, 12.5],
+        "N": [10, 10, 29],
+    }
+)
+AXES = ["problem", "primal", "δ", "assembly", "correction"]
+
+
+@pytest.mark.parametrize("width", [56, 66, 80])
+def test_what_tells_rows_apart_is_not_left_out_nor_what_the_table_is_about(width: int) -> None:
+    """At 80 columns two rows that differ in their corrections alone looked alike, and had no errors."""
+    lines = printed(ALIKE, width, [*AXES, "cell", "error", "online [ms]", "N"], AXES)
+    assert max(map(cell_len, lines)) <= width
+    text = " ".join(lines)
+    assert all(name in text for name in ("cell", "error", "online", "102e", "0.00456", "12.5", "feasible", "certified"))
+    assert text.count("δ=0.5") == 2
+    assert not any(axis in text.split("not shown")[-1] for axis in ("problem", "primal", "correction"))
+
+
+def test_there_is_one_column_for_every_axis_where_there_is_room() -> None:
+    headings = printed(ALIKE, 120, [*AXES, "cell", "error"], AXES)[1].split()
+    assert headings == ["cell", *AXES, "error", "online", "[ms]", "N"]
+
+
+def test_long_texts_share_the_room_that_is_left_and_nothing_is_cut() -> None:
+    """Rich takes room from columns that need it, and cuts what is beyond the width."""
+    words = " ".join(["alpha", "bravo", "charlie"] * 9)
+    frame = pd.DataFrame(
+        {"name": ["a" * 33, "b"], "value": [words, "2"], "unit": ["1", "s"], "meaning": [words, f"{words} delta"]}
+    )
+    lines = printed(frame, 80)
+    assert max(map(cell_len, lines)) <= 80
+    assert sum(line.count("charlie") for line in lines) == 27
 
 
 def test_values_that_all_rows_share_stand_in_the_title_unless_asked_for() -> None:
@@ -153,6 +199,28 @@ class TestShow:
             "vibench: --where selects rows of cells, of which the table is made; "
             "'error_below' is a column of the table alone, for --columns and --sort\n"
         )
+
+    def test_a_cell_has_all_of_its_columns_with_units_and_meanings(
+        self, main: Main, quick_run: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.setenv("COLUMNS", "200")
+        cells = tables.read(tables.results_file(str(quick_run)), "cells")
+        row = cells.iloc[3]
+        code, out, _ = main("show", str(quick_run), row["cell"][:6])
+        body, empty = out.split("\nempty: ")
+        assert code == 0
+        assert out.splitlines()[0] == f"cell {row['cell']} of {quick_run.name}"
+        (line,) = (line for line in body.splitlines() if line.startswith("online_s "))
+        assert line.split(None, 3)[1:3] == [f"{row['online_s']:.3g}", "s"]
+        assert line.split(None, 3)[3].startswith("One query: median")
+        named = {line.split()[0] for line in body.splitlines()[3:] if not line.startswith(" ")}
+        assert named | {name.strip() for name in empty.split(",")} == set(CELLS)
+        _, out, _ = main("show", str(quick_run), row["cell"], "--table", "queries", "--format", "csv")
+        assert set(pd.read_csv(io.StringIO(out))["cell"]) == {row["cell"]}
+        code, out, err = main("show", str(quick_run), "x")
+        assert (code, out) == (2, "")
+        assert err.startswith("vibench: 0 cells of ")
+        assert "begin with 'x', expected one" in err
 
     def test_a_wrong_column_is_refused(self, main: Main, quick_run: Path) -> None:
         for option in ("--columns", "--sort"):
