@@ -212,7 +212,7 @@ class TestShow:
         assert out.splitlines()[0] == f"cell {row['cell']} of {quick_run.name}"
         (line,) = (line for line in body.splitlines() if line.startswith("online_s "))
         assert line.split(None, 3)[1:3] == [f"{row['online_s']:.3g}", "s"]
-        assert line.split(None, 3)[3].startswith("One query: median")
+        assert line.split(None, 3)[3].startswith("One query with assembly")
         named = {line.split()[0] for line in body.splitlines()[3:] if not line.startswith(" ")}
         assert named | {name.strip() for name in empty.split(",")} == set(CELLS)
         _, out, _ = main("show", str(quick_run), row["cell"], "--table", "queries", "--format", "csv")
