@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,10 +18,10 @@ class Pack(Problem):
     Parameters
     ----------
     path
-        The folder, absolute or relative to the folder in which vibench is started.
+        The folder; in a study file relative to that.
     """
 
-    def __init__(self, path: str) -> None:
+    def __init__(self, path: Path) -> None:
         self._pack = pack = read_model_pack(path)
         if pack.V is None:
             raise RequestError(f"pack '{path}' has multipliers and X_W alone, which are not a problem: `vibench cones`")

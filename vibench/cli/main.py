@@ -22,7 +22,7 @@ from vibench.cli.completion import CORRECTIONS, examples, names, solvers, studie
 from vibench.cli.output_commands import draw_figures, export_qps, export_reduced_model, publish_runs, write_report
 from vibench.cli.pack_commands import import_pack, pack_problem, reduce_cones
 from vibench.cli.plugin_commands import check_plugin, list_plugins, new_plugin
-from vibench.cli.result_commands import compare_runs, diff_runs, replay_query, show
+from vibench.cli.result_commands import At, compare_runs, diff_runs, places_of, replay_query, show
 from vibench.errors import RequestError, VibenchError
 from vibench.interrupts import INTERRUPTED, Interrupted, interrupted_at_once, interruptible
 from vibench.study.kinds import DUAL, PRIMAL, PROBLEM
@@ -87,6 +87,7 @@ def run_study_command(
     pod_tol: Annotated[Tolerances, Option(help="Replace the tolerances (or sizes) of the POD.")] = None,
     dual_tol: Annotated[Tolerances, Option(help="Replace the tolerances (or sizes) of the dual strategies.")] = None,
     primal_tol: Annotated[Tolerances, Option(help="Replace the tolerances of the primal strategies.")] = None,
+    at: At = None,
     out: Annotated[Path | None, Option(help="Results folder; runs/STUDY by default.")] = None,
     jobs: Annotated[
         int, Option("--jobs", "-j", min=0, help="Worker processes; 0 for one per core. Does not affect results.")
@@ -112,7 +113,7 @@ def run_study_command(
             "problem": problem, "dual": dual, "primal": primal, "solvers": solver, "correction": correction,
             "pod": pod_tol, "dual_tol": dual_tol, "primal_tol": primal_tol,
         }  # fmt: skip
-        loaded = _study(study, cell, {axis: values for axis, values in overrides.items() if values})
+        loaded = _study(study, cell, {axis: values for axis, values in overrides.items() if values}, at)
     if dry_run:
         cells = expand(loaded)
         echo(*(f"{cell.key}  {cell}" for cell in cells), f"{len(cells)} cells")
@@ -170,7 +171,7 @@ def _warn_of_open_scheduler(scheduler: str, executor: str) -> None:
         sys.stderr.write(f"vibench: {unbroken(scheduler)}: {warning}\n")
 
 
-def _study(request: str, key: str, overrides: dict[str, list[Any]]) -> Study:
+def _study(request: str, key: str, overrides: dict[str, list[Any]], at: list[str] | None) -> Study:
     """The study that is asked for, or what it has, or a results file, of one cell."""
     from vibench.execution.recorded_cell import recorded_study
     from vibench.study.matrix import expand, only_cell, read_study, study_of_cell
@@ -178,7 +179,9 @@ def _study(request: str, key: str, overrides: dict[str, list[Any]]) -> Study:
     if key and Path(request).suffix == SQLITE:
         if overrides:
             raise RequestError(f"a cell of a results file is run as it is recorded: leave out {', '.join(overrides)}")
-        return recorded_study(request, key)
+        return recorded_study(request, key, places_of(at))
+    if at:
+        raise RequestError("--at is for a cell of a results file; a study file says itself where its files are")
     study = read_study(request, overrides)
     if not key:
         return study

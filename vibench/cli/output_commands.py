@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 from typer import Argument, Exit, Option
 
 from vibench.cli.completion import cells, runs
-from vibench.cli.result_commands import RunArgument
+from vibench.cli.result_commands import At, RunArgument, places_of
 from vibench.errors import RequestError
 from vibench.terminal.output import echo, run_argument, warn
 
@@ -134,12 +134,12 @@ def publish_runs(
 
 
 def export_qps(
-    run: RunArgument, folder: Annotated[Path, Argument(metavar="DIR", help="A new or empty folder.")]
+    run: RunArgument, folder: Annotated[Path, Argument(metavar="DIR", help="A new or empty folder.")], at: At = None
 ) -> None:
     """Export the programs of a run as a test set for QP solvers. The set includes their solutions."""
     from vibench.report import replay
 
-    count = replay.export(run, folder)
+    count = replay.export(run, folder, places_of(at))
     echo(f"{count} programs in {folder / 'programs'}; `python {folder / replay.CHECKER}` rechecks every solution")
 
 
@@ -156,13 +156,14 @@ def export_reduced_model(
     ] = 4096,
     bases: Annotated[bool, Option("--bases/--no-bases", help="Include the bases that reconstruct u and λ.")] = True,
     c: Annotated[bool, Option("--c", help="Also write a C99 source and its header, under the same name.")] = False,
+    at: At = None,
 ) -> None:
     """Export a reduced model for use without vibench."""
     from vibench.library.export import BOUNDS, RUNTIME, TOLERANCE, export_model
     from vibench.library.runs import open_run
     from vibench.model.chebyshev import MEASURED
 
-    model = open_run(run).model(cell)
+    model = open_run(run, at=places_of(at)).model(cell)
     tolerance = TOLERANCE if interpolate is None else interpolate
     exported = export_model(model, file, tolerance, evaluations=evaluations, bases=bases, c=c)
     echo(*(f"{name}: {_member_in_words(member)}" for name, member in exported.members.items()))

@@ -10,6 +10,7 @@ from typing import Annotated, Literal
 from typer import Argument, Exit, Option
 
 from vibench.cli.completion import SHOWN, cell_columns, cells, column_names, error_measures, runs, table_names
+from vibench.errors import RequestError
 from vibench.terminal.output import echo, run_argument, warn
 
 EXAMPLE = "solver = 'piqp' and beta_span_min < 1e-3"
@@ -17,6 +18,24 @@ EXAMPLE = "solver = 'piqp' and beta_span_min < 1e-3"
 
 Form = Literal["terminal", "markdown", "csv", "latex", "json"]
 FormOption = Annotated[Form, Option("--format", help="Output format.")]
+At = Annotated[
+    list[str] | None,
+    Option(metavar="NAME=PATH", help="Where a file or folder of the study, such as a pack, is now (repeatable)."),
+]
+
+
+def places_of(at: list[str] | None) -> dict[str, str]:
+    """Places of files and folders, absolute, by name.
+
+    Raises a `RequestError` if one is none.
+    """
+    pairs = [one.partition("=") for one in at or ()]
+    for name, _, path in pairs:
+        if not name or not path:
+            raise RequestError(f"--at is '{name}', expected NAME=PATH, as in --at model=../model")
+    return {name: str(Path(path).absolute()) for name, _, path in pairs}
+
+
 RunArgument = Annotated[str, Argument(metavar="RUN", help="A run folder, or its name in runs/.", autocompletion=runs)]
 
 
@@ -148,13 +167,14 @@ def replay_query(
     cell: Annotated[str, Argument(metavar="CELL", help="Key of a cell, or its beginning.", autocompletion=cells)],
     query: Annotated[int | None, Option(min=0, help="Number of the query; the worst of the cell by default.")] = None,
     out: Annotated[Path | None, Option(help="File for the program; in RUN/replay by default.")] = None,
+    at: At = None,
 ) -> None:
     """Solve the program of one query again with every solver."""
     from vibench.execution.recorded_cell import recorded_cell
     from vibench.report import replay
     from vibench.terminal.console import print_frame
 
-    recorded = recorded_cell(run, cell)
+    recorded = recorded_cell(run, cell, places_of(at))
     number = replay.worst_query(recorded) if query is None else query
     file = out or recorded.path.parent / "replay" / f"{recorded.row['cell']}-{number}.npz"
     frame = replay.replay(recorded, number, file)

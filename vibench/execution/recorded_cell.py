@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Mapping
 from contextlib import closing
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -27,7 +27,7 @@ from vibench.stages.assembly import assembly_stage
 from vibench.stages.base import Done, Stage, value_of
 from vibench.stages.cell_queries import cell_queries
 from vibench.storage.artefacts import Store, usable_store
-from vibench.study.cells import Cell
+from vibench.study.cells import NOT_MOVED, Cell
 from vibench.study.matrix import study_of_cell
 from vibench.study.spec import Study
 
@@ -45,15 +45,18 @@ class RecordedCell:
         The results file.
     row
         The row.
+    places
+        Where files and folders of its plugins are now, by the names under which results know them.
     """
 
     path: Path
     row: Mapping[str, Any]
+    places: Mapping[str, str] = field(default_factory=dict)
 
     @cached_property
     def cell(self) -> Cell:
         """The cell of the study."""
-        return Cell.from_definition(self.row["definition"])
+        return Cell.from_definition(self.row["definition"], self.places)
 
     @cached_property
     def model(self) -> AnyReducedModel:
@@ -66,8 +69,8 @@ class RecordedCell:
         """
         if self.cell.code != self.row["code"]:
             raise RequestError(
-                f"cell {self.row['cell']} was computed by other code, or with another version of its solver; "
-                "run its study again"
+                f"cell {self.row['cell']} was computed by other code, with another version of its solver, or from "
+                "files that were changed since; run its study again"
             )
         store, assembly = usable_store(), assembly_stage(self.cell)
         _provide(assembly.model_inputs, store)
@@ -139,7 +142,7 @@ def _rows(run: str) -> tuple[Path, list[dict[str, Any]]]:
     return path, rows
 
 
-def recorded_cells(run: str) -> list[RecordedCell]:
+def recorded_cells(run: str, places: Mapping[str, str] = NOT_MOVED) -> list[RecordedCell]:
     """All cells of a run that have a reduced model.
 
     Raises
@@ -148,10 +151,10 @@ def recorded_cells(run: str) -> list[RecordedCell]:
         If there is no such run.
     """
     path, rows = _rows(run)
-    return [RecordedCell(path, row) for row in rows if row["model"]]
+    return [RecordedCell(path, row, places) for row in rows if row["model"]]
 
 
-def recorded_cell(run: str, cell: str) -> RecordedCell:
+def recorded_cell(run: str, cell: str, places: Mapping[str, str] = NOT_MOVED) -> RecordedCell:
     """One cell of a run, by its key or a unique prefix of it.
 
     Raises
@@ -159,13 +162,13 @@ def recorded_cell(run: str, cell: str) -> RecordedCell:
     RequestError
         If the prefix fits no cell or several, or the cell failed before it had a reduced model.
     """
-    recorded = _matching(run, cell)
+    recorded = _matching(run, cell, places)
     if not recorded.row["model"]:
         raise RequestError(f"cell {recorded.row['cell']} has no reduced model: {recorded.row['reason']}")
     return recorded
 
 
-def recorded_study(run: str, cell: str) -> Study:
+def recorded_study(run: str, cell: str, places: Mapping[str, str] = NOT_MOVED) -> Study:
     """The study that makes one row of a run again: it has this cell alone.
 
     Raises
@@ -173,7 +176,7 @@ def recorded_study(run: str, cell: str) -> Study:
     RequestError
         If the prefix fits no cell or several, or the cell cannot be run here: its plugins or options are others.
     """
-    recorded = _matching(run, cell)
+    recorded = _matching(run, cell, places)
     name = str(study_of(recorded.path, read_meta(recorded.path)).get("name"))
     rounds = recorded.row["timing_rounds"]
     settings = {} if pd.isna(rounds) else {"timing_rounds": int(rounds)}
@@ -191,10 +194,10 @@ def recorded_study(run: str, cell: str) -> Study:
     return study_of_cell(definition, name, **settings)
 
 
-def _matching(run: str, cell: str) -> RecordedCell:
+def _matching(run: str, cell: str, places: Mapping[str, str]) -> RecordedCell:
     path, rows = _rows(run)
     matching = [row for row in rows if str(row["cell"]).startswith(cell)]
     if len(matching) != 1:
         listed = "the column 'cell' of `vibench show RUN --table cells` lists them"
         raise RequestError(f"{len(matching)} cells of '{run}' begin with '{cell}', expected one; {listed}")
-    return RecordedCell(path, matching[0])
+    return RecordedCell(path, matching[0], places)

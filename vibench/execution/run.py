@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping, Sequence, Set
 from concurrent.futures import FIRST_COMPLETED, Future, wait
 from dataclasses import dataclass, field
@@ -27,7 +28,7 @@ from vibench.stages.cell_queries import CellRows, cell_queries
 from vibench.stages.pictures import PictureStage
 from vibench.storage.artefacts import Store, usable_store
 from vibench.study.cells import Cell
-from vibench.study.kinds import SOLVER
+from vibench.study.kinds import SAMPLING, SOLVER
 from vibench.study.matrix import expand
 from vibench.study.plugin import Plugin
 from vibench.study.registry import find, registered
@@ -89,7 +90,10 @@ class Outcome:
 def identity(study: Study) -> dict[str, Any]:
     """The settings that all numbers of a study depend on; a run folder holds results of one identity only."""
     asked = study.validation
-    validation = asked if isinstance(asked, int) else asked.model_dump(mode="json", exclude={"label"})
+    validation: Any = asked
+    if not isinstance(asked, int):
+        plugin = asked.plugin(SAMPLING)
+        validation = {"name": plugin.name, "options": json.loads(plugin.options)}
     return {"name": study.name, "seed": study.seed, "validation": validation}
 
 

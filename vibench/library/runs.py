@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from functools import cached_property, partial
 from pathlib import Path
@@ -22,6 +22,7 @@ from vibench.results import ranking, tables
 from vibench.results.columns import TABLES
 from vibench.results.plugin_columns import Extended
 from vibench.results.sqlite.reading import read_meta, study_of
+from vibench.study.cells import NOT_MOVED
 from vibench.study.spec import Study
 
 if TYPE_CHECKING:
@@ -35,10 +36,12 @@ class Run:
     ----------
     path
         The results file.
+    at
+        Where files and folders of its study are now, by name; by default where they were.
     """
 
-    def __init__(self, path: Path) -> None:
-        self.path = path
+    def __init__(self, path: Path, at: Mapping[str, str] = NOT_MOVED) -> None:
+        self.path, self._at = path, at
 
     def __repr__(self) -> str:
         return f"Run('{self.path}')"
@@ -179,7 +182,7 @@ class Run:
         RequestError
             If there is no such cell, it failed before it had a model, or other code computed it.
         """
-        recorded = recorded_cell(str(self.path), cell)
+        recorded = recorded_cell(str(self.path), cell, self._at)
         asked = recorded.cell
         certificate, mode = recorded.certificate, CorrectionMode(asked.correction)
         return Model(recorded.model, asked.solver, asked.accuracy, certificate, recorded.row, mode)
@@ -195,15 +198,22 @@ def _following(observer: Observer | None, progress: bool) -> AbstractContextMana
     return ProgressDisplay(new_console())
 
 
-def open_run(path: Path | str) -> Run:
+def open_run(path: Path | str, *, at: Mapping[str, str] = NOT_MOVED) -> Run:
     """A finished run: its folder, its results file, or the name of a study that was run in this folder.
+
+    Parameters
+    ----------
+    path
+        Where it is.
+    at
+        Where files and folders of its study, such as packs, are now, by the name that its tables have of them.
 
     Raises
     ------
     RequestError
         If there is no results file, or it has another schema.
     """
-    return Run(tables.results_file(str(path)))
+    return Run(tables.results_file(str(path)), {name: str(Path(place).absolute()) for name, place in at.items()})
 
 
 def run(

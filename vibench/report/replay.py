@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import io
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict
 from importlib.resources import files
 from itertools import chain
@@ -27,6 +27,7 @@ from vibench.qp.status import Status
 from vibench.qp.verification import QPSolution, verify
 from vibench.results.formats import to_csv
 from vibench.results.solver_agreement import vectors
+from vibench.study.cells import NOT_MOVED
 from vibench.study.kinds import SOLVER
 from vibench.study.registry import registered
 
@@ -106,7 +107,7 @@ def _writing(target: Path) -> Iterator[None]:
         raise RequestError(f"'{target}' cannot be written: {error.strerror or error}") from None
 
 
-def export(run: str, folder: Path) -> int:
+def export(run: str, folder: Path, places: Mapping[str, str] = NOT_MOVED) -> int:
     """Write every reduced program of a run, with its solutions and their verification; returns their number.
 
     The folder holds `programs/NAME.npz` (P, q, G, h), `solutions/NAME.npz` (x_CELL, z_CELL for every cell with a
@@ -119,7 +120,7 @@ def export(run: str, folder: Path) -> int:
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise RequestError(f"'{folder}' exists and is not an empty folder; choose another")
     models: dict[str, list[RecordedCell]] = {}
-    for recorded in recorded_cells(run):
+    for recorded in recorded_cells(run, places):
         models.setdefault(recorded.row["model"], []).append(recorded)
     if not models:
         raise RequestError(f"no cell of '{run}' has a reduced program")

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from typing import Any
 
 from vibench.dependencies import CELL, code_used
+from vibench.errors import RequestError, unknown_name
 from vibench.interfaces.strategies import Stop
 from vibench.study.kinds import SOLVER
 from vibench.study.parameter_sets import OWN, OWN_TRAINING, ParameterSet
@@ -28,6 +30,9 @@ def digest(content: Any) -> str:
 UNCORRECTED, FEASIBLE = "none", "feasible"
 """Corrections of cells that answer with reduced solutions as they are, and with corrected pairs alone."""
 
+
+NOT_MOVED: Mapping[str, str] = {}
+"""Files and folders of a cell are where they were."""
 
 PLUGINS = ("problem", "dual", "primal", "training", "validation_sampling")
 """Names of plugins in the definition of a cell; the last two, of sampling strategies, may be `None`."""
@@ -82,7 +87,7 @@ class Cell:
             if content[name] is None:
                 del content[name]
             else:
-                del content[name]["code"]
+                del content[name]["code"], content[name]["places"]
         return digest(content)
 
     @property
@@ -105,14 +110,21 @@ class Cell:
         }
 
     @classmethod
-    def from_definition(cls, text: str) -> Cell:
+    def from_definition(cls, text: str, places: Mapping[str, str] = NOT_MOVED) -> Cell:
         """The cell of a definition, with the code of its plugins as installed.
 
-        Raises a `RequestError` if a plugin is not installed, or a file that its options name cannot be read.
+        `places` are where files and folders of its plugins are now, by the names under which results know them.
+
+        Raises a `RequestError` if a plugin is not installed, a file that its options name cannot be read, or `places`
+        has a name that is none of them.
         """
         content = json.loads(text)
-        for name in PLUGINS:  # older definitions have no sampling strategies
-            content[name] = Plugin(**content[name]).as_installed() if content.get(name) else None
+        plugins = {name: Plugin(**content[name]) for name in PLUGINS if content.get(name)}  # not all in older ones
+        known = {json.loads(one.options)[option] for one in plugins.values() for option in json.loads(one.places)}
+        for name in places.keys() - known:
+            raise unknown_name("file or folder of the cell", name, known)
+        for name in PLUGINS:
+            content[name] = _found(plugins[name].moved(places)) if name in plugins else None
         for axis in ("pod", "cone"):
             content[axis] = Stop(**content[axis])
         for name in ("labels", "nested_tolerances"):
@@ -152,3 +164,14 @@ class Cell:
         way = "" if self.assembly == "full" else f" · {self.assembly}"
         way += "" if self.correction == UNCORRECTED else f" · corrected: {self.correction}"
         return f"{problem} · {dual} · {primal}{tolerance} · {pod}, {cone} · {self.solver} {self.accuracy:g}{way}"
+
+
+def _found(plugin: Plugin) -> Plugin:
+    """A recorded plugin with the code that is installed; an error about its files says how to tell where they are."""
+    try:
+        return plugin.as_installed()
+    except RequestError as error:
+        names = [str(json.loads(plugin.options)[option]) for option in json.loads(plugin.places)]
+        if not names:
+            raise
+        raise RequestError(f"{error}; if it was moved, say where it is now: --at {names[0]}=PATH") from None

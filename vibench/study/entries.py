@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from datetime import date, time
 from typing import Annotated, Any, Self, TypeAlias
 
@@ -52,6 +53,7 @@ class Entry(BaseModel):
     options: Annotated[dict[str, Any], Field(description="Keyword arguments of its constructor.")] = {}
 
     _given: Any = PrivateAttr(None)
+    _places: Mapping[str, str] = PrivateAttr({})
 
     @model_validator(mode="wrap")
     @classmethod
@@ -88,7 +90,17 @@ class Entry(BaseModel):
 
     def plugin(self, kind: PluginKind) -> Plugin:
         """The plugin with its options."""
-        return Plugin.of(self.registered(kind), self.options)
+        return Plugin.of(self.registered(kind), self.options, self.places)
+
+    @property
+    def places(self) -> Mapping[str, str]:
+        """Where files and folders are that its options name, by option, if these do not say it."""
+        return self._places
+
+    def at(self, places: Mapping[str, str]) -> Self:
+        """The entry, whose files and folders are at these places, by option."""
+        self._places = places
+        return self
 
     @property
     def title(self) -> str:

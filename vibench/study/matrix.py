@@ -15,8 +15,9 @@ from vibench.files import read_regular
 from vibench.interfaces.strategies import Stop
 from vibench.reduction.nested import NestedStrategy
 from vibench.study.cells import Cell
-from vibench.study.entries import Entry
+from vibench.study.entries import Entry, ProblemEntry, SamplingEntry
 from vibench.study.kinds import DUAL, PRIMAL, PROBLEM, SAMPLING, STUDY, PluginKind
+from vibench.study.options import BESIDE
 from vibench.study.parameter_sets import OWN, ParameterSet
 from vibench.study.plugin import GivenPlugin, Plugin
 from vibench.study.registry import find, registered
@@ -77,28 +78,28 @@ def read_study(request: str, overrides: Mapping[str, Sequence[Any]] | None = Non
 
 
 def _anchor(content: dict[str, Any], folder: Path) -> None:
-    """Take the paths among the options of sampling strategies, in unchecked content, relative to a folder."""
-    problems = content.get("problem")
-    tables = [
-        content,
-        *(entry for entry in (problems if isinstance(problems, list) else []) if isinstance(entry, dict)),
-    ]
-    for table in tables:
+    """Take the paths among the options of problems and sampling strategies, in unchecked content, from a folder."""
+    problems = _tables(content.get("problem"))
+    for entry in problems:
+        _anchor_options(PROBLEM, entry, folder)
+    for table in [content, *problems]:
         for key in ("training", "validation"):
-            entries = table.get(key)
-            for entry in entries if isinstance(entries, list) else [entries]:
-                if isinstance(entry, dict):
-                    _anchor_options(entry, folder)
+            for entry in _tables(table.get(key)):
+                _anchor_options(SAMPLING, entry, folder)
 
 
-def _anchor_options(entry: dict[str, Any], folder: Path) -> None:
-    given = entry.get("options")
+def _tables(entries: Any) -> list[dict[str, Any]]:
+    """The entries of an unchecked axis that are tables."""
+    return [entry for entry in (entries if isinstance(entries, list) else [entries]) if isinstance(entry, dict)]
+
+
+def _anchor_options(kind: PluginKind, entry: dict[str, Any], folder: Path) -> None:
+    plugin, given = find(kind, str(entry.get("name"))), entry.get("options")
     for options in (entry, given if isinstance(given, dict) else {}):
-        plugin = find(SAMPLING, str(entry.get("name")))
-        options_of = plugin.options if plugin.entries and not plugin.conflict else {}
-        for name in (name for name, option in options_of.items() if option.annotation is Path):
-            if isinstance(options.get(name), str):
-                options[name] = str(folder / options[name])
+        for name in plugin.path_options if plugin.entries else ():
+            value = options.get(name)
+            if isinstance(value, str) and value and not value.startswith("/"):
+                options[name] = f"{folder}{BESIDE}{value}"
 
 
 def _replace_axes(content: dict[str, Any], given: Mapping[str, list[Any]]) -> dict[str, Any]:
@@ -173,7 +174,11 @@ def expand(study: Study) -> list[Cell]:
                     labels=(problem.title, dual[0].title, primal[0].title),
                     nested_tolerances=nested[primal[0].title],
                 )
-                cells.setdefault(cell.key, cell)
+                if (same := cells.setdefault(cell.key, cell)) is not cell and same.code != cell.code:
+                    raise RequestError(
+                        f"study '{study.name}': two cells are called '{cell}', but have files of one name in different "
+                        "folders: rename one of them, or put the folders beside the study"
+                    )
     if not cells:
         raise RequestError(f"study '{study.name}': the matrix is empty")
     return list(cells.values())
@@ -241,7 +246,9 @@ def study_of_cell(cell: Cell, name: str, **settings: Any) -> Study:
 def _plugin_entry(plugin: Plugin, label: str) -> Any:
     given = plugin.registered
     name = given.given if isinstance(given, GivenPlugin) else plugin.name
-    return {"name": name, "label": label, "options": json.loads(plugin.options)}
+    entries: dict[PluginKind, type[Entry]] = {PROBLEM: ProblemEntry, SAMPLING: SamplingEntry}
+    content = {"name": name, "label": label, "options": json.loads(plugin.options)}
+    return entries.get(plugin.kind, Entry).model_validate(content).at(json.loads(plugin.places))
 
 
 def _entry_of_set(parameters: ParameterSet) -> Any:

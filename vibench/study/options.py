@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import inspect
 import json
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
 from inspect import Parameter
+from pathlib import Path
 from typing import Any, get_type_hints
 
 from pydantic import ConfigDict, PydanticUserError, TypeAdapter, ValidationError
@@ -61,6 +63,25 @@ class Option:
         except ValidationError:
             return f"has the default {self.preset!r}; its annotation expects {expected}"
         return ""
+
+
+BESIDE = "/./"
+"""What stands between the folder of a study and the path of a file in it, as rsync writes what it keeps of a path."""
+
+
+def named(path: Any) -> tuple[Any, Any]:
+    """The name under which results know a file or a folder, and its absolute path; what is no path twice.
+
+    The name is the path from the folder of the study, or the current one; of what lies elsewhere its last part, so that
+    results do not depend on where a study is, and do not tell.
+    """
+    path = os.fspath(path) if isinstance(path, os.PathLike) else path
+    if not isinstance(path, str) or not path:
+        return path, path
+    relative = os.path.normpath(path.rpartition(BESIDE)[2])
+    absolute = os.path.abspath(path)  # noqa: PTH100  links stay
+    elsewhere = Path(relative).parts[:1] in ((), ("/",), ("..",))
+    return Path(absolute).name if elsewhere else relative, absolute
 
 
 @cache

@@ -19,6 +19,7 @@ from vibench.errors import RequestError, in_a_line, message_of
 from vibench.provenance import distribution_version
 from vibench.study.fingerprint import fingerprint_of, is_computed_again, is_importable, module_version
 from vibench.study.kinds import PluginKind
+from vibench.study.options import named
 from vibench.study.registry import RegisteredPlugin, find
 
 
@@ -30,6 +31,8 @@ class Plugin:
     name: str
     options: str
     code: str
+    places: str = field(default="{}", compare=False)
+    """Where the files and folders are that its options name, absolute, as JSON by option; no part of the identity."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "kind", PluginKind(self.kind))  # a text, where it is read from a results file
@@ -40,13 +43,18 @@ class Plugin:
     def __reduce__(self) -> Any:
         """Worker processes get what was given with it; it is part of no field, so that no file ever holds it."""
         given = self.registered if self.code.startswith(GIVEN) else None
-        return _received, (self.kind, self.name, self.options, self.code, given)
+        return _received, (self.kind, self.name, self.options, self.code, self.places, given)
 
     @classmethod
-    def of(cls, registered: RegisteredPlugin, options: Mapping[str, Any]) -> Plugin:
-        """A registered plugin, or a given one, with options."""
+    def of(
+        cls, registered: RegisteredPlugin, options: Mapping[str, Any], places: Mapping[str, str] | None = None
+    ) -> Plugin:
+        """A registered plugin, or a given one, with options; `places` is where those are that were found before."""
+        found = {name: named(given) for name, given in options.items() if name in registered.path_options}
+        names, where = {name: one[0] for name, one in found.items()}, {name: one[1] for name, one in found.items()}
+        canonical = registered.canonical_options({**options, **names})
         return cls(
-            registered.kind, registered.name, registered.canonical_options(options), registered.code
+            registered.kind, registered.name, canonical, registered.code, json.dumps(where | dict(places or {}))
         ).as_installed()
 
     @property
@@ -62,19 +70,30 @@ class Plugin:
 
         Raises a `RequestError` if it is not installed, or one of its files cannot be read.
         """
-        data = self.registered.data_digest(json.loads(self.options))
+        data = self.registered.data_digest(self.arguments)
         return replace(self, code=self.registered.code + f"{DATA}{data}" * bool(data))
+
+    @property
+    def arguments(self) -> dict[str, Any]:
+        """Its options, with the places of files and folders."""
+        places = json.loads(self.places)
+        return {name: places.get(name, value) for name, value in json.loads(self.options).items()}
+
+    def moved(self, places: Mapping[str, str]) -> Plugin:
+        """The plugin whose files and folders are at other places, by the names under which results know them."""
+        there = {name: places[value] for name, value in json.loads(self.options).items() if value in [*places]}
+        return replace(self, places=json.dumps(json.loads(self.places) | there))
 
     def create(self) -> Any:
         """A new instance."""
-        return self.registered.create(json.loads(self.options))
+        return self.registered.create(self.arguments)
 
     @property
     def check(self) -> str:
         """What checks the plugin with these options: a command, or a function for what was given."""
         if self.code.startswith(GIVEN):
             return f"vibench.testing.check_{self.kind.cli_name}"
-        options = (f"{k}={v if isinstance(v, str) else json.dumps(v)}" for k, v in json.loads(self.options).items())
+        options = (f"{k}={v if isinstance(v, str) else json.dumps(v)}" for k, v in self.arguments.items())
         check = ["vibench", "check", f"{self.kind.cli_name}:{self.name}", *(f"--option={text}" for text in options)]
         return shlex.join(check)
 
@@ -220,8 +239,8 @@ def _computed_once(function: Callable[[Any], Any], name: str) -> Any:
     return made
 
 
-def _received(kind: PluginKind, name: str, options: str, code: str, given: GivenPlugin | None) -> Plugin:
+def _received(kind: PluginKind, name: str, options: str, code: str, places: str, given: GivenPlugin | None) -> Plugin:
     """A plugin that was pickled, and what was given with it."""
     if given is not None:
         _given.setdefault((kind, name, given.fingerprint), given)
-    return Plugin(kind, name, options, code)
+    return Plugin(kind, name, options, code, places)

@@ -162,6 +162,11 @@ class RegisteredPlugin:
 
         return options_of(self.load())
 
+    @property
+    def path_options(self) -> set[str]:
+        """Names of the options that are paths of files or folders."""
+        return set() if self.conflict else {name for name, one in self.options.items() if one.annotation is Path}
+
     def check_options(self, given: Mapping[str, Any]) -> dict[str, Any]:
         """Options, converted to the types of its constructor's arguments; as they are if several have its name.
 

@@ -267,7 +267,7 @@ def _check_sets(study: Study, entry: ProblemEntry) -> None:
     samplings = [one for one in asked if isinstance(one, SamplingEntry) and one.name != OWN]
     for sampling in samplings:
         sampling.registered(SAMPLING).check_options(sampling.options)
-    if not samplings and not entry.registered(PROBLEM).data_digest(entry.options):
+    if not samplings and not entry.registered(PROBLEM).data_digest({**entry.options, **entry.places}):
         return
     problem, validation = entry.plugin(PROBLEM), study.validation_set(entry)
     training = study.training_sets(entry)

@@ -258,7 +258,7 @@ def test_the_definition_of_a_cell_holds_no_object(names: dict[str, Any], monkeyp
     (cell,) = expand(study(problem=[names["Mine"](9)]))
     content = json.loads(cell.definition)
     assert content["problem"] == asdict(cell.problem)
-    assert set(content["problem"]) == {"kind", "name", "options", "code"}
+    assert set(content["problem"]) == {"kind", "name", "options", "code", "places"}
     again = Cell.from_definition(cell.definition)
     assert (again.key, again.code) == (cell.key, cell.code)
     (remade,) = expand(study_of_cell(again, "given"))

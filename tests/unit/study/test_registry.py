@@ -142,7 +142,7 @@ def test_every_built_in_plugin_has_a_summary_and_options_with_defaults(kind: str
         assert all(option.expected for option in find(kind, name).options.values())
         required = [option.name for option in find(kind, name).options.values() if option.required]
         assert required == (["path"] if name == "pack" else [])
-        assert find(kind, name).check_options(dict.fromkeys(required, "text")) == dict.fromkeys(required, "text")
+        assert find(kind, name).check_options(dict.fromkeys(required, "text")) == dict.fromkeys(required, Path("text"))
 
 
 def test_names_are_sorted(register: Register) -> None:
