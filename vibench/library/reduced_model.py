@@ -18,7 +18,8 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 FORMAT = "vibench reduced model 1"
-DEGREE = 2**20
+Residuals = tuple[float, float, float]
+DEGREE, ROUND_OFF = 2**20, 1e-13
 
 
 class Solution(NamedTuple):
@@ -33,7 +34,7 @@ class Solution(NamedTuple):
     alpha: Array
     u: Array | None
     lam: Array | None
-    residuals: tuple[float, float, float]
+    residuals: Residuals
     energy: float
 
 
@@ -53,6 +54,23 @@ class Model:
         self.solver = solver or self.about["solver"]
         if self.solver not in SOLVERS:
             raise ValueError(f"the solver is '{self.solver}', expected one of {', '.join(SOLVERS)}")
+        self._last: tuple[bytes, dict[int, Array]] = b"", {}
+        names, known = (
+            [key.removesuffix("_indices") for key in self.data if key.endswith("_indices")],
+            dict[bytes, int](),
+        )
+        self._members = {name: self._prepared(name, known) for name in names}
+        rows, columns = np.triu_indices(len(self.data["f_terms"][0]))
+        self._packed = np.zeros((columns[-1] + 1, columns[-1] + 1), np.intp)  # where packed A has its entries
+        self._packed[rows, columns] = self._packed[columns, rows] = np.arange(len(rows))
+
+    def _prepared(self, name: str, known: dict[bytes, int]) -> tuple[int, NDArray[np.intp], list[Array]]:
+        """A number of the products of a member, their degrees, and what takes their values to its entries."""
+        coefficients, terms = self.data[f"{name}_coefficients"], self.data[f"{name}_terms"]
+        degrees = np.ascontiguousarray(self.data[f"{name}_indices"].T, dtype=np.intp)
+        key = known.setdefault(degrees.tobytes(), len(known))
+        together = terms.size + coefficients.size >= len(coefficients) * terms.shape[1]
+        return key, degrees, [coefficients @ terms] if together else [coefficients, terms]
 
     def _check(self, file: str) -> None:
         """Refuse indices that are none, which NumPy would count from the end, and arrays that do not fit them."""
@@ -72,65 +90,91 @@ class Model:
         at = np.asarray(mu, dtype=float)
         if at.shape != self.lower.shape or not np.all(np.isfinite(at)):
             raise ValueError(f"mu is {at.tolist()}, expected {', '.join(self.about['parameters']['names'])}")
-        if np.any(at < self.lower) or np.any(at > self.upper):
+        if self._is_outside(at):
             warnings.warn(f"mu = {at.tolist()} is outside the box, where the model was not trained", stacklevel=3)
         packed, f, B, g = (self.member(name, at) for name in "AfBg")
-        A, Y, B = np.zeros((len(f), len(f))), np.eye(len(f)), B.reshape(-1, len(f))
-        A[np.triu_indices(len(f))] = packed
-        A += np.triu(A, 1).T
+        A, Y, B = packed[self._packed], np.eye(len(f)), B.reshape(-1, len(f))
         if "plain" in self.data:  # V_N in a larger space; the supremizers that enrich it are the first rows of B
             Y = _enriched(self.data["plain"], B[: len(B) - len(g)].T)
             A, f, B = Y.T @ A @ Y, Y.T @ f, B[len(B) - len(g) :] @ Y
         return A, f, B, g, Y
 
+    def _is_outside(self, mu: Array) -> bool:
+        return bool(((mu < self.lower) | (mu > self.upper)).any())
+
     def member(self, name: str, mu: Array) -> Array:
         """The sum of terms of this name at a parameter."""
-        indices = self.data[f"{name}_indices"]
-        unit = (2.0 * mu - self.lower - self.upper) / (self.upper - self.lower)
-        values = np.cos(np.arccos(unit[:, None] + 0j) * np.arange(indices.max() + 1)).real  # inside the box and outside
-        products = np.prod(values[np.arange(len(mu)), indices], axis=1)
-        return np.asarray(products @ self.data[f"{name}_coefficients"] @ self.data[f"{name}_terms"])
+        (key, degrees, matrices), (at, known) = self._members[name], self._last
+        if at != mu.tobytes():
+            self._last = _, known = mu.tobytes(), {}
+        if key not in known:
+            unit = (2.0 * mu - self.lower - self.upper) / (self.upper - self.lower)
+            unit = unit if (abs(unit) <= 1.0).all() else unit + 0j  # outside the box
+            values = np.cos(np.arccos(unit)[:, None] * np.arange(degrees.max() + 1)).real
+            known[key] = values[0].take(degrees[0])
+            for of_one, which in zip(values[1:], degrees[1:], strict=True):
+                known[key] *= of_one.take(which)
+        found = known[key]
+        for matrix in matrices:
+            found = found @ matrix
+        return found
 
     def solve(self, mu: Sequence[float] | Array) -> Solution:
         """The solution at a parameter, verified; look at its status."""
         A, f, B, g, Y = self.program(mu)
-        rows = np.where((norms := np.linalg.norm(B, axis=1)) > 0.0, norms, 1.0)
+        rows = np.sqrt((B * B).sum(axis=1))
+        rows[rows == 0.0] = 1.0
         N, b = B / rows[:, None], g / rows
         x, forces, found, status = np.full(len(f), np.nan), np.full(len(g), np.nan), (np.nan,) * 3, "failed"
         with suppress(np.linalg.LinAlgError):
-            x, forces = self._solved(A, f, N, b)
-            found, status = residuals(A, f, N, b, x, forces), "ok"
+            (x, forces), found = self._solved(A, f, N, b)
+            status = "ok"
             if not all(residual <= self.about["accuracy"] for residual in found):  # NaN is not
                 status = "inaccurate"
-            elif np.any((at := np.asarray(mu, dtype=float)) < self.lower) or np.any(at > self.upper):
+            elif self._is_outside(np.asarray(mu, dtype=float)):
                 status = "outside"
         energy, x, alpha = float(x @ A @ x), Y @ x, forces / rows
         u, lam = (self.data[n] @ v if n in self.data else None for n, v in (("basis", x), ("generators", alpha)))
         return Solution(status, x, alpha, u, lam, found, energy)
 
-    def _solved(self, A: Array, f: Array, B: Array, g: Array) -> tuple[Array, Array]:
-        """The solver's x and α for rows of B of norm 1, or those of its active set, whichever are better."""
-        if not all(np.all(np.isfinite(array)) for array in (A, f, B, g)):
+    def _solved(self, A: Array, f: Array, B: Array, g: Array) -> tuple[tuple[Array, Array], Residuals]:
+        """The solver's x and α for rows of B of norm 1, or those of its active set, whichever are better; residuals."""
+        if not np.isfinite(A.sum() + f.sum() + B.sum() + g.sum()):
             raise np.linalg.LinAlgError("an array is not finite")
-        np.linalg.cholesky(A)
+        factor = np.linalg.cholesky(A)
         length, force = _units(A, f, g)  # in which the solver's tolerances are relative ones
         settings = self.about["settings"][self.solver]
-        answer = SOLVERS[self.solver](A * (length / force), f / force, B, g / length, settings)
-        y, z = (np.nan_to_num(vector, nan=0.0, posinf=0.0, neginf=0.0) for vector in answer)
-        answers = [(length * y, force * np.maximum(z, 0.0)), _polished(A, f, B, g, z > g / length - B @ y)]
-        return min(answers, key=lambda one: float(np.nan_to_num(np.max(residuals(A, f, B, g, *one)), nan=np.inf)))
+        y, z = SOLVERS[self.solver](A * (length / force), f / force, B, g / length, settings)
+        if not np.isfinite(y.sum() + z.sum()):
+            y, z = (np.nan_to_num(vector, nan=0.0, posinf=0.0, neginf=0.0) for vector in (y, z))
+        best = _polished(A, f, B, g, z > g / length - B @ y, factor)
+        found = residuals(A, f, B, g, *best, factor)
+        if not all(residual <= ROUND_OFF for residual in found):  # NaN is not
+            given = length * y, force * np.maximum(z, 0.0)
+            of_given = residuals(A, f, B, g, *given, factor)
+            if _worst(of_given) <= _worst(found):
+                return given, of_given
+        return best, found
 
 
-def residuals(A: Array, f: Array, B: Array, g: Array, x: Array, alpha: Array) -> tuple[float, float, float]:
-    """With s = B x − g, S² = xᵀA x + ‖Bᵀα‖² and norms in A⁻¹: max (s_i)₊/‖B_i‖S, ‖f − A x − Bᵀα‖/S, |αᵀs|/S²."""
-    s, force = B @ x - g, B.T @ alpha
-    violated = s > 1.01 * np.finfo(float).eps * (np.count_nonzero(B, axis=1) + 2.0) * (abs(B) @ abs(x) + abs(g))
-    whitened = np.linalg.solve(np.linalg.cholesky(A), np.column_stack([f - A @ x - force, force, B[violated].T]))
-    norms = np.linalg.norm(whitened, axis=0)
-    S = np.hypot(np.sqrt(max(float(x @ A @ x), 0.0)), norms[1])
+def residuals(A: Array, f: Array, B: Array, g: Array, x: Array, alpha: Array, factor: Any = None) -> Residuals:
+    """With s = B x − g, S² = xᵀA x + ‖Bᵀα‖² and norms in A⁻¹: max (s_i)₊/‖B_i‖S, ‖f − A x − Bᵀα‖/S, |αᵀs|/S².
+
+    `factor` is the Cholesky factor of A, if it is known.
+    """
+    s, force, Ax = B @ x - g, alpha @ B, A @ x
+    violated = s > 1.01 * np.finfo(float).eps * ((B != 0.0).sum(axis=1) + 2.0) * (abs(B) @ abs(x) + abs(g))
+    factor = np.linalg.cholesky(A) if factor is None else factor
+    whitened = np.linalg.solve(factor, np.vstack([f - Ax - force, force, B[violated]]).T)
+    norms = np.sqrt((whitened**2).sum(axis=0))
+    S = np.hypot(np.sqrt(max(float(x @ Ax), 0.0)), norms[1])
     with np.errstate(divide="ignore", invalid="ignore"):  # a row of zeros, or the solution 0
         ways = np.array([np.max(s[violated] / norms[2:], initial=0.0), norms[0], abs(alpha @ s)])
         return tuple(np.where(ways == 0.0, 0.0, ways / [S, S, S**2]).tolist())
+
+
+def _worst(found: Residuals) -> float:
+    return float(np.nan_to_num(np.max(found), nan=np.inf))
 
 
 def _units(A: Array, f: Array, g: Array) -> tuple[float, float]:
@@ -140,21 +184,38 @@ def _units(A: Array, f: Array, g: Array) -> tuple[float, float]:
     return (max(moved, depth), load) if moved > 1e-10 * depth else (depth or 1.0, 1e-3 * k * (depth or 1.0))
 
 
-def _polished(A: Array, f: Array, B: Array, g: Array, active: NDArray[np.bool_]) -> tuple[Array, Array]:
+def _polished(
+    A: Array, f: Array, B: Array, g: Array, active: NDArray[np.bool_], factor: Any = None
+) -> tuple[Array, Array]:
     """The solution up to round-off: equations on an active set, which changes until all signs are right."""
-    k = np.sqrt(A.trace() / len(A))
+    whitened = np.linalg.solve(np.linalg.cholesky(A) if factor is None else factor, B.T)
+    k, sizes = np.sqrt(A.trace() / len(A)), abs(B)
     for step in range(20 + 4 * len(g)):
-        system = np.block([[A / k, k * B[active].T], [k * B[active], np.zeros([active.sum()] * 2)]])
-        found = np.linalg.lstsq(system, np.append(f / k, k * g[active]), rcond=None)[0]
+        chosen = active.nonzero()[0]
+        system = np.zeros((len(f) + len(chosen), len(f) + len(chosen)))
+        system[: len(f), : len(f)], system[len(f) :, : len(f)] = A / k, k * B[chosen]
+        system[: len(f), len(f) :] = system[len(f) :, : len(f)].T
+        right = np.append(f / k, k * g[chosen])
+        regular = _independent(whitened[:, chosen])
+        found = np.linalg.solve(system, right) if regular else np.linalg.lstsq(system, right, rcond=None)[0]
         x, alpha = found[: len(f)], np.zeros(len(g))
-        alpha[active] = k**2 * found[len(f) :]
-        violated = B @ x - g > 1e-12 * (abs(B) @ abs(x) + abs(g))
+        alpha[chosen] = k**2 * found[len(f) :]
+        violated = B @ x - g > 1e-12 * (sizes @ abs(x) + abs(g))
         pulling = alpha < -1e-12 * abs(alpha).max(initial=0.0)
-        if not np.any(violated | pulling):
+        if not (violated | pulling).any():
             break
         one = np.arange(len(g)) == (np.argmin(alpha) if pulling.any() else np.argmax(B @ x - g))
         active = violated | (active & ~pulling) if step < 20 else active ^ one  # all at once may cycle
     return x, np.maximum(alpha, 0.0)
+
+
+def _independent(columns: Array) -> bool:
+    """Whether every column is at an angle of 1e-5 at least to those before it."""
+    gram = columns.T @ columns
+    sizes = np.sqrt(gram.diagonal())
+    with suppress(np.linalg.LinAlgError):
+        return bool(sizes.all() and (np.linalg.cholesky(gram / np.outer(sizes, sizes)).diagonal() > 1e-5).all())
+    return False
 
 
 def _enriched(plain: Array, vectors: Array) -> Array:

@@ -52,7 +52,8 @@ class Model:
             raise ValueError(f"'{file}' has no error bounds: {why}")
         slack = 1e-12 * np.maximum(abs(data["lower"]), abs(data["upper"]))
         self._box = data["lower"] - slack, data["upper"] + slack
-        self._data = {name.removeprefix(start): data[name] for name in data if name.startswith(start)}
+        self._data: dict[str, Array] = {name.removeprefix(start): data[name] for name in data if name.startswith(start)}
+        self._data["bound_sizes"] = abs(self._data["bounds"])
 
     def solve(self, mu: Sequence[float] | Array, tolerance: float | None = None, corrected: bool = False) -> Certified:
         """The solution at a parameter and its bounds; the tolerance is of the relative error of u in the norm of A.
@@ -97,11 +98,11 @@ class Model:
         And ρ/√α.
         """
         data, lam = self._data, self._data["generators"] @ alpha
-        if not (np.all(np.isfinite(y)) and np.all(np.isfinite(lam))):
+        if not np.isfinite(y.sum() + lam.sum()):
             return Bound(inf, inf, inf, "none", "there is no solution"), inf
-        if np.min(lam, initial=0.0) < 0.0:
+        if lam.min(initial=0.0) < 0.0:
             return Bound(inf, inf, inf, "none", "λ_N has negative coefficients"), inf
-        if np.any((mu < self._box[0]) | (mu > self._box[1])):
+        if ((mu < self._box[0]) | (mu > self._box[1])).any():
             return Bound(inf, inf, inf, "none", "mu is outside the parameter box"), inf
         A, f, B, g = (self.plain.member(f"theta_{name}", mu) for name in "AfBg")
         lower, upper = self._spectrum(mu, A)
@@ -112,14 +113,15 @@ class Model:
             return Bound(inf, inf, inf, "none", f"no {which} was found at this parameter"), inf
         a, norm, slack = lifting
         along, kappa = a @ data["directions"], max(0.0, float(lam @ slack))
-        z = np.concatenate([f, np.outer(-A, y).ravel(), np.outer(-B, alpha).ravel()])
-        coordinates = data["factor"] @ z[data["kept"]]
-        beside = float(data["remainder"] * np.linalg.norm(data["inverse_scale"] * z[data["kept"]]))
+        z = np.concatenate([f, (-A[:, None] * y).ravel(), (-B[:, None] * alpha).ravel()])
+        kept = z[data["kept"]]
+        coordinates, scaled = data["factor"] @ kept, data["inverse_scale"] * kept
+        beside = float(data["remainder"]) * sqrt(scaled @ scaled)
         of_energy = float(data["energy_error"] * (y @ y))
         of_u = sqrt(max(0.0, energy + of_energy) / (lower - error))
         lacking = float(data["norms"] @ abs(z)) + float(data["load_error"]) + error * of_u
         lacking += float(data["constraint_error"] * (data["multiplier_norms"] @ abs(alpha)))
-        rho = float(np.hypot(np.linalg.norm(coordinates), beside)) + lacking
+        rho = sqrt(coordinates @ coordinates + beside**2) + lacking
         omega = norm * sqrt(upper)
         square = rho**2 / lower + omega**2 + 2.0 * kappa
         found = sqrt(square)
@@ -152,9 +154,9 @@ class Model:
             return None
         rows, size = data["rows"], abs(theta) * data["sizes"]
         excess = theta * (data["basis"] @ y) - data["bounds"] @ of_g
-        share, of_y = float(data["constraint_error"]) / abs(theta), float(np.linalg.norm(y)) * size[:, 0]
+        share, of_y = float(data["constraint_error"]) / abs(theta), sqrt(y @ y) * size[:, 0]
         error = share * of_y + data["bound_errors"]
-        uncertain = error + unit * (of_y + abs(data["bounds"]) @ abs(of_g))
+        uncertain = error + unit * (of_y + data["bound_sizes"] @ abs(of_g))
         margin = MARGIN * uncertain
         for _ in range(ATTEMPTS):
             nu = np.maximum(self._complementary(gamma / theta**2, (excess + margin)[rows], lam[rows]), 0.0)
