@@ -14,7 +14,7 @@ from pathlib import Path
 import pandas as pd
 import pytest
 from running import Vibench, assert_same_numbers, by_solver, execute, rows, run_again, without_seconds
-from samples import ROUNDS, wire_study, write_study
+from samples import wire_study, write_study
 
 import vibench.execution.run  # noqa: F401  lists the classes of all stages
 from vibench.results.columns import TABLES
@@ -247,7 +247,7 @@ def test_only_an_edit_of_what_computes_numbers_runs_anything_again(
         edit(module)
     assert "1 cells, 0 to run, 0 stages" in vibench(*run)
     assert "3 programs" in vibench("export-qps", "wire", "programs")  # of the model as it was
-    edit("model/errors.py")  # determines the errors of the queries, and nothing before them
+    edit("stages/query.py")  # determines the queries, and nothing before them
     again = re.search(r"1 cells, 1 to run, (\d+) stages", vibench(*run))
     assert again is not None
     assert int(again[1]) < 10  # the snapshots, the basis and the cone are there
@@ -259,7 +259,6 @@ def test_the_number_of_jobs_changes_no_result(vibench: Vibench, tmp_path: Path) 
         primal=["online-supremizers", "offline-pga"],
         solvers=["piqp", "osqp", "gives-up"],
         tolerances=[{"pod": [1e-3], "dual": [1e-2], "primal": {"offline-pga": [0.5]}}],
-        timing_rounds=ROUNDS,
     )
     write_study(tmp_path, study)
     for jobs in ("1", "2"):
