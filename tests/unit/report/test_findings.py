@@ -120,10 +120,10 @@ def test_stability_and_cost_are_those_of_the_tables(said: Said, quick_run: Path)
     cells = tables.read(quick_run / FILE, "cells")
     mine = cells[(cells["problem"] == "obstacle") & (cells["dual"] == "mcpg")]
     size = mine.iloc[0]
-    texts = said(*DECIDED)[f"obstacle, mcpg, (N, R) = ({size['N']:.0f}, {size['R']:.0f})"]
+    others_are_slow = "UPDATE cells SET online_s = 99 * online_s WHERE solver != 'piqp'"
+    texts = said(*DECIDED, others_are_slow)[f"obstacle, mcpg, (N, R) = ({size['N']:.0f}, {size['R']:.0f})"]
     assert texts[0].startswith("Without enrichment, min β over the span is zero")
-    quickest = mine.groupby("solver")["online_s"].mean().idxmin()
-    of_solver = mine[mine["solver"] == quickest].set_index("primal")
+    of_solver = mine[mine["solver"] == "piqp"].set_index("primal")
     pga = of_solver.loc["offline-pga"]
     share = f"at least {100.0 * pga['share_validation']:.0f} % of the constant"
     assert any(f"adds {pga['enrichment']:.0f} vectors" in text and share in text for text in texts)
