@@ -43,15 +43,29 @@ LONGEST = (
 """Files that take longest, though some have few tests: parallel workers begin with them, so that all end together."""
 
 
+TESTS = Path(__file__).resolve().parent
+
+# Parallel workers import the same tests: their bytecode is kept, whatever the environment says.
+sys.dont_write_bytecode = False
+
+
 def pytest_configure(config: pytest.Config) -> None:
-    """Let pytest-xdist, where it is, keep the order of the files; of its own it would begin with the most tests."""
+    """Let pytest-xdist, where it is, keep the order of the files; of its own it would begin with the most tests.
+
+    Parallel workers begin to collect with different files, and find the bytecode of the others.
+    """
     config.option.loadscopereorder = False
+    parallel = getattr(config, "workerinput", None)
+    if parallel and [Path(given).resolve() for given in config.args] == [TESTS]:
+        files = sorted(map(str, TESTS.rglob("test_*.py")))
+        begin = int(parallel["workerid"].removeprefix("gw")) * len(files) // parallel["workercount"]
+        config.args[:] = files[begin:] + files[:begin]
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Put the longest files first."""
+    """Put the longest files first; parallel workers come to the same order."""
     places = {name: place for place, name in enumerate(LONGEST)}
-    items.sort(key=lambda item: places.get(item.path.stem, len(places)))
+    items.sort(key=lambda item: (places.get(item.path.stem, len(places)), item.path))
 
 
 @pytest.fixture(scope="session", autouse=True)
