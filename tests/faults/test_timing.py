@@ -6,13 +6,13 @@ from pathlib import Path
 
 import pytest
 from running import Vibench, by_solver, execute, rows, run_again
-from samples import wire_study, write_study
+from samples import ROUNDS, wire_study, write_study
 
 ANSWERS = 6
 """Calls of the solver before the timing begins: two for each of three queries."""
 
 
-@pytest.mark.parametrize(("last_call", "lost"), [(ANSWERS + 1, 1), (ANSWERS + 5, 1), (ANSWERS, 0)])
+@pytest.mark.parametrize(("last_call", "lost"), [(ANSWERS + 1, 1), (ANSWERS + 1 + ROUNDS, 1), (ANSWERS, 0)])
 def test_a_solver_that_dies_in_a_round_costs_that_round(
     last_call: int, lost: int, vibench: Vibench, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -26,11 +26,11 @@ def test_a_solver_that_dies_in_a_round_costs_that_round(
     unlucky, other = found["dies-once"], found["piqp"]
     assert (unlucky["status"], unlucky["queries_ok"]) == (("ok", 3) if lost else ("crashed", 2))
     assert (other["status"], other["timing_reason"]) == ("ok", "")
-    reason = f"{lost} of 12 rounds: the worker process died with signal SIGKILL" if lost else ""
+    reason = f"{lost} of {ROUNDS} rounds: the worker process died with signal SIGKILL" if lost else ""
     assert unlucky["timing_reason"] == reason
     assert min(unlucky["online_s"], other["online_s"]) > 0.0
     timed = [row["solver"] for row in rows(tmp_path / "runs" / "wire", "timings")]
-    assert (timed.count("dies-once"), timed.count("piqp")) == (12 - lost, 12)
+    assert (timed.count("dies-once"), timed.count("piqp")) == (ROUNDS - lost, ROUNDS)
 
 
 def test_a_cell_that_never_answers_leaves_the_seconds_of_the_others(vibench: Vibench, tmp_path: Path) -> None:
@@ -39,7 +39,7 @@ def test_a_cell_that_never_answers_leaves_the_seconds_of_the_others(vibench: Vib
     found = {(row["dual"], row["solver"]): row for row in rows(tmp_path / "runs" / "wire")}
     assert len(found) == 6
     assert [key for key, row in found.items() if row["online_s"] is not None] == [("cpg", "piqp")]
-    assert found["cpg", "piqp"]["timing_rounds"] == 12
+    assert found["cpg", "piqp"]["timing_rounds"] == ROUNDS
 
 
 def test_what_was_answered_but_not_timed_is_timed_by_the_next_run(vibench: Vibench, tmp_path: Path) -> None:
@@ -51,7 +51,7 @@ def test_what_was_answered_but_not_timed_is_timed_by_the_next_run(vibench: Viben
     printed, (row,) = run_again(vibench, tmp_path)
     assert "1 cells, 0 to run, 1 stages" in printed
     assert row["online_s"] > 0.0
-    assert len(rows(folder, "timings")) == 12
+    assert len(rows(folder, "timings")) == ROUNDS
     printed, _ = run_again(vibench, tmp_path)
     assert "1 cells, 0 to run, 0 stages" in printed
 

@@ -195,6 +195,7 @@ def wire_study(**axes: Any) -> dict[str, Any]:
         "primal": ["decorrelated"],
         "problem": ["wire"],
         "tolerances": [{"pod": [1e-3], "dual": [1e-2]}],
+        "timing_rounds": ROUNDS,
     }
     return content | axes
 
