@@ -9,16 +9,14 @@ import ctypes
 import subprocess
 import sys
 import tempfile
-import time
-from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 import vibench
 from vibench.library.export import TOLERANCE
+from vibench.library.exported_seconds import HIGH_FIDELITY, LIBRARY, SCRIPT, Call, in_turns, queries
 from vibench.library.reduced_model import Model
 from vibench.library.reduced_model_certificate import Model as WithBounds
 from vibench.qp.exact import exact_solution
@@ -27,46 +25,61 @@ QUERIES = 1000
 
 
 def main(run: str, cell: str, tolerance: float) -> None:
-    """Print largest relative errors of u and λ, and median CPU seconds of a query."""
+    """Print largest relative errors of u and λ, and median CPU seconds of queries, taken in turns."""
     model = vibench.open_run(run).model(cell)
-    seconds: dict[str, list[float]] = {"vibench": [], "script": [], "C": []}
-    errors: dict[str, list[tuple[float, float]]] = {"vibench": [], "script": [], "C": []}
-
-    def timed(name: str, call: Callable[[], Any]) -> Any:
-        start = time.process_time_ns()
-        result = call()
-        seconds[name].append(1e-9 * (time.process_time_ns() - start))
-        return result
-
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "model.npz"
         vibench.export_model(model, file, tolerance, c=True)
-        exported, library = Model(file), file.with_suffix(".so")
-        compiler = ["cc", "-std=c99", "-O3", "-shared", "-fPIC", "-o", str(library), str(file.with_suffix(".c")), "-lm"]
-        subprocess.run(compiler, check=True)
-        function = ctypes.CDLL(str(library)).model_solve
+        exported, compiled = Model(file), in_c(file)
+        mus, errors = model.parameters.sample(QUERIES, seed=0), dict[str, list[tuple[float, float]]]()
         V, W, chi = model.problem.V, model.problem.W, model.reduced.generators
-        for mu in model.parameters.sample(QUERIES, seed=0):
-            solution, answer = timed("vibench", partial(model.solve, mu)), timed("script", partial(exported.solve, mu))
-            x, alpha, residuals = np.zeros(len(answer.x)), np.zeros(len(answer.alpha)), np.zeros(3)
-            pointers = [array.ctypes.data_as(ctypes.c_void_p) for array in (mu.copy(), x, alpha, residuals)]
-            timed("C", partial(function, *pointers))
+        for mu in mus[: QUERIES // 10]:
             reduced = model.reduced.assemble(mu)
             exact = exact_solution(reduced.program)
             if exact is None:
                 continue
             u, lam = reduced.reconstruct(exact.x[:, None])[:, 0], chi @ exact.alpha
-            both = {"vibench": (solution.x, solution.alpha), "script": (answer.x, answer.alpha), "C": (x, alpha)}
+            solution, answer = model.solve(mu, corrected=False), exported.solve(mu)
+            both = {LIBRARY: (solution.x, solution.alpha), SCRIPT: (answer.x, answer.alpha), "C": compiled["C"](mu)}
             for name, (coordinates, forces) in both.items():
                 found = reduced.reconstruct(coordinates[:, None])[:, 0]
                 of_lam = exact.unique * W.norm(chi @ forces - lam) / (W.norm(lam) or 1.0)
-                errors[name].append((V.norm(found - u) / (V.norm(u) or 1.0), of_lam))
-    print(f"{QUERIES} queries; distance from the reduced program solved to round-off, and median CPU time")
-    for name, found in errors.items():
-        of_u, of_lam = np.max(found, axis=0)
-        print(f"{name:8} u {of_u:.1e}  λ {of_lam:.1e}  {1e6 * np.median(seconds[name]):6.0f} µs")
-    if model.certificate is not None:
+                errors.setdefault(name, []).append((V.norm(found - u) / (V.norm(u) or 1.0), of_lam))
+        print(f"{QUERIES // 10} queries: largest distance from the reduced program solved to round-off")
+        for name, distances in errors.items():
+            of_u, of_lam = np.max(distances, axis=0)
+            print(f"    {name:26} u {of_u:.1e}  λ {of_lam:.1e}")
+        print(f"{QUERIES} queries: median CPU time, taken in turns")
+        for name, seconds in in_turns(queries(model, file) | compiled, mus).items():
+            print(f"    {name:26} {1e6 * seconds:6.0f} µs")
+        seconds = in_turns({HIGH_FIDELITY: model.high_fidelity}, mus[:9])[HIGH_FIDELITY]
+        print(f"    {HIGH_FIDELITY:26} {1e6 * seconds:6.0f} µs")
+    if model.certificate is not None and not exported.about["no_bounds"]:
         bounds(model, tolerance)
+
+
+def in_c(file: Path) -> dict[str, Call]:
+    """The functions of the C source beside an exported file."""
+    library, data = file.with_suffix(".so"), np.load(file)
+    compiler = ["cc", "-std=c99", "-O3", "-shared", "-fPIC", "-o", str(library), str(file.with_suffix(".c")), "-lm"]
+    subprocess.run(compiler, check=True)
+    found = ctypes.CDLL(str(library))
+    sizes = data["f_terms"].shape[1], data["g_terms"].shape[1], 3
+    if "certificate_responses" in data:
+        sizes += (*data["certificate_responses"].shape, 3)
+    arrays = [np.zeros(size) for size in sizes]
+    x, alpha, residuals, *others = [array.ctypes.data_as(ctypes.c_void_p) for array in arrays]
+
+    def solve(mu: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        found.model_solve(mu.ctypes.data_as(ctypes.c_void_p), x, alpha, residuals)
+        return arrays[0].copy(), arrays[1].copy()
+
+    def certify(corrected: int, mu: np.ndarray) -> None:
+        solve(mu)
+        found.model_certify(mu.ctypes.data_as(ctypes.c_void_p), x, alpha, corrected, *others)
+
+    bounded = {"C, with bounds": partial(certify, 0), "C, corrected": partial(certify, 1)} if others else {}
+    return {"C": solve} | bounded
 
 
 def bounds(model: vibench.Model, tolerance: float) -> None:

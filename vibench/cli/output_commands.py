@@ -159,6 +159,7 @@ def export_reduced_model(
     at: At = None,
 ) -> None:
     """Export a reduced model for use without vibench."""
+    from vibench.library import exported_seconds
     from vibench.library.export import BOUNDS, RUNTIME, TOLERANCE, export_model
     from vibench.library.runs import open_run
     from vibench.model.chebyshev import MEASURED
@@ -173,6 +174,7 @@ def export_reduced_model(
     why = exported.about["no_bounds"]
     has_bounds = not why
     echo(f"error bounds: {exported.about['certificate']}" if has_bounds else f"no error bounds: {why}")
+    echo(exported_seconds.in_words(model, file))
     beside = [file.with_name(BOUNDS)] if has_bounds else []
     written = ", ".join(
         map(

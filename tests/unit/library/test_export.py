@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import itertools
 import json
+import re
 import subprocess
 import sys
 import warnings
@@ -521,6 +522,7 @@ def test_the_command(run: vibench.Run, main: Main, tmp_path: Path) -> None:
     assert "B: 1 term, polynomials of degree (2, 0, 0)" in out
     assert f"`from reduced_model import Model`, then `Model('{tmp_path / 'out' / 'model.npz'}').solve(mu)" in out
     assert "no error bounds: its cell has no bounds" in out
+    assert re.search(r"^a query takes \S+ ms; the high-fidelity solution \S+ ms$", out, re.MULTILINE)
     assert {file.name for file in (tmp_path / "out").iterdir()} == FILES | {"model.c", "model.h"}
     refused(main(*asked), "model.npz' exists; remove it")
     refused(main(*asked[:-1], str(tmp_path / "b.npz"), "--interpolate", "1e-14"), "A depends on mu", "--evaluations")
@@ -681,6 +683,7 @@ def test_the_command_says_what_has_bounds(run: vibench.Run, main: Main, tmp_path
     code, out, err = main("export-model", str(run.path.parent), cell, str(file), "--c")
     assert (code, err) == (0, "")
     assert "\nerror bounds: verified\n" in out
+    assert re.search(r"^a query takes \S+ ms, \S+ ms with bounds, \S+ ms corrected; the high", out, re.MULTILINE)
     assert "`from reduced_model_certificate import Model`" in out
     assert {file.name for file in (tmp_path / "out").iterdir()} == FILES | {BOUNDS, "model.c", "model.h"}
     assert "int model_certify(" in file.with_suffix(".h").read_text()

@@ -1,0 +1,51 @@
+"""How long queries of an exported model take, beside those of the model and its high-fidelity solutions."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from vibench.arrays import Array
+from vibench.library import reduced_model, reduced_model_certificate
+from vibench.offline.models import Model
+from vibench.timing import timed
+
+Call = Callable[[Array], Any]
+"""A query at a parameter mu (d,)."""
+
+SCRIPT, LIBRARY, HIGH_FIDELITY = "script", "model.solve", "high-fidelity solution"
+
+
+def in_turns(calls: Mapping[str, Call], mus: Array) -> dict[str, float]:
+    """Median CPU seconds of calls by name at parameters (P×d), at each one after the other, once more at the first."""
+    seconds: dict[str, list[float]] = {name: [] for name in calls}
+    for mu in (mus[0], *mus):
+        for name, call in calls.items():
+            seconds[name].append(timed(partial(call, mu))[1].cpu)
+    return {name: float(np.median(found[1:])) for name, found in seconds.items()}
+
+
+def queries(model: Model, file: Path) -> dict[str, Call]:
+    """The script of an exported file and its model; without bounds, with those, and with corrected solutions."""
+    plain = model if model.certificate is None else Model(model.reduced, model.solver, model.accuracy)
+    found: dict[str, Call] = {SCRIPT: reduced_model.Model(file).solve, LIBRARY: partial(plain.solve, corrected=False)}
+    script = reduced_model.Model(file)
+    if not script.about["no_bounds"]:
+        bounded = reduced_model_certificate.Model(file)
+        for corrected, what in ((False, "with bounds"), (True, "corrected")):
+            found[f"{SCRIPT}, {what}"] = partial(bounded.solve, corrected=corrected)
+            found[f"{LIBRARY}, {what}"] = partial(model.solve, corrected=corrected)
+    return found
+
+
+def in_words(model: Model, file: Path, count: int = 5) -> str:
+    """Median CPU milliseconds of queries of the script at `count` parameters, and of high-fidelity solutions there."""
+    calls = {name: call for name, call in queries(model, file).items() if name.startswith(SCRIPT)}
+    seconds = in_turns(calls | {HIGH_FIDELITY: model.high_fidelity}, model.parameters.sample(count, seed=0))
+    of = {name: f"{1e3 * value:.2g} ms" for name, value in seconds.items()}
+    takes = ", ".join(of[name] + name.removeprefix(SCRIPT).replace(",", "") for name in calls)
+    return f"a query takes {takes}; the {HIGH_FIDELITY} {of[HIGH_FIDELITY]}"
