@@ -14,6 +14,7 @@ from types import SimpleNamespace
 from typing import Any
 from urllib.parse import urlsplit
 
+import dask
 import pytest
 from distributed import LocalCluster
 from distributed.security import Security
@@ -38,6 +39,17 @@ def elsewhere(_: str) -> tuple[bool, str, str]:
 
 def job(stage: Stage, store: Path) -> Job:
     return Job(str(store), stage, 1.0, 60.0, 8.0)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def forked_dask_workers() -> Iterator[None]:
+    """Dask forks its workers from a process that has imported dask, here and in the processes that tests start."""
+    with (
+        pytest.MonkeyPatch.context() as patch,
+        dask.config.set({"distributed.worker.multiprocessing-method": "forkserver"}),
+    ):
+        patch.setenv("DASK_DISTRIBUTED__WORKER__MULTIPROCESSING_METHOD", "forkserver")
+        yield
 
 
 @pytest.fixture(scope="module")
