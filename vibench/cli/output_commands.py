@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import sys
+from collections.abc import Iterator
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
+import typer
 from typer import Argument, Exit, Option
 
 from vibench.cli.completion import cells, runs
@@ -117,10 +120,12 @@ def publish_runs(
     doi: Annotated[str, Option(help="DOI of the deposit, such as 10.5281/zenodo.1234567.")] = "",
     url: Annotated[str, Option(help="Address of the site.")] = "",
     figures: Annotated[bool, Option("--figures/--no-figures", help="Add pictures to the reports.")] = True,
+    yes: Annotated[bool, Option("--yes", "-y", help="Do not ask.")] = False,
 ) -> None:
     """Write a static site of runs: reports, data, leaderboard.
 
-    Links are relative: the site can be opened from a disk and served by any host of static files.
+    Links are relative: the site can be opened from a disk and served by any host of static files. Paths, your name and
+    that of the host are taken out; the command lists what could still identify somebody, and asks.
     """
     from vibench.report.site.citation import Citation
     from vibench.report.site.publish import publish
@@ -128,8 +133,16 @@ def publish_runs(
 
     if not title.strip():
         raise RequestError("--title is empty; a site needs one to be cited")
+    if not yes and not sys.stdin.isatty():
+        raise RequestError("nothing was published: answer the question on a terminal, or say --yes")
+
+    def ask(lines: Iterator[str]) -> None:
+        if not yes:
+            echo("what could identify somebody:", *(f"  {line}" for line in lines))
+            typer.confirm("Publish it?", abort=True)
+
     citation = Citation(title, tuple(author or ()), doi, url)
-    page = publish([tables.results_file(one) for one in run], site, citation, warn=warn, figures=figures)
+    page = publish([tables.results_file(one) for one in run], site, citation, warn=warn, figures=figures, ask=ask)
     echo(f"site of {len(run)} run{'s' * (len(run) > 1)}: {page}")
 
 

@@ -120,7 +120,7 @@ class Cell:
         """
         content = json.loads(text)
         plugins = {name: Plugin(**content[name]) for name in PLUGINS if content.get(name)}  # not all in older ones
-        known = {json.loads(one.options)[option] for one in plugins.values() for option in json.loads(one.places)}
+        known = {name for one in plugins.values() if places for name in one.paths.values()}
         for name in places.keys() - known:
             raise unknown_name("file or folder of the cell", name, known)
         for name in PLUGINS:
@@ -171,7 +171,7 @@ def _found(plugin: Plugin) -> Plugin:
     try:
         return plugin.as_installed()
     except RequestError as error:
-        names = [str(json.loads(plugin.options)[option]) for option in json.loads(plugin.places)]
-        if not names:
-            raise
-        raise RequestError(f"{error}; if it was moved, say where it is now: --at {names[0]}=PATH") from None
+        if plugin.registered.entries and plugin.paths:
+            name = next(iter(plugin.paths.values()))
+            raise RequestError(f"{error}; if it was moved, say where it is now: --at {name}=PATH") from None
+        raise

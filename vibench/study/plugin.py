@@ -79,9 +79,15 @@ class Plugin:
         places = json.loads(self.places)
         return {name: places.get(name, value) for name, value in json.loads(self.options).items()}
 
+    @property
+    def paths(self) -> dict[str, str]:
+        """The names under which results know the files and folders that its options name, by option."""
+        known = self.registered.path_options
+        return {name: str(value) for name, value in json.loads(self.options).items() if name in known}
+
     def moved(self, places: Mapping[str, str]) -> Plugin:
         """The plugin whose files and folders are at other places, by the names under which results know them."""
-        there = {name: places[value] for name, value in json.loads(self.options).items() if value in [*places]}
+        there = {option: places[name] for option, name in self.paths.items() if name in places}
         return replace(self, places=json.dumps(json.loads(self.places) | there))
 
     def create(self) -> Any:

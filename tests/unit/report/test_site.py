@@ -303,11 +303,11 @@ def test_a_list_of_files_that_cannot_be_trusted_is_refused(catalogue: str, small
 def test_a_folder_of_others_is_refused(three: list[Path], main: Main, tmp_path: Path) -> None:
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "thesis.tex").write_text("all of it")
-    refused(main("publish", str(three[0]), str(tmp_path / "mine")), "mine", "not written by `vibench publish`")
+    refused(main("publish", "--yes", str(three[0]), str(tmp_path / "mine")), "mine", "not written by `vibench publish`")
     assert [path.name for path in (tmp_path / "mine").iterdir()] == ["thesis.tex"]
-    refused(main("publish", str(three[0]), str(tmp_path / "mine" / "thesis.tex")), "is not a folder")
-    refused(main("publish", "nowhere", str(tmp_path / "new")), "no results in 'nowhere'")
-    refused(main("publish", str(three[0]), str(tmp_path / "new"), "--doi", "abc"), "no DOI")
+    refused(main("publish", "--yes", str(three[0]), str(tmp_path / "mine" / "thesis.tex")), "is not a folder")
+    refused(main("publish", "--yes", "nowhere", str(tmp_path / "new")), "no results in 'nowhere'")
+    refused(main("publish", "--yes", str(three[0]), str(tmp_path / "new"), "--doi", "abc"), "no DOI")
     assert not (tmp_path / "new").exists()
 
 
@@ -316,7 +316,7 @@ def test_the_command_writes_a_site(
 ) -> None:
     monkeypatch.setattr(html, "page", lambda *_, **__: REPORT)
     arguments = ("--title", "Ours", "--author", "Doe, Jane", "--url", "https://example.org/")
-    code, out, err = main("publish", *map(str, three), str(tmp_path / "new" / "site"), *arguments)
+    code, out, err = main("publish", "--yes", *map(str, three), str(tmp_path / "new" / "site"), *arguments)
     assert (code, err) == (0, "")
     assert out == f"site of 3 runs: {tmp_path / 'new' / 'site' / 'index.html'}\n"
     assert of_yaml((tmp_path / "new" / "site" / "CITATION.cff").read_text())["url"] == "https://example.org/"

@@ -286,7 +286,7 @@ def test_a_report_and_a_site_say_once_which_columns_they_do_not_have(
     path = write_sample_run(tmp_path / "run")
     text = html.page(path, figures=False)
     assert [text.count(line.replace("'", "&#39;")) for line in TWO] == [1, 1]
-    code, _, err = main("publish", str(path.parent), str(tmp_path / "site"), "--no-figures")
+    code, _, err = main("publish", "--yes", str(path.parent), str(tmp_path / "site"), "--no-figures")
     assert (code, err) == (0, f"vibench: {TWO[0]}\n")  # no table of histories is published
 
 

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 from vibench.errors import RequestError
 from vibench.provenance import distribution_version, solver_distribution
+from vibench.qp.settings import SETTINGS
 from vibench.results.formats import to_latex_text
 from vibench.text import unbroken
 
@@ -74,6 +75,11 @@ class Citation:
         return "@misc{vibench-results,\n" + "\n".join(lines) + "\n}\n"
 
 
+def is_known(distribution: str) -> bool:
+    """Whether a distribution is installed here, or that of a QP solver that vibench has settings for."""
+    return bool(distribution_version(distribution)) or distribution in map(solver_distribution, SETTINGS)
+
+
 def _yaml(text: str) -> str:
     """A string of YAML: JSON's strings are a subset of its double-quoted ones."""
     return json.dumps(unbroken(text), ensure_ascii=False)
@@ -91,10 +97,15 @@ def requirements(versions: Mapping[str, str], code: str) -> str:
 
     Versions are by name of distribution or solver, as the cells record them; of several, separated by ", ", where cells
     differ, none is required. The hashes of the code are a comment: a vibench under development has no release.
+    Distributions that are neither installed here nor those of a solver are left out: whoever wrote a results file could
+    make others install anything.
     """
     lines = [f"# versions recorded in the results file; code of the cells: {unbroken(code)}"]
-    for name, version in sorted(versions.items()):
-        distribution = solver_distribution(name)
+    known = {name: one for name in versions if name == "python" or is_known(one := solver_distribution(name))}
+    if unknown := len(versions) - len(known):
+        lines.append(f"# left out: {unknown} that the machine which published this does not know")
+    for name, distribution in sorted(known.items()):
+        version = versions[name]
         if name == "python":
             lines.append(f"# python {unbroken(version)}")
         elif not version:

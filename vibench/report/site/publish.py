@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 import json
+import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import pandas as pd
 
+from vibench.files import TEMPORARY
 from vibench.provenance import distribution_version
 from vibench.report import html
 from vibench.report.comparison.compare import Comparison, compare
 from vibench.report.comparison.runs import compared_runs
 from vibench.report.site import folder
 from vibench.report.site.citation import Citation, requirements
+from vibench.report.site.identifying import cleaned, left
 from vibench.report.site.published_run import FILTERED, SHOWN_CELLS, PublishedRun, folder_names
 from vibench.results import formats, tables
 from vibench.results.plugin_columns import faults_of
@@ -39,27 +42,45 @@ def publish(
     warn: Callable[[str], None] = lambda _: None,
     *,
     figures: bool = True,
+    ask: Callable[[Iterator[str]], None] = lambda _: None,
 ) -> Path:
     """Write the site of some results files; the same files give the same site.
 
     The folder is new, empty, or one that was written by this function, whose files are replaced. Notes are remarks on
     results files, which stand on the pages of their runs; `warn` is called with a line for every column of a plugin
-    that a published table does not have; with `figures` reports have pictures.
+    that a published table does not have; with `figures` reports have pictures. Paths, the user's name and that of the
+    host are taken out; `ask` gets lines on what could still identify somebody, before anything is written.
 
     Returns the first page. Raises a `RequestError` if a results file cannot be read, or the folder holds files of
     others or cannot be written.
     """
     folder.check(site)
-    runs = compared_runs(paths)
-    published = [
-        PublishedRun(run, own, (notes or {}).get(run.path, ""))
-        for run, own in zip(runs, folder_names([run.name for run in runs]), strict=True)
-    ]
     faults: list[str] = []
-    folder.write(site, lambda new: faults.extend(_fill(new, published, citation, figures=figures)))
+    with tempfile.TemporaryDirectory(prefix=TEMPORARY) as scratch:
+        copies = [Path(scratch, name, FILE) for name in _names(paths)]
+        for path, copy in zip(paths, copies, strict=True):
+            cleaned(path, copy)
+        runs = compared_runs(copies)
+        names = [run.name for run in runs]
+        ask(left(copies, names, citation.authors))
+        published = [
+            PublishedRun(run, own, (notes or {}).get(path, ""))
+            for run, path, own in zip(runs, paths, folder_names(names), strict=True)
+        ]
+        folder.write(site, lambda new: faults.extend(_fill(new, published, citation, figures=figures)))
     for line in dict.fromkeys(faults):
         warn(line)
     return site / folder.FIRST_PAGE
+
+
+def _names(paths: Sequence[Path]) -> list[str]:
+    """Names of runs, all different: the last folder or the file, without the folders before it, which could tell."""
+    names: list[str] = []
+    for path in paths:
+        name = path.absolute().parent.name if path.name == FILE else path.stem
+        count = 1 + sum(one.rpartition(" (")[0] == name or one == name for one in names)
+        names.append(name if count == 1 else f"{name} ({count})")
+    return names
 
 
 def _fill(site: Path, runs: Sequence[PublishedRun], citation: Citation, *, figures: bool) -> list[str]:

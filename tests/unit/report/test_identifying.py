@@ -1,0 +1,128 @@
+"""A published site tells neither in whose home nor on which host runs were made, and installs nothing of strangers."""
+
+from __future__ import annotations
+
+import shutil
+import sqlite3
+from pathlib import Path
+from typing import Any
+
+import pytest
+import typer
+from packs import write_cable
+from running import Main, Shared, execute, refused, rows
+from samples import toml
+
+from vibench.report.site import identifying
+from vibench.report.site.citation import Citation, requirements
+from vibench.report.site.publish import publish
+from vibench.results import tables
+from vibench.results.sqlite.reading import FILE
+
+STUDY: dict[str, Any] = {
+    "name": "cables", "validation": {"name": "file", "path": "points.csv"}, "solvers": ["piqp"], "dual": ["mcpg"],
+    "primal": ["decorrelated"], "timing_rounds": 1, "tolerances": [{"N": [2], "R": [2]}],
+    "problem": [{"name": "pack", "options": {"path": "packs/cable"}}, {"name": "pack", "options": {"path": "../sag"}}],
+}  # fmt: skip
+WORDS = (b"somebody", b"secret", b"a-host-of-hers")
+
+
+@pytest.fixture
+def made(main: Main, shared: Shared, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A run under somebody/secret, whose texts name it, its user and the host."""
+
+    def make(folder: Path) -> None:
+        home = folder / "home" / "somebody" / "secret work"
+        write_cable(home / "packs" / "cable")
+        write_cable(home.parent / "sag")
+        (home / "points.csv").write_text("load,depth\n4.5,0.2\n7.5,0.3\n")
+        (home / "study.toml").write_text(toml(STUDY))
+        code, _, err = main("run", str(home / "study.toml"), "--out", str(home / "run"), "--jobs", "1", "--no-figures")
+        assert (code, err) == (0, "")
+        noted = (
+            f"somebody''s pack ''{home}/packs/cable'' at {home}/main.py:3 or /home/somebody/secret, on a-host-of-hers"
+        )
+        execute(
+            home / "run",
+            f"UPDATE cells SET reason = '{noted}', timing_reason = 'vibench check --option=path={home}/packs/cable'",
+            f"UPDATE cells SET fallbacks = '{home}' WHERE rowid = 1",
+            f"UPDATE queries SET reason = 'no file \"{home}/x.npz\" or /root/secret/b'",
+            "UPDATE cells SET machine = machine || ' a-host-of-hers'",
+        )
+
+    monkeypatch.setattr(identifying.platform, "node", lambda: "a-host-of-hers")
+    monkeypatch.setenv("LOGNAME", "somebody")
+    monkeypatch.setenv("HOME", "/home/somebody")
+    return shared("identifying", make) / "home" / "somebody" / "secret work" / "run"
+
+
+def test_a_site_names_neither_home_nor_user_nor_host(made: Path, main: Main, tmp_path: Path) -> None:
+    site = tmp_path / "site"
+    before = (made / FILE).read_bytes()
+    code, _, err = main("publish", "--yes", str(made), str(site), "--no-figures")
+    assert (code, err) == (0, "")
+    files = [path for path in site.rglob("*") if path.is_file()]
+    assert {path.name for path in files} >= {FILE, "report.html", "provenance.json", "cells.csv"}
+    for path in files:
+        assert [word for word in WORDS if word in path.read_bytes()] == [], path
+    assert (made / FILE).read_bytes() == before
+    (published,) = site.rglob(FILE)
+    (row, other) = rows(published.parent)
+    assert row["problem_options"] == '{"path": "packs/cable"}'
+    assert other["problem_options"] == '{"path": "sag"}'
+    assert row["validation_options"] == '{"path": "points.csv"}'
+    assert row["cell"] == rows(made)[0]["cell"]
+    assert row["reason"] == "…'s pack '…/cable' at …/main.py:3 or …, on …"
+    assert len(tables.read(published, "queries")) == 4  # its digests fit
+    at = [
+        f"{name}={made.parent / place}"
+        for name, place in (("packs/cable", "packs/cable"), ("points.csv", "points.csv"))
+    ]
+    line = refused(main("run", str(published), "--cell", row["cell"], "--dry-run"), "--at packs/cable=PATH")
+    assert "somebody" not in line
+    code, out, _ = main("run", str(published), "--cell", row["cell"], "--dry-run", "--at", at[0], "--at", at[1])
+    assert (code, out.split()[0]) == (0, row["cell"])
+
+
+def test_damage_is_no_less_found_for_being_published(made: Path, main: Main, tmp_path: Path) -> None:
+    shutil.copytree(made, tmp_path / "run")
+    with sqlite3.connect(tmp_path / "run" / FILE) as db:
+        db.execute("UPDATE queries SET error_u = 2 * error_u WHERE rowid = 1")
+    db.close()
+    refused(main("publish", "--yes", str(tmp_path / "run"), str(tmp_path / "site")), "is damaged")
+
+
+def test_what_could_identify_somebody_is_said_before_a_site_is_written(made: Path, main: Main, tmp_path: Path) -> None:
+    refused(main("publish", str(made), str(tmp_path / "site")), "nothing was published", "--yes")
+    said: list[str] = []
+
+    def ask(lines: Any) -> None:
+        said.extend(lines)
+        raise typer.Abort
+
+    execute(shutil.copytree(made, tmp_path / "run"), "UPDATE cells SET dual = 'the cone of somebody'")
+    with pytest.raises(typer.Abort):
+        publish([tmp_path / "run" / FILE], tmp_path / "site", Citation("x", ("Doe, Jane",)), ask=ask)
+    assert not (tmp_path / "site").exists()
+    assert said[:2] == ["names of runs: run", "authors: Doe, Jane"]
+    assert any(line.startswith("labels: ") and "the cone of somebody" in line for line in said)
+    assert any('"packs/cable"' in line for line in said)
+    assert "the user's name 'somebody', in a name or an option" in said
+
+
+def test_runs_of_one_name_do_not_tell_their_folders(made: Path, main: Main, tmp_path: Path) -> None:
+    shutil.copytree(made, tmp_path / "secret" / "run")
+    code, _, err = main(
+        "publish", "--yes", str(made), str(tmp_path / "secret" / "run"), str(tmp_path / "s"), "--no-figures"
+    )
+    assert (code, err) == (0, "")
+    assert sorted(path.name for path in (tmp_path / "s" / "runs").iterdir()) == ["run", "run-2"]
+    assert b"secret" not in (tmp_path / "s" / "index.html").read_bytes()
+
+
+def test_requirements_hold_nothing_that_a_stranger_invents() -> None:
+    text = requirements({"evil-package": "6.6.6", "numpy": "2.0.0", "osqp": "1.0", "python": "3.12"}, "code")
+    assert "evil" not in text
+    assert "numpy==2.0.0\n" in text
+    assert "osqp==1.0\n" in text
+    assert "# left out: 1 that" in text

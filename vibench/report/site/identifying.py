@@ -1,0 +1,143 @@
+"""Who made results that are published: paths, user and host are taken out of a copy, and what is left is said."""
+
+from __future__ import annotations
+
+import contextlib
+import getpass
+import json
+import platform
+import re
+import sqlite3
+from collections.abc import Iterator, Sequence
+from contextlib import closing
+from pathlib import Path
+
+from vibench.results.columns import KEYS, STORED, TEXT
+from vibench.results.sqlite.digests import Digests
+from vibench.results.sqlite.reading import open_read_only, read_meta, read_rows, text_reader
+from vibench.text import brief, json_object, unbroken
+
+LEFT_OUT = "…"
+"""What stands where something was taken out."""
+
+PATH = re.compile(r"""(?<![\w./])(?:/[^/\s'"`\\:;,<>|()\[\]{}]+){2,}/?""")
+"""An absolute path of two parts at least, in a text or in JSON."""
+
+SHOWN = {
+    "machines": ("machine",),
+    "labels": ("problem", "training", "dual", "primal", "validation"),
+    "options": (*(name for name in KEYS if name.endswith("_options")), "validation_options"),
+}
+"""Columns that are said, by what they are called."""
+
+NAMES = frozenset({*KEYS, "cell", "solver_a", "solver_b", "status"})
+"""Columns whose values tell rows apart: of these only paths are taken out."""
+
+
+def cleaned(path: Path, copy: Path) -> None:
+    """Write a copy of a results file without absolute paths, the user's name, home directory and the host's name.
+
+    Of a path the name of its file is kept, if it has an ending. Where packs and files of points were is left out; their
+    paths beside the study are kept, and the hashes of their content are part of those of the code.
+
+    Raises a `RequestError` if the file is damaged.
+    """
+    read_meta(path)
+    copy.parent.mkdir(parents=True)
+    with open_read_only(path) as db:
+        db.execute("VACUUM INTO ?", (str(copy.absolute()),))
+    parents = {Path(place).parent for place in _places(path)}
+    folders = sorted((str(one) for one in parents if len(one.parts) > 2), key=len, reverse=True)
+    inside = [re.compile(rf"(?<!\w){re.escape(folder)}(?![\w-])") for folder in folders]
+    with closing(sqlite3.connect(copy)) as db, db:
+        db.text_factory = text_reader()
+        for table, columns in {"meta": ("value",), **{name: _texts(name) for name in STORED}}.items():
+            if table != "meta":
+                read_rows(path, table)  # refuses damage, which new digests would hide
+            if sum(_clean(db, table, column, inside) for column in columns):
+                digests = Digests(db)
+                digests.forget(name=table)
+                digests.count(table)
+    with closing(sqlite3.connect(copy)) as db:
+        db.execute("VACUUM")  # what was replaced is no longer in free pages
+
+
+def left(paths: Sequence[Path], names: Sequence[str], authors: Sequence[str]) -> Iterator[str]:
+    """What of cleaned results could still identify somebody, a line each."""
+    yield f"names of runs: {', '.join(names)}"
+    if authors:
+        yield f"authors: {'; '.join(authors)}"
+    tables = [read_rows(path, "cells") for path in paths]
+    rows = [dict(zip(columns, row, strict=True)) for columns, found in tables for row in found]
+    for title, columns in SHOWN.items():
+        values = {str(row[column]) for row in rows for column in columns} - {"{}", "None"}
+        if values:
+            yield f"{title}: {brief('; '.join(sorted(map(unbroken, values))), 500)}"
+    texts = {str(value) for row in rows for value in row.values() if isinstance(value, str)}
+    for what, name in _identities():
+        if any(_word(name).search(text) for text in texts):
+            yield f"the {what} '{name}', in a name or an option"
+
+
+def _identities() -> list[tuple[str, str]]:
+    """What identifies the user and the machine; the longest first."""
+    found = [("name of the host", platform.node())]
+    with contextlib.suppress(RuntimeError):
+        found.append(("home directory", str(Path.home())))
+    with contextlib.suppress(OSError, KeyError):
+        found.append(("user's name", getpass.getuser()))
+    return sorted(((what, name) for what, name in found if len(name) > 1), key=lambda one: -len(one[1]))
+
+
+def _word(name: str) -> re.Pattern[str]:
+    return re.compile(rf"(?<!\w){re.escape(name)}(?!\w)")
+
+
+def _places(path: Path) -> Iterator[str]:
+    """Where the cells of a results file found files and folders."""
+    names, rows = read_rows(path, "cells")
+    for definition in {row[names.index("definition")] for row in rows}:
+        for plugin in (json_object(definition) or {}).values():
+            recorded = json_object(plugin.get("places")) if isinstance(plugin, dict) else None
+            yield from (str(place) for place in (recorded or {}).values() if str(place).startswith("/"))
+
+
+def _texts(table: str) -> list[str]:
+    return [name for name, column in STORED[table].items() if column.kind.startswith(TEXT)]
+
+
+def _clean(db: sqlite3.Connection, table: str, column: str, folders: Sequence[re.Pattern[str]]) -> int:
+    """Clean the values of a column; returns how many were changed."""
+    values = db.execute(
+        f'SELECT DISTINCT CAST("{column}" AS BLOB) FROM "{table}" WHERE "{column}" IS NOT NULL'
+    ).fetchall()
+    changed = 0
+    for (value,) in values:
+        text = value.decode(errors="surrogateescape")
+        new = _without_places(text) if column == "definition" else text
+        for folder in folders:
+            new = folder.sub(LEFT_OUT, new)
+        new = PATH.sub(_file, new)
+        for _, name in _identities() if column not in NAMES else ():
+            new = _word(name).sub(LEFT_OUT, new)
+        if new != text:
+            changed += 1
+            db.execute(
+                f'UPDATE "{table}" SET "{column}" = CAST(? AS TEXT) WHERE CAST("{column}" AS BLOB) = ?',
+                (new.encode(errors="surrogateescape"), value),
+            )
+    return changed
+
+
+def _without_places(definition: str) -> str:
+    content = json_object(definition)
+    for plugin in (content or {}).values():
+        if isinstance(plugin, dict) and "places" in plugin:
+            plugin["places"] = "{}"
+    return definition if content is None else json.dumps(content, sort_keys=True, ensure_ascii=False)
+
+
+def _file(match: re.Match[str]) -> str:
+    """What is kept of a path: the name of a file, if it has an ending."""
+    name = match[0].rsplit("/", 1)[-1]
+    return f"{LEFT_OUT}/{name}" if Path(name).suffix else LEFT_OUT
