@@ -89,6 +89,8 @@ def fault_line(fault: ValidationError, root: type[BaseModel], named: Collection[
             message, shown = str(unknown_name("key", "".join(str(error["loc"][-1]).split()), fields)), ""
         case "missing":
             message, shown = "required, but not given", ""
+        case "list_type" if isinstance(error["input"], dict):
+            message = f"expected a list of tables: write [[{where[-1]}]] in place of [{where[-1]}]"
         case "model_type":
             message = "expected a name, or a table with one" if where[0] in named else "expected a table"
     place = ".".join(map(str, where))

@@ -72,7 +72,12 @@ EXAMPLES: Mapping[str, tuple[str, ...]] = {
         "vibench bench my-problem piqp --against before.json",
         "vibench bench --read after.json --against before.json --format csv",
     ),
-    "new": ("vibench new problem cable", "vibench new solver my-qp", "vibench new dual my-cone --out packages"),
+    "new": (
+        "vibench new study my-study",
+        "vibench new pack my-model",
+        "vibench new problem cable",
+        "vibench new dual my-cone --out packages",
+    ),
     "import": ("vibench import my-model",),
     "pack": (
         "vibench pack my-problem my-model --option resolution=coarse",
@@ -80,6 +85,7 @@ EXAMPLES: Mapping[str, tuple[str, ...]] = {
     ),
     "cones": ("vibench cones my-model", "vibench cones my-model --dual-tol 1e-3"),
     "clean": ("vibench clean --dry-run", "vibench clean --older-than 30"),
+    "help": ("vibench help show", "vibench help beta_cone_lower_min"),
     "doctor": ("vibench doctor", "vibench doctor --out /scratch/runs"),
 }
 """Examples of every command."""

@@ -23,7 +23,7 @@ from vibench.cli.output_commands import draw_figures, export_qps, export_reduced
 from vibench.cli.pack_commands import import_pack, pack_problem, reduce_cones
 from vibench.cli.plugin_commands import check_plugin, list_plugins, new_plugin
 from vibench.cli.result_commands import At, compare_runs, diff_runs, places_of, replay_query, show
-from vibench.errors import RequestError, VibenchError
+from vibench.errors import RequestError, VibenchError, unknown_name
 from vibench.interrupts import INTERRUPTED, Interrupted, interrupted_at_once, interruptible
 from vibench.study.kinds import DUAL, PRIMAL, PROBLEM
 from vibench.terminal.output import echo, warn
@@ -233,16 +233,35 @@ def doctor(out: Annotated[Path, Option(metavar="DIR", help="Folder of the runs."
         raise typer.Exit(1)
 
 
+def help_on(
+    topic: Annotated[str, typer.Argument(help="A command, or a column of the results or its heading.")] = "",
+) -> None:
+    """Say what a command does, or what a column of the results means."""
+    if topic in ("", *COMMANDS):
+        app(args=[*topic.split(), "--help"], standalone_mode=False)
+        return
+    from vibench.results.columns import STORED
+
+    named = [(table, name, of) for table, columns in STORED.items() for name, of in columns.items()]
+    meant = [one for one in named if topic in (one[1], one[2].heading)]
+    if not meant:
+        headings = [of.heading for *_, of in named if of.heading]
+        raise unknown_name("command or column", topic, {*COMMANDS, *(name for _, name, _ in named), *headings})
+    for table, name, of in meant:
+        echo(f"{name}{f' [{of.unit}]' * bool(of.unit)}, in {table}: {of.meaning}")
+
+
 COMMANDS: dict[str, Callable[..., None]] = {
     "run": run_study_command, "list": list_plugins, "show": show, "report": write_report, "figures": draw_figures,
     "diff": diff_runs, "compare": compare_runs, "publish": publish_runs,
     "replay": replay_query, "export-qps": export_qps,
     "export-model": export_reduced_model, "clean": clean, "doctor": doctor,
     "check": check_plugin, "bench": bench_plugins, "new": new_plugin,
-    "import": import_pack, "pack": pack_problem, "cones": reduce_cones,
+    "import": import_pack, "pack": pack_problem, "cones": reduce_cones, "help": help_on,
 }  # fmt: skip
 for _name, _command in COMMANDS.items():
-    app.command(_name, epilog=examples(_name))(interruptible(_command))
+    # a command would take the default above of the option of its name, as that of --help, for its own
+    app.command(_name, epilog=examples(_name), context_settings={"default_map": {}})(interruptible(_command))
 
 
 def run_command_line() -> None:

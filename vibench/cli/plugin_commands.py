@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 import sys
 from collections.abc import Iterator
 from contextlib import suppress
@@ -26,9 +27,9 @@ Row = tuple[str, str, str, str]
 if TYPE_CHECKING:
     from vibench.study.registry import RegisteredPlugin
 
-    CliName = str
+    NewKind = str
 else:
-    CliName = Literal[tuple(CHECKED)]
+    NewKind = Literal[(*CHECKED, "study", "pack")]
 
 SECONDS = 120.0
 """Default of `--seconds`: that of `vibench.testing`, which is too slow to import for a help text."""
@@ -134,16 +135,26 @@ SAMPLE = {"size": 16, "seed": 0}
 
 
 def new_plugin(
-    kind: Annotated[CliName, Argument(metavar="KIND", help="Kind of plugin.")],
-    name: Annotated[str, Argument(metavar="NAME", help="Name of the plugin: a-z, 0-9 and hyphens.")],
-    out: Annotated[Path, Option(metavar="DIR", help="Folder in which the package is created.")] = Path(),
+    kind: Annotated[NewKind, Argument(metavar="KIND", help="A kind of plugin, study, or pack.")],
+    name: Annotated[str, Argument(metavar="NAME", help="Its name: a-z, 0-9 and hyphens.")],
+    out: Annotated[Path, Option(metavar="DIR", help="Folder in which it is created.")] = Path(),
 ) -> None:
-    """Write a package with a new plugin, to install and edit.
+    """Write a package with a new plugin, a study, or a model pack, to edit.
 
-    The package passes its tests as generated. Existing files are never overwritten.
+    A package passes its tests as generated, a study runs. Existing files are never overwritten.
     """
     from vibench.cli import scaffold
 
+    if kind in scaffold.STARTS:
+        start = scaffold.write_start(kind, name, out)
+        path = shlex.quote(str(start))
+        steps = (
+            [f"vibench run {path} --dry-run", f"vibench run {path}"]
+            if kind == "study"
+            else [f"python {path}/write.py", f"vibench import {path}"]
+        )
+        echo(f"{start}: a {kind} that works as it is, to edit", *(f"  {step}" for step in steps))
+        return
     folder = scaffold.write_package(CHECKED[kind], name, out)
     module = scaffold.module_file(folder, CHECKED[kind], name)
     echo(
@@ -177,6 +188,8 @@ def _loaded_rows(kind: PluginKind) -> Iterator[Row]:
             else:
                 description = (plugin.load().__doc__ or "").strip().split("\n")[0]
                 lines += map(str, plugin.options.values())
+            if kind is PROBLEM:
+                lines += _parameters(plugin.load())
             if kind is FIGURE:
                 lines += _columns(name)
         except VibenchError as error:
@@ -190,6 +203,16 @@ def _number_of_cells(study: str) -> str:
     from vibench.study.matrix import expand, read_study
 
     return f"{len(expand(read_study(study)))} cells"
+
+
+def _parameters(problem: type) -> Iterator[str]:
+    """The parameters of a class of problems, each in a line; of one whose options determine them, none."""
+    from vibench.interfaces.problem import ParameterBox
+
+    box = getattr(problem, "parameters", None)
+    if isinstance(box, ParameterBox):
+        for k, (name, low, high, unit) in enumerate(zip(box.names, box.lower, box.upper, box.units, strict=True), 1):
+            yield f"mu_{k}: {name} from {low:g} to {high:g}" + f" {unit}" * (unit != "1")
 
 
 def _columns(plugin: str) -> Iterator[str]:

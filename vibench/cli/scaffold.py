@@ -1,16 +1,17 @@
-"""Packages with a new plugin, written from the templates."""
+"""Packages with a new plugin, studies and model packs, written from the templates."""
 
 from __future__ import annotations
 
 import re
 import tempfile
+from collections.abc import Mapping
 from importlib.resources import files
 from pathlib import Path
 from string import Template
 
 from vibench.errors import RequestError, StorageError
 from vibench.provenance import distribution_version
-from vibench.study.kinds import SOLVER, PluginKind
+from vibench.study.kinds import SOLVER, STUDY, PluginKind
 from vibench.study.registry import find
 
 NAME = re.compile(r"[a-z][a-z0-9]*(-[a-z0-9]+)*")
@@ -29,12 +30,31 @@ def write_package(kind: PluginKind, name: str, parent: Path) -> Path:
     be written.
     """
     check_name(kind, name)
-    target = parent / f"vibench-{name}"
+    return _write(parent / f"vibench-{name}", _contents(kind, name))
+
+
+STARTS = ("study", "pack")
+"""What can be begun beside plugins: a study file, and the folder of a model pack."""
+
+
+def write_start(what: str, name: str, parent: Path) -> Path:
+    """Write a study file `parent/NAME.toml`, or a model pack `parent/NAME`; returns its path. Errors as above."""
+    _check_words(name, what, what)
+    words = {"name": name, "file": f"{name}.toml"}
+    if what == "study":
+        if find(STUDY, name).entries:
+            raise RequestError(f"there is a study '{name}' already; choose another name")
+        return _write(parent / f"{name}.toml", {"": _filled("study.toml", words)})
+    return _write(parent / name, {"pack.toml": _filled("pack.toml", words), "write.py": _filled("pack.py", words)})
+
+
+def _write(target: Path, contents: Mapping[str, str]) -> Path:
+    """Write a folder of texts, or one file where the only path is "", completely or not at all."""
+    parent = target.parent
     if target.exists() or target.is_symlink():
         raise RequestError(f"'{target}' exists already; choose another name, or another folder with --out")
     if parent.exists() and not parent.is_dir():
         raise RequestError(f"--out '{parent}' is a file; expected a folder")
-    contents = _contents(kind, name)
     try:
         parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -53,15 +73,19 @@ def write_package(kind: PluginKind, name: str, parent: Path) -> Path:
 
 def check_name(kind: PluginKind, name: str) -> None:
     """Raise a `RequestError` for a name that no package can have, or that another plugin of the kind has."""
-    if not NAME.fullmatch(name) or len(name) > MAX_LENGTH:
-        raise RequestError(
-            f"'{name}' cannot be the name of a plugin: expected lower case letters and digits, in words joined by '-', "
-            f"a letter first, {MAX_LENGTH} characters at most, such as 'my-{kind.cli_name}'"
-        )
+    _check_words(name, "plugin", kind.cli_name)
     if name in RESERVED:
         raise RequestError(f"'{name}' cannot be the name of a plugin: vibench itself has a package of that name")
     if origin := find(kind, name).origin:
         raise RequestError(f"there is a {kind} '{name}' already, in {origin}; choose another name")
+
+
+def _check_words(name: str, what: str, such_as: str) -> None:
+    if not NAME.fullmatch(name) or len(name) > MAX_LENGTH:
+        raise RequestError(
+            f"'{name}' cannot be the name of a {what}: expected lower case letters and digits, in words joined by '-', "
+            f"a letter first, {MAX_LENGTH} characters at most, such as 'my-{such_as}'"
+        )
 
 
 def module_file(folder: Path, kind: PluginKind, name: str) -> Path:
@@ -96,8 +120,10 @@ def _contents(kind: PluginKind, name: str) -> dict[str, str]:
         f"src/{package}/{kind.module}.py": f"{word}.py",
         f"tests/test_{words['test']}.py": f"test_{word}.py",
     }
-    folder = files("vibench.cli") / "templates"
-    return {
-        path: Template((folder / f"{source}.template").read_text(encoding="utf-8")).substitute(words)
-        for path, source in sources.items()
-    }
+    return {path: _filled(source, words) for path, source in sources.items()}
+
+
+def _filled(template: str, words: Mapping[str, str]) -> str:
+    """The text of a template with its words."""
+    text = (files("vibench.cli") / "templates" / f"{template}.template").read_text(encoding="utf-8")
+    return Template(text).substitute(words)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import shlex
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -204,7 +204,7 @@ def look_up(
         asked = list(rows.columns)
     for column in asked:
         if column not in rows:
-            _refuse(name, column, rows, extended.faults)
+            _refuse(name, column, [*rows, *by_heading], extended.faults)
     default = [column for column in dict.fromkeys(view.columns) if column in rows]
     shown = rows.head(limit) if limit else rows
     listed, length = tuple(dict.fromkeys(asked or default)), selection.short_keys(keys)
@@ -291,9 +291,9 @@ def _with_columns(view: View, columns: Mapping[str, Column]) -> View:
     return replace(view, columns=tuple(dict.fromkeys((*view.columns, *shown))), headings=headings)
 
 
-def _refuse(table: str, column: str, rows: pd.DataFrame, faults: Sequence[str]) -> NoReturn:
+def _refuse(table: str, column: str, known: Iterable[str], faults: Sequence[str]) -> NoReturn:
     """Refuse a column that the table does not have: a plugin may have failed to give it."""
     for line in faults:
         if line.startswith(f"column '{column}' of "):
             raise RequestError(line)
-    raise unknown_name(f"column of {table}", column, rows.columns)
+    raise unknown_name(f"column of {table}", column, known)

@@ -17,7 +17,7 @@ from samples import STUDY, changed, write_study
 
 from vibench.cli.plugin_commands import LISTS
 from vibench.qp.settings import SETTINGS
-from vibench.results.columns import TABLES
+from vibench.results.columns import CELLS, TABLES
 from vibench.results.sqlite.reading import FILE
 from vibench.results.tables import read
 from vibench.study import kinds
@@ -410,3 +410,35 @@ def test_an_error_that_nobody_foresaw_is_not_hidden(main: Main, monkeypatch: pyt
     monkeypatch.setattr("vibench.study.matrix.read_study", broken)
     with pytest.raises(ZeroDivisionError):
         main("run")
+
+
+def test_help_on_a_command_is_its_own(main: Main) -> None:
+    assert main("help", "show") == main("show", "--help")
+    assert main("help")[1] == main("--help")[1]
+
+
+@pytest.mark.parametrize("name", ["online_s", "online [ms]"])
+def test_help_on_a_column_is_what_it_means(name: str, main: Main) -> None:
+    code, out, _ = main("help", name)
+    assert code == 0
+    assert f"online_s [s], in cells: {CELLS['online_s'].meaning}" in out.splitlines()
+
+
+def test_help_on_nothing_there_is_refused(main: Main) -> None:
+    refused(main("help", "shwo"), "no command or column is called 'shwo'; did you mean 'show'?")
+
+
+def test_problems_are_listed_with_their_parameters(main: Main) -> None:
+    _, out, _ = main("list", "problems")
+    text = " ".join(out.split())
+    assert "mu_1: radius from 0.7 to 1.3 m" in text
+    assert "mu_1: scale from 0.8 to 1.2 mu_2: centre_x from -0.05 to 0.05 m" in text
+
+
+def test_a_table_of_tolerances_in_place_of_a_list_is_named(main: Main, tmp_path: Path) -> None:
+    file = write_study(tmp_path, STUDY | {"tolerances": {"pod": [0.01], "dual": [0.1]}})
+    refused(main("run", file), "tolerances: expected a list of tables: write [[tolerances]] in place of")
+
+
+def test_a_wrong_column_has_the_heading_that_was_meant(main: Main, quick_run: Path) -> None:
+    refused(main("show", str(quick_run), "--columns", "online ms"), "did you mean 'online [ms]'?")

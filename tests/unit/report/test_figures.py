@@ -462,7 +462,11 @@ def test_several_processes_draw_the_same_files(
     change("DELETE FROM queries WHERE problem = 'hertz' OR dual = 'cpg'")
     kinds = ("errors", "dimension", "shares", "solvers", "outputs")
     monkeypatch.setattr(figures, "OF_PROBLEM", {kind: OF_PROBLEM[kind] for kind in kinds})
-    one, two = (draw_all(results, tmp_path / f"{jobs}", ("svg",), jobs) for jobs in (1, 2))
+    shown: list[tuple[str, int, int]] = []
+    one, two = (
+        draw_all(results, tmp_path / f"{jobs}", ("svg",), jobs, lambda *now: shown.append(now)) for jobs in (1, 2)
+    )
+    assert [now for now in shown if now[1] == now[2]] == 2 * [("", len(one), len(one))]  # the end is shown, too
     assert len(one) == len(kinds) + len(figures.OF_DUAL)
     assert [file.name for file in one] == [file.name for file in two]
     for first, second in zip(one, two, strict=True):

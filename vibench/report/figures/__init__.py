@@ -227,6 +227,7 @@ def render(
         for k, one in awaited.items():
             progress(tasks[k][0], len(rendered), len(tasks))
             rendered[k] = one.result()
+    progress("", len(rendered), len(tasks))
     return [rendered[k] for k in range(len(tasks))]
 
 
