@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from typer import Argument, Exit, Option
@@ -187,6 +187,7 @@ def export_reduced_model(
     why = exported.about["no_bounds"]
     has_bounds = not why
     echo(f"error bounds: {exported.about['certificate']}" if has_bounds else f"no error bounds: {why}")
+    echo(*_outputs_in_words(exported.about["outputs"]))
     echo(exported_seconds.in_words(model, file))
     beside = [file.with_name(BOUNDS)] if has_bounds else []
     written = ", ".join(
@@ -197,6 +198,13 @@ def export_reduced_model(
     )
     script = Path(BOUNDS if has_bounds else RUNTIME).stem
     echo(f"{written}: `from {script} import Model`, then `Model({str(file)!r}).solve(mu)`")
+
+
+def _outputs_in_words(outputs: Mapping[str, Any]) -> list[str]:
+    """A line on which quantities of interest are exported, none where there are none."""
+    names, others = ", ".join(output["name"] for output in outputs["linear"]), ", ".join(outputs["left_out"])
+    beside = f"; code that the file cannot hold computes {others}" if others else ""
+    return [f"outputs: {names or 'none'}{beside}"] if names or others else []
 
 
 def _member_in_words(member: AffinePolynomial) -> str:

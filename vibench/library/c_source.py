@@ -53,13 +53,19 @@ def source(
         "lower": _numbers(arrays["lower"]),
         "upper": _numbers(arrays["upper"]),
         "members": "\n".join(_member(key, members[key]) for key in MEMBERS),
-        "bounds": "",
-        "certificate": "",
+        "output_count": 0,
     }
+    parts: list[str] = []
+    if "outputs_x" in arrays:
+        names = (f"{output['name']} [{output['unit']}]" for output in about["outputs"]["linear"])
+        values |= {"output_names": _comment(", ".join(names)), "output_count": len(arrays["outputs_x"])}
+        values |= {"output_arrays": "\n".join(_array(key, arrays[key]) for key in ("outputs_x", "outputs_alpha"))}
+        parts.append("outputs")
     if thetas:
         values |= _of_certificate(thetas, arrays)
-        values |= {"bounds": _filled("reduced_model_certificate.h", values)}
-        values |= {"certificate": _filled("reduced_model_certificate.c", values)}
+        parts += ["certificate", "certified_outputs"] if parts else ["certificate"]
+    for kind, name in (("h", "declarations"), ("c", "code")):
+        values[name] = "".join(_filled(f"reduced_model_{part}.{kind}", values) for part in parts)
     header = _filled("reduced_model.h", values)
     return _filled("reduced_model.c", values | {"header": header}), header
 
@@ -112,7 +118,7 @@ def _member(name: str, member: AffinePolynomial) -> str:
 
 def _numbers(values: Array | Indices) -> str:
     """Numbers that a compiler reads back to the last bit."""
-    texts = [repr(value) for value in np.ravel(values).tolist()]
+    texts = [repr(value).replace("inf", "HUGE_VAL") for value in np.ravel(values).tolist()]
     return ",\n".join(", ".join(texts[k : k + PER_LINE]) for k in range(0, len(texts), PER_LINE))
 
 

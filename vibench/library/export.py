@@ -20,7 +20,7 @@ from vibench.files import write_atomically
 from vibench.interfaces.problem import MEMBERS, VariationalInequality
 from vibench.interfaces.strategies import Kind
 from vibench.interfaces.validation import training_parameters
-from vibench.library import c_source, exported_certificate
+from vibench.library import c_source, exported_certificate, exported_outputs
 from vibench.library.reduced_model import FORMAT, SOLVERS
 from vibench.model.affine import affine_decomposition, check_affine
 from vibench.model.certificates.base import Guarantee, contact_unknowns
@@ -171,9 +171,10 @@ def exported(
     arrays = {"lower": box.lower, "upper": box.upper}
     if isinstance(queried, HyperReducedModel) and queried.space is not None:
         arrays["plain"] = queried.space.plain
+    basis = queried.basis if isinstance(queried, HyperReducedModel) else queried.fixed_basis
     if bases:
-        basis = queried.basis if isinstance(queried, HyperReducedModel) else queried.fixed_basis
         arrays |= {"basis": basis, "generators": queried.generators}
+    arrays |= exported_outputs.arrays(model, basis, queried.generators, certificate)
     if certificate is not None:
         unknowns = contact_unknowns(model.problem) if bases else None
         arrays |= exported_certificate.arrays(certificate, polynomials | members, unknowns)
@@ -293,6 +294,7 @@ def _about(model: Model, members: Mapping[str, AffinePolynomial]) -> dict[str, A
             name: {"degrees": list(member.degrees), "terms": len(member.terms), "error": member.error}
             for name, member in members.items()
         },
+        "outputs": exported_outputs.descriptions(model.problem),
         "cell": {name: _plain(row[name]) for name in RECORDED if name in row},
         "exported_by": f"vibench {distribution_version('vibench')}",
         "source": {"distribution": origin, "licence": model.problem.licence or _licence(origin.partition(" ")[0])},

@@ -11,6 +11,7 @@ import warnings
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -23,7 +24,7 @@ DEGREE, ROUND_OFF = 2**20, 1e-13
 
 
 class Solution(NamedTuple):
-    """Status, x, α, u and λ with bases, residuals, and uᵀA u.
+    """Status, x, α, u and λ with bases, residuals, uᵀA u, outputs by name, and with a certificate their bounds.
 
     "ok" is a solution up to the accuracy in the file, "outside" one outside the box, "inaccurate" none, there or not;
     "failed" means that A is not positive definite or an array is not finite, and that the numbers are NaN.
@@ -36,6 +37,8 @@ class Solution(NamedTuple):
     lam: Array | None
     residuals: Residuals
     energy: float
+    outputs: Mapping[str, float] = MappingProxyType({})
+    output_bounds: Mapping[str, float] = MappingProxyType({})
 
 
 class Model:
@@ -54,6 +57,7 @@ class Model:
         self.solver = solver or self.about["solver"]
         if self.solver not in SOLVERS:
             raise ValueError(f"the solver is '{self.solver}', expected one of {', '.join(SOLVERS)}")
+        self._outputs = [output["name"] for output in self.about["outputs"]["linear"]]
         self._last: tuple[bytes, dict[int, Array]] = b"", {}
         names, known = (
             [key.removesuffix("_indices") for key in self.data if key.endswith("_indices")],
@@ -135,7 +139,12 @@ class Model:
                 status = "outside"
         energy, x, alpha = float(x @ A @ x), Y @ x, forces / rows
         u, lam = (self.data[n] @ v if n in self.data else None for n, v in (("basis", x), ("generators", alpha)))
-        return Solution(status, x, alpha, u, lam, found, energy)
+        outputs = self.named(self.data["outputs_x"] @ x + self.data["outputs_alpha"] @ alpha) if self._outputs else {}
+        return Solution(status, x, alpha, u, lam, found, energy, outputs)
+
+    def named(self, values: Array) -> dict[str, float]:
+        """Values of the outputs by name."""
+        return dict(zip(self._outputs, values.tolist(), strict=True))
 
     def _solved(self, A: Array, f: Array, B: Array, g: Array) -> tuple[tuple[Array, Array], Residuals]:
         """The solver's x and α for rows of B of norm 1, or those of its active set, whichever are better; residuals."""

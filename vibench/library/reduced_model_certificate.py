@@ -53,6 +53,7 @@ class Model:
         slack = 1e-12 * np.maximum(abs(data["lower"]), abs(data["upper"]))
         self._box = data["lower"] - slack, data["upper"] + slack
         self._data: dict[str, Array] = {name.removeprefix(start): data[name] for name in data if name.startswith(start)}
+        self._data["outputs_x"] = data.get("outputs_x", np.zeros((0, 0)))
         self._data["bound_sizes"] = abs(self._data["bounds"])
 
     def solve(self, mu: Sequence[float] | Array, tolerance: float | None = None, corrected: bool = False) -> Certified:
@@ -69,6 +70,7 @@ class Model:
         bound, rho = self._bound(at, solution.x, solution.alpha, solution.energy)
         if corrected and bound.guarantee != "none":
             solution, bound = self._pair(at, solution, bound, rho)
+        solution = solution._replace(output_bounds=self.plain.named(self._of_outputs(at, bound)))
         kept = tolerance is None or (solution.status == "ok" and bound.relative <= tolerance)
         return Certified(solution, bound, "not certified" if not kept else "" if tolerance is None else bound.guarantee)
 
@@ -90,7 +92,22 @@ class Model:
         least = bound.u_energy / bound.relative if bound.relative > 0.0 else 0.0  # of ‖u‖
         u = None if solution.u is None or "lift" not in self._data else solution.u - self._data["lift"] @ a
         found = Bound(both, both, both / least if least > 0.0 else inf, bound.guarantee)
-        return solution._replace(u=u, lam=nu), found
+        outputs = solution.outputs
+        if outputs:
+            of_x, of_lam, of_a = (self._data[f"outputs_{name}"] for name in ("x", "lam", "shift"))
+            outputs = self.plain.named(of_x @ solution.x + of_lam @ nu - of_a @ a)
+        return solution._replace(u=u, lam=nu, outputs=outputs), found
+
+    def _of_outputs(self, mu: Array, bound: Bound) -> Array:
+        """Bounds of the errors of outputs, from those of u and λ."""
+        weights = self._data.get("outputs_weights", np.zeros((0, 2)))
+        if bound.guarantee == "none":
+            return np.full(len(weights), inf)
+        A, B = self.plain.member("theta_A", mu), self.plain.member("theta_B", mu)
+        (lower, upper), least = self._spectrum(mu, A), abs(float(B[0])) - float(self._data["constraint_error"])
+        force = bound.lambda_natural * sqrt(upper) / least if least > 0.0 else inf
+        of_lam = np.array([weight * force if weight > 0.0 else 0.0 for weight in weights[:, 1]])
+        return np.asarray(weights[:, 0] * bound.u_energy / sqrt(lower) + of_lam)
 
     def _bound(self, mu: Array, y: Array, alpha: Array, energy: float) -> tuple[Bound, float]:
         """Bounds of a solution: u_N has the coordinates y in the basis, λ_N is generators · α, `energy` is ‖u_N‖²_A.

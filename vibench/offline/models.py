@@ -21,6 +21,7 @@ from vibench.model.certificates.bounds import OnlineBound, OnlineCertificate, On
 from vibench.model.error_bounds import CorrectionMode, ErrorBounds, bound_errors_at
 from vibench.model.galerkin import ReducedModel, ReducedProblem
 from vibench.model.hyperreduced import HyperReducedModel
+from vibench.model.output_bounds import error_bound, weights
 from vibench.offline.assemblies import assemblies
 from vibench.offline.correction import Answer, Corrector
 from vibench.qp.settings import SETTINGS
@@ -112,6 +113,23 @@ class Solution:
             return Answer(u, lam, self.bound)
         v = certificate.corrected(u, self.correction, contact_unknowns(self._model.problem))
         return Answer(v, self.correction.nu, self.bound, is_corrected=True)
+
+    @cached_property
+    def outputs(self) -> dict[str, float]:
+        """Values of the problem's quantities of interest, by name; of the corrected pair where `answer` is one."""
+        given = self.mu[None], self.u[:, None], self.lam[:, None]
+        return {output.name: float(output.values(*given)[0]) for output in self._model.problem.outputs}
+
+    @property
+    def output_bounds(self) -> dict[str, float]:
+        """Bounds of the absolute errors of `outputs`, by name, from `bound`; infinite where there are none.
+
+        There are none without `bound`, of outputs that are not linear, and of those of λ without a bound in W.
+        """
+        bound, certificate, found = self.bound, self._model.certificate, self._model.output_weights
+        if bound is None or certificate is None:
+            return dict.fromkeys(found, inf)
+        return {name: inf if of is None else error_bound(of, certificate.base, bound) for name, of in found.items()}
 
     @cached_property
     def error_bounds(self) -> ErrorBounds:
@@ -224,6 +242,15 @@ class Model:
                 bound = bound if correction is None else correction.bound
         answer = at, status, reason, found.x, found.alpha, residuals
         return Solution(*answer, assembly, solution, self, reduced, bound, tolerance, correction, mode)
+
+    @cached_property
+    def output_weights(self) -> dict[str, tuple[float, float] | None]:
+        """What bounds errors of outputs by those of u and λ, see `vibench.model.output_bounds`; `None` without any."""
+        certificate, found = self.certificate, dict[str, tuple[float, float] | None]()
+        for output in self.problem.outputs:
+            known = None if certificate is None or not output.linear else certificate.base
+            found[output.name] = None if known is None else weights(self.problem, known, output)
+        return found
 
     def reconstruct(self, mu: Parameters, x: Array, alpha: Array) -> tuple[Array, Array]:
         """The solution u (n,), λ (m,) with coordinates x (N',) in the primal basis at mu and α (R,) on generators."""

