@@ -27,6 +27,7 @@ import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cache
 from importlib import import_module
+from inspect import isabstract
 from pathlib import Path
 from pkgutil import walk_packages
 from typing import Any
@@ -44,6 +45,8 @@ PACKAGES = ("cli", "execution", "results", "stages", "storage", "study", "termin
 """Packages of vibench that the template imports with all their modules, and so most others; plugins it does not."""
 
 TESTS = Path(__file__).parents[1]
+
+_starting = threading.Lock()
 
 start_new_worker = supervisor.start_worker
 """Starts a worker process as users' runs do."""
@@ -80,9 +83,15 @@ class Forked:
         return self.returncode
 
 
-@cache
 def template() -> str:
-    """The address of the template process, which ends with this one."""
+    """The address of the template process, which ends with this one; threads that ask at once get the same one."""
+    with _starting:
+        return _started()
+
+
+@cache
+def _started() -> str:
+    """Start the template process."""
     folder = tempfile.mkdtemp(prefix="vibench-tests-")
     ours, theirs = socket.socketpair()
     address = f"{folder}/socket"
@@ -186,10 +195,19 @@ def _load() -> None:
         for module in walk_packages(import_module(f"vibench.{package}").__path__, f"vibench.{package}."):
             import_module(module.name)
     import_module("vibench.execution.jobs").code_here()
+    _hash_stages(import_module("vibench.stages.base").Stage)
     typer = import_module("typer.main")
     typer.get_command = cache(typer.get_command)
     typer.get_command(import_module("vibench.cli.main").app)
     gc.freeze()  # collections in the processes forked leave alone what they share
+
+
+def _hash_stages(kind: Any) -> None:
+    """Hash the sources that determine the values of all stages of a kind."""
+    for stage in kind.__subclasses__():
+        if not isabstract(stage):
+            import_module("vibench.dependencies").code_used(*stage.code())
+        _hash_stages(stage)
 
 
 def _forked(client: socket.socket, own: Sequence[socket.socket]) -> int:
