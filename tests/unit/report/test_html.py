@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -14,8 +15,9 @@ from running import Changed, Main
 from vibench.report import html
 from vibench.report.figures.data import problems
 from vibench.report.findings import MOST, findings
+from vibench.report.page.grids import FIRST
 from vibench.results import tables
-from vibench.results.columns import TABLES
+from vibench.results.columns import CELLS, TABLES
 from vibench.results.ranking import leaderboard
 from vibench.results.sqlite.reading import FILE
 from vibench.text import brief
@@ -42,6 +44,23 @@ def test_it_needs_nothing_but_itself(made: Path) -> None:
 def data(page: str, name: str) -> Any:
     """The data that a page embeds."""
     return json.loads(page.split(f'id="{name}">')[1].split("</script>", maxsplit=1)[0])
+
+
+def test_every_heading_says_what_it_means(made: Path) -> None:
+    embedded = data(made.read_text(encoding="utf-8"), "table-data")
+    meant = {column["name"]: column["meaning"] for grid in embedded.values() for column in grid["columns"]}
+    assert {name for name, meaning in meant.items() if not meaning} == set()
+    assert meant["error λ"].startswith(f"{CELLS['error_lambda_mean'].meaning} [1]")
+
+
+def test_without_javascript_tables_have_their_first_rows(made: Path, reported: Path) -> None:
+    page = made.read_text(encoding="utf-8")
+    (table,) = re.findall(r'data-table="summary"></div>\n<noscript>(.*?)</noscript>', page, re.DOTALL)
+    cells = tables.read(reported / FILE, "cells")
+    assert table.count("<tr>") == 1 + min(len(cells), FIRST)
+    assert "error λ</th>" in table
+    assert all(f"<td>{value:.3g}</td>" in table for value in cells["error_lambda_mean"][:FIRST])
+    assert len(re.findall("<noscript>.*?<table>.*?</noscript>", page, re.DOTALL)) == page.count("data-table=")
 
 
 def test_findings_tables_and_facts_are_in_it(made: Path, reported: Path) -> None:

@@ -4,20 +4,23 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 import pandas as pd
 
 from vibench.results import formats, tables, views
-from vibench.results.columns import CELLS, THRESHOLDS, Column
+from vibench.results.columns import CELLS, STORED, THRESHOLDS, Column
 from vibench.results.plugin_columns import Extended
 from vibench.results.selection import short_keys
 from vibench.text import printable
 
 DIGITS = 6
 """Significant digits of embedded numbers; the results file has all of them."""
+
+FIRST = 50
+"""Rows of a table that a page has without its script."""
 
 FEW = 60
 """Texts of a column up to which it can be filtered by a list of them."""
@@ -53,6 +56,26 @@ class TableGrid:
     """Headings that are not shown at first."""
     disturbed: tuple[int, ...] = ()
     """Numbers of the rows whose seconds were measured on a disturbed machine."""
+    own: Mapping[str, Column] = field(default_factory=dict)
+    """Columns of plugins."""
+
+    def meaning(self, heading: str) -> str:
+        """What stands under a heading, and its unit; "" where nobody says."""
+        for name, column in [*self.own.items(), *RECORDED]:
+            if heading in (name, column.heading):
+                return printable(f"{column.meaning} [{column.unit}]" if column.unit else column.meaning)
+        return ""
+
+    @property
+    def first(self) -> tuple[list[str], list[list[str]]]:
+        """The headings that are shown at first, and the texts of the first rows under them."""
+        shown = [str(name) for name in self.frame.columns if name not in self.hidden]
+        rows = self.frame[shown].head(FIRST).itertuples(index=False)
+        return shown, [[formats.cell_text(value) for value in row] for row in rows]
+
+
+RECORDED = [pair for table in (CELLS, THRESHOLDS, *STORED.values()) for pair in table.items()]
+"""Columns of all tables, those of cells first."""
 
 
 def grid_of_cells(extended: Extended, caption: str) -> TableGrid:
@@ -65,9 +88,8 @@ def grid_of_cells(extended: Extended, caption: str) -> TableGrid:
     offered = (*MORE_OF_CELLS, *(name for name in own if not columns[name].heading))
     hidden = [_heading(columns, name) for name in (*says_nothing, *offered) if name in names]
     axes = tuple(_heading(CELLS, name) for name in (*views.AXES, "status"))
-    return TableGrid(
-        "summary", "All cells", caption, frame, axes, (*hidden, *_constant(frame)), _disturbed(cells["cell"], cells)
-    )
+    disturbed, left_out = _disturbed(cells["cell"], cells), (*hidden, *_constant(frame))
+    return TableGrid("summary", "All cells", caption, frame, axes, left_out, disturbed, extended.columns)
 
 
 def grid_of_thresholds(name: str, title: str, caption: str, rows: Extended, cells: pd.DataFrame) -> TableGrid:
@@ -80,7 +102,7 @@ def grid_of_thresholds(name: str, title: str, caption: str, rows: Extended, cell
     texts = [heading for heading in frame.columns if not pd.api.types.is_numeric_dtype(frame[heading])]
     axes = tuple(heading for heading in texts if heading not in results)
     disturbed = {*_disturbed(ordered["cell_a"], cells), *_disturbed(ordered["cell_b"], cells)}
-    return TableGrid(name, title, caption, frame, axes, tuple(_constant(frame)), tuple(sorted(disturbed)))
+    return TableGrid(name, title, caption, frame, axes, tuple(_constant(frame)), tuple(sorted(disturbed)), rows.columns)
 
 
 def grid_of(name: str, title: str, caption: str, frame: pd.DataFrame, axes: Sequence[str], keys: int) -> TableGrid:
@@ -118,7 +140,9 @@ def script_safe(value: Any) -> str:
 def _columnar(grid: TableGrid) -> dict[str, Any]:
     return {
         "rows": len(grid.frame),
-        "columns": [_column(str(name), grid.frame[name]) for name in grid.frame.columns],
+        "columns": [
+            {"meaning": grid.meaning(str(name))} | _column(str(name), grid.frame[name]) for name in grid.frame.columns
+        ],
         "axes": [name for name in grid.axes if 1 < grid.frame[name].nunique() <= FEW],
         "hidden": sorted(set(grid.hidden)),
         "disturbed": list(grid.disturbed),

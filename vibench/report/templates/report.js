@@ -30,13 +30,13 @@ function numberText(value) {
 const infinite = value => typeof value === "string" ? (value.startsWith("-") ? -Infinity : Infinity) : value;
 
 /** A column with one way to its values, however they are embedded: a value that all rows have stands there once. */
-function opened({ name, numbers, texts, levels, codes }) {
+function opened({ name, meaning, numbers, texts, levels, codes }) {
   if (numbers) {
     const values = numbers.map(infinite), value = values.length === 1 ? () => values[0] : row => values[row];
-    return { name, number: true, value, text: row => numberText(value(row)) };
+    return { name, meaning, number: true, value, text: row => numberText(value(row)) };
   }
   const text = codes ? row => levels[codes[row]] : levels ? () => levels[0] : row => texts[row];
-  return { name, number: false, value: text, text };
+  return { name, meaning, number: false, value: text, text };
 }
 
 function compared(a, b) {
@@ -144,9 +144,9 @@ class Grid {
     this.before.disabled = this.page === 0;
     this.after.disabled = this.page === pages - 1;
     const shown = this.shown();
-    const head = element("tr", {}, ...shown.map(({ name, number }) => {
+    const head = element("tr", {}, ...shown.map(({ name, meaning, number }) => {
       const sorted = this.sort === name && (this.falling ? "descending" : "ascending");
-      return element("th", { scope: "col", class: number && "number", "aria-sort": sorted }, element("button", { type: "button", onclick: () => this.order(name) }, name));
+      return element("th", { scope: "col", class: number && "number", "aria-sort": sorted, title: meaning || null }, element("button", { type: "button", onclick: () => this.order(name) }, name));
     }));
     const body = rows.map(row => element("tr", { "data-row": row }, ...shown.map((column, k) => {
       const text = column.text(row), kind = column.number ? "number" : text.length > 48 ? "long" : text.length > 16 ? "text" : "";
