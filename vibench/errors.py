@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import difflib
+import functools
+import inspect
 import typing
-from collections.abc import Collection, Iterable
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Collection, Iterable
+from types import SimpleNamespace
+from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar
 
-from vibench.text import one_line
+from vibench.text import brief, one_line
 
 if TYPE_CHECKING:
-    from pydantic import BaseModel, ValidationError
+    from pydantic import BaseModel, TypeAdapter, ValidationError
 
 
 class VibenchError(Exception):
@@ -52,6 +55,57 @@ def _text_of(error: BaseException) -> str:
         return str(error)
     except Exception:  # noqa: BLE001  `__str__` of a plugin's exception may raise anything
         return "its message cannot be read"
+
+
+P = ParamSpec("P")
+T = TypeVar("T")
+
+
+def requested(function: Callable[P, T]) -> Callable[P, T]:
+    """A function that users of the library call: its arguments are checked against their annotations.
+
+    Arguments that do not fit end in a `RequestError` that names the first of them, with what was given and what would
+    be right; nothing is converted. Arguments that the function does not have remain a `TypeError`, as Python's own.
+    """
+    signature = inspect.signature(function)
+
+    @functools.wraps(function)
+    def call(*given: P.args, **named: P.kwargs) -> T:
+        for name, value in signature.bind(*given, **named).arguments.items():
+            if name != "self" and not _fits(function, name, value):
+                expected = str(signature.parameters[name].annotation)
+                shown = brief(repr(value), 80)
+                raise RequestError(f"{name} of {function.__qualname__} is {shown}, expected {expected}")
+        return function(*given, **named)
+
+    return call
+
+
+def _fits(function: Callable[..., Any], name: str, value: Any) -> bool:
+    from pydantic import ValidationError  # noqa: PLC0415  slow to import
+
+    value = value.item() if type(value).__module__ == "numpy" and getattr(value, "shape", None) == () else value
+    try:
+        _adapters(function)[name].validate_python(value)
+    except ValidationError:
+        return False
+    return not (isinstance(value, str) and "\0" in value)  # of no path and no name
+
+
+@functools.cache
+def _adapters(function: Callable[..., Any]) -> dict[str, TypeAdapter[Any]]:
+    """What checks the arguments of a function, by name; instances of models are not made anew."""
+    from pydantic import BaseModel, ConfigDict, InstanceOf, TypeAdapter  # noqa: PLC0415
+
+    given = SimpleNamespace(__annotations__={k: v for k, v in function.__annotations__.items() if k != "return"})
+    hints = typing.get_type_hints(given, function.__globals__, include_extras=True)
+    config = ConfigDict(strict=True, arbitrary_types_allowed=True)
+    return {
+        name: TypeAdapter(InstanceOf[hint])  # type: ignore[misc,valid-type]
+        if isinstance(hint, type) and issubclass(hint, BaseModel)
+        else TypeAdapter(hint, config=config)
+        for name, hint in hints.items()
+    }
 
 
 MANY = 30

@@ -44,6 +44,15 @@ def write_atomically(path: Path, content: bytes, *, durable: bool = False) -> No
         part.unlink(missing_ok=True)
 
 
+@contextlib.contextmanager
+def writing(target: Path) -> Iterator[None]:
+    """Block in which a file that cannot be written makes the request for `target` a wrong one."""
+    try:
+        yield
+    except OSError as error:
+        raise RequestError(f"'{target}' cannot be written: {error.strerror or error}") from None
+
+
 def read_regular(path: Path) -> bytes:
     """The content of a regular file. Of a pipe or a device, which somebody else has put there, there may be no end.
 

@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 
 from vibench.arrays import Array
-from vibench.errors import NumericalError, RequestError, in_a_line
-from vibench.files import write_atomically
+from vibench.errors import NumericalError, RequestError, in_a_line, requested
+from vibench.files import write_atomically, writing
 from vibench.interfaces.problem import MEMBERS, VariationalInequality
 from vibench.interfaces.strategies import Kind
 from vibench.interfaces.validation import training_parameters
@@ -82,6 +82,7 @@ class ExportedModel:
         return max(found.error for found in (*self.members.values(), *self.thetas.values()))
 
 
+@requested
 def export_model(
     model: Model,
     file: Path | str,
@@ -117,6 +118,8 @@ def export_model(
         raise RequestError(f"'{file}': the model is written as an npz file, whose name must end in .npz")
     if not 0.0 < tolerance < 1.0:
         raise RequestError(f"the tolerance of the interpolation is {tolerance:g}, expected a number between 0 and 1")
+    if evaluations < 1:
+        raise RequestError(f"evaluations is {evaluations}, expected a number of parameters")
     if file.parent.exists() and not file.parent.is_dir():
         raise RequestError(f"'{file.parent}' is no folder")
     scripts = [RUNTIME] if exported_certificate.reason_for_none(model.certificate) else [RUNTIME, BOUNDS]
@@ -128,9 +131,10 @@ def export_model(
     if c:
         texts = c_source.source(found.members, found.arrays, found.about, file.stem, found.thetas)
         contents |= {path: text.encode() for path, text in zip(sources, texts, strict=True)}
-    file.parent.mkdir(parents=True, exist_ok=True)
-    for path, content in contents.items():
-        write_atomically(path, content)
+    with writing(file):
+        file.parent.mkdir(parents=True, exist_ok=True)
+        for path, content in contents.items():
+            write_atomically(path, content)
     return found
 
 

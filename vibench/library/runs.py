@@ -12,10 +12,11 @@ from typing import TYPE_CHECKING, Any, Literal
 import pandas as pd
 
 from vibench import interrupts
-from vibench.errors import unknown_name
+from vibench.errors import requested, unknown_name
 from vibench.execution.recorded_cell import recorded_cell
 from vibench.execution.run import Observer, Options, run_study
 from vibench.execution.run_folder import REPORT
+from vibench.files import writing
 from vibench.model.error_bounds import CorrectionMode
 from vibench.offline.models import Model
 from vibench.results import ranking, tables
@@ -51,6 +52,7 @@ class Run:
         """What all rows have in common: name and seed of the study, and the number of validation parameters."""
         return study_of(self.path, read_meta(self.path))
 
+    @requested
     def table(self, name: str) -> pd.DataFrame:
         """A table of the results file, its rows in the order of the axes; the documentation lists the columns.
 
@@ -69,7 +71,7 @@ class Run:
         """A table with the columns of plugins; what cannot be used is a warning."""
         extended = tables.extended(self.path, name)
         for line in extended.faults:
-            warnings.warn(line, stacklevel=3)
+            warnings.warn(line, stacklevel=4)
         return extended
 
     @property
@@ -92,6 +94,7 @@ class Run:
         """A row per pair of cells, or of the high-fidelity model and a cell: the break-even and its interval."""
         return self.table("thresholds")
 
+    @requested
     def break_even(self, error: str = ranking.SOLUTION, within: float | None = None) -> pd.DataFrame:
         """The thresholds with the errors of both models, `error_a` and `error_b`; 0 of the high-fidelity model.
 
@@ -124,6 +127,7 @@ class Run:
 
         return findings(self.path)
 
+    @requested
     def figure(self, kind: str, problem: str | None = None, dual: str | None = None) -> Figure:
         """One figure of the run, to be shown or saved; a column of a plugin that cannot be computed is a warning.
 
@@ -141,13 +145,16 @@ class Run:
         """
         from vibench.report.figures import draw  # noqa: PLC0415  loads matplotlib
 
-        return draw(self.path, kind, problem, dual, partial(warnings.warn, stacklevel=3))
+        return draw(self.path, kind, problem, dual, partial(warnings.warn, stacklevel=4))
 
+    @requested
     def write_tables(self, folder: Path | str | None = None) -> list[Path]:
         """Write every table as CSV, and the summary as Markdown; into `tables` beside the results file by default."""
         target = self.path.parent / "tables" if folder is None else Path(folder)
-        return tables.export(self.path, target, partial(warnings.warn, stacklevel=3))
+        with writing(target):
+            return tables.export(self.path, target, partial(warnings.warn, stacklevel=4))
 
+    @requested
     def write_figures(
         self, folder: Path | str | None = None, formats: Sequence[Literal["png", "svg", "pdf"]] = ("png", "svg")
     ) -> list[Path]:
@@ -158,8 +165,10 @@ class Run:
         from vibench.report.figures import draw_all  # noqa: PLC0415  loads matplotlib
 
         target = self.path.parent / "figures" if folder is None else Path(folder)
-        return draw_all(self.path, target, tuple(formats), note=partial(warnings.warn, stacklevel=2))
+        with writing(target):
+            return draw_all(self.path, target, tuple(formats), note=partial(warnings.warn, stacklevel=3))
 
+    @requested
     def report(self, path: Path | str | None = None, *, figures: bool = True) -> Path:
         """Write the report, one HTML page; into the folder of the run by default. Returns its path.
 
@@ -169,6 +178,7 @@ class Run:
 
         return html.write(self.path, self.path.parent / REPORT if path is None else Path(path), figures=figures)
 
+    @requested
     def model(self, cell: str) -> Model:
         """The reduced model of a cell, ready for queries; stages whose artefacts are missing are run again.
 
@@ -198,6 +208,7 @@ def _following(observer: Observer | None, progress: bool) -> AbstractContextMana
     return ProgressDisplay(new_console())
 
 
+@requested
 def open_run(path: Path | str, *, at: Mapping[str, str] = NOT_MOVED) -> Run:
     """A finished run: its folder, its results file, or the name of a study that was run in this folder.
 
@@ -216,6 +227,7 @@ def open_run(path: Path | str, *, at: Mapping[str, str] = NOT_MOVED) -> Run:
     return Run(tables.results_file(str(path)), {name: str(Path(place).absolute()) for name, place in at.items()})
 
 
+@requested
 def run(
     study: Study,
     out: Path | str | None = None,

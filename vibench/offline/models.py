@@ -31,6 +31,7 @@ from vibench.qp.verification import Residuals, verify
 from vibench.stability.coercivity import coercivity_and_continuity, energy_inf_sup
 from vibench.study import registry
 from vibench.study.kinds import SOLVER
+from vibench.text import brief
 from vibench.timing import Seconds, timed
 
 Parameters = Sequence[float] | Array | Mapping[str, float]
@@ -254,7 +255,12 @@ class Model:
 
     def reconstruct(self, mu: Parameters, x: Array, alpha: Array) -> tuple[Array, Array]:
         """The solution u (n,), λ (m,) with coordinates x (N',) in the primal basis at mu and α (R,) on generators."""
-        u = self.reduced.assemble(self._parameter(mu)).reconstruct(np.asarray(x)[:, None])[:, 0]
+        reduced = self.reduced.assemble(self._parameter(mu))
+        sizes = {"x": (x, len(reduced.program.f)), "alpha": (alpha, self.reduced.generators.shape[1])}
+        for name, (given, size) in sizes.items():
+            if np.shape(given) != (size,) or np.asarray(given).dtype.kind not in "fiu":
+                raise RequestError(f"{name} is {brief(repr(given), 80)}, expected {size} numbers")
+        u = reduced.reconstruct(np.asarray(x)[:, None])[:, 0]
         return np.asarray(u), np.asarray(self.reduced.generators @ alpha)
 
     def high_fidelity(self, mu: Parameters) -> HighFidelitySolution:
@@ -272,7 +278,10 @@ class Model:
             if set(mu) != set(box.names):
                 raise RequestError(f"mu has the components {sorted(mu)}, expected {sorted(box.names)}")
             mu = [mu[name] for name in box.names]
-        at = np.asarray(mu, dtype=float)
+        try:
+            at = np.asarray(mu, dtype=float)
+        except (TypeError, ValueError):
+            raise RequestError(f"mu is {brief(repr(mu), 80)}, expected numbers ({', '.join(box.names)})") from None
         if at.shape != (box.dim,) or not np.all(np.isfinite(at)):
             raise RequestError(f"mu is {np.asarray(mu).tolist()}, expected finite numbers ({', '.join(box.names)})")
         if outside := [name for name, out in zip(box.names, box.outside(at), strict=True) if out]:

@@ -35,6 +35,7 @@ from vibench.offline.models import AnyReducedModel, Model
 from vibench.offline.sweep import Snapshots, high_fidelity_sweep
 from vibench.reduction.pod import POD, pod
 from vibench.stability.infsup import Multipliers, multipliers
+from vibench.text import brief
 
 Assembly: TypeAlias = Literal["full", "reduced", "certified"]
 """How a model assembles its programs, as in a study."""
@@ -86,13 +87,21 @@ class Reduction:
         for name, kind in (("problem", Problem), ("dual", DualStrategy), ("primal", PrimalStrategy)):
             value = getattr(self, name)
             if not isinstance(value, kind) and not (name == "primal" and value is None):
-                got = f"the class {value.__qualname__}" if isinstance(value, type) else repr(value)
+                got = f"the class {value.__qualname__}" if isinstance(value, type) else brief(repr(value), 80)
                 raise RequestError(f"{name} is {got}, expected an instance of a subclass of {kind.__name__}")
         for name in ("modes", "generators"):
             if not isinstance(value := getattr(self, name), Stop):
-                raise RequestError(f"{name} is {value!r}, expected a Stop: Stop(tolerance=…) or Stop(size=…)")
-        if self.assembly not in get_args(Assembly):
-            raise RequestError(f"assembly is {self.assembly!r}, expected 'full', 'reduced' or 'certified'")
+                raise RequestError(
+                    f"{name} is {brief(repr(value), 80)}, expected a Stop: Stop(tolerance=…) or Stop(size=…)"
+                )
+        if not isinstance(self.assembly, str) or self.assembly not in get_args(Assembly):
+            raise RequestError(
+                f"assembly is {brief(repr(self.assembly), 80)}, expected 'full', 'reduced' or 'certified'"
+            )
+        for name in ("interpolation", "accuracy"):
+            value = getattr(self, name)
+            if not isinstance(value, int | float | np.number) or not 0.0 < value < 1.0:
+                raise RequestError(f"{name} is {brief(repr(value), 80)}, expected a number between 0 and 1")
         if self.primal is None and self.tolerance is not None:
             raise RequestError("without a primal strategy there is no tolerance")
         if self.primal is not None and self.primal.takes_tolerance == (self.tolerance is None):

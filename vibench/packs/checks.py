@@ -11,7 +11,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from vibench.arrays import Array
-from vibench.errors import NumericalError, RequestError
+from vibench.errors import NumericalError, RequestError, requested
 from vibench.interfaces.problem import MEMBERS, VariationalInequality
 from vibench.linalg.cholesky import SparseCholesky
 from vibench.linalg.inner_product import InnerProduct, asymmetry
@@ -30,6 +30,7 @@ NEGATIVE_RTOL = 1e-8
 """Size of negative entries of λ, relative to its largest one, that count as round-off."""
 
 
+@requested
 def read_model_pack(path: str | Path) -> ModelPack:
     """Read a model pack and check it.
 

@@ -16,7 +16,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from vibench.arrays import Array, Indices
-from vibench.errors import NumericalError, RequestError
+from vibench.errors import NumericalError, RequestError, requested
 from vibench.interfaces.expressions import Expression, normal_names
 from vibench.interfaces.outputs import Output
 from vibench.interfaces.problem import MEMBERS, ParameterBox, without_infinities
@@ -28,6 +28,7 @@ from vibench.packs.meshes import read_mesh
 from vibench.packs.pack import Listing, ModelPack, PackMember, PackMesh, PackSolutions, TabulatedTheta
 
 
+@requested
 def pack_digest(path: str | Path) -> str:
     """Digest of the manifest and of the files it names.
 

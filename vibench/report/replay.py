@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import io
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
@@ -20,7 +19,7 @@ from vibench.arrays import Array
 from vibench.errors import RequestError
 from vibench.execution.recorded_cell import RecordedCell, recorded_cells
 from vibench.execution.solver_trials import Trial, solver_trials
-from vibench.files import PART, TEMPORARY, write_atomically
+from vibench.files import PART, TEMPORARY, write_atomically, writing
 from vibench.interfaces.problem import VariationalInequality
 from vibench.qp.solve import installed_solvers
 from vibench.qp.status import Status
@@ -58,7 +57,7 @@ def replay(recorded: RecordedCell, query: int, file: Path) -> pd.DataFrame:
     if query not in rows:
         raise RequestError(f"cell {recorded.row['cell']} has no query {query}; it has 0 to {len(rows) - 1}")
     program, accuracy = recorded.program(query), recorded.cell.accuracy
-    with _writing(file):
+    with writing(file):
         write_program(program, file)
     recorded_x: Array | None = None
     table: list[dict[str, Any]] = []
@@ -98,15 +97,6 @@ def write_program(program: VariationalInequality, file: Path) -> None:
     write_atomically(file, content.getvalue())
 
 
-@contextlib.contextmanager
-def _writing(target: Path) -> Iterator[None]:
-    """Block in which a file that cannot be written makes the request for `target` a wrong one."""
-    try:
-        yield
-    except OSError as error:
-        raise RequestError(f"'{target}' cannot be written: {error.strerror or error}") from None
-
-
 def export(run: str, folder: Path, places: Mapping[str, str] = NOT_MOVED) -> int:
     """Write every reduced program of a run, with its solutions and their verification; returns their number.
 
@@ -124,7 +114,7 @@ def export(run: str, folder: Path, places: Mapping[str, str] = NOT_MOVED) -> int
         models.setdefault(recorded.row["model"], []).append(recorded)
     if not models:
         raise RequestError(f"no cell of '{run}' has a reduced program")
-    with _writing(folder):
+    with writing(folder):
         folder.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(dir=folder.parent, prefix=TEMPORARY, suffix=PART) as scratch:
             new = Path(scratch) / folder.name

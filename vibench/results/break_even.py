@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from vibench.arrays import Array, Indices
+from vibench.errors import requested
 from vibench.interfaces.strategies import Kind
 from vibench.results.columns import KEYS, THRESHOLDS
 from vibench.study.cells import CERTIFIED
@@ -56,6 +57,7 @@ class BreakEven:
         return self.meaning.value if self.number is None else f"{self.meaning.value} {self.number:.0f}"
 
 
+@requested
 def break_even(offline_a: float, online_a: float, offline_b: float, online_b: float) -> BreakEven:
     """Break-even of b against a, from their offline seconds and their seconds per query.
 

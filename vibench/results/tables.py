@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Callable, Collection, Mapping, Sequence
 from functools import partial
@@ -47,8 +48,9 @@ def results_file(run: str) -> Path:
     Raises a `RequestError` if there is no results file, or its schema has another version.
     """
     for folder in (Path(run), Path("runs") / run):
-        path = folder if folder.is_file() else folder / FILE
-        if path.is_file():
+        # os.path, since methods of Path raise OSError for names too long for a file.
+        path = folder if os.path.isfile(folder) else folder / FILE  # noqa: PTH113
+        if os.path.isfile(path):  # noqa: PTH113
             schema = read_meta(path).get("schema")
             if schema != str(VERSION):
                 raise RequestError(f"'{path}' has schema {schema}, this vibench reads {VERSION}")

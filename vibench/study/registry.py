@@ -14,7 +14,7 @@ from importlib.metadata import Distribution, EntryPoint
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from vibench.errors import RequestError, in_a_line, unknown_name
+from vibench.errors import RequestError, in_a_line, requested, unknown_name
 from vibench.provenance import distribution_version, package_hash, solver_version
 from vibench.study import source
 from vibench.study.kinds import PROBLEM, SAMPLING, SOLVER, STUDY, PluginKind
@@ -236,6 +236,7 @@ def find_named(text: str, kinds: Mapping[str, PluginKind], solvers: Sequence[str
     return find(kinds[having[0]], name)
 
 
+@requested
 def create(kind: str, name: str, options: Mapping[str, Any] | None = None) -> Any:
     """Instance of a registered plugin, its options checked.
 
@@ -253,6 +254,8 @@ def create(kind: str, name: str, options: Mapping[str, Any] | None = None) -> An
     RequestError
         If there is no such plugin, or it does not take these options.
     """
+    if kind not in [*PluginKind]:
+        raise unknown_name("kind of plugins", kind, PluginKind)
     return find(PluginKind(kind), name).create(options or {})
 
 
