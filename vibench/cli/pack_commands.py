@@ -114,6 +114,8 @@ def _description(pack: ModelPack) -> Iterator[str]:
     yield from (f"  {name}: {member}" for name, member in pack.members.items())
     count = "drawn at random in the box" if pack.validation is None else f"{len(pack.validation)} listed"
     yield f"  training parameters: {len(pack.training)}, validation parameters: {count}"
+    if pack.outputs:
+        yield f"  outputs: {', '.join(f'{output.name} [{output.unit}]' for output in pack.outputs)}"
     if pack.reference is not None:
         worst = pack.residual
         checked = "not checked, for want of u or operators" if worst is None else f"KKT residuals up to {worst:.0e}"
@@ -151,6 +153,8 @@ def _interpolation(pack: ModelPack) -> Iterator[str]:
 
 
 def _assembly_in_words(pack: ModelPack) -> str:
-    reduced = "reduced assembly interpolates " + ", ".join(sorted(pack.entrywise)) if pack.entrywise else ""
+    summed, interpolated = sorted(pack.affine), sorted(pack.entrywise - set(pack.affine))
+    ways = [f"interpolates {', '.join(interpolated)}"] * bool(interpolated)
+    ways += [f"sums the terms of {', '.join(summed)}"] * bool(summed)
     where = "anywhere in the box" if pack.everywhere else "at its listed parameters only"
-    return f"it is evaluated {where}{'; ' * bool(reduced)}{reduced}"
+    return f"it is evaluated {where}" + f"; reduced assembly {' and '.join(ways)}" * bool(ways)

@@ -92,6 +92,7 @@ def all_findings(read: Mapping[str, pd.DataFrame], by_problem: Iterable[tuple[st
             yield from _about(f"{name}, {title}", Weight.COMPARISON, _stability(cells, compared))
             yield from _about(f"{name}, {title}", Weight.COMPARISON, _costs(cells, data.thresholds))
         yield from _about(f"{name}, corrections", Weight.COMPARISON, _corrections(data))
+        yield from _about(f"{name}, training", Weight.COMPARISON, _training(data.cells))
         yield from _about(f"{name}, enrichments", Weight.DETAIL, _off_training(data))
         yield from _about(f"{name}, zero solutions", Weight.DETAIL, _zero_solutions(data))
         yield from _about(f"{name}, solvers", Weight.DETAIL, _solvers(data))
@@ -260,6 +261,19 @@ def _corrections(data: Data) -> Iterator[str]:
                 f"{medians['u']:.2g} and that of λ by {medians['λ']:.2g} in the median of "
                 f"{_number(len(cells), 'model')}, of λ by at most {best:.2g}; a query takes "
                 f"{1.0 / medians['query']:.2g} times as long."
+            )
+
+
+def _training(cells: pd.DataFrame) -> Iterator[str]:
+    """Which training sets took longer to choose than to solve: as many solutions again would have cost less."""
+    chosen = cells[(cells["offline_selection_s"] > 0.0) & (cells["hf_s"] > 0.0)]
+    for (training, _), group in chosen.groupby(["training", "training_options"], sort=False):
+        row = group.loc[group["snapshots"].idxmax()]
+        count, instead = int(row["snapshots"]), int(row["offline_selection_s"] / row["hf_s"])
+        if instead > count:
+            yield (
+                f"Choosing {count} training parameters by {training} took {row['offline_selection_s']:.2g} s, as long "
+                f"as {instead} more solutions: it can pay only where a given training set would need {count + instead}."
             )
 
 

@@ -250,8 +250,24 @@ def test_import_says_what_a_pack_can_do(tmp_path: Path, main: Main) -> None:
         "KKT residuals up to",
         "anywhere in the box",
         "validation = 2 at most",
+        "; reduced assembly sums the terms of f, g\n",
     ):
         assert words in out
+    assert "interpolates" not in out
+    assert "outputs" not in out
+
+
+def test_import_says_which_members_are_interpolated_and_what_the_outputs_are(tmp_path: Path, main: Main) -> None:
+    content, cable = manifest(), Cable()
+    content["operators"] |= {"f": {"each": "more.npz:f"}}
+    content["outputs"] = [{"name": "sag", "unit": "m", "u": "more.npz:sag"}]
+    listed = content["parameters"]["training"] + content["parameters"]["validation"]
+    f = np.column_stack([-load * cable.mass for load, _ in listed])
+    pack_with(tmp_path / "pack", content, f=f, sag=np.ones(len(cable.mass)))
+    code, out, _ = main("import", str(tmp_path / "pack"))
+    assert code == 0
+    assert "; reduced assembly interpolates f and sums the terms of g\n" in out
+    assert "\n  outputs: sag [m]\n" in out
 
 
 @pytest.mark.parametrize("bump", [0.0, 1e-3])

@@ -185,6 +185,17 @@ def test_of_a_run_with_one_solver_no_agreement_is_told(said: Said) -> None:
     assert not [text for text in whole if "solvers" in text]
 
 
+def test_training_that_takes_longer_to_choose_than_to_solve_is_said_to(said: Said) -> None:
+    """The choice of 10 parameters costs as much as 30 solutions, or as 9."""
+    chosen = "update cells set snapshots = 10, hf_s = 0.5, offline_selection_s = {}"
+    assert said(chosen.format(15.0))["obstacle, training"] == [
+        "Choosing 10 training parameters by own took 15 s, as long as 30 more solutions: it can pay only where a "
+        "given training set would need 40."
+    ]
+    assert "obstacle, training" not in said(chosen.format(4.5))
+    assert "obstacle, training" not in said()
+
+
 def test_solvers_that_have_no_program_in_common_are_said_to(said: Said) -> None:
     assert "No two solvers were ok on the same reduced problem." in said("DELETE FROM disagreements")[""]
 
