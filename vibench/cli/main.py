@@ -241,6 +241,7 @@ def help_on(
         app(args=[*topic.split(), "--help"], standalone_mode=False)
         return
     from vibench.results.columns import STORED
+    from vibench.terminal.console import new_console, shown
 
     named = [(table, name, of) for table, columns in STORED.items() for name, of in columns.items()]
     meant = [one for one in named if topic in (one[1], one[2].heading)]
@@ -248,7 +249,7 @@ def help_on(
         headings = [of.heading for *_, of in named if of.heading]
         raise unknown_name("command or column", topic, {*COMMANDS, *(name for _, name, _ in named), *headings})
     for table, name, of in meant:
-        echo(f"{name}{f' [{of.unit}]' * bool(of.unit)}, in {table}: {of.meaning}")
+        new_console().print(shown(f"{name}{f' [{of.unit}]' * bool(of.unit)}, in {table}: {of.meaning}"))
 
 
 COMMANDS: dict[str, Callable[..., None]] = {
