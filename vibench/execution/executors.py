@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import resource
 import secrets
@@ -22,6 +23,9 @@ from vibench.stages.base import Done, Failed, Unstored
 
 OPEN_FILES, OPEN_FILES_OF_A_WORKER = 64, 16
 """Files and sockets that a cluster keeps open, and for each worker; about 30 and 11 were counted in /proc."""
+
+ANSWER_SECONDS = 10.0
+"""Seconds within which a scheduler answers."""
 
 ASKED_AGAIN = 5.0
 """Seconds after which a result that has not come is asked for again, if the client is still there."""
@@ -135,6 +139,8 @@ class Dask(Executor):
         if scheduler is not None and is_authenticated(scheduler) and not _has_credentials():
             raise RequestError(f"the scheduler '{scheduler}' asks for credentials: set distributed.comm.tls of dask")
         _allow_open_files(slots if scheduler is None else 0)
+        if scheduler is not None:
+            _greet(scheduler)
         self._token = secrets.token_hex(8)
         self._cluster: Any = None
         if scheduler is None:
@@ -195,6 +201,27 @@ class Dask(Executor):
         self._client.close()
         if self._cluster is not None:
             self._cluster.close()
+
+
+def _greet(scheduler: str) -> None:
+    """Shake hands with a scheduler: a client waits for ever for one that says nothing, and trusts sizes it is told.
+
+    Raises a `RequestError` if no scheduler answers.
+    """
+    from distributed.comm import connect  # noqa: PLC0415
+    from distributed.security import Security  # noqa: PLC0415
+
+    async def greet() -> None:
+        credentials = Security().get_connection_args("client")
+        comm = await asyncio.wait_for(connect(scheduler, timeout=ANSWER_SECONDS, **credentials), ANSWER_SECONDS)
+        comm.abort()
+
+    with ThreadPoolExecutor(1) as other:  # where a notebook has a loop of its own
+        try:
+            other.submit(lambda: asyncio.run(greet())).result()
+        except Exception as error:  # noqa: BLE001  whatever answers may say anything
+            why = f"nothing within {ANSWER_SECONDS:g} s" if isinstance(error, TimeoutError) else in_a_line(error)
+            raise RequestError(f"no dask scheduler answers at '{scheduler}': {why}") from None
 
 
 def _allow_open_files(workers: int) -> None:

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import socket
 import ssl
+import struct
 import subprocess
+import threading
 import time
 from collections.abc import Iterator
 from concurrent.futures import Future, wait
@@ -197,6 +200,37 @@ def test_a_scheduler_that_does_not_answer_is_named(vibench: Vibench, tmp_path: P
     warning, line = done.stderr.splitlines()
     assert warning.startswith("vibench: tcp://127.0.0.1:9: the connection is not authenticated")
     assert line.startswith("vibench: no dask scheduler answers at 'tcp://127.0.0.1:9'")
+
+
+@pytest.mark.parametrize(
+    ("said", "words"),
+    [
+        (b"", "nothing within 0.5 s"),
+        (struct.pack("<Q", 2**50) + bytes(99), "Error: "),
+        (b"HTTP/1.1 400 Bad\r\n\r\n", "Error: "),
+    ],
+)
+def test_a_port_that_is_no_scheduler_is_refused_in_a_line(
+    said: bytes, words: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One accepts and says nothing, the others say how much they are about to say."""
+    monkeypatch.setattr(executors, "ANSWER_SECONDS", 0.5 if not said else 60.0)
+    with socket.create_server(("127.0.0.1", 0)) as server:
+
+        def answer() -> None:
+            with contextlib.suppress(OSError):  # the server is closed
+                while True:
+                    taken.append(server.accept()[0])
+                    taken[-1].sendall(said)
+
+        taken: list[socket.socket] = []
+        threading.Thread(target=answer, daemon=True).start()
+        address = f"tcp://127.0.0.1:{server.getsockname()[1]}"
+        with pytest.raises(RequestError, match=f"no dask scheduler answers at '{address}': .*{words}") as error:
+            executors._greet(address)
+        assert "\n" not in str(error.value)
+        for one in taken:
+            one.close()
 
 
 def test_an_authenticated_scheduler_needs_credentials(vibench: Vibench, tmp_path: Path) -> None:
