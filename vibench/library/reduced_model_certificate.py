@@ -35,7 +35,7 @@ class Bound(NamedTuple):
 
 
 class Certified(NamedTuple):
-    """A `Solution` of `reduced_model.py`, its bounds, and whether `relative` keeps the tolerance, or "" without one."""
+    """A `Solution` of `reduced_model.py`, its bounds, and whether `relative` keeps the tolerance."""
 
     solution: Any
     bound: Bound
@@ -71,8 +71,9 @@ class Model:
         if corrected and bound.guarantee != "none":
             solution, bound = self._pair(at, solution, bound, rho)
         solution = solution._replace(output_bounds=self.plain.named(self._of_outputs(at, bound)))
-        kept = tolerance is None or (solution.status == "ok" and bound.relative <= tolerance)
-        return Certified(solution, bound, "not certified" if not kept else "" if tolerance is None else bound.guarantee)
+        kept = tolerance is not None and solution.status == "ok" and bound.relative <= tolerance
+        verdict = "no tolerance" if tolerance is None else bound.guarantee if kept else "not certified"
+        return Certified(solution, bound, verdict)
 
     def _pair(self, mu: Array, solution: Any, bound: Bound, rho: float) -> tuple[Any, Bound]:
         """The corrected pair of a solution with bounds, and ρ/√α, and its own bounds."""

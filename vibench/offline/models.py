@@ -11,6 +11,7 @@ from types import MappingProxyType
 from typing import Any
 
 import numpy as np
+import pandas as pd
 
 from vibench.arrays import Array
 from vibench.errors import RequestError, unknown_name
@@ -24,6 +25,7 @@ from vibench.model.hyperreduced import HyperReducedModel
 from vibench.model.output_bounds import error_bound, weights
 from vibench.offline.assemblies import assemblies
 from vibench.offline.correction import Answer, Corrector
+from vibench.offline.shown import about_model, about_solution, html
 from vibench.qp.settings import SETTINGS
 from vibench.qp.solve import installed_solvers, solve_qp
 from vibench.qp.status import Status
@@ -32,13 +34,17 @@ from vibench.stability.coercivity import coercivity_and_continuity, energy_inf_s
 from vibench.study import registry
 from vibench.study.kinds import SOLVER
 from vibench.text import brief
-from vibench.timing import Seconds, timed
+from vibench.timing import timed
 
 Parameters = Sequence[float] | Array | Mapping[str, float]
 """A parameter mu: its components in the order of `ParameterBox.names`, or by these names."""
 
 AnyReducedModel = ReducedModel | HyperReducedModel
 """A model that assembles the reduced program at a parameter."""
+
+
+NO_TOLERANCE = "no tolerance"
+"""The verdict on a solution for which no tolerance was given."""
 
 
 @dataclass(frozen=True)
@@ -56,7 +62,7 @@ class Solution:
     residuals
         Its relative KKT residuals, recomputed; `None` without x and α.
     assembly, solution
-        Seconds of the assembly of the program, and of its solution.
+        CPU seconds of the assembly of the program, and of its solution.
     bound, tolerance
         Its error bounds at online cost where the cell is certified, and the relative error asked for; else `None`.
     correction
@@ -72,8 +78,8 @@ class Solution:
     x: Array | None
     alpha: Array | None
     residuals: Residuals | None
-    assembly: Seconds
-    solution: Seconds
+    assembly: float
+    solution: float
     _model: Model = field(repr=False)
     _reduced: ReducedProblem = field(repr=False)
     bound: OnlineBound | None = None
@@ -85,12 +91,15 @@ class Solution:
     def verdict(self) -> str:
         """Whether the bound keeps the tolerance: what it is worth, "certified" or "verified", or "not certified".
 
-        "" where no tolerance was asked for. A solution that is not ok is not certified, however small its bound is.
+        "no tolerance" where none was asked for. A solution that is not ok is not certified, however small its bound is.
         """
         if self.tolerance is None or self.bound is None:
-            return ""
+            return NO_TOLERANCE
         kept = self.status is Status.OK and self.bound.relative <= self.tolerance
         return self.bound.guarantee.value if kept else "not certified"
+
+    def _repr_html_(self) -> str:
+        return html("solution", about_solution(self, self._model.parameters.names))
 
     @property
     def u(self) -> Array:
@@ -179,6 +188,12 @@ class Model:
         self.certificate, self.row, self.correction = certificate, row, correction
         self.problem: Problem = reduced.problem
 
+    def __repr__(self) -> str:
+        return f"Model({', '.join(f'{name}={value!r}' for name, value in about_model(self).items())})"
+
+    def _repr_html_(self) -> str:
+        return html("reduced model", about_model(self))
+
     @property
     def parameters(self) -> ParameterBox:
         """The parameter domain."""
@@ -242,7 +257,7 @@ class Model:
                 bound, correction = self.certificate.certify(*given, mode)
                 bound = bound if correction is None else correction.bound
         answer = at, status, reason, found.x, found.alpha, residuals
-        return Solution(*answer, assembly, solution, self, reduced, bound, tolerance, correction, mode)
+        return Solution(*answer, assembly.cpu, solution.cpu, self, reduced, bound, tolerance, correction, mode)
 
     @cached_property
     def output_weights(self) -> dict[str, tuple[float, float] | None]:
@@ -252,6 +267,31 @@ class Model:
             known = None if certificate is None or not output.linear else certificate.base
             found[output.name] = None if known is None else weights(self.problem, known, output)
         return found
+
+    def solve_all(
+        self,
+        mus: Sequence[Sequence[float]] | Array,
+        solver: str | None = None,
+        accuracy: float | None = None,
+        tolerance: float | None = None,
+        corrected: bool | None = None,
+    ) -> pd.DataFrame:
+        """A table of `solve` at parameters (P×d), a row for each: what a sample or an optimisation needs.
+
+        Its columns are the parameters by name, status, reason and the worst residual; of a certified model the bounds
+        and the verdict; `output:NAME` and with bounds `bound:NAME` of every quantity of interest; and CPU seconds.
+        Programs are assembled and solved one after the other.
+
+        Raises
+        ------
+        RequestError
+            As `solve`, or if the array has another shape.
+        """
+        given = np.asarray(mus, dtype=float)
+        if given.ndim != 2:
+            raise RequestError(f"the parameters have the shape {given.shape}, expected (P, {self.parameters.dim})")
+        found = (self.solve(mu, solver, accuracy, tolerance, corrected) for mu in given)
+        return pd.DataFrame([about_solution(one, self.parameters.names) for one in found])
 
     def reconstruct(self, mu: Parameters, x: Array, alpha: Array) -> tuple[Array, Array]:
         """The solution u (n,), λ (m,) with coordinates x (N',) in the primal basis at mu and α (R,) on generators."""
@@ -282,6 +322,8 @@ class Model:
             at = np.asarray(mu, dtype=float)
         except (TypeError, ValueError):
             raise RequestError(f"mu is {brief(repr(mu), 80)}, expected numbers ({', '.join(box.names)})") from None
+        if at.ndim == 2:
+            raise RequestError(f"mu has the shape {at.shape}: `solve_all` takes an array of parameters (P, {box.dim})")
         if at.shape != (box.dim,) or not np.all(np.isfinite(at)):
             raise RequestError(f"mu is {np.asarray(mu).tolist()}, expected finite numbers ({', '.join(box.names)})")
         if outside := [name for name, out in zip(box.names, box.outside(at), strict=True) if out]:

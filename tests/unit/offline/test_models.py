@@ -13,6 +13,7 @@ import vibench
 from vibench.interfaces.validation import validation_parameters
 from vibench.model.certificates.inf_sup import ON_BODIES
 from vibench.offline.assemblies import assemblies
+from vibench.offline.shown import html
 
 CELLS = list(product(("online-supremizers", "offline-pga"), ("full", "reduced")))
 
@@ -51,6 +52,42 @@ def test_parameters_by_name_and_reconstruction(model: vibench.Model, mus: np.nda
     u, lam = model.reconstruct(mus[0], solution.x, solution.alpha)
     assert np.allclose(u, solution.u, rtol=0.0, atol=1e-14 * np.abs(u).max())
     assert np.array_equal(lam, solution.lam)
+
+
+def test_seconds_are_numbers(model: vibench.Model, mus: np.ndarray) -> None:
+    solution = model.solve(mus[0])
+    assert isinstance(solution.assembly, float)
+    assert isinstance(solution.solution, float)
+    assert solution.solution >= 0.0
+
+
+def test_many_parameters_give_a_table(model: vibench.Model, mus: np.ndarray, certified: vibench.Run) -> None:
+    table = model.solve_all(mus)
+    assert np.array_equal(table[list(model.parameters.names)], mus)
+    assert set(table["status"]) == {"ok"}
+    solution = model.solve(mus[1])
+    assert solution.residuals is not None
+    assert table.loc[1, "residual"] == solution.residuals.worst
+    for name, value in solution.outputs.items():
+        assert table.loc[1, f"output:{name}"] == value
+    with pytest.raises(vibench.RequestError, match=r"the parameters have the shape \(2,\), expected \(P, 2\)"):
+        model.solve_all(mus[0])
+    with pytest.raises(vibench.RequestError, match="`solve_all` takes an array of parameters"):
+        model.solve(mus)
+    bounded = certified.model(str(certified.cells["cell"].iloc[0]))
+    table = bounded.solve_all(bounded.parameters.sample(2, seed=0), tolerance=0.5)
+    assert {"bound_u_energy", "guarantee", "verdict"} <= set(table)
+
+
+def test_models_and_solutions_are_shown_by_what_they_are(model: vibench.Model, mus: np.ndarray) -> None:
+    assert repr(model).startswith("Model(problem='radial-obstacle', R=")
+    assert " at 0x" not in repr(model)
+    shown = model._repr_html_()
+    assert "<th>solver</th><td>piqp</td>" in shown
+    solution = model.solve(mus[0])._repr_html_()
+    assert "<th>status</th><td>ok</td>" in solution
+    assert "<th>reason</th>" not in solution
+    assert "<td>&lt;b&gt;</td>" in html("title", {"name": "<b>"})
 
 
 def test_another_solver_and_accuracy(model: vibench.Model, mus: np.ndarray) -> None:
@@ -127,7 +164,7 @@ def test_a_certified_model_bounds_its_errors_and_says_whether_they_keep_a_tolera
     for query, mu in enumerate(validation_parameters(model.problem, 3, 0)):
         solution = model.solve(mu)
         assert solution.bound is not None
-        assert solution.verdict == ""
+        assert solution.verdict == "no tolerance"
         assert solution.bound.u_energy == pytest.approx(rows.loc[query, "bound_online_u_energy"], rel=1e-6)
         assert rows.loc[query, "error_u_energy_absolute"] <= solution.bound.u_energy
         relative = solution.bound.relative
