@@ -78,7 +78,7 @@ def show(
     """
     from vibench.results import formats, tables, views
     from vibench.results.selection import parts
-    from vibench.terminal.console import print_frame
+    from vibench.terminal.console import new_console, print_frame, shown
 
     path = tables.results_file(run)
     measured = partial(views.look_up, path, table, cell=cell, error=error, largest=within)
@@ -88,7 +88,7 @@ def show(
         (key,) = view.rows["cell"]
         described, empty = view.described
         print_frame(described, f"cell {key} of {path.parent.name}", every=True)
-        echo(f"empty: {', '.join(empty)}")
+        new_console().print(shown(f"empty: {', '.join(empty)}"))
         return
     if form == "terminal":
         rest = f"vibench show {run_argument(path.parent)} CELL" if view.view.source == "cells" else "--format csv"
