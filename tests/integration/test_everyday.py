@@ -149,6 +149,17 @@ class TestAuthor:
         manifest.write_text(manifest.read_text().replace("upper = [4.0, 0.1]", "upper = [4.0, 0.2]"))
         assert narrow("replay", "mine", cell, "--at", f"my-model={elsewhere}")[0] == 2
 
+    def test_a_model_in_a_notebook(self, home: Path) -> None:
+        model = vibench.open_run("mine").model(key(home, **CERTIFIED))
+        assert re.search(r"0x[0-9a-f]{6}", repr(model)) is None
+        box = model.problem.parameters
+        solution = model.solve(box.lower)
+        assert solution.verdict is None or solution.verdict
+        assert float(solution.assembly) > 0.0
+        assert "<" in solution._repr_html_()
+        table = model.solve_all(np.array([box.lower, box.upper]))
+        assert len(table) == 2
+
 
 class TestEngineer:
     """Somebody who wants the reduced model in a program of theirs."""
