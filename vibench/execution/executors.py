@@ -208,7 +208,7 @@ def _greet(scheduler: str) -> None:
 
     Raises a `RequestError` if no scheduler answers.
     """
-    from distributed.comm import connect  # noqa: PLC0415
+    from distributed.comm.core import connect  # noqa: PLC0415
     from distributed.security import Security  # noqa: PLC0415
 
     async def greet() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Iterator, Mapping
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
@@ -56,7 +57,7 @@ def write(path: Path, target: Path, jobs: int = 1, *, figures: bool = True) -> P
 
     Raises a `RequestError` if `target` is the results file, or cannot be written.
     """
-    if target.resolve() == path.resolve():
+    if os.path.realpath(target) == os.path.realpath(path):  # of links in a circle, too
         raise RequestError(f"'{target}' is the results file itself; choose another file for the report")
     try:
         write_atomically(target, page(path, jobs, figures=figures).encode("utf-8"))

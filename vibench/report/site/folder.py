@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import sqlite3
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -51,8 +52,9 @@ def write(site: Path, fill: Callable[[Path], None]) -> None:
                 _replace_files(site, new, files)
             else:
                 new.replace(site)
-    except OSError as error:
-        raise RequestError(f"'{site}' cannot be written: {error.strerror or error}") from None
+    except (OSError, sqlite3.Error) as error:
+        why = getattr(error, "strerror", None) or error
+        raise RequestError(f"'{site}' cannot be written: {why}") from None
 
 
 def _replace_files(site: Path, new: Path, files: Mapping[str, str]) -> None:

@@ -12,6 +12,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import closing
 from pathlib import Path
 
+from vibench.errors import RequestError
 from vibench.results.columns import KEYS, STORED, TEXT
 from vibench.results.sqlite.digests import Digests
 from vibench.results.sqlite.reading import open_read_only, read_meta, read_rows, text_reader
@@ -40,9 +41,16 @@ def cleaned(path: Path, copy: Path) -> None:
     Of a path the name of its file is kept, if it has an ending. Where packs and files of points were is left out; their
     paths beside the study are kept, and the hashes of their content are part of those of the code.
 
-    Raises a `RequestError` if the file is damaged.
+    Raises a `RequestError` if the file is damaged, or the copy cannot be written.
     """
     read_meta(path)
+    try:
+        _write_cleaned(path, copy)
+    except (OSError, sqlite3.Error) as error:
+        raise RequestError(f"a copy of '{path}' cannot be written to '{copy.parent}': {error}") from None
+
+
+def _write_cleaned(path: Path, copy: Path) -> None:
     copy.parent.mkdir(parents=True)
     with open_read_only(path) as db:
         db.execute("VACUUM INTO ?", (str(copy.absolute()),))
