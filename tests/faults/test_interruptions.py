@@ -63,7 +63,7 @@ def test_workers_do_not_see_ctrl_c(command: str, plugins_folder: Path, waiting: 
                 with contextlib.suppress(ProcessLookupError):
                     groups.add(os.getpgid(worker))
             time.sleep(0.005)
-        _, err = process.communicate(timeout=10)
+        _, err = process.communicate(timeout=60)
     assert (process.returncode, err) == (0, "")
     assert len(groups) == 2
     assert process.pid not in groups
@@ -92,7 +92,7 @@ def test_a_run_that_is_terminated_leaves_no_worker_behind(command: str, plugins_
         assert left
         process.terminate()
         process.wait(timeout=60)
-        for _ in range(100):
+        for _ in range(600):  # a busy machine takes its time
             left = {worker for worker in left if Path(f"/proc/{worker}").exists()}
             if not left:
                 return

@@ -281,7 +281,7 @@ def test_a_keeper_that_is_closed_stops_at_once_and_leaves_nobody(watcher: Superv
         time.sleep(0.05)
     worker = int(diary.read_text().split()[0])
     watcher.close()
-    thread.join(timeout=5.0)
+    thread.join(timeout=60.0)
     assert stopped == [True]
     with pytest.raises(ProcessLookupError):
         os.kill(worker, 0)
