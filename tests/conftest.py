@@ -19,7 +19,7 @@ import typer.main
 from forking import fork_workers, run_command, start_new_worker
 from hypothesis import settings
 from running import Changed, Main, Register, Shared, Vibench, execute
-from samples import SMALL, install_fakes
+from samples import QUICK_ROUNDS, SMALL, install_fakes
 from threadpoolctl import threadpool_limits
 
 from vibench.cli import start
@@ -28,6 +28,7 @@ from vibench.library import runs
 from vibench.results.sqlite.reading import FILE
 from vibench.storage.artefacts import CACHE_VARIABLE
 from vibench.study import registry
+from vibench.study.kinds import STUDY
 
 # The examples of a test are the same ones every time and everywhere; `--hypothesis-profile=explore` draws new ones.
 settings.register_profile("same", deadline=None, derandomize=True, database=None)
@@ -138,10 +139,13 @@ def shared(tmp_path_factory: pytest.TempPathFactory) -> Shared:
 
 @pytest.fixture(scope="session")
 def quick_run(command: str, shared: Shared) -> Path:
-    """Folder of one run of the registered study `quick` through the installed command."""
+    """Folder of one run of the study `quick`, timed in half the rounds, through the installed command."""
 
     def run(folder: Path) -> None:
-        arguments = [command, "run", "quick", "--out", str(folder), "--jobs", "2"]
+        study = Path(registry.registered(STUDY)["quick"].load()).read_text(encoding="utf-8")
+        path = folder.with_suffix(".toml")
+        path.write_text(f"timing_rounds = {QUICK_ROUNDS}\n{study}", encoding="utf-8")
+        arguments = [command, "run", str(path), "--out", str(folder), "--jobs", "2"]
         done = subprocess.run(arguments, cwd=folder.parent, capture_output=True, text=True, check=False)
         assert done.returncode == 0, done.stderr
         (folder / "printed.txt").write_text(done.stdout, encoding="utf-8")

@@ -37,6 +37,9 @@ RECORDED: Mapping[str, Any] = {"name": "sample", "seed": 1, "validation": 4, "ac
 ROUNDS = 3
 """Timing rounds of runs whose seconds no test looks at."""
 
+QUICK_ROUNDS = 6
+"""Those of the run of `quick` that tests share: with fewer there is no interval of a median."""
+
 REMOVE = object()
 """Stands for a key that is taken away."""
 

@@ -17,7 +17,7 @@ import pandas as pd
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from samples import cell_row, query_rows
+from samples import QUICK_ROUNDS, cell_row, query_rows
 
 from vibench.errors import RequestError
 from vibench.results import tables
@@ -367,8 +367,8 @@ def test_a_real_run_times_what_its_cells_are_made_of(quick_run: Path) -> None:
     np.testing.assert_allclose(by_cell["assemble_s"] + by_cell["solve_s"], by_cell["total_s"])
     quartiles = by_cell.groupby("cell")["total_s"].quantile([0.25, 0.5, 0.75]).unstack().loc[frame["cell"]]
     np.testing.assert_allclose(quartiles, frame[["online_q1_s", "online_s", "online_q3_s"]])
-    assert set(by_cell.groupby("cell").size()) == {12}
-    assert (frame["timing_rounds"] == 12).all()
+    assert set(by_cell.groupby("cell").size()) == {QUICK_ROUNDS}
+    assert (frame["timing_rounds"] == QUICK_ROUNDS).all()
     np.testing.assert_array_equal(fine.size().loc[frame["cell"]], frame["queries_ok"])
     np.testing.assert_allclose(queries.groupby("cell")["hf_s"].median().loc[frame["cell"]], frame["hf_s"])
     assert (frame[["offline_snapshots_s", "online_s", "hf_s"]] > 0.0).all(axis=None)
