@@ -35,8 +35,10 @@ def queries(model: Model, file: Path) -> dict[str, Call]:
     found: dict[str, Call] = {SCRIPT: reduced_model.Model(file).solve, LIBRARY: partial(plain.solve, corrected=False)}
     script = reduced_model.Model(file)
     if not script.about["no_bounds"]:
-        bounded = reduced_model_certificate.Model(file)
         for corrected, what in ((False, "with bounds"), (True, "corrected")):
+            bounded = reduced_model_certificate.Model(
+                file
+            )  # one each: it keeps what it evaluated at the last parameter
             found[f"{SCRIPT}, {what}"] = partial(bounded.solve, corrected=corrected)
             found[f"{LIBRARY}, {what}"] = partial(model.solve, corrected=corrected)
     return found

@@ -58,7 +58,7 @@ class Model:
         if self.solver not in SOLVERS:
             raise ValueError(f"the solver is '{self.solver}', expected one of {', '.join(SOLVERS)}")
         self._outputs = [output["name"] for output in self.about["outputs"]["linear"]]
-        self._last: tuple[bytes, dict[int, Array]] = b"", {}
+        self._last: tuple[bytes, dict[int | str, Array]] = b"", {}
         names, known = (
             [key.removesuffix("_indices") for key in self.data if key.endswith("_indices")],
             dict[bytes, int](),
@@ -111,6 +111,8 @@ class Model:
         (key, degrees, matrices), (at, known) = self._members[name], self._last
         if at != mu.tobytes():
             self._last = _, known = mu.tobytes(), {}
+        if name in known:
+            return known[name]
         if key not in known:
             unit = (2.0 * mu - self.lower - self.upper) / (self.upper - self.lower)
             unit = unit if (abs(unit) <= 1.0).all() else unit + 0j  # outside the box
@@ -121,6 +123,8 @@ class Model:
         found = known[key]
         for matrix in matrices:
             found = found @ matrix
+        found.setflags(write=False)
+        known[name] = found
         return found
 
     def solve(self, mu: Sequence[float] | Array) -> Solution:
@@ -172,14 +176,22 @@ def residuals(A: Array, f: Array, B: Array, g: Array, x: Array, alpha: Array, fa
     `factor` is the Cholesky factor of A, if it is known.
     """
     s, force, Ax = B @ x - g, alpha @ B, A @ x
-    violated = s > 1.01 * np.finfo(float).eps * ((B != 0.0).sum(axis=1) + 2.0) * (abs(B) @ abs(x) + abs(g))
+    rows = (s > 0.0).nonzero()[0]
+    if len(rows):
+        sizes = abs(B[rows]) @ abs(x) + abs(g[rows])
+        rows = rows[s[rows] > 1.01 * np.finfo(float).eps * ((B[rows] != 0.0).sum(axis=1) + 2.0) * sizes]
     factor = np.linalg.cholesky(A) if factor is None else factor
-    whitened = np.linalg.solve(factor, np.vstack([f - Ax - force, force, B[violated]]).T)
-    norms = np.sqrt((whitened**2).sum(axis=0))
-    S = np.hypot(np.sqrt(max(float(x @ Ax), 0.0)), norms[1])
-    with np.errstate(divide="ignore", invalid="ignore"):  # a row of zeros, or the solution 0
-        ways = np.array([np.max(s[violated] / norms[2:], initial=0.0), norms[0], abs(alpha @ s)])
-        return tuple(np.where(ways == 0.0, 0.0, ways / [S, S, S**2]).tolist())
+    whitened = np.linalg.solve(factor, np.array([f - Ax - force, force, *B[rows]]).T)
+    norms, way = np.sqrt((whitened**2).sum(axis=0)), 0.0
+    if len(rows):
+        with np.errstate(divide="ignore"):  # a row of zeros
+            way = float((s[rows] / norms[2:]).max())
+    rest, S, gap = float(norms[0]), float(np.hypot(np.sqrt(max(float(x @ Ax), 0.0)), norms[1])), abs(float(alpha @ s))
+    return _ratio(way, S), _ratio(rest, S), _ratio(gap, S**2)
+
+
+def _ratio(size: float, scale: float) -> float:
+    return 0.0 if size == 0.0 else size / scale if scale else np.inf
 
 
 def _worst(found: Residuals) -> float:

@@ -50,6 +50,7 @@ class Model:
         self.guarantee, start, data = str(self.plain.about["certificate"]), "certificate_", self.plain.data
         if why := self.plain.about["no_bounds"]:
             raise ValueError(f"'{file}' has no error bounds: {why}")
+        self._known: tuple[bytes, tuple[float, float]] = b"", (1.0, 1.0)  # the spectrum at the last parameter
         slack = 1e-12 * np.maximum(abs(data["lower"]), abs(data["upper"]))
         self._box = data["lower"] - slack, data["upper"] + slack
         self._data: dict[str, Array] = {name.removeprefix(start): data[name] for name in data if name.startswith(start)}
@@ -102,7 +103,7 @@ class Model:
     def _of_outputs(self, mu: Array, bound: Bound) -> Array:
         """Bounds of the errors of outputs, from those of u and λ."""
         weights = self._data.get("outputs_weights", np.zeros((0, 2)))
-        if bound.guarantee == "none":
+        if bound.guarantee == "none" or not len(weights):
             return np.full(len(weights), inf)
         A, B = self.plain.member("theta_A", mu), self.plain.member("theta_B", mu)
         (lower, upper), least = self._spectrum(mu, A), abs(float(B[0])) - float(self._data["constraint_error"])
@@ -150,9 +151,11 @@ class Model:
 
     def _spectrum(self, mu: Array, theta: Array) -> tuple[float, float]:
         """α and γ from the values at the anchors around mu, a grid of the parameter box."""
-        data = self._data
+        data, at = self._data, mu.tobytes()
         if "anchors" not in data:
             return 1.0, 1.0
+        if self._known[0] == at:
+            return self._known[1]
         count, where, weights = int(data["count"]), [0], [1.0]
         for at, low, high in zip(mu, data["lower"], data["upper"], strict=True) if count > 1 else ():
             place = min(max((at - low) / max(high - low, TINY), 0.0), 1.0) * (count - 1)
@@ -161,7 +164,8 @@ class Model:
             weights = [weight * share for weight in weights for share in (first + 1.0 - place, place - first)]
         found = np.array(weights) @ data["anchors"][where]
         lacking = float(abs(theta - found[2:]) @ data["term_norms"]) + 2.0 * float(data["spectral_error"])
-        return float(found[0]) - lacking, float(found[1]) + lacking
+        self._known = at, (float(found[0]) - lacking, float(found[1]) + lacking)
+        return self._known[1]
 
     def _lifting(
         self, theta: float, of_g: Array, y: Array, lam: Array, gamma: float

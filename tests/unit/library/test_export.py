@@ -623,6 +623,7 @@ def test_where_an_exported_certificate_has_no_bound_it_says_why(
         patch.setattr(exported, "_lifting", lambda *_: None)
         assert exported.solve(mu).bound == (np.inf, np.inf, np.inf, "none", f"no w with B w ≥ s{FOUND}")
         assert exported.solve(mu, tolerance=1e9).verdict == "not certified"
+    exported = WithBounds(tmp_path / "model.npz")
     exported._data["spectral_error"] = np.array(1.0)  # as much as A itself
     assert exported.solve(mu).bound == (np.inf, np.inf, np.inf, "none", f"no α > 0{FOUND}")
 
