@@ -1,0 +1,161 @@
+"""Sites, exports and reports that are killed, that find a full disk, links in a circle, or folders of another user."""
+
+from __future__ import annotations
+
+import os
+import random
+import shutil
+import subprocess
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+from running import Main, rows, started
+from samples import wire_study, write_study
+
+from vibench.report.site import folder
+from vibench.results.sqlite.reading import FILE
+from vibench.testing.sample_run import write_sample_run
+
+KILLS = 1
+COARSE = {"name": "radial-obstacle", "options": {"resolution": "coarse"}}
+NOBODY = 65534
+"""A user who owns nothing, for tests that root runs: root may read and write everything."""
+
+
+@pytest.fixture
+def run(tmp_path: Path) -> Path:
+    return write_sample_run(tmp_path / "run").parent
+
+
+def test_a_site_that_is_killed_while_it_is_written_is_whole_or_not_there(
+    run: Path, command: str, tmp_path: Path
+) -> None:
+    rng, site = random.Random(8), tmp_path / "site"
+    arguments = [command, "publish", str(run), str(site), "--no-figures", "--yes"]
+    start = time.monotonic()
+    subprocess.run(arguments, check=True, capture_output=True)
+    seconds, whole = time.monotonic() - start, sorted(path.name for path in site.rglob("*"))
+    shutil.rmtree(site)
+    for kill in range(KILLS):
+        with started(arguments, tmp_path, tmp_path) as process:
+            time.sleep((0.5 + 0.5 * rng.random()) * seconds)
+            process.kill()
+            process.wait()
+        if site.exists():
+            assert sorted(path.name for path in site.rglob("*")) == whole, kill
+            folder.check(site)
+    done = subprocess.run(arguments, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert sorted(path.name for path in site.rglob("*")) == whole
+
+
+def test_an_export_that_is_killed_is_whole_or_not_there(quick_run: Path, command: str, tmp_path: Path) -> None:
+    key = rows(quick_run)[0]["cell"]
+    for arguments, made in (
+        ([command, "export-qps", str(quick_run), "set"], tmp_path / "set" / "check.py"),
+        ([command, "export-model", str(quick_run), str(key), "model.npz"], tmp_path / "model.npz"),
+    ):
+        with started(arguments, tmp_path, tmp_path) as process:
+            time.sleep(2.5)
+            process.kill()
+            process.wait()
+        assert made.exists() == (tmp_path / arguments[-1]).exists()
+
+
+@pytest.mark.parametrize("kib", [20, 150, 600])
+def test_a_site_on_a_full_disk_is_one_line(kib: int, run: Path, command: str, tmp_path: Path) -> None:
+    limited = f'ulimit -f {kib}; PYTHONDONTWRITEBYTECODE=1 exec "$0" "$@"'
+    arguments = ["publish", str(run), str(tmp_path / "site"), "--no-figures", "--yes"]
+    done = subprocess.run(["bash", "-c", limited, command, *arguments], capture_output=True, text=True, check=False)
+    assert done.returncode == 2, done.stderr
+    assert done.stderr.startswith("vibench: ")
+    assert "cannot be written" in done.stderr
+    assert done.stderr.count("\n") == 1
+    assert not (tmp_path / "site").exists()
+    assert {path.name for path in tmp_path.iterdir()} == {"run"}
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ("show", "loop"), ("publish", "--yes", "run", "loop"), ("publish", "--yes", "run", "loop/site"),
+        ("run", "loop"),
+        ("run", "study.toml", "--out", "loop/x"), ("import", "loop"), ("export-qps", "run", "loop/x"),
+        ("export-model", "run", "0", "loop/m.npz"), ("bench", "--read", "loop"), ("run", "loop/study.toml"),
+        ("report", "run", "--out", "loop/x", "--no-figures"),
+    ],
+    ids=" ".join,
+)  # fmt: skip
+def test_links_in_a_circle_are_one_line(
+    arguments: tuple[str, ...], run: Path, main: Main, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.chdir(run.parent)
+    write_study(tmp_path, wire_study())
+    Path("loop").symlink_to("again")
+    Path("again").symlink_to("loop")
+    code, _, err = main(*arguments)
+    assert (code, err.count("\n")) == (2, 1), err
+
+
+def test_a_report_replaces_a_link_in_a_circle(run: Path, main: Main, tmp_path: Path) -> None:
+    (tmp_path / "loop").symlink_to("loop")
+    assert main("report", str(run), "--out", str(tmp_path / "loop"), "--no-figures")[0] == 0
+    assert (tmp_path / "loop").is_file()
+
+
+@contextmanager
+def of_another_user(path: Path) -> Iterator[None]:
+    """A folder that the user of this process may not use; root becomes nobody meanwhile."""
+    user = os.geteuid()
+    path.chmod(0o000)
+    if user == 0:
+        os.seteuid(NOBODY)
+    try:
+        yield
+    finally:
+        os.seteuid(user)
+        path.chmod(0o755)
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ("show", "theirs"),
+        ("publish", "--yes", "theirs", "theirs/site", "--no-figures"),
+        ("report", "theirs", "--no-figures"),
+    ],
+    ids=" ".join,
+)
+def test_a_folder_of_another_user_is_one_line(
+    arguments: tuple[str, ...], run: Path, main: Main, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    shutil.copytree(run, tmp_path / "theirs")
+    assert main(*arguments)[0] == 0  # what is imported late may be in a folder that nobody may read
+    shutil.rmtree(tmp_path / "theirs")
+    shutil.copytree(run, tmp_path / "theirs")
+    with of_another_user(tmp_path / "theirs"):
+        code, out, err = main(*arguments)
+    assert (code, out, err.count("\n")) == (2, "", 1), err
+
+
+def test_a_clock_that_jumps_changes_no_run(
+    main: Main, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, undisturbed_clock: Callable[[], float]
+) -> None:
+    jumps = random.Random(1)
+    monkeypatch.setattr(time, "time", lambda: undisturbed_clock() + jumps.choice([-1e6, 0.0, 1e6]))
+    write_study(tmp_path, wire_study(problem=[COARSE], solvers=["piqp"]))
+    code, _, err = main(
+        "run", str(tmp_path / "study.toml"), "--out", str(tmp_path / "out"), "--jobs", "1", "--no-figures"
+    )
+    assert (code, err) == (0, "")
+    assert {row["status"] for row in rows(tmp_path / "out")} == {"ok"}
+    assert (tmp_path / "out" / FILE).is_file()
+
+
+@pytest.fixture
+def undisturbed_clock() -> Callable[[], float]:
+    return time.time
