@@ -5,12 +5,13 @@ from __future__ import annotations
 import os
 import shutil
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
 import pytest
 from selenium import webdriver
+from selenium.common.exceptions import TimeoutException
 from selenium.webdriver.chrome.service import Service
 
 FORMULA = "=decorrelated"
@@ -24,6 +25,9 @@ BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 
 PATIENCE = 120.0
 """Seconds until what a test waits for is missing: it comes at once, but for a machine that does other work, too."""
+
+LOADING, ATTEMPTS = 30.0, 4
+"""Seconds after which a page is opened again: beside other work Chromium may never say that one is loaded."""
 
 OPTIONS = (
     "--headless=new", "--no-sandbox", "--disable-gpu", "--disable-dev-shm-usage", "--hide-scrollbars",
@@ -53,6 +57,7 @@ def chromium(downloads: Path) -> Iterator[webdriver.Chrome]:
     options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
     browser = webdriver.Chrome(options=options, service=Service(driver))
     browser.set_script_timeout(PATIENCE)
+    browser.set_page_load_timeout(LOADING)
     try:
         saving = {"behavior": "allow", "downloadPath": str(downloads)}
         browser.execute_cdp_cmd("Browser.setDownloadBehavior", saving)
@@ -69,7 +74,16 @@ def look(browser: webdriver.Chrome, page: Path, *, width: int = 1280, theme: str
         "Emulation.setEmulatedMedia", {"features": [{"name": "prefers-color-scheme", "value": theme}]}
     )
     browser.get("about:blank")  # a change of the fragment alone would not load the page again
-    browser.get(page.as_uri() + fragment)
+    load(browser, page.as_uri() + fragment)
+
+
+def load(browser: webdriver.Chrome, address: str) -> None:
+    """Open an address, again if that takes too long; a `TimeoutException` if it always does."""
+    for _ in range(ATTEMPTS - 1):
+        with suppress(TimeoutException):
+            browser.get(address)
+            return
+    browser.get(address)
 
 
 def complaints(browser: webdriver.Chrome) -> list[Any]:
