@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import re
+import resource
 import shutil
+import sqlite3
 import subprocess
 from pathlib import Path
 
@@ -13,7 +15,9 @@ from samples import wire_study, write_study
 
 from vibench import Enrichment, Kind, Offline, PrimalStrategy
 from vibench.cli import doctor
+from vibench.errors import RequestError
 from vibench.provenance import cores, solver_version
+from vibench.results.database import ResultsDatabase
 
 
 def test_more_jobs_than_a_machine_can_bear_are_refused(main: Main, tmp_path: Path) -> None:
@@ -21,6 +25,19 @@ def test_more_jobs_than_a_machine_can_bear_are_refused(main: Main, tmp_path: Pat
     line = refused(main("run", study, "--jobs", "1000000000"), "jobs is 1000000000")
     assert f"expected at most {16 * cores()} worker processes" in line
     assert list(Path.cwd().iterdir()) == []
+
+
+def test_too_few_open_files_are_said_to_be_too_few(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("vibench.results.database.sqlite3.connect", unable)
+    limits = resource.getrlimit(resource.RLIMIT_NOFILE)
+    monkeypatch.setattr("vibench.results.database.resource.getrlimit", lambda _: (7, limits[1]))
+    with pytest.raises(RequestError, match=r"this process may open only 7 files \(`ulimit -n`\)"):
+        ResultsDatabase(tmp_path / "out", {})
+
+
+def unable(*_: object, **__: object) -> None:
+    """What SQLite says of a process that may open no more files."""
+    raise sqlite3.OperationalError("unable to open database file")
 
 
 def test_dask_without_open_files_ends_with_a_line(command: str, tmp_path: Path) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import resource
 import sqlite3
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -42,6 +43,10 @@ UNWRITABLE = {
 """SQLite's error codes of a full, lost or read-only disk, and of a file locked or damaged by another program."""
 
 
+FEW_FILES = 64
+"""Open files below which a results file may be missing some."""
+
+
 class ResultsDatabase:
     """The results of one study in one folder.
 
@@ -77,7 +82,9 @@ class ResultsDatabase:
         except DigestError as error:
             raise DamagedResultsError(f"'{path}' is damaged: {error}; use another --out, or --fresh") from None
         except (OSError, sqlite3.Error) as error:
-            raise RequestError(f"output folder '{folder}' cannot be written: {error}") from None
+            few = resource.getrlimit(resource.RLIMIT_NOFILE)[0]  # SQLite does not say that they are too few
+            hint = f"; this process may open only {few} files (`ulimit -n`)" * (0 <= few < FEW_FILES)
+            raise RequestError(f"output folder '{folder}' cannot be written: {error}{hint}") from None
 
     def _create(self, study: Mapping[str, Any], anew: bool) -> None:
         old = "SELECT name FROM sqlite_master WHERE type = 'table' AND name NOT LIKE 'sqlite_%'"
