@@ -236,7 +236,7 @@ def doctor(out: Annotated[Path, Option(metavar="DIR", help="Folder of the runs."
 def help_on(
     topic: Annotated[str, typer.Argument(help="A command, or a column of the results or its heading.")] = "",
 ) -> None:
-    """Say what a command does, or what a column of the results means."""
+    """Say what a command does, or what a column means."""
     if topic in ("", *COMMANDS):
         app(args=[*topic.split(), "--help"], standalone_mode=False)
         return

@@ -139,7 +139,7 @@ def new_plugin(
     name: Annotated[str, Argument(metavar="NAME", help="Its name: a-z, 0-9 and hyphens.")],
     out: Annotated[Path, Option(metavar="DIR", help="Folder in which it is created.")] = Path(),
 ) -> None:
-    """Write a package with a new plugin, a study, or a model pack, to edit.
+    """Write a plugin in a package, a study or a model pack.
 
     A package passes its tests as generated, a study runs. Existing files are never overwritten.
     """

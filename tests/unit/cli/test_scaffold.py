@@ -164,7 +164,7 @@ def test_a_file_is_no_folder_to_write_in(main: Main) -> None:
 
 
 def test_a_kind_that_is_none_is_refused(main: Main) -> None:
-    refused(main("new", "study", "rope"), "study", "problem")
+    refused(main("new", "stage", "rope"), "stage", "problem")
 
 
 def test_nothing_is_left_of_a_package_that_could_not_be_written(main: Main, monkeypatch: pytest.MonkeyPatch) -> None:
