@@ -11,7 +11,8 @@ from mutations import FAULTS, ROOT, Fault, changed
 def test_a_fault_can_be_put_in_its_place(fault: Fault) -> None:
     text = changed(ROOT, fault)
     assert fault.wrong in text
-    compile(text, fault.file, "exec")
+    if fault.file.endswith(".py"):
+        compile(text, fault.file, "exec")
     assert all((ROOT / tests).exists() for tests in fault.tests)
 
 

@@ -71,7 +71,9 @@ def source(
 
 
 def _filled(template: str, values: Mapping[str, Any]) -> str:
-    return Template((files("vibench.library") / f"{template}.template").read_text(encoding="utf-8")).substitute(values)
+    return Template(
+        (files("vibench.library") / "templates" / f"{template}.template").read_text(encoding="utf-8")
+    ).substitute(values)
 
 
 def _of_certificate(thetas: Mapping[str, AffinePolynomial], arrays: Mapping[str, Array]) -> dict[str, Any]:

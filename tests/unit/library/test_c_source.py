@@ -214,8 +214,12 @@ def test_a_certificate_without_outputs_and_outputs_without_a_certificate(
 @pytest.mark.parametrize("steps", [30, 1])  # after one step all that is not done goes to the other method
 def test_both_methods_of_the_correction_in_c_find_that_of_vibench(steps: int, tmp_path: Path) -> None:
     size, zeros = 8, np.zeros(8)
-    text = files("vibench.library").joinpath("reduced_model_certificate.c.template").read_text(encoding="utf-8")
-    basic = files("vibench.library").joinpath("reduced_model.c.template").read_text(encoding="utf-8")
+    text = (
+        files("vibench.library")
+        .joinpath("templates", "reduced_model_certificate.c.template")
+        .read_text(encoding="utf-8")
+    )
+    basic = files("vibench.library").joinpath("templates", "reduced_model.c.template").read_text(encoding="utf-8")
     parts = [
         "#include <float.h>\n#include <math.h>\n#include <string.h>\n"
         f"enum {{ LOADS = {size}, STEPS = {steps} }};\n"
