@@ -90,7 +90,7 @@ class Tally:
         yield "reduced", Answer(solution.u, solution.lam, bound)
         yield "online", Corrector(self.model.reduced, self.certificate, CorrectionMode.FEASIBLE).answer(mu, *own)
         if self.parameters % EVERY == 1:
-            self.time(mu, solution.x, solution.alpha, solution.solution.cpu)
+            self.time(mu, solution.x, solution.alpha, solution.solution)
             yield "in full", Corrector(self.model.reduced, None, CorrectionMode.FEASIBLE).answer(mu, *own)
 
     def judge(self, answers: Mapping[str, Answer], errors: Mapping[str, Array], sizes: Array) -> None:

@@ -8,10 +8,9 @@ from dataclasses import dataclass, field
 from functools import cached_property, partial
 from math import inf
 from types import MappingProxyType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import pandas as pd
 
 from vibench.arrays import Array
 from vibench.errors import RequestError, unknown_name
@@ -35,6 +34,9 @@ from vibench.study import registry
 from vibench.study.kinds import SOLVER
 from vibench.text import brief
 from vibench.timing import timed
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 Parameters = Sequence[float] | Array | Mapping[str, float]
 """A parameter mu: its components in the order of `ParameterBox.names`, or by these names."""
@@ -287,6 +289,8 @@ class Model:
         RequestError
             As `solve`, or if the array has another shape.
         """
+        import pandas as pd  # noqa: PLC0415  workers load models, and no tables
+
         given = np.asarray(mus, dtype=float)
         if given.ndim != 2:
             raise RequestError(f"the parameters have the shape {given.shape}, expected (P, {self.parameters.dim})")
