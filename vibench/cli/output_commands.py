@@ -190,12 +190,8 @@ def export_reduced_model(
     echo(*_outputs_in_words(exported.about["outputs"]))
     echo(exported_seconds.in_words(model, file))
     beside = [file.with_name(BOUNDS)] if has_bounds else []
-    written = ", ".join(
-        map(
-            str,
-            [file, file.with_name(RUNTIME), *beside, *([file.with_suffix(".c"), file.with_suffix(".h")] if c else [])],
-        )
-    )
+    sources = [file.with_suffix(end) for end in (".c", ".h") if c]
+    written = ", ".join(map(str, [file, file.with_name(RUNTIME), *beside, *sources]))
     script = Path(BOUNDS if has_bounds else RUNTIME).stem
     echo(f"{written}: `from {script} import Model`, then `Model({str(file)!r}).solve(mu)`")
 

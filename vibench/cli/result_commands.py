@@ -84,7 +84,7 @@ def show(
     measured = partial(views.look_up, path, table, cell=cell, error=error, largest=within)
     view = measured(columns=parts(columns), where=where, sort=parts(sort), limit=limit)
     warn(*view.faults)
-    if form == "terminal" and cell and table == "summary" and not columns:
+    if form == "terminal" and cell and table == "summary" and not columns and len(view.rows):
         (key,) = view.rows["cell"]
         described, empty = view.described
         print_frame(described, f"cell {key} of {path.parent.name}", every=True)

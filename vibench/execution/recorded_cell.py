@@ -21,6 +21,7 @@ from vibench.interfaces.problem import VariationalInequality
 from vibench.model.certificates.bounds import OnlineCertificate
 from vibench.offline.models import AnyReducedModel
 from vibench.results import tables
+from vibench.results.selection import key_of
 from vibench.results.sqlite.reading import read_meta, read_rows, study_of
 from vibench.results.tables import results_file
 from vibench.stages.assembly import assembly_stage
@@ -196,8 +197,5 @@ def recorded_study(run: str, cell: str, places: Mapping[str, str] = NOT_MOVED) -
 
 def _matching(run: str, cell: str, places: Mapping[str, str]) -> RecordedCell:
     path, rows = _rows(run)
-    matching = [row for row in rows if str(row["cell"]).startswith(cell)]
-    if len(matching) != 1:
-        listed = "the column 'cell' of `vibench show RUN --table cells` lists them"
-        raise RequestError(f"{len(matching)} cells of '{run}' begin with '{cell}', expected one; {listed}")
-    return RecordedCell(path, matching[0], places)
+    by_key = {str(row["cell"]): row for row in rows}
+    return RecordedCell(path, by_key[key_of(cell, by_key, run)], places)

@@ -137,6 +137,15 @@ def sorted_by(frame: pd.DataFrame, keys: Sequence[str], what: str) -> pd.DataFra
     return frame.sort_values(names, ascending=rising, kind="stable", na_position="last", ignore_index=True)
 
 
+def key_of(cell: str, keys: Iterable[str], run: str) -> str:
+    """The one key of a cell of a run that begins with `cell`; a `RequestError` if there is none, or are several."""
+    matching = [key for key in keys if key.startswith(cell)]
+    if len(matching) != 1:
+        listed = "the column 'cell' of `vibench show RUN --table cells` lists them"
+        raise RequestError(f"{len(matching)} cells of '{run}' begin with '{cell}', expected one; {listed}")
+    return matching[0]
+
+
 def short_keys(keys: Iterable[str], least: int = 4) -> int:
     """Number of characters that tell the keys of cells apart, at least `least`."""
     different = set(keys)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shlex
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -86,6 +85,9 @@ VIEWS: Mapping[str, View] = {
     ),
 }  # fmt: skip
 """Tables that `vibench show` prints, by name: three for reading, and those of the results file."""
+
+OF_ONE_CELL = [name for name, view in VIEWS.items() if "cell" in STORED[view.source]]
+"""Tables whose rows belong to one cell each."""
 
 TOGETHER: Mapping[str, tuple[str, ...]] = {
     "pod_tol": ("pod_size",), "dual_tol": ("dual_size",), "queries_ok": ("queries",),
@@ -187,13 +189,16 @@ def look_up(
     view, extended = _measured(path, name, error, largest is not None)
     view, frame = _with_columns(view, extended.columns), extended.frame
     keys = frame.get("cell", [])
-    if cell:
-        frame = frame[frame["cell"] == _cell(path, cell)] if len(keys) else frame
     if where:
         made = set(view.headings or {}) - set(frame.columns)
         frame = frame[selection.matching(path, view.source, where, frame.columns, extended, made)]
         if frame.empty:  # what keeps rows out of the table is not why there are none
             view = replace(view, empty="")
+    if cell:
+        if "cell" not in frame:
+            raise RequestError(f"the table {name} has no rows of one cell; expected {', '.join(OF_ONE_CELL)}")
+        known = map(str, tables.read(path, "cells")["cell"])
+        frame = frame[frame["cell"] == selection.key_of(cell, known, str(path.parent))]
     rows = view.rows(frame if largest is None else ranking.within(frame, largest))
     by_heading = {column.heading: key for key, column in (view.headings or {}).items() if column.heading}
     if sort:
@@ -209,15 +214,6 @@ def look_up(
     shown = rows.head(limit) if limit else rows
     listed, length = tuple(dict.fromkeys(asked or default)), selection.short_keys(keys)
     return Table(shown, listed, view, bool(asked), length, _varying_options(extended.frame), extended.faults)
-
-
-def _cell(path: Path, beginning: str) -> str:
-    """The one key of a cell that begins so."""
-    matching = [key for key in tables.read(path, "cells")["cell"] if key.startswith(beginning)]
-    if len(matching) != 1:
-        listed = f"`vibench show {shlex.quote(str(path.parent))}` lists them"
-        raise RequestError(f"{len(matching)} cells of '{path.parent}' begin with '{beginning}', expected one; {listed}")
-    return str(matching[0])
 
 
 def _varying_options(frame: pd.DataFrame) -> dict[tuple[str, str], tuple[str, ...]]:

@@ -95,15 +95,7 @@ def print_frame(
     if not count:
         return
     own = [column for column in columns if column not in shared]
-    rank = {name: k for k, name in enumerate(priority)}
-    ranked = sorted(own, key=lambda column: rank.get(column.heading, len(rank)))
-    telling, others = ([c for c in ranked if (c.heading in axes) is told] for told in (True, False))
-    kept = _fitting(ranked, console.width)
-    if len(telling) > 1 and not set(telling + others[:SUBJECT]) <= set(kept):
-        together = _in_one([column for column in own if column in telling])
-        own.insert(min(map(own.index, telling)), together)
-        own = [column for column in own if column not in telling]
-        kept = _fitting([together, *others], console.width)
+    own, kept = _arranged(own, priority, axes, console.width)
     drawn = [column for column in own if column in kept]
     whole = sum(max(column.width, cell_len(column.heading)) + 2 for column in drawn) <= console.width + 2
     # the box has a blank between columns; there is another where there is room
@@ -162,6 +154,21 @@ class PrintedColumn:
         return max(
             (cell_len(line) for cell in map(printable_lines, self.cells) for line in cell.split("\n")), default=1
         )
+
+
+def _arranged(
+    own: list[PrintedColumn], priority: Sequence[str], axes: Collection[str], width: int
+) -> tuple[list[PrintedColumn], list[PrintedColumn]]:
+    """The columns in their order, those that tell rows apart as one where they need more room, and those that fit."""
+    rank = {name: k for k, name in enumerate(priority)}
+    ranked = sorted(own, key=lambda column: rank.get(column.heading, len(rank)))
+    telling, others = ([c for c in ranked if (c.heading in axes) is told] for told in (True, False))
+    kept = _fitting(ranked, width)
+    if len(telling) < 2 or set(telling + others[:SUBJECT]) <= set(kept):
+        return own, kept
+    together, first = _in_one([column for column in own if column in telling]), min(map(own.index, telling))
+    arranged = [*own[:first], together, *own[first:]]
+    return [column for column in arranged if column not in telling], _fitting([together, *others], width)
 
 
 def _in_one(axes: Sequence[PrintedColumn]) -> PrintedColumn:

@@ -222,6 +222,18 @@ class TestShow:
         assert err.startswith("vibench: 0 cells of ")
         assert "begin with 'x', expected one" in err
 
+    def test_a_cell_is_not_ignored_where_a_table_or_a_condition_has_none_of_its_rows(
+        self, main: Main, quick_run: Path
+    ) -> None:
+        cell = tables.read(tables.results_file(str(quick_run)), "cells")["cell"][0]
+        assert main("show", str(quick_run), cell, "--where", "N > 1000")[:2] == (
+            0,
+            f"{quick_run.name}: summary: no rows\n",
+        )
+        code, out, err = main("show", str(quick_run), cell, "--table", "benefits")
+        assert (code, out) == (2, "")
+        assert "the table benefits has no rows of one cell; expected summary, best, cells, queries" in err
+
     def test_a_wrong_column_is_refused(self, main: Main, quick_run: Path) -> None:
         for option in ("--columns", "--sort"):
             code, out, err = main("show", str(quick_run), option, "solvr")

@@ -119,6 +119,7 @@ def _clean(db: sqlite3.Connection, table: str, column: str, folders: Sequence[re
     values = db.execute(
         f'SELECT DISTINCT CAST("{column}" AS BLOB) FROM "{table}" WHERE "{column}" IS NOT NULL'
     ).fetchall()
+    names = [_word(name) for _, name in _identities()] if column not in NAMES else []
     changed = 0
     for (value,) in values:
         text = value.decode(errors="surrogateescape")
@@ -126,8 +127,8 @@ def _clean(db: sqlite3.Connection, table: str, column: str, folders: Sequence[re
         for folder in folders:
             new = folder.sub(LEFT_OUT, new)
         new = PATH.sub(_file, new)
-        for _, name in _identities() if column not in NAMES else ():
-            new = _word(name).sub(LEFT_OUT, new)
+        for name in names:
+            new = name.sub(LEFT_OUT, new)
         if new != text:
             changed += 1
             db.execute(
