@@ -173,6 +173,23 @@ def test_commands_refuse_a_damaged_cell_by_its_name(results: Path, main: Main) -
     assert not (results.parent / "report.html").exists()
 
 
+def test_of_the_first_rows_alone_damage_is_noticed_in_their_cells(results: Path, main: Main) -> None:
+    with closing(sqlite3.connect(results)) as db:
+        order = "problem, dual, primal, primal_tol DESC, solver, pod_tol DESC, dual_tol DESC"
+        first, *_, last = [cell for (cell,) in db.execute(f"SELECT cell FROM cells ORDER BY {order}")]
+        db.execute("UPDATE queries SET error_u = error_u * (1 + 1e-15) WHERE cell = ?", (last,))
+        db.commit()
+    shown = ("show", str(results.parent), "--table", "queries", "--limit", "1")
+    assert main(*shown)[0] == 0
+    code, _, errors = main("show", str(results.parent), last, "--table", "queries", "--limit", "1")
+    assert (code, f"rows of the cell {last} in the table 'queries'" in errors) == (2, True)
+    with closing(sqlite3.connect(results)) as db:
+        db.execute("DELETE FROM queries WHERE cell = ? AND query = 1", (first,))
+        db.commit()
+    code, _, errors = main(*shown)
+    assert (code, f"rows of the cell {first} in the table 'queries'" in errors) == (2, True)
+
+
 def study(path: Path) -> dict[str, Any]:
     return study_of(path, read_meta(path))
 

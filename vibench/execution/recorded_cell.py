@@ -106,7 +106,7 @@ class RecordedCell:
 
     def rows(self, table: str) -> dict[int, dict[str, Any]]:
         """The cell's rows of the queries or the solutions table, by query."""
-        names, rows = read_rows(self.path, table, self.row["cell"])
+        names, rows = read_rows(self.path, table, (self.row["cell"],))
         named = [dict(zip(names, row, strict=True)) for row in rows]
         return {int(row["query"]): row for row in named}
 

@@ -6,6 +6,7 @@ plugin is a line beside the table, which has all other columns.
 
 from __future__ import annotations
 
+import contextlib
 import re
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -87,6 +88,15 @@ def extended_tables(names: Collection[str], read: Read) -> dict[str, Extended]:
             elif column.table in extended:
                 extended[column.table] = _with_column(extended[column.table], plugin, column, tables)
     return extended
+
+
+def is_extended(table: str) -> bool:
+    """Whether a plugin declares a column of a table, which may depend on any of its rows."""
+    for plugin in registered(FIGURE):
+        with contextlib.suppress(VibenchError):  # the line about it is beside the table
+            if any(column.table == table for column in declared(plugin, loaded(plugin))):
+                return True
+    return False
 
 
 def faults_of(extended: Iterable[Extended]) -> list[str]:

@@ -7,6 +7,7 @@ import re
 import sqlite3
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -15,6 +16,7 @@ from vibench.arrays import Array
 from vibench.errors import RequestError, unknown_name
 from vibench.results.columns import PARAMETER, STORED
 from vibench.results.plugin_columns import Extended
+from vibench.results.sqlite.digests import of_cells
 from vibench.results.sqlite.reading import open_read_only
 from vibench.text import printable
 
@@ -36,6 +38,7 @@ def matching(
     columns: Iterable[str],
     plugins: Extended | None = None,
     made: Collection[str] = (),
+    cells: Sequence[str] = (),
 ) -> Array:
     """Which rows of a table satisfy an expression of SQLite over its columns, in the order they are read in.
 
@@ -44,11 +47,41 @@ def matching(
     runs on a copy in memory.
 
     Of the columns that the table has one is suggested for a name that is none. `plugins` is the table with its columns
-    of plugins, if it has any; `made` are columns of what is made of the rows, which they do not have themselves.
+    of plugins, if it has any; `made` are columns of what is made of the rows, which they do not have themselves. With
+    `cells`, only the rows of these are judged.
 
     Raises a `RequestError` if it is no such expression, or names a column that the table does not have.
     """
-    outside = QUOTED.sub("''", expression)
+    query = f'SELECT ({expression}) IS TRUE FROM "{table}" NOT INDEXED WHERE {of_cells(cells)} ORDER BY rowid'
+    with _opened(path, table, expression, plugins) as db:
+        found = _answers(db, table, expression, (query, cells), columns, made)
+    return np.array([matches for (matches,) in found], dtype=bool)
+
+
+def cells_of_first(path: Path, table: str, expression: str, order: Sequence[str], limit: int) -> list[str]:
+    """Cells of the first `limit` rows that satisfy an expression, as in `matching`; without one, of all rows.
+
+    `order` are terms of SQL. No other rows are kept in memory, and their digests are not compared.
+
+    Raises a `RequestError` if it is no such expression, or names a column that the table does not have.
+    """
+    condition = f"({expression})" if expression else "TRUE"
+    query = f'SELECT cell FROM "{table}" NOT INDEXED WHERE {condition} ORDER BY {", ".join(order)} LIMIT {limit}'
+    with open_read_only(path) as db:
+        found = _answers(db, table, expression or "TRUE", (query, ()), STORED[table], ())
+    return list(dict.fromkeys(str(cell) for (cell,) in found))
+
+
+def _answers(
+    db: sqlite3.Connection,
+    table: str,
+    expression: str,
+    query: tuple[str, Sequence[str]],
+    columns: Iterable[str],
+    made: Collection[str],
+) -> list[tuple[Any, ...]]:
+    """What a query with an expression and its values gives, if the expression is one that may run."""
+    outside = _text_free(expression)
     if len(expression) > LONGEST:
         raise RequestError(f"--where has {len(expression)} characters, at most {LONGEST} are read")
     if re.search(r'["`;\[\]\'?@$#:\0]|--|/\*', outside.replace("''", "")):
@@ -64,26 +97,29 @@ def matching(
         return sqlite3.SQLITE_OK if fine else sqlite3.SQLITE_DENY
 
     selects = iter(["the one around the expression"])
-    query = f'SELECT ({expression}) IS TRUE FROM "{table}" NOT INDEXED ORDER BY rowid'
-    with _opened(path, table, outside, plugins) as db:
-        db.setlimit(sqlite3.SQLITE_LIMIT_EXPR_DEPTH, 100)
-        db.set_authorizer(allowed)
-        try:
-            return np.array([matches for (matches,) in db.execute(query)], dtype=bool)
-        except sqlite3.Error as error:
-            unknown = re.fullmatch(r"no such column: (.+)", str(error))
-            if unknown and unknown[1] in made:
-                about = f"'{unknown[1]}' is a column of the table alone, for --columns and --sort"
-                raise RequestError(f"--where selects rows of {table}, of which the table is made; {about}") from None
-            if unknown:
-                raise unknown_name(f"column of {table}", printable(unknown[1]), columns) from None
-            raise _wrong(expression, _in_words(error)) from None
+    db.setlimit(sqlite3.SQLITE_LIMIT_EXPR_DEPTH, 100)
+    db.set_authorizer(allowed)
+    try:
+        return db.execute(*query).fetchall()
+    except sqlite3.Error as error:
+        unknown = re.fullmatch(r"no such column: (.+)", str(error))
+        if unknown and unknown[1] in made:
+            about = f"'{unknown[1]}' is a column of the table alone, for --columns and --sort"
+            raise RequestError(f"--where selects rows of {table}, of which the table is made; {about}") from None
+        if unknown:
+            raise unknown_name(f"column of {table}", printable(unknown[1]), columns) from None
+        raise _wrong(expression, _in_words(error)) from None
+
+
+def _text_free(expression: str) -> str:
+    """An expression without what its texts in quotes say."""
+    return QUOTED.sub("''", expression)
 
 
 @contextlib.contextmanager
 def _opened(path: Path, table: str, expression: str, plugins: Extended | None) -> Iterator[sqlite3.Connection]:
     """Context with the results file, or with a table in memory for an expression that names a column of a plugin."""
-    if plugins is None or not any(re.search(rf"(?i)\b{name}\b", expression) for name in plugins.columns):
+    if plugins is None or not any(re.search(rf"(?i)\b{name}\b", _text_free(expression)) for name in plugins.columns):
         with open_read_only(path) as db:
             yield db
         return

@@ -21,6 +21,7 @@ from vibench.results.columns import (
     CELLS,
     INTEGER,
     KEYS,
+    PARAMETER,
     REAL,
     STORED,
     TABLES,
@@ -58,14 +59,14 @@ def results_file(run: str) -> Path:
     raise RequestError(f"no results in '{run}': expected a folder with {FILE}, as `vibench run` makes under runs/")
 
 
-def read(path: Path, table: str) -> pd.DataFrame:
-    """One table of a results file, in the order in which its rows were written.
+def read(path: Path, table: str, cells: Sequence[str] = ()) -> pd.DataFrame:
+    """One table of a results file, or its rows of some cells, in the order in which they were written.
 
     Raises a `RequestError` if they are damaged, or have a value that is none of its column.
     """
-    names, rows = read_rows(path, table)
+    names, rows = read_rows(path, table, cells)
     frame = pd.DataFrame.from_records(rows, columns=names, coerce_float=True)
-    for name, column in STORED.get(table, {}).items():
+    for name, column in ((name, STORED[table].get(name, PARAMETER)) for name in frame.columns):
         if column.kind.startswith(BLOB) or pd.api.types.is_numeric_dtype(frame[name]):
             continue
         number = column.kind.startswith((REAL, INTEGER))
@@ -88,12 +89,14 @@ RIGHT: Mapping[str, tuple[Callable[[object], bool], str]] = {
 """What the values of some columns of texts have to be, and how it is said."""
 
 
-def extended(path: Path, table: str) -> Extended:
+def extended(path: Path, table: str, cells: Sequence[str] = ()) -> Extended:
     """One table of a results file with the columns that plugins add to it, in the order in which it was written.
+
+    With `cells`, only the rows of these are read: no plugin may add a column to the table, which may depend on others.
 
     Raises a `RequestError` if it is damaged; what is wrong with a plugin is among the faults instead.
     """
-    return extended_tables(path, (table,))[table]
+    return plugin_columns.extended_tables((table,), partial(read, path, cells=cells))[table]
 
 
 def extended_tables(path: Path, names: Collection[str]) -> dict[str, Extended]:
@@ -137,10 +140,23 @@ def export(path: Path, folder: Path, note: Callable[[str], None] = lambda _: Non
 def in_order(frame: pd.DataFrame) -> pd.DataFrame:
     """Rows sorted by the columns that identify them, loose tolerances first, whatever order cells finished in."""
     by = [name for name in ORDER if name in frame.columns]
-    ascending = ["_tol" not in name for name in by]
+    ascending = [_rises(name) for name in by]
     return frame.sort_values(
         by, ascending=ascending, kind="stable", na_position="first", ignore_index=True, key=_without_correction_first
     )
+
+
+def terms_in_order(names: Collection[str]) -> list[str]:
+    """The order of `in_order` as terms of SQL, for a table with columns of these names."""
+    by = [name for name in ORDER if name in names and name != "correction"]
+    terms = {name: f'"{name}" IS NOT NULL, "{name}" {"ASC" if _rises(name) else "DESC"}' for name in by}
+    terms |= {"correction": f"correction IS NOT '{UNCORRECTED}'"} if "correction" in names else {}
+    return [*(terms[name] for name in ORDER if name in terms), "rowid"]
+
+
+def _rises(name: str) -> bool:
+    """Whether the smallest value of a column comes first."""
+    return "_tol" not in name
 
 
 def _without_correction_first(column: pd.Series) -> pd.Series:

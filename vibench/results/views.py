@@ -12,7 +12,7 @@ from typing import NoReturn
 import pandas as pd
 
 from vibench.errors import RequestError, unknown_name
-from vibench.results import ranking, selection, tables
+from vibench.results import plugin_columns, ranking, selection, tables
 from vibench.results.columns import CELLS, STORED, THRESHOLDS, Column
 from vibench.results.formats import cell_text
 from vibench.results.plugin_columns import Extended
@@ -186,19 +186,20 @@ def look_up(
     """
     if name not in VIEWS:
         raise unknown_name("table", name, VIEWS)
-    view, extended = _measured(path, name, error, largest is not None)
+    needed = _cells_needed(path, VIEWS[name], cell, where, sort, limit) if not error and largest is None else ()
+    view, extended = _measured(path, name, error, largest is not None, needed)
     view, frame = _with_columns(view, extended.columns), extended.frame
-    keys = frame.get("cell", [])
+    everything = tables.read(path, "cells") if needed else frame
+    keys = everything.get("cell", [])
     if where:
         made = set(view.headings or {}) - set(frame.columns)
-        frame = frame[selection.matching(path, view.source, where, frame.columns, extended, made)]
+        frame = frame[selection.matching(path, view.source, where, frame.columns, extended, made, needed)]
         if frame.empty:  # what keeps rows out of the table is not why there are none
             view = replace(view, empty="")
     if cell:
         if "cell" not in frame:
             raise RequestError(f"the table {name} has no rows of one cell; expected {', '.join(OF_ONE_CELL)}")
-        known = map(str, tables.read(path, "cells")["cell"])
-        frame = frame[frame["cell"] == selection.key_of(cell, known, str(path.parent))]
+        frame = frame[frame["cell"] == _key_of(path, cell)]
     rows = view.rows(frame if largest is None else ranking.within(frame, largest))
     by_heading = {column.heading: key for key, column in (view.headings or {}).items() if column.heading}
     if sort:
@@ -213,7 +214,36 @@ def look_up(
     default = [column for column in dict.fromkeys(view.columns) if column in rows]
     shown = rows.head(limit) if limit else rows
     listed, length = tuple(dict.fromkeys(asked or default)), selection.short_keys(keys)
-    return Table(shown, listed, view, bool(asked), length, _varying_options(extended.frame), extended.faults)
+    return Table(shown, listed, view, bool(asked), length, _varying_options(everything), extended.faults)
+
+
+LARGE = ("queries", "timings", "outputs")
+"""Tables with many rows of each cell, in which whatever tells cells apart is that of their row in the table cells."""
+
+FEW = 100
+"""Cells up to which only their rows are read."""
+
+
+def _cells_needed(path: Path, view: View, cell: str, where: str, sort: Sequence[str], limit: int) -> Sequence[str]:
+    """Cells of all rows of a large table that are asked for, where they are few; none where all rows are read."""
+    named = [key.removeprefix("-") for key in sort]
+    if view.source not in LARGE or not (cell or limit) or plugin_columns.is_extended(view.source):
+        return ()
+    if cell:
+        return (_key_of(path, cell),)
+    if not set(STORED[view.source]).issuperset(named):  # a parameter, or no column at all
+        return ()
+    first = [
+        f'"{name}" IS NULL, "{name}" {"DESC" if key.startswith("-") else "ASC"}'
+        for key, name in zip(sort, named, strict=True)
+    ]
+    order = [*first, *tables.terms_in_order(STORED[view.source])]
+    cells = selection.cells_of_first(path, view.source, where, order, limit)
+    return cells if len(cells) <= FEW else ()
+
+
+def _key_of(path: Path, cell: str) -> str:
+    return selection.key_of(cell, map(str, tables.read(path, "cells")["cell"]), str(path.parent))
 
 
 def _varying_options(frame: pd.DataFrame) -> dict[tuple[str, str], tuple[str, ...]]:
@@ -256,9 +286,9 @@ def _with_options(name: str, text: str | None, keys: Sequence[str]) -> str:
     return " ".join([name, *(f"{key} {given[key]}" for key in keys if key in given)])
 
 
-def _measured(path: Path, name: str, error: str, limited: bool) -> tuple[View, Extended]:
-    """A table for reading and its rows, with errors by the measure that is asked for."""
-    view, extended = VIEWS[name], tables.extended(path, VIEWS[name].source)
+def _measured(path: Path, name: str, error: str, limited: bool, cells: Sequence[str]) -> tuple[View, Extended]:
+    """A table for reading and its rows, or those of some cells, with errors by the measure that is asked for."""
+    view, extended = VIEWS[name], tables.extended(path, VIEWS[name].source, cells)
     if not error and not limited:
         return view, extended
     if name != "best" and view.source != "thresholds":

@@ -9,6 +9,7 @@ import math
 import re
 import shutil
 import subprocess
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -372,3 +373,30 @@ def test_a_real_run_times_what_its_cells_are_made_of(quick_run: Path) -> None:
     np.testing.assert_array_equal(fine.size().loc[frame["cell"]], frame["queries_ok"])
     np.testing.assert_allclose(queries.groupby("cell")["hf_s"].median().loc[frame["cell"]], frame["hf_s"])
     assert (frame[["offline_snapshots_s", "online_s", "hf_s"]] > 0.0).all(axis=None)
+
+
+@pytest.mark.parametrize("table", ["queries", "timings"])
+@pytest.mark.parametrize("where", ["", "total_s > 0.001 and solver != 'osqp'"])
+@pytest.mark.parametrize("sort", [(), ("-total_s",), ("accuracy", "solver"), ("-primal_tol", "cell")])
+def test_the_first_rows_are_those_of_the_whole_table_and_others_are_not_read(
+    table: str, where: str, sort: tuple[str, ...], quick_run: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path, read = quick_run / FILE, tables.read
+    whole = look_up(path, table, where=where, sort=sort)
+    sizes = []
+
+    def noted(path: Path, name: str, cells: Sequence[str] = ()) -> pd.DataFrame:
+        found = read(path, name, cells)
+        sizes.extend([len(found)] * (name == table))
+        return found
+
+    monkeypatch.setattr(tables, "read", noted)
+    first = look_up(path, table, where=where, sort=sort, limit=3)
+    pd.testing.assert_frame_equal(first.rows, whole.rows.head(3))
+    assert (first.columns, first.varying) == (whole.columns, whole.varying)
+    cell = str(whole.rows["cell"].iloc[-1])
+    of_cell = look_up(path, table, cell=cell, where=where, sort=sort)
+    mine = whole.rows[whole.rows["cell"] == cell].reset_index(drop=True)
+    pd.testing.assert_frame_equal(of_cell.rows, mine, check_dtype=False)
+    assert len(sizes) == 2
+    assert max(sizes) < len(read(path, table)) / 4

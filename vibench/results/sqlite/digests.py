@@ -55,22 +55,21 @@ class Digests:
         """Cells whose rows are not those that were written; "" for a table without cells."""
         return self._compared(table, *self._read(table))
 
-    def verified(self, table: str, cell: str = "") -> tuple[list[str], list[tuple[Any, ...]]]:
-        """Columns and rows of a table, or those of one cell.
+    def verified(self, table: str, cells: Sequence[str] = ()) -> tuple[list[str], list[tuple[Any, ...]]]:
+        """Columns and rows of a table, or those of some cells.
 
         Raises a `DigestError` if they are not those that were written.
         """
-        names, rows = self._read(table, cell)
-        if changed := self._compared(table, names, rows, cell):
+        names, rows = self._read(table, cells)
+        if changed := self._compared(table, names, rows, cells):
             whose = f" of the cell {changed[0]}" if changed[0] else ""
             raise DigestError(f"rows{whose} in the table '{table}' are not those that were written")
         return names, rows
 
-    def _read(self, table: str, cell: str = "") -> tuple[list[str], list[tuple[Any, ...]]]:
+    def _read(self, table: str, cells: Sequence[str] = ()) -> tuple[list[str], list[tuple[Any, ...]]]:
         # An index may be damaged, too: the table itself is read.
-        same, values = ("WHERE cell = ?", (cell,)) if cell else ("", ())
         try:
-            cursor = self._db.execute(f'SELECT * FROM "{table}" NOT INDEXED {same}', values)
+            cursor = self._db.execute(f'SELECT * FROM "{table}" NOT INDEXED WHERE {of_cells(cells)}', cells)
         except UnicodeDecodeError:  # of the name of a column
             raise DigestError(f"the columns of the table '{table}' are not those that were written") from None
         names = [column[0] for column in cursor.description]
@@ -80,13 +79,18 @@ class Digests:
         return names, rows
 
     def _compared(
-        self, table: str, names: Sequence[str], rows: Sequence[tuple[Any, ...]], cell: str = ""
+        self, table: str, names: Sequence[str], rows: Sequence[tuple[Any, ...]], cells: Sequence[str] = ()
     ) -> tuple[str, ...]:
-        same, values = ("AND cell = ?", (table, cell)) if cell else ("", (table,))
-        written = dict(self._db.execute(f"SELECT cell, total FROM digests NOT INDEXED WHERE name = ? {same}", values))
+        query = f"SELECT cell, total FROM digests NOT INDEXED WHERE name = ? AND {of_cells(cells)}"
+        written = dict(self._db.execute(query, (table, *cells)))
         now = {str(key): f"{total:x}" for key, total in _totals(names, rows).items()}
         either = sorted(map(str, written.keys() | now.keys()))
         return tuple(key for key in either if written.get(key, NONE) != now.get(key, NONE))
+
+
+def of_cells(cells: Sequence[str]) -> str:
+    """The condition that a row belongs to one of some cells, which are its values; no cells stand for all."""
+    return f"cell IN ({', '.join('?' * len(cells))})" if cells else "TRUE"
 
 
 def _totals(names: Sequence[str], rows: Sequence[tuple[Any, ...]]) -> dict[Any, int]:

@@ -7,7 +7,7 @@ import os
 import shutil
 import sqlite3
 import tempfile
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -140,15 +140,15 @@ def read_meta(path: Path) -> dict[str, str]:
 STATUSES = tuple(status.value for status in Status)
 
 
-def read_rows(path: Path, table: str, cell: str = "") -> tuple[list[str], list[tuple[Any, ...]]]:
-    """Columns and rows of a table of a results file, or those of one cell, in the order in which they were written.
+def read_rows(path: Path, table: str, cells: Sequence[str] = ()) -> tuple[list[str], list[tuple[Any, ...]]]:
+    """Columns and rows of a table of a results file, or those of some cells, in the order in which they were written.
 
     Raises a `RequestError` if they are damaged, or have a status that does not exist.
     """
     try:
         with open_read_only(path) as db, db:
             db.execute("BEGIN")  # a run that writes in between changes neither rows nor digests
-            names, rows = Digests(db).verified(table, cell)
+            names, rows = Digests(db).verified(table, cells)
     except DigestError as error:
         what = "run its study again, which computes damaged cells anew"
         raise RequestError(f"'{path}' is damaged: {error}; {what}") from None
