@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Set
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
+from heapq import heappop, heappush
 
 from vibench.stages.base import Stage
 
@@ -11,6 +12,8 @@ from vibench.stages.base import Stage
 @dataclass
 class Graph:
     """The stages of a run, by key: the goals, and the stages that they need.
+
+    What begins, ends or is lost costs as many steps as it has neighbours, however many others wait.
 
     Attributes
     ----------
@@ -22,7 +25,11 @@ class Graph:
 
     stages: dict[str, Stage] = field(default_factory=dict)
     waiting: dict[str, set[str]] = field(default_factory=dict)
-    _inputs: dict[str, frozenset[str]] = field(default_factory=dict)
+    _needed: dict[str, dict[str, None]] = field(default_factory=dict)
+    """For each stage, those that need it and have not begun, in the order in which they were planned."""
+    _ready: list[tuple[int, str]] = field(default_factory=list)
+    """A heap of the stages whose inputs are done, by their number; some may have been dropped since."""
+    _numbers: dict[str, int] = field(default_factory=dict)
     _goals: set[str] = field(default_factory=set)
     _there: set[str] = field(default_factory=set)
 
@@ -39,22 +46,31 @@ class Graph:
         if is_there(stage):
             self._there.add(stage.key)
             return False
-        needed = {needed.key for needed in stage.inputs() if self._add(needed, is_there)}
+        inputs = {needed.key for needed in stage.inputs() if self._add(needed, is_there)}
+        self._numbers[stage.key] = len(self.stages)
         self.stages[stage.key] = stage
-        self.waiting[stage.key], self._inputs[stage.key] = needed, frozenset(needed)
+        self.waiting[stage.key] = inputs
+        for needed in inputs:
+            self._needed.setdefault(needed, {})[stage.key] = None
+        if not inputs:
+            heappush(self._ready, (self._numbers[stage.key], stage.key))
         return True
 
     def begin(self, count: int) -> Iterator[Stage]:
-        """Take at most `count` stages whose inputs are done; they count as begun."""
-        for key in [key for key, needed in self.waiting.items() if not needed][: max(count, 0)]:
-            del self.waiting[key]
-            yield self.stages[key]
+        """Take at most `count` stages whose inputs are done, in the order of the plan; they count as begun."""
+        while count > 0 and self._ready:
+            _, key = heappop(self._ready)
+            if self.waiting.pop(key, None) is not None:
+                count -= 1
+                yield self.stages[key]
 
     def done(self, stage: Stage) -> None:
         """Note that a stage succeeded; what is planned later does not wait for it."""
         self._there.add(stage.key)
-        for needed in self.waiting.values():
-            needed.discard(stage.key)
+        for key in self._needed.pop(stage.key, ()):
+            self.waiting[key].discard(stage.key)
+            if not self.waiting[key]:
+                heappush(self._ready, (self._numbers[key], key))
 
     def lost(self, stage: Stage) -> list[Stage]:
         """Drop the stages that depend on a failed one, and those that no remaining goal needs.
@@ -62,28 +78,24 @@ class Graph:
         Returns
         -------
         list
-            The goals that are lost, the stage itself among them if it is one.
+            The goals that are lost, the stage itself among them if it is one, in the order of the plan.
         """
-        used_by: dict[str, set[str]] = {}
-        for key, inputs in self._inputs.items():
-            for needed in inputs:
-                used_by.setdefault(needed, set()).add(key)
-        gone = _closure([stage.key], used_by)
-        # Goals that an earlier failure has dropped are not waiting any more, so that each is reported once.
-        lost = {key for key in self._goals & gone if key in self.waiting or key == stage.key}
-        wanted = _closure((self.waiting.keys() & self._goals) - gone, self._inputs)
-        for key in self.waiting.keys() - wanted:
-            del self.waiting[key]
-        return [self.stages[key] for key in self.stages if key in lost]
+        gone, ahead = {stage.key}, [stage.key]
+        while ahead:
+            # What needs a dropped stage was dropped with it, and is not listed any more.
+            more = self._needed.pop(ahead.pop(), {}).keys() - gone
+            gone |= more
+            ahead += more
+        self._drop(gone - {stage.key})
+        return [self.stages[key] for key in sorted(gone & self._goals, key=self._numbers.__getitem__)]
 
-
-def _closure(keys: Iterable[str], edges: Mapping[str, Set[str]]) -> set[str]:
-    """The keys and all that can be reached from them."""
-    reached: set[str] = set()
-    ahead = list(keys)
-    while ahead:
-        key = ahead.pop()
-        if key not in reached:
-            reached.add(key)
-            ahead += edges.get(key, ())
-    return reached
+    def _drop(self, keys: set[str]) -> None:
+        """Drop stages that wait, and those that nothing else needs."""
+        ahead = list(keys)
+        while ahead:
+            key = ahead.pop()
+            for needed in self.waiting.pop(key):
+                others = self._needed.get(needed, {})
+                others.pop(key, None)
+                if needed in self.waiting and not others and needed not in self._goals and needed not in keys:
+                    ahead.append(needed)

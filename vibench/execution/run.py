@@ -171,11 +171,9 @@ def run_study(study: Study, folder: Path, observer: Observer, options: Options =
             todo = [cell for cell in cells if _to_do(cell, finished, options.retry)]
             run = _Run(study, folder, store, ResultWriter(study, database, labels_of(cells)), observer, options)
             interrupted = run.execute(cells, todo)
-            everything = database.rows("cells")
+            everything = list(database.rows("cells"))
             database.replace("thresholds", break_even_rows(everything, database.rows("timings")))
-            database.replace(
-                "disagreements", disagreement_rows(everything, database.rows("queries"), database.rows("solutions"))
-            )
+            database.replace("disagreements", disagreement_rows(everything, database.fine_solutions))
         finally:
             database.close()
     keys = {cell.key for cell in cells}

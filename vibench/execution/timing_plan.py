@@ -31,6 +31,7 @@ class TimingPlan:
     goals: Mapping[Cell, CellQueries]
     rounds: int
     writer: ResultWriter
+    _groups: dict[tuple[object, ...], list[Cell]] = field(default_factory=dict)
     _open: dict[tuple[object, ...], set[Cell]] = field(default_factory=dict)
     _planned: dict[str, list[Cell]] = field(default_factory=dict)
 
@@ -44,20 +45,19 @@ class TimingPlan:
         """
         waiting = set(todo)
         for cell in self.goals:
-            self._open.setdefault(_group(cell), set())
-            if cell in waiting:
-                self._open[_group(cell)].add(cell)
+            self._groups.setdefault(_group(cell), []).append(cell)
+        self._open = {group: waiting.intersection(cells) for group, cells in self._groups.items()}
         complete = [group for group, left in self._open.items() if not left]
         return [stage for group in complete if (stage := self._stage(group)) is not None]
 
     def ended(self, cell: Cell) -> TimingRounds | None:
         """Note that a cell has its row; the stage of its group if it was the last one."""
-        left = self._open[_group(cell)]
-        left.discard(cell)
-        return None if left else self._stage(_group(cell))
+        group = _group(cell)
+        self._open[group].discard(cell)
+        return None if self._open[group] else self._stage(group)
 
     def _stage(self, group: tuple[object, ...]) -> TimingRounds | None:
-        rows = {cell: self.writer.database.cell(cell.key) for cell in self.goals if _group(cell) == group}
+        rows = {cell: self.writer.database.cell(cell.key) for cell in self._groups[group]}
         members = {cell: row for cell, row in rows.items() if row is not None and row["queries_ok"]}
         if all(row["timing_rounds"] == self.rounds for row in members.values()):
             return None
@@ -71,13 +71,12 @@ class TimingPlan:
         """Write the seconds of a group, or why there are none; a stage that is not of this plan is ignored."""
         if not isinstance(stage, TimingRounds):
             return
-        members = self._planned[stage.key]
-        for cell in members:
-            if isinstance(outcome, Failed):
-                timed = TimedCell((), "", f"all rounds: {outcome.reason}")
-            else:
-                timed = outcome[stage.cells.index(self.goals[cell])]
-            self.writer.seconds(cell, timed, self.rounds)
+        if isinstance(outcome, Failed):
+            outcome = (TimedCell((), "", f"all rounds: {outcome.reason}"),) * len(stage.cells)
+        # By key: comparing two stages compares all that they depend on.
+        timed = dict(zip((one.key for one in stage.cells), outcome, strict=True))
+        for cell in self._planned.pop(stage.key):
+            self.writer.seconds(cell, timed[self.goals[cell].key], self.rounds)
 
 
 def _group(cell: Cell) -> tuple[object, ...]:

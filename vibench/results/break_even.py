@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any
@@ -122,7 +122,9 @@ VALIDATION = ("validation", "validation_options")
 _SHARED = tuple(name for name in THRESHOLDS if name in KEYS)
 
 
-def break_even_rows(cells: Iterable[Mapping[str, Any]], timings: Iterable[Mapping[str, Any]]) -> list[dict[str, Any]]:
+def break_even_rows(
+    cells: Iterable[Mapping[str, Any]], timings: Iterable[Mapping[str, Any]]
+) -> Iterator[dict[str, Any]]:
     """Rows of the thresholds table from rows of the tables of cells and timings.
 
     Every per-parameter enrichment (a) is compared with every fixed one (b) of the same problem, cone, tolerances and
@@ -131,14 +133,19 @@ def break_even_rows(cells: Iterable[Mapping[str, Any]], timings: Iterable[Mappin
     (b). Cells without an ok query are left out.
     """
     timed, resampling = [cell for cell in cells if cell["online_s"] is not None], _Resampling(timings)
-    rows = []
+    alike: dict[tuple[Any, ...], list[Mapping[str, Any]]] = {}
+    for cell in timed:
+        alike.setdefault(_alike(cell), []).append(cell)
     for b in timed:
         model = {"cell": None, "primal": HIGH_FIDELITY, "primal_tol": None, "assembly": ""}
         model |= {"offline_s": b["hf_setup_s"], "online_s": b["hf_s"]}
-        rows.append(_row(model, b, resampling.against_high_fidelity(b)))
-        alike = [a for a in timed if all(a[name] == b[name] for name in (*_SHARED, *VALIDATION, "machine"))]
-        rows += [_row(a, b, resampling.between(a, b)) for a in alike if _compared(a, b)]
-    return rows
+        yield _row(model, b, resampling.against_high_fidelity(b))
+        yield from (_row(a, b, resampling.between(a, b)) for a in alike[_alike(b)] if _compared(a, b))
+
+
+def _alike(cell: Mapping[str, Any]) -> tuple[Any, ...]:
+    """What cells that are compared have in common."""
+    return tuple(cell[name] for name in (*_SHARED, *VALIDATION, "machine"))
 
 
 def _compared(a: Mapping[str, Any], b: Mapping[str, Any]) -> bool:

@@ -207,9 +207,7 @@ class ResultsDatabase:
 
     def cell(self, key: str) -> dict[str, Any] | None:
         """The row of a cell, if it has one."""
-        cursor = self._db.execute("SELECT * FROM cells WHERE cell = ?", (key,))
-        cursor.row_factory = sqlite3.Row
-        return next(map(dict, cursor), None)
+        return next(self._selected("SELECT * FROM cells WHERE cell = ?", key), None)
 
     def write_histories(self, histories: Sequence[Sequence[Mapping[str, Any]]], *, partial: bool = False) -> None:
         """Write histories, each given as its rows; earlier histories of the same name are replaced.
@@ -222,13 +220,13 @@ class ResultsDatabase:
                 within = f" AND step BETWEEN {min(steps)} AND {max(steps)}" if partial else ""
                 self._replace("histories", {name: rows[0].get(name) for name in NAMED}, rows, within)
 
-    def replace(self, table: str, rows: Sequence[Mapping[str, Any]], **keys: Any) -> None:
+    def replace(self, table: str, rows: Iterable[Mapping[str, Any]], **keys: Any) -> None:
         """Replace all rows of a table, or those with these values in the columns `keys`."""
         with self._writing():
             self._replace(table, keys, rows)
 
     def _replace(
-        self, table: str, keys: Mapping[str, Any], rows: Sequence[Mapping[str, Any]], within: str = ""
+        self, table: str, keys: Mapping[str, Any], rows: Iterable[Mapping[str, Any]], within: str = ""
     ) -> None:
         same = " AND ".join(["TRUE", *(f'"{name}" IS ?' for name in keys)]) + within
         values = tuple(storable(table, keys).values())
@@ -240,11 +238,19 @@ class ResultsDatabase:
         self._insert(table, rows)
         self._digests.count(table, same, values)
 
-    def rows(self, table: str) -> list[dict[str, Any]]:
-        """All rows of a table."""
-        cursor = self._db.execute(f"SELECT * FROM {table}")
+    def rows(self, table: str) -> Iterator[dict[str, Any]]:
+        """All rows of a table, one after the other."""
+        return self._selected(f"SELECT * FROM {table}")
+
+    def fine_solutions(self, cell: str) -> Iterator[dict[str, Any]]:
+        """Rows of the solutions table: those of the ok queries of a cell."""
+        fine = "SELECT query FROM queries WHERE cell = ? AND status = 'ok'"
+        return self._selected(f"SELECT * FROM solutions WHERE cell = ? AND query IN ({fine})", cell, cell)
+
+    def _selected(self, command: str, *values: str) -> Iterator[dict[str, Any]]:
+        cursor = self._db.execute(command, values)
         cursor.row_factory = sqlite3.Row
-        return [dict(row) for row in cursor]
+        return map(dict, cursor)
 
     @contextlib.contextmanager
     def _writing(self) -> Iterator[None]:

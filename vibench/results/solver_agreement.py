@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from itertools import combinations
 from typing import TYPE_CHECKING, Any
@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from vibench.arrays import Array
-from vibench.qp.status import Status
 from vibench.qp.verification import Slack, allowed
 from vibench.results.columns import DISAGREEMENTS, KEYS
 
@@ -44,22 +43,28 @@ class Recorded:
 
 
 def disagreement_rows(
-    cells: Iterable[Mapping[str, Any]], queries: Iterable[Mapping[str, Any]], solutions: Iterable[Mapping[str, Any]]
-) -> list[dict[str, Any]]:
-    """Rows of the disagreements table from rows of the cells, queries and solutions tables."""
-    fine = {(row["cell"], row["query"]) for row in queries if row["status"] == Status.OK}
-    by_key = {cell["cell"]: cell for cell in cells if cell["model"]}
-    answers: dict[tuple[str, float], list[Recorded]] = {}
-    for row in solutions:
-        if (row["cell"], row["query"]) in fine:
-            cell, left_open = by_key[row["cell"]], Slack(row["slack_linear"], row["slack_constant"])
-            answer = Recorded(cell["solver"], row["query"], vectors(row)[0], left_open)
-            answers.setdefault((cell["model"], cell["accuracy"]), []).append(answer)
-    keys = {
-        (cell["model"], cell["accuracy"]): {name: cell[name] for name in DISAGREEMENTS if name in KEYS}
-        for cell in by_key.values()
-    }
-    return [keys[programs] | row for programs, given in answers.items() for row in compare(given)]
+    cells: Iterable[Mapping[str, Any]], fine_solutions: Callable[[str], Iterable[Mapping[str, Any]]]
+) -> Iterator[dict[str, Any]]:
+    """Rows of the disagreements table from rows of the cells table.
+
+    `fine_solutions` gives rows of the solutions table, those of the ok queries of a cell, by its key: it is asked for
+    one reduced model after the other, since all solutions of a run may be more than memory holds.
+    """
+    programs: dict[tuple[str, float], list[Mapping[str, Any]]] = {}
+    for cell in cells:
+        if cell["model"]:
+            programs.setdefault((cell["model"], cell["accuracy"]), []).append(cell)
+    for same in programs.values():
+        if len({cell["solver"] for cell in same}) < 2:
+            continue
+        keys = {name: same[-1][name] for name in DISAGREEMENTS if name in KEYS}
+        answers = (_recorded(cell, row) for cell in same for row in fine_solutions(cell["cell"]))
+        yield from (keys | row for row in compare(answers))
+
+
+def _recorded(cell: Mapping[str, Any], row: Mapping[str, Any]) -> Recorded:
+    left_open = Slack(row["slack_linear"], row["slack_constant"])
+    return Recorded(cell["solver"], row["query"], vectors(row)[0], left_open)
 
 
 def sentence(disagreements: pd.DataFrame, solvers: int) -> str:

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import partial
+from functools import lru_cache, partial
 from typing import Any
 
 import numpy as np
 
-from vibench.arrays import Array
+from vibench.arrays import Array, Indices
 from vibench.interfaces.problem import VariationalInequality
 from vibench.interfaces.validation import checked_assembly
 from vibench.model.certificates.bounds import OnlineCertificate
@@ -99,7 +99,7 @@ class TimingRounds(ItemwiseStage):
     def place(self, item: int) -> tuple[int, int]:
         """The round and the cell of a item."""
         number, within = divmod(item, len(self.cells))
-        return number, int(np.random.default_rng(number).permutation(len(self.cells))[within])
+        return number, int(_order(number, len(self.cells))[within])
 
     def stage_of(self, number: int) -> CellQueries:
         """The cell of a item: processes take turns where its plugins are of other packages than the next one's."""
@@ -108,6 +108,12 @@ class TimingRounds(ItemwiseStage):
     def begin(self, store: Store) -> _Rounds:
         """Models are loaded when they are first needed; cells that differ in their solver alone share one."""
         return _Rounds(self, store)
+
+
+@lru_cache(maxsize=2)
+def _order(number: int, cells: int) -> Indices:
+    """The order of the cells in a round."""
+    return np.random.default_rng(number).permutation(cells)
 
 
 class _Rounds(Items):

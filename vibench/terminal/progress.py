@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
-from statistics import fmean
 from typing import Any
 
 from rich.console import Console
@@ -33,7 +32,8 @@ class TimeLeft:
 
     def __init__(self, pending: Sequence[Stage], jobs: int) -> None:
         self._left = Counter(stage.sort for stage in pending)
-        self._done: dict[str, list[float]] = {}
+        self._done: Counter[str] = Counter()
+        self._walls: defaultdict[str, float] = defaultdict(float)
         self._jobs = jobs
 
     def add(self, stage: Stage) -> None:
@@ -43,14 +43,16 @@ class TimeLeft:
     def done(self, stage: Stage, wall: float) -> None:
         """Count a finished stage."""
         self._left[stage.sort] -= 1
-        self._done.setdefault(stage.sort, []).append(wall)
+        self._done[stage.sort] += 1
+        self._walls[stage.sort] += wall
 
     def seconds(self) -> float | None:
         """Seconds left, `None` before there is anything to judge by."""
         if not self._done:
             return None
-        every = [wall for walls in self._done.values() for wall in walls]
-        left = (max(count, 0) * fmean(self._done.get(sort, every)) for sort, count in self._left.items())
+        mean = sum(self._walls.values()) / self._done.total()
+        means = {sort: self._walls[sort] / count for sort, count in self._done.items()}
+        left = (max(count, 0) * means.get(sort, mean) for sort, count in self._left.items())
         return sum(left) / self._jobs
 
 

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cache, cached_property
 
 import pytest
+from counting import growth
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -84,6 +86,32 @@ def test_what_fails_takes_its_goals_along_and_nothing_else(
     assert len(begun) == len(set(begun))
     assert not there & set(begun)
     assert sorted([*lost, *(name for name in begun if name.startswith("goal"))]) == sorted(goal.name for goal in goals)
+
+
+def test_a_stage_costs_the_same_however_many_wait() -> None:
+    """A run of many cells that share a stage; of every third one a stage fails that only it needs."""
+
+    def run(cells: int) -> Callable[[], object]:
+        shared = Node("shared")
+        own = [Node(f"own{k}", (shared,)) for k in range(cells)]
+        goals = [Node(f"goal{k}", (shared, needed)) for k, needed in enumerate(own)]
+
+        failing = {node.name for node in own[::3]}
+
+        def work() -> None:
+            graph = Graph()
+            for goal in goals:
+                graph.add_goal(goal, lambda _: False)
+            while graph.waiting:
+                for stage in graph.begin(2):
+                    if stage.key in failing:
+                        assert [goal.key for goal in graph.lost(stage)] == [stage.key.replace("own", "goal")]
+                    else:
+                        graph.done(stage)
+
+        return work
+
+    assert growth(run, 50) < 1.1
 
 
 Goals = dict[str, tuple[Stage, frozenset[str]]]

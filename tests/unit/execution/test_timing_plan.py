@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
+from counting import growth
 from samples import cell_row, query_rows
 
 from vibench.execution.result_writer import ResultWriter, labels_of
@@ -140,4 +144,27 @@ def test_the_machine_that_timed_a_cell_is_named(writer: ResultWriter) -> None:
 
 def test_what_is_not_timing_is_none_of_its_business(writer: ResultWriter) -> None:
     plan_of(writer).record(cell_queries(GROUP[0], 20.0), Failed(Status.ERROR, "anything"))
-    assert writer.database.rows("cells") == []
+    assert list(writer.database.rows("cells")) == []
+
+
+def test_a_group_costs_the_same_however_many_there_are() -> None:
+    def run(groups: int) -> Callable[[], object]:
+        tolerances = [0.1 / (k + 1) for k in range(groups)]
+        asked = {"problem": ["obstacle"], "dual": ["mcpg"], "primal": ["decorrelated"], "pod": tolerances}
+        cells = expand(read_study("quick", asked))
+        goals = {cell: cell_queries(cell, 20.0) for cell in cells}
+        assert all(goal.key for goal in goals.values())  # hashed before the count
+        rows = {"queries_ok": 4, "timing_rounds": None}
+        database = SimpleNamespace(cell=lambda _: rows, fine_queries=lambda _: (0, 1))
+        writer: Any = SimpleNamespace(database=database, seconds=lambda *_: None)
+
+        def work() -> None:
+            plan = TimingPlan(goals, 1, writer)
+            plan.start(cells)
+            for cell in cells:
+                if (stage := plan.ended(cell)) is not None:
+                    plan.record(stage, Failed(Status.ERROR, "not here"))
+
+        return work
+
+    assert growth(run, 8) < 1.1

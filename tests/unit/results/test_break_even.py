@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 import numpy as np
 import pytest
+from counting import growth
 from hypothesis import assume, given
 from hypothesis import strategies as st
 from samples import cell_row
 
-from vibench.results.break_even import BreakEven, Meaning, break_even, break_even_rows
+from vibench.results.break_even import FEWEST_ROUNDS, BreakEven, Meaning, break_even, break_even_rows
 from vibench.results.columns import THRESHOLDS
 
 PAPER = {
@@ -103,7 +104,18 @@ def rounds(cells: Iterable[Mapping[str, Any]], count: int = 12, slow: float = 1.
 
 
 def compared(cells: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    return break_even_rows(cells, rounds(cells))
+    return list(break_even_rows(cells, rounds(cells)))
+
+
+def test_a_cell_costs_the_same_however_many_there_are() -> None:
+    def run(groups: int) -> Callable[[], object]:
+        cells = [
+            cell(*kinds, pod_tol=0.1 / (k + 1)) for k in range(groups) for kinds in (("a", "fixed"), ("b", "none"))
+        ]
+        timings = rounds(cells, FEWEST_ROUNDS)
+        return lambda: list(break_even_rows(cells, timings))
+
+    assert growth(run, 10) < 1.1
 
 
 def pairs(rows: list[dict[str, Any]]) -> list[tuple[str, str]]:

@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 import pandas as pd
 import pytest
@@ -73,7 +75,15 @@ def test_only_ok_answers_of_the_same_reduced_model_are_compared() -> None:
     queries[3]["status"] = "inaccurate"  # cell 2, query 1
     x = np.array([1.0, 2.0])
     solutions = [{"cell": q["cell"], "query": q["query"], **solution_row(x, x, Slack(0.0, 0.0))} for q in queries]
-    (row,) = disagreement_rows(cells, queries, solutions)
+    asked: list[str] = []
+
+    def fine_solutions(cell: str) -> Iterator[dict[str, object]]:
+        asked.append(cell)
+        fine = {q["query"] for q in queries if q["cell"] == cell and q["status"] == "ok"}
+        return (one for one in solutions if one["cell"] == cell and one["query"] in fine)
+
+    (row,) = disagreement_rows(cells, fine_solutions)
+    assert asked == ["1", "2"]  # of one solver alone there is nothing to read
     assert (row["dual"], row["queries"], row["flagged"], row["difference_max"]) == ("of m", 1, 0, 0.0)
 
 

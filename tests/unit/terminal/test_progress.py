@@ -8,6 +8,7 @@ from itertools import pairwise
 from pathlib import Path
 
 import pytest
+from counting import instructions
 from hypothesis import given
 from hypothesis import strategies as st
 from rich.console import Console
@@ -74,6 +75,16 @@ def test_solvers_are_told_apart(queries: list[Stage]) -> None:
     left.done(fast[0], 1.0)
     left.done(slow[0], 10.0)
     assert left.seconds() == pytest.approx(2 * 1.0 + 2 * 10.0)
+
+
+def test_the_time_left_costs_the_same_however_much_is_done() -> None:
+    def estimate(done: int) -> int:
+        left = TimeLeft(PODS, 1)
+        for _ in range(done):
+            left.done(PODS[0], 2.0)
+        return instructions(left.seconds)
+
+    assert estimate(1000) == estimate(10)
 
 
 def test_nothing_is_left_when_all_is_done() -> None:

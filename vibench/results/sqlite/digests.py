@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import marshal
 import sqlite3
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from itertools import groupby
 from typing import Any
 
@@ -41,7 +41,7 @@ class Digests:
     def count(self, table: str, same: str = "TRUE", values: Sequence[Any] = (), *, sign: int = 1) -> None:
         """Add the rows of a table under a condition, before they are changed with `sign` −1."""
         cursor = self._db.execute(f'SELECT * FROM "{table}" WHERE {same}', values)
-        for cell, total in _totals([column[0] for column in cursor.description], cursor.fetchall()).items():
+        for cell, total in _totals([column[0] for column in cursor.description], cursor).items():
             stored = self._db.execute("SELECT total FROM digests WHERE name = ? AND cell = ?", (table, cell)).fetchone()
             now = int(stored[0] if stored else NONE, 16) + sign * total
             self._db.execute("INSERT OR REPLACE INTO digests VALUES (?, ?, ?)", (table, cell, f"{now:x}"))
@@ -53,33 +53,34 @@ class Digests:
 
     def changed(self, table: str) -> tuple[str, ...]:
         """Cells whose rows are not those that were written; "" for a table without cells."""
-        return self._compared(table, *self._read(table))
+        return self._compared(table, *self._opened(table))
 
     def verified(self, table: str, cells: Sequence[str] = ()) -> tuple[list[str], list[tuple[Any, ...]]]:
         """Columns and rows of a table, or those of some cells.
 
         Raises a `DigestError` if they are not those that were written.
         """
-        names, rows = self._read(table, cells)
+        names, cursor = self._opened(table, cells)
+        rows = cursor.fetchall()
         if changed := self._compared(table, names, rows, cells):
             whose = f" of the cell {changed[0]}" if changed[0] else ""
             raise DigestError(f"rows{whose} in the table '{table}' are not those that were written")
         return names, rows
 
-    def _read(self, table: str, cells: Sequence[str] = ()) -> tuple[list[str], list[tuple[Any, ...]]]:
+    def _opened(self, table: str, cells: Sequence[str] = ()) -> tuple[list[str], sqlite3.Cursor]:
         # An index may be damaged, too: the table itself is read.
         try:
             cursor = self._db.execute(f'SELECT * FROM "{table}" NOT INDEXED WHERE {of_cells(cells)}', cells)
         except UnicodeDecodeError:  # of the name of a column
             raise DigestError(f"the columns of the table '{table}' are not those that were written") from None
         names = [column[0] for column in cursor.description]
-        declared, rows = META if table == "meta" else tuple(STORED[table]), cursor.fetchall()
+        declared = META if table == "meta" else tuple(STORED[table])
         if names != [*declared, *(f"mu_{k + 1}" for k in range(len(names) - len(declared)))]:
             raise DigestError(f"the columns of the table '{table}' are not those that were written")
-        return names, rows
+        return names, cursor
 
     def _compared(
-        self, table: str, names: Sequence[str], rows: Sequence[tuple[Any, ...]], cells: Sequence[str] = ()
+        self, table: str, names: Sequence[str], rows: Iterable[tuple[Any, ...]], cells: Sequence[str] = ()
     ) -> tuple[str, ...]:
         query = f"SELECT cell, total FROM digests NOT INDEXED WHERE name = ? AND {of_cells(cells)}"
         written = dict(self._db.execute(query, (table, *cells)))
@@ -93,7 +94,7 @@ def of_cells(cells: Sequence[str]) -> str:
     return f"cell IN ({', '.join('?' * len(cells))})" if cells else "TRUE"
 
 
-def _totals(names: Sequence[str], rows: Sequence[tuple[Any, ...]]) -> dict[Any, int]:
+def _totals(names: Sequence[str], rows: Iterable[tuple[Any, ...]]) -> dict[Any, int]:
     """Sum over the rows of each cell."""
     at, totals = (names.index("cell") if "cell" in names else None), dict[Any, int]()
     for cell, group in groupby(rows, key=(lambda row: row[at]) if at is not None else lambda _: ""):

@@ -134,7 +134,7 @@ def test_a_file_set_aside_takes_its_log_along(database: ResultsDatabase, tmp_pat
     set_aside(copy)
     assert {path.name for path in copy.parent.iterdir()} == {f"{FILE}{DAMAGED}", f"{FILE}{DAMAGED}-wal"}
     with claimed(copy.parent), contextlib.closing(ResultsDatabase(copy.parent, STUDY)) as anew:
-        assert anew.rows("cells") == []
+        assert list(anew.rows("cells")) == []
 
 
 def test_the_file_of_another_application_is_not_damaged(tmp_path: Path) -> None:

@@ -1,0 +1,31 @@
+"""What work costs, counted: seconds depend on what else the machine does."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from types import FrameType
+from typing import Any
+
+
+def instructions(work: Callable[[], object]) -> int:
+    """Number of instructions of Python that a call executes, whatever functions it passes."""
+    count, before = 0, sys.gettrace()
+
+    def trace(frame: FrameType, event: str, _: Any) -> Callable[..., Any]:
+        nonlocal count
+        frame.f_trace_opcodes, frame.f_trace_lines = True, False
+        count += event == "opcode"
+        return trace
+
+    sys.settrace(trace)
+    try:
+        work()
+    finally:
+        sys.settrace(before)
+    return count
+
+
+def growth(work: Callable[[int], Callable[[], object]], size: int, factor: int = 4) -> float:
+    """How much more a call costs per unit of its size where that is `factor` times as large; `work` prepares it."""
+    return instructions(work(factor * size)) / (factor * instructions(work(size)))
