@@ -572,15 +572,15 @@ FAULTS = (
     Fault(
         "condensed-load-without-the-interface",
         "vibench/linalg/schur_complement.py",
-        "condensed[interface] += self._interface_schur @ particular[self._eliminated :]",
-        "pass",
+        "particular, condensed[self._pattern.interface] = self._factor.eliminate(f[self._pattern.order])",
+        "particular, _ = self._factor.eliminate(f[self._pattern.order])",
         ("tests/unit/linalg/test_schur_complement.py",),
     ),
     Fault(
         "extension-with-the-wrong-sign",
         "vibench/linalg/cholesky.py",
-        "spsolve_triangular(corner, -(coupling @ last), lower=False",
-        "spsolve_triangular(corner, coupling @ last, lower=False",
+        "right[: self._split] = -(self._coupling.T @ last)",
+        "right[: self._split] = self._coupling.T @ last",
         ("tests/unit/linalg/test_cholesky.py",),
     ),
     Fault(

@@ -168,7 +168,7 @@ class HighFidelitySolver:
         if self._pattern is None:
             self._pattern, self._stiffness = EliminationPattern.of(vi.A, self._constrained), None
         if self._stiffness is None or "A" not in self._problem.constant:
-            self._stiffness = CondensedStiffness(vi.A, self._pattern, reused="A" in self._problem.constant)
+            self._stiffness = CondensedStiffness(vi.A, self._pattern)
         return self._stiffness
 
 

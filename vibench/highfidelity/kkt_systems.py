@@ -12,9 +12,9 @@ import scipy.sparse as sp
 from scipy.sparse.linalg import splu
 
 from vibench.arrays import Array, Indices, SparseMatrix
-from vibench.errors import NumericalError
 from vibench.interfaces.problem import VariationalInequality
 from vibench.linalg.cholesky import SparseCholesky
+from vibench.linalg.definite import dense_inverse
 from vibench.linalg.schur_complement import EliminationPattern, StaticCondensation
 from vibench.qp.scaling import row_norms
 
@@ -41,15 +41,13 @@ class CondensedStiffness:
         Sparse SPD (n×n).
     pattern
         Retains at least all unknowns that B touches; by default every unknown is retained.
-    reused
-        Whether A is the same for many solutions.
     """
 
-    def __init__(self, A: SparseMatrix, pattern: EliminationPattern | None = None, *, reused: bool = False) -> None:
+    def __init__(self, A: SparseMatrix, pattern: EliminationPattern | None = None) -> None:
         if pattern is None or len(pattern.retained) > MAX_RETAINED_SHARE * A.shape[0]:
             pattern = EliminationPattern(np.arange(A.shape[0]), np.zeros(0, np.intp), np.zeros(0, np.intp))
         self._pattern = pattern
-        self._condensed = StaticCondensation(A, self._pattern, reused=reused)
+        self._condensed = StaticCondensation(A, self._pattern)
 
     def check_definite(self, name: str) -> None:
         """Raise a `NumericalError` that calls A by `name` if A is not positive definite.
@@ -77,11 +75,7 @@ class CondensedStiffness:
     @cached_property
     def _compliance(self) -> Array:
         """Ŝ⁻¹ (c×c)."""
-        try:
-            factor = scipy.linalg.cho_factor(self._condensed.dense_schur)
-        except np.linalg.LinAlgError:
-            raise NumericalError("A is not positive definite") from None
-        return np.ascontiguousarray(scipy.linalg.cho_solve(factor, np.eye(len(self._pattern.retained))))
+        return dense_inverse(self._condensed.dense_schur, "A")
 
     def active_set_system(self, vi: VariationalInequality) -> ActiveSetSystem:
         """The KKT systems of the active sets of `vi`, whose stiffness must be this one."""

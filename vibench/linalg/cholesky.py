@@ -1,4 +1,4 @@
-"""Cholesky factors of sparse symmetric positive definite matrices, with a chosen elimination order."""
+"""Cholesky factors of sparse symmetric positive definite matrices, whole and up to a dense Schur complement."""
 
 from __future__ import annotations
 
@@ -12,18 +12,22 @@ from scipy.sparse.linalg import SuperLU, splu, spsolve_triangular
 
 from vibench.arrays import Array, Indices, SparseMatrix
 from vibench.errors import NumericalError
+from vibench.linalg.definite import dense_cholesky
 
 SYMMETRIC = {"diag_pivot_thresh": 0.0, "panel_size": 1, "options": {"SymmetricMode": True}}
 """SuperLU without off-diagonal pivoting is a Cholesky factorisation; SciPy has no sparse one of its own. Panels of one
 column are the fastest for matrices of plane meshes."""
 
-FILL_RATIO = 8
-"""A dense extension operator replaces triangular solves where it has at most this many times the entries of the sparse
-factor: a dense product does far more operations in the same time than a sparse triangular solve."""
+SPARSE_COLUMN = 64
+"""Columns of a factor with at most so many entries are multiplied as sparse ones, which needs few operations there."""
+
+DENSE_COLUMNS = 128
+"""Number of consecutive longer columns that are multiplied as one dense matrix, on the rows that they have entries in:
+they belong to neighbouring separators, whose rows are nearly the same."""
 
 
 class SparseCholesky:
-    """X = FᵀF for a sparse symmetric positive definite X (n×n), without pivoting off the diagonal.
+    """X = FᵀF for a sparse symmetric positive definite X (n×n), in minimum degree order, without pivoting.
 
     Parameters
     ----------
@@ -31,10 +35,6 @@ class SparseCholesky:
         X; its symmetry is assumed and not checked.
     name
         Its name in error messages.
-    order
-        Elimination order (n,), from `elimination_order`; by default minimum degree.
-    dense
-        Size of the trailing block of F that is stored as a dense matrix.
 
     Attributes
     ----------
@@ -47,31 +47,16 @@ class SparseCholesky:
         If X is not positive definite.
     """
 
-    def __init__(
-        self, matrix: SparseMatrix, name: str = "the matrix", order: Indices | None = None, dense: int = 0
-    ) -> None:
+    def __init__(self, matrix: SparseMatrix, name: str = "the matrix") -> None:
         matrix = sp.csc_array(matrix)
-        self._arguments = matrix, name, order, dense
-        if order is not None and not np.array_equal(order, np.arange(len(order))):
-            matrix = sp.csc_array(matrix[order][:, order])
-        try:
-            lu = splu(matrix, permc_spec="MMD_AT_PLUS_A" if order is None else "NATURAL", **SYMMETRIC)
-        except RuntimeError as error:
-            raise NumericalError(f"{name} cannot be factorised: {error}") from None
-        pivots = lu.U.diagonal()
-        if not np.array_equal(lu.perm_r, lu.perm_c) or np.any(pivots <= 0.0):
-            raise NumericalError(f"{name} is not positive definite")
-        self._lu: SuperLU = lu
+        self._arguments = matrix, name
+        self._lu, pivots = _pivots(matrix, "MMD_AT_PLUS_A", name)
         self._root = np.sqrt(pivots)
-        eliminated = np.argsort(lu.perm_c)
-        if order is not None and not np.array_equal(eliminated, np.arange(len(order))):
-            raise NumericalError(f"{name} was not factorised in the requested order")
-        self._requested_order, self._split = order, matrix.shape[0] - dense
-        self.order: Indices = eliminated if order is None else order
+        self.order: Indices = np.argsort(self._lu.perm_c)
 
     def __getstate__(self) -> dict[str, object]:
         """What it was made of: SuperLU objects cannot be stored."""
-        return dict(zip(("matrix", "name", "order", "dense"), self._arguments, strict=True))
+        return dict(zip(("matrix", "name"), self._arguments, strict=True))
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Factorise again."""
@@ -88,24 +73,9 @@ class SparseCholesky:
         lower.sort_indices()  # here once; a triangular solve would sort every time
         return lower
 
-    @cached_property
-    def _blocks(self) -> tuple[SparseMatrix, SparseMatrix, Array]:
-        """Leading and coupling block of the unit lower factor, transposed, and the dense trailing block of F."""
-        split = self._split
-        if split == len(self._root):
-            return self._lower.T, sp.csc_array((split, 0)), np.zeros((0, 0))
-        first = sp.csc_array(self._lower[:, :split])
-        corner, coupling = sp.csc_array(first[:split]), sp.csc_array(first[split:])
-        corner.sort_indices()
-        return corner.T, coupling.T, np.asfortranarray(self.trailing_factor())
-
     def solve(self, right: Array) -> Array:
         """X⁻¹ r for right-hand sides (n,) or (n, k)."""
-        if self._requested_order is None:
-            return np.asarray(self._lu.solve(np.ascontiguousarray(right)))
-        x = np.empty_like(right, dtype=float)
-        x[self._requested_order] = self._lu.solve(np.ascontiguousarray(right[self._requested_order]))
-        return x
+        return np.asarray(self._lu.solve(np.ascontiguousarray(right)))
 
     def apply_factor(self, u: Array) -> Array:
         """F u, for u (n,) or (n, k)."""
@@ -113,38 +83,11 @@ class SparseCholesky:
 
     def solve_factor(self, y: Array) -> Array:
         """F⁻¹ y, for y (n,) or (n, k)."""
-        split, u = self._split, np.empty_like(y, dtype=float)
-        corner, coupling, tail = self._blocks
-        last = scipy.linalg.solve_triangular(tail, y[split:], check_finite=False) if len(tail) else y[split:]
-        u[self.order[split:]] = last
-        first = _scale_rows(1.0 / self._root[:split], y[:split]) - coupling @ last
-        if first.size:
-            u[self.order[:split]] = spsolve_triangular(corner, first, lower=False, unit_diagonal=True)
+        u = np.empty_like(y, dtype=float)
+        if y.size:
+            scaled = _scale_rows(1.0 / self._root, y)
+            u[self.order] = spsolve_triangular(self._lower.T, scaled, lower=False, unit_diagonal=True)
         return u
-
-    def extend(self, last: Array) -> Array:
-        """Solution (n,) or (n, k) of X u = 0 in all rows but the last `dense` ones, with u given there."""
-        split, u = self._split, np.zeros((len(self._root), *last.shape[1:]))
-        corner, coupling, _ = self._blocks
-        u[self.order[split:]] = last
-        if split and last.size:
-            where, extension = self._extension
-            u[self.order[:split]] = (
-                spsolve_triangular(corner, -(coupling @ last), lower=False, unit_diagonal=True)
-                if extension is None
-                else extension @ last[where]
-            )
-        return u
-
-    @cached_property
-    def _extension(self) -> tuple[Indices, Array | None]:
-        """Unknowns (c,) among the last `dense` ones that couple to others, and the extension from them, or `None`."""
-        corner, coupling, _ = self._blocks
-        where = np.unique(coupling.indices)
-        if self._split * len(where) > FILL_RATIO * (corner.nnz + coupling.nnz):
-            return where, None
-        right = -coupling[:, where].toarray()
-        return where, spsolve_triangular(corner, right, lower=False, unit_diagonal=True)
 
     def solve_factor_transposed(self, right: Array) -> Array:
         """F⁻ᵀ r, for r (n,) or (n, k)."""
@@ -153,10 +96,135 @@ class SparseCholesky:
             return permuted
         return _scale_rows(1.0 / self._root, spsolve_triangular(self._lower, permuted, lower=True, unit_diagonal=True))
 
+
+class PartialCholesky:
+    """A sparse symmetric positive definite X (n×n) of which all unknowns but a few are eliminated.
+
+    With the eliminated unknowns i and the last ones c, the factors of [X_ii 0; X_ci I] without pivoting are those of
+    X_ii, and L_ci with X_ci = L_ci D L_iiᵀ. Their last block has no fill-in: the Schur complement
+    S = X_cc − L_ci D L_ciᵀ is a dense matrix of its own, and products and factors of it are those of LAPACK. A sparse
+    factorisation of all of X would spend most of its time there.
+
+    Parameters
+    ----------
+    matrix
+        X; its symmetry is assumed and not checked.
+    order
+        Elimination order (n,), from `elimination_order`.
+    last
+        How many unknowns c at the end of `order` are not eliminated.
+    name
+        X in error messages.
+
+    Raises
+    ------
+    NumericalError
+        If X_ii is not positive definite; of S, that is seen where it is factorised.
+    """
+
+    def __init__(self, matrix: SparseMatrix, order: Indices, last: int, name: str = "the matrix") -> None:
+        self._arguments = matrix, order, last, name
+        self.order, self._name, self._split = order, name, len(order) - last
+        if not np.array_equal(order, np.arange(len(order))):
+            matrix = sp.csr_array(matrix)[order][:, order]
+        matrix, split = sp.csc_array(matrix), self._split
+        self._coupling, self._corner = matrix[split:, :split], matrix[split:, split:]
+        unit = sp.eye_array(len(order), last, k=-split)
+        self._lu, pivots = _pivots(sp.csc_array(sp.hstack([matrix[:, :split], unit])), "NATURAL", name)
+        self._root = np.sqrt(pivots[:split])
+
+    def __getstate__(self) -> dict[str, object]:
+        """What it was made of: SuperLU objects cannot be stored."""
+        return dict(zip(("matrix", "order", "last", "name"), self._arguments, strict=True))
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Factorise again."""
+        PartialCholesky.__init__(self, **state)
+
+    @cached_property
+    def _columns(self) -> SparseMatrix:
+        """The columns [L_ii; L_ci] of the unit lower factor."""
+        lower = sp.csc_array(self._lu.L)[:, : self._split]
+        lower.sort_indices()
+        return lower
+
+    @cached_property
+    def _corner_factor(self) -> SparseMatrix:
+        """L_iiᵀ."""
+        corner = sp.csc_array(self._columns[: self._split])
+        corner.sort_indices()
+        return corner.T
+
+    def schur(self) -> Array:
+        """The Schur complement S (c×c) of the eliminated unknowns."""
+        scaled = sp.csc_array(self._columns[self._split :] @ sp.diags_array(self._root))
+        scaled.sort_indices()
+        entries = np.diff(scaled.indptr)
+        short, long = scaled[:, entries <= SPARSE_COLUMN], scaled[:, entries > SPARSE_COLUMN]
+        schur = np.asfortranarray((self._corner - short @ short.T).toarray())
+        for first in range(0, long.shape[1], DENSE_COLUMNS):
+            block = long[:, first : first + DENSE_COLUMNS]
+            rows = np.unique(block.indices)
+            columns = block[rows].toarray()
+            schur[np.ix_(rows, rows)] -= columns @ columns.T
+        return schur
+
+    @cached_property
     def trailing_factor(self) -> Array:
-        """The trailing block F_cc of F on the last `dense` unknowns c; F_ccᵀF_cc is the Schur complement of X on c."""
-        block = sp.csc_array(self._lu.L)[:, self._split :][self._split :].toarray()
-        return np.asarray((block * self._root[self._split :]).T)
+        """The trailing block F_cc (c×c) of F, upper triangular, with F_ccᵀF_cc = S.
+
+        Raises a `NumericalError` if S, and with it X, is not positive definite.
+        """
+        return dense_cholesky(self.schur(), self._name)
+
+    def eliminate(self, right: Array) -> tuple[Array, Array]:
+        """For r (n,) or (n, k), X_ii⁻¹ r_i and the load of the Schur complement, r_c − X_ci X_ii⁻¹ r_i."""
+        solved = np.asarray(self._lu.solve(np.ascontiguousarray(right[self.order])))
+        return solved[: self._split], solved[self._split :]
+
+    def extend(self, last: Array) -> Array:
+        """Solution (n,) or (n, k) of X u = 0 in the rows of i, with u (c,) or (c, k) given on the last unknowns."""
+        right = np.zeros((len(self.order), *last.shape[1:]))
+        right[: self._split] = -(self._coupling.T @ last)
+        u = np.empty_like(right)
+        if right.size:
+            u[self.order] = self._lu.solve(right)
+        u[self.order[self._split :]] = last
+        return u
+
+    def apply_factor(self, u: Array) -> Array:
+        """F u, for u (n,) or (n, k): first the entries of i."""
+        u = u[self.order]
+        return np.concatenate([
+            _scale_rows(self._root, self._columns.T @ u), self.trailing_factor @ u[self._split :]
+        ])  # fmt: skip
+
+    def solve_factor(self, y: Array) -> Array:
+        """F⁻¹ y, for y (n,) or (n, k)."""
+        split, u = self._split, np.empty_like(y, dtype=float)
+        last = y[split:]
+        if last.size:
+            last = scipy.linalg.solve_triangular(self.trailing_factor, last, check_finite=False)
+        u[self.order[split:]] = last
+        corner, coupling = self._corner_factor, self._columns[split:].T
+        first = _scale_rows(1.0 / self._root, y[:split]) - coupling @ last
+        if first.size:
+            u[self.order[:split]] = spsolve_triangular(corner, first, lower=False, unit_diagonal=True)
+        return u
+
+
+def _pivots(matrix: SparseMatrix, permutation: str, name: str) -> tuple[SuperLU, Array]:
+    """Factors without pivoting off the diagonal, and the pivots (n,), which are positive."""
+    try:
+        lu = splu(matrix, permc_spec=permutation, **SYMMETRIC)
+    except RuntimeError as error:
+        raise NumericalError(f"{name} cannot be factorised: {error}") from None
+    pivots = lu.U.diagonal()
+    if not np.array_equal(lu.perm_r, lu.perm_c) or not np.all(pivots > 0.0):
+        raise NumericalError(f"{name} is not positive definite")
+    if permutation == "NATURAL" and not np.array_equal(lu.perm_c, np.arange(len(pivots))):
+        raise NumericalError(f"{name} was not factorised in the requested order")
+    return lu, pivots
 
 
 def _scale_rows(factors: Array, values: Array) -> Array:

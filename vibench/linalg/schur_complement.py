@@ -9,7 +9,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from vibench.arrays import Array, Indices, SparseMatrix
-from vibench.linalg.cholesky import SparseCholesky, elimination_order
+from vibench.linalg.cholesky import PartialCholesky, elimination_order
 
 
 @dataclass(frozen=True)
@@ -77,8 +77,6 @@ class StaticCondensation:
     ----------
     A, pattern
         The matrix (n×n) and its elimination pattern.
-    reused
-        Whether many solutions are recovered from it, so that a dense extension operator pays off.
 
     Attributes
     ----------
@@ -86,17 +84,18 @@ class StaticCondensation:
         Whether most entries of the Schur complement are non-zero.
     """
 
-    def __init__(self, A: SparseMatrix, pattern: EliminationPattern, *, reused: bool = False) -> None:
-        self._pattern, self._size, self._reused = pattern, A.shape[0], reused
+    def __init__(self, A: SparseMatrix, pattern: EliminationPattern) -> None:
+        self._pattern, self._size = pattern, A.shape[0]
         A, count = sp.csr_array(A), len(pattern.interface)
         natural = np.arange(len(pattern.order))
-        self._factor = SparseCholesky(pattern.factorised_block.of(A).T, "A", natural, count) if len(natural) else None
-        self._eliminated = len(natural) - count
-        upper = self._factor.trailing_factor() if self._factor is not None else np.zeros((0, 0))
-        self._interface_schur = upper.T @ upper
+        self._factor = PartialCholesky(pattern.factorised_block.of(A).T, natural, count, "A") if len(natural) else None
         self.dense = 2 * count > len(pattern.retained)
         self._retained_block = pattern.retained_block.of(A)
         self._last_load: tuple[Array, tuple[Array, Array]] | None = None
+
+    @property
+    def _interface_schur(self) -> Array:
+        return self._factor.schur() if self._factor is not None else np.zeros((0, 0))
 
     @property
     def schur(self) -> SparseMatrix:
@@ -117,36 +116,28 @@ class StaticCondensation:
         return np.asarray(schur)
 
     def condense_load(self, f: Array) -> tuple[Array, Array]:
-        """The condensed load (c,) of f (n,), and the particular solution that `recover` needs."""
-        if self._last_load is not None and np.array_equal(self._last_load[0], f):
-            return self._last_load[1]
-        interface, particular = self._pattern.interface, self._particular(f)
-        condensed = f[self._pattern.retained]
-        condensed[interface] += self._interface_schur @ particular[self._eliminated :]
-        self._last_load = f.copy(), (condensed, particular)  # the next load may be written into the same vector
+        """The condensed load (c,) of f (n,), and the solution of the eliminated unknowns that `recover` needs."""
+        if self._last_load is None or not np.array_equal(self._last_load[0], f):
+            condensed, particular = f[self._pattern.retained], np.zeros(0)
+            if self._factor is not None:
+                particular, condensed[self._pattern.interface] = self._factor.eliminate(f[self._pattern.order])
+            self._last_load = f.copy(), (condensed, particular)  # the next load may be written into the same vector
         return self._last_load[1]
-
-    def _particular(self, f: Array) -> Array:
-        """A solution in elimination order of the equations of the eliminated unknowns."""
-        right = f[self._pattern.order]
-        right[self._eliminated :] = 0.0
-        return self._factor.solve(right) if self._factor is not None else right
 
     def recover(self, u_retained: Array, particular: Array) -> Array:
         """All unknowns (n,) from the retained ones (c,), with equilibrium in the eliminated ones."""
         u = np.empty(self._size)
         if self._factor is not None:
-            on_interface = u_retained[self._pattern.interface] - particular[self._eliminated :]
-            if self._reused:
-                extension = self._factor.extend(on_interface)
-            else:
-                right = np.zeros(len(particular))
-                right[self._eliminated :] = self._interface_schur @ on_interface
-                extension = self._factor.solve(right)
-            u[self._pattern.order] = particular + extension
+            extension = self._factor.extend(u_retained[self._pattern.interface])
+            extension[: len(particular)] += particular
+            u[self._pattern.order] = extension
         u[self._pattern.retained] = u_retained
         return u
 
     def correct_eliminated(self, residual: Array) -> Array:
         """Correction (n,) of the eliminated unknowns alone that restores their equilibrium, from a residual (n,)."""
-        return self.recover(np.zeros(len(self._pattern.retained)), self._particular(residual))
+        correction = np.zeros(self._size)
+        if self._factor is not None:
+            particular, _ = self._factor.eliminate(residual[self._pattern.order])
+            correction[self._pattern.order[: len(particular)]] = particular
+        return correction

@@ -11,7 +11,7 @@ import scipy.linalg
 import scipy.sparse as sp
 
 from vibench.arrays import Array, Indices, SparseMatrix
-from vibench.linalg.cholesky import SparseCholesky, elimination_order
+from vibench.linalg.cholesky import PartialCholesky, elimination_order
 from vibench.linalg.inner_product import InnerProduct
 
 PROPORTIONAL_RTOL = 1e-12
@@ -149,11 +149,11 @@ class ContactCoordinates:
 
 
 @lru_cache(maxsize=CACHED_FACTORS)  # so that all models of a problem share one factorisation
-def _contact_factor(V: InnerProduct, dofs: bytes) -> tuple[SparseCholesky, Array]:
+def _contact_factor(V: InnerProduct, dofs: bytes) -> tuple[PartialCholesky, Array]:
     """X_V factorised with some unknowns E last, and the trailing block F_EE (|E|×|E|) of the factor."""
     last = np.frombuffer(dofs, np.intp)
-    factor = SparseCholesky(V.matrix, "X_V", elimination_order(V.matrix, last), len(last))
-    return factor, factor.trailing_factor()
+    factor = PartialCholesky(V.matrix, elimination_order(V.matrix, last), len(last), "X_V")
+    return factor, factor.trailing_factor
 
 
 Coordinates = SpannedCoordinates | ContactCoordinates

@@ -9,7 +9,7 @@ import numpy as np
 
 from vibench.arrays import Array
 from vibench.interfaces.problem import MEMBERS, Problem, VariationalInequality
-from vibench.linalg.cholesky import SparseCholesky
+from vibench.linalg.cholesky import PartialCholesky, SparseCholesky
 from vibench.linalg.inner_product import InnerProduct
 from vibench.model.affine import AffineMember, Evaluation, affine_decomposition
 from vibench.model.galerkin import ReducedModel, leading_part, project
@@ -30,7 +30,7 @@ from vibench.timing import timed
 
 for _kind in (
     AffineMember, Evaluation, ReducedOperators, ProjectedMember, ContactCoordinates, SpannedCoordinates, InnerProduct,
-    SparseCholesky, VariationalInequality, ExactSolution,
+    SparseCholesky, PartialCholesky, VariationalInequality, ExactSolution,
 ):  # fmt: skip
     storable(_kind)
 

@@ -5,70 +5,91 @@ from unittest import mock
 
 import numpy as np
 import pytest
+import scipy.linalg
 import scipy.sparse as sp
 from hypothesis import given
 from hypothesis import strategies as st
 from numerics import spd
 
 from vibench.errors import NumericalError
-from vibench.linalg.cholesky import SparseCholesky, elimination_order
+from vibench.linalg.cholesky import PartialCholesky, SparseCholesky, elimination_order
 
 
-@given(st.integers(0, 10_000), st.booleans())
-def test_the_factor_is_upper_triangular_in_its_order_and_gives_the_matrix(seed: int, chosen: bool) -> None:
+@given(st.integers(0, 10_000))
+def test_the_factor_is_upper_triangular_in_its_order_and_gives_the_matrix(seed: int) -> None:
     rng = np.random.default_rng(seed)
     X = spd(7, rng)
-    order = rng.permutation(7) if chosen else None
-    factor = SparseCholesky(sp.csc_array(X), order=order)
+    factor = pickle.loads(pickle.dumps(SparseCholesky(sp.csc_array(X))))
     F = factor.apply_factor(np.eye(7))
     assert np.allclose(F.T @ F, X)
     assert np.allclose(F[:, factor.order], np.triu(F[:, factor.order]))
-    if order is not None:
-        assert np.array_equal(factor.order, order)
     r = rng.standard_normal((7, 2))
     assert np.allclose(factor.solve(r), np.linalg.solve(X, r))
     assert np.allclose(factor.solve_factor(r), np.linalg.solve(F, r))
     assert np.allclose(factor.solve_factor_transposed(r), np.linalg.solve(F.T, r))
 
 
-@given(st.integers(0, 10_000), st.integers(0, 7), st.integers(0, 3))
-def test_taking_the_last_unknowns_for_coupled_changes_nothing(seed: int, count: int, columns: int) -> None:
+def partly_eliminated(seed: int, count: int, bodies: bool) -> tuple[np.ndarray, np.ndarray, PartialCholesky]:
+    """A matrix of order 9, of two blocks or of one, unknowns that are not eliminated, and what is made of both."""
     rng = np.random.default_rng(seed)
-    X, last = sp.csc_array(spd(7, rng)), rng.permutation(7)[:count]
-    order = elimination_order(X, last)
-    factor = pickle.loads(pickle.dumps(SparseCholesky(X, order=order, dense=count)))
-    y = rng.standard_normal((7, columns)) if columns else rng.standard_normal(7)
-    assert np.allclose(factor.apply_factor(factor.solve_factor(y)), y)
-    assert np.allclose(factor.solve_factor(y), SparseCholesky(X, order=order).solve_factor(y))
+    X = scipy.linalg.block_diag(spd(4, rng), spd(5, rng)) if bodies else spd(9, rng)
+    mixed, last = rng.permutation(9), rng.permutation(9)[:count]
+    X = X[np.ix_(mixed, mixed)]
+    factor = PartialCholesky(sp.csc_array(X), elimination_order(sp.csc_array(X), last), count)
+    return X, last, pickle.loads(pickle.dumps(factor))
 
 
-@given(st.integers(0, 10_000), st.integers(0, 7), st.integers(0, 3), st.sampled_from([0, 1000]))
-def test_all_unknowns_follow_from_the_last(seed: int, count: int, columns: int, denser: int) -> None:
-    rng = np.random.default_rng(seed)
-    scale, last = np.diag(rng.uniform(0.5, 2.0, 7)), rng.permutation(7)[:count]
-    X = sp.csc_array(scale @ (3.0 * np.eye(7) - np.eye(7, k=1) - np.eye(7, k=-1)) @ scale)  # few depend on each other
+PARTLY = given(st.integers(0, 10_000), st.integers(0, 9), st.booleans(), st.integers(0, 3))
+
+
+@PARTLY
+def test_a_partial_factor_gives_the_matrix(seed: int, count: int, bodies: bool, columns: int) -> None:
+    X, last, factor = partly_eliminated(seed, count, bodies)
+    F = factor.apply_factor(np.eye(9))
+    assert np.allclose(F.T @ F, X)
+    assert np.array_equal(factor.order[9 - count :], last)
+    assert np.allclose(F[:, factor.order], np.triu(F[:, factor.order]))
+    y = np.random.default_rng(seed).standard_normal((9, columns) if columns else 9)
+    assert np.allclose(factor.solve_factor(y), np.linalg.solve(F, y))
+
+
+@PARTLY
+def test_all_unknowns_follow_from_the_last(seed: int, count: int, bodies: bool, columns: int) -> None:
+    X, last, factor = partly_eliminated(seed, count, bodies)
+    rng, rest = np.random.default_rng(seed), np.setdiff1d(np.arange(9), last)
     given_there = rng.standard_normal((count, columns) if columns else count)
-    with mock.patch("vibench.linalg.cholesky.FILL_RATIO", denser):  # by solving, and by a full matrix
-        u = SparseCholesky(X, order=elimination_order(X, last), dense=count).extend(given_there)
-    rest = np.setdiff1d(np.arange(7), last)
+    u = factor.extend(given_there)
     assert np.allclose((X @ u)[rest], 0.0)
     assert np.array_equal(u[last], given_there)
+    r = rng.standard_normal((9, columns) if columns else 9)
+    solved, load = factor.eliminate(r)
+    assert np.allclose(X[np.ix_(rest, rest)] @ solved[np.argsort(factor.order[: 9 - count])], r[rest])
+    assert np.allclose(load, r[last] - X[np.ix_(last, rest)] @ np.linalg.solve(X[np.ix_(rest, rest)], r[rest]))
 
 
-@given(st.integers(0, 10_000), st.integers(0, 7))
-def test_the_tail_is_a_factor_of_the_schur_complement(seed: int, count: int) -> None:
-    rng = np.random.default_rng(seed)
-    X = spd(7, rng)
-    last = rng.permutation(7)[:count]
-    factor = SparseCholesky(sp.csc_array(X), order=elimination_order(sp.csc_array(X), last), dense=count)
-    assert np.array_equal(factor.order[7 - count :], last)
-    rest = np.setdiff1d(np.arange(7), last)
+@PARTLY
+def test_the_tail_is_a_factor_of_the_schur_complement(seed: int, count: int, bodies: bool, short: int) -> None:
+    X, last, factor = partly_eliminated(seed, count, bodies)
+    rest = np.setdiff1d(np.arange(9), last)
     taken = X[np.ix_(last, rest)] @ np.linalg.solve(X[np.ix_(rest, rest)], X[np.ix_(rest, last)])
-    F = factor.trailing_factor()
-    assert np.allclose(F.T @ F, X[np.ix_(last, last)] - taken)
+    S, F = X[np.ix_(last, last)] - taken, factor.trailing_factor
+    with mock.patch.multiple("vibench.linalg.cholesky", SPARSE_COLUMN=short, DENSE_COLUMNS=2):  # the rest are long
+        assert np.allclose(factor.schur(), S)
+    assert np.allclose(F.T @ F, S)
+    assert np.array_equal(F, np.triu(F))
+
+
+def test_a_schur_complement_that_is_indefinite_is_refused_where_it_is_factorised() -> None:
+    factor = PartialCholesky(sp.csc_array(np.array([[1.0, 2.0], [2.0, 1.0]])), np.arange(2), 1, "the thing")
+    with pytest.raises(NumericalError, match="the thing is not positive definite"):
+        factor.trailing_factor  # noqa: B018
 
 
 @pytest.mark.parametrize("matrix", [-np.eye(3), np.diag([1.0, 0.0, 1.0]), np.array([[1.0, 2.0], [2.0, 1.0]])])
 def test_what_is_not_positive_definite_is_refused_by_name(matrix: np.ndarray) -> None:
-    with pytest.raises(NumericalError, match="the thing"):
-        SparseCholesky(sp.csc_array(matrix), "the thing")
+    for refuses in (
+        lambda X: SparseCholesky(X, "the thing"),
+        lambda X: PartialCholesky(X, np.arange(len(matrix)), 0, "the thing"),
+    ):
+        with pytest.raises(NumericalError, match="the thing"):
+            refuses(sp.csc_array(matrix))

@@ -106,7 +106,7 @@ def test_factors_and_coordinates_are_those_of_the_same_matrices() -> None:
     assert "_off_contact" not in vars(found)
     np.testing.assert_array_equal(found.vectors(coordinates), expected)
     np.testing.assert_array_equal(loads(dumps(X)).whiten(np.ones(4)), X.whiten(np.ones(4)))
-    factor = SparseCholesky(X.matrix, dense=1)
+    factor = SparseCholesky(X.matrix)
     np.testing.assert_array_equal(loads(dumps(factor)).solve_factor(np.ones(4)), factor.solve_factor(np.ones(4)))
 
 
