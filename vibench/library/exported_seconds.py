@@ -30,18 +30,25 @@ def in_turns(calls: Mapping[str, Call], mus: Array) -> dict[str, float]:
 
 
 def queries(model: Model, file: Path) -> dict[str, Call]:
-    """The script of an exported file and its model; without bounds, with those, and with corrected solutions."""
+    """The script of an exported file and its model; without bounds, with those, and with corrected solutions.
+
+    Both give what the script gives: u, λ, the outputs and their bounds.
+    """
     plain = model if model.certificate is None else Model(model.reduced, model.solver, model.accuracy)
-    found: dict[str, Call] = {SCRIPT: reduced_model.Model(file).solve, LIBRARY: partial(plain.solve, corrected=False)}
+    found: dict[str, Call] = {SCRIPT: reduced_model.Model(file).solve, LIBRARY: partial(_whole, plain, False)}
     script = reduced_model.Model(file)
     if not script.about["no_bounds"]:
         for corrected, what in ((False, "with bounds"), (True, "corrected")):
-            bounded = reduced_model_certificate.Model(
-                file
-            )  # one each: it keeps what it evaluated at the last parameter
+            bounded = reduced_model_certificate.Model(file)  # one each: it keeps what the last parameter needed
             found[f"{SCRIPT}, {what}"] = partial(bounded.solve, corrected=corrected)
-            found[f"{LIBRARY}, {what}"] = partial(model.solve, corrected=corrected)
+            found[f"{LIBRARY}, {what}"] = partial(_whole, model, corrected)
     return found
+
+
+def _whole(model: Model, corrected: bool, mu: Array) -> None:
+    solution = model.solve(mu, corrected=corrected)
+    if solution.x is not None and solution.alpha is not None:
+        _ = solution.answer, solution.outputs, solution.output_bounds
 
 
 def in_words(model: Model, file: Path, count: int = 5) -> str:

@@ -59,10 +59,8 @@ class Model:
             raise ValueError(f"the solver is '{self.solver}', expected one of {', '.join(SOLVERS)}")
         self._outputs = [output["name"] for output in self.about["outputs"]["linear"]]
         self._last: tuple[bytes, dict[int | str, Array]] = b"", {}
-        names, known = (
-            [key.removesuffix("_indices") for key in self.data if key.endswith("_indices")],
-            dict[bytes, int](),
-        )
+        names = [key.removesuffix("_indices") for key in self.data if key.endswith("_indices")]
+        known: dict[bytes, int] = {}
         self._members = {name: self._prepared(name, known) for name in names}
         rows, columns = np.triu_indices(len(self.data["f_terms"][0]))
         self._packed = np.zeros((columns[-1] + 1, columns[-1] + 1), np.intp)  # where packed A has its entries
@@ -154,34 +152,34 @@ class Model:
         """The solver's x and α for rows of B of norm 1, or those of its active set, whichever are better; residuals."""
         if not np.isfinite(A.sum() + f.sum() + B.sum() + g.sum()):
             raise np.linalg.LinAlgError("an array is not finite")
-        factor = np.linalg.cholesky(A)
+        inverse = np.linalg.inv(np.linalg.cholesky(A))
         length, force = _units(A, f, g)  # in which the solver's tolerances are relative ones
         settings = self.about["settings"][self.solver]
         y, z = SOLVERS[self.solver](A * (length / force), f / force, B, g / length, settings)
         if not np.isfinite(y.sum() + z.sum()):
             y, z = (np.nan_to_num(vector, nan=0.0, posinf=0.0, neginf=0.0) for vector in (y, z))
-        best = _polished(A, f, B, g, z > g / length - B @ y, factor)
-        found = residuals(A, f, B, g, *best, factor)
+        best = _polished(A, f, B, g, z > g / length - B @ y, inverse)
+        found = residuals(A, f, B, g, *best, inverse)
         if not all(residual <= ROUND_OFF for residual in found):  # NaN is not
             given = length * y, force * np.maximum(z, 0.0)
-            of_given = residuals(A, f, B, g, *given, factor)
+            of_given = residuals(A, f, B, g, *given, inverse)
             if _worst(of_given) <= _worst(found):
                 return given, of_given
         return best, found
 
 
-def residuals(A: Array, f: Array, B: Array, g: Array, x: Array, alpha: Array, factor: Any = None) -> Residuals:
+def residuals(A: Array, f: Array, B: Array, g: Array, x: Array, alpha: Array, inverse: Any = None) -> Residuals:
     """With s = B x − g, S² = xᵀA x + ‖Bᵀα‖² and norms in A⁻¹: max (s_i)₊/‖B_i‖S, ‖f − A x − Bᵀα‖/S, |αᵀs|/S².
 
-    `factor` is the Cholesky factor of A, if it is known.
+    `inverse` is that of the Cholesky factor of A, if it is known.
     """
     s, force, Ax = B @ x - g, alpha @ B, A @ x
     rows = (s > 0.0).nonzero()[0]
     if len(rows):
         sizes = abs(B[rows]) @ abs(x) + abs(g[rows])
         rows = rows[s[rows] > 1.01 * np.finfo(float).eps * ((B[rows] != 0.0).sum(axis=1) + 2.0) * sizes]
-    factor = np.linalg.cholesky(A) if factor is None else factor
-    whitened = np.linalg.solve(factor, np.array([f - Ax - force, force, *B[rows]]).T)
+    inverse = np.linalg.inv(np.linalg.cholesky(A)) if inverse is None else inverse
+    whitened = inverse @ np.array([f - Ax - force, force, *B[rows]]).T
     norms, way = np.sqrt((whitened**2).sum(axis=0)), 0.0
     if len(rows):
         with np.errstate(divide="ignore"):  # a row of zeros
@@ -205,22 +203,24 @@ def _units(A: Array, f: Array, g: Array) -> tuple[float, float]:
     return (max(moved, depth), load) if moved > 1e-10 * depth else (depth or 1.0, 1e-3 * k * (depth or 1.0))
 
 
-def _polished(
-    A: Array, f: Array, B: Array, g: Array, active: NDArray[np.bool_], factor: Any = None
-) -> tuple[Array, Array]:
+def _polished(A: Array, f: Array, B: Array, g: Array, active: NDArray[np.bool_], inverse: Array) -> tuple[Array, Array]:
     """The solution up to round-off: equations on an active set, which changes until all signs are right."""
-    whitened = np.linalg.solve(np.linalg.cholesky(A) if factor is None else factor, B.T)
+    whitened, load = inverse @ B.T, inverse @ f
     k, sizes = np.sqrt(A.trace() / len(A)), abs(B)
     for step in range(20 + 4 * len(g)):
         chosen = active.nonzero()[0]
-        system = np.zeros((len(f) + len(chosen), len(f) + len(chosen)))
-        system[: len(f), : len(f)], system[len(f) :, : len(f)] = A / k, k * B[chosen]
-        system[: len(f), len(f) :] = system[len(f) :, : len(f)].T
-        right = np.append(f / k, k * g[chosen])
-        regular = _independent(whitened[:, chosen])
-        found = np.linalg.solve(system, right) if regular else np.linalg.lstsq(system, right, rcond=None)[0]
-        x, alpha = found[: len(f)], np.zeros(len(g))
-        alpha[chosen] = k**2 * found[len(f) :]
+        rows, W, x, alpha = B[chosen], whitened[:, chosen], np.zeros(len(f)), np.zeros(len(g))
+        gram, rest, missed = W.T @ W, load, g[chosen]
+        if _independent(gram):
+            for _ in range(2):  # the second time with the residuals, up to round-off
+                forces = np.linalg.solve(gram, W.T @ rest - missed)
+                alpha[chosen] += forces
+                x += (rest - W @ forces) @ inverse
+                rest, missed = inverse @ (f - A @ x - alpha[chosen] @ rows), g[chosen] - rows @ x
+        else:
+            system = np.block([[A / k, k * rows.T], [k * rows, np.zeros_like(gram)]])
+            found = np.linalg.lstsq(system, np.append(f / k, k * g[chosen]), rcond=None)[0]
+            x, alpha[chosen] = found[: len(f)], k**2 * found[len(f) :]
         violated = B @ x - g > 1e-12 * (sizes @ abs(x) + abs(g))
         pulling = alpha < -1e-12 * abs(alpha).max(initial=0.0)
         if not (violated | pulling).any():
@@ -230,9 +230,8 @@ def _polished(
     return x, np.maximum(alpha, 0.0)
 
 
-def _independent(columns: Array) -> bool:
-    """Whether every column is at an angle of 1e-5 at least to those before it."""
-    gram = columns.T @ columns
+def _independent(gram: Array) -> bool:
+    """Whether every vector, of which these are the products, is at an angle of 1e-5 at least to those before it."""
     sizes = np.sqrt(gram.diagonal())
     with suppress(np.linalg.LinAlgError):
         return bool(sizes.all() and (np.linalg.cholesky(gram / np.outer(sizes, sizes)).diagonal() > 1e-5).all())

@@ -320,7 +320,7 @@ def test_polishing_ends_where_changes_of_all_rows_at_once_cycle() -> None:
         B /= np.linalg.norm(B, axis=1)[:, None]
         g[8:] = B[8:] @ np.linalg.lstsq(B[:8], g[:8], rcond=None)[0]
         A, f = np.eye(12), 3.0 * rng.random(12)
-        x, alpha = reduced_model._polished(A, f, B, g, np.ones(11, bool))
+        x, alpha = reduced_model._polished(A, f, B, g, np.ones(11, bool), np.linalg.inv(np.linalg.cholesky(A)))
         assert max(reduced_model.residuals(A, f, B, g, x, alpha)) <= 1e-12
 
 
