@@ -10,6 +10,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
+from numbers import Integral, Real
 from typing import Any, ClassVar
 
 import numpy as np
@@ -18,6 +19,7 @@ from vibench.arrays import Array, Mask
 from vibench.errors import RequestError
 from vibench.interfaces.problem import ParameterBox, Problem, VariationalInequality
 from vibench.linalg.inner_product import InnerProduct
+from vibench.text import brief
 
 
 @dataclass(frozen=True)
@@ -37,7 +39,12 @@ class Stop:
 
     def __post_init__(self) -> None:
         if (self.tolerance is None) == (self.size is None):
-            raise ValueError("a Stop has either a tolerance or a size")
+            raise RequestError("a Stop has either a tolerance or a size")
+        kinds = (("tolerance", self.tolerance, Real, "a number"), ("size", self.size, Integral, "a whole number"))
+        for name, value, kind, right in kinds:
+            fine = isinstance(value, kind) and not isinstance(value, bool) and value >= 0  # NaN is not
+            if value is not None and not fine:
+                raise RequestError(f"{name} of Stop is {brief(repr(value), 80)}, expected {right} of at least 0")
 
     def reached(self, size: int, error: float) -> bool:
         """Whether a construction with `size` vectors and this relative error stops."""

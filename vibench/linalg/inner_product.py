@@ -12,8 +12,9 @@ import scipy.linalg
 import scipy.sparse as sp
 
 from vibench.arrays import Array, SparseMatrix
-from vibench.errors import NumericalError
+from vibench.errors import NumericalError, RequestError
 from vibench.linalg.cholesky import SparseCholesky
+from vibench.text import brief
 
 SYMMETRY_RTOL = 1e-12
 """Difference of two entries of a symmetric matrix, relative to its largest entry, that is taken for round-off."""
@@ -42,9 +43,14 @@ class InnerProduct:
     ------
     NumericalError
         If X is not square, not finite, not symmetric or not positive definite.
+    RequestError
+        If X is no matrix of real numbers, or what a method is given is not of the space.
     """
 
     def __init__(self, matrix: SparseMatrix, name: str = "the Gram matrix") -> None:
+        is_matrix = (sp.issparse(matrix) or isinstance(matrix, np.ndarray)) and matrix.ndim == 2
+        if not is_matrix or matrix.dtype.kind not in "fiub":
+            raise RequestError(f"{name} is {brief(repr(matrix), 80)}, expected a matrix of real numbers")
         self.matrix = sp.csc_array(matrix)
         self._name = name
         check_symmetric(self.matrix, name)
@@ -63,12 +69,22 @@ class InnerProduct:
     def _factor(self) -> SparseCholesky:
         return SparseCholesky(self.matrix, self._name)
 
+    def _refuse_others(self, u: Array) -> None:
+        """Refuse what has not one row for each dimension of the space."""
+        shape = getattr(u, "shape", ())
+        if shape[:1] != self.matrix.shape[:1] or len(shape) > 2:
+            what = f"an array of the shape {shape}" if shape else brief(repr(u), 80)
+            right = f"({self.dim},) or ({self.dim}, k)"
+            raise RequestError(f"{what} is not of a space of dimension {self.dim}, expected the shape {right}")
+
     def apply(self, u: Array) -> Array:
         """X u, for u (n,) or (n, k)."""
+        self._refuse_others(u)
         return np.asarray(self.matrix @ u)
 
     def gram(self, u: Array, v: Array) -> Array:
         """Matrix of inner products uᵀ X v (k×l) of the columns of u (n×k) and v (n×l)."""
+        self._refuse_others(u)
         return np.asarray(u.T @ self.apply(v))
 
     def norm(self, u: Array) -> Array:
@@ -77,18 +93,22 @@ class InnerProduct:
 
     def riesz(self, functional: Array) -> Array:
         """Riesz representer X⁻¹ ℓ of functionals given as (n,) or (n, k)."""
+        self._refuse_others(functional)
         return self._factor.solve(functional)
 
     def whiten(self, u: Array) -> Array:
         """F u: coordinates in which the inner product is Euclidean; u (n,) or (n, k)."""
+        self._refuse_others(u)
         return self._factor.apply_factor(u)
 
     def unwhiten(self, y: Array) -> Array:
         """F⁻¹ y, the inverse of `whiten`; y (n,) or (n, k)."""
+        self._refuse_others(y)
         return self._factor.solve_factor(y)
 
     def whiten_functional(self, functional: Array) -> Array:
         """F⁻ᵀ ℓ: whitened coordinates of the Riesz representer of ℓ (n,) or (n, k); Euclidean norms are dual norms."""
+        self._refuse_others(functional)
         return self._factor.solve_factor_transposed(functional)
 
     def orthonormalise(self, u: Array, against: Array | None = None) -> Array:

@@ -3,12 +3,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from vibench.errors import RequestError
 from vibench.interfaces.strategies import Stop
 
 
 def test_a_stop_is_a_tolerance_or_a_size() -> None:
     for wrong in ({}, {"tolerance": 0.1, "size": 3}):
-        with pytest.raises(ValueError, match="either a tolerance or a size"):
+        with pytest.raises(RequestError, match="either a tolerance or a size"):
             Stop(**wrong)
 
 

@@ -10,10 +10,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+import scipy.sparse as sp
 from packs import write_cable
 
 import vibench
-from vibench import RequestError, Stop
+from vibench import NumericalError, RequestError, Stop
 from vibench.library import runs
 from vibench.testing.sample_run import write_sample_run
 
@@ -46,6 +47,11 @@ def calls(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, tuple[Ca
     pack = vibench.create("problem", "pack", {"path": str(write_cable(tmp_path / "cable"))})
     reduction = vibench.Reduction(pack, vibench.create("dual strategy", "mcpg"), None, Stop(size=2), Stop(size=2))
     model, mu = reduction.model, [5.0, 0.2]
+    space, few = vibench.InnerProduct(sp.eye_array(5)), vibench.InnerProduct(sp.eye_array(3))
+    vi = vibench.VariationalInequality(
+        sp.eye_array(5, format="csr"), np.ones(5), sp.eye_array(3, 5, format="csr"), np.ones(3)
+    )
+    spaces: dict[str, Any] = {"snapshots": np.eye(3, 4), "W": few, "stop": Stop(size=1)}
     bases, coordinates = {"problem": "membrane", "dual": "wide"}, {"x": np.zeros(2), "alpha": np.zeros(2)}
     return {
         "open_run": (vibench.open_run, {"path": "run", "at": {}}),
@@ -86,6 +92,26 @@ def calls(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, tuple[Ca
             | {"accuracy": 1e-9},
         ),
         "Study": (vibench.Study, STUDY),
+        "Stop": (Stop, {"tolerance": 0.1, "size": None}),
+        "Stop of a size": (Stop, {"tolerance": None, "size": 3}),
+        "pod": (vibench.pod, {"snapshots": np.eye(5, 4), "V": space, "stop": Stop(size=1)}),
+        "greedy_cone": (vibench.greedy_cone, spaces),
+        "project_on_cone": (vibench.project_on_cone, {"generators": np.eye(3, 2), "theta": np.ones(3), "W": few}),
+        "supremizers": (vibench.supremizers, {"V": space, "B": sp.eye_array(3, 5), "eta": np.ones((3, 1))}),
+        "solve_high_fidelity": (vibench.solve_high_fidelity, {"vi": vi, "stiffness": None, "start": None}),
+        "solve_qp": (
+            vibench.solve_qp,
+            {"program": vi, "solver": "piqp", "accuracy": 1e-8, "extra": None, "factor": None, "start": None},
+        ),
+        "InnerProduct": (vibench.InnerProduct, {"matrix": sp.eye_array(5), "name": "X"}),
+        **{f"InnerProduct.{name}": (getattr(space, name), {"u": np.ones(5)}) for name in ("apply", "norm", "whiten")},
+        **{
+            f"InnerProduct.{name}": (getattr(space, name), {"functional": np.ones(5)})
+            for name in ("riesz", "whiten_functional")
+        },
+        "InnerProduct.unwhiten": (space.unwhiten, {"y": np.ones(5)}),
+        "InnerProduct.gram": (space.gram, {"u": np.eye(5), "v": np.eye(5)}),
+        "InnerProduct.orthonormalise": (space.orthonormalise, {"u": np.eye(5), "against": None}),
     }
 
 
@@ -105,7 +131,7 @@ def test_every_wrong_argument_is_refused_in_a_line(
                     function(**{**right, parameter: value})
                 except ReachedError:
                     continue
-                except RequestError as error:
+                except (RequestError, NumericalError) as error:
                     refused += 1
                     if "\n" in str(error):
                         wrong.append(f"{name}({parameter}={value!r:.30}): {error}")
@@ -129,6 +155,27 @@ def test_messages_name_the_argument_and_what_is_right(call: Callable[[Any], Any]
     run = vibench.open_run(write_sample_run(tmp_path))
     with pytest.raises(RequestError) as error:
         call(run)
+    assert words in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("call", "words"),
+    [
+        (lambda V: vibench.pod(np.ones((4, 2)), V, Stop(size=1)), "V of pod has n = 5, but that of snapshots is 4"),
+        (lambda V: vibench.pod(np.ones(5), V, Stop(size=1)), "snapshots of pod has the shape (5,), expected (n, P)"),
+        (
+            lambda V: vibench.project_on_cone(np.full((5, 1), np.nan), np.ones(5), V),
+            "generators of project_on_cone has an entry that is not finite",
+        ),
+        (lambda V: vibench.pod(np.ones((5, 2)), V, 1), "stop of pod is 1, expected a Stop"),
+        (lambda V: V.norm(np.ones(4)), "an array of the shape (4,) is not of a space of dimension 5"),
+        (lambda _: Stop(tolerance="x"), "tolerance of Stop is 'x', expected a number of at least 0"),
+        (lambda _: vibench.InnerProduct("x"), "the Gram matrix is 'x', expected a matrix of real numbers"),
+    ],
+)
+def test_functions_on_arrays_name_what_does_not_fit(call: Callable[[Any], Any], words: str) -> None:
+    with pytest.raises(RequestError) as error:
+        call(vibench.InnerProduct(sp.eye_array(5)))
     assert words in str(error.value)
 
 
