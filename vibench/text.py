@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import unicodedata
 from typing import Any
 
 LONGEST = 2000
@@ -71,3 +72,8 @@ def _cut(shown: str, length: int, longest: int) -> str:
         return shown
     note = f"… ({length} characters)"
     return shown[: longest - len(note)] + note
+
+
+def normal_name(name: str) -> str:
+    """A name in the Unicode form NFKC, in which Python compares names: the micro sign µ is the letter μ."""
+    return unicodedata.normalize("NFKC", name)

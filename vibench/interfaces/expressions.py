@@ -5,13 +5,13 @@ from __future__ import annotations
 import ast
 import math
 import operator
-import unicodedata
 import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 
 from vibench.errors import NumericalError, RequestError, unknown_name
+from vibench.text import normal_name
 
 CONSTANTS: Mapping[str, float] = {"pi": math.pi, "e": math.e}
 
@@ -46,7 +46,7 @@ def normal_names(names: Iterable[str]) -> tuple[str, ...]:
     RequestError
         If two names are the same then, or one is that of a constant or function of expressions.
     """
-    normal = tuple(unicodedata.normalize("NFKC", name) for name in names)
+    normal = tuple(normal_name(name) for name in names)
     if len(set(normal)) < len(normal):
         raise RequestError(f"two parameters have the same name: {', '.join(normal)}")
     for name in normal:

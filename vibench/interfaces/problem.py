@@ -16,6 +16,7 @@ from vibench.errors import RequestError, unknown_name
 from vibench.interfaces.affine import AffineSum
 from vibench.interfaces.outputs import Output
 from vibench.linalg.inner_product import InnerProduct
+from vibench.text import normal_name
 
 OUTSIDE_RTOL = 1e-12
 """Largest distance of a parameter from the box, relative to its bounds."""
@@ -84,13 +85,14 @@ class ParameterBox:
 
     def logarithmic(self, log: Sequence[str]) -> list[int]:
         """Numbers of the parameters that `log` names; with the errors of `from_unit`."""
+        known = {normal_name(name): number for number, name in enumerate(self.names)}
         for name in log:
-            if name not in self.names:
+            if normal_name(name) not in known:
                 raise unknown_name("parameter", name, self.names)
-            if self.lower[self.names.index(name)] <= 0.0:
-                low = self.lower[self.names.index(name)]
+            low = self.lower[known[normal_name(name)]]
+            if low <= 0.0:
                 raise RequestError(f"'{name}' cannot have a log scale: its lower bound is {low:g}, expected > 0")
-        return [self.names.index(name) for name in dict.fromkeys(log)]
+        return [known[name] for name in dict.fromkeys(map(normal_name, log))]
 
 
 ABSENT = 1e100

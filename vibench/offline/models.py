@@ -32,7 +32,7 @@ from vibench.qp.verification import Residuals, verify
 from vibench.stability.coercivity import coercivity_and_continuity, energy_inf_sup
 from vibench.study import registry
 from vibench.study.kinds import SOLVER
-from vibench.text import brief
+from vibench.text import brief, normal_name
 from vibench.timing import timed
 
 if TYPE_CHECKING:
@@ -319,9 +319,11 @@ class Model:
         """A parameter as an array (d,)."""
         box = self.parameters
         if isinstance(mu, Mapping):
-            if set(mu) != set(box.names):
-                raise RequestError(f"mu has the components {sorted(mu)}, expected {sorted(box.names)}")
-            mu = [mu[name] for name in box.names]
+            names = [normal_name(name) for name in box.names]
+            given = {normal_name(str(name)): value for name, value in mu.items()}
+            if set(given) != set(names) or len(mu) != len(names):
+                raise RequestError(f"mu has the components {sorted(map(str, mu))}, expected {sorted(box.names)}")
+            mu = [given[name] for name in names]
         try:
             at = np.asarray(mu, dtype=float)
         except (TypeError, ValueError):

@@ -690,3 +690,17 @@ def test_the_command_says_what_has_bounds(run: vibench.Run, main: Main, tmp_path
     assert {file.name for file in (tmp_path / "out").iterdir()} == FILES | {BOUNDS, "model.c", "model.h"}
     assert "int model_certify(" in file.with_suffix(".h").read_text()
     assert len(file.with_name(BOUNDS).read_text().splitlines()) < 250
+
+
+def test_the_code_of_the_page_runs(run: vibench.Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    export_model(certified_model(run), tmp_path / "membrane.npz")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(tmp_path)
+    page = (Path(__file__).parents[3] / "docs" / "export.md").read_text(encoding="utf-8")
+    found: dict[str, Any] = {}
+    for code in re.findall(r"^```python\n(.*?)^```$", page, re.MULTILINE | re.DOTALL):
+        exec(code, found)
+    assert found["solution"].status == "ok"
+    assert found["answer"].bound.guarantee == "verified"
+    for name in ("reduced_model", "reduced_model_certificate"):
+        monkeypatch.delitem(sys.modules, name)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from itertools import product
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -118,6 +119,16 @@ def test_a_parameter_outside_the_domain_is_warned_of(model: vibench.Model) -> No
 def test_what_is_no_parameter(model: vibench.Model, mu: object, line: str) -> None:
     with pytest.raises(vibench.RequestError, match=line):
         model.solve(mu)  # type: ignore[arg-type]
+
+
+def test_names_of_components_are_compared_in_their_unicode_form() -> None:
+    micro, letter = "\u00b5", "\u03bc"
+    box = vibench.ParameterBox((micro, "e"), np.array([1.0, 1.0]), np.array([2.0, 2.0]), ("1", "1"))
+    assert box.logarithmic([letter, micro]) == [0]
+    model = vibench.Model(SimpleNamespace(problem=SimpleNamespace(parameters=box)), "piqp", 1e-8)  # type: ignore[arg-type]
+    assert list(model._parameter({letter: 1.5, "e": 2.0})) == [1.5, 2.0]
+    with pytest.raises(vibench.RequestError, match="mu has the components"):
+        model._parameter({letter: 1.5, micro: 1.5, "e": 2.0})
 
 
 def test_solvers_that_are_not_there(model: vibench.Model, mus: np.ndarray, monkeypatch: pytest.MonkeyPatch) -> None:
