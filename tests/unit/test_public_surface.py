@@ -85,6 +85,10 @@ def test_naming_a_status_loads_no_solver() -> None:
     assert loaded("from vibench import Status; Status.OK") & HEAVY == set()
 
 
+def test_naming_the_qp_solvers_loads_no_numpy() -> None:
+    assert loaded("from vibench.qp.settings import SETTINGS") & (HEAVY | {"numpy"}) == set()
+
+
 def test_reading_results_loads_no_stage_and_no_solver() -> None:
     code = "import vibench.results.tables\nassert not any(name.startswith('vibench.stages') for name in sys.modules)"
     assert loaded(code) & {"qpsolvers", "matplotlib", "skfem"} == set()

@@ -7,13 +7,12 @@ Tolerances are tighter than the accuracy, because solvers measure residuals in n
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
-from vibench.arrays import Array
+if TYPE_CHECKING:  # the list of solvers, which completion asks for, needs no NumPy
+    from vibench.arrays import Array
 
 
 @dataclass(frozen=True)
@@ -51,7 +50,9 @@ class SolverSettings:
         status = _follow(solution.extras, self.status)
         text = ("found" if solution.found else "not found") if status is None else str(status)
         count = _follow(solution.extras, self.iterations)
-        return text, None if count is None else int(np.ravel(count)[0])
+        while isinstance(count, Sequence) or getattr(count, "shape", None):
+            count = count[0]
+        return text, None if count is None else int(count)
 
 
 def _follow(extras: Mapping[str, Any], path: str) -> Any:
