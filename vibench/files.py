@@ -9,7 +9,7 @@ import os
 import platform
 import secrets
 import stat
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import TextIO
 
@@ -22,8 +22,10 @@ PART = ".part"
 """How they end."""
 
 
-def write_atomically(path: Path, content: bytes, *, durable: bool = False) -> None:
+def write_atomically(path: Path, content: bytes | Iterable[bytes], *, durable: bool = False) -> None:
     """Write a file under a random name in the same folder and rename it; a link under its name is replaced.
+
+    Its content may come in parts, which are written one after the other.
 
     Who may read it is decided by the user's mask, as of files that other programs write. `durable` content is on the
     disk when the function returns.
@@ -35,7 +37,7 @@ def write_atomically(path: Path, content: bytes, *, durable: bool = False) -> No
     handle = os.open(part, flags, 0o666)
     try:
         with os.fdopen(handle, "wb") as file:
-            file.write(content)
+            file.writelines([content] if isinstance(content, bytes) else content)
             if durable:
                 file.flush()
                 os.fsync(file.fileno())

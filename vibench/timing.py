@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import statistics
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
@@ -121,7 +120,9 @@ def median_interval(values: Sequence[float]) -> tuple[float, float]:
     """
     ordered, n = sorted(values), len(values)
     outside, below = 0, 0.0  # values left out on each side; probability that the median is among or below them
-    while (below := below + math.comb(n, outside) / 2**n) <= 0.025:
+    ways, every = 1, 2**n  # to choose as many values, of any number: each follows from the one before
+    while (below := below + ways / every) <= 0.025:
+        ways = ways * (n - outside) // (outside + 1)
         outside += 1
     first = max(outside - 1, 0)
     return ordered[first], ordered[n - 1 - first]

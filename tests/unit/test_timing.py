@@ -59,7 +59,9 @@ def test_seconds_beyond_others_are_never_negative() -> None:
     assert Seconds(3.0, 1.0).beyond(Seconds(1.0, 2.0)) == Seconds(2.0, 0.0)
 
 
-@pytest.mark.parametrize(("count", "first"), [(1, 0), (5, 0), (6, 0), (9, 1), (30, 9), (100, 39), (2000, 955)])
+@pytest.mark.parametrize(
+    ("count", "first"), [(1, 0), (5, 0), (6, 0), (9, 1), (30, 9), (100, 39), (2000, 955), (20_000, 9860)]
+)
 def test_the_interval_of_a_median_has_the_tabulated_order_statistics(count: int, first: int) -> None:
     """As in Conover, Practical Nonparametric Statistics: the largest ones left out with a probability up to 0.025."""
     values = [float(k) for k in range(count)]

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import csv
+import io
 import json
 import math
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import lru_cache
 from typing import Any
 
 import pandas as pd
@@ -15,11 +18,17 @@ from vibench.text import printable_lines, unbroken
 
 def to_csv(frame: pd.DataFrame) -> str:
     """CSV with full precision; a text that a spreadsheet would take for a formula has an apostrophe before it."""
-    shown = frame.rename(columns=lambda name: _no_formula(str(name)))
-    for k, kind in enumerate(frame.dtypes):
-        if not pd.api.types.is_numeric_dtype(kind):
-            shown.isetitem(k, pd.Series(map(_no_formula, frame.iloc[:, k]), index=frame.index, dtype=object))
-    return str(shown.to_csv(index=False))
+    columns = [frame.iloc[:, k] for k in range(frame.shape[1])]
+    values = [column.astype(object).where(column.notna(), None).tolist() for column in columns]
+    return csv_lines([list(map(str, frame.columns)), *zip(*values, strict=True)])
+
+
+def csv_lines(rows: Iterable[Sequence[Any]]) -> str:
+    """Lines of CSV as `to_csv` writes them, from rows of values as Python has them; `None` is a missing one."""
+    lines = io.StringIO(newline="")
+    writer = csv.writer(lines, lineterminator="\n")
+    writer.writerows([_no_formula(value) if isinstance(value, str) else value for value in row] for row in rows)
+    return lines.getvalue()
 
 
 FORMULA = tuple("=+-@＝＋－＠\n")
@@ -28,9 +37,8 @@ FORMULA = tuple("=+-@＝＋－＠\n")
 NUMBER = re.compile(r"[+-]([0-9]+(\.[0-9]+)?(e[+-]?[0-9]+)?|inf)")
 
 
-def _no_formula(value: Any) -> Any:
-    if not isinstance(value, str):
-        return value
+@lru_cache(maxsize=1 << 16)  # most rows of a table have the same texts
+def _no_formula(value: str) -> str:
     text = printable_lines(value)
     return f"'{text}" if text.startswith(FORMULA) and not NUMBER.fullmatch(text) else text
 

@@ -9,7 +9,7 @@ pair over the span alone. The tolerance for round-off is relative to the constan
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -45,6 +45,16 @@ class Violation:
 def violations(queries: pd.DataFrame, kinds: pd.Series) -> list[Violation]:
     """Violated invariants in rows of the queries table; `kinds` is the kind of enrichment of each cell, by cell."""
     return list(_violations(queries, kinds))
+
+
+def added_up(parts: Iterable[Violation]) -> list[Violation]:
+    """Violations of several parts of a table, each invariant once."""
+    found: dict[str, Violation] = {}
+    for one in parts:
+        before = found.get(one.invariant, Violation(one.invariant, 0, one.worst))
+        worst = float(np.fmax(before.worst, one.worst))  # NaN where every difference is one
+        found[one.invariant] = Violation(one.invariant, before.rows + one.rows, worst)
+    return list(found.values())
 
 
 def _violations(rows: pd.DataFrame, kinds: pd.Series) -> Iterator[Violation]:

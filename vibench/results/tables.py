@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from types import MappingProxyType
+from types import MappingProxyType, NoneType
 
 import pandas as pd
 
@@ -25,14 +25,15 @@ from vibench.results.columns import (
     REAL,
     STORED,
     TABLES,
+    TEXT,
     THRESHOLDS,
     VERSION,
     Column,
     shown_columns,
 )
-from vibench.results.formats import asked, break_even, interval, to_csv, to_markdown
+from vibench.results.formats import asked, break_even, csv_lines, interval, to_csv, to_markdown
 from vibench.results.plugin_columns import Extended
-from vibench.results.sqlite.reading import FILE, read_meta, read_rows
+from vibench.results.sqlite.reading import FILE, Part, read_meta, read_parts, read_rows
 from vibench.study.cells import UNCORRECTED
 from vibench.text import brief, json_object
 
@@ -64,20 +65,44 @@ def read(path: Path, table: str, cells: Sequence[str] = ()) -> pd.DataFrame:
 
     Raises a `RequestError` if they are damaged, or have a value that is none of its column.
     """
-    names, rows = read_rows(path, table, cells)
+    return _framed(path, table, read_rows(path, table, cells))
+
+
+def read_in_parts(path: Path, table: str) -> Iterator[pd.DataFrame]:
+    """One table as `read` gives it, some thousand rows at a time, since it may be larger than memory.
+
+    Raises a `RequestError` as `read`; of damage after the last part.
+    """
+    return (_framed(path, table, part) for part in read_parts(path, table))
+
+
+def _framed(path: Path, table: str, part: Part) -> pd.DataFrame:
+    names, rows = _checked(path, table, part)
     frame = pd.DataFrame.from_records(rows, columns=names, coerce_float=True)
-    for name, column in ((name, STORED[table].get(name, PARAMETER)) for name in frame.columns):
-        if column.kind.startswith(BLOB) or pd.api.types.is_numeric_dtype(frame[name]):
-            continue
-        number = column.kind.startswith((REAL, INTEGER))
-        is_right, right = A_NUMBER if number else RIGHT.get(name, A_TEXT)
-        for value in frame[name].dropna().unique():
-            if not is_right(value):
-                strange = f"{brief(repr(value), 60)} in the column '{name}' of '{table}'"
-                raise RequestError(f"'{path}' has {strange}, expected {right}")
-        if number:
+    for name in names:
+        if not _column(table, name).kind.startswith((TEXT, BLOB)) and not pd.api.types.is_numeric_dtype(frame[name]):
             frame[name] = frame[name].astype(float)  # every value is NULL
     return frame
+
+
+def _checked(path: Path, table: str, part: Part) -> Part:
+    """Rows as they are; a `RequestError` if one has a value that is none of its column."""
+    names, rows = part
+    for name, values in zip(names, zip(*rows, strict=True), strict=False):  # no values where there are no rows
+        kind = _column(table, name).kind
+        types = set(map(type, values)) - {NoneType}
+        if kind.startswith(BLOB) or (types <= {int, float} and kind.startswith((REAL, INTEGER))):
+            continue
+        is_right, right = A_NUMBER if kind.startswith((REAL, INTEGER)) else RIGHT.get(name, A_TEXT)
+        for value in dict.fromkeys(values):
+            if value is not None and not is_right(value):
+                strange = f"{brief(repr(value), 60)} in the column '{name}' of '{table}'"
+                raise RequestError(f"'{path}' has {strange}, expected {right}")
+    return part
+
+
+def _column(table: str, name: str) -> Column:
+    return STORED[table].get(name, PARAMETER)
 
 
 A_NUMBER = (lambda value: isinstance(value, float | int)), "a number"
@@ -127,14 +152,27 @@ def export(path: Path, folder: Path, note: Callable[[str], None] = lambda _: Non
     `note` is called with a line for every column of a plugin that could not be written.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    read_tables = extended_tables(path, TABLES)
-    for line in plugin_columns.faults_of(read_tables.values()):
+    # The other tables are written as they are read: queries may be more than memory holds.
+    whole = extended_tables(path, [name for name in TABLES if name == "cells" or plugin_columns.is_extended(name)])
+    for line in plugin_columns.faults_of(whole.values()):
         note(line)
-    texts = {f"{table}.csv": to_csv(whole_numbers(in_order(one.frame))) for table, one in read_tables.items()}
-    texts[SUMMARY] = to_markdown(summary(read_tables["cells"].frame, read_tables["cells"].columns))
-    for name, text in texts.items():
-        write_atomically(folder / name, text.encode("utf-8"))
+    texts: dict[str, Iterable[str]] = {
+        f"{name}.csv": [to_csv(whole_numbers(in_order(whole[name].frame)))] if name in whole else _csv_parts(path, name)
+        for name in TABLES
+    }
+    texts[SUMMARY] = [to_markdown(summary(whole["cells"].frame, whole["cells"].columns))]
+    for name, parts in texts.items():
+        write_atomically(folder / name, (part.encode("utf-8") for part in parts))
     return [folder / name for name in texts]
+
+
+def _csv_parts(path: Path, table: str) -> Iterator[str]:
+    """A table without columns of plugins as CSV, in the order of `in_order`, part by part."""
+    header = True
+    for part in read_parts(path, table, order=terms_in_order(STORED[table])):
+        names, rows = _checked(path, table, part)
+        yield csv_lines([names, *rows] if header else rows)
+        header = False
 
 
 def in_order(frame: pd.DataFrame) -> pd.DataFrame:

@@ -5,13 +5,16 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from vibench.qp.status import Status
 from vibench.results import formats, invariants, tables, views
 from vibench.results.solver_agreement import sentence
 from vibench.terminal.console import print_frame
 from vibench.terminal.output import echo, run_argument
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 WHOLE = 20
 """Cells up to which the summary is printed whole."""
@@ -24,7 +27,7 @@ Rows = Sequence[Mapping[str, Any]]
 
 def print_summary(study: str, path: Path, rows: Rows) -> None:
     """Print the summary of a run, why cells are not ok, and violated invariants."""
-    cells, queries = tables.read(path, "cells"), tables.read(path, "queries")
+    cells = tables.read(path, "cells")
     table = views.look_up(path, "summary" if len(cells) <= WHOLE else "best")
     if len(table.rows):
         title = study if len(cells) <= WHOLE else f"{study}, the fastest query at every error reached"
@@ -34,15 +37,24 @@ def print_summary(study: str, path: Path, rows: Rows) -> None:
     not_ok = [row for row in rows if row["status"] != Status.OK]
     echo(*failures(rows, run_argument(path.parent)))
     echo(f"{len(rows)} cells, {len(rows) - len(not_ok)} ok, {len(not_ok)} not ok")
-    violations = invariants.violations(queries, cells.set_index("cell")["enrichment_kind"])
+    queries, violations = _judged_queries(path, cells)
     for violation in violations[:REASONS]:
         echo(f"invariant: {violation}; this is a bug of vibench or of a plugin's inner products")
     if violations[REASONS:]:
         echo(f"invariant: {len(violations) - REASONS} more like these")
-    if len(queries) and not violations:
-        echo(f"invariants of the constants and the error bounds hold in all {len(queries)} queries")
+    if queries and not violations:
+        echo(f"invariants of the constants and the error bounds hold in all {queries} queries")
     if agreement := sentence(tables.read(path, "disagreements"), cells["solver"].nunique()):
         echo(agreement)
+
+
+def _judged_queries(path: Path, cells: pd.DataFrame) -> tuple[int, list[invariants.Violation]]:
+    """Number of queries, and the invariants that they violate; queries may be more than memory holds."""
+    kinds, count, violations = cells.set_index("cell")["enrichment_kind"], 0, list[invariants.Violation]()
+    for part in tables.read_in_parts(path, "queries"):
+        count += len(part)
+        violations += invariants.violations(part, kinds)
+    return count, invariants.added_up(violations)
 
 
 def failures(rows: Rows, run: str) -> Iterator[str]:

@@ -5,7 +5,7 @@ import pandas as pd
 import pytest
 
 from vibench.results.columns import CONSTANTS
-from vibench.results.invariants import EFFECTIVITIES, violations
+from vibench.results.invariants import EFFECTIVITIES, added_up, violations
 
 GOOD: dict[str, float | str] = dict.fromkeys(CONSTANTS, 0.1) | dict.fromkeys(EFFECTIVITIES, 1.0)
 GOOD |= {f"beta_full_{what}": 0.2 for what in ("span", "cone_lower", "cone_upper")}
@@ -58,3 +58,9 @@ def test_a_cone_with_free_generators_is_compared_with_the_high_fidelity_pair_ove
     assert violations(rows(**above, bounds="span/span"), KINDS) == []
     found = violations(rows(**above, bounds="span/U1", beta_hf_span=0.25), KINDS)
     assert [v.invariant for v in found] == ["beta_full_span ≥ beta_hf_span"]
+
+
+def test_violations_of_parts_are_those_of_the_whole() -> None:
+    parts = [rows(beta_cone_lower=0.11), rows(), rows(beta_cone_lower=0.13, effectivity_u=0.5), rows(beta_span=np.nan)]
+    whole = {str(one) for one in violations(pd.concat(parts, ignore_index=True), KINDS)}
+    assert {str(one) for one in added_up(one for part in parts for one in violations(part, KINDS))} == whole

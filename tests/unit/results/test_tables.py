@@ -26,6 +26,7 @@ from vibench.results.break_even import break_even_rows
 from vibench.results.columns import CELLS, HISTORIES, KEYS, QUERIES, TABLES, THRESHOLDS, VERSION
 from vibench.results.database import ResultsDatabase
 from vibench.results.formats import cell_text, to_csv, to_json, to_latex, to_markdown
+from vibench.results.sqlite import digests
 from vibench.results.sqlite.reading import FILE
 from vibench.results.tables import benefits, export, in_order, read, results_file, summary
 from vibench.results.views import look_up
@@ -114,6 +115,17 @@ def test_everything_is_exported(run: Path, tmp_path: Path) -> None:
     assert [path.name for path in files] == names
     assert sorted(path.name for path in (tmp_path / "out" / "tables").iterdir()) == sorted(names)
     assert all(path.read_text(encoding="utf-8").strip() for path in files)
+
+
+@pytest.mark.parametrize("rows", [1, 3, 4096])
+def test_large_tables_are_read_and_written_in_parts(run: Path, rows: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(digests, "PART", rows)
+    path = results_file(str(run))
+    assert [len(part) for part in tables.read_in_parts(path, "queries")] == {1: [1] * 4, 3: [3, 1], 4096: [4]}[rows]
+    export(path, run / "tables")
+    for table in TABLES:
+        whole = to_csv(tables.whole_numbers(in_order(read(path, table))))
+        assert (run / "tables" / f"{table}.csv").read_text() == whole
 
 
 def test_exporting_again_replaces_the_files(run: Path, tmp_path: Path) -> None:

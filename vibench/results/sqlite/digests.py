@@ -5,7 +5,8 @@ from __future__ import annotations
 import hashlib
 import marshal
 import sqlite3
-from collections.abc import Iterable, Sequence
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import groupby
 from typing import Any
 
@@ -22,6 +23,10 @@ CREATE = "CREATE TABLE IF NOT EXISTS digests (name TEXT, cell TEXT, total TEXT, 
 
 FORMAT = 2
 """Format of marshal for the rows: its later ones depend on how often an object is used."""
+
+
+PART = 4096
+"""Rows that are read at a time: a large table has more than memory should hold."""
 
 
 class DigestError(Exception):
@@ -53,24 +58,36 @@ class Digests:
 
     def changed(self, table: str) -> tuple[str, ...]:
         """Cells whose rows are not those that were written; "" for a table without cells."""
-        return self._compared(table, *self._opened(table))
+        names, rows = self._opened(table)
+        return self._compared(table, _totals(names, rows))
 
-    def verified(self, table: str, cells: Sequence[str] = ()) -> tuple[list[str], list[tuple[Any, ...]]]:
-        """Columns and rows of a table, or those of some cells.
+    def verified(
+        self, table: str, cells: Sequence[str] = (), order: Sequence[str] = ()
+    ) -> Iterator[tuple[list[str], list[tuple[Any, ...]]]]:
+        """Columns and rows of a table, or those of some cells, in parts of at most `PART` rows: at least one part.
 
-        Raises a `DigestError` if they are not those that were written.
+        `order` are terms of SQL; without, rows come in the order in which they were written.
+
+        Raises a `DigestError`, after the last part, if they are not those that were written.
         """
-        names, cursor = self._opened(table, cells)
-        rows = cursor.fetchall()
-        if changed := self._compared(table, names, rows, cells):
+        names, cursor = self._opened(table, cells, order)
+        totals, rows = Counter[Any](), cursor.fetchmany(PART)
+        yield names, rows
+        while rows:
+            totals.update(_totals(names, rows))
+            if rows := cursor.fetchmany(PART):
+                yield names, rows
+        if changed := self._compared(table, totals, cells):
             whose = f" of the cell {changed[0]}" if changed[0] else ""
             raise DigestError(f"rows{whose} in the table '{table}' are not those that were written")
-        return names, rows
 
-    def _opened(self, table: str, cells: Sequence[str] = ()) -> tuple[list[str], sqlite3.Cursor]:
+    def _opened(
+        self, table: str, cells: Sequence[str] = (), order: Sequence[str] = ()
+    ) -> tuple[list[str], sqlite3.Cursor]:
         # An index may be damaged, too: the table itself is read.
+        query = f'SELECT * FROM "{table}" NOT INDEXED WHERE {of_cells(cells)}'
         try:
-            cursor = self._db.execute(f'SELECT * FROM "{table}" NOT INDEXED WHERE {of_cells(cells)}', cells)
+            cursor = self._db.execute(f"{query} ORDER BY {', '.join(order)}" if order else query, cells)
         except UnicodeDecodeError:  # of the name of a column
             raise DigestError(f"the columns of the table '{table}' are not those that were written") from None
         names = [column[0] for column in cursor.description]
@@ -79,12 +96,10 @@ class Digests:
             raise DigestError(f"the columns of the table '{table}' are not those that were written")
         return names, cursor
 
-    def _compared(
-        self, table: str, names: Sequence[str], rows: Iterable[tuple[Any, ...]], cells: Sequence[str] = ()
-    ) -> tuple[str, ...]:
+    def _compared(self, table: str, totals: Mapping[Any, int], cells: Sequence[str] = ()) -> tuple[str, ...]:
         query = f"SELECT cell, total FROM digests NOT INDEXED WHERE name = ? AND {of_cells(cells)}"
         written = dict(self._db.execute(query, (table, *cells)))
-        now = {str(key): f"{total:x}" for key, total in _totals(names, rows).items()}
+        now = {str(key): f"{total:x}" for key, total in totals.items()}
         either = sorted(map(str, written.keys() | now.keys()))
         return tuple(key for key in either if written.get(key, NONE) != now.get(key, NONE))
 

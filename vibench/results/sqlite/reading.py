@@ -10,7 +10,7 @@ import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 from vibench.errors import RequestError
 from vibench.files import TEMPORARY
@@ -128,7 +128,7 @@ def read_meta(path: Path) -> dict[str, str]:
                 raise DamagedResultsError(f"'{path}' is damaged: {' '.join(damage.split())}")
             meta = dict(db.execute("SELECT key, value FROM meta")) if kinds else {}
             if meta.get("schema") == str(VERSION):  # other versions are refused, or have no digests
-                Digests(db).verified("meta")
+                list(Digests(db).verified("meta"))
             return meta
     except DigestError as error:
         raise DamagedResultsError(f"'{path}' is damaged: {error}") from None
@@ -140,26 +140,40 @@ def read_meta(path: Path) -> dict[str, str]:
 STATUSES = tuple(status.value for status in Status)
 
 
-def read_rows(path: Path, table: str, cells: Sequence[str] = ()) -> tuple[list[str], list[tuple[Any, ...]]]:
+Part: TypeAlias = tuple[list[str], list[tuple[Any, ...]]]
+"""Columns and some rows of a table."""
+
+
+def read_rows(path: Path, table: str, cells: Sequence[str] = ()) -> Part:
     """Columns and rows of a table of a results file, or those of some cells, in the order in which they were written.
 
     Raises a `RequestError` if they are damaged, or have a status that does not exist.
     """
-    try:
-        with open_read_only(path) as db, db:
-            db.execute("BEGIN")  # a run that writes in between changes neither rows nor digests
-            names, rows = Digests(db).verified(table, cells)
-    except DigestError as error:
-        what = "run its study again, which computes damaged cells anew"
-        raise RequestError(f"'{path}' is damaged: {error}; {what}") from None
-    except (sqlite3.Error, OverflowError, MemoryError) as error:
-        raise RequestError(f"'{path}' cannot be read: {one_line(str(error))}") from None
+    names, rows = list[str](), list[tuple[Any, ...]]()
+    for names, part in read_parts(path, table, cells):  # noqa: B007  there is at least one part
+        rows += part
     if "status" in names:
         strange = {row[names.index("status")] for row in rows}.difference(STATUSES)
         if strange:
             expected = f"expected one of {', '.join(STATUSES)}"
             raise RequestError(f"'{path}' has the status {str(min(strange, key=str))[:60]!a} in '{table}', {expected}")
     return names, rows
+
+
+def read_parts(path: Path, table: str, cells: Sequence[str] = (), order: Sequence[str] = ()) -> Iterator[Part]:
+    """The same in parts of some thousand rows, at least one, whatever their status; `order` are terms of SQL.
+
+    Raises a `RequestError` after the last part if they are damaged.
+    """
+    try:
+        with open_read_only(path) as db, db:
+            db.execute("BEGIN")  # a run that writes in between changes neither rows nor digests
+            yield from Digests(db).verified(table, cells, order)
+    except DigestError as error:
+        what = "run its study again, which computes damaged cells anew"
+        raise RequestError(f"'{path}' is damaged: {error}; {what}") from None
+    except (sqlite3.Error, OverflowError, MemoryError) as error:
+        raise RequestError(f"'{path}' cannot be read: {one_line(str(error))}") from None
 
 
 def study_of(path: Path, meta: Mapping[str, str]) -> dict[str, Any]:
