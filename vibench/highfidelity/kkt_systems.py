@@ -61,12 +61,18 @@ class CondensedStiffness:
 
     def solve(self, right: Array) -> Array:
         """A⁻¹ r for right-hand sides (n, k)."""
-        solutions = np.empty_like(right)
-        for k, column in enumerate(right.T):
-            load, particular = self._condensed.condense_load(column)
-            retained = self._compliance @ load if self._condensed.dense else self._schur_factor.solve(load)
-            solutions[:, k] = self._condensed.recover(retained, particular)
-        return solutions
+        load, particular = self._condensed.eliminate(right)
+        retained = self._compliance @ load if self._condensed.dense else self._schur_factor.solve(load)
+        return self._condensed.recover(retained, particular)
+
+    def norm_of_force(self, force: Array) -> float | None:
+        """‖ℓ‖ in A⁻¹ of a force ℓ (n,) on retained unknowns, such as Bᵀλ; `None` without a dense compliance."""
+        if not self._condensed.dense:
+            return None
+        load = force[self._pattern.retained]
+        pressed = np.flatnonzero(load)
+        energy = load[pressed] @ self._compliance[np.ix_(pressed, pressed)] @ load[pressed]
+        return float(np.sqrt(max(float(energy), 0.0)))
 
     @cached_property
     def _schur_factor(self) -> SparseCholesky:
@@ -225,13 +231,14 @@ def _compliance_solver(compliance: Array, f: Array, B: SparseMatrix, g: Array) -
         rows, lam = B[active], np.zeros(len(g))
         if not len(active):
             return unconstrained, lam
-        displacements = np.asarray(rows @ compliance)
-        contact = rows @ displacements.T
+        touched = np.unique(rows.indices)  # of the compliance of all candidates few rows are needed
+        rows = rows[:, touched]
+        contact = np.asarray(rows @ (rows @ compliance[np.ix_(touched, touched)]).T)
         scale = 1.0 / np.sqrt(np.diag(contact))  # rows of any length
         factor = scipy.linalg.cho_factor(contact * np.outer(scale, scale))
         forces = scale * scipy.linalg.cho_solve(factor, scale * excess[active])
         forces += scale * scipy.linalg.cho_solve(factor, scale * (excess[active] - contact @ forces))
         lam[active] = forces
-        return unconstrained - forces @ displacements, lam
+        return unconstrained - (rows.T @ forces) @ compliance[touched], lam
 
     return solve_active

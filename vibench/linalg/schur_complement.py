@@ -97,7 +97,7 @@ class StaticCondensation:
     def _interface_schur(self) -> Array:
         return self._factor.schur() if self._factor is not None else np.zeros((0, 0))
 
-    @property
+    @cached_property
     def schur(self) -> SparseMatrix:
         """Schur complement Ŝ of the eliminated unknowns (c×c), sparse."""
         retained, interface = sp.coo_array(self._retained_block), self._pattern.interface
@@ -115,18 +115,22 @@ class StaticCondensation:
         schur[np.ix_(interface, interface)] = self._interface_schur
         return np.asarray(schur)
 
+    def eliminate(self, f: Array) -> tuple[Array, Array]:
+        """Condensed loads (c,) or (c, k) of f (n,) or (n, k), and what `recover` needs of the eliminated unknowns."""
+        condensed, particular = f[self._pattern.retained], np.zeros((0, *f.shape[1:]))
+        if self._factor is not None:
+            particular, condensed[self._pattern.interface] = self._factor.eliminate(f[self._pattern.order])
+        return condensed, particular
+
     def condense_load(self, f: Array) -> tuple[Array, Array]:
-        """The condensed load (c,) of f (n,), and the solution of the eliminated unknowns that `recover` needs."""
+        """The same of one load, which is remembered until another one comes."""
         if self._last_load is None or not np.array_equal(self._last_load[0], f):
-            condensed, particular = f[self._pattern.retained], np.zeros(0)
-            if self._factor is not None:
-                particular, condensed[self._pattern.interface] = self._factor.eliminate(f[self._pattern.order])
-            self._last_load = f.copy(), (condensed, particular)  # the next load may be written into the same vector
+            self._last_load = f.copy(), self.eliminate(f)  # the next load may be written into the same vector
         return self._last_load[1]
 
     def recover(self, u_retained: Array, particular: Array) -> Array:
-        """All unknowns (n,) from the retained ones (c,), with equilibrium in the eliminated ones."""
-        u = np.empty(self._size)
+        """All unknowns (n,) or (n, k) from the retained ones, with equilibrium in the eliminated ones."""
+        u = np.empty((self._size, *u_retained.shape[1:]))
         if self._factor is not None:
             extension = self._factor.extend(u_retained[self._pattern.interface])
             extension[: len(particular)] += particular

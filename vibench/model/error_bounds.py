@@ -83,6 +83,9 @@ MARGIN = 4.0
 IMPLAUSIBLE = 1e8
 """Multipliers this many times those that rows alone would have are of dependent constraints, solved in round-off."""
 
+CANCELLED = 1e-4
+"""A representer A⁻¹ℓ that is a sum of terms, whose norm is below this share of theirs, is computed anew from ℓ."""
+
 ATTEMPTS = 4
 """Margins that are tried, each at least ten times the one before."""
 
@@ -151,7 +154,7 @@ def bound_errors_at(
     if corrected is None:
         return ErrorBounds.none(NO_CORRECTION)
     of_u = terms(corrected, vi, energy, u, lam)
-    with_d = _with_constrained_residual(of_u.residual, corrected, vi, energy, u, lam)
+    with_d = _with_constrained_residual(of_u, corrected, vi, energy, u, lam)
     of_lam = min((of_u, *with_d), key=lambda terms: terms.rho)
     in_V = of_u.primal / float(np.sqrt(alpha.value))
     in_W = of_lam.dual / beta.value if beta.value > 0.0 else float("inf")
@@ -174,7 +177,7 @@ def reference_bound(vi: VariationalInequality, energy: Energy, u: Array, lam: Ar
     if correction is None:
         return float("inf")
     bound = terms(correction, vi, energy, u, lam).primal
-    size = float(np.hypot(energy.norm(u), energy.dual_norm(vi.B.T @ lam)))
+    size = float(np.hypot(energy.norm(u), energy.norm_of_force(vi.B.T @ lam)))
     open_by_round_off = np.sqrt(4.0 * MARGIN * float(lam @ np.nan_to_num(_round_off(vi, u, correction.w), posinf=0.0)))
     if not bound <= max(REFERENCE * size, open_by_round_off):
         raise NumericalError(
@@ -222,9 +225,9 @@ def corrected_pair(vi: VariationalInequality, energy: Energy, u: Array, lam: Arr
 
 @dataclass(frozen=True)
 class Terms:
-    """The terms of (ii), with the residual r (n,) and ‖r + A w‖_{A⁻¹}, and the bounds that need no constants."""
+    """The terms of (ii), with A⁻¹r (n,) and ‖r + A w‖_{A⁻¹}, and the bounds that need no constants."""
 
-    residual: Array
+    riesz: Array
     rho: float
     omega: float
     kappa: float
@@ -292,31 +295,60 @@ class Correction:
     constraints: Constraints
 
 
-def terms(correction: Correction, vi: VariationalInequality, energy: Energy, u: Array, lam: Array) -> Terms:
-    """The terms with a correction of u (n,) and λ ≥ 0 (m,)."""
+def terms(
+    correction: Correction,
+    vi: VariationalInequality,
+    energy: Energy,
+    u: Array,
+    lam: Array,
+    near: tuple[Array, float] | None = None,
+) -> Terms:
+    """The terms with a correction of u (n,) and λ ≥ 0 (m,).
+
+    `near` are A⁻¹r (n,) and the ρ of the pair that it follows from; by default A⁻¹r is computed. No other solution with
+    A is needed, since A⁻¹(r + A w) = A⁻¹r + w.
+    """
     w, eta, equalities = correction.w, correction.eta, correction.constraints.equalities
     residual, kappa = vi.f - vi.A @ u - vi.B.T @ lam, max(0.0, float(lam @ _slack(vi, u, w)))
     if equalities is not None:
         kappa += eta * float(lam @ equalities.reach)
-    of_feasible = energy.dual_norm(residual + vi.A @ w) + eta
-    return Terms(residual, energy.dual_norm(residual), energy.norm(w) + eta, kappa, of_feasible)
+    if near is None:
+        riesz = energy.riesz(residual)
+        rho = float(np.sqrt(max(float(residual @ riesz), 0.0)))
+        largest = rho
+    else:
+        riesz, largest = near
+        rho = _dual_norm(energy, residual, riesz, largest)
+    of_feasible = _dual_norm(energy, residual + vi.A @ w, riesz + w, largest) + eta
+    return Terms(riesz, rho, energy.norm(w) + eta, kappa, of_feasible)
+
+
+def _dual_norm(energy: Energy, functional: Array, riesz: Array, largest: float) -> float:
+    """‖ℓ‖_{A⁻¹} of a functional ℓ (n,) from A⁻¹ℓ (n,), a sum of terms whose norm is at most about `largest`."""
+    norm = float(np.sqrt(max(float(functional @ riesz), 0.0)))
+    return norm if norm >= CANCELLED * largest else energy.dual_norm(functional)
 
 
 def _with_constrained_residual(
-    residual: Array, correction: Correction, vi: VariationalInequality, energy: Energy, u: Array, lam: Array
+    of_u: Terms, correction: Correction, vi: VariationalInequality, energy: Energy, u: Array, lam: Array
 ) -> Iterator[Terms]:
-    """The terms for u + d, whose residual is the part of r in the range of Bᵀ, if w is feasible for it and d exists."""
+    """The terms for u + d, whose residual is the part of r in the range of Bᵀ, if w is feasible for it and d exists.
+
+    d is A⁻¹r without the displacement of the forces ξ that hold B d = 0; they load the contact alone.
+    """
     constraints = correction.constraints
     rows = constraints.rows.kept[near_rows(vi)[constraints.rows.kept]]  # any d will do for which w is feasible
-    program = VariationalInequality(vi.A, residual, sp.csr_array(vi.B)[rows], np.zeros(len(rows)))
+    B = sp.csr_array(vi.B)[rows]
+    program = VariationalInequality(vi.A, np.zeros_like(u), B, -(B @ of_u.riesz))
     system = energy.stiffness.active_set_system(program)
     try:
-        d = system.recover(system.solve_active(np.arange(len(program.g)))[0])
+        held = system.recover(system.solve_active(np.arange(len(rows)))[0])
     except (RuntimeError, np.linalg.LinAlgError):  # an exactly singular system
         return
+    d = of_u.riesz + held
     lacking, eta = constraints.lacking(u + d, correction.w)
     if np.all(lacking <= 0.0):
-        yield terms(replace(correction, eta=eta), vi, energy, u + d, lam)
+        yield terms(replace(correction, eta=eta), vi, energy, u + d, lam, (-held, of_u.rho))
 
 
 def find_correction(vi: VariationalInequality, energy: Energy, u: Array, lam: Array) -> Correction | None:

@@ -47,9 +47,18 @@ class Energy:
         """‖v‖_A of v (n,)."""
         return float(np.sqrt(max(float(v @ (self.A @ v)), 0.0)))
 
+    def riesz(self, functional: Array) -> Array:
+        """A⁻¹ ℓ of a functional (n,)."""
+        return self.factor.solve(functional)
+
     def dual_norm(self, functional: Array) -> float:
         """‖ℓ‖_{A⁻¹} of a functional (n,)."""
-        return float(np.sqrt(max(float(functional @ self.factor.solve(functional)), 0.0)))
+        return float(np.sqrt(max(float(functional @ self.riesz(functional)), 0.0)))
+
+    def norm_of_force(self, force: Array) -> float:
+        """‖Bᵀη‖_{A⁻¹} of a force Bᵀη (n,) of the constraints: a product of contact size where A is condensed on it."""
+        norm = self.stiffness.norm_of_force(force)
+        return self.dual_norm(force) if norm is None else norm
 
 
 @dataclass(frozen=True)
@@ -130,7 +139,7 @@ def errors(
     rows = []
     for k, (vi, energy) in enumerate(zip(vis, energies, strict=True)):
         in_energy, energy_u = energy.norm(du[:, k]), energy.norm(reference.u[:, k])
-        natural, natural_lam = (energy.dual_norm(vi.B.T @ eta) for eta in (dlam[:, k], reference.lam[:, k]))
+        natural, natural_lam = (energy.norm_of_force(vi.B.T @ eta) for eta in (dlam[:, k], reference.lam[:, k]))
         rows.append(
             Errors(
                 error_u=None if zero_u[k] else ratio(float(error_u[k]), float(norm_u[k])),

@@ -122,13 +122,14 @@ def _residuals(program: VariationalInequality, x: Array, alpha: Array, norms: Du
     residual, excess = accurate_residuals(program, x, alpha)
     violated = np.flatnonzero(excess > round_off(B, x, g))
     rows = B[violated].T if isinstance(B, np.ndarray) else sp.csr_array(B)[violated].toarray().T
-    reach, energy = norms(rows), solution_energy(program, x, alpha, norms)
+    lengths = norms(np.column_stack([rows, B.T @ alpha, residual]))  # one solve of all takes the least
+    reach, energy = lengths[:-2], _energy(program, x, float(lengths[-2]))
     steps = np.divide(excess[violated], reach, out=np.full(len(violated), np.inf), where=reach > 0.0)
     pressed = alpha > 0.0  # elsewhere s may be infinite
     gap = abs(float(alpha[pressed] @ excess[pressed]))
     return Residuals(
         primal=_over(float(np.max(steps, initial=0.0)), energy),
-        dual=_over(float(norms(residual[:, None])[0]), energy),
+        dual=_over(float(lengths[-1]), energy),
         gap=_over(gap, energy * energy),
     )
 
@@ -145,7 +146,11 @@ def accurate_residuals(program: VariationalInequality, x: Array, alpha: Array) -
 
 def solution_energy(program: VariationalInequality, x: Array, alpha: Array, norms: DualNorms) -> float:
     """S of a solution x (n,), α (m,)."""
-    force = float(norms((program.B.T @ alpha)[:, None])[0])
+    return _energy(program, x, float(norms((program.B.T @ alpha)[:, None])[0]))
+
+
+def _energy(program: VariationalInequality, x: Array, force: float) -> float:
+    """S from ‖Bᵀα‖ in the norm of A⁻¹."""
     return float(np.hypot(np.sqrt(max(float(x @ (program.A @ x)), 0.0)), force))
 
 
