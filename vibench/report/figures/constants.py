@@ -41,6 +41,9 @@ from vibench.stability.infsup import VANISHES
 MOST_PAIRS = 2 * ABREAST
 """Panels over the span in a figure; each has one over the cone below it."""
 
+KEPT = ("pair", "query", "cell", "mu_1", "enrichment_kind", *PRIMAL)
+"""What panels are made of beside the constants: a run may have thousands of pairs, each a copy of every column."""
+
 
 class _Panel(NamedTuple):
     """What one panel over the span and the one below it over the cone show."""
@@ -61,7 +64,8 @@ def inf_sup(data: Data) -> Pages:
     First row: over the span; second row: over the cone, with the certified interval as a band. Fixed enrichments are
     shown at the tolerance of the smallest mean, the same in every panel.
     """
-    constants = pd.concat([one_solver(rows) for _, rows in data.queries.groupby("pair", sort=False)])
+    read = [*KEPT, *(name for name in data.queries if name.startswith("beta_"))]
+    constants = one_solver(data.queries[read], ["pair"])
     shown, axis = loosest(constants), data.parameter
     for panels, part in data.pages(_panels(data, shown), MOST_PAIRS):
         sheet, over, below = two_rows(len(panels), f"{data.problem}, {data.duals[0]}: inf-sup constants")
@@ -96,9 +100,9 @@ def loosest(constants: pd.DataFrame) -> pd.DataFrame:
 
 def _panels(data: Data, shown: pd.DataFrame) -> list[_Panel]:
     """A panel for each pair, and several where there are more strategies than a panel takes."""
-    panels = []
-    for pair, of_pair in data.queries.groupby("pair", sort=False):
-        rows = shown[shown["pair"] == pair]
+    panels, by_pair = [], dict(iter(shown.groupby("pair", sort=False)))
+    for pair, sizes in data.queries[["pair", "N", "R"]].groupby("pair", sort=False):
+        rows = by_pair[pair]
         fixed = rows[rows["enrichment_kind"] == Kind.FIXED]
         sorting = fixed if len(fixed) else rows
         first = sorting[sorting["cell"] == sorting["cell"].iloc[0]]
@@ -106,7 +110,7 @@ def _panels(data: Data, shown: pd.DataFrame) -> list[_Panel]:
         strategies = [
             (series(one["primal"].iloc[0], one["primal_tol"].iloc[0]), name, one) for name, one in by_strategy(rows)
         ]
-        groups = titled_parts(dimensions(of_pair), strategies, SERIES - 1)
+        groups = titled_parts(dimensions(sizes), strategies, SERIES - 1)
         panels += [_Panel(title, group, strategies[0][2], order) for title, group in groups]
     return panels
 

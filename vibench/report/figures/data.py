@@ -255,9 +255,13 @@ def point_names(cells: pd.DataFrame) -> dict[Any, str]:
     return names
 
 
-def one_solver(queries: pd.DataFrame) -> pd.DataFrame:
-    """One row per strategy, tolerance and query: inf-sup constants depend on no solver, assembly or correction."""
-    return queries.drop_duplicates([*PRIMAL, "query"])
+def one_solver(queries: pd.DataFrame, axes: Sequence[str] = ()) -> pd.DataFrame:
+    """One row per strategy, tolerance and query, and per value on the `axes`, in the order of these.
+
+    Inf-sup constants depend on no solver, assembly or correction.
+    """
+    rows = queries.drop_duplicates([*axes, *PRIMAL, "query"])
+    return rows.iloc[np.argsort(rows.groupby(list(axes), sort=False).ngroup(), kind="stable")] if axes else rows
 
 
 def best_solver(cells: pd.DataFrame) -> pd.DataFrame:
