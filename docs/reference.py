@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterable, Mapping
 from typing import Any
 
 from vibench.packs.manifest import Manifest
 from vibench.results.columns import CELLS, PARAMETER, STORED, THRESHOLDS, UNITS, Column, shown_columns
+from vibench.study.described import keys, places
 from vibench.study.spec import Study
-
-KINDS = {"integer": "int", "number": "float", "string": "text", "boolean": "true or false"}
-SIGNS = {"exclusiveMinimum": ">", "minimum": "≥", "exclusiveMaximum": "<", "maximum": "≤"}
 
 
 def study_fields() -> str:
@@ -25,62 +22,17 @@ def pack_fields() -> str:
 
 
 def _models(schema: Mapping[str, Any]) -> str:
-    parts = [_fields(schema)]
-    for name, part in schema["$defs"].items():
-        title = _title(name, [schema, *schema["$defs"].values()])
-        parts.append(f"## {title} {{ #{name.lower()} }}\n\n{part['description']}\n\n{_fields(part)}")
+    rows: dict[str, list[tuple[str, ...]]] = {}
+    for key in keys(schema, lambda model: f"[table](#{model.lower()})"):
+        default = "**required**" if key.required else f"`{key.default}`" * bool(key.default)
+        rows.setdefault(key.table, []).append((f"`{key.name}`", key.expected, default, key.meaning))
+    parts = []
+    for model, fields in rows.items():
+        if model:
+            title = ", ".join(f"`{key}`" for key in places(schema, model))
+            parts.append(f"## {title} {{ #{model.lower()} }}\n\n{schema['$defs'][model]['description']}")
+        parts.append(markdown(("key", "what is expected", "default", "meaning"), fields))
     return "\n\n".join(parts)
-
-
-def _title(model: str, places: Iterable[Mapping[str, Any]]) -> str:
-    reference = json.dumps(f"#/$defs/{model}")
-    keys = [key for place in places for key, field in place["properties"].items() if reference in json.dumps(field)]
-    return ", ".join(f"`{key}`" for key in dict.fromkeys(keys))
-
-
-def _fields(model: Mapping[str, Any]) -> str:
-    required = model.get("required", [])
-    rows = [
-        (
-            f"`{key}`",
-            _words(field),
-            "**required**" if key in required else _default(field.get("default")),
-            field["description"],
-        )
-        for key, field in model["properties"].items()
-    ]
-    return markdown(("key", "what is expected", "default", "meaning"), rows)
-
-
-def _default(value: Any) -> str:
-    if value in (None, "", {}) or (isinstance(value, dict) and "query_seconds" in value):
-        return ""
-    if isinstance(value, list) and value and isinstance(value[0], dict):  # entries, which may be given by their names
-        value = [entry["name"] for entry in value]
-    return f"`{json.dumps(value)}`"
-
-
-def _words(schema: Mapping[str, Any]) -> str:
-    """What a schema expects, in words."""
-    for key in ("anyOf", "oneOf"):
-        if key in schema:
-            return " or ".join(_words(part) for part in schema[key] if part.get("type") != "null")
-    if "$ref" in schema:
-        name = schema["$ref"].rsplit("/", 1)[-1]
-        return f"[table](#{name.lower()})"
-    if "enum" in schema or "const" in schema:
-        return " or ".join(f"`{json.dumps(value)}`" for value in schema.get("enum", [schema.get("const")]))
-    if schema["type"] == "array":
-        return f"list of {_words(schema['items'])}"
-    if schema["type"] == "object":
-        values = schema["additionalProperties"]
-        return "table" if values is True else f"table: name = {_words(values)}"
-    bounds = [f"{sign} {_number(schema[key])}" for key, sign in SIGNS.items() if key in schema]
-    return " ".join([KINDS[schema["type"]], " and ".join(bounds)]).strip()
-
-
-def _number(value: float) -> str:
-    return f"{value:g}" if isinstance(value, float) else str(value)
 
 
 def units() -> str:

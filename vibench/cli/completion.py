@@ -85,7 +85,7 @@ EXAMPLES: Mapping[str, tuple[str, ...]] = {
     ),
     "cones": ("vibench cones my-model", "vibench cones my-model --dual-tol 1e-3"),
     "clean": ("vibench clean --dry-run", "vibench clean --older-than 30"),
-    "help": ("vibench help show", "vibench help beta_cone_lower_min"),
+    "help": ("vibench help show", "vibench help timing_rounds", "vibench help beta_cone_lower_min"),
     "doctor": ("vibench doctor", "vibench doctor --out /scratch/runs"),
 }
 """Examples of every command."""

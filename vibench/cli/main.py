@@ -23,7 +23,7 @@ from vibench.cli.output_commands import draw_figures, export_qps, export_reduced
 from vibench.cli.pack_commands import import_pack, pack_problem, reduce_cones
 from vibench.cli.plugin_commands import check_plugin, list_plugins, new_plugin
 from vibench.cli.result_commands import At, compare_runs, diff_runs, places_of, replay_query, show
-from vibench.errors import RequestError, VibenchError, unknown_name
+from vibench.errors import RequestError, VibenchError
 from vibench.interrupts import INTERRUPTED, Interrupted, interrupted_at_once, interruptible
 from vibench.study.kinds import DUAL, PRIMAL, PROBLEM
 from vibench.terminal.output import echo, warn
@@ -234,22 +234,19 @@ def doctor(out: Annotated[Path, Option(metavar="DIR", help="Folder of the runs."
 
 
 def help_on(
-    topic: Annotated[str, typer.Argument(help="A command, or a column of the results or its heading.")] = "",
+    topic: Annotated[
+        str, typer.Argument(help="A command, a key of study files, or a column of the results or its heading.")
+    ] = "",
 ) -> None:
-    """Say what a command does, or what a column means."""
+    """Say what a command does, or what a key of a study file or a column of the results means."""
     if topic in ("", *COMMANDS):
         app(args=[*topic.split(), "--help"], standalone_mode=False)
         return
-    from vibench.results.columns import STORED
+    from vibench.cli.meanings import meanings
     from vibench.terminal.console import new_console, shown
 
-    named = [(table, name, of) for table, columns in STORED.items() for name, of in columns.items()]
-    meant = [one for one in named if topic in (one[1], one[2].heading)]
-    if not meant:
-        headings = [of.heading for *_, of in named if of.heading]
-        raise unknown_name("command or column", topic, {*COMMANDS, *(name for _, name, _ in named), *headings})
-    for table, name, of in meant:
-        new_console().print(shown(f"{name}{f' [{of.unit}]' * bool(of.unit)}, in {table}: {of.meaning}"))
+    for line in meanings(topic, COMMANDS):
+        new_console().print(shown(line))
 
 
 COMMANDS: dict[str, Callable[..., None]] = {

@@ -17,12 +17,14 @@ from samples import STUDY, changed, write_study
 
 from vibench.cli.plugin_commands import LISTS
 from vibench.qp.settings import SETTINGS
-from vibench.results.columns import CELLS, TABLES
+from vibench.results.columns import CELLS, STORED, TABLES
 from vibench.results.sqlite.reading import FILE
 from vibench.results.tables import read
 from vibench.study import kinds
+from vibench.study.entries import ProblemEntry
 from vibench.study.matrix import expand, read_study
 from vibench.study.registry import find, registered
+from vibench.study.spec import Study
 from vibench.text import printable
 
 
@@ -424,8 +426,20 @@ def test_help_on_a_column_is_what_it_means(name: str, main: Main) -> None:
     assert f"online_s [s], in cells: {CELLS['online_s'].meaning}" in out.splitlines()
 
 
+def test_help_on_a_key_of_study_files_is_what_it_means_wherever_it_stands(main: Main) -> None:
+    code, out, _ = main("help", "training")
+    assert code == 0
+    meanings = [model.model_fields["training"].description for model in (Study, ProblemEntry)]
+    of_file, of_entry, *columns = out.splitlines()
+    assert of_file.startswith('training, in a study file (list of table, default ["own"]): ')
+    assert of_entry.startswith("training, in problem of a study file (")
+    assert [line.partition("): ")[2] for line in (of_file, of_entry)] == meanings
+    in_all = [table for table, described in STORED.items() if "training" in described]
+    assert columns == [f"training, in {', '.join(in_all)}: {CELLS['training'].meaning}"]
+
+
 def test_help_on_nothing_there_is_refused(main: Main) -> None:
-    refused(main("help", "shwo"), "no command or column is called 'shwo'; did you mean 'show'?")
+    refused(main("help", "shwo"), "no command, key of study files or column is called 'shwo'; did you mean 'show'?")
 
 
 def test_problems_are_listed_with_their_parameters(main: Main) -> None:
