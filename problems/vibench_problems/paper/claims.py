@@ -44,6 +44,9 @@ class Agreement(StrEnum):
     AGREES = "agrees"
     DIFFERS = "differs"
     OPEN = "cannot be compared"
+    GIVEN = "by construction"
+    """Agrees because it was put in: an input that is copied from the paper, a size that a study prescribes, arithmetic
+    on numbers that the paper prints. It is no outcome, and does not count as one."""
 
 
 @dataclass(frozen=True)
@@ -86,18 +89,30 @@ def number(
     within: float = 0.0,
     why: str = "",
     cause: str = "",
+    given: bool = False,
 ) -> Claim:
-    """A claim about numbers: one or several, which agree within a relative difference; open where one is missing."""
+    """A claim about numbers: one or several, which agree within a relative difference; open where one is missing.
+
+    `given` says that ours was put in, so that agreement is no outcome.
+    """
     measured = bool(np.all(np.isfinite(np.asarray(ours, float))))
-    verdict = judged(close(paper, ours, within) if measured else None)
+    verdict = judged(close(paper, ours, within) if measured else None, given=given)
     return Claim(place, statement, text(paper), text(ours), verdict, reason(verdict, why, cause))
 
 
 def holds(
-    place: str, statement: str, ours: str, condition: Any, *, paper: str = "yes", why: str = "", cause: str = ""
+    place: str,
+    statement: str,
+    ours: str,
+    condition: Any,
+    *,
+    paper: str = "yes",
+    why: str = "",
+    cause: str = "",
+    given: bool = False,
 ) -> Claim:
-    """A claim that a predicate of our numbers decides; open where it is `None`."""
-    verdict = judged(condition)
+    """A claim that a predicate of our numbers decides; open where it is `None`, no outcome where it was put in."""
+    verdict = judged(condition, given=given)
     return Claim(place, statement, paper, ours, verdict, reason(verdict, why, cause))
 
 
@@ -122,14 +137,15 @@ def ordered(
     return holds(place, statement, ours, not bad, paper="for all r", why=why, cause=cause)
 
 
-def judged(condition: Any) -> Agreement:
-    """The verdict of a predicate, open where it is `None`."""
-    return Agreement.OPEN if condition is None else Agreement.AGREES if condition else Agreement.DIFFERS
+def judged(condition: Any, *, given: bool = False) -> Agreement:
+    """The verdict of a predicate, open where it is `None`; `given` where it holds because it was put in."""
+    agreed = Agreement.GIVEN if given else Agreement.AGREES
+    return Agreement.OPEN if condition is None else agreed if condition else Agreement.DIFFERS
 
 
 def reason(verdict: Agreement, why: str, cause: str) -> str:
     """The remark, and the cause where they do not agree."""
-    return why if verdict is Agreement.AGREES else " ".join(part for part in (why, cause) if part)
+    return why if verdict in (Agreement.AGREES, Agreement.GIVEN) else " ".join(part for part in (why, cause) if part)
 
 
 def close(paper: float | Sequence[float], ours: float | Sequence[float], within: float = 0.0) -> bool:

@@ -33,26 +33,27 @@ def data(evidence: Evidence) -> Iterator[Claim]:
     training, section = problem.training_set(), "Hertz, §5.2"
     (upper, small), (same, large) = (problem.points(np.array([mu])) for mu in (0.7, 1.3))
     radii = (float(small[0].max()), float(large[0].max()))
-    yield number("Hertz, (43)", "range of the radius R₂ = µ [m]", (0.7, 1.3), radii)
-    yield holds(section, "h(µ) does not depend on µ on Ω̂₁", "equal nodes", np.array_equal(upper, same))
+    yield number("Hertz, (43)", "range of the radius R₂ = µ [m]", (0.7, 1.3), radii, given=True)
+    yield holds(section, "h(µ) does not depend on µ on Ω̂₁", "equal nodes", np.array_equal(upper, same), given=True)
     yield from configuration_claims(evidence)
     d = problem.approach(np.array([0.7]))
-    yield holds(section, "d ≥ γ₀ / 2", f"{d:g} ≥ {problem.gap / 2:g}", d >= problem.gap / 2.0)
+    yield holds(section, "d ≥ γ₀ / 2", f"{d:g} ≥ {problem.gap / 2:g}", d >= problem.gap / 2.0, given=True)
     share = d / max(1.0, float(problem.parameters.lower[0]))
-    yield holds(section, "d below 10 % of max(R₁, R₂)", f"at most {100 * share:.3g} %", share < 0.1)
+    yield holds(section, "d below 10 % of max(R₁, R₂)", f"at most {100 * share:.3g} %", share < 0.1, given=True)
     yield from contact_claims(problem)
-    yield number(section, "E [Pa], ν", (15, 0.35), (problem.young, problem.poisson))
+    yield number(section, "E [Pa], ν", (15, 0.35), (problem.young, problem.poisson), given=True)
     steps = (len(training), float(training[1, 0] - training[0, 0]))
-    yield number(section, "training points, step [m]", (81, 0.0075), steps)
+    yield number(section, "training points, step [m]", (81, 0.0075), steps, given=True)
     yield number(
         section,
         "validation points, uniform random",
         30,
         int(evidence.cells["queries"].max()),
         why="The sample is another one; that of the paper is not published.",
+        given=True,
     )
     why = "The paper counts all components, 2 · 6130; here those that are fixed are left out."
-    yield number(section, "primal degrees of freedom", 12260, problem.V.dim, within=MESH, why=why)
+    yield number(section, "primal degrees of freedom", 12260, problem.V.dim, within=MESH, why=why, given=True)
     yield unknown("Hertz, (44)", "characteristic length ℓ̂", "not given", "1 m", "The constants and σ depend on it.")
     yield unknown("Hertz, (48)", "load ℓ(µ)", "not given", "0", "The flats are moved by a lifting without stress.")
 
@@ -85,15 +86,17 @@ def configuration_claims(evidence: Evidence) -> Iterator[Claim]:
     problem, section = evidence.problem, "Hertz, §5.2"
     first, second = problem.points(np.array([0.7]))
     gap = float(first[1, first[0] == 0.0].min() - second[1, second[0] == 0.0].max())
-    yield number(f"{section}, Fig. 9", "radius R₁ [m]", 1, float(first[0].max()), why="Quarter-disks are meshed.")
-    yield number(section, "initial gap γ₀ [m]", 0.001, round(gap, 12))
-    yield number(section, "imposed displacement d [m]", 0.09, problem.approach(np.array([0.7])))
+    yield number(
+        f"{section}, Fig. 9", "radius R₁ [m]", 1, float(first[0].max()), why="Quarter-disks are meshed.", given=True
+    )
+    yield number(section, "initial gap γ₀ [m]", 0.001, round(gap, 12), given=True)
+    yield number(section, "imposed displacement d [m]", 0.09, problem.approach(np.array([0.7])), given=True)
     cause = "The mesh of the run, or its master surface, is finer or coarser."
-    yield number(section, "nodes", evidence.paper.nodes, problem.nodes, within=MESH, cause=cause)
+    yield number(section, "nodes", evidence.paper.nodes, problem.nodes, within=MESH, cause=cause, given=True)
     zone = len(problem.slave.zone)
-    yield number(section, "nodes on the potential contact manifold", 560, zone, within=MESH)
+    yield number(section, "nodes on the potential contact manifold", 560, zone, within=MESH, given=True)
     why = "Macro-edges of two slave edges (LAC)."
-    yield number(section, "dual degrees of freedom", 280, problem.W.dim, why=why)
+    yield number(section, "dual degrees of freedom", 280, problem.W.dim, why=why, given=True)
     yield unknown(
         section, "extent of the potential contact zones", "not given", "30° on disc 1", "It limits the contact."
     )

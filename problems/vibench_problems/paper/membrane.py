@@ -30,7 +30,7 @@ def data(evidence: Evidence) -> Iterator[Claim]:
     """Geometry, parameters, mesh."""
     problem: Obstacle = evidence.problem
     box, training, section = problem.parameters, problem.training_set(), "Obstacle, §5.1"
-    yield number(f"{section}, Fig. 2", "side A of Ω [m]", 1, float(np.ptp(problem.mesh.p[0])))
+    yield number(f"{section}, Fig. 2", "side A of Ω [m]", 1, float(np.ptp(problem.mesh.p[0])), given=True)
     yield number(
         "Obstacle, (35)",
         "range of the radius r = µ₁ of ω(µ) [m]",
@@ -46,6 +46,7 @@ def data(evidence: Evidence) -> Iterator[Claim]:
         RADIUS,
         within=0.05,
         why="√(467 / 3594 / π) on a uniform mesh, within 5 %.",
+        given=True,
     )
     total = problem.constraint(np.array(MEMBRANE))[0].data.sum()
     yield holds(
@@ -57,24 +58,25 @@ def data(evidence: Evidence) -> Iterator[Claim]:
         cause="b(u, η) ≤ g(η) means u ≥ ψ only with a minus sign in b and in g.",
     )
     centre = (float(box.lower[1]), float(box.upper[1]))
-    yield number("Obstacle, (35)", "range of the coordinates of the centre [m]", (-0.05, 0.05), centre)
-    yield number(section, "coefficient of ψ [1/m]", -1.25, problem.obstacle)
-    yield number(section, "load [1/m]", -1, problem.load)
+    yield number("Obstacle, (35)", "range of the coordinates of the centre [m]", (-0.05, 0.05), centre, given=True)
+    yield number(section, "coefficient of ψ [1/m]", -1.25, problem.obstacle, given=True)
+    yield number(section, "load [1/m]", -1, problem.load, given=True)
     yield inactive_rim(evidence, section)
     steps = [float(np.diff(np.unique(training[:, k]))[0]) for k in (0, 1)]
-    yield number(section, "training points, steps of the grid", (125, 0.1, 0.025), (len(training), *steps))
+    yield number(section, "training points, steps of the grid", (125, 0.1, 0.025), (len(training), *steps), given=True)
     yield number(
         section,
         "validation points, uniform random",
         64,
         int(evidence.cells["queries"].max()),
         why="The sample is another one; that of the paper is not published.",
+        given=True,
     )
     yield mesh_size(evidence)
-    yield number(section, "nodes in ω̂", 467, len(problem.disc_nodes), within=MESH)
+    yield number(section, "nodes in ω̂", 467, len(problem.disc_nodes), within=MESH, given=True)
     cause = "The paper counts the nodes on Γ, where u = 0."
     yield number(section, "primal degrees of freedom", 3594, problem.V.dim, within=MESH, cause=cause)
-    yield number(section, "dual degrees of freedom", 467, problem.W.dim, within=MESH)
+    yield number(section, "dual degrees of freedom", 467, problem.W.dim, within=MESH, given=True)
     yield unknown(section, "norm of V", "not given", "(44), ℓ̂ = 1 m", "The constants, σ and N depend on it.")
     yield unknown(section, "h(µ) outside ω̂", "smooth, invertible", "harmonic extension", "The paper gives no formula.")
 
@@ -86,7 +88,7 @@ def _radius(problem: Obstacle, scale: float) -> float:
 
 def mesh_size(evidence: Evidence) -> Claim:
     """The size of the mesh."""
-    return number("Obstacle, §5.1", "nodes", evidence.paper.nodes, evidence.problem.nodes, within=MESH)
+    return number("Obstacle, §5.1", "nodes", evidence.paper.nodes, evidence.problem.nodes, within=MESH, given=True)
 
 
 def inactive_rim(evidence: Evidence, place: str) -> Claim:

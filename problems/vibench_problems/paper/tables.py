@@ -16,7 +16,9 @@ from vibench_problems.paper.claims import (
     break_even_text,
     break_even_verdict,
     cheaper_from,
+    close,
     holds,
+    judged,
     number,
     reason,
     text,
@@ -105,6 +107,7 @@ def table(evidence: Evidence, transcription: Mapping[str, float] | None = None) 
         [column.pair.threshold for column in measured],
         [round(n) for n in computed if n is not None],
         why="(T_off − T_on) / (t_on − t_off), rounded.",
+        given=True,
     )
     if transcription is not None:
         # the obstacle is timed at the first pair of the table, Hertz contact at the last
@@ -125,12 +128,14 @@ def column_claims(problem: str, column: PaperColumn, place: str) -> Iterator[Cla
     pair, on, off = column.pair, column.on, column.off
     prescribed = (
         "Prescribed; Fig. 11 has the dimensions for the tolerances."
-        if "dual_size" in pair.prescribed
+        if pair.by_size
         else f"At δ_POD = {on['pod_tol']:g}, δ_mCPG = {on['dual_tol']:g}."
     )
     for name, size in zip("NR", pair.size, strict=True):
         cause = CAUSES[problem][name]
-        yield number(place, name, size, int(on[name]), within=DIMENSION, why=prescribed, cause=cause)
+        yield number(
+            place, name, size, int(on[name]), within=DIMENSION, why=prescribed, cause=cause, given=pair.by_size
+        )
     for kind, seconds, cell in zip(("on", "off"), pair.offline, (on, off), strict=True):
         yield unknown(place, f"offline time, {kind} [s]", seconds, cell["offline_s"], MACHINE)
     yield offline_ratio(column, place, COSTS[problem]["offline"])
@@ -193,19 +198,22 @@ def threshold(column: PaperColumn, place: str, cause: str) -> Claim:
 
 
 def transcribed(seconds: Mapping[str, float], pair: Pair, place: str) -> Claim:
-    """Offline ratio of the published algorithms in our transcription, in which PGA treats every µ."""
+    """Offline ratio of the published algorithms in our transcription, in which PGA treats every µ.
+
+    The paper does not say how σ is evaluated. Its ratio is confirmed only where it does not depend on that.
+    """
     shared = sum(seconds[stage] for stage in ("snapshots", "POD", "mCPG"))
-    anew, kept = (1.0 + float(seconds[stage] / shared) for stage in ("PGA", "PGA, residuals kept"))
-    return number(
+    kept, anew = (1.0 + float(seconds[stage] / shared) for stage in ("PGA, residuals kept", "PGA"))
+    paper = pair.offline[1] / pair.offline[0]
+    near = {close(paper, ratio, RATIO) for ratio in (kept, anew)}
+    return Claim(
         place,
         "offline time, off / on, the published algorithms in our transcription",
-        pair.offline[1] / pair.offline[0],
-        kept,
-        within=RATIO,
-        why=f"`results/speed`: PGA treats the space of every µ and keeps residuals between its steps. It takes "
-        f"{seconds['PGA, residuals kept']:.3g} s, all else {shared:.3g} s. With residuals computed anew at every step "
-        f"the ratio is {anew:.3g}.",
-        cause="The paper does not say how σ is evaluated.",
+        text(paper),
+        f"{text(kept)} with residuals kept, {text(anew)} computed anew",
+        judged(None if len(near) > 1 else near.pop()),
+        f"`results/speed`: PGA treats the space of every µ. Everything else takes {shared:.3g} s. The paper does not "
+        "say whether residuals of supremizers are kept between the steps of PGA.",
     )
 
 
