@@ -120,15 +120,24 @@ def _in_a_process(over: str, *arguments: Any) -> Iterator[dict[str, Any]]:
 
 
 def table(rows: pd.DataFrame, what: str) -> pd.DataFrame:
-    """One line per problem and stage, one column per size; the exponent of a fit in the logarithms."""
+    """One line per problem and stage, one column per size, and the exponents between neighbouring sizes."""
     lines = []
     for (name, stage), group in rows.groupby(["problem", "stage"], sort=False):
         size = "n" if group["over"].iloc[0] == "mesh" else "R"
         points = group.groupby(size)[what].median()
-        slope = np.polyfit(np.log(points.index), np.log(points), 1)[0] if len(points) > 1 else np.nan
         values = {f"{size} = {k}": value for k, value in points.items()}
-        lines.append({"problem": name, "stage": stage, **values, "exponent": slope})
+        lines.append(
+            {"problem": name, "stage": stage, **values, "exponents": ", ".join(map("{:.1f}".format, slopes(points)))}
+        )
     return pd.DataFrame(lines)
+
+
+def slopes(points: pd.Series) -> list[float]:
+    """Local slopes in logarithmic axes, from every size to the next one.
+
+    One slope through all points would mix the constant overhead of small sizes with the growth of large ones.
+    """
+    return list(np.diff(np.log(points.to_numpy())) / np.diff(np.log(points.index.to_numpy(float))))
 
 
 def draw(rows: pd.DataFrame, size: str) -> Figure:
@@ -165,7 +174,8 @@ def write_page(rows: pd.DataFrame, target: str) -> None:
         "Growth of seconds and memory",
         f"taskset -c 1 {made_by('scaling', 'scaling')}",
         SECONDS,
-        "An exponent is the slope of the least squares line through all points of a row in logarithmic axes. "
+        "Exponents are the slopes in logarithmic axes from every size to the next one: the first ones show constant "
+        "costs, the last one the growth of large sizes. "
         f"{cases}; mCPG; queries by PIQP at accuracy {ACCURACY:g}.",
         machine=f"{provenance.machine()}; {versions}",
     )

@@ -15,8 +15,7 @@ class ModifiedCPG(DualStrategy):
         while not cone.reached(stop):
             theta = snapshots[:, cone.farthest]  # lines 5 to 8: the snapshot with the largest projection error
             upsilon, note = part_in_cone(theta, cone.generators, W)  # line 9
-            # Lines 10 and 11. Line 11 should read Span⁺{ν_r}, as the text says. Where θ − Υ vanishes the algorithm
-            # ends (Remark 4.2).
+            # Lines 10 and 11. Where θ − Υ vanishes the algorithm ends (Remark 4.2).
             if not cone.add(theta - upsilon, note):
                 break
         return cone.result()
