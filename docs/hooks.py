@@ -1,4 +1,4 @@
-"""What mkdocs does beside its own work: formulas, generated tables, figures from `results/`, a check of every page."""
+"""What mkdocs does beside its own work: formulas, the pages of `results/` and their files, a check of every page."""
 
 from __future__ import annotations
 
@@ -9,10 +9,11 @@ from typing import Any
 from formulas import Formulas
 from mkdocs.exceptions import PluginError
 from mkdocs.structure.files import File
-from reference import GENERATED
 
-FIGURES = ("paper-obstacle", "paper-hertz", "field")
-TWINS = "paper-figures"
+RESULTS = "results"
+"""Folder of the repository, and of the site, with the pages of results."""
+
+SHOWN = {".md", ".png", ".csv"}
 ELSEWHERE = re.compile(
     r"""<(?:script|img|iframe|link\s[^>]*rel=["']?stylesheet)[^>]*(?:src|href)=["']?(?:https?:)?//"""
 )
@@ -25,25 +26,21 @@ def on_config(config: Any) -> Any:
 
 
 def on_files(files: Any, config: Any) -> Any:
-    """Put the figures that were measured last beside the pages, under `figures/`."""
-    results = Path(config.config_file_path).parent / "results"
-    for study in FIGURES:
-        for path in sorted((results / study).glob("*.png")):
-            files.append(File.generated(config, f"figures/{path.name}", abs_src_path=str(path)))
-    for path in sorted((results / TWINS).glob("*")):  # a page with its figures
-        files.append(File.generated(config, f"{TWINS}/{path.name}", abs_src_path=str(path)))
+    """Put the pages of results with their files on the site."""
+    root = Path(config.config_file_path).parent
+    for path in sorted((root / RESULTS).rglob("*")):
+        if path.suffix in SHOWN:
+            name = path.relative_to(root).as_posix()
+            files.append(File.generated(config, name, abs_src_path=str(path)))
     return files
 
 
 def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
-    """Fill in what is generated."""
-
-    def fill(found: re.Match[str]) -> str:
-        if found[1] not in GENERATED:
-            raise PluginError(f"{page.file.src_uri}: nothing generates '{found[1]}', only {', '.join(GENERATED)}")
-        return GENERATED[found[1]]()
-
-    return re.sub(r"<!-- generated: ([\w-]+) -->", fill, markdown)
+    """Correct links between `docs/` and `results/`: side by side in the repository, nested on the site."""
+    up = "../" * page.file.src_uri.count("/")
+    if page.file.src_uri.startswith(f"{RESULTS}/"):
+        return markdown.replace(f"]({up}docs/", f"]({up}")
+    return markdown.replace(f"](../{up}{RESULTS}/", f"]({up}{RESULTS}/")
 
 
 def on_post_page(output: str, page: Any, **_: Any) -> str:

@@ -1,8 +1,13 @@
-"""Tables of the documentation that are made from the code: fields of study files, columns of the results."""
+"""Tables of the documentation that are made from the code: fields of study files, columns of the results.
+
+`python docs/reference.py` writes them into the pages, between `<!-- generated: NAME -->` and `<!-- end: NAME -->`.
+"""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Mapping
+from pathlib import Path
 from typing import Any
 
 from vibench.packs.manifest import Manifest
@@ -77,4 +82,27 @@ def markdown(head: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
 GENERATED = {"study": study_fields, "pack": pack_fields, "units": units, "summary": summary, "benefits": benefits} | {
     table: lambda table=table: columns(table) for table in STORED
 }
-"""What may stand in a page as `<!-- generated: NAME -->`."""
+"""What may stand in a page, by name."""
+
+PLACE = re.compile(r"<!-- generated: ([\w-]+) -->\n.*?<!-- end: \1 -->", re.DOTALL)
+
+
+def filled(page: str) -> str:
+    """The text of a page with its generated parts as they are made today."""
+
+    def made(place: re.Match[str]) -> str:
+        return f"<!-- generated: {place[1]} -->\n\n{GENERATED[place[1]]()}\n\n<!-- end: {place[1]} -->"
+
+    return PLACE.sub(made, page)
+
+
+def main() -> None:
+    """Write the generated parts of all pages."""
+    for path in sorted(Path(__file__).parent.rglob("*.md")):
+        text = path.read_text(encoding="utf-8")
+        if (made := filled(text)) != text:
+            path.write_text(made, encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()

@@ -13,6 +13,8 @@ import pkgutil
 import re
 import sys
 import tomllib
+import unicodedata
+import urllib.parse
 from collections.abc import Iterator
 from functools import partial
 from itertools import pairwise
@@ -32,8 +34,9 @@ from vibench.errors import RequestError
 from vibench.results import columns, tables
 from vibench.study import registry
 from vibench.study.entries import Entry, ProblemEntry, SamplingEntry
-from vibench.study.kinds import STUDY, PluginKind
+from vibench.study.kinds import DUAL, PRIMAL, SAMPLING, STUDY, PluginKind
 from vibench.study.matrix import expand, read_study
+from vibench.study.registry import registered
 from vibench.study.spec import Limits, Study, ToleranceTable
 from vibench.testing import check_figure, check_problem
 
@@ -211,6 +214,22 @@ def test_every_generated_part_is_in_a_page(reference: ModuleType) -> None:
     assert set(re.findall(r"<!-- generated: ([\w-]+) -->", text)) == set(reference.GENERATED)
 
 
+@pytest.mark.parametrize("page", ["study.md", "tables.md", "model-packs.md"])
+def test_the_tables_of_a_page_are_as_the_code_makes_them(page: str, reference: ModuleType) -> None:
+    """`python docs/reference.py` writes them."""
+    text = (DOCS / page).read_text(encoding="utf-8")
+    assert len(reference.PLACE.findall(text)) == text.count("<!-- generated: ") > 0
+    assert reference.filled(text) == text
+
+
+def test_the_site_leads_to_every_page() -> None:
+    listed = set(
+        re.findall(r"^ +- [^:\n]+: (\S+\.md)$", (ROOT / "mkdocs.yml").read_text(encoding="utf-8"), re.MULTILINE)
+    )
+    results = {page.relative_to(ROOT).as_posix() for page in RESULTS[1:]}
+    assert listed == {page.relative_to(DOCS).as_posix() for page in PAGES} | results
+
+
 STUDY_PAGE = blocks(DOCS / "study.md")
 EXAMPLE = next(text for _, title, text in STUDY_PAGE if title == "my-study.toml")
 RULES = [
@@ -246,6 +265,7 @@ def test_there_are_rules() -> None:
     [
         ("library.md", 13, {"runs", "tables", "decision.html", "inf-sup.svg"}),
         ("tolerances.md", 2, {"runs"}),
+        ("methods.md", 27, {"runs", "points.npy"}),
     ],
 )
 def test_a_page_prints_what_it_says(
@@ -265,6 +285,53 @@ def test_a_page_prints_what_it_says(
             compared += 1
     assert compared == texts
     assert {file.name for file in tmp_path.iterdir()} == written
+
+
+METHODS = DOCS / "methods.md"
+ENTRY = re.compile(r'^<a id="([a-z]+)-(\d{4})"></a>(.+)$', re.MULTILINE)
+BIBLIOGRAPHY = ENTRY.findall((DOCS / "bibliography.md").read_text(encoding="utf-8"))
+CITED = re.compile(r"\b([A-Z][a-z][\w'’]+)(?:, [A-Z][\w'’]+)* and [A-Z][\w'’]+ \(?((?:19|20)\d\d)\b")
+WITHOUT_DOI = {"conover"}
+
+
+@pytest.mark.parametrize("kind", [DUAL, PRIMAL, SAMPLING], ids=str)
+def test_every_strategy_has_its_formula_source_and_snippet(kind: PluginKind) -> None:
+    sections = re.split(r"^##+ (.+)$", METHODS.read_text(encoding="utf-8"), flags=re.MULTILINE)
+    described = {name: text for title, text in pairwise(sections[1:]) for name in title.split(", ")}
+    names = [name for name, plugin in registered(kind).items() if not plugin.package]
+    assert len(names) > 4
+    for name in names:
+        text = described[name]
+        assert f'"{name}"' in text or "reduction.enrichment" in text, name
+        assert "$$" in text, name
+        assert "```python" in text, name
+        # a product of points, a list and a file need no source
+        assert "](bibliography.md#" in text or name in {"grid", "random", "list", "file", "pod-dual"}, name
+
+
+def test_whatever_is_cited_is_in_the_bibliography() -> None:
+    known = {(name, year) for name, year, _ in BIBLIOGRAPHY}
+    sources = [*PAGES, ROOT / "README.md"]
+    for folder in ("vibench", "strategies", "problems"):
+        sources += sorted((ROOT / folder).rglob("*.py"))
+    cited = {
+        (unicodedata.normalize("NFKD", name).encode("ascii", "ignore").decode().lower().rstrip("'"), year)
+        for source in sources
+        for name, year in CITED.findall(" ".join(source.read_text(encoding="utf-8").split()))
+    }
+    assert len(cited) > 15
+    assert cited - known == set()
+
+
+def test_the_bibliography_is_in_order_and_has_a_doi_where_there_is_one() -> None:
+    assert len(BIBLIOGRAPHY) > 30
+    assert sorted(BIBLIOGRAPHY, key=lambda entry: entry[:2]) == BIBLIOGRAPHY
+    for name, year, text in BIBLIOGRAPHY:
+        assert f"({year})" in text
+        link = re.search(r"\[doi:(10\.\d{4,5}/[^\]]+)\]\(https://doi\.org/([^)]+)\)|\[arXiv:", text)
+        assert link or name in WITHOUT_DOI, text
+        if link and link[1]:
+            assert urllib.parse.unquote(link[2]) == link[1]
 
 
 def test_the_api_reference_has_every_public_name_once() -> None:

@@ -10,9 +10,9 @@ from vibench_strategies.samplings.drawn import Drawn
 
 
 class Sobol(Drawn):
-    """The first points of a Sobol sequence with Owen's scrambling (Owen 1998); balanced where `size` is a power of two.
+    """The first points of a Sobol sequence (Sobol' 1967), scrambled; balanced where `size` is a power of two.
 
-    The seed is that of the scrambling.
+    SciPy scrambles by random lower triangular matrices and a random digital shift (Matoušek 1998); the seed is theirs.
     """
 
     def drawn(self, dim: int) -> Array:
