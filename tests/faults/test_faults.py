@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from forking import forked
 from running import Vibench, assert_same_numbers, rows, started, without_seconds
 from samples import wire_study, write_study
 
@@ -80,9 +81,9 @@ def seen(folder: Path) -> dict[str, dict[str, Any]]:
     return {}
 
 
-def kill_at_random(command: list[str], place: Path, plugins: Path, rng: random.Random, within: float) -> bool:
-    """Begin a run and kill it, or all its processes, within some seconds; `False` if it was quicker."""
-    with started(command, place, plugins) as process:
+def kill_at_random(arguments: list[str], place: Path, plugins: Path, rng: random.Random, within: float) -> bool:
+    """Begin a run and kill it, or the group that it leads, within some seconds; `False` if it was quicker."""
+    with forked(arguments, place, plugins) as process:
         with contextlib.suppress(subprocess.TimeoutExpired):
             process.wait(timeout=within * rng.random())
         if process.returncode is not None:
@@ -108,7 +109,6 @@ def test_a_run_that_is_killed_again_and_again_loses_and_doubles_nothing(
     executor: str,
     length: str,
     undisturbed: Callable[[str], Undisturbed],
-    command: str,
     plugins_folder: Path,
     vibench: Vibench,
     place: Path,
@@ -119,7 +119,7 @@ def test_a_run_that_is_killed_again_and_again_loses_and_doubles_nothing(
     while killed < kills:
         number += 1
         out, known = f"out{number}", {}
-        again = [command, *OPTIONS[:-1], out, "--executor", executor]
+        again = [*OPTIONS[:-1], out, "--executor", executor]
         while killed < kills and kill_at_random(again, place, plugins_folder, rng, seconds):
             killed += 1
             found = seen(place / out)

@@ -13,10 +13,13 @@ from pathlib import Path
 
 import pandas as pd
 import pytest
+from forking import forked
 from running import Main, Vibench, read_until, rows, run_again, started, without_seconds, workers
 from samples import ROUNDS, wire_study, write_study
 
 from vibench.results import tables
+
+RUN = ("run", "study.toml", "--jobs", "2", "--no-figures")
 
 
 @pytest.fixture
@@ -31,7 +34,7 @@ def waiting(tmp_path: Path) -> Path:
 def test_a_run_that_was_stopped_goes_on_later(
     kill: signal.Signals, code: int, command: str, plugins_folder: Path, vibench: Vibench, waiting: Path
 ) -> None:
-    with started([command, "run", "study.toml", "--jobs", "2", "--no-figures"], waiting, plugins_folder) as process:
+    with started([command, *RUN], waiting, plugins_folder) as process:
         read_until(process, "[1/2] ok")
         os.killpg(process.pid, kill)  # the workers too, as a terminal does
         out, err = process.communicate(timeout=60)
@@ -57,7 +60,7 @@ def test_workers_do_not_see_ctrl_c(command: str, plugins_folder: Path, waiting: 
     """A terminal tells the group of the command; from the moment on which they come to life, workers are in others."""
     (waiting / "go on").touch()
     groups: set[int] = set()
-    with started([command, "run", "study.toml", "--jobs", "2", "--no-figures"], waiting, plugins_folder) as process:
+    with started([command, *RUN], waiting, plugins_folder) as process:
         while process.poll() is None:
             for worker in workers(process.pid):
                 with contextlib.suppress(ProcessLookupError):
@@ -69,10 +72,9 @@ def test_workers_do_not_see_ctrl_c(command: str, plugins_folder: Path, waiting: 
     assert process.pid not in groups
 
 
-def test_a_second_interrupt_changes_nothing(command: str, plugins_folder: Path, waiting: Path) -> None:
+def test_a_second_interrupt_changes_nothing(plugins_folder: Path, waiting: Path) -> None:
     """Under --fresh the same command would begin anew, and says so."""
-    run = [command, "run", "study.toml", "--jobs", "2", "--no-figures", "--fresh"]
-    with started(run, waiting, plugins_folder) as process:
+    with forked([*RUN, "--fresh"], waiting, plugins_folder) as process:
         read_until(process, "[1/2] ok")
         for _ in range(20):
             with contextlib.suppress(ProcessLookupError):
@@ -86,7 +88,7 @@ def test_a_second_interrupt_changes_nothing(command: str, plugins_folder: Path, 
 
 def test_a_run_that_is_terminated_leaves_no_worker_behind(command: str, plugins_folder: Path, waiting: Path) -> None:
     """As where a terminal is closed, or a scheduler ends a job: only the command itself is told."""
-    with started([command, "run", "study.toml", "--jobs", "2", "--no-figures"], waiting, plugins_folder) as process:
+    with started([command, *RUN], waiting, plugins_folder) as process:
         read_until(process, "[1/2] ok")
         left = set(workers(process.pid))
         assert left
@@ -100,10 +102,8 @@ def test_a_run_that_is_terminated_leaves_no_worker_behind(command: str, plugins_
         pytest.fail("a worker goes on")
 
 
-def test_two_runs_do_not_write_into_one_folder(
-    command: str, plugins_folder: Path, vibench: Vibench, waiting: Path
-) -> None:
-    with started([command, "run", "study.toml", "--jobs", "2", "--no-figures"], waiting, plugins_folder) as process:
+def test_two_runs_do_not_write_into_one_folder(plugins_folder: Path, vibench: Vibench, waiting: Path) -> None:
+    with forked(RUN, waiting, plugins_folder) as process:
         read_until(process, "[1/2] ok")
         for options in ((), ("--fresh",)):
             second = vibench(waiting, "run", "study.toml", *options)
@@ -120,11 +120,11 @@ def test_two_runs_do_not_write_into_one_folder(
 
 @pytest.mark.parametrize("swapped", [False, True], ids=["removed", "swapped"])
 def test_a_run_folder_that_is_gone_ends_the_run_with_a_line(
-    swapped: bool, command: str, plugins_folder: Path, vibench: Vibench, waiting: Path
+    swapped: bool, plugins_folder: Path, vibench: Vibench, waiting: Path
 ) -> None:
     """At the next commit; what was computed is in the store of artefacts, from which the next run takes it."""
     folder = waiting / "runs" / "wire"
-    with started([command, "run", "study.toml", "--jobs", "2", "--no-figures"], waiting, plugins_folder) as process:
+    with forked(RUN, waiting, plugins_folder) as process:
         read_until(process, "[1/2] ok")
         folder.rename(waiting / "elsewhere")
         if swapped:

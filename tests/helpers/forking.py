@@ -2,7 +2,7 @@
 
 A template process imports the libraries and vibench, and hashes its sources, once for each process of the tests. What
 is forked from it has the arguments, folder, environment and path that a new interpreter would get, and imports plugins
-itself. Tests of how processes start, die and are stopped take new interpreters: the fixtures `command` and
+itself. Tests of how processes start and what belongs to them take new interpreters: the fixtures `command` and
 `new_workers`.
 """
 
@@ -25,6 +25,7 @@ import tempfile
 import threading
 import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from functools import cache
 from importlib import import_module
 from inspect import isabstract
@@ -83,6 +84,60 @@ class Forked:
         return self.returncode
 
 
+class ForkedCommand(Forked):
+    """A command that the template has forked; what `subprocess.Popen` is to a test that reads what it prints."""
+
+    def __init__(self, arguments: Sequence[str], folder: Path, plugins: Path) -> None:
+        (out, out_end), (err, err_end) = os.pipe(), os.pipe()
+        super().__init__(template(), command_request(arguments, folder, plugins), out_end, err_end)
+        for end in (out_end, err_end):
+            os.close(end)
+        self.stdout, self.stderr = (os.fdopen(end, encoding="utf-8") for end in (out, err))
+
+    def send_signal(self, number: int) -> None:
+        if self.poll() is None:
+            os.kill(self.pid, number)
+
+    def kill(self) -> None:
+        self.send_signal(signal.SIGKILL)
+
+    def communicate(self, timeout: float | None = None) -> tuple[str, str]:
+        """What is left of what it prints, once it has ended; it is killed if that takes longer."""
+        with ThreadPoolExecutor(2) as pool:
+            texts = [pool.submit(stream.read) for stream in (self.stdout, self.stderr)]
+            try:
+                self.wait(timeout)
+            except subprocess.TimeoutExpired:
+                self.kill()
+                raise
+            out, err = (text.result() for text in texts)
+        self.stdout.close()
+        self.stderr.close()
+        return out, err
+
+
+@contextlib.contextmanager
+def forked(arguments: Sequence[str], folder: Path, plugins: Path) -> Iterator[ForkedCommand]:
+    """`vibench ARGUMENTS` as `running.started` starts it, but forked; it is killed at the end if it goes on."""
+    process = ForkedCommand(arguments, folder, plugins)
+    try:
+        yield process
+    finally:
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(process.pid, signal.SIGKILL)
+        process.wait()
+        process.stdout.close()
+        process.stderr.close()
+
+
+def command_request(arguments: Sequence[str], folder: Path, plugins: Path) -> dict[str, Any]:
+    """What the template is asked for `vibench ARGUMENTS` in a folder, third-party plugins first on its path."""
+    return {
+        "main": "command", "arguments": ["vibench", *arguments], "folder": str(folder), "template": template(),
+        "environment": dict(os.environ), "path": [str(plugins), *paths()],
+    }  # fmt: skip
+
+
 def template() -> str:
     """The address of the template process, which ends with this one; threads that ask at once get the same one."""
     with _starting:
@@ -120,10 +175,7 @@ def run_command(
 ) -> subprocess.CompletedProcess[str]:
     """Run `vibench ARGUMENTS` in a folder, third-party plugins first on its path; as `subprocess.run` does."""
     printed = [folder / f".printed-{name}" for name in ("out", "err")]
-    request = {
-        "main": "command", "arguments": ["vibench", *arguments], "folder": str(folder), "template": template(),
-        "environment": dict(os.environ), "path": [str(plugins), *paths()],
-    }  # fmt: skip
+    request = command_request(arguments, folder, plugins)
     with contextlib.ExitStack() as opened:
         files = [opened.enter_context(file.open("w")).fileno() for file in printed]
         process = Forked(template(), request, *files)
@@ -254,6 +306,9 @@ def _be(request: Mapping[str, Any], files: Sequence[int]) -> None:
             for descriptor, file in zip((1, 2), files, strict=True):
                 os.dup2(file, descriptor)
                 os.close(file)
+            # Streams of its own: the template's may be files, and a test waits for a line.
+            sys.stdout = open(1, "w", 1, sys.stdout.encoding, sys.stdout.errors)  # noqa: PTH123, SIM115
+            sys.stderr = open(2, "w", 1, sys.stderr.encoding, sys.stderr.errors)  # noqa: PTH123, SIM115
             with fork_workers(lambda: request["template"]):
                 import_module("vibench.cli").start()
         else:

@@ -47,13 +47,16 @@ def change(results: Path) -> Callable[..., None]:
 Draw = Callable[..., Drawn]
 
 
-def drawn_from(results: Path, folder: Path, *kinds: str) -> Drawn:
-    """Figures of a results file by the names of their files, of some kinds or of all; nothing is rendered."""
+def drawn_from(results: Path, folder: Path, *kinds: str, rendered: bool = False) -> Drawn:
+    """Figures of a results file by the names of their files, of some kinds or of all; files are empty if not rendered."""
     kept: Drawn = {}
+    write = Figure.savefig
 
-    def keep(figure: Figure, target: Path, **_: object) -> None:
+    def keep(figure: Figure, target: Path, **options: object) -> None:
         target.touch(exist_ok=False)
         kept[target.stem] = figure
+        if rendered:
+            write(figure, target, **options)
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Figure, "savefig", keep)
@@ -68,9 +71,15 @@ def drawn_from(results: Path, folder: Path, *kinds: str) -> Drawn:
 
 
 @pytest.fixture(scope="module")
-def drawn(quick_run: Path, tmp_path_factory: pytest.TempPathFactory) -> Drawn:
-    """All figures of the run as it is."""
-    return drawn_from(quick_run / FILE, tmp_path_factory.mktemp("drawn") / "figures")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Folder of the figures of the run as it is."""
+    return tmp_path_factory.mktemp("drawn") / "figures"
+
+
+@pytest.fixture(scope="module")
+def drawn(quick_run: Path, folder: Path) -> Drawn:
+    """All of them: the only ones of these tests that are rendered, in both formats."""
+    return drawn_from(quick_run / FILE, folder, rendered=True)
 
 
 @pytest.fixture
@@ -113,18 +122,19 @@ def problems() -> list[str]:
     return [entry.title for entry in read_study("quick").problem]
 
 
-def test_a_run_draws_its_figures(quick_run: Path) -> None:
-    names = {path.stem for path in (quick_run / "figures").glob("*.png")}
+def test_a_run_has_its_figures(drawn: Drawn, folder: Path) -> None:
+    names = {path.stem for path in folder.glob("*.png")}
     for problem in problems():
         assert {f"{problem}-{kind}" for kind in OF_PROBLEM if kind not in SOMETIMES} <= names
         for dual in read_study("quick").dual:
             assert {f"{problem}-{dual.title}-enrichment", f"{problem}-{dual.title}-inf-sup"} <= names
     assert "obstacle-diagnostics" in names
-    assert {path.stem for path in (quick_run / "figures").glob("*.svg")} == names
+    assert {path.stem for path in folder.glob("*.svg")} == names == {*drawn}
 
 
-def test_the_pictures_are_no_blank_sheets(quick_run: Path) -> None:
-    for path in (quick_run / "figures").glob("*.png"):
+@pytest.mark.usefixtures("drawn")
+def test_the_pictures_are_no_blank_sheets(folder: Path) -> None:
+    for path in folder.glob("*.png"):
         picture = Image.open(path)
         assert min(picture.size) > 300
         assert len(picture.getcolors(picture.width * picture.height)) > 20
@@ -539,8 +549,8 @@ def test_at_most_three_panels_are_abreast(drawn: Drawn) -> None:
         assert max(sum(place[1] == row for place in places) for row in {place[1] for place in places}) <= 3, name
 
 
-def test_every_figure_has_a_caption_that_stands_beside_it(quick_run: Path, drawn: Drawn) -> None:
-    captions = figures.read_captions(quick_run / "figures")
+def test_every_figure_has_a_caption_that_stands_beside_it(folder: Path, drawn: Drawn) -> None:
+    captions = figures.read_captions(folder)
     assert set(captions) == set(drawn)
     for name, figure in drawn.items():
         assert captions[name] == figures.caption_of(figure)
