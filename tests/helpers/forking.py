@@ -307,8 +307,8 @@ def _be(request: Mapping[str, Any], files: Sequence[int]) -> None:
                 os.dup2(file, descriptor)
                 os.close(file)
             # Streams of its own: the template's may be files, and a test waits for a line.
-            sys.stdout = open(1, "w", 1, sys.stdout.encoding, sys.stdout.errors)  # noqa: PTH123, SIM115
-            sys.stderr = open(2, "w", 1, sys.stderr.encoding, sys.stderr.errors)  # noqa: PTH123, SIM115
+            sys.stdout = open(1, "w", 1, sys.stdout.encoding, sys.stdout.errors)  # noqa: SIM115
+            sys.stderr = open(2, "w", 1, sys.stderr.encoding, sys.stderr.errors)  # noqa: SIM115
             with fork_workers(lambda: request["template"]):
                 import_module("vibench.cli").start()
         else:

@@ -48,7 +48,7 @@ Draw = Callable[..., Drawn]
 
 
 def drawn_from(results: Path, folder: Path, *kinds: str, rendered: bool = False) -> Drawn:
-    """Figures of a results file by the names of their files, of some kinds or of all; files are empty if not rendered."""
+    """Figures of a results file by the names of their files, of some kinds or all; files stay empty if not rendered."""
     kept: Drawn = {}
     write = Figure.savefig
 
