@@ -204,10 +204,11 @@ def vibench(plugins_folder: Path) -> Vibench:
     """Function that runs the command in a folder; it draws where a test is about figures."""
 
     def run(
-        folder: Path, *arguments: str, plugins: Path = plugins_folder, figures: bool = False, timeout: float = 120.0
-    ) -> subprocess.CompletedProcess[str]:
+        folder: Path, *arguments: str, plugins: Path = plugins_folder, figures: bool = False, timeout: float = 120.0,
+        file_kib: int | None = None,
+    ) -> subprocess.CompletedProcess[str]:  # fmt: skip
         plain = ["--no-figures"] if arguments[:1] == ("run",) and not figures else []
-        return run_command([*arguments, *plain], folder, plugins, timeout)
+        return run_command([*arguments, *plain], folder, plugins, timeout, file_kib)
 
     return run
 

@@ -17,7 +17,7 @@ from typing import Any
 
 import pytest
 from forking import forked
-from running import Vibench, assert_same_numbers, rows, started, without_seconds
+from running import Vibench, assert_same_numbers, rows, without_seconds
 from samples import wire_study, write_study
 
 from vibench.results.sqlite.reading import FILE
@@ -141,19 +141,14 @@ def test_a_full_disk_stops_a_run_with_one_line_and_a_later_one_completes_it(
     kib: int,
     length: str,
     undisturbed: Callable[[str], Undisturbed],
-    command: str,
-    plugins_folder: Path,
     vibench: Vibench,
     place: Path,
 ) -> None:
-    """No file may be longer than so many KiB, which is how a disk of that size looks to every process of the run."""
-    limited = ["bash", "-c", f'ulimit -f {kib}; PYTHONDONTWRITEBYTECODE=1 exec "$0" "$@"', command, *OPTIONS]
-    with started(limited, place, plugins_folder) as process:
-        _, errors = process.communicate(timeout=120)
-    assert process.returncode in (1, 2)
-    assert errors.startswith("vibench: ")
-    assert "cannot be written" in errors
-    assert errors.count("\n") == 1
+    full = vibench(place, *OPTIONS, file_kib=kib)
+    assert full.returncode in (1, 2)
+    assert full.stderr.startswith("vibench: ")
+    assert "cannot be written" in full.stderr
+    assert full.stderr.count("\n") == 1
     done = vibench(place, *OPTIONS, *ALONE)
     assert (done.returncode, done.stderr) == (0, "")
     assert_same_numbers(undisturbed(length).folder, place / "out")

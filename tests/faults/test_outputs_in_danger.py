@@ -5,21 +5,21 @@ from __future__ import annotations
 import os
 import random
 import shutil
-import subprocess
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
-from running import Main, rows, started
+from forking import forked
+from running import Main, Vibench, rows
 from samples import wire_study, write_study
 
 from vibench.report.site import folder
 from vibench.results.sqlite.reading import FILE
 from vibench.testing.sample_run import write_sample_run
 
-KILLS = 1
+KILLS = 2
 COARSE = {"name": "radial-obstacle", "options": {"resolution": "coarse"}}
 NOBODY = 65534
 """A user who owns nothing, for tests that root runs: root may read and write everything."""
@@ -31,45 +31,46 @@ def run(tmp_path: Path) -> Path:
 
 
 def test_a_site_that_is_killed_while_it_is_written_is_whole_or_not_there(
-    run: Path, command: str, tmp_path: Path
+    run: Path, vibench: Vibench, tmp_path: Path
 ) -> None:
     rng, site = random.Random(8), tmp_path / "site"
-    arguments = [command, "publish", str(run), str(site), "--no-figures", "--yes"]
+    arguments = ["publish", str(run), str(site), "--no-figures", "--yes"]
     start = time.monotonic()
-    subprocess.run(arguments, check=True, capture_output=True)
+    assert vibench(tmp_path, *arguments).returncode == 0
     seconds, whole = time.monotonic() - start, sorted(path.name for path in site.rglob("*"))
     shutil.rmtree(site)
     for kill in range(KILLS):
-        with started(arguments, tmp_path, tmp_path) as process:
-            time.sleep((0.5 + 0.5 * rng.random()) * seconds)
+        with forked(arguments, tmp_path, tmp_path) as process:
+            time.sleep(rng.random() * seconds)
             process.kill()
-            process.wait()
         if site.exists():
             assert sorted(path.name for path in site.rglob("*")) == whole, kill
             folder.check(site)
-    done = subprocess.run(arguments, capture_output=True, text=True, check=False)
+        for left in tmp_path.glob("vibench-*"):
+            shutil.rmtree(left)
+    done = vibench(tmp_path, *arguments)
     assert (done.returncode, done.stderr) == (0, "")
     assert sorted(path.name for path in site.rglob("*")) == whole
 
 
-def test_an_export_that_is_killed_is_whole_or_not_there(quick_run: Path, command: str, tmp_path: Path) -> None:
-    key = rows(quick_run)[0]["cell"]
+def test_an_export_that_is_killed_is_whole_or_not_there(quick_run: Path, vibench: Vibench, tmp_path: Path) -> None:
+    key, rng = rows(quick_run)[0]["cell"], random.Random(9)
     for arguments, made in (
-        ([command, "export-qps", str(quick_run), "set"], tmp_path / "set" / "check.py"),
-        ([command, "export-model", str(quick_run), str(key), "model.npz"], tmp_path / "model.npz"),
+        (["export-qps", str(quick_run), "set"], tmp_path / "set" / "check.py"),
+        (["export-model", str(quick_run), str(key), "model.npz"], tmp_path / "model.npz"),
     ):
-        with started(arguments, tmp_path, tmp_path) as process:
-            time.sleep(2.5)
+        start = time.monotonic()
+        assert vibench(tmp_path, *arguments[:-1], f"whole-{arguments[-1]}").returncode == 0
+        seconds = time.monotonic() - start
+        with forked(arguments, tmp_path, tmp_path) as process:
+            time.sleep(rng.random() * seconds)
             process.kill()
-            process.wait()
         assert made.exists() == (tmp_path / arguments[-1]).exists()
 
 
 @pytest.mark.parametrize("kib", [20, 150, 600])
-def test_a_site_on_a_full_disk_is_one_line(kib: int, run: Path, command: str, tmp_path: Path) -> None:
-    limited = f'ulimit -f {kib}; PYTHONDONTWRITEBYTECODE=1 exec "$0" "$@"'
-    arguments = ["publish", str(run), str(tmp_path / "site"), "--no-figures", "--yes"]
-    done = subprocess.run(["bash", "-c", limited, command, *arguments], capture_output=True, text=True, check=False)
+def test_a_site_on_a_full_disk_is_one_line(kib: int, run: Path, vibench: Vibench, tmp_path: Path) -> None:
+    done = vibench(tmp_path, "publish", str(run), str(tmp_path / "site"), "--no-figures", "--yes", file_kib=kib)
     assert done.returncode == 2, done.stderr
     assert done.stderr.startswith("vibench: ")
     assert "cannot be written" in done.stderr

@@ -14,6 +14,8 @@ import faulthandler
 import gc
 import os
 import pickle
+import resource
+import runpy
 import select
 import shutil
 import signal
@@ -46,6 +48,9 @@ PACKAGES = ("cli", "execution", "results", "stages", "storage", "study", "termin
 """Packages of vibench that the template imports with all their modules, and so most others; plugins it does not."""
 
 TESTS = Path(__file__).parents[1]
+
+FILE_KIB = "VIBENCH_TESTS_FILE_KIB"
+"""Variable of the environment: the largest file that a forked process and its workers may write, in KiB."""
 
 _starting = threading.Lock()
 
@@ -85,41 +90,37 @@ class Forked:
 
 
 class ForkedCommand(Forked):
-    """A command that the template has forked; what `subprocess.Popen` is to a test that reads what it prints."""
+    """A program that the template has forked; what `subprocess.Popen` is to a test that reads what it prints."""
 
-    def __init__(self, arguments: Sequence[str], folder: Path, plugins: Path) -> None:
+    def __init__(self, program: Mapping[str, Any], folder: Path, file_kib: int | None = None) -> None:
+        limit = {} if file_kib is None else {FILE_KIB: str(file_kib)}
+        request = {"folder": str(folder), "template": template(), "environment": os.environ | limit, **program}
         (out, out_end), (err, err_end) = os.pipe(), os.pipe()
-        super().__init__(template(), command_request(arguments, folder, plugins), out_end, err_end)
+        super().__init__(template(), request, out_end, err_end)
         for end in (out_end, err_end):
             os.close(end)
         self.stdout, self.stderr = (os.fdopen(end, encoding="utf-8") for end in (out, err))
 
-    def send_signal(self, number: int) -> None:
-        if self.poll() is None:
-            os.kill(self.pid, number)
-
     def kill(self) -> None:
-        self.send_signal(signal.SIGKILL)
+        if self.poll() is None:
+            os.kill(self.pid, signal.SIGKILL)
 
-    def communicate(self, timeout: float | None = None) -> tuple[str, str]:
-        """What is left of what it prints, once it has ended; it is killed if that takes longer."""
+    def communicate(self, timeout: float) -> tuple[str, str]:
+        """What is left of what it prints, once it has ended; its group is killed if that takes longer."""
         with ThreadPoolExecutor(2) as pool:
             texts = [pool.submit(stream.read) for stream in (self.stdout, self.stderr)]
             try:
                 self.wait(timeout)
             except subprocess.TimeoutExpired:
-                self.kill()
+                os.killpg(self.pid, signal.SIGKILL)
                 raise
             out, err = (text.result() for text in texts)
-        self.stdout.close()
-        self.stderr.close()
         return out, err
 
 
 @contextlib.contextmanager
-def forked(arguments: Sequence[str], folder: Path, plugins: Path) -> Iterator[ForkedCommand]:
-    """`vibench ARGUMENTS` as `running.started` starts it, but forked; it is killed at the end if it goes on."""
-    process = ForkedCommand(arguments, folder, plugins)
+def _ended(process: ForkedCommand) -> Iterator[ForkedCommand]:
+    """Block at the end of which whoever is left of the group of a process is killed."""
     try:
         yield process
     finally:
@@ -130,12 +131,12 @@ def forked(arguments: Sequence[str], folder: Path, plugins: Path) -> Iterator[Fo
         process.stderr.close()
 
 
-def command_request(arguments: Sequence[str], folder: Path, plugins: Path) -> dict[str, Any]:
-    """What the template is asked for `vibench ARGUMENTS` in a folder, third-party plugins first on its path."""
-    return {
-        "main": "command", "arguments": ["vibench", *arguments], "folder": str(folder), "template": template(),
-        "environment": dict(os.environ), "path": [str(plugins), *paths()],
-    }  # fmt: skip
+def forked(
+    arguments: Sequence[str], folder: Path, plugins: Path, file_kib: int | None = None
+) -> contextlib.AbstractContextManager[ForkedCommand]:
+    """`vibench ARGUMENTS` as `running.started` starts it, but forked."""
+    program = {"main": "command", "arguments": ["vibench", *arguments], "path": [str(plugins), *paths()]}
+    return _ended(ForkedCommand(program, folder, file_kib))
 
 
 def template() -> str:
@@ -171,25 +172,23 @@ def paths() -> list[str]:
 
 
 def run_command(
-    arguments: Sequence[str], folder: Path, plugins: Path, timeout: float
+    arguments: Sequence[str], folder: Path, plugins: Path, timeout: float, file_kib: int | None = None
 ) -> subprocess.CompletedProcess[str]:
-    """Run `vibench ARGUMENTS` in a folder, third-party plugins first on its path; as `subprocess.run` does."""
-    printed = [folder / f".printed-{name}" for name in ("out", "err")]
-    request = command_request(arguments, folder, plugins)
-    with contextlib.ExitStack() as opened:
-        files = [opened.enter_context(file.open("w")).fileno() for file in printed]
-        process = Forked(template(), request, *files)
-    try:
-        process.wait(timeout)
-    except subprocess.TimeoutExpired:
-        with contextlib.suppress(ProcessLookupError):
-            os.killpg(process.pid, signal.SIGKILL)
-        process.wait()
-        raise subprocess.TimeoutExpired(list(arguments), timeout) from None
-    out, err = (file.read_text(encoding="utf-8") for file in printed)
-    for file in printed:
-        file.unlink()
+    """Run `vibench ARGUMENTS` in a folder, third-party plugins first on its path; as `subprocess.run` does.
+
+    With `file_kib` no file may be longer than so many KiB, which is how a full disk looks to every process of it.
+    """
+    with forked(arguments, folder, plugins, file_kib) as process:
+        out, err = process.communicate(timeout)
     return subprocess.CompletedProcess(list(arguments), process.wait(), out, err)
+
+
+def run_script(script: Path, *arguments: str, timeout: float = 120.0) -> subprocess.CompletedProcess[str]:
+    """Run a script of Python in its folder, as `subprocess.run` does."""
+    program = {"main": "script", "arguments": [str(script), *arguments], "path": [str(script.parent), *paths()]}
+    with _ended(ForkedCommand(program, script.parent)) as process:
+        out, err = process.communicate(timeout)
+    return subprocess.CompletedProcess([str(script), *arguments], process.wait(), out, err)
 
 
 @contextlib.contextmanager
@@ -302,7 +301,10 @@ def _be(request: Mapping[str, Any], files: Sequence[int]) -> None:
         os.environ.clear()
         os.environ.update(request["environment"])
         sys.path[:], sys.argv = request["path"], request["arguments"]
-        if request["main"] == "command":
+        if FILE_KIB in os.environ:
+            resource.setrlimit(resource.RLIMIT_FSIZE, (1024 * int(os.environ[FILE_KIB]),) * 2)
+            sys.dont_write_bytecode = True  # it would be cut off
+        if request["main"] != "worker":
             for descriptor, file in zip((1, 2), files, strict=True):
                 os.dup2(file, descriptor)
                 os.close(file)
@@ -310,7 +312,10 @@ def _be(request: Mapping[str, Any], files: Sequence[int]) -> None:
             sys.stdout = open(1, "w", 1, sys.stdout.encoding, sys.stdout.errors)  # noqa: SIM115
             sys.stderr = open(2, "w", 1, sys.stderr.encoding, sys.stderr.errors)  # noqa: SIM115
             with fork_workers(lambda: request["template"]):
-                import_module("vibench.cli").start()
+                if request["main"] == "command":
+                    import_module("vibench.cli").start()
+                else:
+                    runpy.run_path(sys.argv[0], run_name="__main__")
         else:
             sys.argv[1] = str(files[0])
             import_module("vibench.execution.worker").main()

@@ -5,10 +5,12 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
+from forking import run_script
 from running import Main, refused
 
 import vibench
@@ -75,11 +77,18 @@ if __name__ == "__main__":
 '''
 
 
-def run_script(folder: Path, out: str, source: str = SCRIPT) -> tuple[int, str, list[Any]]:
+def interpreted(script: Path, out: str) -> subprocess.CompletedProcess[str]:
+    """A script run by a new interpreter."""
+    line = [sys.executable, script.name, out]
+    return subprocess.run(line, cwd=script.parent, capture_output=True, text=True, check=False, timeout=120)
+
+
+def run_source(
+    folder: Path, source: str, run: Callable[[Path, str], subprocess.CompletedProcess[str]] = run_script
+) -> tuple[int, str, list[Any]]:
     """Cells that had to be run, the status of a query of the first one's model, and the rows."""
     (folder / "script.py").write_text(source)
-    line = [sys.executable, "script.py", out]
-    done = subprocess.run(line, cwd=folder, capture_output=True, text=True, check=False, timeout=120)
+    done = run(folder / "script.py", "out")
     assert done.returncode == 0, done.stderr
     count, status, rows = json.loads(done.stdout.splitlines()[-1])
     return count, status, rows
@@ -89,7 +98,7 @@ def run_script(folder: Path, out: str, source: str = SCRIPT) -> tuple[int, str, 
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Folder in which the script has run, its results in `out`."""
     folder = tmp_path_factory.mktemp("script")
-    count, status, rows = run_script(folder, "out")
+    count, status, rows = run_source(folder, SCRIPT, interpreted)
     assert (count, status) == (3, "ok")
     assert [(row["problem"], row["dual"], row["dual_options"]) for row in rows] == [
         (name, "MyCone", '{"share": 0.5}') for name in ("Wire", "short", "Slack")
@@ -102,8 +111,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_the_same_classes_are_not_run_again_and_edited_ones_are(folder: Path) -> None:
     before = vibench.open_run(folder / "out").cells
-    assert run_script(folder, "out", f"# a remark\n{SCRIPT}")[0] == 0
-    count, status, _ = run_script(folder, "out", SCRIPT.replace("DEPTH = 0.2", "DEPTH = 0.15"))
+    assert run_source(folder, f"# a remark\n{SCRIPT}")[0] == 0
+    count, status, _ = run_source(folder, SCRIPT.replace("DEPTH = 0.2", "DEPTH = 0.15"))
     assert (count, status) == (3, "ok")
     after = vibench.open_run(folder / "out").cells
     assert list(after["cell"]) == list(before["cell"])

@@ -10,6 +10,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import qpsolvers
+from running import Vibench
 from typer.testing import CliRunner
 
 import vibench
@@ -24,6 +25,7 @@ from vibench.study import registry
 STUDY = """
 name = "small"
 seed = 1
+timing_rounds = 3
 validation = 3
 accuracy = [1e-7, 1e-5]
 solvers = ["piqp", "osqp"]
@@ -135,24 +137,14 @@ def test_the_exported_set_is_rechecked_by_a_script_that_knows_nothing_of_vibench
     ("kib", "arguments"), [(0, ["export-qps"]), (3, ["export-qps"]), (1, ["replay"]), (8, ["report"])]
 )
 def test_on_a_full_disk_nothing_half_written_is_left(
-    kib: int, arguments: list[str], run: Path, command: str, tmp_path: Path
+    kib: int, arguments: list[str], run: Path, vibench: Vibench, tmp_path: Path
 ) -> None:
-    """No file may be longer than so many KiB, which is how a full disk looks. Python would cut off bytecode, too."""
     target = {
         "export-qps": ["set"],
         "replay": [key(run), "--out", "one.npz"],
         "report": ["--no-figures", "--out", "one.html"],
     }
-    limited = [
-        "bash",
-        "-c",
-        f'ulimit -f {kib}; PYTHONDONTWRITEBYTECODE=1 exec "$0" "$@"',
-        command,
-        *arguments,
-        str(run),
-        *target[arguments[0]],
-    ]
-    done = subprocess.run(limited, cwd=tmp_path, capture_output=True, text=True, check=False)
+    done = vibench(tmp_path, *arguments, str(run), *target[arguments[0]], file_kib=kib)
     assert (done.returncode, done.stdout) == (2, "")
     assert done.stderr == f"vibench: '{target[arguments[0]][-1]}' cannot be written: File too large\n"
     assert list(tmp_path.iterdir()) == []
