@@ -120,18 +120,25 @@ def command() -> str:
 
 
 @pytest.fixture(scope="session")
-def shared(tmp_path_factory: pytest.TempPathFactory) -> Shared:
-    """Function that makes a folder once, whichever of the parallel workers needs it first; nobody changes it."""
+def shared(tmp_path_factory: pytest.TempPathFactory, artefacts: Path) -> Shared:
+    """Function that makes a folder once, whichever of the parallel workers needs it first; nobody changes it.
+
+    The artefacts of runs in it are kept beside it, and copied to where runs of this process look for theirs: none of
+    the workers computes them again.
+    """
     base = tmp_path_factory.getbasetemp()
     parent = base.parent if "PYTEST_XDIST_WORKER" in os.environ else base
 
     def once(name: str, make: Callable[[Path], object]) -> Path:
-        folder, made = parent / name, parent / f"{name}.made"
-        with (parent / f"{name}.lock").open("w") as lock:
+        folder, made, cache = parent / name, parent / f"{name}.made", parent / f"{name}.cache"
+        with (parent / f"{name}.lock").open("w") as lock, pytest.MonkeyPatch.context() as patch:
             fcntl.flock(lock, fcntl.LOCK_EX)
             if not made.exists():
+                patch.setenv(CACHE_VARIABLE, str(cache))
                 make(folder)
                 made.touch()
+        if cache.exists():
+            shutil.copytree(cache, artefacts.parent, dirs_exist_ok=True)
         return folder
 
     return once

@@ -15,6 +15,7 @@ from forking import forked
 from running import Main, Vibench, rows
 from samples import wire_study, write_study
 
+from vibench.library.runs import Run
 from vibench.report.site import folder
 from vibench.results.sqlite.reading import FILE
 from vibench.testing.sample_run import write_sample_run
@@ -53,11 +54,12 @@ def test_a_site_that_is_killed_while_it_is_written_is_whole_or_not_there(
     assert sorted(path.name for path in site.rglob("*")) == whole
 
 
-def test_an_export_that_is_killed_is_whole_or_not_there(quick_run: Path, vibench: Vibench, tmp_path: Path) -> None:
-    key, rng = rows(quick_run)[0]["cell"], random.Random(9)
+def test_an_export_that_is_killed_is_whole_or_not_there(small_run: Run, vibench: Vibench, tmp_path: Path) -> None:
+    rng, run = random.Random(9), str(small_run.path.parent)
+    key = small_run.cells.set_index(["problem", "assembly"]).loc[("radial-obstacle", "reduced"), "cell"].iloc[0]
     for arguments, made in (
-        (["export-qps", str(quick_run), "set"], tmp_path / "set" / "check.py"),
-        (["export-model", str(quick_run), str(key), "model.npz"], tmp_path / "model.npz"),
+        (["export-qps", run, "set"], tmp_path / "set" / "check.py"),
+        (["export-model", run, key, "model.npz"], tmp_path / "model.npz"),
     ):
         start = time.monotonic()
         assert vibench(tmp_path, *arguments[:-1], f"whole-{arguments[-1]}").returncode == 0
