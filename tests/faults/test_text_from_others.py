@@ -54,7 +54,7 @@ def ended(vibench: Vibench, tmp_path_factory: pytest.TempPathFactory) -> tuple[P
     """The folder of a run that ended, and what it printed."""
     folder = tmp_path_factory.mktemp("odd")
     done = vibench(
-        folder, "run", write_study(folder, STUDY), "--jobs", "2", "--out", "run", figures=True, timeout=300.0
+        folder, "run", write_study(folder, STUDY), "--jobs", "1", "--out", "run", figures=True, timeout=300.0
     )
     assert (done.returncode, done.stderr) == (0, "")
     return folder, done.stdout

@@ -5,15 +5,14 @@ from __future__ import annotations
 import importlib.util
 import json
 import math
-import os
 import statistics
-import subprocess
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import pytest
+from forking import run_command
 from outputs import clean
 from running import Main, Register, refused
 from samples import install_fakes
@@ -54,7 +53,7 @@ class Timed:
 
 
 @pytest.fixture(scope="module")
-def third_party(command: str, tmp_path_factory: pytest.TempPathFactory) -> Timed:
+def third_party(tmp_path_factory: pytest.TempPathFactory) -> Timed:
     """The benchmarks of two problems and two solvers, and one dual strategy that fails."""
     folder = tmp_path_factory.mktemp("third-party")
     site = install_fakes(folder / "site")
@@ -70,16 +69,10 @@ def third_party(command: str, tmp_path_factory: pytest.TempPathFactory) -> Timed
         "mcpg",
         *PRIMALS,
     ]
-    paths = os.pathsep.join(filter(None, [str(site), os.environ.get("PYTHONPATH")]))
-    done = subprocess.run(
-        [command, "bench", *plugins, "--seconds", "0.001", "--out", str(folder / "file.json")],
-        cwd=folder,
-        env=os.environ | {"PYTHONPATH": paths, "COLUMNS": "80"},
-        capture_output=True,
-        text=True,
-        check=False,
-        timeout=120,
-    )
+    options = ["--seconds", "0.001", "--out", str(folder / "file.json")]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("COLUMNS", "80")
+        done = run_command(["bench", *plugins, *options], folder, site, 120.0)
     assert done.returncode in {0, 1}, done.stdout + done.stderr
     return Timed(done.returncode, done.stdout, done.stderr, json.loads((folder / "file.json").read_text("utf-8")))
 
