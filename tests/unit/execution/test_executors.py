@@ -22,7 +22,8 @@ import pytest
 from distributed import LocalCluster
 from distributed.security import Security
 from fake_stages import KillsItsParent, Whole
-from running import Vibench, assert_same_numbers, read_until, started
+from forking import forked
+from running import Vibench, assert_same_numbers, read_until
 from samples import wire_study, write_study
 
 from vibench.errors import ExecutorError, RequestError
@@ -171,7 +172,7 @@ def test_workers_that_do_not_see_the_artefacts_are_refused(
 
 
 def test_a_cluster_that_is_shut_down_stops_the_run_with_a_line_and_it_goes_on_without(
-    command: str, plugins_folder: Path, vibench: Vibench, tmp_path: Path
+    plugins_folder: Path, vibench: Vibench, tmp_path: Path
 ) -> None:
     waits = {"name": "cone-waits", "options": {"file": str(tmp_path / "go on")}}
     path = write_study(tmp_path, wire_study(dual=["cpg", waits]))
@@ -179,7 +180,7 @@ def test_a_cluster_that_is_shut_down_stops_the_run_with_a_line_and_it_goes_on_wi
         patch.syspath_prepend(plugins_folder)  # which processes that are spawned inherit
         cluster = LocalCluster(n_workers=2, threads_per_worker=1, protocol="tcp", dashboard_address="127.0.0.1:0")
     options = ["run", path, "--executor", "dask", "--scheduler", cluster.scheduler_address]
-    with started([command, *options], tmp_path, plugins_folder) as process:
+    with forked(options, tmp_path, plugins_folder) as process:
         read_until(process, "[1/2] ok")
         cluster.close()
         _, err = process.communicate(timeout=90)

@@ -13,7 +13,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from samples import small_study
 
 import vibench
 from vibench.interfaces.outputs import Output
@@ -63,21 +62,14 @@ def compiled(file: Path, unknowns: int, constraints: int) -> Solve:
 PROBLEMS = ["radial-obstacle", "obstacle"]
 
 
-@pytest.fixture(scope="module")
-def run(tmp_path_factory: pytest.TempPathFactory) -> vibench.Run:
-    problems = [{"name": name, "options": {"resolution": 150}} for name in PROBLEMS]
-    assembly = ["reduced", "certified"]
-    study = small_study("small", problems, assembly=assembly, tolerances=[{"pod": [1e-2], "dual": [1e-1]}])
-    return vibench.run(study, tmp_path_factory.mktemp("c") / "run", progress=False, jobs=1)
-
-
 @pytest.fixture(scope="module", params=PROBLEMS)
-def model(request: pytest.FixtureRequest, run: vibench.Run) -> vibench.Model:
-    return model_of(run, request.param, "reduced")
+def model(request: pytest.FixtureRequest, small_run: vibench.Run) -> vibench.Model:
+    return model_of(small_run, request.param, "reduced")
 
 
 def model_of(run: vibench.Run, problem: str, assembly: str) -> vibench.Model:
-    return run.model(str(run.cells.set_index(["problem", "assembly"]).loc[(problem, assembly), "cell"]))
+    cells = run.cells.set_index(["primal", "problem", "assembly"])
+    return run.model(str(cells.loc[("decorrelated", problem, assembly), "cell"]))
 
 
 def test_a_c_source_gives_the_answers_of_the_model(model: vibench.Model, tmp_path: Path) -> None:
@@ -106,9 +98,9 @@ def test_a_c_source_gives_the_answers_of_the_model(model: vibench.Model, tmp_pat
 
 @pytest.mark.parametrize("problem", PROBLEMS)
 def test_a_c_source_has_the_bounds_and_the_corrected_pair_of_the_model(
-    problem: str, run: vibench.Run, tmp_path: Path
+    problem: str, small_run: vibench.Run, tmp_path: Path
 ) -> None:
-    model = model_of(run, problem, "certified")
+    model = model_of(small_run, problem, "certified")
     export_model(model, tmp_path / "model.npz", tolerance=2e-13, evaluations=6000, c=True)
     found, data = library(tmp_path / "model.c"), dict(np.load(tmp_path / "model.npz"))
     (rows, loads), basis = data["certificate_responses"].shape, data["basis"]
@@ -142,9 +134,9 @@ def test_a_c_source_has_the_bounds_and_the_corrected_pair_of_the_model(
 
 @pytest.mark.parametrize("problem", PROBLEMS)
 def test_outputs_and_their_bounds_are_those_of_the_model_in_script_and_c(
-    problem: str, run: vibench.Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    problem: str, small_run: vibench.Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    model = model_of(run, problem, "certified")
+    model = model_of(small_run, problem, "certified")
     rng, sizes = np.random.default_rng(0), (model.problem.V.dim, model.problem.W.dim)
     outputs = (
         Output("load", "N", u=rng.random(sizes[0])),
@@ -194,10 +186,10 @@ def test_outputs_and_their_bounds_are_those_of_the_model_in_script_and_c(
 
 
 def test_a_certificate_without_outputs_and_outputs_without_a_certificate(
-    run: vibench.Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    small_run: vibench.Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for assembly, outputs in (("certified", ()), ("reduced", (Output("s", "1", u=np.ones(1)),))):
-        model = model_of(run, "radial-obstacle", assembly)
+        model = model_of(small_run, "radial-obstacle", assembly)
         given = tuple(Output(one.name, one.unit, u=np.ones(model.problem.V.dim)) for one in outputs)
         monkeypatch.setattr(type(model.problem), "outputs", given)
         folder = tmp_path / assembly
