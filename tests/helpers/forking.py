@@ -196,7 +196,8 @@ def fork_workers(address: Callable[[], str] = template) -> Iterator[None]:
     """Block in which the worker processes that this process starts are forked, by the template at an address."""
 
     def start(descriptor: int, log: str, environment: Mapping[str, str]) -> Any:
-        if "PYTHONHASHSEED" in environment:  # only a new interpreter has another one
+        # Only a new interpreter has another seed than this process was given; dask leaves one in the environment.
+        if environment.get("PYTHONHASHSEED") != os.environ.get("PYTHONHASHSEED"):
             return start_new_worker(descriptor, log, environment)
         request = {
             "main": "worker", "arguments": ["worker", str(descriptor), log], "folder": str(Path.cwd()),
