@@ -106,9 +106,9 @@ def is_absent(g: Array) -> Mask:
 
 def without_infinities(g: Any) -> Any:
     """A bound g (m,) with `ABSENT` in place of +inf."""
-    if not isinstance(g, np.ndarray) or g.dtype.kind != "f" or not np.isposinf(g).any():
+    if not isinstance(g, np.ndarray) or g.dtype.kind != "f" or not (infinite := g == np.inf).any():
         return g
-    return np.where(np.isposinf(g), ABSENT, g)
+    return np.where(infinite, ABSENT, g)
 
 
 @dataclass(frozen=True)

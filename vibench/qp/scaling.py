@@ -32,14 +32,18 @@ Negative ones within a solver's tolerance are set to zero, which opens a gap.
 
 def row_norms(B: SparseMatrix | Array) -> Array:
     """Euclidean norms (m,) of the rows, 1 where a row is zero."""
-    squares = (B * B).sum(axis=1) if isinstance(B, np.ndarray) else B.multiply(B).sum(axis=1)
-    norms = np.sqrt(np.asarray(squares, float).ravel())
-    return np.where(norms > 0.0, norms, 1.0)
+    if isinstance(B, np.ndarray):
+        squares = np.asarray((B * B).sum(axis=1), float)
+    else:
+        squares = np.asarray(B.multiply(B).sum(axis=1), float).ravel()
+    norms = np.sqrt(squares)
+    norms[norms == 0.0] = 1.0
+    return np.asarray(norms)
 
 
 def peak(vector: Array) -> float:
     """Largest entry in absolute value; 0 of an empty vector."""
-    return float(np.max(np.abs(vector), initial=0.0))
+    return float(np.abs(vector).max(initial=0.0))
 
 
 def size(vector: Array) -> float:
@@ -77,25 +81,30 @@ def drive(program: VariationalInequality, rows: Array) -> Drive:
     neither moves anything the solution is 0, and all units are 1.
     """
     A, f = program.A, program.f
-    k, load, curvature = stiffness(A), peak(f), float(f @ (A @ f))
+    load, curvature = peak(f), float(f @ (A @ f))
     moved = load * float(f @ f) / curvature if curvature > 0.0 else 0.0
-    depth = float(np.max(-program.g / rows, initial=0.0))
+    depth = -float((program.g / rows).min(initial=0.0))
     if moved > NO_LOAD * depth:
         return Drive(max(moved, depth), load, loaded=True)
     length = depth if depth > 0.0 else 1.0
-    return Drive(length, k * length, loaded=False)
+    return Drive(length, stiffness(A) * length, loaded=False)
 
 
 def near_rows(program: VariationalInequality) -> Mask:
     """Constraints (m,) that are less than `FAR` lengths from 0; solvers lose their digits to the others."""
     rows = row_norms(program.B)
-    return np.asarray(program.g <= FAR * drive(program, rows).length * rows)
+    return near(program, rows, drive(program, rows))
+
+
+def near(program: VariationalInequality, rows: Array, driven: Drive) -> Mask:
+    """The same where the norms (m,) of its rows, and what drives it, are known."""
+    return np.asarray(program.g <= FAR * driven.length * rows)
 
 
 def stiffness(A: SparseMatrix | Array) -> float:
     """Mean of the diagonal of A (n×n), or 1 where that is not positive."""
     diagonal = A.diagonal()
-    mean = float(np.sum(diagonal)) / max(len(diagonal), 1)
+    mean = float(diagonal.sum()) / max(len(diagonal), 1)
     return mean if mean > 0.0 else 1.0
 
 
@@ -137,8 +146,12 @@ class Units:
 def units_of(program: VariationalInequality) -> Units:
     """Units of what drives a program: those in which ‖f‖∞ = 1, or of what the constraints prescribe without load."""
     rows = row_norms(program.B)
-    found = drive(program, rows)
-    return Units(rows, found.length, found.force if found.loaded else OBJECTIVE_UNIT * found.force)
+    return units_driven(rows, drive(program, rows))
+
+
+def units_driven(rows: Array, driven: Drive) -> Units:
+    """The same from the norms (m,) of the rows of a program, and what drives it."""
+    return Units(rows, driven.length, driven.force if driven.loaded else OBJECTIVE_UNIT * driven.force)
 
 
 def units_of_dual(dual: VariationalInequality, loaded: bool) -> Units:
@@ -146,7 +159,7 @@ def units_of_dual(dual: VariationalInequality, loaded: bool) -> Units:
 
     Entries of d below zero are constraints that the unconstrained solution satisfies, and drive nothing.
     """
-    length = float(np.max(dual.f, initial=0.0)) or size(dual.f)
+    length = float(dual.f.max(initial=0.0)) or size(dual.f)
     return Units(
         np.ones(len(dual.g)),
         MULTIPLIER_UNIT * length / stiffness(dual.A),

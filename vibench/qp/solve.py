@@ -14,14 +14,15 @@ from typing import Any
 
 import numpy as np
 import qpsolvers
-import scipy.linalg
 import scipy.sparse as sp
+from scipy.linalg.lapack import dtrtrs
 
 from vibench.arrays import Array, Mask
 from vibench.errors import NumericalError, message_of
 from vibench.interfaces.problem import VariationalInequality
 from vibench.provenance import solver_version
-from vibench.qp.scaling import Units, drive, near_rows, row_norms, units_of, units_of_dual
+from vibench.qp.direct import DIRECT, DirectSolution
+from vibench.qp.scaling import Units, drive, near, row_norms, units_driven, units_of_dual
 from vibench.qp.settings import SETTINGS
 from vibench.qp.verification import QPSolution, QPSolver
 from vibench.text import one_line
@@ -65,21 +66,23 @@ def solve_qp(
     NumericalError
         If the solver does not return a `QPSolution` of the right shapes, with a text as its status.
     """
-    if not np.any(program.f) and np.all(program.g >= 0.0):
+    if not program.f.any() and (program.g >= 0.0).all():
         return QPSolution(np.zeros_like(program.f), np.zeros_like(program.g), "nothing to solve: 0 is the solution")
-    near = near_rows(program)
-    if not np.all(near):
-        answer = solve_qp(_rows(program, near), solver, accuracy, extra, factor, _start_of(start, near))
+    rows = row_norms(program.B)
+    driven = drive(program, rows)
+    kept = near(program, rows, driven)
+    if not kept.all():
+        answer = solve_qp(_rows(program, kept), solver, accuracy, extra, factor, _start_of(start, kept))
         if answer.x is None or answer.alpha is None:
             return answer
-        if np.all(program.B[~near] @ answer.x <= program.g[~near]):
-            alpha = np.zeros(len(near))
-            alpha[near] = answer.alpha
+        if np.all(program.B[~kept] @ answer.x <= program.g[~kept]):
+            alpha = np.zeros(len(kept))
+            alpha[kept] = answer.alpha
             return replace(answer, alpha=alpha)
     solve = partial(_solve_in, solver=solver, accuracy=accuracy, extra=extra)
     if factor is None or not len(program.f):
-        return solve(units_of(program), program, start)
-    return _solve_dual(program, solve, factor, start)
+        return solve(units_driven(rows, driven), program, start)
+    return _solve_dual(program, solve, factor, start, rows, driven.loaded)
 
 
 def _rows(program: VariationalInequality, chosen: Mask) -> VariationalInequality:
@@ -113,16 +116,16 @@ def _solve_in(
         warm_start, starter = dict[str, Any](), SETTINGS[solver].start
         if start is not None and starter is not None and start.x is not None and start.alpha is not None:
             warm_start |= starter(*units.to(start.x, start.alpha))
-        answer = _call_qpsolvers(scaled, solver, accuracy, warm_start)
-    answer = _sound_answer(answer, program)
+        answer = _call(scaled, solver, accuracy, warm_start)
+    status, iterations = _report(answer, program)
     if answer.x is None or answer.alpha is None:
-        return replace(answer, x=None, alpha=None)
+        return QPSolution(None, None, status, iterations, answer.negative)
     x, alpha = units.back(answer.x, answer.alpha)
-    return replace(answer, x=x, alpha=np.maximum(alpha, 0.0), negative=-float(np.min(alpha, initial=0.0)))
+    return QPSolution(x, np.maximum(alpha, 0.0), status, iterations, -float(alpha.min(initial=0.0)))
 
 
-def _sound_answer(answer: QPSolution, program: VariationalInequality) -> QPSolution:
-    """An answer with vectors of the right shapes, a status of one line, and iterations if they are a number of them."""
+def _report(answer: QPSolution, program: VariationalInequality) -> tuple[str, int | None]:
+    """The status in one line and iterations if they are a number of them, of an answer with vectors of right shapes."""
     for name, value, count in (("x", answer.x, len(program.f)), ("α", answer.alpha, len(program.g))):
         if value is not None and value.shape != (count,):
             raise NumericalError(f"the solver returned {name} of shape {value.shape}, expected ({count},)")
@@ -131,32 +134,48 @@ def _sound_answer(answer: QPSolution, program: VariationalInequality) -> QPSolut
         raise NumericalError(f"the solver reports the status {status!r:.40}; expected a text")
     # A results file holds whole numbers of 64 bits.
     iterations = int(steps) if isinstance(steps, int | np.integer) and 0 <= steps < 2**63 else None
-    return replace(answer, solver_status=one_line(status), iterations=iterations)
+    return one_line(status), iterations
 
 
 def _solve_dual(
-    program: VariationalInequality, solve: Callable[..., QPSolution], factor: Array, start: QPSolution | None
+    program: VariationalInequality,
+    solve: Callable[..., QPSolution],
+    factor: Array,
+    start: QPSolution | None,
+    rows: Array,
+    loaded: bool,
 ) -> QPSolution:
     """Solve a dense program with A = L Lᵀ through its dual, which has one unknown per constraint.
 
     The multipliers minimise ½ αᵀ(B A⁻¹Bᵀ)α − (B A⁻¹f − g)ᵀα over α ≥ 0; then x = A⁻¹(f − Bᵀα).
     """
-    rows = row_norms(program.B)  # scaled before products: the matrix of the dual has their squares
-    right = np.column_stack([(program.B / rows[:, None]).T, program.f])
-    whitened = scipy.linalg.solve_triangular(factor, right, lower=True, check_finite=False)
-    constraints, load = whitened[:, :-1], whitened[:, -1]
-    A, f, count = constraints.T @ constraints, constraints.T @ load - program.g / rows, len(program.g)
+    count = len(program.g)
+    right = np.empty((count + 1, len(program.f)))
+    np.divide(program.B, rows[:, None], out=right[:count])  # before products: the matrix of the dual has their squares
+    right[count] = program.f
+    whitened = _solve_factor(factor, right.T)
+    constraints, load = whitened[:, :count], whitened[:, count]
+    A, f = constraints.T @ constraints, constraints.T @ load - program.g / rows
     dual = VariationalInequality(A, f, B=-np.eye(count), g=np.zeros(count))
     if start is not None and start.alpha is not None and start.x is not None:  # slack g − Bx of the constraints −α ≤ 0
         slack = np.maximum(program.g - program.B @ start.x, 0.0) / rows
         start = replace(start, x=rows * start.alpha, alpha=slack)
-    units = units_of_dual(dual, drive(program, rows).loaded)
-    answer = solve(units, dual, start)
+    answer = solve(units_of_dual(dual, loaded), dual, start)
     if answer.x is None:
         return answer
     forces = np.maximum(answer.x, 0.0)
-    x = scipy.linalg.solve_triangular(factor, load - constraints @ forces, lower=True, trans="T", check_finite=False)
-    return replace(answer, x=x, alpha=forces / rows, negative=-float(np.min(answer.x / rows, initial=0.0)))
+    x = _solve_factor(factor, load - constraints @ forces, transposed=True)
+    negative = -float((answer.x / rows).min(initial=0.0))
+    return QPSolution(x, forces / rows, answer.solver_status, answer.iterations, negative)
+
+
+def _solve_factor(L: Array, right: Array, *, transposed: bool = False) -> Array:
+    """L⁻¹ or L⁻ᵀ of right-hand sides (n,) or (n×k), which may be overwritten; what LAPACK takes needs no copy of L."""
+    by_column = L.flags.f_contiguous
+    solution, _ = dtrtrs(
+        L if by_column else L.T, right, lower=by_column, trans=transposed is by_column, overwrite_b=True
+    )
+    return np.asarray(solution)
 
 
 def installed_solvers(extra: Iterable[str] = ()) -> list[str]:
@@ -173,17 +192,20 @@ def takes_start(solver: str) -> bool:
     return solver in SETTINGS and SETTINGS[solver].start is not None
 
 
-def _call_qpsolvers(
-    program: VariationalInequality, solver: str, accuracy: float, start: Mapping[str, Any]
-) -> QPSolution:
-    problem = qpsolvers.Problem(_as_csc(program.A), -program.f, _as_csc(program.B), program.g)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # the status is part of the solution, which is verified later
-        settings = SETTINGS[solver].at(MARGIN * accuracy)
-        try:
-            solution = qpsolvers.solve_problem(problem, solver=solver, **settings, **start)
-        except qpsolvers.SolverError as error:  # cvxopt raises where no point is feasible
-            return QPSolution(None, None, message_of(error))
+def _call(program: VariationalInequality, solver: str, accuracy: float, start: Mapping[str, Any]) -> QPSolution:
+    """The answer of a solver to a program with data of order one; without qpsolvers where `DIRECT` has the solver."""
+    settings = SETTINGS[solver].at(MARGIN * accuracy)
+    solution: DirectSolution | qpsolvers.Solution
+    if solver in DIRECT and isinstance(program.A, np.ndarray) and isinstance(program.B, np.ndarray):
+        solution = DIRECT[solver](program, **settings, **start)
+    else:
+        problem = qpsolvers.Problem(_as_csc(program.A), -program.f, _as_csc(program.B), program.g)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # the status is part of the solution, which is verified later
+            try:
+                solution = qpsolvers.solve_problem(problem, solver=solver, **settings, **start)
+            except qpsolvers.SolverError as error:  # cvxopt raises where no point is feasible
+                return QPSolution(None, None, message_of(error))
     status, iterations = SETTINGS[solver].report(solution)
     if solution.x is None or solution.z is None:
         return QPSolution(None, None, status, iterations)
