@@ -28,6 +28,7 @@ from .interfaces.figures import RunTables as RunTables
 from .interfaces.outputs import Output as Output
 from .interfaces.problem import MEMBERS as MEMBERS
 from .interfaces.problem import Contact as Contact
+from .interfaces.problem import ContactLoads as ContactLoads
 from .interfaces.problem import ParameterBox as ParameterBox
 from .interfaces.problem import Picture as Picture
 from .interfaces.problem import Problem as Problem

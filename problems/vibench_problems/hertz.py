@@ -13,6 +13,7 @@ from skfem.helpers import ddot, eye, sym_grad, trace
 from vibench import (
     Array,
     Contact,
+    ContactLoads,
     Indices,
     InnerProduct,
     Output,
@@ -23,7 +24,7 @@ from vibench import (
     fem,
 )
 from vibench_problems.graded_mesh import Triangulation, quarter_disc
-from vibench_problems.mortar import Pairing
+from vibench_problems.mortar import ALL, Pairing
 
 SLAVE_ANGLE = np.pi / 6.0
 """End of the potential contact zone on disc 1 [rad]: x ≤ 0.5 m."""
@@ -190,6 +191,24 @@ class Hertz(Problem):
         """The non-interpenetration condition on the potential contact zones."""
         integrals = self._pairing.couple(mu[0] * self._master_zone)
         return Contact(integrals.jump, integrals.gap - integrals.jump @ (self.approach(mu) * self._contact_lift))
+
+    def contact_loads(self, eta: Array) -> ContactLoads:
+        """Those of multipliers η (m×k) on disc 1 are the same at every radius; those on disc 2 begin at its axis."""
+        tested, slaves, (x, y) = self._pairing.tested(eta), len(self.slave.zone), self._master_zone
+        fixed = np.zeros((len(self._contact_dofs), eta.shape[1]))
+        fixed[:slaves] = tested.on_slave
+        lift_below, lift_above = self._contact_lift[slaves:], tested.on_slave.T @ self._contact_lift[:slaves]
+
+        def varying(mu: Array) -> tuple[Array, Array]:
+            radius, approach = mu[0], self.approach(mu)
+            loads = tested.on_master(radius * x)
+            j = len(loads)
+            return loads, tested.height - approach * lift_above - (radius * y[:j] + approach * lift_below[:j]) @ loads
+
+        # At the smallest radius that covers the zone η reaches the most nodes of disc 2.
+        smallest = self._pairing.end(ALL) / x[-1]
+        reach = int(np.searchsorted(smallest * x, tested.end)) + 1
+        return ContactLoads(fixed, varying, slaves, min(reach + 1, len(x)))
 
     def refuse(self, mu: Array, u: Array, lam: Array) -> str:  # noqa: ARG002
         """Refuse contact that reaches the last macro-edge: it may extend beyond the potential contact zone."""

@@ -10,6 +10,8 @@ import scipy.sparse as sp
 
 from vibench import Array, Indices, NumericalError, SparseMatrix
 
+ALL = slice(None)
+
 
 @dataclass(frozen=True)
 class Coupling:
@@ -65,19 +67,43 @@ class Pairing:
         NumericalError
             If the master side does not cover the slave side.
         """
-        slave = self._slave
-        if master[0, -1] < slave[0, -1]:
-            raise NumericalError(
-                f"the pairing ends at x = {master[0, -1]:.4g} m, but the potential contact zone of disc 1 reaches "
-                f"x = {slave[0, -1]:.4g} m: the radius of disc 2 is too small"
-            )
-        macro, edge, x, weight = self._cut(master[0]) if self._points is None else self._facing(self._points, master[0])
-        right = weight * (x - master[0, edge]) / np.diff(master[0])[edge]
-        left = weight - right
+        macro, edge, left, right = self.halves(master[0])
         on_master = left * master[1, edge] + right * master[1, edge + 1]
         height = np.asarray(np.bincount(macro, on_master, minlength=len(self._height)), float)
         jump = self._beside_slave(*_by_row(macro, edge, left, right), master.shape[1])
         return Coupling(jump, self._height - height)
+
+    def tested(self, eta: Array) -> Tested:
+        """The same integrals for given multipliers η (m×k), and any master polygon."""
+        return Tested(self, eta)
+
+    def on_slave(self, eta: Array) -> tuple[Array, Array]:
+        """−∫ v η (s×k) for nodal values of v on the slave side, and ∫ y η (k,) there."""
+        return np.asarray(self._on_slave.T @ eta), np.asarray(self._height @ eta)
+
+    def end(self, macros: slice) -> float:
+        """The abscissa where the last of some macro-edges ends."""
+        return float(self._slave[0, 2 * macros.indices(len(self._height))[1]])
+
+    def halves(self, abscissae: Array, macros: slice = ALL) -> tuple[Indices, Indices, Array, Array]:
+        """Macro-edge and master edge of points on the slave side, and the weights of the two nodes of the master edge.
+
+        Those of some macro-edges alone, if they are asked for. The abscissae (j,) are those of the master polygon.
+
+        Raises
+        ------
+        NumericalError
+            If the master side does not cover the slave side.
+        """
+        if abscissae[-1] < self._slave[0, -1]:
+            raise NumericalError(
+                f"the pairing ends at x = {abscissae[-1]:.4g} m, but the potential contact zone of disc 1 reaches "
+                f"x = {self._slave[0, -1]:.4g} m: the radius of disc 2 is too small"
+            )
+        macro, edge, x, weight = (self._cut if self._points is None else self._facing)(abscissae, macros)
+        begin = abscissae[edge]
+        right = weight * (x - begin) / (abscissae[edge + 1] - begin)
+        return macro, edge, weight - right, right
 
     def _beside_slave(self, rows: Indices, nodes: Indices, values: Array, count: int) -> SparseMatrix:
         """Matrix of the slave entries followed by those of `count` master nodes, sorted by row and node."""
@@ -91,23 +117,28 @@ class Pairing:
         pointers = (fixed.indptr + before).astype(columns.dtype)
         return sp.csr_array((data, columns, pointers), shape=(fixed.shape[0], fixed.shape[1] + count))
 
-    def _cut(self, abscissae: Array) -> tuple[Indices, Indices, Array, Array]:
+    def _cut(self, abscissae: Array, macros: slice) -> tuple[Indices, Indices, Array, Array]:
         """Macro-edge, master edge, abscissa and weight of the midpoints of all segments between projected nodes."""
-        nodes = self._slave[0]
-        first, last = np.searchsorted(abscissae, nodes[[0, -1]])
+        begin, end, _ = macros.indices(len(self._height))
+        nodes = self._slave[0, 2 * begin : 2 * end + 1]
+        first, last = abscissae.searchsorted(nodes[[0, -1]])
         merged = np.concatenate([nodes, abscissae[first:last]])
-        order = np.argsort(merged, kind="stable")
-        cuts, begun = merged[order], np.cumsum(order < len(nodes))[:-1]  # slave nodes up to each segment
+        order = merged.argsort(kind="stable")
+        cuts, begun = merged[order], (order < len(nodes)).cumsum()[:-1]  # slave nodes up to each segment
         # The other cuts are master nodes; the last one before a segment is the number of its master edge. It would be
         # −1 on the empty segment between two nodes that coincide on the axis.
-        facing = np.maximum(first + np.arange(len(begun)) - begun, 0)
+        facing = np.maximum(np.arange(first, first + len(begun)) - begun, 0)
         x = 0.5 * (cuts[1:] + cuts[:-1])  # exact: the integrands are linear on every segment
-        return self._macros[begun - 1], facing, x, np.diff(cuts) * self._stretch[begun - 1]
+        edges = begun + (2 * begin - 1)
+        return self._macros[edges], facing, x, (cuts[1:] - cuts[:-1]) * self._stretch[edges]
 
-    @staticmethod
-    def _facing(points: tuple[Indices, Array, Array], abscissae: Array) -> tuple[Indices, Indices, Array, Array]:
+    def _facing(self, abscissae: Array, macros: slice) -> tuple[Indices, Indices, Array, Array]:
         """Macro-edge, master edge, abscissa and weight of given points on the slave side."""
-        macro, x, weight = points
+        assert self._points is not None  # implied by the quadrature
+        macro, x, weight = self._points
+        begin, end, _ = macros.indices(len(self._height))
+        chosen = slice(*macro.searchsorted([begin, end]))
+        macro, x, weight = macro[chosen], x[chosen], weight[chosen]
         return macro, np.clip(np.searchsorted(abscissae, x, side="right") - 1, 0, len(abscissae) - 2), x, weight
 
     def _gauss(self, count: int) -> tuple[Indices, Array, Array]:
@@ -117,6 +148,46 @@ class Pairing:
         edge = np.repeat(np.arange(len(widths)), count)
         x = self._slave[0, edge] + np.tile(0.5 * (1.0 + nodes), len(widths)) * widths[edge]
         return self._macros[edge], x, 0.5 * np.tile(weights, len(widths)) * (widths * self._stretch)[edge]
+
+
+class Tested:
+    """The integrals of a pairing for given multipliers η (m×k), of whose macro-edges alone the slave edges are cut.
+
+    Attributes
+    ----------
+    on_slave
+        −∫ v η for nodal values of v on the slave side, as loads (s×k).
+    height
+        ∫ y η on the slave side (k,).
+    end
+        The largest abscissa where η is not zero.
+    """
+
+    def __init__(self, pairing: Pairing, eta: Array) -> None:
+        acting = np.flatnonzero(eta.any(axis=1))
+        self._macros = slice(int(acting[0]), int(acting[-1]) + 1) if len(acting) else slice(0, 1)
+        self._pairing, self._eta = pairing, np.ascontiguousarray(eta)
+        self.on_slave, self.height = pairing.on_slave(eta)
+        self.end = pairing.end(self._macros)
+
+    def on_master(self, abscissae: Array) -> Array:
+        """∫ (v∘φ) η for nodal values of v on a master polygon, as loads (j×k) on its first nodes; the others have none.
+
+        Raises
+        ------
+        NumericalError
+            As `Pairing.couple`.
+        """
+        macro, edge, left, right = self._pairing.halves(abscissae, self._macros)
+        points, begun = len(macro), np.flatnonzero(np.diff(edge, prepend=-1))
+        pointers = np.concatenate([begun, begun + points, [2 * points]])
+        entries = np.concatenate([left, right]), np.concatenate([macro, macro]), pointers
+        sums = sp.csr_array(entries, shape=(2 * len(begun), len(self._eta))) @ self._eta  # of the points of every edge
+        met = edge[begun]
+        loads = np.zeros((int(met[-1]) + 2, self._eta.shape[1]))
+        loads[met] = sums[: len(met)]
+        loads[met + 1] += sums[len(met) :]
+        return loads
 
 
 def _by_row(rows: Indices, edges: Indices, left: Array, right: Array) -> tuple[Indices, Indices, Array]:

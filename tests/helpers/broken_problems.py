@@ -9,7 +9,17 @@ import numpy as np
 import scipy.sparse as sp
 from fake_plugins import Wire
 
-from vibench import Array, Contact, InnerProduct, Output, ParameterBox, Picture, Problem, VariationalInequality
+from vibench import (
+    Array,
+    Contact,
+    ContactLoads,
+    InnerProduct,
+    Output,
+    ParameterBox,
+    Picture,
+    Problem,
+    VariationalInequality,
+)
 
 
 class Declared(Wire):
@@ -233,6 +243,20 @@ class PartlyWrong(Declared):
     def contact(self, mu: Array) -> Contact:
         found = super().contact(mu)
         return Contact(found.B, found.g * (1.0 + 1e-6))
+
+
+class LoadsWrong(Declared):
+    """The loads of multipliers are those of others."""
+
+    def contact_loads(self, eta: Array) -> ContactLoads:
+        return super().contact_loads(2.0 * eta)
+
+
+class LoadsReachFarther(Declared):
+    """Loads vary on more rows than it says."""
+
+    def contact_loads(self, eta: Array) -> ContactLoads:
+        return replace(super().contact_loads(eta), reach=1)
 
 
 class NoContact(Declared):

@@ -157,6 +157,33 @@ class Contact:
 
 
 @dataclass(frozen=True)
+class ContactLoads:
+    """What B and g are for k given multipliers η (m×k): the loads Bᵀη on the contact unknowns, and the bounds ηᵀg.
+
+    Attributes
+    ----------
+    fixed
+        The part of Bᵀη (|E|×k) that does not depend on mu.
+    varying
+        From mu (d,) to what is added to rows of it from `first` on (j×k), where j may depend on mu, and to ηᵀg (k,).
+    first
+        The first of these rows.
+    reach
+        The largest j; `None` for all rows from the first one on.
+    """
+
+    fixed: Array
+    varying: Callable[[Array], tuple[Array, Array]]
+    first: int = 0
+    reach: int | None = None
+
+    @property
+    def reached(self) -> slice:
+        """Rows that may vary."""
+        return slice(self.first, len(self.fixed) if self.reach is None else self.first + self.reach)
+
+
+@dataclass(frozen=True)
 class Picture:
     """A solution to be drawn.
 
@@ -252,6 +279,21 @@ class Problem(ABC):
     def has_contact(self) -> bool:
         """Whether the problem defines `contact_dofs` and `contact`."""
         return self.contact_dofs is not None and type(self).contact is not Problem.contact
+
+    def contact_loads(self, eta: Array) -> ContactLoads:
+        """Bᵀη on `contact_dofs` and ηᵀg for multipliers η (m×k), from `contact` where nothing cheaper is known.
+
+        Queries of reduced models evaluate these at every parameter, for few multipliers: a problem that knows which
+        rows depend on the parameter, or needs no sparse matrix for the product, answers them faster.
+        """
+        assert self.contact_dofs is not None  # implied by `has_contact`
+
+        def varying(mu: Array) -> tuple[Array, Array]:
+            contact = self.contact(mu)
+            assert contact is not None  # implied by `has_contact`
+            return np.asarray(contact.B.T @ eta), np.asarray(eta.T @ contact.g)
+
+        return ContactLoads(np.zeros((len(self.contact_dofs), eta.shape[1])), varying)
 
     def sampler(self, wanted: Mapping[str, tuple[Indices, Indices]]) -> Sampler:
         """Function that evaluates chosen entries of the members in `entrywise`, at the cost of these entries alone.

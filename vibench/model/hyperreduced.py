@@ -3,20 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
+from math import isfinite
 
 import numpy as np
 import scipy.linalg
 
 from vibench.arrays import Array, Indices
 from vibench.errors import NumericalError
-from vibench.interfaces.problem import MEMBERS, Contact, VariationalInequality
+from vibench.interfaces.problem import MEMBERS, ContactLoads, VariationalInequality
 from vibench.interfaces.strategies import Kind
-from vibench.linalg.inner_product import orthonormal_range
+from vibench.linalg.inner_product import RANK_RTOL
 from vibench.model.affine import AffineMember, Evaluation, coefficients, evaluated_members
 from vibench.model.galerkin import Evaluated, ReducedModel, ReducedProblem
-from vibench.reduction.supremizers import ContactCoordinates, Coordinates, SpannedCoordinates, supremizers
+from vibench.reduction.supremizers import LoadCoordinates, PlainCoordinates, SpannedCoordinates, supremizers
 
 Samples = Mapping[str, Array]
 """Coefficients θ of the terms at one parameter, by member."""
@@ -86,12 +87,12 @@ class ReducedOperators:
     A, f
         Stiffness (d×d) and load (d,) on Φ.
     g
-        Bound (R,); `None` where it is evaluated by `Problem.contact`.
+        Bound (R,); `None` where it is evaluated by `Problem.contact_loads`.
     B
         Constraint (R×d) on the generators χ, or ((k+R)×d) on (η, χ) for a per-parameter enrichment; `None` where it is
-        evaluated by `Problem.contact`.
+        evaluated by `Problem.contact_loads`.
     contact_basis
-        Rows of Φ at the contact unknowns (|E|×d), for a fixed space and a constraint from `Problem.contact`.
+        Rows of Φ at the contact unknowns (|E|×d), for a fixed space and a constraint from `Problem.contact_loads`.
     supremizer_coordinates
         Coordinates of Φ = V_N + supremizers for a per-parameter enrichment that varies in it, else `None`.
     basis
@@ -108,7 +109,7 @@ class ReducedOperators:
     g: ProjectedMember | None
     B: ProjectedMember | None
     contact_basis: Array | None
-    supremizer_coordinates: Coordinates | None
+    supremizer_coordinates: PlainCoordinates | None
     basis: Array | None
     factor: Array | None
 
@@ -156,12 +157,13 @@ def hyper_reduce(model: ReducedModel, members: Mapping[str, AffineMember]) -> Re
     )
 
 
-def _supremizer_space(model: ReducedModel, B: AffineMember, eta: Array) -> Coordinates:
+def _supremizer_space(model: ReducedModel, B: AffineMember, eta: Array) -> PlainCoordinates:
     """Coordinates of V_N and of the supremizers of η at any parameter."""
     V, basis = model.problem.V, model.fixed_basis
     if B.way is Evaluation.CONTACT:
         assert model.problem.contact_dofs is not None  # implied by `Evaluation.CONTACT`
-        return ContactCoordinates(V, basis, model.problem.contact_dofs)
+        loads = model.problem.contact_loads(np.hstack([eta, model.generators]))
+        return LoadCoordinates(V, basis, model.problem.contact_dofs, loads)
     return SpannedCoordinates(V, basis, np.hstack([supremizers(V, term, eta) for term in B.terms]))
 
 
@@ -201,22 +203,24 @@ class HyperReducedModel:
         NumericalError
             If the reduced problem has entries that are not finite.
         """
-        samples, contact = self.coefficients(mu), self._contact(mu)
-        members, space = self._members(samples, contact), self.space
-        A, f, B, g = members.A, members.f, members.B, members.g
-        Y = None
+        samples = self.coefficients(mu)
+        members, space = self._members(samples, self._varying(mu)), self.space
+        A, f, B, g, Y = members.A, members.f, members.B, members.g, None
         if space is not None:
-            count = len(B) - self.generators.shape[1]
-            Y, B = np.hstack([space.plain, orthonormal_range(B[:count].T, space.plain)]), B[count:]
-            A, f, B = Y.T @ (A @ Y), Y.T @ f, B @ Y
-            A = 0.5 * (A + A.T)
+            A, f, B, Y = _enriched(members, space.plain)
             reconstruct = partial(_reconstructed, space, Y)
         else:
             reconstruct = partial(np.matmul, self.basis)
-        if not all(np.isfinite(member.sum()) for member in (A, f, B, g)):
+        known = space is None and self._operators.A.constant
+        if not isfinite((self._sum_of_stiffness if known else A.sum()) + f.sum() + B.sum() + g.sum()):
             raise NumericalError(f"the reduced problem has entries that are not finite at mu = {mu.tolist()}")
-        evaluated = Evaluated(samples, contact, Y)
+        evaluated = Evaluated(samples, coordinates=Y)
         return ReducedProblem(VariationalInequality(A, f, B, g), reconstruct, self._operators.factor, evaluated)
+
+    @cached_property
+    def _sum_of_stiffness(self) -> float:
+        """Of a constant A, whose entries are not looked at in every query."""
+        return float(self._operators.A.at(None).sum())
 
     def reconstruct(self, mu: Array, vi: VariationalInequality, x: Array) -> Array:  # noqa: ARG002
         """Vectors u = Z x (n×k) with coordinates x (N'×k) at mu, for reconstruction; it assembles again."""
@@ -231,24 +235,37 @@ class HyperReducedModel:
 
         `samples` are the `coefficients` at mu, which whoever needs members on Φ evaluates for other purposes, too.
         """
-        return self._members(samples, self._contact(mu))
+        found = self._members(samples, self._varying(mu))
+        missing = len(found.f) - found.B.shape[1]  # coordinates of supremizers that are zero
+        return replace(found, B=np.pad(found.B, ((0, 0), (0, missing)))) if missing else found
 
-    def _contact(self, mu: Array) -> Contact | None:
-        """B and g at mu (d,) on the contact unknowns, where a member is projected from there."""
-        return self.problem.contact(mu) if self._operators.B is None or self._operators.g is None else None
+    def _varying(self, mu: Array) -> tuple[Array, Array] | None:
+        """The varying contact loads and the bounds at mu (d,), where a member is projected from contact unknowns."""
+        return None if self._loads is None else self._loads.varying(mu)
 
-    def _members(self, samples: Samples, contact: Contact | None) -> VariationalInequality:
-        operators, generators = self._operators, self.generators
+    @cached_property
+    def _loads(self) -> ContactLoads | None:
+        """The contact loads of the generators; for a space that varies in Φ of (η, χ)."""
+        if self._operators.B is not None and self._operators.g is not None:
+            return None
+        eta = self.model.enrichment.eta
+        return self.problem.contact_loads(
+            self.generators if eta is None or self.space is None else np.hstack([eta, self.generators])
+        )
+
+    def _members(self, samples: Samples, varying: tuple[Array, Array] | None) -> VariationalInequality:
+        """The members on Φ; of a space that varies in it B has the coordinates alone that supremizers use."""
+        operators, count = self._operators, self.generators.shape[1]
         A, f = operators.A.at(samples.get("A")), operators.f.at(samples.get("f"))
         if operators.g is not None:
             g = operators.g.at(samples.get("g"))
         else:
-            assert contact is not None  # from `_contact`
-            g = np.asarray(generators.T @ contact.g)
-        return VariationalInequality(A, f, self._constraint(samples, contact), g)
+            assert varying is not None  # from `_varying`
+            g = varying[1][len(varying[1]) - count :]
+        return VariationalInequality(A, f, self._constraint(samples, varying), g)
 
     @property
-    def space(self) -> Coordinates | None:
+    def space(self) -> PlainCoordinates | None:
         """Coordinates of Φ = V_N + supremizers where the enrichment varies in it; `None` for a fixed space."""
         return self._operators.supremizer_coordinates
 
@@ -259,19 +276,53 @@ class HyperReducedModel:
             return self.space.vectors(np.eye(self.space.plain.shape[0]))
         return self.fixed_basis if self._operators.basis is None else self._operators.basis
 
-    def _constraint(self, samples: Samples, contact: Contact | None) -> Array:
+    def _constraint(self, samples: Samples, varying: tuple[Array, Array] | None) -> Array:
         operators = self._operators
         if operators.B is not None:
             return operators.B.at(samples.get("B"))
-        assert contact is not None  # evaluated by `members`
-        if isinstance(self.space, ContactCoordinates):
-            eta = self.model.enrichment.eta
-            assert eta is not None  # implied by `supremizer_coordinates`
-            return self.space.supremizers(np.asarray(contact.B.T @ np.hstack([eta, self.generators]))).T
-        assert operators.contact_basis is not None  # set by `hyper_reduce`
-        return np.asarray(self.model.generators.T @ (contact.B @ operators.contact_basis))
+        assert varying is not None  # from `_varying`
+        loads = varying[0]
+        if isinstance(self.space, LoadCoordinates):
+            return self.space.supremizers(loads).T
+        constant, reached = self._contact_rows
+        return np.asarray(constant + loads.T @ reached[: len(loads)])
+
+    @cached_property
+    def _contact_rows(self) -> tuple[Array, Array]:
+        """B (R×d) as far as it does not depend on mu, and the rows (j×d) of Φ that varying contact loads meet."""
+        loads, basis = self._loads, self._operators.contact_basis
+        assert loads is not None
+        assert basis is not None  # set by `hyper_reduce`
+        return np.asarray(loads.fixed.T @ basis), basis[loads.reached]
 
 
-def _reconstructed(space: Coordinates, Y: Array, x: Array) -> Array:
-    """Vectors (n×k) from coordinates (N'×k) in an orthonormal basis with coordinates Y (d×N')."""
+def _enriched(members: VariationalInequality, plain: Array) -> tuple[Array, Array, Array, Array]:
+    """A (N'×N'), f (N',) and B (R×N') in an orthonormal basis of V_N and what the supremizers of η add, and that basis.
+
+    `members` are on Φ, B on (η, χ) as far as its columns are not zero; V_N has the first coordinates `plain` (d×N). The
+    basis has coordinates Y (d'×N'). What supremizers add is orthonormalised as by `orthonormal_range`, for which their
+    coordinates in V_N have to be left out and no more.
+    """
+    A, f, B, count = members.A, members.f, members.B, len(members.B) - len(members.g)
+    used, N = B.shape[1], plain.shape[1]
+    lengths = np.sqrt(np.einsum("ij,ij->i", B[:count], B[:count]))
+    added = B[:count, N:].T[:, lengths > 0.0] / lengths[lengths > 0.0]
+    Y = np.zeros((used, N))
+    if added.size:
+        q, r, _ = scipy.linalg.qr(added, mode="economic", pivoting=True, overwrite_a=True, check_finite=False)
+        added = q[:, np.abs(np.diagonal(r)) > RANK_RTOL]
+        Y = np.zeros((used, N + added.shape[1]))
+        Y[N:, N:] = added
+    Y[:N, :N] = np.eye(N)
+    rest = A[N:used, N:used] @ added
+    projected = np.empty((Y.shape[1], Y.shape[1]))
+    projected[:N, :N], projected[:N, N:], projected[N:, N:] = A[:N, :N], A[:N, N:used] @ added, added.T @ rest
+    projected[N:, :N] = projected[:N, N:].T
+    projected[N:, N:] = 0.5 * (projected[N:, N:] + projected[N:, N:].T)
+    enriched = np.hstack([B[count:, :N], B[count:, N:] @ added])
+    return projected, np.append(f[:N], f[N:used] @ added), enriched, Y
+
+
+def _reconstructed(space: PlainCoordinates, Y: Array, x: Array) -> Array:
+    """Vectors (n×k) from coordinates (N'×k) in an orthonormal basis with coordinates Y (d'×N')."""
     return space.vectors(Y @ x)

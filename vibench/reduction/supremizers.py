@@ -11,6 +11,8 @@ import scipy.linalg
 import scipy.sparse as sp
 
 from vibench.arrays import Array, Indices, SparseMatrix
+from vibench.errors import NumericalError
+from vibench.interfaces.problem import ContactLoads
 from vibench.linalg.cholesky import PartialCholesky, elimination_order
 from vibench.linalg.inner_product import InnerProduct
 
@@ -101,15 +103,13 @@ def _equal_up_to_sign(one: Array, other: Array) -> bool:
 class SpannedCoordinates:
     """Euclidean coordinates in V_N, given by a V-orthonormal basis (n×N), + span of vectors (n×k), dependent or not.
 
-    `plain` are the coordinates (d×N) of the basis, orthonormal, `represented` those (d×k) of the vectors.
+    `plain` are the coordinates (d×N) of the basis, which are the first ones, `represented` those (d×k) of the vectors.
     """
 
     def __init__(self, V: InnerProduct, basis: Array, vectors: Array) -> None:
         self._V = V
-        count = basis.shape[1]
-        self._whitened, r = np.linalg.qr(V.whiten(np.hstack([basis, vectors])))
-        self.plain: Array = r[:, :count]
-        self.represented: Array = r[:, count:]
+        self._whitened, self.represented = _beside(V.whiten(basis), V.whiten(vectors))
+        self.plain: Array = np.eye(self._whitened.shape[1], basis.shape[1])
 
     def vectors(self, coordinates: Array) -> Array:
         """Vectors (n×k) with these coordinates (d×k)."""
@@ -148,6 +148,60 @@ class ContactCoordinates:
         return self._factor.solve_factor(np.vstack([self._others, np.zeros((len(self._tail), self._others.shape[1]))]))
 
 
+class LoadCoordinates:
+    """Coordinates in V_N + X_V⁻¹(fixed loads, loads on reached unknowns): the supremizers of B(mu) that loads give.
+
+    V_N has the first coordinates, then come the fixed loads, then the reached unknowns one by one: what loads on the
+    first j of these give needs no coordinates of the others. `plain` are the coordinates (d×N) of the basis of V_N.
+
+    Parameters
+    ----------
+    V, basis, dofs
+        As for `ContactCoordinates`.
+    loads
+        The loads of some multipliers.
+    """
+
+    def __init__(self, V: InnerProduct, basis: Array, dofs: Indices, loads: ContactLoads) -> None:
+        self._contact = ContactCoordinates(V, basis, dofs)
+        acting = loads.fixed.any(axis=0)
+        given = self._contact.supremizers(np.hstack([loads.fixed[:, acting], np.eye(len(dofs))[:, loads.reached]]))
+        self._axes, represented = _beside(self._contact.plain, given)
+        dim, count = self._axes.shape[1], int(acting.sum())
+        self.plain: Array = np.eye(dim, basis.shape[1])
+        self._fixed, self._reached = np.zeros((dim, loads.fixed.shape[1])), np.ascontiguousarray(represented[:, count:])
+        self._fixed[:, acting] = represented[:, :count]
+        self._before = basis.shape[1] + count
+
+    def supremizers(self, varying: Array) -> Array:
+        """Coordinates (d'×k) of the supremizers with `varying` (j×k) added to the fixed loads; those after d' are zero.
+
+        Raises
+        ------
+        NumericalError
+            If the loads reach unknowns that they were not said to.
+        """
+        j = len(varying)
+        if j > self._reached.shape[1]:
+            raise NumericalError(f"contact loads reach {j} unknowns, {self._reached.shape[1]} were expected at most")
+        used = min(self._before + j, self._axes.shape[1])
+        return np.asarray(self._fixed[:used] + self._reached[:used, :j] @ varying)
+
+    def vectors(self, coordinates: Array) -> Array:
+        """Vectors (n×k) with these first coordinates (d'×k)."""
+        return self._contact.vectors(self._axes[:, : len(coordinates)] @ coordinates)
+
+
+def _beside(basis: Array, vectors: Array) -> tuple[Array, Array]:
+    """Orthonormal columns, first those of `basis` (d×N), that span vectors (d×k), too, and the coordinates of these."""
+    count = basis.shape[1]
+    q, r = np.linalg.qr(np.hstack([basis, vectors]))
+    signs = np.where(np.diagonal(r)[:count] < 0.0, -1.0, 1.0)  # of the basis itself r is the identity but for these
+    q[:, :count] *= signs
+    r[:count] *= signs[:, None]
+    return q, r[:, count:]
+
+
 @lru_cache(maxsize=CACHED_FACTORS)  # so that all models of a problem share one factorisation
 def _contact_factor(V: InnerProduct, dofs: bytes) -> tuple[PartialCholesky, Array]:
     """X_V factorised with some unknowns E last, and the trailing block F_EE (|E|×|E|) of the factor."""
@@ -157,6 +211,9 @@ def _contact_factor(V: InnerProduct, dofs: bytes) -> tuple[PartialCholesky, Arra
 
 
 Coordinates = SpannedCoordinates | ContactCoordinates
+
+PlainCoordinates = SpannedCoordinates | LoadCoordinates
+"""Those in which V_N has the first ones."""
 
 IsometricSupremizers = Callable[[SparseMatrix, Array], Array]
 """From B (m×n) and η (m×k): an isometric image (d×k) of T(mu)η."""

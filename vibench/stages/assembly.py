@@ -18,7 +18,7 @@ from vibench.offline.assemblies import assemblies
 from vibench.offline.models import AnyReducedModel
 from vibench.offline.reduction import Reduction
 from vibench.qp.exact import ExactSolution, exact_solution
-from vibench.reduction.supremizers import ContactCoordinates, SpannedCoordinates
+from vibench.reduction.supremizers import ContactCoordinates, LoadCoordinates, SpannedCoordinates
 from vibench.stages.base import Result, Stage, build_problem, value_of
 from vibench.stages.enrichment import EnrichmentStage, GrowthStage, enrichment_stage
 from vibench.storage.artefacts import Store
@@ -29,8 +29,8 @@ from vibench.study.plugin import Plugin
 from vibench.timing import timed
 
 for _kind in (
-    AffineMember, Evaluation, ReducedOperators, ProjectedMember, ContactCoordinates, SpannedCoordinates, InnerProduct,
-    SparseCholesky, PartialCholesky, VariationalInequality, ExactSolution,
+    AffineMember, Evaluation, ReducedOperators, ProjectedMember, ContactCoordinates, LoadCoordinates,
+    SpannedCoordinates, InnerProduct, SparseCholesky, PartialCholesky, VariationalInequality, ExactSolution,
 ):  # fmt: skip
     storable(_kind)
 

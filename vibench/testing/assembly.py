@@ -184,6 +184,23 @@ def _check_contact(case: ProblemCase, dofs: Indices, mu: Array, full: Arrays) ->
     if not isinstance(contact, Contact):
         raise ConformanceError(f"contact returns a {type(contact).__name__} {at(mu)}; expected a vibench.Contact")
     _compare("contact", mu, {columns: contact.B, "g": contact.g}, full | {columns: full["B"][:, dofs]})
+    if type(case.plugin).contact_loads is not Problem.contact_loads:
+        _check_contact_loads(case, dofs, mu, full)
+
+
+def _check_contact_loads(case: ProblemCase, dofs: Indices, mu: Array, full: Arrays) -> None:
+    """Loads of multipliers on all rows, on a part of them, and none are those of B and g."""
+    eta = np.random.default_rng(0).random((len(full["g"]), 3)) * [1.0, 1.0, 0.0]
+    eta[len(eta) // 2 :, 1] = 0.0
+    for chosen in (eta, eta[:, 1:]):
+        loads = case.plugin.contact_loads(chosen)
+        varying, bounds = loads.varying(mu.copy())
+        if len(varying) > loads.reached.stop - loads.reached.start:
+            raise ConformanceError(f"loads vary on {len(varying)} rows {at(mu)}, more than `reach` of `contact_loads`")
+        B_eta = loads.fixed.copy()
+        B_eta[loads.first : loads.first + len(varying)] += varying
+        expected = {"Bᵀη": full["B"][:, dofs].T @ chosen, "ηᵀg": chosen.T @ full["g"]}
+        _compare("contact_loads", mu, {"Bᵀη": B_eta, "ηᵀg": bounds}, expected)
 
 
 def affine(case: ProblemCase) -> Iterator[str]:

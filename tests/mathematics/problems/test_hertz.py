@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -154,3 +156,32 @@ def test_the_picture_shows_deformed_discs_and_pressures(coarse: Hertz) -> None:
     assert picture.positions[0, np.argmax(picture.multiplier)] < 0.1
     assert picture.points[1].max() == pytest.approx(1.001 - 0.09)
     assert picture.points[1].min() == pytest.approx(-1.2 + 0.09)
+
+
+@pytest.mark.parametrize("options", [{}, {"quadrature": 3}, {"approach": "parameter"}, {"ratio": 2.0}], ids=str)
+@pytest.mark.parametrize("rows", [slice(0, 1), slice(3, 11), slice(None)], ids=str)
+def test_loads_of_multipliers_are_those_of_the_matrix_at_every_radius(options: dict[str, Any], rows: slice) -> None:
+    problem = Hertz(resolution="coarse", **options)
+    eta = np.zeros((problem.W.dim, 3))
+    eta[rows] = np.random.default_rng(0).random(eta[rows].shape)
+    loads = problem.contact_loads(eta)
+    slaves = len(problem.slave.zone)
+    for radius in (0.68, 0.7, 0.93, 1.0, 1.3, 4.0):  # the first and the last are outside the box
+        mu = np.array([radius, 0.11])[: problem.parameters.dim]
+        contact, (varying, bounds) = problem.contact(mu), loads.varying(mu)
+        expected = contact.B.T @ eta
+        assert np.allclose(loads.fixed[:slaves], expected[:slaves], rtol=0.0, atol=1e-16)
+        assert not loads.fixed[slaves:].any()
+        assert len(varying) <= loads.reach
+        assert np.allclose(varying, expected[slaves : slaves + len(varying)], rtol=0.0, atol=1e-16)
+        assert not expected[slaves + len(varying) :].any()
+        assert np.allclose(bounds, eta.T @ contact.g, rtol=1e-13, atol=1e-16)
+    with pytest.raises(NumericalError, match="the radius of disc 2 is too small"):
+        loads.varying(np.array([0.5, 0.11])[: problem.parameters.dim])
+
+
+def test_multipliers_that_are_zero_have_no_loads() -> None:
+    problem = Hertz(resolution="coarse")
+    loads = problem.contact_loads(np.zeros((problem.W.dim, 2)))
+    varying, bounds = loads.varying(np.ones(1))
+    assert not (loads.fixed.any() or varying.any() or bounds.any())

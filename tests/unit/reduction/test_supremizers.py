@@ -5,9 +5,12 @@ import pytest
 import scipy.sparse as sp
 from numerics import Varying, space
 
+from vibench.errors import NumericalError
+from vibench.interfaces.problem import ContactLoads
 from vibench.reduction import supremizers as module
 from vibench.reduction.supremizers import (
     ContactCoordinates,
+    LoadCoordinates,
     SpannedCoordinates,
     constraint_classes,
     proportionality,
@@ -72,3 +75,30 @@ def test_proportional_matrices_are_recognised_and_others_are_not() -> None:
     for k, matrix in enumerate([B, other, 3.0 * B, 2.0 * other]):
         rebuilt = classes.factors[k] * classes.representatives[classes.members[k]]
         assert np.allclose(rebuilt.toarray(), matrix.toarray())
+
+
+@pytest.mark.parametrize("reach", [3, 5, None])
+@pytest.mark.parametrize("dependent", [False, True])
+def test_coordinates_of_loads_that_vary_on_some_unknowns_are_those_of_their_supremizers(
+    reach: int | None, dependent: bool
+) -> None:
+    V, rng, dofs = space(16), np.random.default_rng(3), np.arange(5, 15)
+    basis = V.orthonormalise(rng.standard_normal((16, 3)))
+    fixed = np.zeros((10, 4))
+    fixed[:4, 1:] = rng.random((4, 3))  # the first multiplier has no fixed load
+    if dependent:
+        fixed[:, 3] = fixed[:, 1] - 2.0 * fixed[:, 2]
+    coordinates = LoadCoordinates(V, basis, dofs, ContactLoads(fixed, lambda _: (fixed, fixed), 4, reach))
+    assert np.allclose(coordinates.vectors(coordinates.plain), basis, atol=1e-12)
+    everything = coordinates.vectors(np.eye(len(coordinates.plain)))
+    assert np.allclose(V.gram(everything, everything), np.eye(len(coordinates.plain)), atol=1e-12)
+    for j in range(7):
+        varying, loads = rng.random((j, 4)), np.zeros((16, 4))
+        if reach is not None and j > reach:
+            with pytest.raises(NumericalError, match=f"contact loads reach {j} unknowns, {reach} were expected"):
+                coordinates.supremizers(varying)
+            continue
+        loads[dofs] = fixed
+        loads[dofs[4 : 4 + j]] += varying
+        found = coordinates.supremizers(varying)
+        assert np.allclose(coordinates.vectors(found), V.riesz(loads), atol=1e-12)

@@ -81,6 +81,8 @@ MORE_PROBLEMS: Mapping[str, Case] = {
     "ConstantOfNothing": ("independence of mu", ["`constant` names 'a'; expected A, f, B, g"]),
     "ConstantText": ("independence of mu", ["`constant` is the string 'A'", "frozenset({'A'})"]),
     "NoContact": ("assembly on the contact", ["contact returns a NoneType at mu = [4.0]"]),
+    "LoadsWrong": ("assembly on the contact", ["Bᵀη of `contact_loads` differs from that of `assemble`"]),
+    "LoadsReachFarther": ("assembly on the contact", ["more than `reach` of `contact_loads`"]),
     "ContactOfNothing": ("assembly on the contact", ["`contact` is defined but `contact_dofs` is not"]),
     "ContactChangesTheParameter": ("assembly on the contact", ["contact changes its argument mu: entry 0 is 5"]),
     "Overlooked": ("assembly on the contact", ["B touches 1 unknowns outside `contact_dofs`", "the first is 0"]),
