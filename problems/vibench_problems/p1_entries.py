@@ -1,11 +1,61 @@
-"""Single entries of P1 stiffness matrices and load vectors on meshes whose node positions are linear in weights."""
+"""P1 stiffness matrices and load vectors on meshes whose nodes move, as a whole and by single entries."""
 
 from __future__ import annotations
 
 import numpy as np
+import scipy.sparse as sp
 from numpy.typing import NDArray
 
-from vibench import Array, Indices
+from vibench import Array, Indices, SparseMatrix
+
+
+class MovedMesh:
+    """∫ ∇φ_i · ∇φ_j and ∫ φ_i of the free nodes of one triangulation, for any positions of its nodes.
+
+    On a triangle with edges e_i, e_j opposite to the nodes i, j they are e_i · e_j / (4 |T|) and |T| / 3. Which of
+    these numbers make which entry is found once.
+
+    Parameters
+    ----------
+    triangles
+        Nodes of the triangles (3×t).
+    free
+        The nodes (n,) without Dirichlet conditions, rising.
+    nodes
+        The number of all nodes.
+    """
+
+    def __init__(self, triangles: NDArray[np.integer], free: Indices, nodes: int) -> None:
+        self._triangles = triangles
+        number = np.full(nodes, -1)
+        number[free] = np.arange(len(free))
+        numbers = number[triangles]
+        rows, columns = np.repeat(numbers, 3, axis=0).ravel(), np.tile(numbers, (3, 1)).ravel()
+        self._pairs, self._starts, keys = _gathered(rows * len(free) + columns, (rows >= 0) & (columns >= 0))
+        self._corners, self._first, _ = _gathered(numbers.ravel(), numbers.ravel() >= 0)
+        self._columns = (keys % len(free)).astype(np.int32)
+        self._ends = np.searchsorted(keys // len(free), np.arange(len(free) + 1)).astype(np.int32)
+
+    def forms(self, points: Array) -> tuple[SparseMatrix, Array]:
+        """The stiffness matrix (n×n) and the load vector (n,) of nodes at `points` (2×nodes)."""
+        corners = points[:, self._triangles]
+        edges = np.roll(corners, -1, axis=1) - np.roll(corners, 1, axis=1)
+        (x, y) = edges
+        areas = 0.5 * np.abs(x[0] * y[1] - x[1] * y[0])
+        products = (x[:, None] * x + y[:, None] * y) / (4.0 * areas)
+        stiffness = np.add.reduceat(products.ravel()[self._pairs], self._starts)
+        load = np.add.reduceat(np.tile(areas / 3.0, 3)[self._corners], self._first)
+        # copies, since libraries sort indices in place
+        matrix = sp.csr_array((stiffness, self._columns.copy(), self._ends.copy()), shape=2 * load.shape)
+        return matrix, np.asarray(load)
+
+
+def _gathered(keys: Indices, kept: NDArray[np.bool_]) -> tuple[Indices, Indices, Indices]:
+    """Positions of the kept keys in rising order, where a new key begins among them, and these keys."""
+    positions = np.flatnonzero(kept)
+    positions = positions[np.argsort(keys[positions], kind="stable")]
+    distinct, starts = np.unique(keys[positions], return_index=True)
+    return positions, starts, distinct
 
 
 class StiffnessEntries:

@@ -5,6 +5,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from other_problems import Put
+from skfem import Basis, ElementTriP1, MeshTri
+from skfem.models.poisson import laplace, unit_load
 
 from vibench.interfaces.problem import Problem
 from vibench_problems.hertz import Hertz
@@ -56,6 +58,16 @@ def test_every_entry_of_a_matrix_and_a_vector() -> None:
     found = OBSTACLE.sampler({"A": A.coords, "f": (np.arange(OBSTACLE.V.dim), np.zeros(OBSTACLE.V.dim, np.intp))})(mu)
     assert np.allclose(found["A"], A.data, atol=1e-12)
     assert np.allclose(found["f"], vi.f, rtol=1e-12)
+
+
+@given(seeds)
+def test_forms_of_the_obstacle_are_those_of_a_finite_element_library(seed: int) -> None:
+    mu = parameters(OBSTACLE, seed)
+    vi, basis = OBSTACLE.assemble(mu), Basis(MeshTri(OBSTACLE.points(mu), OBSTACLE.mesh.t), ElementTriP1())
+    free = OBSTACLE.free
+    assert abs(vi.A - laplace.assemble(basis)[free][:, free]).max() < 1e-13 * abs(vi.A).max()
+    assert np.allclose(vi.f, -unit_load.assemble(basis)[free], rtol=1e-13, atol=0.0)
+    assert vi.A.has_canonical_format
 
 
 @pytest.mark.parametrize("names", [("A",), ("f",), ("A", "f"), ()])
