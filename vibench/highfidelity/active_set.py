@@ -36,6 +36,9 @@ SIGNIFICANT = 4.0
 NO_ROOM = 1e-14
 """Opposite rows whose bounds differ by less than this share of them are an equality."""
 
+FEW_ROWS = 1000
+"""Of so many constraints the multipliers are the last unknowns of a sparse factorisation, which is dense there."""
+
 MAX_ITERATIONS = 100
 """Largest number of iterations, or the number of constraints if larger: the contact set may move node by node."""
 
@@ -166,10 +169,20 @@ class HighFidelitySolver:
                 raise NumericalError(f"B touches {undeclared}")
             self._constrained, self._pattern = np.union1d(self._constrained, outside), None
         if self._pattern is None:
-            self._pattern, self._stiffness = EliminationPattern.of(vi.A, self._constrained), None
+            self._pattern, self._stiffness = self._elimination(vi), None
         if self._stiffness is None or "A" not in self._problem.constant:
             self._stiffness = CondensedStiffness(vi.A, self._pattern)
         return self._stiffness
+
+    def _elimination(self, vi: VariationalInequality) -> EliminationPattern:
+        """Which unknowns to eliminate: none where A varies, few rows constrain, and no dense matrix would be left.
+
+        One factorisation per parameter serves all then: the first system, its borders and the verification.
+        """
+        pattern = EliminationPattern.of(vi.A, self._constrained)
+        if "A" in self._problem.constant or pattern.is_dense or len(vi.g) > FEW_ROWS:
+            return pattern
+        return EliminationPattern.of_none(vi.A)
 
 
 def solve_high_fidelity(
@@ -253,15 +266,12 @@ def _refined_to_accuracy(
     """The solution after the refinements that `ACCURACY` takes, or after all of them."""
     u, lam = found.u, found.lam
 
-    def norms(functionals: Array) -> Array:
-        return verification.norms_by_solutions(functionals, stiffness.solve(functionals))
-
-    residuals = verification.kkt_residuals(vi, u, lam, norms)
+    residuals = verification.kkt_residuals(vi, u, lam, stiffness.dual_norms)
     for _ in range(REFINEMENTS):
         if residuals.worst <= ACCURACY:
             break
         u, lam = _refined(vi, stiffness, u, lam)
-        residuals = verification.kkt_residuals(vi, u, lam, norms)
+        residuals = verification.kkt_residuals(vi, u, lam, stiffness.dual_norms)
     return HighFidelitySolution(u, lam, found.fallback, found.iterations, residuals)
 
 

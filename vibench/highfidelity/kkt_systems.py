@@ -9,14 +9,15 @@ from functools import cached_property, partial
 import numpy as np
 import scipy.linalg
 import scipy.sparse as sp
-from scipy.sparse.linalg import splu
+from scipy.sparse.linalg import SuperLU, splu
 
 from vibench.arrays import Array, Indices, SparseMatrix
 from vibench.interfaces.problem import VariationalInequality
-from vibench.linalg.cholesky import SparseCholesky
+from vibench.linalg.cholesky import SYMMETRIC, SparseCholesky
 from vibench.linalg.definite import dense_inverse
-from vibench.linalg.schur_complement import EliminationPattern, StaticCondensation
+from vibench.linalg.schur_complement import EliminationPattern, PrincipalSubmatrix, StaticCondensation
 from vibench.qp.scaling import row_norms
+from vibench.qp.verification import norms_by_solutions
 
 MAX_RETAINED_SHARE = 0.5
 """Systems are condensed on the constrained unknowns where these are at most this share of all."""
@@ -44,16 +45,19 @@ class CondensedStiffness:
     """
 
     def __init__(self, A: SparseMatrix, pattern: EliminationPattern | None = None) -> None:
-        if pattern is None or len(pattern.retained) > MAX_RETAINED_SHARE * A.shape[0]:
+        if pattern is None or (pattern.whole is None and len(pattern.retained) > MAX_RETAINED_SHARE * A.shape[0]):
             pattern = EliminationPattern(np.arange(A.shape[0]), np.zeros(0, np.intp), np.zeros(0, np.intp))
         self._pattern = pattern
         self._condensed = StaticCondensation(A, self._pattern)
+        self._saddle: SaddlePointSolver | None = None
 
     def check_definite(self, name: str) -> None:
         """Raise a `NumericalError` that calls A by `name` if A is not positive definite.
 
         The elimination has factorised one block; A is definite exactly where the Schur complement is, too.
         """
+        if self._saddle is not None and self._saddle.is_definite:
+            return
         if self._condensed.dense:
             self._compliance  # noqa: B018  its Cholesky factorisation fails otherwise
         else:
@@ -64,6 +68,12 @@ class CondensedStiffness:
         load, particular = self._condensed.eliminate(right)
         retained = self._compliance @ load if self._condensed.dense else self._schur_factor.solve(load)
         return self._condensed.recover(retained, particular)
+
+    def dual_norms(self, functionals: Array) -> Array:
+        """‖ℓ‖ in A⁻¹ of functionals (n, k)."""
+        if self._saddle is not None and self._saddle.is_definite:
+            return self._saddle.dual_norms(functionals)
+        return norms_by_solutions(functionals, self.solve(functionals))
 
     def norm_of_force(self, force: Array) -> float | None:
         """‖ℓ‖ in A⁻¹ of a force ℓ (n,) on retained unknowns, such as Bᵀλ; `None` without a dense compliance."""
@@ -87,12 +97,14 @@ class CondensedStiffness:
         """The KKT systems of the active sets of `vi`, whose stiffness must be this one."""
         condensed = self._condensed
         load, particular = condensed.condense_load(vi.f)
-        B = sp.csr_array(sp.csc_array(vi.B)[:, self._pattern.retained])
-        solve_active = (
-            _compliance_solver(self._compliance, load, B, vi.g)
-            if condensed.dense
-            else SaddlePointSolver(condensed.schur, load, B, vi.g)
-        )
+        whole = self._pattern.whole
+        B = sp.csr_array(vi.B if whole else sp.csc_array(vi.B)[:, self._pattern.retained])
+        solve_active: ActiveSolver
+        if condensed.dense:
+            solve_active = _compliance_solver(self._compliance, load, B, vi.g)
+        else:
+            solve_active = SaddlePointSolver(condensed.schur, load, B, vi.g, whole)
+            self._saddle = solve_active if whole else None
         recover = partial(condensed.recover, particular=particular)
         return ActiveSetSystem(B, vi.g, solve_active, recover, condensed.correct_eliminated)
 
@@ -123,15 +135,27 @@ class SaddlePointSolver:
         Stiffness, sparse SPD (c×c), and load (c,).
     B, g
         Constraints, B sparse (m×c), and their bounds (m,).
+    ordered
+        Extracts A in an elimination order. Where it is given, systems are factorised in this order, with the
+        multipliers last, without pivoting: of A that is a Cholesky factorisation, and what is left for the multipliers
+        is −B_a A⁻¹B_aᵀ, negative definite where the rows are independent. Where it is not, as without an order, rows
+        are exchanged.
     """
 
-    def __init__(self, A: SparseMatrix, f: Array, B: SparseMatrix, g: Array) -> None:
+    def __init__(
+        self, A: SparseMatrix, f: Array, B: SparseMatrix, g: Array, ordered: PrincipalSubmatrix | None = None
+    ) -> None:
+        A, B, self._order = sp.csr_array(A), sp.csr_array(B), slice(None) if ordered is None else ordered.chosen
+        if ordered is not None:
+            A, f = ordered.of(A), f[self._order]
+            B = sp.csr_array((B.data, np.argsort(ordered.chosen)[B.indices], B.indptr), shape=B.shape)
+        self._ordered = ordered is not None
         stiffness = np.abs(A.diagonal())
         # Jacobi scaling: displacements and forces of steel in metres differ by 1e11, and `ROUND_OFF` compares them
         self._displacement = 1.0 / np.sqrt(np.where(stiffness > 0.0, stiffness, 1.0))
-        B = _in_units(np.ones(len(g)), sp.csr_array(B), self._displacement)
+        B = _in_units(np.ones(len(g)), B, self._displacement)
         self._force = 1.0 / row_norms(B)
-        self._A, self._f = _in_units(self._displacement, sp.csr_array(A), self._displacement), self._displacement * f
+        self._A, self._f = _in_units(self._displacement, A, self._displacement), self._displacement * f
         self._B, self._g = _in_units(self._force, B, np.ones(len(f))), self._force * g
         self._factorised_set = np.zeros(0, dtype=np.intp)
         self._factorisation: _BorderedFactorisation | None = None
@@ -152,11 +176,27 @@ class SaddlePointSolver:
             B = self._B[active]
             zero = sp.csr_array((len(active), len(active)))  # SciPy stacks blocks that are all CSR without triplets
             saddle = sp.block_array([[self._A, sp.csr_array(B.T)], [B, zero]], format="csr").T
-            self._factorisation = _BorderedFactorisation(saddle)
+            self._factorisation = _BorderedFactorisation(saddle, len(active) if self._ordered else None)
             self._factorised_set = active
             solution = self._solve_bordered(self._factorisation, active)
         assert solution is not None  # an empty border is always independent
         return solution
+
+    @property
+    def is_definite(self) -> bool:
+        """Whether a factorisation has shown that A is positive definite, and the rows of its active set independent."""
+        return self._factorisation is not None and self._factorisation.pivots is not None
+
+    def dual_norms(self, functionals: Array) -> Array:
+        """Norms (k,) in A⁻¹ of functionals (c×k), from a factorisation that `is_definite`.
+
+        The system with ℓ and zero on the right has the solution x, y: ℓ = A x + B_aᵀy, B_a x = 0, both parts orthogonal
+        in A⁻¹, and the second one has the norm of y in B_a A⁻¹B_aᵀ.
+        """
+        assert self._factorisation is not None  # as `is_definite` says
+        functionals = self._displacement[:, None] * functionals[self._order]
+        x, forces = self._factorisation.split(functionals)
+        return np.asarray(np.sqrt(np.maximum(np.einsum("ik,ik->k", x, functionals), 0.0) + forces))
 
     def _solve_bordered(self, factorisation: _BorderedFactorisation, active: Indices) -> tuple[Array, Array] | None:
         """The solution from the factorised set; `None` where the border is not clearly linearly independent."""
@@ -166,13 +206,15 @@ class SaddlePointSolver:
         border[:n, : len(added)] = self._B[added].toarray().T
         border[n + removed, len(added) + np.arange(len(removed))] = 1.0
         values = np.concatenate([self._g[added], np.zeros(len(removed))])
-        solved = factorisation.solve(border, np.concatenate([self._f, self._g[base]]), values)
+        names = [*added.tolist(), *(-1 - removed).tolist()]
+        solved = factorisation.solve(names, border, np.concatenate([self._f, self._g[base]]), values)
         if solved is None:
             return None
-        lam = np.zeros(self._B.shape[0])
+        u, lam = np.empty(n), np.zeros(self._B.shape[0])
+        u[self._order] = self._displacement * solved[0][:n]
         lam[base], lam[added] = solved[0][n:], solved[1][: len(added)]
         lam[base[removed]] = 0.0
-        return self._displacement * solved[0][:n], self._force * lam
+        return u, self._force * lam
 
 
 def _in_units(rows: Array, matrix: SparseMatrix, columns: Array) -> SparseMatrix:
@@ -191,24 +233,60 @@ class _BorderedFactorisation:
         verified by the active set method.
     """
 
-    def __init__(self, matrix: SparseMatrix) -> None:
-        self._matrix, self._factor = matrix, splu(matrix)
+    def __init__(self, matrix: SparseMatrix, last: int | None = None) -> None:
+        """Of ordered systems `last` is the number of multipliers, at the end."""
+        self._matrix, self.pivots = matrix, None
+        self._unbordered: Array | None = None
+        self._columns = dict[int, Array]()
+        if last is not None:
+            self._factor = splu(matrix, permc_spec="NATURAL", **SYMMETRIC)
+            self.pivots = _definite_pivots(self._factor, last)
+        if self.pivots is None:
+            self._factor = splu(matrix)
 
-    def solve(self, border: Array, right: Array, values: Array) -> tuple[Array, Array] | None:
-        """The x (k,) and y (d,) with K x + C y = r and Cᵀx = s; `None` where Cᵀ K⁻¹ C is not clearly regular."""
-        solved = self._factor.solve(border) if border.size else border
+    def split(self, functionals: Array) -> tuple[Array, Array]:
+        """For ℓ (n×k), x (n×k) of the solution with ℓ and zero on the right, and yᵀ(B_a A⁻¹B_aᵀ)y (k,)."""
+        assert self.pivots is not None  # of an ordered system
+        n = len(functionals)
+        right = np.zeros((self._matrix.shape[0], functionals.shape[1]))
+        right[:n] = functionals
+        solved = self._factor.solve(right)
+        corner = self._factor.L[:, n:].T @ solved
+        return solved[:n], np.asarray(-self.pivots[n:] @ corner**2)
+
+    def solve(self, names: list[int], border: Array, right: Array, values: Array) -> tuple[Array, Array] | None:
+        """The x (k,) and y (d,) with K x + C y = r and Cᵀx = s; `None` where Cᵀ K⁻¹ C is not clearly regular.
+
+        `names` say which columns of C, and of borders before it, are the same; r is always the same.
+        """
+        if self._unbordered is None:
+            self._unbordered = self._factor.solve(right)
+        new = [k for k, name in enumerate(names) if name not in self._columns]
+        if new:
+            self._columns.update(zip([names[k] for k in new], self._factor.solve(border[:, new]).T, strict=True))
+        solved = np.array([self._columns[name] for name in names]).reshape(len(names), len(right)).T
         schur = border.T @ solved
         if not _regular(schur, np.linalg.norm(border, axis=0) * np.linalg.norm(solved, axis=0)):
             return None
 
-        def solve_once(right: Array, values: Array) -> tuple[Array, Array]:
-            unbordered = self._factor.solve(right)
+        def bordered(unbordered: Array, values: Array) -> tuple[Array, Array]:
             y = np.linalg.solve(schur, border.T @ unbordered - values)
             return unbordered - solved @ y, y
 
-        x, y = solve_once(right, values)
-        dx, dy = solve_once(right - self._matrix @ x - border @ y, values - border.T @ x)
+        x, y = bordered(self._unbordered, values)
+        dx, dy = bordered(self._factor.solve(right - self._matrix @ x - border @ y), values - border.T @ x)
         return x + dx, y + dy
+
+
+def _definite_pivots(factor: SuperLU, last: int) -> Array | None:
+    """The pivots of a saddle point system in natural order; `None` unless all have their signs beyond round-off."""
+    pivots = np.asarray(factor.U.diagonal())
+    size = len(pivots) - last
+    regular = np.all(pivots[:size] > 0.0) and np.all(
+        pivots[size:] < -ROUND_OFF
+    )  # of rows of length 1, A with diagonal 1
+    natural = np.array_equal(factor.perm_r, np.arange(len(pivots)))
+    return pivots if regular and natural else None
 
 
 def _regular(schur: Array, sizes: Array) -> bool:

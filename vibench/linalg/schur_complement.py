@@ -22,6 +22,13 @@ class EliminationPattern:
     """Elimination order of all others, followed by the interface: the retained unknowns that couple to others."""
     interface: Indices
     """Positions of the interface among the retained unknowns."""
+    whole: PrincipalSubmatrix | None = None
+    """Extracts the whole matrix in an elimination order, where no unknown is eliminated; `None` elsewhere."""
+
+    @property
+    def is_dense(self) -> bool:
+        """Whether most entries of the Schur complement are non-zero."""
+        return 2 * len(self.interface) > len(self.retained)
 
     @cached_property
     def factorised_block(self) -> PrincipalSubmatrix:
@@ -42,6 +49,12 @@ class EliminationPattern:
         order = elimination_order(sp.csr_array(A)[inside][:, inside], np.searchsorted(inside, retained[interface]))
         return cls(retained, inside[order], interface)
 
+    @classmethod
+    def of_none(cls, A: SparseMatrix) -> EliminationPattern:
+        """The pattern that eliminates no unknown of matrices with the sparsity of A (n×n), and orders all."""
+        none = np.zeros(0, np.intp)
+        return cls(np.arange(A.shape[0]), none, none, PrincipalSubmatrix(elimination_order(A, none)))
+
 
 class PrincipalSubmatrix:
     """Extracts the rows and columns of chosen unknowns from many square matrices.
@@ -55,7 +68,7 @@ class PrincipalSubmatrix:
     """
 
     def __init__(self, chosen: Indices) -> None:
-        self._chosen = chosen
+        self.chosen = chosen
         self._sparsity: tuple[Indices, Indices] | None = None
 
     def of(self, A: SparseMatrix) -> SparseMatrix:
@@ -64,7 +77,7 @@ class PrincipalSubmatrix:
         if self._sparsity is None or not all(map(np.array_equal, self._sparsity, sparsity)):
             self._sparsity = A.indptr.copy(), A.indices.copy()  # copies, since libraries sort indices in place
             numbered = sp.csr_array((np.arange(A.nnz), *reversed(sparsity)), shape=A.shape)
-            self._positions = numbered[self._chosen][:, self._chosen]
+            self._positions = numbered[self.chosen][:, self.chosen]
             self._positions.sort_indices()
         block = self._positions
         return sp.csr_array((A.data[block.data], block.indices.copy(), block.indptr.copy()), shape=block.shape)
@@ -89,7 +102,7 @@ class StaticCondensation:
         A, count = sp.csr_array(A), len(pattern.interface)
         natural = np.arange(len(pattern.order))
         self._factor = PartialCholesky(pattern.factorised_block.of(A).T, natural, count, "A") if len(natural) else None
-        self.dense = 2 * count > len(pattern.retained)
+        self.dense = pattern.is_dense
         self._retained_block = pattern.retained_block.of(A)
         self._last_load: tuple[Array, tuple[Array, Array]] | None = None
 
@@ -100,6 +113,8 @@ class StaticCondensation:
     @cached_property
     def schur(self) -> SparseMatrix:
         """Schur complement Ŝ of the eliminated unknowns (c×c), sparse."""
+        if self._factor is None:
+            return self._retained_block.T
         retained, interface = sp.coo_array(self._retained_block), self._pattern.interface
         rows, columns = retained.coords
         kept = ~(np.isin(rows, interface) & np.isin(columns, interface))

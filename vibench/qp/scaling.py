@@ -34,8 +34,13 @@ def row_norms(B: SparseMatrix | Array) -> Array:
     """Euclidean norms (m,) of the rows, 1 where a row is zero."""
     if isinstance(B, np.ndarray):
         squares = np.asarray((B * B).sum(axis=1), float)
-    else:
-        squares = np.asarray(B.multiply(B).sum(axis=1), float).ravel()
+    else:  # as `B.multiply(B).sum(axis=1)`, without the matrices that it makes
+        B = sp.csr_array(B)
+        if not B.has_canonical_format:
+            B = B.copy()
+            B.sum_duplicates()
+        rows = np.repeat(np.arange(B.shape[0]), np.diff(B.indptr))
+        squares = np.bincount(rows, weights=B.data * B.data, minlength=B.shape[0])
     norms = np.sqrt(squares)
     norms[norms == 0.0] = 1.0
     return np.asarray(norms)

@@ -11,8 +11,12 @@ from numerics import spd
 
 from vibench.errors import NumericalError
 from vibench.highfidelity import kkt_systems
+from vibench.highfidelity.active_set import HighFidelitySolver, solve_unverified, verified
 from vibench.highfidelity.kkt_systems import CondensedStiffness, SaddlePointSolver
-from vibench.linalg.schur_complement import EliminationPattern
+from vibench.linalg import cholesky
+from vibench.linalg.schur_complement import EliminationPattern, PrincipalSubmatrix
+from vibench.qp import verification
+from vibench_problems.obstacle import Obstacle
 
 
 @given(
@@ -20,14 +24,18 @@ from vibench.linalg.schur_complement import EliminationPattern
     st.lists(st.sets(st.integers(0, 5)), min_size=1, max_size=5),
     st.integers(0, 6),
     st.sampled_from([1e-6, 1.0, 2e11]),
+    st.booleans(),
 )
-def test_solutions_are_those_of_the_whole_system(seed: int, sets: list[set[int]], border: int, young: float) -> None:
+def test_solutions_are_those_of_the_whole_system(
+    seed: int, sets: list[set[int]], border: int, young: float, ordered: bool
+) -> None:
     rng = np.random.default_rng(seed)
     A, f = young * spd(8, rng), young * rng.standard_normal(8)
     B, g = rng.standard_normal((6, 8)), rng.standard_normal(6)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(kkt_systems, "MAX_BORDER", border)
-        solve = SaddlePointSolver(sp.csc_array(A), f, sp.csr_array(B), g)
+        order = PrincipalSubmatrix(rng.permutation(8)) if ordered else None
+        solve = SaddlePointSolver(sp.csc_array(A), f, sp.csr_array(B), g, order)
         for chosen in sets:
             active = np.array(sorted(chosen), dtype=np.intp)
             rows = B[active]
@@ -37,6 +45,11 @@ def test_solutions_are_those_of_the_whole_system(seed: int, sets: list[set[int]]
             assert np.allclose(u, expected[:8], atol=1e-8)
             assert np.allclose(lam[active] / young, expected[8:], atol=1e-8)
             assert not np.any(np.delete(lam, active))
+            assert solve.is_definite == ordered
+            if ordered:
+                functionals = rng.standard_normal((8, 3))
+                squares = np.sum(functionals * np.linalg.solve(A, functionals), axis=0)
+                assert np.allclose(solve.dual_norms(functionals), np.sqrt(squares), rtol=1e-8)
 
 
 @pytest.mark.parametrize("young", [1e-12, 1.0, 2e11])
@@ -68,6 +81,42 @@ def test_a_stiffness_that_is_not_definite_is_for_others_to_refuse() -> None:
     u, lam = SaddlePointSolver(A, np.ones(3), sp.csr_array(np.eye(3)), np.zeros(3))(np.array([0]))
     assert np.allclose((A @ u + lam)[1:], 1.0)
     assert np.isclose(u[0], 0.0)
+
+
+def test_an_order_serves_definite_systems_alone() -> None:
+    """Others have exchanged rows as without it, and nothing is said of A."""
+    rng = np.random.default_rng(2)
+    A, rows, order = spd(5, rng), rng.standard_normal((2, 5)), PrincipalSubmatrix(np.array([3, 1, 4, 0, 2]))
+    dependent = SaddlePointSolver(sp.csc_array(A), np.ones(5), sp.csr_array(rows[[0, 1, 0]]), np.zeros(3), order)
+    with contextlib.suppress(RuntimeError):  # exactly singular or nearly so
+        dependent(np.arange(3))
+    assert not dependent.is_definite
+    indefinite = A - 2.0 * np.linalg.eigvalsh(A)[0] * np.eye(5)
+    solve = SaddlePointSolver(sp.csc_array(indefinite), np.ones(5), sp.csr_array(rows), np.zeros(2), order)
+    u, lam = solve(np.arange(1))
+    assert not solve.is_definite
+    assert np.allclose(indefinite @ u + rows.T @ lam, 1.0)
+
+
+def test_one_factorisation_per_parameter_solves_and_verifies(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where A varies and few rows constrain: nothing else is factorised, and residuals are those of a factor of A."""
+    problem = Obstacle("medium")
+    first, second = problem.parameters.sample(2, 3)
+    solver = HighFidelitySolver(problem)
+    start = solver.solve(first).lam > 0.0
+    made = []
+    monkeypatch.setattr(kkt_systems, "splu", lambda matrix, **how: made.append(how) or sp.linalg.splu(matrix, **how))
+    monkeypatch.setattr(cholesky, "splu", None)
+    vi = problem.assemble(second)
+    stiffness = solver.condensed(vi)
+    found = verified(vi, stiffness, solve_unverified(vi, stiffness, start))
+    stiffness.check_definite("A")
+    assert len(made) == 1
+    monkeypatch.undo()
+    away = found.lam * (1.0 + 1e-6)
+    ours, exact = (verification.kkt_residuals(vi, found.u, away, norms) for norms in (stiffness.dual_norms, None))
+    assert ours.dual == pytest.approx(exact.dual, rel=1e-6)
+    assert ours.gap == pytest.approx(exact.gap, rel=1e-6)
 
 
 @pytest.mark.parametrize("coupled", [0, 3], ids=["sparse", "dense"])
