@@ -50,6 +50,7 @@ class CondensedStiffness:
         self._pattern = pattern
         self._condensed = StaticCondensation(A, self._pattern)
         self._saddle: SaddlePointSolver | None = None
+        self._last: tuple[Array, Array] | None = None
 
     def check_definite(self, name: str) -> None:
         """Raise a `NumericalError` that calls A by `name` if A is not positive definite.
@@ -73,6 +74,10 @@ class CondensedStiffness:
         """‖ℓ‖ in A⁻¹ of functionals (n, k)."""
         if self._saddle is not None and self._saddle.is_definite:
             return self._saddle.dual_norms(functionals)
+        if self._condensed.dense:
+            load, eliminated = self._condensed.eliminated_squares(functionals)
+            retained = np.einsum("ik,ik->k", load, self._compliance @ load)
+            return np.asarray(np.sqrt(np.maximum(eliminated + retained, 0.0)))
         return norms_by_solutions(functionals, self.solve(functionals))
 
     def norm_of_force(self, force: Array) -> float | None:
@@ -83,6 +88,12 @@ class CondensedStiffness:
         pressed = np.flatnonzero(load)
         energy = load[pressed] @ self._compliance[np.ix_(pressed, pressed)] @ load[pressed]
         return float(np.sqrt(max(float(energy), 0.0)))
+
+    def _unconstrained(self, load: Array) -> Array:
+        """Ŝ⁻¹ f̂ (c,) of a condensed load, which is remembered until another one comes."""
+        if self._last is None or self._last[0] is not load:
+            self._last = load, self._compliance @ load
+        return self._last[1]
 
     @cached_property
     def _schur_factor(self) -> SparseCholesky:
@@ -101,7 +112,7 @@ class CondensedStiffness:
         B = sp.csr_array(vi.B if whole else sp.csc_array(vi.B)[:, self._pattern.retained])
         solve_active: ActiveSolver
         if condensed.dense:
-            solve_active = _compliance_solver(self._compliance, load, B, vi.g)
+            solve_active = _compliance_solver(self._compliance, self._unconstrained(load), B, vi.g)
         else:
             solve_active = SaddlePointSolver(condensed.schur, load, B, vi.g, whole)
             self._saddle = solve_active if whole else None
@@ -300,9 +311,11 @@ def _regular(schur: Array, sizes: Array) -> bool:
     return bool(np.linalg.cond(schur / np.outer(scale, scale)) < 1.0 / np.sqrt(ROUND_OFF))
 
 
-def _compliance_solver(compliance: Array, f: Array, B: SparseMatrix, g: Array) -> ActiveSolver:
-    """Solutions for active sets through their dense compliance B_a Ŝ⁻¹B_aᵀ; multipliers are refined once."""
-    unconstrained = compliance @ f
+def _compliance_solver(compliance: Array, unconstrained: Array, B: SparseMatrix, g: Array) -> ActiveSolver:
+    """Solutions for active sets through their dense compliance B_a Ŝ⁻¹B_aᵀ; multipliers are refined once.
+
+    `unconstrained` is the displacement (c,) without constraints.
+    """
     excess = B @ unconstrained - g
 
     def solve_active(active: Indices) -> tuple[Array, Array]:
@@ -311,12 +324,13 @@ def _compliance_solver(compliance: Array, f: Array, B: SparseMatrix, g: Array) -
             return unconstrained, lam
         touched = np.unique(rows.indices)  # of the compliance of all candidates few rows are needed
         rows = rows[:, touched]
-        contact = np.asarray(rows @ (rows @ compliance[np.ix_(touched, touched)]).T)
+        of_touched = compliance[touched]
+        contact = np.asarray(rows @ (rows @ of_touched[:, touched]).T)
         scale = 1.0 / np.sqrt(np.diag(contact))  # rows of any length
         factor = scipy.linalg.cho_factor(contact * np.outer(scale, scale))
         forces = scale * scipy.linalg.cho_solve(factor, scale * excess[active])
         forces += scale * scipy.linalg.cho_solve(factor, scale * (excess[active] - contact @ forces))
         lam[active] = forces
-        return unconstrained - (rows.T @ forces) @ compliance[touched], lam
+        return unconstrained - (rows.T @ forces) @ of_touched, lam
 
     return solve_active

@@ -137,6 +137,12 @@ class StaticCondensation:
             particular, condensed[self._pattern.interface] = self._factor.eliminate(f[self._pattern.order])
         return condensed, particular
 
+    def eliminated_squares(self, right: Array) -> tuple[Array, Array]:
+        """Condensed loads (c, k) of r (n, k), and r_iᵀ A_ii⁻¹ r_i (k,): what ‖r‖² in A⁻¹ has beside them in Ŝ⁻¹."""
+        load, particular = self.eliminate(right)
+        eliminated = self._pattern.order[: len(particular)]
+        return load, np.asarray(np.einsum("ik,ik->k", particular, right[eliminated]))
+
     def condense_load(self, f: Array) -> tuple[Array, Array]:
         """The same of one load, which is remembered until another one comes."""
         if self._last_load is None or not np.array_equal(self._last_load[0], f):
