@@ -184,4 +184,4 @@ def test_multipliers_that_are_zero_have_no_loads() -> None:
     problem = Hertz(resolution="coarse")
     loads = problem.contact_loads(np.zeros((problem.W.dim, 2)))
     varying, bounds = loads.varying(np.ones(1))
-    assert not (loads.fixed.any() or varying.any() or bounds.any())
+    assert not any(array.any() for array in (loads.fixed, varying, bounds))
