@@ -37,11 +37,12 @@ settings.load_profile("same")
 
 
 LONGEST = (
-    "test_executors", "test_figures", "test_docs", "test_run", "test_interruptions", "test_scaffold",
-    "test_other_problems", "test_export", "test_conformance", "test_bounds", "test_keys", "test_compare",
-    "test_html_in_browser", "test_findings", "test_faults", "test_text_from_others", "test_machines", "test_c_source",
-    "test_processes", "test_correction", "test_own_classes", "test_other_codes", "test_as_published",
-    "test_supervisor", "test_results_folder", "test_example_rope",
+    "test_executors", "test_figures", "test_docs", "test_run", "test_interruptions", "test_other_problems",
+    "test_c_source", "test_export", "test_scaffold", "test_site", "test_conformance", "test_bounds", "test_keys",
+    "test_correction", "test_machines", "test_compare", "test_text_from_others", "test_outputs_in_danger",
+    "test_findings", "test_supervisor", "test_example_rope", "test_invariance", "test_error_bounds",
+    "test_html_in_browser", "test_misbehaviour", "test_damaged_files", "test_packs", "test_as_published",
+    "test_other_codes", "test_own_classes", "test_faults",
 )  # fmt: skip
 """Files that take longest, though some have few tests: parallel workers begin with them, so that all end together."""
 
