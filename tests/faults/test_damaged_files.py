@@ -32,7 +32,7 @@ STUDY = {
     "dual": ["mcpg"],
     "primal": ["decorrelated", "offline-pga"],
     "assembly": ["full", "reduced"],
-    "problem": [{"name": "obstacle", "options": {"resolution": "coarse"}}],
+    "problem": [{"name": "radial-obstacle", "options": {"resolution": 200}}],
     "tolerances": [{"pod": [1e-1], "dual": [1e-1], "primal": {"offline-pga": [0.5]}}],
     "timing_rounds": 2,
 }

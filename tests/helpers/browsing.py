@@ -70,11 +70,15 @@ def look(browser: webdriver.Chrome, page: Path, *, width: int = 1280, theme: str
     """Open a page anew, in a window of this width and in a colour scheme."""
     size = {"width": width, "height": 900, "deviceScaleFactor": 1, "mobile": width < 500}
     browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
-    browser.execute_cdp_cmd(
-        "Emulation.setEmulatedMedia", {"features": [{"name": "prefers-color-scheme", "value": theme}]}
-    )
+    prefer(browser, theme)
     browser.get("about:blank")  # a change of the fragment alone would not load the page again
     load(browser, page.as_uri() + fragment)
+
+
+def prefer(browser: webdriver.Chrome, theme: str) -> None:
+    """Change the colour scheme that the user prefers, "light" or "dark"."""
+    features = [{"name": "prefers-color-scheme", "value": theme}]
+    browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": features})
 
 
 def load(browser: webdriver.Chrome, address: str) -> None:

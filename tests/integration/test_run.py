@@ -210,7 +210,7 @@ def edited_core(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A copy of the core, to be edited; first on the path it takes the place of the one that is installed."""
     folder = tmp_path_factory.mktemp("core")
     package = Path(str(importlib.util.find_spec("vibench").submodule_search_locations[0]))
-    shutil.copytree(package, folder / "vibench", ignore=shutil.ignore_patterns("__pycache__"))
+    shutil.copytree(package, folder / "vibench")  # with its bytecode, which takes seconds to make
     return folder
 
 
@@ -221,11 +221,12 @@ def test_only_an_edit_of_what_computes_numbers_runs_anything_again(
     monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path / "cache"))
     study = write_study(tmp_path, wire_study())
 
-    def vibench(*arguments: str) -> str:
-        program = "import sys; from vibench.cli import start; sys.argv[0] = 'vibench'; start()"
+    def vibench(*commands: tuple[str, ...]) -> str:
+        """What commands print, one after the other, in one new interpreter."""
+        program = f"from vibench.cli.main import app\nfor c in {commands}: app(args=[*c], standalone_mode=False)"
         path = os.pathsep.join(map(str, (edited_core, plugins_folder)))
         done = subprocess.run(
-            [sys.executable, "-c", program, *arguments],
+            [sys.executable, "-c", program],
             cwd=tmp_path, env=os.environ | {"PYTHONPATH": path}, capture_output=True, text=True, check=False,
         )  # fmt: skip
         assert (done.returncode, done.stderr) == (0, "")
@@ -236,7 +237,7 @@ def test_only_an_edit_of_what_computes_numbers_runs_anything_again(
             source.write("\n# edited\n")
 
     run = ("run", study, "--jobs", "1", "--no-figures")
-    assert "1 cells, 1 to run" in vibench(*run)
+    assert "1 cells, 1 to run" in vibench(run)
     for module in (
         "report/html.py",
         "report/figures/style.py",
@@ -245,10 +246,11 @@ def test_only_an_edit_of_what_computes_numbers_runs_anything_again(
         "testing/sample.py",
     ):
         edit(module)
-    assert "1 cells, 0 to run, 0 stages" in vibench(*run)
-    assert "3 programs" in vibench("export-qps", "wire", "programs")  # of the model as it was
+    printed = vibench(run, ("export-qps", "wire", "programs"))
+    assert "1 cells, 0 to run, 0 stages" in printed
+    assert "3 programs" in printed  # of the model as it was
     edit("stages/query.py")  # determines the queries, and nothing before them
-    again = re.search(r"1 cells, 1 to run, (\d+) stages", vibench(*run))
+    again = re.search(r"1 cells, 1 to run, (\d+) stages", vibench(run))
     assert again is not None
     assert int(again[1]) < 10  # the snapshots, the basis and the cone are there
 

@@ -11,7 +11,7 @@ from typing import Any
 
 import pandas as pd
 import pytest
-from browsing import FORMULA, PATIENCE, complaints, look
+from browsing import FORMULA, PATIENCE, complaints, look, prefer
 from many_cells import write_many
 from selenium.common.exceptions import TimeoutException
 from selenium.webdriver import ActionChains, Chrome
@@ -99,22 +99,27 @@ def choose(browser: Chrome, axis: str, value: str) -> None:
     label.find_element(By.XPATH, f".//option[normalize-space(.)='{value}']").click()
 
 
-@pytest.mark.parametrize("theme", ["light", "dark"])
-@pytest.mark.parametrize("width", [1280, 390])
-def test_nothing_is_cut_or_wrapped_inside_a_number(width: int, theme: str, browser: Chrome, made: Path) -> None:
-    look(browser, made, width=width, theme=theme)
+@pytest.mark.parametrize(("width", "themes"), [(1280, ("light", "dark")), (390, ("dark", "light"))])
+def test_nothing_is_cut_or_wrapped_inside_a_number(
+    width: int, themes: tuple[str, str], browser: Chrome, made: Path
+) -> None:
+    """In the scheme in which the page is opened, and in the other one, to which it changes with the user."""
+    look(browser, made, width=width, theme=themes[0])
     browser.execute_script("for (const figure of document.querySelectorAll('[data-plot]')) drawPlot(figure);")
     ready = "return [...Bokeh.index.roots].filter(view => view.model.type === 'Figure').length === drawn.length"
     awaited(browser, lambda b: b.execute_script(ready))
     assert browser.execute_script("return drawn.length") > 8
-    seen = browser.execute_script(GEOMETRY)
-    assert complaints(browser) == []
-    assert seen["wide"] <= width
-    assert seen["outside"] == []
-    assert seen["wrapped"] == []
-    assert seen["cut"] == 0
-    red = int(seen["paper"].split("(")[1].split(",")[0])
-    assert red > 240 if theme == "light" else red < 40
+    for theme in themes:
+        prefer(browser, theme)
+        awaited(browser, lambda b: b.execute_script(ready))
+        seen = browser.execute_script(GEOMETRY)
+        assert complaints(browser) == []
+        assert seen["wide"] <= width
+        assert seen["outside"] == []
+        assert seen["wrapped"] == []
+        assert seen["cut"] == 0
+        red = int(seen["paper"].split("(")[1].split(",")[0])
+        assert red > 240 if theme == "light" else red < 40
     pictures = browser.execute_script(
         "return [...document.images].map(image => { image.loading = 'eager'; return image.alt.length; })"
     )
