@@ -11,19 +11,49 @@ from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path, PurePosixPath
 
+PROTOCOL = "1"
+"""Version of the benchmark: what is measured, and how seconds are. Results say by which they were measured.
+
+It changes with every change after which seconds, or the meaning of a number, can no longer be compared with earlier
+ones; the page docs/benchmark.md has a line for each. Names, formats and new columns do not change it.
+"""
+
 SOLVER_DISTRIBUTIONS = {"highs": "highspy", "proxqp": "proxsuite"}
 """Distributions of the solvers that are not called like their solver."""
 
 
 @cache
 def machine() -> str:
-    """The machine as results quote it: processor, cores usable, memory, system."""
-    processor = platform.processor() or platform.machine()
-    info = Path("/proc/cpuinfo")
-    if info.is_file():
-        models = [line.split(":", 1)[1].strip() for line in info.read_text().splitlines() if "model name" in line]
-        processor = models[0] if models else processor
-    return f"{processor}, {cores()} cores, {memory() / 2**30:.0f} GiB, {platform.system()} {platform.machine()}"
+    """The machine as results quote it: processor with its model and caches, cores usable, memory, system."""
+    parts = [processor(), *caches(), f"{cores()} cores", f"{memory() / 2**30:.0f} GiB"]
+    return ", ".join([*parts, f"{platform.system()} {platform.machine()}"])
+
+
+def processor(info: Path = Path("/proc/cpuinfo")) -> str:
+    """The name of the processor, with family and model where the system has them.
+
+    Virtual machines may have a name such as "AMD EPYC", which many processors share.
+    """
+    if not info.is_file():
+        return platform.processor() or platform.machine()
+    first, *_ = info.read_text().split("\n\n")
+    fields = {name.strip(): value.strip() for name, _, value in (line.partition(":") for line in first.splitlines())}
+    name = fields.get("model name", platform.processor() or platform.machine())
+    numbers = [
+        f"{words} {fields[key]}" for words, key in (("family", "cpu family"), ("model", "model")) if key in fields
+    ]
+    return f"{name} ({' '.join(numbers)})" if numbers else name
+
+
+def caches(folder: Path = Path("/sys/devices/system/cpu/cpu0/cache")) -> list[str]:
+    """Sizes of the caches of data of one core, "L2 1024K", from the first level to the last; none where nobody says."""
+    sizes: dict[str, str] = {}
+    for index in sorted(folder.glob("index*")):
+        with contextlib.suppress(OSError):
+            level, kind, size = ((index / name).read_text().strip() for name in ("level", "type", "size"))
+            if kind != "Instruction":
+                sizes[f"L{level}"] = size
+    return [f"{level} {size}" for level, size in sorted(sizes.items())]
 
 
 def memory(groups: Path = Path("/proc/self/cgroup"), root: Path = Path("/sys/fs/cgroup")) -> int:
@@ -47,9 +77,9 @@ def cores() -> int:
 
 
 def versions(solver: str) -> dict[str, str]:
-    """Versions of Python, the numerical libraries, vibench and one solver."""
+    """Versions of the benchmark protocol, of Python, the numerical libraries, vibench and one solver."""
     numerical = {name: distribution_version(name) for name in ("numpy", "scipy", "scikit-fem", "qpsolvers", "vibench")}
-    return {"python": platform.python_version(), **numerical, solver: solver_version(solver)}
+    return {"protocol": PROTOCOL, "python": platform.python_version(), **numerical, solver: solver_version(solver)}
 
 
 @cache

@@ -53,6 +53,22 @@ def test_the_machine_is_named_with_cores_memory_and_system() -> None:
     assert "\n" not in text
 
 
+def test_the_processor_has_its_model_and_the_sizes_of_its_caches_of_data(tmp_path: Path) -> None:
+    info = tmp_path / "cpuinfo"
+    core = "processor\t: {}\ncpu family\t: 26\nmodel\t\t: 2\nmodel name\t: AMD EPYC\nflags\t\t: fpu: all\n"
+    info.write_text("\n".join(core.format(k) for k in range(2)))
+    assert provenance.processor(info) == "AMD EPYC (family 26 model 2)"
+    info.write_text("processor\t: 0\nmodel name\t: Neoverse-N1\n")
+    assert provenance.processor(info) == "Neoverse-N1"
+    for k, (level, kind, size) in enumerate([(1, "Data", "48K"), (1, "Instruction", "32K"), (2, "Unified", "1024K")]):
+        (tmp_path / f"index{k}").mkdir()
+        for name, value in {"level": level, "type": kind, "size": size}.items():
+            (tmp_path / f"index{k}" / name).write_text(f"{value}\n")
+    (tmp_path / "index9").mkdir()  # without files: the system does not say
+    assert provenance.caches(tmp_path) == ["L1 48K", "L2 1024K"]
+    assert provenance.caches(tmp_path / "none") == []
+
+
 def test_there_is_a_core() -> None:
     assert cores() >= 1
 
@@ -62,6 +78,7 @@ def test_versions_are_those_installed(name: str) -> None:
     found = versions("piqp")
     assert found[name] == importlib.metadata.version(name)
     assert found["python"] == platform.python_version()
+    assert found["protocol"] == provenance.PROTOCOL
     assert found["piqp"] == importlib.metadata.version("piqp")
 
 

@@ -150,6 +150,14 @@ def test_times_of_another_machine_are_left_out(changed: Changed, quick_run: Path
     assert any("different machines" in note for note in found.notes)
 
 
+def test_times_of_another_version_of_the_benchmark_are_left_out(changed: Changed, quick_run: Path) -> None:
+    other = 'versions = replace(versions, \'"protocol": "1"\', \'"protocol": "0"\')'
+    later = changed(f"UPDATE cells SET {other}, online_s = 9 * online_s")
+    found = compare([quick_run / FILE, later], 1.25)
+    assert found.changes.empty
+    assert any("different machines or protocols" in note for note in found.notes)
+
+
 THRESHOLD = "WHERE solver = 'piqp' AND problem = 'obstacle' AND dual = 'cpg' AND primal_a = 'high-fidelity'"
 
 NUMBERS = ("benefit_threshold", "threshold_low", "threshold_high")
@@ -258,7 +266,7 @@ def test_seconds_of_many_runs_are_compared_with_the_first_run_of_the_same_machin
     assert row["ratio"] == pytest.approx(3.0)
     numbers = found.changes[~found.changes["what"].isin(["online_s", "offline_s"])]
     assert set(numbers["against"]) == {"steady"}
-    assert "server: times and break-even of different machines are not compared" in found.notes
+    assert "server: times and break-even of different machines or protocols are not compared" in found.notes
     assert not any(note.startswith("later: times") for note in found.notes)
 
 

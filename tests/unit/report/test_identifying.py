@@ -121,7 +121,9 @@ def test_runs_of_one_name_do_not_tell_their_folders(made: Path, main: Main, tmp_
 
 
 def test_requirements_hold_nothing_that_a_stranger_invents() -> None:
-    text = requirements({"evil-package": "6.6.6", "numpy": "2.0.0", "osqp": "1.0", "python": "3.12"}, "code")
+    text = requirements(
+        {"evil-package": "6.6.6", "numpy": "2.0.0", "osqp": "1.0", "python": "3.12", "protocol": "1"}, "code"
+    )
     assert "evil" not in text
     assert "numpy==2.0.0\n" in text
     assert "osqp==1.0\n" in text

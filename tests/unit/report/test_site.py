@@ -217,6 +217,21 @@ def of_yaml(text: str) -> dict[str, str]:
     return {key: json.loads(value) if value.startswith('"') else value for key, _, value in lines}
 
 
+@pytest.mark.parametrize("title", ["plain", "an { open brace", "100 % \\ of } it", "{}{", "a \\{ b", "#1 & ~ ^ $ _"])
+def test_bibtex_has_balanced_braces_and_no_empty_field(title: str) -> None:
+    bib = Citation(title, ("Doe, {Jane", "A group"), url="https://example.org/{a}_b").bibtex()
+    depth = 0
+    for at, character in enumerate(bib):
+        depth += {"{": 1, "}": -1}.get(character, 0)
+        assert depth > 0 or at < len("@misc") or at >= len(bib.rstrip()) - 1
+    assert depth == 0
+    fields = re.findall(r"^  (\w+) = \{(.*)\},$", bib, re.MULTILINE)
+    assert [name for name, _ in fields] == ["title", "author", "url", "note"]  # there is no DOI
+    assert all(value for _, value in fields)
+    with pytest.raises(RequestError, match="is no DOI"):
+        Citation("braces", doi="10.5281/zenodo.{1}")
+
+
 def test_a_citation_is_valid_and_its_texts_are_data(site: Path) -> None:
     text = (site / "CITATION.cff").read_text(encoding="utf-8")
     known = of_yaml(text)
@@ -224,7 +239,7 @@ def test_a_citation_is_valid_and_its_texts_are_data(site: Path) -> None:
     assert (known["title"], known["doi"]) == (CITATION.title, CITATION.doi)
     assert '  - family-names: "Doe"\n    given-names: "Jane"\n  - name: "The {team}"\n' in text
     bib = (site / "citation.bib").read_text(encoding="utf-8")
-    assert "author = {Doe, Jane and {The \\{team\\}}}," in bib
+    assert "author = {Doe, Jane and {The \\textbraceleft{}team\\textbraceright{}}}," in bib
     assert f"doi = {{{CITATION.doi}}}," in bib
     without = Citation('a "title": #1\n- b', ()).cff()
     assert of_yaml(without)["title"] == 'a "title": #1 - b'

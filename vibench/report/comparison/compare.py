@@ -49,7 +49,8 @@ class RunPair(NamedTuple):
 class Comparison:
     """The differences of runs from earlier ones.
 
-    Every run is compared with the first one; its seconds, cell by cell, with the first one of the same machine.
+    Every run is compared with the first one; its seconds, cell by cell, with the first one of the same machine and
+    benchmark protocol.
     """
 
     runs: tuple[ComparedRun, ...]
@@ -198,7 +199,7 @@ def compare(paths: Sequence[Path], limit: float) -> Comparison:
             if same:
                 by_pair[run.name, earlier.name] += of_seconds(earlier, run, same, limit)
         if compared < len([key for key in run.cells if any(key in earlier.cells for earlier in runs[:k])]):
-            notes.append(f"{of_run}times and break-even of different machines are not compared")
+            notes.append(f"{of_run}times and break-even of different machines or protocols are not compared")
     notes += dict.fromkeys(line for run in runs for line in run.extended.faults)
     pairs = tuple(RunPair(*names, differences) for names, differences in by_pair.items())
     return Comparison(tuple(runs), pairs, tuple(notes))

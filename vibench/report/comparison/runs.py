@@ -92,17 +92,21 @@ class ComparedRun:
         return tables.read(self.path, "thresholds")
 
     def measured_beside(self, other: ComparedRun, unless: Sequence[ComparedRun]) -> list[str]:
-        """Cells that the same machine measured in the other run, and in none of the runs `unless`."""
+        """Cells whose seconds compare with those of the other run, and with those of none of the runs `unless`."""
+        found = {key: self.measured_by(key) for key in self.cells}
         return [
             key
-            for key, row in self.cells.items()
-            if other.has_seconds_of(key, row["machine"])
-            and not any(run.has_seconds_of(key, row["machine"]) for run in unless)
+            for key, instrument in found.items()
+            if other.measured_by(key) == instrument and all(run.measured_by(key) != instrument for run in unless)
         ]
 
-    def has_seconds_of(self, cell: str, machine: str) -> bool:
-        """Whether this run has the cell, measured by that machine."""
-        return cell in self.cells and self.cells[cell]["machine"] == machine
+    def measured_by(self, cell: str) -> tuple[str, str] | None:
+        """Machine and version of the benchmark protocol that measured a cell; `None` without it."""
+        if cell not in self.cells:
+            return None
+        row = self.cells[cell]
+        versions = json.loads(row["versions"]) if isinstance(row["versions"], str) else {}
+        return str(row["machine"]), str(versions.get("protocol", ""))
 
 
 def compared_runs(paths: Sequence[Path]) -> list[ComparedRun]:

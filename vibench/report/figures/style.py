@@ -69,8 +69,9 @@ STYLE: Any = {
 CHARACTER, TITLE_CHARACTER = 0.068, 0.085
 """Average widths of a character of a legend and of a title, in inches."""
 
-FEW, DENSE = 0.6, 2.2
-"""Decades below which a logarithmic axis has the ticks of a linear one, and ticks at 1, 2 and 5, as plain numbers."""
+FEW, WIDE, DENSE = 0.6, 1.4, 2.2
+"""Decades below which a logarithmic axis has the ticks of a linear one, ticks at 1, 2 and 5, and at 1 and 3, all as
+plain numbers."""
 
 SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
@@ -259,7 +260,8 @@ def _ticks(axes: Axes) -> None:
         if decades < FEW:
             axis.set_major_locator(ticker.MaxNLocator(5))
         elif decades < DENSE:
-            axis.set_major_locator(ticker.LogLocator(subs=(1.0, 2.0, 5.0)))
+            # numbers such as 0.00005 at 2 and 5 of every decade would touch where there are more than about five
+            axis.set_major_locator(ticker.LogLocator(subs=(1.0, 2.0, 5.0) if decades < WIDE else (1.0, 3.0)))
         axis.set_major_formatter("{x:.3g}" if decades < DENSE else _power)
 
 

@@ -21,6 +21,9 @@ SOFTWARE = "vibench: a benchmark framework for reduced-order models of parametri
 NAME, VERSION = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*"), re.compile(r"[A-Za-z0-9.!+_-]+")
 """A distribution and its version, as a file of requirements names them: anything else could be an option of pip."""
 
+NO_DISTRIBUTION = frozenset({"protocol", "python"})
+"""Names in the versions of a cell that pip does not install."""
+
 
 @dataclass(frozen=True)
 class Citation:
@@ -38,7 +41,7 @@ class Citation:
     """Address of the site, "" where it has none yet."""
 
     def __post_init__(self) -> None:
-        if self.doi and not DOI.fullmatch(self.doi):
+        if self.doi and (not DOI.fullmatch(self.doi) or set("{}") & {*self.doi}):  # braces would end a field of BibTeX
             raise RequestError(f"'{unbroken(self.doi)}' is no DOI, expected such as 10.5281/zenodo.1234567")
 
     def cff(self) -> str:
@@ -62,17 +65,23 @@ class Citation:
         return "\n".join(lines) + "\n"
 
     def bibtex(self) -> str:
-        """The same as an entry of BibTeX."""
-        names = [to_latex_text(unbroken(author)) for author in self.authors or ("unnamed",)]
+        """The same as an entry of BibTeX, with the fields that there is something for."""
+        names = [_in_braces(author) for author in self.authors or ("unnamed",)]
         fields = {
-            "title": f"{{{to_latex_text(unbroken(self.title))}}}",
+            "title": f"{{{_in_braces(self.title)}}}",
             "author": " and ".join(name if "," in name else f"{{{name}}}" for name in names),
             "doi": self.doi,
-            "url": unbroken(self.url),
+            "url": unbroken(self.url).replace("{", "%7B").replace("}", "%7D"),
             "note": f"Computed by vibench {distribution_version('vibench')}",
         }
-        lines = (f"  {name} = {{{value}}}," for name, value in fields.items())
+        lines = (f"  {name} = {{{value}}}," for name, value in fields.items() if value)
         return "@misc{vibench-results,\n" + "\n".join(lines) + "\n}\n"
+
+
+def _in_braces(text: str) -> str:
+    """A text in a field of BibTeX, which counts escaped braces, too, so that they are commands there."""
+    escaped = to_latex_text(unbroken(text))
+    return escaped.replace("\\{", "\\textbraceleft{}").replace("\\}", "\\textbraceright{}")
 
 
 def is_known(distribution: str) -> bool:
@@ -101,13 +110,13 @@ def requirements(versions: Mapping[str, str], code: str) -> str:
     make others install anything.
     """
     lines = [f"# versions recorded in the results file; code of the cells: {unbroken(code)}"]
-    known = {name: one for name in versions if name == "python" or is_known(one := solver_distribution(name))}
+    known = {name: one for name in versions if name in NO_DISTRIBUTION or is_known(one := solver_distribution(name))}
     if unknown := len(versions) - len(known):
         lines.append(f"# left out: {unknown} that the machine which published this does not know")
     for name, distribution in sorted(known.items()):
         version = versions[name]
-        if name == "python":
-            lines.append(f"# python {unbroken(version)}")
+        if name in NO_DISTRIBUTION:
+            lines.append(f"# {name} {unbroken(version)}")
         elif not version:
             lines.append(f"# {unbroken(distribution)} was not installed")
         elif NAME.fullmatch(distribution) and VERSION.fullmatch(version):
