@@ -424,7 +424,7 @@ FAULTS = (
     ),
     Fault(
         "pair-in-c-without-what-is-left-of-complementarity",
-        "vibench/library/templates/reduced_model_certificate.c.template",
+        "vibench/offline/templates/reduced_model_certificate.c.template",
         "sqrt(rho * rho + 2.0 * fmax(0.0, gap))",
         "rho",
         ("tests/unit/library/test_c_source.py",),

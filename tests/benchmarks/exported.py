@@ -15,10 +15,10 @@ from pathlib import Path
 import numpy as np
 
 import vibench
-from vibench.library.export import TOLERANCE
 from vibench.library.exported_seconds import HIGH_FIDELITY, LIBRARY, SCRIPT, Call, in_turns, queries
 from vibench.library.reduced_model import Model
 from vibench.library.reduced_model_certificate import Model as WithBounds
+from vibench.offline.polynomials import TOLERANCE
 from vibench.qp.exact import exact_solution
 
 QUERIES = 1000

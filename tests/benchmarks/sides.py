@@ -9,11 +9,14 @@ import numpy as np
 import published
 
 from vibench.arrays import Array
+from vibench.errors import UnsupportedError
 from vibench.interfaces.problem import Problem
 from vibench.interfaces.strategies import Stop
+from vibench.offline.compiled import CompiledModel, Program
 from vibench.offline.models import AnyReducedModel
 from vibench.offline.reduction import Reduction
 from vibench.qp.solve import solve_qp
+from vibench.qp.verification import kkt_residuals
 from vibench_problems.hertz import Hertz
 from vibench_problems.obstacle import Obstacle
 from vibench_strategies.cpg import CPG
@@ -144,6 +147,9 @@ class Published(Side):
 class Ours(Side):
     """vibench's own."""
 
+    compiled: Program
+    not_compiled = ""
+
     def __init__(self, problem: Problem, case: Case, solver: str, accuracy: float) -> None:
         super().__init__(problem, case, solver, accuracy)
         self.fixed = Reduction(
@@ -181,6 +187,10 @@ class Ours(Side):
         made = {name: getattr(self.fixed, name) for name in ("snapshots", "pod", "cone", "multipliers", "members")}
         self.per_parameter = replace(self.fixed, primal=OnlineSupremizers(), tolerance=None).given(**made)
         assert self.per_parameter.assembled
+        try:
+            self.compiled = CompiledModel.of(self.fixed.assembled, self.accuracy).program()
+        except UnsupportedError as error:
+            self.not_compiled = str(error)
 
     def query_online(self, mu: Array) -> published.Answer:
         return self._answered(self.per_parameter.projection, mu)
@@ -194,9 +204,19 @@ class Ours(Side):
     def query_offline_reduced(self, mu: Array) -> published.Answer:
         return self._answered(self.fixed.assembled, mu)
 
-    def bare_program(self, mu: Array) -> Callable[[], object]:
-        """Solving the program of a reduced offline query, and nothing else."""
-        reduced = self.fixed.assembled.assemble(mu)
+    def compiled_query(self, mu: Array) -> Callable[[], object]:
+        """A query of the compiled program."""
+        return lambda: self.compiled(mu)
+
+    def compiled_residual(self, mu: Array) -> float:
+        """Its largest residual in the program of the reduced offline query."""
+        found = self.compiled(mu)
+        return kkt_residuals(self.fixed.assembled.assemble(mu).program, found.x, found.alpha).worst
+
+    def bare_program(self, mu: Array, query: str) -> Callable[[], object]:
+        """Solving the program of a reduced query, "online" or "offline", and nothing else."""
+        of = self.fixed if query == "offline" else self.per_parameter
+        reduced = of.assembled.assemble(mu)
         return lambda: solve_qp(reduced.program, self.solver, self.accuracy, factor=reduced.factor)
 
     def _answered(self, model: AnyReducedModel, mu: Array) -> published.Answer:

@@ -173,9 +173,10 @@ def export_reduced_model(
 ) -> None:
     """Export a reduced model for use without vibench."""
     from vibench.library import exported_seconds
-    from vibench.library.export import BOUNDS, RUNTIME, TOLERANCE, export_model
+    from vibench.library.export import BOUNDS, RUNTIME, export_model
     from vibench.library.runs import open_run
     from vibench.model.chebyshev import MEASURED
+    from vibench.offline.polynomials import TOLERANCE
 
     model = open_run(run, at=places_of(at)).model(cell)
     tolerance = TOLERANCE if interpolate is None else interpolate

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import partial
 from importlib.metadata import PackageNotFoundError, metadata
@@ -15,19 +15,17 @@ from typing import Any
 import numpy as np
 
 from vibench.arrays import Array
-from vibench.errors import NumericalError, RequestError, in_a_line, requested
+from vibench.errors import RequestError, requested
 from vibench.files import write_atomically, writing
-from vibench.interfaces.problem import MEMBERS, VariationalInequality
-from vibench.interfaces.strategies import Kind
-from vibench.interfaces.validation import training_parameters
-from vibench.library import c_source, exported_certificate, exported_outputs
+from vibench.interfaces.problem import MEMBERS
+from vibench.library import exported_certificate, exported_outputs
 from vibench.library.reduced_model import FORMAT, SOLVERS
-from vibench.model.affine import affine_decomposition, check_affine
 from vibench.model.certificates.base import Guarantee, contact_unknowns
-from vibench.model.certificates.bounds import OnlineCertificate
-from vibench.model.chebyshev import AffinePolynomial, interpolate_on_box
-from vibench.model.hyperreduced import HyperReducedModel, hyper_reduce
-from vibench.offline.models import AnyReducedModel, Model
+from vibench.model.chebyshev import AffinePolynomial
+from vibench.model.hyperreduced import HyperReducedModel
+from vibench.offline import c_source
+from vibench.offline.models import Model
+from vibench.offline.polynomials import EVALUATIONS, TOLERANCE, InaccurateError, member_polynomials
 from vibench.provenance import distribution_version
 from vibench.qp.settings import SETTINGS
 from vibench.qp.solve import MARGIN
@@ -38,12 +36,6 @@ RUNTIME = "reduced_model.py"
 
 BOUNDS = "reduced_model_certificate.py"
 """The same with error bounds, written where there are some."""
-
-TOLERANCE = 1e-11
-"""Largest relative error of a polynomial where nothing else is asked for; solutions then agree to 1e-9 and better."""
-
-EVALUATIONS = 4096
-"""Points of the largest grid on which the members are interpolated, where nothing else is asked for."""
 
 RECORDED = (
     "cell", "problem", "problem_options", "training", "training_options", "dual", "dual_options", "primal",
@@ -155,21 +147,14 @@ def exported(
     box = model.parameters
     why = exported_certificate.reason_for_none(model.certificate)
     certificate = None if why else model.certificate
+    beside = None if certificate is None else partial(exported_certificate.thetas, certificate)
     try:
-        queried = declared_model(model.reduced)
-        if c and isinstance(queried, HyperReducedModel) and queried.space is not None:
-            raise RequestError("the enrichment changes the basis at every parameter; C sources are for fixed bases")
-        first = members_of(queried, box.lower, coefficients_of(queried, box.lower))
-        if not len(first.f) or not len(first.g):
-            raise RequestError("the model has no unknowns or no constraints")
-        terms = declared_terms(queried)
-        evaluate = partial(_evaluated, queried, len(first.f), frozenset(terms), certificate)
-        polynomials = interpolate_on_box(evaluate, box.lower, box.upper, tolerance, evaluations, terms=terms)
-    except NumericalError as error:
-        raise RequestError(f"the model cannot be evaluated in the whole parameter box: {error}") from None
-    except (ArithmeticError, ValueError, LookupError) as error:  # what the code of a problem raises
-        raise RequestError(f"the model cannot be evaluated in the whole parameter box: {in_a_line(error)}") from None
-    _refuse_inaccurate(polynomials, tolerance, evaluations)
+        queried, polynomials = member_polynomials(model.reduced, tolerance, evaluations, fixed=c, beside=beside)
+    except InaccurateError as error:
+        raise RequestError(
+            f"{error}; `--interpolate {1.05 * error.error:.1e}` exports this approximation, more `--evaluations` than "
+            f"{evaluations} may reach a better one"
+        ) from None
     members = {name: polynomials.pop(name) for name in MEMBERS}
     about = _about(model, members) | {"certificate": Guarantee.NONE.value, "no_bounds": why}
     arrays = {"lower": box.lower, "upper": box.upper}
@@ -184,104 +169,6 @@ def exported(
         arrays |= exported_certificate.arrays(certificate, polynomials | members, unknowns)
         about["certificate"] = exported_certificate.guarantee(certificate, model.problem.constant).value
     return ExportedModel(members, arrays, about, polynomials)
-
-
-def declared_model(queried: AnyReducedModel) -> AnyReducedModel:
-    """The model without high-fidelity assembly where its problem declares all members constant or affine sums.
-
-    Their terms are projected, whatever the assembly of the cell was; any other model is returned as it is.
-
-    Raises
-    ------
-    NumericalError
-        If a declared sum differs from the assembled member.
-    """
-    if isinstance(queried, HyperReducedModel):
-        return queried
-    problem = queried.problem
-    training = training_parameters(problem)
-    if queried.enrichment.supply is not None or not set(MEMBERS) <= {*problem.constant, *problem.affine}:
-        check_affine(problem, training)
-        return queried
-    members = affine_decomposition(problem, training, tolerance=TOLERANCE)  # nothing is left to interpolate
-    return HyperReducedModel(queried, hyper_reduce(queried, members))
-
-
-def declared_terms(queried: AnyReducedModel) -> dict[str, Array]:
-    """Flat terms (Q×size) of the members declared affine, of A packed upper triangles, on a fixed space."""
-    if isinstance(queried, HyperReducedModel):
-        return queried.declared_terms()
-    Z, chi, problem = queried.fixed_basis, queried.generators, queried.problem
-    upper = np.triu_indices(Z.shape[1])
-    projected: Mapping[str, Callable[[Any], Array]] = {
-        "A": lambda term: (0.5 * (Z.T @ (term @ Z) + (Z.T @ (term @ Z)).T))[upper],
-        "f": lambda term: Z.T @ term,
-        "B": lambda term: chi.T @ (term @ Z),
-        "g": lambda term: chi.T @ term,
-    }
-    declared = {name: sums for name, sums in problem.affine.items() if name not in problem.constant}
-    return {name: np.stack([np.ravel(projected[name](t)) for t in sums.terms]) for name, sums in declared.items()}
-
-
-def coefficients_of(queried: AnyReducedModel, mu: Array) -> Mapping[str, Array]:
-    """θ (Q,) at a parameter of the members that are sums of terms, as far as the model evaluates them."""
-    if isinstance(queried, HyperReducedModel):
-        return queried.coefficients(mu)
-    problem = queried.problem
-    return {name: sums.coefficients(mu) for name, sums in problem.affine.items() if name not in problem.constant}
-
-
-def members_of(queried: AnyReducedModel, mu: Array, theta: Mapping[str, Array]) -> VariationalInequality:
-    """A, f, B, g at a parameter with these coefficients, on a space that does not depend on it.
-
-    Raises
-    ------
-    RequestError
-        If the model has no such space.
-    """
-    if isinstance(queried, HyperReducedModel):
-        return queried.members(mu, theta)
-    if queried.kind is Kind.PER_PARAMETER:
-        raise RequestError(
-            "the enrichment changes the basis at every parameter, the cell assembles in full, and its problem does not "
-            'declare all members constant or affine; export the same cell with assembly = "reduced"'
-        )
-    return queried.assemble(mu).program
-
-
-def _evaluated(
-    queried: AnyReducedModel, size: int, declared: frozenset[str], certificate: OnlineCertificate | None, mu: Array
-) -> dict[str, Array]:
-    """The members as flat arrays, of declared affine ones θ; and what the certificate evaluates."""
-    theta = coefficients_of(queried, mu)
-    found = _packed(queried, size, mu, theta)
-    beside = {} if certificate is None else exported_certificate.thetas(certificate, theta)
-    return found | {name: theta[name] for name in declared} | beside
-
-
-def _packed(queried: AnyReducedModel, size: int, mu: Array, theta: Mapping[str, Array]) -> dict[str, Array]:
-    """The members as flat arrays; of A the upper triangle."""
-    found = members_of(queried, mu, theta)
-    if len(found.f) != size:
-        raise RequestError(f"the reduced program has {len(found.f)} unknowns at mu = {mu.tolist()}, {size} elsewhere")
-    arrays = {name: np.asarray(getattr(found, name)) for name in MEMBERS}
-    arrays["A"] = 0.5 * (arrays["A"] + arrays["A"].T)[np.triu_indices(size)]
-    if not all(np.all(np.isfinite(array)) for array in arrays.values()):
-        raise NumericalError(f"it has entries that are not finite at mu = {mu.tolist()}")
-    return {name: array.ravel() for name, array in arrays.items()}
-
-
-def _refuse_inaccurate(members: Mapping[str, AffinePolynomial], tolerance: float, evaluations: int) -> None:
-    missed = {name: member for name, member in members.items() if member.error > tolerance}
-    if not missed:
-        return
-    worst = max(missed, key=lambda name: missed[name].error)
-    error, degrees = missed[worst].error, ", ".join(map(str, missed[worst].degrees))
-    raise RequestError(
-        f"{worst} depends on mu through the code of the problem, which the file cannot hold, and polynomials of degree "
-        f"({degrees}) reach a relative error of {error:.1e}, not {tolerance:.0e}; `--interpolate {1.05 * error:.1e}` "
-        f"exports this approximation, more `--evaluations` than {evaluations} may reach a better one"
-    )
 
 
 def _about(model: Model, members: Mapping[str, AffinePolynomial]) -> dict[str, Any]:

@@ -89,9 +89,9 @@ KEYS: Mapping[str, Column] = {
     "dual_tol": real("1", "Tolerance δ_dual of the cone; empty where the study prescribes R.", "δ_dual", 3),
     "dual_size": integer("Prescribed R; empty where the study gives a tolerance."),
     "primal_tol": real("1", "Tolerance δ of the primal strategy; empty for strategies that take none.", "δ", 6),
-    "solver": text("QP solver.", "solver", 7),
+    "solver": text("QP solver; compiled programs use none.", "solver", 7),
     "accuracy": real("1", "Relative accuracy prescribed to the solver.", "accuracy", 8),
-    "assembly": text("Assembly of the queries: full, reduced, or certified: reduced with bounds.", "assembly", 9),
+    "assembly": text("Assembly of queries: full, reduced, certified (reduced with bounds), compiled.", "assembly", 9),
     "correction": text(
         "Which solutions are corrected: none, feasible: all, or auto: where ω > ρ; rows judge the corrected pair.",
         "correction",
@@ -159,7 +159,9 @@ CELLS: Mapping[str, Column] = {
     "offline_pod_s": real("s", "POD."),
     "offline_cone_s": real("s", "Dual strategy, with the orthonormal basis of the span."),
     "offline_enrichment_s": real("s", "Primal strategy."),
-    "offline_assembly_s": real("s", "Preparation of reduced assembly; 0 with full assembly."),
+    "offline_assembly_s": real(
+        "s", "Preparation of reduced assembly, and of a compiled program; 0 with full assembly."
+    ),
     "offline_certificate_s": real("s", "Preparation of certificates at online cost; 0 without."),
     "offline_s": real(
         "s",
@@ -293,7 +295,7 @@ QUERIES: Mapping[str, Column] = {
     "cell": text("The cell it belongs to.", kind=MEMBER),
     **KEYS,
     "query": integer("Number of the validation parameter, from 0."),
-    "form": text("Form in which the program was solved: primal or dual."),
+    "form": text("Form in which the program was solved: primal, dual, or compiled."),
     "started_from": integer("Query from whose solution the solver started; empty for a cold start."),
     "assembly_error": real("1", "Largest relative difference of a member of the program from its projection."),
     "assemble_s": real("s", "Assembly of the reduced program: median over the rounds."),

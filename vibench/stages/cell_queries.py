@@ -29,12 +29,13 @@ from vibench.stages.assembly import AssemblyStage, ExactSolutions, assembly_stag
 from vibench.stages.base import Failed, Items, ItemwiseStage, Row, Stage, value_of
 from vibench.stages.cell_summary import summarise
 from vibench.stages.certification import CertificateStage
+from vibench.stages.compilation import CompilationStage, compiled_query, loaded_program
 from vibench.stages.infsup_constants import InfSupConstants, ReferenceConstants
 from vibench.stages.offline import ConstraintMatrices, ReducedCone
 from vibench.stages.query import Queries, Query, error_columns, run_query
 from vibench.stages.snapshots import gather, solution_stages
 from vibench.storage.artefacts import Artefact, Store
-from vibench.study.cells import CERTIFIED, Cell
+from vibench.study.cells import CERTIFIED, COMPILED, Cell
 from vibench.study.kinds import SOLVER
 from vibench.study.registry import find
 from vibench.timing import median_interval, median_of
@@ -69,6 +70,7 @@ class CellQueries(ItemwiseStage):
     warm_start: bool = False
     certificate: CertificateStage | None = None
     correction: CorrectionMode = CorrectionMode.NONE
+    compilation: CompilationStage | None = None
 
     @property
     def sort(self) -> str:
@@ -86,7 +88,10 @@ class CellQueries(ItemwiseStage):
         return self.assembly.validation.count
 
     def query(self, queries: Queries, number: int) -> Query:
-        """One query of the cell's reduced model, for its solver."""
+        """One query of the cell's reduced model, for its solver or its compiled program."""
+        if self.compilation is not None:
+            program = loaded_program(queries.store, self.compilation)
+            return compiled_query(queries, program, number, self.solver, self.accuracy)
         return queries.query(number, self.solver, self.accuracy, self.warm_start)
 
     @property
@@ -125,12 +130,13 @@ class CellQueries(ItemwiseStage):
     def offline(self) -> Mapping[str, tuple[Stage, ...]]:
         """The stages whose seconds add up to the offline time of the cell, by column."""
         enrichment, reduction = self.assembly.enrichment, self.assembly.reduction
+        compiled = () if self.compilation is None else (self.compilation,)
         return {
             "snapshots": self.training,
             "pod": (enrichment.pod,),
             "cone": (enrichment.cone,),
             "enrichment": (enrichment,),
-            "assembly": () if reduction is None else (reduction.decomposition, reduction),
+            "assembly": () if reduction is None else (reduction.decomposition, reduction, *compiled),
             "certificate": () if self.certificate is None else (self.certificate.base, self.certificate),
         }
 
@@ -151,7 +157,8 @@ def cell_queries(cell: Cell, query_seconds: float) -> CellQueries:
     assembly = assembly_stage(cell)
     certificate = CertificateStage(assembly) if cell.assembly == CERTIFIED else None
     mode, asked = CorrectionMode(cell.correction), (cell.solver, cell.accuracy, query_seconds, cell.warm_start)
-    return CellQueries(assembly, *asked, certificate, mode)
+    compilation = CompilationStage(assembly, cell.accuracy) if cell.assembly == COMPILED else None
+    return CellQueries(assembly, *asked, certificate, mode, compilation)
 
 
 class _Queries(Items):

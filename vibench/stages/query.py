@@ -53,6 +53,17 @@ class Query:
     """Relative accuracy prescribed to the solver."""
     start: tuple[int, VariationalInequality] | None = None
     """Number and program of the query whose solution the solver starts from; `None` for a cold start."""
+    units: Array | None = None
+    """Units (n,) of the unknowns where they are not those of the model."""
+
+    @property
+    def form(self) -> str:
+        """How it is solved: in the unknowns of the program, or in its multipliers."""
+        return "primal" if self.factor is None else "dual"
+
+    def in_model(self, x: Array) -> Array:
+        """Coordinates (n,) of the model from those of an answer."""
+        return x if self.units is None else self.units * x
 
     def repeated(self, *seed: int) -> Query:
         """The same query in other units of the unknowns, which depend on the seed; see `vibench.qp.repeats`."""
@@ -62,6 +73,7 @@ class Query:
             program=in_units(self.program, d),
             factor=None if self.factor is None else self.factor * d[:, None],
             start=None if self.start is None else (self.start[0], in_units(self.start[1], d)),
+            units=d,
         )
 
     def prepare(self, watch: Watch) -> Callable[[], tuple[QPSolution, Seconds]]:
@@ -86,7 +98,7 @@ class Query:
 class Queries:
     """The queries of a reduced model, one per validation parameter, for any QP solver.
 
-    The store holds the artefacts of the stage of the reduced programs and of its inputs. `model` is the reduced model,
+    The store holds the artefacts of the stage of the reduced programs, of its inputs, and of what else queries need. `model` is the reduced model,
     `note` says why requested reduced assembly was replaced by full assembly, or is "", `mus` are the validation
     parameters (P×d) and `reduced` the reduced programs.
     """
@@ -95,6 +107,7 @@ class Queries:
         self.model, self.note = assembly.model(store)
         self.mus, self._seed = assembly.validation.of(self.model.problem), assembly.validation.seed
         self.reduced: ReducedPrograms = value_of(store, assembly)
+        self.store = store
 
     @cached_property
     def _before(self) -> list[int | None]:
@@ -136,7 +149,7 @@ def run_query(query: Query, query_seconds: float, watch: Watch) -> tuple[Row, Ro
     solved a second time, to see whether the solver repeats itself.
     """
     program = query.program
-    row: Row = {"form": "primal" if query.factor is None else "dual"}
+    row: Row = {"form": query.form}
     if query.start is not None:
         row["started_from"] = query.start[0]
     try:

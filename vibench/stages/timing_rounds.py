@@ -18,13 +18,13 @@ from vibench.model.hyperreduced import HyperReducedModel
 from vibench.offline.assemblies import Assemblies
 from vibench.offline.correction import corrected_in_full
 from vibench.provenance import machine
-from vibench.qp.repeats import check_answer, units
+from vibench.qp.repeats import check_answer
 from vibench.stages.assembly import AssemblyStage
 from vibench.stages.base import Failed, Items, ItemwiseStage, Row, Stage, value_of
 from vibench.stages.cell_queries import CellQueries
 from vibench.stages.query import Queries, Watch
 from vibench.storage.artefacts import Store
-from vibench.timing import DISTURBED, WAITED, Seconds, calibration, timed
+from vibench.timing import DISTURBED, NO_TIME, WAITED, Seconds, calibration, timed
 
 SHARE = 4
 """A round takes every fourth query of a cell, another quarter each time: short rounds interleave more closely."""
@@ -93,7 +93,7 @@ class TimingRounds(ItemwiseStage):
     def inputs(self) -> tuple[Stage, ...]:
         """The models and the programs of the cells."""
         read = [stage for cell in self.cells for stage in (*cell.assembly.model_inputs, cell.assembly)]
-        read += [cell.certificate for cell in self.cells if cell.certificate is not None]
+        read += [stage for cell in self.cells for stage in (cell.certificate, cell.compilation) if stage is not None]
         return tuple(dict.fromkeys(read))
 
     def place(self, item: int) -> tuple[int, int]:
@@ -158,9 +158,8 @@ class _Rounds(Items):
             check_answer(query.program, answer, query.accuracy)
             asked = stage.certificate is not None or stage.correction is not CorrectionMode.NONE
             if asked and answer.x is not None and answer.alpha is not None:
-                x = units(len(answer.x), query.accuracy, *seed) * answer.x
                 near = queries.near(k, at, cell, int(warm_up))
-                certify[k] = self._certified(stage, queries, near, (x, answer.alpha))
+                certify[k] = self._certified(stage, queries, near, (query.in_model(answer.x), answer.alpha))
             if sum(seconds.wall for seconds in solve.values()) > ROUND_SECONDS:
                 break
         return assemble, solve, certify
@@ -193,6 +192,8 @@ class _Rounds(Items):
         High-fidelity matrices are the same for all models: they are assembled once in a round.
         """
         model = queries.model
+        if self._stage.cells[cell].compilation is not None:
+            return dict.fromkeys(order, NO_TIME)  # it is part of the solution
         if isinstance(model, HyperReducedModel):
             return {k: timed(partial(model.assemble, queries.near(k, at, cell, int(warm_up))))[1] for k in order}
         k = order[0]

@@ -20,6 +20,9 @@ from vibench.study.registry import find
 CERTIFIED = "certified"
 """Assembly of queries that are assembled as reduced ones, and have certificates."""
 
+COMPILED = "compiled"
+"""Assembly of queries that a compiled program answers, without a QP solver."""
+
 
 def digest(content: Any) -> str:
     """Short hash of JSON content, independent of the order of keys."""
@@ -56,7 +59,7 @@ class Cell:
     """One cell: a problem, strategies, tolerances, a QP solver, and how queries are assembled and corrected.
 
     `interpolation` is the tolerance of reduced assembly, `None` for full assembly; certified queries are assembled as
-    reduced ones. `labels` of problem, dual and primal strategy are no part of the identity, nor are those of the
+    reduced ones, and compiled programs are made of them. `labels` of problem, dual and primal strategy are no part of the identity, nor are those of the
     parameter sets; nor are `nested_tolerances`, all tolerances of a nested primal strategy in the study, whose
     enrichments are stages of one.
     """

@@ -14,7 +14,7 @@ from vibench.errors import RequestError, requested
 from vibench.files import read_regular
 from vibench.interfaces.strategies import Stop
 from vibench.reduction.nested import NestedStrategy
-from vibench.study.cells import Cell
+from vibench.study.cells import COMPILED, Cell
 from vibench.study.entries import Entry, ProblemEntry, SamplingEntry
 from vibench.study.kinds import DUAL, PRIMAL, PROBLEM, SAMPLING, STUDY, PluginKind
 from vibench.study.options import BESIDE
@@ -157,6 +157,8 @@ def expand(study: Study) -> list[Cell]:
         for training, (dual, pod, cone, primal, tolerance) in product(sets, _combinations(duals, primals, table)):
             solved = product(study.assembly, study.correction, study.solver_names(), study.accuracy)
             for assembly, correction, solver, accuracy in solved:
+                if assembly == COMPILED and solver != study.solver_names()[0]:
+                    continue  # the answer is that of the program, whatever the solver is
                 cell = Cell(
                     problem=plugin,
                     dual=dual[1],

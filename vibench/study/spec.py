@@ -164,7 +164,9 @@ class Study(_Model):
     dual: Annotated[list[Entry], MinLen(1), Field(description="Dual strategies.")]
     primal: Annotated[list[Entry], MinLen(1), Field(description="Primal strategies.")]
     assembly: Annotated[
-        list[Literal["full", "reduced", "certified"]], MinLen(1), Field(description="How queries are assembled.")
+        list[Literal["full", "reduced", "certified", "compiled"]],
+        MinLen(1),
+        Field(description="How queries are assembled; `compiled` programs need no QP solver and a C compiler."),
     ] = ["full"]
     correction: Annotated[
         list[Literal["none", "feasible", "auto"]],

@@ -16,12 +16,12 @@ import pytest
 
 import vibench
 from vibench.interfaces.outputs import Output
-from vibench.library import c_source
 from vibench.library.export import export_model, exported
 from vibench.library.reduced_model import Model as Exported
 from vibench.library.reduced_model_certificate import Model as WithBounds
 from vibench.model.certificates import complementarity
 from vibench.model.chebyshev import AffinePolynomial, products
+from vibench.offline import c_source
 from vibench.qp.exact import exact_solution
 from vibench.qp.verification import infeasibility_certificate
 
@@ -207,11 +207,11 @@ def test_a_certificate_without_outputs_and_outputs_without_a_certificate(
 def test_both_methods_of_the_correction_in_c_find_that_of_vibench(steps: int, tmp_path: Path) -> None:
     size, zeros = 8, np.zeros(8)
     text = (
-        files("vibench.library")
+        files("vibench.offline")
         .joinpath("templates", "reduced_model_certificate.c.template")
         .read_text(encoding="utf-8")
     )
-    basic = files("vibench.library").joinpath("templates", "reduced_model.c.template").read_text(encoding="utf-8")
+    basic = files("vibench.offline").joinpath("templates", "reduced_model.c.template").read_text(encoding="utf-8")
     parts = [
         "#include <float.h>\n#include <math.h>\n#include <string.h>\n"
         f"enum {{ LOADS = {size}, STEPS = {steps} }};\n"

@@ -24,7 +24,7 @@ from running import Main, refused
 from samples import small_study
 
 import vibench
-from vibench.library import export, exported_certificate, reduced_model
+from vibench.library import exported_certificate, reduced_model
 from vibench.library.export import BOUNDS, RUNTIME, export_model
 from vibench.library.export import exported as exported_model
 from vibench.library.reduced_model import Model as Exported
@@ -32,6 +32,7 @@ from vibench.library.reduced_model_certificate import Model as WithBounds
 from vibench.model.affine import affine_decomposition
 from vibench.model.certificates.base import Guarantee, contact_unknowns
 from vibench.model.hyperreduced import HyperReducedModel, hyper_reduce
+from vibench.offline import polynomials
 from vibench.qp.exact import exact_solution
 
 FILES = {"model.npz", RUNTIME}
@@ -510,7 +511,7 @@ def test_coefficients_are_evaluated_once_per_parameter(run: vibench.Run, monkeyp
         return evaluate(at)
 
     monkeypatch.setattr(model.reduced, "coefficients", count)
-    assert export._evaluated(model.reduced, size, frozenset(), None, mu).keys() == {"A", "f", "B", "g"}
+    assert polynomials._evaluated(model.reduced, size, frozenset(), None, mu).keys() == {"A", "f", "B", "g"}
     assert len(points) == 1
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import shutil
 import sys
 from collections.abc import Callable, Iterator, Mapping, Set
 from itertools import chain
@@ -28,6 +29,8 @@ from vibench.study.matrix import expand
 from vibench.study.plugin import Plugin
 from vibench.study.spec import Study
 
+COMPILED = ["compiled"] if shutil.which("cc") else []
+
 RANDOM = {"name": "random", "size": 60, "seed": 1}
 GREEDY = {"name": "greedy", "candidates": 30, "tolerance": 0.5, "checked": 10}
 TOLERANCES = {
@@ -42,7 +45,7 @@ TRAINED = small_study(
 )  # fmt: skip
 ADAPTIVE = small_study(
     "adaptive", [{"name": "radial-obstacle", "options": {"resolution": "coarse"}}], training=[GREEDY], validation=2,
-    dual=["orthant", "enlarged-cpg"], primal=["online-supremizers"], assembly=["full", "certified"],
+    dual=["orthant", "enlarged-cpg"], primal=["online-supremizers"], assembly=["full", "certified", *COMPILED],
 )  # fmt: skip
 """Studies that need every sort of stage between them, and most of what plugins can do."""
 
@@ -137,6 +140,7 @@ def concrete(kind: type) -> Iterator[type[Stage]]:
         yield from concrete(one)
 
 
+@pytest.mark.skipif(not COMPILED, reason="NO C COMPILER (cc): programs are not compiled")
 def test_every_sort_of_stage_is_among_them() -> None:
     assert {type(stage) for stage in [*stages_of(TRAINED), *stages_of(ADAPTIVE)]} == set(concrete(Stage))
 

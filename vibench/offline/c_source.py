@@ -72,7 +72,7 @@ def source(
 
 def _filled(template: str, values: Mapping[str, Any]) -> str:
     return Template(
-        (files("vibench.library") / "templates" / f"{template}.template").read_text(encoding="utf-8")
+        (files("vibench.offline") / "templates" / f"{template}.template").read_text(encoding="utf-8")
     ).substitute(values)
 
 

@@ -1,0 +1,179 @@
+"""Cells whose queries a compiled program answers: judged as all others, and unavailable where there is no program."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from samples import small_study
+
+import vibench
+from vibench.errors import UnsupportedError
+from vibench.interfaces.problem import MEMBERS, VariationalInequality
+from vibench.model.chebyshev import AffinePolynomial
+from vibench.offline import compiled
+from vibench.offline.compiled import CompiledModel, compiler
+from vibench.offline.polynomials import InaccurateError
+from vibench.qp.status import Status
+from vibench.qp.verification import verify
+from vibench.stages.compilation import CompiledQuery
+
+pytestmark = pytest.mark.skipif(shutil.which("cc") is None, reason="needs a C compiler")
+
+STUDY = small_study(
+    "compiled",
+    [{"name": "radial-obstacle", "options": {"resolution": 150}}],
+    assembly=["reduced", "compiled"],
+    solvers=["piqp", "osqp"],
+    accuracy=1e-7,
+    validation=4,
+)
+
+
+def script(folder: Path, text: str) -> str:
+    """An executable file of the shell, which takes the place of the compiler."""
+    path = folder / "compiler"
+    path.write_text(f"#!/bin/sh\n{text}\n", encoding="utf-8")
+    path.chmod(0o755)
+    return str(path)
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> vibench.Run:
+    return vibench.run(STUDY, tmp_path_factory.mktemp("compiled") / "run", progress=False, jobs=1)
+
+
+def test_a_compiled_cell_has_the_rows_of_the_reduced_one(run: vibench.Run) -> None:
+    cells = run.cells.set_index(["assembly", "solver"]).sort_index()
+    assert list(cells.index) == [("compiled", "piqp"), ("reduced", "osqp"), ("reduced", "piqp")]
+    mine, other = cells.loc[("compiled", "piqp")], cells.loc[("reduced", "piqp")]
+    assert mine["status"] == other["status"] == "ok"
+    assert mine["online_assemble_s"] == 0.0 < mine["online_solve_s"]
+    assert mine["offline_assembly_s"] > other["offline_assembly_s"]
+    queries = run.table("queries").set_index(["cell", "query"])
+    for cell, form in ((mine, "compiled"), (other, "primal")):
+        assert set(queries.loc[cell["cell"], "form"]) == {form}
+    rows, expected = (queries.loc[cell["cell"]] for cell in (mine, other))
+    assert (rows["repeatable"] == 1).all()
+    assert (rows[["primal_residual", "dual_residual", "gap"]] <= 1e-9).all(axis=None)
+    for name in ("error_u", "error_lambda", "bound_u_energy"):
+        assert np.allclose(rows[name], expected[name], rtol=1e-3, atol=1e-7)  # PIQP solves to 1e-7
+
+
+def test_a_crash_of_the_program_costs_its_query_alone(
+    run: vibench.Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    heights = run.table("queries").groupby("query")["mu_1"].first().sort_values()
+    crash = f"if (mu[0] > {heights.iloc[-2]:.17g}) __builtin_trap();"
+    edit = rf"sed -i '/^int model_solve/,$ s/    Set set;/    Set set; {crash}/' model.c"
+    monkeypatch.setenv("CC", script(tmp_path, f'{edit}\nexec cc "$@"'))
+    study = STUDY.model_copy(update={"assembly": ["compiled"], "solvers": ["piqp"]})
+    queries = vibench.run(study, tmp_path / "run", progress=False, jobs=1).table("queries").set_index("query")
+    assert queries.loc[heights.index[-1], "status"] == "crashed"
+    assert set(queries.drop(heights.index[-1])["status"]) == {"ok"}
+
+
+def test_without_a_compiler_a_line_says_why(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("CC", "no-such-compiler -O2")
+    study = STUDY.model_copy(update={"validation": 1})
+    cells = vibench.run(study, tmp_path / "run", progress=False, jobs=1).cells.set_index("assembly")
+    assert cells.loc["compiled", "status"] == "unavailable"
+    reason = "in compilation: the environment variable CC names the C compiler 'no-such-compiler', which is not found"
+    assert cells.loc["compiled", "reason"] == reason
+    assert pd.unique(cells.loc["reduced", "status"]).tolist() == ["ok"]
+
+
+def polynomial(value: np.ndarray, slope: float = 0.0) -> AffinePolynomial:
+    """A polynomial of two parameters: a value times 1 + slope · t in the second one, t from −1 to 1."""
+    return AffinePolynomial(np.array([[0, 0], [0, 1]]), np.array([[1.0], [slope]]), value.reshape(1, -1), 0.0)
+
+
+LIMITS = np.array([[1.0, 0.0], [0.0, -1.0]])
+
+
+def small_model(**members: np.ndarray) -> CompiledModel:
+    """Min ½|x|² − x₁ subject to x₁ ≤ ¼, x₂ ≥ −1, and limits that grow by a fifth to the end of the box."""
+    values = {"A": np.array([1.0, 0.0, 1.0]), "f": np.array([1.0, 0.0]), "B": LIMITS, "g": np.array([0.25, 1.0])}
+    values |= members
+    polynomials = {name: polynomial(values[name], 0.2 if name == "g" else 0.0) for name in MEMBERS}
+    return CompiledModel(polynomials, np.zeros(2), np.ones(2), ("s", "t"), ("1", "m"), 1e-9)
+
+
+def test_a_program_answers_and_says_what_it_cannot() -> None:
+    program, strided = small_model().program(), np.array([[0.3, 9.0], [0.5, 9.0], [1.0, 9.0], [7.0, 9.0]])[:, 0]
+    for mu, limit in ((strided[:2], 0.25), (strided[1:3], 0.3), (strided[[3, 1]], 0.25)):  # the last one is outside
+        found = program(mu)
+        assert found.solver_status == "solved"
+        assert found.x == pytest.approx([limit, 0.0])
+        assert found.alpha == pytest.approx([1.0 - limit, 0.0])
+        vi = VariationalInequality(np.eye(2), np.array([1.0, 0.0]), LIMITS, limit * np.array([1.0, 4.0]))
+        assert verify(vi, found, 1e-9)[0] is Status.OK
+    middle = np.full(2, 0.5)
+    found = small_model(B=np.array([[1.0, 0.0], [-1.0, 0.0]]), g=-np.ones(2)).program()(middle)
+    assert (found.x, found.alpha, found.solver_status) == (None, None, "the constraints contradict each other")
+    found = small_model(A=np.array([1.0, 2.0, 1.0])).program()(middle)
+    assert (found.x, found.solver_status) == (None, "not solved")
+
+
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [
+        ("echo 'model.c:1:1: error: no space' >&2; exit 3", r"compiler' failed \(3\): model.c:1:1: error: no space$"),
+        ("exit 1", r"failed \(1\): it says nothing$"),
+        ("exit 0", r"failed \(0\): it says nothing$"),  # and makes no file
+    ],
+)
+def test_a_compiler_that_fails_is_quoted(
+    text: str, reason: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("CC", script(tmp_path, text))
+    with pytest.raises(UnsupportedError, match=reason):
+        small_model().program()
+
+
+def test_compilers_are_looked_for_by_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("CC", f"{shutil.which('cc')} -g")
+    assert compiler() == [shutil.which("cc"), "-g"]
+    monkeypatch.delenv("CC")
+    assert compiler() == ["cc"]
+    monkeypatch.setenv("PATH", str(tmp_path))
+    with pytest.raises(UnsupportedError, match="none of cc, gcc, clang is on the PATH; install one, or name it in"):
+        compiler()
+
+
+def test_there_is_no_program_of_a_model_that_is_too_large_or_not_smooth_enough(
+    run: vibench.Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    reduced = run.model(str(run.cells["cell"].iloc[0])).reduced
+    monkeypatch.setattr(compiled, "STACK", 100)
+    with pytest.raises(UnsupportedError, match="MiB of arrays on the stack"):
+        CompiledModel.of(reduced, 1e-9)
+
+    def inaccurate(*_: object, **__: object) -> None:
+        raise InaccurateError("B is not smooth", 0.1)
+
+    monkeypatch.setattr(compiled, "member_polynomials", inaccurate)
+    with pytest.raises(UnsupportedError, match="the model cannot be exported to C: B is not smooth"):
+        CompiledModel.of(reduced, 1e-9)
+
+
+def test_repetitions_are_posed_at_parameters_near_by() -> None:
+    asked: list[tuple[int, ...]] = []
+    vi = VariationalInequality(np.eye(2), np.array([1.0, 0.0]), LIMITS, np.array([0.25, 1.0]))
+
+    def near(*seed: int) -> tuple[np.ndarray, VariationalInequality]:
+        asked.append(seed)
+        return np.array([0.5, 0.5 + 1e-10]), vi
+
+    query = CompiledQuery(vi, None, "piqp", 1e-9, compiled=small_model().program(), mu=np.full(2, 0.5), near=near)
+    other = query.repeated(3, 1)
+    assert asked == [(3, 1)]
+    assert other.mu[1] > query.mu[1]
+    for one, limit in ((query, 0.25), (other, 0.25 * (1.0 + 0.4e-10))):
+        answer, seconds = one.prepare(lambda _: None)()
+        assert answer.x is not None
+        assert one.in_model(answer.x)[0] == pytest.approx(limit, rel=1e-14)
+        assert seconds.cpu > 0.0

@@ -1,0 +1,153 @@
+"""Reduced models as programs of the machine: their exported C source, compiled and loaded into this process.
+
+A query is one call of the program, from the parameter to the verified solution. It runs in the calling process: whoever
+may not die with it asks in a process of its own, as the workers of a run are.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import shlex
+import shutil
+import subprocess
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+
+from vibench.arrays import Array
+from vibench.errors import RequestError, UnsupportedError
+from vibench.interfaces.problem import MEMBERS
+from vibench.model.chebyshev import AffinePolynomial
+from vibench.offline import c_source
+from vibench.offline.models import AnyReducedModel
+from vibench.offline.polynomials import EVALUATIONS, TOLERANCE, member_polynomials
+from vibench.qp.verification import QPSolution
+from vibench.text import one_line
+
+COMPILERS = ("cc", "gcc", "clang")
+"""C compilers that are looked for where the environment variable CC names none."""
+
+FLAGS = ("-std=c99", "-O3", "-shared", "-fPIC")
+"""Options of the compiler; no sum may be reordered."""
+
+STACK = 4 * 2**20
+"""Bytes of arrays that the program may have on the stack, which has eight mebibytes and aborts the process beyond."""
+
+OUTSIDE = 16
+"""Added to the code of the program at parameters outside the box."""
+
+SAYS = {0: "solved", 1: "inaccurate", 2: "the constraints contradict each other", 3: "not solved"}
+"""What the codes of the program mean."""
+
+
+@dataclass(frozen=True)
+class CompiledModel:
+    """What the C source of a model is made of: polynomials of A, f, B and g, the box (d,), the accuracy it verifies."""
+
+    members: Mapping[str, AffinePolynomial]
+    lower: Array
+    upper: Array
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    accuracy: float
+
+    @classmethod
+    def of(cls, reduced: AnyReducedModel, accuracy: float) -> CompiledModel:
+        """That of a reduced model.
+
+        Raises
+        ------
+        UnsupportedError
+            If there is none: the basis depends on the parameter, polynomials of the members are not accurate enough or
+            too large.
+        """
+        try:
+            _, polynomials = member_polynomials(reduced, TOLERANCE, EVALUATIONS, fixed=True)
+        except RequestError as error:
+            raise UnsupportedError(f"the model cannot be exported to C: {error}") from None
+        box, members = reduced.problem.parameters, {name: polynomials[name] for name in MEMBERS}
+        N, R = members["f"].terms.shape[1], members["g"].terms.shape[1]
+        size = 8 * (5 * N * N + 2 * N * R)  # A packed and twice in full, J and U; B and the normals
+        if size > STACK:
+            what = f"the program of {N} unknowns and {R} constraints has {size / 2**20:.1f} MiB of arrays on the stack"
+            raise UnsupportedError(f"{what}, at most {STACK // 2**20} MiB are safe")
+        return cls(members, box.lower, box.upper, box.names, box.units, accuracy)
+
+    @property
+    def source(self) -> str:
+        """The C source; its function is called `model_solve`."""
+        about: Mapping[str, Any] = {
+            "parameters": {"names": self.names, "units": self.units},
+            "cell": dict.fromkeys(("problem", "dual", "primal", "cell"), "of this run"),
+            "source": dict.fromkeys(("distribution", "licence"), "as the problem"),
+            "exported_by": "vibench",
+            "accuracy": self.accuracy,
+        }
+        return c_source.source(self.members, {"lower": self.lower, "upper": self.upper}, about, "model")[0]
+
+    def program(self) -> Program:
+        """Compile and load the program.
+
+        Raises
+        ------
+        UnsupportedError
+            If there is no C compiler, or it fails.
+        """
+        with TemporaryDirectory(prefix="vibench-") as folder:  # what is loaded needs its file no longer
+            loaded = ctypes.CDLL(str(_compiled(self.source, Path(folder))))
+        return Program(loaded, self.members["f"].terms.shape[1], self.members["g"].terms.shape[1])
+
+
+class Program:
+    """A loaded program of `unknowns` and `constraints`."""
+
+    def __init__(self, loaded: Any, unknowns: int, constraints: int) -> None:
+        self._solve, self._sizes = loaded.model_solve, (unknowns, constraints)
+        self._solve.argtypes, self._solve.restype = [ctypes.c_void_p] * 4, ctypes.c_int
+
+    def __call__(self, mu: Array) -> QPSolution:
+        """The solution at mu (d,), which is not verified by anyone but the program."""
+        at = np.ascontiguousarray(mu, dtype=float)
+        x, alpha, residuals = np.empty(self._sizes[0]), np.empty(self._sizes[1]), np.empty(3)
+        code = self._solve(at.ctypes.data, x.ctypes.data, alpha.ctypes.data, residuals.ctypes.data)
+        says = SAYS.get(code % OUTSIDE, f"code {code}")
+        return QPSolution(x, alpha, says) if code % OUTSIDE in {0, 1} else QPSolution(None, None, says)
+
+
+def compiler() -> list[str]:
+    """The command of the C compiler: that of the environment variable CC, or the first of `COMPILERS` that is there.
+
+    Raises
+    ------
+    UnsupportedError
+        If there is none.
+    """
+    named = shlex.split(os.environ.get("CC", ""))
+    for command in [named] if named else [[name] for name in COMPILERS]:
+        if shutil.which(command[0]):
+            return command
+    if named:
+        raise UnsupportedError(f"the environment variable CC names the C compiler '{named[0]}', which is not found")
+    raise UnsupportedError(
+        f"there is no C compiler: none of {', '.join(COMPILERS)} is on the PATH; install one, or name it in the "
+        "environment variable CC"
+    )
+
+
+def _compiled(source: str, folder: Path) -> Path:
+    """The shared library of a source, made in a folder."""
+    command, library = compiler(), folder / "model.so"
+    (folder / "model.c").write_text(source, encoding="utf-8")
+    ended = subprocess.run(
+        [*command, *FLAGS, "model.c", "-o", library.name, "-lm"],
+        cwd=folder, stdin=subprocess.DEVNULL, capture_output=True, text=True, errors="replace", check=False,
+    )  # fmt: skip
+    if ended.returncode or not library.is_file():
+        said = next((line for line in ended.stderr.splitlines() if "error" in line), ended.stderr) or "it says nothing"
+        raise UnsupportedError(f"the C compiler '{' '.join(command)}' failed ({ended.returncode}): {one_line(said)}")
+    return library

@@ -1,0 +1,165 @@
+"""Polynomials on the parameter box in place of A, f, B and g of a reduced model, which need no code of its problem."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from vibench.arrays import Array
+from vibench.errors import NumericalError, RequestError, in_a_line
+from vibench.interfaces.problem import MEMBERS, VariationalInequality
+from vibench.interfaces.strategies import Kind
+from vibench.interfaces.validation import training_parameters
+from vibench.model.affine import affine_decomposition, check_affine
+from vibench.model.chebyshev import AffinePolynomial, interpolate_on_box
+from vibench.model.hyperreduced import HyperReducedModel, hyper_reduce
+from vibench.offline.models import AnyReducedModel
+
+TOLERANCE = 1e-11
+"""Largest relative error of a polynomial where nothing else is asked for; solutions then agree to 1e-9 and better."""
+
+EVALUATIONS = 4096
+"""Points of the largest grid on which the members are interpolated, where nothing else is asked for."""
+
+Beside = Callable[[Mapping[str, Array]], Mapping[str, Array]]
+"""What else is to be interpolated, from the θ of the members at a parameter."""
+
+
+class InaccurateError(RequestError):
+    """Polynomials do not reach the tolerance; their relative `error`."""
+
+    def __init__(self, message: str, error: float) -> None:
+        super().__init__(message)
+        self.error = error
+
+
+def member_polynomials(
+    reduced: AnyReducedModel, tolerance: float, evaluations: int, *, fixed: bool, beside: Beside | None = None
+) -> tuple[AnyReducedModel, dict[str, AffinePolynomial]]:
+    """The model whose members are evaluated, see `declared_model`, and polynomials of the members.
+
+    A is a packed upper triangle (row by row). With `fixed` a basis that depends on the parameter is refused; what is
+    interpolated `beside` the members has polynomials, too.
+
+    Raises
+    ------
+    RequestError
+        If polynomials do not reach the tolerance on a grid of so many evaluations, or the model has none.
+    """
+    box = reduced.problem.parameters
+    try:
+        queried = declared_model(reduced)
+        if fixed and isinstance(queried, HyperReducedModel) and queried.space is not None:
+            raise RequestError("the enrichment changes the basis at every parameter; C sources are for fixed bases")
+        first = members_of(queried, box.lower, coefficients_of(queried, box.lower))
+        if not len(first.f) or not len(first.g):
+            raise RequestError("the model has no unknowns or no constraints")
+        terms = declared_terms(queried)
+        evaluate = partial(_evaluated, queried, len(first.f), frozenset(terms), beside)
+        polynomials = interpolate_on_box(evaluate, box.lower, box.upper, tolerance, evaluations, terms=terms)
+    except NumericalError as error:
+        raise RequestError(f"the model cannot be evaluated in the whole parameter box: {error}") from None
+    except (ArithmeticError, ValueError, LookupError) as error:  # what the code of a problem raises
+        raise RequestError(f"the model cannot be evaluated in the whole parameter box: {in_a_line(error)}") from None
+    _refuse_inaccurate(polynomials, tolerance)
+    return queried, polynomials
+
+
+def declared_model(queried: AnyReducedModel) -> AnyReducedModel:
+    """The model without high-fidelity assembly where its problem declares all members constant or affine sums.
+
+    Their terms are projected, whatever the assembly of the cell was; any other model is returned as it is.
+
+    Raises
+    ------
+    NumericalError
+        If a declared sum differs from the assembled member.
+    """
+    if isinstance(queried, HyperReducedModel):
+        return queried
+    problem = queried.problem
+    training = training_parameters(problem)
+    if queried.enrichment.supply is not None or not set(MEMBERS) <= {*problem.constant, *problem.affine}:
+        check_affine(problem, training)
+        return queried
+    members = affine_decomposition(problem, training, tolerance=TOLERANCE)  # nothing is left to interpolate
+    return HyperReducedModel(queried, hyper_reduce(queried, members))
+
+
+def declared_terms(queried: AnyReducedModel) -> dict[str, Array]:
+    """Flat terms (Q×size) of the members declared affine, of A packed upper triangles, on a fixed space."""
+    if isinstance(queried, HyperReducedModel):
+        return queried.declared_terms()
+    Z, chi, problem = queried.fixed_basis, queried.generators, queried.problem
+    upper = np.triu_indices(Z.shape[1])
+    projected: Mapping[str, Callable[[Any], Array]] = {
+        "A": lambda term: (0.5 * (Z.T @ (term @ Z) + (Z.T @ (term @ Z)).T))[upper],
+        "f": lambda term: Z.T @ term,
+        "B": lambda term: chi.T @ (term @ Z),
+        "g": lambda term: chi.T @ term,
+    }
+    declared = {name: sums for name, sums in problem.affine.items() if name not in problem.constant}
+    return {name: np.stack([np.ravel(projected[name](t)) for t in sums.terms]) for name, sums in declared.items()}
+
+
+def coefficients_of(queried: AnyReducedModel, mu: Array) -> Mapping[str, Array]:
+    """θ (Q,) at a parameter of the members that are sums of terms, as far as the model evaluates them."""
+    if isinstance(queried, HyperReducedModel):
+        return queried.coefficients(mu)
+    problem = queried.problem
+    return {name: sums.coefficients(mu) for name, sums in problem.affine.items() if name not in problem.constant}
+
+
+def members_of(queried: AnyReducedModel, mu: Array, theta: Mapping[str, Array]) -> VariationalInequality:
+    """A, f, B, g at a parameter with these coefficients, on a space that does not depend on it.
+
+    Raises
+    ------
+    RequestError
+        If the model has no such space.
+    """
+    if isinstance(queried, HyperReducedModel):
+        return queried.members(mu, theta)
+    if queried.kind is Kind.PER_PARAMETER:
+        raise RequestError(
+            "the enrichment changes the basis at every parameter, the cell assembles in full, and its problem does not "
+            'declare all members constant or affine; export the same cell with assembly = "reduced"'
+        )
+    return queried.assemble(mu).program
+
+
+def _evaluated(
+    queried: AnyReducedModel, size: int, declared: frozenset[str], beside: Beside | None, mu: Array
+) -> dict[str, Array]:
+    """The members as flat arrays, of declared affine ones θ; and what is interpolated beside them."""
+    theta = coefficients_of(queried, mu)
+    found = _packed(queried, size, mu, theta)
+    return found | {name: theta[name] for name in declared} | dict(beside(theta) if beside is not None else {})
+
+
+def _packed(queried: AnyReducedModel, size: int, mu: Array, theta: Mapping[str, Array]) -> dict[str, Array]:
+    """The members as flat arrays; of A the upper triangle."""
+    found = members_of(queried, mu, theta)
+    if len(found.f) != size:
+        raise RequestError(f"the reduced program has {len(found.f)} unknowns at mu = {mu.tolist()}, {size} elsewhere")
+    arrays = {name: np.asarray(getattr(found, name)) for name in MEMBERS}
+    arrays["A"] = 0.5 * (arrays["A"] + arrays["A"].T)[np.triu_indices(size)]
+    if not all(np.all(np.isfinite(array)) for array in arrays.values()):
+        raise NumericalError(f"it has entries that are not finite at mu = {mu.tolist()}")
+    return {name: array.ravel() for name, array in arrays.items()}
+
+
+def _refuse_inaccurate(members: Mapping[str, AffinePolynomial], tolerance: float) -> None:
+    missed = {name: member for name, member in members.items() if member.error > tolerance}
+    if not missed:
+        return
+    worst = max(missed, key=lambda name: missed[name].error)
+    error, degrees = missed[worst].error, ", ".join(map(str, missed[worst].degrees))
+    raise InaccurateError(
+        f"{worst} depends on mu through the code of the problem, which the file cannot hold, and polynomials of degree "
+        f"({degrees}) reach a relative error of {error:.1e}, not {tolerance:.0e}",
+        error,
+    )
