@@ -83,7 +83,7 @@ class AffineSum:
             If they are not as many finite numbers as there are terms.
         """
         theta = np.asarray(self.thetas(mu), float)
-        if theta.shape != (len(self.terms),) or not np.all(np.isfinite(theta)):
+        if theta.shape != (len(self.terms),) or not np.isfinite(theta).all():
             where = f"at mu = {mu.tolist()}: {theta.tolist()}"
             raise NumericalError(f"{len(self.terms)} terms need as many finite coefficients, found {where}")
         return theta

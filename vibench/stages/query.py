@@ -98,9 +98,9 @@ class Query:
 class Queries:
     """The queries of a reduced model, one per validation parameter, for any QP solver.
 
-    The store holds the artefacts of the stage of the reduced programs, of its inputs, and of what else queries need. `model` is the reduced model,
-    `note` says why requested reduced assembly was replaced by full assembly, or is "", `mus` are the validation
-    parameters (P×d) and `reduced` the reduced programs.
+    The store holds the artefacts of the stage of the reduced programs, of its inputs, and of what else queries need.
+    `model` is the reduced model, `note` says why requested reduced assembly was replaced by full assembly, or is "",
+    `mus` are the validation parameters (P×d) and `reduced` the reduced programs.
     """
 
     def __init__(self, store: Store, assembly: AssemblyStage) -> None:

@@ -59,9 +59,9 @@ class Cell:
     """One cell: a problem, strategies, tolerances, a QP solver, and how queries are assembled and corrected.
 
     `interpolation` is the tolerance of reduced assembly, `None` for full assembly; certified queries are assembled as
-    reduced ones, and compiled programs are made of them. `labels` of problem, dual and primal strategy are no part of the identity, nor are those of the
-    parameter sets; nor are `nested_tolerances`, all tolerances of a nested primal strategy in the study, whose
-    enrichments are stages of one.
+    reduced ones, and compiled programs are made of them. `labels` of problem, dual and primal strategy are no part of
+    the identity, nor are those of the parameter sets; nor are `nested_tolerances`, all tolerances of a nested primal
+    strategy in the study, whose enrichments are stages of one.
     """
 
     problem: Plugin
