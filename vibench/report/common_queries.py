@@ -9,6 +9,7 @@ import pandas as pd
 
 from vibench.qp.status import Status
 from vibench.results.columns import KEYS
+from vibench.study.cells import COMPILED
 
 FEWEST = 0.5
 """Who solved a smaller share of the queries is not compared: it would leave the others too few of them."""
@@ -59,9 +60,15 @@ def common_programs(queries: pd.DataFrame) -> pd.DataFrame:
 
     Solvers that have fewer than half of their programs ok at an accuracy are left out there.
     """
+    queries = of_solvers(queries)
     fine = queries[queries["status"] == Status.OK]
     solved, asked = fine.groupby(WAY).size(), queries.groupby(WAY).size()
     compared = solved.index[solved >= FEWEST * asked.reindex(solved.index)]
     fine = fine[pd.MultiIndex.from_frame(fine[WAY]).isin(compared)]
     ways = fine.groupby(PROGRAM, dropna=False)["solver"].transform("size")
     return fine[ways == len(compared)]
+
+
+def of_solvers(queries: pd.DataFrame) -> pd.DataFrame:
+    """Rows of the queries that a QP solver answered, and no compiled program, which a solver lends its name."""
+    return queries[queries["assembly"] != COMPILED]

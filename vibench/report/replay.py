@@ -26,7 +26,7 @@ from vibench.qp.status import Status
 from vibench.qp.verification import QPSolution, verify
 from vibench.results.formats import to_csv
 from vibench.results.solver_agreement import vectors
-from vibench.study.cells import NOT_MOVED
+from vibench.study.cells import COMPILED, NOT_MOVED
 from vibench.study.kinds import SOLVER
 from vibench.study.registry import registered
 
@@ -66,7 +66,8 @@ def replay(recorded: RecordedCell, query: int, file: Path) -> pd.DataFrame:
         solution = QPSolution(recorded_x, alpha, rows[query]["solver_status"] or "", rows[query]["iterations"])
         status, reason, residuals = verify(program, solution, accuracy)
         line = _line(Trial(status, reason, solution, residuals), None) | {"seconds": rows[query]["solve_s"]}
-        table.append({"solver": f"{recorded.cell.solver} (recorded)"} | line)
+        by = COMPILED if recorded.cell.assembly == COMPILED else recorded.cell.solver
+        table.append({"solver": f"{by} (recorded)"} | line)
     solvers = installed_solvers(registered(SOLVER))
     for solver, trial in solver_trials(program, accuracy, solvers).items():
         table.append({"solver": solver} | _line(trial, recorded_x))

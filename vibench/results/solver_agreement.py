@@ -12,6 +12,7 @@ import numpy as np
 from vibench.arrays import Array
 from vibench.qp.verification import Slack, allowed
 from vibench.results.columns import DISAGREEMENTS, KEYS
+from vibench.study.cells import COMPILED
 
 if TYPE_CHECKING:  # worker processes, which start often, have no use for pandas
     import pandas as pd
@@ -52,7 +53,7 @@ def disagreement_rows(
     """
     programs: dict[tuple[str, float], list[Mapping[str, Any]]] = {}
     for cell in cells:
-        if cell["model"]:
+        if cell["model"] and cell["assembly"] != COMPILED:  # whose answers are no solver's
             programs.setdefault((cell["model"], cell["accuracy"]), []).append(cell)
     for same in programs.values():
         if len({cell["solver"] for cell in same}) < 2:

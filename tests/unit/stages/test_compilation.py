@@ -19,6 +19,7 @@ from vibench.offline.compiled import CompiledModel, compiler
 from vibench.offline.polynomials import InaccurateError
 from vibench.qp.status import Status
 from vibench.qp.verification import verify
+from vibench.report.common_queries import of_solvers
 from vibench.stages.compilation import CompiledQuery
 
 pytestmark = pytest.mark.skipif(shutil.which("cc") is None, reason="needs a C compiler")
@@ -177,3 +178,12 @@ def test_repetitions_are_posed_at_parameters_near_by() -> None:
         assert answer.x is not None
         assert one.in_model(answer.x)[0] == pytest.approx(limit, rel=1e-14)
         assert seconds.cpu > 0.0
+
+
+def test_no_solver_is_compared_by_answers_of_a_program(run: vibench.Run) -> None:
+    queries = run.table("queries")
+    kept = set(of_solvers(queries)["cell"])
+    assert kept == set(run.cells[run.cells["assembly"] == "reduced"]["cell"]) < set(queries["cell"])
+    compared = run.table("disagreements")
+    assert len(compared) > 0
+    assert (compared["solver_a"] != compared["solver_b"]).all()

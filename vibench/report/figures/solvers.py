@@ -7,7 +7,7 @@ import pandas as pd
 from matplotlib.axes import Axes
 
 from vibench.qp.status import Status
-from vibench.report.common_queries import PROGRAM, WAY, common_programs
+from vibench.report.common_queries import PROGRAM, WAY, common_programs, of_solvers
 from vibench.report.figures.data import Data, parts
 from vibench.report.figures.looks import Looks, Series
 from vibench.report.figures.style import SERIES, Pages, Sheet, plot, scatter
@@ -25,7 +25,7 @@ def solvers(data: Data) -> Pages:
     solver of that program. Failures count as infinite times, so that a curve ends at the share its solver solved. One
     solver has no profile.
     """
-    queries = data.queries
+    queries = of_solvers(data.queries)
     if not queries["solve_s"].notna().any():
         return
     names = [str(name) for name in queries["solver"].unique()]
