@@ -241,6 +241,10 @@ class Trainer(ABC):
         An estimate of the error of λ in W is taken where it is larger than the bounds of u and λ.
         """
 
+    def estimate(self, mu: Array) -> float | None:  # noqa: ARG002
+        """About what `bound` is, for less, to rank candidates by; `None` where nothing is cheaper than the bound."""
+        return None
+
 
 class AdaptiveSampling(Sampling):
     """Chooses training parameters one after the other, by what the solutions so far know; `parameters` are candidates.

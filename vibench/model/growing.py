@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 
@@ -13,6 +15,7 @@ from vibench.interfaces.strategies import Trainer
 from vibench.interfaces.validation import ReferenceAssembly, checked_assembly
 from vibench.linalg.cholesky import SparseCholesky
 from vibench.linalg.inner_product import orthonormal_range
+from vibench.model.contact_estimates import ContactEstimates
 from vibench.model.error_bounds import find_correction, terms
 from vibench.model.errors import Energy
 from vibench.model.galerkin import project
@@ -23,6 +26,8 @@ from vibench.qp.verification import QPSolution
 from vibench.reduction.cone_parts import part_in_cone
 from vibench.reduction.supremizers import supremizers
 from vibench.timing import NO_TIME, Seconds, timed
+
+T = TypeVar("T")
 
 IN_CONE = 1e-6
 """A multiplier is in the cone where less than this share of it is outside: it may be what a solver left."""
@@ -51,10 +56,11 @@ class GrowingModel:
         self._basis = np.zeros((problem.V.dim, 0))
         self.generators = np.zeros((problem.W.dim, 0))
         self._factor: SparseCholesky | None = None
+        self._estimates: ContactEstimates | None = None
 
     def add(self, vi: VariationalInequality, solution: HighFidelitySolution) -> str:
         """Add the solution of `vi`; returns what was less accurate than usual, "" if nothing."""
-        V, W = self._problem.V, self._problem.W
+        V, W, size = self._problem.V, self._problem.W, self._basis.shape[1]
         part, note = part_in_cone(solution.lam, self.generators, W)
         new, rest = [solution.u[:, None]], solution.lam - part
         norm = float(W.norm(rest))
@@ -65,6 +71,10 @@ class GrowingModel:
             more = orthonormal_range(V.whiten(column), self._whitened)
             self._whitened = np.hstack([self._whitened, more])
             self._basis = np.hstack([self._basis, V.unwhiten(more)])
+        if self._estimates is None and ContactEstimates.supports(self._problem):
+            self._estimates = ContactEstimates(self._problem, vi)
+        if self._estimates is not None:
+            self._estimates.grow(vi, self._basis[:, size:], self.generators)
         return note
 
     def solution(self, vi: VariationalInequality) -> tuple[Array, Array] | None:
@@ -76,6 +86,10 @@ class GrowingModel:
         if answer.x is None or answer.alpha is None:
             return None
         return self._basis @ answer.x, self.generators @ np.maximum(answer.alpha, 0.0)
+
+    def estimate(self, mu: Array) -> float | None:
+        """What `bound` is about, at the cost of the contact; `None` where the problem does not allow it."""
+        return None if self._estimates is None else self._estimates.at(mu)
 
     def bound(self, mu: Array) -> float:
         """The largest of two bounds and an estimate at mu (d,), relative to the reduced solution; infinite without one.
@@ -107,9 +121,10 @@ class GrowingModel:
 
 @dataclass(frozen=True)
 class Solved:
-    """One solution of an adaptive training, the bound that led to it, and the number of bounds evaluated before it.
+    """One solution of an adaptive training, the bound that led to it, and how many were evaluated before it.
 
-    `fallback` says what was used besides the active set method, and what was less accurate in the growth of the model.
+    Estimates are among these. `fallback` says what was used besides the active set method, and what was less accurate
+    in the growth of the model.
     """
 
     mu: Array
@@ -162,6 +177,13 @@ class GrowingTrainer(Trainer):
 
     def bound(self, mu: Array) -> float:
         """The bound of the model of all solutions."""
-        bound, seconds = timed(lambda: self._model.bound(np.array(mu, float)))
-        self.selecting, self._evaluated = self.selecting + seconds, self._evaluated + 1
-        return bound
+        return self._evaluate(self._model.bound, mu)
+
+    def estimate(self, mu: Array) -> float | None:
+        """What the bound is about, or `None`."""
+        return self._evaluate(self._model.estimate, mu)
+
+    def _evaluate(self, judge: Callable[[Array], T], mu: Array) -> T:
+        found, seconds = timed(lambda: judge(np.array(mu, float)))
+        self.selecting, self._evaluated = self.selecting + seconds, self._evaluated + int(found is not None)
+        return found

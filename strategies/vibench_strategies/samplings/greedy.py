@@ -16,6 +16,7 @@ WEAK = 0.8
 class Greedy(AdaptiveSampling):
     """Weak greedy training (Haasdonk, Salomon and Wohlmuth 2012) over random subsets (Hesthaven, Stamm, Zhang 2014).
 
+    Candidates are ranked by estimates; what is solved, and what ends it, has been bounded.
     The first candidates are grids: multipliers of nested contacts on one axis of the box leave thin differences, of
     which cones are made. `drawn` new candidates are evaluated for every solution; it ends when all known bounds, and
     those of `checked` random candidates in a row, meet the tolerance: with 95 % confidence fewer than 3 in `checked` do
@@ -41,17 +42,29 @@ class Greedy(AdaptiveSampling):
     def train(self, box: ParameterBox, trainer: Trainer) -> None:
         """Solve in the middle of the box, then where the bound is worst."""
         mus, (coarse, fixed), unseen = nested_candidates(box, self.candidates, self.seed)
+
+        bounds = dict[int, float]()
+
+        def judge(k: int) -> bool:
+            """Take the estimate if it is above the tolerance; whether it is a bound, which alone can meet that."""
+            estimate = trainer.estimate(mus[k])
+            is_bound = estimate is None or estimate <= self.tolerance
+            bounds[k] = trainer.bound(mus[k]) if estimate is None or is_bound else estimate
+            return is_bound
+
         trainer.solve(mus[0])
-        bounds, solved, passed, draws = dict[int, float](), 1, 0, coarse + self.drawn
+        solved, passed, draws = 1, 0, coarse + self.drawn
         while solved < self.most and (bounds or unseen):
             for k in [unseen.pop() for _ in range(min(draws, len(unseen)))]:
-                bounds[k] = trainer.bound(mus[k])
+                judge(k)
                 passed = 0 if bounds[k] > self.tolerance else passed + int(k >= fixed)
             k, draws = max(bounds, key=bounds.__getitem__), 0
-            bounds[k] = trainer.bound(mus[k])  # of the present model
+            is_bound = judge(k)  # of the present model
             if bounds[k] > self.tolerance and bounds[k] >= WEAK * max(bounds.values()):
-                trainer.solve(mus[k], bounds.pop(k))
-                solved, passed, draws = solved + 1, 0, self.drawn
+                bounds[k] = bounds[k] if is_bound else trainer.bound(mus[k])
+                if bounds[k] > self.tolerance:
+                    trainer.solve(mus[k], bounds.pop(k))
+                    solved, passed, draws = solved + 1, 0, self.drawn
             elif max(bounds.values()) <= self.tolerance:
                 if passed >= self.checked or not unseen:
                     return

@@ -58,6 +58,21 @@ def test_all_candidates_meet_the_tolerance_where_all_are_checked() -> None:
     assert len(trainer.asked) < 400 + 10 * len(trainer.solved)  # lazy: not all candidates in all steps
 
 
+def test_estimates_rank_and_bounds_decide() -> None:
+    """Estimates a third of the bounds: no candidate that they alone call good enough is left out."""
+
+    class Optimist(Distance):
+        def estimate(self, mu: Array) -> float:
+            return float(np.linalg.norm(np.array(self.solved) - mu, axis=1).min()) / 3.0
+
+    strategy, trainer = create("sampling strategy", "greedy", {"candidates": 200, "tolerance": 0.2}), Optimist()
+    strategy.train(BOX, trainer)
+    candidates = strategy.parameters(BOX)
+    apart = np.linalg.norm(candidates[:, None] - np.array(trainer.solved), axis=2).min(axis=1)
+    assert apart.max() <= 0.2
+    assert set(trainer.reasons[1:]) <= {bound for _, bound in trainer.asked}
+
+
 def test_reasons_are_above_the_tolerance_and_nearly_the_worst_of_the_pool() -> None:
     _, trainer = trained(candidates=300, tolerance=0.25, drawn=300, checked=300)
     reasons = np.array(trainer.reasons[1:])

@@ -67,6 +67,28 @@ def test_the_cone_has_every_multiplier_and_grows_by_what_it_lacks(case: str) -> 
     assert model.generators.shape[1] == size
 
 
+@pytest.mark.parametrize(("name", "resolution", "share"), [("hertz", 300, 1e-4), ("obstacle", 200, 0.2)])
+def test_estimates_are_about_what_bounds_are(name: str, resolution: int, share: float) -> None:
+    """At the cost of the contact; where A is constant they are the same."""
+    problem = create("problem", name, {"resolution": resolution})
+    solver = HighFidelitySolver(problem)
+    model = GrowingModel(problem, solver)
+    for mu in problem.parameters.sample(4, 1):
+        vi = problem.assemble(mu).copy()
+        model.add(vi, solver.solve_assembled(mu, vi))
+    for mu in problem.parameters.sample(10, 2):
+        assert model.estimate(mu) == pytest.approx(model.bound(mu), rel=share)
+
+
+def test_without_contact_unknowns_there_are_no_estimates() -> None:
+    problem = Varying()
+    first, second = problem.parameters.sample(2, 1)
+    trainer = GrowingTrainer(problem, ReferenceAssembly(problem, problem.assemble(first)))
+    trainer.solve(first)
+    assert trainer.estimate(second) is None
+    assert trainer.bound(second) > 0.0
+
+
 def test_what_chooses_follows_large_errors_of_the_multiplier() -> None:
     """In the norm of A⁻¹ they are eight times smaller here."""
     problem = Varying()

@@ -13,7 +13,9 @@ from vibench.arrays import Array, Indices, SparseMatrix
 from vibench.errors import UnsupportedError
 from vibench.interfaces.problem import Contact, Problem
 from vibench.interfaces.validation import checked_assembly
+from vibench.linalg.definite import dense_inverse
 from vibench.linalg.inner_product import InnerProduct
+from vibench.linalg.schur_complement import EliminationPattern, StaticCondensation
 from vibench.model.affine import AffineMember, Evaluation, coefficients, evaluated_members
 from vibench.model.certificates.inf_sup import OnlineInfSup, online_inf_sup
 from vibench.model.certificates.prepared_correction import constant_unknowns
@@ -131,7 +133,6 @@ def certificate_base(problem: Problem, members: Mapping[str, AffineMember], trai
     constant = is_exact(problem, "A", A) and A.way is Evaluation.CONSTANT
     box = problem.parameters
     X = InnerProduct(A.terms[0] if constant else checked_assembly(problem, 0.5 * (box.lower + box.upper)).A, "A")
-    compliance = X.riesz(injected(problem))[dofs]
     load, stiffness = _interpolation_errors(problem, X, A, f)
     terms, rotation, spectral = list(A.terms), None, None
     if not constant:
@@ -139,7 +140,8 @@ def certificate_base(problem: Problem, members: Mapping[str, AffineMember], trai
         samples = np.column_stack([evaluate(mu).get("A", ONE) for mu in training])
         rotation, terms = T, _ = rotated(A.terms, samples)
         spectral = spectral_bounds(problem, X, terms, lambda mu: T @ evaluate(mu).get("A", ONE), stiffness)
-    C = 0.5 * (compliance + compliance.T)
+    condensed = StaticCondensation(X.matrix, EliminationPattern.of(X.matrix, dofs))
+    C = dense_inverse(condensed.dense_schur, "A")  # Eᵀ X⁻¹ E is the inverse of a Schur complement
     constraint, bound, inf_sup = _constant_constraint(problem, members, X, C, training)
     exact = all(is_exact(problem, name, members[name]) for name in "Af")
     return CertificateBase(X, C, tuple(terms), rotation, spectral, load, stiffness, exact, constraint, bound, inf_sup)

@@ -1,0 +1,147 @@
+"""Estimates of the error bounds of a growing model at the cost of the contact, to rank candidates by.
+
+The bounds (ii) of `vibench.model.error_bounds` take two factorisations of mesh size at a parameter. Here A(µ) is
+replaced by γ X in them, X = A(µ₁) at the first solution and γ = ‖u_N‖²_A / ‖u_N‖²_X: the correction is that of
+`vibench.model.certificates.contact_correction` with the compliance C = Eᵀ X⁻¹ E of the contact unknowns E, which is
+computed once. Where A and f are constant nothing of mesh size is left: X is A, the estimates are the bounds, and with
+Φ and z the basis and u_N = Φ z,
+
+    ‖r‖²_{A⁻¹} = ‖f‖² − 2 fᵀu_N + ‖u_N‖²_A − 2 (A⁻¹f)_Eᵀ F + 2 (u_N)_Eᵀ F + Fᵀ C F,    F = Bᵀλ_N on E.
+
+This sum keeps half of the digits: a residual below 1e-7 of u_N is round-off. Otherwise r is formed, and X⁻¹ r solved.
+"""
+
+from __future__ import annotations
+
+from math import inf, sqrt
+
+import numpy as np
+import scipy.sparse as sp
+
+from vibench.arrays import Array, Mask
+from vibench.interfaces.problem import Contact, Problem, VariationalInequality
+from vibench.interfaces.validation import checked_assembly
+from vibench.linalg.cholesky import SparseCholesky
+from vibench.linalg.definite import dense_inverse
+from vibench.linalg.schur_complement import EliminationPattern, StaticCondensation
+from vibench.model.certificates.contact_correction import ContactCompliance, find_contact_correction
+from vibench.model.galerkin import project
+from vibench.qp.exact import exact_solution
+from vibench.qp.scaling import ratio
+
+MOST_CONTACT = 4000
+"""Largest number of contact unknowns whose compliance is a dense matrix here."""
+
+
+class ContactEstimates:
+    """What estimates of one growing model are computed from; see above.
+
+    Parameters
+    ----------
+    problem
+        One that `supports` estimates.
+    vi
+        The variational inequality of the first solution.
+    """
+
+    def __init__(self, problem: Problem, vi: VariationalInequality) -> None:
+        assert problem.contact_dofs is not None  # as `supports` says
+        self._problem, self._dofs, self._A, self._f = problem, problem.contact_dofs, vi.A.copy(), vi.f.copy()
+        self._constant = {"A", "f"} <= set(problem.constant)
+        self._factor = SparseCholesky(vi.A, "A")
+        condensed = StaticCondensation(vi.A, EliminationPattern.of(vi.A, self._dofs))
+        self._compliance = ContactCompliance(dense_inverse(condensed.dense_schur, "A"), np.zeros(0, np.intp))
+        self._near = np.zeros(len(self._dofs), bool)
+        self._of_load = self._factor.solve(self._f)[self._dofs]
+        self._square_of_load = float(self._f @ self._factor.solve(self._f))
+        self._basis, self._at_contact = np.zeros((len(vi.f), 0)), np.zeros((len(self._dofs), 0))
+        self._stiffness, self._loads, self._generators = np.zeros((0, 0)), np.zeros(0), np.zeros((len(vi.g), 0))
+
+    @staticmethod
+    def supports(problem: Problem) -> bool:
+        """Whether the problem assembles its constraint on contact unknowns, which are not too many."""
+        dofs = problem.contact_dofs
+        return problem.has_contact and dofs is not None and len(dofs) <= MOST_CONTACT
+
+    def grow(self, vi: VariationalInequality, new: Array, generators: Array) -> None:
+        """Take the model with new basis vectors (n×k) and all of its generators (m×R), after a solution of `vi`."""
+        self._basis, self._generators = np.hstack([self._basis, new]), generators
+        self._at_contact = np.ascontiguousarray(self._basis[self._dofs])
+        products, size = self._basis.T @ (self._A @ new), len(self._stiffness)
+        grown = np.zeros((self._basis.shape[1],) * 2)
+        grown[:size, :size], grown[:, size:], grown[size:] = self._stiffness, products, products.T
+        self._stiffness, self._loads = 0.5 * (grown + grown.T), np.append(self._loads, new.T @ self._f)
+        touches = abs(sp.csr_array(vi.B)[:, self._dofs]) > 0.0
+        near = self._near | self._next_to(touches)
+        if np.any(near & ~self._near):
+            self._near = near
+            self._compliance = ContactCompliance(self._compliance.matrix, np.flatnonzero(near))
+
+    def _next_to(self, touches: Mask) -> Mask:
+        """Contact unknowns (k,) in rows of the support of a generator, or in rows that touch one of these."""
+        rows = np.any(self._generators > 0.0, axis=1)
+        return np.asarray(touches.T @ (touches @ (touches.T @ rows)), bool)
+
+    def at(self, mu: Array) -> float:
+        """The estimate at mu (d,); infinite where the reduced program has no solution, or no correction was found."""
+        contact = self._problem.contact(mu)
+        assert contact is not None  # as `supports` says
+        chi, rows = self._generators, sp.csr_array(contact.B)
+        vi = None if self._constant else checked_assembly(self._problem, mu)
+        if vi is None:
+            B = chi.T @ np.asarray(rows @ self._at_contact)
+            program = VariationalInequality(self._stiffness, self._loads, B, chi.T @ contact.g)
+        else:
+            program = project(vi, self._basis, chi)
+        answer = exact_solution(program)
+        if answer is None:
+            return inf
+        z, lam = answer.x, chi @ np.maximum(answer.alpha, 0.0)
+        energy, force = float(z @ (program.A @ z)), np.asarray(rows.T @ lam)
+        pushed = self._compliance.matrix @ force
+        if vi is None:
+            gamma, riesz = 1.0, self._of_load - self._at_contact @ z - pushed
+            square = self._square_of_load + energy - 2.0 * float(self._loads @ z + self._of_load @ force)
+            square += float(force @ (2.0 * (self._at_contact @ z) + pushed))
+        else:
+            gamma, riesz, square = self._residual(vi, z, force, energy)
+        return self._relative(contact, z, lam, gamma, max(square, 0.0) / gamma, riesz, (energy, float(force @ pushed)))
+
+    def _residual(self, vi: VariationalInequality, z: Array, force: Array, energy: float) -> tuple[float, Array, float]:
+        """γ, X⁻¹ r (k,) on the contact unknowns, and the square of ‖r‖ in X⁻¹."""
+        u = self._basis @ z
+        residual = vi.f - vi.A @ u
+        residual[self._dofs] -= force
+        riesz = self._factor.solve(residual)
+        gamma = ratio(energy, float(z @ (self._stiffness @ z))) or 1.0
+        return gamma, riesz[self._dofs], float(residual @ riesz)
+
+    def _relative(
+        self,
+        contact: Contact,
+        z: Array,
+        lam: Array,
+        gamma: float,
+        square: float,
+        riesz: Array,
+        sizes: tuple[float, float],
+    ) -> float:
+        """The largest of the bounds of u and λ and the estimate of λ in W, relative to u_N and λ_N, as in `bound`.
+
+        `square` is ρ², `sizes` are the squares of ‖u_N‖_A and, in X⁻¹, of ‖Bᵀλ_N‖.
+        """
+        unit = (len(z) + 4.0) * float(np.finfo(float).eps) * float(np.linalg.norm(z))
+        uncertain = unit * np.linalg.norm(self._at_contact, axis=1)
+        found = find_contact_correction(self._compliance, contact, self._at_contact @ z, uncertain, lam, gamma)
+        if found is None:
+            return inf
+        omega, W = sqrt(gamma) * found.norm, self._problem.W
+        total = square + omega**2 + 2.0 * found.kappa
+        primal, work = sqrt(total), float(riesz[found.unknowns] @ found.load)
+        dual = min(sqrt(max(0.0, total + 2.0 * work)), omega + primal)
+        energy, pressed = (sqrt(max(0.0, value)) for value in sizes)
+        of_u = ratio(primal, energy)
+        if not pressed > 0.0:
+            return of_u
+        in_W = 0.0 if found.nu is None else ratio(float(W.norm(found.nu - lam)), float(W.norm(lam)))
+        return max(of_u, ratio(dual, pressed / sqrt(gamma)), in_W)
