@@ -15,6 +15,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
+import forking
 import pytest
 from fake_stages import InItems, OfAPlugin, Whole
 
@@ -62,6 +63,15 @@ def test_a_stage_that_goes_well_is_stored(run: Run, tmp_path: Path) -> None:
     found = Store(tmp_path).get(stage.key)
     assert found is not None
     assert found.value == "fine"
+
+
+def test_processes_of_tests_are_forked_whatever_seed_dask_leaves_in_the_environment(
+    watcher: Supervisor, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With new interpreters the suite would take the same steps, in much longer."""
+    monkeypatch.setenv("PYTHONHASHSEED", "6640")
+    monkeypatch.setattr(forking, "start_new_worker", None)
+    assert isinstance(watcher.run(Job(str(tmp_path), Whole("fine"), 1.0, 30.0, 8.0)), Done)
 
 
 def test_the_process_is_kept_from_one_stage_to_the_next(run: Run) -> None:
