@@ -238,7 +238,7 @@ def help_on(
         str, typer.Argument(help="A command, a key of study files, or a column of the results or its heading.")
     ] = "",
 ) -> None:
-    """Say what a command does, or what a key of a study file or a column of the results means."""
+    """Say what a command does, or what a key or a column means."""
     if topic in ("", *COMMANDS):
         app(args=[*topic.split(), "--help"], standalone_mode=False)
         return
