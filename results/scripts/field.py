@@ -18,7 +18,7 @@ from matplotlib.figure import Figure
 from page import SECONDS, Page, machines, made_by, read, start
 
 from vibench.report.figures.data import label
-from vibench.report.figures.looks import COLOURS, MARKERS, Looks, Series
+from vibench.report.figures.looks import MARKERS, Looks, Series, look_of
 from vibench.report.figures.style import Sheet, plot, styled
 
 SHARES = (0.3, 0.5, 0.7, 0.9)
@@ -26,7 +26,6 @@ REFERENCE = "mcpg"
 CONTROL = "pod-dual (negative control)"
 """Its generators are not in W⁺: it is drawn and left out of the fronts."""
 
-HUES = (*COLOURS, "0.2", "0.6")
 PAIR = ["problem", "pod_tol", "dual_tol"]
 CELL = [*PAIR, "dual", "primal", "primal_tol"]
 
@@ -168,7 +167,11 @@ def draw_shares(field: Field) -> Figure:
         panel.set(
             title=f"{pair[0]}, δ_POD = {pair[1]:g}, δ = {pair[2]:g}", xlabel="vectors added", ylabel="share of β_on"
         )
-    return sheet.finish()
+    return sheet.finish(
+        "Smallest share of β over the span in that of online supremizers over the training set, over the number of "
+        f"vectors, with the cone of {REFERENCE}; a panel for every problem and pair of tolerances, a line for every "
+        "enrichment."
+    )
 
 
 def scatter(field: Field, cost: Callable[[pd.DataFrame], pd.Series], xlabel: str, title: str) -> Figure:
@@ -179,8 +182,8 @@ def scatter(field: Field, cost: Callable[[pd.DataFrame], pd.Series], xlabel: str
     sheet = Sheet(1, len(names), title)
     for panel, problem in zip(sheet.panels, names, strict=True):
         mine = cells[cells["problem"] == problem]
-        for k, dual in enumerate(duals):
-            panel.plot([], [], color=HUES[k % len(HUES)], linewidth=3, label=dual)
+        for dual in duals:
+            panel.plot([], [], color=look_of(dual.partition(" ")[0]).colour, linewidth=3, label=dual)
         for k, primal in enumerate(primals):
             panel.plot([], [], color="0.3", linestyle="none", marker=MARKERS[k % len(MARKERS)], label=primal)
         for (dual, primal), group in mine.groupby(["dual", "primal"], sort=False):
@@ -188,7 +191,7 @@ def scatter(field: Field, cost: Callable[[pd.DataFrame], pd.Series], xlabel: str
                 cost(group),
                 group["error_lambda_mean"],
                 linestyle="none",
-                color=HUES[duals.index(dual) % len(HUES)],
+                color=look_of(dual.partition(" ")[0]).colour,
                 marker=MARKERS[primals.index(primal) % len(MARKERS)],
                 markersize=4,
             )
@@ -198,7 +201,10 @@ def scatter(field: Field, cost: Callable[[pd.DataFrame], pd.Series], xlabel: str
         )
         panel.set(title=problem, xlabel=xlabel, ylabel="mean relative error of λ")
         panel.set(xscale="log", yscale="log")
-    return sheet.finish()
+    return sheet.finish(
+        f"{title}: one point per cell with reduced assembly; colours are cones, markers are enrichments, and the grey "
+        f"line is the Pareto front, in which {CONTROL} takes no part."
+    )
 
 
 SECTIONS: dict[str, tuple[str, Callable[[Field], pd.DataFrame]]] = {

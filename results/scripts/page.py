@@ -4,16 +4,36 @@ from __future__ import annotations
 
 import inspect
 import json
+import re
 import sys
 from collections.abc import Callable
 from pathlib import Path
 
 import pandas as pd
 from matplotlib.figure import Figure
-from PIL import Image
+from PIL import Image, PngImagePlugin
 
-from vibench.report.figures.style import save
+from vibench.report.figures.style import caption_of, save
 from vibench.results import formats, tables
+
+ONE_MACHINE = "One machine measured all seconds; offline seconds are measured once."
+
+LIMITATIONS = {
+    "paper-obstacle": f"{ONE_MACHINE} The norm of V and the map of the mesh are not published and are ours. Every query of full assembly projects matrices of mesh size in Python.",  # noqa: E501
+    "paper-hertz": f"{ONE_MACHINE} Quadrature and master mesh of the paper are not published; with others N and R are different ones (page hertz-quadrature). A is constant, which full assembly does not use.",  # noqa: E501
+    "benefit": f"{ONE_MACHINE} One cone (mCPG), two pairs of dimensions and one solver for each problem. Gains are those of queries at different errors: compare rows of equal errors.",  # noqa: E501
+    "field": f"{ONE_MACHINE} One mesh of medium size for each problem, one solver, 32 validation parameters. Strategies of others are our implementations, with their default options.",  # noqa: E501
+    "certified": f"{ONE_MACHINE} One cone (mCPG) in `certified`. Effectivities are those at 64 parameters; bounds of the obstacle rest on interpolation errors that were measured at other parameters.",  # noqa: E501
+    "hertz-quadrature": "One problem; eight validation parameters. Variants that are not in the table, such as other pairings, were not tried.",  # noqa: E501
+    "meshes": "Two obstacle meshes and three of Hertz contact, all of one size: what holds on finer ones is not shown.",
+    "solvers": f"{ONE_MACHINE} Solvers have their default options but for the accuracy, and solve small dense programs; larger or sparse ones may order them differently.",  # noqa: E501
+    "scaling": "Each mesh was measured once, on one machine. Exponents between two sizes carry the noise of both.",
+    "speed": f"{ONE_MACHINE} The transcription is ours and not the code of the authors.",
+    "stability-per-vector": "One mesh and one pair of N and R for each problem; the counts are those of the training set.",  # noqa: E501
+    "exact-answers": "A problem with radial symmetry, whose solution is smoother than those of the other problems.",
+    "hertz-theory": "The theory is of small deformations and half-planes, the problem of discs of finite size: deviations of some per cent are those of the models, and not of the discretisation alone.",  # noqa: E501
+}
+"""What a page does not show, by its folder; it is said at its end."""
 
 SECONDS = "Seconds are CPU seconds on one thread."
 
@@ -57,10 +77,10 @@ class Page:
         """A heading and what stands under it."""
         self.add(f"{'#' * level} {heading}", *parts)
 
-    def draw(self, name: str, figure: Figure, alternative: str = "") -> None:
-        """A figure, written beside the page, with the text that stands where it is not shown; by default its name."""
+    def draw(self, name: str, figure: Figure) -> None:
+        """A figure, written beside the page, with its caption below it and a sentence where it is not shown."""
         file = write_figure(figure, self.folder, name)
-        self.add(f"![{alternative or name}]({file.name})")
+        self.add(f"![{alternative(figure, name)}]({file.name})", escaped(caption_of(figure)))
 
     def link(self, name: str, frame: pd.DataFrame) -> str:
         """A link to a table, which is written beside the page as CSV with six digits."""
@@ -74,7 +94,20 @@ class Page:
 
     def write(self) -> None:
         """Write the page."""
+        if limits := LIMITATIONS.get(self.folder.name):
+            self.section("Limitations", limits)
         (self.folder / self._file).write_text(self.text, encoding="utf-8")
+
+
+def alternative(figure: Figure, name: str) -> str:
+    """A sentence that stands where a figure is not shown: the first one of its caption, or what its name says."""
+    first = re.match(r".+?[^.\W\d]\.(?= |$)|.+$", caption_of(figure))
+    return escaped(first[0] if first else f"Figure {name}.").replace("[", "(").replace("]", ")")
+
+
+def escaped(text: str) -> str:
+    """A text in which Markdown finds no markup."""
+    return re.sub(r"([\\`*_|<])", r"\\\1", text)
 
 
 def write_figure(figure: Figure, folder: Path, name: str) -> Path:
@@ -87,8 +120,11 @@ def write_figure(figure: Figure, folder: Path, name: str) -> Path:
 def use_palette(path: Path) -> None:
     """Replace a PNG file by one with a palette of 256 colours, a third of its size."""
     with Image.open(path) as picture:
+        described = PngImagePlugin.PngInfo()
+        for key, text in getattr(picture, "text", {}).items():  # the caption: an image of a palette loses it otherwise
+            described.add_itxt(key, str(text))
         reduced = picture.convert("RGB").quantize(256, dither=Image.Dither.NONE)  # dithering would double the size
-    reduced.save(path, optimize=True)
+    reduced.save(path, optimize=True, pnginfo=described)
 
 
 def made_by(script: str, target: str, *studies: str, options: str = "") -> str:

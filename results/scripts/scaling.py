@@ -29,7 +29,7 @@ from matplotlib.figure import Figure
 from page import SECONDS, Page, made_by, start
 
 from vibench import Reduction, Stop, create, provenance, solve_qp
-from vibench.report.figures.style import STYLE
+from vibench.report.figures.style import STYLE, CaptionedFigure
 from vibench.timing import median_seconds, timed
 
 ACCURACY = 1e-10
@@ -142,7 +142,12 @@ def slopes(points: pd.Series) -> list[float]:
 
 def draw(rows: pd.DataFrame, size: str) -> Figure:
     """Seconds and memory over a size, logarithmic: a column for every problem."""
-    figure = Figure(figsize=(10.0, 7.6), layout="constrained")
+    figure = CaptionedFigure(figsize=(10.0, 7.6), layout="constrained")
+    over = "the number n of unknowns" if size == "n" else "the number R of generators"
+    figure.caption = (
+        f"CPU seconds (top) and peak memory (bottom) of every stage over {over}, in logarithmic axes; a column for "
+        "every problem."
+    )
     axes = figure.subplots(2, 2, sharex="col", squeeze=False)
     for column, (name, group) in enumerate(rows.groupby("problem", sort=False)):
         for k, stage in enumerate((*OFFLINE, *ONLINE)):
@@ -183,7 +188,7 @@ def write_page(rows: pd.DataFrame, target: str) -> None:
         chosen = rows[rows["over"] == over]
         page.section(f"Over {size}")
         with mpl.rc_context(STYLE):
-            page.draw(f"over-{size}", draw(chosen, size), f"over {size}")
+            page.draw(f"over-{size}", draw(chosen, size))
         for name, group in chosen.groupby("problem", sort=False):
             offline = group[group["stage"].isin(OFFLINE)]
             page.section(f"{name}: seconds", table(group, "seconds"), level=3)

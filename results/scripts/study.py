@@ -10,10 +10,10 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pandas as pd
-from page import SECONDS, Page, machines, made_by, read, start, versions, write_figure
+from page import SECONDS, Page, alternative, escaped, machines, made_by, read, start, versions, write_figure
 
 from vibench.report import figures
-from vibench.report.figures.style import styled
+from vibench.report.figures.style import caption_of, styled
 from vibench.results import tables
 from vibench_problems.paper.evidence import SOLVER, Evidence
 from vibench_problems.paper.tables import columns
@@ -58,7 +58,7 @@ def main(run: str, target: str) -> None:
     of_enrichments = tables.read(path, "thresholds").dropna(subset="cell_a")
     if len(of_enrichments):
         page.section("Break-even of fixed enrichments", tables.benefits(of_enrichments))
-    page.section("Figures", "\n".join(f"![{file.stem}]({file.name})" for file in sorted(drawn(path, page.folder))))
+    page.section("Figures", *dict(sorted(drawn(path, page.folder))).values())
     written = {table: frame for table in TABLES if len(frame := read(run, table))}
     page.add(f"Full tables: {', '.join(page.link(table, frame) for table, frame in written.items())}.")
     page.write()
@@ -75,13 +75,17 @@ def outcomes(cells: pd.DataFrame) -> tuple[str, str]:
     return f"{fine}{'; the others:' if lines else '.'}", "\n".join(lines)
 
 
-def drawn(path: Path, folder: Path) -> Iterator[Path]:
-    """Draw the figures of the page."""
-    kinds = FIGURES.get(folder.name, "")
+def drawn(path: Path, folder: Path) -> Iterator[tuple[str, str]]:
+    """Draw the figures of the page; returns the name of each, and the picture with its caption."""
+    kinds = FIGURES.get(folder.name, ())
     with styled():
         for task in figures.drawings(path):
             pages = figures.pages_of(task) if task[0].endswith(kinds) else ()
-            yield from (write_figure(figure, folder, name) for name, figure in pages if name.endswith(kinds))
+            for name, figure in pages:
+                if kinds and not name.endswith(kinds):
+                    continue
+                file = write_figure(figure, folder, name)
+                yield name, f"![{alternative(figure, name)}]({file.name})\n\n{escaped(caption_of(figure))}"
 
 
 def comparison(evidence: Evidence) -> pd.DataFrame:

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import io
+from itertools import combinations
 from xml.etree import ElementTree
 
 import matplotlib as mpl
+import numpy as np
 import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
@@ -13,7 +15,7 @@ from matplotlib.backends.backend_agg import RendererAgg
 from matplotlib.figure import Figure
 
 from vibench.report.figures.data import file_names
-from vibench.report.figures.looks import Looks, Series, look_of
+from vibench.report.figures.looks import COLOURS, Looks, Series, look_of
 from vibench.report.figures.style import WRITTEN, Sheet, caption_of, plot, styled, write_figure
 from vibench.study.kinds import DUAL, PRIMAL
 from vibench.study.registry import registered
@@ -118,8 +120,47 @@ def test_no_two_series_of_a_figure_look_the_same(names: list[str], tolerances: l
 def test_what_is_shipped_has_colours_and_markers_of_its_own(names: list[str]) -> None:
     looks = [look_of(name) for name in names]
     assert len(set(looks)) == len(looks)
-    if len(names) <= 6:
+    if len(names) <= len(COLOURS):
         assert len({look.colour for look in looks}) == len(looks)
+
+
+LINEAR_TO_XYZ = np.array(
+    [(0.4124564, 0.3575761, 0.1804375), (0.2126729, 0.7151522, 0.0721750), (0.0193339, 0.1191920, 0.9503041)]
+)
+WHITE = np.array([0.95047, 1.0, 1.08883])
+DEFICIENCIES = {
+    name: np.reshape(entries, (3, 3))
+    for name, entries in {
+        "none": (1, 0, 0, 0, 1, 0, 0, 0, 1),
+        "protan": (0.152286, 1.052583, -0.204868, 0.114503, 0.786281, 0.099216, -0.003882, -0.048116, 1.051998),
+        "deutan": (0.367322, 0.860646, -0.227968, 0.280085, 0.672501, 0.047413, -0.011820, 0.042940, 0.968881),
+        "tritan": (1.255528, -0.076749, -0.178779, -0.078411, 0.930809, 0.147602, 0.004733, 0.691367, 0.303900),
+    }.items()
+}
+"""Complete deficiencies of colour vision on linear RGB (Machado, Oliveira and Fernandes 2009)."""
+
+
+def cielab(colour: str, seen: np.ndarray) -> np.ndarray:
+    """L*, a*, b* of a colour "#RRGGBB" under D65, as it is seen."""
+    stored = np.array([int(colour[k : k + 2], 16) / 255 for k in (1, 3, 5)])
+    linear = np.where(stored <= 0.04045, stored / 12.92, ((stored + 0.055) / 1.055) ** 2.4)
+    xyz = LINEAR_TO_XYZ @ np.clip(seen @ linear, 0.0, 1.0) / WHITE
+    f = np.where(xyz > 216 / 24389, np.cbrt(xyz), (24389 / 27 * xyz + 16) / 116)
+    return np.array([116 * f[1] - 16, 500 * (f[0] - f[1]), 200 * (f[1] - f[2])])
+
+
+def test_colours_differ_in_grey() -> None:
+    lightness = [cielab(colour, DEFICIENCIES["none"])[0] for colour in COLOURS]
+    assert np.diff(lightness).min() > 7.5
+    assert cielab("#FFFFFF", np.eye(3))[0] == pytest.approx(100.0, abs=0.01)
+    assert lightness[-1] < 80.0  # visible on white paper
+
+
+@pytest.mark.parametrize("seen", DEFICIENCIES)
+def test_colours_differ_for_the_colour_blind(seen: str) -> None:
+    """By ten times what is just noticeable (2.3)."""
+    places = [cielab(colour, DEFICIENCIES[seen]) for colour in COLOURS]
+    assert min(np.linalg.norm(one - other) for one, other in combinations(places, 2)) > 23.0
 
 
 @pytest.mark.parametrize("form", WRITTEN)
