@@ -13,7 +13,7 @@ import pandas as pd
 from matplotlib.figure import Figure
 from PIL import Image, PngImagePlugin
 
-from vibench.report.figures.style import caption_of, save
+from vibench.report.figures.style import caption_of, first_sentence, save
 from vibench.results import formats, tables
 
 ONE_MACHINE = "One machine measured all seconds; offline seconds are measured once."
@@ -101,8 +101,7 @@ class Page:
 
 def alternative(figure: Figure, name: str) -> str:
     """A sentence that stands where a figure is not shown: the first one of its caption, or what its name says."""
-    first = re.match(r".+?[^.\W\d]\.(?= |$)|.+$", caption_of(figure))
-    return escaped(first[0] if first else f"Figure {name}.").replace("[", "(").replace("]", ")")
+    return escaped(first_sentence(caption_of(figure)) or f"Figure {name}.").replace("[", "(").replace("]", ")")
 
 
 def escaped(text: str) -> str:

@@ -118,7 +118,9 @@ def _description(pack: ModelPack) -> Iterator[str]:
         yield f"  outputs: {', '.join(f'{output.name} [{output.unit}]' for output in pack.outputs)}"
     if pack.reference is not None:
         worst = pack.residual
-        checked = "not checked, for want of u or operators" if worst is None else f"KKT residuals up to {worst:.0e}"
+        checked = (
+            "not checked, since u or the operators are missing" if worst is None else f"KKT residuals up to {worst:.0e}"
+        )
         yield f"  reference solutions: {pack.reference.lam.shape[1]}, {checked}"
 
 

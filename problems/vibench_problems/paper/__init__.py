@@ -1,1 +1,1 @@
-"""Twins of the figures of Niakh et al. (2022): what is published of each, what a run has, and how the two compare."""
+"""The figures of Niakh et al. (2022), drawn again: what is published, what a run has, and how they compare."""

@@ -1,4 +1,4 @@
-"""Figures 8, 13 and 15: inf-sup constants over the validation set; their claims and their twins."""
+"""Figures 8, 13 and 15: inf-sup constants over the validation set; their claims and the figures drawn again."""
 
 from __future__ import annotations
 

@@ -12,7 +12,7 @@ from vibench_problems.paper.published import PROBLEMS, PUBLICATION
 if TYPE_CHECKING:  # tables ask every plugin for columns: this module loads no matplotlib
     from vibench.report import CaptionedFigure
 
-Twin = Callable[[], "CaptionedFigure | None"]
+Redrawn = Callable[[], "CaptionedFigure | None"]
 
 NOT_IN_THE_PAPER = {"bulge": True, "approach": "parameter"}
 """Options that add a parameter which the problems of the paper do not have."""
@@ -26,7 +26,7 @@ class PaperFigures(FigurePlugin):
 
     publication: ClassVar[str] = PUBLICATION
 
-    def drawings(self, tables: ProblemTables) -> Mapping[str, Twin]:
+    def drawings(self, tables: ProblemTables) -> Mapping[str, Redrawn]:
         """The figures of one of the two problems, none of any other."""
         paper = PROBLEMS.get(tables.problem_name)
         if paper is None or any(tables.problem_options.get(name) == value for name, value in NOT_IN_THE_PAPER.items()):
@@ -35,10 +35,10 @@ class PaperFigures(FigurePlugin):
         from vibench_problems.paper.evidence import Evidence  # noqa: PLC0415
 
         drawn = (offline.projection_errors, offline.orthogonality, offline.greedy, constants.comparison)
-        twins: dict[int, Callable[[Evidence], CaptionedFigure | None]] = dict(zip(paper.figures, drawn, strict=True))
+        figures: dict[int, Callable[[Evidence], CaptionedFigure | None]] = dict(zip(paper.figures, drawn, strict=True))
         if tables.problem_name == "obstacle":
-            twins |= {3: membrane.aspect_ratios, 4: membrane.solution}
+            figures |= {3: membrane.aspect_ratios, 4: membrane.solution}
         else:
-            twins |= {9: discs.configuration, 10: discs.solution, 13: constants.without_enrichment}
+            figures |= {9: discs.configuration, 10: discs.solution, 13: constants.without_enrichment}
         evidence = Evidence(tables)
-        return {f"figure-{number}": partial(twins[number], evidence) for number in sorted(twins)}
+        return {f"figure-{number}": partial(figures[number], evidence) for number in sorted(figures)}

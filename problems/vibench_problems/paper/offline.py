@@ -1,4 +1,4 @@
-"""Figures 5 to 7, 11, 12 and 14: projection errors, angles between generators, PGA; their claims and their twins."""
+"""Figures 5 to 7, 11, 12 and 14: projection errors, angles between generators, PGA; claims, and the figures again."""
 
 from __future__ import annotations
 

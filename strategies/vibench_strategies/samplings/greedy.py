@@ -1,4 +1,4 @@
-"""Weak greedy training: solve where the error bound of the model of all solutions so far is worst."""
+"""Weak greedy training: solve where the error bound of the model of all solutions so far is largest."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class Greedy(AdaptiveSampling):
         return nested_candidates(box, self.candidates, self.seed)[0]
 
     def train(self, box: ParameterBox, trainer: Trainer) -> None:
-        """Solve in the middle of the box, then where the bound is worst."""
+        """Solve in the middle of the box, then where the bound is largest."""
         mus, (coarse, fixed), unseen = nested_candidates(box, self.candidates, self.seed)
 
         bounds = dict[int, float]()

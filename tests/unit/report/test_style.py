@@ -209,7 +209,7 @@ def test_labels_of_points_cover_neither_each_other_nor_leave_the_panel(points: l
         assert frame.y0 - 1 <= box.y0 <= box.y1 <= frame.y1 + 1
         assert not any(box.overlaps(other) for other in boxes[:k])
     missing = len(points) - len(boxes)
-    assert caption_of(figure) == (f"{missing} points have no label for want of room." if missing else "")
+    assert caption_of(figure) == (f"{missing} points have no label, since others are too close." if missing else "")
 
 
 def test_a_point_without_a_text_is_kept_clear() -> None:

@@ -146,7 +146,10 @@ def enrichment(data: Data) -> Pages:
                 panel = sheet.at(row, column)
                 for name, one in by_strategy(steps[steps["quantity"] == quantity]):
                     look = looks[series(one["primal"].iloc[0], one["primal_tol"].iloc[0])]
-                    plot(panel, one["step"], positive(one["value"], SINE_FLOOR), look, name)
+                    # σ that is round-off is drawn at the floor, so that its curve ends at the last vector
+                    sines = quantity == "sigma"
+                    values = np.maximum(one["value"], SINE_FLOOR) if sines else positive(one["value"], SINE_FLOOR)
+                    plot(panel, one["step"], values, look, name)
                 panel.set(xlabel="vectors added", ylabel=ylabel, title=title, xlim=(0, None), yscale="log")
                 counted(panel)
             _validation(sheet.at(row, 2), data, fixed[fixed["pair"] == pair], names, looks)
@@ -163,7 +166,8 @@ def _enrichment_caption(data: Data, fixed: pd.DataFrame) -> str:
     )
     return (
         f"Fixed enrichments of {data.problem} with the cones of {data.duals[0]}, a row for every pair (N, R). Left, "
-        "the largest σ over the training set against the number of vectors added, for strategies that report it; "
+        f"the largest σ over the training set against the number of vectors added, for strategies that report it, at "
+        f"{SINE_FLOOR:g} where it is smaller, which is round-off; "
         "middle, the smallest β over the span on the training set; both for the tolerance that went farthest. Right, "
         f"β over the span at the validation parameters, for every tolerance{f' ({tolerances})' * bool(tolerances)}."
     )

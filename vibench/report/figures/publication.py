@@ -17,7 +17,7 @@ from vibench.files import write_atomically
 from vibench.interfaces.figures import Drawing
 from vibench.report.figures.data import Data, file_names, problems
 from vibench.report.figures.plugins import FigureError, draw_guarded, named
-from vibench.report.figures.style import FORMATS, caption_of, save, styled
+from vibench.report.figures.style import FORMATS, caption_of, first_sentence, save, styled
 from vibench.results.plugin_columns import loaded
 from vibench.results.sqlite.reading import read_meta, study_of
 from vibench.study.kinds import FIGURE
@@ -31,7 +31,7 @@ MARKDOWN = re.compile(r"([\\`*_\[\]|#])")
 
 
 @dataclass(frozen=True)
-class Twin:
+class Redrawn:
     """A figure of a publication that can be drawn from a run."""
 
     publication: str
@@ -62,32 +62,32 @@ def draw_published(
 
     Raises a `RequestError` if no plugin draws figures of these runs' problems, or a figure plugin cannot be loaded.
     """
-    twins = sorted(_twins(paths, note), key=lambda twin: (twin.publication, _natural(twin.name)))
-    if not twins:
+    redrawn = sorted(_redrawn(paths, note), key=lambda one: (one.publication, _natural(one.name)))
+    if not redrawn:
         named_runs = ", ".join(unbroken(path.parent.name) for path in paths)
         raise RequestError(f"no installed plugin draws figures of a publication from {named_runs}")
     files: list[Path] = []
-    drawn: list[tuple[Twin, Figure]] = []
+    drawn: list[tuple[Redrawn, Figure]] = []
     folder.mkdir(parents=True, exist_ok=True)
-    for k, twin in enumerate(twins):
-        progress(twin.name, k, len(twins))
+    for k, one in enumerate(redrawn):
+        progress(one.name, k, len(redrawn))
         with styled():
             try:
-                figure = twin.draw()
+                figure = one.draw()
             except FigureError as error:
                 note(str(error))
                 continue
             if figure is None:
-                note(f"{twin.name}: {twin.run} has no data for it")
+                note(f"{one.name}: {one.run} has no data for it")
                 continue
-            files += save(figure, folder, twin.name, formats)
-        drawn.append((twin, figure))
+            files += save(figure, folder, one.name, formats)
+        drawn.append((one, figure))
     shown = next((form for form in formats if form != "pdf"), formats[0])  # no page shows a PDF
     write_atomically(folder / PAGE, _page(drawn, paths, shown).encode("utf-8"))
     return files
 
 
-def _twins(paths: Sequence[Path], note: Callable[[str], None]) -> Iterator[Twin]:
+def _redrawn(paths: Sequence[Path], note: Callable[[str], None]) -> Iterator[Redrawn]:
     """What can be drawn; of figures that several runs have, each after the first is named after its run."""
     seen = Counter[str]()
     plugins = {name: loaded(name) for name in registered(FIGURE)}  # one that cannot be loaded may be asked for
@@ -104,29 +104,29 @@ def _twins(paths: Sequence[Path], note: Callable[[str], None]) -> Iterator[Twin]
                     seen[kind] += 1
                     name = kind + f"-{run}" * (seen[kind] > 1) + f"-{seen[kind]}" * (seen[kind] > 2)
                     drawn = partial(draw_guarded, plugin_name, name, draw)
-                    yield Twin(plugin.publication, name, drawn, path.parent.name, data)
+                    yield Redrawn(plugin.publication, name, drawn, path.parent.name, data)
 
 
-def _page(drawn: Sequence[tuple[Twin, Figure]], paths: Sequence[Path], form: str) -> str:
+def _page(drawn: Sequence[tuple[Redrawn, Figure]], paths: Sequence[Path], form: str) -> str:
     """The page in Markdown."""
     runs = [path.parent.name for path in paths]
     studies = list(dict.fromkeys(str(study_of(path, read_meta(path)).get("name", "")) for path in paths))
-    machines = list(dict.fromkeys(twin.data.machine for twin, _ in drawn))
+    machines = list(dict.fromkeys(one.data.machine for one, _ in drawn))
     parts = ["# Figures of a publication, drawn again"]
-    parts += [f"{_text(publication)}." for publication in dict.fromkeys(twin.publication for twin, _ in drawn)]
+    parts += [f"{_text(publication)}." for publication in dict.fromkeys(one.publication for one, _ in drawn)]
     parts.append(
         f"Drawn by `vibench figures {_code(' '.join(runs))} --paper` from runs of the studies "
         f"{', '.join(f'`{_code(study)}`' for study in studies)}, measured on {_text('; '.join(machines))}. Below each "
         "figure: its caption, what the publication says of it in text, captions and tables, and what agrees and what "
         "differs, computed from the run. No curve was read off a published figure."
     )
-    for twin, figure in drawn:
+    for one, figure in drawn:
         published, compared = (getattr(figure, name, "") for name in ("published", "compared"))
-        title = twin.name.replace("-", " ").capitalize()
+        title = one.name.replace("-", " ").capitalize()
         parts += [
             f"## {_text(title)}",
-            f"![{_text(title)}]({twin.name}.{form})",
-            f"{_text(caption_of(figure))} {_text(twin.origin)}",
+            f"![{_text(first_sentence(caption_of(figure)))}]({one.name}.{form})",
+            f"{_text(caption_of(figure))} {_text(one.origin)}",
             *([f"**Published.** {_text(published)}"] if published else []),
             *([f"**Here.** {_text(compared)}"] if compared else []),
         ]

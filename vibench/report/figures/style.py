@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 import textwrap
 import warnings
 from collections.abc import Iterable, Iterator
@@ -120,6 +121,12 @@ def caption_of(figure: Figure) -> str:
     return " ".join(str(getattr(figure, "caption", "")).split())
 
 
+def first_sentence(text: str) -> str:
+    """The first sentence of a text; a point after a digit or a single letter ends none."""
+    found = re.match(r".+?[^\W\d_]{2}[)’”]?\.(?= |$)", text)
+    return found[0] if found else text
+
+
 def set_caption(figure: Figure, text: str) -> None:
     """Give a figure a caption, unless it has one."""
     if not caption_of(figure):
@@ -196,7 +203,7 @@ class Sheet:
             panel.set_position((left / wide, bottom / high, layout.width / wide, layout.height / high))
             _ticks(panel)
         missing = sum(label_points(self.panels[k], points) for k, points in self._labels.items())
-        unlabelled = f"{missing} points have no label for want of room." if missing else ""
+        unlabelled = f"{missing} points have no label, since others are too close." if missing else ""
         self.figure.caption = " ".join(f"{caption} {part} {unlabelled}".split())
         self.figure.part = part
         return self.figure
