@@ -7,13 +7,16 @@ import inspect
 import re
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 
 import pandas as pd
 import pytest
+from PIL import Image
 
 from vibench.execution.recorded_cell import recorded_study
 from vibench.report import html
+from vibench.report.figures.style import Sheet
 from vibench.results import tables
 from vibench.results.sqlite.reading import FILE
 from vibench.study.matrix import expand
@@ -21,6 +24,7 @@ from vibench.study.matrix import expand
 ROOT = Path(__file__).parents[2]
 RESULTS = ROOT / "results"
 SCRIPTS = RESULTS / "scripts"
+LOCK = ROOT / "requirements.lock"
 FILES = sorted(path for path in RESULTS.rglob("*") if path.is_file() and "__pycache__" not in path.parts)
 PAGES = [path for path in FILES if path.suffix == ".md"]
 LARGEST = 8_000_000
@@ -129,3 +133,23 @@ def test_the_readme_says_what_a_query_is_compared_with() -> None:
     }
     sizes = {row[1] for row in rows if row[1].isdigit()}
     assert len(sizes) == 2  # the pair that enrichment serves best is not shown alone
+
+
+def test_a_smaller_picture_keeps_its_caption_and_is_described_in_a_sentence(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.syspath_prepend(str(SCRIPTS))
+    page = importlib.import_module("page")
+    figure = Sheet(1, 1).finish("Errors at δ = 0.5 of [all] models. More of it.")
+    file = page.write_figure(figure, tmp_path, "errors")
+    with Image.open(file) as picture:
+        assert picture.text["Description"] == "Errors at δ = 0.5 of [all] models. More of it."
+    assert page.alternative(figure, "errors") == "Errors at δ = 0.5 of (all) models."
+
+
+def test_the_lock_file_has_every_distribution_that_is_needed() -> None:
+    locked = set(re.findall(r"^([\w.-]+)==\S+ \\\n +--hash=sha256:[0-9a-f]{64}$", LOCK.read_text(), re.MULTILINE))
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    extras = [line for name in ("solvers", "nmf", "hdf5", "mesh") for line in project["optional-dependencies"][name]]
+    needed = {re.split(r"[^\w.-]", line)[0].lower() for line in [*project["dependencies"], *extras, "hatchling"]}
+    assert needed - locked == set()
