@@ -19,6 +19,9 @@ from vibench.model.affine import AffineMember, Evaluation, coefficients, evaluat
 from vibench.model.galerkin import Evaluated, ReducedModel, ReducedProblem
 from vibench.reduction.supremizers import LoadCoordinates, PlainCoordinates, SpannedCoordinates, supremizers
 
+SPANNED = 1e-14
+"""Generators are combinations of η where they differ from them by less than this share: round-off."""
+
 Samples = Mapping[str, Array]
 """Coefficients θ of the terms at one parameter, by member."""
 
@@ -162,9 +165,23 @@ def _supremizer_space(model: ReducedModel, B: AffineMember, eta: Array) -> Plain
     V, basis = model.problem.V, model.fixed_basis
     if B.way is Evaluation.CONTACT:
         assert model.problem.contact_dofs is not None  # implied by `Evaluation.CONTACT`
-        loads = model.problem.contact_loads(np.hstack([eta, model.generators]))
+        loads = model.problem.contact_loads(_tested(model, eta)[0])
         return LoadCoordinates(V, basis, model.problem.contact_dofs, loads)
     return SpannedCoordinates(V, basis, np.hstack([supremizers(V, term, eta) for term in B.terms]))
+
+
+def _tested(model: ReducedModel, eta: Array) -> tuple[Array, Array | None]:
+    """Multipliers whose contact loads give those of (η, χ): η and C, where χ = η C up to round-off, or all of them."""
+    combination = _combination(model, eta)
+    W, chi = model.problem.W, model.generators
+    missed = W.norm(chi - eta @ combination) > SPANNED * W.norm(chi)
+    return (np.hstack([eta, chi]), None) if missed.any() else (eta, combination)
+
+
+def _combination(model: ReducedModel, eta: Array) -> Array:
+    """C (k×R) for which η C is nearest to the generators χ in W."""
+    W = model.problem.W
+    return np.asarray(np.linalg.lstsq(W.whiten(eta), W.whiten(model.generators), rcond=None)[0])
 
 
 class HyperReducedModel:
@@ -245,13 +262,20 @@ class HyperReducedModel:
 
     @cached_property
     def _loads(self) -> ContactLoads | None:
-        """The contact loads of the generators; for a space that varies in Φ of (η, χ)."""
+        """The contact loads of the generators; for a space that varies in Φ of η, and of χ unless these give it."""
         if self._operators.B is not None and self._operators.g is not None:
             return None
-        eta = self.model.enrichment.eta
-        return self.problem.contact_loads(
-            self.generators if eta is None or self.space is None else np.hstack([eta, self.generators])
-        )
+        return self.problem.contact_loads(self._tested[0])
+
+    @cached_property
+    def _tested(self) -> tuple[Array, Array | None]:
+        """The multipliers whose contact loads are evaluated, and what makes χ of them; `None` if they end with χ."""
+        eta, space = self.model.enrichment.eta, self.space
+        if eta is None or not isinstance(space, LoadCoordinates):
+            return self.generators, None
+        if space.multipliers == eta.shape[1]:  # as `hyper_reduce` decided
+            return eta, _combination(self.model, eta)
+        return np.hstack([eta, self.generators]), None
 
     def _members(self, samples: Samples, varying: tuple[Array, Array] | None) -> VariationalInequality:
         """The members on Φ; of a space that varies in it B has the coordinates alone that supremizers use."""
@@ -261,7 +285,8 @@ class HyperReducedModel:
             g = operators.g.at(samples.get("g"))
         else:
             assert varying is not None  # from `_varying`
-            g = varying[1][len(varying[1]) - count :]
+            combination, bounds = self._tested[1], varying[1]
+            g = bounds[len(bounds) - count :] if combination is None else bounds @ combination
         return VariationalInequality(A, f, self._constraint(samples, varying), g)
 
     @property
@@ -283,7 +308,8 @@ class HyperReducedModel:
         assert varying is not None  # from `_varying`
         loads = varying[0]
         if isinstance(self.space, LoadCoordinates):
-            return self.space.supremizers(loads).T
+            coordinates, combination = self.space.supremizers(loads).T, self._tested[1]
+            return coordinates if combination is None else np.vstack([coordinates, combination.T @ coordinates])
         constant, reached = self._contact_rows
         return np.asarray(constant + loads.T @ reached[: len(loads)])
 

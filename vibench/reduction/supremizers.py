@@ -173,6 +173,11 @@ class LoadCoordinates:
         self._fixed[:, acting] = represented[:, :count]
         self._before = basis.shape[1] + count
 
+    @property
+    def multipliers(self) -> int:
+        """Number k of the multipliers that the loads are of."""
+        return int(self._fixed.shape[1])
+
     def supremizers(self, varying: Array) -> Array:
         """Coordinates (d'×k) of the supremizers with `varying` (j×k) added to the fixed loads; those after d' are zero.
 
