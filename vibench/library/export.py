@@ -148,8 +148,11 @@ def exported(
     why = exported_certificate.reason_for_none(model.certificate)
     certificate = None if why else model.certificate
     beside = None if certificate is None else partial(exported_certificate.thetas, certificate)
+    rotated = {} if certificate is None else exported_certificate.rotated(certificate)
     try:
-        queried, polynomials = member_polynomials(model.reduced, tolerance, evaluations, fixed=c, beside=beside)
+        queried, polynomials = member_polynomials(
+            model.reduced, tolerance, evaluations, fixed=c, beside=beside, rotated=rotated
+        )
     except InaccurateError as error:
         raise RequestError(
             f"{error}; `--interpolate {1.05 * error.error:.1e}` exports this approximation, more `--evaluations` than "

@@ -34,6 +34,12 @@ def thetas(certificate: OnlineCertificate, samples: Mapping[str, Array]) -> dict
     return {f"theta_{name}": value for name, value in found.items()}
 
 
+def rotated(certificate: OnlineCertificate) -> dict[str, Array]:
+    """What takes the θ of A as a query evaluates them to those in the terms of the certificate; none of a constant A."""
+    rotation = certificate.base.rotation
+    return {} if rotation is None else {"theta_A": rotation}
+
+
 def arrays(
     certificate: OnlineCertificate, polynomials: Mapping[str, AffinePolynomial], unknowns: Indices | None
 ) -> dict[str, Array]:

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 FORMAT = "vibench reduced model 1"
 Residuals = tuple[float, float, float]
-DEGREE, ROUND_OFF = 2**20, 1e-13
+DEGREE, ROUND_OFF, SMALL = 2**20, 1e-13, 1e-3
 
 
 class Solution(NamedTuple):
@@ -58,21 +58,32 @@ class Model:
         if self.solver not in SOLVERS:
             raise ValueError(f"the solver is '{self.solver}', expected one of {', '.join(SOLVERS)}")
         self._outputs = [output["name"] for output in self.about["outputs"]["linear"]]
-        self._last: tuple[bytes, dict[int | str, Array]] = b"", {}
+        self._last: tuple[bytes, dict[int, Array]] = b"", {}
         names = [key.removesuffix("_indices") for key in self.data if key.endswith("_indices")]
-        known: dict[bytes, int] = {}
-        self._members = {name: self._prepared(name, known) for name in names}
+        constant = [name for name in names if not self.data[f"{name}_indices"].any()]
+        self._constant: dict[str, Array] = {
+            name: (self.data[f"{name}_coefficients"] @ self.data[f"{name}_terms"])[0] for name in constant
+        }
+        numbers: dict[bytes, int] = {}
+        self._members = {name: self._prepared(name, numbers) for name in names}
+        self._matrices: _Matrices | None = None  # of a program whose A and B do not depend on the parameter
         rows, columns = np.triu_indices(len(self.data["f_terms"][0]))
         self._packed = np.zeros((columns[-1] + 1, columns[-1] + 1), np.intp)  # where packed A has its entries
         self._packed[rows, columns] = self._packed[columns, rows] = np.arange(len(rows))
 
-    def _prepared(self, name: str, known: dict[bytes, int]) -> tuple[int, NDArray[np.intp], list[Array]]:
-        """A number of the products of a member, their degrees, and what takes their values to its entries."""
+    def _prepared(self, name: str, numbers: dict[bytes, int]) -> tuple[list[int], NDArray[np.intp], list[Array]]:
+        """Numbers of the products of a member, of what each matrix makes of them, their degrees, and the matrices.
+
+        What several members have in common has one number.
+        """
         coefficients, terms = self.data[f"{name}_coefficients"], self.data[f"{name}_terms"]
         degrees = np.ascontiguousarray(self.data[f"{name}_indices"].T, dtype=np.intp)
-        key = known.setdefault(degrees.tobytes(), len(known))
-        together = terms.size + coefficients.size >= len(coefficients) * terms.shape[1]
-        return key, degrees, [coefficients @ terms] if together else [coefficients, terms]
+        known = degrees.tobytes() + b"|" + coefficients.tobytes() in numbers  # θ of a member before
+        together = not known and terms.size + coefficients.size >= len(coefficients) * terms.shape[1]
+        matrices = [coefficients @ terms] if together else [coefficients, terms]
+        parts = [degrees.tobytes(), *(matrix.tobytes() for matrix in matrices)]
+        keys = (b"|".join(parts[: k + 1]) for k in range(len(parts)))
+        return [numbers.setdefault(key, len(numbers)) for key in keys], degrees, matrices
 
     def _check(self, file: str) -> None:
         """Refuse indices that are none, which NumPy would count from the end, and arrays that do not fit them."""
@@ -106,40 +117,41 @@ class Model:
 
     def member(self, name: str, mu: Array) -> Array:
         """The sum of terms of this name at a parameter."""
-        (key, degrees, matrices), (at, known) = self._members[name], self._last
+        if name in self._constant:
+            return self._constant[name]
+        (numbers, degrees, matrices), (at, known) = self._members[name], self._last
         if at != mu.tobytes():
             self._last = _, known = mu.tobytes(), {}
-        if name in known:
-            return known[name]
-        if key not in known:
+        if numbers[0] not in known:
             unit = (2.0 * mu - self.lower - self.upper) / (self.upper - self.lower)
             unit = unit if (abs(unit) <= 1.0).all() else unit + 0j  # outside the box
             values = np.cos(np.arccos(unit)[:, None] * np.arange(degrees.max() + 1)).real
-            known[key] = values[0].take(degrees[0])
+            known[numbers[0]] = values[0].take(degrees[0])
             for of_one, which in zip(values[1:], degrees[1:], strict=True):
-                known[key] *= of_one.take(which)
-        found = known[key]
-        for matrix in matrices:
-            found = found @ matrix
-        found.setflags(write=False)
-        known[name] = found
-        return found
+                known[numbers[0]] *= of_one.take(which)
+        for before, number, matrix in zip(numbers, numbers[1:], matrices, strict=False):
+            if number not in known:
+                known[number] = known[before] @ matrix
+                known[number].setflags(write=False)
+        return known[numbers[-1]]
 
     def solve(self, mu: Sequence[float] | Array) -> Solution:
         """The solution at a parameter, verified; look at its status."""
         A, f, B, g, Y = self.program(mu)
-        rows = np.sqrt((B * B).sum(axis=1))
-        rows[rows == 0.0] = 1.0
-        N, b = B / rows[:, None], g / rows
-        x, forces, found, status = np.full(len(f), np.nan), np.full(len(g), np.nan), (np.nan,) * 3, "failed"
+        x, alpha, found, status = np.full(len(f), np.nan), np.full(len(g), np.nan), (np.nan,) * 3, "failed"
         with suppress(np.linalg.LinAlgError):
-            (x, forces), found = self._solved(A, f, N, b)
-            status = "ok"
+            if not np.isfinite(A.sum() + f.sum() + B.sum() + g.sum()):
+                raise np.linalg.LinAlgError("an array is not finite")
+            of = self._matrices or _matrices(A, B)
+            if {"A", "B"} <= self._constant.keys() and "plain" not in self.data:
+                self._matrices = of
+            (x, forces), found = self._solved(of, f, g / of.norms)
+            alpha, status = forces / of.norms, "ok"
             if not all(residual <= self.about["accuracy"] for residual in found):  # NaN is not
                 status = "inaccurate"
             elif self._is_outside(np.asarray(mu, dtype=float)):
                 status = "outside"
-        energy, x, alpha = float(x @ A @ x), Y @ x, forces / rows
+        energy, x = float(x @ A @ x), Y @ x
         u, lam = (self.data[n] @ v if n in self.data else None for n, v in (("basis", x), ("generators", alpha)))
         outputs = self.named(self.data["outputs_x"] @ x + self.data["outputs_alpha"] @ alpha) if self._outputs else {}
         return Solution(status, x, alpha, u, lam, found, energy, outputs)
@@ -148,24 +160,41 @@ class Model:
         """Values of the outputs by name."""
         return dict(zip(self._outputs, values.tolist(), strict=True))
 
-    def _solved(self, A: Array, f: Array, B: Array, g: Array) -> tuple[tuple[Array, Array], Residuals]:
+    def _solved(self, of: _Matrices, f: Array, g: Array) -> tuple[tuple[Array, Array], Residuals]:
         """The solver's x and α for rows of B of norm 1, or those of its active set, whichever are better; residuals."""
-        if not np.isfinite(A.sum() + f.sum() + B.sum() + g.sum()):
-            raise np.linalg.LinAlgError("an array is not finite")
-        inverse = np.linalg.inv(np.linalg.cholesky(A))
+        A, B = of.A, of.B
         length, force = _units(A, f, g)  # in which the solver's tolerances are relative ones
         settings = self.about["settings"][self.solver]
         y, z = SOLVERS[self.solver](A * (length / force), f / force, B, g / length, settings)
         if not np.isfinite(y.sum() + z.sum()):
             y, z = (np.nan_to_num(vector, nan=0.0, posinf=0.0, neginf=0.0) for vector in (y, z))
-        best = _polished(A, f, B, g, z > g / length - B @ y, inverse)
-        found = residuals(A, f, B, g, *best, inverse)
+        # small forces are often those of rows that touch without any: those that are missing come back
+        best = _polished(of, f, g, (z > g / length - B @ y) & (z > SMALL * z.max(initial=0.0)))
+        found = residuals(A, f, B, g, *best, of.inverse)
         if not all(residual <= ROUND_OFF for residual in found):  # NaN is not
             given = length * y, force * np.maximum(z, 0.0)
-            of_given = residuals(A, f, B, g, *given, inverse)
+            of_given = residuals(A, f, B, g, *given, of.inverse)
             if _worst(of_given) <= _worst(found):
                 return given, of_given
         return best, found
+
+
+class _Matrices(NamedTuple):
+    """A, B with rows of norm 1, these norms, |B|, the inverse L⁻¹ of the factor of A, and L⁻¹Bᵀ."""
+
+    A: Array
+    B: Array
+    norms: Array
+    sizes: Array
+    inverse: Array
+    whitened: Array
+
+
+def _matrices(A: Array, B: Array) -> _Matrices:
+    norms = np.sqrt((B * B).sum(axis=1))
+    norms[norms == 0.0] = 1.0
+    B, inverse = B / norms[:, None], np.linalg.inv(np.linalg.cholesky(A))
+    return _Matrices(A, B, norms, abs(B), inverse, inverse @ B.T)
 
 
 def residuals(A: Array, f: Array, B: Array, g: Array, x: Array, alpha: Array, inverse: Any = None) -> Residuals:
@@ -203,39 +232,42 @@ def _units(A: Array, f: Array, g: Array) -> tuple[float, float]:
     return (max(moved, depth), load) if moved > 1e-10 * depth else (depth or 1.0, 1e-3 * k * (depth or 1.0))
 
 
-def _polished(A: Array, f: Array, B: Array, g: Array, active: NDArray[np.bool_], inverse: Array) -> tuple[Array, Array]:
+def _polished(of: _Matrices, f: Array, g: Array, active: NDArray[np.bool_]) -> tuple[Array, Array]:
     """The solution up to round-off: equations on an active set, which changes until all signs are right."""
-    whitened, load = inverse @ B.T, inverse @ f
-    k, sizes = np.sqrt(A.trace() / len(A)), abs(B)
+    (A, B, _, sizes, inverse, whitened), load = of, of.inverse @ f
+    k = np.sqrt(A.trace() / len(A))
     for step in range(20 + 4 * len(g)):
         chosen = active.nonzero()[0]
         rows, W, x, alpha = B[chosen], whitened[:, chosen], np.zeros(len(f)), np.zeros(len(g))
-        gram, rest, missed = W.T @ W, load, g[chosen]
-        if _independent(gram):
+        rest, missed, root = load, g[chosen], _root(W.T @ W)
+        if root is not None:
             for _ in range(2):  # the second time with the residuals, up to round-off
-                forces = np.linalg.solve(gram, W.T @ rest - missed)
+                forces = (root @ (W.T @ rest - missed)) @ root
                 alpha[chosen] += forces
                 x += (rest - W @ forces) @ inverse
                 rest, missed = inverse @ (f - A @ x - alpha[chosen] @ rows), g[chosen] - rows @ x
         else:
-            system = np.block([[A / k, k * rows.T], [k * rows, np.zeros_like(gram)]])
-            found = np.linalg.lstsq(system, np.append(f / k, k * g[chosen]), rcond=None)[0]
-            x, alpha[chosen] = found[: len(f)], k**2 * found[len(f) :]
-        violated = B @ x - g > 1e-12 * (sizes @ abs(x) + abs(g))
+            system = np.block([[A / k, k * rows.T], [k * rows, np.zeros((len(chosen), len(chosen)))]])
+            solved = np.linalg.lstsq(system, np.append(f / k, k * g[chosen]), rcond=None)[0]
+            x, alpha[chosen] = solved[: len(f)], k**2 * solved[len(f) :]
+        excess = B @ x - g
+        violated = excess > 1e-12 * (sizes @ abs(x) + abs(g))
         pulling = alpha < -1e-12 * abs(alpha).max(initial=0.0)
         if not (violated | pulling).any():
             break
-        one = np.arange(len(g)) == (np.argmin(alpha) if pulling.any() else np.argmax(B @ x - g))
+        one = np.arange(len(g)) == (np.argmin(alpha) if pulling.any() else np.argmax(excess))
         active = violated | (active & ~pulling) if step < 20 else active ^ one  # all at once may cycle
     return x, np.maximum(alpha, 0.0)
 
 
-def _independent(gram: Array) -> bool:
-    """Whether every vector, of which these are the products, is at an angle of 1e-5 at least to those before it."""
+def _root(gram: Array) -> Array | None:
+    """R with RᵀR = G⁻¹ for the products G of vectors, each at an angle of 1e-5 at least to those before it, or none."""
     sizes = np.sqrt(gram.diagonal())
     with suppress(np.linalg.LinAlgError):
-        return bool(sizes.all() and (np.linalg.cholesky(gram / np.outer(sizes, sizes)).diagonal() > 1e-5).all())
-    return False
+        if sizes.all():
+            factor = np.linalg.cholesky(gram / (sizes[:, None] * sizes))
+            return np.linalg.inv(factor) / sizes if (factor.diagonal() > 1e-5).all() else None
+    return None
 
 
 def _enriched(plain: Array, vectors: Array) -> Array:

@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
 UNIT, TINY = float(np.finfo(float).eps), float(np.finfo(float).tiny)
 STEPS, ATTEMPTS, MARGIN = 30, 4, 4.0
 
@@ -32,6 +33,15 @@ class Bound(NamedTuple):
     relative: float
     guarantee: str
     note: str = ""
+
+
+class Lifting(NamedTuple):
+    """Of a w: θ (ν − λ)/γ on the loaded rows, ‖w‖, bounds of B w − s, and in which loaded rows that may be positive."""
+
+    load: Array
+    norm: float
+    slack: Array
+    released: Mask
 
 
 class Certified(NamedTuple):
@@ -56,6 +66,8 @@ class Model:
         self._data: dict[str, Array] = {name.removeprefix(start): data[name] for name in data if name.startswith(start)}
         self._data["outputs_x"] = data.get("outputs_x", np.zeros((0, 0)))
         self._data["bound_sizes"] = abs(self._data["bounds"])
+        compliance = self._data["responses"][self._data["rows"]]
+        self._data["compliance"] = 0.5 * (compliance + compliance.T)
 
     def solve(self, mu: Sequence[float] | Array, tolerance: float | None = None, corrected: bool = False) -> Certified:
         """The solution at a parameter and its bounds; the tolerance is of the relative error of u in the norm of A.
@@ -68,24 +80,25 @@ class Model:
             raise ValueError(f"the tolerance is {tolerance}, expected a positive finite number")
         solution = self.plain.solve(mu)
         at = np.asarray(mu, dtype=float)
-        bound, rho = self._bound(at, solution.x, solution.alpha, solution.energy)
-        if corrected and bound.guarantee != "none":
-            solution, bound = self._pair(at, solution, bound, rho)
+        bound, rho, lifting = self._bound(at, solution.x, solution.alpha, solution.energy)
+        if corrected and lifting is not None:
+            solution, bound = self._pair(at, solution, bound, rho, lifting)
         solution = solution._replace(output_bounds=self.plain.named(self._of_outputs(at, bound)))
         kept = tolerance is not None and solution.status == "ok" and bound.relative <= tolerance
         verdict = "no tolerance" if tolerance is None else bound.guarantee if kept else "not certified"
         return Certified(solution, bound, verdict)
 
-    def _pair(self, mu: Array, solution: Any, bound: Bound, rho: float) -> tuple[Any, Bound]:
-        """The corrected pair of a solution with bounds, and ρ/√α, and its own bounds."""
+    def _pair(self, mu: Array, solution: Any, bound: Bound, rho: float, found: Lifting | None) -> tuple[Any, Bound]:
+        """The corrected pair of a solution with bounds, ρ/√α and the w `found` for them, and its own bounds."""
         A, B, g = (self.plain.member(f"theta_{name}", mu) for name in "ABg")
         (lower, upper), lam, theta = self._spectrum(mu, A), self._data["generators"] @ solution.alpha, float(B[0])
         c, rows = 0.5 * (lower + upper), self._data["rows"]
-        lifting = self._lifting(theta, g, solution.x, lam, c)
-        if lifting is None:
+        if found is not None and c != upper:
+            found = self._lifting(theta, g, solution.x, lam, c, found.released)
+        if found is None:
             none = "no corrected pair was found at this parameter: the solution is that of the reduced model"
             return solution, bound._replace(note=none)
-        a, norm, slack = lifting
+        a, norm, slack, _ = found
         nu = lam.copy()
         nu[rows] = np.maximum(lam[rows] + (c / theta) * a, 0.0)
         missed = float(self._data["constraint_error"]) / abs(theta) * c  # of θ in c X w = Bᵀ(ν − λ_N)
@@ -93,12 +106,12 @@ class Model:
         both = sqrt(rho**2 + 2.0 * max(0.0, float(nu @ slack)))
         least = bound.u_energy / bound.relative if bound.relative > 0.0 else 0.0  # of ‖u‖
         u = None if solution.u is None or "lift" not in self._data else solution.u - self._data["lift"] @ a
-        found = Bound(both, both, both / least if least > 0.0 else inf, bound.guarantee)
+        own = Bound(both, both, both / least if least > 0.0 else inf, bound.guarantee)
         outputs = solution.outputs
         if outputs:
             of_x, of_lam, of_a = (self._data[f"outputs_{name}"] for name in ("x", "lam", "shift"))
             outputs = self.plain.named(of_x @ solution.x + of_lam @ nu - of_a @ a)
-        return solution._replace(u=u, lam=nu, outputs=outputs), found
+        return solution._replace(u=u, lam=nu, outputs=outputs), own
 
     def _of_outputs(self, mu: Array, bound: Bound) -> Array:
         """Bounds of the errors of outputs, from those of u and λ."""
@@ -111,26 +124,26 @@ class Model:
         of_lam = np.array([weight * force if weight > 0.0 else 0.0 for weight in weights[:, 1]])
         return np.asarray(weights[:, 0] * bound.u_energy / sqrt(lower) + of_lam)
 
-    def _bound(self, mu: Array, y: Array, alpha: Array, energy: float) -> tuple[Bound, float]:
+    def _bound(self, mu: Array, y: Array, alpha: Array, energy: float) -> tuple[Bound, float, Lifting | None]:
         """Bounds of a solution: u_N has the coordinates y in the basis, λ_N is generators · α, `energy` is ‖u_N‖²_A.
 
-        And ρ/√α.
+        And ρ/√α, and the w in them; none without bounds.
         """
         data, lam = self._data, self._data["generators"] @ alpha
         if not np.isfinite(y.sum() + lam.sum()):
-            return Bound(inf, inf, inf, "none", "there is no solution"), inf
+            return _none("there is no solution")
         if lam.min(initial=0.0) < 0.0:
-            return Bound(inf, inf, inf, "none", "λ_N has negative coefficients"), inf
+            return _none("λ_N has negative coefficients")
         if ((mu < self._box[0]) | (mu > self._box[1])).any():
-            return Bound(inf, inf, inf, "none", "mu is outside the parameter box"), inf
+            return _none("mu is outside the parameter box")
         A, f, B, g = (self.plain.member(f"theta_{name}", mu) for name in "AfBg")
         lower, upper = self._spectrum(mu, A)
         error = float(data["stiffness_error"])
         lifting = self._lifting(float(B[0]), g, y, lam, upper) if lower > error else None
         if lifting is None:
             which = "α > 0" if lower <= error else "w with B w ≥ s"
-            return Bound(inf, inf, inf, "none", f"no {which} was found at this parameter"), inf
-        a, norm, slack = lifting
+            return _none(f"no {which} was found at this parameter")
+        a, norm, slack, _ = lifting
         along, kappa = a @ data["directions"], max(0.0, float(lam @ slack))
         z = np.concatenate([f, (-A[:, None] * y).ravel(), (-B[:, None] * alpha).ravel()])
         kept = z[data["kept"]]
@@ -147,7 +160,8 @@ class Model:
         work = float(along @ coordinates) + (beside + lacking) * norm
         least = sqrt(max(0.0, energy - of_energy - error * of_u**2)) - found
         natural = min(sqrt(max(0.0, square + 2.0 * work)), omega + found)
-        return Bound(found, natural, found / least if least > 0.0 else inf, self.guarantee), rho / sqrt(lower)
+        relative = found / least if least > 0.0 else inf
+        return Bound(found, natural, relative, self.guarantee), rho / sqrt(lower), lifting
 
     def _spectrum(self, mu: Array, theta: Array) -> tuple[float, float]:
         """α and γ from the values at the anchors around mu, a grid of the parameter box."""
@@ -168,9 +182,9 @@ class Model:
         return self._known[1]
 
     def _lifting(
-        self, theta: float, of_g: Array, y: Array, lam: Array, gamma: float
-    ) -> tuple[Array, float, Array] | None:
-        """For a w with B w ≥ s in spite of all errors: θ (ν − λ)/γ on `rows`, ‖w‖, and bounds of B w − s."""
+        self, theta: float, of_g: Array, y: Array, lam: Array, gamma: float, released: Mask | None = None
+    ) -> Lifting | None:
+        """A w with B w ≥ s in spite of all errors; `released` says where B w > s at a γ nearby."""
         data, unit = self._data, 1.01 * float(self._data["terms"]) * UNIT
         if theta == 0.0:
             return None
@@ -179,36 +193,54 @@ class Model:
         share, of_y = float(data["constraint_error"]) / abs(theta), sqrt(y @ y) * size[:, 0]
         error = share * of_y + data["bound_errors"]
         uncertain = error + unit * (of_y + data["bound_sizes"] @ abs(of_g))
-        margin = MARGIN * uncertain
+        margin, here = MARGIN * uncertain, lam[rows]
         for _ in range(ATTEMPTS):
-            nu = np.maximum(self._complementary(gamma / theta**2, (excess + margin)[rows], lam[rows]), 0.0)
-            a = (theta / gamma) * (nu - lam[rows])
+            scale, wanted = gamma / theta**2, (excess + margin)[rows]
+            released = here * data["diagonal"] <= -scale * wanted if released is None else released
+            nu, released = self._complementary(scale, wanted, here, released)
+            a = (theta / gamma) * (np.maximum(nu, 0.0) - here)
             values = data["responses"] @ a
             slack = theta * values - excess
             of_w = float(data["reach"] @ abs(a)) * size[:, 1]
             lacking = uncertain + (unit + share) * of_w - slack
             if lacking.max() <= 0.0:
                 norm = sqrt(max(0.0, float(a @ values[rows])))
-                return a, norm, slack + error + share * of_w
+                return Lifting(a, norm, slack + error + share * of_w, released)
             margin = margin + 2.0 * np.maximum(lacking, 0.0)
         return None
 
-    def _complementary(self, scale: float, excess: Array, lam: Array) -> Array:
-        """ν = λ + scale · M (s + v) with ν, v ≥ 0 and νᵀv = 0, by the primal-dual active set method."""
-        inverse = self._data["inverse"]
-        fixed = lam + scale * (inverse @ excess)
-        released = lam * self._data["diagonal"] <= -scale * excess
+    def _complementary(self, scale: float, excess: Array, lam: Array, released: Mask) -> tuple[Array, Mask]:
+        """ν = λ + scale · M (s + v) with ν, v ≥ 0 and νᵀv = 0, by the primal-dual active set method; where v ≥ 0.
+
+        A system is one with M for v where that is released, or one with M⁻¹ for ν elsewhere, whichever is smaller.
+        """
+        inverse, compliance = self._data["inverse"], self._data["compliance"]
+        fixed: Array | None = None
+        load: Array | None = None
         for _ in range(STEPS):
-            K = released.nonzero()[0]
-            v = np.linalg.solve(inverse[np.ix_(K, K)], -fixed[K])
-            nu: Array = fixed + v @ inverse[K]
-            nu[K] = 0.0
-            wanted = nu < 0.0
-            wanted[K] = v >= 0.0
+            K, held = released.nonzero()[0], (~released).nonzero()[0]
+            if len(K) <= len(held):
+                rows, fixed = inverse[K], lam + scale * (inverse @ excess) if fixed is None else fixed
+                v = np.linalg.solve(rows[:, K], -fixed[K])
+                nu: Array = fixed + v @ rows
+                nu[K] = 0.0
+                wanted = nu < 0.0
+                wanted[K] = v >= 0.0
+            else:
+                rows, load = compliance[held], compliance @ lam + scale * excess if load is None else load
+                nu = np.zeros(len(lam))
+                nu[held] = np.linalg.solve(rows[:, held], load[held])
+                wanted = nu[held] @ rows >= load
+                wanted[held] = nu[held] < 0.0
             if np.array_equal(wanted, released):
-                return nu
+                return nu, released
             released = wanted
-        return np.asarray(fixed + inverse @ _descent(inverse, fixed))  # it cycles
+        fixed = lam + scale * (inverse @ excess)
+        return fixed + inverse @ _descent(inverse, fixed), released  # it cycles
+
+
+def _none(why: str) -> tuple[Bound, float, Lifting | None]:
+    return Bound(inf, inf, inf, "none", why), inf, None
 
 
 def _descent(M: Array, fixed: Array) -> Array:

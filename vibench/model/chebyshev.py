@@ -78,6 +78,7 @@ def interpolate_on_box(
     budget: int,
     seed: int = 0,
     terms: Mapping[str, Array] = MappingProxyType({}),
+    alike: Sequence[str] = (),
 ) -> dict[str, AffinePolynomial]:
     """Tensor-product Chebyshev interpolation of arrays on a box (Trefethen 2013, chapters 3 and 8).
 
@@ -101,6 +102,8 @@ def interpolate_on_box(
         Seed of the random points.
     terms
         Flat terms (Q×size) of those arrays for which `evaluate` returns the coefficients θ (Q,) instead.
+    alike
+        Names of arrays with terms whose θ are the same: so are their polynomials, which serve the most demanding one.
     """
     random = np.random.default_rng(seed)
     anchors, corners = random.random((LINES, len(lower))), np.array(np.meshgrid(*[[0.0, 1.0]] * len(lower)))
@@ -112,6 +115,8 @@ def interpolate_on_box(
     scale = {name: float(np.linalg.norm(each, axis=-1).max()) or 1.0 for name, each in values.items()}
     # A coefficient counts by what it adds to the array: times the norm of its term.
     units = {name: scale[name] / _norms(terms[name]) if name in terms else scale[name] for name in scale}
+    if alike:
+        units |= dict.fromkeys(alike, np.min([np.asarray(units[name]) for name in alike], axis=0))
     along = _Sampled(evaluate, lower, upper, units)
     # A function that needs more points than that along a line has a grid beyond the budget, or nearly.
     limit = max(9, round(4 * budget ** (1.0 / len(lower)))) if len(lower) > 1 else budget

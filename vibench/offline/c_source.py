@@ -81,7 +81,7 @@ def _of_certificate(thetas: Mapping[str, AffinePolynomial], arrays: Mapping[str,
     own: dict[str, Array] = {f"{PREFIX}{name}": np.zeros(1) for name in SPECTRAL}
     own |= {name: array for name, array in arrays.items() if name.startswith(PREFIX) and name != f"{PREFIX}lift"}
     (rows, loads), (directions, kept) = own[f"{PREFIX}responses"].shape, own[f"{PREFIX}factor"].shape
-    numbers = loads * (loads + 1) // 2 + 8 * rows + 16 * loads + own[f"{PREFIX}norms"].size + kept
+    numbers = loads * (loads + 1) // 2 + 8 * rows + 20 * loads + own[f"{PREFIX}norms"].size + kept
     sizes = {name: polynomial.terms.shape[1] for name, polynomial in thetas.items()}
     return sizes | {
         "rows": rows,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from functools import partial
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -37,12 +38,19 @@ class InaccurateError(RequestError):
 
 
 def member_polynomials(
-    reduced: AnyReducedModel, tolerance: float, evaluations: int, *, fixed: bool, beside: Beside | None = None
+    reduced: AnyReducedModel,
+    tolerance: float,
+    evaluations: int,
+    *,
+    fixed: bool,
+    beside: Beside | None = None,
+    rotated: Mapping[str, Array] = MappingProxyType({}),
 ) -> tuple[AnyReducedModel, dict[str, AffinePolynomial]]:
     """The model whose members are evaluated, see `declared_model`, and polynomials of the members.
 
     A is a packed upper triangle (row by row). With `fixed` a basis that depends on the parameter is refused; what is
-    interpolated `beside` the members has polynomials, too.
+    interpolated `beside` the members has polynomials, too. Of these, the `rotated` ones are a matrix times the θ of A, by
+    name: one polynomial serves them and A.
 
     Raises
     ------
@@ -58,8 +66,14 @@ def member_polynomials(
         if not len(first.f) or not len(first.g):
             raise RequestError("the model has no unknowns or no constraints")
         terms = declared_terms(queried)
-        evaluate = partial(_evaluated, queried, len(first.f), frozenset(terms), beside)
-        polynomials = interpolate_on_box(evaluate, box.lower, box.upper, tolerance, evaluations, terms=terms)
+        if rotated:
+            terms |= {"A": _stiffness_terms(queried, box.lower)} | {name: of.T for name, of in rotated.items()}
+        theta_of = {name: "A" if name in rotated else name for name in terms}
+        evaluate = partial(_evaluated, queried, len(first.f), theta_of, beside)
+        alike = ["A", *rotated] if rotated else []
+        polynomials = interpolate_on_box(
+            evaluate, box.lower, box.upper, tolerance, evaluations, terms=terms, alike=alike
+        )
     except NumericalError as error:
         raise RequestError(f"the model cannot be evaluated in the whole parameter box: {error}") from None
     except (ArithmeticError, ValueError, LookupError) as error:  # what the code of a problem raises
@@ -105,6 +119,13 @@ def declared_terms(queried: AnyReducedModel) -> dict[str, Array]:
     return {name: np.stack([np.ravel(projected[name](t)) for t in sums.terms]) for name, sums in declared.items()}
 
 
+def _stiffness_terms(queried: AnyReducedModel, mu: Array) -> Array:
+    """Flat terms (Q×size) of A, packed upper triangles, of a model that evaluates their coefficients."""
+    theta = coefficients_of(queried, mu)
+    terms = (members_of(queried, mu, {**theta, "A": one}).A for one in np.eye(len(theta["A"])))
+    return np.stack([np.asarray(term)[np.triu_indices(len(term))] for term in terms])
+
+
 def coefficients_of(queried: AnyReducedModel, mu: Array) -> Mapping[str, Array]:
     """θ (Q,) at a parameter of the members that are sums of terms, as far as the model evaluates them."""
     if isinstance(queried, HyperReducedModel):
@@ -132,12 +153,13 @@ def members_of(queried: AnyReducedModel, mu: Array, theta: Mapping[str, Array]) 
 
 
 def _evaluated(
-    queried: AnyReducedModel, size: int, declared: frozenset[str], beside: Beside | None, mu: Array
+    queried: AnyReducedModel, size: int, theta_of: Mapping[str, str], beside: Beside | None, mu: Array
 ) -> dict[str, Array]:
-    """The members as flat arrays, of declared affine ones θ; and what is interpolated beside them."""
+    """The members as flat arrays, and what is interpolated beside them; of sums of known terms the θ of a member."""
     theta = coefficients_of(queried, mu)
     found = _packed(queried, size, mu, theta)
-    return found | {name: theta[name] for name in declared} | dict(beside(theta) if beside is not None else {})
+    others = dict(beside(theta) if beside is not None else {})
+    return found | others | {name: theta[member] for name, member in theta_of.items()}
 
 
 def _packed(queried: AnyReducedModel, size: int, mu: Array, theta: Mapping[str, Array]) -> dict[str, Array]:

@@ -215,25 +215,34 @@ def test_both_methods_of_the_correction_in_c_find_that_of_vibench(steps: int, tm
     parts = [
         "#include <float.h>\n#include <math.h>\n#include <string.h>\n"
         f"enum {{ LOADS = {size}, STEPS = {steps} }};\n"
-        "double certificate_inverse[LOADS * LOADS], certificate_diagonal[LOADS];\n",
+        "double certificate_inverse[LOADS * LOADS], certificate_responses[LOADS * LOADS];\n"
+        f"int certificate_rows[] = {{ {', '.join(map(str, range(size)))} }};\n",
         basic[basic.index("static double dot(") : basic.index("/* The largest of two")],
+        text[text.index("static const double *inverse_row(") : text.index("static double dot_sizes(")],
         text[text.index("static double dot_sizes(") : text.index("/* A w with B w >= s")].replace("static", ""),
     ]
     (tmp_path / "part.c").write_text("".join(parts), encoding="utf-8")
     found = library(tmp_path / "part.c", strict=())
-    found.complement.argtypes = [ctypes.c_double, POINTER, POINTER, POINTER]
-    matrix = np.ctypeslib.as_array((ctypes.c_double * size**2).in_dll(found, "certificate_inverse")).reshape(size, size)
-    np.ctypeslib.as_array((ctypes.c_double * size).in_dll(found, "certificate_diagonal"))[:] = 1.0
+    found.complement.argtypes = [ctypes.c_double, POINTER, POINTER, ctypes.POINTER(ctypes.c_int), POINTER]
+    matrix, compliance = (
+        np.ctypeslib.as_array((ctypes.c_double * size**2).in_dll(found, f"certificate_{name}")).reshape(size, size)
+        for name in ("inverse", "responses")
+    )
     for seed in range(200):
         rng = np.random.default_rng(seed)
         Q = np.linalg.qr(rng.standard_normal((size, size)))[0]
         M, excess = Q @ np.diag(np.geomspace(1.0, 1e3, size)) @ Q.T, rng.standard_normal(size)
         matrix[:] = M = 0.5 * (M + M.T)
+        compliance[:] = np.linalg.inv(M)
         fixed, nu, descended = M @ excess, np.zeros(size), np.zeros(size)
         expected = complementarity.complementary(fixed, M.__getitem__, excess <= 0.0)
-        found.complement(1.0, *pointers(excess, zeros, nu))
         found.descend(*pointers(fixed, descended))
-        for one in (nu, descended):
+        answers = [descended]
+        for released in (excess <= 0.0, np.zeros(size), np.ones(size)):  # systems with M, and with M⁻¹
+            flags = (ctypes.c_int * size)(*map(int, released))
+            found.complement(1.0, *pointers(excess, zeros), flags, *pointers(nu))
+            answers.append(nu.copy())
+        for one in answers:
             assert one == pytest.approx(expected, abs=1e-9 * np.abs(fixed).max())
 
 
