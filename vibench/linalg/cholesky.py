@@ -214,6 +214,18 @@ class PartialCholesky:
             u[self.order[:split]] = spsolve_triangular(corner, first, lower=False, unit_diagonal=True)
         return u
 
+    def solve_factor_transposed(self, right: Array) -> Array:
+        """F⁻ᵀ r, for r (n,) or (n, k); of a functional on the last unknowns only the last entries are not zero."""
+        right, split = np.ascontiguousarray(right[self.order], dtype=float), self._split
+        first, last = right[:split], right[split:]
+        if first.any():
+            first = spsolve_triangular(self._corner_factor.T, first, lower=True, unit_diagonal=True)
+            first = _scale_rows(1.0 / self._root, first)
+            last = last - self._columns[split:] @ _scale_rows(self._root, first)
+        if last.size:
+            last = scipy.linalg.solve_triangular(self.trailing_factor, last, trans="T", check_finite=False)
+        return np.concatenate([first, last])
+
 
 def _pivots(matrix: SparseMatrix, permutation: str, name: str) -> tuple[SuperLU, Array]:
     """Factors without pivoting off the diagonal, and the pivots (n,), which are positive."""

@@ -51,6 +51,7 @@ def test_a_partial_factor_gives_the_matrix(seed: int, count: int, bodies: bool, 
     assert np.allclose(F[:, factor.order], np.triu(F[:, factor.order]))
     y = np.random.default_rng(seed).standard_normal((9, columns) if columns else 9)
     assert np.allclose(factor.solve_factor(y), np.linalg.solve(F, y))
+    assert np.allclose(factor.solve_factor_transposed(y), np.linalg.solve(F.T, y))
 
 
 @PARTLY

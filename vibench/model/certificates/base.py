@@ -164,14 +164,6 @@ def _constant_constraint(
     return constraint, None, online_inf_sup(X, problem.W, contact, constraint, kept)
 
 
-def injected(problem: Problem) -> Array:
-    """E (n×k): the functionals that act on one contact unknown each."""
-    dofs = contact_unknowns(problem)
-    E = np.zeros((problem.V.dim, len(dofs)))
-    E[dofs, np.arange(len(dofs))] = 1.0
-    return E
-
-
 def contact_unknowns(problem: Problem) -> Indices:
     """E (k,): the contact unknowns of a problem that certificates support."""
     assert problem.contact_dofs is not None  # `unsupported` refuses problems without

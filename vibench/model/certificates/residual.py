@@ -18,6 +18,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import Protocol
 
 import numpy as np
 
@@ -38,6 +39,43 @@ FEW, SHARE_OF_FEW = 1000, 0.25
 
 MOST, OVERSAMPLING = 800, 100
 """Largest number of principal directions, and how many more a randomised method computes."""
+
+BLOCK = 100
+"""Directions that the randomised method computes at once."""
+
+
+class Terms(Protocol):
+    """Some of the F⁻ᵀt_j, of which not all may be wanted."""
+
+    @property
+    def norms(self) -> Array:
+        """Their norms (p,)."""
+
+    def columns(self, chosen: Indices) -> Array:
+        """The chosen ones (n×c)."""
+
+    def combined(self, samples: Array) -> Array:
+        """Their sums (n×S) with coefficients (p×S)."""
+
+
+@dataclass(frozen=True)
+class Known:
+    """All of them, as an array (n×p)."""
+
+    values: Array
+
+    @property
+    def norms(self) -> Array:
+        """Their norms (p,)."""
+        return np.asarray(np.linalg.norm(self.values, axis=0))
+
+    def columns(self, chosen: Indices) -> Array:
+        """The chosen ones (n×c)."""
+        return self.values[:, chosen]
+
+    def combined(self, samples: Array) -> Array:
+        """Their sums (n×S) with coefficients (p×S)."""
+        return np.asarray(self.values @ samples)
 
 
 @dataclass(frozen=True)
@@ -80,26 +118,43 @@ class ResidualBasis:
         return float(np.hypot(np.linalg.norm(coordinates), beside)) + missing
 
 
-def residual_basis(blocks: Sequence[Array], samples: Array, beside: float) -> tuple[ResidualBasis, Array]:
+def residual_basis(
+    blocks: Sequence[Terms], samples: Array, beside: float, last: int | None = None
+) -> tuple[ResidualBasis, Array]:
     """Basis of the F⁻ᵀt_j, given as blocks (n×·), from samples of their coefficients (Z×S), and U itself (n×K).
 
     What is left out is compared with the sampled norms and `beside`, what else enters the same bound in quadrature.
+    With `last`, U is returned in so many rows at the end alone (last×K): where few terms have entries in the rows
+    before, these are replaced by as many by an orthogonal factorisation.
     """
-    sizes, ends = np.abs(samples), np.cumsum([0, *(block.shape[1] for block in blocks)])
+    norms = np.concatenate([block.norms for block in blocks])
+    sizes, ranges = np.abs(samples), list(pairwise(np.cumsum([0, *(len(block.norms) for block in blocks)])))
     scale = sizes.max(axis=1, initial=0.0)
-    norms = np.concatenate([np.linalg.norm(block, axis=0) for block in blocks])
-    ranges = list(pairwise(ends))
-    sampled = sum(block @ samples[a:b] for block, (a, b) in zip(blocks, ranges, strict=True))
+    sampled = sum(block.combined(samples[a:b]) for block, (a, b) in zip(blocks, ranges, strict=True))
     typical = float(np.hypot(np.median(np.linalg.norm(sampled, axis=0)), beside))
     kept = _worth_keeping(norms * scale, norms * sizes.mean(axis=1), TERMS * typical)
     pairs = zip(blocks, ranges, strict=True)
-    R = np.hstack([block[:, kept[(kept >= a) & (kept < b)] - a] for block, (a, b) in pairs])
+    R = np.hstack([block.columns(kept[(kept >= a) & (kept < b)] - a) for block, (a, b) in pairs])
+    if last is not None:
+        R = _with_fewer_rows(R, last)
     inverse = 1.0 / scale[kept]
     reach = float(np.linalg.norm(inverse[:, None] * samples[kept], axis=0).mean())
     U, remainder = _directions(R * scale[kept], DIRECTIONS * typical / max(reach, np.finfo(float).tiny))
     norms[kept], factor = 0.0, U.T @ R
     round_off = 1.01 * UNIT * (len(kept) + 8.0) * float(np.linalg.norm(factor * scale[kept]))
-    return ResidualBasis(kept, factor, inverse, remainder + round_off, norms), U
+    basis = ResidualBasis(kept, factor, inverse, remainder + round_off, norms)
+    return basis, U if last is None else U[len(U) - last :]
+
+
+def _with_fewer_rows(R: Array, last: int) -> Array:
+    """R (n×p) after an orthogonal transformation of all rows but the last ones, that leaves few of them."""
+    first, last_rows = R[: len(R) - last], R[len(R) - last :]
+    entering = np.flatnonzero(first.any(axis=0))
+    if 2 * len(entering) >= len(first):
+        return R
+    few = np.zeros((len(entering), R.shape[1]))
+    few[:, entering] = np.linalg.qr(first[:, entering], mode="r")
+    return np.vstack([few, last_rows])
 
 
 def _worth_keeping(largest: Array, mean: Array, allowed: float) -> Indices:
@@ -119,10 +174,10 @@ def _directions(scaled: Array, allowed: float) -> tuple[Array, float]:
     """
     count = scaled.shape[1]
     if count > FEW:
-        mixed = scaled @ np.random.default_rng(0).standard_normal((count, MOST + OVERSAMPLING))
-        Q = np.linalg.qr(mixed)[0]  # a randomised range finder (Halko, Martinsson and Tropp, 2011)
-        Q = np.linalg.qr(scaled @ (scaled.T @ Q))[0]
-        small, rest = Q.T @ scaled, float(np.linalg.norm(project_out(Q, scaled)))
+        found = _random_range(scaled, allowed)
+        if found is None:
+            return np.linalg.qr(scaled)[0], 0.0
+        Q, small, rest = found
     else:
         Q, small = np.linalg.qr(scaled)
         rest, allowed = 0.0, allowed * SHARE_OF_FEW  # but for round-off
@@ -132,3 +187,27 @@ def _directions(scaled: Array, allowed: float) -> tuple[Array, float]:
     if remainders[enough] <= allowed and enough <= min(MOST, 0.7 * count):
         return Q @ left[:, :enough], float(remainders[enough])
     return (Q if count <= FEW else np.linalg.qr(scaled)[0]), 0.0
+
+
+def _random_range(scaled: Array, allowed: float) -> tuple[Array, Array, float] | None:
+    """Orthonormal Q (n×k), Qᵀ S (k×p) and ‖S − QQᵀS‖ in the Frobenius norm for S (n×p), at most half of `allowed`.
+
+    A randomised range finder by blocks (Martinsson and Voronin, 2016): each of them is found in what the ones before
+    leave, so that no more are computed than are needed. `None` where the decay says that `MOST` will not do.
+    """
+    rng, left, limit = np.random.default_rng(0), scaled.copy(), min(MOST + OVERSAMPLING, *scaled.shape)
+    bases, parts, rests = list[Array](), list[Array](), [float(np.linalg.norm(scaled))]
+    while rests[-1] > 0.5 * allowed:
+        remaining = limit - sum(basis.shape[1] for basis in bases)
+        decay = rests[-1] / rests[-2] if len(bases) > 1 else 0.0  # of a block; the first one is the fastest
+        if not remaining or rests[-1] * decay ** (remaining / BLOCK) > allowed:
+            return None
+        Q = np.linalg.qr(left @ rng.standard_normal((scaled.shape[1], min(BLOCK, remaining))))[0]
+        Q = np.linalg.qr(left @ (left.T @ Q))[0]
+        if bases:
+            Q = np.linalg.qr(project_out(np.hstack(bases), Q))[0]
+        parts.append(Q.T @ left)
+        left -= Q @ parts[-1]
+        bases.append(Q)
+        rests.append(float(np.linalg.norm(left)))
+    return np.hstack(bases), np.vstack(parts), rests[-1]

@@ -7,13 +7,13 @@ from hypothesis import strategies as st
 from numerics import space
 
 from vibench.model.certificates import residual
-from vibench.model.certificates.residual import residual_basis
+from vibench.model.certificates.residual import Known, residual_basis
 
 X = space(40, 5)
 rng = np.random.default_rng(1)
 DECAY = np.exp(-0.25 * np.arange(60))
 BLOCKS = [rng.standard_normal((40, 50)), rng.standard_normal((40, 10)), np.zeros((40, 2))]
-WHITENED = [X.whiten_functional(block) for block in BLOCKS]
+WHITENED = [Known(X.whiten_functional(block)) for block in BLOCKS]
 SAMPLES = np.append(DECAY, [1.0, 0.0])[:, None] * rng.standard_normal((62, 30))
 
 
@@ -43,7 +43,7 @@ def test_small_residuals_of_large_terms_keep_their_digits() -> None:
     """Two terms that cancel to 1e-9: the square root of a sum of products would see 1e-8 of noise."""
     term = rng.standard_normal((40, 1))
     blocks = [term, term * (1.0 + 1e-9)]
-    basis, _ = residual_basis([X.whiten_functional(block) for block in blocks], np.ones((2, 3)), 0.0)
+    basis, _ = residual_basis([Known(X.whiten_functional(block)) for block in blocks], np.ones((2, 3)), 0.0)
     difference = np.array([1.0, -1.0])
     assert basis.norm(difference) == pytest.approx(1e-9 * float(np.linalg.norm(X.whiten_functional(term))), rel=1e-5)
 
@@ -61,6 +61,38 @@ def test_few_directions_are_enough_for_many_terms(monkeypatch: pytest.MonkeyPatc
     np.testing.assert_allclose(U.T @ U, np.eye(U.shape[1]), atol=1e-12)
     for z in SAMPLES.T:
         assert exact(z) * (1.0 - 1e-12) <= found.norm(z)
+
+
+def test_a_random_range_leaves_what_it_says(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(residual, "BLOCK", 6)
+    S = np.linalg.qr(rng.standard_normal((50, 50)))[0] * 0.5 ** np.arange(50) @ rng.standard_normal((50, 80))
+    found = residual._random_range(S, 1e-3)
+    assert found is not None
+    Q, small, rest = found
+    np.testing.assert_allclose(Q.T @ Q, np.eye(Q.shape[1]), atol=1e-12)
+    assert np.linalg.norm(S - Q @ small) == pytest.approx(rest, rel=1e-6)
+    assert rest <= 0.5e-3
+    assert Q.shape[1] < 40
+    monkeypatch.setattr(residual, "MOST", 12)
+    monkeypatch.setattr(residual, "OVERSAMPLING", 0)
+    assert residual._random_range(S, 1e-3) is None
+
+
+def test_rows_that_few_terms_enter_are_made_fewer() -> None:
+    """Norms are the same as from all rows, and directions those of the functionals on the last ones."""
+    last, few = 7, np.zeros((40, 12))
+    few[:33, :4] = rng.standard_normal((33, 4))
+    few[33:] = rng.standard_normal((7, 12))
+    samples = rng.standard_normal((12, 20))
+    whole, U = residual_basis([Known(few)], samples, 0.0)
+    reduced, tail = residual_basis([Known(few)], samples, 0.0, last)
+    assert tail.shape[0] == last
+    functional = rng.standard_normal(last)
+    for z in rng.standard_normal((5, 12)):
+        exact = float(np.linalg.norm(few @ z))
+        assert reduced.norm(z) == pytest.approx(exact, rel=1e-10)
+        products = [(functional @ rows) @ basis.parts(z)[0] for basis, rows in ((whole, U[33:]), (reduced, tail))]
+        assert products == pytest.approx([functional @ few[33:] @ z] * 2)
 
 
 WHOLE, _ = residual_basis(WHITENED, np.ones((62, 1)), 0.0)
