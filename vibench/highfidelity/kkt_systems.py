@@ -80,14 +80,35 @@ class CondensedStiffness:
             return np.asarray(np.sqrt(np.maximum(eliminated + retained, 0.0)))
         return norms_by_solutions(functionals, self.solve(functionals))
 
-    def norm_of_force(self, force: Array) -> float | None:
-        """‖ℓ‖ in A⁻¹ of a force ℓ (n,) on retained unknowns, such as Bᵀλ; `None` without a dense compliance."""
+    @property
+    def retained(self) -> Indices:
+        """The retained unknowns (c,), rising."""
+        return self._pattern.retained
+
+    @property
+    def dense(self) -> bool:
+        """Whether the Schur complement Ŝ is treated as a dense matrix."""
+        return self._condensed.dense
+
+    def compliance(self, load: Array) -> Array:
+        """Ŝ⁻¹ times loads (c,) or (c, k) of the retained unknowns."""
         if not self._condensed.dense:
-            return None
-        load = force[self._pattern.retained]
-        pressed = np.flatnonzero(load)
-        energy = load[pressed] @ self._compliance[np.ix_(pressed, pressed)] @ load[pressed]
-        return float(np.sqrt(max(float(energy), 0.0)))
+            return self._schur_factor.solve(load)
+        pressed = np.flatnonzero(load if load.ndim == 1 else load.any(axis=1))
+        return np.asarray(self._compliance[:, pressed] @ load[pressed])
+
+    def load(self, retained: Array) -> Array:
+        """Ŝ times retained unknowns (c,), where it is sparse."""
+        return np.asarray(self._condensed.schur @ retained)
+
+    def represent(self, functionals: Array) -> tuple[Array, Array, Array]:
+        """Condensed loads ℓ̂ (c, k) of functionals (n, k), Ŝ⁻¹ℓ̂ (c, k), and ℓ_iᵀA_ii⁻¹ℓ_i (k,), i being eliminated."""
+        load, rest = self._condensed.eliminated_squares(functionals)
+        return load, self.compliance(load), rest
+
+    def extend(self, retained: Array) -> Array:
+        """The vector (n,) with these retained unknowns (c,) and no forces on the others."""
+        return self._condensed.recover(retained, np.zeros(0))
 
     def _unconstrained(self, load: Array) -> Array:
         """Ŝ⁻¹ f̂ (c,) of a condensed load, which is remembered until another one comes."""

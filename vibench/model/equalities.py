@@ -71,6 +71,11 @@ class Equalities:
         scaled = missing[self.chosen] / self.lengths
         return np.asarray(self.liftings @ scipy.linalg.solve_triangular(self.factor, scaled, trans="T"))
 
+    def forces(self, missing: Array) -> Array:
+        """The forces (r,) on the chosen rows that displace them by d: X d = B_Eᵀ times these."""
+        scaled = scipy.linalg.solve_triangular(self.factor, missing[self.chosen] / self.lengths, trans="T")
+        return np.asarray(scipy.linalg.solve_triangular(self.factor, scaled) / self.lengths)
+
     def distance(self, missing: Array) -> float:
         """η for a bound (e,) of |δ|."""
         return SAFETY * float(np.linalg.norm(missing[self.chosen] / self.lengths)) / self.smallest

@@ -52,20 +52,22 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
+from functools import cached_property
 
 import numpy as np
 import scipy.sparse as sp
 
-from vibench.arrays import Array, Mask
+from vibench.arrays import Array, Indices, Mask
 from vibench.errors import NumericalError
 from vibench.highfidelity.active_set import active_set_iterations
 from vibench.interfaces.problem import VariationalInequality, is_absent
 from vibench.linalg.inertia import UNIT
 from vibench.model.equalities import Equalities
-from vibench.model.errors import Energy
+from vibench.model.errors import Energy, rieszes
+from vibench.model.on_contact import OnContact, Representer
 from vibench.qp.exact import least_distance_solution
 from vibench.qp.rows import Rows, rows_that_matter
-from vibench.qp.scaling import near_rows, ratio
+from vibench.qp.scaling import ratio
 from vibench.stability.coercivity import Constant, Stability
 
 NO_ROOM = 1e-12
@@ -82,9 +84,6 @@ MARGIN = 4.0
 
 IMPLAUSIBLE = 1e8
 """Multipliers this many times those that rows alone would have are of dependent constraints, solved in round-off."""
-
-CANCELLED = 1e-4
-"""A representer A⁻¹ℓ that is a sum of terms, whose norm is below this share of theirs, is computed anew from ℓ."""
 
 ATTEMPTS = 4
 """Margins that are tried, each at least ten times the one before."""
@@ -138,23 +137,43 @@ def error_bounds(
     lam: Array,
 ) -> list[ErrorBounds]:
     """Bounds (ii) of reduced u (n×P) and λ (m×P), column by column at the parameters of `vis`."""
-    given = zip(vis, energies, constants, u.T, lam.T, strict=True)
-    return [bound_errors_at(vi, energy, c.coercivity, c.energy_inf_sup, *one) for vi, energy, c, *one in given]
+    residuals = [residual(vi, u[:, k], lam[:, k]) for k, vi in enumerate(vis)]
+    given = zip(vis, energies, constants, u.T, lam.T, rieszes(energies, residuals), strict=True)
+    return [_bounds(vi, energy, c.coercivity, c.energy_inf_sup, *one) for vi, energy, c, *one in given]
 
 
 def bound_errors_at(
     vi: VariationalInequality, energy: Energy, alpha: Constant, beta: Constant, u: Array, lam: Array
 ) -> ErrorBounds:
     """Bounds (ii) of one reduced u (n,) and λ (m,), from lower bounds of α and of β_A."""
+    (riesz,) = rieszes([energy], [residual(vi, u, lam)])
+    return _bounds(vi, energy, alpha, beta, u, lam, riesz)
+
+
+def residual(vi: VariationalInequality, u: Array, lam: Array) -> Array:
+    """R = f − A u − Bᵀλ (n,)."""
+    return np.asarray(vi.f - vi.A @ u - vi.B.T @ lam)
+
+
+def _bounds(
+    vi: VariationalInequality,
+    energy: Energy,
+    alpha: Constant,
+    beta: Constant,
+    u: Array,
+    lam: Array,
+    riesz: Representer,
+) -> ErrorBounds:
+    """Bounds (ii), with the representer A⁻¹r."""
     if np.min(lam, initial=0.0) < 0.0:
         return ErrorBounds.none(NOT_IN_CONE)
     if np.any(lam[is_absent(vi.g)]):
         return ErrorBounds.none(ON_ABSENT_ROW)
-    corrected = find_correction(vi, energy, u, lam)
-    if corrected is None:
+    correction = find_correction(vi, energy, u, lam)
+    if correction is None:
         return ErrorBounds.none(NO_CORRECTION)
-    of_u = terms(corrected, vi, energy, u, lam)
-    with_d = _with_constrained_residual(of_u, corrected, vi, energy, u, lam)
+    of_u = terms(correction, u, lam, riesz)
+    with_d = _with_constrained_residual(correction, u, lam, riesz)
     of_lam = min((of_u, *with_d), key=lambda terms: terms.rho)
     in_V = of_u.primal / float(np.sqrt(alpha.value))
     in_W = of_lam.dual / beta.value if beta.value > 0.0 else float("inf")
@@ -176,9 +195,12 @@ def reference_bound(vi: VariationalInequality, energy: Energy, u: Array, lam: Ar
     correction = find_correction(vi, energy, u, lam)
     if correction is None:
         return float("inf")
-    bound = terms(correction, vi, energy, u, lam).primal
-    size = float(np.hypot(energy.norm(u), energy.norm_of_force(vi.B.T @ lam)))
-    open_by_round_off = np.sqrt(4.0 * MARGIN * float(lam @ np.nan_to_num(_round_off(vi, u, correction.w), posinf=0.0)))
+    (riesz,) = rieszes([energy], [residual(vi, u, lam)])
+    bound = terms(correction, u, lam, riesz).primal
+    on = correction.on
+    size = float(np.hypot(energy.norm(u), on.of_force(lam).norm))
+    round_off = np.nan_to_num(_round_off(on, on.values(u), correction.values), posinf=0.0)
+    open_by_round_off = np.sqrt(4.0 * MARGIN * float(lam @ round_off))
     if not bound <= max(REFERENCE * size, open_by_round_off):
         raise NumericalError(
             f"the error bound of the high-fidelity solution is {ratio(bound, size):.1e} of it in the energy norm, "
@@ -218,16 +240,15 @@ def corrected_pair(vi: VariationalInequality, energy: Energy, u: Array, lam: Arr
     correction = find_correction(vi, energy, u, lam)
     if correction is None:
         return None
-    rho = energy.dual_norm(vi.f - vi.A @ u - vi.B.T @ lam)
-    omega = energy.norm(correction.w) + correction.eta
-    return CorrectedPair(u - correction.w, np.maximum(correction.nu, 0.0), omega, rho)
+    (riesz,) = rieszes([energy], [residual(vi, u, lam)])
+    found = terms(correction, u, lam, riesz)
+    return CorrectedPair(u - correction.w, np.maximum(correction.nu, 0.0), found.omega, found.rho)
 
 
 @dataclass(frozen=True)
 class Terms:
-    """The terms of (ii), with A⁻¹r (n,) and ‖r + A w‖_{A⁻¹}, and the bounds that need no constants."""
+    """The terms of (ii), and ‖r + A w‖_{A⁻¹}, that need no constants."""
 
-    riesz: Array
     rho: float
     omega: float
     kappa: float
@@ -249,27 +270,32 @@ class Terms:
 class Constraints:
     """The rows of one inequality that matter, and those of them that are equalities."""
 
-    vi: VariationalInequality
+    on: OnContact
     rows: Rows
     equalities: Equalities | None
 
     @classmethod
     def of(cls, vi: VariationalInequality, energy: Energy, u: Array, lam: Array) -> Constraints:
-        """As a correction of u_N (n,) and λ_N (m,) reads them."""
-        room = NO_ROOM * (abs(sp.csr_array(vi.B)) @ np.abs(u) + np.abs(vi.g))
-        rows, equalities = rows_that_matter(vi.B, vi.g, room, lam), None
+        """As a correction of u_N with retained unknowns u (c,) and λ_N (m,) reads them."""
+        on = energy.on_contact(vi)
+        room = NO_ROOM * (on.sizes @ np.abs(u) + np.abs(vi.g))
+        rows, equalities = rows_that_matter(on.B, vi.g, room, lam), None
         if rows.equal.any():
-            K = energy.factor.solve_factor_transposed(sp.csr_array(vi.B)[rows.kept[rows.equal]].toarray().T)
-            equalities = Equalities.of(K, energy.factor.solve_factor, vi.B)
-        return cls(vi, rows, equalities)
+            K = energy.factor.solve_factor_transposed(sp.csr_array(vi.B)[rows.equalities].toarray().T)
+            equalities = Equalities.of(K, lambda y: on.values(energy.factor.solve_factor(y)), on.B)
+        return cls(on, rows, equalities)
 
-    def moved(self, u: Array, w: Array) -> Array:
-        """The correction w (n,) with the equalities held."""
-        return w if self.equalities is None else w - self.equalities.step(_slack(self.vi, u, w)[self.rows.equalities])
+    def moved(self, u: Array, w: Array, forces: Array) -> tuple[Array, Array]:
+        """The correction w (c,) with the equalities held, and the forces (m,) that it follows from as w from others."""
+        if self.equalities is None:
+            return w, forces
+        missing, moved = _slack(self.on, u, w)[self.rows.equalities], forces.copy()
+        moved[self.rows.equalities[self.equalities.chosen]] -= self.equalities.forces(missing)
+        return w - self.equalities.step(missing), moved
 
     def lacking(self, u: Array, w: Array) -> tuple[Array, float]:
         """What rows may lack of B w' ≥ s in exact arithmetic (m,), and η, a bound of ‖w' − w‖_A."""
-        slack, round_off, eta, equal = _slack(self.vi, u, w), _round_off(self.vi, u, w), 0.0, self.rows.equalities
+        slack, round_off, eta, equal = _slack(self.on, u, w), _round_off(self.on, u, w), 0.0, self.rows.equalities
         lacking = np.where(self.rows.implied, 0.0, round_off - slack)
         if self.equalities is not None:
             eta = self.equalities.distance((np.abs(slack) + round_off)[equal])
@@ -282,73 +308,62 @@ class Constraints:
 
 @dataclass(frozen=True)
 class Correction:
-    """A w (n,) with B w ≥ s also in exact arithmetic, and ν ≥ 0 (m,) with A w = Bᵀ(ν − λ_N).
+    """A w with B w ≥ s also in exact arithmetic, and ν ≥ 0 (m,) with A w = Bᵀ(ν − λ_N).
 
     As A(u_N − w) + Bᵀν = f − r and ν is complementary to B(u_N − w) ≤ g, u_N − w and ν solve (7) with the load f − r:
     up to the residual of (u_N, λ_N), ν is the high-fidelity multiplier. It is approximate where w is. Where there are
     equalities B w ≥ s holds for a w' with ‖w' − w‖_A ≤ `eta`.
+
+    `values` are the retained unknowns (c,) of w, the extension of these with the smallest energy; `load` is A w there.
     """
 
-    w: Array
+    values: Array
+    load: Array
     nu: Array
     eta: float
     constraints: Constraints
 
+    @property
+    def on(self) -> OnContact:
+        """The inequality on the retained unknowns."""
+        return self.constraints.on
 
-def terms(
-    correction: Correction,
-    vi: VariationalInequality,
-    energy: Energy,
-    u: Array,
-    lam: Array,
-    near: tuple[Array, float] | None = None,
-) -> Terms:
-    """The terms with a correction of u (n,) and λ ≥ 0 (m,).
+    @cached_property
+    def w(self) -> Array:
+        """W (n,)."""
+        return self.on.extended(self.values)
 
-    `near` are A⁻¹r (n,) and the ρ of the pair that it follows from; by default A⁻¹r is computed. No other solution with
-    A is needed, since A⁻¹(r + A w) = A⁻¹r + w.
-    """
-    w, eta, equalities = correction.w, correction.eta, correction.constraints.equalities
-    residual, kappa = vi.f - vi.A @ u - vi.B.T @ lam, max(0.0, float(lam @ _slack(vi, u, w)))
+
+def terms(correction: Correction, u: Array, lam: Array, riesz: Representer) -> Terms:
+    """The terms with a correction of u_N (n,) and λ_N ≥ 0 (m,), from A⁻¹r; A⁻¹(r + A w) = A⁻¹r + w."""
+    return _terms(correction, correction.on.values(u), lam, riesz, riesz.norm)
+
+
+def _terms(correction: Correction, u: Array, lam: Array, riesz: Representer, largest: float) -> Terms:
+    """The same for u_N with retained unknowns u (c,), and an A⁻¹r that is a difference of terms of a norm `largest`."""
+    on, eta, equalities = correction.on, correction.eta, correction.constraints.equalities
+    kappa, w = max(0.0, float(lam @ _slack(on, u, correction.values))), Representer(correction.values, correction.load)
     if equalities is not None:
         kappa += eta * float(lam @ equalities.reach)
-    if near is None:
-        riesz = energy.riesz(residual)
-        rho = float(np.sqrt(max(float(residual @ riesz), 0.0)))
-        largest = rho
-    else:
-        riesz, largest = near
-        rho = _dual_norm(energy, residual, riesz, largest)
-    of_feasible = _dual_norm(energy, residual + vi.A @ w, riesz + w, largest) + eta
-    return Terms(riesz, rho, energy.norm(w) + eta, kappa, of_feasible)
+    of_feasible = on.norm(riesz.plus(w), largest) + eta
+    return Terms(on.norm(riesz, largest), w.norm + eta, kappa, of_feasible)
 
 
-def _dual_norm(energy: Energy, functional: Array, riesz: Array, largest: float) -> float:
-    """‖ℓ‖_{A⁻¹} of a functional ℓ (n,) from A⁻¹ℓ (n,), a sum of terms whose norm is at most about `largest`."""
-    norm = float(np.sqrt(max(float(functional @ riesz), 0.0)))
-    return norm if norm >= CANCELLED * largest else energy.dual_norm(functional)
-
-
-def _with_constrained_residual(
-    of_u: Terms, correction: Correction, vi: VariationalInequality, energy: Energy, u: Array, lam: Array
-) -> Iterator[Terms]:
+def _with_constrained_residual(correction: Correction, u: Array, lam: Array, riesz: Representer) -> Iterator[Terms]:
     """The terms for u + d, whose residual is the part of r in the range of Bᵀ, if w is feasible for it and d exists.
 
-    d is A⁻¹r without the displacement of the forces ξ that hold B d = 0; they load the contact alone.
+    d is A⁻¹r without the displacement A⁻¹Bᵀξ of the forces that hold B d = 0, which is A⁻¹ times the residual left.
     """
-    constraints = correction.constraints
-    rows = constraints.rows.kept[near_rows(vi)[constraints.rows.kept]]  # any d will do for which w is feasible
-    B = sp.csr_array(vi.B)[rows]
-    program = VariationalInequality(vi.A, np.zeros_like(u), B, -(B @ of_u.riesz))
-    system = energy.stiffness.active_set_system(program)
+    on, constraints = correction.on, correction.constraints
+    rows = constraints.rows.kept[on.near[constraints.rows.kept]]  # any d will do for which w is feasible
     try:
-        held = system.recover(system.solve_active(np.arange(len(rows)))[0])
+        held = on.holding(rows, riesz.values)
     except (RuntimeError, np.linalg.LinAlgError):  # an exactly singular system
         return
-    d = of_u.riesz + held
-    lacking, eta = constraints.lacking(u + d, correction.w)
+    moved = on.values(u) + (riesz.values - held.values)
+    lacking, eta = constraints.lacking(moved, correction.values)
     if np.all(lacking <= 0.0):
-        yield terms(replace(correction, eta=eta), vi, energy, u + d, lam, (-held, of_u.rho))
+        yield _terms(replace(correction, eta=eta), moved, lam, held, riesz.norm)
 
 
 def find_correction(vi: VariationalInequality, energy: Energy, u: Array, lam: Array) -> Correction | None:
@@ -361,21 +376,28 @@ def find_correction(vi: VariationalInequality, energy: Energy, u: Array, lam: Ar
     u, lam
         u_N (n,) and λ_N ≥ 0 (m,).
     """
+    on = energy.on_contact(vi)
+    u = on.values(u)
     constraints = Constraints.of(vi, energy, u, lam)
     kept, equal = constraints.rows.kept, constraints.rows.equal
-    B, excess = sp.csr_array(vi.B)[kept], (vi.B @ u - vi.g)[kept]
-    margin = np.where(equal, 0.0, MARGIN * _round_off(vi, u, np.zeros_like(u))[kept])
-    largest = IMPLAUSIBLE * max(np.max(lam, initial=0.0), _largest_multiplier(replace(vi, B=B), excess))
+    excess = (on.B @ u - vi.g)[kept]
+    margin = np.where(equal, 0.0, MARGIN * _round_off(on, u, np.zeros_like(u))[kept])
+    # the largest multiplier s / b A⁻¹bᵀ that a row b w ≥ s would have alone, from above
+    alone = float(np.max(excess * on.stiffnesses[kept], initial=0.0))
+    largest = IMPLAUSIBLE * max(np.max(lam, initial=0.0), alone)
     doubtful = None
     for _ in range(ATTEMPTS):
-        raised = VariationalInequality(vi.A, -(vi.B.T @ lam), -B, -(excess + margin))
-        for w, forces in _minimisers(raised, energy, equal, lam[kept] > 0.0, largest):
-            moved = constraints.moved(u, w)
-            lacking, eta = constraints.lacking(u, moved)
+        least, start = excess + margin, (equal, lam[kept] > 0.0)
+        for values, forces in _minimisers(on, energy, kept, lam, least, *start, largest):
+            multipliers = np.zeros(len(vi.g))
+            multipliers[kept] = forces
+            w, multipliers = constraints.moved(u, values, multipliers)
+            lacking, eta = constraints.lacking(u, w)
             if not np.all(lacking <= 0.0):  # NaN is not
                 margin = np.maximum(margin, 2.0 * np.nan_to_num(lacking[kept], nan=0.0, posinf=0.0))
                 continue
-            found = Correction(moved, constraints.rows.multipliers(forces, len(vi.g)), eta, constraints)
+            nu, load = constraints.rows.multipliers(forces, len(vi.g)), on.load(w, multipliers - lam)
+            found = Correction(w, load, nu, eta, constraints)
             if np.max(forces[~equal], initial=0.0) <= largest:
                 return found
             doubtful = found
@@ -384,42 +406,31 @@ def find_correction(vi: VariationalInequality, energy: Energy, u: Array, lam: Ar
 
 
 def _minimisers(
-    program: VariationalInequality, energy: Energy, equal: Mask, start: Mask, largest: float
+    on: OnContact, energy: Energy, kept: Indices, lam: Array, least: Array, equal: Mask, start: Mask, largest: float
 ) -> Iterator[tuple[Array, Array]]:
-    """Solutions and multipliers of the program, up to round-off: by active sets, then as a least distance problem.
+    """Minimisers of ½‖w‖²_A + λᵀB w with B w ≥ s in the rows `kept` (k,), on retained unknowns (c,), and forces (k,).
 
-    Active sets of constraints that are dependent but for round-off may have a w that is feasible and huge, with a
-    multiplier above `largest`: the other follows it.
+    Up to round-off, by active sets, then as a least distance problem: active sets of constraints that are dependent but
+    for round-off may have a w that is feasible and huge, with a multiplier above `largest`. `least` is s (k,).
     """
-    system = energy.stiffness.active_set_system(program)
+    system = on.correction_system(kept, lam, least)
     for active in (start, np.zeros_like(start)):
         settled = active_set_iterations(system, active, equal)
         if settled is not None:
-            yield system.recover(settled[0]), settled[1]
+            yield settled[:2]
             if np.max(settled[1][~equal], initial=0.0) <= largest:
                 return
+    vi = on.vi
+    program = VariationalInequality(vi.A, -(vi.B.T @ lam), -sp.csr_array(vi.B)[kept], -least)
     if (nearest := least_distance_solution(program, energy.factor, equal, start)) is not None:
-        yield nearest
+        yield on.values(nearest[0]), nearest[1]
 
 
-def _largest_multiplier(vi: VariationalInequality, excess: Array) -> float:
-    """An upper bound of the largest multiplier s / b A⁻¹ bᵀ that a row b w ≥ s of the excess s (m,) would have alone.
-
-    It is at most s b A bᵀ / |b|⁴, by the inequality of Cauchy and Schwarz.
-    """
-    B = sp.csr_array(vi.B)
-    squares, energies = (np.asarray((B * other).sum(axis=1)) for other in (B, B @ vi.A))
-    shares = np.divide(energies, squares**2, out=np.zeros_like(squares), where=squares > 0.0)
-    return float(np.max(excess * shares, initial=0.0))
+def _slack(on: OnContact, u: Array, w: Array) -> Array:
+    """B w − s (m,), from retained unknowns (c,)."""
+    return np.asarray(on.B @ w - (on.B @ u - on.vi.g))
 
 
-def _slack(vi: VariationalInequality, u: Array, w: Array) -> Array:
-    """B w − s (m,)."""
-    return np.asarray(vi.B @ w - (vi.B @ u - vi.g))
-
-
-def _round_off(vi: VariationalInequality, u: Array, w: Array) -> Array:
+def _round_off(on: OnContact, u: Array, w: Array) -> Array:
     """Bound (m,) of the round-off in `_slack` (Higham 2002, §3.1)."""
-    B = sp.csr_array(vi.B)
-    terms = np.diff(B.indptr) + 4.0
-    return np.asarray(1.01 * terms * UNIT * (abs(B) @ (np.abs(w) + np.abs(u)) + np.abs(vi.g)))
+    return np.asarray(1.01 * (on.entries + 4.0) * UNIT * (on.sizes @ (np.abs(w) + np.abs(u)) + np.abs(on.vi.g)))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -13,6 +13,7 @@ from vibench.highfidelity.kkt_systems import CondensedStiffness
 from vibench.interfaces.outputs import Output
 from vibench.interfaces.problem import Problem, VariationalInequality
 from vibench.linalg.cholesky import SparseCholesky
+from vibench.model.on_contact import OnContact, Representer, representers
 from vibench.qp.scaling import ratio
 
 UNMEASURABLE = 1e-8
@@ -37,11 +38,25 @@ class Energy:
     A: SparseMatrix
     factor: SparseCholesky
     stiffness: CondensedStiffness
+    shared: bool = False
+    """Whether the errors of many solutions are measured with it: what they have in common is worth more work then."""
+    _on_contact: list[OnContact] = field(default_factory=list, repr=False, compare=False)
 
     @property
     def nbytes(self) -> int:
         """Memory, about: that of the condensed matrix is as large, and SuperLU allocates twice what it fills."""
-        return 4 * self.factor.nbytes
+        return 4 * self.factor.nbytes + self.nbytes_on_contact
+
+    @property
+    def nbytes_on_contact(self) -> int:
+        """Memory of what belongs to the constraints, once everything is computed."""
+        return sum(one.nbytes for one in self._on_contact)
+
+    def on_contact(self, vi: VariationalInequality) -> OnContact:
+        """The constraints of `vi`, whose A this is, on contact; those of the last inequality are kept."""
+        if not self._on_contact or self._on_contact[0].vi is not vi:
+            self._on_contact[:] = [OnContact(vi, self.stiffness, shared=self.shared)]
+        return self._on_contact[0]
 
     def norm(self, v: Array) -> float:
         """‖v‖_A of v (n,)."""
@@ -55,10 +70,16 @@ class Energy:
         """‖ℓ‖_{A⁻¹} of a functional (n,)."""
         return float(np.sqrt(max(float(functional @ self.riesz(functional)), 0.0)))
 
-    def norm_of_force(self, force: Array) -> float:
-        """‖Bᵀη‖_{A⁻¹} of a force Bᵀη (n,) of the constraints: a product of contact size where A is condensed on it."""
-        norm = self.stiffness.norm_of_force(force)
-        return self.dual_norm(force) if norm is None else norm
+
+def rieszes(energies: Sequence[Energy], functionals: Sequence[Array]) -> list[Representer]:
+    """A⁻¹ℓ of functionals (n,), each at its own parameter; those of one A are solved in one block."""
+    found: dict[int, Representer] = {}
+    stiffnesses = {id(energy.stiffness): energy.stiffness for energy in energies}
+    for key, stiffness in stiffnesses.items():
+        numbers = [k for k, energy in enumerate(energies) if id(energy.stiffness) == key]
+        of_one = representers(stiffness, np.column_stack([functionals[k] for k in numbers]))
+        found |= dict(zip(numbers, of_one, strict=True))
+    return [found[k] for k in range(len(energies))]
 
 
 @dataclass(frozen=True)
@@ -139,7 +160,7 @@ def errors(
     rows = []
     for k, (vi, energy) in enumerate(zip(vis, energies, strict=True)):
         in_energy, energy_u = energy.norm(du[:, k]), energy.norm(reference.u[:, k])
-        natural, natural_lam = (energy.norm_of_force(vi.B.T @ eta) for eta in (dlam[:, k], reference.lam[:, k]))
+        natural, natural_lam = (energy.on_contact(vi).of_force(eta).norm for eta in (dlam[:, k], reference.lam[:, k]))
         rows.append(
             Errors(
                 error_u=None if zero_u[k] else ratio(float(error_u[k]), float(norm_u[k])),

@@ -16,8 +16,8 @@ from vibench.interfaces.validation import ReferenceAssembly, checked_assembly
 from vibench.linalg.cholesky import SparseCholesky
 from vibench.linalg.inner_product import orthonormal_range
 from vibench.model.contact_estimates import ContactEstimates
-from vibench.model.error_bounds import find_correction, terms
-from vibench.model.errors import Energy
+from vibench.model.error_bounds import find_correction, residual, terms
+from vibench.model.errors import Energy, rieszes
 from vibench.model.galerkin import project
 from vibench.qp.exact import ExactSolution, exact_solution
 from vibench.qp.scaling import ratio
@@ -110,9 +110,10 @@ class GrowingModel:
         corrected = find_correction(vi, energy, u, lam)
         if corrected is None:
             return float("inf")
-        of_pair = terms(corrected, vi, energy, u, lam)
+        (riesz,) = rieszes([energy], [residual(vi, u, lam)])
+        of_pair = terms(corrected, u, lam, riesz)
         of_u = ratio(of_pair.primal, energy.norm(u))
-        pressed, W = energy.dual_norm(vi.B.T @ lam), self._problem.W
+        pressed, W = corrected.on.of_force(lam).norm, self._problem.W
         if not pressed > 0.0:
             return of_u
         in_W = ratio(float(W.norm(corrected.nu - lam)), float(W.norm(lam)))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
@@ -18,7 +19,8 @@ LIMIT = 2**28
 """Size limit of the assemblies in bytes; the least recently used one is dropped first."""
 
 FACTORS = 2**29
-"""The same of the factors of A. Cells use the same parameters in the same order: too small a cache is none."""
+"""The same of factors of A, and of compliances. Cells use the same parameters in the same order: too small a cache is
+none."""
 
 
 class Assemblies:
@@ -27,7 +29,7 @@ class Assemblies:
     def __init__(self, problem: Problem, limit: int = LIMIT) -> None:
         self._problem = problem
         self._kept: LRUCache[bytes, VariationalInequality] = LRUCache(limit, getsizeof=_bytes)
-        self._energies: LRUCache[bytes, Energy] = LRUCache(FACTORS, getsizeof=lambda energy: energy.nbytes)
+        self._energies: LRUCache[bytes, Energy] = LRUCache(FACTORS, getsizeof=self._own_bytes)
         self._solver = HighFidelitySolver(problem)
         self._constant: SparseCholesky | None = None
 
@@ -41,11 +43,12 @@ class Assemblies:
         return vi
 
     def energy_at(self, mu: Array) -> Energy:
-        """Factorisations of A at mu (d,); a constant A is factorised once."""
+        """Factorisations of A at mu (d,) and what errors and bounds at mu share; a constant A is factorised once."""
         vi, found = self.at(mu), self._energies.get(_key(mu))
         if found is None:
-            found = self.energy_of(vi)
-            if "A" not in self._problem.constant and found.nbytes <= self._energies.maxsize:
+            found = replace(self.energy_of(vi), shared=True)
+            found.on_contact(vi)  # is of its size
+            if self._own_bytes(found) <= self._energies.maxsize:
                 self._energies[_key(mu)] = found
         return found
 
@@ -55,6 +58,10 @@ class Assemblies:
             return Energy(vi.A, SparseCholesky(vi.A, "A"), self._solver.condensed(vi))
         self._constant = self._constant or SparseCholesky(vi.A, "A")
         return Energy(vi.A, self._constant, self._solver.condensed(vi))
+
+    def _own_bytes(self, energy: Energy) -> int:
+        """Memory of what is of one parameter alone."""
+        return energy.nbytes if "A" not in self._problem.constant else energy.nbytes_on_contact
 
 
 @lru_cache(maxsize=1)

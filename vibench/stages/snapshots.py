@@ -136,7 +136,8 @@ class SnapshotStage(Stage):
         assembled = Assemblies(problem)
         for k, mu in enumerate(mus if self.parameters.role != "training" else ()):
             try:
-                yield reference_bound(assembled.at(mu), assembled.energy_at(mu), u[:, k], lam[:, k])
+                vi = assembled.at(mu)
+                yield reference_bound(vi, assembled.energy_of(vi), u[:, k], lam[:, k])
             except NumericalError as error:
                 raise NumericalError(f"at mu = {mu.tolist()}: {error}") from error
 

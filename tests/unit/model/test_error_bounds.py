@@ -291,7 +291,7 @@ def test_what_equalities_may_miss_is_in_every_term(monkeypatch: pytest.MonkeyPat
         sp.csc_array([[4.0]]), np.array([4.0]), sp.csr_array([[2.0], [-2.0]]), np.array([1.0, -1.0])
     )
     known = Stability(InfSup(0.0, 0.0, 0.0, ""), Constant(0.25, True), Constant(9.0, True), Constant(0.0, True))
-    monkeypatch.setattr(module, "_round_off", lambda vi, u, w: np.full(2, 0.01))
+    monkeypatch.setattr(module, "_round_off", lambda on, u, w: np.full(2, 0.01))
     found = bounds_or_note(vi, np.array([0.6]), np.array([0.8, 0.0]), known)
     square = 0.22**2 + 2.0 * 0.02 * 0.8  # r = 0, ω = 0.2 and κ = 0 without η
     expected = ErrorBounds(np.sqrt(square), 2.0 * np.sqrt(square), np.sqrt(square), np.inf, 0.0, 0.0, 0.22, 0.016)

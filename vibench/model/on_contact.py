@@ -1,0 +1,204 @@
+"""The inequality of one parameter on the unknowns that its constraints touch, and the energy norm there.
+
+Let c be the retained unknowns of a condensed stiffness, i the eliminated ones, Ŝ the Schur complement. Every v is the
+sum of a part that vanishes on c and of the extension of v_c with the smallest energy, which are orthogonal in A:
+
+    ‖v‖²_A = ‖v − ext v_c‖²_A + v_cᵀŜ v_c,    ‖ℓ‖²_{A⁻¹} = ℓ_iᵀA_ii⁻¹ℓ_i + ℓ̂ᵀŜ⁻¹ℓ̂,    ℓ̂ = ℓ_c − A_ci A_ii⁻¹ ℓ_i.
+
+Forces Bᵀη of the contact load c alone, and B v = B v_c: all that error bounds do with them is of contact size. What the
+bounds of all pairs (u_N, λ_N) at one parameter share is computed once: D = Ŝ⁻¹Bᵀ, the compliance K = B Ŝ⁻¹Bᵀ = B A⁻¹Bᵀ
+of the constraints, and its Cholesky factor.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import scipy.linalg
+import scipy.sparse as sp
+
+from vibench.arrays import Array, Indices, Mask, SparseMatrix
+from vibench.highfidelity.kkt_systems import ActiveSetSystem, CondensedStiffness
+from vibench.interfaces.problem import VariationalInequality
+from vibench.qp.scaling import near_rows
+
+LARGEST = 2**24
+"""Entries of D up to which it is computed; beyond, sparse systems are solved for every active set."""
+
+CANCELLED = 1e-4
+"""A representer A⁻¹ℓ that is a sum of terms, whose norm is below this share of theirs, is computed anew from ℓ."""
+
+
+@dataclass(frozen=True)
+class Representer:
+    """A⁻¹ℓ of a functional ℓ: its values on c (c,), the load ℓ̂ (c,), and ℓ_iᵀA_ii⁻¹ℓ_i, zero for forces on c alone."""
+
+    values: Array
+    load: Array
+    rest: float = 0.0
+
+    @property
+    def norm(self) -> float:
+        """‖ℓ‖ in A⁻¹, the energy norm of the representer."""
+        return float(np.sqrt(max(self.rest + float(self.load @ self.values), 0.0)))
+
+    def plus(self, force: Representer) -> Representer:
+        """The sum with the representer of a force on c alone."""
+        return Representer(self.values + force.values, self.load + force.load, self.rest + force.rest)
+
+
+class OnContact:
+    """The constraints and the energy norm of one parameter on the c retained unknowns.
+
+    Parameters
+    ----------
+    vi
+        A, f, B and g at the parameter.
+    stiffness
+        Its A, condensed on unknowns that include those that B touches.
+    shared
+        Whether bounds of many pairs share D and K; they are computed for a dense Ŝ in any case.
+
+    Attributes
+    ----------
+    B, sizes
+        B on the retained unknowns and its absolute values, sparse (m×c).
+    """
+
+    def __init__(self, vi: VariationalInequality, stiffness: CondensedStiffness, *, shared: bool) -> None:
+        self.vi, self._stiffness, self._retained = vi, stiffness, stiffness.retained
+        self.B: SparseMatrix = sp.csr_array(sp.csc_array(vi.B)[:, self._retained])
+        self.sizes: SparseMatrix = abs(self.B)
+        m, c = self.B.shape
+        self._is_dense = m * c <= LARGEST and (shared or stiffness.dense)
+        self._factor: tuple[bytes, _Factor] | None = None
+
+    @property
+    def nbytes(self) -> int:
+        """Memory, about, once everything is computed: B and |B|, D, K, and a factor of K."""
+        m, c = self.B.shape
+        return 24 * int(self.B.nnz) + (8 * m * (c + 2 * m) if self._is_dense else 0)
+
+    def values(self, u: Array) -> Array:
+        """The retained unknowns (c,) of u (n,)."""
+        return np.asarray(u[self._retained])
+
+    def extended(self, values: Array) -> Array:
+        """The vector (n,) with these retained unknowns (c,) that has the smallest energy."""
+        return self._stiffness.extend(values)
+
+    @cached_property
+    def near(self) -> Mask:
+        """Constraints (m,) that solvers see: see `near_rows`."""
+        return near_rows(self.vi)
+
+    @cached_property
+    def entries(self) -> Indices:
+        """Numbers of entries (m,) of the rows."""
+        return np.asarray(np.diff(self.B.indptr))
+
+    @cached_property
+    def stiffnesses(self) -> Array:
+        """Upper bounds b A bᵀ / |b|⁴ (m,) of the stiffness 1 / b A⁻¹ bᵀ of a row, by Cauchy and Schwarz."""
+        B = sp.csr_array(self.vi.B)
+        squares, energies = (np.asarray((B * other).sum(axis=1)) for other in (B, B @ self.vi.A))
+        return np.asarray(np.divide(energies, squares**2, out=np.zeros_like(squares), where=squares > 0.0))
+
+    @cached_property
+    def _liftings(self) -> Array:
+        """Dᵀ (m×c): few of its rows are needed at a time."""
+        return np.ascontiguousarray(self._stiffness.compliance(np.ascontiguousarray(self.B.toarray().T)).T)
+
+    @cached_property
+    def _compliance(self) -> Array:
+        """K (m×m), not symmetrised: what forces displace is to the last digit what B says of it."""
+        return np.asarray(self.B @ self._liftings.T)
+
+    def of_force(self, multiplier: Array) -> Representer:
+        """The representer of a force Bᵀη of a multiplier η (m,)."""
+        load = np.asarray(self.B.T @ multiplier)
+        return Representer(self._displaced(multiplier) if self._is_dense else self._stiffness.compliance(load), load)
+
+    def _displaced(self, multiplier: Array) -> Array:
+        """D η (c,) of a multiplier η (m,) with few entries."""
+        pressed = np.flatnonzero(multiplier)
+        return np.asarray(multiplier[pressed] @ self._liftings[pressed])
+
+    def load(self, values: Array, multiplier: Array) -> Array:
+        """Ŝ v (c,) of retained unknowns v (c,), which a force Bᵀη of a multiplier η (m,) displaces up to round-off."""
+        return np.asarray(self.B.T @ multiplier) if self._is_dense else self._stiffness.load(values)
+
+    def norm(self, terms: Representer, largest: float) -> float:
+        """The norm of a sum of terms whose norm is at most about `largest`."""
+        if terms.norm >= CANCELLED * largest:
+            return terms.norm
+        return Representer(self._stiffness.compliance(terms.load), terms.load, terms.rest).norm
+
+    def correction_system(self, rows: Indices, pressed: Array, least: Array) -> ActiveSetSystem:
+        """The systems of min ½‖w‖²_A + ηᵀB w subject to B w ≥ s in some rows (k,), with η (m,) and s (k,)."""
+        vi = self.vi
+        if not self._is_dense:
+            program = VariationalInequality(vi.A, -(vi.B.T @ pressed), -sp.csr_array(vi.B)[rows], -least)
+            return self._stiffness.active_set_system(program)
+        B = -(self.B if len(rows) == len(vi.g) else self.B[rows])
+
+        def solve_active(active: Indices) -> tuple[Array, Array]:
+            # in terms of ν − η, which is small where η is nearly the multiplier: nothing cancels
+            chosen, forces, released = rows[active], np.zeros(len(rows)), pressed.copy()
+            released[chosen] = 0.0
+            w = -self._displaced(released)
+            if len(active):
+                added = _Factor(self._compliance[np.ix_(chosen, chosen)]).solve(least[active] + (B @ w)[active])
+                forces[active] = pressed[chosen] + added
+                w += added @ self._liftings[chosen]
+            return w, forces
+
+        return ActiveSetSystem(B, -least, solve_active, self.extended, np.asarray)
+
+    def holding(self, rows: Indices, values: Array) -> Representer:
+        """The representer of the force Bᵀξ of some rows (k,) with B A⁻¹Bᵀξ = B v there, v (c,) on retained unknowns.
+
+        Raises
+        ------
+        RuntimeError, numpy.linalg.LinAlgError
+            If the rows are linearly dependent.
+        """
+        given, multiplier = (self.B @ values)[rows], np.zeros(self.B.shape[0])
+        if self._is_dense:
+            multiplier[rows] = self._forces(rows, given)
+            return self.of_force(multiplier)
+        vi = self.vi
+        program = VariationalInequality(vi.A, np.zeros_like(vi.f), sp.csr_array(vi.B)[rows], -given)
+        moved, multiplier[rows] = self._stiffness.active_set_system(program).solve_active(np.arange(len(rows)))
+        return Representer(-moved, -self.load(moved, -multiplier))
+
+    def _forces(self, rows: Indices, given: Array) -> Array:
+        """Solution of K ξ = r in some rows (k,); the last factor is kept."""
+        if self._factor is None or self._factor[0] != rows.tobytes():
+            self._factor = rows.tobytes(), _Factor(self._compliance[np.ix_(rows, rows)])
+        return self._factor[1].solve(given)
+
+
+def representers(stiffness: CondensedStiffness, functionals: Array) -> list[Representer]:
+    """A⁻¹ℓ of functionals, the columns (n×k), all in one block."""
+    loads, values, rest = stiffness.represent(functionals)
+    return [Representer(*of_one) for of_one in zip(values.T, loads.T, rest.tolist(), strict=True)]
+
+
+class _Factor:
+    """The Cholesky factor of a compliance (k×k) in units of its diagonal, which serve rows of any length."""
+
+    def __init__(self, compliance: Array) -> None:
+        self._compliance, self._unit = compliance, 1.0 / np.sqrt(np.diag(compliance))
+        self._factor = scipy.linalg.cho_factor(compliance * self._unit * self._unit[:, None], overwrite_a=True)
+
+    def solve(self, given: Array) -> Array:
+        """Forces (k,) that displace the rows by given values (k,); refined once."""
+        forces = self._solve_once(given)
+        return forces + self._solve_once(given - self._compliance @ forces)
+
+    def _solve_once(self, given: Array) -> Array:
+        solved = scipy.linalg.cho_solve(self._factor, self._unit * given, overwrite_b=True, check_finite=False)
+        return np.asarray(self._unit * solved)
