@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property, partial
+from types import MappingProxyType
 
 import numpy as np
 
@@ -153,10 +154,20 @@ class ReducedModel:
         return ReducedProblem(project(vi, Z, self.generators), partial(np.matmul, Z))
 
 
-def project(vi: VariationalInequality, Z: Array, chi: Array) -> VariationalInequality:
-    """Galerkin projection on span Z (n×N') and the cone of χ (m×R): dense A, f, B, g."""
-    A = Z.T @ np.asarray(vi.A @ Z)
-    return VariationalInequality(A=0.5 * (A + A.T), f=Z.T @ vi.f, B=chi.T @ np.asarray(vi.B @ Z), g=chi.T @ vi.g)
+def project(
+    vi: VariationalInequality, Z: Array, chi: Array, known: Mapping[str, Array] = MappingProxyType({})
+) -> VariationalInequality:
+    """Galerkin projection on span Z (n×N') and the cone of χ (m×R): dense A, f, B, g.
+
+    `known` has projections of members, by name, that were made at another parameter.
+    """
+    A = known["A"] if "A" in known else Z.T @ np.asarray(vi.A @ Z)
+    return VariationalInequality(
+        A=A if "A" in known else 0.5 * (A + A.T),
+        f=known["f"] if "f" in known else Z.T @ vi.f,
+        B=known["B"] if "B" in known else chi.T @ np.asarray(vi.B @ Z),
+        g=known["g"] if "g" in known else chi.T @ vi.g,
+    )
 
 
 def leading_part(program: VariationalInequality, size: int) -> VariationalInequality:

@@ -11,7 +11,7 @@ eigenvalue of M: that has a floor of √eps.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 
 import numpy as np
@@ -191,6 +191,8 @@ class ProjectedSupremizers:
 
     of_classes: Sequence[Array]
     classes: ConstraintClasses
+    _known: dict[tuple[int, int], float] = field(default_factory=dict, repr=False, compare=False)
+    """β_span of representatives that several histories need, by the number of vectors and of the class."""
 
     def first(self, count: int) -> ProjectedSupremizers:
         """The projections on the first `count` vectors of Z."""
@@ -218,7 +220,9 @@ class ProjectedSupremizers:
         """
 
         def negative(count: int, k: int) -> float:
-            return -value(beta_span(self.of_classes[k][:count]), k)
+            if (count, k) not in self._known:
+                self._known[count, k] = beta_span(self.of_classes[k][:count])
+            return -value(self._known[count, k], k)
 
         lazy, last = LazyMaximum(np.zeros(len(self.of_classes))), self.of_classes[0].shape[0]
         return np.array([-lazy.next(partial(negative, count))[1] for count in range(first, last + 1)])

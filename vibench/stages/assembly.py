@@ -9,6 +9,7 @@ import numpy as np
 
 from vibench.arrays import Array
 from vibench.interfaces.problem import MEMBERS, Problem, VariationalInequality
+from vibench.interfaces.strategies import Kind
 from vibench.linalg.cholesky import PartialCholesky, SparseCholesky
 from vibench.linalg.inner_product import InnerProduct
 from vibench.model.affine import AffineMember, Evaluation, affine_decomposition
@@ -98,8 +99,7 @@ class NestedPrograms(Stage):
     def run(self, store: Store) -> Result:
         """One program per validation parameter; not timed."""
         model = self.growth.reduction(store).projection
-        mus, kept = self.validation.of(model.problem), assemblies(model.problem)
-        return Result(tuple(model.reduce(kept.at(mu)).program for mu in mus))
+        return Result(tuple(_projections(model, self.validation.of(model.problem))))
 
 
 @storable
@@ -209,11 +209,21 @@ def _reduced(model: HyperReducedModel, mus: Array, larger: InFull) -> ReducedPro
 
 def _in_full(model: ReducedModel, mus: Array, larger: InFull) -> ReducedPrograms:
     """The projection of the high-fidelity matrices at every parameter."""
-    matrices, size = assemblies(model.problem), model.fixed_basis.shape[1]
-    programs = (
-        [leading_part(p, size) for p in larger] if larger else [model.reduce(matrices.at(mu)).program for mu in mus]
-    )
+    size = model.fixed_basis.shape[1]
+    programs = [leading_part(p, size) for p in larger] if larger else _projections(model, mus)
     return ReducedPrograms(tuple(programs), None, (0.0,) * len(mus))
+
+
+def _projections(model: ReducedModel, mus: Array) -> list[VariationalInequality]:
+    """The Galerkin projections at every parameter; constant members are projected once on a fixed basis."""
+    matrices, problem = assemblies(model.problem), model.problem
+    if model.kind is Kind.PER_PARAMETER:
+        return [model.reduce(matrices.at(mu)).program for mu in mus]
+    Z, chi, programs = model.fixed_basis, model.generators, list[VariationalInequality]()
+    for mu in mus:
+        known = {name: getattr(programs[0], name) for name in problem.constant if programs}
+        programs.append(project(matrices.at(mu), Z, chi, known))
+    return programs
 
 
 def _largest_difference(program: VariationalInequality, exact: VariationalInequality) -> float:
