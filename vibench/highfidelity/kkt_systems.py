@@ -47,10 +47,15 @@ class CondensedStiffness:
     def __init__(self, A: SparseMatrix, pattern: EliminationPattern | None = None) -> None:
         if pattern is None or (pattern.whole is None and len(pattern.retained) > MAX_RETAINED_SHARE * A.shape[0]):
             pattern = EliminationPattern(np.arange(A.shape[0]), np.zeros(0, np.intp), np.zeros(0, np.intp))
-        self._pattern = pattern
+        self._A, self._pattern = A, pattern
         self._condensed = StaticCondensation(A, self._pattern)
         self._saddle: SaddlePointSolver | None = None
         self._last: tuple[Array, Array] | None = None
+
+    @cached_property
+    def factor(self) -> SparseCholesky:
+        """The Cholesky factor of all of A."""
+        return SparseCholesky(self._A, "A")
 
     def check_definite(self, name: str) -> None:
         """Raise a `NumericalError` that calls A by `name` if A is not positive definite.
@@ -81,6 +86,11 @@ class CondensedStiffness:
         return norms_by_solutions(functionals, self.solve(functionals))
 
     @property
+    def nbytes(self) -> int:
+        """Memory, about, without `factor`."""
+        return self._condensed.nbytes + (8 * len(self.retained) ** 2 if self.dense else 0)
+
+    @property
     def retained(self) -> Indices:
         """The retained unknowns (c,), rising."""
         return self._pattern.retained
@@ -100,6 +110,12 @@ class CondensedStiffness:
     def load(self, retained: Array) -> Array:
         """Ŝ times retained unknowns (c,), where it is sparse."""
         return np.asarray(self._condensed.schur @ retained)
+
+    def liftings(self, B: SparseMatrix) -> Array:
+        """B Ŝ⁻¹ (m×c) for rows B (m×c) of the retained unknowns."""
+        if self._condensed.dense:
+            return np.asarray(B @ self._compliance)
+        return np.ascontiguousarray(self._schur_factor.solve(B.toarray().T).T)
 
     def represent(self, functionals: Array) -> tuple[Array, Array, Array]:
         """Condensed loads ℓ̂ (c, k) of functionals (n, k), Ŝ⁻¹ℓ̂ (c, k), and ℓ_iᵀA_ii⁻¹ℓ_i (k,), i being eliminated."""

@@ -141,6 +141,11 @@ class PartialCholesky:
         """Factorise again."""
         PartialCholesky.__init__(self, **state)
 
+    @property
+    def nbytes(self) -> int:
+        """Memory of the factors: a value of 8 bytes and an index of 4 per entry."""
+        return 12 * int(self._lu.nnz)
+
     @cached_property
     def _columns(self) -> SparseMatrix:
         """The columns [L_ii; L_ci] of the unit lower factor."""

@@ -107,6 +107,11 @@ class StaticCondensation:
         self._last_load: tuple[Array, tuple[Array, Array]] | None = None
 
     @property
+    def nbytes(self) -> int:
+        """Memory of the factor of the eliminated unknowns, twice: SuperLU allocates more than it fills."""
+        return 0 if self._factor is None else 2 * self._factor.nbytes
+
+    @property
     def _interface_schur(self) -> Array:
         return self._factor.schur() if self._factor is not None else np.zeros((0, 0))
 

@@ -29,14 +29,11 @@ class Energy:
     ----------
     A
         Sparse SPD (n×n).
-    factor
-        Its Cholesky factor.
     stiffness
         A condensed on the unknowns that constraints involve, for programs with this A and these constraints.
     """
 
     A: SparseMatrix
-    factor: SparseCholesky
     stiffness: CondensedStiffness
     shared: bool = False
     """Whether the errors of many solutions are measured with it: what they have in common is worth more work then."""
@@ -44,8 +41,8 @@ class Energy:
 
     @property
     def nbytes(self) -> int:
-        """Memory, about: that of the condensed matrix is as large, and SuperLU allocates twice what it fills."""
-        return 4 * self.factor.nbytes + self.nbytes_on_contact
+        """Memory, about, once everything is computed."""
+        return self.stiffness.nbytes + self.nbytes_on_contact
 
     @property
     def nbytes_on_contact(self) -> int:
@@ -62,13 +59,14 @@ class Energy:
         """‖v‖_A of v (n,)."""
         return float(np.sqrt(max(float(v @ (self.A @ v)), 0.0)))
 
-    def riesz(self, functional: Array) -> Array:
-        """A⁻¹ ℓ of a functional (n,)."""
-        return self.factor.solve(functional)
+    @property
+    def factor(self) -> SparseCholesky:
+        """The Cholesky factor of A, computed where it is needed."""
+        return self.stiffness.factor
 
     def dual_norm(self, functional: Array) -> float:
         """‖ℓ‖_{A⁻¹} of a functional (n,)."""
-        return float(np.sqrt(max(float(functional @ self.riesz(functional)), 0.0)))
+        return float(np.sqrt(max(float(functional @ self.factor.solve(functional)), 0.0)))
 
 
 def rieszes(energies: Sequence[Energy], functionals: Sequence[Array]) -> list[Representer]:

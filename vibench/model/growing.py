@@ -13,7 +13,6 @@ from vibench.highfidelity.active_set import ActiveSetSolution, HighFidelitySolut
 from vibench.interfaces.problem import Problem, VariationalInequality
 from vibench.interfaces.strategies import Trainer
 from vibench.interfaces.validation import ReferenceAssembly, checked_assembly
-from vibench.linalg.cholesky import SparseCholesky
 from vibench.linalg.inner_product import orthonormal_range
 from vibench.model.contact_estimates import ContactEstimates
 from vibench.model.error_bounds import find_correction, residual, terms
@@ -55,7 +54,6 @@ class GrowingModel:
         self._whitened = np.zeros((problem.V.dim, 0))
         self._basis = np.zeros((problem.V.dim, 0))
         self.generators = np.zeros((problem.W.dim, 0))
-        self._factor: SparseCholesky | None = None
         self._estimates: ContactEstimates | None = None
 
     def add(self, vi: VariationalInequality, solution: HighFidelitySolution) -> str:
@@ -104,9 +102,7 @@ class GrowingModel:
         if solved is None:
             return float("inf")
         u, lam = solved
-        if self._factor is None or "A" not in self._problem.constant:
-            self._factor = SparseCholesky(vi.A, "A")
-        energy = Energy(vi.A, self._factor, self._solver.condensed(vi))
+        energy = Energy(vi.A, self._solver.condensed(vi))
         corrected = find_correction(vi, energy, u, lam)
         if corrected is None:
             return float("inf")

@@ -24,8 +24,8 @@ from vibench.highfidelity.kkt_systems import ActiveSetSystem, CondensedStiffness
 from vibench.interfaces.problem import VariationalInequality
 from vibench.qp.scaling import near_rows
 
-LARGEST = 2**24
-"""Entries of D up to which it is computed; beyond, sparse systems are solved for every active set."""
+LARGEST, SMALL = 2**24, 2**18
+"""Entries of D up to which it is computed, for a dense and for a sparse Ŝ; beyond, systems are solved for every set."""
 
 CANCELLED = 1e-4
 """A representer A⁻¹ℓ that is a sum of terms, whose norm is below this share of theirs, is computed anew from ℓ."""
@@ -59,7 +59,8 @@ class OnContact:
     stiffness
         Its A, condensed on unknowns that include those that B touches.
     shared
-        Whether bounds of many pairs share D and K; they are computed for a dense Ŝ in any case.
+        Whether bounds of many pairs may share D and K. For a sparse Ŝ they are computed only then, and only if they are
+        small: where they are not kept until the next pair they cost more than sparse systems.
 
     Attributes
     ----------
@@ -72,7 +73,7 @@ class OnContact:
         self.B: SparseMatrix = sp.csr_array(sp.csc_array(vi.B)[:, self._retained])
         self.sizes: SparseMatrix = abs(self.B)
         m, c = self.B.shape
-        self._is_dense = m * c <= LARGEST and (shared or stiffness.dense)
+        self._is_dense = m * c <= (LARGEST if stiffness.dense else SMALL if shared else 0)
         self._factor: tuple[bytes, _Factor] | None = None
 
     @property
@@ -109,7 +110,7 @@ class OnContact:
     @cached_property
     def _liftings(self) -> Array:
         """Dᵀ (m×c): few of its rows are needed at a time."""
-        return np.ascontiguousarray(self._stiffness.compliance(np.ascontiguousarray(self.B.toarray().T)).T)
+        return self._stiffness.liftings(self.B)
 
     @cached_property
     def _compliance(self) -> Array:
@@ -177,7 +178,9 @@ class OnContact:
     def _forces(self, rows: Indices, given: Array) -> Array:
         """Solution of K ξ = r in some rows (k,); the last factor is kept."""
         if self._factor is None or self._factor[0] != rows.tobytes():
-            self._factor = rows.tobytes(), _Factor(self._compliance[np.ix_(rows, rows)])
+            all_of_them = len(rows) == len(self._compliance)
+            compliance = self._compliance if all_of_them else self._compliance[np.ix_(rows, rows)]
+            self._factor = rows.tobytes(), _Factor(compliance)
         return self._factor[1].solve(given)
 
 

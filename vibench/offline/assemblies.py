@@ -12,14 +12,13 @@ from vibench.arrays import Array
 from vibench.highfidelity.active_set import HighFidelitySolver
 from vibench.interfaces.problem import Problem, VariationalInequality
 from vibench.interfaces.validation import checked_assembly
-from vibench.linalg.cholesky import SparseCholesky
 from vibench.model.errors import Energy
 
 LIMIT = 2**28
 """Size limit of the assemblies in bytes; the least recently used one is dropped first."""
 
-FACTORS = 2**29
-"""The same of factors of A, and of compliances. Cells use the same parameters in the same order: too small a cache is
+FACTORS = 3 * 2**28
+"""The same of factors of A and of compliances. Cells use the same parameters in the same order: too small a cache is
 none."""
 
 
@@ -31,7 +30,6 @@ class Assemblies:
         self._kept: LRUCache[bytes, VariationalInequality] = LRUCache(limit, getsizeof=_bytes)
         self._energies: LRUCache[bytes, Energy] = LRUCache(FACTORS, getsizeof=self._own_bytes)
         self._solver = HighFidelitySolver(problem)
-        self._constant: SparseCholesky | None = None
 
     def at(self, mu: Array) -> VariationalInequality:
         """A copy of `checked_assembly` at mu (d,), which later assemblies leave as it is."""
@@ -54,10 +52,7 @@ class Assemblies:
 
     def energy_of(self, vi: VariationalInequality) -> Energy:
         """Factorisations of an assembled A, which are not kept unless it is constant: this may be timed."""
-        if "A" not in self._problem.constant:
-            return Energy(vi.A, SparseCholesky(vi.A, "A"), self._solver.condensed(vi))
-        self._constant = self._constant or SparseCholesky(vi.A, "A")
-        return Energy(vi.A, self._constant, self._solver.condensed(vi))
+        return Energy(vi.A, self._solver.condensed(vi))
 
     def _own_bytes(self, energy: Energy) -> int:
         """Memory of what is of one parameter alone."""

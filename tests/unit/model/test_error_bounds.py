@@ -14,7 +14,6 @@ from vibench.errors import NumericalError
 from vibench.highfidelity.active_set import ACCURACY
 from vibench.highfidelity.kkt_systems import CondensedStiffness
 from vibench.interfaces.problem import VariationalInequality
-from vibench.linalg.cholesky import SparseCholesky
 from vibench.model import error_bounds as module
 from vibench.model.error_bounds import (
     ESTIMATED,
@@ -43,7 +42,7 @@ EXACT = 1e-12
 
 
 def energy(vi: VariationalInequality) -> Energy:
-    return Energy(vi.A, SparseCholesky(vi.A), CondensedStiffness(vi.A))
+    return Energy(vi.A, CondensedStiffness(vi.A))
 
 
 def stability(vi: VariationalInequality) -> Stability:
