@@ -96,6 +96,11 @@ class CondensedStiffness:
         return self._pattern.retained
 
     @property
+    def eliminated(self) -> Indices:
+        """All others, in the order of their elimination."""
+        return self._pattern.order[: len(self._pattern.order) - len(self._pattern.interface)]
+
+    @property
     def dense(self) -> bool:
         """Whether the Schur complement Ŝ is treated as a dense matrix."""
         return self._condensed.dense

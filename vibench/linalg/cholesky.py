@@ -18,6 +18,9 @@ SYMMETRIC = {"diag_pivot_thresh": 0.0, "panel_size": 1, "options": {"SymmetricMo
 """SuperLU without off-diagonal pivoting is a Cholesky factorisation; SciPy has no sparse one of its own. Panels of one
 column are the fastest for matrices of plane meshes."""
 
+UNIT = float(np.finfo(float).eps) / 2.0
+"""The unit round-off."""
+
 SPARSE_COLUMN = 64
 """Columns of a factor with at most so many entries are multiplied as sparse ones, which needs few operations there."""
 
@@ -181,6 +184,28 @@ class PartialCholesky:
         Raises a `NumericalError` if S, and with it X, is not positive definite.
         """
         return dense_cholesky(self.schur(), self._name)
+
+    def round_off(self, weights: Array) -> Array:
+        """Row sums Σ_j |X − P|_ij w_j (n,) with weights w (n,), both in elimination order, or upper bounds of them.
+
+        P is the matrix whose factors are exactly the computed L_ii, L_ci and D, with the computed S as its complement:
+        |X − P| ≤ γ|L||U| + |L||U − D Lᵀ| in the columns of i (Higham 2002, Theorem 9.3), and the round-off in S.
+        """
+        split = self._split
+        lower, upper = sp.csc_array(self._lu.L)[:, :split], sp.csc_array(self._lu.U)[:split, :split]
+        terms = int(np.max(np.bincount(lower.indices), initial=0)) + 8
+        gamma = terms * UNIT / (1.0 - terms * UNIT)
+        missing = abs(upper - sp.csc_array(sp.diags_array(self._root**2) @ lower[:split].T))
+        lower, upper = abs(lower), abs(upper)
+        (of_i, of_c), corner = (lower[:split], lower[split:]), abs(self._corner)
+        w_i, w_c = weights[:split], weights[split:]
+        inner = gamma * (upper @ w_i) + (1.0 + gamma) * (missing @ w_i)
+        back = of_c.T @ w_c  # the columns of c are those of i mirrored
+        sums = np.concatenate([
+            of_i @ inner + gamma * (upper.T @ back) + (1.0 + gamma) * (missing.T @ back),
+            of_c @ inner + gamma * (corner @ w_c + of_c @ (self._root**2 * back)),
+        ])  # fmt: skip
+        return np.asarray(1.01 * sums)
 
     def eliminate(self, right: Array) -> tuple[Array, Array]:
         """For r (n,) or (n, k), X_ii⁻¹ r_i and the load of the Schur complement, r_c − X_ci X_ii⁻¹ r_i."""

@@ -22,9 +22,7 @@ import scipy.sparse as sp
 from scipy.sparse.linalg import SuperLU, splu
 
 from vibench.arrays import Array, Indices, SparseMatrix
-from vibench.linalg.cholesky import SYMMETRIC
-
-UNIT = float(np.finfo(float).eps) / 2.0
+from vibench.linalg.cholesky import SYMMETRIC, UNIT
 
 FIRST_SHIFT = 1e-11
 """τ of the first attempt; where the round-off exceeds it, τ becomes twice the round-off."""

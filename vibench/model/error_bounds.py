@@ -61,7 +61,7 @@ from vibench.arrays import Array, Indices, Mask
 from vibench.errors import NumericalError
 from vibench.highfidelity.active_set import active_set_iterations
 from vibench.interfaces.problem import VariationalInequality, is_absent
-from vibench.linalg.inertia import UNIT
+from vibench.linalg.cholesky import UNIT
 from vibench.model.equalities import Equalities
 from vibench.model.errors import Energy, rieszes
 from vibench.model.on_contact import OnContact, Representer

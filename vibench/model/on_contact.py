@@ -66,6 +66,8 @@ class OnContact:
     ----------
     B, sizes
         B on the retained unknowns and its absolute values, sparse (m×c).
+    is_dense
+        Whether D and K are computed.
     """
 
     def __init__(self, vi: VariationalInequality, stiffness: CondensedStiffness, *, shared: bool) -> None:
@@ -73,14 +75,14 @@ class OnContact:
         self.B: SparseMatrix = sp.csr_array(sp.csc_array(vi.B)[:, self._retained])
         self.sizes: SparseMatrix = abs(self.B)
         m, c = self.B.shape
-        self._is_dense = m * c <= (LARGEST if stiffness.dense else SMALL if shared else 0)
+        self.is_dense = m * c <= (LARGEST if stiffness.dense else SMALL if shared else 0)
         self._factor: tuple[bytes, _Factor] | None = None
 
     @property
     def nbytes(self) -> int:
         """Memory, about, once everything is computed: B and |B|, D, K, and a factor of K."""
         m, c = self.B.shape
-        return 24 * int(self.B.nnz) + (8 * m * (c + 2 * m) if self._is_dense else 0)
+        return 24 * int(self.B.nnz) + (8 * m * (c + 2 * m) if self.is_dense else 0)
 
     def values(self, u: Array) -> Array:
         """The retained unknowns (c,) of u (n,)."""
@@ -108,28 +110,28 @@ class OnContact:
         return np.asarray(np.divide(energies, squares**2, out=np.zeros_like(squares), where=squares > 0.0))
 
     @cached_property
-    def _liftings(self) -> Array:
+    def liftings(self) -> Array:
         """Dᵀ (m×c): few of its rows are needed at a time."""
         return self._stiffness.liftings(self.B)
 
     @cached_property
     def _compliance(self) -> Array:
         """K (m×m), not symmetrised: what forces displace is to the last digit what B says of it."""
-        return np.asarray(self.B @ self._liftings.T)
+        return np.asarray(self.B @ self.liftings.T)
 
     def of_force(self, multiplier: Array) -> Representer:
         """The representer of a force Bᵀη of a multiplier η (m,)."""
         load = np.asarray(self.B.T @ multiplier)
-        return Representer(self._displaced(multiplier) if self._is_dense else self._stiffness.compliance(load), load)
+        return Representer(self._displaced(multiplier) if self.is_dense else self._stiffness.compliance(load), load)
 
     def _displaced(self, multiplier: Array) -> Array:
         """D η (c,) of a multiplier η (m,) with few entries."""
         pressed = np.flatnonzero(multiplier)
-        return np.asarray(multiplier[pressed] @ self._liftings[pressed])
+        return np.asarray(multiplier[pressed] @ self.liftings[pressed])
 
     def load(self, values: Array, multiplier: Array) -> Array:
         """Ŝ v (c,) of retained unknowns v (c,), which a force Bᵀη of a multiplier η (m,) displaces up to round-off."""
-        return np.asarray(self.B.T @ multiplier) if self._is_dense else self._stiffness.load(values)
+        return np.asarray(self.B.T @ multiplier) if self.is_dense else self._stiffness.load(values)
 
     def norm(self, terms: Representer, largest: float) -> float:
         """The norm of a sum of terms whose norm is at most about `largest`."""
@@ -140,7 +142,7 @@ class OnContact:
     def correction_system(self, rows: Indices, pressed: Array, least: Array) -> ActiveSetSystem:
         """The systems of min ½‖w‖²_A + ηᵀB w subject to B w ≥ s in some rows (k,), with η (m,) and s (k,)."""
         vi = self.vi
-        if not self._is_dense:
+        if not self.is_dense:
             program = VariationalInequality(vi.A, -(vi.B.T @ pressed), -sp.csr_array(vi.B)[rows], -least)
             return self._stiffness.active_set_system(program)
         B = -(self.B if len(rows) == len(vi.g) else self.B[rows])
@@ -153,7 +155,7 @@ class OnContact:
             if len(active):
                 added = _Factor(self._compliance[np.ix_(chosen, chosen)]).solve(least[active] + (B @ w)[active])
                 forces[active] = pressed[chosen] + added
-                w += added @ self._liftings[chosen]
+                w += added @ self.liftings[chosen]
             return w, forces
 
         return ActiveSetSystem(B, -least, solve_active, self.extended, np.asarray)
@@ -167,7 +169,7 @@ class OnContact:
             If the rows are linearly dependent.
         """
         given, multiplier = (self.B @ values)[rows], np.zeros(self.B.shape[0])
-        if self._is_dense:
+        if self.is_dense:
             multiplier[rows] = self._forces(rows, given)
             return self.of_force(multiplier)
         vi = self.vi

@@ -78,7 +78,7 @@ def coercivity_and_continuity(A: SparseMatrix, V: InnerProduct) -> tuple[Constan
     def continuous(c: float) -> bool:
         return proved_positive([c * X, -A], np.sqrt(c) * root_X) == V.dim
 
-    return _moved(low, -1.0, coercive), _moved(high, 1.0, continuous)
+    return moved(low, -1.0, coercive), moved(high, 1.0, continuous)
 
 
 def operator_norm(M: SparseMatrix, X: InnerProduct) -> Constant:
@@ -96,10 +96,10 @@ def operator_norm(M: SparseMatrix, X: InnerProduct) -> Constant:
         scaled = np.sqrt(c / estimate) * root
         return all(proved_positive([c * X.matrix, sign * M], scaled) == X.dim for sign in (-1.0, 1.0))
 
-    return _moved(estimate, 1.0, above)
+    return moved(estimate, 1.0, above)
 
 
-def _moved(estimate: float, sign: float, proves: Callable[[float], bool]) -> Constant:
+def moved(estimate: float, sign: float, proves: Callable[[float], bool]) -> Constant:
     """The estimate moved outwards, downwards for a negative sign, until it is proved."""
     candidates = [estimate * (1.0 + margin) ** sign for margin in MARGINS]
     for candidate in candidates:
@@ -139,7 +139,7 @@ def energy_inf_sup(A: SparseMatrix, B: SparseMatrix, W: InnerProduct) -> Constan
         saddle = -_saddle_point(A, B, beta**2 * W.matrix)
         return bool(proved_positive([saddle], np.concatenate([roots[0], beta * roots[1]]), order) >= m)
 
-    constant = _moved(float(np.sqrt(square)), -1.0, stable)
+    constant = moved(float(np.sqrt(square)), -1.0, stable)
     return constant if constant.proved else Constant(0.0, True)
 
 
@@ -167,6 +167,21 @@ def _smallest_compliance(
 
 def _saddle_point(A: SparseMatrix, B: SparseMatrix, corner: SparseMatrix) -> SparseMatrix:
     return sp.csc_array(sp.block_array([[A, B.T], [B, corner]]))
+
+
+def smallest_quotient(matrix: Array, X: InnerProduct) -> float:
+    """Estimate of the smallest eigenvalue of a symmetric matrix (m×m) against that of X; 0 if it is not positive."""
+    if len(matrix) <= FEW:
+        return max(0.0, float(scipy.linalg.eigvalsh(matrix, X.matrix.toarray())[0]))
+    try:
+        factor = scipy.linalg.cho_factor(matrix)
+    except np.linalg.LinAlgError:
+        return 0.0
+
+    def inverse(y: Array) -> Array:
+        return np.asarray(scipy.linalg.cho_solve(factor, y, check_finite=False))
+
+    return _smallest(_operator(len(matrix), lambda y: matrix @ y), X.matrix, inverse)
 
 
 def _smallest(matrix: SparseMatrix | LinearOperator, product: SparseMatrix, inverse: Callable[[Array], Array]) -> float:
