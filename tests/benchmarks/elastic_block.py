@@ -10,18 +10,29 @@ factors of X_V, is known before both. On one thread.
 
 from __future__ import annotations
 
+import argparse
 import os
+import statistics
 
 if __name__ == "__main__":  # before NumPy is imported
     for library in ("OMP", "OPENBLAS", "MKL", "NUMEXPR"):
         os.environ[f"{library}_NUM_THREADS"] = "1"
+
+from functools import partial
 
 import numpy as np
 import scipy.sparse as sp
 from skfem import Basis, BilinearForm, ElementHex1, ElementVector, MeshHex
 from skfem.helpers import ddot, eye, sym_grad, trace
 
-from vibench import AffineProblem, Array, InnerProduct, ParameterBox, fem
+from vibench import AffineProblem, Array, InnerProduct, ParameterBox, Problem, fem
+from vibench.highfidelity.active_set import ActiveSetSolution, HighFidelitySolver
+from vibench.interfaces.validation import checked_assembly
+from vibench.model.error_bounds import ErrorBounds, bound_errors_at
+from vibench.offline.assemblies import Assemblies
+from vibench.stages.base import build_problem
+from vibench.study.plugin import Plugin
+from vibench.timing import timed
 
 
 @BilinearForm
@@ -68,3 +79,54 @@ class Block(AffineProblem):
 
     def training_set(self) -> Array:
         return self.parameters.grid(2, 2, 2)
+
+
+def measure(problem: Problem, count: int) -> None:
+    """Print one line per parameter, and the medians."""
+    box, ratios = problem.parameters, []
+    mus = box.lower + np.random.default_rng(2022).random((count + 1, len(box.lower))) * (box.upper - box.lower)
+    solver, kept = HighFidelitySolver(problem), Assemblies(problem)
+    solver.solve(mus[0])
+    _judged(kept, mus[0], *_approximation(solver.solve(mus[0])))  # what is known of the problem
+    for mu in mus[1:]:
+        solution, once = timed(partial(_solved, solver, problem, mu))
+        (bounds, parts), judging = timed(partial(_judged, kept, mu, *_approximation(solution)))
+        ratios.append(judging.cpu / once.cpu)
+        named = ", ".join(f"{name} {seconds:.3f}" for name, seconds in parts.items())
+        print(f"solution {once.cpu:.3f} s, constants and bounds {judging.cpu:.3f} s ({named}): {ratios[-1]:.2f} times")
+        assert np.isfinite(bounds.lam)
+    print(f"n = {problem.V.dim}, m = {problem.W.dim}: {statistics.median(ratios):.2f} times, the median of {count}")
+
+
+def _solved(solver: HighFidelitySolver, problem: Problem, mu: Array) -> ActiveSetSolution:
+    return solver.solve_assembled(mu, checked_assembly(problem, mu))
+
+
+def _approximation(solution: ActiveSetSolution) -> tuple[Array, Array]:
+    """A pair that is not the solution."""
+    return 0.99 * solution.u, 1.02 * solution.lam
+
+
+def _judged(kept: Assemblies, mu: Array, u: Array, lam: Array) -> tuple[ErrorBounds, dict[str, float]]:
+    """The error bounds of u (n,) and λ (m,), and the CPU seconds of their parts."""
+    energy, factorising = timed(lambda: kept.energy_at(mu))
+    alpha, of_alpha = timed(lambda: kept.coercivity_at(mu))
+    beta, of_beta = timed(lambda: kept.energy_inf_sup_at(mu))
+    bounds, of_bounds = timed(lambda: bound_errors_at(kept.at(mu), energy, alpha, beta, u, lam))
+    parts = {"A": factorising, "α": of_alpha, "β_A": of_beta, "bounds": of_bounds}
+    return bounds, {name: seconds.cpu for name, seconds in parts.items()}
+
+
+def main() -> None:
+    """Read the command line."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n", 1)[0])
+    parser.add_argument("problem", choices=["block", "obstacle", "hertz"])
+    parser.add_argument("--cells", type=int, default=21)
+    parser.add_argument("--count", type=int, default=3)
+    given = parser.parse_args()
+    is_block = given.problem == "block"
+    measure(Block(given.cells) if is_block else build_problem(Plugin("problem", given.problem, "{}", "")), given.count)
+
+
+if __name__ == "__main__":
+    main()

@@ -24,8 +24,9 @@ from scipy.sparse.linalg import SuperLU, splu
 from vibench.arrays import Array, Indices, SparseMatrix
 from vibench.linalg.cholesky import SYMMETRIC, UNIT
 
-FIRST_SHIFT = 1e-11
-"""τ of the first attempt; where the round-off exceeds it, τ becomes twice the round-off."""
+FIRST_SHIFT, PLANE = 1e-11, 16.0
+"""τ of the first attempt, and the entries of a row from which on it is larger by their share: factors of matrices of
+meshes in space have longer sums. Where the round-off exceeds it, τ becomes twice the round-off."""
 
 ATTEMPTS = 3
 
@@ -48,7 +49,7 @@ def proved_positive(parts: Sequence[SparseMatrix], scale: Array, order: Indices 
     if order is not None:
         total, size, squares = sp.csc_array(total[order][:, order]), size[order][:, order], squares[order]
     permutation, inverse = "MMD_AT_PLUS_A" if order is None else "NATURAL", 1.0 / np.sqrt(squares)
-    shift = FIRST_SHIFT
+    shift = first_shift(total)
     for _ in range(ATTEMPTS):
         try:
             lu = splu(total - sp.diags_array(shift * squares, format="csc"), permc_spec=permutation, **SYMMETRIC)
@@ -65,6 +66,11 @@ def proved_positive(parts: Sequence[SparseMatrix], scale: Array, order: Indices 
             return 0
         shift = 2.0 * error
     return 0
+
+
+def first_shift(matrix: SparseMatrix) -> float:
+    """τ of the first attempt for a matrix (n×n)."""
+    return FIRST_SHIFT * max(1.0, int(matrix.nnz) / (PLANE * max(int(matrix.shape[0]), 1)))
 
 
 def _factorisation_error(lu: SuperLU, inverse: Array) -> Array:

@@ -13,6 +13,8 @@ from vibench.highfidelity.active_set import HighFidelitySolver
 from vibench.interfaces.problem import Problem, VariationalInequality
 from vibench.interfaces.validation import checked_assembly
 from vibench.model.errors import Energy
+from vibench.stability.coercivity import Constant, coercivity, continuity, energy_inf_sup
+from vibench.stability.contact_infsup import SchurFromAbove
 
 LIMIT = 2**28
 """Size limit of the assemblies in bytes; the least recently used one is dropped first."""
@@ -30,6 +32,9 @@ class Assemblies:
         self._kept: LRUCache[bytes, VariationalInequality] = LRUCache(limit, getsizeof=_bytes)
         self._energies: LRUCache[bytes, Energy] = LRUCache(FACTORS, getsizeof=self._own_bytes)
         self._solver = HighFidelitySolver(problem)
+        self._above: SchurFromAbove | None = None
+        self._alpha: Constant | None = None
+        self._gamma: Constant | None = None
 
     def at(self, mu: Array) -> VariationalInequality:
         """A copy of `checked_assembly` at mu (d,), which later assemblies leave as it is."""
@@ -53,6 +58,28 @@ class Assemblies:
     def energy_of(self, vi: VariationalInequality) -> Energy:
         """Factorisations of an assembled A, which are not kept unless it is constant: this may be timed."""
         return Energy(vi.A, self._solver.condensed(vi))
+
+    def coercivity_at(self, mu: Array) -> Constant:
+        """Lower bound of α at mu (d,), with the factorisation of `energy_at`; that of a constant A is computed once."""
+        if self._alpha is None or "A" not in self._problem.constant:
+            self._alpha = coercivity(self.at(mu).A, self._problem.V, self.energy_at(mu).stiffness.solve)
+        return self._alpha
+
+    def continuity_at(self, mu: Array) -> Constant:
+        """Upper bound of γ_a, likewise."""
+        if self._gamma is None or "A" not in self._problem.constant:
+            self._gamma = continuity(self.at(mu).A, self._problem.V)
+        return self._gamma
+
+    def energy_inf_sup_at(self, mu: Array) -> Constant:
+        """Lower bound of β_A at mu (d,): by dense matrices of contact size where these are few, else by sparse ones."""
+        vi, energy, W = self.at(mu), self.energy_at(mu), self._problem.W
+        on, stiffness = energy.on_contact(vi), energy.stiffness
+        if not on.is_dense:
+            return energy_inf_sup(vi.A, vi.B, W)
+        if self._above is None or "A" not in self._problem.constant:
+            self._above = SchurFromAbove(vi.A, stiffness.eliminated, stiffness.retained)
+        return self._above.energy_inf_sup(on.B, on.liftings, W)
 
     def _own_bytes(self, energy: Energy) -> int:
         """Memory of what is of one parameter alone."""

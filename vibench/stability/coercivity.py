@@ -64,21 +64,39 @@ class Stability:
     """Lower bound of β_A, the inf-sup constant over the span with the norm of A instead of that of V."""
 
 
-def coercivity_and_continuity(A: SparseMatrix, V: InnerProduct) -> tuple[Constant, Constant]:
-    """Lower bound of α and upper bound of γ_a for A (n×n).
+Solve = Callable[[Array], Array]
+"""From a right-hand side (n,) to the solution with A."""
 
-    Raises a `NumericalError` if A is not symmetric positive definite.
+
+def coercivity_and_continuity(
+    A: SparseMatrix, V: InnerProduct, solve: Solve | None = None
+) -> tuple[Constant, Constant]:
+    """Lower bound of α and upper bound of γ_a for A (n×n); see `coercivity` and `continuity`."""
+    return coercivity(A, V, solve), continuity(A, V)
+
+
+def coercivity(A: SparseMatrix, V: InnerProduct, solve: Solve | None = None) -> Constant:
+    """Lower bound of α for A (n×n).
+
+    `solve` solves with a factorisation of A that exists; by default A is factorised. Raises a `NumericalError` if A is
+    not symmetric positive definite.
     """
-    low, high = extreme_quotients(A, V)
-    X, root_A, root_X = V.matrix, np.sqrt(A.diagonal()), np.sqrt(V.matrix.diagonal())
+    root = np.sqrt(A.diagonal())
 
     def coercive(a: float) -> bool:
-        return proved_positive([A, -a * X], root_A) == V.dim
+        return proved_positive([A, -a * V.matrix], root) == V.dim
+
+    return moved(lowest_quotient(A, V, solve), -1.0, coercive)
+
+
+def continuity(A: SparseMatrix, V: InnerProduct) -> Constant:
+    """Upper bound of γ_a for A (n×n), symmetric positive definite."""
+    root = np.sqrt(V.matrix.diagonal())
 
     def continuous(c: float) -> bool:
-        return proved_positive([c * X, -A], np.sqrt(c) * root_X) == V.dim
+        return proved_positive([c * V.matrix, -A], np.sqrt(c) * root) == V.dim
 
-    return moved(low, -1.0, coercive), moved(high, 1.0, continuous)
+    return moved(highest_quotient(A, V), 1.0, continuous)
 
 
 def operator_norm(M: SparseMatrix, X: InnerProduct) -> Constant:
@@ -108,17 +126,30 @@ def moved(estimate: float, sign: float, proves: Callable[[float], bool]) -> Cons
     return Constant(candidates[0], False)
 
 
+def lowest_quotient(A: SparseMatrix, V: InnerProduct, solve: Solve | None = None) -> float:
+    """Estimate of α for A (n×n), the smallest eigenvalue of A against X_V, by Lanczos iterations.
+
+    Raises a `NumericalError` if A is not symmetric positive definite and no `solve` is given.
+    """
+    solve = solve or SparseCholesky(A, "A").solve
+    if V.dim <= FEW:
+        return float(scipy.linalg.eigvalsh(A.toarray(), V.matrix.toarray())[0])
+    return _smallest(A, V.matrix, solve)
+
+
+def highest_quotient(A: SparseMatrix, V: InnerProduct) -> float:
+    """Estimate of γ_a for A (n×n), the largest eigenvalue of A against X_V, by Lanczos iterations."""
+    if V.dim <= FEW:
+        return float(scipy.linalg.eigvalsh(A.toarray(), V.matrix.toarray())[-1])
+    return float(eigsh(A, M=V.matrix, Minv=_operator(V.dim, V.riesz), which="LA", **_lanczos(V.dim))[0])
+
+
 def extreme_quotients(A: SparseMatrix, V: InnerProduct) -> tuple[float, float]:
-    """Estimates of α and γ_a for A (n×n): the extreme eigenvalues of A against X_V, by Lanczos iterations.
+    """Estimates of α and γ_a for A (n×n).
 
     Raises a `NumericalError` if A is not symmetric positive definite.
     """
-    factor = SparseCholesky(A, "A")
-    if V.dim <= FEW:
-        values = scipy.linalg.eigvalsh(A.toarray(), V.matrix.toarray())
-        return float(values[0]), float(values[-1])
-    largest = eigsh(A, M=V.matrix, Minv=_operator(V.dim, V.riesz), which="LA", **_lanczos(V.dim))[0]
-    return _smallest(A, V.matrix, factor.solve), float(largest)
+    return lowest_quotient(A, V), highest_quotient(A, V)
 
 
 def energy_inf_sup(A: SparseMatrix, B: SparseMatrix, W: InnerProduct) -> Constant:

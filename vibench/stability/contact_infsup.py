@@ -21,7 +21,7 @@ import scipy.sparse as sp
 from vibench.arrays import Array, Indices, SparseMatrix
 from vibench.errors import NumericalError
 from vibench.linalg.cholesky import UNIT, PartialCholesky
-from vibench.linalg.inertia import ATTEMPTS, FIRST_SHIFT
+from vibench.linalg.inertia import ATTEMPTS, first_shift
 from vibench.linalg.inner_product import InnerProduct
 from vibench.stability.coercivity import Constant, moved, smallest_quotient
 
@@ -53,7 +53,7 @@ class SchurFromAbove:
         if not np.all(squares > 0.0):
             raise NumericalError("A is not positive definite")
         inverse = 1.0 / np.sqrt(squares[order])
-        shift = FIRST_SHIFT
+        shift = first_shift(A)
         for _ in range(ATTEMPTS):
             partial = PartialCholesky(A + sp.diags_array(shift * squares, format="csc"), order, last, "A")
             try:

@@ -6,14 +6,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from vibench.arrays import Array
-from vibench.interfaces.problem import Problem, VariationalInequality
+from vibench.interfaces.problem import VariationalInequality
 from vibench.interfaces.strategies import Kind
 from vibench.model.galerkin import ReducedModel
 from vibench.offline.assemblies import assemblies
 from vibench.reduction.supremizers import ConstraintClasses
-from vibench.stability.coercivity import Constant, Stability, coercivity_and_continuity, energy_inf_sup
-from vibench.stability.contact_infsup import SchurFromAbove
+from vibench.stability.coercivity import Constant, Stability
 from vibench.stability.infsup import (
     InfSup,
     Multipliers,
@@ -45,30 +43,13 @@ class ReferenceConstants(Stage):
         """Compute the constants."""
         problem = build_problem(self.constraints.problem)
         inf_sup = constants_full(problem.V, value_of(store, self.constraints), nodal_multipliers(problem.W))
-        mus = self.constraints.parameters.of(problem)
-        different = mus[:1] if "A" in problem.constant else mus  # the eigenvalue problems are the expensive part
-        quotients = [coercivity_and_continuity(assemblies(problem).at(mu).A, problem.V) for mu in different]
-        quotients *= len(mus) // len(different)
+        mus, kept = self.constraints.parameters.of(problem), assemblies(problem)
+        quotients = [(kept.coercivity_at(mu), kept.continuity_at(mu)) for mu in mus]
         different = mus[:1] if {"A", "B"} <= problem.constant else mus
-        energies = energy_inf_sups(problem, different)
+        energies = [kept.energy_inf_sup_at(mu) for mu in different]
         energies *= len(mus) // len(different)
         constants = zip(inf_sup, quotients, energies, strict=True)
         return Result([Stability(hf, *extremes, energy) for hf, extremes, energy in constants])
-
-
-def energy_inf_sups(problem: Problem, mus: Array) -> list[Constant]:
-    """β_A at every parameter (P×d): from dense matrices of contact size where these are few, else from sparse ones."""
-    kept, above, found = assemblies(problem), None, []
-    for mu in mus:
-        vi, energy = kept.at(mu), kept.energy_at(mu)
-        on, stiffness = energy.on_contact(vi), energy.stiffness
-        if not on.is_dense:
-            found.append(energy_inf_sup(vi.A, vi.B, problem.W))
-            continue
-        if above is None or "A" not in problem.constant:
-            above = SchurFromAbove(vi.A, stiffness.eliminated, stiffness.retained)
-        found.append(above.energy_inf_sup(on.B, on.liftings, problem.W))
-    return found
 
 
 @dataclass(frozen=True)
