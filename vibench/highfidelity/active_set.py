@@ -91,10 +91,12 @@ class HighFidelitySolver:
     ----------
     problem
         Its declarations `constant` and `contact_dofs` decide what is computed once.
+    condensing
+        Whether systems are condensed on the constrained unknowns in any case: error bounds are of that size.
     """
 
-    def __init__(self, problem: Problem) -> None:
-        self._problem = problem
+    def __init__(self, problem: Problem, *, condensing: bool = False) -> None:
+        self._problem, self._condensing = problem, condensing
         self._constrained = problem.contact_dofs if problem.contact_dofs is not None else np.zeros(0, dtype=np.intp)
         self._pattern: EliminationPattern | None = None
         self._stiffness: CondensedStiffness | None = None
@@ -180,7 +182,7 @@ class HighFidelitySolver:
         One factorisation per parameter serves all then: the first system, its borders and the verification.
         """
         pattern = EliminationPattern.of(vi.A, self._constrained)
-        if "A" in self._problem.constant or pattern.is_dense or len(vi.g) > FEW_ROWS:
+        if self._condensing or "A" in self._problem.constant or pattern.is_dense or len(vi.g) > FEW_ROWS:
             return pattern
         return EliminationPattern.of_none(vi.A)
 

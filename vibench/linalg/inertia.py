@@ -28,6 +28,9 @@ FIRST_SHIFT, PLANE = 1e-11, 16.0
 """τ of the first attempt, and the entries of a row from which on it is larger by their share: factors of matrices of
 meshes in space have longer sums. Where the round-off exceeds it, τ becomes twice the round-off."""
 
+SPACE, PANEL = 32.0, 20
+"""Entries of a row from which on factors are so full that SuperLU is the fastest with panels of so many columns."""
+
 ATTEMPTS = 3
 
 
@@ -49,10 +52,12 @@ def proved_positive(parts: Sequence[SparseMatrix], scale: Array, order: Indices 
     if order is not None:
         total, size, squares = sp.csc_array(total[order][:, order]), size[order][:, order], squares[order]
     permutation, inverse = "MMD_AT_PLUS_A" if order is None else "NATURAL", 1.0 / np.sqrt(squares)
-    shift = first_shift(total)
+    shift, options = first_shift(total), SYMMETRIC
+    if total.nnz > SPACE * total.shape[0]:
+        options = options | {"panel_size": PANEL}
     for _ in range(ATTEMPTS):
         try:
-            lu = splu(total - sp.diags_array(shift * squares, format="csc"), permc_spec=permutation, **SYMMETRIC)
+            lu = splu(total - sp.diags_array(shift * squares, format="csc"), permc_spec=permutation, **options)
         except RuntimeError:  # exactly singular
             return 0
         pivots = lu.U.diagonal()

@@ -31,7 +31,7 @@ class Assemblies:
         self._problem = problem
         self._kept: LRUCache[bytes, VariationalInequality] = LRUCache(limit, getsizeof=_bytes)
         self._energies: LRUCache[bytes, Energy] = LRUCache(FACTORS, getsizeof=self._own_bytes)
-        self._solver = HighFidelitySolver(problem)
+        self._solver = HighFidelitySolver(problem, condensing=True)
         self._above: SchurFromAbove | None = None
         self._alpha: Constant | None = None
         self._gamma: Constant | None = None
