@@ -29,16 +29,24 @@ class Evaluated:
     contact
         The constraint on the contact unknowns, where B or g are evaluated there.
     coordinates
-        Coordinates (d×N') of the primal basis Z in the space Φ of the model; `None` where Z is Φ.
+        Coordinates of the primal basis Z in the space Φ of the model, without those at the end that are zero in all of
+        Z; `None` where Z is Φ.
+    dim
+        d, the dimension of Φ, where there are coordinates.
     """
 
     samples: Mapping[str, Array] = field(default_factory=dict)
     contact: Contact | None = None
     coordinates: Array | None = None
+    dim: int = 0
 
     def in_space(self, x: Array) -> Array:
         """Coordinates (d,) in Φ from those (N',) in Z."""
-        return x if self.coordinates is None else np.asarray(self.coordinates @ x)
+        if self.coordinates is None:
+            return x
+        y = np.zeros(self.dim)
+        y[: len(self.coordinates)] = self.coordinates @ x
+        return y
 
 
 @dataclass(frozen=True)

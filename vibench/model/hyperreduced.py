@@ -231,7 +231,7 @@ class HyperReducedModel:
         known = space is None and self._operators.A.constant
         if not isfinite((self._sum_of_stiffness if known else A.sum()) + f.sum() + B.sum() + g.sum()):
             raise NumericalError(f"the reduced problem has entries that are not finite at mu = {mu.tolist()}")
-        evaluated = Evaluated(samples, coordinates=Y)
+        evaluated = Evaluated(samples, None, Y, 0 if space is None else len(space.plain))
         return ReducedProblem(VariationalInequality(A, f, B, g), reconstruct, self._operators.factor, evaluated)
 
     @cached_property

@@ -147,3 +147,17 @@ def test_what_is_asked_for_wrongly_is_one_line(reduce: partial[vibench.Reduction
         vibench.Reduction(problem, dual, None, *stops, assembly="fulll")  # type: ignore[arg-type]
     with pytest.raises(UnsupportedError, match="needs reduced assembly, and the model is assembled in full"):
         _ = vibench.Reduction(problem, dual, None, *stops, training=Few()).certificate
+
+
+def test_certificates_hold_where_supremizers_use_few_of_the_coordinates_of_their_space() -> None:
+    """Those of Hertz contact, whose loads reach some contact unknowns only."""
+    problem = vibench.create("problem", "hertz", {"resolution": 300})
+    cone, supremizers = vibench.create("dual strategy", "mcpg"), vibench.create("primal strategy", "online-supremizers")
+    stops = vibench.Stop(tolerance=1e-2), vibench.Stop(tolerance=1e-2)
+    model = vibench.Reduction(problem, cone, supremizers, *stops, assembly="certified").model
+    for mu in problem.parameters.sample(2, 5):
+        found, exact = model.solve(mu), model.high_fidelity(mu)
+        e, A = exact.u - found.u, problem.assemble(mu).A
+        error = float(np.sqrt(e @ (A @ e)))
+        assert found.bound is not None
+        assert error <= found.bound.u_energy <= 10.0 * error

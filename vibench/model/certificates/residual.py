@@ -37,6 +37,9 @@ UNIT = float(np.finfo(float).eps)
 FEW, SHARE_OF_FEW = 1000, 0.25
 """All principal directions of up to so many terms are computed, and this share of the above is left out."""
 
+TERMS_OF_FEW = 0.003
+"""Few terms in all are kept but for this share: what they contribute elsewhere may be larger than in samples."""
+
 MOST, OVERSAMPLING = 800, 100
 """Largest number of principal directions, and how many more a randomised method computes."""
 
@@ -132,7 +135,8 @@ def residual_basis(
     scale = sizes.max(axis=1, initial=0.0)
     sampled = sum(block.combined(samples[a:b]) for block, (a, b) in zip(blocks, ranges, strict=True))
     typical = float(np.hypot(np.median(np.linalg.norm(sampled, axis=0)), beside))
-    kept = _worth_keeping(norms * scale, norms * sizes.mean(axis=1), TERMS * typical)
+    share = TERMS if np.count_nonzero(scale) > FEW else TERMS_OF_FEW
+    kept = _worth_keeping(norms * scale, norms * sizes.mean(axis=1), share * typical)
     pairs = zip(blocks, ranges, strict=True)
     R = np.hstack([block.columns(kept[(kept >= a) & (kept < b)] - a) for block, (a, b) in pairs])
     if last is not None:
