@@ -7,9 +7,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 import scipy.sparse as sp
 
-from vibench.arrays import Array, Mask
+from vibench.arrays import Array, Mask, SparseMatrix
 from vibench.errors import NumericalError
-from vibench.highfidelity.kkt_systems import ActiveSetSystem, CondensedStiffness
+from vibench.highfidelity.kkt_systems import ActiveSetSystem, CondensedStiffness, condensed_stiffness
 from vibench.interfaces.problem import Problem, VariationalInequality
 from vibench.interfaces.validation import checked_assembly
 from vibench.linalg.cholesky import SparseCholesky
@@ -173,7 +173,7 @@ class HighFidelitySolver:
         if self._pattern is None:
             self._pattern, self._stiffness = self._elimination(vi), None
         if self._stiffness is None or "A" not in self._problem.constant:
-            self._stiffness = CondensedStiffness(vi.A, self._pattern)
+            self._stiffness = condensed_stiffness(vi.A, self._pattern, self._stiffness)
         return self._stiffness
 
     def _elimination(self, vi: VariationalInequality) -> EliminationPattern:
@@ -225,8 +225,8 @@ def solve_unverified(
     system = stiffness.active_set_system(program)
     starts = [] if start is None else [start[reading.kept]]
     for active in [*starts, np.zeros(len(reading.kept), bool)]:
-        if found := active_set_iterations(system, active, reading.equal):
-            u, forces, iterations = system.recover(found[0]), *found[1:]
+        if found := _solution_everywhere(system, active, reading.equal):
+            u, forces, iterations = found
             fallback = ""
             break
     else:
@@ -285,9 +285,9 @@ def _without_cycling(
     if not equal.any() and answer.alpha is not None and np.all(np.isfinite(answer.alpha)):
         weights = answer.alpha * row_norms(vi.B)
         guess = weights > 1e-8 * np.max(weights, initial=0.0)
-        found = active_set_iterations(system, guess)
+        found = _solution_everywhere(system, guess)
         if found is not None:
-            return (system.recover(found[0]), *found[1:]), f"the active set cycled; first guess by {FALLBACK_SOLVER}"
+            return found, f"the active set cycled; first guess by {FALLBACK_SOLVER}"
     exact = least_distance_solution(vi, SparseCholesky(vi.A, "A"), equal, guess)
     if exact is None:
         raise NumericalError("no active set solves the high-fidelity problem; is it feasible?")
@@ -306,10 +306,38 @@ def _refined(vi: VariationalInequality, stiffness: CondensedStiffness, u: Array,
     active = np.flatnonzero(lam > 0.0)
     system = stiffness.active_set_system(VariationalInequality(vi.A, residual, vi.B, -excess))
     try:
-        change, forces = system.solve_active(active)
+        change, forces = system.holding(active)
     except (RuntimeError, np.linalg.LinAlgError):  # dependent constraints: nothing better is known
         return u, lam
-    return u + system.recover(change), np.maximum(lam + forces, 0.0)
+    return u + change, np.maximum(lam + forces, 0.0)
+
+
+def _solution_everywhere(
+    system: ActiveSetSystem, active: Mask, equal: Mask | None = None
+) -> tuple[Array, Array, int] | None:
+    """U (n,), λ (m,) and iterations of the active set method; `None` where it finds none.
+
+    Rows beyond the zone of the system are looked at when those in it are settled; what they violate enlarges it.
+    """
+    iterations = 0
+    while True:
+        system = system.watching(active if equal is None else active | equal)
+        settled = active_set_iterations(system, active, equal)
+        if settled is None:
+            return None
+        u, lam, iterations = system.recover(settled[0]), settled[1], iterations + settled[2]
+        if system.beyond is None:
+            return u, lam, iterations
+        B, g = sp.csr_array(system.beyond.vi.B), system.beyond.vi.g
+        violated = ~system.beyond.watched & (B @ u - g > _unit(B) * (abs(B) @ np.abs(u) + np.abs(g)))
+        if not violated.any():
+            return u, lam, iterations
+        active = (lam > 0.0) | violated
+
+
+def _unit(B: SparseMatrix) -> Array:
+    """Round-off (m,) of B u − g, relative to the sum of its terms, that counts as no violation."""
+    return np.asarray(SIGNIFICANT * verification.UNIT * (np.diff(B.indptr) + 2.0))
 
 
 def active_set_iterations(
@@ -327,7 +355,7 @@ def active_set_iterations(
     always = np.zeros_like(active) if equal is None else equal
     active = active | always
     B, g, weights = system.B, system.g, row_norms(system.B)
-    sizes, unit = abs(B), SIGNIFICANT * verification.UNIT * (np.diff(B.indptr) + 2.0)
+    sizes, unit = abs(B), _unit(B)
     for iteration in range(1, max(MAX_ITERATIONS, len(active)) + 1):
         try:
             u, lam = system.solve_active(np.flatnonzero(active))
@@ -335,6 +363,8 @@ def active_set_iterations(
             return None
         forces = weights * lam
         violated = ~active & (B @ u - g > unit * (sizes @ np.abs(u) + np.abs(g)))
+        if system.beyond is not None:
+            violated &= system.beyond.watched
         in_contact = active & (forces > 1e-14 * np.max(np.abs(forces), initial=0.0))
         following = violated | in_contact | always
         if np.array_equal(following, active):

@@ -11,10 +11,11 @@ import scipy.linalg
 import scipy.sparse as sp
 from scipy.sparse.linalg import SuperLU, splu
 
-from vibench.arrays import Array, Indices, SparseMatrix
+from vibench.arrays import Array, Indices, Mask, SparseMatrix
+from vibench.highfidelity.contact_zone import coarse_contact, watched, zone_of
 from vibench.interfaces.problem import VariationalInequality
 from vibench.linalg.cholesky import SYMMETRIC, SparseCholesky
-from vibench.linalg.definite import dense_inverse
+from vibench.linalg.definite import MANY_UNKNOWNS, BlockDiagonal
 from vibench.linalg.schur_complement import EliminationPattern, PrincipalSubmatrix, StaticCondensation
 from vibench.qp.scaling import row_norms
 from vibench.qp.verification import norms_by_solutions
@@ -28,6 +29,9 @@ MAX_BORDER = 16
 ROUND_OFF = 1e-12
 """Entries of a bordered system below this, relative to their terms, may consist of round-off alone."""
 
+
+MOST = 4
+"""The compliance of all rows serves active sets of more than this part of them."""
 
 ActiveSolver = Callable[[Indices], tuple[Array, Array]]
 """From the active constraints to u (c,) and λ (m,): these are equalities, all other multipliers vanish."""
@@ -48,9 +52,17 @@ class CondensedStiffness:
         if pattern is None or (pattern.whole is None and len(pattern.retained) > MAX_RETAINED_SHARE * A.shape[0]):
             pattern = EliminationPattern(np.arange(A.shape[0]), np.zeros(0, np.intp), np.zeros(0, np.intp))
         self._A, self._pattern = A, pattern
-        self._condensed = StaticCondensation(A, self._pattern)
         self._saddle: SaddlePointSolver | None = None
         self._last: tuple[Array, Array] | None = None
+        self._condense()
+
+    def _condense(self) -> None:
+        """Eliminate what is not retained, which refuses a block that is not definite."""
+        self._condensed  # noqa: B018
+
+    @cached_property
+    def _condensed(self) -> StaticCondensation:
+        return StaticCondensation(self._A, self._pattern)
 
     @cached_property
     def factor(self) -> SparseCholesky:
@@ -134,7 +146,7 @@ class CondensedStiffness:
     def _unconstrained(self, load: Array) -> Array:
         """Ŝ⁻¹ f̂ (c,) of a condensed load, which is remembered until another one comes."""
         if self._last is None or self._last[0] is not load:
-            self._last = load, self._compliance @ load
+            self._last = load, self._blocks @ load
         return self._last[1]
 
     @cached_property
@@ -144,7 +156,12 @@ class CondensedStiffness:
     @cached_property
     def _compliance(self) -> Array:
         """Ŝ⁻¹ (c×c)."""
-        return dense_inverse(self._condensed.dense_schur, "A")
+        return self._blocks.toarray()
+
+    @cached_property
+    def _blocks(self) -> BlockDiagonal:
+        """Ŝ⁻¹, body by body."""
+        return self._condensed.dense_blocks.inverse("A")
 
     def active_set_system(self, vi: VariationalInequality) -> ActiveSetSystem:
         """The KKT systems of the active sets of `vi`, whose stiffness must be this one."""
@@ -154,12 +171,107 @@ class CondensedStiffness:
         B = sp.csr_array(vi.B if whole else sp.csc_array(vi.B)[:, self._pattern.retained])
         solve_active: ActiveSolver
         if condensed.dense:
-            solve_active = _compliance_solver(self._compliance, self._unconstrained(load), B, vi.g)
+            solve_active = ComplianceSolver(self._blocks, self._unconstrained(load), B, vi.g)
         else:
             solve_active = SaddlePointSolver(condensed.schur, load, B, vi.g, whole)
             self._saddle = solve_active if whole else None
         recover = partial(condensed.recover, particular=particular)
         return ActiveSetSystem(B, vi.g, solve_active, recover, condensed.correct_eliminated)
+
+
+class ZoneStiffness(CondensedStiffness):
+    """A stiffness matrix A, condensed on the zone that contact reaches, which is found and enlarged as needed.
+
+    Programs are solved on the zone, right-hand sides with a factor of A. What others ask of all retained unknowns is
+    computed where they ask for it.
+
+    Parameters
+    ----------
+    A, pattern
+        As for `CondensedStiffness`; the interface is all that is retained.
+    zone
+        Unknowns of the zone, where another stiffness of the problem has found them.
+    """
+
+    def __init__(self, A: SparseMatrix, pattern: EliminationPattern, zone: Indices | None = None) -> None:
+        self.zone = zone
+        super().__init__(A, pattern)
+
+    def _condense(self) -> None:
+        """Eliminate nothing before it is asked for."""
+
+    def check_definite(self, name: str) -> None:
+        """Raise a `NumericalError` that calls A by `name` if A is not positive definite."""
+        if "factor" not in vars(self):
+            self.factor = SparseCholesky(self._A, name)
+
+    def solve(self, right: Array) -> Array:
+        """A⁻¹ r for right-hand sides (n, k)."""
+        return self.factor.solve(right)
+
+    def dual_norms(self, functionals: Array) -> Array:
+        """‖ℓ‖ in A⁻¹ of functionals (n, k)."""
+        return norms_by_solutions(functionals, self.solve(functionals))
+
+    @cached_property
+    def _on_zone(self) -> tuple[StaticCondensation, BlockDiagonal]:
+        """A condensed on the zone, and its inverse there; others are eliminated in their order in the factor of A."""
+        assert self.zone is not None
+        order, positions = self.factor.order, np.arange(len(self.zone))
+        pattern = EliminationPattern(
+            self.zone, np.concatenate([order[~np.isin(order, self.zone)], self.zone]), positions
+        )
+        condensed = StaticCondensation(sp.csr_array(self._A), pattern)
+        return condensed, condensed.dense_blocks.inverse("A")
+
+    def active_set_system(self, vi: VariationalInequality) -> ActiveSetSystem:
+        """The KKT systems of the active sets of `vi`, whose stiffness must be this one."""
+        if self.zone is None:
+            self.zone = zone_of(vi.B, coarse_contact(self.factor, vi))
+        zone, inside = self.zone, watched(vi.B, self.zone)
+        B, (condensed, compliance) = sp.csr_array(sp.csc_array(vi.B)[:, zone]), self._on_zone
+        load, particular = condensed.condense_load(vi.f)
+
+        def enlarged(rows: Mask) -> ActiveSetSystem:
+            self.zone = np.union1d(zone, zone_of(vi.B, rows | inside))
+            vars(self).pop("_on_zone", None)
+            return self.active_set_system(vi)
+
+        solver = ComplianceSolver(compliance, compliance @ load, B, vi.g, inside)
+        recover = partial(condensed.recover, particular=particular)
+        beyond = Beyond(vi, inside, enlarged)
+        return ActiveSetSystem(B, vi.g, solver, recover, condensed.correct_eliminated, beyond)
+
+
+def condensed_stiffness(
+    A: SparseMatrix, pattern: EliminationPattern, before: CondensedStiffness | None = None
+) -> CondensedStiffness:
+    """A condensed on the unknowns that constraints involve, or on the zone of them that contact reaches.
+
+    `before` is that of another parameter of the problem, whose zone is the first one of this.
+    """
+    if not pattern.is_dense or len(pattern.interface) <= MANY_UNKNOWNS:
+        return CondensedStiffness(A, pattern)
+    return ZoneStiffness(A, pattern, before.zone if isinstance(before, ZoneStiffness) else None)
+
+
+@dataclass(frozen=True)
+class Beyond:
+    """What is beyond the zone of a system.
+
+    Attributes
+    ----------
+    vi
+        The variational inequality in all unknowns.
+    watched
+        Rows (m,) that touch no unknown beyond the zone; only these are active.
+    enlarged
+        Gives the system of a larger zone in which some rows (m,) are watched, too.
+    """
+
+    vi: VariationalInequality
+    watched: Mask
+    enlarged: Callable[[Mask], ActiveSetSystem]
 
 
 @dataclass(frozen=True)
@@ -174,6 +286,21 @@ class ActiveSetSystem:
     solve_active: ActiveSolver
     recover: Callable[[Array], Array]
     correct_eliminated: Callable[[Array], Array]
+    beyond: Beyond | None = None
+
+    def watching(self, rows: Mask) -> ActiveSetSystem:
+        """The same, or one of a larger zone in which some rows (m,) are watched, too."""
+        if self.beyond is None or not np.any(rows & ~self.beyond.watched):
+            return self
+        return self.beyond.enlarged(rows)
+
+    def holding(self, active: Indices) -> tuple[Array, Array]:
+        """U (n,) and λ (m,) with these constraints as equalities and no other multiplier; raises as solvers do."""
+        rows = np.zeros(len(self.g), bool)
+        rows[active] = True
+        system = self.watching(rows)
+        u, lam = system.solve_active(active)
+        return system.recover(u), lam
 
 
 class SaddlePointSolver:
@@ -353,26 +480,48 @@ def _regular(schur: Array, sizes: Array) -> bool:
     return bool(np.linalg.cond(schur / np.outer(scale, scale)) < 1.0 / np.sqrt(ROUND_OFF))
 
 
-def _compliance_solver(compliance: Array, unconstrained: Array, B: SparseMatrix, g: Array) -> ActiveSolver:
-    """Solutions for active sets through their dense compliance B_a Ŝ⁻¹B_aᵀ; multipliers are refined once.
+class ComplianceSolver:
+    """Solutions for active sets through the dense compliance B_a C B_aᵀ of their rows; multipliers are refined once.
 
-    `unconstrained` is the displacement (c,) without constraints.
+    Parameters
+    ----------
+    compliance, unconstrained
+        C (c×c), and the unknowns (c,) without constraints.
+    B, g
+        Constraints, B sparse (m×c), and their bounds (m,).
+    rows
+        The constraints (m,) that may be active; all by default.
     """
-    excess = B @ unconstrained - g
 
-    def solve_active(active: Indices) -> tuple[Array, Array]:
-        rows, lam = B[active], np.zeros(len(g))
+    def __init__(
+        self, compliance: BlockDiagonal, unconstrained: Array, B: SparseMatrix, g: Array, rows: Mask | None = None
+    ) -> None:
+        self._compliance, self._unconstrained, self._B, self._g = compliance, unconstrained, B, g
+        self._excess = B @ unconstrained - g
+        self._rows = np.arange(len(g)) if rows is None else np.flatnonzero(rows)
+        self._contact: Array | None = None
+
+    def __call__(self, active: Indices) -> tuple[Array, Array]:
+        """U (c,) and λ (m,).
+
+        Raises a `LinAlgError` where the rows are dependent.
+        """
+        lam, rows = np.zeros(len(self._g)), self._B[active]
         if not len(active):
-            return unconstrained, lam
-        touched = np.unique(rows.indices)  # of the compliance of all candidates few rows are needed
-        rows = rows[:, touched]
-        of_touched = compliance[touched]
-        contact = np.asarray(rows @ (rows @ of_touched[:, touched]).T)
+            return self._unconstrained, lam
+        contact, excess = self._contact_of(active), self._excess[active]
         scale = 1.0 / np.sqrt(np.diag(contact))  # rows of any length
-        factor = scipy.linalg.cho_factor(contact * np.outer(scale, scale))
-        forces = scale * scipy.linalg.cho_solve(factor, scale * excess[active])
-        forces += scale * scipy.linalg.cho_solve(factor, scale * (excess[active] - contact @ forces))
+        factor = scipy.linalg.cho_factor(contact * np.outer(scale, scale), overwrite_a=True, check_finite=False)
+        forces = scale * scipy.linalg.cho_solve(factor, scale * excess)
+        forces += scale * scipy.linalg.cho_solve(factor, scale * (excess - contact @ forces))
         lam[active] = forces
-        return unconstrained - (rows.T @ forces) @ of_touched, lam
+        return self._unconstrained - self._compliance @ (rows.T @ forces), lam
 
-    return solve_active
+    def _contact_of(self, active: Indices) -> Array:
+        """B_a C B_aᵀ: of the matrix of all rows, which successive active sets share, where most of them are active."""
+        if self._contact is None and MOST * len(active) < len(self._rows):
+            return self._compliance.congruent(self._B[active])
+        if self._contact is None:
+            self._contact = self._compliance.congruent(self._B[self._rows])
+        places = np.searchsorted(self._rows, active)
+        return self._contact[np.ix_(places, places)]

@@ -8,11 +8,13 @@ from typing import Any
 import numpy as np
 import scipy.linalg
 import scipy.sparse as sp
+from scipy.linalg.blas import dsyrk
+from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import SuperLU, splu, spsolve_triangular
 
 from vibench.arrays import Array, Indices, SparseMatrix
 from vibench.errors import NumericalError
-from vibench.linalg.definite import dense_cholesky
+from vibench.linalg.definite import BlockDiagonal, dense_cholesky, mirrored
 
 SYMMETRIC = {"diag_pivot_thresh": 0.0, "panel_size": 1, "options": {"SymmetricMode": True}}
 """SuperLU without off-diagonal pivoting is a Cholesky factorisation; SciPy has no sparse one of its own. Panels of one
@@ -21,10 +23,10 @@ column are the fastest for matrices of plane meshes."""
 UNIT = float(np.finfo(float).eps) / 2.0
 """The unit round-off."""
 
-SPARSE_COLUMN = 64
+SPARSE_COLUMN = 256
 """Columns of a factor with at most so many entries are multiplied as sparse ones, which needs few operations there."""
 
-DENSE_COLUMNS = 128
+DENSE_COLUMNS = 256
 """Number of consecutive longer columns that are multiplied as one dense matrix, on the rows that they have entries in:
 they belong to neighbouring separators, whose rows are nearly the same."""
 
@@ -134,7 +136,7 @@ class PartialCholesky:
         self._coupling, self._corner = matrix[split:, :split], matrix[split:, split:]
         unit = sp.eye_array(len(order), last, k=-split)
         self._lu, pivots = _pivots(sp.csc_array(sp.hstack([matrix[:, :split], unit])), "NATURAL", name)
-        self._root = np.sqrt(pivots[:split])
+        self._root, self._bodies = np.sqrt(pivots[:split]), connected_components(matrix, directed=False)[1][split:]
 
     def __getstate__(self) -> dict[str, object]:
         """What it was made of: SuperLU objects cannot be stored."""
@@ -165,17 +167,19 @@ class PartialCholesky:
 
     def schur(self) -> Array:
         """The Schur complement S (c×c) of the eliminated unknowns."""
-        scaled = sp.csc_array(self._columns[self._split :] @ sp.diags_array(self._root))
-        scaled.sort_indices()
-        entries = np.diff(scaled.indptr)
-        short, long = scaled[:, entries <= SPARSE_COLUMN], scaled[:, entries > SPARSE_COLUMN]
-        schur = np.asfortranarray((self._corner - short @ short.T).toarray())
-        for first in range(0, long.shape[1], DENSE_COLUMNS):
-            block = long[:, first : first + DENSE_COLUMNS]
-            rows = np.unique(block.indices)
-            columns = block[rows].toarray()
-            schur[np.ix_(rows, rows)] -= columns @ columns.T
-        return schur
+        return self.schur_blocks().toarray()
+
+    def schur_blocks(self) -> BlockDiagonal:
+        """S, body by body."""
+        lower = sp.csc_array(self._lu.L)[self._split :, : self._split]
+        lower.data *= np.repeat(self._root, np.diff(lower.indptr))
+        blocks = []
+        for body in np.unique(self._bodies):
+            unknowns = np.flatnonzero(self._bodies == body)
+            columns = sp.csc_array(lower if len(unknowns) == len(self._bodies) else lower[unknowns])
+            columns.eliminate_zeros()
+            blocks.append((unknowns, _less_products(self._corner[unknowns][:, unknowns], columns)))
+        return BlockDiagonal(len(self._bodies), tuple(blocks))
 
     @cached_property
     def trailing_factor(self) -> Array:
@@ -255,6 +259,25 @@ class PartialCholesky:
         if last.size:
             last = scipy.linalg.solve_triangular(self.trailing_factor, last, trans="T", check_finite=False)
         return np.concatenate([first, last])
+
+
+def _less_products(corner: SparseMatrix, columns: SparseMatrix) -> Array:
+    """X_cc − C Cᵀ (c×c) for a sparse C of which most columns have few entries, and some nearly all."""
+    entries = np.diff(columns.indptr)
+    few, many = columns[:, entries <= SPARSE_COLUMN], np.flatnonzero(entries > SPARSE_COLUMN)
+    result, place = (corner - few @ few.T).toarray(order="F"), np.empty(len(entries) and corner.shape[0], np.intp)
+    for first in range(0, len(many), DENSE_COLUMNS):
+        block = columns[:, many[first : first + DENSE_COLUMNS]]
+        rows = np.unique(block.indices)
+        place[rows] = np.arange(len(rows))
+        dense = np.zeros((len(rows), block.shape[1]), order="F")
+        dense[place[block.indices], np.repeat(np.arange(block.shape[1]), np.diff(block.indptr))] = block.data
+        product = dsyrk(-1.0, dense, lower=True)
+        if rows[-1] - rows[0] + 1 == len(rows):  # neighbours, which are added in place
+            result[rows[0] : rows[-1] + 1, rows[0] : rows[-1] + 1] += product
+        else:
+            result[np.ix_(rows, rows)] += product
+    return mirrored(result)
 
 
 def _pivots(matrix: SparseMatrix, permutation: str, name: str) -> tuple[SuperLU, Array]:

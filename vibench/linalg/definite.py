@@ -3,13 +3,110 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 import scipy.linalg
+import scipy.sparse as sp
 from scipy.linalg.lapack import dpotri
 
-from vibench.arrays import Array, Indices
+from vibench.arrays import Array, Indices, SparseMatrix
 from vibench.errors import NumericalError
+
+MANY_UNKNOWNS = 1500
+"""Dense work on at most so many unknowns takes less than to find out which of them it can do without."""
+
+MIRRORED = 256
+"""Number of rows of a triangle that are mirrored at once."""
+
+
+@dataclass(frozen=True)
+class BlockDiagonal:
+    """A matrix (c×c) that is zero between sets of unknowns.
+
+    Attributes
+    ----------
+    size
+        c.
+    blocks
+        Disjoint sets of unknowns (k,), rising, that are all of them together, and the blocks (k×k) of the matrix there.
+    """
+
+    size: int
+    blocks: tuple[tuple[Indices, Array], ...]
+
+    @classmethod
+    def of(cls, matrix: Array) -> BlockDiagonal:
+        """The blocks of a symmetric matrix (c×c)."""
+        sets = connected_blocks(matrix)
+        if len(sets) == 1:
+            return cls(len(matrix), ((sets[0], matrix),))
+        return cls(len(matrix), tuple((block, matrix[np.ix_(block, block)]) for block in sets))
+
+    def __matmul__(self, values: Array) -> Array:
+        product = np.empty((self.size, *values.shape[1:]))
+        for unknowns, block in self.blocks:
+            product[unknowns] = block @ values[unknowns]
+        return product
+
+    def toarray(self) -> Array:
+        """The matrix (c×c)."""
+        if len(self.blocks) == 1:
+            return self.blocks[0][1]
+        matrix = np.zeros((self.size, self.size))
+        for unknowns, block in self.blocks:
+            matrix[np.ix_(unknowns, unknowns)] = block
+        return matrix
+
+    def congruent(self, rows: SparseMatrix) -> Array:
+        """R X Rᵀ (k×k) for a sparse R (k×c)."""
+        total, rows = np.zeros((rows.shape[0], rows.shape[0])), sp.csc_array(rows)
+        for unknowns, block in self.blocks:
+            part = sp.csr_array(rows[:, unknowns])
+            touched = np.unique(part.indices)
+            if not len(touched):
+                continue
+            # of neighbours, that is without a copy, where the unknowns are numbered along the contact
+            along = slice(touched[0], touched[-1] + 1)
+            part = part[:, along]
+            total += part @ np.ascontiguousarray((part @ block[along, along]).T)
+        return total
+
+    def cholesky(self, name: str) -> BlockDiagonal:
+        """The upper triangular F with FᵀF = X.
+
+        Raises a `NumericalError` that calls X by `name` if X is not positive definite.
+        """
+        return self._by_blocks(name, lambda block: np.asarray(scipy.linalg.cholesky(block)))
+
+    def inverse(self, name: str) -> BlockDiagonal:
+        """X⁻¹ of a symmetric positive definite X; raises as `cholesky` does."""
+        return self._by_blocks(name, _inverse)
+
+    def solve_triangular(self, right: Array, transposed: bool = False) -> Array:
+        """F⁻¹ r, or F⁻ᵀ r, for an upper triangular F and r (c,) or (c, k)."""
+        solution, trans = np.empty_like(right, dtype=float), "T" if transposed else "N"
+        for unknowns, block in self.blocks:
+            solution[unknowns] = scipy.linalg.solve_triangular(
+                block, right[unknowns], trans=trans, check_finite=False
+            )  # fmt: skip
+        return solution
+
+    def _by_blocks(self, name: str, function: Callable[[Array], Array]) -> BlockDiagonal:
+        try:
+            return BlockDiagonal(self.size, tuple((unknowns, function(block)) for unknowns, block in self.blocks))
+        except (np.linalg.LinAlgError, ValueError):  # a pivot is not positive, an entry not finite
+            raise NumericalError(f"{name} is not positive definite") from None
+
+
+def dense_cholesky(matrix: Array, name: str) -> Array:
+    """The upper triangular F (c×c) with FᵀF = X, block by block; raises as `BlockDiagonal.cholesky` does."""
+    return BlockDiagonal.of(matrix).cholesky(name).toarray()
+
+
+def dense_inverse(matrix: Array, name: str) -> Array:
+    """The inverse of a symmetric positive definite X (c×c), likewise."""
+    return BlockDiagonal.of(matrix).inverse(name).toarray()
 
 
 def connected_blocks(matrix: Array) -> list[Indices]:
@@ -26,35 +123,15 @@ def connected_blocks(matrix: Array) -> list[Indices]:
     return blocks
 
 
-def dense_cholesky(matrix: Array, name: str) -> Array:
-    """The upper triangular F (c×c) with FᵀF = X.
-
-    Raises a `NumericalError` that calls X by `name` if X is not positive definite.
-    """
-    return _by_blocks(matrix, name, lambda block: np.asarray(scipy.linalg.cholesky(block)))
-
-
-def dense_inverse(matrix: Array, name: str) -> Array:
-    """The inverse of a symmetric positive definite X (c×c).
-
-    Raises a `NumericalError` that calls X by `name` if X is not positive definite.
-    """
-    return _by_blocks(matrix, name, _inverse)
+def mirrored(lower: Array) -> Array:
+    """The symmetric matrix (c×c) of this lower triangle, in place: a second array of this size may not fit."""
+    for first in range(0, len(lower), MIRRORED):
+        last = first + MIRRORED
+        corner = np.tril(lower[first:last, first:last])
+        lower[first:last, first:last] = corner + np.tril(corner, -1).T
+        lower[first:last, last:] = lower[last:, first:last].T
+    return lower
 
 
 def _inverse(block: Array) -> Array:
-    upper = np.asarray(dpotri(scipy.linalg.cholesky(block), overwrite_c=True)[0])
-    return np.asarray(upper + np.triu(upper, 1).T)
-
-
-def _by_blocks(matrix: Array, name: str, function: Callable[[Array], Array]) -> Array:
-    blocks = connected_blocks(matrix)
-    try:
-        if len(blocks) == 1:
-            return function(matrix)
-        result = np.zeros_like(matrix)
-        for block in blocks:
-            result[np.ix_(block, block)] = function(matrix[np.ix_(block, block)])
-    except (np.linalg.LinAlgError, ValueError):  # a pivot is not positive, an entry not finite
-        raise NumericalError(f"{name} is not positive definite") from None
-    return result
+    return mirrored(np.asarray(dpotri(scipy.linalg.cholesky(block, lower=True), lower=True, overwrite_c=True)[0]))

@@ -120,6 +120,23 @@ class InnerProduct:
         return self.unwhiten(orthonormal_range(self.whiten(u), fixed))
 
 
+def orthogonal_factorisation(X: SparseMatrix, y: Array) -> tuple[Array, Array]:
+    """Q (n×k) and R (k×l) with Q R = y (n×l) and QᵀXQ = I, k = min(n, l), for a sparse positive definite X (n×n).
+
+    No factor of X is needed. Householder's factorisation in units of single unknowns leaves columns that are
+    independent in the norm of X, too, and two passes of Cholesky's factorisation of their Gram matrix make them
+    orthonormal to round-off (CholeskyQR2: Yamamoto, Nakatsukasa, Yanagisawa and Fukaya 2015).
+    """
+    units = np.sqrt(X.diagonal())[:, None]
+    q, r = np.linalg.qr(units * y)
+    q = q / units
+    for _ in range(2):
+        lower = np.linalg.cholesky(q.T @ (X @ q))
+        q = scipy.linalg.solve_triangular(lower, q.T, lower=True).T
+        r = lower.T @ r
+    return q, r
+
+
 def asymmetry(matrix: SparseMatrix) -> float:
     """Largest difference of an entry of a square matrix from that of its transpose; 0.0 if they differ by round-off."""
     scale = abs(matrix).max() if matrix.nnz else 0.0

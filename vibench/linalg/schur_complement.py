@@ -10,6 +10,7 @@ import scipy.sparse as sp
 
 from vibench.arrays import Array, Indices, SparseMatrix
 from vibench.linalg.cholesky import PartialCholesky, elimination_order
+from vibench.linalg.definite import BlockDiagonal
 
 
 @dataclass(frozen=True)
@@ -127,6 +128,13 @@ class StaticCondensation:
         rows = np.concatenate([rows[kept], np.repeat(interface, len(interface))])
         columns = np.concatenate([columns[kept], np.tile(interface, len(interface))])
         return sp.csc_array((data, (rows, columns)), shape=retained.shape)
+
+    @property
+    def dense_blocks(self) -> BlockDiagonal:
+        """Ŝ body by body."""
+        if self._factor is not None and len(self._pattern.interface) == len(self._pattern.retained):
+            return self._factor.schur_blocks()
+        return BlockDiagonal.of(self.dense_schur)
 
     @property
     def dense_schur(self) -> Array:

@@ -4,17 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import lru_cache
 
 import numpy as np
-import scipy.linalg
 import scipy.sparse as sp
 
 from vibench.arrays import Array, Indices, SparseMatrix
 from vibench.errors import NumericalError
 from vibench.interfaces.problem import ContactLoads
 from vibench.linalg.cholesky import PartialCholesky, elimination_order
-from vibench.linalg.inner_product import InnerProduct
+from vibench.linalg.definite import MANY_UNKNOWNS, BlockDiagonal
+from vibench.linalg.inner_product import InnerProduct, orthogonal_factorisation
 
 PROPORTIONAL_RTOL = 1e-12
 """Two constraint matrices count as proportional when they differ by less than this, relative to their norm."""
@@ -119,33 +119,32 @@ class SpannedCoordinates:
 class ContactCoordinates:
     """Euclidean coordinates in V_N + X_V⁻¹E: with E the contact unknowns, this contains the supremizers of every B(mu).
 
-    X_V = FᵀF is factorised with E last. For every load r on E, F X_V⁻¹ r = F⁻ᵀ r is then F_EE⁻ᵀ r in its last entries
-    and zero before: no array larger than E is needed for it. V_N is given by a V-orthonormal basis (n×N), E by `dofs`,
-    rising; `plain` are the coordinates (d×N) of the basis, orthonormal.
+    Let S be the Schur complement of X_V on E, and H the extension of values on E by X_V u = 0 elsewhere. Every v is the
+    sum of H v_E, whose norm is that of v_E in S, and of a v⁰ that is zero on E and orthogonal to X_V⁻¹E, the range of
+    H. With S = F_EEᵀF_EE, the coordinates of X_V⁻¹ r for a load r on E are F_EE⁻ᵀ r: no array larger than E is needed
+    for them. V_N is given by a V-orthonormal basis (n×N), E by `dofs`, rising; `plain` are the coordinates (d×N) of the
+    basis, orthonormal.
     """
 
     def __init__(self, V: InnerProduct, basis: Array, dofs: Indices) -> None:
         self._factor, self._tail = _contact_factor(V, dofs.astype(np.intp).tobytes())
-        whitened = self._factor.apply_factor(basis)
-        split = V.dim - len(dofs)
-        self._others, r = np.linalg.qr(whitened[:split])
-        self.plain: Array = np.vstack([r, whitened[split:]])
+        rest, on_contact = np.setdiff1d(np.arange(V.dim), dofs), basis[dofs]
+        X = sp.csr_array(V.matrix)[rest][:, rest]
+        others, r = orthogonal_factorisation(X, (basis - self._factor.extend(on_contact))[rest])
+        self._off_contact = np.zeros((V.dim, len(r)))
+        self._off_contact[rest] = others
+        self.plain: Array = np.vstack([r, self._tail @ on_contact])
 
     def supremizers(self, loads: Array) -> Array:
         """Coordinates (d×k) of X_V⁻¹ r for loads r on E (|E|×k), such as Bᵀη."""
-        on_contact = scipy.linalg.solve_triangular(self._tail, loads, trans="T", check_finite=False)
-        return np.vstack([np.zeros((self._others.shape[1], loads.shape[1])), on_contact])
+        on_contact = self._tail.solve_triangular(loads, transposed=True)
+        return np.vstack([np.zeros((self._off_contact.shape[1], loads.shape[1])), on_contact])
 
     def vectors(self, coordinates: Array) -> Array:
         """Vectors (n×k) with these coordinates (d×k)."""
-        k = self._others.shape[1]
-        last = scipy.linalg.solve_triangular(self._tail, coordinates[k:], check_finite=False)
+        k = self._off_contact.shape[1]
+        last = self._tail.solve_triangular(coordinates[k:])
         return np.asarray(self._off_contact @ coordinates[:k] + self._factor.extend(last))
-
-    @cached_property
-    def _off_contact(self) -> Array:
-        """Vectors (n×N) whose coordinates are the first N unit vectors; they are zero on E."""
-        return self._factor.solve_factor(np.vstack([self._others, np.zeros((len(self._tail), self._others.shape[1]))]))
 
 
 class LoadCoordinates:
@@ -208,11 +207,11 @@ def _beside(basis: Array, vectors: Array) -> tuple[Array, Array]:
 
 
 @lru_cache(maxsize=CACHED_FACTORS)  # so that all models of a problem share one factorisation
-def _contact_factor(V: InnerProduct, dofs: bytes) -> tuple[PartialCholesky, Array]:
-    """X_V factorised with some unknowns E last, and the trailing block F_EE (|E|×|E|) of the factor."""
+def _contact_factor(V: InnerProduct, dofs: bytes) -> tuple[PartialCholesky, BlockDiagonal]:
+    """X_V with all unknowns but some E eliminated, and the factor F_EE (|E|×|E|) of its Schur complement."""
     last = np.frombuffer(dofs, np.intp)
     factor = PartialCholesky(V.matrix, elimination_order(V.matrix, last), len(last), "X_V")
-    return factor, factor.trailing_factor
+    return factor, factor.schur_blocks().cholesky("X_V")
 
 
 Coordinates = SpannedCoordinates | ContactCoordinates
@@ -258,6 +257,8 @@ def supremizer_coordinates(
     """
     space: Coordinates
     constrained = _constrained_unknowns(matrices)
+    if len(constrained) > MANY_UNKNOWNS:  # those that no multiplier loads need no dense work
+        constrained = _constrained_unknowns([sp.csr_array(B)[eta.any(axis=1)] for B in matrices])
     if SPAN_COST * V.dim * eta.shape[1] * len(matrices) <= len(constrained) ** 2:
         space = SpannedCoordinates(V, basis, np.hstack([supremizers(V, B, eta) for B in matrices]))
         coordinates = space.represented

@@ -11,6 +11,7 @@ from vibench.arrays import Array
 from vibench.interfaces.problem import MEMBERS, Problem, VariationalInequality
 from vibench.interfaces.strategies import Kind
 from vibench.linalg.cholesky import PartialCholesky, SparseCholesky
+from vibench.linalg.definite import BlockDiagonal
 from vibench.linalg.inner_product import InnerProduct
 from vibench.model.affine import AffineMember, Evaluation, affine_decomposition
 from vibench.model.galerkin import ReducedModel, leading_part, project
@@ -31,7 +32,8 @@ from vibench.timing import timed
 
 for _kind in (
     AffineMember, Evaluation, ReducedOperators, ProjectedMember, ContactCoordinates, LoadCoordinates,
-    SpannedCoordinates, InnerProduct, SparseCholesky, PartialCholesky, VariationalInequality, ExactSolution,
+    SpannedCoordinates, InnerProduct, SparseCholesky, PartialCholesky, BlockDiagonal,
+    VariationalInequality, ExactSolution,
 ):  # fmt: skip
     storable(_kind)
 

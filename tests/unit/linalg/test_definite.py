@@ -3,12 +3,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import scipy.linalg
+import scipy.sparse as sp
 from hypothesis import given
 from hypothesis import strategies as st
 from numerics import spd
 
 from vibench.errors import NumericalError
-from vibench.linalg.definite import connected_blocks, dense_cholesky, dense_inverse
+from vibench.linalg.definite import BlockDiagonal, connected_blocks
 
 
 def mixed_blocks(seed: int, sizes: list[int]) -> tuple[np.ndarray, list[set[int]]]:
@@ -25,12 +26,20 @@ def mixed_blocks(seed: int, sizes: list[int]) -> tuple[np.ndarray, list[set[int]
 def test_factor_and_inverse_are_those_of_the_whole_matrix(seed: int, sizes: list[int]) -> None:
     X, blocks = mixed_blocks(seed, sizes)
     assert sorted(map(sorted, blocks)) == sorted(block.tolist() for block in connected_blocks(X))
-    F = dense_cholesky(X, "X")
+    matrix, rng = BlockDiagonal.of(X), np.random.default_rng(seed)
+    assert np.array_equal(matrix.toarray(), X)
+    factor, inverse = matrix.cholesky("X"), matrix.inverse("X")
+    F = factor.toarray()
     assert np.allclose(F.T @ F, X)
     assert np.array_equal(F, np.triu(F))
-    inverse = dense_inverse(X, "X")
-    assert np.allclose(inverse @ X, np.eye(len(X)))
-    assert np.array_equal(inverse, inverse.T)
+    assert np.allclose(inverse.toarray() @ X, np.eye(len(X)))
+    assert np.array_equal(inverse.toarray(), inverse.toarray().T)
+    rows = sp.random_array((3, len(X)), density=0.4, rng=rng)
+    assert np.allclose(matrix.congruent(rows), rows @ X @ rows.T)
+    for right in (rng.standard_normal(len(X)), rng.standard_normal((len(X), 2))):
+        assert np.allclose(matrix @ right, X @ right)
+        assert np.allclose(F @ factor.solve_triangular(right), right)
+        assert np.allclose(F.T @ factor.solve_triangular(right, transposed=True), right)
 
 
 def test_unknowns_in_a_chain_are_one_block() -> None:
@@ -40,8 +49,8 @@ def test_unknowns_in_a_chain_are_one_block() -> None:
 
 
 @pytest.mark.parametrize("bad", [-1.0, 0.0, np.nan])
-@pytest.mark.parametrize("function", [dense_cholesky, dense_inverse])
+@pytest.mark.parametrize("function", [BlockDiagonal.cholesky, BlockDiagonal.inverse])
 def test_what_is_not_positive_definite_is_refused_by_name(function: object, bad: float) -> None:
     for X in (np.diag([1.0, bad]), np.array([[1.0, 0.5], [0.5, bad]])):
         with pytest.raises(NumericalError, match="the thing is not positive definite"):
-            function(X, "the thing")  # type: ignore[operator]
+            function(BlockDiagonal.of(X), "the thing")  # type: ignore[operator]
