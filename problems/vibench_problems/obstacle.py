@@ -99,7 +99,7 @@ class Obstacle(Problem):
 
     def __init__(
         self,
-        resolution: Literal["coarse", "medium", "paper", "fine"] | Annotated[int, Ge(150), Le(200_000)] = "paper",
+        resolution: Literal["coarse", "medium", "paper", "fine"] | Annotated[int, Ge(150), Le(2_000_000)] = "paper",
         length: Annotated[float, Gt(0.0)] = 1.0,
         load: float = -1.0,
         obstacle: float = -1.25,
