@@ -642,8 +642,8 @@ FAULTS = (
     Fault(
         "separation-not-paid-for",
         "vibench/stages/cell_queries.py",
-        '"assembly": () if reduction is None else (reduction.decomposition, reduction),',
-        '"assembly": () if reduction is None else (reduction,),',
+        '"assembly": () if reduction is None else (reduction.decomposition, reduction, *compiled),',
+        '"assembly": () if reduction is None else (reduction, *compiled),',
         ("tests/unit/stages/test_assembly.py",),
     ),
     Fault(

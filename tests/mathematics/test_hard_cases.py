@@ -12,6 +12,7 @@ from hard_problems import Beam, DoubleObstacle, Truss
 from vibench import AffineProblem, Array, Problem, Reduction, Stop, create
 from vibench.highfidelity.active_set import HighFidelitySolver
 from vibench.linalg.cholesky import PartialCholesky, SparseCholesky
+from vibench.linalg.definite import BlockDiagonal
 from vibench.model.error_bounds import bound_errors_at, corrected_pair
 from vibench.offline.assemblies import assemblies
 from vibench.stability.coercivity import Constant
@@ -50,8 +51,13 @@ def test_condensation_loses_nothing_of_a_stiff_problem() -> None:
 
 
 def test_what_condensation_loses_is_won_back() -> None:
-    problem, schur = Truss(40), PartialCholesky.schur
-    with mock.patch.object(PartialCholesky, "schur", lambda self: 1.5 * schur(self)):  # no refinement mends this
+    problem, schur_blocks = Truss(40), PartialCholesky.schur_blocks
+
+    def disturbed(factor: PartialCholesky) -> BlockDiagonal:
+        """The Schur complement, so far from the right one that no refinement mends it."""
+        return BlockDiagonal.of(1.5 * schur_blocks(factor).toarray())
+
+    with mock.patch.object(PartialCholesky, "schur_blocks", disturbed):
         for mu in problem.parameters.sample(3, 1):
             found = HighFidelitySolver(problem).solve(mu)
             assert found.residuals.worst <= 1e-10

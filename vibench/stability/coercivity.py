@@ -81,12 +81,13 @@ def coercivity(A: SparseMatrix, V: InnerProduct, solve: Solve | None = None) -> 
     `solve` solves with a factorisation of A that exists; by default A is factorised. Raises a `NumericalError` if A is
     not symmetric positive definite.
     """
+    lowest = lowest_quotient(A, V, solve)  # refuses a matrix that is not positive definite
     root = np.sqrt(A.diagonal())
 
     def coercive(a: float) -> bool:
         return proved_positive([A, -a * V.matrix], root) == V.dim
 
-    return moved(lowest_quotient(A, V, solve), -1.0, coercive)
+    return moved(lowest, -1.0, coercive)
 
 
 def continuity(A: SparseMatrix, V: InnerProduct) -> Constant:
