@@ -35,7 +35,7 @@ def thetas(certificate: OnlineCertificate, samples: Mapping[str, Array]) -> dict
 
 
 def rotated(certificate: OnlineCertificate) -> dict[str, Array]:
-    """What takes the θ of A as a query evaluates them to those in the terms of the certificate; none of a constant A."""
+    """What takes the θ of A as a query evaluates them to those of the certificate; none of a constant A."""
     rotation = certificate.base.rotation
     return {} if rotation is None else {"theta_A": rotation}
 

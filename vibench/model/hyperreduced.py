@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from math import isfinite
+from types import MappingProxyType
 
 import numpy as np
 import scipy.linalg
@@ -69,12 +70,18 @@ class ProjectedMember:
             return self._constant_value
         return self._unpacked(theta @ self.terms)
 
+    def at_all(self, thetas: Sequence[Array]) -> Array:
+        """The member with each of P coefficients θ (Q,), in one product (P×shape)."""
+        return self._unpacked(np.stack(thetas) @ self.terms)
+
     @cached_property
     def _constant_value(self) -> Array:
         return self._unpacked(self.terms[0])
 
     def _unpacked(self, flat: Array) -> Array:
-        return (flat if self.unpack is None else flat[self.unpack]).reshape(self.shape)
+        """Members (…×shape) from their flat entries (…×size)."""
+        whole = flat if self.unpack is None else flat[..., self.unpack]
+        return whole.reshape(*flat.shape[:-1], *self.shape)
 
 
 @dataclass(frozen=True)
@@ -221,7 +228,31 @@ class HyperReducedModel:
             If the reduced problem has entries that are not finite.
         """
         samples = self.coefficients(mu)
-        members, space = self._members(samples, self._varying(mu)), self.space
+        return self._in_basis(mu, samples, self._members(samples, self._varying(mu)))
+
+    def assemble_all(self, mus: Array) -> list[ReducedProblem]:
+        """The reduced problems at mus (P×d): those of `assemble` up to round-off, sums of terms in one product each.
+
+        Raises
+        ------
+        NumericalError
+            As `assemble`.
+        """
+        if not len(mus):
+            return []
+        samples = [self.coefficients(mu) for mu in mus]
+        sums = {name: getattr(self._operators, name) for name in MEMBERS}
+        varying = {name: of for name, of in sums.items() if of is not None and not of.constant and name in samples[0]}
+        values = {name: of.at_all([each[name] for each in samples]) for name, of in varying.items()}
+        assembled = []
+        for k, (mu, own) in enumerate(zip(mus, samples, strict=True)):
+            members = self._members(own, self._varying(mu), {name: value[k] for name, value in values.items()})
+            assembled.append(self._in_basis(mu, own, members))
+        return assembled
+
+    def _in_basis(self, mu: Array, samples: Samples, members: VariationalInequality) -> ReducedProblem:
+        """The reduced problem at mu (d,) of members on Φ."""
+        space = self.space
         A, f, B, g, Y = members.A, members.f, members.B, members.g, None
         if space is not None:
             A, f, B, Y = _enriched(members, space.plain)
@@ -277,17 +308,20 @@ class HyperReducedModel:
             return eta, _combination(self.model, eta)
         return np.hstack([eta, self.generators]), None
 
-    def _members(self, samples: Samples, varying: tuple[Array, Array] | None) -> VariationalInequality:
-        """The members on Φ; of a space that varies in it B has the coordinates alone that supremizers use."""
+    def _members(
+        self, samples: Samples, varying: tuple[Array, Array] | None, known: Mapping[str, Array] = MappingProxyType({})
+    ) -> VariationalInequality:
+        """The members on Φ but for `known` ones; of a varying space B has what supremizers use alone."""
         operators, count = self._operators, self.generators.shape[1]
-        A, f = operators.A.at(samples.get("A")), operators.f.at(samples.get("f"))
+        A = known["A"] if "A" in known else operators.A.at(samples.get("A"))
+        f = known["f"] if "f" in known else operators.f.at(samples.get("f"))
         if operators.g is not None:
-            g = operators.g.at(samples.get("g"))
+            g = known["g"] if "g" in known else operators.g.at(samples.get("g"))
         else:
             assert varying is not None  # from `_varying`
             combination, bounds = self._tested[1], varying[1]
             g = bounds[len(bounds) - count :] if combination is None else bounds @ combination
-        return VariationalInequality(A, f, self._constraint(samples, varying), g)
+        return VariationalInequality(A, f, known["B"] if "B" in known else self._constraint(samples, varying), g)
 
     @property
     def space(self) -> PlainCoordinates | None:

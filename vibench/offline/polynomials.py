@@ -49,8 +49,8 @@ def member_polynomials(
     """The model whose members are evaluated, see `declared_model`, and polynomials of the members.
 
     A is a packed upper triangle (row by row). With `fixed` a basis that depends on the parameter is refused; what is
-    interpolated `beside` the members has polynomials, too. Of these, the `rotated` ones are a matrix times the θ of A, by
-    name: one polynomial serves them and A.
+    interpolated `beside` the members has polynomials, too. Of these, the `rotated` ones are the θ of A times a
+    matrix, by name: one polynomial serves them and A.
 
     Raises
     ------

@@ -155,6 +155,10 @@ def assert_same_program(model: ReducedModel, reduced: HyperReducedModel, mu: np.
         assert one.shape == other.shape
         assert np.linalg.norm(one - other) <= accuracy * np.linalg.norm(other), name
     assert np.array_equal(found.program.A, found.program.A.T)
+    for together in reduced.assemble_all(np.array([mu, model.problem.parameters.lower, mu]))[::2]:
+        for name in MEMBERS:
+            one, other = getattr(found.program, name), getattr(together.program, name)
+            assert np.linalg.norm(one - other) <= 1e-12 * np.linalg.norm(one), name
 
 
 @pytest.mark.parametrize("kind", KINDS)
