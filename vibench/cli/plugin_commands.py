@@ -43,11 +43,16 @@ def list_plugins(
             autocompletion=lists,
         ),
     ] = None,
+    sizes: Annotated[
+        bool, Option("--sizes", help="Build every problem with its default options, and say how large it is.")
+    ] = False,
 ) -> None:
     """List problems, strategies, figures, studies and QP solvers.
 
     Plugins are listed with their options; a list of one kind has the values of the options, too.
     """
+    if sizes and what != PROBLEM.plural:
+        raise RequestError(f"--sizes is for `vibench list {PROBLEM.plural}`")
     from vibench.study.registry import unreadable
     from vibench.terminal.console import print_rows
 
@@ -57,7 +62,7 @@ def list_plugins(
         echo("", "what the options of one kind are, and whether its plugins can be loaded:")
         echo(f"  vibench list {'|'.join(LISTS)}")
     elif what in LISTS:
-        print_rows(_solver_rows() if LISTS[what] is SOLVER else _loaded_rows(LISTS[what]), HEADINGS, what)
+        print_rows(_solver_rows() if LISTS[what] is SOLVER else _loaded_rows(LISTS[what], sizes), HEADINGS, what)
     else:
         raise unknown_name("list", what, LISTS)
     for distribution, reason in unreadable().items():
@@ -176,7 +181,7 @@ def _read_rows(kind: PluginKind) -> Iterator[Row]:
             yield name, plugin.origin, plugin.summary, ", ".join(plugin.names_of_options)
 
 
-def _loaded_rows(kind: PluginKind) -> Iterator[Row]:
+def _loaded_rows(kind: PluginKind, sizes: bool = False) -> Iterator[Row]:
     """Name, origin, description and options of every plugin of a kind; of one that does not load, the error."""
     from vibench.study.registry import registered
 
@@ -190,6 +195,7 @@ def _loaded_rows(kind: PluginKind) -> Iterator[Row]:
                 lines += map(str, plugin.options.values())
             if kind is PROBLEM:
                 lines += _parameters(plugin.load())
+                lines += [_size(plugin)] if sizes else []
             if kind is FIGURE:
                 lines += _columns(name)
         except VibenchError as error:
@@ -213,6 +219,15 @@ def _parameters(problem: type) -> Iterator[str]:
     if isinstance(box, ParameterBox):
         for k, (name, low, high, unit) in enumerate(zip(box.names, box.lower, box.upper, box.units, strict=True), 1):
             yield f"mu_{k}: {name} from {low:g} to {high:g}" + f" {unit}" * (unit != "1")
+
+
+def _size(plugin: RegisteredPlugin) -> str:
+    """How many unknowns and constraints a problem has with its default options, in a line."""
+    needed = [name for name, option in plugin.options.items() if option.required]
+    if needed:
+        return f"its size depends on {', '.join(needed)}"
+    problem = plugin.load()()
+    return f"n = {problem.V.dim} unknowns, m = {problem.W.dim} constraints"
 
 
 def _columns(plugin: str) -> Iterator[str]:

@@ -20,8 +20,9 @@ from vibench.qp.settings import SETTINGS
 from vibench.results.columns import CELLS, STORED, TABLES
 from vibench.results.sqlite.reading import FILE
 from vibench.results.tables import read
-from vibench.study import kinds
+from vibench.study import kinds, registry
 from vibench.study.entries import ProblemEntry
+from vibench.study.kinds import PROBLEM
 from vibench.study.matrix import expand, read_study
 from vibench.study.registry import find, registered
 from vibench.study.spec import Study
@@ -447,6 +448,18 @@ def test_problems_are_listed_with_their_parameters(main: Main) -> None:
     text = " ".join(out.split())
     assert "mu_1: radius from 0.7 to 1.3 m" in text
     assert "mu_1: scale from 0.8 to 1.2 mu_2: centre_x from -0.05 to 0.05 m" in text
+    assert "unknowns" not in text
+
+
+def test_sizes_of_problems_are_said_where_they_are_asked_for(main: Main, monkeypatch: pytest.MonkeyPatch) -> None:
+    known = registry.registered(PROBLEM)
+    few = {name: known[name] for name in ("radial-obstacle", "pack")}
+    monkeypatch.setattr(registry, "registered", lambda kind: few if kind is PROBLEM else {})
+    _, out, _ = main("list", "problems", "--sizes")
+    text, problem = " ".join(out.split()), known["radial-obstacle"].load()()
+    assert f"n = {problem.V.dim} unknowns, m = {problem.W.dim} constraints" in text
+    assert "its size depends on path" in text
+    refused(main("list", "solvers", "--sizes"), "--sizes is for `vibench list problems`")
 
 
 def test_a_table_of_tolerances_in_place_of_a_list_is_named(main: Main, tmp_path: Path) -> None:
