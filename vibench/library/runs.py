@@ -6,6 +6,7 @@ import warnings
 from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from functools import cached_property, partial
+from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -46,6 +47,10 @@ class Run:
 
     def __repr__(self) -> str:
         return f"Run('{self.path}')"
+
+    def _repr_html_(self) -> str:
+        shown = self.summary.to_html(index=False, na_rep="", float_format="{:.3g}".format, border=0)
+        return f"<p>{escape(str(self.study['name']))}, {escape(str(self.path))}</p>{shown}"
 
     @cached_property
     def study(self) -> dict[str, Any]:

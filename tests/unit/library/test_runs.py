@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import builtins
 import signal
+from html import escape
 from pathlib import Path
 from typing import Any
 
 import matplotlib.figure
 import pandas as pd
 import pytest
+from rich import jupyter
 
 import vibench
 from vibench.execution.run import Agenda, Observer
+from vibench.library.runs import _following
 from vibench.report import figures
 from vibench.results import tables
 
@@ -96,6 +100,25 @@ def test_figures_and_findings(run: vibench.Run) -> None:
 def test_a_figure_that_there_is_not(run: vibench.Run, kind: str, options: dict[str, str], line: str) -> None:
     with pytest.raises(vibench.RequestError, match=line):
         run.figure(kind, **options)
+
+
+def test_a_notebook_shows_the_summary_of_a_run(run: vibench.Run) -> None:
+    shown = run._repr_html_()
+    assert run.study["name"] in shown
+    assert shown.count("<tr") == len(run.summary) + 1
+    assert all(f"<th>{escape(heading)}</th>" in shown for heading in run.summary.columns)
+
+
+def test_progress_in_a_notebook_is_lines(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    shell = type("ZMQInteractiveShell", (), {})
+    monkeypatch.setattr(builtins, "get_ipython", shell, raising=False)
+    shown: list[str] = []
+    monkeypatch.setattr(jupyter, "display", lambda segments, text: shown.append(text))
+    with _following(None, progress=True) as display:
+        display.start(Agenda(cells=2, to_run=2, unavailable=0, stages=(), workers=1))
+        display.note("a line with <b> and [red]")
+    assert [line.rstrip() for line in shown] == ["2 cells, 2 to run, 0 stages on 1 worker", "a line with <b> and [red]"]
+    assert capsys.readouterr().out == ""  # a cell would show it again
 
 
 def test_what_a_run_writes(run: vibench.Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
