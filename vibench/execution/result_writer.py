@@ -43,7 +43,7 @@ class ResultWriter:
         queries = [{"cell": cell.key, **keys, "query": k, **query} for k, query in enumerate(rows.queries)]
         solutions = [{"cell": cell.key, **solution} for solution in rows.solutions]
         outputs = [{"cell": cell.key, **keys, **output} for output in rows.outputs]
-        return self.database.write_cell(row, queries, solutions, outputs)
+        return self.database.write_cell(row, queries, solutions, outputs, rows.parameters)
 
     def seconds(self, cell: Cell, timed: TimedCell, asked: int) -> None:
         """Write the seconds of a cell that has its rows."""

@@ -427,7 +427,7 @@ TIMINGS: Mapping[str, Column] = {
     "slowdown": real("1", "Time of the calibration next to the round, divided by its best in that process."),
 }
 
-PARAMETER = real("µ", "The k-th parameter.")
+PARAMETER = real("µ", "The k-th parameter; tables for reading have its name as heading.")
 """What mu_1, mu_2, … of the queries are, as many as the problem has parameters."""
 
 

@@ -18,6 +18,7 @@ from vibench.results.sqlite.reading import (
     BUSY_SECONDS,
     DAMAGED,
     FILE,
+    PARAMETERS,
     DamagedResultsError,
     code_of,
     read_meta,
@@ -151,17 +152,31 @@ class ResultsDatabase:
         queries: Sequence[Mapping[str, Any]],
         solutions: Sequence[Mapping[str, Any]] = (),
         outputs: Sequence[Mapping[str, Any]] = (),
+        parameters: Sequence[tuple[str, str]] = (),
     ) -> dict[str, Any]:
         """Write a cell, its queries, solutions and outputs in one transaction; its earlier rows are replaced.
+
+        `parameters` are names and units of the parameters of its problem, which are kept in the table `meta`.
 
         Rows that cannot be stored because of their values cost the cell, not the run: it gets an `error` row instead.
 
         Returns the row of the cell as it is stored. Raises a `StorageError` if the file cannot be written.
         """
         try:
+            self._name_parameters(str(cell.get("problem")), parameters)
             return self._write_cell(cell, queries=queries, solutions=solutions, outputs=outputs)
         except (UnstorableError, sqlite3.Error) as error:
             return self._write_cell(error_row(cell, str(error)))
+
+    def _name_parameters(self, problem: str, parameters: Sequence[tuple[str, str]]) -> None:
+        """Keep what mu_1, mu_2, … of a problem are, where it is not known yet."""
+        entry = PARAMETERS + problem, json.dumps(parameters)
+        if not parameters or self._db.execute("SELECT 1 FROM meta WHERE key = ? AND value = ?", entry).fetchone():
+            return
+        with self._writing():
+            self._db.execute("INSERT OR REPLACE INTO meta VALUES (?, ?)", entry)
+            self._digests.forget(name="meta")
+            self._digests.count("meta")
 
     def _write_cell(self, cell: Mapping[str, Any], **others: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
         with self._writing():

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import NoReturn
@@ -17,6 +18,7 @@ from vibench.results.columns import CELLS, STORED, THRESHOLDS, Column
 from vibench.results.formats import cell_text
 from vibench.results.plugin_columns import Extended
 from vibench.results.ranking import BAND
+from vibench.results.sqlite.reading import parameters_of
 from vibench.text import json_object
 
 AXES = (
@@ -107,6 +109,8 @@ class Table:
     key_length: int
     varying: Mapping[tuple[str, str], tuple[str, ...]]
     """Options that tell plugins of one name apart, by the column of the name and the name."""
+    parameters: Mapping[str, str] = field(default_factory=dict)
+    """Names of the parameters of the problems by their columns, mu_1, mu_2, …"""
     faults: tuple[str, ...] = ()
     """A line for every column of a plugin that is missing, or every plugin that cannot be loaded."""
 
@@ -128,7 +132,7 @@ class Table:
             pairs = zip(rows[axis], rows[f"{axis}_options"], strict=True)
             texts = [_with_options(name, text, self.varying.get((axis, name), ())) for name, text in pairs]
             rows = rows.assign(**{axis: texts})
-        return tables.under_headings(rows, names, self.view.headings or {})
+        return tables.under_headings(rows, names, self.view.headings or {}).rename(columns=dict(self.parameters))
 
     @property
     def described(self) -> tuple[pd.DataFrame, list[str]]:
@@ -160,7 +164,7 @@ class Table:
 
     def _heading(self, name: str) -> str:
         column = (self.view.headings or {}).get(name)
-        return column.heading or name if column is not None else name
+        return column.heading or name if column is not None else self.parameters.get(name, name)
 
 
 def look_up(
@@ -201,7 +205,9 @@ def look_up(
             raise RequestError(f"the table {name} has no rows of one cell; expected {', '.join(OF_ONE_CELL)}")
         frame = frame[frame["cell"] == _key_of(path, cell)]
     rows = view.rows(frame if largest is None else ranking.within(frame, largest))
+    named = _parameters(path, rows)
     by_heading = {column.heading: key for key, column in (view.headings or {}).items() if column.heading}
+    by_heading |= _parameters_by_name(named, rows)
     if sort:
         resolved = [f"{'-' * key.startswith('-')}{by_heading.get(k, k)}" for key in sort for k in [key.lstrip("-")]]
         rows = selection.sorted_by(rows, resolved, name)
@@ -214,8 +220,30 @@ def look_up(
     default = [column for column in dict.fromkeys(view.columns) if column in rows]
     shown = rows.head(limit) if limit else rows
     listed, length = tuple(dict.fromkeys(asked or default)), selection.short_keys(keys)
-    return Table(shown, listed, view, bool(asked), length, _varying_options(everything), extended.faults)
+    return Table(shown, listed, view, bool(asked), length, _varying_options(everything), named, extended.faults)
 
+
+def _parameters(path: Path, rows: pd.DataFrame) -> dict[str, str]:
+    """Headings, "radius [m]", of the columns mu_1, mu_2, … of rows; those of several problems side by side."""
+    columns = [name for name in rows.columns if PARAMETER_NAME.fullmatch(name)]
+    if not columns:
+        return {}
+    of, headings = parameters_of(path), dict[str, list[str]]()
+    for problem in rows["problem"].unique():
+        for k, (name, unit) in enumerate(of.get(problem, ()), 1):
+            headings.setdefault(f"mu_{k}", []).append(f"{name} [{unit}]" if unit != "1" else name)
+    joined = {name: " / ".join(dict.fromkeys(headings[name])) for name in columns if name in headings}
+    taken = [*rows.columns, *joined.values()]
+    return {name: heading for name, heading in joined.items() if taken.count(heading) == 1}
+
+
+def _parameters_by_name(named: Mapping[str, str], rows: pd.DataFrame) -> dict[str, str]:
+    """The columns by their headings, and by these without units, where no column is called so."""
+    both = [(text, key) for key, heading in named.items() for text in (heading, heading.partition(" [")[0])]
+    return {text: key for text, key in both if text not in rows}
+
+
+PARAMETER_NAME = re.compile("mu_[1-9][0-9]*")
 
 LARGE = ("queries", "timings", "outputs")
 """Tables with many rows of each cell, in which whatever tells cells apart is that of their row in the table cells."""

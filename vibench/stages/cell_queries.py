@@ -49,12 +49,16 @@ QueryRows = tuple[Row, Row | None]
 
 @dataclass(frozen=True)
 class CellRows:
-    """The rows of one cell: its own, one per query, the solutions of those that have one, and one per output."""
+    """The rows of one cell: its own, one per query, the solutions of those that have one, and one per output.
+
+    `parameters` are names and units of mu_1, mu_2, … of the queries.
+    """
 
     cell: Row
     queries: tuple[Row, ...]
     solutions: tuple[Row, ...] = ()
     outputs: tuple[Row, ...] = ()
+    parameters: tuple[tuple[str, str], ...] = ()
 
 
 @dataclass(frozen=True)
@@ -205,7 +209,9 @@ class _Queries(Items):
         own = summarise(rows) | self._sizes(rows) | self._shares() | self._offline()
         outputs = self._outputs(rows)
         written = [row | {"outputs": json.dumps(values) if (values := row.get("outputs")) else None} for row in rows]
-        return CellRows(own, tuple(written), tuple(solutions.values()), outputs)
+        box = self._model.problem.parameters
+        named = tuple(zip(map(str, box.names), map(str, box.units), strict=True))
+        return CellRows(own, tuple(written), tuple(solutions.values()), outputs, named)
 
     def _outputs(self, rows: Sequence[Row]) -> tuple[Row, ...]:
         """Rows of the problem's outputs, over the ok queries."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import os
 import shutil
 import sqlite3
@@ -17,7 +18,7 @@ from vibench.files import TEMPORARY
 from vibench.qp.status import Status
 from vibench.results.columns import VERSION
 from vibench.results.sqlite.digests import DigestError, Digests
-from vibench.text import json_object, one_line, printable
+from vibench.text import brief, json_object, one_line, printable
 
 FILE = "results.sqlite"
 
@@ -110,6 +111,24 @@ REMEMBERED = 1 << 16
 def text_reader() -> Callable[[bytes], str]:
     """`read_text` for one connection: a text that most rows of a table have is read, and kept in memory, once."""
     return lru_cache(maxsize=REMEMBERED)(read_text)
+
+
+PARAMETERS = "parameters of "
+"""Beginning of the keys of `meta` under which names and units of the parameters of a problem are, by its label."""
+
+
+def parameters_of(path: Path) -> dict[str, list[tuple[str, str]]]:
+    """Names and units of mu_1, mu_2, … by the label of the problem, as far as a results file has them."""
+    texts = {key: value for key, value in read_meta(path).items() if key.startswith(PARAMETERS)}
+    found = {}
+    for key, text in texts.items():
+        try:
+            found[key.removeprefix(PARAMETERS)] = [(str(name), str(unit)) for name, unit in json.loads(text)]
+        except (TypeError, ValueError):
+            raise DamagedResultsError(
+                f"'{path}' has {brief(repr(text), 60)} as the {key}, expected pairs of texts"
+            ) from None
+    return found
 
 
 def read_meta(path: Path) -> dict[str, str]:
