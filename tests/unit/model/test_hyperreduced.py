@@ -142,23 +142,24 @@ def online(model: ReducedModel) -> HyperReducedModel:
 
 
 def assert_same_program(model: ReducedModel, reduced: HyperReducedModel, mu: np.ndarray, accuracy: float) -> None:
-    """The program is that of the full assembly, projected on the same basis; the basis is as good."""
-    V, found, vi = model.problem.V, reduced.assemble(mu), checked_assembly(model.problem, mu)
-    Z, own = found.basis, model.primal_basis(vi)
-    assert Z.shape == own.shape
-    assert np.allclose(V.gram(Z, Z), np.eye(Z.shape[1]), atol=1e-10)
-    assert np.allclose(Z[:, : model.fixed_basis.shape[1]], model.fixed_basis, atol=1e-10)
-    assert np.allclose(singular_values(V.gram(Z, own)), 1.0, atol=max(1e-9, 10.0 * accuracy))
-    exact = project(vi, Z, model.generators)
-    for name in MEMBERS:
-        one, other = getattr(found.program, name), getattr(exact, name)
-        assert one.shape == other.shape
-        assert np.linalg.norm(one - other) <= accuracy * np.linalg.norm(other), name
-    assert np.array_equal(found.program.A, found.program.A.T)
-    for together in reduced.assemble_all(np.array([mu, model.problem.parameters.lower, mu]))[::2]:
+    """The program is that of the full assembly, projected on the same basis; the basis is as good.
+
+    So are programs assembled with others. Their bases may be rotated, since round-off decides between equal pivots.
+    """
+    vi = checked_assembly(model.problem, mu)
+    own, V = model.primal_basis(vi), model.problem.V
+    together = reduced.assemble_all(np.array([mu, model.problem.parameters.lower, mu]))[::2]
+    for found in (reduced.assemble(mu), *together):
+        Z, exact = found.basis, project(vi, found.basis, model.generators)
+        assert Z.shape == own.shape
+        assert np.allclose(V.gram(Z, Z), np.eye(Z.shape[1]), atol=1e-10)
+        assert np.allclose(Z[:, : model.fixed_basis.shape[1]], model.fixed_basis, atol=1e-10)
+        assert np.allclose(singular_values(V.gram(Z, own)), 1.0, atol=max(1e-9, 10.0 * accuracy))
         for name in MEMBERS:
-            one, other = getattr(found.program, name), getattr(together.program, name)
-            assert np.linalg.norm(one - other) <= 1e-12 * np.linalg.norm(one), name
+            one, other = getattr(found.program, name), getattr(exact, name)
+            assert one.shape == other.shape
+            assert np.linalg.norm(one - other) <= accuracy * np.linalg.norm(other), name
+        assert np.array_equal(found.program.A, found.program.A.T)
 
 
 @pytest.mark.parametrize("kind", KINDS)
