@@ -24,8 +24,8 @@ from vibench.highfidelity.kkt_systems import ActiveSetSystem, CondensedStiffness
 from vibench.interfaces.problem import VariationalInequality
 from vibench.qp.scaling import near_rows
 
-LARGEST, SMALL = 2**24, 2**18
-"""Entries of D up to which it is computed, for a dense and for a sparse Ŝ; beyond, systems are solved for every set."""
+SMALL = 2**18
+"""Entries of D up to which it is computed for a sparse Ŝ; beyond, systems are solved for every set."""
 
 CANCELLED = 1e-4
 """A representer A⁻¹ℓ that is a sum of terms, whose norm is below this share of theirs, is computed anew from ℓ."""
@@ -75,7 +75,7 @@ class OnContact:
         self.B: SparseMatrix = sp.csr_array(sp.csc_array(vi.B)[:, self._retained])
         self.sizes: SparseMatrix = abs(self.B)
         m, c = self.B.shape
-        self.is_dense = m * c <= (LARGEST if stiffness.dense else SMALL if shared else 0)
+        self.is_dense = stiffness.dense or (shared and m * c <= SMALL)
         self._factor: tuple[bytes, _Factor] | None = None
 
     @property
