@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import statistics
+from bisect import insort
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import cache, partial
@@ -22,10 +23,13 @@ SLOW = 1.0
 """Seconds of repeats after which there are no more; what takes longer is timed once."""
 
 DISTURBED = 1.3
-"""A row is marked as disturbed if the calibration is slower than its best by more than this factor."""
+"""A row is marked as disturbed if the calibration is slower than when the machine is calm by more than this factor."""
+
+CALM = 0.1
+"""Share of the runs of the calibration that are taken for those of a calm machine: the very best one is luck."""
 
 WAITED = 1.5
-"""A row is marked as disturbed if its wall seconds exceed its CPU seconds by more than this factor."""
+"""Wall seconds above this multiple of the CPU seconds are those of a process that often waits for a core."""
 
 ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMEXPR_NUM_THREADS"), "1")
 """Environment in which numerical libraries start with one thread."""
@@ -129,25 +133,26 @@ def median_interval(values: Sequence[float]) -> tuple[float, float]:
 
 
 class Calibration:
-    """Fixed numerical work whose time, relative to its best, measures how much the machine is slowed down at present.
+    """Fixed numerical work whose CPU time, relative to that on a calm machine, measures how much this one is disturbed.
 
-    Other processes on the core, a shared cache and a lower clock rate slow down all that is timed beside it.
+    Other processes on the core, a shared cache and a lower clock rate slow down all that is timed beside it. That a
+    process waits for a core does not: its CPU seconds stop meanwhile.
     """
 
     def __init__(self) -> None:
         self._matrix = np.random.default_rng(0).standard_normal((160, 160))
-        self._best = float("inf")
+        self._sorted: list[float] = []
         self.slowdown()
 
     def slowdown(self) -> float:
-        """Wall seconds of the work, the quickest of three runs, over the quickest in this process so far."""
-        now = self.seconds().wall
-        self._best = min(self._best, now)
-        return now / self._best
+        """CPU seconds of the work, the quicker of two runs, over the lowest `CALM` of all in this process so far."""
+        now = self.seconds().cpu
+        insort(self._sorted, now)
+        return now / self._sorted[int(CALM * len(self._sorted))]
 
     def seconds(self) -> Seconds:
-        """Seconds of the work, the quickest of three runs."""
-        runs = [timed(self._work)[1] for _ in range(3)]
+        """Seconds of the work, the quicker of two runs."""
+        runs = [timed(self._work)[1] for _ in range(2)]
         return Seconds(min(run.cpu for run in runs), min(run.wall for run in runs))
 
     def _work(self) -> float:

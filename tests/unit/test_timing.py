@@ -161,8 +161,16 @@ def test_every_repeat_may_have_work_of_its_own_and_the_first_result_counts(clock
     assert seconds.cpu == pytest.approx(0.1)
 
 
-def test_the_calibration_tells_how_much_slower_than_at_its_best(clocks: Callable[..., None]) -> None:
-    walls = (2.0, 1.0, 3.0, 2.0, 4.0, 9.0, 0.5, 0.7, 0.9, 1.0, 2.0, 3.0)
-    clocks(*[(0.0, wall) for wall in walls])
+def test_the_calibration_tells_how_much_slower_than_on_a_calm_machine(clocks: Callable[..., None]) -> None:
+    spent = (2.0, 1.0, 2.0, 4.0, 0.7, 0.5, 1.0, 2.0)
+    clocks(*[(cpu, 9.0) for cpu in spent])
     calibration = Calibration()
     assert [calibration.slowdown() for _ in range(3)] == pytest.approx([2.0, 1.0, 2.0])
+
+
+def test_one_quick_run_of_the_calibration_marks_no_others(clocks: Callable[..., None]) -> None:
+    """Against the best of all, every round but the luckiest would count as disturbed."""
+    clocks(*[(cpu, cpu) for cpu in [0.5] * 2 + [1.0] * 38 + [1.5] * 2])
+    calibration = Calibration()
+    slowdowns = [calibration.slowdown() for _ in range(20)]
+    assert slowdowns[8:] == pytest.approx([1.0] * 11 + [1.5])

@@ -247,7 +247,7 @@ def check_timings() -> Iterator[Diagnosis]:
     for subject, text, doubtful in (
         ("other load", f"{others:.1f} of {cores} cores", others > MAX_OTHER_LOAD * cores),
         ("slowdown", f"{slowdown:.2f}; rows are marked above {DISTURBED}", slowdown > DISTURBED),
-        ("wall over CPU", f"{ratio:.2f}; rows are marked above {WAITED}", ratio > WAITED),
+        ("wall over CPU", f"{ratio:.2f}; above {WAITED} processes often wait for a core", ratio > WAITED),
     ):
         yield Diagnosis(subject, text, _note_if(doubtful))
         doubts += [subject] * doubtful

@@ -92,6 +92,9 @@ def run_study_command(
     jobs: Annotated[
         int, Option("--jobs", "-j", min=0, help="Worker processes; 0 for one per core. Does not affect results.")
     ] = 0,
+    repeats: Annotated[
+        int, Option(min=0, metavar="K", help="Measure seconds in at least K cold processes, offline stages K times.")
+    ] = 0,
     dry_run: Annotated[bool, Option("--dry-run", help="List the cells of the matrix and stop.")] = False,
     fresh: Annotated[bool, Option("--fresh", help="Remove earlier results and recompute everything.")] = False,
     retry: Annotated[bool, Option("--retry", help="Also rerun cells that did not end ok.")] = False,
@@ -121,7 +124,7 @@ def run_study_command(
     if scheduler is not None:
         _warn_of_open_scheduler(scheduler, executor)
     folder = out or Path("runs") / loaded.name
-    options = Options(jobs, fresh, retry, executor, scheduler)
+    options = Options(jobs, fresh, retry, executor, scheduler, repeats)
     with ProgressDisplay(new_console()) as progress:
         outcome = run_study(loaded, folder, progress, options)
     _conclude(loaded.name, outcome, folder, draw=options.workers if draw else None, fresh=fresh, strict=strict)
@@ -186,7 +189,8 @@ def _study(request: str, key: str, overrides: dict[str, list[Any]], at: list[str
     if not key:
         return study
     cell = only_cell(expand(study), key, f"'{request}'")
-    return study_of_cell(cell, study.name, timing_rounds=study.timing_rounds, limits=study.limits)
+    rounds = {name: getattr(study, name) for name in ("timing_rounds", "timing_rounds_min")}
+    return study_of_cell(cell, study.name, limits=study.limits, **rounds)
 
 
 def clean(

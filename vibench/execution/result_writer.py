@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence, Set
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,7 +11,7 @@ from vibench import provenance
 from vibench.results.database import ResultsDatabase
 from vibench.stages.base import Row, Stage, value_of
 from vibench.stages.cell_queries import CellRows
-from vibench.stages.timing_rounds import TimedCell, round_rows, seconds_of_cell, seconds_of_queries
+from vibench.stages.timed_seconds import TimedRound, seconds_of_cell, seconds_of_queries
 from vibench.storage.artefacts import History, Store
 from vibench.study.cells import Axes, Cell, digest
 from vibench.study.parameter_sets import ParameterSet
@@ -45,15 +45,27 @@ class ResultWriter:
         outputs = [{"cell": cell.key, **keys, **output} for output in rows.outputs]
         return self.database.write_cell(row, queries, solutions, outputs, rows.parameters)
 
-    def seconds(self, cell: Cell, timed: TimedCell, asked: int) -> None:
-        """Write the seconds of a cell that has its rows."""
-        row, rounds = self.database.cell(cell.key), round_rows(timed.rounds)
+    def seconds(
+        self,
+        cell: Cell,
+        rows: Sequence[Row],
+        rounds: Sequence[TimedRound],
+        machines: Set[str],
+        asked: int | None,
+        lost: str,
+    ) -> None:
+        """Write the seconds of a cell that has its rows; `asked` are the rounds that were allowed once all are done."""
+        row = self.database.cell(cell.key)
         assert row is not None  # cells are timed when they have their rows
-        own = seconds_of_cell(rounds, row["offline_s"]) | {"timing_rounds": asked, "timing_reason": timed.reason}
-        if rounds:
-            own["machine"] = "; ".join(sorted({*row["machine"].split("; "), timed.machine}))
+        own = seconds_of_cell(rows) | {"timing_rounds": asked, "timed_rounds": len(rows), "timing_reason": lost}
+        if rows:
+            own["machine"] = "; ".join(sorted({*row["machine"].split("; "), *machines}))
         keys = {"cell": cell.key, **cell_columns(cell)}
-        self.database.write_seconds(cell.key, own, seconds_of_queries(timed.rounds), [keys | row for row in rounds])
+        self.database.write_seconds(cell.key, own, seconds_of_queries(rounds), [keys | row for row in rows])
+
+    def offline(self, cell: Cell, columns: Row) -> None:
+        """Write the offline columns of a cell that has its rows."""
+        self.database.write_columns(cell.key, columns)
 
     def stage(self, stage: Stage, histories: Iterable[History], store: Store) -> None:
         """Write the histories and rows of a stage whose value is stored."""

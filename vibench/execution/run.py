@@ -14,6 +14,7 @@ from vibench.errors import ExecutorError, RequestError, StorageError, VibenchErr
 from vibench.execution.executors import Dask, Executor, Local
 from vibench.execution.graph import Graph
 from vibench.execution.jobs import Job
+from vibench.execution.offline_plan import OfflinePlan
 from vibench.execution.result_writer import ResultWriter, labels_of
 from vibench.execution.run_folder import LOG, claimed, clear
 from vibench.execution.timing_plan import TimingPlan
@@ -26,6 +27,7 @@ from vibench.results.solver_agreement import disagreement_rows
 from vibench.stages.base import Done, Failed, Stage, Unstored
 from vibench.stages.cell_queries import CellRows, cell_queries
 from vibench.stages.pictures import PictureStage
+from vibench.stages.timing_rounds import SHARE, TimingRounds
 from vibench.storage.artefacts import Store, usable_store
 from vibench.study.cells import Cell
 from vibench.study.kinds import SAMPLING, SOLVER
@@ -36,6 +38,9 @@ from vibench.study.spec import Study
 
 CHECK_INTERVAL = 5.0
 """Seconds between two checks that the executor still runs."""
+
+MOST_REPEATS = 100
+"""Most cold processes in which seconds are measured."""
 
 JOBS_PER_CORE = 16
 """Most worker processes per core: more than one makes a run slower, and thousands stop the machine."""
@@ -113,6 +118,8 @@ class Options:
         "local" or "dask".
     scheduler
         Address of a dask scheduler; `None` for a cluster on this machine.
+    repeats
+        Cold processes in which seconds are measured, at least; 0 for what decides the comparisons of the study.
 
     Raises
     ------
@@ -125,8 +132,11 @@ class Options:
     retry: bool = False
     executor: str = "local"
     scheduler: str | None = None
+    repeats: int = 0
 
     def __post_init__(self) -> None:
+        if not 0 <= self.repeats <= MOST_REPEATS:
+            raise RequestError(f"repeats is {self.repeats}, expected 0 to {MOST_REPEATS} processes")
         cores = provenance.cores()
         if not 0 <= self.jobs <= JOBS_PER_CORE * cores:
             expected = (
@@ -200,6 +210,7 @@ class _Run:
     cells: dict[str, list[Cell]] = field(default_factory=dict)
     """The cells that get their rows from a goal, by its key; several cells may share a goal."""
     timing: TimingPlan = field(init=False)
+    offline: OfflinePlan = field(init=False)
     machines: Set[str] = frozenset()
 
     def execute(self, cells: Sequence[Cell], todo: Sequence[Cell]) -> bool:
@@ -208,9 +219,13 @@ class _Run:
         seconds = self.study.limits.query_seconds
         goals = {cell: cell_queries(cell, seconds) for cell in cells if cell.key not in reasons}
         runnable = [cell for cell in todo if cell in goals]
-        self.timing = TimingPlan(goals, self.study.timing_rounds, self.writer)
+        rounds, fewest = self.study.timing_rounds, self.study.timing_rounds_min
+        asked = SHARE * self.options.repeats
+        self.timing = TimingPlan(goals, max(rounds, asked), self.writer, max(fewest, asked))
+        self.offline = OfflinePlan(self.store, self.writer, max(self.options.repeats - 1, 0))
         untimed = self.timing.start(runnable)
         workers: Executor | None = None
+        interrupted = False
         try:
             workers = self._workers() if runnable or untimed else None
             self.machines = self.machines if workers is None else workers.machines
@@ -222,7 +237,7 @@ class _Run:
                 for stage in (goals[cell], pictured[cell.problem]):
                     self.graph.add_goal(stage, self._is_there)
             for group in untimed:
-                self.graph.add_goal(group, self._is_there)
+                self._time(group, plan=False)
             slots = workers.slots if workers is not None else 0
             left_out = [cell for cell in todo if cell.key in reasons]
             stages = list(self.graph.stages.values())
@@ -233,11 +248,12 @@ class _Run:
                 self._loop(workers)
         except KeyboardInterrupt:
             interrupts.ignore()  # until the results are complete
-            return True
+            interrupted = True
         finally:
             if workers is not None:
                 workers.close()
-        return False
+        self.offline.finish()
+        return interrupted
 
     def _workers(self) -> Executor:
         options = self.options
@@ -255,6 +271,7 @@ class _Run:
         artefact = self.store.get(stage.key)
         if artefact is None or artefact.machine not in self.machines:
             return False
+        self.offline.note(stage, artefact.seconds)
         self.writer.stage(stage, artefact.histories, self.store)
         return True
 
@@ -281,7 +298,7 @@ class _Run:
         if isinstance(outcome, Failed):
             reason = outcome.reason if stage.key in self.cells else f"in {stage.label}: {outcome.reason}"
             self.writer.failure(stage, outcome.reason)
-            self.timing.record(stage, outcome)
+            self._timed(stage, outcome)
             for goal in self.graph.lost(stage):
                 for cell in self.cells.get(goal.key, ()):
                     self._fail_cell(cell, Failed(outcome.status, reason))
@@ -290,9 +307,10 @@ class _Run:
         self.observer.stage(stage, outcome.wall)
         self.graph.done(stage)
         if stage.stored:
+            self.offline.note(stage, outcome.seconds, outcome.wall)
             self.writer.stage(stage, outcome.histories, self.store)
         else:
-            self.timing.record(stage, outcome.value)
+            self._timed(stage, outcome.value)
         for cell in self.cells.get(stage.key, ()):
             self.observer.cell(cell, self.writer.cell(cell, outcome.value))
             self._ended(cell)
@@ -301,8 +319,23 @@ class _Run:
         """Plan the timing of the cell's group if this was its last one."""
         group = self.timing.ended(cell)
         if group is not None:
-            self.graph.add_goal(group, self._is_there)
-            self.observer.plan(group)
+            self._time(group)
+
+    def _time(self, group: TimingRounds, *, plan: bool = True) -> None:
+        """Plan the first block of a group's rounds, and before it repeats of the offline stages of its cells."""
+        # What a stage depends on notes its seconds when it is planned.
+        self.graph.add_goal(group, self._is_there)
+        for stage in (group, *self.offline.repeats(self.timing.members(group))):
+            self.graph.add_goal(stage, self._is_there)
+            if plan and stage.key in self.graph.waiting:
+                self.observer.plan(stage)
+
+    def _timed(self, stage: Stage, outcome: Any) -> None:
+        """Record the rounds of a group, and plan its next block."""
+        following = self.timing.record(stage, outcome)
+        if following is not None:
+            self.graph.add_goal(following, self._is_there)
+            self.observer.plan(following)
 
     def _fail_cell(self, cell: Cell, failed: Failed) -> None:
         queries = {"queries": cell.validation.count, "queries_ok": 0}

@@ -137,6 +137,7 @@ class Supervisor:
     def __init__(self, log: Path | None = None, environment: Mapping[str, str] | None = None) -> None:
         self._log, self._environment = log, dict(environment or {})
         self._workers: OrderedDict[frozenset[str], _Worker] = OrderedDict()  # the one used last comes last
+        self._session = 0
         self._stop = threading.Event()
 
     def run(self, job: Job, observe: Callable[[Any], None] = lambda _: None) -> Done | Failed | Unstored:
@@ -147,6 +148,9 @@ class Supervisor:
         StoppedError
             If `stop` is called meanwhile.
         """
+        if job.stage.session > self._session:
+            self._kill()
+            self._session = job.stage.session
         try:
             return self._run(job, observe)
         except BaseException:

@@ -101,7 +101,7 @@ def perform(
             return Done((), value, time.perf_counter() - start)
         result = job.stage.run(store)
         store.put(job.stage.key, result.value, result.seconds, result.histories)
-        return Done(result.histories, None, time.perf_counter() - start)
+        return Done(result.histories, None, time.perf_counter() - start, result.seconds)
 
     try:
         return _guarded(job.memory_gib, work)

@@ -242,6 +242,7 @@ def run(
     retry: bool = False,
     executor: Literal["local", "dask"] = "local",
     scheduler: str | None = None,
+    repeats: int = 0,
     observer: Observer | None = None,
     progress: bool = True,
 ) -> Run:
@@ -264,6 +265,9 @@ def run(
     scheduler
         Address of the scheduler of an existing dask cluster; without one a cluster is started on this machine, for
         which a script needs the guard `if __name__ == "__main__"`.
+    repeats
+        Cold processes in which seconds are measured, at least, and how often offline stages are; by default what
+        decides the comparisons of the study.
     observer
         Follows the run, in place of the progress display.
     progress
@@ -279,7 +283,7 @@ def run(
         On Ctrl-C: what is finished is written, and the same call continues the run.
     """
     folder = Path("runs") / study.name if out is None else Path(out)
-    options = Options(jobs, fresh, retry, executor, scheduler)
+    options = Options(jobs, fresh, retry, executor, scheduler, repeats)
     # A run that Ctrl-C ends ignores any other until all is written.
     with _following(observer, progress) as following, interrupts.restored():
         outcome = run_study(study, folder, following, options)

@@ -2,27 +2,36 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from vibench.arrays import Array, Indices
+from vibench.arrays import Array
 from vibench.errors import requested
 from vibench.interfaces.strategies import Kind
 from vibench.results.columns import KEYS, THRESHOLDS
+from vibench.results.paired_seconds import PairedSeconds
 from vibench.study.cells import CERTIFIED
 
 DRAWS = 2000
-"""Resamples of the rounds that an interval is taken from."""
+"""Draws of what other runs might measure, from which an interval is taken."""
 
 TAIL = 0.025
 """Probability left out on each side of an interval."""
 
 FEWEST_ROUNDS = 6
-"""With fewer rounds no sign is significant at 95 %: all of five have the same one with probability 2 / 2⁵ by chance."""
+"""Rounds of two blocks; with fewer nothing is known of the scatter between blocks, and nothing is decided."""
+
+
+MOST_ROUNDS = 1e6
+"""Rounds beyond which it is not worth saying how many would decide a comparison."""
+
+SCATTER = 0.2
+"""Standard deviation of the logarithm of offline seconds that were measured once, where a run repeats no stage."""
 
 
 class Meaning(StrEnum):
@@ -39,13 +48,16 @@ class Meaning(StrEnum):
 class BreakEven:
     """Number n* of queries, `None` where the total costs are never equal, and on which side of it b is cheaper.
 
-    `low` and `high` are the ends of the 95 % interval of n*, where seconds were measured in rounds.
+    `low` and `high` are the ends of the 95 % interval of n*, where seconds were measured in rounds. Where it is
+    undecided, `rounds` is how many more of them would decide it at the present scatter, `None` where none would since
+    it is the offline seconds that do not differ by more than theirs.
     """
 
     number: float | None
     meaning: Meaning
     low: float | None = None
     high: float | None = None
+    rounds: int | None = None
 
     def overlaps(self, other: BreakEven) -> bool:
         """Whether both mean the same, and their intervals have a number in common."""
@@ -75,7 +87,7 @@ def break_even(offline_a: float, online_a: float, offline_b: float, online_b: fl
 
 @dataclass(frozen=True)
 class Costs:
-    """Seconds offline and per query of a model: measured, and resampled (`DRAWS`,) as they might have been measured."""
+    """Seconds offline and per query of a model: measured, and drawn (`DRAWS`,) as another run might measure them."""
 
     offline: float
     online: float
@@ -83,8 +95,8 @@ class Costs:
     online_draws: Array
 
 
-def resampled_break_even(a: Costs, b: Costs) -> BreakEven:
-    """Break-even of b against a with its interval; undecided where the resamples do not agree on its meaning."""
+def drawn_break_even(a: Costs, b: Costs, tail: float = TAIL) -> BreakEven:
+    """Break-even of b against a with its interval; undecided where more than `tail` of the draws deny its meaning."""
     dearer, faster = b.offline_draws - a.offline_draws, a.online_draws - b.online_draws
     drawn = {
         Meaning.AT_ONCE: (dearer <= 0.0) & (faster >= 0.0),
@@ -95,7 +107,7 @@ def resampled_break_even(a: Costs, b: Costs) -> BreakEven:
     measured = break_even(a.offline, a.online, b.offline, b.online)
     equal = drawn[Meaning.FROM] | drawn[Meaning.UNTIL]
     low, high = np.quantile(dearer[equal] / faster[equal], (TAIL, 1.0 - TAIL)) if equal.any() else (None, None)
-    if np.mean(drawn[measured.meaning]) < 1.0 - TAIL:
+    if np.mean(drawn[measured.meaning]) < 1.0 - tail:
         return BreakEven(None, Meaning.UNDECIDED, low)
     return measured if measured.number is None else BreakEven(measured.number, measured.meaning, low, high)
 
@@ -116,31 +128,49 @@ MODEL_PHASES = (*SHARED_PHASES, "offline_enrichment_s", "offline_assembly_s")
 NORMAL_95 = 1.96
 """Half the width of the 95 % interval of a normal distribution, in standard deviations."""
 
+STUDENT_95 = 2.1
+"""The same of Student's distribution, with the degrees of freedom that further rounds would lead to."""
+
 VALIDATION = ("validation", "validation_options")
 """Columns that name the validation set: seconds of a query are means over its queries."""
 
 _SHARED = tuple(name for name in THRESHOLDS if name in KEYS)
 
 
+class Comparison(NamedTuple):
+    """The break-even of a cell b against a cell a, or against the high-fidelity model where that is `None`."""
+
+    a: Mapping[str, Any] | None
+    b: Mapping[str, Any]
+    result: BreakEven
+    online: tuple[float, float]
+    """Seconds of a query of both, in the blocks of rounds that they share."""
+    gain: tuple[float, float] | None
+    """95 % interval of their quotient, of a over b."""
+
+
 def break_even_rows(
     cells: Iterable[Mapping[str, Any]], timings: Iterable[Mapping[str, Any]]
 ) -> Iterator[dict[str, Any]]:
-    """Rows of the thresholds table from rows of the tables of cells and timings.
+    """Rows of the thresholds table from rows of the tables of cells and timings; see `compared`."""
+    return (_row(one) for one in compared(cells, PairedSeconds(timings)))
+
+
+def compared(cells: Iterable[Mapping[str, Any]], paired: PairedSeconds, tail: float = TAIL) -> Iterator[Comparison]:
+    """Break-even of the models that are compared, undecided where more than `tail` of the draws deny it.
 
     Every per-parameter enrichment (a) is compared with every fixed one (b) of the same problem, cone, tolerances and
     solver, if one machine measured both and both or none have certificates; every reduced cell (a) with that of the
     same model with certificates (b); the high-fidelity model (a, whose offline phase is its set-up) with every strategy
     (b). Cells without an ok query are left out.
     """
-    timed, resampling = [cell for cell in cells if cell["online_s"] is not None], _Resampling(timings)
+    timed = [cell for cell in cells if cell["online_s"] is not None]
     alike: dict[tuple[Any, ...], list[Mapping[str, Any]]] = {}
     for cell in timed:
         alike.setdefault(_alike(cell), []).append(cell)
     for b in timed:
-        model = {"cell": None, "primal": HIGH_FIDELITY, "primal_tol": None, "assembly": ""}
-        model |= {"offline_s": b["hf_setup_s"], "online_s": b["hf_s"]}
-        yield _row(model, b, resampling.against_high_fidelity(b))
-        yield from (_row(a, b, resampling.between(a, b)) for a in alike[_alike(b)] if _compared(a, b))
+        yield _comparison(paired, None, b, tail)
+        yield from (_comparison(paired, a, b, tail) for a in alike[_alike(b)] if _compared(a, b))
 
 
 def _alike(cell: Mapping[str, Any]) -> tuple[Any, ...]:
@@ -155,60 +185,51 @@ def _compared(a: Mapping[str, Any], b: Mapping[str, Any]) -> bool:
     return a["assembly"] == "reduced" and all(a[name] == b[name] for name in STRATEGY)
 
 
-class _Resampling:
-    """Seconds as they might have been measured.
-
-    Of a query: the median over rounds drawn with replacement, the same ones for both models, since what disturbs a
-    round disturbs both. Of what is measured once, an offline phase or the high-fidelity model: the measured seconds
-    with the slowdown of another time of the run.
-    """
-
-    def __init__(self, timings: Iterable[Mapping[str, Any]]) -> None:
-        self._rounds: dict[str, dict[int, float]] = {}
-        slowdowns = []
-        for row in timings:
-            self._rounds.setdefault(row["cell"], {})[row["round"]] = row["total_s"]
-            slowdowns.append(row["slowdown"])
-        self._slowdowns = np.array(slowdowns) / np.median(slowdowns) if slowdowns else np.ones(1)
-
-    def between(self, a: Mapping[str, Any], b: Mapping[str, Any]) -> BreakEven:
-        """Break-even of two cells, whose snapshots, POD and cone are the same."""
-        rng = np.random.default_rng(0)
-        common = sorted(self._rounds.get(a["cell"], {}).keys() & self._rounds.get(b["cell"], {}).keys())
-        phases = MODEL_PHASES if b["assembly"] == CERTIFIED != a["assembly"] else SHARED_PHASES
-        shared = sum(a[name] for name in phases if a[name] == b[name])
-        which = rng.integers(max(len(common), 1), size=(DRAWS, len(common)))
-        costs = [self._costs(cell, common, which, shared, rng) for cell in (a, b)]
-        return resampled_break_even(*costs) if len(common) >= FEWEST_ROUNDS else UNDECIDED
-
-    def against_high_fidelity(self, b: Mapping[str, Any]) -> BreakEven:
-        """Break-even of a cell against the high-fidelity model, whose set-up is part of the cell's snapshots."""
-        rng = np.random.default_rng(0)
-        rounds = sorted(self._rounds.get(b["cell"], {}))
-        which = rng.integers(max(len(rounds), 1), size=(DRAWS, len(rounds)))
-        cell = self._costs(b, rounds, which, b["hf_setup_s"], rng)
-        spread = np.log(b["hf_high_s"] / b["hf_low_s"]) / (2.0 * NORMAL_95)
-        online = b["hf_s"] * self._slowdown(rng) * np.exp(spread * rng.standard_normal(DRAWS))
-        model = Costs(b["hf_setup_s"], b["hf_s"], np.full(DRAWS, b["hf_setup_s"]), online)
-        return resampled_break_even(model, cell) if len(rounds) >= FEWEST_ROUNDS else UNDECIDED
-
-    def _costs(
-        self, cell: Mapping[str, Any], rounds: list[int], which: Indices, shared: float, rng: np.random.Generator
-    ) -> Costs:
-        """Costs of a cell; offline seconds that both models `shared` do not differ between them."""
-        seconds = np.array([self._rounds[cell["cell"]][number] for number in rounds])
-        online = np.median(seconds[which], axis=1) if len(seconds) else np.zeros(DRAWS)
-        offline = shared + (cell["offline_s"] - shared) * self._slowdown(rng)
-        return Costs(cell["offline_s"], cell["online_s"], offline, online)
-
-    def _slowdown(self, rng: np.random.Generator) -> Array:
-        return rng.choice(self._slowdowns, DRAWS)
+def _comparison(paired: PairedSeconds, a: Mapping[str, Any] | None, b: Mapping[str, Any], tail: float) -> Comparison:
+    """Break-even of b against a; what both have in common, offline phases or the set-up, does not differ."""
+    key, offline_a = (None, b["hf_setup_s"]) if a is None else (a["cell"], a["offline_s"])
+    ratio, level = paired.ratio(key, b["cell"]), paired.level(key, b["cell"])
+    if ratio is None or level is None:
+        online = (b["hf_s"] if a is None else a["online_s"]), b["online_s"]
+        return Comparison(a, b, UNDECIDED, online, None)
+    rng = np.random.default_rng(0)
+    shared = b["hf_setup_s"] if a is None else _shared(a, b)
+    seconds = np.exp(level.draws(rng, DRAWS))
+    online_a, quotient = float(np.exp(level.mean)), float(np.exp(ratio.mean))
+    costs_a = Costs(offline_a, online_a, offline_draws(a, shared, rng) if a else np.full(DRAWS, offline_a), seconds)
+    quotients = np.exp(ratio.draws(rng, DRAWS))
+    costs_b = Costs(b["offline_s"], online_a * quotient, offline_draws(b, shared, rng), seconds * quotients)
+    result = drawn_break_even(costs_a, costs_b, tail)
+    faster = float(np.mean(quotients < 1.0))
+    if result.meaning is Meaning.UNDECIDED and tail < faster < 1.0 - tail:
+        done = paired.rounds(key, b["cell"])
+        needed = done * (STUDENT_95 * ratio.error / ratio.mean) ** 2 if ratio.mean else math.inf
+        result = replace(result, rounds=max(1, math.ceil(min(needed, MOST_ROUNDS) - done)))
+    low, high = ratio.interval(TAIL)
+    return Comparison(a, b, result, (online_a, online_a * quotient), (math.exp(-high), math.exp(-low)))
 
 
-def _row(a: Mapping[str, Any], b: Mapping[str, Any], result: BreakEven) -> dict[str, Any]:
+def _shared(a: Mapping[str, Any], b: Mapping[str, Any]) -> float:
+    """Offline seconds of the phases that two cells have in common."""
+    phases = MODEL_PHASES if b["assembly"] == CERTIFIED != a["assembly"] else SHARED_PHASES
+    return float(sum(a[name] for name in phases if a[name] == b[name]))
+
+
+def offline_draws(cell: Mapping[str, Any], shared: float, rng: np.random.Generator) -> Array:
+    """Offline seconds of a cell as other runs might measure them (`DRAWS`,), but for those that are `shared`."""
+    low, high = cell["offline_low_s"], cell["offline_high_s"]
+    spread = SCATTER if low is None else math.log(high / low) / (2.0 * NORMAL_95)
+    return np.asarray(shared + (cell["offline_s"] - shared) * np.exp(spread * rng.standard_normal(DRAWS)))
+
+
+def _row(one: Comparison) -> dict[str, Any]:
+    model = {"cell": None, "primal": HIGH_FIDELITY, "primal_tol": None, "assembly": ""}
+    a, b, result = one.a or model | {"offline_s": one.b["hf_setup_s"]}, one.b, one.result
     row = {name: b[name] for name in _SHARED}
-    for side, cell in (("a", a), ("b", b)):
+    for side, cell, online in zip("ab", (a, b), one.online, strict=True):
         row |= {f"{name}_{side}": cell[name] for name in ("cell", "primal", "primal_tol", "assembly")}
-        row |= {f"{phase}_{side}_s": cell[f"{phase}_s"] for phase in ("offline", "online")}
+        row |= {f"offline_{side}_s": cell["offline_s"], f"online_{side}_s": online}
     numbers = {"benefit_threshold": result.number, "threshold_low": result.low, "threshold_high": result.high}
-    return row | numbers | {"meaning": result.meaning.value}
+    low, high = one.gain or (None, None)
+    gains = {"gain": one.online[0] / one.online[1], "gain_low": low, "gain_high": high}
+    return row | gains | numbers | {"meaning": result.meaning.value, "rounds_missing": result.rounds}

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import NamedTuple
 
-VERSION = 16
+VERSION = 17
 """Schema version of a results file; a file of another version is refused."""
 
 TEXT, REAL, INTEGER, BLOB = "TEXT", "REAL", "INTEGER", "BLOB"
@@ -171,13 +171,17 @@ CELLS: Mapping[str, Column] = {
     ),
     "offline_low_s": real(
         "s",
-        "The same at the speed of the fastest timing rounds (2.5 % quantile), since offline work is timed only once.",
+        "Lower end of its 95 % interval: from the scatter of the offline stages of the run that were repeated.",
     ),
-    "offline_high_s": real("s", "The same at the speed of the slowest timing rounds (97.5 % quantile)."),
+    "offline_high_s": real("s", "Upper end of this interval."),
+    "offline_repeats": integer(
+        "Offline stages of the cell, of at least a millisecond, that were timed more than once."
+    ),
     "offline_wall_s": real("s", "The same sum in wall seconds."),
     "online_s": real(
         "s",
-        "One query with assembly, certificate and correction: median over the rounds of the mean over ok queries.",
+        "One query with assembly, certificate and correction, mean over the ok queries: geometric mean over the blocks "
+        "of the median over their rounds, each divided by its pace.",
         "online [ms]",
         23,
     ),
@@ -189,14 +193,19 @@ CELLS: Mapping[str, Column] = {
     "online_certify_s": real(
         "s", "Certificate and correction of a query: median over the rounds; empty without either."
     ),
-    "timing_rounds": integer("Number of timing rounds; empty if the cell has not been timed yet."),
+    "timing_rounds": integer(
+        "Most timing rounds that were asked for; empty if the cell has not been timed yet, or not to the end."
+    ),
+    "timed_rounds": integer("Rounds that were timed: they end when all comparisons of the cell are decided."),
     "timing_reason": text("Why rounds are missing."),
     "hf_setup_s": real(
         "s", "Set-up of the high-fidelity solver, once: the time by which the first solution exceeds its repetition."
     ),
-    "hf_s": real("s", "One high-fidelity solution after the set-up: median over the validation parameters."),
-    "hf_low_s": real("s", "Lower end of the 95 % interval of this median over the validation parameters."),
-    "hf_high_s": real("s", "Upper end of this interval."),
+    "hf_s": real(
+        "s",
+        "One high-fidelity solution after the set-up, mean over the validation parameters, timed in the rounds of the "
+        "cell as online_s; where it could not be, in the sweep over these parameters.",
+    ),
     "beta_span_min": real(
         "b/VW", "Smallest β over the span of the generators, over the validation parameters.", "min β span", 14
     ),
@@ -247,10 +256,11 @@ CELLS: Mapping[str, Column] = {
     "residual_max": real("1", "Largest of all natural residuals."),
     "fallbacks": text("Steps that deviate from their algorithm, and what was done instead."),
     "peak_memory_mib": real("MiB", "Peak resident memory of the worker process."),
-    "slowdown": real("1", "Time of the calibration next to the rounds, divided by its best in that process."),
-    "disturbed": integer(
-        "1 if the slowdown exceeds 1.3, or the wall seconds exceed 1.5 times the CPU seconds; else 0."
+    "slowdown": real(
+        "1",
+        "CPU time of the calibration next to the rounds, divided by the lowest tenth of it in that process.",
     ),
+    "disturbed": integer("1 if the slowdown exceeds 1.3, else 0."),
     "seed": integer("Seed of the study."),
     "validation": text("Validation set: own, or the label or name of its sampling strategy."),
     "validation_options": as_json("Options of that strategy that are not at their default, as JSON."),
@@ -424,7 +434,10 @@ TIMINGS: Mapping[str, Column] = {
     "certify_s": real("s", "Certificate and correction of a query: mean over these; empty without either."),
     "total_s": real("s", "Sum of the three."),
     "total_wall_s": real("s", "The same in wall seconds."),
-    "slowdown": real("1", "Time of the calibration next to the round, divided by its best in that process."),
+    "block": text("Block of rounds, which cells that were timed together share; each block is a process of its own."),
+    "hf_s": real("s", "High-fidelity solution in the round, mean over the parameters that it takes."),
+    "pace": real("1", "How much slower than in the other rounds of the block all that was timed was: the median."),
+    "slowdown": real("1", "CPU time of the calibration next to the round, divided by that on a calm machine."),
 }
 
 PARAMETER = real("µ", "The k-th parameter; tables for reading have its name as heading.")
@@ -457,9 +470,12 @@ THRESHOLDS: Mapping[str, Column] = {
     "primal_tol_b": real("1", "Tolerance of the primal strategy of b.", "δ of b", 15),
     "assembly_b": text("Assembly of the queries of b.", "assembly b", 14),
     "offline_a_s": real("s", "Offline seconds of a.", "offline a [s]", 16),
-    "online_a_s": real("s", "Seconds of a query of a.", "online a [ms]", 17),
+    "online_a_s": real("s", "Seconds of a query of a, in the blocks of rounds that both share.", "online a [ms]", 17),
     "offline_b_s": real("s", "Offline seconds of b.", "offline b [s]", 18),
-    "online_b_s": real("s", "Seconds of a query of b.", "online b [ms]", 19),
+    "online_b_s": real("s", "Seconds of a query of b, in these blocks.", "online b [ms]", 19),
+    "gain": real("1", "Seconds of a query of a divided by those of b, paired within rounds.", "gain", 19),
+    "gain_low": real("1", "Lower end of the 95 % interval of the gain."),
+    "gain_high": real("1", "Upper end of this interval."),
     "benefit_threshold": real(
         "1", "Number n* of queries at break-even; empty if there is none or it is undecided.", "break-even", 20
     ),
@@ -467,6 +483,11 @@ THRESHOLDS: Mapping[str, Column] = {
     "threshold_high": real("1", "Upper end of the 95 % interval of n*.", "interval", 21),
     "meaning": text(
         "Queries for which b is cheaper than a in total: from n* on, until n*, never or at once; or undecided."
+    ),
+    "rounds_missing": integer(
+        "If undecided, how many more rounds would decide it; empty where none would: offline seconds are as close.",
+        "more rounds",
+        22,
     ),
 }
 

@@ -209,6 +209,13 @@ class ResultsDatabase:
                 self._digests.count(table, "cell = ?", (cell,))
             self._replace("timings", {"cell": cell}, rounds)
 
+    def write_columns(self, cell: str, columns: Mapping[str, Any]) -> None:
+        """Write some columns of a cell that has its row."""
+        with self._writing():
+            self._digests.count("cells", "cell = ?", (cell,), sign=-1)
+            self._update("cells", columns, cell=cell)
+            self._digests.count("cells", "cell = ?", (cell,))
+
     def _update(self, table: str, columns: Mapping[str, Any], **keys: Any) -> None:
         changes = ", ".join(f'"{name}" = ?' for name in columns)
         same = " AND ".join(f'"{name}" IS ?' for name in keys)

@@ -52,11 +52,12 @@ class Result:
 
 @dataclass(frozen=True)
 class Done:
-    """A stage that succeeded: its histories, its value where that is not stored, and its wall seconds in all."""
+    """A stage that succeeded: its histories, its value where that is not stored, wall seconds in all, and its own."""
 
     histories: tuple[History, ...]
     value: Any
     wall: float
+    seconds: Seconds = NO_TIME
 
 
 @dataclass(frozen=True)
@@ -117,9 +118,23 @@ class Stage(ABC):
         return 1
 
     @property
+    def session(self) -> int:
+        """A process that has run a stage of an earlier session is replaced before it runs this one."""
+        return 0
+
+    @property
     def axes(self) -> Axes:
         """The axes of the study that the stage depends on; they name its histories."""
         return Axes()
+
+    @property
+    def measured_by(self) -> tuple[Stage, str]:
+        """The stage whose work the seconds of this one are, and their name among what it measures."""
+        return self, ""
+
+    def measure(self, store: Store) -> Mapping[str, Seconds]:
+        """Do the work again, and say how long it took, by name; the artefacts of the inputs are in the store."""
+        return {"": self.run(store).seconds}
 
     def _fields(self) -> dict[str, Any]:
         return {part.name: getattr(self, part.name) for part in fields(self)}  # type: ignore[arg-type]

@@ -25,7 +25,7 @@ from vibench.storage.artefacts import History, Store
 from vibench.storage.serialisation import storable
 from vibench.study.cells import Axes, Cell
 from vibench.study.plugin import Plugin
-from vibench.timing import timed
+from vibench.timing import Seconds, timed
 
 for _kind in (Kind, Grown, Milestone):
     storable(_kind)
@@ -105,6 +105,11 @@ class GrowthStage(Stage):
         training = {tolerance: projected.first(size + m.count).beta_span() for tolerance, m in grown.milestones.items()}
         shares = projected.shares_over_steps(size, value_of(store, TrainingConstants(self.cone)))
         return Result(AssessedGrowth(grown, projected.over_steps(size), shares, training))
+
+    def measure(self, store: Store) -> Mapping[str, Seconds]:
+        """Grow again, without the constants; the seconds of every tolerance."""
+        grown = grow_through(self.primal.create(), _offline(store, self.pod, self.cone), self.tolerances)
+        return {f"{tolerance!r}": milestone.seconds for tolerance, milestone in grown.milestones.items()}
 
     def reduction(self, store: Store) -> Reduction:
         """The offline phase with all vectors."""
@@ -193,6 +198,11 @@ class NestedEnrichment(EnrichmentStage):
     def growth(self) -> GrowthStage:
         """The stage that holds the vectors of all `tolerances`."""
         return GrowthStage(self.pod, self.cone, self.primal, self.tolerances)
+
+    @property
+    def measured_by(self) -> tuple[Stage, str]:
+        """The growth, which has seconds of every tolerance."""
+        return self.growth, f"{self.tolerance!r}"
 
     @property
     def model_inputs(self) -> tuple[Stage, ...]:

@@ -1,11 +1,10 @@
-"""Seconds of the queries of several cells, measured interleaved: a round over all cells, then the next round."""
+"""Seconds of queries of several cells and of high-fidelity solutions, measured interleaved, round by round."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
-from functools import lru_cache, partial
-from typing import Any
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property, lru_cache, partial
 
 import numpy as np
 
@@ -19,58 +18,34 @@ from vibench.offline.assemblies import Assemblies
 from vibench.offline.correction import corrected_in_full
 from vibench.provenance import machine
 from vibench.qp.repeats import check_answer
+from vibench.results.paired_seconds import paces
 from vibench.stages.assembly import AssemblyStage
-from vibench.stages.base import Failed, Items, ItemwiseStage, Row, Stage, value_of
+from vibench.stages.base import Failed, Items, ItemwiseStage, Row, Stage, build_problem, value_of
 from vibench.stages.cell_queries import CellQueries
+from vibench.stages.marginal_solutions import MarginalSolutions, parts_alike
 from vibench.stages.query import Queries, Watch
+from vibench.stages.snapshots import TimedSnapshots, gather
+from vibench.stages.timed_seconds import TimedCell, TimedRound, round_columns
 from vibench.storage.artefacts import Store
-from vibench.timing import DISTURBED, NO_TIME, WAITED, Seconds, calibration, timed
+from vibench.timing import NO_TIME, Seconds, calibration, timed
 
-SHARE = 4
-"""A round takes every fourth query of a cell, another quarter each time: short rounds interleave more closely."""
+SHARE = 3
+"""A round takes a third of the queries of a cell, another one each time: short rounds interleave more closely."""
 
 ROUND_SECONDS = 5.0
 """Wall seconds of the solver after which a cell's part of a round ends."""
 
 
-SPREAD = (0.025, 0.975)
-"""Quantiles of the slowdowns of a cell's rounds: what is timed once may have met any of them."""
-
-CELL_SECONDS = (
-    "online_s", "online_q1_s", "online_q3_s", "online_wall_s", "online_assemble_s", "online_solve_s",
-    "online_certify_s", "slowdown", "disturbed", "offline_low_s", "offline_high_s",
-)  # fmt: skip
-"""Columns of a cell that follow from its rounds."""
-
-
-@dataclass(frozen=True)
-class TimedRound:
-    """One round of one cell: seconds of its queries by their number, and how slow the machine was beside them."""
-
-    assemble: Mapping[int, Seconds]
-    """Seconds of the assembly; in full, of one query, which counts for all."""
-    solve: Mapping[int, Seconds]
-    slowdown: float
-    """Slowdown of the calibration before or after it, whichever is larger."""
-    certify: Mapping[int, Seconds] = field(default_factory=dict)
-    """Seconds of the certificate; nothing without one."""
-
-
-@dataclass(frozen=True)
-class TimedCell:
-    """The rounds of one cell, the machine that timed them, and why rounds are missing, or ""."""
-
-    rounds: tuple[TimedRound, ...]
-    machine: str
-    reason: str
+HIGH_FIDELITY_SECONDS = 0.02
+"""CPU seconds of high-fidelity solutions after which their part of a round ends."""
 
 
 @dataclass(frozen=True)
 class TimingRounds(ItemwiseStage):
-    """Timing of the queries of cells that are compared; a item is one round of one cell.
+    """One block of rounds of cells that are compared and of the high-fidelity model; a item is a round of one of them.
 
-    A disturbance of the machine that lasts longer than a round meets all cells alike. The order of the cells is another
-    one in each round. The value is a `TimedCell` per cell.
+    A disturbance of the machine that lasts longer than a round meets all alike. Their order is another one in each
+    round. The value is a `TimedCell` per cell, then that of the high-fidelity model.
     """
 
     label = "timing"
@@ -79,31 +54,45 @@ class TimingRounds(ItemwiseStage):
     queries: tuple[tuple[int, ...], ...]
     """The queries of every cell that are ok."""
     rounds: int
+    first: int = 0
+    """Number of the first one of its rounds: those of earlier blocks come before."""
+    session: int = 0
+    """Blocks of a later session are timed in processes that have timed none of an earlier one."""
 
     @property
     def items(self) -> int:
-        """One for each round of each cell."""
-        return self.rounds * len(self.cells)
+        """One for each round of each cell, and of the high-fidelity model."""
+        return self.rounds * self.competitors
+
+    @property
+    def competitors(self) -> int:
+        """The cells and the high-fidelity model, which is the last one."""
+        return len(self.cells) + 1
 
     @property
     def weight(self) -> int:
         """It works for all of its cells."""
-        return len(self.cells)
+        return self.competitors
+
+    @property
+    def solutions(self) -> tuple[Stage, ...]:
+        """The stages of the high-fidelity solutions at the validation parameters."""
+        return self.cells[0].validation
 
     def inputs(self) -> tuple[Stage, ...]:
-        """The models and the programs of the cells."""
+        """The models and the programs of the cells, and the solutions that high-fidelity ones start from."""
         read = [stage for cell in self.cells for stage in (*cell.assembly.model_inputs, cell.assembly)]
         read += [stage for cell in self.cells for stage in (cell.certificate, cell.compilation) if stage is not None]
-        return tuple(dict.fromkeys(read))
+        return tuple(dict.fromkeys((*read, *self.solutions)))
 
     def place(self, item: int) -> tuple[int, int]:
-        """The round and the cell of a item."""
-        number, within = divmod(item, len(self.cells))
-        return number, int(_order(number, len(self.cells))[within])
+        """The round of the block, and the competitor, of a item."""
+        number, within = divmod(item, self.competitors)
+        return number, int(_order(self.first + number, self.competitors)[within])
 
-    def stage_of(self, number: int) -> CellQueries:
+    def stage_of(self, number: int) -> Stage:
         """The cell of a item: processes take turns where its plugins are of other packages than the next one's."""
-        return self.cells[self.place(number)[1]]
+        return (*self.cells, self.solutions[0])[self.place(number)[1]]
 
     def begin(self, store: Store) -> _Rounds:
         """Models are loaded when they are first needed; cells that differ in their solver alone share one."""
@@ -126,19 +115,56 @@ class _Rounds(Items):
         self._factors: dict[str, Assemblies] = {}
         self._warm: set[int] = set()
         self._forms: dict[tuple[int, int], tuple[VariationalInequality, Seconds]] = {}
+        self._slowdown: float | None = None
+
+    @cached_property
+    def _reference(self) -> TimedSnapshots:
+        return gather(self._store, self._stage.solutions)
+
+    @cached_property
+    def _parts(self) -> tuple[tuple[int, ...], ...]:
+        """The validation parameters that the rounds of a block take in turn."""
+        return parts_alike([seconds.cpu for seconds in self._reference.seconds], SHARE)
+
+    @cached_property
+    def _marginal(self) -> MarginalSolutions:
+        assembly = self._stage.cells[0].assembly
+        problem = build_problem(assembly.enrichment.pod.problem)
+        return MarginalSolutions(problem, self._reference, assembly.validation.seed)
 
     def item(self, number: int, watch: Watch) -> TimedRound:
         """One round of one cell, after a warm-up if it is the cell's first one in this process."""
-        at, cell = self._stage.place(number)
+        within, cell = self._stage.place(number)
+        at, before = self._stage.first + within, self._slowdown
+        timed_round = self._solutions if cell == len(self._stage.cells) else partial(self._round, cell, watch)
         if cell not in self._warm:
-            self._round(at, cell, watch, warm_up=True)
+            timed_round(at, warm_up=True)
             self._warm.add(cell)
-        before = calibration().slowdown()
-        assemble, solve, certify = self._round(at, cell, watch)
-        return TimedRound(assemble, solve, max(before, calibration().slowdown()), certify)
+            before = None
+        before = calibration().slowdown() if before is None else before
+        assemble, solve, certify = timed_round(at)
+        self._slowdown = calibration().slowdown()
+        return TimedRound(assemble, solve, max(before, self._slowdown), certify)
+
+    def _solutions(
+        self, at: int, *, warm_up: bool = False
+    ) -> tuple[dict[int, Seconds], dict[int, Seconds], dict[int, Seconds]]:
+        """Seconds of high-fidelity solutions of a round, or of one to warm up.
+
+        Where they are too long for all parameters of the round, what the sweep took says how many the others stand for.
+        """
+        part, sweep = self._parts[at % SHARE] or self._parts[0], [s.cpu for s in self._reference.seconds]
+        shift = at // SHARE % len(part)  # another one in every block
+        solve: dict[int, Seconds] = {}
+        for k in [*part[shift:], *part[:shift]][: 1 if warm_up else None]:
+            solve[k] = self._marginal.seconds(k, at, int(warm_up))
+            if sum(seconds.cpu for seconds in solve.values()) > HIGH_FIDELITY_SECONDS:
+                break
+        share = float(np.mean([sweep[k] for k in part]) / np.mean([sweep[k] for k in solve]))
+        return {}, {k: Seconds(share * seconds.cpu, share * seconds.wall) for k, seconds in solve.items()}, {}
 
     def _round(
-        self, at: int, cell: int, watch: Watch, *, warm_up: bool = False
+        self, cell: int, watch: Watch, at: int, *, warm_up: bool = False
     ) -> tuple[dict[int, Seconds], dict[int, Seconds], dict[int, Seconds]]:
         """Seconds of assembly, solution, certificate and correction of the cell's queries, or of one to warm up.
 
@@ -146,8 +172,8 @@ class _Rounds(Items):
         """
         stage = self._stage.cells[cell]
         queries, fine = self._queries(stage.assembly), self._stage.queries[cell]
-        share = min(SHARE, len(fine))
-        order = fine[at % share :: share][: 1 if warm_up else None]
+        mine = [k for k in fine if k in self._parts[at % SHARE]] or [fine[at % len(fine)]]
+        order = mine[: 1 if warm_up else None]
         assemble = self._assemblies(queries, order, at, cell, warm_up=warm_up)
         solve: dict[int, Seconds] = {}
         certify: dict[int, Seconds] = {}
@@ -210,75 +236,33 @@ class _Rounds(Items):
         return failed
 
     def finish(self, items: Sequence[TimedRound | Failed]) -> tuple[TimedCell, ...]:
-        """The rounds of every cell, in their order."""
-        rounds: list[list[TimedRound]] = [[] for _ in self._stage.cells]
-        lost: list[list[Failed]] = [[] for _ in self._stage.cells]
+        """The rounds of every cell and of the high-fidelity model, in their order."""
+        rounds: list[dict[int, TimedRound]] = [{} for _ in range(self._stage.competitors)]
+        lost: list[list[Failed]] = [[] for _ in rounds]
         for number, outcome in enumerate(items):
-            cell = self._stage.place(number)[1]
+            within, competitor = self._stage.place(number)
             if isinstance(outcome, Failed):
-                lost[cell].append(outcome)
+                lost[competitor].append(outcome)
             else:
-                rounds[cell].append(outcome)
-        reasons = [f"{len(gone)} of {self._stage.rounds} rounds: {gone[0].reason}" if gone else "" for gone in lost]
-        return tuple(TimedCell(tuple(f), machine(), reason) for f, reason in zip(rounds, reasons, strict=True))
+                rounds[competitor][self._stage.first + within] = outcome
+        return tuple(
+            TimedCell(mine, machine(), len(gone), gone[0].reason if gone else "")
+            for mine, gone in zip(rounds, lost, strict=True)
+        )
 
 
-def round_rows(rounds: Sequence[TimedRound]) -> list[Row]:
-    """Rows of the timings table: seconds of a query, mean over the queries of the round."""
+def block_rows(stage: TimingRounds, timed: Sequence[TimedCell]) -> list[list[Row]]:
+    """Rows of the timings table of every cell of a block, from its rounds and those of the high-fidelity model."""
+    numbers = range(stage.first, stage.first + stage.rounds)
+    seconds = np.array([[one.rounds[k].cpu if k in one.rounds else np.nan for k in numbers] for one in timed])
+    pace, high_fidelity = dict(zip(numbers, paces(seconds), strict=True)), timed[-1].rounds
+    block = stage.key.rpartition("-")[2]
     return [
-        {"round": number, "queries": len(one.solve), "slowdown": one.slowdown}
-        | _columns(*(_of_all(np.mean, parts.values()) for parts in (one.assemble, one.solve, one.certify)))
-        for number, one in enumerate(rounds)
+        [
+            {"block": block, "round": k, "queries": len(one.solve), "slowdown": one.slowdown, "pace": pace[k]}
+            | {"hf_s": high_fidelity[k].cpu if k in high_fidelity else None}
+            | round_columns(one)
+            for k, one in cell.rounds.items()
+        ]
+        for cell in timed[:-1]
     ]
-
-
-def _of_all(average: Callable[..., Any], parts: Iterable[Seconds]) -> Array | None:
-    """Average CPU and wall seconds (2,); `None` of none."""
-    every = np.array([(seconds.cpu, seconds.wall) for seconds in parts])
-    return np.asarray(average(every, axis=0)) if len(every) else None
-
-
-def _columns(assemble: Array | None, solve: Array | None, certify: Array | None) -> Row:
-    """The columns that rounds and queries share, from CPU and wall seconds of the parts of a query (2,)."""
-    parts = {"assemble_s": assemble, "solve_s": solve, "certify_s": certify}
-    total, wall = sum((part for part in parts.values() if part is not None), np.zeros(2))
-    seconds = {name: None if part is None else part[0] for name, part in parts.items()}
-    return seconds | {"total_s": total, "total_wall_s": wall}
-
-
-def seconds_of_cell(rows: Sequence[Row], offline: float) -> Row:
-    """The columns of a cell from its rounds: medians, and quartiles of the seconds of a query; empty without any.
-
-    `offline` are its offline seconds, measured once: they are as uncertain as the machine was unsteady in the rounds.
-    """
-    if not rows:
-        return dict.fromkeys(CELL_SECONDS)
-    total, wall, slowdown = (np.array([row[name] for row in rows]) for name in ("total_s", "total_wall_s", "slowdown"))
-    certified = [row["certify_s"] for row in rows if row["certify_s"] is not None]
-    low, middle, high = np.quantile(total, (0.25, 0.5, 0.75))
-    quickest, slowest = np.quantile(slowdown / np.median(slowdown), SPREAD)
-    return {
-        "online_s": middle,
-        "online_q1_s": low,
-        "online_q3_s": high,
-        "online_wall_s": np.median(wall),
-        "online_assemble_s": np.median([row["assemble_s"] for row in rows]),
-        "online_solve_s": np.median([row["solve_s"] for row in rows]),
-        "online_certify_s": np.median(certified) if certified else None,
-        "offline_low_s": offline * quickest,
-        "offline_high_s": offline * slowest,
-        "slowdown": np.median(slowdown),
-        "disturbed": int(np.median(wall / total) > WAITED or np.median(slowdown) > DISTURBED),
-    }
-
-
-def seconds_of_queries(rounds: Sequence[TimedRound]) -> dict[int, Row]:
-    """The columns of the queries that were timed: medians over the rounds."""
-    rows = {}
-    for k in sorted({k for one in rounds for k in one.solve}):
-        # In full, a query is not assembled in every round: the other queries' seconds stand for its own.
-        assembled = [one.assemble[k] if k in one.assemble else next(iter(one.assemble.values())) for one in rounds]
-        solved = [one.solve[k] for one in rounds if k in one.solve]
-        certified = [one.certify[k] for one in rounds if k in one.certify]
-        rows[k] = _columns(*(_of_all(np.median, parts) for parts in (assembled, solved, certified)))
-    return rows

@@ -215,7 +215,7 @@ def _combinations(
 def study_of_cell(cell: Cell, name: str, **settings: Any) -> Study:
     """The study that has one cell, whose key is that of the cell given.
 
-    Other settings are those that do not determine its numbers: `timing_rounds`, `limits`.
+    Other settings are those that do not determine its numbers: `timing_rounds`, `timing_rounds_min`, `limits`.
 
     Raises a `RequestError` if a plugin of the cell is not installed, or the name is none of a study.
     """

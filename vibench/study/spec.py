@@ -183,8 +183,14 @@ class Study(_Model):
         int,
         Ge(1),
         Lt(1000),
-        Field(description="Rounds of timing; break-even is undecided with fewer than six."),
-    ] = 12
+        Field(description="Most rounds of timing of a cell; break-even is undecided with fewer than six."),
+    ] = 18
+    timing_rounds_min: Annotated[
+        int,
+        Ge(1),
+        Lt(1000),
+        Field(description="Rounds after which those of a cell end once its comparisons are decided."),
+    ] = 6
     problem: Annotated[list[ProblemEntry], MinLen(1), Field(description="Problems.")]
     tolerances: Annotated[
         list[ToleranceTable], MinLen(1), Field(description="Grids of tolerances; cells are their union.")

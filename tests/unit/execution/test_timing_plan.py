@@ -7,23 +7,26 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 from counting import growth
 from samples import cell_row, query_rows
 
 from vibench.execution.result_writer import ResultWriter, labels_of
-from vibench.execution.timing_plan import TimingPlan
+from vibench.execution.timing_plan import TimingPlan, block_sizes
 from vibench.qp.status import Status
 from vibench.results.database import ResultsDatabase
 from vibench.stages.base import Failed
-from vibench.stages.cell_queries import cell_queries
-from vibench.stages.timing_rounds import TimedCell, TimedRound, TimingRounds
+from vibench.stages.cell_queries import CellQueries, cell_queries
+from vibench.stages.timed_seconds import TimedCell, TimedRound
+from vibench.stages.timing_rounds import TimingRounds
 from vibench.study.cells import Cell
 from vibench.study.matrix import expand, read_study
 from vibench.timing import Seconds
 
 STUDY = read_study("quick")
 CELLS = expand(STUDY)
+FIXED = "offline-pga"
 GROUP = [cell for cell in CELLS if cell.problem.name == "hertz" and cell.dual.name == "mcpg"]
 
 
@@ -42,12 +45,36 @@ def write(writer: ResultWriter, cell: Cell, *failed: int, **columns: object) -> 
     for number in failed:
         queries[number]["status"] = "inaccurate"
     own = {"queries_ok": 4 - len(failed), "timing_rounds": None, "online_s": None, "machine": "this one"} | columns
+    own |= {"offline_s": 10.0, "offline_low_s": None, "hf_setup_s": 1.0, "primal": cell.primal.name}
+    kinds = {"decorrelated": "none", "online-supremizers": "per-parameter", FIXED: "fixed"}
+    own |= {"enrichment_kind": kinds[cell.primal.name], "solver": cell.solver, "assembly": "full"}
     writer.database.write_cell(cell_row(cell.key, **own), queries)
 
 
-def timed(stage: TimingRounds, reason: str = "") -> tuple[TimedCell, ...]:
-    once = TimedRound({0: Seconds(1.0, 1.0)}, {0: Seconds(2.0, 2.0)}, 1.0)
-    return tuple(TimedCell((once,) * stage.rounds, "this one", reason) for _ in stage.cells)
+def timed(stage: TimingRounds, unsteady: float = 0.0) -> tuple[TimedCell, ...]:
+    """A block in which a query takes two seconds to solve, one to assemble, and a high-fidelity solution thirty.
+
+    Those of fixed enrichments deviate by the factor `unsteady`, in even blocks above and in others below.
+    """
+    numbers = range(stage.first, stage.first + stage.rounds)
+    even = stage.first // stage.rounds % 2 == 0
+
+    def once(cell: CellQueries) -> TimedRound:
+        factor = np.exp(unsteady * (1.2 if even else -1.0)) if cell.assembly.enrichment.primal.name == FIXED else 1.0
+        return TimedRound({0: Seconds(factor, factor)}, {0: Seconds(2.0 * factor, 2.0 * factor)}, 1.0)
+
+    model = TimedRound({}, {0: Seconds(30.0, 30.0)}, 1.0)
+    cells = tuple(TimedCell(dict.fromkeys(numbers, once(cell)), "this one") for cell in stage.cells)
+    return (*cells, TimedCell(dict.fromkeys(numbers, model), "this one"))
+
+
+def record(plan: TimingPlan, stage: TimingRounds | None, unsteady: float = 0.0) -> list[TimingRounds]:
+    """Record a stage and those that follow it; returns all of them."""
+    stages = []
+    while stage is not None:
+        stages.append(stage)
+        stage = plan.record(stage, timed(stage, unsteady))
+    return stages
 
 
 def test_a_group_is_timed_when_its_last_cell_has_its_row(writer: ResultWriter) -> None:
@@ -91,17 +118,77 @@ def test_seconds_are_written_once_and_asked_again_for_another_number_of_rounds(w
         write(writer, cell)
     plan = plan_of(writer)
     (stage,) = plan.start([])
-    plan.record(stage, timed(stage))
+    record(plan, stage)
     row = writer.database.cell(GROUP[0].key)
     assert row is not None
-    assert (row["online_s"], row["timing_rounds"], row["timing_reason"], row["machine"]) == (3.0, 12, "", "this one")
+    assert (row["online_s"], row["hf_s"]) == pytest.approx((3.0, 30.0))
+    assert (row["timing_rounds"], row["timed_rounds"], row["timing_reason"]) == (12, 6, "")
+    assert row["machine"] == "this one"
     timings = [row for row in writer.database.rows("timings") if row["cell"] == GROUP[0].key]
-    assert [row["total_s"] for row in timings] == [3.0] * 12
+    assert [(row["total_s"], row["hf_s"], row["round"]) for row in timings] == [(3.0, 30.0, k) for k in range(6)]
     (query,) = [row for row in writer.database.rows("queries") if row["cell"] == GROUP[0].key and row["query"] == 0]
     assert (query["assemble_s"], query["solve_s"]) == (1.0, 2.0)
     assert plan_of(writer).start([]) == []
     (again,) = plan_of(writer, rounds=20).start([])
-    assert again.rounds == 20
+    assert (again.rounds, again.first) == (4, 0)  # twenty are six blocks of three or four
+
+
+@pytest.mark.parametrize(
+    ("rounds", "sizes"), [(1, [1]), (5, [5]), (6, [3, 3]), (7, [4, 3]), (8, [4, 4]), (10, [4, 3, 3]), (12, [3] * 4)]
+)
+def test_rounds_come_in_passes_and_at_least_two_blocks_where_they_decide_anything(
+    rounds: int, sizes: list[int]
+) -> None:
+    assert block_sizes(rounds) == sizes
+
+
+def test_rounds_end_for_the_cells_whose_comparisons_are_decided(writer: ResultWriter) -> None:
+    """Thirty seconds against three are decided in two blocks, enrichments that differ by less than they scatter not."""
+    for cell in GROUP:
+        write(writer, cell)
+    plan = plan_of(writer)
+    (stage,) = plan.start([])
+    stages = record(plan, stage, unsteady=0.1)
+    assert [(one.first, one.rounds) for one in stages] == [(3 * k, 3) for k in range(len(stages))]
+    assert [one.session for one in stages] == list(range(len(stages)))
+    assert len(stages) > 2
+    assert [len(one.cells) for one in stages[:2]] == [len(GROUP)] * 2
+    compared = {cell_queries(cell, 20.0) for cell in GROUP if cell.primal.name != "decorrelated"}
+    assert all(set(one.cells) <= compared for one in stages[2:])
+    counts = {(cell.primal.name, (writer.database.cell(cell.key) or {})["timed_rounds"]) for cell in GROUP}
+    assert {count for name, count in counts if name == "decorrelated"} == {6}
+    assert max(count for _, count in counts) == 3 * len(stages)
+
+
+def test_rounds_end_where_a_decision_would_take_far_too_many(writer: ResultWriter) -> None:
+    """Two equal enrichments are never told apart."""
+    for cell in GROUP:
+        write(writer, cell)
+    plan = plan_of(writer, rounds=60)
+    (stage,) = plan.start([])
+    assert len(record(plan, stage)) == 2
+
+
+def test_as_many_rounds_as_are_asked_for_at_least(writer: ResultWriter) -> None:
+    for cell in GROUP:
+        write(writer, cell)
+    plan = TimingPlan({cell: cell_queries(cell, 20.0) for cell in CELLS}, 60, writer, 15)
+    (stage,) = plan.start([])
+    assert [len(one.cells) for one in record(plan, stage)] == [len(GROUP)] * 5
+
+
+def test_a_group_that_was_not_timed_to_the_end_is_timed_again(writer: ResultWriter) -> None:
+    """As after an interruption between two blocks; what was measured can be shown until then."""
+    for cell in GROUP:
+        write(writer, cell)
+    plan = plan_of(writer)
+    (stage,) = plan.start([])
+    plan.record(stage, timed(stage))
+    row = writer.database.cell(GROUP[0].key)
+    assert row is not None
+    assert (row["online_s"], row["timing_rounds"], row["timed_rounds"]) == (pytest.approx(3.0), None, 3)
+    (again,) = plan_of(writer).start([])
+    assert len(again.cells) == len(GROUP)
 
 
 def test_a_cell_that_is_done_again_is_timed_together_with_the_others(writer: ResultWriter) -> None:
@@ -109,7 +196,7 @@ def test_a_cell_that_is_done_again_is_timed_together_with_the_others(writer: Res
         write(writer, cell)
     plan = plan_of(writer)
     (stage,) = plan.start([])
-    plan.record(stage, timed(stage))
+    record(plan, stage)
     plan = plan_of(writer)
     assert plan.start(GROUP[:1]) == []
     write(writer, GROUP[0])
@@ -123,7 +210,7 @@ def test_a_failed_timing_leaves_a_reason_and_is_not_tried_for_ever(writer: Resul
         write(writer, cell)
     plan = plan_of(writer)
     (stage,) = plan.start([])
-    plan.record(stage, Failed(Status.CRASHED, "the worker died"))
+    assert plan.record(stage, Failed(Status.CRASHED, "the worker died")) is None
     row = writer.database.cell(GROUP[0].key)
     assert row is not None
     assert (row["online_s"], row["timing_reason"]) == (None, "all rounds: the worker died")
@@ -136,7 +223,7 @@ def test_the_machine_that_timed_a_cell_is_named(writer: ResultWriter) -> None:
         write(writer, cell)
     plan = plan_of(writer)
     (stage,) = plan.start([])
-    plan.record(stage, tuple(TimedCell(one.rounds, "another", "") for one in timed(stage)))
+    plan.record(stage, tuple(TimedCell(one.rounds, "another") for one in timed(stage)))
     row = writer.database.cell(GROUP[0].key)
     assert row is not None
     assert row["machine"] == "another; this one"

@@ -2,7 +2,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from statistics import median
+from statistics import mean, median
 from typing import Literal
 
 import numpy as np
@@ -177,8 +177,7 @@ def test_rows_of_a_cell(store: SampleStore, primal: str, tolerance: float | None
     setup = median(seconds.cpu for seconds in (*training.setups, *validation.setups))
     assert rows.cell["offline_snapshots_s"] == pytest.approx(snapshots.cpu + setup)
     assert rows.cell["hf_setup_s"] == pytest.approx(setup)
-    assert rows.cell["hf_s"] == pytest.approx(median(seconds.cpu for seconds in validation.seconds))
-    assert rows.cell["hf_low_s"] <= rows.cell["hf_s"] <= rows.cell["hf_high_s"]
+    assert rows.cell["hf_s"] == pytest.approx(mean(seconds.cpu for seconds in validation.seconds))
     assert [row["hf_s"] for row in rows.queries] == [seconds.cpu for seconds in validation.seconds]
     enrichment = store.get(cell(primal, tolerance).assembly.enrichment.key)
     assert rows.cell["offline_enrichment_s"] == enrichment.seconds.cpu

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,15 +12,19 @@ from hypothesis import given
 from hypothesis import strategies as st
 from samples import SampleStore, carry_out
 
+from vibench.errors import NumericalError
 from vibench.interfaces.strategies import Stop
 from vibench.qp.status import Status
-from vibench.stages import timing_rounds
+from vibench.stages import marginal_solutions, timing_rounds
 from vibench.stages.assembly import AssemblyStage
 from vibench.stages.base import Failed
 from vibench.stages.cell_queries import CellQueries
 from vibench.stages.enrichment import SingleEnrichment
+from vibench.stages.marginal_solutions import MarginalSolutions, parts_alike
 from vibench.stages.offline import ConeStage, PODStage
-from vibench.stages.timing_rounds import TimedRound, TimingRounds, round_rows, seconds_of_cell, seconds_of_queries
+from vibench.stages.snapshots import gather
+from vibench.stages.timed_seconds import TimedCell, TimedRound, round_columns, seconds_of_cell, seconds_of_queries
+from vibench.stages.timing_rounds import TimingRounds, block_rows
 from vibench.study.parameter_sets import ParameterSet
 from vibench.study.plugin import Plugin
 from vibench.timing import Seconds
@@ -50,33 +55,47 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> SampleStore:
     return store
 
 
+def as_rows(*rounds: TimedRound, hf: float | None = 4.0, pace: float = 1.0, per_block: int = 4) -> list[dict[str, Any]]:
+    """Rows of the timings table of a cell."""
+    return [
+        {"block": str(k // per_block), "round": k, "queries": len(one.solve), "slowdown": one.slowdown}
+        | {"hf_s": hf, "pace": pace}
+        | round_columns(one)
+        for k, one in enumerate(rounds)
+    ]
+
+
 def steady(seconds: float, queries: tuple[int, ...] = (0, 1), slowdown: float = 1.0) -> TimedRound:
     return TimedRound({0: Seconds(seconds, seconds)}, dict.fromkeys(queries, Seconds(seconds, seconds)), slowdown)
 
 
 @given(st.integers(1, 9), st.integers(1, 9))
 def test_every_round_has_every_cell_once_before_the_next_one_begins(rounds: int, count: int) -> None:
+    """And the high-fidelity model, which comes after the cells in number alone."""
     stage = TimingRounds((CELLS[0],) * count, (EVERY,) * count, rounds)
     places = [stage.place(item) for item in range(stage.items)]
     assert [number for number, _ in places] == sorted(number for number, _ in places)
-    assert sorted(places) == [(number, k) for number in range(rounds) for k in range(count)]
+    assert sorted(places) == [(number, k) for number in range(rounds) for k in range(count + 1)]
 
 
 def test_the_order_of_the_cells_changes_from_round_to_round() -> None:
     """Whoever comes after a large model finds its own arrays out of the cache: not always the same one."""
     stage = TimingRounds((CELLS[0],) * 6, (EVERY,) * 6, 12)
-    first = {stage.place(number * 6)[1] for number in range(12)}
-    assert len(first) > 3
+    first = [stage.place(number * 7)[1] for number in range(12)]
+    assert len(set(first)) > 3
+    later = TimingRounds((CELLS[0],) * 6, (EVERY,) * 6, 4, first=8)
+    assert [later.place(number * 7)[1] for number in range(4)] == first[8:]
 
 
-def test_a_machine_that_slows_down_halfway_meets_all_cells_alike() -> None:
+def test_a_machine_that_slows_down_halfway_meets_all_alike() -> None:
     """Cell after cell, the second of two equal ones would seem thrice as slow."""
     stage = TimingRounds((CELLS[0],) * 2, (EVERY,) * 2, 12)
     items = [steady(1.0 if item < stage.items / 2 else 3.0) for item in range(stage.items)]
     timed = timing_rounds._Rounds.finish(_in(stage), items)
-    one, other = (seconds_of_cell(round_rows(each.rounds), 1.0) for each in timed)
+    one, other = map(seconds_of_cell, block_rows(stage, timed))
     assert one == other
     assert one["online_q1_s"] < one["online_s"] < one["online_q3_s"]
+    assert one["online_s"] == pytest.approx(one["hf_s"])
 
 
 def _in(stage: TimingRounds) -> timing_rounds._Rounds:
@@ -87,22 +106,75 @@ def _in(stage: TimingRounds) -> timing_rounds._Rounds:
 
 
 def test_every_ok_query_is_timed_and_no_other(store: SampleStore) -> None:
-    fine = (EVERY, (0, 2, 5), EVERY, (3,))
-    timed = TimingRounds(CELLS, fine, 8).run(store).value
+    fine = (EVERY, (0, 2, 5), EVERY, (3,), EVERY)
+    timed = TimingRounds(CELLS, fine[:-1], 8).run(store).value
     for one, numbers in zip(timed, fine, strict=True):
-        assert len(one.rounds) == 8
-        assert {k for each in one.rounds for k in each.solve} == set(numbers)
-        assert all(s.cpu > 0.0 for each in one.rounds for part in (each.assemble, each.solve) for s in part.values())
-        assert one.reason == ""
-        rows = seconds_of_queries(one.rounds)
+        rounds = list(one.rounds.values())
+        assert list(one.rounds) == list(range(8))
+        assert {k for each in rounds for k in each.solve} == set(numbers)
+        assert all(s.cpu > 0.0 for each in rounds for part in (each.assemble, each.solve) for s in part.values())
+        assert (one.lost, one.reason) == (0, "")
+    for one, numbers in zip(timed[:-1], fine, strict=False):
+        rows = seconds_of_queries(list(one.rounds.values()))
         assert set(rows) == set(numbers)
         assert all(row["total_s"] == row["assemble_s"] + row["solve_s"] for row in rows.values())
 
 
 def test_reduced_assembly_is_timed_at_every_query_and_full_assembly_once_a_round(store: SampleStore) -> None:
     timed = TimingRounds(CELLS, (EVERY,) * len(CELLS), 2).run(store).value
-    assert [[len(each.assemble) for each in one.rounds] for one in timed[:3]] == [[1, 1]] * 3
-    assert all(each.assemble.keys() == each.solve.keys() for each in timed[3].rounds)
+    assert [[len(each.assemble) for each in one.rounds.values()] for one in timed[:3]] == [[1, 1]] * 3
+    assert all(each.assemble.keys() == each.solve.keys() for each in timed[3].rounds.values())
+
+
+def test_high_fidelity_solutions_start_where_those_of_the_sweep_do(
+    store: SampleStore, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """From the contact set of the nearest parameter before, and without any at the first one of a part."""
+    stage = TimingRounds(CELLS, (EVERY,) * len(CELLS), 1)
+    reference = gather(store, stage.solutions)
+    starts: list[Any] = []
+    solve = marginal_solutions.solve_unverified
+    monkeypatch.setattr(
+        marginal_solutions, "solve_unverified", lambda *given: (starts.append(given[2]), solve(*given))[1]
+    )
+    marginal = MarginalSolutions(PROBLEM.create(), reference, 1)
+    assert all(marginal.seconds(k, 0).cpu > 0.0 for k in EVERY)
+    edges = [0, 2, 3, 4, 6]
+    for k, start in enumerate(starts):
+        before = range(max(edge for edge in edges if edge <= k), k)
+        assert (start is None) == (not before)
+        if start is not None:
+            assert any(np.array_equal(start, reference.lam[:, number] > 0.0) for number in before)
+    wrong = replace(reference, u=reference.u[:, ::-1].copy())
+    with pytest.raises(NumericalError, match="differs from the one that was verified"):
+        MarginalSolutions(PROBLEM.create(), wrong, 1).seconds(0, 0)
+
+
+def test_long_high_fidelity_solutions_stand_for_others(store: SampleStore, monkeypatch: pytest.MonkeyPatch) -> None:
+    """One is timed in a round; the sweep says how long the others of the round take beside it."""
+    monkeypatch.setattr(timing_rounds, "HIGH_FIDELITY_SECONDS", 0.0)
+    work = TimingRounds(CELLS[:1], (EVERY,), 1).begin(store)
+    assert isinstance(work, timing_rounds._Rounds)
+    sweep = [1.0, 2.0, 3.0, 4.0, 5.0, 6.0]
+    work._reference = replace(work._reference, seconds=tuple(Seconds(one, one) for one in sweep))
+    seen = {}
+    for at in range(8):
+        _, solve, _ = work._solutions(at)
+        (k,) = solve
+        seen[k] = at % timing_rounds.SHARE
+    part = work._parts[0]
+    monkeypatch.setattr(MarginalSolutions, "seconds", lambda _, k, *__: Seconds(sweep[k], sweep[k]))
+    _, solve, _ = work._solutions(0)
+    assert [one.cpu for one in solve.values()] == pytest.approx([np.mean([sweep[k] for k in part])])
+    assert len(seen) > timing_rounds.SHARE  # in later blocks it is another one
+
+
+@given(st.lists(st.floats(0.1, 10.0), min_size=1, max_size=40))
+def test_parts_of_a_pass_have_all_queries_once_and_take_about_as_long(seconds: list[float]) -> None:
+    parts = parts_alike(seconds, 4)
+    assert sorted(k for part in parts for k in part) == list(range(len(seconds)))
+    sums = [sum(seconds[k] for k in part) for part in parts]
+    assert max(sums) - min(sums) <= 2.0 * max(seconds)
 
 
 def test_matrices_in_full_are_assembled_once_in_a_round_for_all_cells(
@@ -113,68 +185,82 @@ def test_matrices_in_full_are_assembled_once_in_a_round_for_all_cells(
     monkeypatch.setattr(
         timing_rounds, "checked_assembly", lambda problem, mu: (calls.append(float(mu[0])), plain(problem, mu))[1]
     )
-    TimingRounds(CELLS[:3], (EVERY,) * 3, 4).run(store)
+    TimingRounds(CELLS[:3], (EVERY,) * 3, 4).run(store)  # high-fidelity solutions assemble for themselves
     assert len(calls) == 1 + 4  # a warm-up, then once per round, at another parameter each time
-    assert len({round(mu, 6) for mu in calls}) == 4
+    assert len({round(mu, 6) for mu in calls}) == timing_rounds.SHARE
     assert len(set(calls)) == 5
 
 
 def test_a_round_that_takes_long_ends_early(store: SampleStore, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(timing_rounds, "ROUND_SECONDS", 0.0)
-    (timed,) = TimingRounds(CELLS[:1], (EVERY,), 4).run(store).value
-    assert [len(each.solve) for each in timed.rounds] == [1] * 4
+    timed = TimingRounds(CELLS[:1], (EVERY,), 4).run(store).value[0]
+    assert [len(each.solve) for each in timed.rounds.values()] == [1] * 4
 
 
-def test_a_lost_round_is_told_and_the_others_count() -> None:
-    stage = TimingRounds((CELLS[0],) * 2, (EVERY,) * 2, 3)
+def test_a_lost_round_is_told_and_the_others_keep_their_numbers() -> None:
+    stage = TimingRounds((CELLS[0],) * 2, (EVERY,) * 2, 3, first=6)
     items: list[TimedRound | Failed] = [steady(2.0) for _ in range(stage.items)]
-    items[stage.items - 1] = Failed(Status.CRASHED, "the worker died")
-    unlucky = stage.place(stage.items - 1)[1]
+    gone = next(item for item in range(stage.items) if stage.place(item) == (1, 0))
+    items[gone] = Failed(Status.CRASHED, "the worker died")
     timed = _in(stage).finish(items)
-    assert [len(one.rounds) for one in timed] == [2 if k == unlucky else 3 for k in range(2)]
-    assert timed[unlucky].reason == "1 of 3 rounds: the worker died"
-    assert timed[1 - unlucky].reason == ""
+    assert [list(one.rounds) for one in timed] == [[6, 8], [6, 7, 8], [6, 7, 8]]
+    assert [(one.lost, one.reason) for one in timed] == [(1, "the worker died"), (0, ""), (0, "")]
+    assert [[row["round"] for row in rows] for rows in block_rows(stage, timed)] == [[6, 8], [6, 7, 8]]
+
+
+def test_rows_have_what_the_high_fidelity_model_took_in_their_round() -> None:
+    stage = TimingRounds((CELLS[0],), (EVERY,), 2)
+    model = TimedCell({0: TimedRound({}, {3: Seconds(7.0, 7.0), 4: Seconds(9.0, 9.0)}, 1.0)}, "here", 1, "lost")
+    (rows,) = block_rows(stage, [TimedCell({0: steady(1.0), 1: steady(3.0)}, "here"), model])
+    assert [row["hf_s"] for row in rows] == [8.0, None]
+    assert len({row["block"] for row in rows}) == 1
+    other = TimingRounds((CELLS[0],), (EVERY,), 2, first=2)
+    assert (
+        block_rows(other, [TimedCell({2: steady(1.0)}, "here"), TimedCell({}, "")])[0][0]["block"] != rows[0]["block"]
+    )
 
 
 def test_a_certificate_is_a_part_of_its_query() -> None:
     rounds = [replace(steady(1.0), certify=dict.fromkeys((0, 1), Seconds(spent, 2.0))) for spent in (0.25, 0.5, 4.0)]
-    rows = round_rows(rounds)
+    rows = as_rows(*rounds)
     assert [(row["certify_s"], row["total_s"], row["total_wall_s"]) for row in rows] == [
         (0.25, 2.25, 4.0), (0.5, 2.5, 4.0), (4.0, 6.0, 4.0),
     ]  # fmt: skip
-    assert (seconds_of_cell(rows, 1.0)["online_certify_s"], seconds_of_cell(rows, 1.0)["online_s"]) == (0.5, 2.5)
+    assert seconds_of_cell(rows)["online_certify_s"] == 0.5
+    assert seconds_of_cell(rows)["online_s"] == pytest.approx(2.5)
     assert seconds_of_queries(rounds)[1]["certify_s"] == 0.5
 
 
-def test_columns_are_medians_and_quartiles_over_the_rounds() -> None:
+def test_columns_are_means_over_blocks_and_medians_and_quartiles_over_rounds() -> None:
     rounds = [
         TimedRound({k: Seconds(0.5, 1.0)}, {k: Seconds(spent, spent), k + 4: Seconds(spent, spent)}, slow)
         for k, (spent, slow) in enumerate([(1.0, 1.0), (3.0, 1.2), (2.0, 1.4), (8.0, 3.0)])
     ]
-    rows = round_rows(rounds)
+    rows = as_rows(*rounds, per_block=2, pace=2.0)
     assert [row["total_s"] for row in rows] == [1.5, 3.5, 2.5, 8.5]
-    assert [(row["round"], row["queries"]) for row in rows] == [(k, 2) for k in range(4)]
-    own = seconds_of_cell(rows, 10.0)
-    assert (own["online_s"], own["online_solve_s"], own["online_assemble_s"]) == (3.0, 2.5, 0.5)
+    own = seconds_of_cell(rows)
+    # the median of two is the geometric mean, and so is the mean over blocks
+    assert own["online_s"] == pytest.approx((1.5 * 3.5 * 2.5 * 8.5) ** 0.25 / 2.0)
+    assert own["hf_s"] == pytest.approx(2.0)
+    assert "hf_s" not in seconds_of_cell(as_rows(*rounds, hf=None))
+    assert (own["online_solve_s"], own["online_assemble_s"]) == (2.5, 0.5)
     assert (own["online_q1_s"], own["online_q3_s"]) == tuple(np.quantile([1.5, 3.5, 2.5, 8.5], (0.25, 0.75)))
     assert own["online_wall_s"] == 3.5
     assert own["slowdown"] == pytest.approx(1.3)
-    slowdowns = np.array([1.0, 1.2, 1.4, 3.0]) / 1.3
-    ends = 10.0 * np.quantile(slowdowns, (0.025, 0.975))
-    assert (own["offline_low_s"], own["offline_high_s"]) == pytest.approx(tuple(ends))
     queries = seconds_of_queries([replace(one, assemble={k: one.assemble[k]}) for k, one in enumerate(rounds)])
     assert queries[2] == {"assemble_s": 0.5, "solve_s": 2.0, "certify_s": None, "total_s": 2.5, "total_wall_s": 3.0}
     assert own["online_certify_s"] is None
-    assert set(seconds_of_cell([], 10.0)) == set(own)
-    assert set(seconds_of_cell([], 10.0).values()) == {None}
+    assert set(seconds_of_cell([])) == set(own) - {"hf_s"}
+    assert set(seconds_of_cell([]).values()) == {None}
 
 
-@pytest.mark.parametrize(("wall", "slow", "disturbed"), [(1.0, 1.0, 0), (1.6, 1.0, 1), (1.0, 1.4, 1)])
-def test_a_machine_that_waits_or_is_slow_marks_the_row(wall: float, slow: float, disturbed: int) -> None:
+@pytest.mark.parametrize(("wall", "slow", "disturbed"), [(1.0, 1.0, 0), (9.0, 1.0, 0), (1.0, 1.4, 1)])
+def test_a_slow_machine_marks_the_row_and_waiting_for_a_core_does_not(wall: float, slow: float, disturbed: int) -> None:
+    """CPU seconds stop while a process waits; what others do to the caches, the calibration shows."""
     once = TimedRound({0: Seconds(1.0, wall)}, {0: Seconds(1.0, wall)}, slow)
-    assert seconds_of_cell(round_rows([once] * 3), 1.0)["disturbed"] == disturbed
+    assert seconds_of_cell(as_rows(*[once] * 3))["disturbed"] == disturbed
 
 
 def test_the_limit_of_the_stage_is_that_of_all_its_cells(tmp_path: Path) -> None:
-    assert TimingRounds(CELLS, (EVERY,) * 4, 12).weight == 4
+    assert TimingRounds(CELLS, (EVERY,) * 4, 12).weight == 5
     assert CELLS[0].weight == 1

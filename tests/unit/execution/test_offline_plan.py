@@ -1,0 +1,117 @@
+"""Which offline stages are timed again, and what their seconds become."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from samples import SampleStore, carry_out
+
+from vibench.execution import offline_plan
+from vibench.execution.offline_plan import OfflinePlan
+from vibench.results.break_even import SCATTER
+from vibench.stages.base import Stage
+from vibench.stages.cell_queries import CellQueries, cell_queries
+from vibench.stages.offline_repeats import OfflineRepeat, offline_columns, scatter, sources
+from vibench.study.cells import Cell
+from vibench.study.matrix import expand, read_study
+from vibench.timing import Seconds
+
+ASKED = {"problem": ["hertz"], "dual": ["mcpg"], "primal": ["offline-pga"], "solvers": ["piqp"]}
+(CELL,) = expand(read_study("quick", ASKED))
+GOAL = cell_queries(CELL, 20.0)
+STAGES = list({stage.key: stage for stage in sources(GOAL)}.values())
+
+
+def spent(seconds: float) -> Seconds:
+    return Seconds(seconds, seconds)
+
+
+def plan_of(seconds: Mapping[str, float], asked: int = 0, store: Any = None) -> tuple[OfflinePlan, list[OfflineRepeat]]:
+    plan = OfflinePlan(store, SimpleNamespace(), asked)  # type: ignore[arg-type]
+    for key, cpu in seconds.items():
+        plan.note(next(stage for stage in STAGES if stage.key == key), spent(cpu), 1.5 * cpu)
+    return plan, plan.repeats([(CELL, GOAL)])
+
+
+def test_short_stages_are_repeated_the_cheapest_first_within_the_budget() -> None:
+    costs = dict(zip((stage.key for stage in STAGES), (0.5, 0.1, 2.0, 0.2, 0.3, 9.0, 0.1), strict=False))
+    plan, repeats = plan_of(costs)
+    paid = [costs[one.stage.key] for one in repeats]
+    assert sum(paid) <= offline_plan.BUDGET * sum(costs.values())
+    assert max(paid) <= offline_plan.SHORT
+    firsts = [costs[one.stage.key] for one in repeats if one.number == 1]
+    assert firsts == sorted(cost for cost in costs.values() if cost <= offline_plan.SHORT)
+    assert plan.repeats([(CELL, GOAL)]) == []  # once is enough
+
+
+def test_repeats_that_are_asked_for_are_all_run() -> None:
+    costs = dict.fromkeys((stage.key for stage in STAGES), 100.0)
+    _, repeats = plan_of(costs, asked=3)
+    assert sorted(one.number for one in repeats) == sorted([1, 2, 3] * len(STAGES))
+
+
+def test_the_seconds_of_a_nested_enrichment_are_those_of_its_growth(tmp_path_factory: pytest.TempPathFactory) -> None:
+    store = SampleStore(tmp_path_factory.mktemp("artefacts"))
+    enrichment = GOAL.assembly.enrichment
+    carry_out(enrichment, store)
+    source, name = enrichment.measured_by
+    repeat = OfflineRepeat(source, 1)
+    store.put(repeat.key, (result := repeat.run(store)).value, result.seconds, ())
+    first, again = store.get(enrichment.key), repeat.seconds(store, name)
+    assert first is not None
+    assert again is not None
+    assert 0.0 < again.cpu < 20.0 * first.seconds.cpu
+    assert repeat.seconds(store, name) == again
+    assert OfflineRepeat(source, 2).seconds(store, name) is None
+
+
+def test_the_scatter_of_stages_is_pooled() -> None:
+    rng = np.random.default_rng(0)
+    runs = [[spent(base * float(np.exp(0.3 * rng.standard_normal()))) for _ in range(3)] for base in [0.1, 1.0] * 300]
+    assert scatter(runs) == pytest.approx(0.3, rel=0.05)
+    assert scatter([[spent(1.0)]]) == SCATTER
+    assert scatter([*runs, [spent(1e-5), spent(1e-3)]]) == scatter(runs)  # too short to say anything
+
+
+def columns(runs_of: Mapping[str, list[float]], deviation: float = 0.1) -> dict[str, Any]:
+    stages: dict[str, Stage] = {one.key: one for some in GOAL.offline.values() for one in some}
+    runs = {key: [spent(cpu) for cpu in runs_of.get(stage.label, [0.0])] for key, stage in stages.items()}
+    return offline_columns(GOAL, 0.5, runs, deviation)
+
+
+def test_the_median_of_all_runs_of_a_stage_counts() -> None:
+    found = columns({"high-fidelity solutions": [1.0, 2.0, 9.0], "cone": [3.0, 5.0]})
+    assert (found["offline_snapshots_s"], found["offline_cone_s"]) == (4 * 2.0 + 0.5, 4.0)
+    assert found["offline_s"] == 12.5
+    assert found["offline_repeats"] == 5
+
+
+def test_an_interval_narrows_with_the_repeats_of_what_takes_long() -> None:
+    def width(**runs: list[float]) -> float:
+        found = columns({name.replace("_", " "): values for name, values in runs.items()})
+        return float(np.log(found["offline_high_s"] / found["offline_low_s"]))
+
+    once = width(cone=[1.0])
+    assert once == pytest.approx(2.0 * 1.96 * 0.1)
+    assert width(cone=[1.0] * 4) == pytest.approx(once / 2.0)
+    assert width(cone=[1.0], POD=[1e-6] * 4) == pytest.approx(once, rel=1e-3)
+
+
+def test_seconds_of_cells_whose_artefacts_are_gone_stay_as_they_are() -> None:
+    written: list[Cell] = []
+    database = SimpleNamespace(cell=lambda _: {"hf_setup_s": 1.0})
+    writer = SimpleNamespace(database=database, offline=lambda cell, _: written.append(cell))
+    for there in (False, True):
+        artefact = SimpleNamespace(seconds=spent(1.0), value={"": [1.0, 1.0]}) if there else None
+        plan = OfflinePlan(SimpleNamespace(get=lambda _, found=artefact: found), writer)  # type: ignore[arg-type]
+        plan.repeats([(CELL, GOAL)])
+        plan._seconds = {}
+        if there:
+            plan._runs = lambda stage: [spent(1.0)]  # type: ignore[method-assign]
+        plan.finish()
+    assert written == [CELL]
+    assert isinstance(GOAL, CellQueries)

@@ -1,0 +1,241 @@
+"""Seconds of models that were timed in the same rounds: their ratios, and where those of another run would lie.
+
+A *block* is a pass of rounds over all queries, in a process of its own. Within a block the seconds of a model are the
+median over its rounds, each divided by the pace of the round, which is how much slower all models were in it: whatever
+slows down a whole round leaves ratios as they are, and what hits one model in one round is an outlier. Blocks are
+independent, and what differs between processes differs between them. The interval of a ratio is that of a mean over
+blocks: Student's, its variance moderated by those of all models of the run (Smyth 2004, "Linear models and empirical
+Bayes methods for assessing differential expression", section 6), since a model has few blocks of its own.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy.special import digamma, polygamma, stdtrit
+
+from vibench.arrays import Array
+
+FEWEST_BLOCKS = 2
+"""A scatter takes two blocks."""
+
+CELLS_PER_DEGREE = 4
+"""Cells that stand for one degree of freedom of the common variance: cells of a group share much of their scatter."""
+
+CERTAIN = 1e3
+"""Degrees of freedom of a variance that is as good as known."""
+
+FAR = 50.0
+"""Deviations of logarithms beyond which exponentials overflow."""
+
+ROUND_OFF = 1e-18
+"""Variances below this are those of equal numbers."""
+
+
+class Estimate(NamedTuple):
+    """A mean, its standard error, and the degrees of freedom of that."""
+
+    mean: float
+    error: float
+    freedom: float
+
+    def interval(self, tail: float) -> tuple[float, float]:
+        """The interval that leaves out the probability `tail` on each side."""
+        half = self.error * float(stdtrit(self.freedom, 1.0 - tail))
+        return self.mean - half, self.mean + half
+
+    def draws(self, rng: np.random.Generator, count: int) -> Array:
+        """Means as other runs might have them (`count`,); of logarithms, none that is no number any more."""
+        return self.mean + np.clip(self.error * rng.standard_t(self.freedom, count), -FAR, FAR)
+
+    def minus(self, other: Estimate) -> Estimate:
+        """The difference of independent means, its degrees of freedom those of Welch and Satterthwaite."""
+        mine, others = self.error**2, other.error**2
+        spread = mine**2 / self.freedom + others**2 / other.freedom
+        freedom = (mine + others) ** 2 / spread if spread else CERTAIN
+        return Estimate(self.mean - other.mean, math.sqrt(mine + others), min(freedom, CERTAIN))
+
+
+class _Scatter(NamedTuple):
+    """The logarithm of a variance over blocks, unbiased, and the variance of that."""
+
+    log: float
+    noise: float
+
+
+@dataclass
+class CommonVariance:
+    """The distribution of the variances of many models, from those of few blocks each; added to one by one."""
+
+    _of: dict[str, _Scatter] = field(default_factory=dict)
+    _sums: Array = field(default_factory=lambda: np.zeros(3))
+    """Sums of logarithms, of their squares, and of their noise."""
+
+    def add(self, name: str, values: Sequence[float]) -> None:
+        """Take note of a model's values, one for each of its blocks; earlier ones of that name are replaced."""
+        if name in self._of:
+            self._count(self._of.pop(name), -1.0)
+        if len(values) >= FEWEST_BLOCKS:
+            half = (len(values) - 1.0) / 2.0
+            log = math.log(max(float(np.var(values, ddof=1)), ROUND_OFF)) - float(digamma(half)) + math.log(half)
+            self._of[name] = _Scatter(log, float(polygamma(1, half)))
+            self._count(self._of[name], 1.0)
+
+    def _count(self, one: _Scatter, sign: float) -> None:
+        self._sums += sign * np.array([one.log, one.log**2, one.noise])
+
+    def prior(self, blocks: int) -> tuple[float, float]:
+        """A typical variance, and its degrees of freedom: at most as many as there are independent `blocks`, or 0."""
+        count = len(self._of)
+        most = min(float(blocks), count / CELLS_PER_DEGREE)
+        if most < 1.0:
+            return 0.0, 0.0
+        mean, squares, noise = self._sums / count
+        excess = (squares - mean**2) * count / (count - 1.0) - noise
+        if excess <= polygamma(1, CERTAIN / 2.0):
+            return math.exp(mean), min(most, CERTAIN)
+        half = _inverse_trigamma(excess)
+        return math.exp(mean + float(digamma(half)) - math.log(half)), min(most, 2.0 * half)
+
+
+def _inverse_trigamma(value: float) -> float:
+    """Where the trigamma function has a positive value: Newton's method for its reciprocal (Smyth 2004, appendix)."""
+    x = 0.5 + 1.0 / value
+    for _ in range(50):
+        trigamma = float(polygamma(1, x))
+        step = trigamma * (1.0 - trigamma / value) / float(polygamma(2, x))
+        x += step
+        if abs(step) < 1e-9 * x:
+            break
+    return x
+
+
+def paces(seconds: Array) -> Array:
+    """How much slower a block's rounds were than its typical one (R,), from seconds (C×R) of all who were timed.
+
+    It is the median over them of the deviation from their own median over the rounds; NaN where a round is missing.
+    """
+    with np.errstate(all="ignore"):
+        logarithms = np.log(seconds)
+    own = np.array([_median(row) for row in logarithms])
+    return np.exp([_median(column) for column in (logarithms - own[:, None]).T])
+
+
+def _median(values: Array) -> float:
+    """Median of the values that there are; NaN of none."""
+    there = values[np.isfinite(values)]
+    return float(np.median(there)) if len(there) else math.nan
+
+
+class Block(NamedTuple):
+    """Logarithms of the seconds of a query and of a high-fidelity solution in one block."""
+
+    online: float
+    high_fidelity: float
+
+
+Measured = tuple[str, float, float]
+"""The block of a round, and the seconds of a query and of a high-fidelity solution in it, at its pace."""
+
+
+def _measured(row: Mapping[str, Any]) -> Measured:
+    high_fidelity = math.nan if row["hf_s"] is None else row["hf_s"]
+    return row["block"], row["total_s"] / row["pace"], high_fidelity / row["pace"]
+
+
+def blocks_of(rounds: Iterable[Mapping[str, Any]]) -> dict[str, Block]:
+    """The blocks of a cell by their names, from its rows of the timings table."""
+    return _blocks(map(_measured, rounds))
+
+
+def _blocks(rounds: Iterable[Measured]) -> dict[str, Block]:
+    by_block: dict[str, list[tuple[float, float]]] = {}
+    for block, *seconds in rounds:
+        by_block.setdefault(block, []).append((seconds[0], seconds[1]))
+    with np.errstate(all="ignore"):
+        return {name: Block(*map(_median, np.log(np.array(rows)).T)) for name, rows in by_block.items()}
+
+
+def mean_seconds(blocks: Iterable[Block]) -> tuple[float, float | None]:
+    """Seconds of a query and of a high-fidelity solution: geometric means over blocks; of the latter `None` if unknown.
+
+    Only blocks with both count, if there are any.
+    """
+    every = np.array(list(blocks))
+    paired = every[np.isfinite(every[:, 1])]
+    online, high_fidelity = np.exp((paired if len(paired) else every).mean(axis=0))
+    return float(online), float(high_fidelity) if len(paired) else None
+
+
+class PairedSeconds:
+    """Seconds of the cells of a run, from rows of its timings table."""
+
+    def __init__(self, timings: Iterable[Mapping[str, Any]] = ()) -> None:
+        self._blocks: dict[str, dict[str, Block]] = {}
+        self._rounds: dict[str, Counter[str]] = {}
+        self._ratios, self._levels = CommonVariance(), CommonVariance()
+        self._names: set[str] = set()
+        self._first: set[str] = set()
+        by_cell: dict[str, list[Measured]] = {}
+        for row in timings:
+            by_cell.setdefault(row["cell"], []).append(_measured(row))
+        for cell, measured in by_cell.items():
+            self._add(cell, measured)
+
+    def add(self, cell: str, rounds: Iterable[Mapping[str, Any]]) -> None:
+        """Take note of all rounds of a cell, rows of the timings table; earlier ones are replaced."""
+        self._add(cell, list(map(_measured, rounds)))
+
+    def _add(self, cell: str, rounds: Sequence[Measured]) -> None:
+        blocks = self._blocks[cell] = _blocks(rounds)
+        self._rounds[cell] = Counter(block for block, *_ in rounds)
+        self._names.update(blocks)
+        self._first.update(list(blocks)[:1])
+        self._ratios.add(cell, [b.online - b.high_fidelity for b in blocks.values() if math.isfinite(b.high_fidelity)])
+        self._levels.add(cell, [b.online for b in blocks.values()])
+
+    def rounds(self, a: str | None, b: str) -> int:
+        """Number of rounds in the blocks that b shares with a, or with the high-fidelity model without a."""
+        shared = self._blocks.get(b, {}) if a is None else self._blocks.get(b, {}).keys() & self._blocks.get(a, {})
+        return sum(self._rounds[b][name] for name in shared)
+
+    def ratio(self, a: str | None, b: str) -> Estimate | None:
+        """The logarithm of the seconds of a query of b over those of a, or of the high-fidelity model without a.
+
+        Cells of different groups are compared by their ratios to the high-fidelity model. `None` with fewer than two
+        blocks.
+        """
+        mine = self._blocks.get(b, {})
+        if a is None:
+            return self._estimate(
+                self._ratios, [x.online - x.high_fidelity for x in mine.values() if math.isfinite(x.high_fidelity)]
+            )
+        others = self._blocks.get(a, {})
+        common = [name for name in mine if name in others]
+        if common:
+            return self._estimate(self._ratios, [mine[name].online - others[name].online for name in common])
+        apart = self.ratio(None, b), self.ratio(None, a)
+        return None if apart[0] is None or apart[1] is None else apart[0].minus(apart[1])
+
+    def level(self, a: str | None, b: str) -> Estimate | None:
+        """The logarithm of the seconds of a query of a, or of the high-fidelity model, in the blocks shared with b."""
+        mine = self._blocks.get(b, {})
+        if a is None:
+            values = [x.high_fidelity for x in mine.values() if math.isfinite(x.high_fidelity)]
+        else:
+            values = [x.online for name, x in self._blocks.get(a, {}).items() if name in mine]
+        return self._estimate(self._levels, values)
+
+    def _estimate(self, common: CommonVariance, values: Sequence[float]) -> Estimate | None:
+        count = len(values)
+        if count < FEWEST_BLOCKS:
+            return None
+        typical, degrees = common.prior(len(self._names) - len(self._first))
+        own = count - 1.0
+        variance = (degrees * typical + own * max(float(np.var(values, ddof=1)), ROUND_OFF)) / (degrees + own)
+        return Estimate(float(np.mean(values)), math.sqrt(variance / count), degrees + own)
