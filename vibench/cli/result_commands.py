@@ -68,7 +68,11 @@ def show(
         ),
     ] = "",
     within: Annotated[
-        float | None, Option(metavar="ERROR", help="Break-even of models with this error at most; 0.01 is 1 %.")
+        float | None,
+        Option(metavar="ERROR", help="Break-even, or with --queries best, of models with this error at most: 0.01."),
+    ] = None,
+    queries: Annotated[
+        float | None, Option(metavar="N", help="In the table best: the cheapest model in total for N queries.")
     ] = None,
     form: FormOption = "terminal",
 ) -> None:
@@ -81,7 +85,7 @@ def show(
     from vibench.terminal.console import new_console, print_frame, shown
 
     path = tables.results_file(run)
-    measured = partial(views.look_up, path, table, cell=cell, error=error, largest=within)
+    measured = partial(views.look_up, path, table, cell=cell, error=error, largest=within, queries=queries)
     view = measured(columns=parts(columns), where=where, sort=parts(sort), limit=limit)
     warn(*view.faults)
     if form == "terminal" and cell and table == "summary" and not columns and len(view.rows):

@@ -20,7 +20,7 @@ from vibench.execution.run_folder import REPORT
 from vibench.files import writing
 from vibench.model.error_bounds import CorrectionMode
 from vibench.offline.models import Model
-from vibench.results import ranking, tables
+from vibench.results import ranking, tables, views
 from vibench.results.columns import TABLES
 from vibench.results.plugin_columns import Extended
 from vibench.results.sqlite.reading import read_meta, study_of
@@ -118,6 +118,31 @@ class Run:
         """
         rows = ranking.with_errors(self.thresholds, *tables.measured(self.path, error))
         return rows if within is None else ranking.within(rows, within).reset_index(drop=True)
+
+    @requested
+    def best(
+        self, queries: float | None = None, error: float | None = None, measure: str = ranking.SOLUTION
+    ) -> pd.DataFrame:
+        """The best model of every problem: at every level of error that is reached, or within one.
+
+        Parameters
+        ----------
+        queries
+            Number of queries: the model with the smallest total costs for so many, with the interval of these, the
+            numbers of queries between which it is the cheapest, the share of draws in which it is, and the number of
+            others that may be as cheap. By default the model with the fastest query.
+        error
+            Largest error that is allowed; needs `queries`. By default there is a row for every power of ten.
+        measure
+            What errors are of, as in `break_even`.
+
+        Raises
+        ------
+        RequestError
+            If a number is not positive, there is an error without a number of queries, or no such measure.
+        """
+        of_solution = "" if measure == ranking.SOLUTION else measure
+        return views.look_up(self.path, "best", error=of_solution, largest=error, queries=queries).rows
 
     @property
     def summary(self) -> pd.DataFrame:

@@ -28,6 +28,7 @@ from vibench.report.figures.data import (
 )
 from vibench.results import formats, invariants, tables
 from vibench.results.columns import KEYS
+from vibench.results.paired_seconds import PairedSeconds
 from vibench.results.ranking import (
     LARGEST_BAND,
     LARGEST_SHARE,
@@ -74,7 +75,7 @@ def findings(path: Path) -> dict[str, list[str]]:
     return dict(by_subject)
 
 
-READ = ("cells", "queries", "disagreements")
+READ = ("cells", "queries", "disagreements", "timings")
 """Tables that findings on the whole run are made from."""
 
 
@@ -83,10 +84,11 @@ def all_findings(read: Mapping[str, pd.DataFrame], by_problem: Iterable[tuple[st
 
     They are made from the tables `READ` of the run, and from what `problems` gives: names and data of its problems.
     """
+    paired = PairedSeconds(read["timings"].to_dict("records"))
     for weight, text in _whole_run(read):
         yield Finding("", text, weight)
     for name, data in by_problem:
-        yield from _about(name, Weight.ANSWER, _answer(data))
+        yield from _about(name, Weight.ANSWER, _answer(data, paired))
         for title, cells in by_dimensions(best_solver(data.cells)):
             compared = on_common_queries(cells, data.queries)
             yield from _about(f"{name}, {title}", Weight.COMPARISON, _stability(cells, compared))
@@ -162,12 +164,12 @@ def _whole_run(read: Mapping[str, pd.DataFrame]) -> Iterator[tuple[Weight, str]]
             f"{_number(len(few), 'cell')} {'has' if len(few) == 1 else 'have'} fewer than half of the queries ok: "
             "such errors are not compared with others.",
         )
-    disturbed = cells[cells["disturbed"] == 1]
-    if len(disturbed):
+    timed, disturbed = int(cells["disturbed"].notna().sum()), int((cells["disturbed"] == 1).sum())
+    if disturbed:
         yield (
             Weight.WHOLE_RUN,
-            f"{_number(len(disturbed), 'cell')} {'was' if len(disturbed) == 1 else 'were'} timed while other processes "
-            "slowed the machine down (column disturbed).",
+            f"{disturbed} of {_number(timed, 'timed cell')} {'was' if disturbed == 1 else 'were'} timed while other "
+            "processes slowed the machine down (column disturbed).",
         )
 
 
@@ -179,27 +181,33 @@ def _are(items: pd.DataFrame | list[Any]) -> str:
     return "is" if len(items) == 1 else "are"
 
 
-def _answer(data: Data) -> Iterator[str]:
+def _answer(data: Data, paired: PairedSeconds) -> Iterator[str]:
     """The fastest query of a problem in the widest and in the narrowest band of the leaderboard."""
-    for standings in leaderboard(data.cells):
+    for standings in leaderboard(data.cells, paired):
         if not standings.bands:
             yield _no_winner(standings)
         for band in standings.bands[:1] + standings.bands[1:][-1:]:
             winner = band.winner(Criterion.QUERY)
             if winner is None:
                 continue
-            cell = winner.cell
+            cell, ties = winner.cell, len(winner.ties)
+            shared = f"; {_number(ties, 'other model')} may be as fast" if ties else ""
+            of_these = f"Of {_number(band.cells, 'cell')} with mean errors of at most {_share(band.error)}"
+            if not cell["cell"]:
+                solution = f"a high-fidelity solution, which takes {_milliseconds(winner.value)}"
+                yield f"{of_these}, none has a query faster than {solution}{shared}."
+                continue
             yield (
-                f"Of {_number(band.cells, 'cell')} with mean errors of at most {_share(band.error)}, the fastest query "
-                f"is that of {_way(cell)}, {_sizes(cell)}: {_milliseconds(winner.value)}, with mean errors of "
-                f"{_errors(cell)}; a high-fidelity solution takes {_milliseconds(cell['hf_s'])}."
+                f"{of_these}, the fastest query is that of {_way(cell)}, {_sizes(cell)}: "
+                f"{_milliseconds(winner.value)}, with mean errors of {_errors(cell)}; a high-fidelity solution takes "
+                f"{_milliseconds(cell['hf_s'])}{shared}."
             )
 
 
 def _no_winner(standings: Standings) -> str:
     return (
-        f"None of {_number(standings.cells, 'cell')} is stable over the span, has every query ok and mean errors of at "
-        f"most {_share(LARGEST_BAND)}."
+        f"None of {_number(standings.cells, 'cell')} has every query ok and mean errors of at most "
+        f"{_share(LARGEST_BAND)}."
     )
 
 

@@ -26,10 +26,12 @@ from vibench.report.page import plots
 from vibench.report.page.grids import TableGrid, grid_of, grid_of_cells, grid_of_thresholds, script_safe, to_json
 from vibench.report.page.images import image_of
 from vibench.results import pictures, tables
+from vibench.results.paired_seconds import PairedSeconds
 from vibench.results.plugin_columns import Extended, faults_of
 from vibench.results.ranking import LARGEST_BAND, Criterion, Winner, leaderboard
 from vibench.results.selection import short_keys
 from vibench.results.sqlite.reading import read_meta, study_of
+from vibench.stability.infsup import VANISHES
 from vibench.text import printable
 
 ERRORS = (
@@ -91,10 +93,11 @@ def _page(path: Path, pool: ProcessPoolExecutor | None, *, figures: bool) -> str
     return template.render(
         study=study.get("name", path.parent.name),
         facts=list(_facts(study, cells)),
-        standings=leaderboard(cells),
+        standings=leaderboard(cells, PairedSeconds(read["timings"].to_dict("records"))),
         criteria=Criterion,
         largest_band=LARGEST_BAND,
         way=_way,
+        vanishes=VANISHES,
         short=lambda cell: str(cell)[:key_length],
         findings=first,
         findings_left_out=len(everything) - len(first) - len(rest),
@@ -146,15 +149,18 @@ MOST_DUALS = 1
 def tasks_of(name: str, data: Data) -> Iterator[FigureTask]:
     """The figures of a problem of which the page has pictures: of long ones the beginning."""
     winners = (winner for one in leaderboard(data.cells) for band in one.bands for winner in band.winners)
-    ranked = dict.fromkeys([*(str(winner.cell["dual"]) for winner in winners), *data.duals])
+    ranked = dict.fromkeys([*filter(None, (str(winner.cell["dual"]) for winner in winners)), *data.duals])
     return figures_of(name, replace(data, extent=Extent.BEGINNING), list(ranked)[:MOST_DUALS])
 
 
 def _way(winner: Winner) -> str:
-    """The model of a cell that wins: its enrichment, cone, dimensions and solver."""
+    """The model of a cell that wins: its enrichment, cone, dimensions and, where that has a part in it, solver."""
     cell = winner.cell
+    if not cell["cell"]:
+        return "the high-fidelity model"
     size = f"N = {cell['N']:.0f}, R = {cell['R']:.0f}"
-    return f"{label_of(cell)}; {cell['dual']}, {size}; {cell['solver']}"
+    solver = "" if winner.criterion is Criterion.OFFLINE else f"; {cell['solver']}"  # no solver has a part in it
+    return f"{label_of(cell)}; {cell['dual']}, {size}{solver}"
 
 
 def _facts(study: dict[str, Any], cells: pd.DataFrame) -> Iterator[tuple[str, str]]:
@@ -165,7 +171,9 @@ def _facts(study: dict[str, Any], cells: pd.DataFrame) -> Iterator[tuple[str, st
     yield "machine", "; ".join(str(name) for name in cells["machine"].unique())
     versions = {name: text for row in cells["versions"].dropna().unique() for name, text in json.loads(row).items()}
     yield "versions", ", ".join(f"{name} {text}" for name, text in versions.items())
-    yield "seconds", "CPU seconds of one process; the offline time of a cell includes every stage it depends on"
+    disturbed, timed = int((cells["disturbed"] == 1).sum()), int(cells["disturbed"].notna().sum())
+    seconds = "CPU seconds of one process; the offline time of a cell includes every stage it depends on"
+    yield "seconds", f"{seconds}; {disturbed} of {timed} timed cells were timed on a disturbed machine"
 
 
 def _grids(read: Mapping[str, Extended]) -> Iterator[TableGrid]:

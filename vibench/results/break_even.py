@@ -193,7 +193,7 @@ def _comparison(paired: PairedSeconds, a: Mapping[str, Any] | None, b: Mapping[s
         online = (b["hf_s"] if a is None else a["online_s"]), b["online_s"]
         return Comparison(a, b, UNDECIDED, online, None)
     rng = np.random.default_rng(0)
-    shared = b["hf_setup_s"] if a is None else _shared(a, b)
+    shared = b["hf_setup_s"] if a is None else shared_offline(a, b)
     seconds = np.exp(level.draws(rng, DRAWS))
     online_a, quotient = float(np.exp(level.mean)), float(np.exp(ratio.mean))
     costs_a = Costs(offline_a, online_a, offline_draws(a, shared, rng) if a else np.full(DRAWS, offline_a), seconds)
@@ -209,7 +209,7 @@ def _comparison(paired: PairedSeconds, a: Mapping[str, Any] | None, b: Mapping[s
     return Comparison(a, b, result, (online_a, online_a * quotient), (math.exp(-high), math.exp(-low)))
 
 
-def _shared(a: Mapping[str, Any], b: Mapping[str, Any]) -> float:
+def shared_offline(a: Mapping[str, Any], b: Mapping[str, Any]) -> float:
     """Offline seconds of the phases that two cells have in common."""
     phases = MODEL_PHASES if b["assembly"] == CERTIFIED != a["assembly"] else SHARED_PHASES
     return float(sum(a[name] for name in phases if a[name] == b[name]))
@@ -218,7 +218,7 @@ def _shared(a: Mapping[str, Any], b: Mapping[str, Any]) -> float:
 def offline_draws(cell: Mapping[str, Any], shared: float, rng: np.random.Generator) -> Array:
     """Offline seconds of a cell as other runs might measure them (`DRAWS`,), but for those that are `shared`."""
     low, high = cell["offline_low_s"], cell["offline_high_s"]
-    spread = SCATTER if low is None else math.log(high / low) / (2.0 * NORMAL_95)
+    spread = SCATTER if low is None or math.isnan(low) else math.log(high / low) / (2.0 * NORMAL_95)
     return np.asarray(shared + (cell["offline_s"] - shared) * np.exp(spread * rng.standard_normal(DRAWS)))
 
 

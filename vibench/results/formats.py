@@ -148,5 +148,10 @@ def interval(low: float | None, high: float | None) -> str:
     return f"≥ {low:.0f}" if pd.isna(high) else f"{low:.0f}–{high:.0f}"
 
 
+def decimal_interval(low: float, high: float) -> str:
+    """The interval of a number with three significant digits, "" where none is known."""
+    return "" if pd.isna(low) or pd.isna(high) else f"{cell_text(float(low))}–{cell_text(float(high))}"
+
+
 FORMS = {"markdown": to_markdown, "csv": to_csv, "latex": to_latex, "json": to_json}
 """Formats in which a table is printed when the output is not a terminal."""

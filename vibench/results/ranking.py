@@ -12,7 +12,9 @@ import pandas as pd
 
 from vibench.errors import RequestError, unknown_name
 from vibench.qp.status import Status
-from vibench.results.columns import CELLS, Column, real
+from vibench.results.break_even import HIGH_FIDELITY, TAIL, offline_draws, shared_offline
+from vibench.results.columns import CELLS, Column, integer, real
+from vibench.results.paired_seconds import PairedSeconds
 from vibench.stability.infsup import VANISHES
 
 SOLUTION = "solution"
@@ -82,9 +84,9 @@ LARGEST_SHARE = 0.1
 """Cells where the QP solver or reduced assembly, not the strategies, makes this share of an error are not compared."""
 
 NO_BEST_CELL = (
-    "no cell takes part in the comparison: one that does has every query ok, β over the span above zero at every "
-    f"parameter, mean errors of at most {100.0 * LARGEST_BAND:g} %, and less than {100.0 * LARGEST_SHARE:g} % of an "
-    "error made by the QP solver, and by reduced assembly"
+    f"no cell takes part in the comparison: one that does has every query ok, mean errors of at most "
+    f"{100.0 * LARGEST_BAND:g} %, and less than {100.0 * LARGEST_SHARE:g} % of an error made by the QP solver, and by "
+    "reduced assembly"
 )
 """Why a run may have no best cell."""
 
@@ -94,20 +96,21 @@ BAND = "error_below"
 HEADINGS: Mapping[str, Column] = {
     **CELLS,
     BAND: real("1", "Power of ten that the mean errors, of u and λ unless told, do not exceed.", "error ≤", 1),
+    "ties": integer("Other models whose query may be as fast: the interval of the ratio contains 1.", "ties", 24),
 }
 
 
 def excluded(cells: pd.DataFrame, errors: pd.Series | None = None) -> pd.DataFrame:
     """Whether a row of the cells table takes no part, for each reason; a row has the first reason that holds.
 
-    A query is not ok (`incomplete`); the inf-sup constant β over the span vanishes at a parameter, so that the
-    multiplier is not unique there (`unstable`); the QP solver makes too large a share of the error (`loose`), or
-    reduced assembly does (`interpolated`); a mean error is above `LARGEST_BAND`, or none is known (`inexact`). `errors`
-    are those of the cells by another measure than the larger one of u and λ.
+    A query is not ok (`incomplete`); the QP solver makes too large a share of the error (`loose`), or reduced assembly
+    does (`interpolated`); a mean error is above `LARGEST_BAND`, or none is known (`inexact`). All of this was measured
+    in the queries of the cell. That β over the span vanishes at a parameter is no such defect: λ need not be unique
+    there, but mostly is; such cells are marked (`unstable`). `errors` are those of the cells by another measure than
+    the larger one of u and λ.
     """
     reasons = {
         "incomplete": cells["status"] != Status.OK,
-        "unstable": cells["beta_span_min"].astype(float) < VANISHES,
         "loose": too_loose(cells, "solver"),
         "interpolated": too_loose(cells, "assembly"),
         "inexact": ~((errors_of_solution(cells) if errors is None else errors) <= LARGEST_BAND),
@@ -115,6 +118,11 @@ def excluded(cells: pd.DataFrame, errors: pd.Series | None = None) -> pd.DataFra
     holds = pd.DataFrame(reasons, index=cells.index).astype(bool)
     earlier = holds.astype(int).cumsum(axis=1).shift(1, axis=1, fill_value=0) > 0
     return holds & ~earlier
+
+
+def unstable(cells: pd.DataFrame) -> pd.Series:
+    """Cells where β over the span vanishes at a parameter, so that λ may not be unique there."""
+    return cells["beta_span_min"].astype(float) < VANISHES
 
 
 def eligible(cells: pd.DataFrame) -> pd.Series:
@@ -127,21 +135,36 @@ def too_loose(cells: pd.DataFrame, source: Literal["solver", "assembly"]) -> pd.
     return cells[f"{source}_share_mean"].astype(float) >= LARGEST_SHARE
 
 
-def fastest(cells: pd.DataFrame, errors: pd.Series | None = None) -> pd.DataFrame:
-    """The timed cell, for every problem and power of ten, with the fastest query whose mean errors do not exceed it.
+TIES = "ties"
+"""Column of the number of other models whose query may be as fast."""
 
-    Cells that are not `eligible` take no part, as in the leaderboard of a report. A band whose cell is that of the next
-    smaller one is left out. `errors` are those of the cells by another measure, in their rows or in more.
+
+def fastest(cells: pd.DataFrame, errors: pd.Series | None = None, paired: PairedSeconds | None = None) -> pd.DataFrame:
+    """The model, for every problem and power of ten, with the fastest query whose mean errors do not exceed it.
+
+    The high-fidelity model competes. Cells that are not `eligible` take no part, as in the leaderboard of a report. A
+    band whose model is that of the next smaller one is left out. `errors` are those of the cells by another measure, in
+    their rows or in more; with the rounds of the cells, others that may be as fast are counted in `TIES`.
     """
     measured = errors_of_solution(cells) if errors is None else errors.reindex(cells.index)
     fine = ~excluded(cells, measured).any(axis=1) & cells["online_s"].notna()
-    rows = [
-        pd.concat([mine.loc[fastest_of["online_s"]], pd.Series({BAND: error})])
-        for _, mine in cells[fine].groupby(["problem", "problem_options"], dropna=False)
-        for error, _, fastest_of in bands(mine, measured[mine.index], ["online_s"])
-    ]
-    columns = ["problem", BAND, *cells.columns.drop("problem")]
-    return pd.DataFrame(rows, columns=columns).astype({**cells.dtypes, BAND: float}).reset_index(drop=True)
+    rows = list[pd.Series]()
+    for _, mine in cells[fine].groupby(["problem", "problem_options"], dropna=False):
+        for error, within, smallest in bands(mine, measured[mine.index], ["online_s"]):
+            winner = _fastest(within, smallest["online_s"], paired)
+            rows.append(pd.Series({**winner.cell, BAND: error, TIES: len(winner.ties)}))
+    columns = ["problem", BAND, TIES, *cells.columns.drop("problem")]
+    return pd.DataFrame(rows, columns=columns).reset_index(drop=True)
+
+
+def reached_errors(errors: pd.Series) -> list[float]:
+    """The powers of ten that errors do not exceed, from the largest to the smallest."""
+    return [10.0**digit for digit in sorted(set(_digits(errors)), reverse=True)]
+
+
+def _digits(errors: pd.Series) -> pd.Series:
+    exponents = np.log10(errors.clip(lower=np.finfo(float).tiny))
+    return np.ceil(exponents - 1e-12)  # by round-off the logarithm of 1e-3 may be above -3
 
 
 def bands(
@@ -153,18 +176,26 @@ def bands(
     has a value the index of the smallest one, of equal ones the first. A band in which the same cells have these as in
     the next smaller one is left out.
     """
-    exponents = np.log10(errors.clip(lower=np.finfo(float).tiny))
-    digits = np.ceil(exponents - 1e-12)  # by round-off the logarithm of 1e-3 may be above -3
+    digits = _digits(errors)
     smaller: dict[str, Any] | None = None
     reached = list[tuple[float, pd.DataFrame, dict[str, Any]]]()
     for digit in sorted(set(digits)):
         mine = cells[digits <= digit]
-        smallest = {name: mine[name].astype(float).idxmin() for name in columns if mine[name].notna().any()}
+        smallest = {name: _compared(mine, name).idxmin() for name in columns if mine[name].notna().any()}
         keys = {name: mine.at[index, "cell"] for name, index in smallest.items()}
         if keys != smaller:
             reached.append((10.0**digit, mine, smallest))
         smaller = keys
     yield from reversed(reached)
+
+
+def _compared(cells: pd.DataFrame, column: str) -> pd.Series:
+    """What is compared: a column, or instead of seconds of a query their ratio to those of a high-fidelity solution.
+
+    Both are timed in the same rounds; those of other cells may have come when the machine was slower.
+    """
+    values = cells[column].astype(float)
+    return values / cells["hf_s"].astype(float) if column == COMPARED[Criterion.QUERY] else values
 
 
 class Criterion(StrEnum):
@@ -191,7 +222,9 @@ class Winner:
     value: float
     """What is compared, as `COMPARED` says: seconds, or a relative error."""
     cell: Mapping[str, Any]
-    """The whole row of the cells table, its key under "cell"."""
+    """The whole row of the cells table, its key under "cell"; that is empty of the high-fidelity model."""
+    ties: tuple[str, ...] = ()
+    """Other cells that share the place: the 95 % interval of the difference contains 0, or there is no difference."""
 
 
 @dataclass(frozen=True)
@@ -222,7 +255,7 @@ class Standings:
     incomplete: int
     """A query is not ok."""
     unstable: int
-    """The inf-sup constant β over the span vanishes at a parameter, so that the multiplier is not unique there."""
+    """The inf-sup constant β over the span vanishes at a parameter: such cells do take part."""
     loose: int
     """The QP solver makes too large a share of the error."""
     interpolated: int
@@ -231,29 +264,82 @@ class Standings:
     """A mean error is above `LARGEST_BAND` or unknown."""
 
 
-def leaderboard(cells: pd.DataFrame) -> tuple[Standings, ...]:
+def leaderboard(cells: pd.DataFrame, paired: PairedSeconds | None = None) -> tuple[Standings, ...]:
     """The winners of every problem in every band of accuracy, in the order of the cells.
 
-    The cells are those of one run, or of several that one machine measured, since seconds are compared. There are no
-    bands where no cell takes part. Of equal values the first cell wins. A band in which the same cells win as in the
+    The cells are those of one run, or of several that one machine measured, since seconds are compared. The
+    high-fidelity model competes for the fastest query. There are no bands where no cell takes part. Who may be as good
+    shares the place, of seconds of a query where their rounds are given. A band in which the same cells win as in the
     next smaller one is left out.
     """
     groups = cells.groupby(["problem", "problem_options"], dropna=False, sort=False)
-    return tuple(_standings(str(problem), str(options), mine) for (problem, options), mine in groups)
+    return tuple(_standings(str(problem), str(options), mine, paired) for (problem, options), mine in groups)
 
 
-def _standings(problem: str, options: str, cells: pd.DataFrame) -> Standings:
+def _standings(problem: str, options: str, cells: pd.DataFrame, paired: PairedSeconds | None) -> Standings:
     without, errors = excluded(cells), errors_of_solution(cells)
     rows = cells.assign(**{COMPARED[Criterion.ERROR]: errors})[~without.any(axis=1)]
     reached = tuple(
-        Band(error, len(mine), tuple(_winners(cells, rows, smallest)))
+        Band(error, len(mine), tuple(_winners(cells, mine, smallest, paired)))
         for error, mine, smallest in bands(rows, errors[rows.index], COMPARED.values())
     )
     counts = {str(reason): int(count) for reason, count in without.sum().items()}
-    return Standings(problem, options, reached, len(cells), **counts)
+    return Standings(problem, options, reached, len(cells), unstable=int(unstable(rows).sum()), **counts)
 
 
-def _winners(cells: pd.DataFrame, rows: pd.DataFrame, smallest: Mapping[str, Any]) -> Iterator[Winner]:
+def _winners(
+    cells: pd.DataFrame, rows: pd.DataFrame, smallest: Mapping[str, Any], paired: PairedSeconds | None
+) -> Iterator[Winner]:
     for criterion, column in COMPARED.items():
-        if column in smallest:
-            yield Winner(criterion, float(rows.at[smallest[column], column]), cells.loc[smallest[column]])
+        if column not in smallest:
+            continue
+        if criterion is Criterion.QUERY:
+            yield _fastest(rows.drop(columns=COMPARED[Criterion.ERROR]), smallest[column], paired)
+            continue
+        first = rows.loc[smallest[column]]
+        others = rows.drop(index=smallest[column])
+        alike = tuple(other["cell"] for _, other in others.iterrows() if _as_good(criterion, first, other))
+        yield Winner(criterion, float(first[column]), cells.loc[smallest[column]], alike)
+
+
+def _as_good(criterion: Criterion, first: pd.Series, other: pd.Series) -> bool:
+    """Whether a cell shares the place of the first one, by errors or by offline seconds."""
+    if criterion is Criterion.OFFLINE:
+        rng, shared = np.random.default_rng(0), shared_offline(first, other)
+        more = offline_draws(other, shared, rng) - offline_draws(first, shared, rng)
+        return float(np.mean(more <= 0.0)) > TAIL
+    column, names = COMPARED[Criterion.ERROR], ("solver_error_u_max", "solver_error_lambda_max")
+    parts = [[float(one[name]) for name in names if pd.notna(one[name])] for one in (first, other)]
+    allowed = sum(max(some, default=0.0) for some in parts)
+    return bool(other[column] - first[column] <= allowed)
+
+
+def model_row(cell: Mapping[str, Any], setup: float, solution: float) -> dict[str, Any]:
+    """A row of the cells table for the high-fidelity model of a cell, which has no errors."""
+    same = ("problem", "problem_options", "machine", "status", "queries", "queries_ok", "accuracy")
+    row = dict.fromkeys(cell) | {name: cell.get(name) for name in same}
+    row |= {"N": cell.get("dim_V"), "R": cell.get("dim_W"), "primal_options": "{}", "training_options": "{}"}
+    row |= {"dual_options": "{}", "cell": "", "primal": HIGH_FIDELITY, "dual": "", "training": cell.get("training")}
+    row |= {"error_u_mean": 0.0, "error_lambda_mean": 0.0, "offline_s": setup, "online_s": solution, "hf_s": solution}
+    return row | {"solver": "", "assembly": "", "correction": "none", "disturbed": 0}
+
+
+def _fastest(cells: pd.DataFrame, index: Any, paired: PairedSeconds | None) -> Winner:
+    """The fastest query of some cells, of which that in row `index` is the fastest, and of the high-fidelity model."""
+    first, criterion = cells.loc[index], Criterion.QUERY
+    timed = cells[cells["online_s"].notna()]
+    if first["online_s"] > first["hf_s"]:
+        solution = float(np.exp(np.mean(np.log(timed["hf_s"].astype(float)))))
+        row = model_row(first.to_dict(), float(np.median(timed["hf_setup_s"].astype(float))), solution)
+        ties = [cell for cell in timed["cell"] if paired is not None and _may_be_as_fast(paired, None, cell)]
+        return Winner(criterion, solution, row, tuple(ties))
+    key = first["cell"]
+    others = timed["cell"][timed["cell"] != key]
+    ties = [cell for cell in others if paired is not None and _may_be_as_fast(paired, key, cell)]
+    return Winner(criterion, float(first["online_s"]), first, tuple(ties))
+
+
+def _may_be_as_fast(paired: PairedSeconds, first: str | None, other: str) -> bool:
+    """Whether the 95 % interval of the ratio of the seconds of two queries contains 1; where none is known it does."""
+    ratio = paired.ratio(first, other)
+    return ratio is None or ratio.interval(TAIL)[0] <= 0.0

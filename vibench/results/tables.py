@@ -31,7 +31,7 @@ from vibench.results.columns import (
     Column,
     shown_columns,
 )
-from vibench.results.formats import asked, break_even, csv_lines, interval, to_csv, to_markdown
+from vibench.results.formats import asked, break_even, csv_lines, decimal_interval, interval, to_csv, to_markdown
 from vibench.results.plugin_columns import Extended
 from vibench.results.sqlite.reading import FILE, Part, read_meta, read_parts, read_rows
 from vibench.study.cells import UNCORRECTED
@@ -224,6 +224,8 @@ def says_something(frame: pd.DataFrame, name: str) -> bool:
         return bool((frame[name] != UNCORRECTED).any())
     if name in ("training", "snapshots"):
         return bool(frame["training"].nunique() > 1)
+    if name == "rounds_missing":
+        return bool((frame["meaning"] == Meaning.UNDECIDED).any())
     if name == "status":
         return bool((frame[name] != Status.OK).any())
     zero = re.fullmatch(r"queries_zero_(u|lambda)|error_(u|lambda)_zero_max", name)
@@ -242,6 +244,12 @@ def under_headings(frame: pd.DataFrame, names: Sequence[str], table: Mapping[str
     return pd.DataFrame(shown, index=frame.index)
 
 
+INTERVALS: Mapping[str, tuple[str, Callable[..., str]]] = {
+    "threshold_high": ("threshold_low", interval), "total_high_s": ("total_low_s", decimal_interval),
+}  # fmt: skip
+"""Columns that are shown as the upper end of an interval: its lower end, and how it is written."""
+
+
 def _shown(frame: pd.DataFrame, name: str, column: Column) -> pd.Series | list[str]:
     """One column under its heading; some combine several columns of the results file."""
     if name in ("pod_tol", "dual_tol"):
@@ -250,8 +258,9 @@ def _shown(frame: pd.DataFrame, name: str, column: Column) -> pd.Series | list[s
         return [f"{fine:.0f}/{count:.0f}" for fine, count in zip(frame[name], frame["queries"], strict=True)]
     if name == "benefit_threshold":
         return [break_even(*row) for row in zip(frame["meaning"], frame[name], strict=True)]
-    if name == "threshold_high":
-        return [interval(*ends) for ends in zip(frame["threshold_low"], frame[name], strict=True)]
+    if name in INTERVALS:
+        low, shown = INTERVALS[name]
+        return [shown(*ends) for ends in zip(frame[low], frame[name], strict=True)]
     if column.kind == INTEGER:
         return frame[name].astype("Int64")
     return 1e3 * frame[name] if column.unit == "s" and column.heading.endswith("[ms]") else frame[name]

@@ -13,9 +13,10 @@ from typing import NoReturn
 import pandas as pd
 
 from vibench.errors import RequestError, unknown_name
-from vibench.results import plugin_columns, ranking, selection, tables
+from vibench.results import best, plugin_columns, ranking, selection, tables
 from vibench.results.columns import CELLS, STORED, THRESHOLDS, Column
 from vibench.results.formats import cell_text
+from vibench.results.paired_seconds import PairedSeconds
 from vibench.results.plugin_columns import Extended
 from vibench.results.ranking import BAND
 from vibench.results.sqlite.reading import parameters_of
@@ -34,8 +35,16 @@ OF_CELLS = (
 
 OF_BENEFITS = (
     "problem", "dual", "primal_a", "primal_b", "benefit_threshold", "primal_tol_b", "solver", "assembly_a",
-    "assembly_b", "correction", "threshold_high", "pod_tol", "dual_tol", "accuracy", "online_b_s", "online_a_s",
+    "assembly_b", "correction", "threshold_high", "gain", "rounds_missing", "pod_tol",
+    "dual_tol", "accuracy", "online_b_s", "online_a_s",
     "offline_b_s", "offline_a_s",
+)  # fmt: skip
+
+
+OF_TOTALS = (
+    "problem", ranking.BAND, "primal", "primal_tol", "dual", "total_s", "probability", "cheapest_from", "ties", "cell",
+    "error_lambda_mean", "certified_error", "error_u_mean", "assembly", "total_high_s", "cheapest_until", "solver", "N",
+    "R", "correction", "offline_s", "online_s", "training", "accuracy",
 )  # fmt: skip
 
 
@@ -58,7 +67,10 @@ class View:
 
 VIEWS: Mapping[str, View] = {
     "summary": View("cells", (*OF_CELLS, *(name for name in CELLS if CELLS[name].heading)), CELLS),
-    "best": View("cells", ("problem", BAND, *OF_CELLS), ranking.HEADINGS, ranking.fastest, ranking.NO_BEST_CELL),
+    "best": View(
+        "cells", ("problem", BAND, *OF_CELLS[:13], "ties", *OF_CELLS[13:]), ranking.HEADINGS, ranking.fastest,
+        ranking.NO_BEST_CELL,
+    ),
     "benefits": View("thresholds", (*OF_BENEFITS, *(n for n in THRESHOLDS if THRESHOLDS[n].heading)), THRESHOLDS),
     "cells": View("cells", (*OF_CELLS, "reason")),
     "queries": View(
@@ -93,7 +105,8 @@ OF_ONE_CELL = [name for name, view in VIEWS.items() if "cell" in STORED[view.sou
 
 TOGETHER: Mapping[str, tuple[str, ...]] = {
     "pod_tol": ("pod_size",), "dual_tol": ("dual_size",), "queries_ok": ("queries",),
-    "benefit_threshold": ("meaning",), "threshold_high": ("threshold_low",),
+    "benefit_threshold": ("meaning",), "threshold_high": ("threshold_low",), "total_high_s": ("total_low_s",),
+    "gain": ("gain_low", "gain_high"),
 }  # fmt: skip
 """What a column of a table for reading shows beside its own value."""
 
@@ -178,12 +191,14 @@ def look_up(
     limit: int = 0,
     error: str = "",
     largest: float | None = None,
+    queries: float | None = None,
 ) -> Table:
     """A table of a results file: the rows that satisfy a condition, sorted, the first `limit` of them.
 
-    With an error measure (`ranking`) models are compared by it: `best` has its bands, tables of break-even have
-    the errors of both models, of which neither is above `largest`. `cell` is the key of a cell, or its beginning, to
-    which the rows belong.
+    With an error measure (`ranking`) models are compared by it: `best` has its bands, tables of break-even have the
+    errors of both models, of which neither is above `largest`. With a number of `queries`, `best` has the model that is
+    the cheapest in total for so many, at every error or within `largest`. `cell` is the key of a cell, or its
+    beginning, to which the rows belong.
 
     Raises a `RequestError` if there is no such table, cell, column or measure, the table does not depend on one, or the
     condition is none.
@@ -191,7 +206,7 @@ def look_up(
     if name not in VIEWS:
         raise unknown_name("table", name, VIEWS)
     needed = _cells_needed(path, VIEWS[name], cell, where, sort, limit) if not error and largest is None else ()
-    view, extended = _measured(path, name, error, largest is not None, needed)
+    view, extended = _measured(path, name, error, largest, needed, queries)
     view, frame = _with_columns(view, extended.columns), extended.frame
     everything = tables.read(path, "cells") if needed else frame
     keys = everything.get("cell", [])
@@ -204,7 +219,7 @@ def look_up(
         if "cell" not in frame:
             raise RequestError(f"the table {name} has no rows of one cell; expected {', '.join(OF_ONE_CELL)}")
         frame = frame[frame["cell"] == _key_of(path, cell)]
-    rows = view.rows(frame if largest is None else ranking.within(frame, largest))
+    rows = view.rows(frame if largest is None or name == "best" else ranking.within(frame, largest))
     named = _parameters(path, rows)
     by_heading = {column.heading: key for key, column in (view.headings or {}).items() if column.heading}
     by_heading |= _parameters_by_name(named, rows)
@@ -314,24 +329,40 @@ def _with_options(name: str, text: str | None, keys: Sequence[str]) -> str:
     return " ".join([name, *(f"{key} {given[key]}" for key in keys if key in given)])
 
 
-def _measured(path: Path, name: str, error: str, limited: bool, cells: Sequence[str]) -> tuple[View, Extended]:
+def _measured(
+    path: Path, name: str, error: str, largest: float | None, cells: Sequence[str], queries: float | None
+) -> tuple[View, Extended]:
     """A table for reading and its rows, or those of some cells, with errors by the measure that is asked for."""
     view, extended = VIEWS[name], tables.extended(path, VIEWS[name].source, cells)
-    if not error and not limited:
-        return view, extended
-    if name != "best" and view.source != "thresholds":
-        raise RequestError(f"the table {name} compares no models by an error; expected {', '.join(COMPARING)}")
-    if limited and name == "best":
-        raise RequestError("--within is for tables of break-even points; the table best has all levels of error")
-    cells, errors = tables.measured(path, error or ranking.SOLUTION)
+    if queries is not None and name != "best":
+        raise RequestError(f"--queries is for the table best, not for {name}")
     if name == "best":
-        return replace(view, rows=partial(ranking.fastest, errors=errors)), extended
-    frame = ranking.with_errors(extended.frame, cells, errors)
+        return _best(path, view, error, largest, queries), extended
+    if not error and largest is None:
+        return view, extended
+    if view.source != "thresholds":
+        raise RequestError(f"the table {name} compares no models by an error; expected {', '.join(COMPARING)}")
+    recorded, errors = tables.measured(path, error or ranking.SOLUTION)
+    frame = ranking.with_errors(extended.frame, recorded, errors)
     first = ("problem", "dual", "primal_a", "primal_b", "benefit_threshold", "error_b", "error_a")
     columns = {**extended.columns, **ranking.ERROR_COLUMNS}
     return replace(view, columns=tuple(dict.fromkeys((*first, *view.columns)))), replace(
         extended, frame=frame, columns=columns
     )
+
+
+def _best(path: Path, view: View, error: str, largest: float | None, queries: float | None) -> View:
+    """The table of the fastest query at every error, or with a number of queries of the cheapest model."""
+    if queries is None and largest is not None:
+        raise RequestError("--within is for tables of break-even points, and for the table best with --queries")
+    errors = tables.measured(path, error)[1] if error else None
+    paired = PairedSeconds(tables.read(path, "timings").to_dict("records"))
+    if queries is None:
+        return replace(view, rows=partial(ranking.fastest, errors=errors, paired=paired))
+    certified = best.certified_errors(tables.read(path, "queries"))
+    asked = {"queries": queries, "errors": errors, "within": largest, "certified": certified}
+    rows = partial(best.cheapest, paired=paired, **asked)
+    return replace(view, rows=rows, columns=OF_TOTALS, headings=best.COLUMNS)
 
 
 COMPARING = ("best", *(name for name, view in VIEWS.items() if view.source == "thresholds"))
