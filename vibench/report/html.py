@@ -25,7 +25,7 @@ from vibench.report.figures.data import TABLES, Data, Extent, label_of, problems
 from vibench.report.page import plots
 from vibench.report.page.grids import TableGrid, grid_of, grid_of_cells, grid_of_thresholds, script_safe, to_json
 from vibench.report.page.images import image_of
-from vibench.results import pictures, tables
+from vibench.results import best, pictures, tables
 from vibench.results.paired_seconds import PairedSeconds
 from vibench.results.plugin_columns import Extended, faults_of
 from vibench.results.ranking import LARGEST_BAND, Criterion, Winner, leaderboard
@@ -86,6 +86,9 @@ def _page(path: Path, pool: ProcessPoolExecutor | None, *, figures: bool) -> str
     key_length = short_keys(cells["cell"])
     rows = {str(cell): k for k, cell in enumerate(cells["cell"])}
     live = [plot for name, data in data_of.items() for plot in plots.plots(name, data, rows)]
+    paired = PairedSeconds(read["timings"].to_dict("records"))
+    certified = best.certified_errors(read["queries"])
+    first_plots = [p for name, data in data_of.items() for p in plots.overview(name, data, rows, paired, certified)]
     tasks = [task for name, data in data_of.items() for task in tasks_of(name, data)] if figures else []
     rendered = render(tasks, image_of, pool)
     images = [image for figure in rendered for image in figure.pages]
@@ -93,7 +96,7 @@ def _page(path: Path, pool: ProcessPoolExecutor | None, *, figures: bool) -> str
     return template.render(
         study=study.get("name", path.parent.name),
         facts=list(_facts(study, cells)),
-        standings=leaderboard(cells, PairedSeconds(read["timings"].to_dict("records"))),
+        standings=leaderboard(cells, paired),
         criteria=Criterion,
         largest_band=LARGEST_BAND,
         way=_way,
@@ -113,10 +116,11 @@ def _page(path: Path, pool: ProcessPoolExecutor | None, *, figures: bool) -> str
         images=images,
         cut=any(image.cut for image in images) or any(len(data.duals) > MOST_DUALS for data in data_of.values()),
         plots={plot.name: plot for plot in live},
+        overviews=first_plots,
         plots_alone=[plot for plot in live if plot.name not in {image.name for image in images}],
         table_data=Markup(to_json(grids)),
-        plot_data=Markup(script_safe({plot.name: plot.data for plot in live})),
-        library=Markup(plots.library()) if live else "",
+        plot_data=Markup(script_safe({plot.name: plot.data for plot in (*first_plots, *live)})),
+        library=Markup(plots.library()) if live or first_plots else "",
         style=Markup(_asset("report.css")),
         script=Markup(_asset("report.js")),
     )

@@ -340,3 +340,29 @@ def test_a_page_of_many_cells_shows_some_rows_at_a_time(browser: Chrome, quick_r
     accuracy = formats.cell_text(tables.read(tmp_path / "many" / FILE, "cells")["accuracy"].iloc[0])
     assert [(row["solver"], row["accuracy"]) for row in shown_rows(browser)] == [("piqp", accuracy)] * 50
     assert complaints(browser) == []
+
+
+OVERVIEW = """
+const views = [...Bokeh.index.roots].filter(view => view.el.closest("[data-plot$=overview]") && view.model.renderers);
+const lines = view => view.model.renderers.filter(one => one.glyph.type === "Line");
+const named = views.filter(view => lines(view).some(one => one.data_source.data.name));
+if (!named.length) return null;
+const points = views[0].model.renderers.filter(one => one.data_source.data.cell && one.data_source.data.cell[0]);
+const { selected, data } = points[0].data_source;
+selected.indices = [0];
+const curves = lines(named[0]).map(one => one.data_source.data.name[0]);
+const top = views[0].el.getBoundingClientRect().top;
+return { cell: data.cell[0], lines: lines(views[0]).length, curves, hash: location.hash, top };
+"""
+
+
+def test_the_first_screen_says_which_model_for_how_many_queries(browser: Chrome, made: Path) -> None:
+    """Points with the high-fidelity model as a line, total costs with bands; a selected point leads to its row."""
+    look(browser, made)
+    found = awaited(browser, lambda b: b.execute_script(OVERVIEW))
+    assert found["lines"] == 1
+    assert found["curves"][0] == "high-fidelity"
+    assert len(found["curves"]) > 1
+    assert found["top"] < 900
+    assert found["hash"] == f"#summary?q={found['cell']}"
+    assert complaints(browser) == []

@@ -18,8 +18,10 @@ from vibench.report.comparison.differences import (
     MOVED,
     UNKNOWN,
     WHATS,
+    Agreement,
     ChangeKind,
     Difference,
+    agreement,
     of_numbers,
     of_plugins,
     of_seconds,
@@ -200,9 +202,23 @@ def compare(paths: Sequence[Path], limit: float) -> Comparison:
                 by_pair[run.name, earlier.name] += of_seconds(earlier, run, same, limit)
         if compared < len([key for key in run.cells if any(key in earlier.cells for earlier in runs[:k])]):
             notes.append(f"{of_run}times and break-even of different machines or protocols are not compared")
+    notes += _agreements(runs)
     notes += dict.fromkeys(line for run in runs for line in run.extended.faults)
     pairs = tuple(RunPair(*names, differences) for names, differences in by_pair.items())
     return Comparison(tuple(runs), pairs, tuple(notes))
+
+
+def _agreements(runs: Sequence[ComparedRun]) -> list[str]:
+    """A line on how often intervals of break-evens overlap, over all pairs of runs of one machine."""
+    found = list[Agreement]()
+    for k, run in enumerate(runs):
+        for earlier in runs[:k]:
+            if same := run.measured_beside(earlier, unless=()):
+                found.append(agreement(earlier.thresholds_of(same), run.thresholds_of(same)))
+    if not found:
+        return []
+    total = Agreement(*map(sum, zip(*found, strict=True)))
+    return [f"{len(found)} pair{'s' * (len(found) != 1)} of runs of one machine: {total}"]
 
 
 Means = dict[str, dict[str, float]]

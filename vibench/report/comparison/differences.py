@@ -200,6 +200,35 @@ def _break_evens(one: pd.DataFrame, two: pd.DataFrame, limit: float) -> Iterator
             yield Difference(cell, f"break-even against {row['primal_a']}", str(before), str(after), verdict)
 
 
+class Agreement(NamedTuple):
+    """How break-evens of two runs agree, of those that both have."""
+
+    both: int
+    """Numbers with an interval in both runs."""
+    overlapping: int
+    """Those whose intervals have a number in common."""
+    opposite: int
+    """Comparisons that are decided in both runs and do not mean the same."""
+    decided: int
+    """Comparisons that are decided in both."""
+
+    def __str__(self) -> str:
+        numbers = f"{self.overlapping} of {self.both} pairs of intervals of a break-even overlap"
+        return f"{numbers}; {self.opposite} of {self.decided} that both decide are decided otherwise"
+
+
+def agreement(one: pd.DataFrame, two: pd.DataFrame) -> Agreement:
+    """How break-evens of two runs, rows of their thresholds, agree; whatever the machines were."""
+    pairs = [
+        (_break_even(row, "one"), _break_even(row, "two"))
+        for row in one.merge(two, on=["cell_a", "cell_b"], suffixes=("_one", "_two")).to_dict("records")
+    ]
+    decided = [pair for pair in pairs if Meaning.UNDECIDED not in (pair[0].meaning, pair[1].meaning)]
+    numbers = [(a, b) for a, b in decided if a.meaning == b.meaning and a.number is not None]
+    overlapping = sum(a.overlaps(b) for a, b in numbers)
+    return Agreement(len(numbers), overlapping, sum(a.meaning != b.meaning for a, b in decided), len(decided))
+
+
 def _break_even(row: Mapping[Any, Any], run: str) -> BreakEven:
     number, low, high = (None if pd.isna(n := row[f"{name}_{run}"]) else float(n) for name in NUMBERS)
     return BreakEven(number, Meaning(row[f"meaning_{run}"]), low, high)

@@ -7,7 +7,7 @@ with its assembly and correction, in the colour of the pictures; the filling of 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from importlib.resources import files
 from typing import Any
@@ -20,6 +20,9 @@ from vibench.report.figures.costs import ERRORS
 from vibench.report.figures.data import Data, best_solver, label
 from vibench.report.figures.looks import Look, Looks, Series
 from vibench.report.page.grids import short
+from vibench.results import best, ranking
+from vibench.results.break_even import HIGH_FIDELITY, TAIL
+from vibench.results.paired_seconds import PairedSeconds
 from vibench.text import printable
 
 MARKERS = {
@@ -54,6 +57,8 @@ class PlotPanel:
     x_label: str
     y_label: str
     logarithmic: bool = True
+    line: float | None = None
+    """Abscissa of the high-fidelity model, which has no error."""
 
 
 @dataclass(frozen=True)
@@ -95,6 +100,70 @@ def plots(name: str, data: Data, rows: Mapping[str, int]) -> Iterator[Plot]:
     yield from _plot(f"{name}-shares", f"{data.problem}: {title}", fixed, panels, rows)
 
 
+OVERVIEW = "overview"
+"""End of the name of the plot that a report begins with."""
+
+MOST_CURVES = 6
+"""Reduced models whose total costs are drawn: those that are the cheapest at some error for some number of queries."""
+
+QUERIES = np.logspace(0.0, 6.0, 61)
+"""Numbers of queries."""
+
+
+def overview(
+    name: str, data: Data, rows: Mapping[str, int], paired: PairedSeconds, certified: pd.Series
+) -> Iterator[Plot]:
+    """Errors, and certified ones, against the seconds of a query, and total costs over the number of queries.
+
+    All models are in it, with the high-fidelity model as a line; names and rows are those of `plots`.
+    """
+    cells = data.cells[ranking.eligible(data.cells) & data.cells["online_s"].notna()]
+    if cells.empty:
+        return
+    errors = ranking.errors_of_solution(cells)
+    relative = cells["online_s"] / cells["hf_s"]
+    solution = 1e3 * float(np.exp(np.log(cells["hf_s"]).mean()))
+    shown = cells.assign(
+        online_ms=solution * relative, error=errors, certified=cells["cell"].map(certified).astype(float)
+    )
+    panels = [
+        PlotPanel("online_ms", column, "time of a query [ms]", label_, line=solution)
+        for column, label_ in (("error", "larger mean error of u and λ"), ("certified", "certified error, in energy"))
+    ]
+    for plot in _plot(f"{name}-{OVERVIEW}", f"{data.problem}: which model, for how many queries", shown, panels, rows):
+        looks = Looks([Series(*way) for way in zip(cells["primal"], cells["way"], strict=True)])
+        yield replace(plot, data=plot.data | {"costs": _costs(cells, errors, paired, rows, looks)})
+
+
+def _costs(
+    cells: pd.DataFrame, errors: pd.Series, paired: PairedSeconds, rows: Mapping[str, int], looks: Looks
+) -> dict[str, Any]:
+    """Total costs over the number of queries with their 95 % bands, of the high-fidelity model and of the cheapest."""
+    ways = dict(zip(cells["cell"], (Series(*w) for w in zip(cells["primal"], cells["way"], strict=True)), strict=True))
+    every = {one.key: one for one in best.candidates(cells, paired)}
+    winners: dict[str | None, None] = {None: None}
+    for level in ranking.reached_errors(errors):
+        allowed = [every[None], *(every[cell] for cell in cells["cell"][errors <= level * (1.0 + 1e-12)])]
+        totals = np.array([one.offline + QUERIES * one.online for one in allowed])
+        winners |= dict.fromkeys(allowed[k].key for k in dict.fromkeys(totals.argmin(axis=0)))
+    curves = []
+    for key in list(winners)[: MOST_CURVES + 1]:
+        one = every[key]
+        drawn = one.offline_draws[:, None] + one.online_draws[:, None] * QUERIES
+        low, high = np.quantile(drawn, (TAIL, 1.0 - TAIL), axis=0)
+        look = None if key is None else looks[ways[key]]
+        name = HIGH_FIDELITY if key is None else label(one.row["primal"], one.row["primal_tol"], str(one.row["way"]))
+        curves.append(
+            {"name": printable(name), "row": None if key is None else rows[key]}
+            | {"colour": "#000000" if look is None else look.colour, "dashed": key is None}
+            | {
+                side: [short(value, DIGITS) for value in values]
+                for side, values in (("y", one.offline + QUERIES * one.online), ("low", low), ("high", high))
+            }
+        )
+    return {"x": [short(value, DIGITS) for value in QUERIES], "curves": curves}
+
+
 def _plot(
     name: str, title: str, cells: pd.DataFrame, panels: list[PlotPanel], rows: Mapping[str, int]
 ) -> Iterator[Plot]:
@@ -133,6 +202,7 @@ def _panel(panel: PlotPanel, points: pd.DataFrame) -> dict[str, Any]:
         "x_label": panel.x_label,
         "y_label": panel.y_label,
         "scale": "log" if panel.logarithmic else "linear",
+        "line": None if panel.line is None else short(panel.line, DIGITS),
         "x": [short(value, DIGITS) for value in points[panel.x]],
         "y": [short(value, DIGITS) for value in points[panel.y]],
     }

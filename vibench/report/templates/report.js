@@ -268,10 +268,50 @@ function points(plot, panel, series) {
   return data;
 }
 
+/** Lead to the row of a cell in the table of all cells. */
+function openRow(source, row) {
+  source.selected.properties.indices.change.connect(() => {
+    const [k] = source.selected.indices;
+    if (k !== undefined && row(k)) location.hash = `#summary?q=${encodeURIComponent(row(k))}`;
+  });
+}
+
+/** A vertical line at the seconds of the high-fidelity model, over the range of the points. */
+function drawModelLine(made, panel) {
+  const there = panel.y.filter(value => value !== null);
+  if (panel.line === null || !there.length) return;
+  const soft = pageColours().soft;
+  made.line([panel.line, panel.line], [Math.min(...there), Math.max(...there)], { line_dash: "dashed", line_color: soft, line_width: 1.5 });
+}
+
+/** Total costs over the number of queries, a curve with its band per model. */
+function drawCosts(costs, place) {
+  const made = Bokeh.Plotting.figure({
+    x_axis_type: "log", y_axis_type: "log", height: 340, sizing_mode: "stretch_width", min_border_right: 12,
+    tools: "pan,box_zoom,wheel_zoom,tap,reset,save", x_axis_label: "queries", y_axis_label: "total [s]",
+    background_fill_color: null, border_fill_color: null,
+  });
+  made.toolbar.logo = null;
+  made.toolbar.active_scroll = null;
+  made.toolbar.active_drag = made.toolbar.tools.find(tool => tool.type === "BoxZoomTool");
+  const summary = grids.get("summary"), renderers = costs.curves.map(curve => {
+    const cell = curve.row === null ? "" : summary.columns[0].text(curve.row), colour = visible(curve.colour), all = value => costs.x.map(() => value);
+    const source = new Bokeh.ColumnDataSource({ data: { x: costs.x, y: curve.y, low: curve.low, high: curve.high, cell: all(cell), name: all(curve.name) } });
+    made.varea({ field: "x" }, { field: "low" }, { field: "high" }, { source, fill_color: colour, fill_alpha: 0.15 });
+    openRow(source, () => cell);
+    made.line({ field: "x" }, { field: "y" }, { source, line_color: colour, line_width: 2, line_dash: curve.dashed ? "dashed" : "solid" });
+    return made.scatter({ field: "x" }, { field: "y" }, { source, size: 6, line_color: null, fill_color: colour, fill_alpha: 0.01 });
+  });
+  made.add_tools(new Bokeh.HoverTool({ tooltips: [["model", "@name"], ["cell", "@cell"], ["queries", "@x{0}"], ["total [s]", "@y"], ["interval", "@low – @high"]], renderers }));
+  paint(made);
+  drawn.push(made);
+  Bokeh.Plotting.show(made, place);
+}
+
 function drawPanel(plot, panel, place) {
   const made = Bokeh.Plotting.figure({
     x_axis_type: panel.scale, y_axis_type: panel.scale, height: 340, sizing_mode: "stretch_width", min_border_right: 12,
-    tools: "pan,box_zoom,wheel_zoom,reset,save", x_axis_label: panel.x_label, y_axis_label: panel.y_label,
+    tools: "pan,box_zoom,wheel_zoom,tap,reset,save", x_axis_label: panel.x_label, y_axis_label: panel.y_label,
     background_fill_color: null, border_fill_color: null,
   });
   made.toolbar.logo = null;
@@ -281,10 +321,12 @@ function drawPanel(plot, panel, place) {
     const data = points(plot, panel, k);
     if (!data.x.length) return null;
     const source = new Bokeh.ColumnDataSource({ data }), colour = visible(series.colour);
+    openRow(source, k => data.cell[k]);
     return made.scatter({ field: "x" }, { field: "y" }, {
       source, marker: series.marker, size: 8, line_color: colour, line_width: series.edge, fill_color: colour, fill_alpha: { field: "fill" },
     });
   });
+  drawModelLine(made, panel);
   const tooltips = [["cell", "@cell"], ["model", "@model"], [panel.x_label, "@x_text"], [panel.y_label, "@y_text"]];
   made.add_tools(new Bokeh.HoverTool({ tooltips, renderers: renderers.filter(Boolean) }));
   paint(made);
@@ -302,6 +344,11 @@ function drawPlot(figure) {
   figure.prepend(...figure.querySelectorAll(".title"), legend, panels);
   figure.classList.add("live");
   const renderers = plot.panels.map((panel, k) => drawPanel(plot, panel, places[k]));
+  if (plot.costs) {
+    const place = element("div");
+    panels.append(place);
+    drawCosts(plot.costs, place);
+  }
   const counts = plot.series.map((_, k) => plot.of.filter(which => which === k).length);
   legend.append(...plot.series.map(({ name, colour }, k) => {
     const toggle = event => {
