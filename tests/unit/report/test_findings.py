@@ -127,8 +127,7 @@ def test_stability_and_cost_are_those_of_the_tables(said: Said, quick_run: Path)
     pga = of_solver.loc["offline-pga"]
     share = f"at least {100.0 * pga['share_validation']:.0f} % of the constant"
     assert any(f"adds {pga['enrichment']:.0f} vectors" in text and share in text for text in texts)
-    stable = of_solver[of_solver["beta_span_min"] > 0.0]
-    best = stable.loc[stable["online_s"].idxmin()]
+    best = of_solver.loc[of_solver["online_s"].idxmin()]
     assert any(f"{1e3 * best['online_s']:.3g} ms" in text and text.startswith("The fastest query") for text in texts)
     number = (best["offline_s"] - 0.001) / (0.1 - best["online_s"])
     (against,) = [text for text in texts if text.startswith("Break-even")]
@@ -205,11 +204,11 @@ def test_cells_are_called_disturbed_where_some_are(said: Said) -> None:
     assert not [text for text in said(calm)[""] if "disturbed" in text]
     one = f"{calm} WHERE rowid > 1"
     (told,) = [text for text in said(one, "UPDATE cells SET disturbed = 1 WHERE rowid = 1")[""] if "disturbed" in text]
-    assert told.startswith("1 cell was timed while other processes slowed the machine down")
+    assert told.startswith("1 of 36 timed cells was timed while other processes slowed the machine down")
 
 
-def test_a_model_that_is_unstable_and_ten_per_cent_off_is_praised_nowhere(said: Said) -> None:
-    """It answers fastest by far; stable, and within a per cent, it would be praised in all of these sentences."""
+def test_a_model_that_is_too_inexact_is_praised_nowhere(said: Said) -> None:
+    """It answers fastest by far; within a per cent it is praised in all of these sentences, whatever its β is."""
     fastest = (
         "UPDATE cells SET online_s = 1e-9, beta_span_min = {}, error_lambda_mean = {} WHERE primal = 'decorrelated'"
     )
@@ -220,25 +219,24 @@ def test_a_model_that_is_unstable_and_ten_per_cent_off_is_praised_nowhere(said: 
         assert len(praising) > 6
         return [text for text in praising if "decorrelated" in text]
 
-    assert praised(0.0, 0.1) == praised(0.0, 1e-3) == praised(0.1, 0.2) == []
-    assert len(praised(0.1, 1e-3)) > 6
+    assert praised(0.0, 0.2) == praised(0.1, 0.2) == []
+    assert len(praised(0.1, 1e-3)) == len(praised(0.0, 1e-3)) > 6
 
 
 def test_where_no_model_is_good_enough_that_is_said(said: Said) -> None:
     texts = said("UPDATE cells SET error_lambda_mean = 0.5 WHERE problem = 'hertz'")
-    assert texts["hertz"] == [
-        "None of 18 cells is stable over the span, has every query ok and mean errors of at most 10 %."
-    ]
+    assert texts["hertz"] == ["None of 18 cells has every query ok and mean errors of at most 10 %."]
     assert not [text for subject, found in texts.items() if "hertz, " in subject for text in found if "fastest" in text]
 
 
 def test_the_fastest_of_a_problem_is_named_with_its_errors(said: Said, quick_run: Path) -> None:
-    texts = said("UPDATE cells SET online_s = 1e-3 * rowid, error_lambda_mean = 0.02, error_u_mean = 0.001")["hertz"]
+    slow = "UPDATE cells SET online_s = 1e-3 * rowid, hf_s = 1, error_lambda_mean = 0.02, error_u_mean = 0.001"
+    texts = said(slow)["hertz"]
     cells = tables.read(quick_run / FILE, "cells")
-    stable = cells[(cells["problem"] == "hertz") & (cells["beta_span_min"] > 0.0)]
+    mine = cells[cells["problem"] == "hertz"]
     assert len(texts) == 1
-    assert texts[0].startswith(f"Of {len(stable)} cells with mean errors of at most 10 %, the fastest query is that of")
-    assert f": {stable.index.min() + 1} ms, with mean errors of 0.001 in u and 0.02 in λ;" in texts[0]
+    assert texts[0].startswith(f"Of {len(mine)} cells with mean errors of at most 10 %, the fastest query is that of")
+    assert f": {mine.index.min() + 1} ms, with mean errors of 0.001 in u and 0.02 in λ;" in texts[0]
 
 
 def test_findings_that_say_most_come_first_and_every_subject_has_a_turn(quick_run: Path) -> None:

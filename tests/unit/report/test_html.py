@@ -164,7 +164,7 @@ def test_a_run_without_any_query_has_a_report(changed: Changed) -> None:
     page = html.page(changed(*emptied, lost))
     assert "There is nothing to draw" in page
     assert "0 with every query ok" in page
-    assert page.count("No cell of this problem is stable") == 2
+    assert page.count("No cell of this problem has every query ok") == 2
     assert data(page, "plot-data") == {}
 
 

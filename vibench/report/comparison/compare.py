@@ -218,7 +218,10 @@ def _agreements(runs: Sequence[ComparedRun]) -> list[str]:
     if not found:
         return []
     total = Agreement(*map(sum, zip(*found, strict=True)))
-    return [f"{len(found)} pair{'s' * (len(found) != 1)} of runs of one machine: {total}"]
+    return [
+        f"intervals of break-evens overlap in {total.overlapping} of {total.both} pairs",
+        f"{total.opposite} of {total.decided} break-evens that two runs decide differ in meaning",
+    ]
 
 
 Means = dict[str, dict[str, float]]

@@ -212,10 +212,6 @@ class Agreement(NamedTuple):
     decided: int
     """Comparisons that are decided in both."""
 
-    def __str__(self) -> str:
-        numbers = f"{self.overlapping} of {self.both} pairs of intervals of a break-even overlap"
-        return f"{numbers}; {self.opposite} of {self.decided} that both decide are decided otherwise"
-
 
 def agreement(one: pd.DataFrame, two: pd.DataFrame) -> Agreement:
     """How break-evens of two runs, rows of their thresholds, agree; whatever the machines were."""
