@@ -182,7 +182,7 @@ def test_seconds_are_in_seconds(name: str) -> None:
 def test_the_tables_for_reading_have_the_columns_that_are_described(table: str, reference: ModuleType) -> None:
     zero = {name: [0, 1] for name in ("queries_zero_u", "queries_zero_lambda") if table == "cells"}
     several = pd.DataFrame(
-        {"accuracy": [1e-7, 1e-10], "training": ["own", "another"], **zero}
+        {"accuracy": [1e-7, 1e-10], "training": ["own", "another"], "meaning": "undecided", **zero}
     )  # with one for all, or none, they have no columns
     empty = several.reindex(columns=list(columns.STORED[table])).astype({"accuracy": float})
     name, view = {"cells": ("summary", tables.summary), "thresholds": ("benefits", tables.benefits)}[table]

@@ -200,3 +200,10 @@ def test_only_rows_of_a_disturbed_machine_are_said_to_be_marked(changed: Changed
     assert embedded["summary"]["disturbed"] == list(keys.index[keys["disturbed"] == 1])
     assert len(embedded["summary"]["disturbed"]) == 2
     assert page.count("marks rows") == sum(bool(table["disturbed"]) for table in embedded.values())
+
+
+def test_answers_that_are_all_undecided_are_shown(changed: Changed) -> None:
+    """An interval without its column would read like a result."""
+    path = changed("UPDATE thresholds SET meaning = 'undecided', benefit_threshold = NULL, threshold_low = 7")
+    table = data(html.page(path, figures=False), "table-data")["model"]
+    assert "break-even" not in table["hidden"]

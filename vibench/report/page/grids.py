@@ -102,7 +102,9 @@ def grid_of_thresholds(name: str, title: str, caption: str, rows: Extended, cell
     texts = [heading for heading in frame.columns if not pd.api.types.is_numeric_dtype(frame[heading])]
     axes = tuple(heading for heading in texts if heading not in results)
     disturbed = {*_disturbed(ordered["cell_a"], cells), *_disturbed(ordered["cell_b"], cells)}
-    return TableGrid(name, title, caption, frame, axes, tuple(_constant(frame)), tuple(sorted(disturbed)), rows.columns)
+    # Where all answers are undecided that is said: an interval alone would read like a result.
+    hidden = tuple(heading for heading in _constant(frame) if heading not in results)
+    return TableGrid(name, title, caption, frame, axes, hidden, tuple(sorted(disturbed)), rows.columns)
 
 
 def grid_of(name: str, title: str, caption: str, frame: pd.DataFrame, axes: Sequence[str], keys: int) -> TableGrid:
