@@ -255,6 +255,16 @@ def test_what_disturbs_a_round_disturbs_both_models() -> None:
     assert (row["gain_low"], row["gain_high"]) == pytest.approx((1.01, 1.01))
 
 
+def test_what_differs_between_blocks_is_the_same_for_both_models() -> None:
+    """Ratios are taken within blocks: a later one may have been timed on a machine that was thrice as slow."""
+    cells = [cell("varying", "per-parameter", online_s=0.101), cell("fixed", "fixed", online_s=0.100, offline_s=12.0)]
+    timings = rounds(cells)
+    for row in timings:
+        row["total_s"] *= 1.0 + int(row["block"][-1])
+    row = the_one(cells, timings)
+    assert (row["gain_low"], row["gain_high"]) == pytest.approx((1.01, 1.01))
+
+
 def test_only_blocks_that_both_have_are_compared() -> None:
     """Whose comparisons are decided is timed no more; the machine may be another afterwards."""
     cells = [cell("varying", "per-parameter", online_s=0.2), cell("fixed", "fixed", online_s=0.1, offline_s=12.0)]
